@@ -1,17 +1,19 @@
 """Predictions one mission ahead by kind of world: the value of each component of the model.
 
     python benchmarks/predictions.py --data DIR --out out/predictions
+    python benchmarks/predictions.py paths --only tahoe-aged tahoe-rain --data DIR
 
 Missions of the default campaign are driven in every world; after missions 1, 2, 4, 8 and 12, each
 method predicts the rates of the next one on the path it took. Methods: the default model; the same
 without one of its parts (`no memory`: beta0 ~ Beta(1, 1000), 0 but for .001, for a point mass has
 no quantiles, which the exact sampler needs); and those that predict rates without a state space,
-see `Predictor`. Of the default model also the 90 % band of the contact kept on the path that it
-would recommend, against the truth. Called again, it goes on where it stopped; worlds and courses
-added later are added to it. Intervals are 95 %, by a bootstrap over worlds and courses.
+see `Predictor`. Part `paths` holds the 90 % band of the contact lost on the path that the default
+campaign would recommend against the truth of the next mission. Called again, it goes on where it
+stopped; worlds and courses added later are added to it. Intervals are 95 %, by a bootstrap over
+worlds and courses.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any, Protocol
 
@@ -113,27 +115,24 @@ PREDICTORS: dict[str, Callable[[], Predictor]] = {
 
 def main():
     parser = arguments(
-        __doc__, data=True, out="out/predictions", quick="two small worlds, one course, 4 missions"
-    )
+        __doc__, names=PARTS, data=True, out="out/predictions",
+        quick="two small worlds, one course, 4 missions",
+    )  # fmt: skip
     parser.add_argument("--only", nargs="*", help="names of worlds; all by default")
     parser.add_argument("--courses", nargs="*", default=list(COURSES))
     parser.add_argument("-m", "--missions", type=int, default=13, help="missions, default 13")
     given = parsed(parser)
-    chosen, file = _chosen(given), given.out / "scores.jsonl"
+    chosen = _chosen(given)
     courses, n = (given.courses[:1], 4) if given.quick else (given.courses, given.missions)
-    show(records_of(file, chosen, courses, n, scored))
+    for name in given.names:
+        measure, show = PARTS[name]
+        show(records_of(given.out / f"{name}.jsonl", chosen, courses, n, measure))
 
 
 def scored(world: World, course: str, n: int) -> dict[str, Any]:
-    """Scores of every method on some missions of one campaign, rate by rate; and path values."""
-    workspace, truth = world.workspace(), world.truth()
-    campaign = Campaign(workspace, *world.ends(course), seed=0)
-    missions, values = [], []
-    for _, mission in campaign.run(world.simulator(workspace), n):
-        missions.append(workspace.fill(mission))
-        if (m := len(missions)) in AFTER and m < n:
-            low, high, path = _band(campaign)
-            values.append([low, high, truth.at(m).value(path).lost])
+    """Scores of every method on some missions of one campaign, rate by rate."""
+    workspace = world.workspace()
+    missions = [workspace.fill(mission) for _, mission in _driven(world, course, n)]
     methods: dict[str, dict[str, list[float]]] = {}
     for m in AFTER:
         if m >= n:
@@ -151,11 +150,28 @@ def scored(world: World, course: str, n: int) -> dict[str, Any]:
             columns = methods.setdefault(name, {column: [] for column in NAMES})
             for column, values_of in _columns(one).items():
                 columns[column] += values_of
-    return {"world": world.name, "kind": world.kind, "course": course, "n": n,
-            "methods": methods, "values": values}  # fmt: skip
+    return {"world": world.name, "kind": world.kind, "course": course, "n": n, "methods": methods}
 
 
-def show(records: Sequence[dict[str, Any]]) -> None:
+def banded(world: World, course: str, n: int) -> dict[str, Any]:
+    """Bands of the contact lost on recommended paths in one campaign, and the truth: `values`."""
+    truth, values = world.truth(), []
+    for m, (campaign, _) in enumerate(_driven(world, course, n), start=1):
+        if m in AFTER and m < n:
+            low, high, path = _band(campaign)
+            values.append([low, high, truth.at(m).value(path).lost])
+    return {"world": world.name, "kind": world.kind, "course": course, "n": n, "values": values}
+
+
+def _driven(world: World, course: str, n: int) -> Iterator[tuple[Campaign, Mission]]:
+    """The default campaign after each of its missions, and the mission."""
+    workspace = world.workspace()
+    campaign = Campaign(workspace, *world.ends(course), seed=0)
+    for _, mission in campaign.run(world.simulator(workspace), n):
+        yield campaign, mission
+
+
+def show_scores(records: Sequence[dict[str, Any]]) -> None:
     """Print a table of all worlds, by bounds seen and new, and one by kind."""
     print(f"\n{len({r['world'] for r in records})} worlds, {len(records)} campaigns\n")
     table = Table("method", "bounds", "rates", "within 50 %", "within 90 %", "log score, nats",
@@ -166,19 +182,34 @@ def show(records: Sequence[dict[str, Any]]) -> None:
             cells = [interval(one, share) for share in (_within_50, _within_90, _log_score)]
             more = "" if name == "default" else _more(sums, name)
             table.row(name, among, f"{one[:, 0].sum():.0f}", *cells, more, interval(one, _r2))
-    kinds = list(dict.fromkeys(r["kind"] for r in records))
     others = list(records[0]["methods"])[1:]
-    print("\nThe default by kind, its band of the contact lost on the recommended path, and its "
-          "log score less that of others\n")  # fmt: skip
-    table = Table("kind", "worlds", "within 50 %", "within 90 %", "path within 90 %", *others)
-    for title, members in [("all", kinds), *((kind, [kind]) for kind in kinds)]:
-        mine = [r for r in records if r["kind"] in members]
+    print("\nThe default by kind, and its log score less that of others\n")
+    table = Table("kind", "worlds", "within 50 %", "within 90 %", *others)
+    for title, mine in _by_kind(records):
         sums = _by_method(mine, "all")
+        shares = [interval(sums["default"], share) for share in (_within_50, _within_90)]
+        more = [_more(sums, name) for name in others]
+        table.row(title, len({r["world"] for r in mine}), *shares, *more)
+
+
+def show_paths(records: Sequence[dict[str, Any]]) -> None:
+    """Print the share of the bands that hold the truth, by kind of world."""
+    print("\nThe contact lost on the recommended path, within its 90 % band\n")
+    table = Table("kind", "worlds", "campaigns", "paths", "path within 90 %")
+    for title, mine in _by_kind(records):
         paths = np.array([[len(v), sum(low <= lost <= high for low, high, lost in v)]
                           for v in (r["values"] for r in mine)], float)  # fmt: skip
-        table.row(title, len({r["world"] for r in mine}), interval(sums["default"], _within_50),
-                  interval(sums["default"], _within_90), interval(paths, lambda s: s[1] / s[0]),
-                  *(_more(sums, name) for name in others))  # fmt: skip
+        table.row(title, len({r["world"] for r in mine}), len(mine), f"{paths[:, 0].sum():.0f}",
+                  interval(paths, lambda s: s[1] / s[0]))  # fmt: skip
+
+
+PARTS = {"scores": (scored, show_scores), "paths": (banded, show_paths)}
+
+
+def _by_kind(records: Sequence[dict[str, Any]]) -> list[tuple[str, list[dict[str, Any]]]]:
+    """All records, and those of each kind of world."""
+    kinds = list(dict.fromkeys(r["kind"] for r in records))
+    return [("all", list(records)), *((k, [r for r in records if r["kind"] == k]) for k in kinds)]
 
 
 def _by_method(records: Sequence[dict[str, Any]], among: str) -> dict[str, np.ndarray]:
