@@ -36,10 +36,10 @@ def test_report_writes_a_page_and_an_interactive_one_beside_it(invoke, finished,
 
 def test_export_writes_what_is_asked_for(invoke, finished, tmp_path):
     folder, _ = finished
-    formats = ("--format", "gpx", "--format", "csv", "--format", "gpx")
+    formats = ("--format", "geojson", "--format", "csv", "--format", "geojson")
     done = invoke("export", folder, *formats, "--out", tmp_path)
     assert done.exit_code == 0, done.output
-    names = ["path.gpx", "missions.csv", "path.csv", "path_posts.csv", "path_ways.csv"]
+    names = ["path.geojson", "missions.csv"]
     assert done.output.splitlines() == [str(tmp_path / name) for name in names]
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted(names)
 
@@ -86,12 +86,12 @@ def test_export_writes_all_there_is_and_says_what_there_is_not(invoke, finished,
         lines = [line for line in done.stderr.splitlines() if line.startswith("left out ")]
         absent = [line.split(":")[0].removeprefix("left out ") for line in lines]
         assert done.stderr.count("\nwarning: ") + done.stderr.startswith("warning: ") == 1
-        bags = ["grid_map", "ros1_bag", "ros2_bag"]
+        bags = ["grid_map", "ros2_bag"]
         assert absent == ([] if done is once and there_are_bags else bags)
         assert len(done.stdout.splitlines()) >= len(FORMATS) - len(absent)
     if there_are_bags:
-        assert f"left out ros1_bag: '{tmp_path / 'path.bag'}' exists; bags are not" in again.stderr
-    strict = invoke(*ask, "--format", "ros1_bag", "--out", tmp_path)
+        assert f"left out ros2_bag: '{tmp_path / 'path_ros2'}' exists; bags are not" in again.stderr
+    strict = invoke(*ask, "--format", "ros2_bag", "--out", tmp_path)
     assert strict.exit_code == 2
     assert strict.stderr.startswith("error: ")
     assert strict.stdout == ""
@@ -101,7 +101,7 @@ def test_export_writes_all_there_is_and_says_what_there_is_not(invoke, finished,
     ("ask", "message"),
     [
         (
-            ("gpx", "--resolution", 5),
+            ("geojson", "--resolution", 5),
             "--resolution 5 is of files for robots; leave it out, or ask for",
         ),
         (("ros_map", "--resolution", 0), "resolution must be positive and finite; got 0.0"),

@@ -10,21 +10,21 @@ import yaml
 
 import trustbo as tb
 from trustbo.errors import TrustboError
-from trustbo.export import FORMATS, export_result
+from trustbo.export import FORMATS, Frame, export_result
 from trustbo.export.everything import left_out
+from trustbo.export.frame import OF_CRS
 
 FILES = {
     "geotiff": ["maps.tif", "maps.qml"],
     "cog": ["maps_cog.tif"],
     "netcdf": ["maps.nc"],
     "geojson": ["path.geojson"],
-    "gpx": ["path.gpx"],
     "geopackage": ["path.gpkg"],
     "overwatch": ["overwatch.tif"],
     "kmz": ["mission.kmz"],
     "qgc": [f"mission_{robot}.plan" for robot in ("lead", "r1", "r2", "r3")],
     "cot": ["mission_tak.zip"],
-    "csv": ["missions.csv", "path.csv", "path_posts.csv", "path_ways.csv"],
+    "csv": ["missions.csv"],
     "ros_map": ["cost_map.yaml", "cost_map.pgm", "cost_map_filters.yaml"],
     "nav2": [
         "route_graph.geojson",
@@ -33,11 +33,10 @@ FILES = {
     ],
     "grid_map": ["grid_map"],
     "foxglove": ["scene.mcap"],
-    "ros1_bag": ["path.bag"],
     "ros2_bag": ["path_ros2"],
 }
 NEEDS_A_PLACE = (
-    "geotiff", "cog", "geojson", "gpx", "geopackage", "overwatch", "kmz", "qgc", "cot"
+    "geotiff", "cog", "geojson", "geopackage", "overwatch", "kmz", "qgc", "cot"
 )  # fmt: skip
 
 
@@ -57,47 +56,50 @@ def test_by_default_it_is_what_a_gis_takes_and_a_second_time_replaces_it(result,
         written = export_result(result, tmp_path)
         assert [file.name for file in written] == ["maps.tif", "maps.qml", "path.geojson"]
     assert len(list(tmp_path.iterdir())) == 3
-    assert export_result(result, tmp_path, "gpx") == [tmp_path / "path.gpx"]
+    assert export_result(result, tmp_path, "geopackage") == [tmp_path / "path.gpkg"]
 
 
 def test_maps_for_ros_have_the_frame_that_is_asked_for(result, tmp_path):
     lon, lat = result.workspace.grid.lonlat(result.path[0])
-    options = {"rotation": 0.1, "frame": "odom"}
+    frame = Frame(rotation=0.1, name="odom")
     (tmp_path / "cost_map_frame.yaml").touch()  # as version 0.2 wrote it
-    written = export_result(result, tmp_path, ["csv", "ros_map"], **options)
+    written = export_result(result, tmp_path, ["csv", "ros_map"], frame=frame)
     assert written[-1] == tmp_path / "frame.yaml"
     assert all(file.exists() for file in written)
     assert not (tmp_path / "cost_map_frame.yaml").exists()
-    frame = yaml.safe_load(written[-1].read_text())
-    assert frame["origin"] == list(result.workspace.grid.center(result.path[0]))
-    export_result(result, tmp_path / "b", "ros_map", origin=f"lon={lon},lat={lat}", **options)
+    record = yaml.safe_load(written[-1].read_text())
+    assert record["origin"] == list(result.workspace.grid.center(result.path[0]))
+    export_result(result, tmp_path / "b", "ros_map",
+                  frame=frame._replace(origin=f"lon={lon},lat={lat}"))  # fmt: skip
     again = yaml.safe_load((tmp_path / "b" / "frame.yaml").read_text())
-    np.testing.assert_allclose(again["origin"], frame["origin"], rtol=0.0, atol=1e-3)
-    for name, value in {"origin": "crs", "rotation": 0.1, "frame": "odom"}.items():
-        with pytest.raises(
-            TrustboError, match=f"{name}={value!r} is of files for robots; leave it"
-        ):
-            export_result(result, tmp_path, "geotiff", **{name: value})
+    np.testing.assert_allclose(again["origin"], record["origin"], rtol=0.0, atol=1e-3)
+    for name, given in (
+        ("origin='crs'", OF_CRS),
+        ("rotation=0.1", Frame(rotation=0.1)),
+        ("frame='odom'", Frame(name="odom")),
+    ):
+        with pytest.raises(TrustboError, match=f"{name} is of files for robots; leave it"):
+            export_result(result, tmp_path, "geotiff", frame=given)
     with pytest.raises(TrustboError, match=r"origin 'x=0,y=0' .* is 5239 km from the grid, x 380"):
-        export_result(result, tmp_path, "ros_map", origin=(0.0, 0.0))
+        export_result(result, tmp_path, "ros_map", frame=Frame((0.0, 0.0)))
 
 
 def test_files_for_robots_in_one_folder_have_one_frame(result, tmp_path):
     pytest.importorskip("rosbags", reason="needs the extra ros")
     export_result(result, tmp_path, ["ros_map", "nav2"])
     with pytest.raises(TrustboError, match=r"holds cost_map.yaml, .*geojson, .* in another frame"):
-        export_result(result, tmp_path, "ros2_bag", origin="crs")
+        export_result(result, tmp_path, "ros2_bag", frame=OF_CRS)
     assert not (tmp_path / "path_ros2").exists()
     export_result(result, tmp_path, "ros2_bag")
-    export_result(result, tmp_path / "b", "ros_map", origin="crs")
+    export_result(result, tmp_path / "b", "ros_map", frame=OF_CRS)
     export_result(result, tmp_path / "b", "ros_map")  # alone, it is replaced
-    export_result(result, tmp_path / "b", "ros_map", origin="crs")
+    export_result(result, tmp_path / "b", "ros_map", frame=OF_CRS)
     (tmp_path / "b" / "frame.yaml").unlink()  # as an export of version 0.2
     with pytest.raises(TrustboError, match=r"asked for, 'map' at x 380015, y 5224925 of the"):
         export_result(result, tmp_path / "b", "ros2_bag")
-    export_result(result, tmp_path / "b", "ros2_bag", origin="crs")
+    export_result(result, tmp_path / "b", "ros2_bag", frame=OF_CRS)
     with pytest.raises(TrustboError, match=r"float32, in steps of 0.5 m .* origin='auto' is the"):
-        export_result(result, tmp_path / "c", "nav2", origin="crs")
+        export_result(result, tmp_path / "c", "nav2", frame=OF_CRS)
 
 
 def test_the_assumed_trust_of_the_start_does_not_stretch_the_colours(result, tmp_path):
@@ -129,7 +131,7 @@ def test_maps_are_made_for_formats_that_have_maps_and_once(result, tmp_path):
 
     fields = {f.name: getattr(result, f.name) for f in dataclasses.fields(result)}
     watched = Watched(**fields)
-    export_result(watched, tmp_path, ["geojson", "gpx", "geopackage", "csv"])
+    export_result(watched, tmp_path, ["geojson", "geopackage", "csv"])
     assert made == []
     export_result(watched, tmp_path, ["geotiff", "cog", "netcdf", "ros_map"])
     assert made == [{}]
@@ -138,11 +140,11 @@ def test_maps_are_made_for_formats_that_have_maps_and_once(result, tmp_path):
 def test_what_cannot_be_written_is_said_beforehand(result, nowhere, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rosbags", None)
     absent = left_out(nowhere, tmp_path)
-    assert list(absent) == [*NEEDS_A_PLACE, "grid_map", "foxglove", "ros1_bag", "ros2_bag"]
-    assert "only a workspace made from a terrain has a CRS" in absent["gpx"]
+    assert list(absent) == [*NEEDS_A_PLACE, "grid_map", "foxglove", "ros2_bag"]
+    assert "only a workspace made from a terrain has a CRS" in absent["geojson"]
     assert "pip install rosbags" in absent["ros2_bag"]
-    (tmp_path / "path.csv").mkdir()
-    assert list(left_out(result, tmp_path)) == ["csv", "grid_map", "ros1_bag", "ros2_bag"]
+    (tmp_path / "missions.csv").mkdir()
+    assert list(left_out(result, tmp_path)) == ["csv", "grid_map", "ros2_bag"]
     (tmp_path / "file").touch()
     with pytest.raises(TrustboError, match=r"cannot write to '.*file': .* is a file"):
         left_out(result, tmp_path / "file")
@@ -169,24 +171,24 @@ def test_what_one_format_refuses_keeps_all_from_being_written(result, tmp_path, 
     with pytest.raises(
         TrustboError, match=r"resolution=5 is of files for robots; leave it out, or"
     ):
-        export_result(result, tmp_path, ["csv", "gpx"], resolution=5)
+        export_result(result, tmp_path, ["csv", "geojson"], resolution=5)
     monkeypatch.setitem(sys.modules, "rosbags", None)
     with pytest.raises(TrustboError, match="pip install rosbags"):
-        export_result(result, tmp_path, ["csv", "ros1_bag"])
+        export_result(result, tmp_path, ["csv", "ros2_bag"])
     assert list(tmp_path.iterdir()) == []
 
 
 def test_what_is_in_the_way_is_named_before_anything_is_written(result, tmp_path):
     pytest.importorskip("rosbags", reason="needs the extra ros")
-    (tmp_path / "path.csv").mkdir()
-    (tmp_path / "path.bag").touch()
-    with pytest.raises(TrustboError, match=r"path\.csv': it is a folder"):
+    (tmp_path / "missions.csv").mkdir()
+    (tmp_path / "path_ros2").touch()
+    with pytest.raises(TrustboError, match=r"missions\.csv': it is a folder"):
         export_result(result, tmp_path, ["geojson", "csv"])
-    with pytest.raises(TrustboError, match=r"path\.bag' exists; bags are not overwritten"):
-        export_result(result, tmp_path, ["geojson", "ros1_bag"])
-    with pytest.raises(TrustboError, match=r"cannot write to '.*path\.bag': .* is a file"):
-        export_result(result, tmp_path / "path.bag")
-    assert {file.name for file in tmp_path.iterdir()} == {"path.csv", "path.bag"}
+    with pytest.raises(TrustboError, match=r"path_ros2' exists; bags are not overwritten"):
+        export_result(result, tmp_path, ["geojson", "ros2_bag"])
+    with pytest.raises(TrustboError, match=r"cannot write to '.*path_ros2': .* is a file"):
+        export_result(result, tmp_path / "path_ros2")
+    assert {file.name for file in tmp_path.iterdir()} == {"missions.csv", "path_ros2"}
 
 
 def test_names_that_a_format_cannot_hold_are_refused_before_anything_is_written(result, tmp_path):

@@ -9,9 +9,10 @@ from pyproj import CRS, Geod, Transformer
 
 import trustbo as tb
 from trustbo.errors import TrustboError
-from trustbo.export import write_frame, write_ros_bag, write_ros_map
+from trustbo.export import Frame, write_frame, write_ros_bag, write_ros_map
+from trustbo.export.frame import OF_CRS
 
-ASK = {"origin": "auto", "rotation": 0.4, "frame": "odom"}
+ASK = Frame("auto", 0.4, "odom")
 
 
 def test_one_transform_is_in_the_file_and_in_the_bag(result, maps, tmp_path):
@@ -20,13 +21,13 @@ def test_one_transform_is_in_the_file_and_in_the_bag(result, maps, tmp_path):
     from mcap.reader import make_reader
     from mcap_ros2.decoder import DecoderFactory
 
-    write_frame(tmp_path / "frame.yaml", result, **ASK)
+    write_frame(tmp_path / "frame.yaml", result, frame=ASK)
     text = (tmp_path / "frame.yaml").read_text()
     record = yaml.safe_load(text)
-    write_ros_bag(tmp_path / "bag", result, maps["cost"], result.workspace, **ASK)
+    write_ros_bag(tmp_path / "bag", result, maps["cost"], result.workspace, frame=ASK)
     assert (tmp_path / "bag_frame.yaml").read_text() == text
-    of_map = ASK | {"origin": result.workspace.grid.center(result.path[0])}
-    write_ros_map(tmp_path / "map.yaml", maps["cost"], result.workspace, **of_map)
+    of_map = ASK._replace(origin=result.workspace.grid.center(result.path[0]))
+    write_ros_map(tmp_path / "map.yaml", maps["cost"], result.workspace, frame=of_map)
     assert (tmp_path / "map_frame.yaml").read_text() == text
     with (tmp_path / "bag" / "bag.mcap").open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
@@ -56,8 +57,8 @@ def test_one_transform_is_in_the_file_and_in_the_bag(result, maps, tmp_path):
 @pytest.mark.parametrize("rotation", [0.0, 2.0, -1.0])
 def test_the_datum_is_a_place_and_a_direction_on_earth(result, tmp_path, rotation):
     """50 m along the x axis, from the datum by geodesics, is 50 m along it by the CRS."""
-    write_frame(tmp_path / "frame.yml", result.workspace, origin=(380050, 5224950),
-                rotation=rotation)  # fmt: skip
+    write_frame(tmp_path / "frame.yml", result.workspace,
+                frame=Frame((380050, 5224950), rotation))  # fmt: skip
     record = yaml.safe_load((tmp_path / "frame.yml").read_text())
     lat, lon, yaw = record["datum"]
     assert (lon, lat) == (record["longitude"], record["latitude"])
@@ -71,7 +72,7 @@ def test_the_datum_is_a_place_and_a_direction_on_earth(result, tmp_path, rotatio
 
 def test_without_a_crs_there_is_no_datum(tmp_path):
     workspace = tb.Workspace.from_awareness(np.full((3, 3, 4, 2), 0.5), cell_size=2.0)
-    write_frame(tmp_path / "frame.yaml", workspace, origin=None)
+    write_frame(tmp_path / "frame.yaml", workspace, frame=OF_CRS)
     record = yaml.safe_load((tmp_path / "frame.yaml").read_text())
     assert (record["frame"], record["parent"], record["origin"]) == ("map", "grid", [0.0, 0.0])
     assert not record.keys() & {"crs", "longitude", "latitude", "datum"}
@@ -80,7 +81,11 @@ def test_without_a_crs_there_is_no_datum(tmp_path):
 def test_a_frame_that_cannot_be_is_refused(result, tmp_path):
     for given, options, message in (
         (result.workspace, {}, 'origin="auto" is the start of a path; a map alone has none'),
-        (result, {"frame": "epsg_32616"}, "frame 'epsg_32616' is that of the CRS itself"),
+        (
+            result,
+            {"frame": Frame(name="epsg_32616")},
+            "frame 'epsg_32616' is that of the CRS",
+        ),
         ("result", {}, "plan: got str 'result'; give a Plan, a Result or a Workspace"),
     ):
         with pytest.raises(TrustboError, match=message):

@@ -8,7 +8,8 @@ import xarray as xr
 
 import trustbo as tb
 from trustbo.errors import ShapeError, TrustboError
-from trustbo.export import read_grid_map, write_grid_map
+from trustbo.export import Frame, read_grid_map, write_grid_map
+from trustbo.export.frame import OF_CRS
 from trustbo.terrain import read_terrain, synthetic_terrain
 
 rosbags = pytest.importorskip("rosbags", reason="needs the extra ros")
@@ -46,17 +47,17 @@ def decoded(path):
 
 
 @pytest.mark.parametrize("options", [
-    {}, {"origin": (380010.0, 5224920.0), "frame": "odom"}, {"resolution": 7.5},
-    {"origin": (380010.0, 5224920.0), "rotation": 0.5},
+    {}, {"frame": Frame((380010.0, 5224920.0), 0.0, "odom")}, {"resolution": 7.5},
+    {"frame": Frame((380010.0, 5224920.0), 0.5)},
 ])  # fmt: skip
 def test_each_place_has_its_values_by_the_arithmetic_of_grid_map(result, maps, tmp_path, options):
     write_grid_map(tmp_path / "bag", maps, result.workspace, **options)
     found = decoded(tmp_path / "bag" / "bag.mcap")
     message, (static,) = found["/trustbo/maps"], found["/tf_static"].transforms
-    assert message.header.frame_id == static.child_frame_id == options.get("frame", "map")
+    assert message.header.frame_id == static.child_frame_id == options.get("frame", OF_CRS).name
     assert set(message.layers) == set(maps.data_vars)
     assert not message.basic_layers
-    angle, grid = options.get("rotation", 0.0), result.workspace.grid
+    angle, grid = options.get("frame", OF_CRS).rotation, result.workspace.grid
     c, s = np.cos(angle), np.sin(angle)
     shift, n_seen = static.transform.translation, 0
     for name, matrix in matrices(message).items():
@@ -76,7 +77,7 @@ def test_each_place_has_its_values_by_the_arithmetic_of_grid_map(result, maps, t
 
 @pytest.mark.parametrize(("name", "options"), [
     ("maps.bag", {}), ("maps", {}), ("maps", {"storage": "sqlite3"}),
-    ("maps", {"origin": (380010.0, 5224920.0), "frame": "odom"}),
+    ("maps", {"frame": Frame((380010.0, 5224920.0), 0.0, "odom")}),
 ])  # fmt: skip
 def test_maps_come_back_bit_by_bit(result, maps, tmp_path, name, options):
     write_grid_map(tmp_path / name, maps, result.workspace, **options)
@@ -88,7 +89,7 @@ def test_maps_come_back_bit_by_bit(result, maps, tmp_path, name, options):
     for axis in ("y", "x"):
         np.testing.assert_allclose(again[axis], maps[axis], rtol=0.0, atol=1e-6)
     assert again.rio.crs == maps.rio.crs
-    assert again.attrs["frame"] == options.get("frame", "map")
+    assert again.attrs["frame"] == options.get("frame", OF_CRS).name
 
 
 @pytest.mark.parametrize("corner", [(0, 0), (0, 3), (2, 0), (2, 3)])

@@ -17,7 +17,7 @@ from pyproj import Transformer
 
 import trustbo as tb
 from trustbo.errors import TrustboError
-from trustbo.export import export_result, write_cot, write_foxglove, write_kmz, write_qgc
+from trustbo.export import Frame, export_result, write_cot, write_foxglove, write_kmz, write_qgc
 from trustbo.export.schedule import schedule_of
 
 ROBOTS = ("lead", "r1", "r2", "r3")
@@ -319,8 +319,8 @@ def test_a_scene_is_read_by_mcap_and_its_schemas(result, maps, schedule, tmp_pat
     from mcap.reader import make_reader
     from mcap_protobuf.decoder import DecoderFactory
 
-    options = {"origin": (380010.0, 5224920.0), "frame": "odom"}
-    write_foxglove(tmp_path / "s.mcap", result, maps, **options)
+    frame = Frame((380010.0, 5224920.0), name="odom")
+    write_foxglove(tmp_path / "s.mcap", result, maps, frame=frame)
     with (tmp_path / "s.mcap").open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
         found = [(c.topic, s.name, m.log_time, d) for s, c, m, d in reader.iter_decoded_messages()]
@@ -334,7 +334,7 @@ def test_a_scene_is_read_by_mcap_and_its_schemas(result, maps, schedule, tmp_pat
     (one,) = transforms.transforms
     assert (one.parent_frame_id, one.child_frame_id) == ("epsg_32616", "odom")
     shift = np.array([one.translation.x, one.translation.y])
-    assert tuple(shift) == options["origin"]
+    assert tuple(shift) == frame.origin
     ((_, grid),) = by_topic["/trustbo/maps"]
     rows = len(grid.data) // grid.row_stride
     assert (rows, grid.column_count) == result.workspace.grid.shape

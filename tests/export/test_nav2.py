@@ -7,7 +7,8 @@ import pytest
 import yaml
 
 from trustbo.errors import TrustboError
-from trustbo.export import write_costmap_filters, write_ros_map, write_waypoints
+from trustbo.export import Frame, write_costmap_filters, write_ros_map, write_waypoints
+from trustbo.export.frame import OF_CRS
 
 
 def poses_of(file):
@@ -30,8 +31,7 @@ def test_waypoints_are_the_stops_of_a_robot_in_the_frame(result, tmp_path, robot
     plan, angle = result.plan, 0.3
     origin = np.array([380010.0, 5224920.0])
     write_waypoints(
-        tmp_path / "w.yaml", result, robot=robot, origin=tuple(origin), rotation=angle,
-        frame="odom",
+        tmp_path / "w.yaml", result, robot=robot, frame=Frame(tuple(origin), angle, "odom"),
     )  # fmt: skip
     assert yaml.safe_load((tmp_path / "w_frame.yaml").read_text())["rotation"] == angle
     poses = poses_of(tmp_path / "w.yaml")
@@ -53,8 +53,9 @@ def test_waypoints_are_the_stops_of_a_robot_in_the_frame(result, tmp_path, robot
 def test_filters_heed_the_map_by_the_rules_of_the_costmap(result, maps, tmp_path):
     """SpeedFilter: base + multiplier x mask, in percent; 0 is no limit. KeepoutFilter: the mask."""
     cost, workspace = maps["cost"], result.workspace
-    write_ros_map(tmp_path / "map.yaml", cost, workspace, origin=(380000, 5224910), frame="odom")
-    write_costmap_filters(tmp_path / "map.yaml", slowest=0.4, frame="odom")
+    odom = Frame((380000, 5224910), name="odom")
+    write_ros_map(tmp_path / "map.yaml", cost, workspace, frame=odom)
+    write_costmap_filters(tmp_path / "map.yaml", slowest=0.4, frame=odom)
     nodes = {
         name: values["ros__parameters"]
         for name, values in yaml.safe_load((tmp_path / "map_filters.yaml").read_text()).items()
@@ -80,7 +81,7 @@ def test_what_cannot_be_followed_is_refused(result, nowhere, tmp_path):
     with pytest.raises(TrustboError, match="unknown robot 'r9'; choose one of lead, r1, r2, r3"):
         write_waypoints(tmp_path / "w.yaml", result, robot="r9")
     with pytest.raises(TrustboError, match="a plan has posts and ways where its workspace was"):
-        write_waypoints(tmp_path / "w.yaml", nowhere, origin=None)
+        write_waypoints(tmp_path / "w.yaml", nowhere, frame=OF_CRS)
     for slowest in (0.0, 1.1):
         with pytest.raises(TrustboError, match=r"slowest must be a share in \(0, 1\]; got"):
             write_costmap_filters(tmp_path / "map.yaml", slowest=slowest)

@@ -1,13 +1,10 @@
 """Paths, each format read back by a reader that is not the writer."""
 
-import csv
 import json
 import sqlite3
 from dataclasses import replace
 
-import gpxpy
 import numpy as np
-import pandas as pd
 import pytest
 from pyproj import Transformer
 from references import geometry_of_blob
@@ -90,40 +87,6 @@ def test_geojson_is_in_degrees_on_the_right_place(result, centers, tmp_path):
             assert found == trust_of(result.plan, k, robot)
 
 
-def test_gpx_is_a_route_over_the_ground(result, centers, tmp_path):
-    write_path(tmp_path / "path.gpx", result.plan, result.workspace)
-    gpx = gpxpy.parse((tmp_path / "path.gpx").read_text(), version="1.1")
-    assert gpx.version == "1.1"
-    assert [route.name for route in gpx.routes[1:]] == ["lead", *ROBOTS]
-    route, n = gpx.routes[0], len(centers)
-    assert route.name == "most trustworthy path"
-    between = [f"bound {k}" for k in range(1, n - 1)]
-    assert between
-    assert [point.name for point in route.points] == ["start", *between, "goal"]
-    lon, lat = TO_DEGREES.transform(*centers.T)
-    np.testing.assert_allclose([p.longitude for p in route.points], lon, rtol=0.0, atol=1e-8)
-    np.testing.assert_allclose([p.latitude for p in route.points], lat, rtol=0.0, atol=1e-8)
-    dem = result.workspace.terrain["dem"].values  # 1 m pixels, the centre is a corner of four
-    for point, (row, col) in zip(route.points, result.path, strict=True):
-        corner = dem[30 * row + 14 : 30 * row + 16, 30 * col + 14 : 30 * col + 16]
-        assert corner.min() - 0.01 <= point.elevation <= corner.max() + 0.01
-    said = [[(robot, *trust_of(result.plan, k, robot)) for robot in ROBOTS] for k in range(1, n)]
-    texts = [", ".join(f"{r} {t:.2f} ({a:.2f} to {b:.2f})" for r, t, a, b in one) for one in said]
-    assert [point.description for point in route.points] == ["start", *texts]
-
-
-def test_gpx_says_no_elevation_where_the_ground_is_not_known(result, nowhere, tmp_path):
-    lost = result.workspace.terrain.copy()
-    lost["dem"] = lost["dem"].where(lost["x"] > 380030.0)  # the first column of cells
-    write_path(tmp_path / "path.gpx", result.plan, replace(result.workspace, terrain=lost))
-    route, *_ = gpxpy.parse((tmp_path / "path.gpx").read_text()).routes
-    known = [point.elevation is not None for point in route.points]
-    assert known == [col > 0 for _, col in result.path]
-    placed = replace(nowhere.workspace, grid=result.workspace.grid)
-    write_path(tmp_path / "path.gpx", result.plan, placed)
-    assert "<ele>" not in (tmp_path / "path.gpx").read_text()
-
-
 def test_a_geopackage_has_a_layer_of_the_line_and_one_of_the_bounds(result, centers, tmp_path):
     write_path(tmp_path / "path.gpkg", result)
     assert [file.name for file in tmp_path.iterdir()] == ["path.gpkg"]
@@ -153,43 +116,27 @@ def test_a_geopackage_has_a_layer_of_the_line_and_one_of_the_bounds(result, cent
             assert found == (trust_of(result.plan, k, robot) if k else [None] * 3)
 
 
-def test_a_table_has_degrees_where_there_are_any(result, nowhere, centers, tmp_path):
-    write_path(tmp_path / "path.csv", result)
-    write_path(tmp_path / "bare.csv", result.plan, nowhere.workspace)
-    tables = {}
-    for name in ("path", "bare"):
-        with (tmp_path / f"{name}.csv").open(newline="") as stream:
-            tables[name] = list(csv.DictReader(stream))
-    lon, lat = TO_DEGREES.transform(*centers.T)
-    for k, row in enumerate(tables["path"]):
-        place = float(row.pop("longitude")), float(row.pop("latitude"))
-        np.testing.assert_allclose(place, (lon[k], lat[k]), rtol=0.0, atol=1e-10)
-        assert (float(row["x"]), float(row["y"])) == tuple(centers[k])
-        for robot in ROBOTS:
-            found = [row[f"trust_{robot}{end}"] for end in ("", "_low", "_high")]
-            if k:
-                assert [float(f) for f in found] == trust_of(result.plan, k, robot)
-            else:
-                assert found == ["", "", ""]
-    assert tables["bare"] == tables["path"]
-    assert not (tmp_path / "bare_posts.csv").exists()
+def test_a_frame_without_a_crs_is_that_of_the_grid(result, nowhere, centers):
+    table = path_frame(result.plan, nowhere.workspace, crs=None)
+    np.testing.assert_array_equal(table[["x", "y"]], centers)
+    assert table.crs is None
 
 
 def test_what_cannot_be_written_is_refused_before_anything_is(result, nowhere, tmp_path):
     plan, workspace = result.plan, result.workspace
-    choices = r"choose one of \.geojson, \.gpx, \.gpkg, \.csv"
+    choices = r"choose one of \.geojson, \.gpkg"
     for name, suffix in (("path.kml", r"\.kml"), ("path", "")):
         with pytest.raises(TrustboError, match=f"unknown suffix '{suffix}'; {choices}"):
             write_path(tmp_path / name, result)
-    for name in ("path.geojson", "path.gpx", "path.gpkg"):
+    for name in ("path.geojson", "path.gpkg"):
         with pytest.raises(TrustboError, match=r"has a CRS; use Workspace\.from_t"):
             write_path(tmp_path / name, nowhere)
     alone = tb.Workspace.from_awareness(np.full((1, 3, 4, 2), 0.5))
     with pytest.raises(ShapeError, match=r"the plan has 3 robots, the workspace \('r1',\)"):
-        write_path(tmp_path / "path.csv", plan, alone)
+        write_path(tmp_path / "path.gpkg", plan, alone)
     small = tb.Workspace.from_awareness(np.full((3, 2, 2, 2), 0.5))
     with pytest.raises(TrustboError, match=r"path\[0\] \(2, 0\) is outside the grid of 2 rows"):
-        write_path(tmp_path / "path.csv", plan, small)
+        write_path(tmp_path / "path.gpkg", plan, small)
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "path.gpkg").mkdir()
     with pytest.raises(TrustboError, match=r"cannot write '.*path\.gpkg': it is a folder"):
@@ -197,12 +144,12 @@ def test_what_cannot_be_written_is_refused_before_anything_is(result, nowhere, t
 
 
 def test_a_file_is_replaced_whole(result, tmp_path):
-    for suffix in ("geojson", "gpx", "gpkg", "csv"):
+    for suffix in ("geojson", "gpkg"):
         file = tmp_path / f"path.{suffix.upper()}"
         file.write_text("an older file " * 100_000)
         write_path(file, result)
         assert b"an older file" not in file.read_bytes()
-    assert len(list(tmp_path.iterdir())) == 6  # with tables of posts and of ways
+    assert len(list(tmp_path.iterdir())) == 2
 
 
 def test_bounds_carry_their_chances_to_fail_and_to_get_as_far(result):
@@ -218,12 +165,10 @@ def test_bounds_carry_their_chances_to_fail_and_to_get_as_far(result):
     np.testing.assert_allclose(sum(causes), risk.p_fail, rtol=1e-12)
 
 
-def test_a_chance_too_small_to_mean_anything_is_0_in_tables(result, tmp_path):
+def test_a_chance_too_small_to_mean_anything_is_0_in_tables(result):
     risk = result.plan.risk
     by_cause = {cause: np.full(len(risk.p_fail), 4.8e-161) for cause in risk.by_cause}
     plan = replace(result.plan, risk=risk._replace(by_cause=by_cause))
-    write_path(tmp_path / "path.csv", plan)
-    table = pd.read_csv(tmp_path / "path.csv")
+    table = path_frame(plan)
     assert (table[[f"p_fail_{cause}" for cause in by_cause]][1:] == 0.0).all(axis=None)
     np.testing.assert_array_equal(table["p_fail"][1:], risk.p_fail)
-    assert "e-161" not in (tmp_path / "path.csv").read_text()

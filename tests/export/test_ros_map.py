@@ -11,7 +11,8 @@ from pyproj import Transformer
 
 import trustbo as tb
 from trustbo.errors import ShapeError, TrustboError
-from trustbo.export import write_ros_map
+from trustbo.export import Frame, write_ros_map
+from trustbo.export.frame import OF_CRS
 from trustbo.export.ros import occupancy
 
 
@@ -83,7 +84,13 @@ def test_pixels_are_as_the_cell_at_their_centre(workspace, cost):
 def test_each_place_has_its_value_in_both_loaders(result, maps, resolution, origin, tmp_path):
     workspace, cost = result.workspace, maps["cost"]
     path = tmp_path / "maps" / "cost.map.yaml"
-    write_ros_map(path, cost, workspace, resolution=resolution, origin=origin)
+    write_ros_map(
+        path,
+        cost,
+        workspace,
+        resolution=resolution,
+        frame=OF_CRS if origin is None else Frame(origin),
+    )
     names = {"cost.map.yaml", "cost.map.pgm"} | ({"cost.map_frame.yaml"} if origin else set())
     assert {file.name for file in path.parent.iterdir()} == names
     values, record = load(path)
@@ -136,13 +143,14 @@ def test_without_a_terrain_the_corner_is_that_of_the_grid(workspace, cost, tmp_p
     [
         ({"resolution": 0.0}, "resolution must be positive and finite; got 0.0"),
         ({"resolution": 1e-4}, r"resolution=0\.0001 m gives 2\.4e\+09 pixels; take a coarser one"),
-        ({"origin": (0.0,)}, r"origin must be two finite numbers \(x, y\); got \(0\.0,\)"),
-        ({"origin": "here"}, "origin must be two finite numbers"),
-        ({"origin": "auto"}, "is the start of a path; a map alone has none"),
-        ({"origin": (0.0, 3e5)}, r"y 300000\.0 m in no CRS\) is 300 km from the grid"),
-        ({"rotation": np.nan}, "rotation must be a finite angle; got nan"),
-        ({"frame": "my map"}, "frame must be a name of ROS such as 'map' .* got 'my map'"),
-        ({"origin": (0.0, np.inf)}, "origin must be two finite numbers"),
+        ({"frame": Frame((0.0,))}, r"origin must be two finite numbers \(x, y\); got \(0\.0,\)"),
+        ({"frame": Frame("here")}, "origin must be two finite numbers"),
+        ({"frame": Frame()}, "is the start of a path; a map alone has none"),
+        ({"frame": Frame((0.0, 3e5))}, r"y 300000\.0 m in no CRS\) is 300 km from the grid"),
+        ({"frame": Frame("crs", np.nan)}, "rotation must be a finite angle; got nan"),
+        ({"frame": Frame("crs", name="my map")}, "one of ROS such as 'map' .* got 'my map'"),
+        ({"frame": "map"}, r"frame: got str 'map'; give export.Frame\(name='odom'\)"),
+        ({"frame": Frame((0.0, np.inf))}, "origin must be two finite numbers"),
         ({"path": "map.pgm"}, r"map\.pgm' must end in \.yaml or \.yml"),
         ({"path": "busy.yaml"}, r"cannot write '.*busy\.pgm': it is a folder"),
     ],
@@ -169,7 +177,7 @@ def test_a_map_in_a_turned_frame_has_the_cost_of_the_cell_at_each_centre(result,
     workspace, cost, angle = result.workspace, maps["cost"], 0.4
     east, north = 380060.0, 5224950.0
     path = tmp_path / "turned.yaml"
-    write_ros_map(path, cost, workspace, origin=(east, north), rotation=angle, frame="odom")
+    write_ros_map(path, cost, workspace, frame=Frame((east, north), angle, "odom"))
     values, record = load(path)
     side, (left, bottom, yaw) = record["resolution"], record["origin"]
     assert (side, yaw) == (3.0, 0.0)

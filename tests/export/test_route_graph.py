@@ -15,7 +15,8 @@ from worlds import unequal_robots
 
 import trustbo as tb
 from trustbo.errors import DamagedFileError, TrustboError
-from trustbo.export import edge_updates, read_route_graph, write_frame, write_route_graph
+from trustbo.export import Frame, edge_updates, read_route_graph, write_frame, write_route_graph
+from trustbo.export.frame import OF_CRS
 from trustbo.models import TrustParams
 from trustbo.planning import Planner
 from trustbo.workspace.moves import MOVES
@@ -34,7 +35,7 @@ def planner():
 @pytest.fixture
 def written(planner, tmp_path):
     file = tmp_path / "graph.geojson"
-    return file, write_route_graph(file, *planner, origin="auto")
+    return file, write_route_graph(file, *planner)
 
 
 def random_case(seed):
@@ -57,7 +58,7 @@ def cells_of(file, planner):
 def test_edges_follow_the_ways_of_the_lead_in_the_frame(planner, written, tmp_path):
     (file, graph), (planner, _) = written, planner
     workspace, server = planner.workspace, load(file)
-    write_frame(tmp_path / "frame.yaml", workspace, origin=workspace.grid.center((2, 0)))
+    write_frame(tmp_path / "frame.yaml", workspace, frame=Frame(workspace.grid.center((2, 0))))
     text = (tmp_path / "frame.yaml").read_text()
     assert (tmp_path / "graph_frame.yaml").read_text() == text
     shift = np.array(yaml.safe_load(text)["origin"])
@@ -190,7 +191,7 @@ def test_small_and_whole_costs_have_a_decimal_point(tmp_path):
     for b, beta in ((30.0, [1.0, 1.0]), (1.0, [0.0, 0.0]), (-2.0, [0.0, 0.0])):
         params = TrustParams(0.0, np.array(beta), b, 0.1, 0.1, 0.5, 0.5)
         graph = write_route_graph(
-            tmp_path / "g.json", Planner(workspace, (2, 0), (0, 2)), params, origin=None
+            tmp_path / "g.json", Planner(workspace, (2, 0), (0, 2)), params, frame=OF_CRS
         )
         assert graph.costs.min() == pytest.approx(max(1e-9, 1.0 - b))
         server = load(tmp_path / "g.json")
@@ -228,7 +229,10 @@ def test_updates_of_graphs_that_do_not_fit_are_refused(planner, tmp_path):
     first = write_route_graph(tmp_path / "a.json", *planner)
     for options, message in (
         ({"objective": "stationary"}, "of 'lost_contact' before, and of 'stationary' after"),
-        ({"rotation": 0.5}, "nodes and 0 edges of the graph after are not in that before"),
+        (
+            {"frame": Frame(rotation=0.5)},
+            "nodes and 0 edges of the graph after are not in that before",
+        ),
         ({"tolerance": math.inf}, "edges of the graph after are not in that before"),
     ):
         other = write_route_graph(tmp_path / "b.json", *planner, **options)
@@ -261,7 +265,7 @@ def test_what_no_route_graph_can_hold_is_refused(planner, tmp_path):
     terminal = Planner(planner.workspace, (2, 0), (0, 3), "terminal")
     change = Planner(planner.workspace, (2, 0), (0, 3), response="change")
     for given, options, message in (
-        ((planner, params), {"origin": None}, r"float32, in steps of 0.5 m .* origin='auto' is"),
+        ((planner, params), {"frame": OF_CRS}, r"float32, in steps of 0.5 m .* origin='auto' is"),
         (
             (large, PARAMS),
             {},

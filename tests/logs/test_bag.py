@@ -80,7 +80,7 @@ def assert_same(got, expected):
 @pytest.mark.parametrize(("name", "options"), FORMATS)
 def test_simulated_missions_come_back_as_they_were(name, options, workspace, simulated, tmp_path):
     path = tmp_path / "new" / name
-    write_bag(simulated, path, version=1 if name == "log.bag" else 2, **options)
+    write_bag(simulated, path, **options)
     assert_same(read_bag(path), simulated)
     assert_same(read_bag(path, workspace), simulated)
     assert [file.name for file in path.parent.iterdir()] == [name]
@@ -231,16 +231,11 @@ def test_what_a_bag_cannot_keep_is_refused(change, message, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_bags_are_not_written_over_others_nor_under_a_wrong_name(tmp_path):
+def test_bags_are_not_written_over_others(tmp_path):
     write_bag([mission(poses=None)], tmp_path / "log")
     assert read_bag(tmp_path / "log")[0].bounds[0].poses is None
     with pytest.raises(TrustboError, match=r"log' exists; bags are not overwritten"):
         write_bag([mission()], tmp_path / "log")
-    for name, version in (("new", 1), ("new.bag", 2), ("new", 3)):
-        with pytest.raises(
-            TrustboError, match=rf"version must be 1 .* got {version} and '.*{name}'"
-        ):
-            write_bag([mission()], tmp_path / name, version=version)
     with pytest.raises(TrustboError, match="unknown storage 'zip'; choose one of sqlite3, mcap"):
         write_bag([mission()], tmp_path / "new", storage="zip")
     with pytest.raises(ShapeError, match="there are no missions; give at least one"):

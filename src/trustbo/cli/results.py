@@ -40,9 +40,9 @@ def export(
     rotation: float = 0.0,
     frame: str = "map",
 ) -> None:
-    """Write a result's maps and path for GIS, GPS units and robots.
+    """Write a result's maps and path for GIS and robots.
 
-    Example: trustbo export out/demo --format geotiff --format gpx
+    Example: trustbo export out/demo --format geotiff --format geojson
     All formats: trustbo export out/demo --format all --out for-the-field
     For robots: trustbo export out/demo --format nav2 --format ros_map --out robots
 
@@ -52,21 +52,19 @@ def export(
     """
     _require_result(folder)
     from trustbo.campaign.storage import load_result
-    from trustbo.export import FORMATS, export_result
+    from trustbo.export import FORMATS, Frame, export_result
     from trustbo.export.everything import left_out
 
     for name in formats:
         require_choice("format", name, (*FORMATS, "all"))
     result, target = load_result(folder), out or folder
+    place = Frame(origin, radians(rotation), frame)
     chosen, absent = formats, {}
     if "all" in formats:
-        reasons = left_out(result, target, origin=origin, rotation=radians(rotation), frame=frame)
+        reasons = left_out(result, target, frame=place)
         absent = {name: why for name, why in reasons.items() if name not in formats}
         chosen = [name for name in FORMATS if name not in absent]
-    files = export_result(
-        result, target, chosen, resolution=resolution, origin=origin,
-        rotation=radians(rotation), frame=frame,
-    )  # fmt: skip
+    files = export_result(result, target, chosen, resolution=resolution, frame=place)
     for name, why in absent.items():
         print(f"left out {name}: {in_flags(why)}", file=sys.stderr)
     for file in files:

@@ -3,7 +3,7 @@
 from trustbo.export.cot import write_cot
 from trustbo.export.everything import FORMATS, export_result
 from trustbo.export.foxglove_scene import write_foxglove
-from trustbo.export.frame import write_frame
+from trustbo.export.frame import Frame, write_frame
 from trustbo.export.grid_map import read_grid_map, write_grid_map
 from trustbo.export.kmz import write_kmz
 from trustbo.export.nav2 import write_costmap_filters, write_waypoints
@@ -18,6 +18,7 @@ from trustbo.export.tables import write_csv
 
 __all__ = [
     "FORMATS",
+    "Frame",
     "RouteGraph",
     "edge_updates",
     "export_result",

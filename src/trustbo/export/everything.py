@@ -19,12 +19,12 @@ from trustbo.export.checks import (
 from trustbo.export.cot import write_cot
 from trustbo.export.foxglove_scene import require_foxglove, save_foxglove
 from trustbo.export.frame import (
-    AUTO,
+    AT_START,
     Frame,
-    Origin,
+    PlacedFrame,
     frame_file,
-    frame_of,
     is_frame,
+    placed,
     require_fine,
     save_frame,
 )
@@ -32,7 +32,7 @@ from trustbo.export.grid_map import save_grid_map
 from trustbo.export.kmz import require_simplekml, write_kmz
 from trustbo.export.nav2 import save_waypoints, stops_of, write_costmap_filters
 from trustbo.export.overwatch import require_overwatch, write_overwatch
-from trustbo.export.paths import tables_beside, write_path
+from trustbo.export.paths import write_path
 from trustbo.export.qgroundcontrol import save_qgc, warn_of_holds
 from trustbo.export.rasters import write_geotiff, write_netcdf
 from trustbo.export.ros import occupancy, require_robots, save_ros_bag, save_ros_map
@@ -52,7 +52,7 @@ class _Content(NamedTuple):
     result: Result
     maps: Callable[[], xr.Dataset]
     """Its maps, computed once and only if a format needs them: they are slow."""
-    frame: Frame
+    frame: PlacedFrame
     """Frame of all formats for robots."""
     resolution: float | None
     """Side of a pixel of their maps, m."""
@@ -67,7 +67,7 @@ class _Format(NamedTuple):
     """Whether the format needs a CRS."""
     in_frame: bool = False
     """Whether its positions are in the frame of robots."""
-    require: Callable[[Result, Frame], object] | None = None
+    require: Callable[[Result, PlacedFrame], object] | None = None
     """Check that refuses a result, or a frame, that the format cannot hold."""
     on_terrain: tuple[str, ...] = ()
     """Further files, of posts and ways, which need a terrain in memory; `{robot}`: one for each."""
@@ -86,9 +86,7 @@ def export_result(
     formats: Sequence[str] = ("geotiff", "geojson"),
     *,
     resolution: float | None = None,
-    origin: Origin = AUTO,
-    rotation: float = 0.0,
-    frame: str = "map",
+    frame: Frame = AT_START,
 ) -> list[Path]:
     """Write the maps and the recommended path of a result to a folder.
 
@@ -98,10 +96,7 @@ def export_result(
         formats: Names of formats, keys of `FORMATS`.
         resolution: Side of a pixel of the maps for ROS, m; by default that of a cell, or a tenth of
             its shorter side if cells are not square.
-        origin: Position in the CRS that is (0, 0) of the files for robots, x and y, m, or with
-            names; `"auto"`: the centre of the path's first cell; `"crs"`: that of the CRS.
-        rotation: Angle from east to the x axis of their frame, rad, anticlockwise.
-        frame: Name of their frame; see `write_ros_map`.
+        frame: Frame of the files for robots.
 
     Returns:
         Files written; the folder of a ROS 2 bag. With files for robots, the last is
@@ -118,10 +113,10 @@ def export_result(
     target, for_robots = require_folder(folder), any(kind.in_frame for kind in chosen.values())
     if resolution is not None:
         require_positive("resolution", resolution)
-    place = frame_of(result.workspace, origin, rotation, frame, result.path[0])
-    given = {"resolution": resolution, "origin": origin, "rotation": rotation, "frame": frame}
-    for option, default in _FOR_ROBOTS.items():
-        if not for_robots and (value := given[option]) != default:
+    place = placed(frame, result.workspace, result.path[0])
+    options, defaults = ("resolution", "origin", "rotation", "frame"), (None, *AT_START)
+    for option, value, default in zip(options, (resolution, *frame), defaults, strict=True):
+        if not for_robots and value != default:
             shown = f"{value:g}" if isinstance(value, float | int) else repr(value)
             raise TrustboError(
                 f"{option}={shown} is of files for robots; leave it out, or ask for one of "
@@ -146,7 +141,7 @@ def export_result(
     return written
 
 
-def _require_frame(place: Frame, target: Path, chosen: Collection[str]) -> None:
+def _require_frame(place: PlacedFrame, target: Path, chosen: Collection[str]) -> None:
     """Refuse another frame than that of files for robots that stay in a folder: TrustboError."""
     others = (file for name in _in_frame() if name not in chosen for file in _FORMATS[name].files)
     staying = [file for file in others if (target / file).exists()]
@@ -167,16 +162,14 @@ def left_out(
     result: Result,
     folder: FilePath,
     *,
-    origin: Origin = AUTO,
-    rotation: float = 0.0,
-    frame: str = "map",
+    frame: Frame = AT_START,
 ) -> dict[str, str]:
     """Return the formats that cannot be written, and why, in a frame as of `export_result`.
 
     TrustboError: the folder is a file, or the frame cannot be.
     """
     target, reasons = require_folder(folder), {}
-    place = frame_of(result.workspace, origin, rotation, frame, result.path[0])
+    place = placed(frame, result.workspace, result.path[0])
     for name in _FORMATS:
         try:
             _require_possible(name, result, target, place)
@@ -185,7 +178,7 @@ def left_out(
     return reasons
 
 
-def _require_possible(name: str, result: Result, target: Path, place: Frame) -> None:
+def _require_possible(name: str, result: Result, target: Path, place: PlacedFrame) -> None:
     """Refuse a format that cannot be written: TrustboError.
 
     It needs a CRS that the result lacks, or cannot hold one of its names, or its frame; a bag
@@ -200,7 +193,7 @@ def _require_possible(name: str, result: Result, target: Path, place: Frame) -> 
         kind.require(result, place)
     for file in kind.files_in(target, result):
         if name in _BAGS:
-            require_new_bag(file, None)
+            require_new_bag(file)
         else:
             require_file(file)
 
@@ -212,11 +205,6 @@ def _write_maps(content: _Content, file: Path) -> None:
     # The trust of the start cell is assumed; it must not set the limits of the colours.
     learned = maps.where((maps["y"] != maps["y"][row]) | (maps["x"] != maps["x"][col]))
     write_style(file.with_suffix(".qml"), learned)
-
-
-def _write_tables(content: _Content, file: Path) -> None:
-    write_csv(file, content.result)
-    write_path(file.with_name("path.csv"), content.result)
 
 
 def _write_bag(content: _Content, file: Path) -> None:
@@ -231,7 +219,7 @@ def _write_path(content: _Content, file: Path) -> None:
 def _write_map(content: _Content, file: Path) -> None:
     result, cost, place = content.result, content.maps()["cost"], content.frame
     save_ros_map(file, cost, result.workspace, content.resolution, place)
-    write_costmap_filters(file, frame=place.name)
+    write_costmap_filters(file, frame=Frame(name=place.name))
 
 
 def _write_grid_map(content: _Content, file: Path) -> None:
@@ -252,7 +240,7 @@ def _write_kmz(content: _Content, file: Path) -> None:
     write_kmz(file, content.result, content.maps()["cost"])
 
 
-def _require_kmz(result: Result, place: Frame) -> None:
+def _require_kmz(result: Result, place: PlacedFrame) -> None:
     require_simplekml()
     schedule_of(result.plan)
 
@@ -269,12 +257,12 @@ def _write_scene(content: _Content, file: Path) -> None:
     save_foxglove(file, plan, maps, content.resolution, content.frame)
 
 
-def _require_scene(result: Result, place: Frame) -> None:
+def _require_scene(result: Result, place: PlacedFrame) -> None:
     require_foxglove()
     schedule_of(result.plan)
 
 
-def _route_graph(result: Result, place: Frame) -> RouteGraph:
+def _route_graph(result: Result, place: PlacedFrame) -> RouteGraph:
     """Graph of the campaign's objective, or of lost_contact where its value is no sum."""
     planner = result.planner
     require_fine(place, result.workspace, "a route graph")
@@ -282,7 +270,7 @@ def _route_graph(result: Result, place: Frame) -> RouteGraph:
     return graph_of(summable, params_of(result.posterior).mean(), place)
 
 
-def _require_nav2(result: Result, place: Frame) -> None:
+def _require_nav2(result: Result, place: PlacedFrame) -> None:
     _require_topics(result, place)
     _route_graph(result, place)
     if result.workspace.ground is not None:
@@ -290,18 +278,16 @@ def _require_nav2(result: Result, place: Frame) -> None:
             stops_of(result.plan, robot, place)
 
 
-def _require_topics(result: Result, place: Frame) -> None:
+def _require_topics(result: Result, place: PlacedFrame) -> None:
     require_robots(result.workspace)
 
 
-_BAGS = ("grid_map", "ros1_bag", "ros2_bag")
+_BAGS = ("grid_map", "ros2_bag")
 _WITH_COST = ("ros_map", *_BAGS)
 """Formats with the cost map, as occupancy or at the same resolution."""
 _WAYPOINTS, _MISSION = "waypoints_{robot}.yaml", "mission_{robot}.plan"
 _FRAME = "frame.yaml"
 """File with the frame of all formats for ROS."""
-_FOR_ROBOTS = {"resolution": None, "origin": AUTO, "rotation": 0.0, "frame": "map"}
-"""Options of the formats for robots, with their defaults."""
 _FORMATS = {
     "geotiff": _Format(
         "all maps as bands of a GeoTIFF, with a style for QGIS",
@@ -329,12 +315,6 @@ _FORMATS = {
     "geojson": _Format(
         "path, posts and ways in longitude and latitude",
         ("path.geojson",),
-        _write_path,
-        on_earth=True,
-    ),
-    "gpx": _Format(
-        "the path, and each robot's way, as routes for GPS receivers",
-        ("path.gpx",),
         _write_path,
         on_earth=True,
     ),
@@ -375,10 +355,9 @@ _FORMATS = {
         require=lambda result, _: schedule_of(result.plan),
     ),
     "csv": _Format(
-        "tables of all bounds, of the path, its posts and its ways",
-        ("missions.csv", "path.csv"),
-        _write_tables,
-        on_terrain=tuple(file.name for file in tables_beside(Path("path.csv"))),
+        "a table of all bounds that were run",
+        ("missions.csv",),
+        lambda content, file: write_csv(file, content.result),
     ),
     "ros_map": _Format(
         "the cost map for map_server and Nav2, and filters of costmaps",
@@ -406,13 +385,6 @@ _FORMATS = {
         _write_scene,
         in_frame=True,
         require=_require_scene,
-    ),
-    "ros1_bag": _Format(
-        "cost map, path, posts and ways as a bag of ROS 1",
-        ("path.bag",),
-        _write_bag,
-        in_frame=True,
-        require=_require_topics,
     ),
     "ros2_bag": _Format(
         "cost map, path, posts and ways as a bag of ROS 2 (mcap)",

@@ -12,7 +12,7 @@ from trustbo.campaign.result import Result
 from trustbo.errors import TrustboError, pip_install
 from trustbo.export.checks import Maps, require_maps
 from trustbo.export.colours import Colour, of_robot, of_values
-from trustbo.export.frame import AUTO, Frame, Origin, frame_file, frame_of, save_beside
+from trustbo.export.frame import AT_START, Frame, PlacedFrame, frame_file, placed, save_beside
 from trustbo.export.lattice import Raster, sampled
 from trustbo.export.layers import plan_of
 from trustbo.export.schedule import Schedule, schedule_of
@@ -28,9 +28,7 @@ def write_foxglove(
     plan: Plan | Result,
     maps: Maps | None = None,
     *,
-    origin: Origin = AUTO,
-    rotation: float = 0.0,
-    frame: str = "map",
+    frame: Frame = AT_START,
 ) -> None:
     """Write a plan as a scene that Foxglove plays in the 3D panel.
 
@@ -50,9 +48,7 @@ def write_foxglove(
         path: .mcap file to write, or to replace.
         plan: Plan, or result whose recommended path is meant, on a terrain in memory.
         maps: Maps (row, col), e.g. `Result.maps()`.
-        origin: See `write_ros_map`; by default the start of the path.
-        rotation: See `write_ros_map`.
-        frame: See `write_ros_map`.
+        frame: Frame, by default at the start of the path.
 
     Raises:
         ShapeError: The maps have other dims or another number of cells.
@@ -63,7 +59,7 @@ def write_foxglove(
     target = require_file(path, ".mcap")
     frame_file(target)
     plan = plan_of(plan, None)
-    place = frame_of(plan.workspace, origin, rotation, frame, plan.path[0])
+    place = placed(frame, plan.workspace, plan.path[0])
     save_foxglove(target, plan, maps, None, place)
     save_beside(target, place, plan.workspace)
 
@@ -75,7 +71,7 @@ def require_foxglove() -> None:
 
 
 def save_foxglove(
-    target: Path, plan: Plan, maps: Maps | None, resolution: float | None, place: Frame
+    target: Path, plan: Plan, maps: Maps | None, resolution: float | None, place: PlacedFrame
 ) -> None:
     """Write a scene in a frame, without the file of the frame; see `write_foxglove`."""
     schedule, raster, names = schedule_of(plan), None, []
@@ -109,7 +105,7 @@ def save_foxglove(
 class _Scene:
     """Messages of Foxglove in a frame."""
 
-    def __init__(self, place: Frame, now: int) -> None:
+    def __init__(self, place: PlacedFrame, now: int) -> None:
         from foxglove import messages
 
         self._m, self._place, self._now = messages, place, now

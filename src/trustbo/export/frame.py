@@ -23,17 +23,37 @@ from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Grid
 from trustbo.workspace.location import Location, crs_name, lonlat_of, position_near
 
-AUTO, OF_CRS = "auto", "crs"
+AUTO, CRS = "auto", "crs"
 """Origins at the centre of the first cell of the path, and at that of the CRS."""
 _FAR = 1e5
 """Distance of an origin from the grid, m, beyond which float32 is coarser than 8 mm again."""
 _AHEAD = 100.0
 """Distance over which the direction of the x axis on Earth is measured, m."""
 _COARSE = 0.01
-Origin = Location | tuple[float, float] | None
+Origin = Location | tuple[float, float]
 
 
 class Frame(NamedTuple):
+    """Frame of the positions in files for robots.
+
+    Attributes:
+        origin: Position in the CRS that is (0, 0) of the frame: x and y, m, or with names, such as
+            `"lon=174.7,lat=-41.3"`; `"auto"`: the centre of the path's first cell, which a map
+            alone has not; `"crs"`: that of the CRS.
+        rotation: Angle from east, the CRS's x axis, to that of the frame, rad, anticlockwise.
+        name: Name, the `frame_id` of messages.
+    """
+
+    origin: Origin = AUTO
+    rotation: float = 0.0
+    name: str = "map"
+
+
+AT_START, OF_CRS = Frame(), Frame(CRS)
+"""Frames at the start of the path, and of the CRS."""
+
+
+class PlacedFrame(NamedTuple):
     """Frame of robots, and its pose in the frame of the CRS, its parent.
 
     Attributes:
@@ -51,7 +71,7 @@ class Frame(NamedTuple):
     @property
     def is_default(self) -> bool:
         """Whether positions in the frame are those in the CRS, under the default name."""
-        return self == Frame(parent=self.parent)
+        return self == PlacedFrame(parent=self.parent)
 
     @property
     def turn(self) -> tuple[float, float, float, float]:
@@ -75,20 +95,17 @@ class Frame(NamedTuple):
         return turned + self.origin
 
 
-def frame_of(
-    workspace: Workspace,
-    origin: Origin,
-    rotation: float,
-    name: str,
-    start: tuple[int, int] | None = None,
-) -> Frame:
-    """Frame of a user's arguments; `start` is the cell of `"auto"`.
+def placed(frame: Frame, workspace: Workspace, start: tuple[int, int] | None = None) -> PlacedFrame:
+    """Place a user's frame; `start` is the cell of `"auto"`.
 
-    TrustboError: an origin that is no position, or far from the grid; a rotation that is not
-    finite; or a name that ROS has not.
+    TrustboError: no frame; an origin that is no position, or far from the grid; a rotation that is
+    not finite; or a name that ROS has not.
     """
+    origin, rotation, name = require_kind("frame", frame, Frame, "give export.Frame(name='odom')")
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z]\w*(/\w+)*", name):
-        raise TrustboError(f"frame must be a name of ROS such as 'map' or 'r1/odom'; got {name!r}.")
+        raise TrustboError(
+            f"the name of a frame is one of ROS such as 'map' or 'r1/odom'; got {name!r}."
+        )
     try:
         angle = float(rotation)
     except (TypeError, ValueError):
@@ -98,16 +115,11 @@ def frame_of(
     parent = _parent(workspace.grid)
     if name == parent:
         raise TrustboError(f"frame {name!r} is that of the CRS itself; choose another name.")
-    return Frame(name, _origin(workspace.grid, origin, start), angle, parent)
+    return PlacedFrame(name, _origin(workspace.grid, origin, start), angle, parent)
 
 
 def write_frame(
-    path: FilePath,
-    plan: Plan | Result | Workspace,
-    *,
-    origin: Origin = AUTO,
-    rotation: float = 0.0,
-    frame: str = "map",
+    path: FilePath, plan: Plan | Result | Workspace, *, frame: Frame = AT_START
 ) -> None:
     """Write the pose of a frame in the CRS to a YAML file, as other exports with a frame do.
 
@@ -120,13 +132,11 @@ def write_frame(
     Args:
         path: .yaml or .yml file to write, or to replace.
         plan: Plan or result, at whose start is the origin `"auto"`; or a workspace.
-        origin: Position in the CRS that is (0, 0) of the frame, see `write_ros_map`; `"auto"` is
-            the centre of the path's first cell, `"crs"` that of the CRS.
-        rotation: Angle from east to the x axis of the frame, rad, anticlockwise.
-        frame: Name of the frame.
+        frame: Frame.
 
     Raises:
-        TrustboError: An argument is refused by `write_ros_map`, or the file cannot be written.
+        TrustboError: A frame that cannot be: an origin that is no position, or over 100 km from the
+            grid, a rotation that is not finite, or no name of ROS; or the file cannot be written.
     """
     target = require_file(path, ".yaml", ".yml")
     require_kind("plan", plan, Plan | Result | Workspace, "give a Plan, a Result or a Workspace")
@@ -134,7 +144,7 @@ def write_frame(
     if not isinstance(plan, Workspace):
         workspace, start = plan.workspace, plan.path[0]
     assert isinstance(workspace, Workspace)  # noqa: S101
-    save_frame(target, frame_of(workspace, origin, rotation, frame, start), workspace)
+    save_frame(target, placed(frame, workspace, start), workspace)
 
 
 def frame_file(path: Path) -> Path:
@@ -142,13 +152,13 @@ def frame_file(path: Path) -> Path:
     return require_file(path.with_name(f"{path.stem}_frame.yaml"))
 
 
-def save_beside(path: Path, frame: Frame, workspace: Workspace) -> None:
+def save_beside(path: Path, frame: PlacedFrame, workspace: Workspace) -> None:
     """Write the frame of the map or bag at `path` to a file; nothing for that of the CRS."""
     if not frame.is_default:
         save_frame(frame_file(path), frame, workspace)
 
 
-def save_frame(file: Path, frame: Frame, workspace: Workspace) -> None:
+def save_frame(file: Path, frame: PlacedFrame, workspace: Workspace) -> None:
     """Write a frame to a file; see `write_frame`."""
     (x, y), turn = frame.origin, frame.turn
     record: dict[str, object] = {
@@ -179,7 +189,7 @@ def save_frame(file: Path, frame: Frame, workspace: Workspace) -> None:
     write_text(file, about + yaml.safe_dump(record, sort_keys=False))
 
 
-def is_frame(file: Path, frame: Frame) -> bool:
+def is_frame(file: Path, frame: PlacedFrame) -> bool:
     """Whether a file of `save_frame` has a frame; without a file, whether it is that of the CRS."""
     if not file.exists():
         return frame.is_default
@@ -191,7 +201,7 @@ def is_frame(file: Path, frame: Frame) -> bool:
     )  # fmt: skip
 
 
-def require_fine(frame: Frame, workspace: Workspace, what: str) -> None:
+def require_fine(frame: PlacedFrame, workspace: Workspace, what: str) -> None:
     """Refuse a frame so far from the grid that float32, which a reader uses, is coarse there.
 
     TrustboError: its step is more than a centimetre.
@@ -207,7 +217,7 @@ def require_fine(frame: Frame, workspace: Workspace, what: str) -> None:
         )
 
 
-def _from_east(grid: Grid, frame: Frame) -> float:
+def _from_east(grid: Grid, frame: PlacedFrame) -> float:
     """Angle from true east to the x axis of a frame at its origin, rad, anticlockwise."""
     ahead = frame.to_crs(np.array([_AHEAD, 0.0]))
     places = lonlat_of(grid, frame.origin), lonlat_of(grid, (float(ahead[0]), float(ahead[1])))
@@ -224,7 +234,7 @@ def _parent(grid: Grid) -> str:
 
 def _origin(grid: Grid, origin: Origin, start: tuple[int, int] | None) -> tuple[float, float]:
     """Position of an origin in the CRS."""
-    if origin is None or (isinstance(origin, str) and origin == OF_CRS):
+    if isinstance(origin, str) and origin == CRS:
         return 0.0, 0.0
     if isinstance(origin, str) and origin == AUTO:
         if start is None:

@@ -12,7 +12,7 @@ import xarray as xr
 
 from trustbo.errors import TrustboError, require_choice
 from trustbo.export.checks import Maps, require_maps
-from trustbo.export.frame import Frame, Origin, frame_file, frame_of, save_beside
+from trustbo.export.frame import OF_CRS, Frame, PlacedFrame, frame_file, placed, save_beside
 from trustbo.export.lattice import sampled
 from trustbo.export.ros import static_transform
 from trustbo.files import FilePath
@@ -31,12 +31,9 @@ def write_grid_map(
     maps: Maps,
     workspace: Workspace,
     *,
-    version: int | None = None,
     storage: str = "mcap",
     resolution: float | None = None,
-    origin: Origin = None,
-    rotation: float = 0.0,
-    frame: str = "map",
+    frame: Frame = OF_CRS,
 ) -> None:
     """Write maps as the layers of one grid_map_msgs/GridMap in a ROS bag.
 
@@ -47,22 +44,19 @@ def write_grid_map(
         path: New `.bag` file for ROS 1, or new folder for ROS 2.
         maps: Maps (row, col), e.g. `Result.maps()`.
         workspace: Workspace of the cells.
-        version: Version of ROS, 1 or 2; by default that of the suffix.
         storage: Storage of ROS 2, "mcap" or "sqlite3".
         resolution: Side of a pixel, m, see `write_ros_map`.
-        origin: Position in the CRS that is (0, 0) of the frame, see `write_ros_map`.
-        rotation: Angle from east to the x axis of the frame, rad, anticlockwise.
-        frame: Name of the frame, see `write_ros_map`.
+        frame: Frame, see `write_ros_map`.
 
     Raises:
         ShapeError: The dims or the number of cells differ.
-        TrustboError: rosbags is not installed; the path exists, or is of the other version; or an
-            argument is refused by `write_ros_map`.
+        TrustboError: rosbags is not installed; the path exists; or an argument is
+            refused by `write_ros_map`.
     """
     target = Path(path)
     require_choice("storage", storage, STORAGES)
-    require_new_bag(target, version)
-    place = frame_of(workspace, origin, rotation, frame)
+    require_new_bag(target)
+    place = placed(frame, workspace)
     frame_file(target)
     save_grid_map(target, maps, workspace, resolution, place, storage)
     save_beside(target, place, workspace)
@@ -73,7 +67,7 @@ def save_grid_map(
     maps: Maps,
     workspace: Workspace,
     resolution: float | None,
-    place: Frame,
+    place: PlacedFrame,
     storage: str = "mcap",
 ) -> None:
     """Write maps in a frame, without the file of the frame; see `write_grid_map`."""
@@ -87,7 +81,7 @@ def save_grid_map(
         message = make.grid_map(now, layers, raster.resolution, raster.corner)
         return [static_transform(make, now, place), Record(now, TOPIC, GRID_MAP, message)]
 
-    version = require_new_bag(target, None)
+    version = require_new_bag(target)
     write_messages(target, version, storage, records, latched=True, frame=place.name)
 
 

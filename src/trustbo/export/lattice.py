@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from trustbo.errors import TrustboError, require_positive
-from trustbo.export.frame import Frame
+from trustbo.export.frame import PlacedFrame
 from trustbo.workspace import Workspace
 
 _MOST_PIXELS = 100_000_000
@@ -25,7 +25,7 @@ def sampled(
     fill: float,
     workspace: Workspace,
     resolution: float | None,
-    frame: Frame,
+    frame: PlacedFrame,
 ) -> Raster:
     """Map of values of cells (..., row, col), the northern row first, `fill` beyond the grid.
 

@@ -97,15 +97,6 @@ def ways_layer(plan: Plan) -> gpd.GeoDataFrame:
     return gpd.GeoDataFrame(table, geometry=list(lines), crs=_crs(plan))
 
 
-def way_points(plan: Plan) -> pd.DataFrame:
-    """Return the points of `ways_layer`, a row for each; `point` counts from 0 on each way."""
-    layer = ways_layer(plan)
-    xy, line = shapely.get_coordinates(layer.geometry.to_numpy(), return_index=True)
-    points = layer.loc[line, ["bound", "robot"]].reset_index(drop=True)
-    points["point"] = points.groupby(["bound", "robot"]).cumcount()
-    return points.assign(x=xy[:, 0], y=xy[:, 1])
-
-
 def routes_of(plan: Plan) -> dict[str, list[np.ndarray]]:
     """Return the ways of each robot, bound by bound, the lead first, up to the first missing one.
 

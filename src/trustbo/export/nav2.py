@@ -9,7 +9,7 @@ import yaml
 from trustbo.campaign.result import Result
 from trustbo.errors import TrustboError, require_choice, require_not_negative
 from trustbo.export.checks import LEAD
-from trustbo.export.frame import AUTO, Frame, Origin, frame_file, frame_of, save_beside
+from trustbo.export.frame import AT_START, Frame, PlacedFrame, frame_file, placed, save_beside
 from trustbo.export.layers import plan_of
 from trustbo.export.poses import onward, towards
 from trustbo.export.schedule import complete_routes
@@ -22,9 +22,7 @@ def write_waypoints(
     plan: Plan | Result,
     *,
     robot: str = LEAD,
-    origin: Origin = AUTO,
-    rotation: float = 0.0,
-    frame: str = "map",
+    frame: Frame = AT_START,
 ) -> None:
     """Write the stops of a robot in order as a goal of the action FollowWaypoints of Nav2.
 
@@ -37,9 +35,7 @@ def write_waypoints(
         path: .yaml or .yml file to write, or to replace.
         plan: Plan, or result whose recommended path is meant, on a terrain in memory.
         robot: Name of a robot of T2, or `"lead"`.
-        origin: See `write_ros_map`; by default the start of the path.
-        rotation: See `write_ros_map`.
-        frame: See `write_ros_map`.
+        frame: Frame, by default at the start of the path.
 
     Raises:
         TrustboError: An unknown robot; one that has no way in a bound; no terrain in memory; or an
@@ -49,12 +45,12 @@ def write_waypoints(
     frame_file(target)
     plan = plan_of(plan, None)
     require_choice("robot", robot, (LEAD, *plan.workspace.team.names))
-    place = frame_of(plan.workspace, origin, rotation, frame, plan.path[0])
+    place = placed(frame, plan.workspace, plan.path[0])
     save_waypoints(target, plan, robot, place)
     save_beside(target, place, plan.workspace)
 
 
-def save_waypoints(target: Path, plan: Plan, robot: str, place: Frame) -> None:
+def save_waypoints(target: Path, plan: Plan, robot: str, place: PlacedFrame) -> None:
     """Write the stops of a robot, without the file of the frame; see `write_waypoints`."""
     poses = [
         {
@@ -77,7 +73,7 @@ def save_waypoints(target: Path, plan: Plan, robot: str, place: Frame) -> None:
     write_text(target, about + yaml.safe_dump({"poses": poses}, sort_keys=False))
 
 
-def stops_of(plan: Plan, robot: str, place: Frame) -> np.ndarray:
+def stops_of(plan: Plan, robot: str, place: PlacedFrame) -> np.ndarray:
     """Poses of a robot's stops in a frame, (stop, 3); TrustboError: it has no way in a bound."""
     ways = complete_routes(plan)[robot]
     assert plan.waypoints is not None and plan.posts is not None  # noqa: S101, PT018  # it has ways
@@ -90,7 +86,7 @@ def stops_of(plan: Plan, robot: str, place: Frame) -> np.ndarray:
     return towards(stops, watched - stops)
 
 
-def write_costmap_filters(path: FilePath, *, slowest: float = 0.5, frame: str = "map") -> None:
+def write_costmap_filters(path: FilePath, *, slowest: float = 0.5, frame: Frame = AT_START) -> None:
     """Write parameters of nodes by which costmaps of Nav2 heed a map of `write_ros_map`.
 
     The map is the mask of both filters. Keepout: impassable cells are closed, and those of a high
@@ -101,7 +97,7 @@ def write_costmap_filters(path: FilePath, *, slowest: float = 0.5, frame: str = 
         path: .yaml or .yml file of the map; the parameters are written to a file in its folder with
             the suffix _filters.yaml.
         slowest: Share of its speed that a robot keeps where the cost is 1, in (0, 1].
-        frame: Name of the frame of the map.
+        frame: Frame of the map, of which the name is written.
 
     Raises:
         TrustboError: A share outside (0, 1], or the file cannot be written.
@@ -117,7 +113,7 @@ def write_costmap_filters(path: FilePath, *, slowest: float = 0.5, frame: str = 
     ):
         mask, info = f"/{name}_filter_mask", f"/{name}_costmap_filter_info"
         nodes[f"{name}_filter_mask_server"] = {
-            "yaml_filename": target.name, "topic_name": mask, "frame_id": frame
+            "yaml_filename": target.name, "topic_name": mask, "frame_id": frame.name
         }  # fmt: skip
         nodes[f"{name}_costmap_filter_info_server"] = {
             "type": kind, "filter_info_topic": info, "mask_topic": mask, "base": base,

@@ -1,4 +1,4 @@
-"""The recommended path, posts and ways as GeoJSON, GPX, GeoPackage or CSV."""
+"""The recommended path, posts and ways as GeoJSON or GeoPackage."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -12,12 +12,10 @@ from shapely import LineString
 
 from trustbo.campaign.result import Result
 from trustbo.errors import TrustboError, require_choice
-from trustbo.export.checks import find_crs, require_crs, require_names_for_sql
-from trustbo.export.gpx import gpx_routes
-from trustbo.export.layers import bounds_layer, plan_of, posts_layer, way_points, ways_layer
+from trustbo.export.checks import require_crs, require_names_for_sql
+from trustbo.export.layers import bounds_layer, plan_of, posts_layer, ways_layer
 from trustbo.files import FilePath, require_file, to_json, write_file, write_text
 from trustbo.planning import Plan
-from trustbo.spreadsheet import frame_as_csv
 from trustbo.workspace import Workspace
 
 _WGS84 = "EPSG:4326"
@@ -79,29 +77,19 @@ def write_path(path: FilePath, plan: Plan | Result, workspace: Workspace | None 
              goal, a Point per cell with its `bound`, `cell` and trust, a Point per
              post, a LineString per way; the property `layer` is "path", "bounds",
              "posts" or "ways".
-    .gpx     GPX 1.1: a route along the centres of the cells; its points are named
-             start, bound 1, ..., goal; the description is the trust, the elevation
-             that of the ground above the datum of the DEM, in metres, if the
-             workspace has a terrain. Then a route of the lead, and one of each robot:
-             its ways, thinned by at most half a pixel; where it stops, points have
-             names.
     .gpkg    GeoPackage: layers `path` (LineString), `bounds` (points), `posts` and
              `ways`, in the terrain's CRS.
-    .csv     The points of cells as a table, with longitude and latitude if there is a
-             CRS; in the same folder, tables of posts, and of the points of ways, whose names end in
-             _posts.csv and _ways.csv.
     ======== ========================================================================
 
     Columns and properties are those of `path_frame`; those of the whole path are its name, number
     of bounds, length, value and objective, and where known `unseen`, the share of the time in which
     nobody sees anybody, and the toll on it, `unseen_toll`. Posts and ways are left out where the
-    workspace has no terrain in memory; the route of a robot ends where it has no way.
+    workspace has no terrain in memory.
 
     Args:
         path: File to write, or to replace.
         plan: Plan, or result whose recommended path is meant.
-        workspace: Workspace of the plan; by default the plan's. Without a terrain, only a table can
-            be written.
+        workspace: Workspace of the plan; by default the plan's.
 
     Raises:
         ShapeError: The plan and the workspace differ in their numbers of robots.
@@ -111,12 +99,6 @@ def write_path(path: FilePath, plan: Plan | Result, workspace: Workspace | None 
     plan = plan_of(plan, workspace)
     file = require_file(path)
     _WRITERS[require_choice("suffix", file.suffix.lower(), _WRITERS)](file, plan)
-
-
-def tables_beside(file: Path) -> tuple[Path, Path]:
-    """Return the files of posts and of ways that belong to the table of a path."""
-    posts, ways = (file.with_name(f"{file.stem}_{name}{file.suffix}") for name in ("posts", "ways"))
-    return posts, ways
 
 
 def _facts(plan: Plan) -> dict[str, object]:
@@ -161,10 +143,6 @@ def _feature(layer: str, place: Any, properties: dict[str, object]) -> dict[str,
     return {"type": "Feature", "geometry": geometry, "properties": {"layer": layer, **properties}}
 
 
-def _write_gpx(file: Path, plan: Plan) -> None:
-    write_text(file, gpx_routes(plan, _NAME))
-
-
 def _write_geopackage(file: Path, plan: Plan) -> None:
     workspace = plan.workspace
     require_crs(workspace)
@@ -183,20 +161,6 @@ def _write_geopackage(file: Path, plan: Plan) -> None:
     write_file(file, write)
 
 
-def _write_csv(file: Path, plan: Plan) -> None:
-    tables: dict[Path, Any] = {file: bounds_layer(plan).drop(columns="geometry")}
-    if _of_terrain(plan):
-        posts, ways = map(require_file, tables_beside(file))
-        tables |= {posts: posts_layer(plan).drop(columns="geometry"), ways: way_points(plan)}
-    for target, table in tables.items():
-        if (crs := find_crs(plan.workspace)) is not None:
-            place = gpd.points_from_xy(table["x"], table["y"], crs=crs.to_wkt()).to_crs(_WGS84)
-            after = 1 + list(table.columns).index("y")
-            table.insert(after, "longitude", place.x)
-            table.insert(after + 1, "latitude", place.y)
-        write_text(target, frame_as_csv(table, index=False))
-
-
 def _of_terrain(plan: Plan) -> tuple[str, ...]:
     """Names of the layers that a plan has on a terrain in memory only."""
     return () if plan.workspace.ground is None else ("posts", "ways")
@@ -204,7 +168,5 @@ def _of_terrain(plan: Plan) -> tuple[str, ...]:
 
 _WRITERS: dict[str, Callable[[Path, Plan], None]] = {
     ".geojson": _write_geojson,
-    ".gpx": _write_gpx,
     ".gpkg": _write_geopackage,
-    ".csv": _write_csv,
 }

@@ -14,7 +14,7 @@ import yaml
 from trustbo.campaign.result import Result
 from trustbo.errors import TrustboError, require_choice
 from trustbo.export.checks import LEAD, require_maps
-from trustbo.export.frame import Frame, Origin, frame_file, frame_of, save_beside
+from trustbo.export.frame import OF_CRS, Frame, PlacedFrame, frame_file, placed, save_beside
 from trustbo.export.lattice import Raster, sampled
 from trustbo.export.layers import plan_of, routes_of
 from trustbo.export.poses import onward, towards
@@ -50,11 +50,11 @@ def occupancy(
     ShapeError: other dims or another number of cells. TrustboError: a cost outside [0, 1], or a
     resolution that is not positive, or far too fine.
     """
-    return _raster(cost, workspace, resolution, Frame()).values
+    return _raster(cost, workspace, resolution, PlacedFrame()).values
 
 
 def _raster(
-    cost: xr.DataArray, workspace: Workspace, resolution: float | None, frame: Frame
+    cost: xr.DataArray, workspace: Workspace, resolution: float | None, frame: PlacedFrame
 ) -> Raster:
     """Map of a cost whose pixels lie along the axes of a frame."""
     return sampled(_cells(cost, workspace), UNKNOWN, workspace, resolution, frame)
@@ -77,9 +77,7 @@ def write_ros_map(
     workspace: Workspace,
     *,
     resolution: float | None = None,
-    origin: Origin = None,
-    rotation: float = 0.0,
-    frame: str = "map",
+    frame: Frame = OF_CRS,
 ) -> None:
     """Write a cost map for map_server of ROS 1 and of Nav2: a .yaml and a .pgm file.
 
@@ -90,12 +88,9 @@ def write_ros_map(
         workspace: Workspace of the cells.
         resolution: Side of a pixel, m, by default that of a cell, or a tenth of its shorter side if
             cells are not square.
-        origin: Position in the CRS that is (0, 0) of the frame: x and y, m, or with names, such as
-            `"lon=174.7,lat=-41.3"`; by default that of the CRS.
-        rotation: Angle from east to the x axis of the frame, rad, anticlockwise. Pixels lie along
-            its axes: they take the cost of the cell at their centre.
-        frame: Name of the frame. Unless all three are left out, a file with the suffix _frame.yaml
-            in the map's folder defines it.
+        frame: Frame, by default that of the CRS; another is defined by a file with the suffix
+            _frame.yaml in the map's folder. Pixels lie along its axes: they take the cost of the
+            cell at their centre.
 
     Raises:
         ShapeError: The dims or the number of cells differ.
@@ -105,7 +100,7 @@ def write_ros_map(
     """
     target = require_file(path, ".yaml", ".yml")
     require_file(target.with_suffix(".pgm"))
-    place = frame_of(workspace, origin, rotation, frame)
+    place = placed(frame, workspace)
     frame_file(target)
     save_ros_map(target, cost, workspace, resolution, place)
     save_beside(target, place, workspace)
@@ -116,7 +111,7 @@ def save_ros_map(
     cost: xr.DataArray,
     workspace: Workspace,
     resolution: float | None,
-    place: Frame,
+    place: PlacedFrame,
 ) -> None:
     """Write a map in a frame, without the file of the frame; see `write_ros_map`."""
     raster, picture = _raster(cost, workspace, resolution, place), target.with_suffix(".pgm")
@@ -146,12 +141,9 @@ def write_ros_bag(
     cost: xr.DataArray,
     workspace: Workspace,
     *,
-    version: int | None = None,
     storage: str = "mcap",
     resolution: float | None = None,
-    origin: Origin = None,
-    rotation: float = 0.0,
-    frame: str = "map",
+    frame: Frame = OF_CRS,
 ) -> None:
     """Write a cost map, a path, and all robots' posts and ways as a ROS bag.
 
@@ -173,24 +165,21 @@ def write_ros_bag(
         plan: Plan, or result whose recommended path is meant.
         cost: Cost map, see `write_ros_map`.
         workspace: Workspace of the cells.
-        version: Version of ROS, 1 or 2; by default that of the suffix.
         storage: Storage of ROS 2, "mcap" or "sqlite3".
         resolution: Side of a pixel, m, see `write_ros_map`.
-        origin: See `write_ros_map`; `"auto"` is the centre of the path's first cell.
-        rotation: See `write_ros_map`.
-        frame: Name of the frame of all messages, see `write_ros_map`.
+        frame: Frame of all messages, see `write_ros_map`.
 
     Raises:
         ShapeError: The dims, or the number of cells or robots, differ.
-        TrustboError: rosbags is not installed; the path exists, or is of the other version; a name
+        TrustboError: rosbags is not installed; the path exists; a name
             of a robot is none of ROS, or "lead"; or an argument is refused by `write_ros_map`.
     """
     target = Path(path)
     require_choice("storage", storage, STORAGES)
-    require_new_bag(target, version)
+    require_new_bag(target)
     plan = plan_of(plan, workspace)
     require_robots(workspace)
-    place = frame_of(workspace, origin, rotation, frame, plan.path[0])
+    place = placed(frame, workspace, plan.path[0])
     frame_file(target)
     save_ros_bag(target, plan, cost, workspace, resolution, place, storage)
     save_beside(target, place, workspace)
@@ -202,7 +191,7 @@ def save_ros_bag(
     cost: xr.DataArray,
     workspace: Workspace,
     resolution: float | None,
-    place: Frame,
+    place: PlacedFrame,
     storage: str = "mcap",
 ) -> None:
     """Write a bag in a frame, without the file of the frame; see `write_ros_bag`."""
@@ -223,11 +212,11 @@ def save_ros_bag(
             ),
         ]
 
-    version = require_new_bag(target, None)
+    version = require_new_bag(target)
     write_messages(target, version, storage, records, latched=True, frame=place.name)
 
 
-def static_transform(make: Messages, now: int, place: Frame) -> Record:
+def static_transform(make: Messages, now: int, place: PlacedFrame) -> Record:
     """Pose of a frame in that of the CRS, for `/tf_static`; time in ns."""
     message = make.transform(now, place.parent, place.origin, place.turn)
     return Record(now, "/tf_static", TRANSFORMS, message)
@@ -239,7 +228,7 @@ def require_robots(workspace: Workspace) -> None:
         require_topic_names(LEAD, workspace.team.names)
 
 
-def _topics(plan: Plan, frame: Frame) -> dict[str, tuple[str, np.ndarray]]:
+def _topics(plan: Plan, frame: PlacedFrame) -> dict[str, tuple[str, np.ndarray]]:
     """Return the type and the poses (pose, 3) of each topic, in the frame."""
     centers = np.array([plan.workspace.grid.center(cell) for cell in plan.path])
     topics = {"path": (PATH, onward(frame.of_crs(centers)))}

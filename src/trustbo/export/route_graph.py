@@ -18,7 +18,7 @@ import shapely
 from trustbo.data import Cell
 from trustbo.display.card import Card, Displayed
 from trustbo.errors import TrustboError, require_choice
-from trustbo.export.frame import Frame
+from trustbo.export.frame import PlacedFrame
 from trustbo.models.params import Params
 from trustbo.planning import Planner
 from trustbo.workspace.moves import MOVES, move_indices
@@ -93,14 +93,14 @@ class RouteGraph(Displayed):
 
 
 def graph_of(
-    planner: Planner, params: Params, place: Frame, tolerance: float | None = None
+    planner: Planner, params: Params, place: PlacedFrame, tolerance: float | None = None
 ) -> RouteGraph:
     """Make the graph of a planner whose objective is one of `OBJECTIVES`.
 
     Args:
         planner: Planner of stationary or lost_contact.
         params: Parameters without leading axes.
-        place: Frame of the positions.
+        place: PlacedFrame of the positions.
         tolerance: Largest distance of a chain of edges from the lead's way, m, by default half a
             pixel; `inf` for straight edges.
 

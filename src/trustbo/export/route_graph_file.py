@@ -15,14 +15,7 @@ import yaml
 
 from trustbo.campaign.result import Result
 from trustbo.errors import TrustboError, require_kind, require_not_negative
-from trustbo.export.frame import (
-    AUTO,
-    Origin,
-    frame_file,
-    frame_of,
-    require_fine,
-    save_beside,
-)
+from trustbo.export.frame import AT_START, Frame, frame_file, placed, require_fine, save_beside
 from trustbo.export.route_graph import RouteGraph, graph_of, summed
 from trustbo.files import FilePath, interpreting, read_record, require_file, write_text
 from trustbo.inference import params_of
@@ -46,9 +39,7 @@ def write_route_graph(
     objective: str | None = None,
     tolerance: float | None = None,
     overridable: bool = True,
-    origin: Origin = AUTO,
-    rotation: float = 0.0,
-    frame: str = "map",
+    frame: Frame = AT_START,
 ) -> RouteGraph:
     """Write the graph of all possible bounds, with their costs, for the route server of Nav2.
 
@@ -68,10 +59,7 @@ def write_route_graph(
             ones; by default half a pixel. `inf`: each bound is one edge.
         overridable: Whether scorers of the server may change costs, which `edge_updates` need:
             the cost is in `metadata` then, for PenaltyScorer. False: costs are final.
-        origin: Position in the CRS that is (0, 0) of the frame, see `write_ros_map`; by default the
-            start of the path, as the server holds positions in float32.
-        rotation: Angle from east to the x axis of the frame, rad, anticlockwise.
-        frame: Name of the frame.
+        frame: Frame, by default at the start of the path, as the server holds positions in float32.
 
     Returns:
         Graph that was written.
@@ -92,7 +80,7 @@ def write_route_graph(
     if tolerance is not None and tolerance != math.inf:
         tolerance = require_not_negative("tolerance", tolerance)
     planner = summed(planner, objective)
-    place = frame_of(planner.workspace, origin, rotation, frame, planner.start)
+    place = placed(frame, planner.workspace, planner.start)
     require_fine(place, planner.workspace, "a route graph")
     graph = graph_of(planner, params, place, tolerance)
     save_route_graph(target, graph, overridable=overridable)

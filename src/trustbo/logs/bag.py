@@ -106,7 +106,6 @@ def write_bag(
     missions: Sequence[Mission],
     path: FilePath,
     *,
-    version: int | None = None,
     storage: str = "sqlite3",
     topics: Topics | None = None,
     start: datetime | float | None = None,
@@ -119,21 +118,20 @@ def write_bag(
     Args:
         missions: Missions with the same robots and features, and with a contact of every tick.
         path: A `.bag` file for ROS 1, or a folder for ROS 2; written whole or not at all.
-        version: Version of ROS, 1 or 2; by default that of the path.
         storage: Storage of ROS 2, "sqlite3" or "mcap".
         topics: Names of topics, if not the default ones.
         start: Time of the first message, a datetime or POSIX seconds; by default the present.
 
     Raises:
         ShapeError: No missions, or missions that disagree on robots or features.
-        TrustboError: No rosbags; a path that exists, or is of the other version; missions whose
+        TrustboError: No rosbags; a path that exists; missions whose
             ticks do not hold all they measured; names or a start that ROS does not take.
     """
     require_same_team(missions)
     require_choice("storage", storage, STORAGES)
     target, names = Path(path), Topics() if topics is None else topics
     begin = time.time_ns() if start is None else _ns(start)
-    of_path = require_new_bag(target, version)
+    version = require_new_bag(target)
     _require_names(missions[0], names.lead)
     for j, mission in enumerate(missions):
         _require_ticks(f"mission {j}", mission)
@@ -145,7 +143,7 @@ def write_bag(
             yield from in_time
             now = in_time[-1].time + _NS
 
-    write_messages(target, of_path, storage, records)
+    write_messages(target, version, storage, records)
 
 
 def _ns(start: datetime | float) -> int:

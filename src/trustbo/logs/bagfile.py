@@ -139,23 +139,17 @@ def opened(path: Path) -> Iterator[Bag]:
         reader.close()
 
 
-def require_new_bag(path: Path, version: int | None) -> int:
+def require_new_bag(path: Path) -> int:
     """Version of ROS of a new bag, by its path: .bag for 1.
 
-    TrustboError: no rosbags; another version asked for; the path exists.
+    TrustboError: no rosbags; the path exists.
     """
     _require_rosbags()
-    of_path = 1 if path.suffix == ".bag" else 2
-    if version not in (None, of_path):
-        raise TrustboError(
-            f"version must be 1 with a path that ends in .bag, 2 with another; got {version!r} and "
-            f"{str(path)!r}."
-        )
     if path.exists():
         raise TrustboError(
             f"{str(path)!r} exists; bags are not overwritten: remove it, or give another path."
         )
-    return of_path
+    return 1 if path.suffix == ".bag" else 2
 
 
 def write_messages(
