@@ -54,23 +54,10 @@ class PlanningProblem:
     risk: Risk | None = None
 
     def __post_init__(self) -> None:
-        name, _, family, lag, unseen_cost = self.objective
-        self.rule.checked(name)
-        require_choice("objective", name, OBJECTIVES)
-        require_choice("team", self.team, TEAMS)
-        for weight in ("length_weight", "unseen_cost"):
-            per_unit = require_not_negative(weight, getattr(self.objective, weight))
-            if per_unit and name not in TOLLED:
-                raise TrustboError(
-                    f"{weight} is for {', '.join(TOLLED)}; the objective is {name!r}."
-                )
-        if unseen_cost:
+        self.rule.checked(self.objective.name)
+        require_objective(self.objective, self.team)
+        if self.objective.unseen_cost:
             _ = self.paths.unseen  # which refuses a workspace without line of sight
-        if name == "lost_contact" and lag and (self.team == "min" or self.objective.has_labels):
-            raise TrustboError(
-                "'lost_contact' of rates that measure the change of trust is for Gaussian rates "
-                f"and team='mean'; got {family.name!r} and {self.team!r}. Use 'terminal' or 'mean'."
-            )
 
     @property
     def workspace(self) -> Workspace:
@@ -232,6 +219,22 @@ class PlanningProblem:
 def _any_move(cells: np.ndarray) -> np.ndarray:
     """Awareness of cells with an axis of moves of length 1."""
     return cells[..., None, :, :, :]
+
+
+def require_objective(objective: Objective, team: str) -> None:
+    """Refuse an objective or a team that is unknown, or that cannot be together: TrustboError."""
+    name, _, family, lag, _ = objective
+    require_choice("objective", name, OBJECTIVES)
+    require_choice("team", team, TEAMS)
+    for weight in ("length_weight", "unseen_cost"):
+        per_unit = require_not_negative(weight, getattr(objective, weight))
+        if per_unit and name not in TOLLED:
+            raise TrustboError(f"{weight} is for {', '.join(TOLLED)}; the objective is {name!r}.")
+    if name == "lost_contact" and lag and (team == "min" or objective.has_labels):
+        raise TrustboError(
+            "'lost_contact' of rates that measure the change of trust is for Gaussian rates "
+            f"and team='mean'; got {family.name!r} and {team!r}. Use 'terminal' or 'mean'."
+        )
 
 
 def draws_of(posterior: Params | xr.DataTree, *, day: bool = False) -> Params:

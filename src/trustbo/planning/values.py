@@ -3,6 +3,7 @@
 import itertools
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -49,6 +50,50 @@ def entry_cost(passable: np.ndarray, dynamics: Dynamics) -> np.ndarray:
     return np.where(possible, softplus(-np.where(possible, trust, 0.0)), np.inf)
 
 
+class Value(NamedTuple):
+    """Value of a path, without its risk."""
+
+    draws: np.ndarray
+    """Expected trust under every draw, (draw, bound, robot)."""
+    value: float
+    values: np.ndarray
+    """Value under every draw, (draw,)."""
+    success_index: float
+
+
+def value_along(
+    params: Params,
+    awareness: np.ndarray,
+    objective: Objective,
+    team: str,
+    toll: float,
+    x0: ArrayLike | None = None,
+    *,
+    cap: bool = True,
+) -> Value:
+    """Compute the value of a path from the parameters and awareness of its bounds.
+
+    Awareness (bound, robot, feature), or with a leading axis (draw,); `cap`: see `path_trust`.
+    """
+    z = as_map(awareness)
+    draws = roll(trust_dynamics(params, z, "min", x0))
+    draws = draws.reshape(-1, *draws.shape[-2:])
+    value_of, trust = OBJECTIVES[objective.name], draws.mean(0)
+    of_team, teams = (t.mean(-1) if team == "mean" else t.min(-1) for t in (trust, draws))
+    if objective.name in ("stationary", "lost_contact"):
+        dynamics = trust_dynamics(params, z, team, x0)
+        value = value_of(path_trust(dynamics, objective, toll, cap=cap)).mean()
+        # Trust capped draw by draw is biased, so that the band is of trust as it is; but no path
+        # loses less than nothing.
+        values = value_of(path_trust(dynamics, objective, toll, cap=False))
+        if objective.name == "lost_contact":
+            values = np.minimum(values, -toll)
+    else:
+        values, value = (value_of(PathTrust(t, t, toll)) for t in (teams, of_team))
+    index = float(np.exp(-softplus(-of_team).sum()))
+    return Value(draws, float(value), np.atleast_1d(values), index)
+
+
 def evaluate(
     problem: PlanningProblem,
     path: tuple[Cell, ...],
@@ -62,34 +107,20 @@ def evaluate(
     cells = flat.reshape(-1, 2)
     rows, cols = cells.T
     z, along = problem.awareness_along(cells, params), params.along(cells)
-    z = as_map(z)
-    draws = roll(trust_dynamics(along, z, "min", x0))
-    draws = draws.reshape(-1, *draws.shape[-2:])
-    trust, objective = draws.mean(0), problem.objective
-    tolls = toll_along(problem.paths, objective, cells)
-    toll = tolls.total
-    value_of, cost = OBJECTIVES[objective.name], problem.cost_of_failure(cells)
-    team, teams = (t.mean(-1) if problem.team == "mean" else t.min(-1) for t in (trust, draws))
-    if objective.name in ("stationary", "lost_contact"):
-        dynamics = trust_dynamics(along, z, problem.team, x0)
-        value = value_of(path_trust(dynamics, objective, toll, cap=cap)).mean()
-        # Trust capped draw by draw is biased, so that the band is of trust as it is; but no path
-        # loses less than nothing.
-        values = value_of(path_trust(dynamics, objective, toll, cap=False))
-        if objective.name == "lost_contact":
-            values = np.minimum(values, -toll)
-    else:
-        values, value = (value_of(PathTrust(t, t, toll)) for t in (teams, team))
+    tolls = toll_along(problem.paths, problem.objective, cells)
+    kind = problem.objective, problem.team
+    found = value_along(along, z, *kind, tolls.total, x0, cap=cap)
+    cost, draws = problem.cost_of_failure(cells), found.draws
     risk = None if problem.risk is None else problem.risk.along(cells)
     plan = Plan(
         path=path,
         positions=np.stack([grid.x[cols], grid.y[rows]], axis=1),
         length=problem.paths.length_of(cells),
-        trust=trust,
-        bands=_bands(draws),
-        value=float(value) - cost,
-        success_index=float(np.exp(-softplus(-team).sum())),
-        objective=objective.name,
+        trust=draws.mean(0),
+        bands=bands_of(draws),
+        value=found.value - cost,
+        success_index=found.success_index,
+        objective=problem.objective.name,
         exact=False,
         bound=np.nan,
         revisits=len(path) - len(set(path)),
@@ -98,7 +129,7 @@ def evaluate(
         workspace=problem.workspace,
         risk=risk,
         infeasible=risk is not None and not problem.is_within_risk(cells),
-        value_band=_value_band(np.atleast_1d(values) - cost),
+        value_band=_value_band(found.values - cost),
         unseen_toll=tolls.unseen,
     )
     if len(draws) == 1 or plan.posts is None:
@@ -106,7 +137,7 @@ def evaluate(
     return replace(plan, cover=cover_along(plan.workspace, path, plan.posts, draws))
 
 
-def _bands(trust: np.ndarray) -> np.ndarray:
+def bands_of(trust: np.ndarray) -> np.ndarray:
     """Quantiles over draws (draw, bound, robot); one draw is repeated for every quantile."""
     if len(trust) == 1:
         return np.repeat(trust, len(QUANTILES), axis=0)

@@ -1,5 +1,6 @@
 """The compiled engine: the search for each kind of case, in one table."""
 
+from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
@@ -7,6 +8,7 @@ import numpy as np
 from trustbo.data import Cell
 from trustbo.errors import TrustboError
 from trustbo.parallel import over_rows, plain
+from trustbo.planning.dynamics import Dynamics
 from trustbo.planning.objectives import Objective
 from trustbo.planning.paths import AdmissiblePaths
 from trustbo.planning.search import labels, labels_vector
@@ -62,21 +64,36 @@ def _sums_within(case: Case) -> Best:
 
 
 def _best_sums(case: Case, gains: list[np.ndarray], weights: Weights) -> Best:
+    """Find the paths of the largest score of gains (left, bound) or (left, cell) of each draw."""
+    layers, n_cells = case.admissible.layers, case.admissible.passable.size
+    left, bound, cell = layers.rank[layers.head], layers.bound, layers.cell[layers.head]
+    return best_sums(
+        layers,
+        lambda d: gains[d][left, bound if gains[d].shape[1] > n_cells else cell],
+        weights,
+        case.tolls_on(layers),
+        _resources(case, layers),
+    )
+
+
+def best_sums(
+    layers: Graph,
+    gains: Callable[[int], np.ndarray],
+    weights: Weights,
+    tolls: np.ndarray,
+    resources: Resources,
+) -> Best:
     """Find the paths of the largest (constant + sum of gains) / scale less their toll.
 
-    Gains (left, bound) or (left, cell) of each draw, by the bounds left after a bound.
+    Gains (edge,) of a draw, by its index, and tolls (edge,).
     """
-    layers, scale = case.admissible.layers, weights.scale
-    lengths = np.flatnonzero(layers.starts >= 0)
-    left, bound = layers.rank[layers.head], layers.bound
-    cell, tolls = layers.cell[layers.head], case.tolls_on(layers)
-    resources, n_cells = _resources(case, layers), case.admissible.passable.size
+    scale, lengths = weights.scale, np.flatnonzero(layers.starts >= 0)
     groups = [lengths] if (scale == 1.0).all() else lengths[:, None]
-    found: list[Best] = [_nothing()] * len(gains)
+    found: list[Best] = [_nothing()] * len(weights.constant)
 
     def work(first: int, last: int) -> None:
         for d in range(first, last):
-            of_edges = gains[d][left, bound if gains[d].shape[1] > n_cells else cell]
+            of_edges = gains(d)
             for group in groups:
                 start_cost = np.full((1, len(scale)), np.inf)
                 start_cost[0, group] = -weights.constant[d, group] / scale[group]
@@ -120,21 +137,24 @@ def _together(found: list[Best]) -> Best:
 
 
 def _history(case: Case) -> Best:
-    layers, dynamics = case.admissible.layers, case.dynamics
+    layers = case.admissible.layers
+    toll = np.zeros(len(layers.head))
+    if case.objective.has_toll:
+        toll = case.tolls_on(layers)
+    return best_history(layers, case.dynamics, case.objective, toll, _resources(case, layers))
+
+
+def best_history(
+    layers: Graph, dynamics: Dynamics, objective: Objective, tolls: np.ndarray, resources: Resources
+) -> Best:
+    """Find the paths of the least sum of losses of one trust, and of tolls (edge,)."""
     n_draws = len(dynamics.start)
     start_cost, trust = np.zeros((1, len(layers.starts))), np.empty((n_draws, 3))
     trust[:, 0], trust[:, 1] = dynamics.transition[:, 0, 0], dynamics.start[:, 0]
     trust[:, 2] = np.maximum(dynamics.noise_sd, TINY_SD)
-    toll = np.zeros((1, len(layers.head)))
-    if case.objective.has_toll:
-        toll = case.tolls_on(layers)[None]
     drift = plain(dynamics.drift[:, 0].reshape(n_draws, -1))
-    return solve(
-        SearchProblem(
-            layers, toll, drift, start_cost, trust, _loss_of(case.objective),
-            _resources(case, layers),
-        )
-    )  # fmt: skip
+    loss = _loss_of(objective)
+    return solve(SearchProblem(layers, tolls[None], drift, start_cost, trust, loss, resources))
 
 
 def _loss_of(objective: Objective) -> int:
