@@ -112,6 +112,11 @@ def test_on_the_graph_of_a_grid_the_plan_is_the_planner_s(objective, connectivit
     plan = planner.plan(PARAMS)
     assert found.value == pytest.approx(plan.value, abs=1e-12)
     assert found.path == plan.path
+    costs, expected = RoadPlanner(graph, (4, 0), (0, 5)).graph_of(PARAMS), planner.graph_of(PARAMS)
+    for edge in expected.edges:
+        assert costs.edges[edge]["cost"] == pytest.approx(expected.edges[edge]["cost"], rel=1e-12)
+        if objective == "lost_contact":
+            assert costs.edges[edge]["lost"] == pytest.approx(expected.edges[edge]["lost"])
     assert found.length == pytest.approx(plan.length)
     np.testing.assert_allclose(found.trust, plan.trust, rtol=0.0, atol=1e-14)
     assert found.exact

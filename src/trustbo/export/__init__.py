@@ -11,6 +11,7 @@ from trustbo.export.overwatch import write_overwatch
 from trustbo.export.paths import path_frame, write_path
 from trustbo.export.qgroundcontrol import write_qgc
 from trustbo.export.rasters import write_geotiff, write_netcdf
+from trustbo.export.roads import from_route_graph
 from trustbo.export.ros import write_ros_bag, write_ros_map
 from trustbo.export.route_graph import RouteGraph
 from trustbo.export.route_graph_file import edge_updates, read_route_graph, write_route_graph
@@ -22,6 +23,7 @@ __all__ = [
     "RouteGraph",
     "edge_updates",
     "export_result",
+    "from_route_graph",
     "path_frame",
     "read_grid_map",
     "read_route_graph",

@@ -6,8 +6,8 @@ those of nodes and edges differ, and its costs are positive.
 
 import math
 import warnings
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -21,7 +21,7 @@ from trustbo.errors import TrustboError, require_choice
 from trustbo.export.frame import PlacedFrame
 from trustbo.models.params import Params
 from trustbo.planning import Planner
-from trustbo.workspace.moves import MOVES, move_indices
+from trustbo.workspace.moves import MOVES, along, move_indices
 
 OBJECTIVES = ("lost_contact", "stationary")
 """Objectives whose values are sums over bounds, or nearly."""
@@ -32,6 +32,7 @@ LEAST_COST = 1e-9
 _FIRST = 1 + len(MOVES[8])
 """Ids of stops and of first edges, by the number of cells; those within chains follow."""
 Bound = tuple[Cell, Cell]
+Awareness = Mapping[str, float | list[float]]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -54,6 +55,9 @@ class RouteGraph(Displayed):
         gap: Loss of the route beyond that of the exact plan, as a share of the contact expected on
             the plan; negative where it loses less, as routes are not limited to `max_bounds`. 0 for
             stationary, NaN from a file.
+        awareness: Awareness of each bound, by the id of its first edge: for each feature a number,
+            or one for each robot.
+        robots: Names of the robots; empty where they are not known.
     """
 
     nodes: np.ndarray
@@ -66,6 +70,8 @@ class RouteGraph(Displayed):
     objective: str = ""
     route: tuple[Cell, ...] = ()
     gap: float = np.nan
+    awareness: Mapping[int, Awareness] = field(default_factory=dict)
+    robots: tuple[str, ...] = ()
 
     def _card(self) -> Card:
         low, high = self.costs.min(), self.costs.max()
@@ -109,10 +115,17 @@ def graph_of(
     """
     chains = _chains(planner, tolerance)
     costs, route, gap = _costs(planner, params)
-    edges, positions = [], {}
+    edges, positions, awareness = [], {}, {}
+    maps, features = planner.mean_awareness, planner.workspace.features
     for bound, cost in costs.items():
         edges += chains[bound].edges(cost)
         positions.update(chains[bound].nodes())
+        values = along(maps, bound)[:, 0].T
+        alike = (values == values[:, :1]).all(1)
+        awareness[chains[bound].edge_ids[0]] = {
+            name: v[0].item() if same else v.tolist()
+            for name, v, same in zip(features, values, alike, strict=True)
+        }
     edges.sort()
     nodes = np.array(sorted(positions))
     shape = planner.paths.passable.shape
@@ -129,6 +142,8 @@ def graph_of(
         planner.objective,
         route,
         gap,
+        awareness,
+        planner.workspace.team.names,
     )
 
 

@@ -24,6 +24,7 @@ from trustbo.planning import Planner
 
 _NEAR = 1e-6
 """Distance within which positions are the same, m."""
+_ENDS = "startid", "endid"
 _SERVER = {
     "edge_cost_functions": ["PenaltyScorer", "DynamicEdgesScorer"],
     "PenaltyScorer": {"plugin": "nav2_route::PenaltyScorer"},
@@ -106,9 +107,13 @@ def save_route_graph(target: Path, graph: RouteGraph, *, overridable: bool = Tru
     rows = zip(graph.edges.tolist(), graph.ends.tolist(), graph.costs.tolist(), strict=True)
     for edge, (start, end), cost in rows:
         about = {"id": edge, "startid": start, "endid": end, "cost": cost}
-        about |= {"overridable": overridable, "metadata": {"penalty": cost}}
+        metadata: dict[str, Any] = {"penalty": cost}
+        if edge in graph.awareness:
+            metadata["awareness"] = graph.awareness[edge]
+        about |= {"overridable": overridable, "metadata": metadata}
         lines.append(_feature("MultiLineString", [[where[start], where[end]]], about))
-    text = '{"type": "FeatureCollection", "features": [\n' + ",\n".join(lines) + "\n]}\n"
+    head = f'{{"type": "FeatureCollection", "robots": {_json(list(graph.robots))}, "features": [\n'
+    text = head + ",\n".join(lines) + "\n]}\n"
     server = {"graph_filepath": target.name, "route_frame": graph.frame, **_SERVER}
     settings = params_file(target)
     head = (
@@ -127,24 +132,36 @@ def save_route_graph(target: Path, graph: RouteGraph, *, overridable: bool = Tru
 
 
 def read_route_graph(path: FilePath) -> RouteGraph:
-    """Read the nodes, edges and costs of a file that `write_route_graph` wrote.
+    """Read the nodes, edges and costs of a file of `write_route_graph`, or another for Nav2.
+
+    A cost is the `penalty` in the metadata of an edge, else its `cost`, else 0.
 
     Raises:
-        DamagedFileError: There is no such file, or it is none of `write_route_graph`.
+        DamagedFileError: There is no such file, or it is no route graph.
     """
     with interpreting(path):
-        features = read_record(path, checked=False)["features"]
-        nodes = [f for f in features if f["geometry"]["type"] == "Point"]
-        edges = [f["properties"] for f in features if f["geometry"]["type"] == "MultiLineString"]
-        cells = [f["properties"].get("metadata", {"row": -1, "col": -1}) for f in nodes]
+        record = read_record(path, checked=False)
+        kinds = [(f["geometry"]["type"], f) for f in record["features"]]
+        points = [f for kind, f in kinds if kind == "Point"]
+        nodes, places = zip(
+            *((f["properties"], f["geometry"]["coordinates"][:2]) for f in points), strict=True
+        )
+        edges = [f["properties"] for kind, f in kinds if kind in ("LineString", "MultiLineString")]
+        cells = [node.get("metadata") or {} for node in nodes]
+        about = {edge["id"]: edge.get("metadata") or {} for edge in edges}
+        known = {node["id"] for node in nodes}
+        if not known or not {edge[end] for edge in edges for end in _ENDS} <= known:
+            raise KeyError("an edge without its nodes")
         return RouteGraph(
-            np.array([f["properties"]["id"] for f in nodes]),
-            np.array([f["geometry"]["coordinates"] for f in nodes]),
-            np.array([(cell["row"], cell["col"]) for cell in cells]),
+            np.array([node["id"] for node in nodes]),
+            np.array(places, dtype=float),
+            np.array([(cell.get("row", -1), cell.get("col", -1)) for cell in cells]),
             np.array([edge["id"] for edge in edges]),
-            np.array([(edge["startid"], edge["endid"]) for edge in edges]),
-            np.array([edge["metadata"]["penalty"] for edge in edges]),
-            nodes[0]["properties"]["frame"],
+            np.array([[edge[end] for end in _ENDS] for edge in edges]),
+            np.array([about[e["id"]].get("penalty", e.get("cost", 0.0)) for e in edges], float),
+            nodes[0].get("frame", "map"),
+            awareness={n: one["awareness"] for n, one in about.items() if "awareness" in one},
+            robots=tuple(record.get("robots", ())),
         )
 
 

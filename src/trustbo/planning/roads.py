@@ -153,7 +153,7 @@ class RoadPlanner(Displayed):
         require_objective(self._objective, team)
         self.graph, self.start, self.goal = graph, start, goal
         try:
-            self.shortest = nx.shortest_path_length(graph, start, goal)
+            self.shortest = int(nx.shortest_path_length(graph, start, goal))
         except nx.NetworkXNoPath:
             raise NoPathError(f"no edges lead from {start!r} to {goal!r}.") from None
         limit = (
@@ -262,13 +262,43 @@ class RoadPlanner(Displayed):
                 raise TrustboError(f"no edge leads from {edge[0]!r} to {edge[1]!r}.")
         which = [self._edges[edge] for edge in pairwise(path)]
         z, length = self._awareness[which], float(self._lengths[which].sum())
-        weight = self._objective.length_weight
-        toll = weight * length if weight else 0.0
+        toll = float(self._tolls[which].sum())
         found = value_along(params, z, self._objective, self._team, toll, x0)
         return RoadPlan(
             tuple(path), length, z, found.draws.mean(0), bands_of(found.draws), found.value,
             self._objective.name, False, np.nan, self.features, self.robots,
         )  # fmt: skip
+
+    def graph_of(self, params: Params | xr.DataTree) -> nx.DiGraph:
+        """Build the graph with the costs of its edges, for other programs: see `Planner.graph_of`.
+
+        Args:
+            params: Posterior or parameters, whose mean is taken.
+
+        Returns:
+            Copy of the graph whose edges have `cost`, that of stationary, and for lost_contact of
+            rates that measure trust `lost`, the contact that the bound would lose if all were like
+            it, in bounds; tolls of length are in both.
+
+        Raises:
+            TrustboError: abs(beta0) >= 1, for which trust settles nowhere; or effects of places.
+        """
+        draws, graph = self._require_params(params), self.graph.copy()
+        dynamics = self._dynamics(draws.mean() if draws.leading else draws, self._awareness, None)
+        solve.require_valid(dynamics, self._objective._replace(name="stationary"))
+        values = {"cost": softplus(-dynamics.steady_state().ravel())}
+        if self._objective.name == "lost_contact" and not self._objective.lag:
+            values["lost"] = solve.settled_loss(self._objective, dynamics).ravel()
+        for name, of_edges in values.items():
+            for edge, value in zip(self._edges, (of_edges + self._tolls).tolist(), strict=True):
+                graph.edges[edge][name] = value
+        return graph
+
+    @property
+    def _tolls(self) -> np.ndarray:
+        """Cost of each edge's metres, (edge,)."""
+        weight = self._objective.length_weight
+        return weight * self._lengths if weight else np.zeros(len(self._edges))
 
     def _require_params(self, params: Params | xr.DataTree) -> Params:
         draws = draws_of(params)
@@ -285,10 +315,7 @@ class RoadPlanner(Displayed):
 
     def _search(self, dynamics: Dynamics) -> Best:
         """Best path of one draw; cells are indices of nodes."""
-        objective = self._objective
-        tolls = np.zeros(len(self._edges))
-        if objective.length_weight:
-            tolls = objective.length_weight * self._lengths
+        objective, tolls = self._objective, self._tolls
         if objective.name == "stationary":
             return self._shortest(softplus(-dynamics.steady_state().ravel()) + tolls)
         if not (dynamics.is_scalar if objective.has_labels else len(dynamics.views) == 1):
@@ -317,7 +344,7 @@ class RoadPlanner(Displayed):
     def _layers(self) -> Graph:
         """Roads unrolled over the bounds left: a node for each of these and the edge of before.
 
-        Edge e of the roads is state e, the start is a state of its own, and node 0 is the goal.
+        Edge e of the roads is state e, the start is one more state, and node 0 is the goal.
         """
         index = {node: i for i, node in enumerate(self.graph)}
         tail, head = np.array([[index[a], index[c]] for a, c in self._edges]).T

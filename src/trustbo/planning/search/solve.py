@@ -115,11 +115,11 @@ def graph_of(problem: PlanningProblem, dynamics: Dynamics) -> nx.DiGraph:
     values["drift"] = np.tensordot(dynamics.views.mean(0), dynamics.drift, 1)
     tolls = tolls_of(paths, problem.objective)
     if problem.objective.name == "lost_contact" and not problem.objective.lag:
-        values["lost"] = _settled_loss(problem.objective, dynamics) + on_map(paths, tolls)
+        values["lost"] = settled_loss(problem.objective, dynamics) + on_map(paths, tolls)
     return with_costs(paths, entry_cost(paths.passable, dynamics), tolls, **values)
 
 
-def _settled_loss(objective: Objective, dynamics: Dynamics) -> np.ndarray:
+def settled_loss(objective: Objective, dynamics: Dynamics) -> np.ndarray:
     """Contact lost in each bound once trust has settled on it, (move, row, col), in bounds.
 
     The sum along a path is the loss of lost_contact but for the memory of trust: with drifts u and
