@@ -178,7 +178,7 @@ def test_help_of_export_names_every_format(invoke):
         (
             ["resume", "--out", "x"],
             2,
-            "error: unknown option --out; give the folder alone: trustbo resume FOLDER\n",
+            "error: unknown option --out; give it without a flag: trustbo resume FOLDER\n",
         ),
         (
             ["run", "--itertions", "3"],

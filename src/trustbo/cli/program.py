@@ -126,10 +126,11 @@ def _unknown_option(error: Any) -> str:
     if near is None or not hasattr(error, "option_name"):
         return ""
     typed, context = error.option_name, error.ctx
-    if typed == "--out" and context is not None:
-        places = [p for p in context.command.params if p.param_type_name == "argument"]
-        if places:
-            return f"unknown option --out; give the folder alone: {context.command_path} FOLDER"
+    params = () if context is None else context.command.params
+    places = {p.name: p.metavar for p in params if p.param_type_name == "argument"}
+    if typed[2:] in places or (typed == "--out" and "folder" in places):
+        alone = " ".join(places.values())
+        return f"unknown option {typed}; give it without a flag: {context.command_path} {alone}"
     swapped = [name for name in near if sorted(name) == sorted(typed)]  # the usual slip
     advice = f"; did you mean {(swapped or near)[0]}?" if near else "."
     return f"unknown option {typed}{advice}"
