@@ -163,6 +163,8 @@ def test_what_is_no_graph_of_bounds_is_refused_in_a_sentence():
         (lambda: RoadPlanner(graph, 0, 4, "speed"), TrustboError, "unknown objective 'speed'"),
         (lambda: RoadPlanner(graph, 0, 4, team="min").plan(PARAMS), TrustboError, "robots that sh"),
         (lambda: RoadPlanner(graph, 0, 4).evaluate([0, 4, 0], PARAMS), TrustboError, "no edge l"),
+        (lambda: RoadPlanner(graph, 0, 4).evaluate([0], PARAMS), TrustboError, "two nodes at le"),
+        (lambda: RoadPlanner(graph, 0, 4, max_bounds=10**8).plan(PARAMS), TrustboError, "unroll"),
     ):
         with pytest.raises(error, match=message):
             make()

@@ -38,6 +38,8 @@ Node = Hashable
 AWARENESS = "awareness"
 """Attribute of edges with their awareness, by feature: a number, or one for each robot."""
 _ROBOTS = ("r1", "r2", "r3")
+_MOST_EDGES = 50_000_000
+"""Most edges of the graph unrolled, whose tables take some gigabytes."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -257,6 +259,8 @@ class RoadPlanner(Displayed):
             TrustboError: No edge leads from a node to the next, or effects of places.
         """
         params = self._require_params(params)
+        if len(path) < 2:
+            raise TrustboError(f"a path has two nodes at least; got {path!r}.")
         for edge in pairwise(path):
             if edge not in self._edges:
                 raise TrustboError(f"no edge leads from {edge[0]!r} to {edge[1]!r}.")
@@ -361,6 +365,11 @@ class RoadPlanner(Displayed):
         if not self._u_turns:
             turns = (a < n) & (head[b] == tail[np.minimum(a, n - 1)])
             a, b = a[~turns], b[~turns]
+        if self.longest * len(a) > _MOST_EDGES:
+            raise TrustboError(
+                f"paths of up to {self.longest} bounds over {n} edges are too many to unroll; give "
+                "a smaller max_bounds, or a part of the graph."
+            )
         done = nx.single_source_shortest_path_length(self.graph, self.start)
         entered = np.array([done.get(node, n) for node in self.graph])[tail] + 1
         entered = np.append(entered, 0)  # fewest bounds up to each state
