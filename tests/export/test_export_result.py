@@ -17,7 +17,6 @@ from trustbo.export.frame import OF_CRS
 FILES = {
     "geotiff": ["maps.tif", "maps.qml"],
     "cog": ["maps_cog.tif"],
-    "netcdf": ["maps.nc"],
     "geojson": ["path.geojson"],
     "geopackage": ["path.gpkg"],
     "overwatch": ["overwatch.tif"],
@@ -133,7 +132,7 @@ def test_maps_are_made_for_formats_that_have_maps_and_once(result, tmp_path):
     watched = Watched(**fields)
     export_result(watched, tmp_path, ["geojson", "geopackage", "csv"])
     assert made == []
-    export_result(watched, tmp_path, ["geotiff", "cog", "netcdf", "ros_map"])
+    export_result(watched, tmp_path, ["geotiff", "cog", "ros_map"])
     assert made == [{}]
 
 
@@ -150,7 +149,7 @@ def test_what_cannot_be_written_is_said_beforehand(result, nowhere, tmp_path, mo
         left_out(result, tmp_path / "file")
 
 
-def test_without_a_terrain_there_are_tables_netcdf_and_ros(nowhere, tmp_path):
+def test_without_a_terrain_there_are_tables_and_ros(nowhere, tmp_path):
     pytest.importorskip("rosbags", reason="needs the extra ros")
     for name in NEEDS_A_PLACE:
         with pytest.raises(TrustboError, match="only a workspace made from a terrain has a CRS"):
@@ -164,7 +163,9 @@ def test_without_a_terrain_there_are_tables_netcdf_and_ros(nowhere, tmp_path):
 
 
 def test_what_one_format_refuses_keeps_all_from_being_written(result, tmp_path, monkeypatch):
-    with pytest.raises(TrustboError, match="unknown format 'kml'; choose one of geotiff, cog, net"):
+    with pytest.raises(
+        TrustboError, match="unknown format 'kml'; choose one of geotiff, cog, geoj"
+    ):
         export_result(result, tmp_path, ["csv", "kml"])
     with pytest.raises(TrustboError, match=r"resolution must be positive and finite; got 0"):
         export_result(result, tmp_path, ["csv", "ros_map"], resolution=0)
@@ -199,7 +200,5 @@ def test_names_that_a_format_cannot_hold_are_refused_before_anything_is_written(
     odd = dataclasses.replace(result, workspace=odd)
     with pytest.raises(TrustboError, match=r"does not tell capitals .* \('R1', 'r1', 'r2'\)"):
         export_result(odd, tmp_path, ["geojson", "geopackage"])
-    with pytest.raises(TrustboError, match="a map in netCDF cannot be called 'a/b'"):
-        export_result(odd, tmp_path, ["geojson", "netcdf"])
     assert list(tmp_path.iterdir()) == []
-    assert {"geopackage", "netcdf"} <= set(left_out(odd, tmp_path))
+    assert "geopackage" in left_out(odd, tmp_path)

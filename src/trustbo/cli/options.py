@@ -94,7 +94,7 @@ Program
   debug: Show the whole traceback of an error.
   title TEXT: Title of the page.
 Options
-  formats NAME: Format, may be repeated: geotiff, cog, netcdf (maps); geojson, geopackage (the
+  formats NAME: Format, may be repeated: geotiff, cog (maps); geojson, geopackage (the
     path); kmz, qgc (QGroundControl), cot (TAK) (each robot's mission); overwatch (what one
     would see of its bounds); csv (missions); ros_map, nav2 (route graph and waypoints),
     grid_map (maps), foxglove (a scene), ros2_bag (cost and path); or all that can be

@@ -10,7 +10,7 @@ from trustbo.export.nav2 import write_costmap_filters, write_waypoints
 from trustbo.export.overwatch import write_overwatch
 from trustbo.export.paths import path_frame, write_path
 from trustbo.export.qgroundcontrol import write_qgc
-from trustbo.export.rasters import write_geotiff, write_netcdf
+from trustbo.export.rasters import write_geotiff
 from trustbo.export.roads import from_route_graph
 from trustbo.export.ros import write_ros_bag, write_ros_map
 from trustbo.export.route_graph import RouteGraph
@@ -35,7 +35,6 @@ __all__ = [
     "write_geotiff",
     "write_grid_map",
     "write_kmz",
-    "write_netcdf",
     "write_overwatch",
     "write_path",
     "write_qgc",

@@ -1,6 +1,6 @@
 """Checks of workspaces, maps and names, before an export writes anything."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import rioxarray  # noqa: F401  (registers the .rio accessor)
@@ -62,13 +62,6 @@ def require_maps(maps: Maps, workspace: Workspace) -> xr.Dataset:
             raise TrustboError(f"map {name!r} must hold numbers; got {values.dtype}.")
         bands[str(name)] = (("row", "col"), values.values.astype(np.float64), values.attrs)
     return xr.Dataset(bands)
-
-
-def require_names_for_netcdf(names: Iterable[str]) -> None:
-    """Refuse names of maps with a slash, or those of coordinates: TrustboError."""
-    for name in names:
-        if "/" in name or name in ("x", "y", "spatial_ref"):
-            raise TrustboError(f"a map in netCDF cannot be called {name!r}; rename it.")
 
 
 def require_lead_apart(robots: Sequence[str]) -> None:

@@ -13,7 +13,6 @@ from trustbo.export.checks import (
     LEAD,
     require_crs,
     require_lead_apart,
-    require_names_for_netcdf,
     require_names_for_sql,
 )
 from trustbo.export.cot import write_cot
@@ -34,7 +33,7 @@ from trustbo.export.nav2 import save_waypoints, stops_of, write_costmap_filters
 from trustbo.export.overwatch import require_overwatch, write_overwatch
 from trustbo.export.paths import write_path
 from trustbo.export.qgroundcontrol import save_qgc, warn_of_holds
-from trustbo.export.rasters import write_geotiff, write_netcdf
+from trustbo.export.rasters import write_geotiff
 from trustbo.export.ros import occupancy, require_robots, save_ros_bag, save_ros_map
 from trustbo.export.route_graph import OBJECTIVES, RouteGraph, graph_of, summed
 from trustbo.export.route_graph_file import save_route_graph
@@ -302,15 +301,6 @@ _FORMATS = {
             file, content.maps(), content.result.workspace, cog=True, style=False
         ),
         on_earth=True,
-    ),
-    "netcdf": _Format(
-        "all maps as netCDF by the CF conventions",
-        ("maps.nc",),
-        lambda content, file: write_netcdf(file, content.maps(), content.result.workspace),
-        # Result.maps renames features that have the name of a coordinate.
-        require=lambda result, _: require_names_for_netcdf(
-            name for name in result.workspace.features if "/" in name
-        ),
     ),
     "geojson": _Format(
         "path, posts and ways in longitude and latitude",
