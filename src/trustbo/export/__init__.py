@@ -1,4 +1,4 @@
-"""Results as files for other programs: GIS, GPS, robots, tables."""
+"""Results as files for other programs: GIS, robots, tables."""
 
 from trustbo.export.cot import write_cot
 from trustbo.export.everything import FORMATS, export_result
