@@ -1,8 +1,7 @@
 """Plans on a given graph, such as roads: its nodes are stops, its directed edges are bounds.
 
 A path is searched by the label search of the planner of cells, on the graph unrolled over the
-bounds left. Its nodes are edges of the roads, each with the next one still to choose, so that a
-U-turn, back along the edge of before, is left out of the graph.
+bounds left (`search/roads.py`).
 """
 
 import time
@@ -32,14 +31,13 @@ from trustbo.planning.search import solve
 from trustbo.planning.search.compiled import best_history, best_sums
 from trustbo.planning.search.graph import Best, Graph, no_resources
 from trustbo.planning.search.layers import additive_weights
+from trustbo.planning.search.roads import unroll
 from trustbo.planning.values import bands_of, value_along
 
 Node = Hashable
 AWARENESS = "awareness"
 """Attribute of edges with their awareness, by feature: a number, or one for each robot."""
 _ROBOTS = ("r1", "r2", "r3")
-_MOST_EDGES = 50_000_000
-"""Most edges of the graph unrolled, whose tables take some gigabytes."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -346,52 +344,10 @@ class RoadPlanner(Displayed):
 
     @cached_property
     def _layers(self) -> Graph:
-        """Roads unrolled over the bounds left: a node for each of these and the edge of before.
-
-        Edge e of the roads is state e, the start is one more state, and node 0 is the goal.
-        """
+        """Roads unrolled over the bounds left."""
         index = {node: i for i, node in enumerate(self.graph)}
         tail, head = np.array([[index[a], index[c]] for a, c in self._edges]).T
-        start, goal, n = index[self.start], index[self.goal], len(tail)
-        enters = np.append(head, start)  # node of each state
-        # Edges b that go on from the state a.
-        order = np.argsort(tail, kind="stable")
-        first = np.searchsorted(tail[order], np.arange(len(index) + 1))
-        going_on = np.flatnonzero(enters != goal)
-        count = np.diff(first)[enters[going_on]]
-        a = np.repeat(going_on, count)
-        before = np.repeat(first[enters[going_on]] - count.cumsum() + count, count)
-        b = order[before + np.arange(len(a))]
-        if not self._u_turns:
-            turns = (a < n) & (head[b] == tail[np.minimum(a, n - 1)])
-            a, b = a[~turns], b[~turns]
-        if self.longest * len(a) > _MOST_EDGES:
-            raise TrustboError(
-                f"paths of up to {self.longest} bounds over {n} edges are too many to unroll; give "
-                "a smaller max_bounds, or a part of the graph."
-            )
         done = nx.single_source_shortest_path_length(self.graph, self.start)
-        entered = np.array([done.get(node, n) for node in self.graph])[tail] + 1
-        entered = np.append(entered, 0)  # fewest bounds up to each state
-        starts, node_of = np.full(self.longest + 1, -1), np.full(n + 1, -1)
-        ranks, cells, heads, bounds, edges = [np.zeros(1, int)], [np.array([goal])], [], [], [0]
-        n_nodes, last = 1, head == goal
-        for left in range(1, self.longest + 1):
-            ahead = last[b] if left == 1 else node_of[b] >= 0
-            kept = ahead & (entered[a] <= self.longest - left)
-            states, per_state = np.unique(a[kept], return_counts=True)
-            heads.append(np.zeros(kept.sum(), int) if left == 1 else node_of[b[kept]])
-            bounds.append(b[kept])
-            edges.extend(per_state.tolist())
-            node_of = np.full(n + 1, -1)
-            node_of[states] = n_nodes + np.arange(len(states))
-            starts[left] = node_of[n]
-            ranks.append(np.full(len(states), left))
-            cells.append(enters[states])
-            n_nodes += len(states)
-        bound = np.concatenate(bounds).astype(np.int32)
-        return Graph(
-            np.concatenate([[0], np.cumsum(edges)]), np.concatenate(heads).astype(np.int32),
-            np.concatenate(ranks).astype(np.int32), np.concatenate(cells).astype(np.int32),
-            np.zeros(len(bound), np.int8), bound, starts, 1, True, True,
-        )  # fmt: skip
+        from_start = np.array([done.get(node, len(tail)) for node in self.graph])
+        ends = index[self.start], index[self.goal]
+        return unroll(tail, head, ends, from_start, self.longest, u_turns=self._u_turns)
