@@ -2,8 +2,8 @@
 
 State: a node (j, e) is the edge e by which a path came, with j bounds left; the start is one more
 state. Edges lead from (j, e) to (j - 1, f) for each edge f that goes on from e: a U-turn, f back
-along e, is left out where it is forbidden, so that the search need not know the moves. Node 0 is
-the goal, which the last bound alone enters.
+along e, is left out where it is forbidden, so that the search has no moves to heed. Node 0 is the
+goal, which the last bound alone enters.
 
 Invariant: a node is there only if the goal can be reached from it in exactly the bounds left, and
 it from the start in those that are not. All paths through the graph are hence admissible walks, and
