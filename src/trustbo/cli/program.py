@@ -126,11 +126,12 @@ def _unknown_option(error: Any) -> str:
     if near is None or not hasattr(error, "option_name"):
         return ""
     typed, context = error.option_name, error.ctx
-    params = () if context is None else context.command.params
-    places = {p.name: p.metavar for p in params if p.param_type_name == "argument"}
-    if typed[2:] in places or (typed == "--out" and "folder" in places):
-        alone = " ".join(places.values())
-        return f"unknown option {typed}; give it without a flag: {context.command_path} {alone}"
+    if context is not None:
+        params = context.command.params
+        places = {p.name: p.metavar for p in params if p.param_type_name == "argument"}
+        if typed[2:] in places or (typed == "--out" and "folder" in places):
+            alone = " ".join((context.command_path, *places.values()))
+            return f"unknown option {typed}; give it without a flag: {alone}"
     swapped = [name for name in near if sorted(name) == sorted(typed)]  # the usual slip
     advice = f"; did you mean {(swapped or near)[0]}?" if near else "."
     return f"unknown option {typed}{advice}"

@@ -46,7 +46,8 @@ def unroll(
         )
     entered = np.append(from_start[tail] + 1, 0)  # fewest bounds up to each state
     starts, node_of = np.full(longest + 1, -1), np.full(n + 1, -1)
-    ranks, cells, heads, bounds, counts = [[0]], [[goal]], [], [], [[0]]
+    none: list[np.ndarray] = [np.zeros(1, int)]  # edges and rank of the goal
+    ranks, cells, counts, heads, bounds = [*none], [np.array([goal])], [*none], [], []
     n_nodes = 1
     for left in range(1, longest + 1):
         ahead = head[b] == goal if left == 1 else node_of[b] >= 0
