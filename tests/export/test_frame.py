@@ -24,7 +24,7 @@ def test_one_transform_is_in_the_file_and_in_the_bag(result, maps, tmp_path):
     write_frame(tmp_path / "frame.yaml", result, frame=ASK)
     text = (tmp_path / "frame.yaml").read_text()
     record = yaml.safe_load(text)
-    write_ros_bag(tmp_path / "bag", result, maps["cost"], result.workspace, frame=ASK)
+    write_ros_bag(tmp_path / "bag", result, maps["cost"], frame=ASK)
     assert (tmp_path / "bag_frame.yaml").read_text() == text
     of_map = ASK._replace(origin=result.workspace.grid.center(result.path[0]))
     write_ros_map(tmp_path / "map.yaml", maps["cost"], result.workspace, frame=of_map)

@@ -194,7 +194,7 @@ def test_maps_that_do_not_agree_with_themselves_are_refused(result, maps, tmp_pa
         write_elevation(tmp_path / name, heights, 1.0, (0.0, 0.0), **options)
         with pytest.raises(TrustboError, match=message):
             read_grid_map(tmp_path / name, "/map" if name == "c" else None)
-    tb.export.write_ros_bag(tmp_path / "d", result, maps["cost"], result.workspace)
+    tb.export.write_ros_bag(tmp_path / "d", result, maps["cost"])
     with pytest.raises(TrustboError, match=r"one topic of grid_map_msgs/msg/GridMap, .* has none"):
         read_grid_map(tmp_path / "d")
     with pytest.raises(TrustboError, match=r"/trustbo/path is nav_msgs/msg/Path; it must be grid"):

@@ -10,7 +10,7 @@ from pyproj import Transformer
 from references import geometry_of_blob
 
 import trustbo as tb
-from trustbo.errors import ShapeError, TrustboError
+from trustbo.errors import TrustboError
 from trustbo.export import path_frame, write_path
 
 ROBOTS = ("r1", "r2", "r3")
@@ -46,11 +46,12 @@ def test_a_frame_has_a_point_per_cell(result, centers):
 
 
 def test_a_frame_may_be_in_another_crs_or_in_none(result, nowhere, centers):
-    own = path_frame(result.plan, result.workspace, crs=None)
+    own = path_frame(result.plan, crs=None)
     assert own.crs.to_epsg() == 32616
     np.testing.assert_array_equal(own.get_coordinates(), centers)
     assert path_frame(result, crs=32617).crs.to_epsg() == 32617
-    bare = path_frame(result.plan, nowhere.workspace, crs=None)
+    placed = replace(result.plan, workspace=nowhere.workspace)
+    bare = path_frame(placed, crs=None)
     assert bare.crs is None
     np.testing.assert_array_equal(bare.get_coordinates(), centers)
     with pytest.raises(TrustboError, match=r"unknown crs 'EPSG:0'; give e\.g\. 'EPSG:4326'"):
@@ -116,14 +117,7 @@ def test_a_geopackage_has_a_layer_of_the_line_and_one_of_the_bounds(result, cent
             assert found == (trust_of(result.plan, k, robot) if k else [None] * 3)
 
 
-def test_a_frame_without_a_crs_is_that_of_the_grid(result, nowhere, centers):
-    table = path_frame(result.plan, nowhere.workspace, crs=None)
-    np.testing.assert_array_equal(table[["x", "y"]], centers)
-    assert table.crs is None
-
-
 def test_what_cannot_be_written_is_refused_before_anything_is(result, nowhere, tmp_path):
-    plan, workspace = result.plan, result.workspace
     choices = r"choose one of \.geojson, \.gpkg"
     for name, suffix in (("path.kml", r"\.kml"), ("path", "")):
         with pytest.raises(TrustboError, match=f"unknown suffix '{suffix}'; {choices}"):
@@ -131,16 +125,10 @@ def test_what_cannot_be_written_is_refused_before_anything_is(result, nowhere, t
     for name in ("path.geojson", "path.gpkg"):
         with pytest.raises(TrustboError, match=r"has a CRS; use Workspace\.from_t"):
             write_path(tmp_path / name, nowhere)
-    alone = tb.Workspace.from_awareness(np.full((1, 3, 4, 2), 0.5))
-    with pytest.raises(ShapeError, match=r"the plan has 3 robots, the workspace \('r1',\)"):
-        write_path(tmp_path / "path.gpkg", plan, alone)
-    small = tb.Workspace.from_awareness(np.full((3, 2, 2, 2), 0.5))
-    with pytest.raises(TrustboError, match=r"path\[0\] \(2, 0\) is outside the grid of 2 rows"):
-        write_path(tmp_path / "path.gpkg", plan, small)
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "path.gpkg").mkdir()
     with pytest.raises(TrustboError, match=r"cannot write '.*path\.gpkg': it is a folder"):
-        write_path(tmp_path / "path.gpkg", plan, workspace)
+        write_path(tmp_path / "path.gpkg", result)
 
 
 def test_a_file_is_replaced_whole(result, tmp_path):

@@ -184,18 +184,18 @@ def test_a_bag_has_posts_towards_the_lead_s_stop_and_whole_ways(
             np.testing.assert_allclose(np.exp(1j * turns[:-1]), (x + 1j * y) / np.hypot(x, y))
 
     cost = planner.cost_map(params)
-    write_ros_bag(tmp_path / "path", plan, cost, workspace)
+    write_ros_bag(tmp_path / "path", plan, cost)
     assert_says_what_is_planned(read(tmp_path / "path"))
     for n, wrong in enumerate(faults(plan).values()):
         broken = replace(plan)
         vars(broken).update(waypoints=plan.waypoints, posts=plan.posts, ways=plan.ways)
         vars(broken).update(wrong)
-        write_ros_bag(tmp_path / str(n) / "path", broken, cost, workspace)
+        write_ros_bag(tmp_path / str(n) / "path", broken, cost)
         with pytest.raises(AssertionError):
             assert_says_what_is_planned(read(tmp_path / str(n) / "path"))
     named = replace(workspace, team=tb.Team(3, names=("r 1", "r2", "r3")))
     with pytest.raises(TrustboError, match="robot 'r 1' cannot be in a topic"):
-        write_ros_bag(tmp_path / "new", plan, cost, named)
+        write_ros_bag(tmp_path / "new", replace(plan, workspace=named), cost)
 
 
 def test_a_bag_in_a_frame_of_its_own_keeps_millimetres_in_float32(
@@ -207,7 +207,7 @@ def test_a_bag_in_a_frame_of_its_own_keeps_millimetres_in_float32(
     from mcap_ros2.decoder import DecoderFactory
 
     cost, options = planner.cost_map(params), {"frame": Frame("auto", 0.4, "odom")}
-    write_ros_bag(tmp_path / "path", plan, cost, workspace, **options)
+    write_ros_bag(tmp_path / "path", plan, cost, **options)
     frame = yaml.safe_load((tmp_path / "path_frame.yaml").read_text())
     c, s, (east, north) = math.cos(0.4), math.sin(0.4), frame["origin"]
     to_crs = Transformer.from_pipeline(
@@ -274,8 +274,8 @@ def test_what_is_exported_is_what_is_driven(plan, workspace, slip, tmp_path, mon
 def test_a_robot_called_as_the_lead_is_refused(plan, workspace, tmp_path):
     named = replace(workspace, team=tb.Team(3, names=("lead", "r2", "r3")))
     with pytest.raises(TrustboError, match="a robot is called 'lead', as the lead is"):
-        write_path(tmp_path / "path.geojson", plan, named)
+        write_path(tmp_path / "path.geojson", replace(plan, workspace=named))
     bare = tb.Workspace.from_awareness(np.full((3, 3, 4, 2), 0.5))
     with pytest.raises(TrustboError, match="posts and ways where its workspace was made from a"):
-        path_frame(plan, bare, layer="ways", crs=None)
+        path_frame(replace(plan, workspace=bare), layer="ways", crs=None)
     assert list(tmp_path.iterdir()) == []

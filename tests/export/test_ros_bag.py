@@ -90,7 +90,7 @@ def assert_is_the_result(grid, path, result, maps, shift=(0.0, 0.0), side=30.0):
 def test_a_bag_of_ros_1_is_latched(result, maps, tmp_path):
     from rosbags.rosbag1 import Reader
 
-    write_ros_bag(tmp_path / "path.bag", result.plan, maps["cost"], result.workspace)
+    write_ros_bag(tmp_path / "path.bag", result.plan, maps["cost"])
     with Reader(tmp_path / "path.bag") as reader:
         raw = {c.topic: data for c, _, data in reader.messages()}
         kinds = {c.topic: (c.msgtype, c.digest, c.ext.latching) for c in reader.connections}
@@ -112,7 +112,7 @@ def test_a_bag_of_ros_1_is_latched(result, maps, tmp_path):
 
 def test_a_database_of_ros_2_is_transient_local(result, maps, tmp_path):
     options = {"storage": "sqlite3", "resolution": 10.0, "frame": Frame((380000, 5224910))}
-    write_ros_bag(tmp_path / "path", result, maps["cost"], result.workspace, **options)
+    write_ros_bag(tmp_path / "path", result, maps["cost"], **options)
     assert {f.name for f in (tmp_path / "path").iterdir()} == {"metadata.yaml", "path.db3"}
     assert (tmp_path / "path_frame.yaml").exists()
     base = sqlite3.connect(tmp_path / "path" / "path.db3")
@@ -140,7 +140,7 @@ def test_mcap_is_read_by_its_own_library(result, maps, tmp_path):
     from mcap.reader import make_reader
     from mcap_ros2.decoder import DecoderFactory
 
-    write_ros_bag(tmp_path / "path", result.plan, maps["cost"], result.workspace)
+    write_ros_bag(tmp_path / "path", result.plan, maps["cost"])
     with (tmp_path / "path" / "path.mcap").open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
         found = {c.topic: (s.name, c, m) for s, c, _, m in reader.iter_decoded_messages()}
@@ -169,7 +169,7 @@ def test_without_a_terrain_the_frame_is_the_grid_s(maps, tmp_path):
     workspace = tb.Workspace.from_awareness(np.full((3, 3, 4, 2), 0.5), cell_size=2.0)
     params = tb.models.TrustParams(0.5, np.array([0.3, 0.3]), 0.1, 0.1, 0.1, 0.5, 0.5)
     plan = tb.planning.Planner(workspace, (2, 0), (2, 1), max_bounds="shortest").plan(params)
-    write_ros_bag(tmp_path / "path.bag", plan, maps["cost"], workspace)
+    write_ros_bag(tmp_path / "path.bag", plan, maps["cost"])
     with Reader(tmp_path / "path.bag") as reader:
         raw = {c.topic: data for c, _, data in reader.messages()}
     _, corner, values = Bytes(raw["/trustbo/cost"], cdr=False).grid()
@@ -181,7 +181,7 @@ def test_without_a_terrain_the_frame_is_the_grid_s(maps, tmp_path):
 
 
 def test_what_makes_no_bag_is_refused(result, maps, tmp_path):
-    plan, cost, workspace = result.plan, maps["cost"], result.workspace
+    plan, cost = result.plan, maps["cost"]
     (tmp_path / "there").mkdir()
     for name, options, message in (
         ("there", {}, r"there' exists; bags are not overwritten"),
@@ -190,15 +190,12 @@ def test_what_makes_no_bag_is_refused(result, maps, tmp_path):
         ("new", {"frame": Frame((1.0, 2.0, 3.0))}, "origin must be two finite numbers"),
     ):
         with pytest.raises(TrustboError, match=message):
-            write_ros_bag(tmp_path / name, plan, cost, workspace, **options)
-    small = tb.Workspace.from_awareness(np.full((3, 2, 2, 2), 0.5))
-    with pytest.raises(TrustboError, match=r"path\[0\] \(2, 0\) is outside the grid"):
-        write_ros_bag(tmp_path / "new", plan, cost, small)
+            write_ros_bag(tmp_path / name, plan, cost, **options)
     assert [file.name for file in tmp_path.iterdir()] == ["there"]
 
 
 def test_without_rosbags_the_extra_is_named(result, maps, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rosbags", None)
     with pytest.raises(TrustboError, match=r"ROS bags need rosbags: .* pip install rosbags$"):
-        write_ros_bag(tmp_path / "path", result.plan, maps["cost"], result.workspace)
+        write_ros_bag(tmp_path / "path", result.plan, maps["cost"])
     assert list(tmp_path.iterdir()) == []

@@ -41,7 +41,7 @@ def write_cot(
             without a time zone; or the file cannot be written.
     """
     target = require_file(path, ".zip", ".dpk")
-    plan = plan_of(plan, None)
+    plan = plan_of(plan)
     require_crs(plan.workspace)
     begin, schedule = begin_of(start), schedule_of(plan)
     end = begin + timedelta(seconds=float(schedule.begins[-1])) + _KEPT

@@ -207,8 +207,8 @@ def _write_maps(content: _Content, file: Path) -> None:
 
 
 def _write_bag(content: _Content, file: Path) -> None:
-    result, cost = content.result, content.maps()["cost"]
-    save_ros_bag(file, result.plan, cost, result.workspace, content.resolution, content.frame)
+    plan, cost = content.result.plan, content.maps()["cost"]
+    save_ros_bag(file, plan, cost, content.resolution, content.frame)
 
 
 def _write_path(content: _Content, file: Path) -> None:

@@ -58,7 +58,7 @@ def write_foxglove(
     require_foxglove()
     target = require_file(path, ".mcap")
     frame_file(target)
-    plan = plan_of(plan, None)
+    plan = plan_of(plan)
     place = placed(frame, plan.workspace, plan.path[0])
     save_foxglove(target, plan, maps, None, place)
     save_beside(target, place, plan.workspace)

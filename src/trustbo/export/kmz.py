@@ -53,7 +53,7 @@ def write_kmz(
     """
     require_simplekml()
     target = require_file(path, ".kmz")
-    plan = plan_of(plan, None)
+    plan = plan_of(plan)
     require_crs(plan.workspace)
     begin, schedule = begin_of(start), schedule_of(plan)
     picture = None if cost is None else _picture(cost, plan)

@@ -1,6 +1,5 @@
 """Layers of a plan as tables: its bounds, the posts of T2, and the ways of all robots."""
 
-from dataclasses import replace
 from itertools import takewhile
 
 import geopandas as gpd
@@ -9,7 +8,7 @@ import pandas as pd
 import shapely
 
 from trustbo.campaign.result import Result
-from trustbo.errors import ShapeError, TrustboError, require_kind
+from trustbo.errors import TrustboError, require_kind
 from trustbo.export.checks import LEAD, find_crs, require_crs, require_lead_apart
 from trustbo.planning import Plan
 from trustbo.planning.plan import QUANTILES
@@ -20,23 +19,12 @@ _LEAST = 1e-6
 """Least probability in tables; a smaller one is 0."""
 
 
-def plan_of(plan: Plan | Result, workspace: Workspace | None) -> Plan:
-    """Return a plan, or that of a result, on a workspace; by default the plan's.
-
-    ShapeError: they differ in their numbers of robots. TrustboError: the path leaves the workspace,
-    or a robot is called as the lead.
-    """
+def plan_of(plan: Plan | Result) -> Plan:
+    """Return a plan, or that of a result; TrustboError: a robot is called as the lead."""
     remedy = "give a Plan, as Campaign.ask returns it, or a Result"
     plan = plan.plan if isinstance(plan, Result) else plan
     require_kind("plan", plan, Plan, remedy)
-    if workspace is not None and workspace is not plan.workspace:
-        plan = replace(plan, workspace=workspace)
-    for k, cell in enumerate(plan.path):
-        plan.workspace.require_cell(f"path[{k}]", cell)
-    n_robots, names = plan.trust.shape[1], plan.workspace.team.names
-    if n_robots != len(names):
-        raise ShapeError(f"the plan has {n_robots} robots, the workspace {names}.")
-    require_lead_apart(names)
+    require_lead_apart(plan.workspace.team.names)
     return plan
 
 

@@ -43,7 +43,7 @@ def write_waypoints(
     """
     target = require_file(path, ".yaml", ".yml")
     frame_file(target)
-    plan = plan_of(plan, None)
+    plan = plan_of(plan)
     require_choice("robot", robot, (LEAD, *plan.workspace.team.names))
     place = placed(frame, plan.workspace, plan.path[0])
     save_waypoints(target, plan, robot, place)

@@ -16,7 +16,6 @@ from trustbo.export.checks import require_crs, require_names_for_sql
 from trustbo.export.layers import bounds_layer, plan_of, posts_layer, ways_layer
 from trustbo.files import FilePath, require_file, to_json, write_file, write_text
 from trustbo.planning import Plan
-from trustbo.workspace import Workspace
 
 _WGS84 = "EPSG:4326"
 _NAME = "most trustworthy path"
@@ -24,11 +23,7 @@ _LAYERS = {"bounds": bounds_layer, "posts": posts_layer, "ways": ways_layer}
 
 
 def path_frame(
-    plan: Plan | Result,
-    workspace: Workspace | None = None,
-    *,
-    layer: str = "bounds",
-    crs: Any = _WGS84,
+    plan: Plan | Result, *, layer: str = "bounds", crs: Any = _WGS84
 ) -> gpd.GeoDataFrame:
     """Return a path as points, one per cell, or the posts or the ways of its bounds.
 
@@ -49,16 +44,14 @@ def path_frame(
 
     Args:
         plan: Plan, or result whose recommended path is meant.
-        workspace: Workspace of the plan; by default the plan's.
         layer: "bounds", "posts" or "ways"; the last two need a terrain.
         crs: CRS of the geometry, anything that pyproj accepts; None for that of the grid, if any.
 
     Raises:
-        ShapeError: The plan and the workspace differ in their numbers of robots.
-        TrustboError: The layer or `crs` is unknown, the workspace has no CRS or no terrain, the
-            path leaves it, or a robot is called "lead".
+        TrustboError: The layer or `crs` is unknown, the workspace has no CRS or no terrain, or a
+            robot is called "lead".
     """
-    plan = plan_of(plan, workspace)
+    plan = plan_of(plan)
     make = _LAYERS[require_choice("layer", layer, _LAYERS)]
     if crs is None:
         return make(plan)
@@ -69,7 +62,7 @@ def path_frame(
         raise TrustboError(f"unknown crs {crs!r}; give e.g. 'EPSG:4326', or None.") from None
 
 
-def write_path(path: FilePath, plan: Plan | Result, workspace: Workspace | None = None) -> None:
+def write_path(path: FilePath, plan: Plan | Result) -> None:
     """Write a path, with its posts and ways, in the format of the suffix.
 
     ======== ========================================================================
@@ -89,14 +82,12 @@ def write_path(path: FilePath, plan: Plan | Result, workspace: Workspace | None 
     Args:
         path: File to write, or to replace.
         plan: Plan, or result whose recommended path is meant.
-        workspace: Workspace of the plan; by default the plan's.
 
     Raises:
-        ShapeError: The plan and the workspace differ in their numbers of robots.
-        TrustboError: The suffix is unknown, the workspace has no CRS, the path leaves the
-            workspace, a robot is called "lead", or the file cannot be written.
+        TrustboError: The suffix is unknown, the workspace has no CRS, a robot is called "lead", or
+            the file cannot be written.
     """
-    plan = plan_of(plan, workspace)
+    plan = plan_of(plan)
     file = require_file(path)
     _WRITERS[require_choice("suffix", file.suffix.lower(), _WRITERS)](file, plan)
 

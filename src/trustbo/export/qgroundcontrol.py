@@ -38,7 +38,7 @@ def write_qgc(
             has no way in a bound; or the file cannot be written.
     """
     target = require_file(path, ".plan")
-    plan = plan_of(plan, None)
+    plan = plan_of(plan)
     require_choice("robot", robot, (LEAD, *plan.workspace.team.names))
     firmware = _AUTOPILOTS[require_choice("autopilot", autopilot, _AUTOPILOTS)]
     require_crs(plan.workspace)

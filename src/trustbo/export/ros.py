@@ -139,7 +139,6 @@ def write_ros_bag(
     path: FilePath,
     plan: Plan | Result,
     cost: xr.DataArray,
-    workspace: Workspace,
     *,
     storage: str = "mcap",
     resolution: float | None = None,
@@ -164,24 +163,24 @@ def write_ros_bag(
         path: New `.bag` file for ROS 1, or new folder for ROS 2.
         plan: Plan, or result whose recommended path is meant.
         cost: Cost map, see `write_ros_map`.
-        workspace: Workspace of the cells.
         storage: Storage of ROS 2, "mcap" or "sqlite3".
         resolution: Side of a pixel, m, see `write_ros_map`.
         frame: Frame of all messages, see `write_ros_map`.
 
     Raises:
-        ShapeError: The dims, or the number of cells or robots, differ.
+        ShapeError: The dims or the number of cells differ.
         TrustboError: rosbags is not installed; the path exists; a name
             of a robot is none of ROS, or "lead"; or an argument is refused by `write_ros_map`.
     """
     target = Path(path)
     require_choice("storage", storage, STORAGES)
     require_new_bag(target)
-    plan = plan_of(plan, workspace)
+    plan = plan_of(plan)
+    workspace = plan.workspace
     require_robots(workspace)
     place = placed(frame, workspace, plan.path[0])
     frame_file(target)
-    save_ros_bag(target, plan, cost, workspace, resolution, place, storage)
+    save_ros_bag(target, plan, cost, resolution, place, storage)
     save_beside(target, place, workspace)
 
 
@@ -189,13 +188,12 @@ def save_ros_bag(
     target: Path,
     plan: Plan,
     cost: xr.DataArray,
-    workspace: Workspace,
     resolution: float | None,
     place: PlacedFrame,
     storage: str = "mcap",
 ) -> None:
     """Write a bag in a frame, without the file of the frame; see `write_ros_bag`."""
-    raster, topics = _raster(cost, workspace, resolution, place), _topics(plan, place)
+    raster, topics = _raster(cost, plan.workspace, resolution, place), _topics(plan, place)
     of_kind = {PATH: Messages.path, POSES: Messages.poses}
 
     def records(make: Messages) -> list[Record]:
