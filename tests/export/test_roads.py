@@ -113,3 +113,12 @@ def test_roads_of_others_get_their_awareness_from_a_terrain(tmp_path):
     for fault in ([(1, 9)], []):
         with pytest.raises(DamagedFileError, match="damaged: it does not hold what it should"):
             from_route_graph(written_by_others(tmp_path, nodes if fault else {}, fault))
+
+
+def test_a_chain_without_an_end_is_damage(tmp_path):
+    file = written_by_others(tmp_path, {1: [0, 0], 2: [1, 0], 3: [2, 0]}, [(1, 2), (2, 3), (3, 2)])
+    record = json.loads(file.read_text())
+    record["features"][0]["properties"]["metadata"] = {"row": 0, "col": 0}  # the only stop
+    file.write_text(json.dumps(record))
+    with pytest.raises(DamagedFileError, match="a chain without an end"):
+        from_route_graph(file)

@@ -83,6 +83,8 @@ def _chains(read: RouteGraph, stops: set[int]) -> list[tuple[list[int], list[int
         for edge, end, cost in onward.get(start, ()):
             nodes, edges, costs = [start, end], [edge], [cost]
             while nodes[-1] not in stops:  # a node within a chain has one edge on
+                if len(nodes) > len(read.nodes):
+                    raise ValueError("a chain without an end")
                 ((edge, end, cost),) = onward[nodes[-1]]
                 nodes.append(end)
                 edges.append(edge)

@@ -106,7 +106,7 @@ def graph_of(
     Args:
         planner: Planner of stationary or lost_contact.
         params: Parameters without leading axes.
-        place: PlacedFrame of the positions.
+        place: Frame of the positions.
         tolerance: Largest distance of a chain of edges from the lead's way, m, by default half a
             pixel; `inf` for straight edges.
 
