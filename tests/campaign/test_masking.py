@@ -100,8 +100,11 @@ def test_masks_stay_after_a_campaign_is_saved_and_read_again(jammed, tmp_path):
 
 
 def test_what_has_no_effects_of_places_or_forgets_is_not_masked_by_default():
-    censored = PooledTrust(place=PlaceEffect(), observation="censored")
-    for model, changes in ((None, "mask"), (PooledTrust(), "ignore"), (censored, "ignore")):
+    place = PlaceEffect()
+    censored, odd = (PooledTrust(place=place, observation=o) for o in ("censored", "student_t"))
+    for model, changes in (
+        (None, "mask"), (PooledTrust(), "ignore"), (censored, "mask"), (odd, "ignore"),
+    ):  # fmt: skip
         campaign = tb.Campaign(workspace_of(), (4, 0), (0, 4), model=model)
         assert campaign.learner.changes == changes
     assert begun(forgetting=0.9).learner.changes == "ignore"
@@ -110,11 +113,11 @@ def test_what_has_no_effects_of_places_or_forgets_is_not_masked_by_default():
 @pytest.mark.parametrize(
     ("model", "named"),
     [
-        (PooledTrust(observation="censored"), "censored"),
+        (PooledTrust(observation="student_t"), "student_t"),
         (PooledTrust(response="change"), "change"),
         (tb.models.HierarchicalTrust(), "HierarchicalTrust"),
     ],
 )
 def test_models_under_which_changes_are_not_weighed_are_refused(model, named):
-    with pytest.raises(tb.TrustboError, match=f'changes="mask" weighs.*{named}'):
+    with pytest.raises(tb.TrustboError, match=f'changes are weighed .*{named}.*changes="ignore"'):
         tb.Campaign(workspace_of(), (4, 0), (0, 4), model=model, changes="mask")

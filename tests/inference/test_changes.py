@@ -241,6 +241,35 @@ def test_a_robot_that_changes_is_named_with_and_without_effects_of_robots(furthe
     assert abs(first["effect"] - SIZES["robot"]) < 4.0 * first["sd"] + 0.1
 
 
+def at_limits(missions):
+    """Missions with counts of 40 ticks and more contact: a third of the rates are 1."""
+    args = [(m, np.clip(1.4 * m.contact_rate + 0.25, 0.0, 1.0)) for m in missions]
+    return [
+        Mission.from_arrays(m.path, m.awareness, np.round(40 * y) / 40, features=FEATURES,
+                            n_ticks=np.full(y.shape, 40))
+        for m, y in args
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("family", "kind"), [("censored", None), ("censored", "robot"), ("beta_binomial", "area")]
+)
+def test_changes_are_found_under_families_that_are_not_gaussian(family, kind):
+    missions = at_limits(changing_missions(0, PLANTED.get(kind)))
+    model = PooledTrust(effects=[PlaceEffect(), RobotEffect()], observation=family)
+    posterior = tb.fit(missions, model, draws=50, progress=False, whole=False)
+    table = tb.inference.changes(posterior)
+    if kind is None:
+        assert table["probability"][0] > 0.5
+        return
+    first = table.iloc[1]
+    assert (first["kind"], first["from_mission"]) == (kind, START)
+    assert np.abs(np.subtract(first["where"], PLANTED[kind].where)[:2]).max() <= (kind == "area")
+    assert first["probability"] > 0.9
+    # Rates were stretched by 1.4; logits of counts that fall to 0 have no limit.
+    assert 1.0 < first["effect"] / SIZES[kind] < (2.0 if family == "censored" else np.inf)
+
+
 def test_changes_under_a_model_that_has_no_scan_are_refused():
     missions = changing_missions(0, n_missions=5)
     model = HierarchicalTrust(observation="gaussian")

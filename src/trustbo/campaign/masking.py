@@ -16,10 +16,9 @@ import xarray as xr
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
-from trustbo.inference.changes import scan_posterior
+from trustbo.inference.changes import scan_posterior, why_no_changes
 from trustbo.models.effects.change import Change
 from trustbo.models.model import TrustModel
-from trustbo.models.pooled import PooledTrust
 from trustbo.workspace import Workspace
 
 _PROBABLE, _LEAST = 0.5, 1e-3  # probability: of a change, and of one that is looked at
@@ -125,15 +124,11 @@ def resolved(changes: str, model: TrustModel, *, all_alike: bool) -> str:
     Raises:
         TrustboError: Changes cannot be weighed under the model, and are to be.
     """
-    gaussian = model.family.integrates_out and model.observation == "gaussian"
-    able = isinstance(model, PooledTrust) and gaussian and not model.lag and model.memory == "level"
+    reason = why_no_changes(model)
     if changes == "auto":
-        return "mask" if able and all_alike and model.place is not None else "ignore"
-    if changes != "ignore" and not able:
-        raise TrustboError(
-            f'changes="{changes}" weighs changes under PooledTrust for Gaussian rates of trust; '
-            f'got {model.describe()}. Give changes="ignore", or another model.'
-        )
+        return "mask" if not reason and all_alike and model.place is not None else "ignore"
+    if changes != "ignore" and reason:
+        raise TrustboError(f'{reason} Give changes="ignore", or another model.')
     return changes
 
 

@@ -8,7 +8,7 @@ drawn again with the column of the most probable one, and every weight is relati
 
 import json
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, Protocol, cast
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -17,13 +17,13 @@ from scipy.special import logsumexp
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError, require_whole
-from trustbo.inference.evidence.gaussian import Gaussian
+from trustbo.inference.evidence.evidence import ColumnEvidence
 from trustbo.inference.posterior_tree import missions_of, require_posterior
 from trustbo.inference.samplers.importance import sample_scores
-from trustbo.inference.samplers.posterior import Posterior, posterior_of
+from trustbo.inference.samplers.posterior import evidence_of, posterior_of
 from trustbo.inference.samplers.student import proposal_of
 from trustbo.models.effects.change import KINDS, Candidates, Change
-from trustbo.models.effects.effect import Columns, Slots, Theta
+from trustbo.models.effects.effect import Slots, Theta, rest_of
 from trustbo.models.model import TrustModel
 from trustbo.models.place import PlaceEffect, bounds_of, visited
 from trustbo.models.pooled import PooledTrust
@@ -42,23 +42,13 @@ _MOST_FITS = 3  # with one change or another
 _LISTED = 1e-3  # probability of a change in a table
 
 
-class Scanned(Protocol):
-    """An evidence that scans further columns, see `evidence.gaussian.Gaussian.scan`."""
-
-    def scan(
-        self, theta: Theta, columns: Columns, run: np.ndarray | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Products z'C^-1 z and z'C^-1 r of further columns z, each (point, column)."""
-        ...
-
-
 class Weighed(NamedTuple):
     """Probabilities of the candidates of a scan, and what they add to trust."""
 
     candidates: Candidates
     p: np.ndarray  # (candidate,)
     p_none: float
-    effect: np.ndarray  # (candidate,), mean of d in units of stationary trust, given the candidate
+    effect: np.ndarray  # (candidate,), mean of d in units of contact, given the candidate
     sd: np.ndarray  # (candidate,), of d
     largest_share: float
     """Largest share of one draw of theta in all weights together: near 1, they are of one draw."""
@@ -126,8 +116,8 @@ def changes(
     stand for bad days and slow drifts, against which a change has to stand out.
 
     Args:
-        posterior: Posterior of `PooledTrust` for Gaussian rates that measure trust, with any
-            effects.
+        posterior: Posterior of `PooledTrust` for rates that measure trust, with any effects, of any
+            family of observations but `"student_t"`.
         missions: Missions that it was fitted to, in order; by default those it holds.
         workspace: Workspace of the missions, to fill in awareness that they lack, as for `fit`; its
             grid is that of the areas.
@@ -180,17 +170,8 @@ def scan_posterior(
     if model is None:
         model = model_from_record(json.loads(attrs["model_record"]), features=features)
     model = model.observing(attrs["observation"])
-    if (
-        not isinstance(model, PooledTrust)
-        or not model.family.integrates_out
-        or model.lag
-        or model.memory != "level"
-    ):
-        raise TrustboError(
-            "changes are weighed under PooledTrust for Gaussian rates of trust; got "
-            f"{model.describe()}, memory of {model.memory}. Fit the missions with "
-            'PooledTrust(observation="gaussian").'
-        )
+    if reason := why_no_changes(model):
+        raise TrustboError(f"{reason} Fit the missions with PooledTrust().")
     batch = stack_missions(missions)
     weight = np.ones(len(batch.contact_rate))
     weight[: len(missions)] = np.atleast_1d(attrs.get("weights", 1.0))
@@ -202,10 +183,7 @@ def scan_posterior(
     slots = Slots.of(batch, len(missions), features, weight, places)
     effects = model.all_effects
 
-    def target_of(further: list[Change]) -> Posterior:
-        return posterior_of(model.priors, model.family, [*effects, *further], slots)
-
-    target = target_of([])
+    known = model.priors, model.family
     names = "beta0", "delta_w", "delta_v", *(name for e in effects for name in e.names)
 
     def draw_theta(change: Change | None) -> Theta:
@@ -215,15 +193,29 @@ def scan_posterior(
             params = {name: drawn[name].values[chosen] for name in names}
         else:
             start = proposal_of(posterior)
-            params = sample_scores(target_of([change]), N_DRAWS, seed, start).draws.params
-        return {name: params[name] for name in names} | {"rest": 1.0 - params["beta0"]}
+            target = posterior_of(*known, [*effects, change], slots, memory=model.memory)
+            params = sample_scores(target, N_DRAWS, seed, start).draws.params
+        return {name: params[name] for name in names} | {
+            "rest": rest_of(params["beta0"], model.memory)
+        }
 
-    evidence = cast(Gaussian, target.evidence)  # that of rates that integrate out
-    return find_changes(evidence, Candidates.of(slots), draw_theta)
+    candidates = Candidates.of(slots, unit=model.family.line_of_sight[0])
+    evidence = evidence_of(*known, effects, slots, memory=model.memory)
+    return find_changes(evidence, candidates, draw_theta)
+
+
+def why_no_changes(model: TrustModel) -> str:
+    """Reason why changes cannot be weighed under a model; empty if they can."""
+    if isinstance(model, PooledTrust) and not model.lag and model.why_not_exact is None:
+        return ""
+    return (
+        "changes are weighed under PooledTrust for rates of trust that the exact sampler treats; "
+        f"got {model.describe()}."
+    )
 
 
 def weigh(
-    evidence: Scanned, theta: Theta, candidates: Candidates, believed: int | None = None
+    evidence: ColumnEvidence, theta: Theta, candidates: Candidates, believed: int | None = None
 ) -> Weighed:
     """Weigh candidates, and none, by draws of theta.
 
@@ -233,7 +225,7 @@ def weigh(
         candidates: Changes to weigh.
         believed: Index of the candidate whose column theta was drawn with; None for no change.
     """
-    rest = np.abs(theta["rest"])[:, None]
+    rest = candidates.unit * np.abs(theta["rest"])[:, None]
     n, n_candidates = len(rest), len(candidates.first)
     log_w = np.concatenate([np.zeros((n, 1)), np.full((n, n_candidates), -np.inf)], axis=1)
     a, b = np.zeros((2, n, n_candidates))
@@ -273,9 +265,9 @@ def weigh(
 
 
 def _scanned(
-    evidence: Scanned, theta: Theta, candidates: Candidates, kept: np.ndarray
+    evidence: ColumnEvidence, theta: Theta, candidates: Candidates, kept: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Products of `Scanned.scan` of some candidates, each (point, candidate kept)."""
+    """Products of `ColumnEvidence.scan` of some candidates, each (point, candidate kept)."""
     first = candidates.first[kept]
     needed = np.isin(candidates.run, candidates.run[first])
     a, b = evidence.scan(theta, candidates.columns[:, needed], candidates.run[needed])
@@ -285,7 +277,7 @@ def _scanned(
 
 @one_blas_thread()
 def find_changes(
-    evidence: Scanned, candidates: Candidates, draw_theta: Callable[[Change | None], Theta]
+    evidence: ColumnEvidence, candidates: Candidates, draw_theta: Callable[[Change | None], Theta]
 ) -> Weighed:
     """Weigh candidates by theta drawn with the believed one.
 

@@ -69,6 +69,7 @@ class Gaussian:
         *,
         apart: bool = False,
         lag: float = 0.0,
+        by_slot: bool = False,
     ) -> None:
         """Sum products of columns over missions.
 
@@ -79,13 +80,17 @@ class Gaussian:
             memory: `"level"`, trust is carried on, or `"deviation"` from what effects expect.
             apart: Whether theta has a beta0 of each robot, (point, robot).
             lag: 1 where rates measure the change of trust, else 0.
+            by_slot: Whether theta has the rates and the variances of their noise, `rates` and
+                `variances`, each (point, chain, bound), in place of those of slots and of delta_v.
         """
         self.slots, self.groups, self.x0, self.lag = slots, tuple(groups), x0, lag
         self.level = require_choice("memory", memory, MEMORIES) == "level"
         seen = ~np.isnan(slots.y)
         robot = slots.robot if apart else np.zeros_like(slots.robot)
-        kinds, kind = np.unique(np.column_stack([robot, seen]), axis=0, return_inverse=True)
-        self.robot, self.seen, self.kind = kinds[:, 0], kinds[:, 1:] > 0, kind.ravel()
+        chain = np.arange(len(seen)) if by_slot else np.zeros_like(robot)
+        alike = np.column_stack([chain, robot, seen])
+        kinds, kind = np.unique(alike, axis=0, return_inverse=True)
+        self.robot, self.seen, self.kind = kinds[:, 1], kinds[:, 2:] > 0, kind.ravel()
         self.n_measured = float(slots.weight @ seen.sum(1))
         self.mass = np.bincount(self.kind, slots.weight, len(self.seen))
         self.y = np.where(seen, slots.y, 0.0)
@@ -136,20 +141,7 @@ class Gaussian:
     def scan(
         self, theta: Theta, columns: Columns, run: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Products a = z'C^-1 z and b = z'C^-1 r of further columns z, each (point, column).
-
-        r are the rates less their mean and C is their covariance, each through L^-1 M z as above:
-        with a coefficient N(0, t^2) of z, the log evidence rises by
-        -log(1 + t^2 a) / 2 + t^2 b^2 / (2 (1 + t^2 a)), and given the rates the coefficient has
-        variance 1 / (a + t^-2) and mean b times that.
-
-        Args:
-            theta: Hyperparameters, each (point,).
-            columns: Sparse matrix (slot, column).
-            run: Run of each column (column,), runs being contiguous: z is the sum of a column and
-                of all later ones of its run, which may not share a chain. By default z is the
-                column.
-        """
+        """See `ColumnEvidence.scan`: C^-1 through L^-1 M z as above."""
         run = np.arange(columns.shape[1]) if run is None else run
         sums = Sums.of(sparse.csc_array(columns))
         (atom, column), G = self._products(sums.atoms, self.U)
@@ -276,7 +268,8 @@ class Gaussian:
 
     def _impulses(self, theta: Theta) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """See `impulses`."""
-        noises = theta["delta_w"][:, None], theta["delta_v"][:, None]
+        variances = theta.get("variances", theta["delta_v"][:, None, None] ** 2)
+        noises = theta["delta_w"], variances
         return impulses(self._beta0(theta), *noises, self.x0[1], self.seen, self.lag)
 
     def _beta0(self, theta: Theta) -> np.ndarray:
@@ -302,8 +295,8 @@ class Gaussian:
             start = self._beta0(theta)[..., None] * self.x0[0] * N[..., 0]
             start -= self.lag * self.x0[0] * E[..., 0]
         R, misfit = np.zeros((n, n_chains, K)), np.zeros(n)
-        C = N if self.level else E
-        _residuals(self.y, expected, start, E, C, self.kind, self.slots.weight, R, misfit)
+        C, y = N if self.level else E, theta.get("rates", self.y[None])
+        _residuals(y, expected, start, E, C, self.kind, self.slots.weight, R, misfit)
         return R.reshape(n, -1), misfit
 
     def _whiten(self, P: np.ndarray, prior: Prior) -> None:
@@ -391,7 +384,7 @@ def named_effects(
 def impulses(
     b: np.ndarray,
     delta_w: np.ndarray,
-    delta_v: np.ndarray,
+    variances: np.ndarray,
     x0_sd: float,
     seen: np.ndarray,
     lag: float = 0.0,
@@ -400,17 +393,16 @@ def impulses(
 
     Args:
         b: Memory beta0, (point, kind) or (point, 1).
-        delta_w: Process noise, (point, 1).
-        delta_v: Measurement noise, (point, 1).
+        delta_w: Process noise, (point,).
+        variances: Variances of the measurement noise, (point, kind, bound) or of length 1.
         x0_sd: Sd of trust before the first bound.
         seen: Mask of the measured rates (kind, bound).
         lag: 1 where rates measure the change of trust, else 0.
     """
     n, (n_kinds, K) = len(b), seen.shape
     (N, E), log_det = np.zeros((2, n, n_kinds, K, K)), np.zeros((n, n_kinds))
-    b = np.broadcast_to(b, (n, n_kinds))
-    variances = delta_w[:, 0] ** 2, delta_v[:, 0] ** 2, x0_sd**2
-    _impulses(b, *variances, seen, float(lag), N, E, log_det)
+    b, R = np.broadcast_to(b, (n, n_kinds)), np.broadcast_to(variances, (n, n_kinds, K))
+    _impulses(b, delta_w**2, R, x0_sd**2, seen, float(lag), N, E, log_det)
     return N, E, log_det
 
 
@@ -419,7 +411,9 @@ def _impulses(b, Q, R, x0_variance, seen, lag, N, E, log_det):
     gain = np.empty(seen.shape[1])
     for t in range(len(b)):
         for q in range(len(seen)):
-            log_det[t, q] = _filter(b[t, q], Q[t], R[t], x0_variance, seen[q], lag, N[t, q], gain)
+            log_det[t, q] = _filter(
+                b[t, q], Q[t], R[t, q], x0_variance, seen[q], lag, N[t, q], gain
+            )
             _whitening(b[t, q], gain, lag, N[t, q], E[t, q])
 
 
@@ -431,8 +425,8 @@ def _filter(b, Q, R, last, seen, lag, N, gain):
     for k in range(len(seen)):
         left, over, gain[k], m[k] = 1.0, 0.0, 0.0, 1.0
         if seen[k]:
-            F = P + R + lag * (lag - 2.0 * b) * last
-            left, over, gain[k] = R / F, lag / F, (P - lag * b * last) / F
+            F = P + R[k] + lag * (lag - 2.0 * b) * last
+            left, over, gain[k] = R[k] / F, lag / F, (P - lag * b * last) / F
             log_det += np.log(F)
             N[k, : k + 1] = m[: k + 1] / np.sqrt(F)
         m[:k] *= b * left + over * Q
@@ -458,18 +452,19 @@ def _whitening(b, gain, lag, N, E):
 def _residuals(y, expected, start, E, C, kind, weight, R, misfit):
     """R (point, chain, bound) and misfit (point,), see `Gaussian._residual`.
 
-    Expected rates (point, chain, bound) but for the first trust, whose responses (point, kind,
-    bound) are `start`.
+    Rates y (point, chain, bound), the same at all points if of length 1. Expected rates (point,
+    chain, bound) but for the first trust, whose responses (point, kind, bound) are `start`.
     """
-    n_chains, K = y.shape
+    _, n_chains, K = y.shape
     r = np.empty(K)
     for t in range(len(expected)):
+        rates = y[t if len(y) > 1 else 0]
         for c in range(n_chains):
             q = kind[c]
             for k in range(K):
                 r[k] = -start[t, q, k]
                 for i in range(k + 1):
-                    r[k] += E[t, q, k, i] * y[c, i] - C[t, q, k, i] * expected[t, c, i]
+                    r[k] += E[t, q, k, i] * rates[c, i] - C[t, q, k, i] * expected[t, c, i]
             for i in range(K):
                 for k in range(i, K):
                     R[t, c, i] += weight[c] * C[t, q, k, i] * r[k]

@@ -40,6 +40,7 @@ _ENOUGH, _ROUND = 200.0, 512  # effective number of points; points that make a r
 _RIDGE = 1e-3
 _MANY, _PER_AXIS = 12, 4.0  # axes; effective points for each that moments are taken of
 _MORE, _MORE_LAST = 3, 24  # times that uneven draws are added to; that refused ones are
+_FEWEST = 100  # draws whose weights are smoothed
 _EVEN = 0.9  # effective share of draws from which on no weight exceeds 1 % of 1000: no tail
 
 
@@ -155,7 +156,9 @@ def sample_scores(
         points, proposal = weighted_points(target, seed, start, watch)
         watch.stage("exact sampler draws")
         rng = np.random.default_rng(seed)
-        n = min(n_draws, target.n_corrected or n_draws)
+        n = n_draws
+        if target.n_corrected is not None:
+            n = min(max(n_draws, _FEWEST), target.n_corrected)
         drawn = None
         if points.khat < MAX_KHAT or not target.sharpen():
             drawn = _draw(target, points, n, rng)

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 from scipy.optimize import minimize
 
-from trustbo.inference.evidence.evidence import Evidence
+from trustbo.inference.evidence.evidence import ColumnEvidence, Evidence
 from trustbo.inference.evidence.gaussian import Gaussian
 from trustbo.inference.evidence.sites import Sites
 from trustbo.inference.samplers import scores
@@ -249,17 +249,32 @@ def posterior_of(
         carries: Whether anything lasts from one bound to the next; else beta0 = 0, which all robots
             share.
     """
-    effects = [Weights(priors, by_robot), *effects]
-    groups, x0 = [e.group(slots) for e in effects], (float(priors.x0_mean), float(priors.x0_sd))
-    if family.integrates_out:
-        evidence = Gaussian(slots, groups, x0, memory, apart=by_robot, lag=lag)
-    else:
-        evidence = Sites(slots, groups, family, x0, memory, apart=by_robot)
+    evidence = evidence_of(
+        priors, family, effects, slots, by_robot=by_robot, lag=lag, memory=memory
+    )
     if by_robot:
         coordinates = PerRobot(priors, slots.n_robots, slots.z.shape[2])
     else:
         coordinates = (Shared if carries else Memoryless)(priors, effects, memory)
     return Posterior(coordinates, evidence, float(np.nanstd(slots.y)))
+
+
+def evidence_of(
+    priors: Priors,
+    family: Family,
+    effects: Sequence[Effect],
+    slots: Slots,
+    *,
+    by_robot: bool = False,
+    lag: float = 0.0,
+    memory: str = "level",
+) -> ColumnEvidence:
+    """Evidence of weights and other effects, by the family of observations; see `posterior_of`."""
+    groups = [effect.group(slots) for effect in (Weights(priors, by_robot), *effects)]
+    x0 = float(priors.x0_mean), float(priors.x0_sd)
+    if family.integrates_out:
+        return Gaussian(slots, groups, x0, memory, apart=by_robot, lag=lag)
+    return Sites(slots, groups, family, x0, memory, apart=by_robot)
 
 
 def _take(theta: Theta, points: np.ndarray) -> dict[str, np.ndarray]:

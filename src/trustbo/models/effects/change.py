@@ -2,7 +2,8 @@
 
 A change adds d times its profile to the drift of bounds from a mission on: line of sight for all
 robots or one of them, a constant for an area, the cells within a radius of its centre. d is in
-units of stationary trust. Neither the mission nor the area is given: every start and place that the
+units of contact: of stationary trust, and of logits where rates are counts, by their line through
+contact. Neither the mission nor the area is given: every start and place that the
 paths separate is a candidate column, and inference weighs them (`inference.changes`).
 """
 
@@ -32,17 +33,19 @@ class Change(Effect):
         kind: `"all"`, `"robot"` or `"area"`.
         where: Nothing; the index of the robot; or row, column and radius in cells.
         from_mission: Index of the first mission after the change.
+        unit: Stationary trust that is one of contact, see `Family.line_of_sight`.
     """
 
     kind: Kind
     where: tuple[int, ...]
     from_mission: int
+    unit: float = 1.0
 
     def group(self, slots: Slots) -> Independent:
         """See `Effect.group`."""
         kind, where = KINDS.index(self.kind), np.array([*self.where, 0, 0, 0][:3])
         values = _profile(slots, kind, where) * (slots.mission >= self.from_mission)[:, None]
-        return Independent(sparse.csr_array(values.reshape(-1, 1)), "change", SDS[kind])
+        return Independent(sparse.csr_array(values.reshape(-1, 1)), "change", SDS[kind] * self.unit)
 
     def met(self, cells: np.ndarray) -> np.ndarray:
         """Whether bounds into cells (..., 2) belong to the area; all do of other kinds."""
@@ -78,13 +81,15 @@ class Candidates(NamedTuple):
     stands_for: np.ndarray  # (column,), candidate; -1 for a start too early or too late
     first: np.ndarray  # (candidate,), column
     log_odds: np.ndarray  # (candidate,), prior odds against no change
-    sd: np.ndarray  # (candidate,)
+    sd: np.ndarray  # (candidate,), of d
+    unit: float  # see `Change`
 
     @classmethod
-    def of(cls, slots: Slots, sides: tuple[int, int] = SIDES) -> "Candidates":
+    def of(cls, slots: Slots, sides: tuple[int, int] = SIDES, unit: float = 1.0) -> "Candidates":
         """Candidates of some slots; areas where places are given.
 
-        `sides`: missions that meet the profile before a start, and from it on, at least.
+        `sides`: missions that meet the profile before a start, and from it on, at least; `unit`:
+        see `Change`.
         """
         entries, profile, n_profiles = _entries(slots)
         slot, which, value = entries
@@ -112,7 +117,7 @@ class Candidates(NamedTuple):
         log_odds = np.log(np.bincount(same.ravel(), odds[possible], len(first)))
         sd = np.array(SDS)[kind[first]]
         return cls(
-            columns, run, profile[run], mission, earliest, stands_for, first, log_odds, sd
+            columns, run, profile[run], mission, earliest, stands_for, first, log_odds, sd, unit
         )  # fmt: skip
 
     def change(self, candidate: int) -> Change:
@@ -127,7 +132,7 @@ class Candidates(NamedTuple):
     def _change_of(self, column: np.intp) -> Change:
         kind, *where = self.profile[column].tolist()
         length = {"all": 0, "robot": 1, "area": 3}[KINDS[kind]]
-        return Change(KINDS[kind], tuple(where[:length]), int(self.mission[column]))
+        return Change(KINDS[kind], tuple(where[:length]), int(self.mission[column]), self.unit)
 
 
 def cells_of(slots: Slots) -> np.ndarray:
