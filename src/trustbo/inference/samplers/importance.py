@@ -193,19 +193,19 @@ def _draw(
     """Indices of resampled points, parameters there, and their smoothed weights.
 
     Where n weights are uneven more are drawn, as k-hat of few weights is noisy; None where an
-    approximate density was sharpened instead.
+    approximate density was sharpened instead, as more did not help.
     """
     chosen = np.sort(systematic(np.exp(points.log_w), n, rng))
     params, log_weight = target.draw(points.z, points.log_p, chosen, rng)
     if log_weight is None:
         return chosen, params, None
     smoothing = smoothed_weights(log_weight)
-    if smoothing[1] >= GOOD_KHAT and target.sharpen():
-        return None
     for k in range(_MORE_LAST):
         enough = smoothing[1] < (GOOD_KHAT if k < _MORE else MAX_KHAT)
         if enough or _kish(smoothing[0]) > _EVEN * len(chosen):
             break
+        if k == _MORE and target.sharpen():
+            return None
         more = np.sort(systematic(np.exp(points.log_w), n, rng))
         others, added = target.draw(points.z, points.log_p, more, rng)
         chosen, log_weight = np.append(chosen, more), np.append(log_weight, added)  # pyright: ignore
