@@ -130,7 +130,7 @@ def criticise(given):
     done = {record["campaign"] for record in read_records(file)}
     for folder in sorted((given.out / "campaigns").iterdir()):
         if folder.name not in done:
-            started, result = time.process_time(), tb.read(folder)
+            started, result = time.process_time(), tb.load_result(folder)
             found = tb.criticise(result.posteriors[-1], result.missions, compare=False)
             seconds = time.process_time() - started
             add_record(file, {"campaign": folder.name, "fault": found.fault, "seconds": seconds})

@@ -1,9 +1,8 @@
 """Criticism of a fitted trust model: tests, residuals and comparisons, with a verdict."""
 
-import json
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +12,7 @@ import xarray as xr
 from trustbo.criticism.ablation import ablate
 from trustbo.criticism.departures import Departure, departures
 from trustbo.criticism.findings import (
+    IN_CONTACT,
     LEAST,
     coverage_row,
     family_test,
@@ -28,6 +28,7 @@ from trustbo.criticism.joint_normal import (
     posterior_point,
     with_start,
 )
+from trustbo.criticism.normal_scores import with_normal_rates
 from trustbo.criticism.prior_moments import Coefficients, coefficients_of, test_prior
 from trustbo.criticism.residuals import curves_of, groups_of, table_of_rates
 from trustbo.criticism.robots import (
@@ -41,10 +42,9 @@ from trustbo.criticism.score import Derivatives, Innovations, Outcome, derivativ
 from trustbo.data import Mission
 from trustbo.display.card import Card, Displayed
 from trustbo.errors import TrustboError, require_whole
-from trustbo.inference.fit import fit
 from trustbo.inference.posterior_tree import missions_of
+from trustbo.models.families import FAMILIES
 from trustbo.models.model import TrustModel
-from trustbo.models.record import model_from_record
 from trustbo.parallel import one_blas_thread
 
 _LEVEL = 0.05
@@ -67,8 +67,8 @@ class Criticism(Displayed):
             once the fault that explains most is accounted for; and the finding in words. A
             probability below 1e-6, which is extrapolated, is 0.
         rates: Row of each measured rate: mission, bound, robot, row, col, contact_rate, expected
-            and sd given the rates before, standardised residual, pit, and `ahead`, the standardised
-            residual of predictions one mission ahead.
+            and sd given the rates before (of the normal rates), standardised residual, pit, and
+            `ahead`, the standardised residual of predictions one mission ahead.
         groups: Mean residual by kind (mission, bound, robot, cell, contact: class of expected
             rate) and group, the half-width `band` of its simultaneous 95 % band, and whether it
             stands out.
@@ -135,16 +135,17 @@ def criticise(
     one of least p. Missions are counted from 0, as in the posterior.
 
     Args:
-        posterior: DataTree from `fit`, or one of `Result.posteriors`. Of observations that are not
-            Gaussian the model is fitted again, to the same rates taken for Gaussian ones, whose
-            residuals are tested for all but the family.
+        posterior: DataTree from `fit`, or one of `Result.posteriors`. Of rates that are not
+            Gaussian, residuals are those of normal ones that stand for them, drawn once: trust
+            drawn from the posterior, and a randomised normal score of the rate given it. Of
+            censored rates, this is the rate before it was cut.
         missions: Missions that it was fitted to, or all of its campaign; needed where it holds no
             data.
         model: Its model, needed for comparisons if its priors are custom.
         compare: Whether to compare, by LOO, with the model without each feature, and with or
             without places: each is a fit.
         n_replicates: Number of replicates for p-values and bands.
-        seed: Seed of the replicates.
+        seed: Seed of the replicates, and of normal rates.
 
     Raises:
         TrustboError: The posterior is not of a linear model, or holds no data and no missions are
@@ -153,8 +154,6 @@ def criticise(
     """
     require_whole("n_replicates", n_replicates, 100)
     missions = _checked(posterior, missions)
-    if posterior.attrs["observation"] != "gaussian":
-        posterior, model = _of_gaussian_rates(posterior, missions, model)
     try:
         return _criticise(posterior, missions, model, compare, n_replicates, seed)
     except np.linalg.LinAlgError:
@@ -178,11 +177,13 @@ class _Tested(NamedTuple):
 
 
 def _tested(
-    posterior: xr.DataTree, missions: Sequence[Mission], n_replicates: int, seed: int
+    posterior: xr.DataTree, missions: list[Mission], n_replicates: int, seed: int
 ) -> _Tested:
     """Test the residuals; LinAlgError: rates are all but equal."""
     point, place = posterior_point(posterior)
-    data = gather(missions, place)
+    family = FAMILIES[posterior.attrs["observation"]]
+    data = gather(missions, place, family.line_of_sight[0])
+    data, point = with_normal_rates(posterior, missions, data, point, seed)
     point = with_start(point, data)
     normal, by_parameter = joint_normal(point, data), derivatives(point, data)
     n_parameters = len(by_parameter.names) - len(point.scales)  # scales of effects have priors
@@ -197,13 +198,6 @@ def _tested(
     tests, left_out = departures(missions, data, normal, point, place)
     coefficients = coefficients_of(posterior, point, by_parameter, list(missions[0].features))
     outcomes = _test_all(innovations, tests, coefficients, seed)
-    family = posterior.attrs.get("criticised_for", "gaussian")
-    if family != "gaussian":
-        del outcomes["family"]
-        left_out["family"] = (
-            f"residuals are those of Gaussian rates, the posterior is of {family} ones; see "
-            "tb.inference.by_rate and az.plot_ppc_pit."
-        )
     return _Tested(
         data, by_parameter, draws, innovations, tests, left_out, coefficients, outcomes
     )  # fmt: skip
@@ -224,6 +218,7 @@ def _criticise(
     by_name = {test.name: test for test in tested.departures}
     sizes = {
         name: size_of(one, by_name.get(name), innovations, coefficients)
+        / (tested.data.unit if name in IN_CONTACT else 1.0)
         for name, one in outcomes.items()
     }
     clear = [name for name, p in zip(outcomes, adjusted, strict=True) if p <= _LEVEL]
@@ -348,23 +343,6 @@ def _checked(posterior: xr.DataTree, missions: Sequence[Mission] | None) -> list
             "criticise(result.posteriors[j], result.missions[: j + 1])."
         )
     return missions_of(posterior)
-
-
-def _of_gaussian_rates(
-    posterior: xr.DataTree, missions: Sequence[Mission], model: TrustModel | None
-) -> tuple[xr.DataTree, TrustModel]:
-    """Posterior and model of the same missions, the rates taken for Gaussian ones.
-
-    Priors are the default ones, as those of counts are of another scale.
-    """
-    if model is None:
-        record = json.loads(posterior.attrs["model_record"])
-        model = model_from_record(record, features=missions[0].features)
-    model = replace(model, observation="gaussian", priors=None)
-    seed = int(posterior.attrs["seed"])
-    fitted = fit(missions, model, seed=seed, draws=250, check=False)
-    fitted.attrs["criticised_for"] = posterior.attrs["observation"]
-    return fitted, model
 
 
 def _learned(posterior: xr.DataTree, missions: Sequence[Mission]) -> list[Mission]:

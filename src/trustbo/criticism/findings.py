@@ -18,6 +18,8 @@ _MOST_CELLS = 3
 _LEVEL = 0.05
 LEAST = {"place": 0.05, "curvature": 0.05, "prior": 0.05, "correlation": 0.2, "family": 0.05}
 """Size of each departure from which on it is a fault, see `size_of`."""
+IN_CONTACT = "place", "curvature", "prior"
+"""Departures whose sizes are of trust, and those from which on they are faults of contact."""
 
 
 def family_test(innovations: Innovations) -> Outcome:
@@ -113,7 +115,8 @@ def finding(
         )
     if name == "correlation":
         return f"noise is correlated: {label} go together beyond what the model says."
-    limits = ((data.y <= 0.0) | (data.y >= 1.0)).mean()
+    cut = (data.rates <= 0.0) | (data.rates >= 1.0)
+    limits = (cut & (data.y == data.rates)).mean()  # of rates that are taken as they are
     end = f"; {limits:.0%} of the rates are 0 or 1, try observation='censored'" if limits else ""
     e = innovations.e[:, 0]
     shape = f"{label}: skewness {stats.skew(e):.2f}, excess kurtosis {stats.kurtosis(e):.2f}"

@@ -35,9 +35,11 @@ class Data(NamedTuple):
     n_bounds: np.ndarray  # (mission,)
     slots: np.ndarray  # (slot, 3): mission, bound from 0, robot
     seen: np.ndarray  # (rate,), slots with a rate
-    y: np.ndarray  # (rate,)
+    rates: np.ndarray  # (rate,), as measured
+    y: np.ndarray  # (rate,), normal ones that stand for them
     places: Visited | None  # of the model
     sight: tuple[int, ...]  # features that are predicted contact rates
+    unit: float  # trust that is one of contact
 
     @property
     def z(self) -> np.ndarray:
@@ -72,7 +74,7 @@ class Point(NamedTuple):
     rho: float | None  # of robots, see `RobotEffect`
 
 
-def gather(missions: Sequence[Mission], place: PlaceEffect | None) -> Data:
+def gather(missions: Sequence[Mission], place: PlaceEffect | None, unit: float = 1.0) -> Data:
     """Data of missions; TrustboError: there are more rates than a dense matrix takes."""
     batch = stack_missions(missions, pad=False)
     n_bounds = np.array([len(mission.bounds) for mission in missions])
@@ -91,7 +93,8 @@ def gather(missions: Sequence[Mission], place: PlaceEffect | None) -> Data:
     if place is not None:
         places = visited(bounds_of(missions), place, n_robots)
     sight = tuple(m for m, name in enumerate(missions[0].features) if is_line_of_sight(name))
-    return Data(batch, n_bounds, slots, seen, rates[seen], places, sight)
+    y = rates[seen]
+    return Data(batch, n_bounds, slots, seen, y, y, places, sight, unit)
 
 
 def posterior_point(posterior: xr.DataTree) -> tuple[Point, PlaceEffect | None]:

@@ -30,7 +30,7 @@ def table_of_rates(
     robot, e = np.array(missions[0].robots)[i], innovations.e[:, 0]
     place = {"mission": j, "bound": k + 1, "robot": robot, "row": cells[:, 0], "col": cells[:, 1]}
     expected = innovations.normal.mean + before @ innovations.white
-    predicted = {"contact_rate": data.y, "expected": expected, "sd": spread}
+    predicted = {"contact_rate": data.rates, "expected": expected, "sd": spread}
     return pd.DataFrame({**place, **predicted, "residual": e, "pit": stats.norm.cdf(e)})
 
 

@@ -8,6 +8,7 @@ of all; a change is named where its probability exceeds .9 and its mean .1.
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -22,6 +23,7 @@ from trustbo.inference.changes import ALARM, changes
 from trustbo.inference.fit import fit
 from trustbo.models.effects.change import Change
 from trustbo.models.effects.robot import RobotEffect
+from trustbo.models.families import FAMILIES
 from trustbo.models.place import PlaceEffect, bounds_of
 from trustbo.models.pooled import PooledTrust
 
@@ -33,7 +35,10 @@ Finding = tuple[tuple[str, float, str], Departure | None]
 
 
 def with_robots(posterior: xr.DataTree, missions: Sequence[Mission]) -> xr.DataTree:
-    """Return a posterior of Gaussian rates with effects of robots: the given one if it has them."""
+    """Return a posterior with effects of robots: the given one if it has them.
+
+    Of its family of observations, or of Gaussian rates where the sampler would take minutes.
+    """
     if "robots" in posterior.children:
         return posterior
     record = posterior.attrs.get("place", "none")
@@ -43,18 +48,25 @@ def with_robots(posterior: xr.DataTree, missions: Sequence[Mission]) -> xr.DataT
     except TrustboError:  # paths jump between cells
         place = None
     response, seed = str(posterior.attrs["response"]), int(posterior.attrs["seed"])
-    model = PooledTrust(effects=(RobotEffect(),), place=place, response=response)
+    model = PooledTrust(
+        effects=(RobotEffect(),), place=place, response=response,
+        observation=posterior.attrs["observation"],
+    )  # fmt: skip
+    if model.why_not_exact:
+        model = replace(model, observation="gaussian", priors=None)
     return fit(missions, model, seed=seed, draws=250, check=False, whole=False)
 
 
 def effects_of_robots(posterior: xr.DataTree) -> pd.DataFrame:
     """Row of each mission and robot: effect, sd, p_worse, p_better and whether it `stands_out`.
 
-    Effects are less their median over all rows, as the weight of line of sight fits their level.
+    Effects are in contact, less their median over all rows, as the weight of line of sight fits
+    their level.
     """
     d = posterior["robots"]["robot_effect"].transpose("chain", "draw", "mission", "robot")
     draws = d.values.reshape(-1, *d.shape[2:])
     draws = draws - np.median(draws, axis=(1, 2), keepdims=True)
+    draws = draws / FAMILIES[posterior.attrs["observation"]].line_of_sight[0]
     mission, robot = np.indices(d.shape[2:]).reshape(2, -1)
     where = {"mission": d["mission"].values[mission], "robot": d["robot"].values[robot]}
     head = ["effect", "sd", "p_worse", "p_better"]

@@ -14,6 +14,7 @@ import numpyro.distributions as dist
 from jax import Array, lax, random
 from jax.scipy.special import gammaln
 from scipy.special import expit
+from scipy.stats import betabinom
 
 from trustbo.models.backend import own_settings
 from trustbo.models.families.family import SSM, Observed
@@ -140,6 +141,14 @@ class BetaBinomial(Linearised):
         flat = (np.array(a, dtype=float).ravel() for a in args)  # a broadcast one cannot be written
         moments = count_moments(*flat)
         return moments[0].reshape(shape), moments[1].reshape(shape), moments[2].reshape(shape)
+
+    def probabilities(
+        self, trust: np.ndarray, noise_sd: np.ndarray, y: np.ndarray, n_ticks: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """See `Family.probabilities`."""
+        phi, n = 1.0 / (noise_sd**2 + 1e-6), np.round(y * n_ticks)
+        counts = betabinom(n_ticks.astype(int), phi * expit(trust), phi * expit(-trust))
+        return counts.cdf(n - 1.0), counts.cdf(n)
 
     def terms(self, y: np.ndarray, n_ticks: np.ndarray) -> Terms:
         """See `Family.terms`; each distinct count is a case."""

@@ -89,6 +89,13 @@ class Censored(Gaussian):
             np.where(cut, log_p, density),
         )
 
+    def probabilities(
+        self, trust: np.ndarray, noise_sd: np.ndarray, y: np.ndarray, n_ticks: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """See `Family.probabilities`."""
+        p, _ = super().probabilities(trust, noise_sd, np.clip(y, 0.0, 1.0), n_ticks)
+        return np.where(y <= 0.0, 0.0, p), np.where(y >= 1.0, 1.0, p)
+
     def terms(self, y: np.ndarray, n_ticks: np.ndarray) -> Terms:
         """See `Family.terms`."""
         inside = super().terms(y, n_ticks).kind

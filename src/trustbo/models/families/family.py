@@ -128,6 +128,12 @@ class Family(ABC):
         Arrays broadcast; `y` is not NaN.
         """
 
+    @abstractmethod
+    def probabilities(
+        self, trust: np.ndarray, noise_sd: np.ndarray, y: np.ndarray, n_ticks: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Probabilities of a rate below y, and of one up to y, given trust; arrays broadcast."""
+
     def terms(self, y: np.ndarray, n_ticks: np.ndarray) -> Terms:
         """Terms of measured rates of any shape, for expectation propagation; see `ep.terms`.
 

@@ -6,6 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 from jax import Array, random
+from scipy.stats import norm
 
 from trustbo.models.families.family import SSM, Family, Observed
 from trustbo.models.families.terms import GAUSSIAN, NONE, Terms
@@ -69,6 +70,13 @@ class Gaussian(Family):
         """See `Family.observe`; the density without its constant."""
         value = np.broadcast_to(y, mean.shape)
         return value, np.zeros(mean.shape), -0.5 * ((y - mean) ** 2 / var + np.log(var))
+
+    def probabilities(
+        self, trust: np.ndarray, noise_sd: np.ndarray, y: np.ndarray, n_ticks: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """See `Family.probabilities`."""
+        p = norm.cdf((y - trust) / noise_sd)
+        return p, p
 
     def terms(self, y: np.ndarray, n_ticks: np.ndarray) -> Terms:
         """See `Family.terms`."""

@@ -96,6 +96,13 @@ class StudentT(Linearised):
         ) ** 2
         return center, (share * spread).sum(-1), total
 
+    def probabilities(
+        self, trust: np.ndarray, noise_sd: np.ndarray, y: np.ndarray, n_ticks: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """See `Family.probabilities`."""
+        p = special.stdtr(NU, (y - trust) / noise_sd)
+        return p, p
+
     def is_density(self, y: np.ndarray) -> np.ndarray:
         """See `Family.is_density`: every rate has a density."""
         return np.ones(y.shape, dtype=bool)
