@@ -41,6 +41,7 @@ _RIDGE = 1e-3
 _MANY, _PER_AXIS = 12, 4.0  # axes; effective points for each that moments are taken of
 _MORE, _MORE_LAST = 3, 24  # times that uneven draws are added to; that refused ones are
 _FEWEST = 100  # draws whose weights are smoothed
+_HOPELESS = 1.0  # k-hat of weights without a mean, which further draws do not cure
 _EVEN = 0.9  # effective share of draws from which on no weight exceeds 1 % of 1000: no tail
 
 
@@ -206,6 +207,8 @@ def _draw(
             break
         if k == _MORE and target.sharpen():
             return None
+        if k >= _MORE and smoothing[1] > _HOPELESS:
+            break
         more = np.sort(systematic(np.exp(points.log_w), n, rng))
         others, added = target.draw(points.z, points.log_p, more, rng)
         chosen, log_weight = np.append(chosen, more), np.append(log_weight, added)  # pyright: ignore
