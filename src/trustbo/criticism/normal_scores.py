@@ -28,7 +28,7 @@ def with_normal_rates(
 ) -> tuple[Data, Point]:
     """Data with normal rates in place of the measured ones, and the point with their noise.
 
-    Those of Gaussian rates are returned as they are.
+    Those of Gaussian rates are returned unchanged.
 
     Args:
         posterior: Posterior, with latent trust where this does not follow from the parameters.

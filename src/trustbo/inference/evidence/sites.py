@@ -5,7 +5,7 @@ gamma of `ep.joint`, in the chains of which a bound has the columns that touch i
 log p(rates | theta) to a few hundredths of a nat; draws of the coefficients come with weights that
 average to its ratio to the exact one (`ep.draws`).
 
-Scans of further columns take each theta's settled sites for Gaussian rates of their own noise
+Scans of further columns take each theta's settled sites for Gaussian rates with noise by slot
 (`gaussian`): rank-one Bayes factors with the sites fixed, of which the evidence is stationary.
 
 EP inverts the prior, so that a scale is `_LEAST` at least: a coefficient of sd 1e-4 changes contact
