@@ -17,7 +17,7 @@ from trustbo.data import Mission
 from trustbo.errors import PosteriorError, ShapeError, TrustboError
 from trustbo.inference import diagnostics, fit, params_of
 from trustbo.inference.samplers import complaints, nuts, run, watching
-from trustbo.inference.samplers.nuts import _advance, run_nuts
+from trustbo.inference.samplers.nuts_scores import run_nuts_of_scores
 from trustbo.inference.samplers.settings import NutsSettings
 from trustbo.models import HierarchicalTrust, PooledTrust, Priors
 from trustbo.stacking import stack_missions
@@ -123,10 +123,8 @@ def test_a_long_run_and_its_retry_are_said_in_a_file_unless_progress_is_off(
 ):
     monkeypatch.setattr(watching, "LONG", 0.0)
     monkeypatch.setattr(watching, "_TRIAL_SECONDS", 0.0)
-    few = NutsSettings(draws=30)  # of the program that is compiled already; so the longer run
-    monkeypatch.setattr(
-        run, "run_nuts", lambda _, *args, **options: run_nuts(few, *args, **options)
-    )
+    few = NutsSettings(150, 30)  # of the program that is compiled already; so the longer run
+    monkeypatch.setattr(run, "run_nuts_of_scores", lambda _, *args: run_nuts_of_scores(few, *args))
     for options in ({}, {"progress": False}):
         with pytest.raises(PosteriorError, match="refused after a longer retry"):
             fit(missions, sampler="nuts", whole=False, **options)
@@ -134,8 +132,8 @@ def test_a_long_run_and_its_retry_are_said_in_a_file_unless_progress_is_off(
         if options:
             assert said == ""
         else:
-            assert said.startswith(f"NUTS: 4 chains of {few.warmup} + 30 draws, about ")
-            assert "\nNUTS again, for longer (4 chains of 600 + 2000 draws" in said
+            assert f"\nNUTS: 4 chains of {few.warmup} + 30 draws, about " in said
+            assert "\nNUTS again, for longer (4 chains of 300 + 2000 draws" in said
             assert "\r" not in said
 
 
@@ -197,11 +195,11 @@ def test_trajectories_keep_to_their_limit(missions):
 
 
 def test_more_missions_and_other_priors_meet_the_same_compiled_program(posterior):
-    compiled = _advance._cache_size()
+    compiled = nuts.advance._cache_size()
     for n in (3, 4, 8):  # three lengths of missions each
         model = PooledTrust(Priors(x0_sd=0.1 * n))
         fit(simulate_missions(n), model, "nuts", draws=30, check=False, whole=False)
-    assert _advance._cache_size() == compiled
+    assert nuts.advance._cache_size() == compiled
 
 
 HEAVY = Priors(b=dist.Cauchy(0.0, 0.5), delta_v=dist.HalfCauchy(0.2))
@@ -230,19 +228,19 @@ def test_a_bad_posterior_is_refused_with_the_parameter_s_name(missions, monkeypa
     assert (complaints.MAX_RHAT, complaints.MIN_ESS) == (1.01, 400.0)
     tried = []
 
-    def short(settings, *args, **options):
+    def short(settings, *args):
         tried.append(settings)
-        return run_nuts(NutsSettings(), *args, **options)
+        return run_nuts_of_scores(NutsSettings(150), *args)
 
-    monkeypatch.setattr(run, "run_nuts", short)
+    monkeypatch.setattr(run, "run_nuts_of_scores", short)
     monkeypatch.setattr(complaints, "MIN_ESS", 1e6)
     expected = r"bulk ESS of beta0 is \d{3,} \(at least 1000000\)"
     with pytest.raises(PosteriorError, match=expected) as error:
         fit(missions, sampler="nuts", progress=True, whole=False)
     assert capsys.readouterr().err.startswith(
-        "NUTS again, for longer (4 chains of 600 + 2000 draws, target_accept 0.98): bulk ESS of b"
+        "NUTS again, for longer (4 chains of 300 + 2000 draws, target_accept 0.98): bulk ESS of b"
     )
-    assert tried == [NutsSettings(), NutsSettings(600, 2000, 4, 0.98, collapse=True)]
+    assert tried == [NutsSettings(150), NutsSettings(300, 2000, 4, 0.98)]
     assert error.value.posterior.attrs["retries"] == 1
     unchecked = fit(missions, sampler="nuts", draws=30, check=False, whole=False)
     assert unchecked.attrs["retries"] == 0

@@ -15,16 +15,12 @@ import trustbo as tb
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
 from trustbo.inference import complete, fit, params_of
-from trustbo.inference.evidence import place_marginal
 from trustbo.inference.place_maps import PlaceScales, draw_maps, nowhere, place_group, place_maps_of
 from trustbo.inference.samplers import scores
 from trustbo.inference.samplers.importance import sample_scores
 from trustbo.inference.samplers.posterior import posterior_of
-from trustbo.inference.samplers.run import nuts_data
 from trustbo.inference.samplers.student import Student, log_mixture
-from trustbo.inference.samplers.target import Target
-from trustbo.models import HierarchicalTrust, PlaceEffect, PooledTrust, TrustParams
-from trustbo.models.backend import own_settings
+from trustbo.models import CoupledTrust, HierarchicalTrust, PlaceEffect, PooledTrust, TrustParams
 from trustbo.models.effects.effect import Slots
 from trustbo.models.effects.place import Place
 from trustbo.models.families import FAMILIES
@@ -201,139 +197,6 @@ def test_effects_given_hyperparameters_are_those_of_dense_conditioning(place):
         error = np.sqrt((1.0 + correlation**2) / n)
         white = (draws - mean) / sd
         assert (np.abs(white.T @ white / n - correlation) < 5.5 * error).all(), name
-
-
-@pytest.mark.parametrize("place", PLACES, ids=str)
-def test_what_nuts_sees_is_the_same_marginal(place):
-    """By dense algebra in JAX: given coefficients of sd 0, to rounding."""
-    missions = random_missions(2)
-    params = TrustParams(0.4, np.array([0.3, -0.2]), 0.1, 0.1, 0.2)
-    theta = (0.4, 0.1, 0.2, 0.3 * place.cells, 1.7, 0.2 * place.bounds)
-    dense = Dense(missions, place, theta, Priors())
-    c = np.append(params.beta, params.b)
-    inside = dense.K_s + dense.K_e
-    full = (
-        dense.cov
-        - (dense.T @ dense.U @ dense.c_cov @ dense.U.T @ dense.T.T)[np.ix_(dense.seen, dense.seen)]
-    )
-    off = dense.off - (dense.T @ dense.U @ (c - dense.c_mean))[dense.seen]
-    expected = stats.multivariate_normal(cov=full).logpdf(off)
-    assert inside.shape == dense.T.shape
-    batch = tb.stacking.stack_missions(missions)
-    shape = batch.contact_rate.shape[:2]
-    there = visited(bounds_of(missions, shape), place, 3, SHAPE)
-    index = place_marginal.PlaceIndex.of(there, batch.contact_rate)
-    with jax.enable_x64(True):
-        as64 = params.map(lambda value, _: jax.numpy.asarray(value, dtype=float))
-        hyper = place_marginal.PlaceHyper(*(jax.numpy.asarray(float(t)) for t in theta[3:]))
-        weight = np.ones(len(batch.awareness))
-        found = jax.jit(place_marginal.log_likelihood)(
-            as64.ssm(batch.awareness), batch.contact_rate, weight, hyper, index
-        )
-    assert float(found) == pytest.approx(expected, rel=1e-9 if place.bounds else 1e-5)
-
-
-def test_nuts_integrates_weights_and_intercept_out_with_the_effects():
-    """The density is that of a dense joint normal, and draws have its conditional moments."""
-    missions, priors = random_missions(2), Priors(stationary=True)
-    place = PlaceEffect(shared=False)
-    theta = (0.4, 0.1, 0.2, 0.3, 1.7, 0.2)
-    dense = Dense(missions, place, theta, priors)
-    batch = tb.stacking.stack_missions(missions)
-    there = visited(bounds_of(missions, batch.contact_rate.shape[:2]), place, 3, SHAPE)
-    weight = np.ones(len(batch.awareness))
-    data = nuts_data(PooledTrust(priors=priors, place=place), batch, weight, there)
-    with own_settings():
-        target = Target(PooledTrust(priors=priors, place=place), data, complete=False)
-        values = {name: jax.numpy.asarray(v) for name, v in zip(NAMES, theta, strict=True)}
-
-        @jax.jit  # one program compiles faster than each operation by itself
-        def on_the_line(values):
-            site = {name: target.inverse[name].inv(v) for name, v in values.items()}
-            base = {name: 1.1 * v for name, v in site.items()}
-            return site, base, target.values(base)
-
-        site, base, at_base = on_the_line(values)
-        other = {name: float(v) for name, v in at_base.items()}
-        keys = jax.random.split(jax.random.key(0), 20_000)
-        drawn = jax.jit(jax.vmap(lambda key: target.draw_effects(values, key)))(keys)
-        potential = jax.jit(target.potential)
-        jump = float(potential(base) - potential(site))
-    # Of two points the difference: the priors' densities on the real line, by SciPy.
-    again = Dense(missions, place, tuple(other[name] for name in NAMES), priors)
-    expected = dense.log_likelihood() - again.log_likelihood()
-    for name in NAMES:
-        expected += log_prior(priors, place, name, float(values[name]))
-        expected -= log_prior(priors, place, name, other[name])
-    assert jump == pytest.approx(expected, rel=1e-8)
-    mean, cov = dense.posterior(dense.c_cov @ dense.U.T, dense.c_cov, dense.c_mean)
-    c = np.column_stack([drawn["beta"], drawn["b"]])
-    error = np.sqrt(np.diag(cov) / len(c))
-    assert (np.abs(c.mean(0) - mean) < 4.5 * error).all()
-    np.testing.assert_allclose(np.cov(c.T), cov, atol=4.5 * cov.max() * np.sqrt(2 / len(c)))
-    K = dense.K_s + dense.K_e
-    mean, cov = dense.posterior(K, K, 0.0)
-    units, n_units = [tuple(u) for u in there.units.tolist()], len(there.units)
-    moves = {tuple(m): i for i, m in enumerate(tb.workspace.moves.MOVES[8])}
-    robots = [i * (not place.shared) for i, _, _ in dense.rows]
-    index = [
-        units.index((i, moves[tuple(np.subtract(c, a).tolist())], *c))
-        for i, (_, a, c) in zip(robots, dense.rows, strict=True)
-    ]
-    g = np.asarray(drawn["place_unit"])[:, :n_units][:, index]
-    assert (np.abs(g.mean(0) - mean) < 4.5 * np.sqrt(np.diag(cov) / len(g))).all()
-    np.testing.assert_allclose(g.var(0), np.diag(cov), rtol=4.5 * np.sqrt(2 / len(g)))
-
-
-def log_prior(priors, place, name, value):
-    """Log density of a parameter's prior on the real line: its logit, or its logarithm."""
-    if name == "beta0":
-        density = stats.beta(priors.beta0.concentration1, priors.beta0.concentration0)
-        return density.logpdf(value) + np.log(value * (1.0 - value))
-    of_places = {
-        "tau_s": stats.halfnorm(scale=place.tau_s),
-        "tau_e": stats.halfnorm(scale=place.tau_e),
-        "length_scale": stats.lognorm(place.length_scale_sd, scale=place.length_scale),
-    }
-    noise = stats.halfnorm(scale=float(getattr(priors, name).scale)) if name[0] == "d" else None
-    return (noise or of_places[name]).logpdf(value) + np.log(value)
-
-
-@pytest.mark.parametrize("place", PLACES[:1] + PLACES[3:], ids=str)
-def test_gradient_that_nuts_takes_is_that_of_its_marginal(place):
-    """By central differences, with gaps in rates, robots alike and not, and a mission half used."""
-    missions = random_missions(2)
-    batch = tb.stacking.stack_missions(missions)
-    there = visited(bounds_of(missions, batch.contact_rate.shape[:2]), place, 3, SHAPE)
-    index = place_marginal.PlaceIndex.of(there, batch.contact_rate)
-    weight = np.append(0.5, np.ones(len(batch.awareness) - 1))
-
-    def value(at, each):
-        own = at[0] + each * np.array([0.0, 0.05, -0.1])
-        params = TrustParams(own, at[6:8], at[8], at[1], at[2])
-        hyper = place_marginal.PlaceHyper(*at[3:6])
-        ssm = params.ssm(batch.awareness)
-        return place_marginal.log_likelihood(ssm, batch.contact_rate, weight, hyper, index)
-
-    at = np.array([0.4, 0.1, 0.2, 0.3, 1.7, 0.2, 0.3, -0.2, 0.1])
-    with own_settings():
-        call = jax.jit(jax.value_and_grad(value))
-        for each in (0.0, 1.0):
-            found = call(at, each)[1]
-            steps = 1e-5 * np.eye(len(at))
-            by_steps = [(call(at + h, each)[0] - call(at - h, each)[0]) / 2e-5 for h in steps]
-            np.testing.assert_allclose(found, by_steps, rtol=1e-5, atol=1e-5)
-        together = call(at, 0.0)[0]
-
-        @jax.jit  # one program compiles faster than each operation by itself
-        def of_one_autoregression(at):
-            params = TrustParams(at[0], at[6:8], at[8], at[1], at[2])
-            hyper = place_marginal.PlaceHyper(*at[3:6])
-            ssm = params.ssm(batch.awareness)
-            return place_marginal.log_likelihood(ssm, batch.contact_rate, weight, hyper, index)
-
-        apart = of_one_autoregression(at)
-    assert float(together) == pytest.approx(float(apart), rel=1e-12)
 
 
 def test_maps_are_those_of_dense_conditioning():
@@ -609,8 +472,9 @@ def test_places_that_cannot_be_are_named():
         PlaceEffect(tau_s=0.0)
     with pytest.raises(TrustboError, match="place must be a PlaceEffect"):
         PooledTrust(place=True)
-    with pytest.raises(TrustboError, match='"exact" cannot treat Hierarchical'):
-        fit(missions, HierarchicalTrust(place=PlaceEffect()), "exact")
+    apart = CoupledTrust(inter_robot="none", place=PlaceEffect())
+    with pytest.raises(TrustboError, match=r'"exact" cannot treat CoupledTrust.*nothing else in'):
+        fit(missions, apart, "exact")
     with pytest.raises(TrustboError, match='need inter_robot="none"'):
         tb.models.CoupledTrust(place=PlaceEffect())
 
@@ -623,13 +487,14 @@ def test_places_by_nuts_are_said_to_take_minutes(monkeypatch):
         raise BegunError
 
     monkeypatch.setattr(import_module("trustbo.inference.fit"), "draw_posterior", begin)
-    missions, model = random_missions(0), HierarchicalTrust(place=PlaceEffect())
+    missions = random_missions(0)
+    model = CoupledTrust(inter_robot="none", place=PlaceEffect())
     said = pytest.warns(UserWarning, match=r"by NUTS, .* minutes .* PooledTrust\(place=...\)")
     with said, pytest.raises(BegunError):
         fit(missions, model)
     for quick in (
         lambda: fit(missions, model, "nuts"),  # asked for
-        lambda: fit(missions, HierarchicalTrust()),
+        lambda: fit(missions, HierarchicalTrust(place=PlaceEffect())),
         lambda: fit(missions, PooledTrust(place=PlaceEffect())),
     ):
         with pytest.raises(BegunError):  # a warning would be an error

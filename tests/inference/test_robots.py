@@ -317,8 +317,6 @@ def test_what_has_no_effects_of_robots_refuses_them(missions):
         tb.inference.update_statistics(model, None, missions)
     with pytest.raises(TypeError, match="effects"):
         HierarchicalTrust(effects=[RobotEffect()])
-    with pytest.raises(TrustboError, match="numpyro_model has effects of robots that share all"):
-        HierarchicalTrust(place=PlaceEffect()).numpyro_model(missions)
 
 
 def test_rates_at_their_limits_are_taken_for_censored_ones_with_robots(missions):

@@ -1,7 +1,5 @@
 """Learning mission by mission: sums, weights, forgetting, and the moments of the later code."""
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import numpyro.distributions as dist
 import pytest
@@ -11,7 +9,6 @@ from references import dense_coupled
 from trustbo.data import Mission
 from trustbo.errors import ShapeError, TrustboError
 from trustbo.inference import fit, params_of, sample_statistics
-from trustbo.inference.evidence.gram_jax import log_likelihood, spectrum
 from trustbo.inference.evidence.statistics import gather
 from trustbo.inference.updating import moment_matched, update_statistics
 from trustbo.models import (
@@ -20,7 +17,6 @@ from trustbo.models import (
     PooledTrust,
     Priors,
     RobotParams,
-    TrustParams,
 )
 from trustbo.stacking import stack_missions
 
@@ -63,20 +59,6 @@ def test_the_quadratic_form_of_changes_is_the_dense_joint_normal(response):
             for m in missions
         )
         np.testing.assert_allclose(found, expected, rtol=1e-9)
-
-
-@pytest.mark.parametrize("response", ["level", "change"])
-def test_what_nuts_sums_up_is_the_likelihood(response):
-    model, missions = PooledTrust(response=response), simulate_missions(6)
-    sums = spectrum(update_statistics(model, None, missions)[0])
-    assert sums.mask.sum() == 7 + 5 + 8  # three lengths, padded to four of eight bounds
-    assert sums.mask.shape == (4, 8)
-    p = TrustParams(0.55, np.array([0.2, 0.3]), 0.07, 0.06, 0.08, 0.5, 0.5)
-    with jax.enable_x64(True):
-        params = p.map(lambda value, _: jnp.asarray(value, dtype=float))
-        compiled = jax.jit(log_likelihood, static_argnums=2)
-        found = float(compiled(params, jax.tree.map(jnp.asarray, sums), model.lag))
-    np.testing.assert_allclose(found, model.log_likelihood(p, missions).sum(), rtol=1e-10)
 
 
 def test_missions_add_up_in_any_order():

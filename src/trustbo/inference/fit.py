@@ -22,6 +22,7 @@ from trustbo.inference.samplers.choice import (
     needs_evidence,
     resolve_sampler,
     slow_places,
+    with_warmup,
 )
 from trustbo.inference.samplers.run import Draws, UnevenWeightsError, draw_posterior
 from trustbo.inference.samplers.settings import NutsSettings
@@ -39,7 +40,6 @@ from trustbo.stacking import MissionBatch, require_same_team, stack_missions
 from trustbo.workspace import Workspace
 
 _N_PRIOR = 500
-_WARMUP_OF_SCORES = 150
 
 
 def fit(
@@ -145,20 +145,19 @@ def fit(
         model = model.for_features(missions[0].features)
         chosen, reason = resolve_sampler(model, sampler)
         settings.require_sampler(chosen)
+        watch.faster = "" if chosen == "exact" else faster_than_nuts(model)
         if sampler == "auto" and chosen != "exact" and model.place is not None:
             warnings.warn(slow_places(reason), stacklevel=3)
         floored = model.at_resolution(ticks)
         prior = draw_sites(floored, batch.awareness.shape[2:], _N_PRIOR, seed + 2)
-        start, slots = (
-            proposal_of(earlier),
-            _slots(model, chosen, missions, batch, weight, places),
-        )
-        watch.faster = "" if chosen == "exact" else faster_than_nuts(model)
-        drawn, complaints = draw_posterior(
-            floored, chosen, _length(settings, slots, former or warmup is not None), seed, batch,
-            weight, places, start, slots, check=check, fallback=fallback, watch=watch,
+        slots = _slots(model, chosen, missions, batch, weight, places)
+        sampled = draw_posterior(
+            floored, chosen,
+            settings if former or warmup is not None else with_warmup(settings, model),
+            seed, batch, weight, places, proposal_of(earlier), slots,
+            check=check, fallback=fallback, watch=watch,
         )  # fmt: skip
-        return _Drawn(model, prior, drawn, complaints, drawn.fallback or reason)
+        return _Drawn(model, prior, *sampled, sampled[0].fallback or reason)
 
     with watch:
         try:
@@ -195,13 +194,6 @@ def fit(
             )  # fmt: skip
     posterior.attrs["seconds"] = time.perf_counter() - started
     return _require_sound(posterior, complaints)
-
-
-def _length(settings: NutsSettings, slots: Slots | None, given: object) -> NutsSettings:
-    """Settings with the default warm-up of NUTS of scores, unless one was given."""
-    if slots is None or given:
-        return settings
-    return settings._replace(warmup=_WARMUP_OF_SCORES)
 
 
 def _add_weights(posterior: xr.DataTree, weight: np.ndarray) -> None:

@@ -15,7 +15,7 @@ from trustbo.files import FilePath, read_record, write_text
 from trustbo.inference.draws import theta_of
 from trustbo.inference.people import draw_people
 from trustbo.inference.prior_predictive import draw_sites
-from trustbo.inference.samplers.choice import needs_evidence, resolve_sampler
+from trustbo.inference.samplers.choice import needs_evidence, resolve_sampler, with_warmup
 from trustbo.inference.samplers.run import Draws, draw_posterior
 from trustbo.inference.samplers.settings import NutsSettings
 from trustbo.models.backend import own_settings
@@ -109,6 +109,7 @@ def sbc(
         )
     kept = require_whole("n_ranked", n_ranked, _CHAINS) // _CHAINS
     settings = NutsSettings(draws=kept if sampler == "exact" else n_draws, n_chains=_CHAINS)
+    settings = settings if sampler == "exact" else with_warmup(settings, model)
     thinned = np.linspace(0, settings.draws - 1, kept).astype(int)
     awareness = np.random.default_rng(seed).uniform(size=shape)
     ticks = np.full(shape[:3], float(n_ticks))

@@ -121,17 +121,6 @@ class CoupledTrust(TrustModel):
         # Rates that are independent given trust have noise without correlations.
         return noise == "w" or self.family.correlates
 
-    def level(self, sites: Mapping[str, Array], mean_y: Array, mean_z: Array) -> dict[str, Array]:
-        """See `TrustModel.level`."""
-        if self.inter_robot != "full":
-            shift = sites["beta0"] * mean_y + sites["beta"] @ mean_z
-            if self.inter_robot == "ordered":
-                shift = shift + jnp.pad(sites["gamma"] * mean_y, (1, 0))
-            return {"b": shift}
-        rows = _matrix(sites["B0_diagonal"], sites["B0_coupling"]).sum(-1) * mean_y
-        B = _matrix(sites["B_diagonal"].T, sites["B_coupling"])
-        return {"b": rows + mean_z @ B.sum(-1)}
-
     @property
     def dims(self) -> dict[str, tuple[str, ...]]:
         """Axes of the matrices, or of each robot's coefficients if robots are apart."""

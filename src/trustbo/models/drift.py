@@ -144,10 +144,6 @@ class DriftTrust(TrustModel):
 
     # --- what the library asks a model ---
 
-    def level(self, sites: Mapping[str, Array], mean_y: Array, mean_z: Array) -> dict[str, Array]:
-        """See `TrustModel.level`: no intercept is known."""
-        return {}
-
     @property
     def dims(self) -> Axes:
         """Axes of beta0, the drift's parameters, delta_w and delta_v."""

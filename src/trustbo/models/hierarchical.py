@@ -8,7 +8,6 @@ import numpy as np
 import numpyro
 import numpyro.distributions as dist
 from jax import Array
-from numpyro.distributions import constraints
 from numpyro.distributions.transforms import biject_to
 
 from trustbo.models.model import TrustModel, register, sample
@@ -31,7 +30,7 @@ class HierarchicalTrust(TrustModel):
         """Sample statements of means, spreads, and each robot's deviation."""
         priors, unit = self.priors, dist.Normal(0.0, 1.0)
         mean_beta0 = sample("mean_beta0", priors.beta0)
-        params = self.assemble(
+        params = self._assemble(
             {
                 "mean_beta0": mean_beta0,
                 "mean_beta": sample("mean_beta", priors.weights(mean_beta0), (n_features,)),
@@ -90,56 +89,20 @@ class HierarchicalTrust(TrustModel):
         """See `TrustModel.robot_sets`."""
         return "pooled"
 
-    @property
-    def partial_pooling(self) -> "HierarchicalTrust":
-        """The model itself."""
-        return self
-
-    def assemble(self, sites: Mapping[str, Array]) -> RobotParams:
+    def _assemble(self, sites: Mapping[str, Array]) -> RobotParams:
         """Each robot's parameters."""
-        c, _, _ = self.robot_coefficients(sites)
-        n_robots = len(c)
+        line = biject_to(self.priors.beta0.support)
+        own = line.inv(sites["mean_beta0"]) + sites["tau_beta0"] * sites["e_beta0"]
+        robot = own.shape
         return RobotParams(
-            beta0=biject_to(self.priors.beta0.support)(c[:, 0]),
-            beta=c[:, 1:-1],
-            b=c[:, -1],
-            delta_w=jnp.broadcast_to(sites["delta_w"], (n_robots,)),
-            delta_v=jnp.broadcast_to(sites["delta_v"], (n_robots,)),
+            beta0=line(own),
+            beta=sites["mean_beta"][None] + sites["tau_beta"][None] * sites["e_beta"],
+            b=sites["mean_b"] + sites["tau_b"] * sites["e_b"],
+            delta_w=jnp.broadcast_to(sites["delta_w"], robot),
+            delta_v=jnp.broadcast_to(sites["delta_v"], robot),
             x0_mean=self.priors.x0_mean,
             x0_sd=self.priors.x0_sd,
         )
-
-    def robot_coefficients(self, sites: Mapping[str, Array]) -> tuple[Array, Array, Array]:
-        """Coefficients on the real line (robot, coefficient), and their means and spreads."""
-        mean_beta0 = biject_to(self.priors.beta0.support).inv(sites["mean_beta0"])
-        mu = jnp.concatenate([mean_beta0[None], sites["mean_beta"], sites["mean_b"][None]])
-        tau = [sites["tau_beta0"][None], sites["tau_beta"], sites["tau_b"][None]]
-        tau = jnp.concatenate(tau)
-        return mu[None] + tau[None] * self.robot_deviations(sites), mu, tau
-
-    def robot_deviations(self, sites: Mapping[str, Array]) -> Array:
-        """Deviations in units of tau, (robot, coefficient)."""
-        columns = [sites["e_beta0"][:, None], sites["e_beta"], sites["e_b"][:, None]]
-        return jnp.concatenate(columns, axis=1)
-
-    def robot_sites(self, deviations: Array) -> dict[str, Array]:
-        """Sites of deviations: the inverse of `robot_deviations`."""
-        columns = {"e_beta0": 0, "e_beta": slice(1, -1), "e_b": -1}
-        return {name: deviations[:, column] for name, column in columns.items()}
-
-    @property
-    def means_are_real(self) -> bool:
-        """Whether the means of the coefficients can be anywhere on the real line."""
-        supports = (self.priors.beta.support, self.priors.b.support)
-        return all(support is constraints.real for support in supports)
-
-    def mean_sites(self, mu: Array) -> dict[str, Array]:
-        """Unconstrained sites of the means."""
-        return {"mean_beta0": mu[0], "mean_beta": mu[1:-1], "mean_b": mu[-1]}
-
-    def level(self, sites: Mapping[str, Array], mean_y: Array, mean_z: Array) -> dict[str, Array]:
-        """See `TrustModel.level`."""
-        return {"mean_b": sites["mean_beta0"] * mean_y + sites["mean_beta"] @ mean_z}
 
     @property
     def dims(self) -> dict[str, tuple[str, ...]]:

@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import jax
 import numpy as np
@@ -19,7 +19,7 @@ from trustbo.errors import ShapeError, TrustboError, require_choice
 from trustbo.models.backend import own_settings
 from trustbo.models.effects.effect import Effect, Slots, rest_of
 from trustbo.models.effects.place import Place
-from trustbo.models.effects.sampled import sampled_drift
+from trustbo.models.effects.sampled import SampledDrift
 from trustbo.models.families import AUTO, FAMILIES, Family, choose, family_of
 from trustbo.models.params import Params, assemble_params, check_params
 from trustbo.models.place import PlaceEffect, bounds_of, visited
@@ -29,9 +29,6 @@ from trustbo.models.state_space.contact_rate import ContactRate, mission_log_lik
 from trustbo.models.state_space.generate import TrustSample, draw_missions
 from trustbo.models.ticks import broadcast_ticks, require_ticks, resolution, weigh_ticks
 from trustbo.stacking import MissionBatch, stack_missions
-
-if TYPE_CHECKING:
-    from trustbo.models.hierarchical import HierarchicalTrust
 
 RESPONSES = ("level", "change")
 _REFUSED: tuple[tuple[tuple[str, ...], set[str], str], ...] = (
@@ -47,13 +44,11 @@ _REFUSED: tuple[tuple[tuple[str, ...], set[str], str], ...] = (
     ),
     ((), {"not propagated"}, "expectation propagation does not know its observations"),
     (("other",), set(), "its robots share some parameters only, or influence each other"),
-    (("pooled",), {"places"}, "it has effects of places, and robots partially pooled"),
     (
         ("all", "each", "pooled"),
         {"not Gaussian", "changes"},
         "it measures changes of trust, and its observations are not Gaussian",
     ),
-    (("all", "each"), {"places", "changes"}, "it has effects of places, and rates measure changes"),
     (("each",), {"places"}, "it has effects of places, and robots with nothing else in common"),
     ((), {"effects", "changes"}, "it has effects of {0}, and rates measure changes"),
 )
@@ -109,19 +104,6 @@ class TrustModel(Displayed, ABC):
     @abstractmethod
     def sample_params(self, n_robots: int, n_features: int) -> Params:
         """Sample statements of the parameters, assembled."""
-
-    @abstractmethod
-    def level(self, sites: Mapping[str, Array], mean_y: Array, mean_z: Array) -> dict[str, Array]:
-        """Distance of each intercept below the average level of trust.
-
-        Args:
-            sites: Sampled parameters.
-            mean_y: Mean rate, or its logit.
-            mean_z: Mean awareness, shape (feature,).
-
-        Returns:
-            Part of the mean level that does not come from the intercept, by name of its site.
-        """
 
     @property
     @abstractmethod
@@ -198,11 +180,6 @@ class TrustModel(Displayed, ABC):
     def marks(self, shape: tuple[int, int]) -> dict[str, Any]:
         """Attributes that identify the model in a posterior of that many robots and features."""
         return {}
-
-    @property
-    def partial_pooling(self) -> "HierarchicalTrust | None":
-        """The model, if its robots' coefficients are drawn from a common distribution."""
-        return None
 
     def for_features(self, features: Sequence[str]) -> Self:
         """The model with default priors for features of these names; custom priors stay.
@@ -316,8 +293,7 @@ class TrustModel(Displayed, ABC):
 
         Raises:
             ShapeError: There are no missions, or they disagree on robots or features.
-            TrustboError: An awareness value is NaN, no rate was measured, or effects are of robots
-                with separate parameters or of changes of trust.
+            TrustboError: An awareness value is NaN, or no rate was measured.
         """
         batch = stack_missions(missions)
         ticks = weigh_ticks(batch, np.ones(len(batch.contact_rate)))
@@ -327,16 +303,11 @@ class TrustModel(Displayed, ABC):
         require_ticks(model.family, batch)
         drift, shape = None, batch.contact_rate.shape
         if model.place is not None or model.effects:
-            if model.robot_sets != "all" or model.lag:
-                raise TrustboError(
-                    "numpyro_model has effects of robots that share all parameters, and of rates "
-                    f"that measure trust; got {model.describe()}."
-                )
             places = None
             if model.place is not None:
                 places = visited(bounds_of(missions, shape[:2]), model.place, shape[2])
             slots = Slots.of(batch, len(missions), missions[0].features, places=places)
-            drift = sampled_drift(model.all_effects, slots, shape, model.memory)
+            drift = SampledDrift(model.all_effects, slots, shape, model.memory)
         return partial(model._program, *batch, drift=drift)
 
     def _program(
@@ -345,13 +316,13 @@ class TrustModel(Displayed, ABC):
         contact_rate: Array | None,
         n_ticks: Array | None,
         *,
-        drift: Callable[[Array], Array] | None = None,
+        drift: Callable[[Any], Array] | None = None,
     ) -> None:
-        """Sample statements; `drift`, of beta0, adds the effects."""
+        """Sample statements; `drift`, of parameters, adds the effects."""
         n_missions, n_bounds, n_robots, n_features = awareness.shape
         params, innovations = self.sample_params(n_robots, n_features), None
         if drift is not None:
-            params: Any = params._replace(b=params.b + drift(params.beta0))  # pyright: ignore
+            params: Any = params._replace(b=params.b + drift(params))  # pyright: ignore
         if not self.family.integrates_out:
             innovations = sample_innovations((n_bounds, n_missions, n_robots))
         self.sample_rates(params, awareness, contact_rate, n_ticks, innovations)

@@ -193,7 +193,7 @@ def visited(
 def matern(distance: ArrayLike, length_scale: ArrayLike) -> np.ndarray:
     """Matern 3/2 correlation at a distance, both in cells."""
     xp: Any = namespace(length_scale)
-    h = np.sqrt(3.0) * np.asarray(distance) / xp.asarray(length_scale)
+    h = np.sqrt(3.0) * xp.asarray(distance) / xp.asarray(length_scale)
     return (1.0 + h) * xp.exp(-h)
 
 

@@ -1,11 +1,9 @@
 """The paper's one-robot form (3)-(4): all robots share one set of parameters."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import jax.numpy as jnp
-from jax import Array
 
 from trustbo.errors import TrustboError, require_choice
 from trustbo.models.effects.effect import EFFECTS, MEMORIES, Effect
@@ -69,11 +67,6 @@ class PooledTrust(TrustModel):
             x0_mean=priors.x0_mean,
             x0_sd=priors.x0_sd,
         )
-
-    def level(self, sites: Mapping[str, Array], mean_y: Array, mean_z: Array) -> dict[str, Array]:
-        """See `TrustModel.level`."""
-        carried = sites["beta0"] * mean_y if self.memory == "level" else 0.0
-        return {"b": carried + sites["beta"] @ mean_z}
 
     @property
     def dims(self) -> dict[str, tuple[str, ...]]:

@@ -21,7 +21,9 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(64)
 
 
 def log_prob(prior: Distribution, x: np.ndarray) -> np.ndarray:
-    """Log density, in closed form for the usual priors, by numpyro for others."""
+    """Log density, in closed form for the usual priors; by numpyro for others, and in JAX."""
+    if namespace(x) is not np:
+        return prior.log_prob(x)  # pyright: ignore
     if isinstance(prior, Floored):
         above = log_prob(prior.base, x) - number(prior, "log_above")
         return np.where(x < number(prior, "low"), -np.inf, above)

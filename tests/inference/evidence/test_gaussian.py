@@ -14,7 +14,7 @@ from scipy import sparse
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
 from trustbo.inference.evidence.gaussian import Gaussian
-from trustbo.inference.evidence.gaussian_jax import GaussianJax, Sums
+from trustbo.inference.evidence.gaussian_jax import GaussianJax
 from trustbo.inference.evidence.statistics import gather
 from trustbo.inference.samplers import exact
 from trustbo.models import PlaceEffect, PooledTrust, Priors
@@ -109,9 +109,9 @@ def test_the_evidence_in_jax_is_that_in_numpy(name, memory):
     evidence = Gaussian(*gathered(missions, effects, rng.uniform(0.2, 1.0, 4)), X0, memory)
     theta = random_theta(effects, rng, 4, memory)
     with own_settings():
-        sums, density = Sums.of(evidence), jax.jit(GaussianJax(evidence).log_density)
-        in_jax = [density(jax.tree.map(jnp.asarray, point(theta, t)), sums) for t in range(4)]
-    np.testing.assert_allclose(in_jax, evidence.log_density(theta), rtol=1e-9)
+        density, in_jax = GaussianJax.of(evidence), jax.jit(GaussianJax.log_density)
+        found = [in_jax(density, jax.tree.map(jnp.asarray, point(theta, t))) for t in range(4)]
+    np.testing.assert_allclose(found, evidence.log_density(theta), rtol=1e-9)
 
 
 @pytest.mark.parametrize("memory", ["level", "deviation"])
@@ -211,6 +211,19 @@ def test_draws_have_the_moments_of_dense_conditioning(name):
     correlation = cov / np.where(sd > 0.0, sd, 1.0) / np.where(sd > 0.0, sd, 1.0)[:, None]
     error = np.sqrt((1.0 + correlation**2) / n)
     assert (np.abs(white.T @ white / n - correlation) < 5.5 * error + 1e-9).all()
+
+
+def test_draws_of_many_points_are_those_of_each():
+    evidence, theta = (
+        Gaussian(*gathered(walking_missions(6), []), X0),
+        random_theta([], np.random.default_rng(0), 5),
+    )
+    one = np.ones(5, dtype=int)
+    together = evidence.coefficients(theta, one, np.random.default_rng(1))
+    rng = np.random.default_rng(1)
+    factors = evidence._factors(theta)
+    apart = [evidence._draw(factors, t, 1, rng)[0] for t in range(5)]
+    np.testing.assert_allclose(together, apart, rtol=1e-9)
 
 
 def test_the_pooled_evidence_is_that_of_the_exact_sampler():

@@ -2,7 +2,6 @@
 
 import importlib
 
-import jax
 import numpy as np
 import numpyro.distributions as dist
 import pytest
@@ -17,9 +16,8 @@ from trustbo.inference import diagnostics, fit
 from trustbo.inference.evidence.gram import sufficient_statistics
 from trustbo.inference.evidence.statistics import gather
 from trustbo.inference.samplers.exact import sample_exact
-from trustbo.inference.samplers.nuts import run_nuts
+from trustbo.inference.samplers.run import draw_posterior
 from trustbo.inference.samplers.settings import NutsSettings
-from trustbo.inference.samplers.target import NutsData
 from trustbo.models import CoupledTrust, PooledTrust, Priors, TrustParams
 from trustbo.stacking import stack_missions
 
@@ -90,11 +88,10 @@ def test_exact_draws_and_a_long_nuts_run_agree(seed):
     missions = simulate_missions(6, seed)
     batch = stack_missions(missions)
     exact = sample_exact(sufficient_statistics(batch, 0.5), Priors(), 4000, seed).params
-    with jax.enable_x64(True):
-        settings = NutsSettings(draws=20_000)
-        data = NutsData(*batch, np.ones(len(batch.contact_rate)))
-        nuts = run_nuts(settings, jax.random.key(seed), PooledTrust(), data).params
-        nuts = {name: np.asarray(a).reshape(80_000, -1) for name, a in nuts.items()}
+    drawn, _ = draw_posterior(
+        PooledTrust(), "nuts", NutsSettings(draws=20_000), seed, batch, check=False
+    )
+    nuts = {name: a.reshape(80_000, -1) for name, a in drawn.params.items()}
     for name, reference in nuts.items():
         for ours, theirs in zip(exact[name].reshape(4000, -1).T, reference.T, strict=True):
             sd = theirs.std()

@@ -6,11 +6,11 @@ import pytest
 from missions import walking_missions
 from numpyro.distributions import LogNormal
 
-from trustbo.inference.samplers.nuts_scores import Core, Ridge, in_jax
+from trustbo.inference.samplers.nuts_scores import Ridge, ScoresInJax, Tables
 from trustbo.inference.samplers.posterior import Posterior
 from trustbo.inference.samplers.run import _by_evidence
-from trustbo.inference.samplers.scores import beta0_and_noises
-from trustbo.models import PlaceEffect, PooledTrust, Priors, RobotEffect
+from trustbo.inference.samplers.scores import beta0_and_noises, quantile
+from trustbo.models import HierarchicalTrust, PlaceEffect, PooledTrust, Priors, RobotEffect
 from trustbo.models.backend import own_settings
 from trustbo.models.effects.effect import Slots
 from trustbo.models.place import bounds_of, visited
@@ -20,23 +20,35 @@ from trustbo.stacking import stack_missions
 WIDE = Priors(delta_w=LogNormal(-2.0, 0.5))
 
 
-def posterior_of(missions) -> Posterior:
+MODELS = {
+    "weights": PooledTrust(),
+    "changes": PooledTrust(response="change"),
+    "places and robots": PooledTrust(effects=[PlaceEffect(), RobotEffect()]),
+    "by robot": HierarchicalTrust(),
+    "by robot, places": HierarchicalTrust(place=PlaceEffect()),
+}
+
+
+def posterior_of(missions, model) -> Posterior:
     batch = stack_missions(missions)
-    model = PooledTrust(effects=[PlaceEffect(), RobotEffect()]).at_resolution({0.05: 1.0})
+    model = model.at_resolution({0.05: 1.0})
     bounds = bounds_of(missions, batch.contact_rate.shape[:2])
     places = visited(bounds, PlaceEffect(), 3)
     return _by_evidence(model, Slots.of(batch, len(missions), (), None, places))
 
 
-def test_the_density_and_its_slope_are_those_of_the_exact_sampler():
-    posterior, h = posterior_of(walking_missions(1, 3)), 1e-5
+@pytest.mark.parametrize("name", MODELS)
+def test_the_density_and_its_slope_are_those_of_the_exact_sampler(name):
+    """With gaps; the slope by differences of a density that NumPy has."""
+    posterior, h = posterior_of(walking_missions(1, 3, missing=0.2), MODELS[name]), 1e-5
     z = np.random.default_rng(0).standard_normal((4, posterior.n_scores))
     z[:, 1] -= 1.0
     steps = h * np.eye(posterior.n_scores)
     with own_settings():
-        density = jax.jit(jax.value_and_grad(in_jax(posterior, z[0]).log_density))
+        density = ScoresInJax.of(posterior, z[0])
+        both = jax.jit(jax.value_and_grad(ScoresInJax.log_density, argnums=1))
         for x in z:
-            value, slope = density(x)
+            value, slope = both(density, x)
             np.testing.assert_allclose(value, posterior.log_density(x[None])[0], rtol=1e-9)
             ahead, behind = (posterior.log_density(x + s * steps) for s in (1.0, -1.0))
             np.testing.assert_allclose(slope, (ahead - behind) / (2.0 * h), rtol=1e-5, atol=1e-5)
@@ -47,8 +59,11 @@ def test_parameters_of_scores_are_those_of_any_prior(priors):
     z = np.random.default_rng(0).normal(scale=2.0, size=(200, 3))
     z[:, 1] = np.minimum(z[:, 1], 1.0)  # quantiles of few priors are exact farther out
     with own_settings():
-        at = jax.jit(jax.vmap(Core.of(priors).at))
-        np.testing.assert_allclose(at(z), beta0_and_noises(priors, z), rtol=1e-8, atol=1e-9)
+        tables = Tables.of(priors, by_robot=True)
+        tau = jax.jit(Tables.tau)(tables, z)
+        np.testing.assert_allclose(tau, quantile(priors.tau, z), rtol=1e-8)
+        at = jax.jit(Tables.core)
+        np.testing.assert_allclose(at(tables, z), beta0_and_noises(priors, z), rtol=1e-8, atol=1e-9)
 
 
 @pytest.mark.parametrize("priors", [Priors(), Priors().above_resolution(0.05), WIDE])

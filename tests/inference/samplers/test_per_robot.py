@@ -6,6 +6,7 @@ import pytest
 from missions import simulate_missions
 from references import named
 from scipy import special, stats
+from scipy.linalg import block_diag
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
@@ -17,6 +18,7 @@ from trustbo.inference.updating import update_statistics
 from trustbo.models import HierarchicalTrust, PlaceEffect, Priors
 from trustbo.models.effects.effect import Slots
 from trustbo.models.model import TrustModel
+from trustbo.models.place import bounds_of, visited
 from trustbo.stacking import stack_missions
 
 
@@ -31,22 +33,27 @@ def small(n_missions=2, n_bounds=3, n_robots=2, seed=0):
 
 
 def target_of(missions, model: TrustModel):
-    slots = Slots.of(stack_missions(missions), len(missions))
-    return posterior_of(model.priors, model.family, [], slots, by_robot=True)
+    batch, places = stack_missions(missions), None
+    if model.place is not None:
+        bounds = bounds_of(missions, batch.contact_rate.shape[:2])
+        places = visited(bounds, model.place, batch.contact_rate.shape[2])
+    slots = Slots.of(batch, len(missions), places=places)
+    return posterior_of(model.priors, model.family, model.all_effects, slots, by_robot=True)
 
 
+@pytest.mark.parametrize("place", [None, PlaceEffect(), PlaceEffect(shared=False)])
 @pytest.mark.parametrize("stationary", [False, True])
-def test_the_density_is_the_dense_joint_normal_s_with_the_priors(stationary):
-    """Weights, intercepts and their means are in the covariance of all rates of all robots."""
+def test_the_density_is_the_dense_joint_normal_s_with_the_priors(stationary, place):
+    """Weights, intercepts, their means and places are in the covariance of all rates of all."""
     missions, rng = small(), np.random.default_rng(1)
     priors = Priors(
         beta=dist.Normal(np.array([0.2, -0.1]), np.array([0.7, 0.5])),
         b=dist.Normal(0.1, 0.4),
         stationary=stationary,
     )
-    target = target_of(missions, HierarchicalTrust(priors))
-    target.recentre(np.zeros(9))
-    z = 0.7 * rng.standard_normal((4, 9))
+    target = target_of(missions, HierarchicalTrust(priors, place=place))
+    target.recentre(np.zeros(target.n_scores))
+    z = 0.7 * rng.standard_normal((4, target.n_scores))
     found = target.log_density(z)
     theta, log_prior = target.scores.theta(z), target.scores.log_prior(z)
     for t in range(len(z)):
@@ -56,11 +63,12 @@ def test_the_density_is_the_dense_joint_normal_s_with_the_priors(stationary):
             rest = 1.0 - theta["mean_beta0"][t]
         mean_of_mu = rest * np.array([0.2, -0.1, 0.1])
         sd_of_mu = rest * np.array([0.7, 0.5, 0.4])
-        X, centre, own, robots = [], [], [], []
+        X, centre, own, robots, rolls = [], [], [], [], []
         for m in missions:
             for i in range(2):
                 a, n = theta["beta0"][t, i], len(m.contact_rate)
                 roll = np.linalg.inv(np.eye(n) - a * np.eye(n, k=-1))
+                rolls.append(roll)
                 X.append(roll @ np.c_[m.awareness[:, i], np.ones(n)])
                 centre.append(roll[:, 0] * a * 0.5)
                 own.append(delta_w**2 * roll @ roll.T + delta_v**2 * np.eye(n))
@@ -70,6 +78,13 @@ def test_the_density_is_the_dense_joint_normal_s_with_the_priors(stationary):
         cov = (X * sd_of_mu**2) @ X.T
         cov += (X * tau**2) @ X.T * (robots[:, None] == robots)
         cov[np.kron(np.eye(4), np.ones((3, 3))) > 0] += np.concatenate([c.ravel() for c in own])
+        if place is not None:  # bounds of both missions are the same three, one cell apart
+            tau_s, ell, tau_e = (theta[name][t] for name in ("tau_s", "length_scale", "tau_e"))
+            h = np.sqrt(3.0) * np.abs(np.subtract.outer(np.arange(3), np.arange(3))) / ell
+            of_bounds = tau_s**2 * (1.0 + h) * np.exp(-h) + tau_e**2 * np.eye(3)
+            same = place.shared | (robots[:, None] == robots)
+            T = block_diag(*rolls)
+            cov += T @ (np.tile(of_bounds, (4, 4)) * same) @ T.T
         y = np.concatenate([m.contact_rate[:, i] for m in missions for i in range(2)])
         law = stats.multivariate_normal(np.concatenate(centre) + X @ mean_of_mu, cov)
         np.testing.assert_allclose(found[t] - log_prior[t], law.logpdf(y), rtol=1e-9)
@@ -205,8 +220,6 @@ def test_what_it_cannot_treat_is_refused():
     change = HierarchicalTrust(observation="censored", response="change")
     with pytest.raises(TrustboError, match="it measures changes of trust, and its observations"):
         fit(missions, change, "exact")
-    with pytest.raises(TrustboError, match="places, and robots partially pooled"):
-        fit(missions, HierarchicalTrust(place=PlaceEffect()), "exact")
     heavy = HierarchicalTrust(Priors(beta=dist.StudentT(3.0, 0.0, 0.5)))
     with pytest.raises(TrustboError, match=r"it needs the prior of beta to be a Normal.*StudentT"):
         fit(missions, heavy, "exact")

@@ -39,7 +39,7 @@ def test_rates_within_the_limits_have_the_closed_form_s_density():
     y[1, 2:, 1] = np.nan
     missions = missions_of(y)
     latent = target_of(missions, HierarchicalTrust(observation="censored"))
-    exact = target_of(missions, HierarchicalTrust(latent.scores.priors))
+    exact = target_of(missions, HierarchicalTrust(latent.scores.quantiles.priors))
     exact.recentre(np.zeros(10))
     theta = exact.scores.theta(0.7 * rng.standard_normal((5, 10)))
     found, expected = (each.evidence.log_density(theta) for each in (latent, exact))

@@ -169,17 +169,25 @@ class Gaussian:
         drawn = []
         for i in self._chunks(len(count)):
             factors = self._factors(_take(theta, i))
-            drawn += [self._draw(factors, t, int(n), rng) for t, n in enumerate(count[i])]
+            if self.joined or (count[i] != 1).any():
+                drawn += [self._draw(factors, t, int(n), rng) for t, n in enumerate(count[i])]
+            else:  # of independent columns one draw each, as NUTS has thousands: all at once
+                root, right = np.tril(factors.P[:, :-1, :-1]), factors.P[:, -1, :-1]
+                white = (right + rng.standard_normal(right.shape))[..., None]
+                e = np.linalg.solve(np.swapaxes(root, 1, 2), white)[..., 0]
+                drawn.append(factors.prior.mean + factors.prior.sd * e)
         c = np.empty((int(count.sum()), len(self.order)))
         c[:, self.order] = np.concatenate(drawn)
         return c
 
-    def gram(self) -> tuple[np.ndarray, np.ndarray, Columns]:
+    def gram(self, further: Columns) -> tuple[np.ndarray, np.ndarray, Columns]:
         """Row and column of the entries of A, and G (entry, pair of bounds of a kind), see step 2.
 
-        Of all columns, in the order of `order`; the upper triangle is left out.
+        Of all columns, in the order of `order`, and then of further ones (slot, column); the upper
+        triangle is left out.
         """
-        (row, column), G = self._products(self.U, self.U)
+        U = sparse.hstack([self.U, further], format="csr")
+        (row, column), G = self._products(U, U)
         lower = row >= column
         return row[lower], column[lower], G[lower]
 

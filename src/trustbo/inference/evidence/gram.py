@@ -22,13 +22,6 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from trustbo.errors import ShapeError, TrustboError
-from trustbo.inference.evidence.toeplitz import (
-    corner,
-    cosines,
-    eigenvalues,
-    sine_basis,
-    tridiagonal,
-)
 from trustbo.models.state_space.kalman import innovation, update
 from trustbo.models.ticks import TickWeights, add_ticks, weigh_ticks
 from trustbo.stacking import MissionBatch
@@ -295,3 +288,33 @@ def _collapse_lag(
     v = np.stack([np.ones_like(beta0), -beta0, -h], axis=1)
     rows = (v[:, None] @ M[:, :3])[:, 0]
     return Quadratic((rows[:, :3] * v).sum(1), rows[:, 3:], M[:, 3:, 3:], log_det)
+
+
+def sine_basis(n: int) -> np.ndarray:
+    """Orthonormal, symmetric matrix of the type-I discrete sine transform, (n, n)."""
+    k = np.arange(1, n + 1)
+    return np.sqrt(2.0 / (n + 1)) * np.sin(np.pi * np.outer(k, k) / (n + 1))
+
+
+def cosines(n: int) -> np.ndarray:
+    """cos(pi k / (n + 1)), k = 1..n: the frequencies of the sine transform."""
+    return np.cos(np.pi * np.arange(1, n + 1) / (n + 1))
+
+
+def tridiagonal(
+    beta0: np.ndarray, Q: np.ndarray, R: np.ndarray, lag: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Diagonal of T, and minus its off-diagonal entry."""
+    return Q * (1.0 + lag) + R * (1.0 + beta0**2), lag * Q + beta0 * R
+
+
+def eigenvalues(diagonal: np.ndarray, beside: np.ndarray, cosine: np.ndarray) -> np.ndarray:
+    """Eigenvalues of T, one for each of the `cosines`."""
+    return diagonal - 2.0 * beside * cosine
+
+
+def corner(
+    beta0: np.ndarray, h: np.ndarray, Q: np.ndarray, R: np.ndarray, lag: float, x0_sd: float
+) -> np.ndarray:
+    """The corner entry kappa, with h = beta0 - lag."""
+    return h**2 * x0_sd**2 - lag * Q - beta0**2 * R

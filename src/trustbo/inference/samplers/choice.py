@@ -3,6 +3,7 @@
 from trustbo.errors import TrustboError, require_choice
 from trustbo.inference.samplers.exact import why_not_conjugate
 from trustbo.inference.samplers.scores import why_no_quantiles
+from trustbo.inference.samplers.settings import NutsSettings
 from trustbo.models.model import TrustModel
 
 SAMPLERS = ("auto", "exact", "nuts", "joint")
@@ -63,13 +64,22 @@ def resolve_sampler(model: TrustModel, sampler: str) -> tuple[str, str]:
 def why_not_scores(model: TrustModel) -> str | None:
     """Reason why no evidence serves NUTS of scores alone; None if one does.
 
-    It is for Gaussian rates, effects that the engine has, and priors of the exact sampler.
+    It is for Gaussian rates, robots whose coefficients are columns, and priors of scores.
     """
     if reason := model.why_not_exact:
         return reason
-    if model.robot_sets != "all" or not model.family.integrates_out:
-        return "its robots do not share all parameters, or its observations are not Gaussian"
-    return why_not_conjugate(model.priors) or why_no_quantiles(model.priors)
+    if not model.family.integrates_out:
+        return "its observations are not Gaussian"
+    if model.robot_sets not in ("all", "each", "pooled"):
+        return "its drift is a function of your own, or its robots influence each other"
+    pooled = model.robot_sets == "pooled"
+    return why_not_conjugate(model.priors) or why_no_quantiles(model.priors, partial_pooling=pooled)
+
+
+def with_warmup(settings: NutsSettings, model: TrustModel) -> NutsSettings:
+    """Settings with the default warm-up of a model: half of it for scores, of known metric."""
+    warmup = NutsSettings().warmup
+    return settings._replace(warmup=warmup if why_not_scores(model) else warmup // 2)
 
 
 def why_not_priors(model: TrustModel) -> str | None:

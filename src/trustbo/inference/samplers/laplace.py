@@ -80,17 +80,13 @@ def laplace(
 
 
 def newton(
-    potential: Callable[[Array], Array],
-    start: Array,
-    longest: Array | float = np.inf,
-    n_steps: int = 60,
+    potential: Callable[[Array], Array], start: Array, n_steps: int = 60
 ) -> tuple[Array, Array]:
     """Mode and Hessian of a potential there, in JAX; the ridge shrinks as steps succeed.
 
     Args:
         potential: Cost of a point.
         start: Shape (axis,).
-        longest: Longest step along each axis, (axis,): a long one may leave for another mode.
         n_steps: Largest number of steps; fewer where they promise less than 1e-12 nats.
     """
 
@@ -112,7 +108,6 @@ def newton(
         derivatives = jax.tree.map(lambda a, b: jnp.where(better, a, b), new, derivatives)
         ridge = jnp.where(better, ridge / 4.0, ridge * 8.0 + 1e-6)
         direction = newton_direction(jnp, derivatives[1], derivatives[2], 1e-6, ridge)
-        direction = direction * jnp.minimum(1.0, (longest / jnp.abs(direction)).min())
         return k + 1, z, derivatives, z - direction, ridge, derivatives[1] @ direction
 
     def unfinished(carry):

@@ -1,28 +1,29 @@
 """NUTS on the scores of hyperparameters, all else integrated out by the evidence.
 
-The unknowns are those of the exact sampler (`posterior.Shared`), some 8 for places and robots, and
+The unknowns are those of the exact sampler (`posterior.Scores`), some 8 for places and robots, and
 near normal once the ridge of the noises is straightened. The mean and the covariance of the exact
 sampler's points, which it weighs in a second, are start and metric, so that warm-up learns a step
-size alone. Weights and effects are drawn given
-theta by the evidence itself.
+size alone. Weights and effects are drawn given theta by the evidence itself.
 """
 
+import copy
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple, cast
+from typing import Any, ClassVar, NamedTuple, Self, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array, random
-from numpyro.infer.hmc import HMCState
+from jax import Array
 from numpyro.infer.util import ParamInfo
 
 from trustbo.inference.evidence.gaussian import Gaussian
-from trustbo.inference.evidence.gaussian_jax import GaussianJax, Sums
+from trustbo.inference.evidence.gaussian_jax import GaussianJax
 from trustbo.inference.samplers import scores
 from trustbo.inference.samplers.importance import Points, weighted_points
-from trustbo.inference.samplers.nuts import Chain, kernel, run_chains, step_on
-from trustbo.inference.samplers.posterior import Posterior, Shared
+from trustbo.inference.samplers.nuts import Chain, run_nuts
+from trustbo.inference.samplers.posterior import Posterior
 from trustbo.inference.samplers.settings import NutsSettings
 from trustbo.inference.samplers.student import Student
 from trustbo.inference.samplers.watching import SILENT, Watch
@@ -35,31 +36,42 @@ _FARTHEST = 8.0  # score of beta0, or of the angle
 _SIZES = -25.0, 3.4  # log sizes of noises
 _RIDGE = 1e-6  # of covariances
 _HALVINGS = 60  # of their range, to the last digit
+_KNOTS = 401  # of the ridge, which may be a rough one
+_POINTS = 32  # of a proposal for each score, enough for a mean and a covariance
 
 
-class Core(NamedTuple):
-    """Beta0 and the noises of the first three scores, see `scores.beta0_and_noises`."""
+class Tables(NamedTuple):
+    """`scores.Quantiles` as tables, for JAX."""
 
     beta0: Table
     log_noises: tuple[Table, Table]
+    log_tau: Table | None  # where robots have spreads
 
     @classmethod
-    def of(cls, priors: Priors) -> "Core":
+    def of(cls, priors: Priors, *, by_robot: bool = False) -> Self:
         """Tables of priors."""
 
         def log_noise(prior) -> Table:
             return Table.of(lambda x: np.log(scores.noise(prior, np.exp(x))), *_SIZES)
 
-        beta0 = Table.of(partial(scores.quantile, priors.beta0), -_FARTHEST, _FARTHEST)
-        return cls(beta0, (log_noise(priors.delta_w), log_noise(priors.delta_v)))
+        def at_scores(function: Callable[[np.ndarray], np.ndarray]) -> Table:
+            return Table.of(function, -_FARTHEST, _FARTHEST)
 
-    def at(self, z: Array) -> Array:
-        """Parameters beta0, delta_w and delta_v (3,) of scores (score,)."""
+        noises = log_noise(priors.delta_w), log_noise(priors.delta_v)
+        tau = at_scores(lambda z: np.log(scores.quantile(priors.tau, z))) if by_robot else None
+        return cls(at_scores(partial(scores.quantile, priors.beta0)), noises, tau)
+
+    def core(self, z: Array) -> Array:
+        """See `scores.beta0_and_noises`."""
         noises = []
         for table, side in zip(self.log_noises, (1.0, -1.0), strict=True):
-            angle = 0.5 * np.pi * jax.scipy.special.ndtr(side * z[2])
-            noises.append(jnp.exp(table(z[1] + jnp.log(jnp.sin(angle)))))
-        return jnp.stack([self.beta0(z[0]), *noises])
+            angle = 0.5 * np.pi * jax.scipy.special.ndtr(side * z[:, 2])
+            noises.append(jnp.exp(table(z[:, 1] + jnp.log(jnp.sin(angle)))))
+        return jnp.stack([self.beta0(z[:, 0]), *noises], axis=1)
+
+    def tau(self, z: Array) -> Array:
+        """See `scores.Quantiles.tau`."""
+        return jnp.exp(cast(Table, self.log_tau)(z))
 
 
 class Ridge(NamedTuple):
@@ -88,7 +100,7 @@ class Ridge(NamedTuple):
                 low, high = np.where(above, low, middle), np.where(above, middle, high)
             return low
 
-        return cls(Table.of(log_size, -_FARTHEST, _FARTHEST))
+        return cls(Table.of(log_size, -_FARTHEST, _FARTHEST, _KNOTS))
 
     def to_scores(self, x: Any) -> Any:
         """Scores (..., score) of coordinates, in NumPy or JAX."""
@@ -104,47 +116,34 @@ class Ridge(NamedTuple):
         return xp.concatenate([x[..., :1], size, x[..., 2:]], axis=-1)
 
 
-class _Data(NamedTuple):
-    """Arguments of the compiled programs."""
-
-    sums: Sums
-    core: Core
-    ridge: Ridge
-
-
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
 class ScoresInJax:
     """Log posterior density of scores in JAX, equal to `Posterior.log_density`."""
 
-    def __init__(self, coordinates: Shared, evidence: GaussianJax, data: _Data) -> None:
-        """Take the scores and the evidence."""
-        self.scores, self.evidence, self.data = coordinates, evidence, data
+    learns: ClassVar[bool] = False  # a metric: that of the points is better
+    scores: Any  # `posterior.Scores` by `Tables`
+    evidence: GaussianJax
+    ridge: Ridge
 
-    def theta(self, z: Array) -> dict[str, Array]:
-        """Hyperparameters, each (1,), of scores (score,)."""
-        return self.scores.with_core(self.data.core.at(z)[None], z[None])
+    @classmethod
+    def of(cls, posterior: Posterior, center: np.ndarray) -> Self:
+        """The density of a posterior under `evidence.gaussian`, its `Ridge` through a point."""
+        coordinates: Any = copy.copy(posterior.scores)
+        priors = coordinates.quantiles.priors
+        coordinates.quantiles = Tables.of(priors, by_robot=coordinates.pools)
+        evidence = GaussianJax.of(cast(Gaussian, posterior.evidence))
+        return cls(coordinates, evidence, Ridge.of(priors, center))
 
     def log_density(self, z: Array) -> Array:
         """Log density of scores (score,), -inf where there is none."""
-        value = self.evidence.log_density(self.theta(z), self.data.sums)
-        value += scores.log_prior(z[None])[0]  # pyright: ignore
+        value = self.evidence.log_density(self.scores.theta(z[None]))
+        value += self.scores.log_prior(z[None])[0]
         return jnp.where(jnp.isnan(value), -jnp.inf, value)
 
     def potential(self, site: dict[str, Array]) -> Array:
         """See `nuts.Density`."""
-        return -self.log_density(self.data.ridge.to_scores(site["theta"]))
-
-
-def in_jax(posterior: Posterior, center: np.ndarray) -> ScoresInJax:
-    """The density of a posterior of shared scores and Gaussian rates, in JAX.
-
-    Args:
-        posterior: The posterior.
-        center: Scores (score,) that the `Ridge` goes through.
-    """
-    coordinates, evidence = cast(Shared, posterior.scores), cast(Gaussian, posterior.evidence)
-    priors = coordinates.priors
-    data = _Data(Sums.of(evidence), Core.of(priors), Ridge.of(priors, center))
-    return ScoresInJax(coordinates, GaussianJax(evidence), data)
+        return -self.log_density(self.ridge.to_scores(site["theta"]))
 
 
 class _Around(NamedTuple):
@@ -184,29 +183,17 @@ class _Around(NamedTuple):
 
 def run_nuts_of_scores(
     settings: NutsSettings, seed: int, posterior: Posterior, watch: Watch = SILENT
-) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Scores (chain, draw, score) and statistics, each (chain, draw); see `nuts.run_nuts`."""
+) -> tuple[np.ndarray, dict[str, np.ndarray], Points]:
+    """Scores (chain, draw, score), statistics, each (chain, draw), and the points before these."""
+    enough = 1 << (_POINTS * posterior.n_scores).bit_length()
+    posterior.n_pilot = min(posterior.n_pilot, enough)
+    posterior.n_final = min(posterior.n_final, enough)
     with one_blas_thread():
         points, fitted = weighted_points(posterior, seed, None, watch)
-    with own_settings(), one_blas_thread(), watch.running(settings) as seen:
-        density = in_jax(posterior, fitted.center)
-        around = _Around.of(posterior, density.data.ridge, points)
+    with own_settings(), one_blas_thread():
+        density = ScoresInJax.of(posterior, fitted.center)
+        around = _Around.of(posterior, density.ridge, points)
         chain = Chain(jnp.asarray(around.center), jnp.asarray(around.scale))
-        length_free = settings._replace(draws=0, n_chains=0)
-
-        def of(data: _Data) -> ScoresInJax:
-            return ScoresInJax(density.scores, density.evidence, data)
-
-        @jax.jit
-        def begin(chain: Chain, start: ParamInfo, key: Array) -> HMCState:
-            return kernel(length_free, density, chain, start, key, adapt=False)[0]
-
-        @jax.jit
-        def advance(data: _Data, chain: Chain, state: HMCState, n: int):
-            return step_on(length_free, of(data), chain, state, n, adapt=False)
-
-        keys = random.split(random.key(seed), settings.n_chains)
-        starts = [begin(chain, around.start([seed, i]), key) for i, key in enumerate(keys)]
-        go_on = [partial(advance, density.data, chain)] * settings.n_chains
-        x, stats = run_chains(settings, go_on, starts, seen)
-    return around.scores(x["theta"]), stats
+        starts = [around.start([seed, i]) for i in range(settings.n_chains)]
+        x, stats = run_nuts(settings, seed, density, chain, starts, watch)
+    return around.scores(x["theta"]), stats, points

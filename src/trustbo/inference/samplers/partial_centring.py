@@ -6,15 +6,16 @@ of each robot's likelihood, c given mu and tau is normal in closed form, and so 
 standard normal innovations of these two conditionals take the places of e and mu.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 from jax.scipy.linalg import cho_solve, solve_triangular
+from numpyro.distributions.transforms import biject_to
 
-from trustbo.inference.samplers.target import Sites, Target
-from trustbo.models.hierarchical import HierarchicalTrust
+_COLUMNS = {"e_beta0": 0, "e_beta": slice(1, -1), "e_b": -1}
 
 
 class RobotFit(NamedTuple):
@@ -24,19 +25,25 @@ class RobotFit(NamedTuple):
     precision: Array  # (robot, coefficient, coefficient)
 
 
-def fit_robots(target: Target, pooling: HierarchicalTrust, site: Sites) -> RobotFit:
-    """One Newton step from `site` on each robot's log-likelihood of its coefficients."""
-    values = target.values(site)
-    c, mu, tau = pooling.robot_coefficients(values)
+def fit_robots(
+    values: Mapping[str, Array], support: Any, log_likelihood: Callable[[dict[str, Array]], Array]
+) -> RobotFit:
+    """One Newton step on each robot's log-likelihood of its coefficients.
 
-    def log_likelihood(c: Array) -> Array:
-        deviations = pooling.robot_sites((c - mu[None]) / tau[None])
-        log_p = target.log_likelihood(pooling.assemble(values | deviations))
-        return (log_p * target.data.weight[:, None]).sum(0)
+    Args:
+        values: Sites of `HierarchicalTrust`, on their supports.
+        support: Support of the mean of beta0.
+        log_likelihood: Log density (robot,) of rates at sites.
+    """
+    mu, tau = _moments(values, support)
+    c = mu[None] + tau[None] * _deviations(values)
+
+    def of_robots(c: Array) -> Array:
+        return log_likelihood({**values, **_sites((c - mu[None]) / tau[None])})
 
     index = jnp.arange(len(c))
-    gradient = jax.jacfwd(log_likelihood)(c)[index, index]
-    hessian = jax.jacfwd(jax.jacfwd(log_likelihood))(c)[index, index, :, index]
+    gradient = jax.jacfwd(of_robots)(c)[index, index]
+    hessian = jax.jacfwd(jax.jacfwd(of_robots))(c)[index, index, :, index]
     # A robot whose likelihood is not concave here is informed by the others only.
     eigenvalues, vectors = jnp.linalg.eigh(-hessian)
     eigenvalues = jnp.maximum(eigenvalues, 1e-3)
@@ -46,24 +53,40 @@ def fit_robots(target: Target, pooling: HierarchicalTrust, site: Sites) -> Robot
 
 
 def centre(
-    target: Target, pooling: HierarchicalTrust, site: Sites, fit: RobotFit
-) -> tuple[Sites, Array]:
-    """Sites of innovations in the places of means and deviations, and the log Jacobian."""
-    innovations = pooling.robot_deviations(site)
-    _, mu, tau = pooling.robot_coefficients(target.values(site))
+    values: Mapping[str, Array], support: Any, fit: RobotFit
+) -> tuple[dict[str, Array], Array]:
+    """Means on the real line and deviations, of innovations in their places; the log Jacobian."""
+    innovations, (mu, tau) = _deviations(values), _moments(values, support)
     log_jacobian = -len(innovations) * jnp.log(tau).sum()
-    if pooling.means_are_real:
-        spread = jnp.linalg.inv(fit.precision) + jnp.diag(tau**2)[None]
-        information = jnp.linalg.inv(spread)
-        # Unit precision stands for the priors, which are about so wide.
-        L = jnp.linalg.cholesky(information.sum(0) + jnp.eye(len(mu)))
-        center = cho_solve((L, True), jnp.einsum("icd,id->c", information, fit.center))
-        mu = center + solve_triangular(L, mu, trans=1, lower=True)
-        log_jacobian = log_jacobian - jnp.log(jnp.diagonal(L)).sum()
-        site = site | pooling.mean_sites(mu)
+    information = jnp.linalg.inv(jnp.linalg.inv(fit.precision) + jnp.diag(tau**2)[None])
+    # Unit precision stands for the priors, which are about so wide.
+    L = jnp.linalg.cholesky(information.sum(0) + jnp.eye(len(mu)))
+    middle = cho_solve((L, True), jnp.einsum("icd,id->c", information, fit.center))
+    mu = middle + solve_triangular(L, mu, trans=1, lower=True)
+    log_jacobian -= jnp.log(jnp.diagonal(L)).sum()
     L = jnp.linalg.cholesky(fit.precision + jnp.diag(tau**-2.0)[None])
     total = jnp.einsum("icd,id->ic", fit.precision, fit.center) + (mu / tau**2)[None]
     c = cho_solve((L, True), total[..., None])
     c = c + solve_triangular(L, innovations[..., None], trans=1, lower=True)
-    log_jacobian = log_jacobian - jnp.log(jnp.diagonal(L, axis1=1, axis2=2)).sum()
-    return site | pooling.robot_sites((c[..., 0] - mu[None]) / tau[None]), log_jacobian
+    log_jacobian -= jnp.log(jnp.diagonal(L, axis1=1, axis2=2)).sum()
+    means = {"mean_beta0": mu[0], "mean_beta": mu[1:-1], "mean_b": mu[-1]}
+    return means | _sites((c[..., 0] - mu[None]) / tau[None]), log_jacobian
+
+
+def _moments(values: Mapping[str, Array], support: Any) -> tuple[Array, Array]:
+    """Means and spreads of the coefficients on the real line, each (coefficient,)."""
+    mean_beta0 = biject_to(support).inv(values["mean_beta0"])
+    mu = jnp.concatenate([mean_beta0[None], values["mean_beta"], values["mean_b"][None]])
+    tau = [values["tau_beta0"][None], values["tau_beta"], values["tau_b"][None]]
+    return mu, jnp.concatenate(tau)
+
+
+def _deviations(values: Mapping[str, Array]) -> Array:
+    """Deviations in units of tau, (robot, coefficient)."""
+    columns = [values["e_beta0"][:, None], values["e_beta"], values["e_b"][:, None]]
+    return jnp.concatenate(columns, axis=1)
+
+
+def _sites(deviations: Array) -> dict[str, Array]:
+    """Sites of deviations: the inverse of `_deviations`."""
+    return {name: deviations[:, column] for name, column in _COLUMNS.items()}

@@ -18,7 +18,7 @@ from trustbo.inference.samplers import scores
 from trustbo.inference.samplers.laplace import derivatives, inverse_hessian
 from trustbo.inference.samplers.per_robot import PerRobot
 from trustbo.inference.samplers.student import Proposal, Spanning, Student
-from trustbo.models.effects.effect import Effect, Slots, Theta, rest_of
+from trustbo.models.effects.effect import Effect, Slots, Theta, rest_of, scales_of
 from trustbo.models.effects.weights import Weights
 from trustbo.models.families import Family
 from trustbo.models.priors import Priors
@@ -37,6 +37,11 @@ class Scores(Protocol):
     @property
     def fixed(self) -> bool:
         """Whether `recentre` leaves the coordinates unchanged."""
+        ...
+
+    @property
+    def pools(self) -> bool:
+        """Whether there are spreads of robots."""
         ...
 
     @property
@@ -71,19 +76,21 @@ class Scores(Protocol):
         ...
 
 
+@scores.with_data("quantiles")
 class Shared:
     """Scores of beta0 and the noises, which all robots share, and of the effects' scales."""
 
-    fixed, n_core = True, 3
+    fixed, n_core, pools = True, 3, False
 
     def __init__(self, priors: Priors, effects: Sequence[Effect], memory: str = "level") -> None:
         """Take the priors; `memory` as in `evidence.gaussian`."""
-        self.priors, self.effects, self.memory = priors, tuple(effects), memory
+        self.quantiles: Any = scores.Quantiles(priors)
+        self.effects, self.memory = tuple(e for e in effects if e.names), memory
         self.n_scores = self.n_core + sum(len(effect.names) for effect in effects)
 
     def theta(self, z: np.ndarray) -> dict[str, np.ndarray]:
         """See `Scores.theta`."""
-        return self.with_core(scores.beta0_and_noises(self.priors, z), z)
+        return self.with_core(self.quantiles.core(z), z)
 
     def named(self, z: np.ndarray) -> dict[str, np.ndarray]:
         """See `Scores.named`."""
@@ -102,12 +109,7 @@ class Shared:
         beta0, delta_w, delta_v = core.T
         rest = rest_of(beta0, self.memory)
         theta = {"beta0": beta0, "delta_w": delta_w, "delta_v": delta_v, "rest": rest}
-        start = self.n_core
-        for effect in self.effects:
-            stop = start + len(effect.names)
-            theta |= effect.scales(z[:, start:stop])
-            start = stop
-        return theta
+        return theta | scales_of(self.effects, z[:, self.n_core :])
 
 
 class Memoryless(Shared):
@@ -253,7 +255,7 @@ def posterior_of(
         priors, family, effects, slots, by_robot=by_robot, lag=lag, memory=memory
     )
     if by_robot:
-        coordinates = PerRobot(priors, slots.n_robots, slots.z.shape[2])
+        coordinates = PerRobot(priors, effects, slots.n_robots, slots.z.shape[2])
     else:
         coordinates = (Shared if carries else Memoryless)(priors, effects, memory)
     return Posterior(coordinates, evidence, float(np.nanstd(slots.y)))

@@ -1,19 +1,16 @@
 """Draws from a model's posterior by the chosen sampler."""
 
 import warnings
-from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple, cast
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
-from jax import Array, random
 
 from trustbo.errors import PosteriorError
-from trustbo.inference.evidence.gram_jax import spectrum
 from trustbo.inference.evidence.latent import Latents
-from trustbo.inference.evidence.place_marginal import PlaceIndex
 from trustbo.inference.evidence.statistics import gather, split_robots
 from trustbo.inference.samplers.choice import by_sums, why_not_scores
-from trustbo.inference.samplers.complaints import complaints_of, complaints_of_modes
+from trustbo.inference.samplers.complaints import complaints_of, complaints_of_means
 from trustbo.inference.samplers.convergence import MAX_KHAT
 from trustbo.inference.samplers.coupled_target import CoupledTarget
 from trustbo.inference.samplers.drift_scores import DriftPosterior
@@ -23,21 +20,22 @@ from trustbo.inference.samplers.importance import (
     UnevenWeightsError,
     sample_scores,
 )
-from trustbo.inference.samplers.nuts import run_nuts
 from trustbo.inference.samplers.nuts_scores import run_nuts_of_scores
+from trustbo.inference.samplers.nuts_sites import SitesInJax, run_nuts_of_sites
 from trustbo.inference.samplers.people import PeoplePosterior
 from trustbo.inference.samplers.posterior import Posterior, posterior_of
 from trustbo.inference.samplers.settings import NutsSettings
 from trustbo.inference.samplers.student import Student
-from trustbo.inference.samplers.target import NutsData
 from trustbo.inference.samplers.watching import SILENT, Watch
 from trustbo.models.backend import own_settings
 from trustbo.models.effects.effect import Slots
-from trustbo.models.effects.place import split_units
+from trustbo.models.effects.sampled import SampledDrift
 from trustbo.models.model import TrustModel
-from trustbo.models.place import PlaceEffect, Visited
+from trustbo.models.place import Visited
 from trustbo.parallel import one_blas_thread
 from trustbo.stacking import MissionBatch
+
+_RETRY = 7919  # of the seed, from one try to the next
 
 
 class Draws(NamedTuple):
@@ -107,40 +105,17 @@ def draw_posterior(
                 raise PosteriorError(f"the exact sampler's {error}.") from None
             failure = str(error)
             warnings.warn(f"the exact sampler's {failure}; NUTS is used instead.", stacklevel=4)
-    if slots is not None:
-        draws, complaints = _sample_nuts_of_scores(model, settings, seed, slots, watch, check=check)
-        return draws._replace(fallback=failure), complaints
-    data = nuts_data(model, batch, weight, places)
-    with own_settings(), one_blas_thread():
-        draws, complaints = _sample_nuts(
-            model, settings, random.key(seed), data, watch, check=check
+    if slots is not None or why_not_scores(model) is None:
+        targets = _targets(model, batch, weight, places, slots)
+        draws, complaints = _sample_nuts_of_scores(
+            model, settings, seed, targets, watch, check=check
         )
-    if places is not None:
-        draws = _with_effects(model, draws, places, seed)
+    else:
+        chains = None if places is None else Slots.of(batch, len(weight), (), weight, places)
+        draws, complaints = _sample_nuts(
+            model, settings, seed, batch, weight, chains, watch, check=check
+        )
     return draws._replace(fallback=failure), complaints
-
-
-def nuts_data(
-    model: TrustModel, batch: MissionBatch, weight: np.ndarray, places: Visited | None = None
-) -> NutsData:
-    """Data for NUTS: sums alone for the pooled Gaussian model without gaps and places."""
-    if places is not None:
-        return NutsData(*batch, weight, places=PlaceIndex.of(places, batch.contact_rate))
-    if model.robot_sets == "all" and model.family.integrates_out:
-        (statistics,) = gather(model, batch, weight)
-        if not statistics.gaps:
-            seen = ~np.isnan(batch.contact_rate)
-            rates = batch.contact_rate[seen]
-            means = (
-                np.asarray(rates.mean()),
-                batch.awareness[seen].mean(0),
-                np.asarray(rates.std()),
-            )
-            # One unmeasured bound and robot: the shape carries the number of features.
-            nothing = np.full((1, 1, 1), np.nan)
-            awareness = np.zeros((1, 1, 1, batch.awareness.shape[3]))
-            return NutsData(awareness, nothing, nothing, np.ones(1), spectrum(statistics), means)
-    return NutsData(*batch, weight)
 
 
 def _sample_exact(
@@ -263,87 +238,119 @@ def _join(posteriors: list[ExactDraws], shape: tuple[int, int], *, per_robot: bo
 def _sample_nuts(
     model: TrustModel,
     settings: NutsSettings,
-    key: Array,
-    data: NutsData,
+    seed: int,
+    batch: MissionBatch,
+    weight: np.ndarray,
+    chains: Slots | None,
     watch: Watch,
     *,
     check: bool,
 ) -> tuple[Draws, list[str]]:
-    """Draws by NUTS, rerun for longer if diagnostics fail, and the failures of the last run."""
-    complete = _is_complete(np.asarray(data.contact_rate))
+    """Draws by NUTS, rerun for longer if diagnostics fail, and the failures of the last run.
+
+    `chains` are rates by chain, where places have effects.
+    """
     name = "nuts" if model.family.integrates_out else "joint"
 
     def attempt(tried: NutsSettings, retries: int) -> tuple[Draws, list[str]]:
-        subkey = random.fold_in(key, retries)
-        raw = run_nuts(tried, subkey, model, data, complete=complete, watch=watch)
-        params, stats = ({k: np.asarray(v) for k, v in g.items()} for g in (raw.params, raw.stats))
-        stats["tree_depth"] = np.ceil(np.log2(stats["n_steps"] + 1)).astype(int)
-        innovations = None if raw.innovations is None else np.asarray(raw.innovations)
-        latents = Latents(innovations, raw.linearisation)
-        draws = Draws(params, stats, {"retries": retries}, name, latents)
-        return draws, [*complaints_of(params, stats), *complaints_of_modes(raw)] if check else []
+        with own_settings(), one_blas_thread():
+            drift = None
+            if chains is not None:
+                drift = SampledDrift(model.all_effects, chains, batch.contact_rate.shape)
+            density = SitesInJax.of(model, batch, weight, drift)
+            drawn = run_nuts_of_sites(tried, seed + _RETRY * retries, density, watch)
+        params, stats = drawn.params, _with_tree_depth(drawn.stats)
+        complaints = complaints_of(params, stats) if check else []
+        places = {}
+        if drift is not None:
+            shape, rng = stats["lp"].shape, np.random.default_rng([seed, 3])
+            flat = {n: values.reshape(-1, *values.shape[2:]) for n, values in params.items()}
+            effects = drift.named(flat, rng)
+            places = {n: values.reshape(*shape, -1) for n, values in effects.items()}
+            params = {n: values for n, values in params.items() if n not in drift.names}
+        summary = {"retries": retries}
+        return Draws(params, stats, summary, name, drawn.latents, places), complaints
 
-    return _retried(attempt, settings, watch, collapse=data.places is None)
+    return _retried(attempt, settings, watch)
 
 
 def _sample_nuts_of_scores(
     model: TrustModel,
     settings: NutsSettings,
     seed: int,
-    slots: Slots,
+    targets: Sequence[Any],
     watch: Watch,
     *,
     check: bool,
 ) -> tuple[Draws, list[str]]:
     """Draws of scores by NUTS, of all else given them by the evidence; see `_sample_nuts`."""
-    posterior = _by_evidence(model, slots)
 
     def attempt(tried: NutsSettings, retries: int) -> tuple[Draws, list[str]]:
-        z, stats = run_nuts_of_scores(tried, seed + 7919 * retries, posterior, watch)
-        shape = z.shape[:2]
-        flat, n = z.reshape(-1, z.shape[2]), z.shape[0] * z.shape[1]
-        rng = np.random.default_rng([seed, 3, retries])
-        drawn, _ = posterior.draw(flat, np.zeros(n), np.arange(n), rng)
-        params = {name: values.reshape(*shape, *values.shape[1:]) for name, values in drawn.items()}
+        first = seed + _RETRY * retries
+        drawn = [_scores_by_nuts(tried, first + i, one, watch) for i, one in enumerate(targets)]
+        of_robots = {name: np.stack([one.stats[name] for one in drawn]) for name in drawn[0].stats}
+        stats = {name: _OVER_ROBOTS[name](values, axis=0) for name, values in of_robots.items()}
+        apart = model.robot_sets == "each"
+        params = {
+            name: np.stack([one.params[name] for one in drawn], axis=2) if apart else values
+            for name, values in drawn[0].params.items()
+        }
+        complaints = [moved for one in drawn for moved in one.moved]
+        complaints = [*complaints_of(params, stats), *complaints] if check else []
         places, effects = _pop_effects(model, params)
-        stats["tree_depth"] = np.ceil(np.log2(stats["n_steps"] + 1)).astype(int)
-        summary = {"retries": retries}
-        draws = Draws(params, stats, summary, "nuts", places=places, effects=effects)
-        return draws, complaints_of(params, stats) if check else []
+        summary, stats = {"retries": retries}, _with_tree_depth(stats)
+        return Draws(params, stats, summary, "nuts", places=places, effects=effects), complaints
 
-    return _retried(attempt, settings, watch, collapse=False)
+    return _retried(attempt, settings, watch)
+
+
+class _OfRobots(NamedTuple):
+    """Draws and statistics of robots alike, or of one, with leading axes (chain, draw)."""
+
+    params: dict[str, np.ndarray]
+    stats: dict[str, np.ndarray]
+    moved: list[str]
+    """Complaints of draws that the exact sampler's points contradict."""
+
+
+_OVER_ROBOTS: dict[str, Any] = {
+    "lp": np.sum,
+    "energy": np.sum,
+    "n_steps": np.sum,
+    "diverging": np.any,
+    "acceptance_rate": np.min,
+    "step_size": np.min,
+}
+"""Statistics of robots that are sampled apart, taken together."""
+
+
+def _scores_by_nuts(
+    settings: NutsSettings, seed: int, target: Posterior, watch: Watch
+) -> _OfRobots:
+    """Draws of scores by NUTS, and of all else given them."""
+    z, stats, points = run_nuts_of_scores(settings, seed, target, watch)
+    shape, n = z.shape[:2], z.shape[0] * z.shape[1]
+    rng = np.random.default_rng([seed, 3])
+    drawn, _ = target.draw(z.reshape(n, -1), np.zeros(n), np.arange(n), rng)
+    params = {name: values.reshape(*shape, *values.shape[1:]) for name, values in drawn.items()}
+    moved = []
+    if points.khat <= MAX_KHAT:
+        moved = complaints_of_means(params, target.scores.named(points.z), np.exp(points.log_w))
+    return _OfRobots(params, stats, moved)
+
+
+def _with_tree_depth(stats: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    return stats | {"tree_depth": np.ceil(np.log2(stats["n_steps"] + 1)).astype(int)}
 
 
 def _retried(
     attempt: Callable[[NutsSettings, int], tuple[Draws, list[str]]],
     settings: NutsSettings,
     watch: Watch,
-    *,
-    collapse: bool,
 ) -> tuple[Draws, list[str]]:
     """Draws of an attempt, or of a second, longer one where the diagnostics of the first fail."""
     draws, complaints = attempt(settings, 0)
     if not complaints:
         return draws, complaints
-    longer = settings.longer(collapse=collapse)
-    watch.retry(longer, complaints)
-    return attempt(longer, 1)
-
-
-def _with_effects(model: TrustModel, draws: Draws, places: Visited, seed: int) -> Draws:
-    """Draws with the effects of visited places, of cells and bounds apart."""
-    params = dict(draws.params)
-    units = params.pop("place_unit")[..., : len(places.units)]
-    flat = units.reshape(-1, units.shape[-1])
-    hyper = {name: params[name].ravel() for name in model.place_dims}
-    rng = np.random.default_rng([seed, 3])
-    effects = split_units(cast(PlaceEffect, model.place), places, flat, hyper, rng)
-    shaped = {n: values.reshape(*units.shape[:2], -1) for n, values in effects.items()}
-    return draws._replace(params=params, places=shaped)
-
-
-def _is_complete(contact_rate: np.ndarray) -> bool:
-    """Whether no rate is missing before the last of a mission, the same bound for all robots."""
-    seen = ~np.isnan(contact_rate)
-    together = (seen.any(2) == seen.all(2)).all()
-    return bool(together and (np.diff(seen.any(2).astype(int), axis=1) <= 0).all())
+    watch.retry(settings.longer, complaints)
+    return attempt(settings.longer, 1)

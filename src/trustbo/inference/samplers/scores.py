@@ -6,8 +6,10 @@ with half-normal priors log size has the density of a Rayleigh variable's logari
 over pi / 2 is uniform. On log and logit scales tails are exponential, and weights uneven.
 """
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import numpyro.distributions as dist
@@ -47,6 +49,39 @@ def beta0_and_noises(priors: Priors, z: np.ndarray) -> np.ndarray:
         angle = 0.5 * np.pi * special.ndtr(side * r)
         theta[:, i] = noise(prior, size * np.sin(angle))
     return theta
+
+
+class Quantiles(NamedTuple):
+    """Parameters at scores, by the quantiles of their priors."""
+
+    priors: Priors
+
+    def core(self, z: np.ndarray) -> np.ndarray:
+        """See `beta0_and_noises`."""
+        return beta0_and_noises(self.priors, z)
+
+    def tau(self, z: np.ndarray) -> np.ndarray:
+        """Spreads of robots at scores (point, spread)."""
+        return quantile(self.priors.tau, z)
+
+
+def with_data[Kind](*names: str) -> Callable[[type[Kind]], type[Kind]]:
+    """Make a class an argument of compiled code, in which all but the named attributes are."""
+
+    def flatten(one: Any) -> tuple[list[Any], tuple[Any, ...]]:
+        others = tuple((name, x) for name, x in vars(one).items() if name not in names)
+        return [getattr(one, name) for name in names], others
+
+    def register(cls: type[Kind]) -> type[Kind]:
+        def unflatten(others: tuple[Any, ...], data: list[Any]) -> Any:
+            one: Any = object.__new__(cls)
+            vars(one).update(others, **dict(zip(names, data, strict=True)))
+            return one
+
+        jax.tree_util.register_pytree_node(cls, flatten, unflatten)
+        return cls
+
+    return register
 
 
 def quantile(prior: Distribution, score: np.ndarray) -> np.ndarray:

@@ -24,8 +24,6 @@ class NutsSettings(NamedTuple):
     n_chains: int = 4
     target_accept: float = 0.9
     max_tree_depth: int = 10
-    collapse: bool = False
-    """Collapse the pooled model's weights and intercept: slower, but no funnel for few data."""
 
     @classmethod
     def of(cls, given: Mapping[str, Any], former: Mapping[str, Any] | None = None) -> Self:
@@ -79,13 +77,13 @@ class NutsSettings(NamedTuple):
         """Settings that every sampler takes."""
         return {name: getattr(self, name) for name in _OF_ALL}
 
-    def longer(self, *, collapse: bool) -> Self:
+    @property
+    def longer(self) -> Self:
         """Settings of a longer run, after failed diagnostics."""
         return self._replace(
             warmup=2 * self.warmup,
             draws=2 * self.draws,
             target_accept=max(self.target_accept, 0.98),
-            collapse=collapse,
         )
 
     def __str__(self) -> str:

@@ -317,6 +317,16 @@ def draw_effects(
     return group.name(prior.mean + prior.sd * e, theta, rng)
 
 
+def scales_of(effects: Sequence[Effect], scores: Any) -> dict[str, Any]:
+    """Hyperparameters of all effects by name, of scores (point, ...) in their order."""
+    theta, start = {}, 0
+    for effect in effects:
+        stop = start + len(effect.names)
+        theta |= effect.scales(scores[:, start:stop])
+        start = stop
+    return theta
+
+
 def rest_of(beta0: Any, memory: str) -> Any:
     """Drift by which stationary trust rises by 1, of the shape of beta0."""
     return 1.0 - beta0 if memory == "level" else 0.0 * beta0 + 1.0

@@ -90,7 +90,7 @@ class PlaceColumns(NamedTuple):
         xp: Any = namespace(theta["beta0"])
         n, place = len(theta["beta0"]), self.place
         tau_e = theta["tau_e"] if place.bounds else xp.zeros(n)
-        mean = np.zeros((n, self.rotation.shape[0]))
+        mean = np.zeros((n, self.columns.shape[1]))
         if not place.cells:
             return Prior(mean, xp.repeat(tau_e[:, None], mean.shape[1], axis=1))
         tau_s, roots, sds = theta["tau_s"], [], []

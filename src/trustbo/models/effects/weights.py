@@ -1,10 +1,11 @@
 """Weights of features and the intercept, which all robots share, or drawn for each of them."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from trustbo.models.backend import namespace
 from trustbo.models.effects.effect import (
     Columns,
     Effect,
@@ -12,6 +13,7 @@ from trustbo.models.effects.effect import (
     Slots,
     Theta,
     dense_columns,
+    hypot,
     share_of,
 )
 from trustbo.models.priors import Priors
@@ -82,15 +84,20 @@ class FeatureColumnsByRobot(NamedTuple):
     def prior(self, theta: Theta) -> Prior:
         """Coefficients of one feature alike, as they share its mean."""
         n, of_mean, tau = self.n_robots, self.shared.prior(theta), _spreads(theta)
-        sd = np.hypot(of_mean.sd, tau)
-        apart = np.maximum(share_of(tau, sd), _LEAST)  # the correlation is apart I + alike 11'
-        alike, root = 1.0 - apart, np.zeros((*sd.shape, n, n))
-        for i in range(n):
-            root[..., i, i] = np.sqrt(apart + alike)
-            root[..., i + 1 :, i] = (alike / root[..., i, i])[..., None]
+        xp: Any = namespace(tau)
+        sd = hypot(of_mean.sd, tau)
+        apart = xp.maximum(share_of(tau, sd), _LEAST)  # the correlation is apart I + alike 11'
+        alike, diagonal, below = 1.0 - apart, [], []
+        for _ in range(n):  # columns of its root, alike below the diagonal
+            diagonal.append(xp.sqrt(apart + alike))
+            below.append(alike / diagonal[-1])
             alike = alike * apart / (apart + alike)
-        mean, sd = (np.repeat(moment, n, axis=1) for moment in (of_mean.mean, sd))
-        return Prior(mean, sd, list(np.moveaxis(root, 1, 0)))
+        columns = (xp.stack(column, axis=-1)[..., None, :] for column in (diagonal, below))
+        root = sum(
+            x * where for x, where in zip(columns, (np.eye(n), np.tri(n, k=-1)), strict=True)
+        )
+        mean, sd = (xp.repeat(moment, n, axis=1) for moment in (of_mean.mean, sd))
+        return Prior(mean, sd, list(xp.moveaxis(root, 1, 0)))
 
     def name(self, c: np.ndarray, theta: Theta, rng: np.random.Generator) -> dict[str, np.ndarray]:
         """Weights beta (draw, robot, feature), intercepts b (draw, robot), and a draw of means."""
@@ -104,4 +111,5 @@ class FeatureColumnsByRobot(NamedTuple):
 
 
 def _spreads(theta: Theta) -> np.ndarray:
-    return np.column_stack([theta["tau_beta"], theta["tau_b"]])
+    xp: Any = namespace(theta["tau_b"])
+    return xp.concatenate([theta["tau_beta"], theta["tau_b"][:, None]], axis=1)

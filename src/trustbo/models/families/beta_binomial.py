@@ -52,11 +52,6 @@ class BetaBinomial(Linearised):
                 "x0_sd": 1.5,
             }
 
-    def mean_level(self, y: Array) -> tuple[Array, Array]:
-        """See `Family.mean_level`: a logit, and the binomial variance there."""
-        p = jnp.clip(y, 0.02, 0.98)
-        return jax.scipy.special.logit(p), -0.5 * jnp.log(p * (1.0 - p))
-
     def log_prob(self, ssm: SSM, data: Data, trust: Array) -> Array:
         """See `Linearised.log_prob`."""
         (n, N), phi = data, _concentration(ssm)

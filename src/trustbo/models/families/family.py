@@ -164,10 +164,6 @@ class Family(ABC):
         """Default priors that differ from those of `Priors()`, by name."""
         return {}
 
-    def mean_level(self, y: Array) -> tuple[Array, Array]:
-        """Trust equivalent of a mean rate, and the log scale of delta_v there."""
-        return y, jnp.zeros(())
-
     def refine(self, ssm: SSM, observed: Observed) -> Observed:
         """Find the linearisation point, if the family has one."""
         return observed

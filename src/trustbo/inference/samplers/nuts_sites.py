@@ -1,0 +1,245 @@
+"""NUTS on a model's sample statements, for what no evidence integrates out.
+
+These are coupled robots, custom drifts, priors without quantiles, and rates that are not Gaussian,
+whose innovations of trust are sampled too. The numpyro model itself stays plain: here its sample
+statements stand with a likelihood that takes the weight of each mission and the linearisation
+point. The unknowns are the sites on the real line, but for the noises: data fix their total well
+and their ratio badly, so that the log of the total and that of the ratio stand in their places,
+with Jacobian 1. Start and metric are those of a Gaussian fit at the mode (Laplace).
+"""
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+from jax import Array, random
+from jax.flatten_util import ravel_pytree
+from numpyro import handlers
+from numpyro.distributions import constraints
+from numpyro.distributions.transforms import biject_to
+from numpyro.infer.util import constrain_fn, potential_energy
+
+from trustbo.inference.evidence.latent import Latents
+from trustbo.inference.samplers.laplace import inverse_hessian, newton
+from trustbo.inference.samplers.nuts import Chain, run_nuts
+from trustbo.inference.samplers.partial_centring import RobotFit, centre, fit_robots
+from trustbo.inference.samplers.settings import NutsSettings
+from trustbo.inference.samplers.watching import Watch
+from trustbo.models.effects.sampled import SampledDrift
+from trustbo.models.families import Observed
+from trustbo.models.model import TrustModel, sample_innovations
+from trustbo.models.params import Params
+from trustbo.stacking import MissionBatch
+
+Sites = dict[str, Array]
+_NOISES = ("delta_w", "delta_v")
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class SitesInJax:
+    """Log posterior density of a model's unconstrained sample sites.
+
+    Attributes:
+        model: Model.
+        batch: Missions, padded.
+        weight: Weight of each mission, (mission,).
+        linearisation: Linearisation point of families that have one, once it is known.
+        robots: Fit of each robot's likelihood, once it is known, where robots are partially pooled.
+        drift: Sampled effects of places.
+        complete: Whether no rate is missing before the last of a mission.
+    """
+
+    learns: ClassVar[bool] = True
+    model: TrustModel
+    batch: MissionBatch
+    weight: Array | np.ndarray
+    linearisation: Array | None = None
+    robots: RobotFit | None = None
+    drift: SampledDrift | None = field(default=None, metadata={"static": True})
+    complete: bool = field(default=False, metadata={"static": True})
+
+    @classmethod
+    def of(
+        cls,
+        model: TrustModel,
+        batch: MissionBatch,
+        weight: np.ndarray,
+        drift: SampledDrift | None = None,
+    ) -> "SitesInJax":
+        """Density of a model given missions."""
+        seen = ~np.isnan(batch.contact_rate)
+        together = (seen.any(2) == seen.all(2)).all()
+        over = (np.diff(seen.any(2).astype(int), axis=1) <= 0).all()
+        return cls(model, batch, weight, drift=drift, complete=bool(together and over))
+
+    @property
+    def innovations(self) -> tuple[int, int, int] | None:
+        """Shape of the innovations of trust (bound, mission, robot), if they are sampled."""
+        if self.model.family.integrates_out:
+            return None
+        n_missions, n_bounds, n_robots = self.batch.contact_rate.shape
+        return n_bounds, n_missions, n_robots
+
+    @cached_property
+    def _priors(self) -> dict[str, Any]:
+        """Prior of each site."""
+        trace = handlers.trace(handlers.seed(self._params, random.key(0))).get_trace()
+        return {name: site["fn"] for name, site in trace.items() if site["type"] == "sample"}
+
+    @cached_property
+    def _flat(self) -> tuple[Array, Any]:
+        """Vector of the priors' means, and the function from a vector to sites."""
+        return ravel_pytree({name: _mean(prior) for name, prior in self._priors.items()})
+
+    def sites(self, theta: Array) -> tuple[Sites, Array]:
+        """Unconstrained sites of a vector of unknowns, and the log Jacobian."""
+        site, none = self._flat[1](theta), jnp.zeros(())
+        if site.keys() >= set(_NOISES):
+            total, ratio = (site[name] for name in _NOISES)
+            site |= {
+                name: total + 0.5 * jax.nn.log_sigmoid(sign * ratio)
+                for name, sign in zip(_NOISES, (2.0, -2.0), strict=True)
+            }
+        if self.robots is None:
+            return site, none
+        moved, log_jacobian = centre(self._values(site), self._support, self.robots)
+        return site | moved, log_jacobian
+
+    def potential(self, site: Sites) -> Array:
+        """See `nuts.Density`."""
+        others = {name: site[name] for name in site if name != "theta"}
+        full, log_jacobian = self.sites(site["theta"])
+        energy: Any = potential_energy(self._program, (), {}, full | others)
+        return energy - log_jacobian
+
+    def named(self, theta: Array) -> Sites:
+        """The model's parameters by name, and coefficients of sampled effects."""
+        sites, _ = self.sites(theta)
+        values = constrain_fn(self._params, (), {}, sites, return_deterministic=True)
+        names = (*self.model.dims, *(self.drift.names if self.drift else ()))
+        return {name: values[name] for name in names if name in values}
+
+    def centred(self) -> tuple["SitesInJax", Chain]:
+        """The density around the mode, and Laplace's fit there.
+
+        As the noises go to 0 around a perfect fit, a density of few data grows without bound, but
+        holds no mass: each location parameter takes a power of the noise away. That is added for
+        the search, as in REML.
+        """
+        shape = self.innovations
+        zeros = {} if shape is None else {"innovations": jnp.zeros(shape)}
+
+        def cost(density: SitesInJax, theta: Array) -> Array:
+            energy, noise = density.potential({"theta": theta, **zeros}), density._flat[1](theta)
+            total = noise.get("delta_w", jnp.zeros(()))
+            return energy - (len(theta) - 2 * total.size) * total.mean()
+
+        density: SitesInJax = self
+        mode, hessian = newton(lambda theta: cost(self, theta), self._flat[0])
+        means = (self.model.priors.beta, self.model.priors.b)
+        pooled = self.model.robot_sets == "pooled" and all(
+            prior.support is constraints.real for prior in means
+        )
+        if pooled or self.model.family.linearises:
+            values, start = self._values(self.sites(mode)[0]), mode
+            if self.model.family.linearises:
+                density = replace(density, linearisation=self._refined(values))
+            if pooled:
+                robots = fit_robots(values, self._support, density._of_robots)
+                density, start = replace(density, robots=robots), self._flat[0]
+            mode, hessian = newton(lambda theta: cost(density, theta), start)
+        return density, Chain(mode, jnp.linalg.cholesky(inverse_hessian(jnp, hessian, 0.1)))
+
+    @property
+    def _support(self) -> Any:
+        return self.model.priors.beta0.support
+
+    def _values(self, sites: Sites) -> Sites:
+        """Sites on their priors' supports."""
+        return {n: biject_to(prior.support)(sites[n]) for n, prior in self._priors.items()}
+
+    def _params(self) -> Params:
+        """Sample statements of the parameters, sampled effects in the intercept."""
+        params: Any = self.model.sample_params(*self.batch.awareness.shape[2:])
+        return params if self.drift is None else params._replace(b=params.b + self.drift(params))
+
+    def _ssm(self, params: Params) -> Any:
+        return params.ssm(self.batch.awareness, self.model.lag)  # pyright: ignore
+
+    def _at(self, values: Sites) -> Any:
+        return self._ssm(handlers.substitute(self._params, values)())  # pyright: ignore
+
+    def _refined(self, values: Sites) -> Array | None:
+        return self.model.family.refine(self._at(values), self._observed).linearisation
+
+    def _of_robots(self, values: Sites) -> Array:
+        """Log density of each robot's rates, at innovations 0."""
+        observed = self._observed
+        nothing, family = jnp.zeros_like(observed.y), self.model.family
+        return self.weight @ family.log_density(self._at(values), observed, nothing, False)  # pyright: ignore
+
+    @property
+    def _observed(self) -> Observed:
+        _, rates, ticks = self.batch
+        return Observed.of(rates, ticks, self.linearisation)  # pyright: ignore
+
+    def _program(self) -> None:
+        params, observed, shape = self._params(), self._observed, self.innovations
+        innovations = jnp.zeros_like(observed.y) if shape is None else sample_innovations(shape)
+        family = self.model.family
+        log_p = family.log_density(self._ssm(params), observed, innovations, self.complete)
+        numpyro.factor("contact_rate", log_p.sum(1) @ self.weight)  # pyright: ignore
+
+
+class SiteDraws(NamedTuple):
+    """Draws and statistics, each with leading axes (chain, draw)."""
+
+    params: dict[str, np.ndarray]
+    stats: dict[str, np.ndarray]
+    latents: Latents
+
+
+def run_nuts_of_sites(
+    settings: NutsSettings, seed: int, density: SitesInJax, watch: Watch
+) -> SiteDraws:
+    """Draw from a model's posterior; call it in a float64 scope. See `nuts.run_nuts`."""
+    density, chain = _centred(density)
+    rng = [np.random.default_rng([seed, i]) for i in range(settings.n_chains)]
+    # Overdispersed starts (1.5 Laplace sd), so that R-hat means something.
+    starts = [{"theta": jnp.asarray(1.5 * one.standard_normal(len(chain.center)))} for one in rng]
+    if (shape := density.innovations) is not None:
+        innovations = [{"innovations": jnp.asarray(one.standard_normal(shape))} for one in rng]
+        starts = [a | b for a, b in zip(starts, innovations, strict=True)]
+    z, stats = run_nuts(settings, seed, density, chain, starts, watch)
+    params = _named(density, chain, z["theta"].reshape(-1, len(chain.center)))
+    shaped = {
+        name: np.asarray(values).reshape(*z["theta"].shape[:2], *values.shape[1:])
+        for name, values in params.items()
+    }
+    return SiteDraws(shaped, stats, Latents(z.get("innovations"), density.linearisation))
+
+
+@jax.jit
+def _centred(density: SitesInJax) -> tuple[SitesInJax, Chain]:
+    return density.centred()
+
+
+@jax.jit
+def _named(density: SitesInJax, chain: Chain, x: Array) -> Sites:
+    return jax.vmap(lambda one: density.named(chain.theta(one)))(x)
+
+
+def _mean(prior: Any) -> Array:
+    """Prior mean on the real line, or 0 there if it has none, such as a Cauchy."""
+    to_support = biject_to(prior.support)
+    try:
+        mean = jnp.asarray(prior.mean, dtype=float)
+    except NotImplementedError:  # LKJCholesky: no correlation
+        return to_support.inv(jnp.eye(prior.event_shape[-1]))
+    z = to_support.inv(jnp.broadcast_to(mean, prior.shape()))
+    return jnp.where(jnp.isfinite(z), z, 0.0)
