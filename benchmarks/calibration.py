@@ -13,6 +13,7 @@ from numpyro.distributions import HalfNormal, LogNormal, Normal
 from sbc_places import Walks
 
 from trustbo.inference import sbc
+from trustbo.inference.samplers.choice import why_not_scores
 from trustbo.models import (
     CoupledTrust,
     DriftTrust,
@@ -70,6 +71,7 @@ def cases():
     yield PooledTrust(response="change"), "nuts", 200, SMALL
     yield CoupledTrust(inter_robot="ordered"), "nuts", 200, SMALL
     yield PooledTrust(place=PlaceEffect()), "nuts", 200, SMALL
+    yield PooledTrust(effects=[RobotEffect()]), "nuts", 200, SMALL
     yield PooledTrust(effects=[PlaceEffect(), RobotEffect()]), "nuts", 200, SMALL
 
 
@@ -109,6 +111,7 @@ def main():
             "shape": shape,
             "checkpoint": file,
             "max_refused": 0.05,
+            "n_draws": 400 if why_not_scores(model) is None else 1000,
             "progress": False,
         }
         seconds, result = timed(

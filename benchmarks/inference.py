@@ -32,12 +32,15 @@ from threadpoolctl import threadpool_limits
 from trustbo import Mission
 from trustbo.inference import TrustFilter, fit, sample_prior, sample_statistics
 from trustbo.inference.evidence.statistics import gather
+from trustbo.inference.samplers.choice import why_not_scores, with_warmup
 from trustbo.inference.samplers.exact import _matched, _modes, _target
-from trustbo.inference.samplers.reparam import reparametrise
-from trustbo.inference.samplers.run import draw_posterior, nuts_data
+from trustbo.inference.samplers.nuts_scores import ScoresInJax
+from trustbo.inference.samplers.nuts_sites import SitesInJax
+from trustbo.inference.samplers.run import _targets, draw_posterior
 from trustbo.inference.samplers.settings import NutsSettings
 from trustbo.inference.updating import update_statistics
 from trustbo.models import CoupledParams, CoupledTrust, HierarchicalTrust, PooledTrust, TrustParams
+from trustbo.models.backend import own_settings
 from trustbo.stacking import stack_missions
 
 N_BOUNDS, N_ROBOTS, N_FEATURES = 10, 3, 2
@@ -223,9 +226,9 @@ def pooled(quick):
     reference = unknowns(trustbo_exact(data.missions)(1000).sites)
     table = aligned(*HEADER)
     exact = measure(table, "trustbo exact, 4000 draws", trustbo_exact(data.missions), reference)
-    settings = NutsSettings(draws=100 if quick else 1000)
+    settings = with_warmup(NutsSettings(draws=100 if quick else 1000), PooledTrust())
     sampler = trustbo_nuts(PooledTrust(), data.missions, settings)
-    nuts = measure(table, "trustbo NUTS, 4 x (300 + 1000)", sampler, reference)
+    nuts = measure(table, "trustbo NUTS, 4 x (150 + 1000)", sampler, reference)
     mcmc = numpyro_pooled(table, arrays, reference, quick)
     if dynamax := peer("dynamax_blackjax", "dynamax", "blackjax"):
         sampler = dynamax.pooled(*arrays, **settings_of(500, 1000, 4, quick))
@@ -241,7 +244,7 @@ def pooled(quick):
     print_ratios([
         ("trustbo exact / best PyMC + nutpie", exact, rows.values(), 20, "warm"),
         ("trustbo exact / best numpyro MCMC", exact, mcmc, 40, "warm"),
-        ("trustbo NUTS / best numpyro MCMC", nuts, mcmc, 5, "warm"),
+        ("trustbo NUTS / best numpyro MCMC", nuts, mcmc, 20, "warm"),
         ("trustbo NUTS / best PyMC + nutpie low rank", nuts, low_rank, 2, "warm"),
     ])  # fmt: skip
 
@@ -445,24 +448,30 @@ def exact_cost(data):
 
 def gradient_row(table, model, data, quick):
     batch = stack_missions(data.missions)
-    missions = nuts_data(model, batch, np.ones(len(batch.contact_rate)))
+    weight = np.ones(len(batch.contact_rate))
     n = 20 if quick or batch.contact_rate.size > 20_000 else 200
 
     @jax.jit
-    def run(missions):
-        target = reparametrise(model, missions, complete=True)
-        potential = jax.value_and_grad(lambda theta: target.potential({"theta": theta}))
+    def run(density, theta):
+        potential = jax.value_and_grad(lambda theta: density.potential({"theta": theta}))
 
         def step(_, carry):
             theta, total = carry
             value, gradient = potential(theta)
             return theta - 1e-9 * gradient, total + value
 
-        return lax.fori_loop(0, n, step, (target.starts[0], 0.0))
+        return lax.fori_loop(0, n, step, (theta, 0.0))
 
-    with jax.enable_x64(True):
-        jax.block_until_ready(run(missions))
-        seconds = median_seconds(lambda: jax.block_until_ready(run(missions)), 5) / n
+    with own_settings():
+        if why_not_scores(model):
+            density = SitesInJax.of(model, batch, weight)
+            theta = density._flat[0]
+        else:
+            (target,) = _targets(model, batch, weight, None, None)
+            theta = np.append(0.0, np.append(-1.0, np.zeros(target.n_scores - 2)))
+            density = ScoresInJax.of(target, theta)
+        jax.block_until_ready(run(density, theta))
+        seconds = median_seconds(lambda: jax.block_until_ready(run(density, theta)), 5) / n
     name = f"{type(model).__name__}, {len(data.missions)} missions, {data.rates.shape[2]} robots"
     cells = (data.rates.size, batch.contact_rate.size, f"{1e6 * seconds:.0f}")
     table.row(name, *cells, f"{1e9 * seconds / data.rates.size:.0f}")
