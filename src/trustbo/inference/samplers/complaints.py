@@ -7,8 +7,6 @@ import numpy as np
 
 from trustbo.inference.samplers.convergence import MAX_RHAT, MIN_ESS, convergence
 
-_MAX_OFF = 0.3  # sd, of means; points of an effective number of 200 have an error of .07
-
 
 def complaints_of(params: Mapping[str, np.ndarray], stats: Mapping[str, np.ndarray]) -> list[str]:
     """Limits exceeded by the draws, parameter by parameter; empty if none."""
@@ -26,7 +24,10 @@ def complaints_of(params: Mapping[str, np.ndarray], stats: Mapping[str, np.ndarr
 
 
 def complaints_of_means(
-    params: Mapping[str, np.ndarray], at_points: Mapping[str, np.ndarray], weight: np.ndarray
+    params: Mapping[str, np.ndarray],
+    at_points: Mapping[str, np.ndarray],
+    weight: np.ndarray,
+    limit: float = 0.3,
 ) -> list[str]:
     """Parameters whose mean is far from that of weighted points; empty if there are none.
 
@@ -37,15 +38,16 @@ def complaints_of_means(
         params: Draws, each (chain, draw, ...).
         at_points: Parameters at weighted points, each (point, ...), by the same names.
         weight: Weight of each point, sum 1.
+        limit: Largest distance, in sd; points of an effective number of 200 have an error of .07.
     """
     complaints = []
     for name, values in at_points.items():
         mean = np.tensordot(weight, values, 1)
         sd = np.sqrt(np.tensordot(weight, (values - mean) ** 2, 1))
         off = np.max(np.abs(params[name].mean((0, 1)) - mean) / np.maximum(sd, 1e-12))
-        if not off <= _MAX_OFF:
+        if not off <= limit:
             complaints.append(
-                f"the mean of {name} is {off:.2f} sd from that of importance sampling (limit "
-                f"{_MAX_OFF})"
+                f"the mean of {name} is {off:.2f} sd from that of importance sampling "
+                f"(limit {limit})"
             )
     return complaints

@@ -107,8 +107,9 @@ def draw_posterior(
             warnings.warn(f"the exact sampler's {failure}; NUTS is used instead.", stacklevel=4)
     if slots is not None or why_not_scores(model) is None:
         targets = _targets(model, batch, weight, places, slots)
+        reference = _draws_by_sums(model, settings, seed, batch, weight) if check else {}
         draws, complaints = _sample_nuts_of_scores(
-            model, settings, seed, targets, watch, check=check
+            model, settings, seed, targets, reference, watch, check=check
         )
     else:
         chains = None if places is None else Slots.of(batch, len(weight), (), weight, places)
@@ -279,11 +280,15 @@ def _sample_nuts_of_scores(
     settings: NutsSettings,
     seed: int,
     targets: Sequence[Any],
+    reference: Mapping[str, np.ndarray],
     watch: Watch,
     *,
     check: bool,
 ) -> tuple[Draws, list[str]]:
-    """Draws of scores by NUTS, of all else given them by the evidence; see `_sample_nuts`."""
+    """Draws of scores by NUTS, of all else given them by the evidence; see `_sample_nuts`.
+
+    `reference` are draws (draw, ...) that means are compared with, where there are some.
+    """
 
     def attempt(tried: NutsSettings, retries: int) -> tuple[Draws, list[str]]:
         first = seed + _RETRY * retries
@@ -296,12 +301,32 @@ def _sample_nuts_of_scores(
             for name, values in drawn[0].params.items()
         }
         complaints = [moved for one in drawn for moved in one.moved]
+        if reference:
+            n = len(reference["beta0"])
+            complaints = complaints_of_means(params, reference, np.full(n, 1.0 / n), 0.15)
         complaints = [*complaints_of(params, stats), *complaints] if check else []
         places, effects = _pop_effects(model, params)
         summary, stats = {"retries": retries}, _with_tree_depth(stats)
         return Draws(params, stats, summary, "nuts", places=places, effects=effects), complaints
 
     return _retried(attempt, settings, watch)
+
+
+def _draws_by_sums(
+    model: TrustModel,
+    settings: NutsSettings,
+    seed: int,
+    batch: MissionBatch,
+    weight: np.ndarray,
+) -> dict[str, np.ndarray]:
+    """Draws (draw, ...) of the exact sampler by sums, which seeks all modes; none if it fails."""
+    if not by_sums(model):
+        return {}
+    try:
+        exact = _sample_exact(model, settings, seed, batch, weight)
+    except UnevenWeightsError:
+        return {}
+    return {name: values.reshape(-1, *values.shape[2:]) for name, values in exact.params.items()}
 
 
 class _OfRobots(NamedTuple):
