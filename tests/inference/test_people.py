@@ -183,7 +183,7 @@ def test_a_person_left_out_is_an_integral_over_the_person_s_own_part(persons, po
     evidence = evidence_of(model, slots)
     evidence.recentre({name: values[:1] for name, values in theta.items()})
     shared = model.weights_of(sites["beta"], sites["b"])
-    _, found = evidence.given(theta, shared, np.random.default_rng(0), 400)
+    _, found, _ = evidence.given(theta, shared, np.random.default_rng(0), 400)
     kept = posterior["log_likelihood"]["contact_rate"].values[0, :5, :3]
     # Eight particles a person, 400 here: a few hundredths of a nat.
     assert np.abs(found - kept).max() < 0.25

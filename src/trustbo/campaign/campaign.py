@@ -32,6 +32,7 @@ from trustbo.errors import TrustboError, require_kind, require_whole
 from trustbo.files import FilePath, as_path, interpreting
 from trustbo.hazard.exposures import CAUSES
 from trustbo.hazard.risk import BoundRisk
+from trustbo.logs.reports import scale_of
 from trustbo.models.backend import VERSIONS
 from trustbo.models.model import TrustModel
 from trustbo.models.params import Params
@@ -276,11 +277,14 @@ class Campaign(Displayed):
         Raises:
             ShapeError: Robots or features differ from the workspace's.
             TrustboError: The path leaves the grid, jumps or is not the one asked for; the mission
-                was recorded before; or an extra is no number. Nothing is stored then.
+                was recorded before; its reports are on another scale than those before; or an
+                extra is no number. Nothing is stored then.
         """
         earlier = [] if again else [e.measured for e in self.state.entries if e.state != SET_ASIDE]
         asked = self.ask().path
         mission = require_mission(mission, self.workspace, asked, earlier, other_path=other_path)
+        if mission.reports is not None:
+            scale_of([*self.state.measured, mission])
         self._take(mission, require_extra(extra))
         return self.state.last_tree
 

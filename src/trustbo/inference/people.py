@@ -55,15 +55,15 @@ def groups_of_people(
     model, batch = model_of_people(posterior), stack_missions(missions, pad=False)
     seed, n_chains = posterior.attrs["seed"], posterior["posterior"].sizes["chain"]
     rng, sites = np.random.default_rng([seed, 1]), sites_of(posterior)
-    theta, c = _draws(model, sites)
+    theta, c = draws_of(model, sites)
     slots = every_slot(model, batch)  # every bound has trust, with a report or without
-    evidence = evidence_of(model, slots, every=True)
+    evidence = evidence_of(model, slots, np.ones(slots.y.shape, dtype=bool))
     evidence.recentre({name: values.mean(0, keepdims=True) for name, values in theta.items()})
     points = np.column_stack([*theta.values(), c])
     _, first, index = np.unique(points, axis=0, return_index=True, return_inverse=True)
     index = index.ravel()  # resampled draws repeat: each is evaluated once
     some = {name: values[first] for name, values in theta.items()}
-    x, log_likelihood = evidence.given(some, c[first], rng, _PARTICLES)
+    x, log_likelihood, _ = evidence.given(some, c[first], rng, _PARTICLES)
     chain, k = evidence.at
     n_missions, n_bounds, n_robots = batch.contact_rate.shape
     trust = np.full((len(x), n_missions, n_bounds, n_robots), np.nan)
@@ -106,7 +106,7 @@ def draw_people(
     model: HumanTrust, slots: Slots, sites: Mapping[str, np.ndarray], rng: np.random.Generator
 ) -> dict[str, np.ndarray]:
     """Persons' own parts (draw, mission, part) and reports, under draws of the prior by name."""
-    theta, c = _draws(model, sites)
+    theta, c = draws_of(model, sites)
     sds = model.effect.group(slots).sds(theta)
     own = sds[:, None] * rng.standard_normal((len(c), slots.n_missions, sds.shape[1]))
     own[:, :, 1] /= theta["rest"][:, None]
@@ -204,8 +204,8 @@ def predict_reports(
             "missions of the same."
         )
     slots = every_slot(model, batch)
-    evidence = evidence_of(model, slots, every=True)
-    theta, c = _draws(model, sites_of(posterior))
+    evidence = evidence_of(model, slots, np.ones(slots.y.shape, dtype=bool))
+    theta, c = draws_of(model, sites_of(posterior))
     n = require_whole("n_draws", n_draws, 1)
     n = max(1, n // _ALIKE) if fitted else n
     some = np.unique(np.linspace(0, len(c) - 1, n).astype(int))
@@ -358,7 +358,7 @@ def _dataset(
     return xr.Dataset(variables, coords, attrs)
 
 
-def _draws(model: HumanTrust, sites: Mapping[str, np.ndarray]) -> tuple[Theta, np.ndarray]:
+def draws_of(model: HumanTrust, sites: Mapping[str, np.ndarray]) -> tuple[Theta, np.ndarray]:
     """Hyperparameters and shared coefficients of draws by name."""
     theta = theta_of(sites, model.memory)
     names = ("beta0", "delta_w", "delta_v", "rest", *model.effect.names, *model.levels.names)

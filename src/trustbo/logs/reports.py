@@ -5,21 +5,23 @@ in [0, 1]. Inputs of a step become features: what the person saw since the repor
 """
 
 import math
-import re
 from collections.abc import Mapping, Sequence
 from os import PathLike
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from trustbo.answers import levels_of, report_of
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
 from trustbo.logs.rows import columns_of, number_of
+from trustbo.stacking import require_same_team
 
 _YES = {"1", "1.0", "true", "yes", "success", "succeeded", "ok"}
 _NO = {"0", "0.0", "false", "no", "failure", "failed", "fail"}
-_SCALE = re.compile(r"(likert|ordinal)(\d+)")
 _TASK = "report"
+OUTCOMES = ("success", "failure")
+"""Features of what a robot did."""
 
 
 class _Row(NamedTuple):
@@ -76,7 +78,7 @@ def read_reports(
             scale, a person without reports, or no outcome and no input at all.
     """
     columns = columns_of(table)
-    levels = _levels(scale)
+    levels = levels_of(scale)
     named = {"person": person, "step": step, "report": report}
     named |= {"outcome": outcome, "demand": demand, "task": task}
     wanted = [name for name in (*named.values(), *inputs) if name is not None]
@@ -116,6 +118,69 @@ def read_reports(
     return [
         _mission(who, steps, tuple(tasks), named, inputs, levels) for who, steps in people.items()
     ]
+
+
+def reports_of(missions: Sequence[Mission]) -> dict[tuple[str, str], Mission]:
+    """Reports of trust in the robots of a campaign, as those of persons.
+
+    Trust in a robot has its inputs from what the robot did: after each bound, `success` is its
+    contact rate, and `failure` the rest of 1. A rate that was not measured was not shown either:
+    both are 0, as in the step before each mission. Missions continue each other, so that a report
+    bears on all that came before. A mission without reports was seen by the person of the one
+    before it, those at the beginning by the first person.
+
+    Args:
+        missions: Missions of one team, in order, see `Mission.with_reports`.
+
+    Returns:
+        A mission without a map for each person and robot, for `fit` with `HumanTrust`.
+
+    Raises:
+        TrustboError: No mission has reports, or they are on different scales.
+    """
+    require_same_team(missions)
+    levels, who = levels_of(scale_of(missions)), _persons(missions)
+    found = {}
+    for person in dict.fromkeys(who):
+        seen = [m for m, name in zip(missions, who, strict=True) if name == person]
+        y = np.concatenate([_answered(mission) for mission in seen])
+        rates = [np.pad(m.contact_rate, ((1, 0), (0, 0)), constant_values=np.nan) for m in seen]
+        rate = np.concatenate(rates)
+        z = np.nan_to_num(np.stack([rate, 1.0 - rate], axis=-1))
+        ticks = np.full((len(y), 1), levels - 1.0 if levels else np.nan)
+        for i, robot in enumerate(missions[0].robots):
+            found[person, robot] = Mission.from_arrays(
+                None, z[:, [i]], y[:, [i]], n_ticks=ticks, features=OUTCOMES, robots=(_TASK,)
+            )
+    return found
+
+
+def scale_of(missions: Sequence[Mission]) -> str:
+    """Scale of the reports of missions; TrustboError: there are none, or on several scales."""
+    scales = dict.fromkeys(m.reports.scale for m in missions if m.reports is not None)
+    if not scales:
+        raise TrustboError(
+            "no mission has reports of trust; give them by mission.with_reports(answers)."
+        )
+    if len(scales) > 1:
+        raise TrustboError(f"reports are on one scale; got {', '.join(scales)}.")
+    return next(iter(scales))
+
+
+def _persons(missions: Sequence[Mission]) -> list[str]:
+    """Person who saw each mission."""
+    last = next(m.reports.person for m in missions if m.reports is not None)
+    who = []
+    for mission in missions:
+        last = last if mission.reports is None else mission.reports.person
+        who.append(last)
+    return who
+
+
+def _answered(mission: Mission) -> np.ndarray:
+    if mission.reports is not None:
+        return mission.reports.values
+    return np.full((len(mission.bounds) + 1, len(mission.robots)), np.nan)
 
 
 def read_azevedo_sa(file: str | PathLike[str]) -> list[Mission]:
@@ -277,7 +342,7 @@ def _mission(
     levels: int,
 ) -> Mission:
     features = [f"task_{name}" for name in tasks] if named["task"] else []
-    features += ["success", "failure"] if named["outcome"] else []
+    features += OUTCOMES if named["outcome"] else []
     features += ["success_demand", "failure_demand"] if named["demand"] else []
     features += inputs
     z = np.zeros((len(steps), len(tasks), len(features)))
@@ -309,34 +374,9 @@ def _made(
         raise TrustboError(f"{who}: {error}") from None
 
 
-def _levels(scale: str) -> int:
-    """Number of levels of a scale, 0 for unit."""
-    if scale == "unit":
-        return 0
-    found = _SCALE.fullmatch(scale) if isinstance(scale, str) else None
-    if found is None or int(found[2]) < 2:
-        raise TrustboError(
-            f'scale must be "unit" or such as "likert7", with the number of levels; got {scale!r}.'
-        )
-    return int(found[2])
-
-
 def _report(where: str, name: str, text: str, levels: int) -> float:
     """Report in [0, 1]."""
-    value = number_of(where, name, text)
-    if math.isnan(value):
-        return value
-    if not levels:
-        if 0.0 <= value <= 1.0:
-            return value
-        remedy = (
-            'give its scale, such as scale="likert7"' if 1 < value <= 11 else "divide it by 100"
-        )
-        hint = f"; {remedy}" if value > 0.0 else ""
-        raise TrustboError(f"{where}: {name} = {text} is outside [0, 1]{hint}.")
-    if not (value.is_integer() and 1 <= value <= levels):
-        raise TrustboError(f"{where}: {name} = {text} is no whole number from 1 to {levels}.")
-    return (value - 1.0) / (levels - 1.0)
+    return report_of(f"{where}: {name}", number_of(where, name, text), levels)
 
 
 def _outcome(where: str, name: str, text: str) -> tuple[float, float]:

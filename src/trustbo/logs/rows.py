@@ -15,8 +15,9 @@ from trustbo.spreadsheet import meant
 from trustbo.workspace.grid import Grid
 
 KEYS = ("mission", "bound", "robot", "row", "col")
-NUMBERS = ("contact_rate", "contact_time", "duration", "n_ticks", "t0")
-COLUMNS = (*KEYS, *NUMBERS, "status", "mission_status")
+NUMBERS = ("contact_rate", "contact_time", "duration", "n_ticks", "t0", "report")
+TEXTS = ("status", "mission_status", "report_by", "report_scale")
+COLUMNS = (*KEYS, *NUMBERS, *TEXTS)
 """Columns with a fixed meaning; any other is an awareness feature."""
 POSITIONS = (("row", "col"), ("x", "y"), ("lon", "lat"))
 """Pairs of columns with the cell, or with a position in it."""
@@ -36,7 +37,7 @@ class Row(NamedTuple):
     mission: str
     bound: int
     robot: str
-    """Name of the robot; empty if blank, as both statuses are."""
+    """Name of the robot; empty if blank, as all texts are."""
     cell: Cell
     numbers: dict[str, float]
     """Values by column of `NUMBERS`; NaN if blank or absent."""
@@ -44,6 +45,8 @@ class Row(NamedTuple):
     """Awareness by feature; NaN if blank."""
     status: str
     mission_status: str
+    report_by: str
+    report_scale: str
 
     @property
     def is_blank(self) -> bool:
@@ -165,8 +168,8 @@ def _parse(
         row, col = (_whole(line, name, text[name]) for name in place)
     else:
         row, col = _cell_at(line, place, [text[name] for name in place], grid)
-    names = (text["status"], text["mission_status"])
-    return Row(line, text["mission"], bound, text["robot"], (row, col), numbers, awareness, *names)
+    texts = (text[name] for name in TEXTS)
+    return Row(line, text["mission"], bound, text["robot"], (row, col), numbers, awareness, *texts)
 
 
 def _cell_at(line: int, place: Sequence[str], texts: Sequence[str], grid: Grid) -> Cell:

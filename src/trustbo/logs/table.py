@@ -8,9 +8,10 @@
 | `row`, `col` | no, or `x`, `y`, or `lon`, `lat` | cell of the bound, or a position in it |
 | `contact_rate` | yes, or `contact_time` and `duration` (s) | in [0, 1] |
 | `duration`, `t0` (s), `n_ticks`, `status`, `mission_status` | no | |
+| `report`, `report_by`, `report_scale` | no | trust in the robot that a person reported after the bound (0: before the mission), on the scale |
 | any other | no | awareness feature, in [0, 1] |
 
-A table without places is of a log without a map: bounds are from 1, features of any values. A blank
+A table without places is of a log without a map: features are of any values. A blank
 means "not measured". Bounds after the last one with a measurement were planned, not run. A feature
 with the name of one of these columns takes the prefix `awareness_`, e.g.
 `awareness_status`; so does `exposure`, which was the name of `n_ticks` in version 0.1 and is still
@@ -23,6 +24,7 @@ from typing import Any
 
 import numpy as np
 
+from trustbo.answers import PERSON, Reports
 from trustbo.data import NOWHERE, Bound, Cell, Mission
 from trustbo.errors import TrustboError, require_pair
 from trustbo.files import FilePath, write_text
@@ -30,6 +32,8 @@ from trustbo.logs.rows import KEYS, Row, column_of, features_of, parse_rows, rea
 from trustbo.spreadsheet import rows_as_csv
 from trustbo.stacking import require_same_team
 from trustbo.workspace import Workspace
+
+_REPORTED = ("report", "report_by", "report_scale")
 
 
 def read_table(
@@ -101,16 +105,18 @@ def write_table(missions: Sequence[Mission], path: FilePath) -> None:
     require_same_team(missions)
     features = [column_of(name) for name in missions[0].features]
     measured = ["contact_rate", "duration", "n_ticks", "t0", "status", "mission_status", *features]
+    reported = any(mission.reports is not None for mission in missions)
     mapped = [mission.has_map for mission in missions]
     if any(mapped) and not all(mapped):
         raise TrustboError(
             f"mission {mapped.index(False)} has no path, and others have; write these apart."
         )
-    lines: list[list[object]] = [[*(KEYS if all(mapped) else KEYS[:3]), *measured]]
+    keys = KEYS if all(mapped) else KEYS[:3]
+    lines: list[list[object]] = [[*keys, *measured, *(_REPORTED if reported else ())]]
     for j, mission in enumerate(missions):
         steps = mission.path or [()] * (len(mission.bounds) + 1)
         for k, cell in enumerate(steps):
-            if not k and not mission.has_map:
+            if not k and not mission.has_map and mission.reports is None:
                 continue
             bound = mission.bounds[k - 1] if 1 <= k <= len(mission.bounds) else None
             for i, robot in enumerate(mission.robots):
@@ -120,8 +126,17 @@ def write_table(missions: Sequence[Mission], path: FilePath) -> None:
                     cells = [*map(_text, rates), bound.status, mission.status]
                     cells += map(_text, bound.awareness[i])
                 lines.append([j, k, robot, *cell, *cells])
+                if reported:
+                    lines[-1] += _answer(mission.reports, k, i)
 
     write_text(path, rows_as_csv(lines))
+
+
+def _answer(reports: Reports | None, k: int, i: int) -> list[object]:
+    """Report after bound k about robot i, its person and its scale, as cells of a table."""
+    if reports is None or k >= len(reports.values):
+        return [""] * len(_REPORTED)
+    return [_text(reports.answers[k, i]), reports.person, reports.scale]
 
 
 def _mission(
@@ -152,9 +167,30 @@ def _mission(
     statuses = [row.mission_status for robots in rows.values() for row in robots.values()]
     status = _agreed(f"mission {label}", "mission_status", statuses) or bounds[-1].status
     try:
-        return Mission(cells, tuple(bounds), status, features, team)
+        reports = _reports(f"mission {label}", rows, team, len(bounds))
+        return Mission(cells, tuple(bounds), status, features, team, reports=reports)
     except TrustboError as error:
         raise TrustboError(f"mission {label}: {error}") from None
+
+
+def _reports(
+    where: str, rows: dict[int, dict[str, Row]], team: tuple[str, ...], n_bounds: int
+) -> Reports | None:
+    """Reports of trust in the rows of a mission; None where there are none."""
+    every = [row for of_bound in rows.values() for row in of_bound.values()]
+    person, scale = (
+        _agreed(where, name, [getattr(row, name) for row in every])
+        for name in ("report_by", "report_scale")
+    )
+    answers = np.array(
+        [
+            [rows[k][n].numbers["report"] if n in rows.get(k, ()) else math.nan for n in team]
+            for k in range(n_bounds + 1)
+        ]
+    )
+    if np.isnan(answers).all() and not person:
+        return None
+    return Reports.of(answers, team, n_bounds, person or PERSON, scale or "unit")
 
 
 def _cells(label: str, rows: dict[int, dict[str, Row]], start: Cell | None) -> tuple[Cell, ...]:

@@ -1,16 +1,15 @@
 """Scales on which people report trust: intervals of trust plus noise, or numbers."""
 
-import re
 from collections.abc import Mapping
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 from scipy import special
 
+from trustbo.answers import levels_of
 from trustbo.errors import TrustboError, require_whole
 from trustbo.models.families.terms import GAUSSIAN, INTERVAL, NONE
 
-_NAMED = re.compile(r"(likert|ordinal)(\d*)")
 _SPREAD = 0.5  # sd of the log width of a level, relative to the others
 _NORMAL = np.ones((1, 2))
 _LOGISTIC = np.array(
@@ -33,20 +32,12 @@ class Scale(NamedTuple):
 
     @classmethod
     def named(cls, name: object) -> Self:
-        """Scale "unit", "likert7" or "ordinal7", with any number of levels from 2 (3 if ordinal).
+        """Scale "unit", "likert7" or "ordinal7", with any number of levels from 2 (4 if ordinal).
 
         TrustboError: the name is none of these.
         """
-        found = _NAMED.fullmatch(name) if isinstance(name, str) else None
-        if name != "unit" and found is None:
-            raise TrustboError(
-                f'scale must be "unit", "likert7" or "ordinal7", the number being that of levels; '
-                f"got {name!r}."
-            )
-        if found is None:
-            return cls()
-        free = found[1] == "ordinal"
-        return cls(require_whole("levels of a scale", int(found[2] or 7), 4 if free else 2), free)
+        levels, free = levels_of(name), str(name).startswith("ordinal")
+        return cls(require_whole("levels of an ordinal scale", levels, 4) if free else levels, free)
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -95,6 +95,8 @@ def _sections(result: Result) -> Iterator[Section]:
             "Where contact is better or worse than the terrain says, and how sure we are.",
             [figures.places(result)],
         )
+    if any(mission.reports for mission in result.missions):
+        yield Section("reported", "Reported trust", "", [tables.reports_table(result)])
     if result.planner.problem.risk is not None:
         yield Section(
             "hazard",

@@ -36,6 +36,8 @@ def facts_of(result: Result, plan: Plan | None = None) -> list[Fact]:
     The `plan` is that of the result; a running campaign passes it, and has no time for changes.
     """
     changes = [_changes(result), _memory(result)] if plan is None else []
+    if plan is None and any(mission.reports for mission in result.missions):
+        changes.append(_reported(result))
     plan = result.plan if plan is None else plan
     return [
         Fact("The campaign", f"{_where(result)} {_missions(result)}"),
@@ -166,6 +168,22 @@ def _memory(result: Result) -> Fact:
     except TrustboError as error:
         return Fact("Memory", f"Not weighed: {error}")
     return Fact("Memory", f"{finding[0].upper()}{finding[1:]}.")
+
+
+def _reported(result: Result) -> Fact:
+    """State how contact moves the trust that persons report."""
+    beta = result.reported["posterior"]["beta"]
+    gains = [beta[..., m].values for m in range(2)]
+    low, middle, high = np.quantile(gains[0] - gains[1], (0.05, 0.5, 0.95))
+    given = [mission.reports for mission in result.missions if mission.reports]
+    n = int(sum(np.isfinite(reports.values).sum() for reports in given))
+    people = joined(list(dict.fromkeys(reports.person for reports in given)))
+    return Fact(
+        "Reported trust",
+        f"{counted(n, 'report')} by {people}. A bound of full contact raises reported trust by "
+        f"{number(middle)} ({number(low)} to {number(high)}) over one without, on a scale from 0 "
+        "to 1.",
+    )
 
 
 def _end(result: Result) -> str:

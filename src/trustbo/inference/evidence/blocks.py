@@ -76,7 +76,7 @@ class Blocks:
         x0: tuple[float, float],
         lasting: tuple[np.ndarray, np.ndarray],
         *,
-        every: bool = False,
+        asked: np.ndarray | None = None,
     ) -> None:
         """Lay out the rows of all missions.
 
@@ -87,12 +87,13 @@ class Blocks:
             scale: Scale of the reports.
             x0: Mean and sd of trust before the first bound.
             lasting: Masks of the shared columns and of the own ones that beta0 carries on.
-            every: Whether bounds without a report are rows too, for draws of their trust.
+            asked: Mask (chain, bound) of bounds that are rows without a report too, for draws of
+                their trust.
         """
         self.slots, self.shared, self.own, self.scale = slots, shared, own, scale
         self.x0 = np.array(x0, dtype=float)
         self.lasting = tuple(np.array(mask, dtype=float) for mask in lasting)
-        self.rows, self.index, self.at = _rows(slots, shared, own, scale, every=every)
+        self.rows, self.index, self.at = _rows(slots, shared, own, scale, asked)
         self.exact = not (self.rows.kind == INTERVAL).any()
         self.sites = np.zeros((2, len(self.rows.y)))
         self._guess()
@@ -141,8 +142,8 @@ class Blocks:
 
     def given(
         self, theta: Theta, c: np.ndarray, rng: np.random.Generator, n_particles: int
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Trust and likelihoods under draws of theta and of the shared coefficients.
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Trust, likelihoods and own effects under draws of theta and of shared coefficients.
 
         Args:
             theta: Hyperparameters, each (draw,).
@@ -151,14 +152,17 @@ class Blocks:
             n_particles: Number of particles of a block.
 
         Returns:
-            One draw of trust given all reports (draw, row), and the log likelihood of each mission,
-            the person's effects integrated out too, (draw, mission).
+            One draw of trust given all reports (draw, row); the log likelihood of each mission, the
+            person's effects integrated out too, (draw, mission); and a draw of these effects given
+            that trust, (draw, mission, own column).
         """
         count = np.ones(len(c), dtype=int)
-        x, log_block, _, _ = self._run(theta, count, c.copy(), rng, n_particles=n_particles, nu=0.0)
+        x, log_block, own, _ = self._run(
+            theta, count, c.copy(), rng, n_particles=n_particles, nu=0.0
+        )
         out = np.zeros((len(c), self.slots.n_missions))
         out[:, self.index] = log_block
-        return x, out
+        return x, out, own
 
     def _run(
         self,
@@ -234,24 +238,21 @@ class _Given(NamedTuple):
 
 
 def _rows(
-    slots: Slots, shared: Group, own: PersonColumns, scale: Scale, *, every: bool
+    slots: Slots, shared: Group, own: PersonColumns, scale: Scale, asked: np.ndarray | None
 ) -> tuple[Rows, np.ndarray, np.ndarray]:
     """Rows of the blocks, the mission of each block, and chain and bound of each row."""
-    K = slots.y.shape[1]
     U = shared.columns.toarray().reshape(*slots.y.shape, -1)
     n_ticks = np.full(slots.y.shape, np.nan) if slots.n_ticks is None else slots.n_ticks
     kind, case = scale.terms(slots.y, n_ticks)
+    kept = kind != NONE if asked is None else asked | (kind != NONE)
     missions = np.unique(slots.mission)
     of_bounds: list[tuple[Any, ...]] = []
     start, step, n_rows = [0], [0], 0
     for j in missions:
         for chain in np.flatnonzero(slots.mission == j):
-            seen = np.flatnonzero(kind[chain] != NONE)
-            length = K if every else int(seen[-1]) + 1
-            for k in range(length):
-                kept = every or kind[chain, k] != NONE
-                of_bounds.append((chain, k, n_rows if kept else -1))
-                n_rows += kept
+            for k in range(int(np.flatnonzero(kept[chain])[-1]) + 1):
+                of_bounds.append((chain, k, n_rows if kept[chain, k] else -1))
+                n_rows += kept[chain, k]
         start.append(n_rows)
         step.append(len(of_bounds))
     chain, k, row = np.array(of_bounds, dtype=int).T

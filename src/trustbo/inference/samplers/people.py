@@ -37,10 +37,10 @@ class PeoplePosterior(Posterior):
             self.n_corrected = 1000
 
 
-def evidence_of(model: HumanTrust, slots: Slots, *, every: bool = False) -> Blocks:
-    """Evidence of a model, `every` bound being a row where trust is drawn at each."""
+def evidence_of(model: HumanTrust, slots: Slots, asked: np.ndarray | None = None) -> Blocks:
+    """Evidence of a model; see `Blocks` for the bounds that are `asked` about."""
     x0 = float(model.priors.x0_mean), float(model.priors.x0_sd)
     return Blocks(
         slots, model.shared(slots), model.effect.group(slots), model.levels, x0, model.lasting,
-        every=every,
+        asked=asked,
     )  # fmt: skip

@@ -75,11 +75,11 @@ class PersonEffect(Effect):
         values[:, 0, 0] = 1.0
         if self.own:
             values[:, :, 1] = 1.0
-            gains = self._gains(slots.z)
+            gains = self.gains(slots.z)
             values[:, :, 2:] = gains
         return PersonColumns(values, slots.mission, slots.n_missions, self)
 
-    def _gains(self, z: np.ndarray) -> np.ndarray:
+    def gains(self, z: np.ndarray) -> np.ndarray:
         """Inputs of the two gains (..., 2) of features (..., feature)."""
         none = np.zeros(z.shape[:-1])
         success = z[..., self.success] if self.success >= 0 else none
