@@ -87,8 +87,9 @@ class Reports:
         n, full = len(robots), np.full((1 + n_bounds, len(robots)), np.nan)
         if given.shape not in ((n,), (n_bounds, n), full.shape):
             raise ShapeError(
-                f"reports must be ({n},), of each robot after the mission, ({n_bounds}, {n}), after "
-                f"each bound, or ({n_bounds + 1}, {n}), before the first too; got {given.shape}."
+                f"reports must be ({n},), of each robot after the mission, ({n_bounds}, {n}), "
+                f"after each bound, or ({n_bounds + 1}, {n}), before the first too; got "
+                f"{given.shape}."
             )
         rows = full[len(full) - len(np.atleast_2d(given)) :]
         for (k, i), answer in np.ndenumerate(np.atleast_2d(given)):

@@ -160,23 +160,7 @@ class Mission(Displayed):
 
     def __post_init__(self) -> None:
         require_choice("status", self.status, STATUSES)
-        if not self.path:
-            self._require_no_map()
-        elif not self.bounds or len(self.bounds) > len(self.path) - 1:
-            raise ShapeError(
-                f"a path of {len(self.path)} cells has {len(self.path) - 1} bounds, and a mission "
-                f"at least one; got {len(self.bounds)}."
-            )
-        if self.path and self.status == "ok" and len(self.bounds) < len(self.path) - 1:
-            raise ShapeError(
-                f'status "ok" says the goal was reached, but only {len(self.bounds)} of '
-                f"{len(self.path) - 1} bounds were run; give the status it ended with."
-            )
-        for k, bound in enumerate(self.bounds if self.path else (), start=1):
-            if bound.cell != self.path[k]:
-                raise ShapeError(
-                    f"bound {k} enters {bound.cell}, but the path has {self.path[k]} there."
-                )
+        (self._require_path if self.path else self._require_no_map)()
         shapes = {bound.awareness.shape for bound in self.bounds}
         if len(shapes) != 1:
             raise ShapeError(f"bounds disagree on (robot, feature): {sorted(shapes)}.")
@@ -198,6 +182,24 @@ class Mission(Displayed):
                 raise ShapeError(
                     f"reports must be {shape}, (1 + bound, robot); got "
                     f"{self.reports.values.shape}. Make them by mission.with_reports."
+                )
+
+    def _require_path(self) -> None:
+        """Refuse bounds that do not fit the path."""
+        if not self.bounds or len(self.bounds) > len(self.path) - 1:
+            raise ShapeError(
+                f"a path of {len(self.path)} cells has {len(self.path) - 1} bounds, and a mission "
+                f"at least one; got {len(self.bounds)}."
+            )
+        if self.status == "ok" and len(self.bounds) < len(self.path) - 1:
+            raise ShapeError(
+                f'status "ok" says the goal was reached, but only {len(self.bounds)} of '
+                f"{len(self.path) - 1} bounds were run; give the status it ended with."
+            )
+        for k, bound in enumerate(self.bounds, start=1):
+            if bound.cell != self.path[k]:
+                raise ShapeError(
+                    f"bound {k} enters {bound.cell}, but the path has {self.path[k]} there."
                 )
 
     def _require_no_map(self) -> None:

@@ -608,3 +608,25 @@ def test_a_long_campaign_keeps_the_parameters_alone(workspace, tmp_path):
     again = tb.inference.complete(result.posteriors[1], result.missions[:2])
     direct = fit(result.missions[:2], sampler="exact", seed=int(result.posteriors[1].attrs["seed"]))
     np.testing.assert_array_equal(again["latent"]["trust"], direct["latent"]["trust"])
+
+
+def test_reports_of_trust_are_kept_and_expected_along_the_recommended_path(workspace, tmp_path):
+    with begin(workspace, tmp_path) as campaign:
+        for seed, answer in enumerate((4, 5, 6)):
+            mission = rates(workspace, campaign.ask().path, seed)
+            campaign.tell(mission.with_reports({"r1": answer}, person="ann", scale="likert7"))
+        other = rates(workspace, campaign.ask().path, 7).with_reports([0.5, 0.5, 0.5])
+        with pytest.raises(tb.errors.TrustboError, match="reports are on one scale; got likert7"):
+            campaign.tell(other)
+        assert len(campaign.missions) == 3
+    result = tb.load_result(tmp_path)
+    assert [m.reports.answers[-1, 0] for m in result.missions] == [4.0, 5.0, 6.0]
+    assert tb.Campaign.load(tmp_path).state.measured[1].reports.person == "ann"
+    found = result.expected_reports
+    assert found["mean"].sizes == {"person": 1, "bound": len(result.path), "robot": 3}
+    assert result.reported.attrs["model"] == "HumanTrust"
+    from trustbo.report.summary import _reported
+    from trustbo.report.tables import reports_table
+
+    assert [row[2] for row in reports_table(result).rows] == ["0.833", "\N{EN DASH}", "\N{EN DASH}"]
+    assert "3 reports by ann." in _reported(result).text

@@ -44,6 +44,16 @@ def test_markers_statuses_awareness_and_poses_are_read():
     assert READER.read('{"pose": {"lead": [1, 2.5]}}').places == {"lead": (1.0, 2.5)}
 
 
+def test_reports_are_on_the_scale_of_the_campaign():
+    report = READER.read('{"report": {"r2": 0.5, "r1": null}, "person": "ann"}')
+    np.testing.assert_array_equal(report.values, [np.nan, 0.5, np.nan])
+    assert report.person == "ann"
+    levels = Reader(("r1",), ("a",), levels=7)
+    assert levels.read('{"report": [4]}').values == 0.5
+    with pytest.raises(TrustboError, match="report about r1 = 0 is no whole number from 1 to 7"):
+        levels.read('{"report": [0]}')
+
+
 @pytest.mark.parametrize(
     ("line", "reason"),
     [
@@ -71,6 +81,10 @@ def test_markers_statuses_awareness_and_poses_are_read():
         ('{"awareness": {"r1": [2, 0]}}', r"awareness of r1: 2 is outside \[0, 1\]"),
         ('{"awareness": {"r1": {"c": 0}}}', "unknown feature 'c'"),
         ('{"pose": {"r9": [0, 0]}}', "unknown robot 'r9'"),
+        ('{"report": {"r1": 7}}', r"report about r1 = 7 is outside \[0, 1\]"),
+        ('{"report": {"r9": 0.5}}', "unknown robot 'r9'"),
+        ('{"report": {"r1": true}}', "report must be a number; got True"),
+        ('{"report": {"r1": 0.5}, "person": ""}', "person is a name"),
         ('{"pose": {"r1": [0, 0, 0]}}', "pose must be a list of 2 values"),
         ('{"pose": {"r1": [0, true]}}', "pose must be a number"),
     ],

@@ -319,3 +319,23 @@ def test_what_cannot_be_opened_is_named(folder, tmp_path):
         Live(folder)
     with tb.Campaign.load(folder) as campaign:  # it was not left locked
         assert len(campaign.missions) == 1
+
+
+def test_reports_are_in_the_journal_then_in_the_mission_and_stay_after_a_kill(folder, tmp_path):
+    with Live(folder) as live:
+        live.tell('{"report": {"r1": 0.5}, "person": "ann"}')
+        live.tell('{"bound": 1}')
+        live.tell('{"report": {"r1": 0.75, "r3": 0.25}, "person": "ann"}')
+        journal = (folder / FOLDER / "0002.jsonl").read_text().splitlines()
+        assert json.loads(journal[-1]) == {
+            "event": "report", "values": [0.75, None, 0.25], "person": "ann",
+        }  # fmt: skip
+        shutil.copytree(folder, tmp_path / "killed")
+        assert live.state()["reports"] == [[0.5, None, None], [0.75, None, 0.25]]
+        live.tell('{"contact": [1, 1, 1]}')
+        live.tell('{"status": "stuck"}')
+        told = live.campaign.state.measured[-1].reports
+        assert (told.person, told.scale) == ("ann", "unit")
+        np.testing.assert_array_equal(told.values[1], [0.75, np.nan, 0.25])
+    with Live(tmp_path / "killed") as again:
+        assert again.state()["reports"][1] == [0.75, None, 0.25]

@@ -121,3 +121,21 @@ def test_an_event_of_ticks_holds_their_counts(n_ticks):
     running = mission.after(ticks_event(contacts, ticks, 1.0)).running
     np.testing.assert_array_equal(running.n_contact, contacts)
     np.testing.assert_array_equal(running.n_ticks, ticks)
+
+
+def report(values, person="operator"):
+    return {"event": "report", "values": values, "person": person}
+
+
+def test_reports_are_before_the_mission_or_after_the_bound_that_runs_or_ran():
+    mission = folded(
+        report([0.5, None]), report([None, 0.4]), begin(1, PATH[1]), report([0.6, None]), end(),
+        report([0.7, None]), begin(2, PATH[2]), end("stuck"),
+    )  # fmt: skip
+    told = mission.to_mission(FEATURES, ROBOTS)
+    nan = np.nan
+    np.testing.assert_array_equal(told.reports.values, [[0.5, 0.4], [0.7, nan], [nan, nan]])
+    assert folded(begin(1, PATH[1]), end("stuck")).to_mission(FEATURES, ROBOTS).reports is None
+    with pytest.raises(TrustboError, match="operator reports in this mission; ann may in the next"):
+        folded(report([0.5, None]), report([0.5, None], "ann"))
+    assert folded(report([0.5, None], "ann")).person == "ann"

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from trustbo.answers import PERSON, report_of
 from trustbo.data import STATUSES, Cell
 from trustbo.errors import TrustboError, one_line, require_pair, require_whole, unknown
 
@@ -61,14 +62,26 @@ class Pose(NamedTuple):
     t: float | None
 
 
-Message = Contact | Marker | Ending | Awareness | Pose
+class Report(NamedTuple):
+    """Trust in robots that a person reports now."""
+
+    values: np.ndarray
+    """Reports in [0, 1], (robot,); NaN where none was given."""
+    person: str
+    t: float | None
+
+
+Message = Contact | Marker | Ending | Awareness | Pose | Report
 
 
 class Reader:
     """Reads the messages of a team."""
 
-    def __init__(self, robots: Sequence[str], features: Sequence[str], lead: str = "lead") -> None:
-        """Take the names that messages may use."""
+    def __init__(
+        self, robots: Sequence[str], features: Sequence[str], lead: str = "lead", levels: int = 0
+    ) -> None:
+        """Take the names that messages may use, and the number of levels of reports."""
+        self.levels = levels
         self.robots, self.features, self._lead = tuple(robots), tuple(features), lead
         self._index = {name: i for i, name in enumerate(self.robots)}
 
@@ -167,6 +180,16 @@ class Reader:
                 values[i, m] = number
         return Awareness(values, t)
 
+    def _report(self, record: Mapping[str, Any], t: float | None) -> Report:
+        values, person = np.full(len(self.robots), np.nan), record.get("person", PERSON)
+        if not isinstance(person, str) or not 0 < len(person.strip()) <= _MOST_NOTE:
+            raise TrustboError(f"person is a name; got {one_line(person)}.")
+        for i, value in self._by_robot("report", record["report"]):
+            if value is not None:
+                number = _number("report", value)
+                values[i] = report_of(f"report about {self.robots[i]}", number, self.levels)
+        return Report(values, person, t)
+
     def _pose(self, record: Mapping[str, Any], t: float | None) -> Pose:
         given, places = record["pose"], {}
         if not isinstance(given, Mapping):
@@ -204,6 +227,7 @@ KINDS: dict[
     "status": (Reader._ending, ("note", "mission")),
     "awareness": (Reader._awareness, ()),
     "pose": (Reader._pose, ()),
+    "report": (Reader._report, ("person",)),
 }
 """Keys of messages, with the function that reads each and its further keys."""
 

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
+from trustbo.answers import levels_of
 from trustbo.campaign import Campaign
 from trustbo.campaign.alarms import sentences_of
 from trustbo.campaign.running import better_rest, weighted_mean
@@ -29,8 +30,10 @@ from trustbo.live.messages import (
     Message,
     Pose,
     Reader,
+    Report,
 )
 from trustbo.live.underway import Event, Underway, ticks_event
+from trustbo.logs.reports import scale_of
 from trustbo.planning import Plan
 
 FOLDER = "live"
@@ -103,7 +106,10 @@ class Live:
             )
         self._folder = campaign.storage.path / FOLDER
         self._clock, self._replan = clock, replan
-        self.reader = Reader(campaign.workspace.team.names, campaign.workspace.features)
+        told = [mission for mission in campaign.state.measured if mission.reports is not None]
+        self._scale = scale_of(told) if told else "unit"
+        names = campaign.workspace.team.names, campaign.workspace.features
+        self.reader = Reader(*names, levels=levels_of(self._scale))
         self.poses: dict[str, tuple[float, float]] = {}
         self.log: deque[tuple[float, str]] = deque(maxlen=_MOST_LINES)
         self.job: Job | None = None
@@ -169,6 +175,10 @@ class Live:
             return True
         if self.job is not None:
             return False
+        if isinstance(message, Report):
+            values = [None if np.isnan(v) else v for v in message.values.tolist()]
+            self._happen({"event": "report", "values": values, "person": message.person})
+            return True
         if isinstance(message, Awareness):
             self._awareness(message)
             return True
@@ -353,7 +363,7 @@ class Live:
         """Record the mission in the campaign; returned is a line about it."""
         mission, campaign = self.mission, self.campaign
         names = campaign.workspace.features, self.reader.robots
-        measured = mission.to_mission(*names)
+        measured = mission.to_mission(*names, self._scale)
         tried = any(run.status == "ok" or run.n_ticks.any() for run in mission.bounds)
         if measured is None or not tried:
             where: Cell | None = mission.bounds[-1].cell if mission.bounds else None

@@ -1,9 +1,9 @@
 """The mission that runs, as the fold of the events of its journal.
 
 States are: between two bounds, in a bound, and over. An event is a record with the name `event`:
-`plan` (first), `begin` and `end` of a bound, `ticks` and `awareness` in it, and `route`, the cells
-still to be entered, planned anew. The state is the events applied in their order and nothing else,
-so that a process that reads them goes on where another one was killed.
+`plan` (first), `begin` and `end` of a bound, `ticks` and `awareness` in it, `report` of trust, and
+`route`, the cells still to be entered, planned anew. The state is the events applied in their order
+and nothing else, so that a process that reads them goes on where another one was killed.
 """
 
 from collections.abc import Sequence
@@ -12,6 +12,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from trustbo.answers import PERSON, Reports
 from trustbo.data import Bound, Cell, Mission
 from trustbo.errors import TrustboError, require_pair
 from trustbo.workspace.moves import moves_along, require_on_grid
@@ -31,6 +32,7 @@ class Run:
         awareness: Awareness that was measured, (robot, feature); None where it was not.
         last: Time of its last tick, s; of its end once that is known.
         status: Outcome; empty while it runs.
+        reports: Trust that was reported in it or after it, (robot,); None where it was not.
     """
 
     cell: Cell
@@ -40,6 +42,7 @@ class Run:
     awareness: np.ndarray | None = None
     last: float | None = None
     status: str = ""
+    reports: np.ndarray | None = None
 
     @property
     def rate(self) -> np.ndarray:
@@ -77,6 +80,8 @@ class Underway:
         bounds: Bounds that ended.
         running: Bound that runs.
         status: Outcome of the mission; empty until it is over.
+        before: Trust that was reported before the first bound, (robot,); None where it was not.
+        person: Person who reports trust.
     """
 
     shape: tuple[int, int]
@@ -87,6 +92,8 @@ class Underway:
     bounds: tuple[Run, ...] = ()
     running: Run | None = None
     status: str = ""
+    before: np.ndarray | None = None
+    person: str = PERSON
 
     @property
     def k(self) -> int:
@@ -113,6 +120,7 @@ class Underway:
             "ticks": self._ticked,
             "awareness": self._measured,
             "end": self._ended,
+            "report": self._reported,
             "route": self._routed,
         }.get(str(name))
         if applied is None:
@@ -152,17 +160,40 @@ class Underway:
         return self
 
     def _measured(self, event: Event) -> Self:
-        """Awareness of the bound that runs, or, before the next one, of the last."""
-        last = self.running or (self.bounds[-1] if self.bounds else None)
-        if last is None:
+        if self._last is None:
             raise TrustboError("no bound has begun, of which awareness could be measured.")
-        values = np.array([[np.nan if v is None else v for v in row] for row in event["values"]])
-        if last.awareness is not None:
-            values = np.where(np.isnan(values), last.awareness, values)
-        changed = replace(last, awareness=values)
+        return self._changed(awareness=_updated(self._last.awareness, event["values"]))
+
+    def _reported(self, event: Event) -> Self:
+        if event["person"] != self.person and np.isfinite(self.reports).any():
+            raise TrustboError(
+                f"{self.person} reports in this mission; {event['person']} may in the next one."
+            )
+        if self._last is None:
+            mission = replace(self, before=_updated(self.before, event["values"]))
+        else:
+            mission = self._changed(reports=_updated(self._last.reports, event["values"]))
+        return replace(mission, person=event["person"])
+
+    @property
+    def _last(self) -> Run | None:
+        """Bound that runs, or, before the next one, the last; None before the first."""
+        return self.running or (self.bounds[-1] if self.bounds else None)
+
+    def _changed(self, **fields: np.ndarray) -> Self:
+        """Mission with other fields of the last bound."""
+        changed = replace(self._last, **fields)  # pyright: ignore
         if self.running is not None:
             return replace(self, running=changed)
         return replace(self, bounds=(*self.bounds[:-1], changed))
+
+    @property
+    def reports(self) -> np.ndarray:
+        """Trust that was reported, (1 + bound, robot), the bound that runs included."""
+        runs = (*self.bounds, self.running) if self.running is not None else self.bounds
+        rows = [self.before, *(run.reports for run in runs)]
+        none = np.full(self.n_robots, np.nan)
+        return np.array([none if row is None else row for row in rows])
 
     def _ended(self, event: Event) -> Self:
         status = str(event["status"])
@@ -203,13 +234,27 @@ class Underway:
             raise TrustboError(f"no bound runs: {what} belong to none.")
         return self.running
 
-    def to_mission(self, features: Sequence[str], robots: Sequence[str]) -> Mission | None:
-        """Mission to learn from, once it is over; None if no bound was begun."""
+    def to_mission(
+        self, features: Sequence[str], robots: Sequence[str], scale: str = "unit"
+    ) -> Mission | None:
+        """Mission to learn from, once it is over; None if no bound was begun.
+
+        Reports are on a scale.
+        """
         if not self.bounds:
             return None
         start = self.bounds[0].begun
         bounds = tuple(run.to_bound(len(features), start) for run in self.bounds)
-        return Mission(self.path, bounds, self.status, tuple(features), tuple(robots))
+        given = np.isfinite(self.reports).any()
+        reports = Reports(self.reports, self.person, scale) if given else None
+        names = tuple(features), tuple(robots)
+        return Mission(self.path, bounds, self.status, *names, reports=reports)
+
+
+def _updated(before: np.ndarray | None, values: Sequence[Any]) -> np.ndarray:
+    """Values of an event, with those before where it has none."""
+    new = np.array(values, dtype=float)  # None becomes NaN
+    return new if before is None else np.where(np.isnan(new), before, new)
 
 
 def counts_of(event: Event) -> tuple[Sequence[int], Sequence[int]]:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from trustbo.answers import answer_of
 from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_choice, unknown
 from trustbo.live.follow import Low
@@ -50,6 +51,8 @@ def state_of(live: "Live") -> dict[str, Any]:
         "trust": [_moments(state.mean, state.sd) for state in after],
         "ahead": [] if ahead is None else _forecast(ahead),
         "rates": [_plain(run.rate) for run in mission.bounds],
+        "reports": _plain(answer_of(mission.reports, live.reader.levels)),
+        "levels": live.reader.levels,
         "idle": live.n_idle,
         "alarms": [*(sentence_of(one, robots) for one in low), *live.alarms],
         "log": [[round(t, 3), text] for t, text in live.log],

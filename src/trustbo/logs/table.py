@@ -8,9 +8,10 @@
 | `row`, `col` | no, or `x`, `y`, or `lon`, `lat` | cell of the bound, or a position in it |
 | `contact_rate` | yes, or `contact_time` and `duration` (s) | in [0, 1] |
 | `duration`, `t0` (s), `n_ticks`, `status`, `mission_status` | no | |
-| `report`, `report_by`, `report_scale` | no | trust in the robot that a person reported after the bound (0: before the mission), on the scale |
+| `report`, `report_by`, `report_scale` | no | trust in the robot that a person reported |
 | any other | no | awareness feature, in [0, 1] |
 
+A report is given after its bound, before the mission at bound 0, on a scale such as "likert7".
 A table without places is of a log without a map: features are of any values. A blank
 means "not measured". Bounds after the last one with a measurement were planned, not run. A feature
 with the name of one of these columns takes the prefix `awareness_`, e.g.

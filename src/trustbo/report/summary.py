@@ -8,6 +8,7 @@ from trustbo.data import path_text
 from trustbo.display.card import arrival, joined
 from trustbo.errors import TrustboError
 from trustbo.hazard.risk import PathRisk
+from trustbo.inference.draws import sites_of
 from trustbo.inference.samplers.convergence import GOOD_KHAT, MAX_KHAT, MAX_RHAT, MIN_ESS
 from trustbo.planning import Plan
 from trustbo.planning.cover import PathCover
@@ -172,9 +173,8 @@ def _memory(result: Result) -> Fact:
 
 def _reported(result: Result) -> Fact:
     """State how contact moves the trust that persons report."""
-    beta = result.reported["posterior"]["beta"]
-    gains = [beta[..., m].values for m in range(2)]
-    low, middle, high = np.quantile(gains[0] - gains[1], (0.05, 0.5, 0.95))
+    success, failure = sites_of(result.reported)["beta"].T
+    low, middle, high = np.quantile(success - failure, (0.05, 0.5, 0.95))
     given = [mission.reports for mission in result.missions if mission.reports]
     n = int(sum(np.isfinite(reports.values).sum() for reports in given))
     people = joined(list(dict.fromkeys(reports.person for reports in given)))

@@ -58,7 +58,7 @@ async function connect() {
 function again() {
   at("link").textContent = "no connection: what is shown is old"
   at("link").className = "lost"
-  for (const id of ["begin", "ok", "failed", "give-up"]) at(id).disabled = true
+  for (const id of ["begin", "ok", "failed", "give-up", "reporter"]) at(id).disabled = true
   setTimeout(connect, wait)
   wait = Math.min(2 * wait, 5000)
 }
@@ -95,6 +95,7 @@ function show(next) {
   at("few").textContent = state.filter || (state.n_draws < 20
     ? `The bands rest on ${Math.max(Math.round(state.n_draws), 1)} of the posterior's draws: read them as too narrow.` : "")
   showRobots()
+  showReports()
   fill("log", state.log.toReversed().map(([t, text]) => {
     const line = element("li")
     line.append(element("time", new Date(1000 * t).toLocaleTimeString()), element("span", text))
@@ -318,6 +319,27 @@ function drawRobot(canvas, i, low, high) {
   if (past.length) curve([past[past.length - 1], ...ahead], true)
   state.rates.forEach((rates, k) => {
     if (rates[i] !== null) mark(pen, x(k + 1), y(rates[i]), 3, css("--ink"), 0)
+  })
+}
+
+/* --- reports of trust --- */
+
+function showReports() {
+  const {robots, reports, levels} = state
+  const ends = levels ? {min: 1, max: levels, step: 1, value: (1 + levels) / 2} : {min: 0, max: 1, step: 0.01, value: 0.5}
+  at("reporter").disabled = false
+  if (at("sliders").children.length !== robots.length) {
+    at("sliders").replaceChildren(...robots.map(({name}) => {
+      const slider = Object.assign(document.createElement("input"), {type: "range", ...ends})
+      slider.addEventListener("change", () => tell({report: {[name]: Number(slider.value)}, person: at("person").value}))
+      const made = element("label")
+      made.append(element("span", name), slider, element("output"))
+      return made
+    }))
+  }
+  robots.forEach((_, i) => {
+    const given = reports.map((row) => row[i]).filter((x) => x !== null)
+    at("sliders").children[i].lastChild.textContent = number(given.at(-1), levels ? 0 : 2)
   })
 }
 
