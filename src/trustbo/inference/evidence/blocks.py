@@ -301,67 +301,71 @@ def _prior(given, t, x0, lasting, rows, i, V, m, S, w, P):
 
 
 @njit(**PART_OPTIONS)
-def _under_sites(given, t, rows, i, lam, eta, V, m, S, work, K, block):
-    """Fill in a block under its sites; the log constant of its integral over x.
+def _whiten(rows, i, lam, eta, V, m, S, work, L, block):
+    """Factor a block under its sites; the log constant of its integral over x.
 
-    With R = (S + T^-1)^-1, T the sites' precisions and z their centres, `block` is R^(1/2) V
-    (row, column), R^(1/2) (z - m) (row,), and mean AV c + a and covariance C of x given c.
+    With T the sites' precisions, z their centres and LL' = T^(1/2) S T^(1/2) + 1, the first two of
+    `block` become L^-1 T^(1/2) V (row, column) and L^-1 T^(1/2) (z - m) (row,).
     """
     first, n = rows.start[i], rows.start[i + 1] - rows.start[i]
-    D = V.shape[1]
-    KV, Kd, AV, a, C = block
-    constant = 0.0
+    KV, Kd = block[0], block[1]
+    D, constant = V.shape[1], 0.0
     for r in range(n):
         for k in range(r + 1):
             work[r, k] = S[r, k] * math.sqrt(lam[first + r] * lam[first + k])
         work[r, r] += 1.0
-    if not cholesky(work[:n, :n], C[:n, :n]):  # C holds the factor for now
+    if not cholesky(work[:n, :n], L[:n, :n]):
         return np.nan
-    for r in range(n):  # K = factor^-1 T^(1/2)
-        for k in range(r + 1):
-            z = math.sqrt(lam[first + r]) if k == r else 0.0
-            for j in range(k, r):
-                z -= C[r, j] * K[j, k]
-            K[r, k] = z / C[r, r]
-        constant -= math.log(C[r, r])
     for r in range(n):
+        p = lam[first + r]
+        root, scale = math.sqrt(p), 1.0 / L[r, r]
+        constant += math.log(scale)
         for k in range(D):
-            z = 0.0
-            for j in range(r + 1):
-                z += K[r, j] * V[j, k]
-            KV[r, k] = z
-        z = 0.0
-        for j in range(r + 1):
-            if lam[first + j] > 0.0:
-                z += K[r, j] * (eta[first + j] / lam[first + j] - m[j])
-        Kd[r] = z
-    for r in range(n):  # work = K S
-        for k in range(n):
-            z = 0.0
-            for j in range(r + 1):
-                z += K[r, j] * S[j, k]
-            work[r, k] = z
-    for r in range(n):
-        for k in range(r + 1):
-            z = S[r, k]
-            for j in range(n):
-                z -= work[j, r] * work[j, k]
-            C[r, k] = C[k, r] = z
-        for k in range(D):
-            z = V[r, k]
-            for j in range(n):
-                z -= work[j, r] * KV[j, k]
-            AV[r, k] = z
-        z = m[r]
-        for j in range(n):
-            z += work[j, r] * Kd[j]
-        a[r] = z
-        kind, precision = rows.kind[first + r], lam[first + r]
-        if kind == GAUSSIAN:
-            constant += 0.5 * (math.log(precision) - LOG_2PI)
-        elif kind == INTERVAL:
-            constant += 0.5 * eta[first + r] ** 2 / precision
+            KV[r, k] = root * scale * V[r, k]
+        Kd[r] = root * scale * (eta[first + r] / p - m[r]) if p > 0.0 else 0.0
+        for j in range(r):
+            z = L[r, j] * scale
+            for k in range(D):
+                KV[r, k] -= z * KV[j, k]
+            Kd[r] -= z * Kd[j]
+        if rows.kind[first + r] == GAUSSIAN:
+            constant += 0.5 * (math.log(p) - LOG_2PI)
+        elif rows.kind[first + r] == INTERVAL:
+            constant += 0.5 * eta[first + r] ** 2 / p
     return constant
+
+
+@njit(**PART_OPTIONS)
+def _condition(rows, i, lam, V, m, S, work, L, block, whole):
+    """Mean AV c + a and covariance C of a whitened block's x given c, in `block`.
+
+    Of C its diagonal alone unless `whole`, then its lower triangle. `work` holds L^-1 T^(1/2) S.
+    """
+    first, n = rows.start[i], rows.start[i + 1] - rows.start[i]
+    KV, Kd, AV, a, C = block
+    D = V.shape[1]
+    for r in range(n):
+        root, scale = math.sqrt(lam[first + r]), 1.0 / L[r, r]
+        for k in range(n):
+            work[r, k] = root * scale * S[r, k]
+        for j in range(r):
+            z = L[r, j] * scale
+            for k in range(n):
+                work[r, k] -= z * work[j, k]
+        for k in range(D):
+            AV[r, k] = V[r, k]
+        a[r] = m[r]
+        for k in range(r + 1 if whole else 0):
+            C[r, k] = S[r, k]
+        C[r, r] = S[r, r]
+    for j in range(n):
+        for r in range(n):
+            z = work[j, r]
+            for k in range(D):
+                AV[r, k] -= z * KV[j, k]
+            a[r] += z * Kd[j]
+            for k in range(0 if whole else r, r + 1):
+                C[r, k] -= z * work[j, k]
 
 
 @njit(**PART_OPTIONS)
@@ -393,9 +397,9 @@ def _work(rows):
     D = rows.U.shape[1]
     room = _room(rows, D)
     most = room[5]
-    work, K, block = np.zeros((most, most)), np.zeros((most, most)), _new_block(most, D)
+    work, L, block = np.zeros((most, most)), np.zeros((most, most)), _new_block(most, D)
     lam, eta = np.empty(len(rows.y)), np.empty(len(rows.y))
-    return room, work, K, block, np.zeros((D, D)), np.zeros(D), lam, eta
+    return room, work, L, block, np.zeros((D, D)), np.zeros(D), lam, eta
 
 
 @njit(**PART_OPTIONS)
@@ -409,7 +413,7 @@ def _start(given, t, rows, kept, lam, eta):
 
 
 @njit(**PART_OPTIONS)
-def _gather(given, t, rows, lam, eta, room, work, K, block, Q, h):
+def _gather(given, t, rows, lam, eta, room, work, L, block, Q, h):
     """Quadratic form of the shared coefficients, prior included; the log constant, without it."""
     V, m, S = room[0], room[1], room[2]
     D, total = V.shape[1], 0.0
@@ -421,7 +425,7 @@ def _gather(given, t, rows, lam, eta, room, work, K, block, Q, h):
         total -= 0.5 * h[a] * given.mean[t, a] + math.log(given.sd[t, a])
     for i in range(len(rows.start) - 1):
         f, g = rows.start[i], rows.start[i + 1]
-        total += _under_sites(given, t, rows, i, lam, eta, V[f:g], m[f:g], S[i], work, K, block)
+        total += _whiten(rows, i, lam, eta, V[f:g], m[f:g], S[i], work, L, block)
         KV, Kd = block[0], block[1]
         for r in range(g - f):
             total -= 0.5 * Kd[r] * Kd[r]
@@ -449,11 +453,11 @@ def _solve(Q, h, F, mean):
 
 
 @njit(**PART_OPTIONS)
-def _sweep(given, t, rows, lam, eta, room, work, K, block, Q, h, F, mean, damp):
+def _sweep(given, t, rows, lam, eta, room, work, L, block, Q, h, F, mean, damp):
     """Log evidence under the sites, which are matched then, in place if `damp` > 0."""
     V, m, S = room[0], room[1], room[2]
     D = V.shape[1]
-    total = _gather(given, t, rows, lam, eta, room, work, K, block, Q, h)
+    total = _gather(given, t, rows, lam, eta, room, work, L, block, Q, h)
     total += _solve(Q, h, F, mean)
     if not np.isfinite(total):
         return np.nan
@@ -465,7 +469,8 @@ def _sweep(given, t, rows, lam, eta, room, work, K, block, Q, h, F, mean, damp):
             some = some or rows.kind[r] == INTERVAL
         if not some:
             continue
-        _under_sites(given, t, rows, i, lam, eta, V[f:g], m[f:g], S[i], work, K, block)
+        _whiten(rows, i, lam, eta, V[f:g], m[f:g], S[i], work, L, block)
+        _condition(rows, i, lam, V[f:g], m[f:g], S[i], work, L, block, False)
         AV, a, C = block[2], block[3], block[4]
         for r in range(g - f):
             if rows.kind[f + r] != INTERVAL:
@@ -501,26 +506,26 @@ def _prepare(given, t, x0, lasting, rows, room):
 @njit(**OPTIONS)
 def _log_evidence(given, x0, lasting, rows, kept, n_sweeps):
     """Log evidence at each point; the last sweep only evaluates."""
-    room, work, K, block, Q, h, lam, eta = _work(rows)
+    room, work, L, block, Q, h, lam, eta = _work(rows)
     F, mean, out = np.zeros(Q.shape), np.zeros(len(h)), np.empty(len(given.beta0))
     for t in range(len(out)):
         _prepare(given, t, x0, lasting, rows, room)
         _start(given, t, rows, kept, lam, eta)
         for s in range(n_sweeps):
             damp = 1.0 if s + 1 < n_sweeps else 0.0
-            out[t] = _sweep(given, t, rows, lam, eta, room, work, K, block, Q, h, F, mean, damp)
+            out[t] = _sweep(given, t, rows, lam, eta, room, work, L, block, Q, h, F, mean, damp)
     return out
 
 
 @njit(**OPTIONS)
 def _settle(given, x0, lasting, rows, kept, n_sweeps):
     """Sites (2, row) after damped sweeps at the first point."""
-    room, work, K, block, Q, h, _, _ = _work(rows)
+    room, work, L, block, Q, h, _, _ = _work(rows)
     F, mean, sites = np.zeros(Q.shape), np.zeros(len(h)), kept.copy()
     _prepare(given, 0, x0, lasting, rows, room)
     _start(given, 0, rows, kept, sites[0], sites[1])
     for _ in range(n_sweeps):
-        _sweep(given, 0, rows, sites[0], sites[1], room, work, K, block, Q, h, F, mean, 0.8)
+        _sweep(given, 0, rows, sites[0], sites[1], room, work, L, block, Q, h, F, mean, 0.8)
     return sites
 
 
@@ -674,7 +679,7 @@ def _draws(given, x0, lasting, rows, kept, n_sweeps, nu, n_particles, count, c, 
     become draws of the shared coefficients; with nu = 0 they are these.
     """
     D, n_blocks = rows.U.shape[1], len(rows.start) - 1
-    room, work, K, block, Q, h, lam, eta = _work(rows)
+    room, work, L, block, Q, h, lam, eta = _work(rows)
     V, m, S, most = room[0], room[1], room[2], room[5]
     mean, F = np.zeros((3, D)), np.zeros((3, D, D))
     wide_lam, wide_eta = np.empty(len(rows.y)), np.empty(len(rows.y))
@@ -690,8 +695,8 @@ def _draws(given, x0, lasting, rows, kept, n_sweeps, nu, n_particles, count, c, 
         _start(given, t, rows, kept, lam, eta)
         if not exact:
             for _ in range(n_sweeps + 1):
-                _sweep(given, t, rows, lam, eta, room, work, K, block, Q, h, F[0], mean[0], 1.0)
-        _gather(given, t, rows, lam, eta, room, work, K, block, Q, h)
+                _sweep(given, t, rows, lam, eta, room, work, L, block, Q, h, F[0], mean[0], 1.0)
+        _gather(given, t, rows, lam, eta, room, work, L, block, Q, h)
         _solve(Q, h, F[0], mean[0])
         if not exact and nu > 0.0:
             for r in range(len(rows.y)):
@@ -700,15 +705,14 @@ def _draws(given, x0, lasting, rows, kept, n_sweeps, nu, n_particles, count, c, 
                     low, high = given.limits[t, rows.case[r]]
                     factor = _TEMPER if np.isfinite(high - low) else _TEMPER_AT_END
                 wide_lam[r], wide_eta[r] = factor * lam[r], factor * eta[r]
-            _gather(given, t, rows, wide_lam, wide_eta, room, work, K, block, Q, h)
+            _gather(given, t, rows, wide_lam, wide_eta, room, work, L, block, Q, h)
             _solve(Q, h, F[1], mean[1])
             for k in range(D):
                 mean[2, k], F[2, k, k] = given.mean[t, k], 1.0 / given.sd[t, k]
         for i in range(n_blocks):
             f, g = rows.start[i], rows.start[i + 1]
-            constant[i] = _under_sites(
-                given, t, rows, i, lam, eta, V[f:g], m[f:g], S[i], work, K, block
-            )
+            constant[i] = _whiten(rows, i, lam, eta, V[f:g], m[f:g], S[i], work, L, block)
+            _condition(rows, i, lam, V[f:g], m[f:g], S[i], work, L, block, True)
             _store(block, g - f, D, stored, i)
         for _ in range(count[t]):
             total = 0.0
