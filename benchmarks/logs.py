@@ -67,9 +67,11 @@ def replicate(logs: Logs, windows: list[float]) -> None:
             rows = rows.sort_values("mean_log_score", ascending=False)
             other = rows["scored on"].iloc[0]
             print(f"\nwindows of {window:g} s, {learned} -> {other}")
-            table = Table("model", "R2", "log score", "50 %", "90 %", "n")
+            table = Table("model", "R2", "log score", "95 %", "behind", "95 %", "50 %", "90 %", "n")
             for row in rows.itertuples():
                 table.row(row.model, f"{row.r2:.3f}", f"{row.mean_log_score:.3f}",
+                          f"{row.low:.2f} to {row.high:.2f}", f"{row.behind:.3f}",
+                          f"{row.behind_low:.2f} to {row.behind_high:.2f}",
                           f"{row.coverage_50:.2f}", f"{row.coverage_90:.2f}", row.n)  # fmt: skip
         print(f"{time.process_time() - began:.0f} s of one core, {first} first")
 

@@ -12,7 +12,7 @@ from trustbo.data import Mission
 from trustbo.errors import TrustboError
 from trustbo.models import HierarchicalTrust, PooledTrust
 from trustbo.study import replicate
-from trustbo.study.replicate import BASELINES, persistence, ridge, unobserved_components
+from trustbo.study.replicate import BASELINES, _intervals, persistence, ridge, unobserved_components
 
 FEATURES = ("expected",)
 
@@ -44,7 +44,7 @@ def test_the_model_that_the_logs_are_made_of_is_first_both_ways(logs):
         "level": PooledTrust(observation="beta_binomial"),
     }
     table = replicate(logs, models, baselines=["persistence", "ridge"])
-    assert table.shape == (8, 5)
+    assert table.shape == (8, 10)
     assert (table["n"] == 2 * (2 * 31 - 1)).all()
     assert table["mean_log_score"].is_monotonic_decreasing
     for direction in (("one", "other"), ("other", "one")):
@@ -53,6 +53,21 @@ def test_the_model_that_the_logs_are_made_of_is_first_both_ways(logs):
         assert of_one.index[-1] == "persistence"
         assert of_one.loc["deviation", "r2"] > of_one.loc["level", "r2"]
         assert 0.8 < of_one.loc["deviation", "coverage_90"] < 0.97
+        assert (of_one["low"] < of_one["mean_log_score"]).all()
+        assert (of_one["mean_log_score"] < of_one["high"]).all()
+        assert (of_one.iloc[0][["behind", "behind_low", "behind_high"]] == 0.0).all()
+        assert of_one.loc["persistence", "behind_low"] > 0.0
+
+
+def test_intervals_of_independent_scores_are_those_of_their_mean():
+    rng = np.random.default_rng(3)
+    scores = rng.standard_normal((2, 400, 3))
+    scores[0, 5:9, 1] = np.nan
+    pair = {"one": scores, "less": scores - 0.1 + 0.02 * rng.standard_normal(scores.shape)}
+    found = _intervals(pair, 0)
+    wide = 2 * 1.96 / np.sqrt(np.isfinite(scores).sum())
+    assert abs((found["one"]["high"] - found["one"]["low"]) / wide - 1.0) < 0.25
+    assert 0.09 < found["less"]["behind_low"] < 0.1 < found["less"]["behind_high"] < 0.11
 
 
 def test_forecasts_of_counts_have_the_mass_around_them(logs):

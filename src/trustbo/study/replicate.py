@@ -2,6 +2,7 @@
 
 import importlib.util
 import itertools
+import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -19,7 +20,9 @@ from trustbo.models.model import TrustModel, require_model
 from trustbo.stacking import require_same_team
 
 _LEAST_SD = 1e-3
-_COLUMNS = ["r2", "mean_log_score", "coverage_50", "coverage_90", "n"]
+_COLUMNS = ["r2", "mean_log_score", "low", "high", "behind", "behind_low", "behind_high",
+            "coverage_50", "coverage_90", "n"]  # fmt: skip
+_N_BOOTSTRAP = 1000
 
 
 class Forecast(NamedTuple):
@@ -58,8 +61,11 @@ def replicate(
 
     Returns:
         Table with a row for each (model, fitted to, scored on), the best mean log score first:
-        `r2`, `mean_log_score` (nats, of counts of ticks where all rates have them), `coverage_50`,
-        `coverage_90` and `n`, the number of rates.
+        `r2`, `mean_log_score` (nats, of counts of ticks where all rates have them) with the ends
+        `low` and `high` of its 95 % interval; how far `behind` that of the best on the same logs it
+        is, with `behind_low` and `behind_high`; `coverage_50`, `coverage_90` and `n`, the number of
+        rates. Intervals are of a bootstrap over blocks of bounds that follow each other, in all
+        missions at once, as those of a log with several leads are of the same time.
 
     Raises:
         TrustboError: Fewer than two logs, no models, an unknown baseline, or a missing package.
@@ -80,11 +86,15 @@ def replicate(
     for one, other in itertools.permutations(missions, 2):
         learned, ahead = (list(_of_log(missions[name], one)) for name in (one, other))
         require_same_team([*learned, *ahead])
+        scored = {}
         for name, model in named.items():
             posterior = fit(learned, model, seed=seed, progress=False)
-            rows[name, one, other] = _of_posterior(posterior, ahead, seed)
+            scored[name] = _of_posterior(posterior, ahead, seed)
         for name in chosen:
-            rows[name, one, other] = _of_forecasts(BASELINES[name](learned, ahead), ahead, seed)
+            scored[name] = _of_forecasts(BASELINES[name](learned, ahead), ahead, seed)
+        intervals = _intervals({name: scores[-1] for name, scores in scored.items()}, seed)
+        for name, scores in scored.items():
+            rows[name, one, other] = summarize_scores(*scores) | intervals[name]
     index = pd.MultiIndex.from_tuples(rows, names=["model", "fitted to", "scored on"])
     table = pd.DataFrame(list(rows.values()), index=index, columns=_COLUMNS)
     return table.sort_values("mean_log_score", ascending=False)
@@ -94,23 +104,49 @@ def _of_log(missions: OfLog, learned: str) -> Sequence[Mission]:
     return missions(learned) if callable(missions) else missions
 
 
-def _of_posterior(posterior: object, ahead: Sequence[Mission], seed: int) -> dict[str, float]:
-    """Summary of the scores of a posterior, first bounds left out."""
+def _of_posterior(posterior: object, ahead: Sequence[Mission], seed: int) -> np.ndarray:
+    """Arguments of `summarize_scores`, (4, mission, bound, robot), first bounds left out."""
     scores = score(posterior, ahead, filtered=True, seed=seed).isel(bound=slice(1, None))  # pyright: ignore
-    names = ("contact_rate", "mean", "pit", "log_score")
-    return summarize_scores(*(scores[name].values for name in names))
+    return np.stack([scores[name].values for name in ("contact_rate", "mean", "pit", "log_score")])
 
 
-def _of_forecasts(
-    forecasts: Sequence[Forecast], ahead: Sequence[Mission], seed: int
-) -> dict[str, float]:
-    """Summary of normal forecasts: counts of ticks have the mass around them, the rest at 0 and 1.
+def _intervals(scores: Mapping[str, np.ndarray], seed: int) -> dict[str, dict[str, float]]:
+    """Ends of the mean log score, and distance to the best with its ends, by name.
+
+    Scores are (mission, bound, robot); blocks of bounds are drawn alike for all names.
+    """
+    for name, values in scores.items():
+        if not np.isfinite(values).any():
+            raise TrustboError(f"{name} forecasts no rate: give logs of more than one bound.")
+    rng, n_bounds = np.random.default_rng(seed), max(v.shape[1] for v in scores.values())
+    length = math.ceil(n_bounds ** (1 / 3))
+    starts = rng.integers(n_bounds, size=(_N_BOOTSTRAP, -(-n_bounds // length), 1))
+    drawn = (starts + np.arange(length)) % n_bounds
+    drawn = drawn.reshape(_N_BOOTSTRAP, -1)[:, :n_bounds]
+    means, found = {}, {}
+    for name, values in scores.items():
+        total, count = np.nansum(values, axis=(0, 2)), np.isfinite(values).sum((0, 2))
+        by_draw = total[drawn].sum(1) / np.maximum(count[drawn].sum(1), 1)
+        means[name] = total.sum() / count.sum(), by_draw
+    best = max(means, key=lambda name: means[name][0])
+    for name, (mean, by_draw) in means.items():
+        low, high = np.quantile(by_draw, (0.025, 0.975))
+        behind = np.quantile(means[best][1] - by_draw, (0.025, 0.975))
+        found[name] = {"low": low, "high": high, "behind": means[best][0] - mean,
+                       "behind_low": behind[0], "behind_high": behind[1]}  # fmt: skip
+    return found
+
+
+def _of_forecasts(forecasts: Sequence[Forecast], ahead: Sequence[Mission], seed: int) -> np.ndarray:
+    """The same of normal forecasts: counts of ticks have the mass around them, the rest at 0 and 1.
 
     That is more than a normal density gives a rate at a limit: baselines are censored too.
     """
-    rng, columns = np.random.default_rng(seed), []
+    rng = np.random.default_rng(seed)
+    most = max(len(mission.bounds) for mission in ahead)
+    out = np.full((4, len(ahead), most - 1, len(ahead[0].robots)), np.nan)
     counted = all(np.isfinite(m.n_ticks[np.isfinite(m.contact_rate)]).all() for m in ahead)
-    for mission, (mean, sd) in zip(ahead, forecasts, strict=True):
+    for j, (mission, (mean, sd)) in enumerate(zip(ahead, forecasts, strict=True)):
         y, half = mission.contact_rate, 0.5 / mission.n_ticks
         sd = np.maximum(sd, _LEAST_SD)
         if counted:
@@ -122,8 +158,9 @@ def _of_forecasts(
         else:
             log_score, pit = norm.logpdf(y, mean, sd), ndtr((y - mean) / sd)
         of_one = np.stack([y, np.clip(mean, 0.0, 1.0), pit, log_score])
-        columns.append(np.where(np.isnan(y) | np.isnan(mean), np.nan, of_one)[:, 1:])
-    return summarize_scores(*(c.ravel() for c in np.concatenate(columns, axis=1)))
+        of_one[:, np.isnan(y) | np.isnan(mean)] = np.nan
+        out[:, j, : len(y) - 1] = of_one[:, 1:]
+    return out
 
 
 def persistence(learned: Sequence[Mission], ahead: Sequence[Mission]) -> list[Forecast]:
