@@ -3,7 +3,7 @@
 Run: python benchmarks/reports.py [calibration] [ahead] [--sets 200] [--quick]
 
 Contact is that of three robots, one of which is worse from the middle of the campaign on; reports
-are drawn from the prior of `HumanTrust` (calibration: ranks of all parameters, after missions
+are drawn from the prior of their model (calibration: ranks of all parameters, after missions
 alone, three scales), or from operators of known gains (ahead), who report after each mission, or
 after each bound.
 """
@@ -15,9 +15,9 @@ from scipy import stats
 import trustbo as tb
 from trustbo.errors import PosteriorError
 from trustbo.inference import expect_reports, fit_reports
+from trustbo.inference.operators import operator_model
 from trustbo.inference.people import draw_people
 from trustbo.inference.prior_predictive import draw_sites
-from trustbo.models import HumanTrust
 from trustbo.models.effects.effect import Slots
 from trustbo.stacking import stack_missions
 
@@ -59,7 +59,7 @@ def told(rates, reports=None, scale="unit", *, every=False):
 
 def from_prior(scale, rates, seed):
     """Parameters drawn from the prior, and missions with reports drawn under them."""
-    model = HumanTrust(scale=scale).for_features(("success", "failure"))
+    model = operator_model(scale).for_features(("success", "failure"))
     sites = draw_sites(model, (1, 2), 1, seed)
     units = [*tb.logs.reports_of(told(rates, scale=scale)).values()]
     slots = Slots.every(stack_missions(units, pad=False), len(units), model.names, None)

@@ -65,9 +65,12 @@ class Reports:
     def __post_init__(self) -> None:
         if not isinstance(self.person, str) or not self.person.strip():
             raise TrustboError(f"person must be a name; got {self.person!r}.")
-        levels = levels_of(self.scale)
-        for (k, i), value in np.ndenumerate(self.values):
-            report_of(f"report [{k}, {i}]", float(answer_of(value, levels)), levels)
+        answers, given = self.answers, ~np.isnan(self.values)
+        off = (self.values < 0.0) | (self.values > 1.0)
+        if levels := levels_of(self.scale):
+            off |= given & (answers != np.round(answers))
+        for k, i in np.argwhere(off):
+            report_of(f"report [{k}, {i}]", answers[k, i], levels)
 
     @classmethod
     def of(

@@ -163,5 +163,8 @@ def test_contact_of_another_shape_is_refused(posterior, missions):
         expect_reports(posterior, missions, np.zeros((4, 3)))
     with pytest.raises(TrustboError, match=r"contact: \[0, 0, 0\] = 2 is outside \[0, 1\]"):
         expect_reports(posterior, missions, np.full((4, 2), 2.0))
+    other = fit(missions, progress=False, whole=False)
+    with pytest.raises(TrustboError, match="expect_reports takes a posterior of fit_reports"):
+        expect_reports(other, missions, np.zeros((4, 2)))
     with pytest.raises(TrustboError, match="no mission has reports of trust"):
         fit_reports([tb.Mission.from_arrays([(0, 0), (0, 1)], [[[0.5]]], [[0.5]])])

@@ -1,22 +1,30 @@
 """Trust in robots that operators report in a campaign, and the reports that are to be expected."""
 
 from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
+import numpyro.distributions as dist
 import xarray as xr
 from numpy.typing import ArrayLike
 
 from trustbo.data import Mission, as_array, require_unit_interval
-from trustbo.errors import ShapeError, TrustboError, require_whole
+from trustbo.errors import PosteriorError, ShapeError, TrustboError, require_whole
 from trustbo.inference.draws import is_of_people, sites_of
 from trustbo.inference.fit import fit
 from trustbo.inference.people import QUANTILES, draws_of, every_slot, model_of_people
 from trustbo.inference.posterior_tree import require_posterior
 from trustbo.inference.samplers.people import evidence_of
-from trustbo.logs.reports import reports_of, scale_of
+from trustbo.logs.reports import OUTCOMES, reports_of, scale_of
+from trustbo.models.backend import own_settings
+from trustbo.models.effects.person import PersonEffect
 from trustbo.models.people import HumanTrust
 from trustbo.stacking import stack_missions
 
+_GAINS = 0.15
+"""Sd of the gains of a bound; those of a person are partially pooled around them by .1."""
+_RETRIES = 2
 _N_DRAWS = 1000
 _PARTICLES = 8  # of trust after the last bound
 
@@ -28,7 +36,7 @@ def fit_reports(
 
     Reports depend on the missions through measured contact alone: the joint posterior of robots and
     persons is that of contact times this one, and so are their evidences. Each person's trust in
-    each robot is a mission of `HumanTrust`, see `logs.reports_of`; start, level and gains are
+    each robot is a mission of `operator_model`, see `logs.reports_of`; start, level and gains are
     partially pooled over all of these.
 
     Args:
@@ -43,9 +51,20 @@ def fit_reports(
         TrustboError: No mission has reports, or they are on different scales.
         PosteriorError: The diagnostics are beyond their limits.
     """
-    model = HumanTrust(scale=scale_of(missions))
+    model = operator_model(scale_of(missions))
     units = [*reports_of(missions).values()]
-    return fit(units, model, seed=seed, progress=progress, whole=False)
+    for shift in range(_RETRIES):  # as in campaigns
+        with suppress(PosteriorError):
+            return fit(units, model, seed=seed + shift, progress=progress, whole=False)
+    return fit(units, model, seed=seed + _RETRIES, progress=progress, whole=False)
+
+
+def operator_model(scale: str = "unit") -> HumanTrust:
+    """`HumanTrust` with gains of half the size: outcomes are bounds, which come by the dozen."""
+    model = HumanTrust(scale=scale, effects=(PersonEffect(tau_gain=0.1),))
+    with own_settings():
+        gains = dist.Normal(0.0, _GAINS)
+    return replace(model, priors=replace(model.priors, beta=gains))
 
 
 def expect_reports(
@@ -69,8 +88,10 @@ def expect_reports(
         ShapeError: Contact of another shape.
         TrustboError: Contact outside [0, 1], or no posterior of `fit_reports`.
     """
-    if not is_of_people(require_posterior("expect_reports", posterior)):
-        raise TrustboError("expect_reports takes a posterior of fit_reports.")
+    of_people = is_of_people(require_posterior("expect_reports", posterior))
+    model = model_of_people(posterior) if of_people else None
+    if model is None or model.names != OUTCOMES:
+        raise TrustboError("expect_reports takes a posterior of fit_reports, or of its missions.")
     units, robots = reports_of(missions), missions[0].robots
     people = list(dict.fromkeys(person for person, _ in units))
     contact = as_array("contact", contact)
@@ -83,7 +104,6 @@ def expect_reports(
     require_unit_interval("contact", contact)
     rng = np.random.default_rng([require_whole("seed", seed, 0), 1])
     rates = contact[rng.integers(len(contact), size=_N_DRAWS)]
-    model = model_of_people(posterior)
     reports = _drawn(model, posterior, [*units.values()], np.tile(rates, len(people)), rng)
     y = [unit.contact_rate[:, 0] for unit in units.values()]
     last = np.array([v[~np.isnan(v)][-1] if np.isfinite(v).any() else np.nan for v in y])

@@ -172,8 +172,11 @@ def _memory(result: Result) -> Fact:
 
 
 def _reported(result: Result) -> Fact:
-    """State how contact moves the trust that persons report."""
-    success, failure = sites_of(result.reported)["beta"].T
+    """State how contact moves the trust that persons report, or why that is not known."""
+    try:
+        success, failure = sites_of(result.reported)["beta"].T
+    except TrustboError as error:
+        return Fact("Reported trust", f"Not fitted: {error}")
     low, middle, high = np.quantile(success - failure, (0.05, 0.5, 0.95))
     given = [mission.reports for mission in result.missions if mission.reports]
     n = int(sum(np.isfinite(reports.values).sum() for reports in given))

@@ -25,7 +25,7 @@ import numpy as np
 from numba import njit
 
 from trustbo.inference.evidence.ep.draws import log_student
-from trustbo.inference.evidence.ep.joint import backward, cholesky
+from trustbo.inference.evidence.ep.joint import backward, cholesky, solve
 from trustbo.models.effects.effect import Group, Slots, Theta
 from trustbo.models.effects.person import PersonColumns
 from trustbo.models.families.terms import (
@@ -437,28 +437,12 @@ def _gather(given, t, rows, lam, eta, room, work, L, block, Q, h):
 
 
 @njit(**PART_OPTIONS)
-def _solve(Q, h, F, mean):
-    """Factor F of Q and mean Q^-1 h; (h'Q^-1 h - log |Q|) / 2, or NaN."""
-    if not cholesky(Q, F):
-        return np.nan
-    total = 0.0
-    for i in range(len(h)):
-        z = h[i]
-        for k in range(i):
-            z -= F[i, k] * mean[k]
-        mean[i] = z / F[i, i]
-        total += 0.5 * mean[i] * mean[i] - math.log(F[i, i])
-    backward(F, mean)
-    return total
-
-
-@njit(**PART_OPTIONS)
 def _sweep(given, t, rows, lam, eta, room, work, L, block, Q, h, F, mean, damp):
     """Log evidence under the sites, which are matched then, in place if `damp` > 0."""
     V, m, S = room[0], room[1], room[2]
     D = V.shape[1]
     total = _gather(given, t, rows, lam, eta, room, work, L, block, Q, h)
-    total += _solve(Q, h, F, mean)
+    total += 0.5 * solve(Q, h, F, mean)
     if not np.isfinite(total):
         return np.nan
     u = np.empty(D)
@@ -697,7 +681,7 @@ def _draws(given, x0, lasting, rows, kept, n_sweeps, nu, n_particles, count, c, 
             for _ in range(n_sweeps + 1):
                 _sweep(given, t, rows, lam, eta, room, work, L, block, Q, h, F[0], mean[0], 1.0)
         _gather(given, t, rows, lam, eta, room, work, L, block, Q, h)
-        _solve(Q, h, F[0], mean[0])
+        solve(Q, h, F[0], mean[0])
         if not exact and nu > 0.0:
             for r in range(len(rows.y)):
                 factor = 1.0
@@ -706,7 +690,7 @@ def _draws(given, x0, lasting, rows, kept, n_sweeps, nu, n_particles, count, c, 
                     factor = _TEMPER if np.isfinite(high - low) else _TEMPER_AT_END
                 wide_lam[r], wide_eta[r] = factor * lam[r], factor * eta[r]
             _gather(given, t, rows, wide_lam, wide_eta, room, work, L, block, Q, h)
-            _solve(Q, h, F[1], mean[1])
+            solve(Q, h, F[1], mean[1])
             for k in range(D):
                 mean[2, k], F[2, k, k] = given.mean[t, k], 1.0 / given.sd[t, k]
         for i in range(n_blocks):

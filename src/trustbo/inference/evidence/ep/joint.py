@@ -135,7 +135,7 @@ def backward(L, b):
 
 
 @njit(**PART_OPTIONS)
-def _solve(Q, h, L, mean):
+def solve(Q, h, L, mean):
     """Factor of Q and mean Q^-1 h; returns h'Q^-1 h - log |Q|, or NaN."""
     total = 0.0
     if not cholesky(Q, L):
@@ -268,7 +268,7 @@ def propagate(b0, delta_w, delta_v, x0, P, g, chains, table, lam, eta, n_sweeps,
                     # A bound made twice: both columns have one index in gamma.
                     twice = 2.0 if i == j and a != b else 1.0
                     Q[max(i, j), min(i, j)] += twice * own_Q[a, b]
-        total += 0.5 * _solve(Q, h, L, mean)
+        total += 0.5 * solve(Q, h, L, mean)
         if not np.isfinite(total):
             return -np.inf
         if sweep + 1 == n_sweeps and not evaluate:
