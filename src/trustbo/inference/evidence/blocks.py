@@ -265,12 +265,9 @@ def _rows(
 
 
 @njit(**PART_OPTIONS)
-def _prior(given, t, x0, lasting, rows, i, V, m, S, w, P):
-    """Columns V (row, column), mean m and covariance S of the rows of a block, before reports.
-
-    `w` (row, own column) is filled with the own columns, `P` (row, 2) with variance and bound of
-    each row, for the covariances of later ones of its chain.
-    """
+def _prior(given, t, x0, lasting, rows, i, room):
+    """Fill in the columns, the mean and the covariance of the rows of a block, before reports."""
+    V, m, S, w, P = room.V, room.m, room.S[i], room.w, room.P
     b0, q = given.beta0[t], given.delta_w[t] ** 2
     D, L, first = rows.U.shape[1], rows.own.shape[1], rows.start[i]
     v, own, constant, var, chain = np.zeros(D), np.zeros(L), 0.0, 0.0, 0
@@ -285,67 +282,68 @@ def _prior(given, t, x0, lasting, rows, i, V, m, S, w, P):
         r = rows.row[s] - first
         if r < 0:
             continue
-        m[r] = constant
+        m[first + r] = constant
         for a in range(D):
-            V[r, a] = v[a]
+            V[first + r, a] = v[a]
         for a in range(L):
-            w[r, a] = own[a]
+            w[first + r, a] = own[a]
         P[r, 0], P[r, 1] = var, s
         for k in range(r + 1):
             z = 0.0
             for a in range(L):
-                z += own[a] * given.own_sd[t, a] ** 2 * w[k, a]
+                z += own[a] * given.own_sd[t, a] ** 2 * w[first + k, a]
             if P[k, 1] >= chain:
                 z += b0 ** (s - P[k, 1]) * P[k, 0]
             S[r, k] = S[k, r] = z
 
 
 @njit(**PART_OPTIONS)
-def _whiten(rows, i, lam, eta, V, m, S, work, L, block):
-    """Factor a block under its sites; the log constant of its integral over x.
+def _whiten(rows, i, lam, eta, room):
+    """Factor L of a block under its sites, and `constant`, the log of its integral over x.
 
-    With T the sites' precisions, z their centres and LL' = T^(1/2) S T^(1/2) + 1, the first two of
-    `block` become L^-1 T^(1/2) V (row, column) and L^-1 T^(1/2) (z - m) (row,).
+    With T the sites' precisions, z their centres and LL' = T^(1/2) S T^(1/2) + 1, `KV` becomes
+    L^-1 T^(1/2) V (row, column) and `Kd` L^-1 T^(1/2) (z - m) (row,).
     """
-    first, n = rows.start[i], rows.start[i + 1] - rows.start[i]
-    KV, Kd = block[0], block[1]
-    D, constant = V.shape[1], 0.0
+    f, n = rows.start[i], rows.start[i + 1] - rows.start[i]
+    S, L, work, KV, Kd = room.S[i], room.L[i], room.work, room.KV, room.Kd
+    D, constant = room.V.shape[1], 0.0
     for r in range(n):
         for k in range(r + 1):
-            work[r, k] = S[r, k] * math.sqrt(lam[first + r] * lam[first + k])
+            work[r, k] = S[r, k] * math.sqrt(lam[f + r] * lam[f + k])
         work[r, r] += 1.0
     if not cholesky(work[:n, :n], L[:n, :n]):
-        return np.nan
+        room.constant[i] = np.nan
+        return
     for r in range(n):
-        p = lam[first + r]
+        p = lam[f + r]
         root, scale = math.sqrt(p), 1.0 / L[r, r]
         constant += math.log(scale)
         for k in range(D):
-            KV[r, k] = root * scale * V[r, k]
-        Kd[r] = root * scale * (eta[first + r] / p - m[r]) if p > 0.0 else 0.0
+            KV[f + r, k] = root * scale * room.V[f + r, k]
+        Kd[f + r] = root * scale * (eta[f + r] / p - room.m[f + r]) if p > 0.0 else 0.0
         for j in range(r):
             z = L[r, j] * scale
             for k in range(D):
-                KV[r, k] -= z * KV[j, k]
-            Kd[r] -= z * Kd[j]
-        if rows.kind[first + r] == GAUSSIAN:
+                KV[f + r, k] -= z * KV[f + j, k]
+            Kd[f + r] -= z * Kd[f + j]
+        if rows.kind[f + r] == GAUSSIAN:
             constant += 0.5 * (math.log(p) - LOG_2PI)
-        elif rows.kind[first + r] == INTERVAL:
-            constant += 0.5 * eta[first + r] ** 2 / p
-    return constant
+        elif rows.kind[f + r] == INTERVAL:
+            constant += 0.5 * eta[f + r] ** 2 / p
+    room.constant[i] = constant
 
 
 @njit(**PART_OPTIONS)
-def _condition(rows, i, lam, V, m, S, work, L, block, whole):
-    """Mean AV c + a and covariance C of a whitened block's x given c, in `block`.
+def _condition(rows, i, lam, room, whole):
+    """Mean AV c + a and covariance C of a whitened block's x given c.
 
     Of C its diagonal alone unless `whole`, then its lower triangle. `work` holds L^-1 T^(1/2) S.
     """
-    first, n = rows.start[i], rows.start[i + 1] - rows.start[i]
-    KV, Kd, AV, a, C = block
-    D = V.shape[1]
+    f, n = rows.start[i], rows.start[i + 1] - rows.start[i]
+    S, L, C, work, AV, a = room.S[i], room.L[i], room.C[i], room.work, room.AV, room.a
+    D = room.V.shape[1]
     for r in range(n):
-        root, scale = math.sqrt(lam[first + r]), 1.0 / L[r, r]
+        root, scale = math.sqrt(lam[f + r]), 1.0 / L[r, r]
         for k in range(n):
             work[r, k] = root * scale * S[r, k]
         for j in range(r):
@@ -353,53 +351,51 @@ def _condition(rows, i, lam, V, m, S, work, L, block, whole):
             for k in range(n):
                 work[r, k] -= z * work[j, k]
         for k in range(D):
-            AV[r, k] = V[r, k]
-        a[r] = m[r]
-        for k in range(r + 1 if whole else 0):
+            AV[f + r, k] = room.V[f + r, k]
+        a[f + r] = room.m[f + r]
+        for k in range(0 if whole else r, r + 1):
             C[r, k] = S[r, k]
-        C[r, r] = S[r, r]
     for j in range(n):
         for r in range(n):
             z = work[j, r]
             for k in range(D):
-                AV[r, k] -= z * KV[j, k]
-            a[r] += z * Kd[j]
+                AV[f + r, k] -= z * room.KV[f + j, k]
+            a[f + r] += z * room.Kd[f + j]
             for k in range(0 if whole else r, r + 1):
                 C[r, k] -= z * work[j, k]
 
 
+class _Room(NamedTuple):
+    """Arrays that the kernels write to."""
+
+    V: np.ndarray  # (row, column), columns before reports
+    m: np.ndarray  # (row,), mean
+    S: np.ndarray  # (block, row, row), covariance
+    w: np.ndarray  # (row, own column)
+    P: np.ndarray  # (row, 2), variance and bound of each row of a block
+    L: np.ndarray  # (block, row, row), see `_whiten`; at last factors of C
+    C: np.ndarray  # (block, row, row), see `_condition`
+    KV: np.ndarray  # (row, column)
+    Kd: np.ndarray  # (row,)
+    AV: np.ndarray  # (row, column)
+    a: np.ndarray  # (row,)
+    constant: np.ndarray  # (block,)
+    work: np.ndarray  # (row, row)
+
+
 @njit(**PART_OPTIONS)
-def _room(rows, D):
-    """Arrays of all blocks: columns, means and covariances before reports, and own columns."""
-    n_rows, n_blocks, most = len(rows.y), len(rows.start) - 1, 0
+def _room(rows):
+    """New arrays, and sites lam and eta (row,), and Q and h of the shared coefficients."""
+    n, n_blocks, most = len(rows.y), len(rows.start) - 1, 0
     for i in range(n_blocks):
         most = max(most, rows.start[i + 1] - rows.start[i])
-    L = rows.own.shape[1]
-    V, m = np.zeros((n_rows, D)), np.zeros(n_rows)
-    S = np.zeros((n_blocks, most, most))
-    return V, m, S, np.zeros((n_rows, L)), np.zeros((most, 2)), most
-
-
-@njit(**PART_OPTIONS)
-def _new_block(most, D):
-    return (
-        np.zeros((most, D)),
-        np.zeros(most),
-        np.zeros((most, D)),
-        np.zeros(most),
-        np.zeros((most, most)),
-    )
-
-
-@njit(**PART_OPTIONS)
-def _work(rows):
-    """Arrays that sweeps write to: those of all blocks, of one, of shared columns, and sites."""
-    D = rows.U.shape[1]
-    room = _room(rows, D)
-    most = room[5]
-    work, L, block = np.zeros((most, most)), np.zeros((most, most)), _new_block(most, D)
-    lam, eta = np.empty(len(rows.y)), np.empty(len(rows.y))
-    return room, work, L, block, np.zeros((D, D)), np.zeros(D), lam, eta
+    D, square = rows.U.shape[1], (n_blocks, most, most)
+    room = _Room(
+        np.zeros((n, D)), np.zeros(n), np.zeros(square), np.zeros((n, rows.own.shape[1])),
+        np.zeros((most, 2)), np.zeros(square), np.zeros(square), np.zeros((n, D)), np.zeros(n),
+        np.zeros((n, D)), np.zeros(n), np.zeros(n_blocks), np.zeros((most, most)),
+    )  # fmt: skip
+    return room, np.empty(n), np.empty(n), np.zeros((D, D)), np.zeros(D)
 
 
 @njit(**PART_OPTIONS)
@@ -413,10 +409,9 @@ def _start(given, t, rows, kept, lam, eta):
 
 
 @njit(**PART_OPTIONS)
-def _gather(given, t, rows, lam, eta, room, work, L, block, Q, h):
+def _gather(given, t, rows, lam, eta, room, Q, h):
     """Quadratic form of the shared coefficients, prior included; the log constant, without it."""
-    V, m, S = room[0], room[1], room[2]
-    D, total = V.shape[1], 0.0
+    D, total = len(h), 0.0
     for a in range(D):
         for b in range(D):
             Q[a, b] = 0.0
@@ -424,28 +419,26 @@ def _gather(given, t, rows, lam, eta, room, work, L, block, Q, h):
         Q[a, a], h[a] = p, p * given.mean[t, a]
         total -= 0.5 * h[a] * given.mean[t, a] + math.log(given.sd[t, a])
     for i in range(len(rows.start) - 1):
-        f, g = rows.start[i], rows.start[i + 1]
-        total += _whiten(rows, i, lam, eta, V[f:g], m[f:g], S[i], work, L, block)
-        KV, Kd = block[0], block[1]
-        for r in range(g - f):
-            total -= 0.5 * Kd[r] * Kd[r]
-            for a in range(D):
-                h[a] += KV[r, a] * Kd[r]
-                for b in range(a + 1):
-                    Q[a, b] += KV[r, a] * KV[r, b]
+        _whiten(rows, i, lam, eta, room)
+        total += room.constant[i]
+    KV, Kd = room.KV, room.Kd
+    for r in range(len(rows.y)):
+        total -= 0.5 * Kd[r] * Kd[r]
+        for a in range(D):
+            h[a] += KV[r, a] * Kd[r]
+            for b in range(a + 1):
+                Q[a, b] += KV[r, a] * KV[r, b]
     return total
 
 
 @njit(**PART_OPTIONS)
-def _sweep(given, t, rows, lam, eta, room, work, L, block, Q, h, F, mean, damp):
+def _sweep(given, t, rows, lam, eta, room, Q, h, F, mean, damp):
     """Log evidence under the sites, which are matched then, in place if `damp` > 0."""
-    V, m, S = room[0], room[1], room[2]
-    D = V.shape[1]
-    total = _gather(given, t, rows, lam, eta, room, work, L, block, Q, h)
+    D, total = len(h), _gather(given, t, rows, lam, eta, room, Q, h)
     total += 0.5 * solve(Q, h, F, mean)
     if not np.isfinite(total):
         return np.nan
-    u = np.empty(D)
+    AV, u = room.AV, np.empty(D)
     for i in range(len(rows.start) - 1):
         f, g = rows.start[i], rows.start[i + 1]
         some = False
@@ -453,13 +446,11 @@ def _sweep(given, t, rows, lam, eta, room, work, L, block, Q, h, F, mean, damp):
             some = some or rows.kind[r] == INTERVAL
         if not some:
             continue
-        _whiten(rows, i, lam, eta, V[f:g], m[f:g], S[i], work, L, block)
-        _condition(rows, i, lam, V[f:g], m[f:g], S[i], work, L, block, False)
-        AV, a, C = block[2], block[3], block[4]
-        for r in range(g - f):
-            if rows.kind[f + r] != INTERVAL:
+        _condition(rows, i, lam, room, False)
+        for r in range(f, g):
+            if rows.kind[r] != INTERVAL:
                 continue
-            x, v = a[r], C[r, r]
+            x, v = room.a[r], room.C[i, r - f, r - f]
             for j in range(D):  # AV' Q^-1 AV = |F^-1 AV|^2
                 x += AV[r, j] * mean[j]
                 z = AV[r, j]
@@ -467,78 +458,74 @@ def _sweep(given, t, rows, lam, eta, room, work, L, block, Q, h, F, mean, damp):
                     z -= F[j, k] * u[k]
                 u[j] = z / F[j, j]
                 v += u[j] * u[j]
-            lv, e = lam[f + r], eta[f + r]
+            lv, e = lam[r], eta[r]
             rest = max(1.0 / v - lv, 1e-9)
-            low, high = given.limits[t, rows.case[f + r]]
+            low, high = given.limits[t, rows.case[r]]
             mass, new, slope = match_interval(
                 low, high, given.delta_v[t], given.noise, (x / v - e) / rest, 1.0 / rest, lv, e
             )
             total += mass
-            lam[f + r] += damp * (new - lv)
-            eta[f + r] += damp * (slope - e)
+            lam[r] += damp * (new - lv)
+            eta[r] += damp * (slope - e)
     return total
 
 
 @njit(**PART_OPTIONS)
-def _prepare(given, t, x0, lasting, rows, room):
-    V, m, S, w, P, _ = room
+def _prepare(given, t, x0, lasting, rows, room, kept, lam, eta):
+    """Lay out all blocks at a point, and the sites to begin with."""
     for i in range(len(rows.start) - 1):
-        f, g = rows.start[i], rows.start[i + 1]
-        _prior(given, t, x0, lasting, rows, i, V[f:g], m[f:g], S[i], w[f:g], P)
+        _prior(given, t, x0, lasting, rows, i, room)
+    _start(given, t, rows, kept, lam, eta)
 
 
 @njit(**OPTIONS)
 def _log_evidence(given, x0, lasting, rows, kept, n_sweeps):
     """Log evidence at each point; the last sweep only evaluates."""
-    room, work, L, block, Q, h, lam, eta = _work(rows)
+    room, lam, eta, Q, h = _room(rows)
     F, mean, out = np.zeros(Q.shape), np.zeros(len(h)), np.empty(len(given.beta0))
     for t in range(len(out)):
-        _prepare(given, t, x0, lasting, rows, room)
-        _start(given, t, rows, kept, lam, eta)
+        _prepare(given, t, x0, lasting, rows, room, kept, lam, eta)
         for s in range(n_sweeps):
             damp = 1.0 if s + 1 < n_sweeps else 0.0
-            out[t] = _sweep(given, t, rows, lam, eta, room, work, L, block, Q, h, F, mean, damp)
+            out[t] = _sweep(given, t, rows, lam, eta, room, Q, h, F, mean, damp)
     return out
 
 
 @njit(**OPTIONS)
 def _settle(given, x0, lasting, rows, kept, n_sweeps):
     """Sites (2, row) after damped sweeps at the first point."""
-    room, work, L, block, Q, h, _, _ = _work(rows)
+    room, _, _, Q, h = _room(rows)
     F, mean, sites = np.zeros(Q.shape), np.zeros(len(h)), kept.copy()
-    _prepare(given, 0, x0, lasting, rows, room)
-    _start(given, 0, rows, kept, sites[0], sites[1])
+    _prepare(given, 0, x0, lasting, rows, room, kept, sites[0], sites[1])
     for _ in range(n_sweeps):
-        _sweep(given, 0, rows, sites[0], sites[1], room, work, L, block, Q, h, F, mean, 0.8)
+        _sweep(given, 0, rows, sites[0], sites[1], room, Q, h, F, mean, 0.8)
     return sites
 
 
 @njit(**OPTIONS)
 def _moments_of(given, x0, lasting, rows, i, c, mean, cov):
     """Mean and covariance of the rows of block i at each point, before reports."""
-    D = rows.U.shape[1]
-    V, m, S, w, P, _ = _room(rows, D)
-    n = rows.start[i + 1] - rows.start[i]
+    room, f, n = _room(rows)[0], rows.start[i], rows.start[i + 1] - rows.start[i]
     for t in range(len(c)):
-        _prior(given, t, x0, lasting, rows, i, V, m, S[i], w, P)
+        _prior(given, t, x0, lasting, rows, i, room)
         for r in range(n):
-            z = m[r]
-            for a in range(D):
-                z += V[r, a] * c[t, a]
+            z = room.m[f + r]
+            for a in range(c.shape[1]):
+                z += room.V[f + r, a] * c[t, a]
             mean[t, r] = z
             for k in range(n):
-                cov[t, r, k] = S[i, r, k]
+                cov[t, r, k] = room.S[i, r, k]
 
 
 @njit(**PART_OPTIONS)
-def _draw_block(given, t, rows, i, lam, eta, c, block, G, x, e, rng):
+def _draw_block(given, t, rows, i, lam, eta, c, room, x, e, rng):
     """One particle of a block into x; its log weight."""
     f, n = rows.start[i], rows.start[i + 1] - rows.start[i]
-    AV, a, total = block[2], block[3], 0.0
+    G, total = room.L[i], 0.0
     for r in range(n):
-        mean = a[r]
+        mean = room.a[f + r]
         for k in range(len(c)):
-            mean += AV[r, k] * c[k]
+            mean += room.AV[f + r, k] * c[k]
         for k in range(r):
             mean += G[r, k] * e[k]
         d = G[r, r]
@@ -569,11 +556,11 @@ def _factor(A, n, G):
 
 
 @njit(**PART_OPTIONS)
-def _draw_own(given, t, rows, i, c, x, room, G, work, own, rng):
+def _draw_own(given, t, rows, i, c, x, room, own, rng):
     """Own effects of a block given its trust x."""
-    V, m, S, w = room[0], room[1], room[2], room[3]
+    V, m, w, G = room.V, room.m, room.w, room.work
     f, n, L = rows.start[i], rows.start[i + 1] - rows.start[i], rows.own.shape[1]
-    _factor(S[i], n, G)
+    _factor(room.S[i], n, G)
     e, B = np.empty(n), np.empty((n, L))
     for r in range(n):  # G^-1 (x - m - V c), and G^-1 W diag(sd)
         z = x[r] - m[f + r]
@@ -606,17 +593,6 @@ def _draw_own(given, t, rows, i, c, x, room, G, work, own, rng):
 
 
 @njit(**PART_OPTIONS)
-def _store(block, n, D, stored, i):
-    """Keep a block under its sites, as its arrays are shared."""
-    KV, Kd, AV, a, C = block
-    for r in range(n):
-        stored[1][i, r], stored[3][i, r] = Kd[r], a[r]
-        for k in range(D):
-            stored[0][i, r, k], stored[2][i, r, k] = KV[r, k], AV[r, k]
-    _factor(C, n, stored[4][i])
-
-
-@njit(**PART_OPTIONS)
 def _propose(given, t, mean, F, nu, exact, c, rng):
     """Shared coefficients of numbers c, in place; log prior density less that of the proposal.
 
@@ -643,13 +619,13 @@ def _propose(given, t, mean, F, nu, exact, c, rng):
 
 
 @njit(**PART_OPTIONS)
-def _log_given(block, n, c):
-    """Log integral of a block under its sites given c, but for the constant."""
-    total = 0.0
-    for r in range(n):
-        z = block[1][r]
+def _log_given(rows, i, room, c):
+    """Log integral of a block under its sites given c."""
+    total = room.constant[i]
+    for r in range(rows.start[i], rows.start[i + 1]):
+        z = room.Kd[r]
         for k in range(len(c)):
-            z -= block[0][r, k] * c[k]
+            z -= room.KV[r, k] * c[k]
         total -= 0.5 * z * z
     return total
 
@@ -663,25 +639,17 @@ def _draws(given, x0, lasting, rows, kept, n_sweeps, nu, n_particles, count, c, 
     become draws of the shared coefficients; with nu = 0 they are these.
     """
     D, n_blocks = rows.U.shape[1], len(rows.start) - 1
-    room, work, L, block, Q, h, lam, eta = _work(rows)
-    V, m, S, most = room[0], room[1], room[2], room[5]
+    room, lam, eta, Q, h = _room(rows)
     mean, F = np.zeros((3, D)), np.zeros((3, D, D))
     wide_lam, wide_eta = np.empty(len(rows.y)), np.empty(len(rows.y))
-    stored = (
-        np.zeros((n_blocks, most, D)), np.zeros((n_blocks, most)), np.zeros((n_blocks, most, D)),
-        np.zeros((n_blocks, most)), np.zeros((n_blocks, most, most)),
-    )  # fmt: skip
-    constant = np.zeros(n_blocks)
-    G, particle, best, e = np.zeros((most, most)), np.empty(most), np.empty(most), np.empty(most)
+    most = len(room.work)
+    particle, best, e = np.empty(most), np.empty(most), np.empty(most)
     d = 0
     for t in range(len(count)):
-        _prepare(given, t, x0, lasting, rows, room)
-        _start(given, t, rows, kept, lam, eta)
+        _prepare(given, t, x0, lasting, rows, room, kept, lam, eta)
         if not exact:
             for _ in range(n_sweeps + 1):
-                _sweep(given, t, rows, lam, eta, room, work, L, block, Q, h, F[0], mean[0], 1.0)
-        _gather(given, t, rows, lam, eta, room, work, L, block, Q, h)
-        solve(Q, h, F[0], mean[0])
+                _sweep(given, t, rows, lam, eta, room, Q, h, F[0], mean[0], 1.0)
         if not exact and nu > 0.0:
             for r in range(len(rows.y)):
                 factor = 1.0
@@ -689,37 +657,34 @@ def _draws(given, x0, lasting, rows, kept, n_sweeps, nu, n_particles, count, c, 
                     low, high = given.limits[t, rows.case[r]]
                     factor = _TEMPER if np.isfinite(high - low) else _TEMPER_AT_END
                 wide_lam[r], wide_eta[r] = factor * lam[r], factor * eta[r]
-            _gather(given, t, rows, wide_lam, wide_eta, room, work, L, block, Q, h)
+            _gather(given, t, rows, wide_lam, wide_eta, room, Q, h)
             solve(Q, h, F[1], mean[1])
             for k in range(D):
                 mean[2, k], F[2, k, k] = given.mean[t, k], 1.0 / given.sd[t, k]
+        _gather(given, t, rows, lam, eta, room, Q, h)
+        solve(Q, h, F[0], mean[0])
         for i in range(n_blocks):
-            f, g = rows.start[i], rows.start[i + 1]
-            constant[i] = _whiten(rows, i, lam, eta, V[f:g], m[f:g], S[i], work, L, block)
-            _condition(rows, i, lam, V[f:g], m[f:g], S[i], work, L, block, True)
-            _store(block, g - f, D, stored, i)
+            _condition(rows, i, lam, room, True)
+            _factor(room.C[i], rows.start[i + 1] - rows.start[i], room.L[i])
         for _ in range(count[t]):
             total = 0.0
             if nu > 0.0:
                 total = _propose(given, t, mean, F, nu, exact, c[d], rng)
             for i in range(n_blocks):
                 f, n = rows.start[i], rows.start[i + 1] - rows.start[i]
-                of_block = stored[0][i], stored[1][i], stored[2][i], stored[3][i], stored[4][i]
-                base = constant[i] + _log_given(of_block, n, c[d])
                 log_sum = -np.inf
                 for _p in range(1 if exact else n_particles):
-                    w = _draw_block(
-                        given, t, rows, i, lam, eta, c[d], of_block, stored[4][i], particle, e, rng
-                    )
+                    w = _draw_block(given, t, rows, i, lam, eta, c[d], room, particle, e, rng)
                     top = max(log_sum, w)
                     log_sum = top + math.log(math.exp(log_sum - top) + math.exp(w - top))
                     if math.log(1.0 - rng.random()) <= w - log_sum:  # a choice by weight
                         for r in range(n):
                             best[r] = particle[r]
-                log_block[d, i] = base + log_sum - math.log(1 if exact else n_particles)
+                log_sum -= math.log(1 if exact else n_particles)
+                log_block[d, i] = _log_given(rows, i, room, c[d]) + log_sum
                 total += log_block[d, i]
                 for r in range(n):
                     x[d, f + r] = best[r]
-                _draw_own(given, t, rows, i, c[d], best, room, G, work, own[d, i], rng)
+                _draw_own(given, t, rows, i, c[d], best, room, own[d, i], rng)
             log_weight[d] = total
             d += 1
