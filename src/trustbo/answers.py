@@ -70,7 +70,7 @@ class Reports:
         if levels := levels_of(self.scale):
             off |= given & (answers != np.round(answers))
         for k, i in np.argwhere(off):
-            report_of(f"report [{k}, {i}]", answers[k, i], levels)
+            report_of(f"report [{k}, {i}]", float(answers[k, i]), levels)
 
     @classmethod
     def of(

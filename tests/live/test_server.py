@@ -47,12 +47,19 @@ def test_the_page_needs_no_token_and_everything_else_does(folder, serving):
 def test_what_is_told_is_on_disk_when_it_is_answered(folder, serving):
     with serving(folder) as served:
         status, answer = served.tell(
-            {"bound": 1}, {"contact": [1, 0, None]}, {"contact": [1, 1, 1]}
+            {"bound": 1}, {"contact": [1, 0, None]}, {"contact": [1, 1, 1]}, {"report": {"r2": 0.5}}
         )
-        assert (status, answer["taken"]) == (200, 3)
+        assert (status, answer["taken"]) == (200, 4)
         lines = (folder / FOLDER / "0002.jsonl").read_text().splitlines()
-        assert [json.loads(line)["event"] for line in lines] == ["plan", "begin", "ticks", "ticks"]
+        assert [json.loads(line)["event"] for line in lines] == [
+            "plan",
+            "begin",
+            "ticks",
+            "ticks",
+            "report",
+        ]
         assert served.state()["robots"][1]["rate"] == 0.5
+        assert served.state()["reports"][1] == [None, 0.5, None]
         plan = json.loads(served.call("api/plan")[1])
         assert plan["path"] == served.state()["path"]
         status, text = served.call("api/map?layer=cost&robot=r2")
