@@ -62,7 +62,7 @@ def compared(workspace: Workspace) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         ]  # fmt: skip
         drives = []
         for k in rng.permutation(len(ahead))[:N_NEXT]:
-            state = simulator._start(a, 0, c)
+            state = simulator.standing(a, c)
             drives.append(simulator._drive(state, 1, c, ahead[k], np.random.default_rng(0)))
         drives = [drive for drive in drives if drive.status == "ok"]
         if drives:

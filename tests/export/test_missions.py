@@ -1,5 +1,6 @@
 """A plan with its times for ground stations, TAK, Google Earth and Foxglove, as others read it."""
 
+import dataclasses
 import io
 import json
 import math
@@ -49,6 +50,29 @@ def test_bounds_last_as_long_as_they_are_driven(result, schedule):
     mission = simulator.run(list(result.plan.path), seed=0)
     driven = np.array([bound.duration.max() for bound in mission.bounds])
     planned = np.diff(schedule.begins)
+    assert (np.abs(driven - planned) <= 0.15 * planned + 8.0).all()
+
+
+def test_in_alternate_bounding_robots_stand_while_the_others_pass(result):
+    """The lead drives in bounds 1, 3, ..., T2 in 2, 4, ..., and at the goal the one behind."""
+    rules = dataclasses.replace(result.workspace.formation, bounding="alternate")
+    workspace = dataclasses.replace(result.workspace, formation=rules)
+    plan = dataclasses.replace(result.plan, workspace=workspace)
+    assert len(plan.path) == 6
+    found = schedule_of(plan)
+    lead, *others = (found.robots[name] for name in ROBOTS)
+    assert [stand.name for stand in lead] == ["start", "stop 1", "stop 3", "goal"]
+    for stand, k in zip(lead[1:3], (1, 3), strict=True):
+        times = stand.leaves, stand.arrives
+        np.testing.assert_allclose(times, found.begins[k - 1 : k + 1], atol=1e-6)
+    for robot in others:
+        assert [stand.name for stand in robot] == ["post 1", "post 3", "post 5", "goal"]
+        for stand, k in zip(robot[1:3], (2, 4), strict=True):
+            assert stand.leaves == pytest.approx(found.begins[k - 1])
+            assert stand.leaves < stand.arrives <= found.begins[k] + 1e-6
+    assert {robot[-1].until for robot in found.robots.values()} == {found.begins[-1]}
+    mission = tb.simulation.KinematicSimulator(workspace).run(plan.path, seed=0)
+    driven, planned = [b.duration.max() for b in mission.bounds], np.diff(found.begins)
     assert (np.abs(driven - planned) <= 0.15 * planned + 8.0).all()
 
 

@@ -75,7 +75,7 @@ def test_edges_follow_the_ways_of_the_lead_in_the_frame(planner, written, tmp_pa
         inner = [n for n in chains if n >= n_cells] + [start, goal]
         chain = nx.shortest_path(chains.subgraph(inner), start, goal)
         points = np.array([server.positions[node] for node in chain]) + shift
-        way = workspace.ground.lead(a, c)
+        way = workspace.ground.posts.lead_way(a, c)
         np.testing.assert_allclose(points[[0, -1]], way[[0, -1]], rtol=0.0, atol=1e-6)
         far = shapely.hausdorff_distance(shapely.LineString(points), shapely.LineString(way), 0.01)
         assert far <= near + 1e-6

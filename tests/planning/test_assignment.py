@@ -197,16 +197,13 @@ def test_the_truth_of_a_plan_is_that_of_its_posts(unlike, tmp_path):
 
 
 def test_posts_that_cannot_be_driven_to_are_refused(unlike):
-    workspace, simulator, plan = unlike
+    _, simulator, plan = unlike
     with pytest.raises(ShapeError, match=r"posts must be .*, \(bound, robot, x and y\); got"):
         simulator.run(plan.path, seed=0, posts=plan.posts[:, :2])
     off = plan.posts.copy()
     off[1, 2] += 1000.0
     with pytest.raises(TrustboError, match=r"posts\[1, 2\] = .* cannot be reached from the lead's"):
         simulator.run(plan.path, seed=0, posts=off)
-    by_turns = KinematicSimulator(workspace, bounding="alternate")
-    with pytest.raises(TrustboError, match="posts are of successive bounding, not 'alternate'"):
-        by_turns.run(plan.path, seed=0, posts=plan.posts)
 
 
 def test_a_workspace_that_has_planned_can_be_pickled(unlike):
@@ -251,7 +248,10 @@ def test_posts_that_no_one_can_have_stood_at_are_refused(unlike):
     )
 
 
-def test_alternate_bounding_drives_a_plan_by_the_rule(unlike):
+def test_robots_are_not_assigned_in_alternate_bounding(unlike):
     workspace, _, plan = unlike
-    mission = KinematicSimulator(workspace, bounding="alternate").run(plan, seed=0)
-    assert mission.posts is None
+    rules = replace(workspace.formation, bounding="alternate")
+    by_turns = replace(plan, workspace=replace(workspace, formation=rules))
+    assert plan.robots is not None
+    assert by_turns.robots is None
+    assert KinematicSimulator(by_turns.workspace).run(by_turns, seed=0).posts is None

@@ -307,8 +307,6 @@ def test_impossible_truths_are_refused(of_wooded, wooded):
         Truth.of(object())
     with pytest.raises(TrustboError, match="Bare has no reset and no run_bound"):
         Truth.of(type("Bare", (), {"workspace": grid(), "run": None})())
-    with pytest.raises(TrustboError, match='bounding="alternate" has no truth by bounds'):
-        Truth.of(wooded_simulator(bounding="alternate"))
     with pytest.raises(TrustboError, match="standard_error must be positive and finite; got 0"):
         Truth.of(wooded, standard_error=0)
     with pytest.raises(TrustboError, match="unknown objective of a truth 'terminal'"):

@@ -135,7 +135,7 @@ def test_line_of_sight_predicts_the_simulator_without_noise(name, real_terrain):
         ahead = [n for p, n in pairs if p == c and n != a]
         drives = []
         for n in ahead:
-            state = simulator._start(a, 0, c)
+            state = simulator.standing(a, c)
             drives.append(simulator._drive(state, 1, c, n, np.random.default_rng(0)))
         if any(drive.status != "ok" for drive in drives):
             continue

@@ -52,9 +52,7 @@ def test_a_bound_is_passable_if_and_only_if_all_its_ways_exist():
     for m, row, col in np.argwhere(exists).tolist():
         a = row - MOVES[8][m][0], col - MOVES[8][m][1]
         ahead = [c for c in np.ndindex(3, 3) if max(abs(c[0] - row), abs(c[1] - col)) == 1]
-        ways = [ground.lead(a, (row, col))]
-        for c in (None, *ahead):
-            ways += ground.closing(a, (row, col), c)
+        ways = [way for c in (None, *ahead) for way in ground.bound(a, (row, col), c)]
         assert {way is not None for way in ways} == {bool(passable[m, row, col])}
 
 

@@ -51,6 +51,7 @@ def run_missions(
         if not isinstance(truth, Truth):
             raise TrustboError(f"truth must be Truth.of(simulator); got {truth!r}.")
         truth.require_workspace(campaign.workspace)
+        truth.require_best()
     rules = require_stops(stop)
     describe = getattr(runner, "describe", lambda: {"simulator": type(runner).__name__})
     # As a file gives them back: tuples are lists there, and arrays too.
@@ -70,8 +71,7 @@ def _run_missions(
 ) -> Iterator[tuple[Plan, Mission]]:
     replans = campaign.options.replan == "bound"
     numbered = takes(runner.reset if replans else runner.run, "mission")
-    successive = getattr(runner, "bounding", "successive") == "successive"
-    to_posts = successive and not replans and takes(runner.run, "posts")
+    to_posts = not replans and takes(runner.run, "posts")
     with Progress(campaign, n_iterations, progress) as shown:
         while True:
             n = len(campaign.missions)

@@ -1,7 +1,8 @@
 """Times at which robots drive and stand on a plan, from its ways and their speeds on the slope.
 
 In a bound the lead drives first, from a stop to the next, while T2 watches from its posts; then T2
-closes up. The next bound begins when the last of T2 stands.
+closes up. The next bound begins when the last of T2 stands. In alternate bounding they drive by
+turns.
 """
 
 from typing import NamedTuple
@@ -65,24 +66,26 @@ def schedule_of(plan: Plan) -> Schedule:
     for i, (robot, name) in enumerate(zip((team.lead, *team.robots), names, strict=True)):
         flat, ends = np.concatenate(ways[name]), np.cumsum([0, *map(len, ways[name])])
         times[i] = at_times(surface, robot, np.ascontiguousarray(flat), ends, 1)[1]
-    begins = np.concatenate([[0.0], np.cumsum(times[0] + times[1:].max(0))])
-    stops = begins[:-1] + times[0]  # the lead stands, and T2 sets out
+    t2_time = times[1:].max(0)
+    begins = np.concatenate([[0.0], np.cumsum(times[0] + t2_time)])
+    first = plan.lead_first
+    sets_out = begins[:-1] + np.where(first, 0.0, t2_time)  # the lead
+    stops = begins[:-1] + np.where(first, times[0], 0.0)  # T2 sets out
+    leaves = {name: stops for name in names[1:]} | {LEAD: sets_out}
     near = 0.5 * min(surface.pixel)
-    thin = {name: [_thinned(way, near) for way in of_robot] for name, of_robot in ways.items()}
-    robots = {LEAD: [Stand(ways[LEAD][0][:1], "start", 1, 0.0, 0.0, 0.0)]}
-    for k, way in enumerate(thin[LEAD]):
-        last = k == n_bounds - 1
-        name, bound = ("goal", 0) if last else (f"stop {k + 1}", k + 2)
-        stand = Stand(way, name, bound, begins[k], stops[k], begins[k + 1])
-        robots[LEAD].append(stand)
-    for i, robot in enumerate(names[1:], start=1):
-        robots[robot] = [Stand(ways[robot][0][:1], "post 1", 1, 0.0, 0.0, stops[0])]
-        for k, way in enumerate(thin[robot]):
-            last = k == n_bounds - 1
-            name, bound = ("goal", 0) if last else (f"post {k + 2}", k + 2)
-            until = begins[-1] if last else stops[k + 1]
-            arrives = stops[k] + times[i, k]
-            robots[robot].append(Stand(way, name, bound, stops[k], arrives, until))
+    robots = {}
+    for i, name in enumerate(names):
+        what = "start" if name == LEAD else "post 1"
+        robots[name] = [Stand(ways[name][0][:1], what, 1, 0.0, 0.0, 0.0)]
+        for k, way in enumerate(ways[name]):
+            if (way[0] == way[-1]).all() and k < n_bounds - 1:
+                continue  # it stands while the others pass
+            robots[name][-1] = robots[name][-1]._replace(until=leaves[name][k])
+            what = f"stop {k + 1}" if name == LEAD else f"post {k + 2}"
+            what, bound = ("goal", 0) if k == n_bounds - 1 else (what, k + 2)
+            arrives = leaves[name][k] + times[i, k]
+            stand = Stand(_thinned(way, near), what, bound, leaves[name][k], arrives, begins[-1])
+            robots[name].append(stand)
     return Schedule(robots, begins)
 
 

@@ -1,7 +1,8 @@
 """Difficulty of bounds: measures of their routes relative to the robots' limits.
 
 Each measure is 0 on easy routes and about 1 at the robots' limit; a bound has the maximum over the
-routes of the lead and of T2. T2's routes assume the next cell straight ahead.
+routes of the lead and of T2. T2's routes assume the next cell straight ahead, and those of
+alternate bounding the cell before straight behind.
 """
 
 import math
@@ -14,7 +15,6 @@ import xarray as xr
 from numba import njit
 from scipy import ndimage
 
-from trustbo.data import Cell
 from trustbo.parallel import in_order
 from trustbo.workspace import Workspace
 from trustbo.workspace.bound_awareness import TRAVERSABLE
@@ -72,24 +72,26 @@ def _measure(workspace: Workspace, ways: Ways, exists: np.ndarray, out: np.ndarr
     def work(block: Sequence[list[int]]) -> None:
         for m, row, col in block:
             (down, right), cell = MOVES[8][m], (row, col)
-            ahead = row + down, col + right
+            left, ahead = (row - down, col - right), (row + down, col + right)
             inside = 0 <= ahead[0] < exists.shape[1] and 0 <= ahead[1] < exists.shape[2]
             onward = ahead if inside and exists[m, *ahead] else None
-            out[m, row, col] = _of_bound(ways, easy, room, (row - down, col - right), cell, onward)
+            before = (row - 2 * down, col - 2 * right) if exists[m, *left] else None
+            bound = ways.bound(left, cell, onward, before)
+            out[m, row, col] = _of_bound(ways, easy, room, bound)
 
     for _ in in_order(work, batched(np.argwhere(exists).tolist(), _BLOCK)):
         pass
 
 
 def _of_bound(
-    ways: Ways, easy: np.ndarray, room: np.ndarray, a: Cell, c: Cell, onward: Cell | None
+    ways: Ways, easy: np.ndarray, room: np.ndarray, bound: Sequence[np.ndarray | None]
 ) -> np.ndarray:
-    """Maximum of each measure over the robots' ways a -> c, with maps of pixels (row, col)."""
+    """Maximum of each measure over the robots' ways in a bound, with maps of pixels (row, col)."""
     surface, team = ways.posts.surface, ways.posts.team
     ground = surface.gradient, surface.pixel, surface.origin
     robots = team.lead, *team.robots
     worst = np.zeros(len(MEASURES))
-    for robot, way in zip(robots, (ways.lead(a, c), *ways.closing(a, c, onward)), strict=True):
+    for robot, way in zip(robots, bound, strict=True):
         if way is None:
             continue  # two posts may be in one pixel, with a route of length 0
         pixels = surface.nearest(*way.T)

@@ -14,6 +14,7 @@ from trustbo.hazard.risk import PathRisk
 from trustbo.planning.assignment import robots_along
 from trustbo.planning.cover import PathCover
 from trustbo.workspace import Workspace
+from trustbo.workspace.bounding import legs_along
 
 QUANTILES = (0.05, 0.25, 0.75, 0.95)
 """Quantiles of `Plan.bands`: ends of the 90 % and of the 50 % band."""
@@ -23,9 +24,9 @@ QUANTILES = (0.05, 0.25, 0.75, 0.95)
 class Plan(Displayed):
     """A path with its expected trust, value and exactness.
 
-    What robots are to do, `waypoints`, `posts` and `ways`, is that of successive bounding, in CRS
-    metres; it is the workspace's, but for robots that differ (`robots`), computed on demand, and
-    None without a terrain in memory. Trust, value and bands are for the workspace's posts.
+    What robots are to do, `waypoints`, `posts` and `ways`, in CRS metres, is the workspace's, but
+    for robots that differ (`robots`), computed on demand, and None without a terrain in memory.
+    Trust, value and bands are for the workspace's posts.
 
     Attributes:
         path: Cells, start first.
@@ -148,14 +149,17 @@ class Plan(Displayed):
 
     @cached_property
     def waypoints(self) -> np.ndarray | None:
-        """Stops of the lead in the cells of the path, shape (cell, 2)."""
-        if (ground := self.workspace.ground) is None:
-            return None
-        return np.stack([ground.posts.waypoint(cell) for cell in self.path])
+        """Stops of the lead before each bound and at the goal, shape (bound + 1, 2).
+
+        In successive bounding those in the cells of the path; in alternate bounding it stays where
+        it is while T2 passes.
+        """
+        ground = self.workspace.ground
+        return None if ground is None else ground.posts.places(self.path)[0]
 
     @cached_property
     def posts(self) -> np.ndarray | None:
-        """Posts where T2 stands while the lead runs each bound, shape (bound, robot, 2)."""
+        """Posts where T2 stands before each bound, shape (bound, robot, 2)."""
         if (ground := self.workspace.ground) is None:
             return None
         return ground.posts.along(self.path) if self.own_posts is None else self.own_posts
@@ -185,15 +189,16 @@ class Plan(Displayed):
         """Ways of each bound: the lead's, then each of T2's, polylines of shape (point, 2).
 
         T2 closes up to its posts for the next bound, at the goal around the lead. None for a robot
-        that has no way.
+        that has no way; that of one that does not move in the bound is its place, twice.
         """
-        if (ground := self.workspace.ground) is None:
-            return None
-        assert self.posts is not None  # noqa: S101  # there is a ground
-        at_goal = ground.posts.watching(self.path[-1], None)
-        starts, ends = self.posts, [*self.posts[1:], at_goal]
-        bounds = zip(pairwise(self.path), starts, ends, strict=True)
-        return tuple((ground.lead(*bound), *ground.between(*bound, *way)) for bound, *way in bounds)
+        ground = self.workspace.ground
+        return None if ground is None else tuple(ground.along(self.path, self.own_posts))
+
+    @property
+    def lead_first(self) -> np.ndarray:
+        """Whether the lead drives before T2 in a bound, or alone, (bound,)."""
+        moves = legs_along(self.workspace.formation.bounding, self.path)
+        return np.array([of_bound[0].of_lead for of_bound in moves])
 
 
 def unseen_text(cover: PathCover) -> str:

@@ -9,31 +9,31 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from trustbo.data import Bound, Cell, Mission, require_posts
-from trustbo.errors import TrustboError, require_choice, require_positive, require_whole
+from trustbo.errors import TrustboError, require_positive, require_whole
 from trustbo.planning.plan import Plan
-from trustbo.simulation.bounding import BOUNDING, Drive, State, turns
 from trustbo.simulation.events import Degradation, Event, Threat, require_events
 from trustbo.simulation.measure import Measure
 from trustbo.simulation.motion import drive_together
 from trustbo.simulation.protocol import DescribedSimulator
 from trustbo.simulation.sensing import contact_of, cut_at_lost_contact, detections, new_tracks
+from trustbo.simulation.state import Drive, State
 from trustbo.simulation.world import Worlds, true_surface
 from trustbo.team import Robot, Team
 from trustbo.terrain import CompositeIndex
 from trustbo.terrain.dataset import digest_of
 from trustbo.workspace import Workspace
+from trustbo.workspace.bounding import Leg, after, legs, t2_cells
 from trustbo.workspace.sight import Sight, sights_of
 
 
 class KinematicSimulator(DescribedSimulator):
     """Unicycle robots on a DEM and DSM, in contact while their lidar has a line of sight.
 
-    In the first phase of a bound the lead drives to its waypoint in the next cell while T2 watches
-    from its positions in the last; in the second, T2 closes up to positions around the lead, chosen
-    for sight of the next waypoint, while the lead watches. The contact rate of a robot of T2 is the
-    share of ticks, of both phases, in which it is in contact with the lead. With
-    `bounding="alternate"` T2 does not close up but passes the lead in the next bound, so that they
-    lead by turns; at the goal the one behind closes up.
+    In the first phase of a bound the lead drives to its stop in the next cell while T2 watches from
+    its posts in the last; in the second, T2 closes up to its next posts while the lead watches. The
+    contact rate of a robot of T2 is the share of ticks, of both phases, in which it is in contact
+    with the lead. In a workspace of alternate bounding T2 does not close up but passes the lead in
+    the next bound, so that they lead by turns; at the goal the one behind closes up.
 
     `run` runs a path, `run_batch` many missions over one; `reset`, `run_bound` and `close` run one
     bound by bound.
@@ -49,7 +49,6 @@ class KinematicSimulator(DescribedSimulator):
         tick: float = 0.5,
         bound_timeout: float = 600.0,
         lost_contact_after: float | None = None,
-        bounding: str = "successive",
         threats: Sequence[Threat] = (),
         degradations: Sequence[Degradation] = (),
         events: Sequence[Event] = (),
@@ -71,8 +70,6 @@ class KinematicSimulator(DescribedSimulator):
             bound_timeout: Longest duration of a bound, s; the mission then ends as "timeout".
             lost_contact_after: Longest time without contact of any robot, s; the mission then ends
                 as "lost_contact". None: no limit.
-            bounding: "successive" or "alternate". The workspace's posts, ways and awareness of
-                bounds are those of successive bounding.
             threats: Regions that jam sight or forbid passage in some missions.
             degradations: Lidars of T2 that are worse in some missions.
             events: Events of any kind, `Dust`, `Fouling`, `Vegetation` and `Season` too, which act
@@ -82,8 +79,8 @@ class KinematicSimulator(DescribedSimulator):
             record_states: Keep each robot's state at each tick, `Bound.states`.
 
         Raises:
-            TrustboError: A workspace without terrain, an unknown sight mode, bounding or robot, a
-                value that is not positive, a threat off the terrain.
+            TrustboError: A workspace without terrain, an unknown sight mode or robot, a value that
+                is not positive, a threat off the terrain.
         """
         assumed = (*workspace.sights, Sight())[0]
         self.workspace, self.terrain = workspace, terrain
@@ -97,10 +94,10 @@ class KinematicSimulator(DescribedSimulator):
         surface = true_surface(workspace, terrain)
         self.tick = require_positive("tick", tick)
         self.bound_timeout = require_positive("bound_timeout", bound_timeout)
+        self._max_ticks = round(self.bound_timeout / self.tick)
         self.lost_contact_after = lost_contact_after
         if lost_contact_after is not None:
             require_positive("lost_contact_after", lost_contact_after)
-        self.bounding = require_choice("bounding", bounding, BOUNDING)
         self.realtime, self.record_states = dict(realtime or {}), record_states
         self._wants_states = record_states or bool(self.realtime)
         require_events("threats", threats, Threat)
@@ -114,6 +111,11 @@ class KinematicSimulator(DescribedSimulator):
         self._state: State | None = None
         self._enter(0)
 
+    @property
+    def bounding(self) -> str:
+        """Mode of bounding, the workspace's."""
+        return self.workspace.formation.bounding
+
     def describe(self) -> dict[str, object]:
         """Return the settings that decide what a mission measures."""
         same = self.team == self.workspace.team
@@ -124,7 +126,6 @@ class KinematicSimulator(DescribedSimulator):
             "extinction": self.sight.extinction,
             "crown_base": self.sight.crown_base,
             "tick": self.tick,
-            "bounding": self.bounding,
             "formation": dataclasses.asdict(self.workspace.formation),
             "bound_timeout": self.bound_timeout,
             "lost_contact_after": self.lost_contact_after,
@@ -156,12 +157,12 @@ class KinematicSimulator(DescribedSimulator):
             path: Cells, each a neighbour of the last; or a plan.
             seed: Seed of slip and detections: same seed, same mission, on any machine.
             mission: Number of the mission, from 0, by which events go.
-            posts: Places of T2 while the lead runs each bound, shape (bound, robot, 2), x and y
-                in CRS metres; by default the plan's, or the workspace's, as in alternate bounding.
+            posts: Places of T2 before each bound, shape (bound, robot, 2), x and y in CRS metres;
+                by default the plan's, or the workspace's.
 
         Raises:
             TrustboError: A cell that is off the grid or impassable, fewer than two cells, or posts
-                of another shape, that cannot be reached near their cell, or in alternate bounding.
+                of another shape, or that cannot be reached near their cell.
         """
         return self.run_batch(path, [seed], mission=mission, posts=posts)[0]
 
@@ -185,14 +186,14 @@ class KinematicSimulator(DescribedSimulator):
             TrustboError: See `run`.
         """
         if isinstance(path, Plan):
-            own = path.own_posts if self.bounding == "successive" else None
-            posts, path = own if posts is None else posts, path.path
+            posts, path = path.own_posts if posts is None else posts, path.path
         cells = [self.workspace.require_cell(f"path[{k}]", cell) for k, cell in enumerate(path)]
         if len(cells) < 2:
             raise TrustboError(f"a path needs at least two cells; got {cells}.")
         given = None if posts is None else self._require_posts(posts, cells)
+        numbers = [require_whole("seed", seed, 0) for seed in seeds]
         self._enter(mission)
-        states = [self._start(cells[0], seed, cells[1], given) for seed in seeds]
+        states = [self.standing(*cells[:2], seed=n, posts=given) for n in numbers]
         bounds: list[list[Bound]] = [[] for _ in states]
         under_way = list(range(len(states)))
         for k, cell in enumerate(cells[1:], start=1):
@@ -208,15 +209,14 @@ class KinematicSimulator(DescribedSimulator):
 
     def _require_posts(self, posts: ArrayLike, path: Sequence[Cell]) -> np.ndarray:
         """Posts of T2 for each bound, which it can reach."""
-        if self.bounding != "successive":
-            raise TrustboError(f"posts are of successive bounding, not {self.bounding!r}.")
         given = require_posts(posts, (len(path) - 1, len(self.team.robots), 2))
         ground = self.workspace.ground
         assert ground is not None  # noqa: S101  # `true_surface` has refused others
         for k, i in np.argwhere(~ground.posts.are_reached(path, given)).tolist():
+            cell = t2_cells(self.bounding, path)[k]
             raise TrustboError(
                 f"posts[{k}, {i}] = {given[k, i].round(1).tolist()} cannot be reached from the "
-                f"lead's stop in cell {path[k]} over passable ground at most half a cell around "
+                f"lead's stop in cell {cell} over passable ground at most half a cell around "
                 "it; Workspace.posts has posts that can."
             )
         return given
@@ -233,7 +233,8 @@ class KinematicSimulator(DescribedSimulator):
             mission: See `run`.
         """
         self._enter(mission)
-        self._state = self._start(start, seed, next_cell)
+        cell, seed = self.workspace.require_cell("start", start), require_whole("seed", seed, 0)
+        self._state = self.standing(cell, next_cell, seed=seed)
 
     def run_bound(self, k: int, cell: Cell, *, next_cell: Cell | None = None) -> Bound:
         """Run one bound.
@@ -260,49 +261,52 @@ class KinematicSimulator(DescribedSimulator):
 
     def run_ahead(
         self,
-        way: tuple[Cell, Cell],
+        k: int,
+        cell: Cell,
         ahead: Sequence[Cell | None],
         rng: np.random.Generator,
-        state: State | None = None,
+        state: State,
     ) -> list[tuple[np.ndarray, str, State]]:
-        """Simulate a bound for each admissible next cell; the lead's trajectory is computed once.
+        """Simulate bound k for each admissible next cell; moves that they share are computed once.
 
-        The bound starts from a state of the team, by default at the planned posts. Returns for each
-        the contact rate (robot,), the status and the state after it. The rate is the mean
-        probability of contact over the ticks where scans are independent; where tracks outlast
-        misses, or lost contact ends a mission, that of simulated scans. Fouling is as in the long
-        run.
+        From a state of the team. Returns for each the contact rate (robot,), the status and the
+        state after it. The rate is the mean probability of contact over the ticks where scans are
+        independent; where tracks outlast misses, or lost contact ends a mission, that of simulated
+        scans. Fouling is as in the long run.
         """
-        max_ticks, cell = round(self.bound_timeout / self.tick), way[1]
-        state = self._start(way[0], 0, cell) if state is None else state
-        stop = self._goals(0, cell, None)
-        lead, status = self._phase(0, state.poses, state.stops, way, stop, max_ticks, rng)
-        drives = [Drive(lead, np.ones(len(lead), bool), status, way, state.stops)]
-        for next_cell in ahead if status == "ok" else ():
-            left, goals = max_ticks - len(lead), self._goals(1, cell, next_cell)
-            t2, ended = self._phase(1, lead[-1], state.stops, way, goals, left, rng)
-            stops = np.concatenate([stop, goals])
-            drives.append(Drive(t2, np.zeros(len(t2), bool), ended, (cell, cell), stops))
+        moves: dict[tuple[Leg, bytes], int] = {}  # by their goals
+        drives, runs = [], []
+        for next_cell in ahead:
+            now, run = state, list[int]()
+            for leg in legs(self.bounding, k, state.cells, cell, next_cell is None):
+                goals = self._goals(leg, next_cell)
+                key = leg, goals.tobytes()
+                if key not in moves:
+                    left = self._max_ticks - sum(len(drives[i].poses) for i in run)
+                    moves[key] = len(drives)
+                    drives.append(self._move_leg(now, leg, goals, left, rng))
+                run.append(moves[key])
+                now = _after(now, drives[run[-1]])
+                if drives[run[-1]].status != "ok":
+                    break
+            runs.append(run)
         lidars = self.team.lead, *self.team.robots
         independent = all(robot.acquire == robot.drop == 1 for robot in lidars)
         independent &= self.lost_contact_after is None
         fouling = np.ones(len(self.team.robots))
         for event in self._now.fouling:  # the probability of contact is linear in the factors
             fouling *= event.mean if independent else event.draw(rng, len(fouling))
-        seen, *others = detections(self._now, self.team, drives, fouling)
+        seen = detections(self._now, self.team, drives, fouling)
         outcomes = []
-        for closing, detected in zip(drives[1:], others, strict=True):
-            after = dataclasses.replace(
-                state, cells=closing.cells, poses=closing.poses[-1], stops=closing.stops
-            )
-            after.tracks, status = state.tracks.copy(), closing.status
-            probability = np.concatenate([seen, detected])
+        for run in runs:
+            whole = _joined([drives[i] for i in run])
+            then, status = _after(state, whole), whole.status
+            then.tracks = state.tracks.copy()
+            probability = np.concatenate([seen[i] for i in run])
             if not independent:
-                moves = np.concatenate([drives[0].lead_moves, closing.lead_moves])
-                both = closing._replace(lead_moves=moves)
-                probability, status = self._contact(after, both, probability, rng)
-            outcomes.append((probability.mean(0), status, after))
-        return outcomes or [(seen.mean(0), status, state)] * len(ahead)
+                probability, status = self._contact(then, whole, probability, rng)
+            outcomes.append((probability.mean(0), status, then))
+        return outcomes
 
     def calibration(self, n_bounds: int = 300, seed: int = 0) -> dict[str, xr.Dataset]:
         """Simulate random bounds, without threats, to fit `CompositeIndex.realtime` on.
@@ -340,15 +344,18 @@ class KinematicSimulator(DescribedSimulator):
 
     # --- one bound ---
 
-    def _start(
-        self, start: Cell, seed: int, next_cell: Cell | None, posts: np.ndarray | None = None
+    def standing(
+        self, cell: Cell, next_cell: Cell | None, *, seed: int = 0, posts: np.ndarray | None = None
     ) -> State:
-        cell = self.workspace.require_cell("start", start)
-        first = self._goals(1, cell, next_cell) if posts is None else posts[0]
-        stops = np.concatenate([self._goals(0, cell, None), first])
+        """State of a mission with all in their places in a cell, to go to the next.
+
+        T2 at the first of posts (bound, robot, 2), by default at the workspace's.
+        """
+        rule = self._ways.posts
+        first = rule.watching(cell, next_cell) if posts is None else posts[0]
+        stops = np.concatenate([rule.waypoint(cell)[None], first])
         poses = np.concatenate([stops, np.zeros((len(stops), 1))], axis=1)
-        tracks, seed = new_tracks(len(first)), require_whole("seed", seed, 0)
-        return State((cell, cell), poses, stops, 0.0, seed, tracks, posts)
+        return State((cell, cell), poses, stops, 0.0, seed, new_tracks(len(first)), posts)
 
     def _bounds(
         self, states: Sequence[State], k: int, cell: Cell, next_cell: Cell | None
@@ -389,61 +396,51 @@ class KinematicSimulator(DescribedSimulator):
     def _drive(
         self, state: State, k: int, cell: Cell, next_cell: Cell | None, rng: np.random.Generator
     ) -> Drive:
-        """Drive the lead, then T2; or only one of them, by turns."""
-        cells, status, stops = list(state.cells), "ok", state.stops.copy()
-        poses, lead_moves = [state.poses[None]], []
-        ticks_left = round(self.bound_timeout / self.tick)
-        for mover in turns(self.bounding, k, next_cell is None):
-            i, members = (0, slice(0, 1)) if mover == "lead" else (1, slice(1, None))
-            way, now = (cells[i], cell), poses[-1][-1]
-            goals = self._goals(i, cell, next_cell)
-            if i and state.posts is not None and k < len(state.posts):
+        """Drive the lead, then T2; or in alternate bounding one of them, by turns."""
+        now, drives, left = state, list[Drive](), self._max_ticks
+        for leg in legs(self.bounding, k, state.cells, cell, next_cell is None):
+            goals = self._goals(leg, next_cell)
+            if not leg.of_lead and state.posts is not None and k < len(state.posts):
                 goals = state.posts[k]
-            driven, status = self._phase(i, now, stops, way, goals, ticks_left, rng)
-            poses.append(driven)
-            lead_moves.append(np.full(len(driven), i == 0))
-            ticks_left -= len(driven)
-            if status != "ok":
+            drives.append(self._move_leg(now, leg, goals, left, rng))
+            now, left = _after(now, drives[-1]), left - len(drives[-1].poses)
+            if drives[-1].status != "ok":
                 break
-            cells[i], stops[members] = cell, goals
-        moves = np.concatenate(lead_moves)
-        return Drive(np.concatenate(poses[1:]), moves, status, (cells[0], cells[1]), stops)
+        return _joined(drives)
 
-    def _goals(self, i: int, cell: Cell, next_cell: Cell | None) -> np.ndarray:
-        """Stops of the lead (i = 0) or T2 in a cell, shape (robot, 2)."""
+    def _goals(self, leg: Leg, next_cell: Cell | None) -> np.ndarray:
+        """Stops of those who move, shape (robot, 2)."""
         posts = self._ways.posts
-        return posts.watching(cell, next_cell) if i else posts.waypoint(cell)[None]
+        if leg.of_lead:
+            return posts.waypoint(leg.end)[None]
+        return posts.watching(leg.end, next_cell, leg.watched_from)
 
-    def _phase(
-        self,
-        i: int,
-        now: np.ndarray,
-        stops: np.ndarray,
-        way: tuple[Cell, Cell],
-        goals: np.ndarray,
-        max_ticks: int,
-        rng: np.random.Generator,
-    ) -> tuple[np.ndarray, str]:
-        """Drive the lead (i = 0) or T2 to goals while the others stand.
+    def _move_leg(
+        self, state: State, leg: Leg, goals: np.ndarray, max_ticks: int, rng: np.random.Generator
+    ) -> Drive:
+        """Drive the lead or T2 to goals while the others stand.
 
-        Routes start at the planned posts `stops`, robots at their current poses. Returns poses
-        (tick, 1 + robot, 3) and the status.
+        Routes start at the planned posts, robots at their current poses.
         """
-        if i:
-            members, robots, planned = slice(1, None), self.team.robots, self.workspace.team.robots
+        team, workspace, now = self.team, self.workspace, state.poses
+        if leg.of_lead:
+            members, robots, planned = slice(0, 1), [team.lead], [workspace.team.lead]
         else:
-            members, robots, planned = slice(0, 1), [self.team.lead], [self.workspace.team.lead]
-        window = self._ways.posts.window(*way)
+            members, robots, planned = slice(1, None), team.robots, workspace.team.robots
+        window = self._ways.posts.window(*leg.cells)
         routes: list[np.ndarray | None] = []
         for robot, start, goal, pose in zip(
-            planned, stops[members], goals, now[members], strict=True
+            planned, state.stops[members], goals, now[members], strict=True
         ):
             route = self._ways.routes.find(robot, start, goal, window)
             routes.append(None if route is None else np.concatenate([pose[None, :2], route[1:]]))
         moved, status = self._move(now[members], robots, routes, window, max_ticks, rng)
         poses = np.repeat(now[None], len(moved), axis=0)
         poses[:, members] = moved
-        return poses, status
+        cells, stops = state.cells, state.stops.copy()
+        if status == "ok":
+            cells, stops[members] = after(cells, [leg]), goals
+        return Drive(poses, np.full(len(poses), leg.of_lead), status, cells, stops)
 
     def _move(
         self,
@@ -474,3 +471,16 @@ class KinematicSimulator(DescribedSimulator):
             patience = max(1, round(self.lost_contact_after / self.tick))
             n_ticks, status = cut_at_lost_contact(contact, patience, status)
         return contact[:n_ticks], status
+
+
+def _after(state: State, drive: Drive) -> State:
+    """State after movements, of the same tracks."""
+    return dataclasses.replace(state, cells=drive.cells, poses=drive.poses[-1], stops=drive.stops)
+
+
+def _joined(drives: Sequence[Drive]) -> Drive:
+    """Movements one after the other."""
+    poses, moves = (
+        np.concatenate([getattr(drive, name) for drive in drives]) for name in Drive._fields[:2]
+    )
+    return drives[-1]._replace(poses=poses, lead_moves=moves)

@@ -9,10 +9,10 @@ import numpy as np
 from trustbo.data import Cell
 from trustbo.errors import TrustboError
 from trustbo.parallel import in_order
-from trustbo.simulation.bounding import State
 from trustbo.simulation.events import Fouling
 from trustbo.simulation.overwatch import KinematicSimulator
 from trustbo.simulation.protocol import require_bounds, takes
+from trustbo.simulation.state import State
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import MOVES
 
@@ -64,12 +64,7 @@ class KinematicReplicates:
     """
 
     def __init__(self, simulator: KinematicSimulator, mission: int, seed: int) -> None:
-        """Take a simulator in the world of a mission; TrustboError: it bounds alternately."""
-        if simulator.bounding != "successive":
-            raise TrustboError(
-                f'bounding="{simulator.bounding}" has no truth by bounds: contact depends on whose '
-                'turn it is. Use bounding="successive".'
-            )
+        """Take a simulator of successive bounding in the world of a mission."""
         self._simulator, self._seed, self.most = copy(simulator), seed, 64
         self._edges = edges_of(simulator.workspace)
         self._ends: dict[tuple[Cell, Cell | None], dict[int, State]] = {}
@@ -86,9 +81,11 @@ class KinematicReplicates:
             seed = [self._seed, number, edge.move, *edge.cell]
             rng = np.random.default_rng(seed)
             before = self._ends.get((edge.left, edge.cell), {})
-            state = before[sorted(before)[number % len(before)]] if before else None
-            way = edge.left, edge.cell
-            return edge, self._simulator.run_ahead(way, edge.ahead, rng, state)
+            if before:
+                state = before[sorted(before)[number % len(before)]]
+            else:
+                state = self._simulator.standing(edge.left, edge.cell)
+            return edge, self._simulator.run_ahead(1, edge.cell, edge.ahead, rng, state)
 
         for edge, outcomes in in_order(work, edges):
             for next_cell, (_, status, after) in zip(edge.ahead, outcomes, strict=True):

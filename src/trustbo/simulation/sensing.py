@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numba import njit
 
-from trustbo.simulation.bounding import Drive
+from trustbo.simulation.state import Drive
 from trustbo.simulation.world import World
 from trustbo.team import Robot, Team
 from trustbo.workspace.sight import detection_probability, optics

@@ -57,19 +57,20 @@ class Truth(Displayed):
     Attributes:
         workspace: Workspace of the paths.
         bounds: Expected contact of bounds: a `BoundTable`, whose `data` has it all, or a
-            `ModelContact`.
+            `ModelContact`; None in alternate bounding, where that of a bound depends on those
+            before.
     """
 
     def __init__(
         self,
         workspace: Workspace,
-        bounds: BoundTable | ModelContact,
+        bounds: BoundTable | ModelContact | None,
         at_mission: "Callable[[int], Truth] | None" = None,
-        run: Callable[[Plan], list[Mission]] | None = None,
+        run: Callable[[Sequence[Cell], np.ndarray | None], list[Mission]] | None = None,
     ) -> None:
         """Store the contact of bounds; `at(mission)` is the truth of another mission's world.
 
-        `run(plan)` runs missions over a plan with its posts.
+        `run(path, posts)` runs missions, from posts if they are given.
         """
         self.workspace, self.bounds, self._other = workspace, bounds, at_mission
         self._run = run
@@ -77,9 +78,13 @@ class Truth(Displayed):
 
     def _card(self) -> Card:
         grid = self.workspace.grid
+        source, error = "missions over each path", "that of 64 missions"
+        if self.bounds is not None:
+            source = f"{type(self.bounds).__name__}, of {grid.shape[0]} x {grid.shape[1]} cells"
+            error = f"{self.bounds.standard_error:.2g} of a bound's contact, mean over robots"
         rows = [
-            ("bounds", f"{type(self.bounds).__name__}, of {grid.shape[0]} x {grid.shape[1]} cells"),
-            ("standard error", f"{self.standard_error:.2g} of a bound's contact, mean over robots"),
+            ("bounds", source),
+            ("standard error", error),
             ("worlds", "one" if self._other is None else "of each mission, see at(mission)"),
         ]
         return Card("Truth: expected contact of every bound", rows)
@@ -103,6 +108,9 @@ class Truth(Displayed):
         settings (`describe_mission(mission)`, else `describe()`), the workspace and the code. Of
         what varies within a mission (`Fouling`), contact is the expectation in the long run.
 
+        In alternate bounding contact depends on who moves and on five cells in a row: the truth has
+        the value of paths, each from 64 missions, but no best path, and so no regret.
+
         Args:
             simulator: Simulator with a `workspace`, and with `reset` and `run_bound`.
             seed: Seed of the replicates.
@@ -113,8 +121,8 @@ class Truth(Displayed):
             progress: Whether to show a progress bar.
 
         Raises:
-            TrustboError: A simulator without a workspace or bounds, or whose bounds depend on
-                whose turn it is; a standard error that is not positive.
+            TrustboError: A simulator without a workspace or bounds; a standard error that is not
+                positive.
         """
         workspace = getattr(simulator, "workspace", None)
         if not isinstance(workspace, Workspace):
@@ -129,7 +137,10 @@ class Truth(Displayed):
         def of_mission(number: int) -> Self:
             world = _world(simulator, require_whole("mission", number, 0))
             if (key := to_json(world)) not in cached:
-                table = _table(simulator, number, world, *numbers, folder, progress)
+                by_turns = workspace.formation.bounding == "alternate"
+                by_turns &= isinstance(simulator, KinematicSimulator)
+                asked = simulator, number, world, *numbers, folder, progress
+                table = None if by_turns else _table(*asked)
                 run = partial(_runs, simulator, number) if takes(simulator.run, "posts") else None
                 cached[key] = cls(workspace, table, of_mission, run)
             return cached[key]
@@ -138,8 +149,11 @@ class Truth(Displayed):
 
     @property
     def standard_error(self) -> float:
-        """Standard error of the contact of a bound, mean over robots: root mean square over all."""
-        return self.bounds.standard_error
+        """Standard error of the contact of a bound, mean over robots: root mean square over all.
+
+        NaN without contact of bounds.
+        """
+        return np.nan if self.bounds is None else self.bounds.standard_error
 
     def at(self, mission: int) -> "Truth":
         """Truth of the world of another mission, counted from 0."""
@@ -164,10 +178,11 @@ class Truth(Displayed):
             connectivity: moves, both as for `Planner`.
 
         Raises:
-            TrustboError: An unknown name; a cell off the grid, or impassable.
+            TrustboError: An unknown name; a cell off the grid, or impassable; alternate bounding.
             NoPathError: The goal cannot be reached.
         """
         require_choice("objective of a truth", objective, OBJECTIVES)
+        self.require_best()
         a, b = (self.workspace.require_cell(*e) for e in (("start", start), ("goal", goal)))
         key = a, b, objective, max_bounds, connectivity
         if key not in self._best:
@@ -178,19 +193,21 @@ class Truth(Displayed):
     def value(self, path: Plan | Sequence[Cell]) -> PathContact:
         """Expected contact of a path, or of a plan, and its probability to arrive.
 
-        Of a plan that assigns robots to posts (`Plan.robots`), the mean of 64 missions of the
-        simulator; contact is NaN if none arrives. Of a path, from the table of bounds.
+        From the table of bounds; of a plan that assigns robots to posts (`Plan.robots`), and in
+        alternate bounding, the mean of 64 missions of the simulator, NaN if none arrives.
 
         Raises:
             TrustboError: A cell is off the grid or impassable, or no neighbour of the last.
         """
         cells = self._cells(path)
-        if isinstance(path, Plan) and path.own_posts is not None and self._run is not None:
-            missions = self._run(path)
+        posts = path.own_posts if isinstance(path, Plan) else None
+        if self._run is not None and (posts is not None or self.bounds is None):
+            missions = self._run(cells, posts)
             arrived = [m.contact_rate.mean(1) for m in missions if m.status == "ok"]
             rates = np.mean(arrived, axis=0) if arrived else np.full(len(cells) - 1, np.nan)
             share = len(arrived) / len(missions)
             return PathContact(float((1.0 - rates).sum()), float(rates.mean()), share)
+        assert self.bounds is not None  # noqa: S101  # else it runs missions
         rates = self.bounds.contact(cells).mean(1)
         arrives = float(np.prod(1.0 - self.bounds.failure(cells)))
         return PathContact(float((1.0 - rates).sum()), float(rates.mean()), arrives)
@@ -232,6 +249,18 @@ class Truth(Displayed):
                 "make it with Truth.of(simulator) of this workspace's simulator."
             )
 
+    def require_best(self) -> None:
+        """Refuse a truth without a best path.
+
+        Raises:
+            TrustboError: It is of alternate bounding.
+        """
+        if self.bounds is None:
+            raise TrustboError(
+                "alternate bounding has no best path, and so no regret: contact depends on whose "
+                "turn it is, and on the cells before. Compare paths by Truth.value."
+            )
+
     def _cells(self, path: Plan | Sequence[Cell]) -> tuple[Cell, ...]:
         cells = path.path if isinstance(path, Plan) else path
         cells = tuple(self.workspace.require_cell(f"path[{k}]", c) for k, c in enumerate(cells))
@@ -244,13 +273,15 @@ def _percent(lacking: float, whole: float) -> float:
     return 100.0 * lacking / whole if whole > 0.0 else np.nan
 
 
-def _runs(simulator: Any, mission: int, plan: Plan) -> list[Mission]:
-    """Missions over a plan with its posts, in the world of a mission."""
-    seeds, posts = range(_N_RUNS), plan.own_posts
+def _runs(
+    simulator: Any, mission: int, path: Sequence[Cell], posts: np.ndarray | None
+) -> list[Mission]:
+    """Missions over a path, from posts if they are given, in the world of a mission."""
+    seeds = range(_N_RUNS)
     if isinstance(simulator, KinematicSimulator):
-        return simulator.run_batch(plan.path, seeds, mission=mission, posts=posts)
+        return simulator.run_batch(path, seeds, mission=mission, posts=posts)
     named = {"mission": mission} if takes(simulator.run, "mission") else {}
-    return [simulator.run(plan.path, seed=seed, posts=posts, **named) for seed in seeds]
+    return [simulator.run(path, seed=seed, posts=posts, **named) for seed in seeds]
 
 
 def _world(simulator: Any, mission: int) -> tuple[object, int]:

@@ -11,8 +11,10 @@ lattice around the stop, those are taken with the largest
 
 s the probability of detection under the assumed sight. T2 is within `formation.radius` of the
 stop, also beyond the edge of the cell, out of the lead's way, on ground that is well below the
-slope limit and linked to the stop over such ground. By the rule "sight", the lead stops where the
-ways from the cell to the stops around are seen best.
+slope limit and linked to the stop over such ground. In alternate bounding the lead passes T2 on its
+way from the cell before to c, and it is from the stop there that it has watched T2 come: in place
+of the way from a, and of the stop in a. By the rule "sight", the lead stops where the ways from the
+cell to the stops around are seen best.
 
 Maps lack things that block sight, and have things that do not, so that sight is doubted
 (`Formation.doubted`) where posts and stops are chosen, and nowhere else: the path's line of sight
@@ -20,7 +22,7 @@ is as predicted.
 """
 
 from collections.abc import Sequence
-from itertools import pairwise
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -29,6 +31,7 @@ from scipy import ndimage
 from trustbo.data import Cell
 from trustbo.errors import TerrainError
 from trustbo.team import Robot, Team
+from trustbo.workspace.bounding import legs_along, t2_cells
 from trustbo.workspace.formation import SPACING, Formation
 from trustbo.workspace.grid import Grid
 from trustbo.workspace.moves import MOVES
@@ -71,21 +74,20 @@ class Posts:
         self._safe = self._standable & (steep <= _SAFE * team.max_slope)
         self._central: dict[Cell, np.ndarray] = {}
         self._stops: dict[Cell, np.ndarray] = {}
-        self._cached: dict[Cell, dict[Cell | None, np.ndarray]] = {}
+        self._cached: dict[tuple[Cell, Cell], dict[Cell | None, np.ndarray]] = {}
         # Row and column of the cell that each row and column of pixels belongs to, ascending.
         self._cells = grid.cells_along(*surface.axes)
 
-    def window(self, a: Cell, c: Cell) -> Window:
-        """Window of pixels of two cells and half a cell around: first and end row, then col."""
+    def window(self, *cells: Cell) -> Window:
+        """Window of pixels of cells and half a cell around: first and end row, then col."""
         (rows, cols), shape = self.surface.ground.shape, self.grid.shape
         per_row, per_col = rows / shape[0], cols / shape[1]
-        top, bottom = min(a[0], c[0]) - 0.5, max(a[0], c[0]) + 1.5
-        left, right = min(a[1], c[1]) - 0.5, max(a[1], c[1]) + 1.5
+        of_rows, of_cols = zip(*cells, strict=True)
         return (
-            max(0, int(top * per_row)),
-            min(rows, int(np.ceil(bottom * per_row))),
-            max(0, int(left * per_col)),
-            min(cols, int(np.ceil(right * per_col))),
+            max(0, int((min(of_rows) - 0.5) * per_row)),
+            min(rows, int(np.ceil((max(of_rows) + 1.5) * per_row))),
+            max(0, int((min(of_cols) - 0.5) * per_col)),
+            min(cols, int(np.ceil((max(of_cols) + 1.5) * per_col))),
         )
 
     def are_linked(self, a: Cell, c: Cell) -> bool:
@@ -111,19 +113,22 @@ class Posts:
     def are_reached(self, path: Sequence[Cell], posts: np.ndarray) -> np.ndarray:
         """Whether robots can drive to posts (bound, robot, 2) from the stops, (bound, robot)."""
         linked = np.empty(posts.shape[:2], bool)
-        for k, i in np.ndindex(*linked.shape):
-            linked[k, i] = self.is_linked(path[k], posts[k, i])
+        for (k, cell), i in product(
+            enumerate(t2_cells(self.formation.bounding, path)), range(posts.shape[1])
+        ):
+            linked[k, i] = self.is_linked(cell, posts[k, i])
         return linked
 
-    def lead_way(self, a: Cell, c: Cell) -> np.ndarray | None:
-        """Way of the lead from stop to stop, (point, 2); None if there is none."""
-        ends = self.waypoint(a), self.waypoint(c)
-        return self.routes.find(self.team.lead, *ends, self.window(a, c))
+    def lead_way(self, *cells: Cell) -> np.ndarray | None:
+        """Way of the lead from stop to stop, the first to the last, (point, 2); None if none."""
+        ends = self.waypoint(cells[0]), self.waypoint(cells[-1])
+        return self.routes.find(self.team.lead, *ends, self.window(*cells))
 
-    def lead_line(self, a: Cell, c: Cell) -> np.ndarray:
+    def lead_line(self, *cells: Cell) -> np.ndarray:
         """Way of the lead, or the straight line where there is none, (point, 2)."""
-        way = self.lead_way(a, c)
-        return np.stack([self.waypoint(a), self.waypoint(c)]) if way is None else way
+        way = self.lead_way(*cells)
+        ends = cells[0], cells[-1]
+        return np.stack([self.waypoint(end) for end in ends]) if way is None else way
 
     # --- stops of the lead ---
 
@@ -163,21 +168,46 @@ class Posts:
 
     # --- posts of T2 ---
 
-    def watching(self, cell: Cell, next_cell: Cell | None) -> np.ndarray:
-        """Posts of T2 in a cell, shape (robot, 2), from which it watches the lead's next bound.
+    def watching(
+        self, cell: Cell, next_cell: Cell | None, lead_from: Cell | None = None
+    ) -> np.ndarray:
+        """Posts of T2 in a cell, shape (robot, 2), from which it watches the lead's next move.
 
-        Without a next cell, around the lead at the goal.
+        The lead moves to the next cell from `lead_from`, by default the same cell; in alternate
+        bounding from the one before. Without a next cell, T2 is around the lead at the goal.
         """
-        posts = self._cached.setdefault(cell, {})
+        lead_from = cell if lead_from is None or next_cell is None else lead_from
+        posts = self._cached.setdefault((cell, lead_from), {})
         if next_cell not in posts:  # those of all neighbours cost little more than one
             around = [c for c in self._around(cell) if self._is_in_region(self.waypoint(c))]
             ahead = list(dict.fromkeys([None, *around, next_cell]))
-            posts |= dict(zip(ahead, self._aimed(cell, ahead), strict=True))
+            aimed = self._aimed(cell, ahead, lead_from)
+            posts |= dict(zip(ahead, aimed, strict=True))
         return posts[next_cell]
 
     def along(self, path: Sequence[Cell]) -> np.ndarray:
-        """Posts of T2 while the lead runs each bound of a path, (bound, robot, 2)."""
-        return np.stack([self.watching(a, c) for a, c in pairwise(path)])
+        """Posts of T2 before each bound of a path, (bound, robot, 2)."""
+        return self.places(path)[1][:-1]
+
+    def places(
+        self, path: Sequence[Cell], own: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Places of the lead, (bound + 1, 2), and of T2, (bound + 1, robot, 2).
+
+        Before each bound of a path, and at the goal; T2 at its `own` posts (bound, robot, 2), or by
+        the rule.
+        """
+        lead, t2 = [self.waypoint(path[0])], [self.watching(path[0], path[1])]
+        moves = legs_along(self.formation.bounding, path)
+        for of_bound, next_cell in zip(moves, [*path[2:], None], strict=True):
+            lead.append(lead[-1])
+            t2.append(t2[-1])
+            for leg in of_bound:
+                if leg.of_lead:
+                    lead[-1] = self.waypoint(leg.end)
+                else:
+                    t2[-1] = self.watching(leg.end, next_cell, leg.watched_from)
+        return np.stack(lead), np.stack(t2 if own is None else [*own, t2[-1]])
 
     def candidates(self, cell: Cell, next_cell: Cell | None, n: int) -> np.ndarray:
         """Up to `n` posts to choose from, (post, 2): those of `watching`, then the next best.
@@ -186,7 +216,7 @@ class Posts:
         """
         posts = self.watching(cell, next_cell)
         position, gap = self._standing(cell)
-        score = self._scores(cell, [next_cell], position).mean(0)[0]
+        score = self._scores(cell, [next_cell], position, cell).mean(0)[0]
         while len(posts) < n:
             gaps = np.linalg.norm(position[:, None] - posts, axis=-1).min(1)
             if not (gaps >= gap).any():
@@ -195,12 +225,12 @@ class Posts:
             posts = np.concatenate([posts, position[best, None]])
         return posts
 
-    def _aimed(self, cell: Cell, ahead: list[Cell | None]) -> np.ndarray:
+    def _aimed(self, cell: Cell, ahead: list[Cell | None], lead_from: Cell) -> np.ndarray:
         """Posts of T2 by the next cell, (next cell, robot, 2), with a least distance."""
         here, n_robots = self.waypoint(cell), len(self.team.robots)
         position, gap = self._standing(cell)
         posts = np.empty((len(ahead), n_robots, 2))
-        for i, score in enumerate(self._scores(cell, ahead, position)):
+        for i, score in enumerate(self._scores(cell, ahead, position, lead_from)):
             if i:
                 gaps = np.linalg.norm(position - posts[:, :i, None], axis=-1).min(1)
                 score = score - 10.0 * (gaps < gap)
@@ -221,25 +251,33 @@ class Posts:
                 return position, max(SPACING, _GAP * self.formation.radius)
         return self._pixels_near(cell, here), SPACING
 
-    def _scores(self, cell: Cell, ahead: list[Cell | None], position: np.ndarray) -> np.ndarray:
+    def _scores(
+        self, cell: Cell, ahead: list[Cell | None], position: np.ndarray, lead_from: Cell
+    ) -> np.ndarray:
         """Sight from positions, the nearer the better, (robot, next cell, position)."""
-        seen = self._seen_in_phases if self.formation.is_wide else self._seen_at_end
         distance = np.linalg.norm(position - self.waypoint(cell), axis=1)
-        return np.array(seen(cell, ahead, position)) - _NEARER * distance
+        if self.formation.is_wide:
+            seen = self._seen_in_phases(cell, ahead, position, lead_from)
+        else:
+            seen = self._seen_at_end(cell, ahead, position)
+        return np.array(seen) - _NEARER * distance
 
     def _seen_in_phases(
-        self, cell: Cell, ahead: list[Cell | None], position: np.ndarray
+        self, cell: Cell, ahead: list[Cell | None], position: np.ndarray, lead_from: Cell
     ) -> list[np.ndarray]:
-        """Sight that counts in both phases, (next cell, position) for each robot."""
+        """Sight that counts in all phases, (next cell, position) for each robot."""
         here, lead = self.waypoint(cell), self.team.lead
         goals = [here if c is None else self.waypoint(c) for c in ahead]
-        routes = [np.stack([here, here]) if c is None else self.lead_line(cell, c) for c in ahead]
+        routes = [
+            np.stack([here, here]) if c is None else self.lead_line(lead_from, cell, c)
+            for c in ahead
+        ]
         first = np.cumsum([0, *map(len, routes)])
         aims, _ = at_times(self.surface, lead, np.concatenate(routes), first, _N_AIMS)
         far = np.linalg.norm(position - here, axis=1)
         rows: dict[Robot, np.ndarray] = {}
         for robot in dict.fromkeys(self.team.robots):
-            stops = np.stack([here, *goals])[:, None]
+            stops = np.stack([self.waypoint(lead_from), *goals])[:, None]
             closing = 0.25 * self._seen(stops, position, optics(lead, robot))
             seen = closing[0] + closing[1:]
             best = np.argsort(_NEARER * far - seen, axis=1, kind="stable")[:, :_N_WATCHED]
@@ -248,7 +286,7 @@ class Posts:
             rows[robot] = seen - 1.0  # of positions from which the way was not looked at
             of_best = np.take_along_axis(seen, best, 1) + 0.5 * watched
             np.put_along_axis(rows[robot], best, of_best, 1)
-        in_the_way = np.array([_is_near(position, route, far) for route in routes])
+        in_the_way = np.array([_is_near(position, here, route) for route in routes])
         return [rows[robot] - _IN_THE_WAY * in_the_way for robot in self.team.robots]
 
     def _seen_at_end(
@@ -354,11 +392,12 @@ class Posts:
         return np.stack([x[col], y[row]], axis=-1)
 
 
-def _is_near(position: np.ndarray, route: np.ndarray, far: np.ndarray) -> np.ndarray:
-    """Whether positions, `far` from the route's start, are in the way of a robot on it."""
-    reach = np.linalg.norm(route - route[0], axis=1) <= far.max(initial=0.0) + SPACING
+def _is_near(position: np.ndarray, here: np.ndarray, route: np.ndarray) -> np.ndarray:
+    """Whether positions around a stop, `here`, are in the way of a robot on a route."""
+    far = np.linalg.norm(position - here, axis=1).max(initial=0.0)
+    reach = np.linalg.norm(route - here, axis=1) <= far + SPACING
     off = position[:, None] - route[reach]
-    return np.einsum("...i,...i", off, off).min(1) < SPACING**2
+    return np.einsum("...i,...i", off, off).min(1, initial=np.inf) < SPACING**2
 
 
 def _smoothed(values: np.ndarray, pixel: tuple[float, float], width: float = 5.0) -> np.ndarray:

@@ -13,7 +13,14 @@ import numpy as np
 
 from trustbo.data import Cell
 from trustbo.team import Robot
-from trustbo.workspace.line_of_sight import N_SAMPLES, Geometry, Phases, over_bounds, phases
+from trustbo.workspace.line_of_sight import (
+    N_SAMPLES,
+    Geometry,
+    Phases,
+    geometry_along,
+    over_bounds,
+    phases,
+)
 from trustbo.workspace.moves import MOVES
 from trustbo.workspace.routes import at_times
 from trustbo.workspace.sight import Sight, detection_between, jittered, optics
@@ -69,10 +76,7 @@ class WatchTable:
         Under the model of sight of the table, or another.
         """
         rule = self._ways.posts
-        ends = np.concatenate([posts[1:], rule.watching(path[-1], None)[None]])
-        ways = [self._ways.posts.lead_line(a, c) for a, c in pairwise(path)]
-        ends = np.repeat(ends[:, None], N_SAMPLES, axis=1)
-        given = Geometry(ways, posts, ends, rule.is_wide)
+        given = geometry_along(rule, path, posts)
         return phases(rule.surface, sight or self._sight, rule.team, given)
 
     def unseen(self, passable: np.ndarray) -> np.ndarray:
@@ -84,7 +88,7 @@ class WatchTable:
         rule = self._ways.posts
 
         def work(given: Geometry) -> np.ndarray:
-            return phases(rule.surface, self._sight, rule.team, given).unseen()
+            return given.by_bound(phases(rule.surface, self._sight, rule.team, given).unseen())
 
         shares = np.full((len(MOVES[8]), *passable.shape), np.nan)
         for bounds, some in over_bounds(self._ways, passable, work):
@@ -114,7 +118,9 @@ class WatchTable:
         i, j = (index.ravel() for index in np.indices(pair))
         ends = np.broadcast_to(ends[j, None, None], (len(j), N_SAMPLES, robot, 2))
         posts = np.repeat(starts[i, None], robot, axis=1)
-        given = Geometry([self._ways.posts.lead_line(a, c)] * len(i), posts, ends, rule.is_wide)
+        lines, stops = [rule.lead_line(a, c)] * len(i), np.tile(rule.waypoint(c), (len(i), 1))
+        bounds = np.arange(len(i))
+        given = Geometry(lines, posts, lines, posts, ends, stops, rule.is_wide, bounds)
         seen = phases(rule.surface, self._sight, rule.team, given, rule.formation)
 
         def by_pair(values: np.ndarray) -> np.ndarray:

@@ -3,9 +3,12 @@
 The simulator drives them, exports contain them, and line of sight is computed along them.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from trustbo.data import Cell
+from trustbo.workspace.bounding import legs_along
 from trustbo.workspace.posts import Posts
 
 
@@ -16,19 +19,45 @@ class Ways:
         """Take the routes over the posts' surface."""
         self.posts, self.routes = posts, posts.routes
 
-    def lead(self, a: Cell, c: Cell) -> np.ndarray | None:
-        """Way of the lead from waypoint to waypoint, (point, 2); None if there is none."""
-        return self.posts.lead_way(a, c)
+    def bound(
+        self, a: Cell, c: Cell, next_cell: Cell | None, before: Cell | None = None
+    ) -> list[np.ndarray | None]:
+        """Ways in the bound a -> c: the lead's, then that of each robot of T2 to watch the next.
 
-    def closing(self, a: Cell, c: Cell, next_cell: Cell | None) -> list[np.ndarray | None]:
-        """Way of each robot of T2, from where it watched a -> c to where it watches c -> next."""
-        return self.between(a, c, self.posts.watching(a, c), self.posts.watching(c, next_cell))
+        In alternate bounding those of either, which come from the cell `before`, if there is one.
+        """
+        by_turns = self.posts.formation.bounding == "alternate" and before is not None
+        start, watched, lead_from = (before, a, a) if by_turns else (a, c, c)
+        assert start is not None  # noqa: S101
+        posts = self.posts.watching(start, watched), self.posts.watching(c, next_cell, lead_from)
+        return [self.posts.lead_way(start, a, c), *self.between((start, a, c), *posts)]
+
+    def along(
+        self, path: Sequence[Cell], own: np.ndarray | None = None
+    ) -> list[tuple[np.ndarray | None, ...]]:
+        """Ways in each bound of a path: the lead's, then that of each robot of T2.
+
+        T2 goes between its `own` posts (bound, robot, 2), or those of the rule. The way of a robot
+        that does not move is its place, twice.
+        """
+        lead, t2 = self.posts.places(path, own)
+        ways = []
+        for k, moves in enumerate(legs_along(self.posts.formation.bounding, path)):
+            of_lead: np.ndarray | None = np.stack([lead[k], lead[k + 1]])
+            of_t2: Sequence[np.ndarray | None] = list(np.stack([t2[k], t2[k + 1]], axis=1))
+            for leg in moves:
+                if leg.of_lead:
+                    of_lead = self.posts.lead_way(*leg.cells)
+                else:
+                    of_t2 = self.between(leg.cells, t2[k], t2[k + 1])
+            ways.append((of_lead, *of_t2))
+        return ways
 
     def between(
-        self, a: Cell, c: Cell, starts: np.ndarray, goals: np.ndarray
+        self, cells: Sequence[Cell], starts: np.ndarray, goals: np.ndarray
     ) -> list[np.ndarray | None]:
-        """Way of each robot of T2 in the bound a -> c, from and to positions (robot, 2)."""
-        window = self.posts.window(a, c)
+        """Way of each robot of T2, from and to positions (robot, 2), near some cells."""
+        window = self.posts.window(*cells)
         return [
             self.routes.find(robot, start, goal, window)
             for robot, start, goal in zip(self.posts.team.robots, starts, goals, strict=True)

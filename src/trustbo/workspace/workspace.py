@@ -40,6 +40,7 @@ from trustbo.workspace.bound_awareness import (
     require_sight,
     sight_features,
 )
+from trustbo.workspace.bounding import t2_cells
 from trustbo.workspace.formation import Formation
 from trustbo.workspace.grid import Grid
 from trustbo.workspace.location import Location, cell_of
@@ -73,7 +74,7 @@ class Workspace(Displayed):
             the cell entered, for any move.
         sights: Assumed models of sight; posts go by the first. Empty without a terrain, and in
             files of version 0.1.
-        formation: Rules of the lead's stops and of T2's posts.
+        formation: Order of moves, and rules of the lead's stops and of T2's posts.
     """
 
     awareness: xr.DataArray
@@ -103,6 +104,7 @@ class Workspace(Displayed):
         stops: str = "sight",
         formation_radius: float | None = None,
         sight_discount: float | None = None,
+        bounding: str = "successive",
     ) -> Self:
         """Derive traversability, visibility and line of sight from a DEM and a DSM.
 
@@ -142,16 +144,18 @@ class Workspace(Displayed):
                 8 of the rule `"end"`.
             sight_discount: Rate at which sight is taken to fall with distance in the choice of
                 posts and stops, 1/m; by default 0.005, 0 of `"end"` with `"centre"`.
+            bounding: Order of moves: `"successive"`, T2 closes up to the lead in each bound;
+                `"alternate"`, it passes the lead in the next, so that they lead by turns.
 
         Raises:
             TerrainError: A grid too fine for the raster, an observer off the terrain, a cell
                 without standing room for the team, a DSM without the canopy that a sight needs, a
                 terrain that is read lazily, unless `bounds` is False, or a dataset that is no
                 terrain: without dem, dsm or a metric CRS, or with irregular coordinates.
-            TrustboError: No cell is passable, or an unknown scaling, feature or sight.
+            TrustboError: No cell is passable, or an unknown name of a rule.
         """
         terrain, sights = require_terrain(terrain), sights_of(sight)
-        formation = Formation.of(posts, stops, formation_radius, sight_discount)
+        formation = Formation.of(posts, stops, formation_radius, sight_discount, bounding)
         team = Team.of(team)
         grid = Grid.over(terrain, shape)
         if bounds:
@@ -361,16 +365,17 @@ class Workspace(Displayed):
         easy = self.pixels[TRAVERSABLE].values if TRAVERSABLE in self.pixels else surface.passable
         return Ways(Posts(self.grid, self.team, surface, assumed, easy, self.formation))
 
-    def posts(self, a: Cell, c: Cell) -> np.ndarray | None:
-        """Overwatch points of T2 in cell a while the lead bounds to c, shape (robot, 2).
+    def posts(self, a: Cell, c: Cell, before: Cell | None = None) -> np.ndarray | None:
+        """Overwatch points of T2 in cell a while the lead moves to c, shape (robot, 2).
 
-        X and y in CRS metres, for successive bounding; None without a terrain.
+        X and y in CRS metres; None without a terrain. In alternate bounding the lead comes from the
+        cell `before` a, by default from a, the start; in successive bounding it is in a.
 
         Raises:
             TrustboError: A cell that is off the grid or impassable, or two that are no neighbours.
         """
-        pair = self._require_bound(a, c)
-        return None if self.ground is None else self.ground.posts.watching(*pair)
+        a, c, before = self._require_bound(a, c, before)
+        return None if self.ground is None else self.ground.posts.watching(a, c, before)
 
     def overwatch_map(
         self, bound: tuple[Cell, Cell], *, robot: str | None = None
@@ -391,7 +396,7 @@ class Workspace(Displayed):
             TrustboError: A cell that is off the grid or impassable, two that are no neighbours, or
                 an unknown robot.
         """
-        a, c = self._require_bound(*bound)
+        a, c, _ = self._require_bound(*bound)
         name = self.team.names[0] if robot is None else robot
         require_choice("robot", name, self.team.names)
         if (table := self.watch) is None or self.ground is None or self.terrain is None:
@@ -414,12 +419,14 @@ class Workspace(Displayed):
         return made if self.terrain.rio.crs is None else made.rio.write_crs(self.terrain.rio.crs)
 
     def ways(
-        self, a: Cell, c: Cell, next_cell: Cell | None = None
+        self, a: Cell, c: Cell, next_cell: Cell | None = None, before: Cell | None = None
     ) -> tuple[np.ndarray | None, ...] | None:
         """Ways that the robots drive in the bound a -> c: the lead's, then each of T2's.
 
-        The lead drives to its waypoint in c, then T2 from its posts in a to those from which it
-        watches the bound from c to `next_cell`; at the goal (None) it closes up around the lead.
+        The lead drives to its stop in c, then T2 from its posts in a to those from which it watches
+        the bound from c to `next_cell`; at the goal (None) it closes up around the lead. In
+        alternate bounding either of them comes from the cell `before` a, if there is one; see
+        `Plan.ways` for those of a path.
 
         Returns:
             Polylines, shape (point, 2), x and y in CRS metres; None for one without a way. None
@@ -428,25 +435,26 @@ class Workspace(Displayed):
         Raises:
             TrustboError: A cell that is off the grid or impassable, or two that are no neighbours.
         """
-        a, c = self._require_bound(a, c)
+        a, c, before = self._require_bound(a, c, before)
         if next_cell is not None:
             next_cell = self._require_bound(c, next_cell)[1]
-        if self.ground is None:
-            return None
-        return self.ground.lead(a, c), *self.ground.closing(a, c, next_cell)
+        return None if self.ground is None else tuple(self.ground.bound(a, c, next_cell, before))
 
-    def _require_bound(self, a: Cell, c: Cell) -> tuple[Cell, Cell]:
+    def _require_bound(
+        self, a: Cell, c: Cell, before: Cell | None = None
+    ) -> tuple[Cell, Cell, Cell | None]:
         a, c = self.require_cell("cell", a), self.require_cell("cell", c)
-        moves_along([a, c])
-        return a, c
+        before = None if before is None else self.require_cell("before", before)
+        moves_along([a, c] if before is None else [before, a, c])
+        return a, c, before if self.formation.bounding == "alternate" else None
 
     def along(self, path: Sequence[Cell], posts: ArrayLike | None = None) -> np.ndarray:
         """Awareness of the bounds of a path, shape (bound, robot, feature), in [0, 1].
 
         Args:
             path: Cells, each a neighbour of the one before.
-            posts: Places of T2 while the lead runs each bound, shape (bound, robot, 2), x and y
-                in CRS metres; by default the posts of the workspace.
+            posts: Places of T2 before each bound, shape (bound, robot, 2), x and y in CRS metres;
+                by default the posts of the workspace.
 
         Raises:
             ShapeError: Posts of another shape.
@@ -481,13 +489,14 @@ class Workspace(Displayed):
     def _require_near(self, path: tuple[Cell, ...], posts: ArrayLike) -> np.ndarray:
         """Refuse posts (bound, robot, 2) that are not near the cells that T2 watches from."""
         grid, given = self.grid, require_posts(posts, (len(path) - 1, self.team.n_robots, 2))
-        centres = np.array([grid.center(cell) for cell in path[:-1]])[:, None]
+        cells = t2_cells(self.formation.bounding, path)
+        centres = np.array([grid.center(cell) for cell in cells])[:, None]
         # Half a cell from its edge, by whole pixels: the window that the rule's posts are in.
         pixel = (0.0, 0.0) if self.surface is None else self.surface.pixel
         most = grid.cell_width + pixel[1], grid.cell_height + pixel[0]
         for k, i in np.argwhere(~(np.abs(given - centres) <= most).all(-1)).tolist():
             raise TrustboError(
-                f"posts[{k}, {i}] = {given[k, i].round(1).tolist()} is not near cell {path[k]}, "
+                f"posts[{k}, {i}] = {given[k, i].round(1).tolist()} is not near cell {cells[k]}, "
                 f"whose centre is {centres[k, 0].round(1).tolist()}; give x and y in CRS metres."
             )
         return given

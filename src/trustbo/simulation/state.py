@@ -1,4 +1,4 @@
-"""Order of the moves in bounding overwatch, and the state of a mission between two bounds."""
+"""State of a mission between two bounds, and the movements of a bound."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -6,9 +6,6 @@ from typing import NamedTuple
 import numpy as np
 
 from trustbo.data import Cell
-
-BOUNDING = ("successive", "alternate")
-"""Modes of bounding: T2 closes up to the lead after each bound, or passes it in the next."""
 
 
 @dataclass(eq=False)
@@ -38,11 +35,3 @@ class Drive(NamedTuple):
         closing = ~self.lead_moves[:n_ticks]
         closing[-1] |= not closing.any()
         return closing
-
-
-def turns(bounding: str, k: int, is_last: bool) -> tuple[str, ...]:
-    """Order of the movers in bound k: `"lead"`, `"t2"`."""
-    if bounding == "successive":
-        return "lead", "t2"
-    first, other = ("lead", "t2") if k % 2 else ("t2", "lead")
-    return (first, other) if is_last else (first,)
