@@ -39,14 +39,14 @@ def test_waypoints_are_the_stops_of_a_robot_in_the_frame(result, tmp_path, robot
     places = poses[:, :2] @ [[c, s], [-s, c]] + origin
     headings = np.column_stack([np.cos(poses[:, 2] + angle), np.sin(poses[:, 2] + angle)])
     if robot == "lead":
-        np.testing.assert_allclose(places, plan.waypoints, rtol=0.0, atol=1e-6)
-        ahead = np.diff(plan.waypoints, axis=0)
+        np.testing.assert_allclose(places, plan.stops, rtol=0.0, atol=1e-6)
+        ahead = np.diff(plan.stops, axis=0)
         ahead = np.vstack([ahead, ahead[-1:]])
     else:
         at_goal = plan.ways[-1][2][-1]  # ways begin with the lead's
         expected = np.vstack([plan.posts[:, 1], at_goal])
         np.testing.assert_allclose(places, expected, rtol=0.0, atol=1e-6)
-        ahead = np.vstack([plan.waypoints[1:], plan.waypoints[-1:]]) - expected
+        ahead = np.vstack([plan.stops[1:], plan.stops[-1:]]) - expected
     np.testing.assert_allclose(headings, ahead / np.linalg.norm(ahead, axis=1)[:, None], atol=1e-9)
 
 

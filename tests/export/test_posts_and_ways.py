@@ -117,7 +117,7 @@ def test_a_file_has_the_posts_and_ways_of_each_bound_and_robot(plan, workspace, 
     assert_is_planned(*READERS[suffix](file), workspace, plan.path)
     for wrong in faults(plan).values():
         broken = replace(plan)
-        vars(broken).update(waypoints=plan.waypoints, posts=plan.posts, ways=plan.ways)
+        vars(broken).update(stops=plan.stops, posts=plan.posts, ways=plan.ways)
         vars(broken).update(wrong)
         write_path(file, broken)
         with pytest.raises(AssertionError):
@@ -129,7 +129,7 @@ def test_a_post_says_what_it_watches(plan, workspace):
     for row in frame.to_dict("records"):
         k = row["bound"]
         assert (row["row"], row["col"]) == plan.path[k - 1]
-        watched = workspace.ground.posts.waypoint(plan.path[k])
+        watched = workspace.ground.posts.stop(plan.path[k])
         np.testing.assert_array_equal((row["lead_x"], row["lead_y"]), watched)
         np.testing.assert_array_equal((row["geometry"].x, row["geometry"].y), (row["x"], row["y"]))
     ways = path_frame(plan, layer="ways", crs=None)
@@ -163,7 +163,7 @@ def test_a_bag_has_posts_towards_the_lead_s_stop_and_whole_ways(
 
     def assert_says_what_is_planned(found):
         stops, _ = poses(found, "lead/waypoints", "geometry_msgs/msg/PoseArray")
-        points = [workspace.ground.posts.waypoint(cell) for cell in plan.path]
+        points = [workspace.ground.posts.stop(cell) for cell in plan.path]
         np.testing.assert_array_equal(stops, points)
         bounds = list(itertools.pairwise(plan.path))
         for i, robot in enumerate(ROBOTS[1:]):
@@ -188,7 +188,7 @@ def test_a_bag_has_posts_towards_the_lead_s_stop_and_whole_ways(
     assert_says_what_is_planned(read(tmp_path / "path"))
     for n, wrong in enumerate(faults(plan).values()):
         broken = replace(plan)
-        vars(broken).update(waypoints=plan.waypoints, posts=plan.posts, ways=plan.ways)
+        vars(broken).update(stops=plan.stops, posts=plan.posts, ways=plan.ways)
         vars(broken).update(wrong)
         write_ros_bag(tmp_path / str(n) / "path", broken, cost)
         with pytest.raises(AssertionError):

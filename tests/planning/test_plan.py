@@ -1,4 +1,4 @@
-"""A plan's waypoints, posts and ways are the workspace's, also of one read from a record."""
+"""A plan's stops, posts and ways are the workspace's, also of one read from a record."""
 
 import importlib
 import itertools
@@ -33,7 +33,7 @@ def assert_is_of_its_path(plan, workspace):
         ways = workspace.ways(a, c, path[k + 2] if k + 2 < len(path) else None)
         for found, way in zip(plan.ways[k], ways, strict=True):
             np.testing.assert_array_equal(found, way)
-        np.testing.assert_array_equal(plan.ways[k][0][[0, -1]], plan.waypoints[k : k + 2])
+        np.testing.assert_array_equal(plan.ways[k][0][[0, -1]], plan.stops[k : k + 2])
     assert len(plan.ways) == len(path) - 1
 
 
@@ -45,7 +45,7 @@ def test_a_plan_has_what_each_robot_is_to_do(plan, workspace):
 def test_a_record_has_no_ways_and_the_plan_read_from_it_does(plan, workspace):
     assert_is_of_its_path(plan, workspace)  # they are known now
     record = json.loads(json.dumps(plan_to_record(plan)))
-    assert not {"waypoints", "posts", "ways", "workspace"} & set(record)
+    assert not {"stops", "posts", "ways", "workspace"} & set(record)
     assert_is_of_its_path(plan_from_record(record, workspace), workspace)
 
 
@@ -63,7 +63,9 @@ def test_plans_of_a_campaign_from_disk_have_them(workspace, tmp_path):
 def test_without_a_terrain_there_are_none():
     bare = tb.Workspace.from_awareness(np.full((2, 3, 3, 3), 0.5))
     plan = tb.planning.Planner(bare, (2, 0), (0, 2)).plan(PARAMS)
-    assert (plan.waypoints, plan.posts, plan.ways) == (None, None, None)
+    assert (plan.stops, plan.posts, plan.ways) == (None, None, None)
+    with pytest.warns(FutureWarning, match=r"Plan.waypoints is Plan.stops since version 0.3"):
+        assert plan.waypoints is None
 
 
 @pytest.mark.parametrize(

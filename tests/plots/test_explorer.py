@@ -105,7 +105,7 @@ def test_the_recommended_path_has_what_one_would_see_of_its_bounds(record, resul
     workspace, corner = result.workspace, np.array(result.workspace.grid.corner)
     for (a, c), shown in zip(pairwise(result.path), last["overwatch"], strict=True):
         x, y = corner[0] + np.array(shown["x"]), corner[1] + np.array(shown["y"])
-        stop = workspace.ground.posts.waypoint(a)
+        stop = workspace.ground.posts.stop(a)
         assert np.abs(x - stop[0]).max() <= 30.0
         assert np.abs(y - stop[1]).max() <= 30.0
         seen = workspace.overwatch_map((a, c)).sel(x=x, y=y, method="nearest").values

@@ -33,7 +33,7 @@ def test_a_panel_has_the_posts_sight_lines_and_ways_of_its_bound(result, plan):
         ahead = plan.path[k + 1] if k + 1 < len(plan.path) else None
         for way in result.workspace.ways(a, c, ahead):
             assert_drawn(ax, way - corner)
-        stop = result.workspace.ground.posts.waypoint(c)
+        stop = result.workspace.ground.posts.stop(c)
         for post in result.workspace.posts(a, c):
             assert_drawn(ax, np.array([post]) - corner)
             assert_drawn(ax, np.array([post, stop]) - corner)

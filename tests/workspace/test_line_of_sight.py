@@ -151,7 +151,7 @@ def test_posts_are_near_apart_and_the_best_there_are(by_end):
     posts = by_end.posts(A, C)
     assert posts.shape == (2, 2)
     ground = by_end.ground.posts
-    assert (np.linalg.norm(posts - ground.waypoint(A), axis=1) <= by_end.formation.radius).all()
+    assert (np.linalg.norm(posts - ground.stop(A), axis=1) <= by_end.formation.radius).all()
     assert np.linalg.norm(posts[0] - posts[1]) >= SPACING
     assert all(by_end.grid.cell_at(*post) == A for post in posts)
     assert (by_end.posts(A, (3, 1)) != posts).any()
@@ -188,7 +188,7 @@ def test_posts_by_the_way_are_on_safe_ground_apart_linked_and_not_in_the_way(woo
         posts = wooded.posts(a, c)
         gap = np.linalg.norm(ground.lead_way(a, c)[:, None] - posts, axis=-1)
         assert gap.min() >= SPACING
-        assert (np.linalg.norm(posts - ground.waypoint(a), axis=1) <= 26.0).all()
+        assert (np.linalg.norm(posts - ground.stop(a), axis=1) <= 26.0).all()
         assert np.linalg.norm(posts[0] - posts[1]) >= 3.0  # 4 m, by whole pixels
         pixels = ground.surface.nearest(*posts.T)
         assert (slope[pixels] <= 0.7 * wooded.team.max_slope).all()
@@ -200,9 +200,9 @@ def test_posts_by_the_way_are_on_safe_ground_apart_linked_and_not_in_the_way(woo
 def test_stops_by_sight_stay_in_their_cell_near_the_centre_s(by_end, wooded):
     moved = 0
     for row, col in np.argwhere(wooded.passable.values).tolist():
-        stop = wooded.ground.posts.waypoint((row, col))
+        stop = wooded.ground.posts.stop((row, col))
         assert wooded.grid.cell_at(*stop) == (row, col)
-        distance = np.linalg.norm(stop - by_end.ground.posts.waypoint((row, col)))
+        distance = np.linalg.norm(stop - by_end.ground.posts.stop((row, col)))
         assert distance <= 17.0  # 16 m, by whole pixels
         moved += distance > 0.0
     assert moved > 4
@@ -211,7 +211,7 @@ def test_stops_by_sight_stay_in_their_cell_near_the_centre_s(by_end, wooded):
 def test_equal_robots_keep_their_sides(wooded):
     ground = wooded.ground.posts
     for a, c in bounds_of(wooded)[1]:
-        east, north = ground.waypoint(c) - ground.waypoint(a)
+        east, north = ground.stop(c) - ground.stop(a)
         to_right = wooded.posts(a, c) @ np.array([north, -east])
         assert to_right[0] <= to_right[1]
 
@@ -219,7 +219,7 @@ def test_equal_robots_keep_their_sides(wooded):
 def test_a_discount_brings_posts_nearer(wooded):
     near = Workspace.from_terrain(wooded.terrain, (4, 4), wooded.team, sight_discount=0.1)
     distance = [
-        np.mean([np.linalg.norm(w.posts(a, c) - w.ground.posts.waypoint(a), axis=1)
+        np.mean([np.linalg.norm(w.posts(a, c) - w.ground.posts.stop(a), axis=1)
                  for a, c in bounds_of(w)[1]])
         for w in (wooded, near)
     ]  # fmt: skip
@@ -246,7 +246,7 @@ def test_the_rules_of_posts_survive_a_file_and_missions_lose_less(by_end, wooded
 def test_ways_lead_from_post_to_post(wooded):
     lead, *closing = wooded.ways(A, C, NEXT)
     ground = wooded.ground.posts
-    np.testing.assert_array_equal(lead[[0, -1]], [ground.waypoint(A), ground.waypoint(C)])
+    np.testing.assert_array_equal(lead[[0, -1]], [ground.stop(A), ground.stop(C)])
     for way, start, end in zip(closing, wooded.posts(A, C), wooded.posts(C, NEXT), strict=True):
         np.testing.assert_array_equal(way[[0, -1]], [start, end])
     at_goal = wooded.ways(A, C)[1]

@@ -56,10 +56,10 @@ def bounds_layer(plan: Plan) -> gpd.GeoDataFrame:
 
 def posts_layer(plan: Plan) -> gpd.GeoDataFrame:
     """Return a point for each bound and robot of T2: where it stands, and what it watches."""
-    posts, waypoints = _required(plan, plan.posts), _required(plan, plan.waypoints)
+    posts, stops = _required(plan, plan.posts), _required(plan, plan.stops)
     n_bounds, n_robots = posts.shape[:2]
     (row, col), (x, y) = np.array(plan.path[:-1]).T, posts.reshape(-1, 2).T
-    lead_x, lead_y = waypoints[1:].T
+    lead_x, lead_y = stops[1:].T
     of_bound = {
         "bound": np.arange(1, n_bounds + 1), "row": row, "col": col, "lead_x": lead_x,
         "lead_y": lead_y,

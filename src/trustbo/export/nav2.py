@@ -76,13 +76,13 @@ def save_waypoints(target: Path, plan: Plan, robot: str, place: PlacedFrame) -> 
 def stops_of(plan: Plan, robot: str, place: PlacedFrame) -> np.ndarray:
     """Poses of a robot's stops in a frame, (stop, 3); TrustboError: it has no way in a bound."""
     ways = complete_routes(plan)[robot]
-    assert plan.waypoints is not None and plan.posts is not None  # noqa: S101, PT018  # it has ways
-    waypoints = place.of_crs(plan.waypoints)
+    assert plan.stops is not None and plan.posts is not None  # noqa: S101, PT018  # it has ways
+    of_lead = place.of_crs(plan.stops)
     if robot == LEAD:
-        return onward(waypoints)
+        return onward(of_lead)
     posts = place.of_crs(plan.posts[:, plan.workspace.team.names.index(robot)])
     stops = np.vstack([posts, place.of_crs(ways[-1][-1:])])
-    watched = np.vstack([waypoints[1:], waypoints[-1:]])
+    watched = np.vstack([of_lead[1:], of_lead[-1:]])
     return towards(stops, watched - stops)
 
 

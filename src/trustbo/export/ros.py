@@ -157,7 +157,7 @@ def write_ros_bag(
     /trustbo/lead/waypoints geometry_msgs/PoseArray stops of the lead, each towards the next
     ======================= ======================= ==========================================
 
-    Ways, posts and waypoints need a terrain in memory; the way of a robot ends where it has none.
+    Ways, posts and stops need a terrain in memory; the way of a robot ends where it has none.
 
     Args:
         path: New `.bag` file for ROS 1, or new folder for ROS 2.
@@ -230,13 +230,13 @@ def _topics(plan: Plan, frame: PlacedFrame) -> dict[str, tuple[str, np.ndarray]]
     """Return the type and the poses (pose, 3) of each topic, in the frame."""
     centers = np.array([plan.workspace.grid.center(cell) for cell in plan.path])
     topics = {"path": (PATH, onward(frame.of_crs(centers)))}
-    if plan.waypoints is None or plan.posts is None:
+    if plan.stops is None or plan.posts is None:
         return topics
-    waypoints = frame.of_crs(plan.waypoints)
-    topics[f"{LEAD}/waypoints"] = POSES, onward(waypoints)
+    stops = frame.of_crs(plan.stops)
+    topics[f"{LEAD}/waypoints"] = POSES, onward(stops)
     for i, robot in enumerate(plan.workspace.team.names):
         posts = frame.of_crs(plan.posts[:, i])
-        topics[f"{robot}/posts"] = POSES, towards(posts, waypoints[1:] - posts)
+        topics[f"{robot}/posts"] = POSES, towards(posts, stops[1:] - posts)
     for robot, ways in routes_of(plan).items():
         if ways:
             # The end of a way is the start of the next.

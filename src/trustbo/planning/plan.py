@@ -1,5 +1,6 @@
 """A plan: a path, its expected trust, value and exactness, and what robots are to do."""
 
+import warnings
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from itertools import pairwise
@@ -24,7 +25,7 @@ QUANTILES = (0.05, 0.25, 0.75, 0.95)
 class Plan(Displayed):
     """A path with its expected trust, value and exactness.
 
-    What robots are to do, `waypoints`, `posts` and `ways`, in CRS metres, is the workspace's, but
+    What robots are to do, `stops`, `posts` and `ways`, in CRS metres, is the workspace's, but
     for robots that differ (`robots`), computed on demand, and None without a terrain in memory.
     Trust, value and bands are for the workspace's posts.
 
@@ -148,7 +149,7 @@ class Plan(Displayed):
         return None if self.cover is None else self.cover.band
 
     @cached_property
-    def waypoints(self) -> np.ndarray | None:
+    def stops(self) -> np.ndarray | None:
         """Stops of the lead before each bound and at the goal, shape (bound + 1, 2).
 
         In successive bounding those in the cells of the path; in alternate bounding it stays where
@@ -156,6 +157,13 @@ class Plan(Displayed):
         """
         ground = self.workspace.ground
         return None if ground is None else ground.posts.places(self.path)[0]
+
+    @property
+    def waypoints(self) -> np.ndarray | None:
+        """Stops of the lead, as version 0.2 named them: see `stops`."""
+        message = "Plan.waypoints is Plan.stops since version 0.3; the old name will go."
+        warnings.warn(message, FutureWarning, stacklevel=2)
+        return self.stops
 
     @cached_property
     def posts(self) -> np.ndarray | None:

@@ -52,7 +52,7 @@ def plan_map(
     """
     require_kind("plots.plan_map", plan, Plan, "give a Plan, such as Result.plan or campaign.ask()")
     options = Style.from_options(style)
-    if plan.waypoints is None:
+    if plan.stops is None:
         raise TrustboError(
             "plan_map needs a plan on a workspace made with Workspace.from_terrain of a terrain in "
             "memory."
@@ -94,11 +94,11 @@ def _draw_overwatch(ax: Axes, plan: Plan, k: int, robot: str, options: Style) ->
 
 def _draw_bound(ax: Axes, plan: Plan, k: int) -> None:
     """Draw the bound of index k, and show what is around it."""
-    waypoints, posts, ways = plan.waypoints, plan.posts, plan.ways
-    assert waypoints is not None and posts is not None and ways is not None  # noqa: S101, PT018
+    lead_stops, posts, ways = plan.stops, plan.posts, plan.ways
+    assert lead_stops is not None and posts is not None and ways is not None  # noqa: S101, PT018
     corner = np.array(plan.workspace.grid.corner)
     lead, *closing = [None if way is None else way - corner for way in ways[k]]
-    stops = waypoints[k : k + 2] - corner
+    stops = lead_stops[k : k + 2] - corner
     seen = [stops, posts[k] - corner, *(way for way in (lead, *closing) if way is not None)]
     if lead is not None:
         ax.plot(*lead.T, color=theme().ink, linewidth=2.6, zorder=3)

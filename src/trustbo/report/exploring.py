@@ -160,7 +160,7 @@ def _overwatch(workspace: Workspace, path: Sequence[Cell]) -> list[Overwatch] | 
     left, bottom = workspace.grid.corner
     found = []
     for bound in pairwise(path):
-        x, y = workspace.ground.posts.waypoint(bound[0])
+        x, y = workspace.ground.posts.stop(bound[0])
         by_kind: dict[Robot, xr.DataArray] = {}
         for name, robot in zip(workspace.team.names, workspace.team.robots, strict=True):
             if robot not in by_kind:
@@ -211,7 +211,7 @@ def _planned(
     corner = np.array(workspace.grid.corner)
     if (ground := workspace.ground) is None:
         return np.array([workspace.grid.center(cell) for cell in path]) - corner, None
-    stops = np.stack([ground.posts.waypoint(cell) for cell in path])
+    stops = np.stack([ground.posts.stop(cell) for cell in path])
     return stops - corner, (ground.posts.along(path) if own is None else own) - corner
 
 

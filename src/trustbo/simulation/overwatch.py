@@ -353,7 +353,7 @@ class KinematicSimulator(DescribedSimulator):
         """
         rule = self._ways.posts
         first = rule.watching(cell, next_cell) if posts is None else posts[0]
-        stops = np.concatenate([rule.waypoint(cell)[None], first])
+        stops = np.concatenate([rule.stop(cell)[None], first])
         poses = np.concatenate([stops, np.zeros((len(stops), 1))], axis=1)
         return State((cell, cell), poses, stops, 0.0, seed, new_tracks(len(first)), posts)
 
@@ -412,7 +412,7 @@ class KinematicSimulator(DescribedSimulator):
         """Stops of those who move, shape (robot, 2)."""
         posts = self._ways.posts
         if leg.of_lead:
-            return posts.waypoint(leg.end)[None]
+            return posts.stop(leg.end)[None]
         return posts.watching(leg.end, next_cell, leg.watched_from)
 
     def _move_leg(

@@ -1,7 +1,7 @@
 """Line of sight of bounds: the share of its time in which robot and lead should see each other.
 
 A bound a -> c has two phases (docs/concepts.md, "Why bounds"). T2 stands at its posts in a and
-watches the lead drive to its waypoint in c; then the lead stands and watches T2 close up to posts
+watches the lead drive to its stop in c; then the lead stands and watches T2 close up to posts
 in c, from which each of the admissible next cells can be watched. Both phases are sampled at times
 spread evenly over them, and weighted by their durations:
 
@@ -117,18 +117,18 @@ def _closing_up(posts: Posts, a: Cell, c: Cell, passable: np.ndarray) -> _Case:
     way, start = posts.lead_line(a, c), posts.watching(a, c)
     ahead = _cells_ahead(posts, passable, a, c)
     ends = _in_turn([posts.watching(c, b) for b in ahead])
-    return _Case(way, start, way, start, ends, posts.waypoint(c))
+    return _Case(way, start, way, start, ends, posts.stop(c))
 
 
 def _by_turns(posts: Posts, a: Cell, c: Cell, passable: np.ndarray) -> list[_Case]:
     """Cases of a bound of alternate bounding: by its mover, and the cell that this comes from."""
-    stop = posts.waypoint(a)
+    stop = posts.stop(a)
     stay, cases = np.stack([stop, stop]), []
     for before in _cells_ahead(posts, passable, c, a):
         before = a if before is None else before
         line = posts.lead_line(before, a, c)
         post = posts.watching(a, c, before)
-        cases.append(_Case(line, post, stay, post, _in_turn([post]), posts.waypoint(c)))
+        cases.append(_Case(line, post, stay, post, _in_turn([post]), posts.stop(c)))
         start = posts.watching(before, a, _behind(passable, before, a))
         ends = _in_turn([posts.watching(c, b, a) for b in _cells_ahead(posts, passable, a, c)])
         cases.append(_Case(stay, start, line, start, ends, stop))

@@ -26,10 +26,11 @@ from itertools import product
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import ndimage
 
-from trustbo.data import Cell
-from trustbo.errors import TerrainError
+from trustbo.data import Cell, require_posts
+from trustbo.errors import TerrainError, TrustboError
 from trustbo.team import Robot, Team
 from trustbo.workspace.bounding import legs_along, t2_cells
 from trustbo.workspace.formation import SPACING, Formation
@@ -93,10 +94,10 @@ class Posts:
     def are_linked(self, a: Cell, c: Cell) -> bool:
         """Whether the robots have a route from cell to cell: their posts are in one region.
 
-        T2's posts in a cell are linked to its waypoint within half a cell around, so that one test,
-        of the waypoints, holds for all robots and any next cell.
+        T2's posts in a cell are linked to its stop within half a cell around, so that one test,
+        of the stops, holds for all robots and any next cell.
         """
-        ends = [self.surface.pixel_at(*self.waypoint(cell).tolist()) for cell in (a, c)]
+        ends = [self.surface.pixel_at(*self.stop(cell).tolist()) for cell in (a, c)]
         return are_linked(self.surface.passable, self.window(a, c), ends[0], ends[1])
 
     def is_linked(self, cell: Cell, position: np.ndarray) -> bool:
@@ -107,7 +108,7 @@ class Posts:
         top, bottom, left, right = window = self.window(cell, cell)
         if not (top <= row < bottom and left <= col < right):
             return False
-        start = self.surface.pixel_at(*self.waypoint(cell).tolist())
+        start = self.surface.pixel_at(*self.stop(cell).tolist())
         return bool(linked_to(self.surface.passable, window, start)[row - top, col - left])
 
     def are_reached(self, path: Sequence[Cell], posts: np.ndarray) -> np.ndarray:
@@ -119,20 +120,35 @@ class Posts:
             linked[k, i] = self.is_linked(cell, posts[k, i])
         return linked
 
+    def require_near(self, path: Sequence[Cell], posts: ArrayLike) -> np.ndarray:
+        """Refuse posts (bound, robot, 2) that are not near the cells that T2 stands in."""
+        given = require_posts(posts, (len(path) - 1, self.team.n_robots, 2))
+        cells = t2_cells(self.formation.bounding, path)
+        centres = np.array([self.grid.center(cell) for cell in cells])[:, None]
+        # Half a cell from its edge, by whole pixels: the window that the rule's posts are in.
+        high, wide = self.surface.pixel
+        most = self.grid.cell_width + wide, self.grid.cell_height + high
+        for k, i in np.argwhere(~(np.abs(given - centres) <= most).all(-1)).tolist():
+            raise TrustboError(
+                f"posts[{k}, {i}] = {given[k, i].round(1).tolist()} is not near cell {cells[k]}, "
+                f"whose centre is {centres[k, 0].round(1).tolist()}; give x and y in CRS metres."
+            )
+        return given
+
     def lead_way(self, *cells: Cell) -> np.ndarray | None:
         """Way of the lead from stop to stop, the first to the last, (point, 2); None if none."""
-        ends = self.waypoint(cells[0]), self.waypoint(cells[-1])
+        ends = self.stop(cells[0]), self.stop(cells[-1])
         return self.routes.find(self.team.lead, *ends, self.window(*cells))
 
     def lead_line(self, *cells: Cell) -> np.ndarray:
         """Way of the lead, or the straight line where there is none, (point, 2)."""
         way = self.lead_way(*cells)
         ends = cells[0], cells[-1]
-        return np.stack([self.waypoint(end) for end in ends]) if way is None else way
+        return np.stack([self.stop(end) for end in ends]) if way is None else way
 
     # --- stops of the lead ---
 
-    def waypoint(self, cell: Cell) -> np.ndarray:
+    def stop(self, cell: Cell) -> np.ndarray:
         """Stop of the lead in a cell, shape (2,): a traversable pixel."""
         if cell not in self._stops:
             by_sight = self.formation.stops == "sight"
@@ -179,7 +195,7 @@ class Posts:
         lead_from = cell if lead_from is None or next_cell is None else lead_from
         posts = self._cached.setdefault((cell, lead_from), {})
         if next_cell not in posts:  # those of all neighbours cost little more than one
-            around = [c for c in self._around(cell) if self._is_in_region(self.waypoint(c))]
+            around = [c for c in self._around(cell) if self._is_in_region(self.stop(c))]
             ahead = list(dict.fromkeys([None, *around, next_cell]))
             aimed = self._aimed(cell, ahead, lead_from)
             posts |= dict(zip(ahead, aimed, strict=True))
@@ -197,14 +213,14 @@ class Posts:
         Before each bound of a path, and at the goal; T2 at its `own` posts (bound, robot, 2), or by
         the rule.
         """
-        lead, t2 = [self.waypoint(path[0])], [self.watching(path[0], path[1])]
+        lead, t2 = [self.stop(path[0])], [self.watching(path[0], path[1])]
         moves = legs_along(self.formation.bounding, path)
         for of_bound, next_cell in zip(moves, [*path[2:], None], strict=True):
             lead.append(lead[-1])
             t2.append(t2[-1])
             for leg in of_bound:
                 if leg.of_lead:
-                    lead[-1] = self.waypoint(leg.end)
+                    lead[-1] = self.stop(leg.end)
                 else:
                     t2[-1] = self.watching(leg.end, next_cell, leg.watched_from)
         return np.stack(lead), np.stack(t2 if own is None else [*own, t2[-1]])
@@ -227,7 +243,7 @@ class Posts:
 
     def _aimed(self, cell: Cell, ahead: list[Cell | None], lead_from: Cell) -> np.ndarray:
         """Posts of T2 by the next cell, (next cell, robot, 2), with a least distance."""
-        here, n_robots = self.waypoint(cell), len(self.team.robots)
+        here, n_robots = self.stop(cell), len(self.team.robots)
         position, gap = self._standing(cell)
         posts = np.empty((len(ahead), n_robots, 2))
         for i, score in enumerate(self._scores(cell, ahead, position, lead_from)):
@@ -237,14 +253,12 @@ class Posts:
             posts[:, i] = position[np.argmax(score, axis=1)]
         if self.formation.is_wide:
             for of_next, c in zip(posts, ahead, strict=True):
-                self._abreast(
-                    of_next, np.array([0.0, 1.0]) if c is None else self.waypoint(c) - here
-                )
+                self._abreast(of_next, np.array([0.0, 1.0]) if c is None else self.stop(c) - here)
         return posts
 
     def _standing(self, cell: Cell) -> tuple[np.ndarray, float]:
         """Positions around a stop where T2 may stand, (position, 2), and their least distance."""
-        here = self.waypoint(cell)
+        here = self.stop(cell)
         if self.formation.is_wide:
             position = self._lattice(cell, here, self.formation.radius)
             if len(position) >= len(self.team.robots):
@@ -255,7 +269,7 @@ class Posts:
         self, cell: Cell, ahead: list[Cell | None], position: np.ndarray, lead_from: Cell
     ) -> np.ndarray:
         """Sight from positions, the nearer the better, (robot, next cell, position)."""
-        distance = np.linalg.norm(position - self.waypoint(cell), axis=1)
+        distance = np.linalg.norm(position - self.stop(cell), axis=1)
         if self.formation.is_wide:
             seen = self._seen_in_phases(cell, ahead, position, lead_from)
         else:
@@ -266,8 +280,8 @@ class Posts:
         self, cell: Cell, ahead: list[Cell | None], position: np.ndarray, lead_from: Cell
     ) -> list[np.ndarray]:
         """Sight that counts in all phases, (next cell, position) for each robot."""
-        here, lead = self.waypoint(cell), self.team.lead
-        goals = [here if c is None else self.waypoint(c) for c in ahead]
+        here, lead = self.stop(cell), self.team.lead
+        goals = [here if c is None else self.stop(c) for c in ahead]
         routes = [
             np.stack([here, here]) if c is None else self.lead_line(lead_from, cell, c)
             for c in ahead
@@ -277,7 +291,7 @@ class Posts:
         far = np.linalg.norm(position - here, axis=1)
         rows: dict[Robot, np.ndarray] = {}
         for robot in dict.fromkeys(self.team.robots):
-            stops = np.stack([self.waypoint(lead_from), *goals])[:, None]
+            stops = np.stack([self.stop(lead_from), *goals])[:, None]
             closing = 0.25 * self._seen(stops, position, optics(lead, robot))
             seen = closing[0] + closing[1:]
             best = np.argsort(_NEARER * far - seen, axis=1, kind="stable")[:, :_N_WATCHED]
@@ -293,7 +307,7 @@ class Posts:
         self, cell: Cell, ahead: list[Cell | None], position: np.ndarray
     ) -> list[np.ndarray]:
         """Sight of the lead's next stop, (next cell, position) for each robot."""
-        goals = np.stack([self.waypoint(cell) if c is None else self.waypoint(c) for c in ahead])
+        goals = np.stack([self.stop(cell) if c is None else self.stop(c) for c in ahead])
         rows: dict[Robot, np.ndarray] = {}
         for robot in dict.fromkeys(self.team.robots):
             lidar = optics(robot, self.team.lead)
@@ -382,7 +396,7 @@ class Posts:
     def _linked(self, cell: Cell) -> tuple[np.ndarray, np.ndarray]:
         """Rows and columns of a cell's pixels that are linked to its stop near the cell."""
         row, col = self._pixels_of(cell)
-        start = self.surface.pixel_at(*self.waypoint(cell).tolist())
+        start = self.surface.pixel_at(*self.stop(cell).tolist())
         window = self.window(cell, cell)
         linked = linked_to(self.surface.passable, window, start)[row - window[0], col - window[2]]
         return (row[linked], col[linked]) if linked.any() else (row, col)

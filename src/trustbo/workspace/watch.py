@@ -10,6 +10,8 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike
 
 from trustbo.data import Cell
 from trustbo.team import Robot
@@ -28,6 +30,8 @@ from trustbo.workspace.ways import Ways
 
 N_POSTS = 5
 """Posts to choose from for each bound, or as many as there are robots."""
+_APART = 2.0
+"""Distance of the points of an overwatch map, m."""
 
 
 class Watch(NamedTuple):
@@ -79,6 +83,16 @@ class WatchTable:
         given = geometry_along(rule, path, posts)
         return phases(rule.surface, sight or self._sight, rule.team, given)
 
+    def gain(self, path: tuple[Cell, ...], posts: ArrayLike, sight: Sight) -> np.ndarray:
+        """Line of sight gained on a path by posts over those of the rule, (bound, robot).
+
+        TrustboError: a post that is farther from its cell than half a cell.
+        """
+        given = self._ways.posts.require_near(path, posts)
+        both = (self.seen_along(path, one, sight) for one in (given, self.rule(path)))
+        seen, usual = (one.line_of_sight() for one in both)
+        return seen - usual
+
     def unseen(self, passable: np.ndarray) -> np.ndarray:
         """Share of the time of bounds in which nobody sees anybody, (move, row, col).
 
@@ -118,7 +132,7 @@ class WatchTable:
         i, j = (index.ravel() for index in np.indices(pair))
         ends = np.broadcast_to(ends[j, None, None], (len(j), N_SAMPLES, robot, 2))
         posts = np.repeat(starts[i, None], robot, axis=1)
-        lines, stops = [rule.lead_line(a, c)] * len(i), np.tile(rule.waypoint(c), (len(i), 1))
+        lines, stops = [rule.lead_line(a, c)] * len(i), np.tile(rule.stop(c), (len(i), 1))
         bounds = np.arange(len(i))
         given = Geometry(lines, posts, lines, posts, ends, stops, rule.is_wide, bounds)
         seen = phases(rule.surface, self._sight, rule.team, given, rule.formation)
@@ -140,3 +154,20 @@ class WatchTable:
         eyes = positions[..., None, :] + jittered(N_SAMPLES)
         seen = detection_between(surface, self._sight, eyes, aims[0], optics(robot, team.lead))
         return robot.detection * seen.mean(-1)
+
+    def overwatch_map(self, a: Cell, c: Cell, robot: Robot) -> xr.DataArray:
+        """Map of `overwatch` near a bound, DataArray (y, x); NaN where robots cannot stand."""
+        surface, window = self._ways.posts.surface, self._ways.posts.window(a, c)
+        steps = [max(1, round(_APART / side)) for side in surface.pixel]
+        # All maps are of one lattice, whatever their windows.
+        rows, cols = (
+            slice(-(-first // step) * step, end, step)
+            for first, end, step in zip(window[::2], window[1::2], steps, strict=True)
+        )
+        y, x = surface.axes[0][rows], surface.axes[1][cols]
+        free = surface.passable[rows, cols]
+        positions = np.stack(np.meshgrid(x, y), axis=-1)
+        shares = np.full(free.shape, np.nan)
+        shares[free] = self.overwatch(a, c, positions[free], robot)
+        axes = {"y": y, "x": x}
+        return xr.DataArray(shares, axes, ("y", "x"), "overwatch", {"units": "1"})

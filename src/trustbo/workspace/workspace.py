@@ -18,7 +18,6 @@ from trustbo.data import (
     default_features,
     is_line_of_sight,
     require_map,
-    require_posts,
 )
 from trustbo.display.card import Card, Displayed
 from trustbo.display.svg import map_picture
@@ -40,7 +39,6 @@ from trustbo.workspace.bound_awareness import (
     require_sight,
     sight_features,
 )
-from trustbo.workspace.bounding import t2_cells
 from trustbo.workspace.formation import Formation
 from trustbo.workspace.grid import Grid
 from trustbo.workspace.location import Location, cell_of
@@ -51,9 +49,6 @@ from trustbo.workspace.surface import Surface, surface_of
 from trustbo.workspace.survey import MAX_MISSING, reason_impassable
 from trustbo.workspace.watch import WatchTable
 from trustbo.workspace.ways import Ways
-
-_APART = 2.0
-"""Distance of the points of an overwatch map, m."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -399,23 +394,10 @@ class Workspace(Displayed):
         a, c, _ = self._require_bound(*bound)
         name = self.team.names[0] if robot is None else robot
         require_choice("robot", name, self.team.names)
-        if (table := self.watch) is None or self.ground is None or self.terrain is None:
+        if (table := self.watch) is None or self.terrain is None:
             return None
-        surface, window = self.ground.posts.surface, self.ground.posts.window(a, c)
-        steps = [max(1, round(_APART / side)) for side in surface.pixel]
-        # All maps are of one lattice, whatever their windows.
-        rows, cols = (
-            slice(-(-first // step) * step, end, step)
-            for first, end, step in zip(window[::2], window[1::2], steps, strict=True)
-        )
-        y, x = surface.axes[0][rows], surface.axes[1][cols]
-        free = surface.passable[rows, cols]
-        positions = np.stack(np.meshgrid(x, y), axis=-1)
-        shares = np.full(free.shape, np.nan)
-        watcher = self.team.robots[self.team.names.index(name)]
-        shares[free] = table.overwatch(a, c, positions[free], watcher)
-        named = {"long_name": f"share of the lead's way {a} to {c} that {name} sees", "units": "1"}
-        made = xr.DataArray(shares, {"y": y, "x": x}, ("y", "x"), "overwatch", named)
+        made = table.overwatch_map(a, c, self.team.robots[self.team.names.index(name)])
+        made.attrs["long_name"] = f"share of the lead's way {a} to {c} that {name} sees"
         return made if self.terrain.rio.crs is None else made.rio.write_crs(self.terrain.rio.crs)
 
     def ways(
@@ -477,29 +459,9 @@ class Workspace(Displayed):
         cells = tuple(self.require_cell(f"path[{k}]", cell) for k, cell in enumerate(path))
         gain = np.zeros((len(cells) - 1, self.team.n_robots, len(self.features)))
         if (table := self.watch) is not None and self.of_bounds is not None:
-            given = self._require_near(cells, posts)
-            rule = table.rule(cells)
             for n, sight in enumerate(self.sights, start=-len(self.sights)):
-                seen, usual = (
-                    table.seen_along(cells, p, sight).line_of_sight() for p in (given, rule)
-                )
-                gain[..., n] = seen - usual
+                gain[..., n] = table.gain(cells, posts, sight)
         return gain
-
-    def _require_near(self, path: tuple[Cell, ...], posts: ArrayLike) -> np.ndarray:
-        """Refuse posts (bound, robot, 2) that are not near the cells that T2 watches from."""
-        grid, given = self.grid, require_posts(posts, (len(path) - 1, self.team.n_robots, 2))
-        cells = t2_cells(self.formation.bounding, path)
-        centres = np.array([grid.center(cell) for cell in cells])[:, None]
-        # Half a cell from its edge, by whole pixels: the window that the rule's posts are in.
-        pixel = (0.0, 0.0) if self.surface is None else self.surface.pixel
-        most = grid.cell_width + pixel[1], grid.cell_height + pixel[0]
-        for k, i in np.argwhere(~(np.abs(given - centres) <= most).all(-1)).tolist():
-            raise TrustboError(
-                f"posts[{k}, {i}] = {given[k, i].round(1).tolist()} is not near cell {cells[k]}, "
-                f"whose centre is {centres[k, 0].round(1).tolist()}; give x and y in CRS metres."
-            )
-        return given
 
     def in_order(self, mission: Mission) -> Mission:
         """Return a mission with its robots and features in the order of the workspace's.
