@@ -9,6 +9,7 @@ import yaml
 from trustbo.errors import TrustboError
 from trustbo.export import Frame, write_costmap_filters, write_ros_map, write_waypoints
 from trustbo.export.frame import OF_CRS
+from trustbo.export.poses import onward
 
 
 def poses_of(file):
@@ -86,3 +87,9 @@ def test_what_cannot_be_followed_is_refused(result, nowhere, tmp_path):
         with pytest.raises(TrustboError, match=r"slowest must be a share in \(0, 1\]; got"):
             write_costmap_filters(tmp_path / "map.yaml", slowest=slowest)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_robot_that_stands_faces_its_next_place():
+    """In alternate bounding it is in one place before and after a bound of the others."""
+    places = np.array([[0.0, 0.0], [0.0, 0.0], [0.0, 2.0], [3.0, 2.0]])
+    np.testing.assert_allclose(onward(places)[:, 2], [np.pi / 2, np.pi / 2, 0.0, 0.0])

@@ -19,7 +19,7 @@ class Leg(NamedTuple):
 
     @property
     def cells(self) -> tuple[Cell, Cell, Cell]:
-        """Cells that the way leads through or beside: any two that follow are neighbours."""
+        """Cells by which the way leads: any two that follow are neighbours, or one."""
         return self.start, self.watched_from, self.end
 
 

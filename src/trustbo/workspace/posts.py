@@ -26,6 +26,7 @@ from itertools import product
 from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike
 from scipy import ndimage
 
@@ -410,8 +411,21 @@ def _is_near(position: np.ndarray, here: np.ndarray, route: np.ndarray) -> np.nd
     """Whether positions around a stop, `here`, are in the way of a robot on a route."""
     far = np.linalg.norm(position - here, axis=1).max(initial=0.0)
     reach = np.linalg.norm(route - here, axis=1) <= far + SPACING
-    off = position[:, None] - route[reach]
-    return np.einsum("...i,...i", off, off).min(1, initial=np.inf) < SPACING**2
+    near = np.empty(len(position), bool)
+    _are_within(position, route[reach], SPACING**2, near)
+    return near
+
+
+@njit(cache=True, nogil=True)
+def _are_within(position, points, limit, near):
+    """Whether positions (position, 2) are nearer than sqrt(limit) to one of points (point, 2)."""
+    for p in range(len(position)):
+        near[p] = False
+        for k in range(len(points)):
+            dx, dy = position[p, 0] - points[k, 0], position[p, 1] - points[k, 1]
+            if dx * dx + dy * dy < limit:
+                near[p] = True
+                break
 
 
 def _smoothed(values: np.ndarray, pixel: tuple[float, float], width: float = 5.0) -> np.ndarray:
