@@ -13,7 +13,7 @@ default campaign, in the worlds of wellington; with the share unseen by the map,
 
 `alternate`: by the order of moves, on the first plan of each, in worlds whose map is right or old.
 In alternate bounding at its own posts, and at those of successive bounding, which look at the
-lead's way from their own cell on. `predicted` is by the map, on right maps.
+lead's way from their own cell on. `predicted` is lost by the map.
 
 `robots`: the same of robots that differ (r1 has its lidar on a mast of 3 m, r3 one that finds 60 %
 within 40 m), given to the posts of the path by the plan, or not.
@@ -163,8 +163,7 @@ def show_orders(records: Sequence[dict[str, Any]]) -> None:
     print("\nBy the order of moves, and in alternate bounding by the rule of posts\n")
     table = Table("bounding", "lost", "predicted", "unseen", "seconds", "arrive", first=32)
     for rule in records[0]["rules"]:
-        right = [r for r in records if r["kind"] == "right" and "predicted" in r["rules"][rule]]
-        predicted = np.mean([_of(r, rule, "predicted") for r in right]) if right else np.nan
+        predicted = np.mean([r["rules"][rule].get("predicted", np.nan) for r in records])
         lost, unseen, duration, arrive = (
             np.nanmean([_of(r, rule, what) for r in records])
             for what in ("lost", "unseen", "duration", "arrive")
