@@ -182,12 +182,12 @@ class Truth(Displayed):
             NoPathError: The goal cannot be reached.
         """
         require_choice("objective of a truth", objective, OBJECTIVES)
-        self.require_best()
+        bounds = self.require_best()
         a, b = (self.workspace.require_cell(*e) for e in (("start", start), ("goal", goal)))
         key = a, b, objective, max_bounds, connectivity
         if key not in self._best:
             paths = AdmissiblePaths(self.workspace, a, b, PathClass(connectivity, max_bounds))
-            self._best[key] = self.bounds.best(paths, objective)
+            self._best[key] = bounds.best(paths, objective)
         return self._best[key]
 
     def value(self, path: Plan | Sequence[Cell]) -> PathContact:
@@ -249,8 +249,8 @@ class Truth(Displayed):
                 "make it with Truth.of(simulator) of this workspace's simulator."
             )
 
-    def require_best(self) -> None:
-        """Refuse a truth without a best path.
+    def require_best(self) -> BoundTable | ModelContact:
+        """Return the contact of bounds; refuse a truth without a best path.
 
         Raises:
             TrustboError: It is of alternate bounding.
@@ -260,6 +260,7 @@ class Truth(Displayed):
                 "alternate bounding has no best path, and so no regret: contact depends on whose "
                 "turn it is, and on the cells before. Compare paths by Truth.value."
             )
+        return self.bounds
 
     def _cells(self, path: Plan | Sequence[Cell]) -> tuple[Cell, ...]:
         cells = path.path if isinstance(path, Plan) else path

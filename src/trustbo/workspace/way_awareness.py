@@ -67,7 +67,7 @@ def _geometry(ways: list[np.ndarray], n_robots: int) -> Geometry:
     first, last = (np.stack([way[end] for way in ways]) for end in (0, -1))
     posts = np.repeat(first[:, None], n_robots, axis=1)
     ends = np.broadcast_to(last[:, None, None], (len(ways), N_SAMPLES, n_robots, 2))
-    return Geometry(ways, posts, ends, is_wide=False)
+    return Geometry(ways, posts, ways, posts, ends, last, False, np.arange(len(ways)))
 
 
 def _at_ends(workspace: Workspace, ways: Sequence[np.ndarray]) -> np.ndarray:
