@@ -72,7 +72,7 @@ def test_a_chain_along_a_bent_way_is_one_bound(tmp_path):
     for a, c, edge in roads.edges(data=True):
         bound = cells[a], cells[c]
         assert edge["cost"] == pytest.approx(costs.edges[bound]["lost"], rel=1e-9)
-        way = workspace.ground.lead(*bound)
+        way = workspace.ground.posts.lead_line(*bound)
         length = np.hypot(*np.diff(way, axis=0).T).sum()
         assert edge["length"] == pytest.approx(length, abs=0.02 * length)  # thinned
     plan = planner.plan(params)

@@ -217,8 +217,6 @@ def test_what_cannot_treat_deviations_refuses_them(deviations, of_deviations):
     for sampler in ("nuts", "joint"):
         with pytest.raises(TrustboError, match="observations are not Gaussian"):
             tb.fit(deviations, censored, sampler)
-    with pytest.raises(TrustboError, match=r'changes are weighed.*memory="deviation"'):
-        tb.inference.changes(of_deviations)
     with pytest.raises(TrustboError, match='criticise takes memory="level"'):
         tb.criticise(of_deviations)
     with pytest.raises(TrustboError, match="what lasts is a deviation of trust"):

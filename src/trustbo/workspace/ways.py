@@ -26,9 +26,9 @@ class Ways:
 
         In alternate bounding those of either, which come from the cell `before`, if there is one.
         """
-        by_turns = self.posts.formation.bounding == "alternate" and before is not None
-        start, watched, lead_from = (before, a, a) if by_turns else (a, c, c)
-        assert start is not None  # noqa: S101
+        start, watched, lead_from = a, c, c
+        if self.posts.formation.bounding == "alternate" and before is not None:
+            start, watched, lead_from = before, a, a
         posts = self.posts.watching(start, watched), self.posts.watching(c, next_cell, lead_from)
         return [self.posts.lead_way(start, a, c), *self.between((start, a, c), *posts)]
 

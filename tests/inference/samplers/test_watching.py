@@ -61,7 +61,7 @@ def test_divergences_of_a_piece_across_the_end_of_the_warm_up_are_counted_by_dra
 def test_a_second_run_says_that_it_is_one_and_why(capsys):
     watch = Watch(FILE)
     run(watch, 0.0)
-    watch.retry(SETTINGS.longer(collapse=False), ["R-hat of b is 1.050 (limit 1.01)", "2 others"])
+    watch.retry(SETTINGS.longer, ["R-hat of b is 1.050 (limit 1.01)", "2 others"])
     assert capsys.readouterr().err == (
         "NUTS again, for longer (4 chains of 600 + 2000 draws, target_accept 0.98): R-hat of b is "
         "1.050 (limit 1.01) and 1 more.\n"
