@@ -295,6 +295,12 @@ def test_the_architecture_says_which_sampler_auto_takes():
     assert models == {}
 
 
+def test_pages_count_the_rows_of_the_table_of_calibration():
+    n = (ROOT / "docs/calibration.md").read_text(encoding="utf-8").count("| not rejected |")
+    for page in ("README.md", "docs/claims.md"):
+        assert f"calibration of {n} models" in (ROOT / page).read_text(encoding="utf-8")
+
+
 def test_every_benchmark_is_described():
     page = (ROOT / "docs" / "benchmarks.md").read_text()
     scripts = {script.name for script in (ROOT / "benchmarks").glob("*.py")} - {

@@ -88,8 +88,8 @@ def fit(
             of a long run's time. A file, which has no bar, gets a line about a long fit, and one
             about a retry.
         n_chains: Number of chains; the exact sampler's draws are divided among them.
-        warmup: Warm-up draws per chain of NUTS, not kept; 300 by default, 150 with effects of
-            places or robots, where the exact sampler gives the metric.
+        warmup: Warm-up draws per chain of NUTS, not kept; 300 by default, 150 where weights
+            are integrated out and the exact sampler gives the metric.
         draws: Draws kept per chain; 1000 by default.
         target_accept: Acceptance rate that NUTS adapts its steps to: towards 1, steps are
             smaller, and divergences fewer.
