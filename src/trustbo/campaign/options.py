@@ -59,8 +59,8 @@ class CampaignOptions:
         changes: Rates of an area that has changed: ignore (they stay), mask (those before the
             change are left out, once it is more probable than not), reset (mask, and places are
             drawn from the prior with the chance that they changed since the last visit), or auto
-            (mask where the model has effects of places and changes can be weighed, else ignore). See
-            `Campaign.alarms`.
+            (mask where the model has effects of places and changes can be weighed, else ignore).
+            See `Campaign.alarms`.
         awareness: Trust in the awareness map: map (blind; missions are learned from with it too) or
             belief (missions correct it). Under `"belief"`, or a given `AwarenessBelief`, policies
             draw from it too.
