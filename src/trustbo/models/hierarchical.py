@@ -23,7 +23,7 @@ class HierarchicalTrust(TrustModel):
     beta_{i,m} ~ N(mean_beta_m, tau_beta_m^2), b_i ~ N(mean_b, tau_b^2), and the same for beta0 on
     the real line, where its prior's support is mapped to (by the logit, if that is (0, 1)). The
     means have the priors of the pooled coefficients, the spreads `Priors.tau`; noises are shared.
-    Sampled non-centred.
+    Its numpyro model is non-centred.
     """
 
     def sample_params(self, n_robots: int, n_features: int) -> RobotParams:
