@@ -1,8 +1,10 @@
 """HumanTrust: dense references, effects found, predictions, likelihoods of persons, refusals."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
+import numpyro.distributions as dist
 import pytest
 from scipy import stats
 
@@ -14,6 +16,7 @@ from trustbo.inference.prior_predictive import draw_sites
 from trustbo.inference.samplers.people import evidence_of
 from trustbo.models import HumanTrust, PersonEffect
 from trustbo.models.effects.effect import Slots
+from trustbo.models.record import model_from_record, model_to_record
 from trustbo.stacking import MissionBatch, stack_missions
 
 FEATURES = ("success", "failure", "need")
@@ -169,6 +172,16 @@ def test_parts_of_the_model_pay_by_leave_one_person_out(persons, posterior):
         assert whole.elpd > loo(tree).elpd
 
 
+def test_memory_of_people_is_weighed_by_their_evidence(persons, posterior):
+    """Against a model whose prior has beta0 at most .001, by evidence with errors of some .1."""
+    found = tb.inference.memory(posterior)
+    priors = replace(HumanTrust().priors, beta0=dist.Beta(1.0, 1e4))
+    none = fit(persons, HumanTrust(priors, scale="likert7"), whole=False, progress=False)
+    without = posterior.attrs["log_evidence"] - none.attrs["log_evidence"]
+    assert found.log_bf == pytest.approx(without, abs=0.5)
+    assert found.log_bf > 5.0
+
+
 def test_persons_left_out_have_even_weights(posterior):
     assert (loo(posterior).pareto_k < 0.7).all()
 
@@ -242,6 +255,12 @@ def test_a_posterior_is_kept_in_a_file(posterior, tmp_path):
     assert set(posterior["persons"]["part"].values) == {"start", "level", "success", "failure"}
 
 
+@pytest.mark.parametrize("memory", ["deviation", "level"])
+def test_a_model_comes_back_from_its_record(memory):
+    model = HumanTrust(memory=memory).for_features(FEATURES)
+    assert model_from_record(model_to_record(model)) == model
+
+
 def test_numbers_at_the_ends_are_limits():
     people = simulated(n=20, scale="unit", seed=4)
     tree = fit(people, HumanTrust(), progress=False)
@@ -281,8 +300,10 @@ def test_the_model_refuses_what_it_is_not_for(posterior, persons):
         HumanTrust(persons="no")
     with pytest.raises(TrustboError, match=r"PersonEffect\.tau_gain"):
         PersonEffect(tau_gain=0.0)
-    with pytest.raises(TrustboError, match="on 5 levels, but the missions' have 7 levels"):
+    with pytest.raises(TrustboError, match="on 5 levels, but the missions' are on 7 levels"):
         fit(persons, HumanTrust(scale="likert5"), progress=False, whole=False)
+    with pytest.raises(TrustboError, match=r"in \[0, 1\], but the missions' are on 7 levels"):
+        fit(persons, HumanTrust(), progress=False, whole=False)
     with pytest.raises(TrustboError, match=r"for reports use trustbo\.inference\.predict_reports"):
         tb.inference.params_of(posterior)
     with pytest.raises(TrustboError, match="HumanTrust has no likelihoods of parameters"):

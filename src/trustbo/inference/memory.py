@@ -18,9 +18,11 @@ from trustbo.errors import TrustboError, require_whole
 from trustbo.inference.posterior_tree import missions_of, require_posterior
 from trustbo.inference.samplers.choice import resolve_sampler
 from trustbo.inference.samplers.importance import sample_scores
+from trustbo.inference.samplers.people import PeoplePosterior
 from trustbo.inference.samplers.posterior import posterior_of
 from trustbo.models.effects.effect import Slots
 from trustbo.models.model import TrustModel
+from trustbo.models.people import HumanTrust
 from trustbo.models.place import bounds_of, visited
 from trustbo.models.pooled import PooledTrust
 from trustbo.models.record import model_from_record
@@ -70,7 +72,8 @@ def memory(
     """Weigh whether trust carries over from one bound to the next, against beta0 = 0.
 
     Args:
-        posterior: Posterior of `PooledTrust` by the exact sampler, with any effects.
+        posterior: Posterior of `PooledTrust`, with any effects, or of `HumanTrust`, by the exact
+            sampler.
         missions: Missions that it was fitted to; by default those it holds.
         workspace: Workspace of the missions, to fill in awareness that they lack, as for `fit`.
         model: Model of the posterior; needed with custom priors.
@@ -112,9 +115,12 @@ def memory(
         bounds = bounds_of(missions, batch.contact_rate.shape[:2])
         places = visited(bounds, model.place, batch.contact_rate.shape[2])
     slots = Slots.of(batch, len(missions), features, weight, places)
-    target = posterior_of(
-        model.priors, model.family, model.all_effects, slots, memory=model.memory, carries=False
-    )
+    if isinstance(model, HumanTrust):
+        target = PeoplePosterior(model, slots, carries=False)
+    else:
+        target = posterior_of(
+            model.priors, model.family, model.all_effects, slots, memory=model.memory, carries=False
+        )
     without = sample_scores(target, _N_DRAWS, seed).draws.log_evidence
     beta0 = np.asarray(posterior["posterior"]["beta0"])
     log_bf = float(attrs["log_evidence"]) - without

@@ -130,10 +130,10 @@ class HumanTrust(PooledTrust):
         return super().dims | {name: () for name in self.levels.names}
 
     def options(self) -> dict[str, Any]:
-        """See `TrustModel.options`; files have no truth values."""
+        """See `TrustModel.options`; files have no truth values, and any memory is theirs."""
         return {
             name: int(value) if isinstance(value, bool) else value
-            for name, value in super().options().items()
+            for name, value in (super().options() | {"memory": self.memory}).items()
         }
 
     def sample_params(self, n_robots: int, n_features: int) -> NoReturn:

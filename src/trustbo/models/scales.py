@@ -101,16 +101,16 @@ class Scale(NamedTuple):
 
     def require(self, y: np.ndarray, n_ticks: np.ndarray) -> None:
         """Refuse reports that are not on the scale: TrustboError."""
-        if not self.levels:
-            return
-        seen = ~np.isnan(y)
-        bad = seen & (n_ticks != self.levels - 1)
+        wanted = self.levels - 1.0 if self.levels else np.nan
+        bad = ~np.isnan(y) & ~np.isclose(n_ticks, wanted, equal_nan=True)
         if bad.any():
-            steps = n_ticks[bad][0]
-            known = "no number of levels" if np.isnan(steps) else f"{int(steps) + 1} levels"
+            ours, theirs = (
+                "in [0, 1]" if np.isnan(steps) else f"on {int(steps) + 1} levels"
+                for steps in (wanted, n_ticks[bad][0])
+            )
             raise TrustboError(
-                f"the model is of reports on {self.levels} levels, but the missions' have {known}: "
-                "give the same scale to read_reports and to HumanTrust, or n_ticks = levels - 1."
+                f"the model is of reports {ours}, but the missions' are {theirs}: give the same "
+                "scale to read_reports and to HumanTrust, or n_ticks = levels - 1."
             )
 
     def record(self, trust: np.ndarray, theta: Mapping[str, Any]) -> np.ndarray:

@@ -13,9 +13,9 @@ from trustbo.models.people import HumanTrust
 class PeopleScores(Shared):
     """Scores of `Shared`, and those of free cut points, which are standard normal themselves."""
 
-    def __init__(self, model: HumanTrust) -> None:
-        """Take the priors and effects of a model."""
-        super().__init__(model.priors, model.effects, model.memory)
+    def __init__(self, model: HumanTrust, *, carries: bool = True) -> None:
+        """Take the priors and effects of a model; `carries` as in `Shared`."""
+        super().__init__(model.priors, model.effects, model.memory, carries=carries)
         self.cuts = model.levels.names
         self.n_scores += len(self.cuts)
 
@@ -29,10 +29,10 @@ class PeopleScores(Shared):
 class PeoplePosterior(Posterior):
     """Posterior of scores under blocks of persons, whose points are cheap to draw at."""
 
-    def __init__(self, model: HumanTrust, slots: Slots) -> None:
-        """Lay out the reports of missions."""
+    def __init__(self, model: HumanTrust, slots: Slots, *, carries: bool = True) -> None:
+        """Lay out the reports of missions; `carries` as in `Shared`."""
         evidence = evidence_of(model, slots)
-        super().__init__(PeopleScores(model), evidence, float(np.nanstd(slots.y)))
+        super().__init__(PeopleScores(model, carries=carries), evidence, float(np.nanstd(slots.y)))
         if not evidence.exact:
             self.n_corrected = 1000
 

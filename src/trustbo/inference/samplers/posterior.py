@@ -82,9 +82,20 @@ class Shared:
 
     fixed, n_core, pools = True, 3, False
 
-    def __init__(self, priors: Priors, effects: Sequence[Effect], memory: str = "level") -> None:
-        """Take the priors; `memory` as in `evidence.gaussian`."""
+    def __init__(
+        self,
+        priors: Priors,
+        effects: Sequence[Effect],
+        memory: str = "level",
+        *,
+        carries: bool = True,
+    ) -> None:
+        """Take the priors; `memory` as in `evidence.gaussian`.
+
+        Where nothing `carries` on, beta0 = 0, and the first score is of nothing.
+        """
         self.quantiles: Any = scores.Quantiles(priors)
+        self.share = np.array([float(carries), 1.0, 1.0])
         self.effects, self.memory = tuple(e for e in effects if e.names), memory
         self.n_scores = self.n_core + sum(len(effect.names) for effect in effects)
 
@@ -106,18 +117,10 @@ class Shared:
 
     def with_core(self, core: Any, z: Any) -> dict[str, Any]:
         """Hyperparameters of scores, given beta0 and the noises (point, 3), in NumPy or JAX."""
-        beta0, delta_w, delta_v = core.T
+        beta0, delta_w, delta_v = (core * self.share).T
         rest = rest_of(beta0, self.memory)
         theta = {"beta0": beta0, "delta_w": delta_w, "delta_v": delta_v, "rest": rest}
         return theta | scales_of(self.effects, z[:, self.n_core :])
-
-
-class Memoryless(Shared):
-    """Scores with beta0 = 0: the first one is of nothing, so that the evidence lacks it."""
-
-    def with_core(self, core: Any, z: Any) -> dict[str, Any]:
-        """See `Shared.with_core`."""
-        return super().with_core(core * np.array([0.0, 1.0, 1.0]), z)
 
 
 class Posterior:
@@ -257,7 +260,7 @@ def posterior_of(
     if by_robot:
         coordinates = PerRobot(priors, effects, slots.n_robots, slots.z.shape[2])
     else:
-        coordinates = (Shared if carries else Memoryless)(priors, effects, memory)
+        coordinates = Shared(priors, effects, memory, carries=carries)
     return Posterior(coordinates, evidence, float(np.nanstd(slots.y)))
 
 
