@@ -34,7 +34,10 @@ def report_of(what: str, answer: float, levels: int) -> float:
         return np.nan
     if levels:
         if not (answer == np.round(answer) and 1 <= answer <= levels):
-            raise TrustboError(f"{what} = {answer:g} is no whole number from 1 to {levels}.")
+            raise TrustboError(
+                f"{what} = {answer:g} is no whole number from 1 to {levels}; leave out what was "
+                "not answered."
+            )
         return (answer - 1.0) / (levels - 1.0)
     if not 0.0 <= answer <= 1.0:
         hint = "; divide it by 100" if answer > 11 else ""

@@ -376,7 +376,8 @@ def _made(
 
 def _report(where: str, name: str, text: str, levels: int) -> float:
     """Report in [0, 1]."""
-    return report_of(f"{where}: {name}", number_of(where, name, text), levels)
+    answer = number_of(where, name, text, "; leave out what was not answered")
+    return report_of(f"{where}: {name}", answer, levels)
 
 
 def _outcome(where: str, name: str, text: str) -> tuple[float, float]:

@@ -204,7 +204,10 @@ def _from_file(file: Path) -> tuple[list[str], list[list[str]]]:
                 []
             ]
     except (csv.Error, UnicodeDecodeError, EOFError, gzip.BadGzipFile) as error:
-        raise TrustboError(f"{str(file)!r} cannot be read as CSV in UTF-8: {error}.") from None
+        raise TrustboError(
+            f"{str(file)!r} cannot be read as CSV in UTF-8: {error}. Save it as UTF-8, or give a "
+            'DataFrame, such as pandas.read_csv(file, sep=";", encoding="cp1252").'
+        ) from None
     for i, row in enumerate(rows, start=1):
         if len(row) != len(header):
             raise TrustboError(f"row {i} has {len(row)} values, the header {len(header)}.")

@@ -8,6 +8,7 @@ import xarray as xr
 from matplotlib.ticker import MaxNLocator
 
 from trustbo.errors import ShapeError, TrustboError, require_kind
+from trustbo.inference.draws import is_of_people
 from trustbo.planning.plan import QUANTILES, Plan
 from trustbo.plots.layout import plain, small_multiples
 from trustbo.plots.style import SMALL, Style, StyleOptions, theme
@@ -21,7 +22,7 @@ def mission_trust(
     """Draw latent trust of each robot along a mission, and the measured contact rates.
 
     Bands hold 50 % and 90 % of the draws of trust in the group `latent`, the line is their median.
-    Dots are contact rates; bounds that were not measured have none.
+    Dots are contact rates, or reports of people; bounds that were not measured have none.
 
     Args:
         posterior: Posterior of `tb.fit`, or `Result.posterior`.
@@ -50,7 +51,9 @@ def mission_trust(
     rates = rates.sel(bound=trust["bound"]).transpose("bound", "robot").values
     middle, bands = np.median(trust.values, 0), np.quantile(trust.values, QUANTILES, axis=0)
     robots = [str(name) for name in trust["robot"].values]
-    named = "trust", "median"
+    of_people = is_of_people(posterior)
+    seen, step = ("report", "step") if of_people else ("contact rate", "bound")
+    named = "trust", "median", seen, step
     return _panels(robots, trust["bound"].values, middle, bands, rates, named, options)
 
 
@@ -90,7 +93,8 @@ def plan_trust(
             )
         rates[: len(measured)] = measured
     bounds = np.arange(1, n_bounds + 1)
-    names, named = [str(robot) for robot in robots], ("expected trust", "mean")
+    names = [str(robot) for robot in robots]
+    named = "expected trust", "mean", "contact rate", "bound"
     return _panels(names, bounds, plan.trust, plan.bands, rates, named, options)
 
 
@@ -100,10 +104,10 @@ def _panels(
     middle: np.ndarray,
     bands: np.ndarray,
     rates: np.ndarray,
-    named: tuple[str, str],
+    named: tuple[str, str, str, str],
     options: Style,
 ) -> np.ndarray:
-    (what, centre), colours = named, theme()
+    (what, centre, seen, step), colours = named, theme()
     made = small_multiples(len(robots), _SIZE, options, sharex=True, sharey=True)
     for i, ax in enumerate(made.panels):
         x, m, (low, lower, upper, high) = bounds, middle[:, i], bands[:, :, i]
@@ -115,14 +119,14 @@ def _panels(
             x, lower, upper, color=colours.inner, linewidth=0.0, label=f"50 % of {what}"
         )
         ax.plot(x, m, color=colours.line, linewidth=1.2, label=f"{centre} of {what}")
-        label = "contact rate measured" if np.isfinite(rates[:, i]).any() else "_"
+        label = f"{seen} measured" if np.isfinite(rates[:, i]).any() else "_"
         (dots,) = ax.plot(bounds, rates[:, i], "o", color=colours.ink, markersize=4.0, label=label)
         dots.set(markeredgecolor=colours.paper, markeredgewidth=0.5)
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
         plain(ax)
     made.titles(robots)
-    made.label_lower("bound")
+    made.label_lower(step)
     for ax in made.left:
-        ax.set_ylabel("trust, contact rate", fontsize=SMALL)
+        ax.set_ylabel(f"trust, {seen}", fontsize=SMALL)
     made.legend(made.panels[0].get_legend_handles_labels()[0], ncols=4)
     return made.panels

@@ -25,7 +25,10 @@ def require_sampler(model: TrustModel, sampler: str) -> None:
         remedy = "Give others" if alone else 'Use sampler="nuts", which takes any'
         raise TrustboError(f'sampler "exact": {reason}. {remedy}.')
     if sampler in ("nuts", "joint") and alone and (reason := why_not_scores(model)):
-        raise TrustboError(f'sampler "{sampler}" cannot treat {model.describe()}: {reason}.')
+        remedy = "" if model.why_not_exact or why_not_priors(model) else ' Use sampler="exact".'
+        raise TrustboError(
+            f'sampler "{sampler}" cannot treat {model.describe()}: {reason}.{remedy}'
+        )
     if sampler == "joint" and model.family.integrates_out:
         raise TrustboError(
             'sampler "joint" is for observations that trust does not integrate out of; with '
