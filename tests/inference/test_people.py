@@ -261,6 +261,12 @@ def test_a_model_comes_back_from_its_record(memory):
     assert model_from_record(model_to_record(model)) == model
 
 
+def test_a_figure_of_a_person_speaks_of_reports_and_steps(persons, posterior):
+    (ax,) = tb.plots.mission_trust(posterior, 3)
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("step", "trust, report")
+    np.testing.assert_array_equal(ax.lines[1].get_ydata(), persons[3].contact_rate[:, 0])
+
+
 def test_numbers_at_the_ends_are_limits():
     people = simulated(n=20, scale="unit", seed=4)
     tree = fit(people, HumanTrust(), progress=False)
@@ -304,6 +310,8 @@ def test_the_model_refuses_what_it_is_not_for(posterior, persons):
         fit(persons, HumanTrust(scale="likert5"), progress=False, whole=False)
     with pytest.raises(TrustboError, match=r"in \[0, 1\], but the missions' are on 7 levels"):
         fit(persons, HumanTrust(), progress=False, whole=False)
+    with pytest.raises(TrustboError, match=r"compare_people: got HumanTrust .*models by name"):
+        compare_people(persons, HumanTrust())
     with pytest.raises(TrustboError, match=r"for reports use trustbo\.inference\.predict_reports"):
         tb.inference.params_of(posterior)
     with pytest.raises(TrustboError, match="HumanTrust has no likelihoods of parameters"):

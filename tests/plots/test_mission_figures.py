@@ -32,6 +32,8 @@ def test_the_last_mission_is_shown_unless_another_is_asked_for(result):
         np.testing.assert_array_equal(rates, result.missions[1].contact_rate)
     with pytest.raises(tb.TrustboError, match="mission must be one of 2, from -2 to 1; got 2"):
         tb.plots.mission_trust(result.posterior, 2)
+    with pytest.raises(tb.TrustboError, match=r"has no latent trust; .*complete\(posterior"):
+        tb.plots.mission_trust(tb.fit(result.missions, sampler="exact", whole=False))
 
 
 def test_a_short_mission_ends_where_it_ended():

@@ -7,7 +7,7 @@ import pandas as pd
 import xarray as xr
 from arviz_stats.loo.compare import compare as ranked
 
-from trustbo.errors import TrustboError
+from trustbo.errors import TrustboError, one_line
 from trustbo.inference.loo import loo
 from trustbo.inference.posterior_tree import require_posterior
 
@@ -29,7 +29,7 @@ def compare(posteriors: Mapping[str, xr.DataTree]) -> pd.DataFrame:
     if not isinstance(posteriors, Mapping) or len(posteriors) < 2:
         raise TrustboError(
             "compare takes two or more posteriors by name, {'pooled': one, 'apart': other}; got "
-            f"{posteriors!r:.60}."
+            f"{one_line(posteriors)}."
         )
     trees = {name: require_posterior("compare", tree) for name, tree in posteriors.items()}
     (first, reference), *others = ((name, _rates(tree)) for name, tree in trees.items())

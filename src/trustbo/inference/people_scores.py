@@ -8,7 +8,7 @@ import pandas as pd
 from scipy import special
 
 from trustbo.data import Mission
-from trustbo.errors import TrustboError, require_choice, require_whole
+from trustbo.errors import TrustboError, require_choice, require_kind, require_whole
 from trustbo.inference.fit import fit
 from trustbo.inference.people import GIVEN, predict_reports
 from trustbo.models.people import FAILURE, SUCCESS, HumanTrust
@@ -50,6 +50,7 @@ def compare_people(
         TrustboError: Fewer people than folds, no model is a `HumanTrust`, or see `fit`.
     """
     require_choice("given", given, GIVEN)
+    require_kind("compare_people", models, Mapping, 'give models by name, {"ours": model}')
     batch = stack_missions(missions, pad=False)
     folds = require_whole("folds", folds, 2)
     if len(missions) < folds:

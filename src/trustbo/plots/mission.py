@@ -33,11 +33,16 @@ def mission_trust(
         Axes, shape (robot,).
 
     Raises:
-        TrustboError: There is no such mission.
+        TrustboError: There is no such mission, or the posterior has parameters alone.
     """
     require_kind(
         "plots.mission_trust", posterior, xr.DataTree, "give a posterior, such as Result.posterior"
     )
+    if "latent" not in posterior.children:
+        raise TrustboError(
+            "plots.mission_trust: this posterior has no latent trust; give that of "
+            "trustbo.inference.complete(posterior, missions)."
+        )
     options, latent = Style.from_options(style), posterior["latent"].to_dataset()
     n_missions = latent.sizes["mission"]
     if not isinstance(mission, int | np.integer) or not -n_missions <= mission < n_missions:
