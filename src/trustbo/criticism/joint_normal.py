@@ -17,7 +17,7 @@ from scipy.linalg import solve_triangular
 
 from trustbo.data import Mission, is_line_of_sight
 from trustbo.errors import TrustboError
-from trustbo.inference.draws import effects_of, memory_of
+from trustbo.inference.draws import effects_of, is_of_people, memory_of
 from trustbo.models.effects.robot import RobotEffect
 from trustbo.models.params import CoupledParams, Params, assemble_params
 from trustbo.models.place import PlaceEffect, Visited, bounds_of, correlation, visited
@@ -103,6 +103,11 @@ def posterior_point(posterior: xr.DataTree) -> tuple[Point, PlaceEffect | None]:
     means = {
         str(n): a.transpose("chain", "draw", ...).values.mean((0, 1)) for n, a in draws.items()
     }
+    if is_of_people(posterior):
+        raise TrustboError(
+            "criticise is of robots' contact; of reports of people, trustbo.compare ranks forms of "
+            "HumanTrust, and trustbo.inference.compare_people scores their predictions."
+        )
     if (memory := memory_of(posterior)) != "level":
         raise TrustboError(f'criticise takes memory="level"; this model has "{memory}".')
     x0 = {name: float(posterior.attrs[name]) for name in ("x0_mean", "x0_sd")}
