@@ -71,6 +71,7 @@ def test_what_ours_is_worse_in_is_listed_and_printed_like_what_it_is_better_in()
     assert not any(line.startswith("worse in regret after 0") for line in lines)
     assert sum(line.startswith("worse in seconds") for line in lines) == 1
     text = as_text(table)
+    assert text.startswith("| kind and ours less | pairs |")
     assert "**" not in text
     assert "| wall, good | 2 | 0.0 [0.0, 0.0] | 2.0 [2.0, 2.0] |" in text
     assert "| wall, bad | 2 | 0.0 [0.0, 0.0] | -3.0 [-3.0, -3.0] |" in text

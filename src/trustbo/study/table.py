@@ -136,7 +136,7 @@ def worlds_table(dataset: xr.Dataset, by: str | Sequence[str] = "method") -> pd.
         rows[key if len(by) > 1 else key[0]] = _summary(
             {name: values[mine] for name, values in numbers.items()}, pairs[mine]
         )
-    return _table(rows, " and ".join(by))
+    return _table(rows, by)
 
 
 def differences(dataset: xr.Dataset, ours: str, by: str | Sequence[str] = ()) -> pd.DataFrame:
@@ -180,7 +180,7 @@ def differences(dataset: xr.Dataset, ours: str, by: str | Sequence[str] = ()) ->
         if (n_pairs := len(np.unique(pairs[one]))) == 1:
             row |= {(name, limit): np.nan for name in compared for limit in ("low", "high")}
         table[key if by else key[0]] = {("pairs", "value"): float(n_pairs)} | row
-    return _table(table, " and ".join([*by, f"{ours} less"]))
+    return _table(table, [*by, f"{ours} less"])
 
 
 def worse_than(table: pd.DataFrame) -> list[str]:
@@ -199,10 +199,12 @@ def worse_than(table: pd.DataFrame) -> list[str]:
     return lines or ["worse than: none"]
 
 
-def _table(rows: Mapping[Any, Mapping[tuple[str, str], float]], index: str) -> pd.DataFrame:
+def _table(
+    rows: Mapping[Any, Mapping[tuple[str, str], float]], levels: Sequence[str]
+) -> pd.DataFrame:
     table = pd.DataFrame.from_dict(dict(rows), orient="index")
     table.columns = pd.MultiIndex.from_tuples(table.columns)
-    table.index.name = index
+    table.index.names = list(levels)
     return table
 
 
@@ -265,7 +267,10 @@ def _summary(
 def as_text(table: pd.DataFrame) -> str:
     """Table of `worlds_table` or `differences` in Markdown, each value with its interval."""
     names = list(dict.fromkeys(name for name, _ in table.columns))
-    head = [str(table.index.name), *(f"{name} (%)" if "regret" in name else name for name in names)]
+    head = [
+        " and ".join(table.index.names),
+        *(f"{name} (%)" if "regret" in name else name for name in names),
+    ]
     lines = [" | ".join(head), " | ".join("---" for _ in head)]
     for key, row in table.iterrows():
         cells = []
