@@ -401,7 +401,7 @@ class Live:
         self.follower, self.plan, self.alarms = opened.follower, opened.plan, opened.alarms
         self.journal.records.clear()
         self.maps: dict[str, Any] = {}
-        self.posts: dict[tuple[Cell, Cell], list[list[float]]] = {}
+        self.posts: dict[tuple[Cell, Cell, Cell | None], list[list[float]]] = {}
         self.job, self.busy_with = None, ""
         for alarm in self.alarms:
             self.say(alarm)

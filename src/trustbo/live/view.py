@@ -185,7 +185,8 @@ def _posts(live: "Live") -> list[list[float]]:
         cell = mission.rest[1]
     if cell is None or workspace.ground is None:
         return []
-    key = mission.here, cell
+    n = len(mission.bounds)
+    key = mission.here, cell, mission.path[n - 1] if n else None
     if key not in live.posts:
         live.posts.clear()
         try:
