@@ -17,7 +17,7 @@ def test_there_is_a_row_per_mission_bound_and_robot(result, tmp_path):
     assert len(rows) == 3 * sum(len(mission.bounds) for mission in result.missions)
     latent = result.posterior["latent"]
     for row in rows:
-        mission = result.missions[int(row["mission"])]
+        mission = result.missions[int(row["mission"]) - 1]
         bound = mission.bounds[int(row["bound"]) - 1]
         i = mission.robots.index(row["robot"])
         assert (int(row["row"]), int(row["col"])) == bound.cell
@@ -26,7 +26,11 @@ def test_there_is_a_row_per_mission_bound_and_robot(result, tmp_path):
             assert float(row[name]) == getattr(bound, name)[i]
         z = [float(row[name]) for name in ("traversability", "visibility", "line_of_sight")]
         np.testing.assert_array_equal(z, bound.awareness[i])
-        place = {"mission": int(row["mission"]), "bound": int(row["bound"]), "robot": row["robot"]}
+        place = {
+            "mission": int(row["mission"]) - 1,
+            "bound": int(row["bound"]),
+            "robot": row["robot"],
+        }
         for name in ("trust_mean", "trust_sd"):
             assert float(row[name]) == float(latent[name].sel(place))
     assert len({(row["mission"], row["bound"], row["robot"]) for row in rows}) == len(rows)
@@ -47,9 +51,9 @@ def test_trust_is_blank_in_missions_that_the_last_posterior_is_not_of(result, tm
     write_csv(tmp_path / "bounds.csv", matched)
     with (tmp_path / "bounds.csv").open(newline="", encoding="utf-8") as stream:
         rows = list(csv.DictReader(stream))
-    assert {row["mission"]: row["trust_sd"] != "" for row in rows} == {"0": False, "1": True}
+    assert {row["mission"]: row["trust_sd"] != "" for row in rows} == {"1": False, "2": True}
     last = matched.posterior["latent"]["trust_mean"].values[0]
-    found = [float(row["trust_mean"]) for row in rows if row["mission"] == "1"]
+    found = [float(row["trust_mean"]) for row in rows if row["mission"] == "2"]
     np.testing.assert_array_equal(found, last.ravel())
 
 

@@ -13,7 +13,7 @@ _TRUST = ("trust_mean", "trust_sd")
 
 
 def write_csv(path: FilePath, result: Result) -> None:
-    """Write a table with a row for each mission (from 0), bound run (from 1) and robot.
+    """Write a table with a row for each mission, bound run (both from 1) and robot.
 
     Columns are `mission`, `bound`, `robot`, `row` and `col` of the cell entered, `contact_rate`,
     `duration` (s), `n_ticks`, `status` of the bound, `mission_status`, a column for each awareness
@@ -40,7 +40,7 @@ def write_csv(path: FilePath, result: Result) -> None:
             for i, robot in enumerate(mission.robots):
                 rates = {n: getattr(bound, n)[i] for n in ("contact_rate", "duration", "n_ticks")}
                 rows.append(
-                    dict(zip(KEYS, (j, k + 1, robot, *bound.cell), strict=True))
+                    dict(zip(KEYS, (j + 1, k + 1, robot, *bound.cell), strict=True))
                     | rates
                     | {"status": bound.status, "mission_status": mission.status}
                     | dict(zip(map(_column, mission.features), bound.awareness[i], strict=True))

@@ -98,7 +98,7 @@ def read_table(
 
 
 def write_table(missions: Sequence[Mission], path: FilePath) -> None:
-    """Write missions, without their ticks, as a CSV file that `read_table` reads back.
+    """Write missions, numbered from 1, without their ticks, as a CSV file for `read_table`.
 
     The file is written whole or not at all. ShapeError: no missions, or missions that disagree on
     robots or features. TrustboError: some have a path and others none.
@@ -126,7 +126,7 @@ def write_table(missions: Sequence[Mission], path: FilePath) -> None:
                     rates = (bound.contact_rate[i], bound.duration[i], bound.n_ticks[i], bound.t0)
                     cells = [*map(_text, rates), bound.status, mission.status]
                     cells += map(_text, bound.awareness[i])
-                lines.append([j, k, robot, *cell, *cells])
+                lines.append([j + 1, k, robot, *cell, *cells])
                 if reported:
                     lines[-1] += _answer(mission.reports, k, i)
 
