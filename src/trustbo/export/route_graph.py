@@ -95,7 +95,8 @@ class RouteGraph(Displayed):
         """Comparison of the cheapest route with the exact plan, as text."""
         if self.objective == "stationary":
             return "it is the exact plan"
-        return f"it loses {self.gap:.2%} of contact more than the exact plan"
+        than = "more" if self.gap >= 0 else "less"
+        return f"it loses {abs(self.gap):.2%} of contact {than} than the exact plan"
 
 
 def graph_of(
