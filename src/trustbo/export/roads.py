@@ -19,7 +19,8 @@ def from_route_graph(
     """Read a route graph of Nav2 as a graph whose edges are bounds, for `planning.RoadPlanner`.
 
     Each node is a stop of the lead, each edge a bound. In files of `write_route_graph`, where a
-    chain of edges is one bound, nodes within chains are left out.
+    chain of edges is one bound, nodes within chains are left out, and the id of a cell is
+    row * columns + column.
 
     Args:
         path: GeoJSON file, of `write_route_graph` or any other for the route server.
