@@ -63,7 +63,7 @@ def terrain_maps(workspace: Workspace, **style: Unpack[StyleOptions]) -> np.ndar
     draw_scale(surface, grid)
     made.titles(["surface (DSM)", *(name.replace("_", " ") for name in names)])
     made.label_maps()
-    label = "index (0 worst, 1 best; grey: too steep)"
+    label = "index (0 worst, 1 best; grey: impassable)"
     made.colour_bar(ScalarMappable(Normalize(0, 1), colours), label)
     if options.legend:
         _draw_heights(surface, heights)

@@ -261,13 +261,13 @@ class CompositeIndex(TransformerMixin, BaseEstimator):
         if against:
             warnings.warn(
                 f"{', '.join(against)} enters its composite against the declared sign: here it "
-                "goes along with what it should oppose. Look at the loadings, or leave it out.",
+                "goes along with what it should oppose. Look at plots.loadings, or leave it out.",
                 stacklevel=3,
             )
         if (ratio := float(self.explained_variance_ratio_[0])) < 0.5:
             warnings.warn(
                 f"the first component of {', '.join(self.signs)} explains only {ratio:.0%} of "
-                "their variance.",
+                "their variance; look at plots.loadings, and leave one out, or give two indices.",
                 stacklevel=3,
             )
 
