@@ -264,6 +264,7 @@ class Workspace(Displayed):
             ("awareness", "of each bound" if self.of_bounds is not None else "of cells"),
             *((f"  {name}", f"{values} (middle 80 % of cells)") for name, values in spread),
             ("sight", ", ".join(sight.mode for sight in self.sights) or "none assumed"),
+            *([("bounding", "alternate")] if self.formation.bounding == "alternate" else []),
             ("terrain", " x ".join(map(str, n_pixels)) + " pixels" if n_pixels else "none"),
         ]
         sections = {"grid": grid._card().rows, "team": team._card().rows}
