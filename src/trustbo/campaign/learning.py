@@ -109,8 +109,9 @@ class Learner:
             for j in waiting:
                 entries[j].become(TOLD, str(error))
             belief = "the prior" if last is None else "the posterior before"
+            reason = str(error).rstrip(".")
             warnings.warn(
-                f"mission {len(entries)} is kept, but cannot be learned from yet: {error} "
+                f"mission {len(entries)} is kept, but cannot be learned from yet: {reason}. "
                 f"The campaign goes on with {belief}, and tries again with the next mission.",
                 stacklevel=5,
             )

@@ -136,7 +136,7 @@ class Reader:
                 if not 0.0 <= number <= n or (n > 1 and number != int(number)):
                     raise TrustboError(
                         f"contact of {self.robots[i]}: {number:g} is no number of {n} ticks; give "
-                        "true or false, or with ticks= the number of those with contact."
+                        'true or false, or with "ticks" the number of those with contact.'
                     )
                 number = int(number > 0.5) if n == 1 else int(number)
             contacts[i], ticks[i] = number, n

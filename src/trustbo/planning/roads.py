@@ -144,7 +144,8 @@ class RoadPlanner(Displayed):
         require_kind("graph", graph, nx.DiGraph, "give one of networkx, without parallel edges")
         for name, node in (("start", start), ("goal", goal)):
             if node not in graph:
-                raise TrustboError(f"{name} {node!r} is no node of the graph.")
+                some = ", ".join(map(repr, list(graph)[:3])) or "none"
+                raise TrustboError(f"{name} {node!r} is no node of the graph; its first: {some}.")
         if start == goal:
             raise TrustboError(f"start and goal are the same node {start!r}; choose two.")
         family = FAMILIES[require_choice("observation", observation, FAMILIES)]

@@ -36,7 +36,8 @@ def awareness_of_ways(workspace: Workspace, ways: Sequence[np.ndarray]) -> np.nd
             x, y = way[np.argmax(outside.any(1))]
             raise TrustboError(
                 f"a road leads through x {x:.1f}, y {y:.1f}, off the terrain, x {left:.1f} to "
-                f"{right:.1f}, y {bottom:.1f} to {top:.1f}; give the frame of the file."
+                f"{right:.1f}, y {bottom:.1f} to {top:.1f}; give frame=export.Frame(...) "
+                "with the origin and rotation in the frame.yaml beside the file."
             )
     awareness = _at_ends(workspace, ways)
     easy = np.full(surface.ground.shape, np.nan)
