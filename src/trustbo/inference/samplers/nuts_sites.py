@@ -3,9 +3,10 @@
 These are coupled robots, custom drifts, priors without quantiles, and rates that are not Gaussian,
 whose innovations of trust are sampled too. The numpyro model itself stays plain: here its sample
 statements stand with a likelihood that takes the weight of each mission and the linearisation
-point. The unknowns are the sites on the real line, but for the noises: data fix their total well
-and their ratio badly, so that the log of the total and that of the ratio stand in their places,
-with Jacobian 1. Start and metric are those of a Gaussian fit at the mode (Laplace).
+point. The unknowns are the sites on the real line, but for the noises and the intercept: data fix
+the total of the noises well and their ratio badly, and the mean level of trust, b + beta0 mean(y) +
+beta . mean(z), better than its parts. The logs of total and ratio, and the level, stand in their
+places, with Jacobian 1. Start and metric are those of a Gaussian fit at the mode (Laplace).
 """
 
 from dataclasses import dataclass, field, replace
@@ -16,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import numpyro
-from jax import Array, random
+from jax import Array, lax, random
 from jax.flatten_util import ravel_pytree
 from numpyro import handlers
 from numpyro.distributions import constraints
@@ -33,10 +34,12 @@ from trustbo.models.effects.sampled import SampledDrift
 from trustbo.models.families import Observed
 from trustbo.models.model import TrustModel, sample_innovations
 from trustbo.models.params import Params
+from trustbo.models.state_space.vector import VectorSSM
 from trustbo.stacking import MissionBatch
 
 Sites = dict[str, Array]
 _NOISES = ("delta_w", "delta_v")
+_AUTOREGRESSIONS = ("beta0", "B0_diagonal")
 
 
 @jax.tree_util.register_dataclass
@@ -49,6 +52,7 @@ class SitesInJax:
         batch: Missions, padded.
         weight: Weight of each mission, (mission,).
         linearisation: Linearisation point of families that have one, once it is known.
+        means: Mean rate () and awareness (robot, feature), where the level replaces `b`.
         robots: Fit of each robot's likelihood, once it is known, where robots are partially pooled.
         drift: Sampled effects of places.
         complete: Whether no rate is missing before the last of a mission.
@@ -59,6 +63,7 @@ class SitesInJax:
     batch: MissionBatch
     weight: Array | np.ndarray
     linearisation: Array | None = None
+    means: tuple[Array | np.ndarray, Array | np.ndarray] | None = None
     robots: RobotFit | None = None
     drift: SampledDrift | None = field(default=None, metadata={"static": True})
     complete: bool = field(default=False, metadata={"static": True})
@@ -75,7 +80,13 @@ class SitesInJax:
         seen = ~np.isnan(batch.contact_rate)
         together = (seen.any(2) == seen.all(2)).all()
         over = (np.diff(seen.any(2).astype(int), axis=1) <= 0).all()
-        return cls(model, batch, weight, drift=drift, complete=bool(together and over))
+        means = None
+        linear = model.robot_sets not in ("drift", "pooled") and model.memory == "level"
+        if linear and model.family.integrates_out and model.priors.b.support is constraints.real:
+            n = np.maximum(seen.sum((0, 1)), 1)[:, None]
+            z = np.where(seen[..., None], batch.awareness, 0.0).sum((0, 1)) / n
+            means = np.asarray(batch.contact_rate[seen].mean()), z
+        return cls(model, batch, weight, None, means, drift=drift, complete=bool(together and over))
 
     @property
     def innovations(self) -> tuple[int, int, int] | None:
@@ -105,10 +116,22 @@ class SitesInJax:
                 name: total + 0.5 * jax.nn.log_sigmoid(sign * ratio)
                 for name, sign in zip(_NOISES, (2.0, -2.0), strict=True)
             }
+        if self.means is not None:
+            site |= {"b": site["b"] - self._level(site)}
         if self.robots is None:
             return site, none
         moved, log_jacobian = centre(self._values(site), self._support, self.robots)
         return site | moved, log_jacobian
+
+    def _level(self, site: Sites) -> Array:
+        """Mean level of trust without an intercept, of the shape of `b`."""
+        none = {"b": jnp.zeros_like(site["b"])}
+        params: Any = handlers.substitute(self._of_model, self._values(site) | none)()
+        y, z = self.means  # pyright: ignore[reportGeneralTypeIssues]
+        ssm = params.ssm(z[None, None], self.model.lag)
+        carried = ssm.B0.sum(-1) if isinstance(ssm, VectorSSM) else ssm.beta0
+        level = carried * y + ssm.drift[0, 0]
+        return level if site["b"].ndim else level.mean()
 
     def potential(self, site: Sites) -> Array:
         """See `nuts.Density`."""
@@ -140,7 +163,11 @@ class SitesInJax:
             return energy - (len(theta) - 2 * total.size) * total.mean()
 
         density: SitesInJax = self
-        mode, hessian = newton(lambda theta: cost(self, theta), self._flat[0])
+        modes, hessians = lax.map(
+            lambda start: newton(lambda theta: cost(self, theta), start), self._starts
+        )
+        best = jnp.argmin(jax.vmap(lambda mode: cost(self, mode))(modes))
+        mode, hessian = modes[best], hessians[best]
         means = (self.model.priors.beta, self.model.priors.b)
         pooled = self.model.robot_sets == "pooled" and all(
             prior.support is constraints.real for prior in means
@@ -156,6 +183,27 @@ class SitesInJax:
         return density, Chain(mode, jnp.linalg.cholesky(inverse_hessian(jnp, hessian, 0.1)))
 
     @property
+    def _starts(self) -> Array:
+        """Points to search the mode from, (start, unknown): the priors' means, and further ones.
+
+        Of Gaussian rates these have noises of the rates' scatter, and several autoregressions.
+        """
+        start, unravel = self._flat
+        site, names = unravel(start), _AUTOREGRESSIONS
+        if self.means is None or not site.keys() >= set(_NOISES):
+            return start[None]
+        unit = self._support is constraints.unit_interval
+        values = (-4.0, -1.5, 2.0) if unit else (-0.2, 0.2, 0.8)  # logits, or values
+        scatter = jnp.log(jnp.maximum(jnp.nanstd(self.batch.contact_rate), 0.005)) - 1.0
+        noise = {"delta_w": scatter, "delta_v": 0.0}  # logs of total and ratio
+        further = [
+            {n: jnp.full_like(site[n], v) for n, v in (noise | dict.fromkeys(names, value)).items()
+             if n in site}
+            for value in values
+        ]  # fmt: skip
+        return jnp.stack([start, *(ravel_pytree(site | moved)[0] for moved in further)])
+
+    @property
     def _support(self) -> Any:
         return self.model.priors.beta0.support
 
@@ -165,8 +213,11 @@ class SitesInJax:
 
     def _params(self) -> Params:
         """Sample statements of the parameters, sampled effects in the intercept."""
-        params: Any = self.model.sample_params(*self.batch.awareness.shape[2:])
+        params = self._of_model()
         return params if self.drift is None else params._replace(b=params.b + self.drift(params))
+
+    def _of_model(self) -> Any:
+        return self.model.sample_params(*self.batch.awareness.shape[2:])
 
     def _ssm(self, params: Params) -> Any:
         return params.ssm(self.batch.awareness, self.model.lag)  # pyright: ignore
