@@ -95,7 +95,7 @@ class Shared:
         Where nothing `carries` on, beta0 = 0, and the first score is of nothing.
         """
         self.quantiles: Any = scores.Quantiles(priors)
-        self.share = np.array([float(carries), 1.0, 1.0])
+        self.carried = float(carries)
         self.effects, self.memory = tuple(e for e in effects if e.names), memory
         self.n_scores = self.n_core + sum(len(effect.names) for effect in effects)
 
@@ -117,7 +117,8 @@ class Shared:
 
     def with_core(self, core: Any, z: Any) -> dict[str, Any]:
         """Hyperparameters of scores, given beta0 and the noises (point, 3), in NumPy or JAX."""
-        beta0, delta_w, delta_v = (core * self.share).T
+        beta0, delta_w, delta_v = core.T
+        beta0 = beta0 * self.carried
         rest = rest_of(beta0, self.memory)
         theta = {"beta0": beta0, "delta_w": delta_w, "delta_v": delta_v, "rest": rest}
         return theta | scales_of(self.effects, z[:, self.n_core :])
