@@ -1,5 +1,7 @@
 """Coupled and hierarchical trust: their parameters, posteriors, and what they refuse."""
 
+from dataclasses import replace
+
 import arviz as az
 import jax
 import jax.numpy as jnp
@@ -179,6 +181,8 @@ def test_nuts_of_sites_samples_the_numpyro_model(name):
         density = density_of(name, counted_missions(2))
         if MODELS[name].robot_sets == "pooled":
             density, _ = jax.jit(SitesInJax.centred)(density)
+            # Around another point the innovations stand for other trust: the program has none.
+            density = replace(density, linearisation=None)
         jacobian, claimed, plain, found = map(np.asarray, evaluate(density, noise))
     log_jacobian = np.linalg.slogdet(jacobian)[1]
     np.testing.assert_allclose(claimed, log_jacobian, atol=1e-8)
