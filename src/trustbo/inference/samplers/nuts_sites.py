@@ -166,7 +166,8 @@ class SitesInJax:
         modes, hessians = lax.map(
             lambda start: newton(lambda theta: cost(self, theta), start), self._starts
         )
-        best = jnp.argmin(jax.vmap(lambda mode: cost(self, mode))(modes))
+        costs = jax.vmap(lambda mode: cost(self, mode))(modes)
+        best = jnp.argmin(jnp.where(jnp.isnan(costs), jnp.inf, costs))  # of failed searches none
         mode, hessian = modes[best], hessians[best]
         means = (self.model.priors.beta, self.model.priors.b)
         pooled = self.model.robot_sets == "pooled" and all(
