@@ -20,7 +20,8 @@ def ends_at_once(monkeypatch):
 def test_a_campaign_is_begun_once_and_gone_on_with(invoke, rasters, tmp_path, ends_at_once):
     folder = tmp_path / "field"
     flags = ("--dem", rasters / "dem.tif", "--start", "2,0", "--goal", "0,2", "--shape", "3,3")
-    first = invoke("live", folder, *flags, "--robots", 2, "--port", 0)
+    own = "--robots", 2, "--bounding", "alternate"
+    first = invoke("live", folder, *flags, *own, "--port", 0)
     assert first.exit_code == 0, first.output
     assert f"a campaign was begun in {folder}" in first.output
     assert f"stopped; trustbo live {folder} goes on." in first.output
@@ -33,6 +34,7 @@ def test_a_campaign_is_begun_once_and_gone_on_with(invoke, rasters, tmp_path, en
     assert len({line.partition("#")[2] for line in pages}) == 1
     with tb.Campaign.load(folder) as campaign:
         assert campaign.workspace.team.names == ("r1", "r2")
+        assert campaign.workspace.formation.bounding == "alternate"
         assert campaign.planner.start == (2, 0)
 
 
@@ -41,6 +43,10 @@ def test_a_campaign_is_begun_once_and_gone_on_with(invoke, rasters, tmp_path, en
     [
         ((), "holds no campaign; to begin one, give --dem, --start and --goal"),
         (("--dem", "none.tif", "--start", "2,0", "--goal", "0,2"), "none.tif"),
+        (
+            ("--dem", "none.tif", "--start", "2,0", "--goal", "0,2", "--bounding", "by-turns"),
+            "unknown bounding 'by-turns'",
+        ),
     ],
 )
 def test_what_cannot_be_begun_is_an_error_in_a_line(invoke, tmp_path, flags, reason):

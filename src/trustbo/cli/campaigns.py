@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from trustbo.campaign.options import OBJECTIVE, POLICY, SAMPLER, CampaignOptions
 from trustbo.cli.options import choices_of
 from trustbo.cli.outputs import require_outputs, write_outputs
-from trustbo.cli.terrains import pair, reader_of, team_of, terrain_with
+from trustbo.cli.terrains import pair, reader_of, team_of, workspace_with
 from trustbo.errors import TrustboError, require_choice, require_whole
 
 if TYPE_CHECKING:
@@ -30,6 +30,7 @@ def run(
     max_slope: float = 45.0,
     lidar_range: float = 100.0,
     sight: str = "transmittance",
+    bounding: str = "successive",
     objective: str = OBJECTIVE,
     policy: str = POLICY,
     model: str = "robots",
@@ -60,7 +61,7 @@ def run(
     """
     _require_flags(
         iterations, seed, policy=policy, objective=objective, model=model, sampler=sampler,
-        sight=sight, observation=observation,
+        sight=sight, bounding=bounding, observation=observation,
     )  # fmt: skip
     cells, team = pair("shape", shape), team_of(max_slope, robots, lidar_range)
     chosen = CampaignOptions(**options)
@@ -70,12 +71,12 @@ def run(
     from trustbo import simulation
     from trustbo.campaign.loop import iterate
     from trustbo.campaign.stopping import RegretBound
-    from trustbo.workspace import Workspace
 
     stop = None if stop_regret is None else RegretBound(eps=stop_regret)
     read = reader_of(dem, dsm, crs, resolution, nodata)
-    terrain, ends = terrain_with(start, goal, read, cells, team, progress=not quiet)
-    workspace = Workspace.from_terrain(terrain, cells, team, sight=sight)
+    workspace, ends = workspace_with(
+        start, goal, read, cells, team, progress=not quiet, sight=sight, bounding=bounding
+    )
     result = iterate(
         workspace, *ends, n_iterations=iterations, model=trust_model, policy=policy,
         objective=objective, sampler=sampler, simulator=simulation.KinematicSimulator(workspace),

@@ -4,8 +4,9 @@ import sys
 from functools import partial
 from pathlib import Path
 
-from trustbo.cli.terrains import pair, reader_of, team_of, terrain_with
-from trustbo.errors import TrustboError
+from trustbo.cli.options import choices_of
+from trustbo.cli.terrains import pair, reader_of, team_of, workspace_with
+from trustbo.errors import TrustboError, require_choice
 
 
 def live(
@@ -19,6 +20,7 @@ def live(
     robots: int = 3,
     max_slope: float = 45.0,
     lidar_range: float = 100.0,
+    bounding: str = "successive",
     port: int = 8737,
     listen: str = "127.0.0.1",
     udp: int | None = None,
@@ -43,15 +45,20 @@ def live(
     from trustbo.campaign.replacing import STATE, current
 
     begun = (current(folder) / STATE).exists()
-    if not begun and (dem is None or start is None or goal is None):
-        raise TrustboError(
-            f"{str(folder)!r} holds no campaign; to begin one, give --dem, --start and --goal, or "
-            "make it in Python: trustbo.Campaign(workspace, start, goal, directory=folder)."
-        )
     if not begun:
-        assert dem is not None  # noqa: S101
-        _begin(folder, dem, dsm, str(start), str(goal), shape, crs,
-               team=(max_slope, robots, lidar_range))  # fmt: skip
+        if dem is None or start is None or goal is None:
+            raise TrustboError(
+                f"{str(folder)!r} holds no campaign; to begin one, give --dem, --start and --goal, "
+                "or make it in Python: trustbo.Campaign(workspace, start, goal, directory=folder)."
+            )
+        require_choice("bounding", bounding, choices_of("bounding"))
+        cells, team = pair("shape", shape), team_of(max_slope, robots, lidar_range)
+        from trustbo.campaign import Campaign
+
+        read = reader_of(dem, dsm, crs, None, None)
+        made = workspace_with(start, goal, read, cells, team, progress=True, bounding=bounding)
+        with Campaign(made[0], *made[1], directory=folder):
+            print(f"a campaign was begun in {folder}.")
     from trustbo.live import serve
 
     serve(
@@ -60,25 +67,3 @@ def live(
         ready=partial(print, flush=True),
     )  # fmt: skip
     print(f"stopped; trustbo live {folder} goes on.")
-
-
-def _begin(
-    folder: Path,
-    dem: Path,
-    dsm: Path | None,
-    start: str,
-    goal: str,
-    shape: str,
-    crs: str | None,
-    *,
-    team: tuple[float, int, float],
-) -> None:
-    """Begin a campaign on a terrain, without a mission."""
-    from trustbo.campaign import Campaign
-    from trustbo.workspace import Workspace
-
-    cells, of_team = pair("shape", shape), team_of(*team)
-    read = reader_of(dem, dsm, crs, None, None)
-    terrain, ends = terrain_with(start, goal, read, cells, of_team, progress=True)
-    with Campaign(Workspace.from_terrain(terrain, cells, of_team), *ends, directory=folder):
-        print(f"a campaign was begun in {folder}.")

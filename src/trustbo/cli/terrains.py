@@ -4,7 +4,7 @@ import warnings
 from functools import partial
 from math import radians
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from trustbo.errors import TrustboError, require_whole
 
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
     from trustbo.data import Cell
     from trustbo.team import Team
+    from trustbo.workspace import Workspace
 
 _MOST_PIXELS = 9e6
 """Most pixels of a raster that is not averaged: a campaign on it takes some 2 GB."""
@@ -63,7 +64,7 @@ def reader_of(
     return partial(read_terrain, dem, dsm, crs=crs, resolution=resolution, nodata=nodata)
 
 
-def terrain_with(
+def workspace_with(
     start: str,
     goal: str,
     read: "Callable[..., xr.Dataset]",
@@ -71,12 +72,14 @@ def terrain_with(
     team: "Team",
     *,
     progress: bool,
-) -> "tuple[xr.Dataset, tuple[Cell, Cell]]":
-    """Read a terrain, and locate start and goal: by the headers, then by the heights.
+    **options: Any,
+) -> "tuple[Workspace, tuple[Cell, Cell]]":
+    """Make a workspace once start and goal are located: by the headers, then by the heights.
 
-    TrustboError: one is off the grid, without data or too steep; no awareness was computed.
+    Options are those of `Workspace.from_terrain`. TrustboError: an end is off the grid, without
+    data or too steep; no awareness was computed.
     """
-    from trustbo.workspace import survey
+    from trustbo.workspace import Workspace, survey
     from trustbo.workspace.grid import Grid
     from trustbo.workspace.location import cell_of
 
@@ -89,7 +92,8 @@ def terrain_with(
             cell_of(name, end, grid)
     terrain = read(max_pixels=_MOST_PIXELS, progress=progress)
     cells = survey(terrain, shape, team)
-    return terrain, (cells.require_cell("start", start), cells.require_cell("goal", goal))
+    ends = cells.require_cell("start", start), cells.require_cell("goal", goal)
+    return Workspace.from_terrain(terrain, shape, team, **options), ends
 
 
 def pair(what: str, text: str) -> tuple[int, int]:
