@@ -31,10 +31,9 @@ def folder(learned, tmp_path):
 class Served:
     """A server in a thread, and calls to it."""
 
-    def __init__(self, folder, text):
-        self.page, _, self.token = text.splitlines()[0].split()[1].partition("#token=")
-        self.lines = text.splitlines()
-        self.folder = folder
+    def __init__(self, folder, said):
+        self.folder, self.said, self.lines = folder, said, said[0].splitlines()
+        self.page, _, self.token = self.lines[0].split()[1].partition("#token=")
 
     def port_of(self, kind):
         return int(next(line for line in self.lines if line.startswith(kind)).rpartition(":")[2])
@@ -93,7 +92,7 @@ def _serving(folder, **options):
         assert is_up.wait(60)
         if errors:
             raise errors[0]
-        yield Served(folder, said[0])
+        yield Served(folder, said)
     finally:
         stop.set()
         thread.join()

@@ -104,6 +104,7 @@ def test_a_mission_by_http_is_learned_from_and_the_next_is_asked_for(folder, ser
             )
             assert taken[0] == 200, taken
         assert served.state()["mission"] == 3
+        assert served.said[1:] == [f"learned from mission 2: ok. {served.state()['to_do']}"]
         assert served.tell({"status": "ok", "mission": 2})[0] == 400  # a message that came twice
     with tb.Campaign.load(folder) as campaign:
         assert campaign.state.measured[-1].contact_rate[0].tolist() == [0.9, 0.75, 0.6]

@@ -55,7 +55,8 @@ def serve(
         topics: Names of topics of the bag.
         foxglove: Port of a server for Foxglove, on this machine alone; None for none.
         replan: Whether the rest of a path is planned again after each bound.
-        ready: Function that gets the addresses, in lines of text, once they answer.
+        ready: Function that gets the addresses, in lines of text, once they answer; then a line
+            about each mission that is over.
         stop: Event that ends it; in the main thread Ctrl-C and SIGTERM do too.
 
     Raises:
@@ -74,11 +75,16 @@ def serve(
         from trustbo.live.foxglove import require_foxglove
 
         require_foxglove()
+
+    def over(line: str) -> None:
+        with suppress(OSError):  # a terminal that is gone ends no mission
+            ready(line)
+
     # A thread in a computation lets the loop in more often: ticks wait for less.
     before = sys.getswitchinterval()
     sys.setswitchinterval(5e-4)
     try:
-        with Live(folder, replan=replan) as live:
+        with Live(folder, replan=replan, over=over) as live:
             asyncio.run(
                 _serve(live, as_path(folder), address, port, udp, lines,
                        None if bag is None else (as_path(bag), rate, topics), foxglove, ready, stop)

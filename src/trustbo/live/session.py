@@ -84,6 +84,7 @@ class Live:
         *,
         replan: bool = True,
         clock: Callable[[], float] = time.time,
+        over: Callable[[str], object] = str,
     ) -> None:
         """Open a campaign, and go on with its mission.
 
@@ -91,6 +92,7 @@ class Live:
             campaign: Campaign that writes to a folder, or its folder, see `Campaign.load`.
             replan: Whether the rest of a path is planned again after each bound.
             clock: Time of messages that carry none, s.
+            over: Function that gets a line about each mission that is over, and the `trouble`.
 
         Raises:
             TrustboError: There is no campaign, another process has locked it, or it writes to no
@@ -105,7 +107,7 @@ class Live:
                 "a live campaign writes to a folder: Campaign(..., directory=), or save(keep=True)."
             )
         self._folder = campaign.storage.path / FOLDER
-        self._clock, self._replan = clock, replan
+        self._clock, self._replan, self._over = clock, replan, over
         told = [mission for mission in campaign.state.measured if mission.reports is not None]
         self._scale = scale_of(told) if told else "unit"
         names = campaign.workspace.team.names, campaign.workspace.features
@@ -356,6 +358,7 @@ class Live:
             self.journal.close()
             self._hold(opened)
             self.say(said)
+            self._over(f"{said}. {view.to_do(self)}")
 
         return apply
 
@@ -412,6 +415,7 @@ class Live:
         self.job, self.busy_with = None, ""
         self.trouble = f"{reason} Nothing that was told is lost; start again to go on."
         self.say(self.trouble)
+        self._over(self.trouble)
 
     def say(self, text: str) -> None:
         """Add a line to the log."""
