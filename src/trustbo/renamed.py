@@ -24,3 +24,21 @@ def moved(room: str, names: Mapping[str, Sequence[str]]) -> Callable[[str], obje
         return former(f"{room}.{name}", module, name)
 
     return look_up
+
+
+class Former:
+    """Attribute that an earlier version had: its value of today, with a FutureWarning."""
+
+    def __init__(self, now: str, value: Callable[[Any], Any]) -> None:
+        """Take the name of today, and a function of the object that has the attribute."""
+        self._now, self._value = now, value
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._old = f"{owner.__name__}.{name}"
+
+    def __get__(self, instance: Any, owner: type) -> Any:
+        if instance is None:
+            return self
+        message = f"{self._old} is {self._now} since version 0.3; the old name will go."
+        warnings.warn(message, FutureWarning, stacklevel=2)
+        return self._value(instance)

@@ -2,9 +2,9 @@
 
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import jax
 import numpy as np
@@ -17,7 +17,7 @@ from trustbo.campaign.checks import require_extra, require_mission, require_reas
 from trustbo.campaign.history import history_of, table_of
 from trustbo.campaign.learning import Learner
 from trustbo.campaign.options import OBJECTIVE, POLICY, SAMPLER, CampaignOptions, arguments_of
-from trustbo.campaign.planners import planner_of, to_avoid, under_risk
+from trustbo.campaign.planners import believed_of, planner_given, planner_of
 from trustbo.campaign.posteriors import Posterior, Posteriors, whole_posterior
 from trustbo.campaign.replacing import STATE
 from trustbo.campaign.result import Result
@@ -39,31 +39,13 @@ from trustbo.models.params import Params
 from trustbo.models.record import model_from_record, model_to_record
 from trustbo.planning import Plan, Planner, Policy
 from trustbo.planning.policies import resolve_policy
+from trustbo.renamed import Former
 from trustbo.simulation import Truth
 from trustbo.simulation.protocol import Simulator
 from trustbo.stacking import fill_awareness, replace_awareness
 from trustbo.workspace import Workspace
 from trustbo.workspace.location import Location
 from trustbo.workspace.moves import along, moves_along, require_on_grid
-
-_N_MAPS = 500
-"""Draws of the awareness that plans are made with; the first `_N_KEPT` are in the result."""
-_N_KEPT = 200
-_MOVED: dict[str, tuple[str, Callable[["Campaign"], Any]]] = {
-    "log": ("state", lambda campaign: campaign.state),
-    "seed": ("state.seed", lambda campaign: campaign.state.seed),
-    "plans": ("state.entries[j].plan", lambda campaign: [e.plan for e in campaign.state.entries]),
-    "waiting": (
-        'those of state.numbers("told")',
-        lambda campaign: [campaign.state.measured[j] for j in campaign.state.numbers(TOLD)],
-    ),
-    "awareness": ("learner.awareness", lambda campaign: campaign.learner.awareness),
-    "observation": ("learner.observation", lambda campaign: campaign.learner.observation),
-    "summary": ("table", lambda campaign: campaign.table),
-    "keep": ("save(folder, keep=True)", lambda campaign: partial(campaign.save, keep=True)),
-    "close": ("the end of `with campaign:`", lambda campaign: campaign.__exit__),
-}
-"""Names of version 0.2: those of now, and their values."""
 
 
 class Campaign(Displayed):
@@ -401,15 +383,8 @@ class Campaign(Displayed):
         to fail fell below 0.2.
         """
         if self._planner_now is None:
-            planner = self.planner.with_observation(self.learner.observation)
-            if (awareness := self.learner.awareness) is not None:
-                n_maps = min(_N_MAPS, self.belief.leading[0])
-                maps = awareness.draw(n_maps, self.seed_of("awareness"))
-                planner = planner.with_awareness(maps, awareness.mean())
-            risk = self.risk
-            if (self.state.entries or self.state.failures) and (avoid := to_avoid(risk)).any():
-                planner = planner.avoiding(avoid, risk.mean)
-            self._planner_now = under_risk(planner, risk)
+            seed = self.seed_of("awareness")
+            self._planner_now = planner_given(self.planner, self.learner, self.state, seed)
         return self._planner_now
 
     def known_along(self, path: Sequence[Cell]) -> np.ndarray:
@@ -452,27 +427,13 @@ class Campaign(Displayed):
         """
         if not self.state.entries:
             raise TrustboError("the campaign has no mission yet; tell it one first.")
-        best, believed, problem = self.recommend(), None, self.planner_now().problem
-        if problem.cells is not None:
-            like = self.workspace.awareness
-            # Single precision: they are written after every mission.
-            maps = problem.cells[:_N_KEPT].astype(np.float32)
-            draws = xr.DataArray(maps, like.coords, ("draw", *like.dims))
-            believed = xr.Dataset({"mean": like.copy(data=problem.mean_cells), "draws": draws})
+        best, planner = self.recommend(), self.planner_now()
         return Result(
-            self.workspace,
-            self.missions,
-            self.posteriors,
-            list(best.path),
-            best.trust,
-            best.value,
-            self.trust_map(),
-            self.history,
+            self.workspace, self.missions, self.posteriors, list(best.path), best.trust, best.value,
+            self.trust_map(), self.history,
             {**self.settings, **self.state.notes, "trustbo_version": VERSIONS["trustbo"]},
-            self.state.stop_reason,
-            believed,
-            tuple(self.state.failures),
-        )
+            self.state.stop_reason, believed_of(planner), tuple(self.state.failures),
+        )  # fmt: skip
 
     def _result_so_far(self) -> Result | None:
         return self.result() if self.state.entries else None
@@ -640,12 +601,19 @@ class Campaign(Displayed):
             self.storage.release()
             self.storage = None
 
-    if not TYPE_CHECKING:  # to which a misspelt name would be an attribute too
+    # --- names of version 0.2 ---
 
-        def __getattr__(self, name: str) -> Any:
-            if name not in _MOVED:
-                raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-            now, value = _MOVED[name]
-            message = f"Campaign.{name} is {now} since version 0.3; the old name will go."
-            warnings.warn(message, FutureWarning, stacklevel=2)
-            return value(self)
+    log = Former("state", lambda campaign: campaign.state)
+    seed = Former("state.seed", lambda campaign: campaign.state.seed)
+    plans = Former(
+        "state.entries[j].plan", lambda campaign: [e.plan for e in campaign.state.entries]
+    )
+    waiting = Former(
+        'those of state.numbers("told")',
+        lambda campaign: [campaign.state.measured[j] for j in campaign.state.numbers(TOLD)],
+    )
+    awareness = Former("learner.awareness", lambda campaign: campaign.learner.awareness)
+    observation = Former("learner.observation", lambda campaign: campaign.learner.observation)
+    summary = Former("table", lambda campaign: campaign.table)
+    keep = Former("save(folder, keep=True)", lambda campaign: partial(campaign.save, keep=True))
+    close = Former("the end of `with campaign:`", lambda campaign: campaign.__exit__)

@@ -1,6 +1,5 @@
 """Criticism of a fitted trust model: tests, residuals and comparisons, with a verdict."""
 
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -46,6 +45,7 @@ from trustbo.inference.posterior_tree import missions_of
 from trustbo.models.families import FAMILIES
 from trustbo.models.model import TrustModel
 from trustbo.parallel import one_blas_thread
+from trustbo.renamed import Former
 
 _LEVEL = 0.05
 _LEAST = 1e-6
@@ -91,15 +91,7 @@ class Criticism(Displayed):
     robots: pd.DataFrame
     ablation: pd.DataFrame
 
-    @property
-    def worth(self) -> pd.DataFrame:
-        """Former name of `ablation`."""
-        warnings.warn(
-            "Criticism.worth is Criticism.ablation since version 0.3; the old name will go.",
-            FutureWarning,
-            stacklevel=2,
-        )
-        return self.ablation
+    worth = Former("Criticism.ablation", lambda found: found.ablation)
 
     def _card(self) -> Card:
         rows = [(str(name), str(row["finding"])) for name, row in self.table.iterrows()]

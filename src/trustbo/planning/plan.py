@@ -1,6 +1,5 @@
 """A plan: a path, its expected trust, value and exactness, and what robots are to do."""
 
-import warnings
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from itertools import pairwise
@@ -14,6 +13,7 @@ from trustbo.display.svg import curve_picture
 from trustbo.hazard.risk import PathRisk
 from trustbo.planning.assignment import robots_along
 from trustbo.planning.cover import PathCover
+from trustbo.renamed import Former
 from trustbo.workspace import Workspace
 from trustbo.workspace.bounding import legs_along
 
@@ -158,12 +158,7 @@ class Plan(Displayed):
         ground = self.workspace.ground
         return None if ground is None else ground.posts.places(self.path)[0]
 
-    @property
-    def waypoints(self) -> np.ndarray | None:
-        """Stops of the lead, as version 0.2 named them: see `stops`."""
-        message = "Plan.waypoints is Plan.stops since version 0.3; the old name will go."
-        warnings.warn(message, FutureWarning, stacklevel=2)
-        return self.stops
+    waypoints = Former("Plan.stops", lambda plan: plan.stops)
 
     @cached_property
     def posts(self) -> np.ndarray | None:
