@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from trustbo.campaign.state import LEARNED
 from trustbo.display.bars import FILE, NOTEBOOK, bar_in, place_of, say
+from trustbo.display.compiling import compiling
 from trustbo.errors import TrustboError, require_choice
 
 if TYPE_CHECKING:
@@ -60,6 +61,8 @@ class Progress:
                 self._page.__enter__()
             say(self._place, f"follow the campaign at {self._page.path.resolve().as_uri()}")
         self._bar = bar_in(self._place, total=self._total, initial=done, desc="missions")
+        self._compiling = compiling(self._bar)
+        self._compiling.__enter__()
         return self
 
     def __exit__(
@@ -68,6 +71,7 @@ class Progress:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
+        self._compiling.__exit__(None, None, None)
         self._bar.close()
         self._campaign.learner.progress = self._before
         if self._map is not None and kind is None:  # the result is what a cell shows afterwards

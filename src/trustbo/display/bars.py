@@ -1,6 +1,7 @@
 """Bars and lines that show progress: in a terminal, in a notebook, or in a file."""
 
 import sys
+import threading
 import warnings
 from typing import Any
 
@@ -39,6 +40,26 @@ def bar_in(place: str, **options: Any) -> tqdm:
     if place == NOTEBOOK:
         options |= {"position": 0, "file": sys.stdout}
     return tqdm(disable=place not in (TERMINAL, NOTEBOOK), **options)
+
+
+class Ticker(threading.Thread):
+    """Refreshes a bar each second, so that its clock runs while nothing advances it."""
+
+    def __init__(self, bar: tqdm) -> None:
+        """Start, until `stop`."""
+        super().__init__(daemon=True)
+        self._bar, self._over = bar, threading.Event()
+        self.start()
+
+    def run(self) -> None:
+        """Refresh the bar."""
+        while not self._over.wait(1.0):
+            self._bar.refresh()
+
+    def stop(self) -> None:
+        """Leave the bar alone from now on."""
+        self._over.set()
+        self.join()
 
 
 def say(place: str, line: str) -> None:

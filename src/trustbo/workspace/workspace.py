@@ -20,6 +20,7 @@ from trustbo.data import (
     require_map,
 )
 from trustbo.display.card import Card, Displayed
+from trustbo.display.compiling import compiling
 from trustbo.display.svg import map_picture
 from trustbo.errors import ShapeError, TrustboError, require_choice, require_positive
 from trustbo.renamed import former
@@ -159,26 +160,27 @@ class Workspace(Displayed):
             "traversability": TRAVERSABILITY,
             "visibility": VISIBILITY if bounds else PAPER_VISIBILITY,
         }
-        maps = cell_maps(
-            terrain, grid, features or defaults, team, observers=observers, scaling=scaling
-        )
-        passable = np.nan_to_num(maps.passable_share) >= 1.0 - MAX_MISSING
-        workspace = cls._of_maps(
-            np.repeat(maps.awareness[None], len(team.robots), axis=0),
-            passable & np.isfinite(maps.awareness).all(-1),
-            grid,
-            team,
-            maps.features,
-        )
-        workspace = dataclasses.replace(
-            workspace,
-            terrain=terrain,
-            pixels=maps.pixels,
-            composites=maps.composites,
-            sights=sights,
-            formation=formation,
-        )
-        return workspace._with_line_of_sight() if bounds else workspace
+        with compiling():
+            maps = cell_maps(
+                terrain, grid, features or defaults, team, observers=observers, scaling=scaling
+            )
+            passable = np.nan_to_num(maps.passable_share) >= 1.0 - MAX_MISSING
+            workspace = cls._of_maps(
+                np.repeat(maps.awareness[None], len(team.robots), axis=0),
+                passable & np.isfinite(maps.awareness).all(-1),
+                grid,
+                team,
+                maps.features,
+            )
+            workspace = dataclasses.replace(
+                workspace,
+                terrain=terrain,
+                pixels=maps.pixels,
+                composites=maps.composites,
+                sights=sights,
+                formation=formation,
+            )
+            return workspace._with_line_of_sight() if bounds else workspace
 
     @classmethod
     def from_awareness(

@@ -44,7 +44,7 @@ def test_the_bar_names_the_chains_the_phase_and_divergences_after_the_warm_up(ca
             seen.advanced(0.2, stats_of(130, n_divergences=3))
             seen._bar.refresh()
     shown = capsys.readouterr().err
-    assert "NUTS, compiling:   0%" in shown
+    assert "NUTS, compiling, some 10 s:   0%" in shown
     assert "NUTS, 4 chains, warm-up:  10%" in shown
     assert "NUTS, 4 chains, draws:  50%" in shown
     assert "8 steps a draw, 6 divergences" in shown

@@ -14,7 +14,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from trustbo.display.bars import FILE, NOWHERE, bar_in, say
+from trustbo.display.bars import FILE, NOWHERE, Ticker, bar_in, say
 from trustbo.inference.samplers.settings import NutsSettings
 
 LONG = 10.0
@@ -78,13 +78,17 @@ class Watch:
         self._settings, self._draws, self._n_divergences = settings, 0, 0
         self._seconds, self._n_steps = 0.0, np.zeros(0)
         self._of_chain, self._estimated = settings.warmup + settings.draws, not self._estimates
-        total, label = settings.n_chains * self._of_chain, f"{self._name}, compiling"
+        total, label = settings.n_chains * self._of_chain, f"{self._name}, compiling, some 10 s"
         with bar_in(self._place, total=total, desc=label, unit="draw", leave=False) as bar:
-            self._bar = bar
-            yield self
+            self._bar, self._ticker = bar, Ticker(bar)
+            try:
+                yield self
+            finally:
+                self._ticker.stop()
 
     def compiled(self) -> None:
         """Start the clock of the bar."""
+        self._ticker.stop()
         if not self._draws:
             self._bar.unpause()
 
