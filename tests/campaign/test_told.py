@@ -558,7 +558,6 @@ def test_settings_of_a_simulator_survive_a_file(workspace, tmp_path):
         {"team": tb.Team(robots=(tb.Robot(speed=1.0),) * 3)},
         {"terrain": tb.terrain.synthetic_terrain((120.0, 120.0), seed=9)},
         {"bound_timeout": 99.0},
-        {"lost_contact_after": 40.0},
         {"threats": [tb.simulation.Threat("jam", (380030.0, 5224950.0), 12.0, strength=0.4)]},
         {"degradations": [tb.simulation.Degradation("r1", 0.4)]},
         {"events": [tb.simulation.Dust(0.5)]},

@@ -161,17 +161,6 @@ def test_a_mission_that_runs_out_of_time_keeps_what_it_measured():
     np.testing.assert_array_equal(mission.contact_rate, 1.0)
 
 
-def test_a_mission_without_contact_can_be_ended():
-    canopy = np.full((60, 60), 4.0)  # a thicket: the layer from 1.2 m up, robots below its top
-    workspace = workspace_of(np.zeros((60, 60)), canopy)
-    simulator = KinematicSimulator(workspace, sight="wall", lost_contact_after=3.0)
-    mission = simulator.run(PATH, seed=0)
-    assert mission.status == "lost_contact"
-    contact = mission.bounds[0].contact
-    assert not contact[-6:].any()  # 3 s of 0.5 s ticks
-    assert len(contact) == 6 or contact[-7].any()
-
-
 def test_a_robot_that_tips_over_ends_the_mission():
     """A hillside steeper than the limit only where the gradient, not the cell, says so."""
     workspace = workspace_of(np.zeros((60, 60)), 0.0)

@@ -90,39 +90,9 @@ def test_a_campaign_learns_from_a_log_whatever_it_would_have_run(workspace, reco
     assert result.settings["recorded_missions"] == 2
 
 
-def test_a_mission_is_replayed_bound_by_bound():
-    one, other = mission(MIDDLE, 0.2), mission(AROUND, 0.3)
-    replay = ReplaySimulator([one, other])
-    replay.reset((2, 0), 0)
-    assert replay.run_bound(1, (1, 1), next_cell=(0, 1)) is other.bounds[0]
-    assert replay.run_bound(2, (0, 1)) is other.bounds[1]
-    replay.close()
-    assert replay.remaining == (one,)
-    with pytest.raises(TrustboError, match=r"call reset\(start, seed\) before run_bound"):
-        replay.run_bound(1, (1, 1))
-    replay.reset((2, 0), 0)
-    with pytest.raises(TrustboError, match="bounds are replayed in turn: 1 is next; got 2"):
-        replay.run_bound(2, (1, 1))
-    with pytest.raises(TrustboError, match="path 2,0 0,1 was never recorded"):
-        replay.run_bound(1, (0, 1))
-    assert replay.run_bound(1, (1, 1)) is one.bounds[0]
-    with pytest.raises(
-        TrustboError, match=r"mission 0, begun .* enters \(0, 0\) with bound 2, not"
-    ):
-        replay.run_bound(2, (0, 1))
-    replay.reset((2, 0), 0)
-    with pytest.raises(TrustboError, match="all 2 missions are replayed"):
-        replay.run_bound(1, (1, 1))
-
-
-def test_a_mission_that_ended_early_goes_no_further():
-    replay = ReplaySimulator([mission(LEFT, n_bounds=1, status="stuck")])
-    replay.reset((2, 0), 0)
-    replay.run_bound(1, (1, 0))
-    with pytest.raises(TrustboError, match='mission 0 ended as "stuck" with bound 1; bound 2 was'):
-        replay.run_bound(2, (0, 0))
-    replay.rewind()
-    assert replay.run(LEFT, seed=0).status == "stuck"
+def test_what_needs_bounds_one_by_one_refuses_a_replay(workspace):
+    with pytest.raises(TrustboError, match="ReplaySimulator has no reset and no run_bound"):
+        run(workspace, simulator=ReplaySimulator([mission(LEFT)]), replan="bound")
 
 
 def test_a_replayed_table_gives_the_posterior_of_the_run_that_wrote_it(

@@ -15,7 +15,7 @@ from trustbo.simulation.events import Degradation, Event, Threat, require_events
 from trustbo.simulation.measure import Measure
 from trustbo.simulation.motion import drive_together
 from trustbo.simulation.protocol import DescribedSimulator
-from trustbo.simulation.sensing import contact_of, cut_at_lost_contact, detections, new_tracks
+from trustbo.simulation.sensing import contact_of, detections, new_tracks
 from trustbo.simulation.state import Drive, State
 from trustbo.simulation.world import Worlds, true_surface
 from trustbo.team import Robot, Team
@@ -48,7 +48,6 @@ class KinematicSimulator(DescribedSimulator):
         team: Team | None = None,
         tick: float = 0.5,
         bound_timeout: float = 600.0,
-        lost_contact_after: float | None = None,
         threats: Sequence[Threat] = (),
         degradations: Sequence[Degradation] = (),
         events: Sequence[Event] = (),
@@ -68,8 +67,6 @@ class KinematicSimulator(DescribedSimulator):
             team: True robots, of the same names; by default the workspace's.
             tick: Length of a tick, s.
             bound_timeout: Longest duration of a bound, s; the mission then ends as "timeout".
-            lost_contact_after: Longest time without contact of any robot, s; the mission then ends
-                as "lost_contact". None: no limit.
             threats: Regions that jam sight or forbid passage in some missions.
             degradations: Lidars of T2 that are worse in some missions.
             events: Events of any kind, `Dust`, `Fouling`, `Vegetation` and `Season` too, which act
@@ -95,9 +92,6 @@ class KinematicSimulator(DescribedSimulator):
         self.tick = require_positive("tick", tick)
         self.bound_timeout = require_positive("bound_timeout", bound_timeout)
         self._max_ticks = round(self.bound_timeout / self.tick)
-        self.lost_contact_after = lost_contact_after
-        if lost_contact_after is not None:
-            require_positive("lost_contact_after", lost_contact_after)
         self.realtime, self.record_states = dict(realtime or {}), record_states
         self._wants_states = record_states or bool(self.realtime)
         require_events("threats", threats, Threat)
@@ -128,7 +122,6 @@ class KinematicSimulator(DescribedSimulator):
             "tick": self.tick,
             "formation": dataclasses.asdict(self.workspace.formation),
             "bound_timeout": self.bound_timeout,
-            "lost_contact_after": self.lost_contact_after,
             "threats": [dataclasses.asdict(threat) for threat in self.threats],
             "degradations": [dataclasses.asdict(degradation) for degradation in self.degradations],
             "events": [event.settings for event in self.events[n_older:]],
@@ -271,8 +264,8 @@ class KinematicSimulator(DescribedSimulator):
 
         From a state of the team. Returns for each the contact rate (robot,), the status and the
         state after it. The rate is the mean probability of contact over the ticks where scans are
-        independent; where tracks outlast misses, or lost contact ends a mission, that of simulated
-        scans. Fouling is as in the long run.
+        independent; where tracks outlast misses, that of simulated scans. Fouling is as in the long
+        run.
         """
         moves: dict[tuple[Leg, bytes], int] = {}  # by their goals
         drives, runs = [], []
@@ -292,7 +285,6 @@ class KinematicSimulator(DescribedSimulator):
             runs.append(run)
         lidars = self.team.lead, *self.team.robots
         independent = all(robot.acquire == robot.drop == 1 for robot in lidars)
-        independent &= self.lost_contact_after is None
         fouling = np.ones(len(self.team.robots))
         for event in self._now.fouling:  # the probability of contact is linear in the factors
             fouling *= event.mean if independent else event.draw(rng, len(fouling))
@@ -300,12 +292,12 @@ class KinematicSimulator(DescribedSimulator):
         outcomes = []
         for run in runs:
             whole = _joined([drives[i] for i in run])
-            then, status = _after(state, whole), whole.status
+            then = _after(state, whole)
             then.tracks = state.tracks.copy()
             probability = np.concatenate([seen[i] for i in run])
             if not independent:
-                probability, status = self._contact(then, whole, probability, rng)
-            outcomes.append((probability.mean(0), status, then))
+                probability = self._contact(then, whole, probability, rng)
+            outcomes.append((probability.mean(0), whole.status, then))
         return outcomes
 
     def calibration(self, n_bounds: int = 300, seed: int = 0) -> dict[str, xr.Dataset]:
@@ -373,23 +365,24 @@ class KinematicSimulator(DescribedSimulator):
         contacts = [
             self._contact(*one) for one in zip(states, drives, probabilities, rngs, strict=True)
         ]
-        poses = [drive.poses[: len(c)] for drive, (c, _) in zip(drives, contacts, strict=True)]
-        closing = [drive.closing(len(p)) for drive, p in zip(drives, poses, strict=True)]
-        moved = [self._measure.states(p[:, 1:]) if self._wants_states else None for p in poses]
+        closing = [drive.closing for drive in drives]
+        moved = [
+            self._measure.states(d.poses[:, 1:]) if self._wants_states else None for d in drives
+        ]
         awareness = self._measure(
-            [p[one, 1:] for p, one in zip(poses, closing, strict=True)],
+            [drive.poses[one, 1:] for drive, one in zip(drives, closing, strict=True)],
             [x[one] for x, one in zip(moved, closing, strict=True) if x is not None],
         )
         bounds = []
-        for state, drive, track, (contact, status), x, z in zip(
-            states, drives, poses, contacts, moved, awareness, strict=True
+        for state, drive, contact, x, z in zip(
+            states, drives, contacts, moved, awareness, strict=True
         ):
             n_ticks, n_robots = contact.shape
             duration, ticks = np.full(n_robots, n_ticks * self.tick), np.full(n_robots, n_ticks)
             kept = x if self.record_states else None
-            of_bound = cell, z, contact.mean(0), duration, status, state.time
-            bounds.append(Bound(*of_bound, track, contact, ticks, kept))
-            state.cells, state.poses, state.stops = drive.cells, track[-1], drive.stops
+            of_bound = cell, z, contact.mean(0), duration, drive.status, state.time
+            bounds.append(Bound(*of_bound, drive.poses, contact, ticks, kept))
+            state.cells, state.poses, state.stops = drive.cells, drive.poses[-1], drive.stops
             state.time = bounds[-1].t1
         return bounds
 
@@ -459,18 +452,14 @@ class KinematicSimulator(DescribedSimulator):
 
     def _contact(
         self, state: State, drive: Drive, probabilities: np.ndarray, rng: np.random.Generator
-    ) -> tuple[np.ndarray, str]:
-        """Contact at each tick, (tick, robot), until the bound ends, and its status."""
+    ) -> np.ndarray:
+        """Contact at each tick, (tick, robot)."""
         detected = rng.random(probabilities.shape) < probabilities
         contact = np.empty(detected.shape, bool)
         for phase, watchers in enumerate(self._watchers):
             mask = drive.lead_moves == (phase == 0)
             contact[mask] = contact_of(detected[mask], watchers, state.tracks[phase])
-        n_ticks, status = len(contact), drive.status
-        if self.lost_contact_after is not None:
-            patience = max(1, round(self.lost_contact_after / self.tick))
-            n_ticks, status = cut_at_lost_contact(contact, patience, status)
-        return contact[:n_ticks], status
+        return contact
 
 
 def _after(state: State, drive: Drive) -> State:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Self
 
-from trustbo.data import Bound, Cell, Mission, path_text, require_map
+from trustbo.data import Cell, Mission, path_text, require_map
 from trustbo.errors import TrustboError, require_choice, require_pair
 from trustbo.files import FilePath
 from trustbo.logs.netcdf import read_missions
@@ -22,8 +22,6 @@ class ReplaySimulator(DescribedSimulator):
     with the workspace, settings and seed of the recorded run asks for the same paths, and so
     replays it. With `on_missing="next"` a campaign learns from the missions in the order in which
     they were recorded, independent of the paths it asks for.
-
-    `reset`, `run_bound` and `close` replay a mission bound by bound; `on_missing` does not apply.
 
     Attributes:
         missions: All missions, in the order recorded.
@@ -50,9 +48,6 @@ class ReplaySimulator(DescribedSimulator):
         self.missions = tuple(missions)
         self._on_missing = require_choice("on_missing", on_missing, ON_MISSING)
         self._left = list(range(len(self.missions)))
-        self._start: Cell | None = None
-        self._current: int | None = None
-        self._n_run = 0
 
     @classmethod
     def from_table(cls, table: Any, *, on_missing: str = "error", **options: Any) -> Self:
@@ -89,7 +84,6 @@ class ReplaySimulator(DescribedSimulator):
 
     def rewind(self) -> None:
         """Start over with all missions left."""
-        self.close()
         self._left = list(range(len(self.missions)))
 
     def run(self, path: Sequence[Cell], *, seed: int) -> Mission:
@@ -115,65 +109,8 @@ class ReplaySimulator(DescribedSimulator):
         self._left.remove(j)
         return self.missions[j]
 
-    def reset(self, start: Cell, seed: int, next_cell: Cell | None = None) -> None:
-        """Begin a mission at a cell.
-
-        Args:
-            start: Start cell.
-            seed: Not used.
-            next_cell: Not used.
-        """
-        self.close()
-        self._start = require_pair("start", start)
-
-    def run_bound(self, k: int, cell: Cell, next_cell: Cell | None = None) -> Bound:
-        """Return the next bound of the mission that is replayed.
-
-        Bound 1 selects the mission: the first one left that starts at the cell of `reset` and
-        enters `cell`, and then `next_cell` if given.
-
-        Args:
-            k: Number of the bound, 1 for the first.
-            cell: Cell to enter.
-            next_cell: Cell after it, if given; used with bound 1.
-
-        Raises:
-            TrustboError: `reset` was not called, a bound is out of order, no mission has that path,
-                or the replayed mission had ended or took another path.
-        """
-        if self._start is None:
-            raise TrustboError("call reset(start, seed) before run_bound.")
-        if k != self._n_run + 1:
-            raise TrustboError(f"bounds are replayed in turn: {self._n_run + 1} is next; got {k}.")
-        cell = require_pair("cell", cell)
-        if self._current is None:
-            begin = (self._start, cell) if next_cell is None else (self._start, cell, next_cell)
-            that_way = [j for j, m in enumerate(self.missions) if m.path[: len(begin)] == begin]
-            same = [j for j in that_way if j in self._left]
-            if not same:
-                raise TrustboError(self._missing(begin, that_way))
-            self._current = same[0]
-            self._left.remove(same[0])
-        j, mission = self._current, self.missions[self._current]
-        if k > len(mission.bounds):
-            raise TrustboError(
-                f'recorded mission {j} ended as "{mission.status}" with bound {len(mission.bounds)}'
-                f"; bound {k} was not run."
-            )
-        if mission.path[k] != cell:
-            raise TrustboError(
-                f"recorded mission {j}, begun to be replayed, enters {mission.path[k]} with bound "
-                f"{k}, not {cell}. Give next_cell with bound 1, or replay whole missions with run."
-            )
-        self._n_run = k
-        return mission.bounds[k - 1]
-
-    def close(self) -> None:
-        """End the mission that is replayed bound by bound."""
-        self._start, self._current, self._n_run = None, None, 0
-
     def _missing(self, path: tuple[Cell, ...], recorded: Sequence[int]) -> str:
-        """Message for a path, or the beginning of one, that cannot be replayed."""
+        """Message for a path that cannot be replayed."""
         if not self._left:
             return f"all {len(self.missions)} missions are replayed; rewind() starts over."
         if recorded:

@@ -70,13 +70,3 @@ def _track(detected, limits, tracks, contact):
             else:
                 tracks[i, 1] = 0
             contact[k, i] = tracks[i, 0] == 1
-
-
-def cut_at_lost_contact(contact: np.ndarray, patience: int, status: str) -> tuple[int, str]:
-    """Length in ticks and status of a bound, cut after `patience` ticks without contact."""
-    alone = 0
-    for k, any_contact in enumerate(contact.any(1)):
-        alone = 0 if any_contact else alone + 1
-        if alone >= patience:
-            return k + 1, "lost_contact"
-    return len(contact), status

@@ -30,8 +30,9 @@ class Drive(NamedTuple):
     cells: tuple[Cell, Cell]
     stops: np.ndarray  # (1 + robot, 2)
 
-    def closing(self, n_ticks: int) -> np.ndarray:
-        """Mask of the first ticks in which T2 moves; the last tick if it has not moved yet."""
-        closing = ~self.lead_moves[:n_ticks]
+    @property
+    def closing(self) -> np.ndarray:
+        """Mask of the ticks in which T2 moves; the last tick if it has not moved yet."""
+        closing = ~self.lead_moves
         closing[-1] |= not closing.any()
         return closing
