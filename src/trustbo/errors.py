@@ -1,6 +1,7 @@
 """Errors that trustbo raises for input it refuses; each is also a ValueError."""
 
 import difflib
+import importlib.util
 import math
 import operator
 import os
@@ -53,6 +54,12 @@ def pip_install(*packages: str) -> str:
     elif python.is_relative_to(Path.cwd()):
         python = python.relative_to(Path.cwd())
     return shlex.join([os.fspath(python), "-m", "pip", "install", *packages])
+
+
+def require_package(what: str, package: str, module: str) -> None:
+    """Refuse to go on without a package that `what` needs: TrustboError with the remedy."""
+    if importlib.util.find_spec(module) is None:
+        raise TrustboError(f"{what} needs {package}: {pip_install(package)}")
 
 
 def require_choice(what: str, value: object, choices: Iterable[str]) -> str:

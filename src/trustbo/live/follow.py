@@ -47,6 +47,7 @@ class Follower:
         after: Trust after each bound that ended.
         ahead: Forecast of the bounds of the rest, the one that runs included.
         n_draws: Effective number of draws of the forecast; below 20 its bands are too narrow.
+        filter: Filter after the bounds that ended; None where there is none.
         low: Alarms of the bounds that ended.
         reason: Reason why there is no filter; empty where there is one.
     """
@@ -55,7 +56,7 @@ class Follower:
         """Start before the first bound of a mission of a campaign."""
         self._campaign = campaign
         self.reason = ""
-        self._filter: TrustFilter | None = None
+        self.filter: TrustFilter | None = None
         self._now: TrustState | None = None
         self._waiting: np.ndarray | None = None  # ticks with contact, and ticks, (2, robot)
         self.after: list[TrustState] = []
@@ -63,30 +64,25 @@ class Follower:
         self.low: list[Low] = []
         self.n_draws = 0.0
         try:
-            self._filter = _filter_of(campaign)
-            self._now = self.start = self._filter.state
+            self.filter = _filter_of(campaign)
+            self._now = self.start = self.filter.state
         except TrustboError as error:  # parameters that no filter takes
             self.reason = str(error)
 
     @property
     def now(self) -> TrustState | None:
         """Trust now; of a bound that runs, as if it ended now. None where nothing is filtered."""
-        if self._waiting is not None and self._filter is not None:
+        if self._waiting is not None and self.filter is not None:
             waiting, self._waiting = self._waiting, None
-            self._now = self._filter.update_ticks(*waiting)
+            self._now = self.filter.update_ticks(*waiting)
         return self._now
-
-    @property
-    def filter(self) -> TrustFilter | None:
-        """Filter after the bounds that ended; None where there is none."""
-        return self._filter
 
     def catch_up(self, mission: Underway) -> None:
         """Take in a mission from its beginning."""
-        if self._filter is None:
+        if self.filter is None:
             return
-        self._filter.reset()
-        self._now, self._waiting, self.after, self.low = self._filter.state, None, [], []
+        self.filter.reset()
+        self._now, self._waiting, self.after, self.low = self.filter.state, None, [], []
         cells, runs = mission.path, mission.bounds
         for k, run in enumerate(runs):
             self.look_ahead(cells[k : k + 2])
@@ -99,31 +95,31 @@ class Follower:
     def look_ahead(self, rest: Sequence[Cell]) -> None:
         """Forecast the bounds of the rest of a path, the current cell first."""
         self.ahead = None
-        if self._filter is None or len(rest) < 2:
+        if self.filter is None or len(rest) < 2:
             return
         try:
             known = self._campaign.known_along(rest)
-            self.ahead = self._filter.predict(known, rest)
-            self.n_draws = float(1.0 / np.sum(self._filter.weights**2))
+            self.ahead = self.filter.predict(known, rest)
+            self.n_draws = float(1.0 / np.sum(self.filter.weights**2))
         except TrustboError as error:
             self._give_up(error)
 
     def begin(self, mission: Underway) -> None:
         """Begin the bound that runs."""
-        if self._filter is None or mission.running is None:
+        if self.filter is None or mission.running is None:
             return
         bound = mission.here, mission.running.cell
         try:
             if self.ahead is None or not mission.planned:
                 self.look_ahead(bound)
-            self._filter.begin_bound(self._campaign.known_along(bound)[0], bound)
+            self.filter.begin_bound(self._campaign.known_along(bound)[0], bound)
             self.ticks(*np.zeros((2, mission.n_robots)))  # trust is predicted
         except TrustboError as error:
             self._give_up(error)
 
     def ticks(self, n_contact: np.ndarray, n_ticks: np.ndarray) -> None:
         """Take in ticks of the bound that runs."""
-        if self._filter is None:
+        if self.filter is None:
             return
         if self._waiting is None:
             self._waiting = np.zeros((2, len(n_ticks)))
@@ -132,14 +128,14 @@ class Follower:
 
     def end(self, mission: Underway) -> None:
         """End the last bound of a mission."""
-        if self._filter is None:
+        if self.filter is None:
             return
         run, _ = mission.bounds[-1], self.now  # with all ticks
         if run.awareness is not None and self._campaign.learner.awareness is not None:
             self.catch_up(mission)  # the bound was begun with what was expected
             return
         try:
-            self._filter.end_bound()
+            self.filter.end_bound()
         except TrustboError:  # it failed before it began
             self._over(mission.path[len(mission.bounds) - 1], run)
             return
@@ -147,14 +143,14 @@ class Follower:
 
     def _over(self, left: Cell, run: Run) -> None:
         """Take in a bound that ended."""
-        if self._filter is None:
+        if self.filter is None:
             return
         crossed, names = (left, run.cell), self._campaign.workspace.features
         try:
             bound = replace(run.to_bound(len(names), run.begun), status="ok")
             driven = Mission(crossed, (bound,))
             awareness = self._campaign.as_learned(self._campaign.workspace.in_order(driven))
-            self._filter.update(
+            self.filter.update(
                 awareness.awareness[0], bound.contact_rate, crossed, n_ticks=bound.n_ticks
             )
         except TrustboError as error:
@@ -163,9 +159,9 @@ class Follower:
         self._kept(run)
 
     def _kept(self, run: Run) -> None:
-        assert self._filter is not None  # noqa: S101
+        assert self.filter is not None  # noqa: S101
         self.low += self.low_of(run, len(self.after) + 1)
-        self._now = self._filter.state
+        self._now = self.filter.state
         self.after.append(self._now)
 
     def low_of(self, run: Run, bound: int) -> list[Low]:
@@ -188,7 +184,7 @@ class Follower:
         return [Low(bound, int(i), float(rate[i]), float(mean[i])) for i in np.flatnonzero(far)]
 
     def _give_up(self, error: TrustboError) -> None:
-        self._filter, self._now, self.ahead, self.reason = None, None, None, str(error)
+        self.filter, self._now, self.ahead, self.reason = None, None, None, str(error)
 
 
 def _filter_of(campaign: "Campaign") -> TrustFilter:

@@ -1,7 +1,6 @@
 """Server for Foxglove: map of the team's trust, path, and state of the robots."""
 
 import asyncio
-import importlib.util
 import json
 import logging
 from functools import partial
@@ -10,19 +9,13 @@ from typing import Any, Self
 
 import numpy as np
 
-from trustbo.errors import TrustboError, pip_install
+from trustbo.errors import TrustboError
 from trustbo.live.hub import Hub
 
 _log = logging.getLogger(__name__)
 _FRAME, _SECONDS = "map", 1.0
 _FLOAT32 = 4  # bytes
 _STATE = {"type": "object", "additionalProperties": True}
-
-
-def require_foxglove() -> None:
-    """Refuse to serve without foxglove-sdk: TrustboError."""
-    if importlib.util.find_spec("foxglove") is None:
-        raise TrustboError(f"Foxglove needs foxglove-sdk: {pip_install('foxglove-sdk')}")
 
 
 class Scene:

@@ -83,7 +83,6 @@ class Reader:
         """Take the names that messages may use, and the number of levels of reports."""
         self.levels = levels
         self.robots, self.features, self._lead = tuple(robots), tuple(features), lead
-        self._index = {name: i for i, name in enumerate(self.robots)}
 
     def read(self, line: str | bytes) -> Message:
         """Read a line.
@@ -124,7 +123,7 @@ class Reader:
         given, together = record["contact"], record.get("ticks", 1)
         n = require_whole("ticks", together, 1)
         contacts, ticks = np.zeros((2, len(self.robots)), dtype=np.int64)
-        for i, value in self._by_robot("contact", given):
+        for i, value in _by_name("contact", "robot", self.robots, given):
             if value is True or value is False:
                 number = n * value
             elif value is None:
@@ -170,8 +169,8 @@ class Reader:
 
     def _awareness(self, record: Mapping[str, Any], t: float | None) -> Awareness:
         values = np.full((len(self.robots), len(self.features)), np.nan)
-        for i, row in self._by_robot("awareness", record["awareness"]):
-            for m, value in self._by_name("feature", self.features, row):
+        for i, row in _by_name("awareness", "robot", self.robots, record["awareness"]):
+            for m, value in _by_name("feature", "feature", self.features, row):
                 number = math.nan if value is None else _number("awareness", value, missing=True)
                 if not (0.0 <= number <= 1.0 or math.isnan(number)):
                     raise TrustboError(
@@ -184,7 +183,7 @@ class Reader:
         values, person = np.full(len(self.robots), np.nan), record.get("person", PERSON)
         if not isinstance(person, str) or not 0 < len(person.strip()) <= _MOST_NOTE:
             raise TrustboError(f"person is a name; got {one_line(person)}.")
-        for i, value in self._by_robot("report", record["report"]):
+        for i, value in _by_name("report", "robot", self.robots, record["report"]):
             if value is not None:
                 number = _number("report", value)
                 values[i] = report_of(f"report about {self.robots[i]}", number, self.levels)
@@ -195,28 +194,11 @@ class Reader:
         if not isinstance(given, Mapping):
             raise TrustboError(f"pose names robots and their x and y; got {one_line(given)}.")
         for name, place in given.items():
-            if name != self._lead and name not in self._index:
+            if name != self._lead and name not in self.robots:
                 raise unknown("robot", name, (self._lead, *self.robots))
             x, y = (_number("pose", number) for number in _listed("pose", place, 2))
             places[name] = (x, y)
         return Pose(places, t)
-
-    def _by_robot(self, what: str, given: Any) -> Iterable[tuple[int, Any]]:
-        """Index and value of each robot that is named, or of all, in order."""
-        if isinstance(given, Mapping):
-            for name in given:
-                if name not in self._index:
-                    raise unknown("robot", str(name)[:60], self.robots)
-            return [(self._index[name], value) for name, value in given.items()]
-        return enumerate(_listed(what, given, len(self.robots)))
-
-    def _by_name(self, what: str, names: Sequence[str], given: Any) -> Iterable[tuple[int, Any]]:
-        if isinstance(given, Mapping):
-            for name in given:
-                if name not in names:
-                    raise unknown(what, str(name)[:60], names)
-            return [(names.index(name), value) for name, value in given.items()]
-        return enumerate(_listed(what, given, len(names)))
 
 
 KINDS: dict[
@@ -243,6 +225,16 @@ def _number(what: str, value: Any, *, missing: bool = False) -> float:
     if not (math.isfinite(number) or (missing and math.isnan(number))):
         raise TrustboError(f"{what} must be finite; got {number}.")
     return number
+
+
+def _by_name(what: str, noun: str, names: Sequence[str], given: Any) -> Iterable[tuple[int, Any]]:
+    """Index and value of each robot or feature that is named, or of all, in order."""
+    if not isinstance(given, Mapping):
+        return enumerate(_listed(what, given, len(names)))
+    for name in given:
+        if name not in names:
+            raise unknown(noun, str(name)[:60], names)
+    return [(names.index(name), value) for name, value in given.items()]
 
 
 def _listed(what: str, values: Any, n: int | None = None) -> Sequence[Any]:

@@ -13,7 +13,7 @@ from ipaddress import ip_address
 from pathlib import Path
 from typing import IO
 
-from trustbo.errors import TrustboError, require_not_negative, require_whole
+from trustbo.errors import TrustboError, require_not_negative, require_package, require_whole
 from trustbo.files import FilePath, as_path, folder_to_disk, naming_refusal
 from trustbo.live.hub import Hub
 from trustbo.live.server import http_server
@@ -72,9 +72,7 @@ def serve(
     if bag is not None and not as_path(bag).exists():
         raise TrustboError(f"there is no bag {str(bag)!r}; check its path.")
     if foxglove is not None:
-        from trustbo.live.foxglove import require_foxglove
-
-        require_foxglove()
+        require_package("Foxglove", "foxglove-sdk", "foxglove")
 
     def over(line: str) -> None:
         with suppress(OSError):  # a terminal that is gone ends no mission

@@ -20,6 +20,7 @@ from trustbo.simulation.replicates import END, Edge, KinematicReplicates, PlainR
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import MOVE_NAMES, MOVES, move_indices, moves_along
 
+_DIMS = ("move", "row", "col", "next_move")
 _LEAST = 3
 """Replicates of every bound."""
 _FAILURE_ERROR = 0.1
@@ -159,24 +160,26 @@ class _Tally:
         with np.errstate(invalid="ignore", divide="ignore"):
             outcome = self._status / n
             contact = np.where(n_ok > 0, self._sum / n_ok, np.where(n > 0, 0.0, np.nan))
-        dims = ("move", "row", "col", "next_move")
-        coords = {
-            "robot": list(self._workspace.team.names),
-            "status": list(STATUSES),
-            "move": list(MOVE_NAMES),
-            "next_move": [*MOVE_NAMES, "end"],
-        }
-        return BoundTable(
-            xr.Dataset(
-                {
-                    "contact": (("robot", *dims), contact),
-                    "outcome": (("status", *dims), outcome),
-                    "standard_error": (dims, self._standard_error()),
-                    "n": (dims[:3], n.max(-1)),
-                },
-                coords,
-            )
-        )
+        table = table_of(self._workspace, contact, outcome, self._standard_error())
+        return BoundTable(table.data.assign(n=(_DIMS[:3], n.max(-1))))
+
+
+def table_of(
+    workspace: Workspace, contact: np.ndarray, outcome: np.ndarray, standard_error: np.ndarray
+) -> BoundTable:
+    """Table of arrays, see `BoundTable.data`; `outcome` may have the first of the statuses only."""
+    variables = {
+        "contact": (("robot", *_DIMS), contact),
+        "outcome": (("status", *_DIMS), outcome),
+        "standard_error": (_DIMS, standard_error),
+    }
+    coords = {
+        "robot": list(workspace.team.names),
+        "status": list(STATUSES[: len(outcome)]),
+        "move": list(MOVE_NAMES),
+        "next_move": [*MOVE_NAMES, "end"],
+    }
+    return BoundTable(xr.Dataset(variables, coords))
 
 
 def _root_mean_square(values: np.ndarray) -> float:

@@ -15,11 +15,11 @@ from scipy.stats import t as student
 
 from trustbo.data import Cell, Mission
 from trustbo.errors import TrustboError, require_whole
-from trustbo.simulation.bound_table import BoundTable
+from trustbo.simulation.bound_table import BoundTable, table_of
 from trustbo.simulation.protocol import DescribedSimulator
 from trustbo.terrain.dataset import digest_of
 from trustbo.workspace import Workspace
-from trustbo.workspace.moves import MOVE_NAMES, MOVES, moves_along
+from trustbo.workspace.moves import MOVES, moves_along
 
 FREEDOM, SCALE = 3.0, 0.06
 """Degrees of freedom and scale of the noise of a rate."""
@@ -79,19 +79,8 @@ class RadioSimulator(DescribedSimulator):
         contact = expected_rate(self.mean)[..., None]  # the same before any bound
         exists = self.workspace.passable_bounds.values
         contact = np.where(exists[..., None], np.repeat(contact, len(MOVES[8]) + 1, -1), np.nan)
-        dims = ("move", "row", "col", "next_move")
         certain = np.where(np.isfinite(contact[:1]), 1.0, np.nan)
-        return BoundTable(
-            xr.Dataset(
-                {
-                    "contact": (("robot", *dims), contact),
-                    "outcome": (("status", *dims), certain),
-                    "standard_error": (dims, 0.0 * certain[0]),
-                },
-                {"robot": list(self.workspace.team.names), "status": ["ok"],
-                 "move": list(MOVE_NAMES), "next_move": [*MOVE_NAMES, "end"]},
-            )
-        )  # fmt: skip
+        return table_of(self.workspace, contact, certain, 0.0 * certain[0])
 
     def describe(self) -> dict[str, object]:
         """Return the settings that decide what a mission measures."""

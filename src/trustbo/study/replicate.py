@@ -13,7 +13,7 @@ from scipy.special import expit, ndtr
 from scipy.stats import norm
 
 from trustbo.data import Mission
-from trustbo.errors import TrustboError, pip_install, require_choice
+from trustbo.errors import TrustboError, require_choice, require_package
 from trustbo.inference.fit import fit
 from trustbo.inference.score import score, summarize_scores
 from trustbo.models.model import TrustModel, require_model
@@ -79,9 +79,7 @@ def replicate(
     for model in models.values() if isinstance(models, Mapping) else models:
         require_model(model)
     named = models if isinstance(models, Mapping) else {m.in_short(): m for m in models}
-    chosen = _available() if baselines is None else tuple(baselines)
-    for name in chosen:
-        _require_baseline(name)
+    chosen = _chosen(baselines)
     rows = {}
     for one, other in itertools.permutations(missions, 2):
         learned, ahead = (list(_of_log(missions[name], one)) for name in (one, other))
@@ -244,18 +242,18 @@ BASELINES: dict[str, Baseline] = {
     "unobserved_components": unobserved_components,
 }
 """Forecasts that a model should beat."""
-_PACKAGE = {"unobserved_components": "statsmodels"}
+_PACKAGES = {"unobserved_components": "statsmodels"}
 
 
-def _available() -> tuple[str, ...]:
-    """Baselines whose packages are installed."""
-    return tuple(n for n in BASELINES if importlib.util.find_spec(_PACKAGE.get(n, "sklearn")))
-
-
-def _require_baseline(name: str) -> None:
-    package = _PACKAGE.get(require_choice("baseline", name, BASELINES), "sklearn")
-    if importlib.util.find_spec(package) is None:
-        raise TrustboError(f"baseline {name!r} needs {package}: {pip_install(package)}")
+def _chosen(baselines: Sequence[str] | None) -> tuple[str, ...]:
+    """Baselines, by default those whose packages are installed."""
+    if baselines is None:
+        return tuple(n for n in BASELINES if importlib.util.find_spec(_PACKAGES.get(n, "sklearn")))
+    for name in baselines:
+        require_choice("baseline", name, BASELINES)
+        if package := _PACKAGES.get(name):
+            require_package(f"baseline {name!r}", package, package)
+    return tuple(baselines)
 
 
 def _before(values: np.ndarray) -> np.ndarray:
