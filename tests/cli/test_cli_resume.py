@@ -2,7 +2,6 @@
 
 import json
 import resource
-import shutil
 import signal
 import subprocess
 import sys
@@ -74,20 +73,6 @@ def test_what_is_done_is_kept_and_resume_goes_on(invoke, flags, tmp_path):
     for a, b in zip(again.posteriors, whole.posteriors, strict=True):
         xr.testing.assert_identical(a["posterior"].to_dataset(), b["posterior"].to_dataset())
     assert (out / "report.html").exists()
-
-
-@pytest.mark.usefixtures("blank_figures")
-def test_resume_of_what_is_done_says_so_and_changes_nothing(invoke, finished, tmp_path):
-    whole, folder = tb.load_result(finished[0]), tmp_path / "copy"
-    shutil.copytree(finished[0], folder)
-    (folder / "report.html").unlink()
-    done = invoke("resume", folder)
-    assert done.exit_code == 0, done.output
-    assert "all 2 missions are done; for more, give --iterations." in done.output
-    again = tb.load_result(folder)
-    assert again.path == whole.path
-    np.testing.assert_array_equal(again.trust_map, whole.trust_map)
-    assert (folder / "report.html").exists()
 
 
 def test_resume_says_what_it_cannot_do(invoke, tmp_path):

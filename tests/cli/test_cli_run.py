@@ -10,6 +10,7 @@ import rasterio
 import xarray as xr
 from rasterio.errors import NotGeoreferencedWarning
 
+import trustbo as tb
 from trustbo import files
 from trustbo.report import page
 
@@ -74,7 +75,7 @@ def test_a_page_that_became_the_report_is_not_written_again(invoke, flags, tmp_p
 
 
 @pytest.mark.usefixtures("blank_figures")
-def test_run_passes_every_choice_on(invoke, flags, tmp_path):
+def test_run_passes_every_choice_on_and_resume_drives_nothing_again(invoke, flags, tmp_path):
     done = invoke(
         *("run", *flags, "--iterations", 9, "--awareness", "belief", "--replan", "bound"),
         *("--max-bounds", "shortest", "--objective", "mean", "--stop-regret", 0.9, "--quiet"),
@@ -91,9 +92,17 @@ def test_run_passes_every_choice_on(invoke, flags, tmp_path):
     assert {name: record["settings"][name] for name in chosen} == chosen
     assert record["stop_reason"].startswith("regret_bound: P(regret <= 0.9)")
     assert record["n_missions"] == 3  # the fewest that the rule asks for
-    again = invoke("resume", tmp_path, "--stop-regret", 0.9, "--quiet")  # which ends it at once
-    assert again.exit_code == 0, again.output
-    assert json.loads((tmp_path / "result.json").read_text())["n_missions"] == 3
+    before = tb.load_result(tmp_path)
+    (tmp_path / "report.html").unlink()
+    # What is done is not driven again, but judged by another rule, and drawn.
+    done = invoke("resume", tmp_path, "--stop-regret", 0.8, "--iterations", 3)
+    assert done.exit_code == 0, done.output
+    assert "all 3 missions are done; for more, give --iterations." in done.output
+    again = tb.load_result(tmp_path)
+    assert (len(again.missions), again.path) == (3, before.path)
+    assert again.stop_reason.startswith("regret_bound: P(regret <= 0.8)")
+    np.testing.assert_array_equal(again.trust_map, before.trust_map)
+    assert (tmp_path / "report.html").exists()
 
 
 @pytest.mark.parametrize(
@@ -137,20 +146,18 @@ def test_demo_runs_on_the_rasters_it_writes(invoke, tmp_path):
     assert "mission  status" not in done.output
 
 
-@pytest.mark.usefixtures("blank_figures")
 def test_a_dem_alone_is_enough_and_its_feet_are_read(invoke, rasters, flags, tmp_path):
     feet = tmp_path / "feet.tif"
     shutil.copy(rasters / "dem.tif", feet)
     with rasterio.open(feet, "r+") as source:
         source.write(source.read() / np.float32(0.3048))
         source.units = ["ft"]
-    # A short range, for else nothing would hide the lead.
-    short = ("--lidar-range", 20, "--iterations", 1, "--quiet")
+    # A short range, for else nothing would hide the lead; it ends once the workspace is made.
+    short = ("--lidar-range", 20, "--max-bounds", 1, "--quiet")
     done = invoke("run", "--dem", feet, *flags[4:], *short, "--out", tmp_path)
-    assert done.exit_code == 0, done.output
+    assert "--max-bounds = 1 is below the fewest possible" in done.stderr
     assert done.stderr.count("are converted to metres") == 1
     assert done.stderr.count("no surface (DSM) is given") == 1
-    assert json.loads((tmp_path / "result.json").read_text())["n_missions"] == 1
 
 
 @pytest.mark.parametrize(

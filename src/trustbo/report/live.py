@@ -7,7 +7,6 @@ from typing import Self
 from trustbo.campaign.campaign import Campaign
 from trustbo.campaign.result import Result
 from trustbo.data import Mission
-from trustbo.display.svg import curve_picture, map_picture
 from trustbo.files import FilePath, require_file, write_text
 from trustbo.report import tables
 from trustbo.report.blocks import Drawing, Fact, Section
@@ -86,12 +85,7 @@ def _if_long_ago(campaign: Campaign | None) -> str:
 
 def _sections(result: Result) -> list[Section]:
     """Sections of the first screen, drawn without figures that take seconds."""
-    grid, start = result.workspace.grid, result.path[0]  # where trust is assumed
-    aspect, contacts = grid.cell_height / grid.cell_width, result.history["contact_rate"].values
-    area = map_picture(
-        result.trust_map.values, result.path, aspect=aspect, label="expected trust", apart=start
-    )
-    rates = curve_picture(contacts, label="contact rate", x_label="mission")
+    area, rates = (draw() for draw in result._card().pictures)
     path = (
         "Expected trust now, from dark to yellow, and the path recommended now, from circle to "
         "star. Grey cells are impassable, or the start, whose trust is assumed."
