@@ -1,7 +1,7 @@
 """Comparison with the 2023 code of the paper's authors: its priors, learning and composites.
 
-Nothing here is recommended. The public entries are `Priors.zheng2023()`, `moment_matched` with
-`update="moment_matched"`, and `CompositeIndex(method="zheng2023")`.
+Nothing here is recommended. The public entries are `Priors.zheng2023()`, `moment_matched` and
+`CompositeIndex(method="zheng2023")`.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -10,11 +10,6 @@ import numpy as np
 
 if TYPE_CHECKING:
     from numpyro.distributions import Distribution
-
-MOMENT_MATCHED_WARNING = (
-    'update="moment_matched" is for comparison with the 2023 code: over 20 missions it '
-    'is off by up to 1.15 posterior standard deviations. update="refit" is exact.'
-)
 
 
 def vague_priors() -> dict[str, Any]:

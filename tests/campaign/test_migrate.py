@@ -36,6 +36,12 @@ def test_replanning_of_version_0_1_becomes_an_option_and_the_tilt_of_0_2_goes():
     assert options == {"replan": "mission", "hazard": {"cause": 0.1}}
 
 
+def test_a_campaign_of_matched_moments_is_refused_and_the_others_are_refit():
+    assert "update" not in migrate_state(STATE | {"options": {"update": "refit"}})["options"]
+    with pytest.raises(TrustboError, match="was the last version to have: its result can be"):
+        migrate_state(STATE | {"options": {"update": "moment_matched"}})
+
+
 def test_the_rule_seconds_of_version_0_2_is_a_time_limit():
     rules = [{"rule": "Seconds", "own": False, "limit": 60.0}, {"rule": "bold", "own": True}]
     stop = migrate_state(STATE | {"notes": {"stop": rules}})["notes"]["stop"]

@@ -37,22 +37,16 @@ def test_there_is_a_row_per_mission_bound_and_robot(result, tmp_path):
 
 
 def test_trust_is_blank_in_missions_that_the_last_posterior_is_not_of(result, tmp_path):
-    with pytest.warns(UserWarning, match="is for comparison with the 2023 code"):
-        matched = tb.iterate(
-            result.workspace,
-            (2, 0),
-            (0, 3),
-            n_iterations=2,
-            sampler="exact",
-            update="moment_matched",
-            seed=3,
-            progress=False,
-        )
-    write_csv(tmp_path / "bounds.csv", matched)
+    campaign = tb.Campaign(result.workspace, (2, 0), (0, 3), sampler="exact", seed=3)
+    for _ in campaign.run(n_iterations=2):
+        pass
+    campaign.set_aside("its log was of another hill", mission=1)
+    without = campaign.result()
+    write_csv(tmp_path / "bounds.csv", without)
     with (tmp_path / "bounds.csv").open(newline="", encoding="utf-8") as stream:
         rows = list(csv.DictReader(stream))
     assert {row["mission"]: row["trust_sd"] != "" for row in rows} == {"1": False, "2": True}
-    last = matched.posterior["latent"]["trust_mean"].values[0]
+    last = without.posterior["latent"]["trust_mean"].values[0]
     found = [float(row["trust_mean"]) for row in rows if row["mission"] == "2"]
     np.testing.assert_array_equal(found, last.ravel())
 

@@ -309,8 +309,6 @@ class Campaign(Displayed):
             raise TrustboError(f"there is no mission {number} to set aside; {n} were told.")
         if (entry := self.state.entries[number - 1]).state == SET_ASIDE:
             raise TrustboError(f"mission {number} is set aside already: {entry.row['reason']}")
-        if self.options.update == "moment_matched":
-            raise TrustboError('update="moment_matched" cannot forget a mission; use "refit".')
         entry.become(SET_ASIDE, str(reason))
         self.learner.learn(self.state, self.seed_of("fit"))
         self.state.suggested = self._planner_now = None

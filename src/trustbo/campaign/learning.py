@@ -1,8 +1,7 @@
 """Learning of a campaign: from its missions to a posterior, a hazard and a belief."""
 
 import warnings
-from dataclasses import replace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -24,13 +23,11 @@ from trustbo.inference import diagnostics, fit, params_of, sample_prior
 from trustbo.inference.posterior_groups import parameters_alone
 from trustbo.inference.samplers.choice import resolve_sampler
 from trustbo.inference.samplers.settings import NutsSettings
-from trustbo.inference.updating import moment_matched
-from trustbo.models import HumanTrust, PlaceEffect, PooledTrust, RobotEffect, TrustParams
+from trustbo.models import HumanTrust, PlaceEffect, PooledTrust, RobotEffect
 from trustbo.models.families import AUTO
 from trustbo.models.model import TrustModel, require_model
 from trustbo.models.params import Params
 from trustbo.workspace import AwarenessBelief, Workspace
-from trustbo.zheng2023 import MOMENT_MATCHED_WARNING
 
 _N_DRAWS = 1000
 _MOST_MASKS = 3  # in a mission
@@ -46,7 +43,7 @@ class Learner:
     Attributes:
         workspace: Workspace of the missions.
         options: Options of the campaign.
-        model: Trust model, see `default_model`.
+        model: Trust model, by default with effects of places and of robots.
         sampler: Sampler of the posterior.
         belief: Parameter draws: the posterior's, or, before the first mission, one from the prior.
         observation: Family of observations of the belief.
@@ -66,9 +63,10 @@ class Learner:
         seed: int,
     ) -> None:
         """Begin with the prior, drawn by a seed; see `Campaign` for what is refused."""
-        model = default_model(options.update) if model is None else model
+        if model is None:
+            model = PooledTrust(place=PlaceEffect(), effects=(RobotEffect(),))
         _require_learnable(model, sampler, options)
-        all_alike = options.update == "refit" and options.forgetting == 1.0
+        all_alike = options.forgetting == 1.0
         self.changes = resolved(options.changes, model, all_alike=all_alike)
         self.workspace, self.options, self.model, self.sampler = workspace, options, model, sampler
         self._prior = _prior_belief(model, options.initial, workspace, seed)
@@ -102,7 +100,7 @@ class Learner:
             return
         missions, masks = [entries[j].mission for j in numbers], masks_of(state.last_tree)
         try:
-            tree = self._fit(masked(missions, numbers, masks), len(waiting), state.last_tree, seed)
+            tree = self._fit(masked(missions, numbers, masks), state.last_tree, seed)
             if self.changes != "ignore":
                 tree = self._fit_masked(tree, missions, numbers, masks, seed)
         except CannotLearnError as error:
@@ -116,8 +114,7 @@ class Learner:
                 stacklevel=5,
             )
             return
-        alone = self.options.update == "moment_matched"  # the prior stands for those before
-        tree.attrs["missions"] = waiting if alone else numbers
+        tree.attrs["missions"] = numbers
         if masks:
             tree.attrs["masks"] = np.ravel(masks)
             entries[-1].row["n_masks"] = len(masks)
@@ -194,21 +191,14 @@ class Learner:
             warnings.warn(f"{error} The campaign goes on with the hazard before.", stacklevel=5)
             return None
 
-    def _fit(
-        self, missions: list[Mission], new: int, last: xr.DataTree | None, seed: int
-    ) -> xr.DataTree:
-        """Fit the posterior of missions, of which the `new` last are not in the posterior `last`.
+    def _fit(self, missions: list[Mission], last: xr.DataTree | None, seed: int) -> xr.DataTree:
+        """Fit the posterior of missions; `last` is that of some of them.
 
         One that is refused is tried again in other ways. CannotLearnError: every attempt failed.
         """
-        model, weights, options = self.model, None, self.options
-        if options.update == "moment_matched":
-            priors = model.for_features(missions[0].features).priors
-            if last is not None:
-                priors = moment_matched(cast(TrustParams, params_of(last)), priors)
-            model, missions = replace(model, priors=priors), missions[-new:]
-        if options.forgetting < 1.0:
-            weights = options.forgetting ** np.arange(len(missions) - 1, -1, -1)
+        weights, forgetting = None, self.options.forgetting
+        if forgetting < 1.0:
+            weights = forgetting ** np.arange(len(missions) - 1, -1, -1)
         reason = ""
         for shift, (sampler, sampling) in enumerate(self._attempts()):
             if reason:
@@ -217,7 +207,7 @@ class Learner:
                 say(place_of(self.progress), line)
             try:
                 return fit(
-                    missions, model, sampler, workspace=self.workspace, earlier=last,
+                    missions, self.model, sampler, workspace=self.workspace, earlier=last,
                     weights=weights, seed=seed + shift, progress=self.progress, whole=False,
                     **sampling,
                 )  # fmt: skip
@@ -247,7 +237,7 @@ class Learner:
                 break
             masks.append(mask)
             say(place_of(self.progress), f"{mask}.")
-            tree = self._fit(masked(missions, numbers, masks), 0, tree, seed)
+            tree = self._fit(masked(missions, numbers, masks), tree, seed)
         return tree
 
     def _attempts(self) -> list[tuple[str, dict[str, Any]]]:
@@ -266,13 +256,6 @@ class Learner:
         return [*attempts, (other, shared)]
 
 
-def default_model(update: str) -> TrustModel:
-    """Effects of places and of robots; moments that are matched are of parameters alone."""
-    if update != "refit":
-        return PooledTrust()
-    return PooledTrust(place=PlaceEffect(), effects=(RobotEffect(),))
-
-
 def _require_learnable(model: TrustModel, sampler: str, options: CampaignOptions) -> None:
     require_model(model)
     if isinstance(model, HumanTrust):
@@ -283,18 +266,11 @@ def _require_learnable(model: TrustModel, sampler: str, options: CampaignOptions
     resolved, _ = resolve_sampler(model, sampler)
     NutsSettings.of(options.sampling).require_sampler(resolved)
     gaussian = model.family.integrates_out and model.observation != AUTO
-    if options.forgetting < 1.0 and not (options.update == "refit" and gaussian):
+    if options.forgetting < 1.0 and not gaussian:
         raise TrustboError(
-            f'forgetting = {options.forgetting:g} needs update "refit" and Gaussian observations; '
-            f'got "{options.update}" and "{model.observation}".'
+            f"forgetting = {options.forgetting:g} needs Gaussian observations; got "
+            f'"{model.observation}".'
         )
-    if options.update == "moment_matched":
-        if model.robot_sets != "all" or not gaussian:
-            raise TrustboError(
-                f'update="moment_matched" is for PooledTrust of Gaussian rates; got '
-                f"{model.describe()}."
-            )
-        warnings.warn(MOMENT_MATCHED_WARNING, stacklevel=4)
 
 
 def _prior_belief(model: TrustModel, initial: str, workspace: Workspace, seed: int) -> Params:

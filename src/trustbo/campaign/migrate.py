@@ -8,6 +8,8 @@ import json
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from trustbo.errors import TrustboError
+
 if TYPE_CHECKING:
     import xarray as xr
 
@@ -26,6 +28,11 @@ _RULES = {"Seconds": "TimeLimit"}
 def migrate_state(record: dict[str, Any]) -> dict[str, Any]:
     """Convert the record of `campaign.json`."""
     options, notes = dict(record["options"]), record["notes"]
+    if options.pop("update", "refit") != "refit":  # of versions up to 0.3
+        raise TrustboError(
+            'the campaign was run with update="moment_matched", which 0.3 was the last version to '
+            "have: its result can be read, and its missions told to a new campaign."
+        )
     if "replan" in notes:  # of version 0.1
         options.setdefault("replan", notes["replan"])
     # Version 0.2 had a weight of the tilt, where there is a margin of the limit now.

@@ -51,11 +51,8 @@ class CampaignOptions:
             shortest path, see `Planner`.
         initial: Source of the first plan: prior_mean, or prior_draw (one random draw of the prior,
             as in the paper).
-        update: Missions that a posterior is fitted to: refit (all so far) or, for comparison with
-            the 2023 code, moment_matched (the last). The prior of the latter has the mean and sd of
-            the posterior before, which is not exact.
         forgetting: Weight of a mission relative to the next, in (0, 1]. Below 1, a change of the
-            environment is followed; for `"refit"` with Gaussian observations.
+            environment is followed; for Gaussian observations.
         changes: Rates of an area that has changed: ignore (they stay), mask (those before the
             change are left out, once it is more probable than not), reset (mask, and places are
             drawn from the prior with the chance that they changed since the last visit), or auto
@@ -90,7 +87,6 @@ class CampaignOptions:
     initial: str = field(
         default="prior_mean", metadata=_option(LEARNING, "prior_mean", "prior_draw")
     )
-    update: str = field(default="refit", metadata=_option(LEARNING, "refit", "moment_matched"))
     forgetting: float = field(default=1.0, metadata=_option(LEARNING))
     changes: str = field(
         default="auto", metadata=_option(LEARNING, "auto", "ignore", "mask", "reset")
