@@ -78,15 +78,20 @@ class Hub:
         await self.take(message)
 
     async def take_lines(self, lines: Iterable[bytes]) -> int:
-        """Take lines up to the first that is refused; TrustboError names its number, from 1."""
+        """Take lines up to the first that is refused, until they are on the disk.
+
+        TrustboError: one is refused; the message names its number, from 1.
+        """
         number = 0
-        for line in lines:
-            if line.strip():
-                try:
+        try:
+            for line in lines:
+                if line.strip():
+                    number += 1
                     await self.take_line(line)
-                except TrustboError as error:
-                    raise TrustboError(f"line {number + 1}: {error}") from None
-                number += 1
+        except TrustboError as error:
+            raise TrustboError(f"line {number}: {error}") from None
+        finally:
+            await self.flush()
         return number
 
     def refuse(self, error: TrustboError) -> None:

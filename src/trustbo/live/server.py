@@ -147,11 +147,9 @@ class _Messages(_Api):
         try:
             taken = await self.hub.take_lines(bytes(self._body).splitlines())
         except TrustboError as error:
-            await self.hub.flush()
             self.set_header("X-Taken", str(self.hub.n_taken - before))
             self.refuse(400, str(error))
             return
-        await self.hub.flush()
         self.answer(json.dumps({"taken": taken, "version": self.hub.live.version}))
 
 
@@ -202,11 +200,8 @@ class _Socket(WebSocketHandler):
             return
         lines = (message.encode() if isinstance(message, str) else message).splitlines()
         try:
-            taken = await self.hub.take_lines(lines)
-            await self.hub.flush()
-            self.send(json.dumps({"answer": taken}))
+            self.send(json.dumps({"answer": await self.hub.take_lines(lines)}))
         except TrustboError as error:
-            await self.hub.flush()
             self.send(json.dumps({"error": str(error)}))
 
     def on_close(self) -> None:

@@ -18,16 +18,7 @@ if TYPE_CHECKING:
 LAYERS = ("trust", "cost")
 _BAND = 1.6449  # sds on both sides, of 90 %
 _DIGITS = 4
-_COMPASS = (
-    "north",
-    "north-east",
-    "east",
-    "south-east",
-    "south",
-    "south-west",
-    "west",
-    "north-west",
-)
+_COMPASS = "north north-east east south-east south south-west west north-west".split()
 
 
 def state_of(live: "Live") -> dict[str, Any]:
