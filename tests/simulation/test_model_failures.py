@@ -22,17 +22,14 @@ def workspace():
 def test_missions_end_as_often_as_the_chances_say(workspace):
     p = np.zeros((8, 2, 4))
     p[EAST, 0] = np.nan, 0.2, 0.5, 0.0
-    causes = {"tipped": 0.25, "timeout": 0.75}
-    simulator = ModelSimulator(workspace, PARAMS, p_fail=p, causes=causes)
+    simulator = ModelSimulator(workspace, PARAMS, p_fail=p)
     missions = [simulator.run(ROW, seed=seed) for seed in range(400)]
     ends = np.array([len(m.bounds) if m.status != "ok" else 0 for m in missions])
     shares = np.bincount(ends, minlength=4) / len(missions)
     expected = np.array([0.8 * 0.5, 0.2, 0.8 * 0.5, 0.0])
     # 4 standard errors of a share of 400.
     assert (np.abs(shares - expected) < 4.0 * np.sqrt(0.25 / 400)).all()
-    failed = [m.status for m in missions if m.status != "ok"]
-    assert np.mean(np.array(failed) == "tipped") == pytest.approx(0.25, abs=0.12)
-    assert set(failed) == set(causes)
+    assert {m.status for m in missions} == {"ok", "stuck"}
     assert all(m.bounds[-1].status == m.status for m in missions)
     again = simulator.run(ROW, seed=3)
     np.testing.assert_array_equal(again.contact_rate, missions[3].contact_rate)
@@ -61,7 +58,3 @@ def test_wrong_chances_are_named(workspace):
         ModelSimulator(workspace, PARAMS, p_fail=np.zeros((2, 4)))
     with pytest.raises(TrustboError, match=r"a chance in \[0, 1\]; got 1.5"):
         ModelSimulator(workspace, PARAMS, p_fail=np.full((8, 2, 4), 1.5))
-    with pytest.raises(TrustboError, match="unknown cause 'tired'"):
-        ModelSimulator(workspace, PARAMS, causes={"tired": 1.0})
-    with pytest.raises(TrustboError, match="shares that sum to 1"):
-        ModelSimulator(workspace, PARAMS, causes={"stuck": 0.5})

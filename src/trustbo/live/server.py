@@ -143,11 +143,9 @@ class _Messages(_Api):
         if self._size > _MOST_BODY:
             self.refuse(413, f"a request has at most {_MOST_BODY} bytes; got {self._size}.")
             return
-        before = self.hub.n_taken
         try:
             taken = await self.hub.take_lines(bytes(self._body).splitlines())
         except TrustboError as error:
-            self.set_header("X-Taken", str(self.hub.n_taken - before))
             self.refuse(400, str(error))
             return
         self.answer(json.dumps({"taken": taken, "version": self.hub.live.version}))
@@ -171,10 +169,8 @@ class _Socket(WebSocketHandler):
 
     def open(self, *args: str, **kwargs: str) -> None:
         self.set_nodelay(True)
-        self._quiet = self.get_query_argument("quiet", "") != ""
-        if not self._quiet:
-            self.hub.clients.add(self.send)
-            self.send(self.hub.text())
+        self.hub.clients.add(self.send)
+        self.send(self.hub.text())
 
     def send(self, text: str) -> None:
         """Send a line, unless the other end has not read the last ones."""

@@ -1,6 +1,6 @@
 """Simulator that draws contact rates from a trust model, and failures from given chances."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import jax
 import numpy as np
@@ -11,11 +11,9 @@ from trustbo.errors import (
     ShapeError,
     TrustboError,
     require_cells,
-    require_choice,
     require_kind,
     require_whole,
 )
-from trustbo.hazard.exposures import CAUSES
 from trustbo.models import PooledTrust
 from trustbo.models.backend import own_settings
 from trustbo.models.model import TrustModel
@@ -42,7 +40,6 @@ class ModelSimulator(DescribedSimulator):
         awareness: ArrayLike | None = None,
         n_ticks: int | None = None,
         p_fail: ArrayLike | None = None,
-        causes: Mapping[str, float] | None = None,
     ) -> None:
         """Set the true parameters, awareness and chances to fail.
 
@@ -56,15 +53,13 @@ class ModelSimulator(DescribedSimulator):
                 along their path.
             n_ticks: Ticks of each bound, for `"beta_binomial"`.
             p_fail: Chance that each bound ends the mission, shape (move, row, col), such as a draw
-                of `hazard.risk.BoundRisk`; None for no failures.
-            causes: Share of each of `hazard.exposures.CAUSES` among failures; by default all
-                "stuck".
+                of `hazard.risk.BoundRisk`; robots are "stuck" then. None for no failures.
 
         Raises:
             ShapeError: Parameters or awareness of other robots or features, or of many draws; or
                 chances of other bounds.
             TrustboError: An n_ticks that is no number of ticks, or is missing; a chance outside
-                [0, 1]; an unknown cause, or shares that do not sum to 1.
+                [0, 1].
         """
         require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
         require_kind("params", params, Params, "give parameters, such as TrustParams(...)")
@@ -92,7 +87,6 @@ class ModelSimulator(DescribedSimulator):
         self.p_fail = (
             None if p_fail is None else _require_chances(p_fail, (len(MOVES[8]), *shape[1:3]))
         )
-        self.causes = _require_shares({"stuck": 1.0} if causes is None else dict(causes))
 
     def run(self, path: Sequence[Cell], *, seed: int) -> Mission:
         """Run a path; the same seed gives the same mission."""
@@ -120,9 +114,7 @@ class ModelSimulator(DescribedSimulator):
         rng = np.random.default_rng([seed, 1])
         chance = self.p_fail[moves_along(cells), *np.array(cells)[1:].T]
         failed = np.flatnonzero(rng.random(n) < chance)
-        if not len(failed):
-            return n, "ok"
-        return int(failed[0]) + 1, str(rng.choice(list(self.causes), p=list(self.causes.values())))
+        return (int(failed[0]) + 1, "stuck") if len(failed) else (n, "ok")
 
     def expected_contact(self) -> ModelContact:
         """Return the expected contact and failures of bounds, in closed form."""
@@ -138,7 +130,6 @@ class ModelSimulator(DescribedSimulator):
         }
         if self.p_fail is not None:
             about["p_fail"] = np.nan_to_num(self.p_fail, nan=-1.0).tolist()
-            about["causes"] = self.causes
         return about
 
 
@@ -150,11 +141,3 @@ def _require_chances(p_fail: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
     if (bad := (chances < 0.0) | (chances > 1.0)).any():
         raise TrustboError(f"p_fail is a chance in [0, 1]; got {chances[bad][0]:g}.")
     return chances
-
-
-def _require_shares(causes: dict[str, float]) -> dict[str, float]:
-    for cause in causes:
-        require_choice("cause", cause, CAUSES)
-    if min(causes.values()) < 0.0 or not np.isclose(sum(causes.values()), 1.0):
-        raise TrustboError(f"causes are shares that sum to 1; got {causes}.")
-    return causes
