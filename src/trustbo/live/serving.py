@@ -19,7 +19,6 @@ from trustbo.live.hub import Hub
 from trustbo.live.server import http_server
 from trustbo.live.session import FOLDER, Live
 from trustbo.live.sources import Datagrams, Feed, bag_messages, lines_of
-from trustbo.logs.messages import Topics
 
 PORT = 8737
 _TOKEN_FILE = "token"
@@ -36,7 +35,6 @@ def serve(
     lines: IO[bytes] | None = None,
     bag: FilePath | None = None,
     rate: float = 1.0,
-    topics: Topics | None = None,
     foxglove: int | None = None,
     replan: bool = True,
     ready: Callable[[str], object] = print,
@@ -52,7 +50,6 @@ def serve(
         lines: Stream of messages, such as `sys.stdin.buffer`.
         bag: ROS bag to replay.
         rate: Speed of the replay, 1 that of the bag; 0 for no waiting.
-        topics: Names of topics of the bag.
         foxglove: Port of a server for Foxglove, on this machine alone; None for none.
         replan: Whether the rest of a path is planned again after each bound.
         ready: Function that gets the addresses, in lines of text, once they answer; then a line
@@ -85,7 +82,7 @@ def serve(
         with Live(folder, replan=replan, over=over) as live:
             asyncio.run(
                 _serve(live, as_path(folder), address, port, udp, lines,
-                       None if bag is None else (as_path(bag), rate, topics), foxglove, ready, stop)
+                       None if bag is None else (as_path(bag), rate), foxglove, ready, stop)
             )  # fmt: skip
     finally:
         sys.setswitchinterval(before)
@@ -98,7 +95,7 @@ async def _serve(
     port: int,
     udp: int | None,
     lines: IO[bytes] | None,
-    bag: tuple[Path, float, Topics | None] | None,
+    bag: tuple[Path, float] | None,
     foxglove: int | None,
     ready: Callable[[str], object],
     stop: threading.Event | None,
@@ -143,8 +140,7 @@ async def _serve(
             if lines is not None:
                 feeds.append(Feed(hub, "the standard input", lines_of(lines)))
             if bag is not None:
-                path, rate, topics = bag
-                feeds.append(Feed(hub, str(path), bag_messages(path, rate, hub, topics)))
+                feeds.append(Feed(hub, str(bag[0]), bag_messages(*bag, hub)))
             for feed in feeds:
                 feed.start()
             while not over.is_set() and not (stop is not None and stop.is_set()):

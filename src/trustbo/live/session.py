@@ -83,7 +83,6 @@ class Live:
         campaign: Campaign | FilePath,
         *,
         replan: bool = True,
-        clock: Callable[[], float] = time.time,
         over: Callable[[str], object] = str,
     ) -> None:
         """Open a campaign, and go on with its mission.
@@ -91,7 +90,6 @@ class Live:
         Args:
             campaign: Campaign that writes to a folder, or its folder, see `Campaign.load`.
             replan: Whether the rest of a path is planned again after each bound.
-            clock: Time of messages that carry none, s.
             over: Function that gets a line about each mission that is over, and the `trouble`.
 
         Raises:
@@ -107,7 +105,7 @@ class Live:
                 "a live campaign writes to a folder: Campaign(..., directory=), or save(keep=True)."
             )
         self._folder = campaign.storage.path / FOLDER
-        self._clock, self._replan, self._over = clock, replan, over
+        self._replan, self._over = replan, over
         told = [mission for mission in campaign.state.measured if mission.reports is not None]
         self._scale = scale_of(told) if told else "unit"
         names = campaign.workspace.team.names, campaign.workspace.features
@@ -195,7 +193,7 @@ class Live:
         if running is None:
             self.n_idle += 1
             return
-        t = self._clock() if message.t is None else message.t
+        t = time.time() if message.t is None else message.t
         self._happen(ticks_event(message.n_contact, message.n_ticks, t))
         self.follower.ticks(message.n_contact, message.n_ticks)
 
@@ -247,14 +245,14 @@ class Live:
             if not mission.planned:
                 raise TrustboError(f"no path leads on from {mission.here}: give the cell entered.")
             cell = mission.path[mission.k]
-        t = self._clock() if marker.t is None else marker.t
+        t = time.time() if marker.t is None else marker.t
         return {"event": "begin", "bound": marker.bound, "cell": cell, "t": t}
 
     def _end(self, status: str, note: str, t: float | None) -> None:
         """End the bound that runs, by its last tick unless a time is given."""
         before, running = self.mission, self.mission.running
         if t is None and (running is None or running.last is None):
-            t = self._clock()
+            t = time.time()
         self._happen({"event": "end", "status": status, "note": note, "t": t})
         if len(self.mission.bounds) > len(before.bounds):
             self.follower.end(self.mission)
@@ -419,7 +417,7 @@ class Live:
 
     def say(self, text: str) -> None:
         """Add a line to the log."""
-        self.log.append((self._clock(), text))
+        self.log.append((time.time(), text))
         self.version += 1
 
     # --- views ---

@@ -122,7 +122,7 @@ class Datagrams(asyncio.DatagramProtocol):
             raise refused from None
 
 
-def bag_messages(path: Path, rate: float, hub: Hub, topics: Topics | None = None) -> Iterator[Any]:
+def bag_messages(path: Path, rate: float, hub: Hub) -> Iterator[Any]:
     """Lists of the messages of a bag, with those of one time together, at the bag's pace.
 
     The last mission is over with the bag.
@@ -131,15 +131,14 @@ def bag_messages(path: Path, rate: float, hub: Hub, topics: Topics | None = None
         path: Bag, as of `logs.read_bag`.
         rate: Speed, 1 that of the bag; 0 for no waiting.
         hub: Hub that takes them.
-        topics: Names of topics.
 
     Raises:
         TrustboError: No bag, a topic that is missing or of another type, or a damaged bag.
     """
     require_not_negative("rate", rate)
-    names, reader = Topics() if topics is None else topics, hub.live.reader
+    reader = hub.live.reader
     with opened(path) as bag:
-        kinds = _topics(bag, names, reader)
+        kinds = _topics(bag, reader)
         values = bag.values({topic: types for topic, (types, _, _) in kinds.items()})
         began, first, last = time.monotonic(), None, 0.0
         for stamp, together in groupby(values, key=lambda one: one[1]):
@@ -156,9 +155,9 @@ type _Kind = tuple[tuple[str, ...], int, Callable[[Any, float], Message]]
 """Types of a topic, its place among those of one time, and the message of its value."""
 
 
-def _topics(bag: Bag, names: Topics, reader: Reader) -> dict[str, _Kind]:
+def _topics(bag: Bag, reader: Reader) -> dict[str, _Kind]:
     """Topics of a bag that are read."""
-    robots = reader.robots
+    names, robots = Topics(), reader.robots
     contacts = names.of("contact", robots)
     bag.require([names.bound, *contacts])
     kinds: dict[str, _Kind] = {

@@ -15,10 +15,6 @@ from trustbo.plots.style import SMALL, Style, StyleOptions, curve_colours, theme
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 """Quantiles over the runs: ends of the thin bars, of the thick bars, and the marker."""
 _SPREAD = 0.6  # width of the curves side by side, as a share of a mission's
-_MEANING = {
-    "regret": "regret of the path recommended",
-    "regret_followed": "regret of the path followed",
-}
 
 
 def regret_curves(
@@ -26,7 +22,6 @@ def regret_curves(
     *,
     by: str = "policy",
     panels: str | None = None,
-    variable: str = "regret",
     **style: Unpack[StyleOptions],
 ) -> np.ndarray:
     """Draw the regret of a study after each mission: its median and its spread over the runs.
@@ -38,7 +33,6 @@ def regret_curves(
         dataset: Runs of a study, dims (run, mission), from `study.load_study`.
         by: Coordinate of the runs with a value for each curve.
         panels: Coordinate of the runs with a value for each panel, such as `"terrain"`.
-        variable: Variable to draw, `"regret"` or `"regret_followed"`.
         **style: Options of `Style`; `cmap` is that of the curves.
 
     Returns:
@@ -50,13 +44,12 @@ def regret_curves(
     """
     such = "give a study's dataset, from study.load_study"
     require_kind("plots.regret_curves", dataset, xr.Dataset, such)
-    require_choice("variable", variable, _MEANING)
     options = Style.from_options(style)
     for name in (by, panels or by):
         require_choice(
             "coordinate", name, [str(n) for n, c in dataset.coords.items() if "run" in c.dims]
         )
-    regret = dataset[variable]
+    regret = dataset["regret"]
     if not np.isfinite(regret).any():
         raise TrustboError(
             'no regret is known: use simulators of the kind "model", or known_truth of others.'
@@ -77,7 +70,7 @@ def regret_curves(
     first = made.panels[0]
     for ax in made.left:
         ax.set_ylabel(
-            f"{_MEANING[variable]},\n% of the contact that the best keeps", fontsize=SMALL
+            "regret of the path recommended,\n% of the contact that the best keeps", fontsize=SMALL
         )
     top = max(ax.get_ylim()[1] for ax in made.panels)
     for ax in made.panels:
