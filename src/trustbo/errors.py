@@ -137,3 +137,11 @@ def unknown(what: str, name: str, names: Iterable[str]) -> TrustboError:
     near = difflib.get_close_matches(name, names, n=3, cutoff=0.5)
     advice = f"did you mean {', '.join(near)}?" if near else f"choose one of {', '.join(names)}."
     return TrustboError(f"unknown {what} {name!r}; {advice}")
+
+
+def require_known(what: str, given: Iterable[object], names: Iterable[str]) -> None:
+    """Refuse the first name that is unknown, with those that may be meant: TrustboError."""
+    names = list(names)
+    for name in given:
+        if name not in names:
+            raise unknown(what, str(name)[:60], names)

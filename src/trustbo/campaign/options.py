@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from typing import TYPE_CHECKING, Any, Self, cast
 
-from trustbo.errors import TrustboError, require_choice, unknown
+from trustbo.errors import TrustboError, require_choice, require_known, unknown
 
 if TYPE_CHECKING:
     from trustbo.campaign.campaign import Campaign
@@ -183,10 +183,7 @@ def _hazard_of(given: "Hazard | Mapping[str, Any]") -> "Hazard":
         return given
     if not isinstance(given, Mapping):
         raise TrustboError(f"hazard must be a hazard.Hazard, or some of its fields; got {given!r}.")
-    names = [prior.name for prior in fields(Hazard)]
-    for name in given:
-        if name not in names:
-            raise unknown("prior of the hazard", name, names)
+    require_known("prior of the hazard", given, [prior.name for prior in fields(Hazard)])
     return Hazard(**given)
 
 
@@ -198,9 +195,7 @@ def arguments_of(
     `record` is the field `options` of `CampaignState`; a missing option has its default. A custom
     policy or awareness must be passed again, any other is refused; callbacks are optional.
     """
-    for name in custom:
-        if name not in _CUSTOM:
-            raise unknown("option of one's own", name, _CUSTOM)
+    require_known("option of one's own", custom, _CUSTOM)
     record = dict(record)
     given: dict[str, Any] = {name: tuple(record.pop(name)) for name in ("start", "goal")}
     given["policy"] = _restored("policy", record.pop("policy"), policy, record.pop("own_policy"))

@@ -3,6 +3,7 @@
 import base64
 import io
 from collections.abc import Sequence
+from html import escape
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -114,7 +115,9 @@ def curve_picture(
 
 def _svg(width: float, height: float, parts: list[str], legend: str) -> str:
     below = 16.0 if legend else 0.0
-    text = f'<text x="0" y="{height + 12:.0f}">{_escaped(legend)}</text>' if legend else ""
+    text = (
+        f'<text x="0" y="{height + 12:.0f}">{escape(legend, quote=False)}</text>' if legend else ""
+    )
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{width:.0f}" '
         f'height="{height + below:.0f}" viewBox="0 0 {width:.0f} {height + below:.0f}" '
@@ -156,7 +159,3 @@ def _star(x: float, y: float, radius: float) -> str:
     reach = radius * np.where(np.arange(10) % 2, 0.45, 1.0)
     corners = zip(x + reach * np.cos(angles), y + reach * np.sin(angles), strict=True)
     return f'<polygon points="{_points(list(corners))}" fill="#fff" stroke="#000"/>'
-
-
-def _escaped(text: str) -> str:
-    return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")

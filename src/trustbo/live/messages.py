@@ -9,7 +9,7 @@ import numpy as np
 
 from trustbo.answers import PERSON, report_of
 from trustbo.data import STATUSES, Cell
-from trustbo.errors import TrustboError, one_line, require_pair, require_whole, unknown
+from trustbo.errors import TrustboError, one_line, require_known, require_pair, require_whole
 
 MOST_BYTES = 1 << 16
 """Upper limit in bytes of a line."""
@@ -193,9 +193,8 @@ class Reader:
         given, places = record["pose"], {}
         if not isinstance(given, Mapping):
             raise TrustboError(f"pose names robots and their x and y; got {one_line(given)}.")
+        require_known("robot", given, (self._lead, *self.robots))
         for name, place in given.items():
-            if name != self._lead and name not in self.robots:
-                raise unknown("robot", name, (self._lead, *self.robots))
             x, y = (_number("pose", number) for number in _listed("pose", place, 2))
             places[name] = (x, y)
         return Pose(places, t)
@@ -231,9 +230,7 @@ def _by_name(what: str, noun: str, names: Sequence[str], given: Any) -> Iterable
     """Index and value of each robot or feature that is named, or of all, in order."""
     if not isinstance(given, Mapping):
         return enumerate(_listed(what, given, len(names)))
-    for name in given:
-        if name not in names:
-            raise unknown(noun, str(name)[:60], names)
+    require_known(noun, given, names)
     return [(names.index(name), value) for name, value in given.items()]
 
 

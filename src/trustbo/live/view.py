@@ -8,7 +8,7 @@ import numpy as np
 
 from trustbo.answers import answer_of
 from trustbo.data import Cell
-from trustbo.errors import TrustboError, require_choice, unknown
+from trustbo.errors import TrustboError, require_choice, require_known
 from trustbo.live.follow import Low
 from trustbo.planning.trust_map import cost_of
 
@@ -59,8 +59,7 @@ def map_of(live: "Live", layer: str, robot: str | None) -> dict[str, Any]:
     """Map of a live campaign; `Live.map` has its fields."""
     require_choice("layer", layer, LAYERS)
     robots, grid = live.reader.robots, live.campaign.workspace.grid
-    if robot is not None and robot not in robots:
-        raise unknown("robot", robot[:60], robots)
+    require_known("robot", [] if robot is None else [robot], robots)
     name = "team" if robot is None else "robots"
     if name not in live.maps:  # searched once a mission
         params = live.campaign.belief.mean()

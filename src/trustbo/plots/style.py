@@ -9,7 +9,7 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.colors import Colormap, to_hex, to_rgb
 
-from trustbo.errors import TrustboError, require_positive, require_whole, unknown
+from trustbo.errors import TrustboError, require_known, require_positive, require_whole
 
 COLOURS = "viridis"
 """Perceptually uniform, safe for the colour-blind, and monotone in greyscale."""
@@ -131,10 +131,7 @@ class Style:
     @classmethod
     def from_options(cls, options: StyleOptions) -> Self:
         """Check the keyword arguments of a figure."""
-        names = [f.name for f in fields(cls)]
-        for name in options:
-            if name not in names:
-                raise unknown("option", name, names)
+        require_known("option", options, [f.name for f in fields(cls)])
         return cls(**options)
 
     def colours(self, default: str = COLOURS) -> Colormap:

@@ -15,7 +15,7 @@ import numpy as np
 
 import trustbo
 from trustbo import models, simulation, terrain, workspace
-from trustbo.errors import TrustboError, unknown
+from trustbo.errors import TrustboError, require_known, unknown
 from trustbo.models.params import Params
 
 FILES = ("dem", "dsm", "points")
@@ -67,9 +67,8 @@ def call_of(
     keywords = {name: value for name, value in settings.items() if name != "kind"}
     parameters = {n: p for n, p in parameters_of(kind).items() if n not in given}
     variable = [n for n, p in parameters.items() if p.kind in (p.VAR_KEYWORD, p.VAR_POSITIONAL)]
-    for name in () if variable else keywords:
-        if name not in (names := (*parameters, *more)):
-            raise unknown(f"setting of {what} ({kind})", name, names)
+    if not variable:
+        require_known(f"setting of {what} ({kind})", keywords, (*parameters, *more))
     required = [n for n, p in parameters.items() if p.default is p.empty and n not in variable]
     if missing := [name for name in required if name not in keywords]:
         raise TrustboError(f"{what} ({kind}) needs {', '.join(missing)}; got {keywords}.")

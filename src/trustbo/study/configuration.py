@@ -13,7 +13,13 @@ from typing import Any, Self
 import xarray as xr
 
 from trustbo.campaign.options import OBJECTIVE, POLICY, SAMPLER, CampaignOptions
-from trustbo.errors import TrustboError, require_choice, require_pair, require_whole, unknown
+from trustbo.errors import (
+    TrustboError,
+    require_choice,
+    require_known,
+    require_pair,
+    require_whole,
+)
 from trustbo.files import FilePath, read_yaml
 from trustbo.inference.samplers.choice import SAMPLERS, resolve_sampler
 from trustbo.models.model import TrustModel
@@ -157,9 +163,7 @@ class Study:
             return configuration
         if not isinstance(configuration, Mapping):
             raise TrustboError(f"a study is a Study or a mapping; got {configuration!r}.")
-        for name in configuration:
-            if name not in (names := [f.name for f in fields(cls)]):
-                raise unknown("setting of a study", str(name), names)
+        require_known("setting of a study", configuration, [f.name for f in fields(cls)])
         if "terrains" not in configuration:
             raise TrustboError("a study needs terrains, e.g. terrains: [random_workspace].")
         return cls(**configuration)
