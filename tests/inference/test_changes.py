@@ -11,7 +11,8 @@ from trustbo.inference.changes import N_DRAWS, find_changes, weigh
 from trustbo.inference.evidence.gaussian import Gaussian
 from trustbo.inference.posterior_groups import parameters_alone
 from trustbo.inference.samplers.importance import sample_scores
-from trustbo.inference.samplers.posterior import Posterior, Shared
+from trustbo.inference.samplers.posterior import Posterior
+from trustbo.inference.samplers.scores import Scores
 from trustbo.models import HierarchicalTrust, PlaceEffect, PooledTrust, Priors
 from trustbo.models.effects.change import SDS, Candidates, Change
 from trustbo.models.effects.effect import Slots
@@ -78,7 +79,7 @@ def search(missions, further=()):
     def draw_theta(change):
         some = effects if change is None else [*effects, change]
         target = Posterior(
-            Shared(PRIORS, some), evidence_of(slots, some), float(np.nanstd(slots.y))
+            Scores(PRIORS, some), evidence_of(slots, some), float(np.nanstd(slots.y))
         )
         drawn = sample_scores(target, N_DRAWS, 0).draws.params
         names = [name for effect in some for name in effect.names]

@@ -50,7 +50,7 @@ def test_the_evidence_without_memory_is_that_of_quadrature():
     (mission,) = missions_with(0.3, 1)
     priors = Priors.of(FEATURES)
     slots = Slots.of(stack_missions([mission]), 1, FEATURES)
-    target = posterior_of(priors, PooledTrust().family, [], slots, carries=False)
+    target = posterior_of(PooledTrust(priors), slots, carries=False)
     found = sample_scores(target, 400, 0).draws.log_evidence
     scale = 0.2  # of the priors of both noises
     p = (np.arange(80) + 0.5) / 80

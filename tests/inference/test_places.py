@@ -22,8 +22,6 @@ from trustbo.inference.samplers.posterior import posterior_of
 from trustbo.inference.samplers.student import Student, log_mixture
 from trustbo.models import CoupledTrust, HierarchicalTrust, PlaceEffect, PooledTrust, TrustParams
 from trustbo.models.effects.effect import Slots
-from trustbo.models.effects.place import Place
-from trustbo.models.families import FAMILIES
 from trustbo.models.place import bounds_of, visited
 from trustbo.models.priors import Priors
 
@@ -115,8 +113,7 @@ def target_of(missions, place, priors=None, family="gaussian", weight=None):
     batch = tb.stacking.stack_missions(missions)
     places = visited(bounds_of(missions, batch.contact_rate.shape[:2]), place, 3, SHAPE)
     slots = Slots.of(batch, len(missions), (), weight, places)
-    effects = [Place(**place.to_record())]
-    return posterior_of(priors or Priors(), FAMILIES[family], effects, slots)
+    return posterior_of(PooledTrust(priors or Priors(), family, place=place), slots)
 
 
 def thetas(target, z):

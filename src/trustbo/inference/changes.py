@@ -181,10 +181,7 @@ def scan_posterior(
     bounds = bounds_of(missions, batch.contact_rate.shape[:2])
     places = visited(bounds, place, batch.contact_rate.shape[2], shape)  # pyright: ignore
     slots = Slots.of(batch, len(missions), features, weight, places)
-    effects = model.all_effects
-
-    known = model.priors, model.family
-    names = "beta0", "delta_w", "delta_v", *(name for e in effects for name in e.names)
+    names = "beta0", "delta_w", "delta_v", *(name for e in model.all_effects for name in e.names)
 
     def draw_theta(change: Change | None) -> Theta:
         if change is None:
@@ -193,15 +190,14 @@ def scan_posterior(
             params = {name: drawn[name].values[chosen] for name in names}
         else:
             start = proposal_of(posterior)
-            target = posterior_of(*known, [*effects, change], slots, memory=model.memory)
+            target = posterior_of(model, slots, [change])
             params = sample_scores(target, N_DRAWS, seed, start).draws.params
         return {name: params[name] for name in names} | {
             "rest": rest_of(params["beta0"], model.memory)
         }
 
     candidates = Candidates.of(slots, unit=model.family.line_of_sight[0])
-    evidence = evidence_of(*known, effects, slots, memory=model.memory)
-    return find_changes(evidence, candidates, draw_theta)
+    return find_changes(evidence_of(model, slots), candidates, draw_theta)
 
 
 def why_no_changes(model: TrustModel) -> str:

@@ -17,7 +17,7 @@ import xarray as xr
 from trustbo.inference.draws import params_of, sites_of, theta_of
 from trustbo.inference.fit import fit
 from trustbo.inference.posterior_tree import missions_of
-from trustbo.inference.samplers.posterior import posterior_of
+from trustbo.inference.samplers.posterior import evidence_of
 from trustbo.inference.samplers.weights import smoothed_weights
 from trustbo.models.effects.effect import Slots
 from trustbo.models.model import TrustModel
@@ -71,9 +71,7 @@ def by_hyperparameters(posterior: xr.DataTree, model: TrustModel) -> list[LeftOu
         if j is not None:
             counted[j] = w
         slots = Slots.of(batch, len(missions), missions[0].features, counted, places)
-        effects, memory = model.all_effects, model.memory
-        rates = posterior_of(model.priors, model.family, effects, slots, memory=memory)
-        return rates.evidence.log_density(theta)[index]
+        return evidence_of(model, slots).log_density(theta)[index]
 
     whole, left_out = log_evidence(), []
     for j, w in enumerate(weight):

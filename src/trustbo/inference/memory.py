@@ -118,9 +118,7 @@ def memory(
     if isinstance(model, HumanTrust):
         target = PeoplePosterior(model, slots, carries=False)
     else:
-        target = posterior_of(
-            model.priors, model.family, model.all_effects, slots, memory=model.memory, carries=False
-        )
+        target = posterior_of(model, slots, carries=False)
     without = sample_scores(target, _N_DRAWS, seed).draws.log_evidence
     beta0 = np.asarray(posterior["posterior"]["beta0"])
     log_bf = float(attrs["log_evidence"]) - without

@@ -41,8 +41,7 @@ def sample_exactly(missions, model, n_seeds=3, n_draws=2000):
     """Draws of several seeds together, and the mean of their log evidence."""
     slots = Slots.of(stack_missions(missions), len(missions))
     found = [
-        sample_scores(posterior_of(model.priors, model.family, [], slots), n_draws, seed).draws
-        for seed in range(n_seeds)
+        sample_scores(posterior_of(model, slots), n_draws, seed).draws for seed in range(n_seeds)
     ]
     assert max(each.khat for each in found) < 0.7
     params = {name: np.concatenate([f.params[name] for f in found]) for name in found[0].params}

@@ -7,8 +7,7 @@ from missions import walking_missions
 from numpyro.distributions import LogNormal
 
 from trustbo.inference.samplers.nuts_scores import Ridge, ScoresInJax, Tables
-from trustbo.inference.samplers.posterior import Posterior
-from trustbo.inference.samplers.run import _by_evidence
+from trustbo.inference.samplers.posterior import Posterior, posterior_of
 from trustbo.inference.samplers.scores import beta0_and_noises, quantile
 from trustbo.models import HierarchicalTrust, PlaceEffect, PooledTrust, Priors, RobotEffect
 from trustbo.models.backend import own_settings
@@ -29,18 +28,18 @@ MODELS = {
 }
 
 
-def posterior_of(missions, model) -> Posterior:
+def target_of(missions, model) -> Posterior:
     batch = stack_missions(missions)
     model = model.at_resolution({0.05: 1.0})
     bounds = bounds_of(missions, batch.contact_rate.shape[:2])
     places = visited(bounds, PlaceEffect(), 3)
-    return _by_evidence(model, Slots.of(batch, len(missions), (), None, places))
+    return posterior_of(model, Slots.of(batch, len(missions), (), None, places))
 
 
 @pytest.mark.parametrize("name", MODELS)
 def test_the_density_and_its_slope_are_those_of_the_exact_sampler(name):
     """With gaps; the slope by differences of a density that NumPy has."""
-    posterior, h = posterior_of(walking_missions(1, 3, missing=0.2), MODELS[name]), 1e-5
+    posterior, h = target_of(walking_missions(1, 3, missing=0.2), MODELS[name]), 1e-5
     z = np.random.default_rng(0).standard_normal((4, posterior.n_scores))
     z[:, 1] -= 1.0
     steps = h * np.eye(posterior.n_scores)

@@ -38,7 +38,7 @@ def target_of(missions, model: TrustModel):
         bounds = bounds_of(missions, batch.contact_rate.shape[:2])
         places = visited(bounds, model.place, batch.contact_rate.shape[2])
     slots = Slots.of(batch, len(missions), places=places)
-    return posterior_of(model.priors, model.family, model.all_effects, slots, by_robot=True)
+    return posterior_of(model, slots)
 
 
 @pytest.mark.parametrize("place", [None, PlaceEffect(), PlaceEffect(shared=False)])

@@ -29,7 +29,7 @@ def missions_of(y, seed=2, n_ticks=N):
 
 def target_of(missions, model):
     slots = Slots.of(stack_missions(missions), len(missions))
-    return posterior_of(model.priors, model.family, [], slots, by_robot=True)
+    return posterior_of(model, slots)
 
 
 def test_rates_within_the_limits_have_the_closed_form_s_density():

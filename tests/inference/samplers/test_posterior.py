@@ -7,7 +7,8 @@ from references import pooled_posterior
 
 from trustbo.inference.evidence.gaussian import Gaussian
 from trustbo.inference.samplers.importance import sample_scores
-from trustbo.inference.samplers.posterior import Posterior, Shared
+from trustbo.inference.samplers.posterior import Posterior
+from trustbo.inference.samplers.scores import Scores
 from trustbo.models import Priors
 from trustbo.models.effects.effect import Slots
 from trustbo.models.effects.place import Place
@@ -24,7 +25,7 @@ def posterior_of(missions, effects, priors):
     effects = [Weights(priors), *effects]
     x0 = float(priors.x0_mean), float(priors.x0_sd)
     evidence = Gaussian(slots, [effect.group(slots) for effect in effects], x0)
-    return Posterior(Shared(priors, effects), evidence, float(np.nanstd(slots.y)))
+    return Posterior(Scores(priors, effects), evidence, float(np.nanstd(slots.y)))
 
 
 def test_pooled_draws_are_those_of_a_quadrature():

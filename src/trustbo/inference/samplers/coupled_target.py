@@ -21,6 +21,7 @@ from trustbo.inference.evidence.coupled_marginal import (
     integrate,
 )
 from trustbo.inference.samplers import scores
+from trustbo.inference.samplers.importance import ScoreTarget
 from trustbo.inference.samplers.laplace import laplace
 from trustbo.inference.samplers.student import Student
 from trustbo.models.coupled import CoupledTrust
@@ -28,13 +29,10 @@ from trustbo.models.priors_numpy import numbers
 from trustbo.stacking import MissionBatch
 
 
-class CoupledTarget:
+class CoupledTarget(ScoreTarget):
     """Log posterior density of the scores."""
 
-    n_pilot, widths = 2048, (1.05, 1.1)
-    n_final = 8192
-    """Points of the last proposal."""
-    n_corrected, compiles = None, True
+    n_pilot, n_final, widths, compiles = 2048, 8192, (1.05, 1.1), True
 
     def __init__(self, model: CoupledTrust, batch: MissionBatch, weight: np.ndarray) -> None:
         """Take missions and their weights."""
@@ -71,10 +69,6 @@ class CoupledTarget:
         of_sizes = 2.0 * size - 0.5 * np.exp(2.0 * size) + 0.5 * size**2 + scores.LOG_ROOT_2PI
         return scores.log_normal_density(z) + of_sizes.sum(1)
 
-    def takes(self, start: Student) -> bool:
-        """See `ScoreTarget.takes`: one of as many scores."""
-        return len(start.center) == self.n_scores
-
     def first(self) -> Student:
         """Gaussian fit at the mode that a quasi-Newton search finds."""
         start = np.zeros(self.n_scores)
@@ -90,13 +84,6 @@ class CoupledTarget:
 
         mode = optimize.minimize(cost, start, jac=True, method="BFGS", options={"maxiter": 60}).x
         return Student(mode, laplace(self.log_density, mode[None], 0)[2][0])
-
-    def recentre(self, z: np.ndarray) -> None:
-        """No-op: the density is exact everywhere."""
-
-    def sharpen(self) -> bool:
-        """See `ScoreTarget.sharpen`: the density is exact."""
-        return False
 
     def defensive(self, proposal: Student) -> Student:
         """Defensive proposal: the given one widened."""

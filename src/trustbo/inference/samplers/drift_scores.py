@@ -22,7 +22,8 @@ from scipy import stats
 from trustbo.inference.evidence.gaussian import Gaussian
 from trustbo.inference.samplers.importance import UnevenWeightsError
 from trustbo.inference.samplers.laplace import laplace
-from trustbo.inference.samplers.posterior import Posterior, Shared
+from trustbo.inference.samplers.posterior import Posterior
+from trustbo.inference.samplers.scores import Scores
 from trustbo.inference.samplers.student import Student
 from trustbo.models.backend import own_settings
 from trustbo.models.drift import DriftTrust
@@ -34,7 +35,7 @@ _CHUNK = 256
 _CLOSE, _APART = 6.0, 3.0  # nats below the best that a mode still matters; sd between modes
 
 
-class DriftScores(Shared):
+class DriftScores(Scores):
     """Scores of beta0 and the noises, of a drift's parameters, and of the effects' scales."""
 
     def __init__(self, model: DriftTrust, awareness: np.ndarray, slots: Slots) -> None:
@@ -55,11 +56,11 @@ class DriftScores(Shared):
     def named(self, z: np.ndarray) -> dict[str, np.ndarray]:
         """See `Scores.named`."""
         at_scores = partial(self._model.parameters_at, shape=self._shape)
-        shared = {name: values for name, values in Shared.theta(self, z).items() if name != "rest"}
+        shared = {name: values for name, values in Scores.theta(self, z).items() if name != "rest"}
         return shared | _in_chunks(at_scores, self._of_drift(z))
 
     def _of_drift(self, z: np.ndarray) -> np.ndarray:
-        return z[:, Shared.n_core : self.n_core]
+        return z[:, Scores.n_core : self.n_core]
 
 
 class DriftPosterior(Posterior):

@@ -22,7 +22,8 @@ Invariant: weights are target over proposal density for any proposals, and unbia
 the posterior exact (importance sampling squared). Their means' product is the evidence.
 """
 
-from typing import NamedTuple, Protocol
+from abc import ABC, abstractmethod
+from typing import NamedTuple
 
 import numpy as np
 
@@ -49,58 +50,46 @@ class UnevenWeightsError(Exception):
     """The exact sampler's weights are too uneven, or leave out a mode."""
 
 
-class ScoreTarget(Protocol):
+class ScoreTarget(ABC):
     """Posterior of scores, with everything else drawn given them."""
 
-    @property
-    def compiles(self) -> bool:
-        """Whether the first density takes seconds to compile."""
-        ...
+    compiles = False
+    """Whether the first density takes seconds to compile."""
+    n_scores: int
+    n_pilot: int
+    """Number of points of a round, half of them defensive."""
+    n_final: int
+    """Number of points of each last proposal."""
+    widths: tuple[float, float]
+    """Scale of the proposals in units of the points' covariance: in rounds, and of the last."""
+    n_corrected: int | None = None
+    """Maximum number of draws to weight where the density is approximate."""
 
-    @property
-    def n_pilot(self) -> int:
-        """Number of points of a round, half of them defensive."""
-        ...
-
-    @property
-    def n_final(self) -> int:
-        """Number of points of each last proposal."""
-        ...
-
-    @property
-    def widths(self) -> tuple[float, float]:
-        """Scale of the proposals in units of the points' covariance: in rounds, and of the last."""
-        ...
-
-    @property
-    def n_corrected(self) -> int | None:
-        """Maximum number of draws to weight where the density is approximate."""
-        ...
-
+    @abstractmethod
     def log_density(self, z: np.ndarray) -> np.ndarray:
         """Log posterior density of scores (point, score), perhaps approximate; shape (point,)."""
-        ...
 
     def takes(self, start: Student) -> bool:
-        """Whether the proposal of an earlier posterior serves as the first one."""
-        ...
+        """Whether the proposal of an earlier posterior, such as of as many scores, is the first."""
+        return len(start.center) == self.n_scores
 
+    @abstractmethod
     def first(self) -> Student:
         """Gaussian fit at the best mode."""
-        ...
 
-    def recentre(self, z: np.ndarray) -> object:
-        """Re-expand the approximate density around a point (score,)."""
-        ...
+    def recentre(self, z: np.ndarray) -> np.ndarray:
+        """Re-expand an approximate density around a point (score,); it in new coordinates."""
+        return z
 
     def sharpen(self) -> bool:
         """Make an approximate density more accurate, at more cost; whether it could."""
-        ...
+        return False
 
+    @abstractmethod
     def defensive(self, proposal: Student) -> Proposal:
         """Defensive proposal for regions that the given one may miss."""
-        ...
 
+    @abstractmethod
     def draw(
         self, z: np.ndarray, log_p: np.ndarray, chosen: np.ndarray, rng: np.random.Generator
     ) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
@@ -109,7 +98,6 @@ class ScoreTarget(Protocol):
         With them the log weight of each draw, where the density is approximate: its exponential
         averages to the ratio of the posterior density to the approximate one, `log_p`.
         """
-        ...
 
 
 class ScoreDraws(NamedTuple):

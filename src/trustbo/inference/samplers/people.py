@@ -5,22 +5,23 @@ from typing import Any
 import numpy as np
 
 from trustbo.inference.evidence.blocks import Blocks
-from trustbo.inference.samplers.posterior import Posterior, Shared
+from trustbo.inference.samplers.posterior import Posterior
+from trustbo.inference.samplers.scores import Scores
 from trustbo.models.effects.effect import Slots
 from trustbo.models.people import HumanTrust
 
 
-class PeopleScores(Shared):
-    """Scores of `Shared`, and those of free cut points, which are standard normal themselves."""
+class PeopleScores(Scores):
+    """Scores of `Scores`, and those of free cut points, which are standard normal themselves."""
 
     def __init__(self, model: HumanTrust, *, carries: bool = True) -> None:
-        """Take the priors and effects of a model; `carries` as in `Shared`."""
+        """Take the priors and effects of a model; `carries` as in `Scores`."""
         super().__init__(model.priors, model.effects, model.memory, carries=carries)
         self.cuts = model.levels.names
         self.n_scores += len(self.cuts)
 
     def with_core(self, core: Any, z: Any) -> dict[str, Any]:
-        """See `Shared.with_core`."""
+        """See `Scores.with_core`."""
         first = self.n_scores - len(self.cuts)
         cuts = {name: z[:, first + j] for j, name in enumerate(self.cuts)}
         return super().with_core(core, z) | cuts
@@ -30,7 +31,7 @@ class PeoplePosterior(Posterior):
     """Posterior of scores under blocks of persons, whose points are cheap to draw at."""
 
     def __init__(self, model: HumanTrust, slots: Slots, *, carries: bool = True) -> None:
-        """Lay out the reports of missions; `carries` as in `Shared`."""
+        """Lay out the reports of missions; `carries` as in `Scores`."""
         evidence = evidence_of(model, slots)
         super().__init__(PeopleScores(model, carries=carries), evidence, float(np.nanstd(slots.y)))
         if not evidence.exact:

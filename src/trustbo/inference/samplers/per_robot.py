@@ -41,7 +41,7 @@ class _Memory(NamedTuple):
 
 
 @scores.with_data("quantiles", "_beta0", "_prior", "_center", "_var")
-class PerRobot:
+class PerRobot(scores.Scores):
     """Scores of each robot's beta0, of its mean and spread, of noises and of spreads of weights."""
 
     fixed, pools = False, True
@@ -50,11 +50,9 @@ class PerRobot:
         self, priors: Priors, effects: Sequence[Effect], n_robots: int, n_features: int
     ) -> None:
         """Take the priors, and effects other than the weights."""
-        self.quantiles: Any = scores.Quantiles(priors)
         self._beta0, self.n_robots, self._n_tau = priors.beta0, n_robots, n_features + 2
-        self.effects = tuple(effect for effect in effects if effect.names)
         self.n_core = 3 + self._n_tau + n_robots
-        self.n_scores = self.n_core + sum(len(effect.names) for effect in self.effects)
+        super().__init__(priors, effects)
         self._unit = priors.beta0.support is constraints.unit_interval
         low, middle, high = self._to_line(scores.quantile(priors.beta0, np.array([-1.0, 0.0, 1.0])))
         self._prior = middle, (2.0 / (high - low)) ** 2
@@ -76,10 +74,6 @@ class PerRobot:
             "rest": 1.0 - mean,
             **scales_of(self.effects, z[:, self.n_core :]),
         }
-
-    def named(self, z: np.ndarray) -> dict[str, np.ndarray]:
-        """See `Scores.named`."""
-        return {name: values for name, values in self.theta(z).items() if name != "rest"}
 
     def log_prior(self, z: np.ndarray) -> np.ndarray:
         """See `Scores.log_prior`."""

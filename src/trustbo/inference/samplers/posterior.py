@@ -1,12 +1,11 @@
 """The posterior of scores under any evidence: what the one importance sampler draws from.
 
-`Scores` map standard normal coordinates to hyperparameters theta, an `Evidence` gives
+Scores map standard normal coordinates to hyperparameters theta, an `Evidence` gives
 log p(rates | theta); all else is drawn given theta. A model and a family of observations choose
 one of each.
 """
 
-from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.optimize import minimize
@@ -14,14 +13,14 @@ from scipy.optimize import minimize
 from trustbo.inference.evidence.evidence import ColumnEvidence, Evidence
 from trustbo.inference.evidence.gaussian import Gaussian
 from trustbo.inference.evidence.sites import Sites
-from trustbo.inference.samplers import scores
+from trustbo.inference.samplers.importance import ScoreTarget
 from trustbo.inference.samplers.laplace import derivatives, inverse_hessian
 from trustbo.inference.samplers.per_robot import PerRobot
+from trustbo.inference.samplers.scores import Scores
 from trustbo.inference.samplers.student import Proposal, Spanning, Student
-from trustbo.models.effects.effect import Effect, Slots, Theta, rest_of, scales_of
+from trustbo.models.effects.effect import Effect, Slots, Theta
 from trustbo.models.effects.weights import Weights
-from trustbo.models.families import Family
-from trustbo.models.priors import Priors
+from trustbo.models.model import TrustModel
 
 _LARGEST_NOISE, _LEAST_NOISE = 50.0, 1e-6
 _FARTHEST = 7.0  # score that a search of the mode tries
@@ -31,121 +30,20 @@ _MANY = 8  # scores whose moments take more points
 _WIDEST = 0.3  # precision of a score, at least: the prior's is 1
 
 
-class Scores(Protocol):
-    """Coordinates of hyperparameters: standard normal, but for the second (`scores.log_prior`)."""
+class Posterior(ScoreTarget):
+    """Log posterior density of scores, and draws of all else."""
 
-    @property
-    def fixed(self) -> bool:
-        """Whether `recentre` leaves the coordinates unchanged."""
-        ...
-
-    @property
-    def pools(self) -> bool:
-        """Whether there are spreads of robots."""
-        ...
-
-    @property
-    def n_scores(self) -> int:
-        """Number of coordinates."""
-        ...
-
-    @property
-    def n_core(self) -> int:
-        """Number of the first coordinates, of memory and noises, which the rates determine."""
-        ...
-
-    def theta(self, z: np.ndarray) -> dict[str, np.ndarray]:
-        """Hyperparameters that the evidence takes, by name, of scores (point, score)."""
-        ...
-
-    def named(self, z: np.ndarray) -> dict[str, np.ndarray]:
-        """Parameters of the model among them, by name."""
-        ...
-
-    def log_prior(self, z: np.ndarray) -> np.ndarray:
-        """Log prior density of scores (point,)."""
-        ...
-
-    def recentre(self, z: np.ndarray, log_density: Callable[[Theta], np.ndarray]) -> np.ndarray:
-        """Choose coordinates for the posterior around a point z (score,); z in these.
-
-        Args:
-            z: Scores.
-            log_density: Log density of the rates at each theta.
-        """
-        ...
-
-
-@scores.with_data("quantiles")
-class Shared:
-    """Scores of beta0 and the noises, which all robots share, and of the effects' scales."""
-
-    fixed, n_core, pools = True, 3, False
-
-    def __init__(
-        self,
-        priors: Priors,
-        effects: Sequence[Effect],
-        memory: str = "level",
-        *,
-        carries: bool = True,
-    ) -> None:
-        """Take the priors; `memory` as in `evidence.gaussian`.
-
-        Where nothing `carries` on, beta0 = 0, and the first score is of nothing.
-        """
-        self.quantiles: Any = scores.Quantiles(priors)
-        self.carried = float(carries)
-        self.effects, self.memory = tuple(e for e in effects if e.names), memory
-        self.n_scores = self.n_core + sum(len(effect.names) for effect in effects)
-
-    def theta(self, z: np.ndarray) -> dict[str, np.ndarray]:
-        """See `Scores.theta`."""
-        return self.with_core(self.quantiles.core(z), z)
-
-    def named(self, z: np.ndarray) -> dict[str, np.ndarray]:
-        """See `Scores.named`."""
-        return {name: values for name, values in self.theta(z).items() if name != "rest"}
-
-    def log_prior(self, z: np.ndarray) -> np.ndarray:
-        """See `Scores.log_prior`."""
-        return scores.log_prior(z)
-
-    def recentre(self, z: np.ndarray, log_density: Callable[[Theta], np.ndarray]) -> np.ndarray:
-        """The point itself."""
-        return z
-
-    def with_core(self, core: Any, z: Any) -> dict[str, Any]:
-        """Hyperparameters of scores, given beta0 and the noises (point, 3), in NumPy or JAX."""
-        beta0, delta_w, delta_v = core.T
-        beta0 = beta0 * self.carried
-        rest = rest_of(beta0, self.memory)
-        theta = {"beta0": beta0, "delta_w": delta_w, "delta_v": delta_v, "rest": rest}
-        return theta | scales_of(self.effects, z[:, self.n_core :])
-
-
-class Posterior:
-    """Log posterior density of scores, and draws of all else; see `importance.ScoreTarget`."""
-
-    widths, compiles = (1.25, 1.1), False
+    widths = 1.25, 1.1
 
     def __init__(self, coordinates: Scores, evidence: Evidence, spread: float) -> None:
         """Take the scores and an evidence; `spread` is the sd of the measured rates."""
         self.scores, self.evidence, self._spread = coordinates, evidence, spread
-        alone = coordinates.n_scores == coordinates.n_core  # few coefficients: points are cheap
-        cheap, many = alone and evidence.exact, coordinates.n_scores > _MANY
+        self.n_scores = coordinates.n_scores
+        alone = self.n_scores == coordinates.n_core  # few coefficients: points are cheap
+        cheap, many = alone and evidence.exact, self.n_scores > _MANY
         self.n_pilot = 1024 if cheap else 512 if many else 256
         self.n_final = 4096 if cheap else 1024 if alone else 128
         self.n_corrected = None if evidence.exact else 1000 if alone else 500
-
-    @property
-    def n_scores(self) -> int:
-        """Number of scores."""
-        return self.scores.n_scores
-
-    def takes(self, start: Student) -> bool:
-        """See `ScoreTarget.takes`: one of as many scores."""
-        return len(start.center) == self.n_scores
 
     def log_density(self, z: np.ndarray) -> np.ndarray:
         """Log posterior density, not divided by the evidence; shape (point,)."""
@@ -162,7 +60,7 @@ class Posterior:
 
     def first(self) -> Student:
         """Gaussian fit at the best mode: BFGS from the better of four sizes of the noises."""
-        start = np.zeros((4, self.scores.n_scores))
+        start = np.zeros((4, self.n_scores))
         size = np.log(np.clip(self._spread / 0.2, 1e-2, 3.0))
         start[:, 1] = size - np.array([0.3, 1.0, 1.8, 2.6])
         best = start[self.log_density(start).argmax()]
@@ -232,55 +130,34 @@ class Posterior:
 
 
 def posterior_of(
-    priors: Priors,
-    family: Family,
-    effects: Sequence[Effect],
-    slots: Slots,
-    *,
-    by_robot: bool = False,
-    lag: float = 0.0,
-    memory: str = "level",
-    carries: bool = True,
+    model: TrustModel, slots: Slots, further: Sequence[Effect] = (), *, carries: bool = True
 ) -> Posterior:
-    """Posterior of weights and other effects, by the evidence of a family of observations.
+    """Posterior of a model whose coefficients are columns.
 
     Args:
-        priors: Priors of the weights and of all scores.
-        family: Family of observations.
-        effects: Effects but the weights.
+        model: Model, its priors of the weights Normal.
         slots: Rates of all chains.
-        by_robot: Whether each robot has weights and a beta0 of a common distribution.
-        lag: 1 where rates measure the change of trust, else 0.
-        memory: That of `PooledTrust`.
+        further: Effects beyond those of the model.
         carries: Whether anything lasts from one bound to the next; else beta0 = 0, which all robots
             share.
     """
-    evidence = evidence_of(
-        priors, family, effects, slots, by_robot=by_robot, lag=lag, memory=memory
-    )
-    if by_robot:
-        coordinates = PerRobot(priors, effects, slots.n_robots, slots.z.shape[2])
+    effects: list[Effect] = [*model.all_effects, *further]
+    if model.robot_sets == "pooled":
+        coordinates = PerRobot(model.priors, effects, slots.n_robots, slots.z.shape[2])
     else:
-        coordinates = Shared(priors, effects, memory, carries=carries)
-    return Posterior(coordinates, evidence, float(np.nanstd(slots.y)))
+        coordinates = Scores(model.priors, effects, model.memory, carries=carries)
+    return Posterior(coordinates, evidence_of(model, slots, further), float(np.nanstd(slots.y)))
 
 
-def evidence_of(
-    priors: Priors,
-    family: Family,
-    effects: Sequence[Effect],
-    slots: Slots,
-    *,
-    by_robot: bool = False,
-    lag: float = 0.0,
-    memory: str = "level",
-) -> ColumnEvidence:
-    """Evidence of weights and other effects, by the family of observations; see `posterior_of`."""
-    groups = [effect.group(slots) for effect in (Weights(priors, by_robot), *effects)]
-    x0 = float(priors.x0_mean), float(priors.x0_sd)
-    if family.integrates_out:
-        return Gaussian(slots, groups, x0, memory, apart=by_robot, lag=lag)
-    return Sites(slots, groups, family, x0, memory, apart=by_robot)
+def evidence_of(model: TrustModel, slots: Slots, further: Sequence[Effect] = ()) -> ColumnEvidence:
+    """Evidence of weights and effects, by the family of observations; see `posterior_of`."""
+    by_robot = model.robot_sets == "pooled"
+    effects = Weights(model.priors, by_robot), *model.all_effects, *further
+    groups = [effect.group(slots) for effect in effects]
+    x0 = model.x0["x0_mean"], model.x0["x0_sd"]
+    if model.family.integrates_out:
+        return Gaussian(slots, groups, x0, model.memory, apart=by_robot, lag=model.lag)
+    return Sites(slots, groups, model.family, x0, model.memory, apart=by_robot)
 
 
 def _take(theta: Theta, points: np.ndarray) -> dict[str, np.ndarray]:

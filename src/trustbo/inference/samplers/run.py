@@ -186,15 +186,7 @@ def _targets(
     chains = [slots or Slots.of(one, len(weight), (), weight, places) for one in robots]
     if (target_of := _TARGETS.get(model.robot_sets)) is not None:
         return [target_of(model, batch, weight, of_robot) for of_robot in chains]
-    return [_by_evidence(model, of_robot) for of_robot in chains]
-
-
-def _by_evidence(model: TrustModel, slots: Slots) -> Posterior:
-    """Posterior of robots whose coefficients are columns."""
-    return posterior_of(
-        model.priors, model.family, model.all_effects, slots,
-        by_robot=model.robot_sets == "pooled", lag=model.lag, memory=model.memory,
-    )  # fmt: skip
+    return [posterior_of(model, of_robot) for of_robot in chains]
 
 
 _TARGETS: dict[str, Callable[[Any, MissionBatch, np.ndarray, Slots], ScoreTarget]] = {
@@ -202,7 +194,7 @@ _TARGETS: dict[str, Callable[[Any, MissionBatch, np.ndarray, Slots], ScoreTarget
     "coupled": lambda model, batch, weight, _: CoupledTarget(model, batch, weight),
     "people": lambda model, batch, weight, slots: PeoplePosterior(model, slots),
 }
-"""Scores and evidence of models by `TrustModel.robot_sets`; `_by_evidence` of all others."""
+"""Scores and evidence of models by `TrustModel.robot_sets`; `posterior_of` all others."""
 
 
 def _summarize(posteriors: list[ExactDraws]) -> dict[str, Any]:

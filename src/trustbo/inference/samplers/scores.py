@@ -6,7 +6,7 @@ with half-normal priors log size has the density of a Rayleigh variable's logari
 over pi / 2 is uniform. On log and logit scales tails are exponential, and weights uneven.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -18,6 +18,7 @@ from scipy import special
 
 from trustbo.errors import TrustboError
 from trustbo.models.backend import call, namespace, own_settings
+from trustbo.models.effects.effect import Effect, Theta, rest_of, scales_of
 from trustbo.models.floored import Floored
 from trustbo.models.priors import Priors
 from trustbo.models.priors_numpy import half_normal, number
@@ -82,6 +83,68 @@ def with_data[Kind](*names: str) -> Callable[[type[Kind]], type[Kind]]:
         return cls
 
     return register
+
+
+@with_data("quantiles")
+class Scores:
+    """Scores of beta0 and the noises, which all robots share, and of the effects' scales.
+
+    Coordinates are standard normal a priori, but for the second, see `log_prior`. Subclasses have
+    those of other hyperparameters.
+    """
+
+    fixed = True
+    """Whether `recentre` leaves the coordinates unchanged."""
+    pools = False
+    """Whether there are spreads of robots."""
+    n_core = 3
+    """Number of the first coordinates, of memory and noises, which the rates determine."""
+
+    def __init__(
+        self,
+        priors: Priors,
+        effects: Sequence[Effect],
+        memory: str = "level",
+        *,
+        carries: bool = True,
+    ) -> None:
+        """Take the priors; `memory` as in `evidence.gaussian`.
+
+        Where nothing `carries` on, beta0 = 0, and the first score is of nothing.
+        """
+        self.quantiles: Any = Quantiles(priors)
+        self.carried = float(carries)
+        self.effects, self.memory = tuple(e for e in effects if e.names), memory
+        self.n_scores = self.n_core + sum(len(effect.names) for effect in effects)
+
+    def theta(self, z: np.ndarray) -> dict[str, np.ndarray]:
+        """Hyperparameters that the evidence takes, by name, of scores (point, score)."""
+        return self.with_core(self.quantiles.core(z), z)
+
+    def named(self, z: np.ndarray) -> dict[str, np.ndarray]:
+        """Parameters of the model among them, by name."""
+        return {name: values for name, values in self.theta(z).items() if name != "rest"}
+
+    def log_prior(self, z: np.ndarray) -> np.ndarray:
+        """Log prior density of scores (point,)."""
+        return log_prior(z)
+
+    def recentre(self, z: np.ndarray, log_density: Callable[[Theta], np.ndarray]) -> np.ndarray:
+        """Choose coordinates for the posterior around a point z (score,); z in these.
+
+        Args:
+            z: Scores.
+            log_density: Log density of the rates at each theta.
+        """
+        return z
+
+    def with_core(self, core: Any, z: Any) -> dict[str, Any]:
+        """Hyperparameters of scores, given beta0 and the noises (point, 3), in NumPy or JAX."""
+        beta0, delta_w, delta_v = core.T
+        beta0 = beta0 * self.carried
+        rest = rest_of(beta0, self.memory)
+        theta = {"beta0": beta0, "delta_w": delta_w, "delta_v": delta_v, "rest": rest}
+        return theta | scales_of(self.effects, z[:, self.n_core :])
 
 
 def quantile(prior: Distribution, score: np.ndarray) -> np.ndarray:
