@@ -151,6 +151,13 @@ def solve(Q, h, L, mean):
 
 
 @njit(**PART_OPTIONS)
+def cavity(m, v, lam, eta):
+    """Mean and variance of what is left of N(m, v) without a site."""
+    rest = max(1.0 / v - lam, 1e-9)
+    return (m / v - eta) / rest, 1.0 / rest
+
+
+@njit(**PART_OPTIONS)
 def _invert(L, inverse, covariance):
     """L^-1 and (LL')^-1, by rows: the inner loops run along the memory, and beat LAPACK's."""
     D = len(L)
@@ -207,11 +214,8 @@ def _match_chain(b0, chain, chains, delta_v, table, predicted, filtered, var, me
                     z += Sigma[a, b] * s[b]
                 spread += s[a] * z
             lv, e = lam[chain, k], eta[chain, k]
-            rest = max(1.0 / spread - lv, 1e-9)
-            mass, new, slope = match(
-                kind[chain, k], delta_v, table[case[chain, k]], (m / spread - e) / rest,
-                1.0 / rest, lv, e,
-            )  # fmt: skip
+            m, rest = cavity(m, spread, lv, e)
+            mass, new, slope = match(kind[chain, k], delta_v, table[case[chain, k]], m, rest, lv, e)
             total += mass
             lam[chain, k] += damp * (new - lv)
             eta[chain, k] += damp * (slope - e)
