@@ -36,11 +36,13 @@ from trustbo.inference.samplers.choice import why_not_scores, with_warmup
 from trustbo.inference.samplers.exact import _matched, _modes, _target
 from trustbo.inference.samplers.nuts_scores import ScoresInJax
 from trustbo.inference.samplers.nuts_sites import SitesInJax
-from trustbo.inference.samplers.run import _targets, draw_posterior
+from trustbo.inference.samplers.posterior import posterior_of
+from trustbo.inference.samplers.run import draw_posterior
 from trustbo.inference.samplers.settings import NutsSettings
 from trustbo.inference.updating import update_statistics
 from trustbo.models import CoupledParams, CoupledTrust, HierarchicalTrust, PooledTrust, TrustParams
 from trustbo.models.backend import own_settings
+from trustbo.models.effects.effect import Slots
 from trustbo.stacking import stack_missions
 
 N_BOUNDS, N_ROBOTS, N_FEATURES = 10, 3, 2
@@ -467,7 +469,7 @@ def gradient_row(table, model, data, quick):
             density = SitesInJax.of(model, batch, weight)
             theta = density._flat[0]
         else:
-            (target,) = _targets(model, batch, weight, None, None)
+            target = posterior_of(model, Slots.of(batch, len(weight), (), weight))
             theta = np.append(0.0, np.append(-1.0, np.zeros(target.n_scores - 2)))
             density = ScoresInJax.of(target, theta)
         jax.block_until_ready(run(density, theta))

@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from trustbo.data import Mission
 from trustbo.errors import PosteriorError, ShapeError, TrustboError
 from trustbo.inference import diagnostics, fit, params_of
-from trustbo.inference.samplers import complaints, nuts, run, watching
+from trustbo.inference.samplers import convergence, nuts, run, watching
 from trustbo.inference.samplers.nuts_scores import run_nuts_of_scores
 from trustbo.inference.samplers.settings import NutsSettings
 from trustbo.models import HierarchicalTrust, PooledTrust, Priors
@@ -225,7 +225,7 @@ def test_missing_rates_are_predicted_through(with_a_gap):
 
 def test_a_bad_posterior_is_refused_with_the_parameter_s_name(missions, monkeypatch, capsys):
     """A limit that no run meets; the longer run takes the short one's length, and its program."""
-    assert (complaints.MAX_RHAT, complaints.MIN_ESS) == (1.01, 400.0)
+    assert (convergence.MAX_RHAT, convergence.MIN_ESS) == (1.01, 400.0)
     tried = []
 
     def short(settings, *args):
@@ -233,7 +233,7 @@ def test_a_bad_posterior_is_refused_with_the_parameter_s_name(missions, monkeypa
         return run_nuts_of_scores(NutsSettings(150), *args)
 
     monkeypatch.setattr(run, "run_nuts_of_scores", short)
-    monkeypatch.setattr(complaints, "MIN_ESS", 1e6)
+    monkeypatch.setattr(convergence, "MIN_ESS", 1e6)
     expected = r"bulk ESS of beta0 is \d{3,} \(at least 1000000\)"
     with pytest.raises(PosteriorError, match=expected) as error:
         fit(missions, sampler="nuts", progress=True, whole=False)
@@ -248,7 +248,7 @@ def test_a_bad_posterior_is_refused_with_the_parameter_s_name(missions, monkeypa
 
 @pytest.mark.slow  # its program compiles for this alone
 def test_the_longer_run_samples_the_same_posterior(missions, posterior, monkeypatch):
-    monkeypatch.setattr(complaints, "MIN_ESS", 1e6)
+    monkeypatch.setattr(convergence, "MIN_ESS", 1e6)
     with pytest.raises(PosteriorError) as error:
         fit(missions, sampler="nuts")
     longer = error.value.posterior["posterior"]

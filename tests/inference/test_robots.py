@@ -14,7 +14,7 @@ from trustbo.data import Mission
 from trustbo.errors import TrustboError
 from trustbo.inference.draws import params_of_missions
 from trustbo.inference.left_out import by_hyperparameters, by_refit
-from trustbo.inference.samplers.run import _by_evidence
+from trustbo.inference.samplers.posterior import evidence_of
 from trustbo.models import HierarchicalTrust, PlaceEffect, PooledTrust, RobotEffect, TrustParams
 from trustbo.models.backend import own_settings
 from trustbo.models.effects.effect import Slots
@@ -87,7 +87,7 @@ def test_the_numpyro_model_has_the_same_evidence(missions, memory):
     batch = stack_missions(missions)
     fitted = model.for_features(FEATURES).at_resolution(weigh_ticks(batch, np.ones(8)))
     places = visited(bounds_of(missions, batch.contact_rate.shape[:2]), PlaceEffect(), 3)
-    evidence = _by_evidence(fitted, Slots.of(batch, 3, FEATURES, None, places)).evidence
+    evidence = evidence_of(fitted, Slots.of(batch, 3, FEATURES, None, places))
     theta = {"beta0": 0.3, "delta_w": 0.05, "delta_v": 0.07, "tau_s": 0.1, "tau_e": 0.05}
     theta |= {"length_scale": 1.5, "tau_slow": 0.1, "tau_day": 0.04}
     with own_settings():

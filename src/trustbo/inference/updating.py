@@ -4,13 +4,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-import numpy as np
-
 from trustbo.data import Mission
 from trustbo.errors import ShapeError, require_whole
 from trustbo.inference.evidence.gram import Statistics, require_forgetting
 from trustbo.inference.evidence.statistics import gather, require_statistics
 from trustbo.inference.samplers.exact import sample_exact
+from trustbo.inference.samplers.run import join, summarize
 from trustbo.models.backend import own_settings
 from trustbo.models.model import TrustModel
 from trustbo.models.params import Params, TrustParams
@@ -84,19 +83,9 @@ def sample_statistics(
     posteriors = [
         sample_exact(s, model.priors, n_draws, seed + i) for i, s in enumerate(statistics)
     ]
-    pooled = model.robot_sets == "all"
-    sites = {
-        name: posteriors[0].params[name]
-        if pooled
-        else np.stack([e.params[name] for e in posteriors], axis=1)
-        for name in posteriors[0].params
-    }
-    return ExactPosterior(
-        model.params(sites, statistics[0].n_features),
-        max(e.khat for e in posteriors),
-        min(e.kish for e in posteriors),
-        sum(e.log_evidence for e in posteriors),
-    )
+    sites, _ = join(posteriors, (n_draws,), per_robot=model.robot_sets == "each")
+    params = model.params(sites, statistics[0].n_features)
+    return ExactPosterior(params, **summarize(posteriors))
 
 
 def moment_matched(params: TrustParams, priors: Priors) -> Priors:

@@ -4,8 +4,7 @@ import arviz as az
 import numpy as np
 import xarray as xr
 
-from trustbo.inference.samplers.complaints import complaints_of
-from trustbo.inference.samplers.convergence import convergence
+from trustbo.inference.samplers.convergence import complaints_of, convergence
 
 
 def chains(seed=0, shift=0.0):

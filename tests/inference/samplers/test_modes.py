@@ -8,7 +8,7 @@ import pytest
 
 from trustbo.errors import PosteriorError
 from trustbo.inference import fit
-from trustbo.inference.samplers.complaints import complaints_of_means
+from trustbo.inference.samplers.convergence import complaints_of_means
 from trustbo.models import PooledTrust
 
 SPEC = importlib.util.spec_from_file_location(

@@ -10,8 +10,11 @@ from trustbo.errors import PosteriorError
 from trustbo.inference.evidence.latent import Latents
 from trustbo.inference.evidence.statistics import gather, split_robots
 from trustbo.inference.samplers.choice import by_sums, why_not_scores
-from trustbo.inference.samplers.complaints import complaints_of, complaints_of_means
-from trustbo.inference.samplers.convergence import MAX_KHAT
+from trustbo.inference.samplers.convergence import (
+    MAX_KHAT,
+    complaints_of,
+    complaints_of_means,
+)
 from trustbo.inference.samplers.coupled_target import CoupledTarget
 from trustbo.inference.samplers.drift_scores import DriftPosterior
 from trustbo.inference.samplers.exact import ExactDraws, sample_exact
@@ -91,13 +94,13 @@ def draw_posterior(
         UnevenWeightsError: The exact sampler fails, and there is no fallback.
     """
     weight = np.ones(len(batch.contact_rate)) if weight is None else weight
+    task = _Task(model, settings, seed, batch, weight, places, slots, watch, check)
     failure = ""
     if sampler == "exact":
         try:
             if by_sums(model):
-                return _sample_exact(model, settings, seed, batch, weight), []
-            targets = _targets(model, batch, weight, places, slots)
-            return _sample_scores(model, settings, seed, targets, start, watch), []
+                return _sample_exact(task), []
+            return _sample_scores(task, start), []
         except UnevenWeightsError as error:
             if not fallback:
                 raise
@@ -105,61 +108,70 @@ def draw_posterior(
                 raise PosteriorError(f"the exact sampler's {error}.") from None
             failure = str(error)
             warnings.warn(f"the exact sampler's {failure}; NUTS is used instead.", stacklevel=4)
-    if slots is not None or why_not_scores(model) is None:
-        targets = _targets(model, batch, weight, places, slots)
-        reference = _draws_by_sums(model, settings, seed, batch, weight) if check else {}
-        draws, complaints = _sample_nuts_of_scores(
-            model, settings, seed, targets, reference, watch, check=check
-        )
-    else:
-        chains = None if places is None else Slots.of(batch, len(weight), (), weight, places)
-        draws, complaints = _sample_nuts(
-            model, settings, seed, batch, weight, chains, watch, check=check
-        )
+    by_scores = slots is not None or why_not_scores(model) is None
+    draws, complaints = (_sample_nuts_of_scores if by_scores else _sample_nuts)(task)
     return draws._replace(fallback=failure), complaints
 
 
-def _sample_exact(
-    model: TrustModel,
-    settings: NutsSettings,
-    seed: int,
-    batch: MissionBatch,
-    weight: np.ndarray | None,
-) -> Draws:
+class _Task(NamedTuple):
+    """Arguments of `draw_posterior` that its parts share."""
+
+    model: TrustModel
+    settings: NutsSettings
+    seed: int
+    batch: MissionBatch
+    weight: np.ndarray
+    places: Visited | None
+    slots: Slots | None
+    watch: Watch
+    check: bool
+
+    @property
+    def apart(self) -> bool:
+        """Whether robots have nothing in common."""
+        return self.model.robot_sets == "each"
+
+    @property
+    def targets(self) -> list[ScoreTarget]:
+        """Posterior of the scores of all robots, or of each where they have nothing in common."""
+        robots = [self.batch] if self.slots is not None else split_robots(self.model, self.batch)
+        chains = [self.slots or self.chains(one) for one in robots]
+        if (target_of := _TARGETS.get(self.model.robot_sets)) is not None:
+            return [target_of(self.model, self.batch, self.weight, of_robot) for of_robot in chains]
+        return [posterior_of(self.model, of_robot) for of_robot in chains]
+
+    def chains(self, batch: MissionBatch) -> Slots:
+        """Rates by chain of all robots, or of one."""
+        return Slots.of(batch, len(self.weight), (), self.weight, self.places)
+
+
+def _sample_exact(task: _Task) -> Draws:
     """Draws by importance sampling; UnevenWeightsError: its weights are too uneven."""
-    shape = (settings.n_chains, settings.draws)
+    shape = (task.settings.n_chains, task.settings.draws)
     posteriors = [
-        sample_exact(statistics, model.priors, shape[0] * shape[1], seed + i)
-        for i, statistics in enumerate(gather(model, batch, weight))
+        sample_exact(statistics, task.model.priors, shape[0] * shape[1], task.seed + i)
+        for i, statistics in enumerate(gather(task.model, task.batch, task.weight))
     ]
     _require_even(posteriors)
-    params, stats = _join(posteriors, shape, per_robot=model.robot_sets == "each")
-    return Draws(params, stats, _summarize(posteriors), "exact")
+    params, stats = join(posteriors, shape, per_robot=task.apart)
+    return Draws(params, stats, summarize(posteriors), "exact")
 
 
-def _sample_scores(
-    model: TrustModel,
-    settings: NutsSettings,
-    seed: int,
-    targets: list[ScoreTarget],
-    start: Student | None,
-    watch: Watch,
-) -> Draws:
+def _sample_scores(task: _Task, start: Student | None) -> Draws:
     """Draws by importance sampling of scores: effects, pooling, coupling, or rates not Gaussian."""
-    shape = (settings.n_chains, settings.draws)
+    shape, targets = (task.settings.n_chains, task.settings.draws), task.targets
     start = None if len(targets) > 1 else start  # that of the first robot
-    compiles = targets[0].compiles
-    watch.stage(
-        f"exact sampler {'compiles, and ' if compiles else ''}seeks the mode", slow=compiles
-    )
+    slow = targets[0].compiles
+    task.watch.stage(f"exact sampler {'compiles, and ' if slow else ''}seeks the mode", slow=slow)
     sampled = [
-        sample_scores(t, shape[0] * shape[1], seed + i, start, watch) for i, t in enumerate(targets)
+        sample_scores(target, shape[0] * shape[1], task.seed + i, start, task.watch)
+        for i, target in enumerate(targets)
     ]
     posteriors = [one.draws for one in sampled]
     _require_even(posteriors)
-    params, stats = _join(posteriors, shape, per_robot=model.robot_sets == "each")
-    places, effects = _pop_effects(model, params)
-    summary, proposal = _summarize(posteriors), sampled[0].proposal
+    params, stats = join(posteriors, shape, per_robot=task.apart)
+    places, effects = _pop_effects(task.model, params)
+    summary, proposal = summarize(posteriors), sampled[0].proposal
     summary["proposal_center"] = proposal.center.tolist()
     summary["proposal_scale"] = proposal.scale.ravel().tolist()
     return Draws(params, stats, summary, "exact", places=places, effects=effects)
@@ -174,21 +186,6 @@ def _pop_effects(
     return places, effects
 
 
-def _targets(
-    model: TrustModel,
-    batch: MissionBatch,
-    weight: np.ndarray,
-    places: Visited | None,
-    slots: Slots | None,
-) -> list[ScoreTarget]:
-    """Posterior of the scores of all robots, or of each where they have nothing in common."""
-    robots = [batch] if slots is not None else split_robots(model, batch)
-    chains = [slots or Slots.of(one, len(weight), (), weight, places) for one in robots]
-    if (target_of := _TARGETS.get(model.robot_sets)) is not None:
-        return [target_of(model, batch, weight, of_robot) for of_robot in chains]
-    return [posterior_of(model, of_robot) for of_robot in chains]
-
-
 _TARGETS: dict[str, Callable[[Any, MissionBatch, np.ndarray, Slots], ScoreTarget]] = {
     "drift": lambda model, batch, _, slots: DriftPosterior.of(model, batch, slots),
     "coupled": lambda model, batch, weight, _: CoupledTarget(model, batch, weight),
@@ -197,7 +194,7 @@ _TARGETS: dict[str, Callable[[Any, MissionBatch, np.ndarray, Slots], ScoreTarget
 """Scores and evidence of models by `TrustModel.robot_sets`; `posterior_of` all others."""
 
 
-def _summarize(posteriors: list[ExactDraws]) -> dict[str, Any]:
+def summarize(posteriors: list[ExactDraws]) -> dict[str, Any]:
     """Diagnostics of independent posteriors together."""
     return {
         "k_hat": max(exact.khat for exact in posteriors),
@@ -213,8 +210,13 @@ def _require_even(posteriors: list[ExactDraws]) -> None:
         raise UnevenWeightsError(f"weights are too uneven (k-hat {khat:.2f}, limit {MAX_KHAT})")
 
 
-def _join(posteriors: list[ExactDraws], shape: tuple[int, int], *, per_robot: bool):
-    """Draws of all robots side by side; their weights multiply."""
+def join(
+    posteriors: list[ExactDraws], shape: tuple[int, ...], *, per_robot: bool
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Draws of all robots side by side, of leading axes `shape`, and statistics.
+
+    Weights of robots multiply.
+    """
 
     def join(columns: list[np.ndarray]) -> np.ndarray:
         joined = np.stack(columns, axis=1) if per_robot else columns[0]
@@ -228,35 +230,25 @@ def _join(posteriors: list[ExactDraws], shape: tuple[int, int], *, per_robot: bo
     return params, stats
 
 
-def _sample_nuts(
-    model: TrustModel,
-    settings: NutsSettings,
-    seed: int,
-    batch: MissionBatch,
-    weight: np.ndarray,
-    chains: Slots | None,
-    watch: Watch,
-    *,
-    check: bool,
-) -> tuple[Draws, list[str]]:
-    """Draws by NUTS, rerun for longer if diagnostics fail, and the failures of the last run.
-
-    `chains` are rates by chain, where places have effects.
-    """
+def _sample_nuts(task: _Task) -> tuple[Draws, list[str]]:
+    """Draws by NUTS, rerun for longer if diagnostics fail, and the failures of the last run."""
+    model, batch = task.model, task.batch
     name = "nuts" if model.family.integrates_out else "joint"
 
     def attempt(tried: NutsSettings, retries: int) -> tuple[Draws, list[str]]:
         with own_settings(), one_blas_thread():
             drift = None
-            if chains is not None:
-                drift = SampledDrift(model.all_effects, chains, batch.contact_rate.shape)
-            density = SitesInJax.of(model, batch, weight, drift)
-            drawn = run_nuts_of_sites(tried, seed + _RETRY * retries, density, watch)
+            if task.places is not None:
+                drift = SampledDrift(
+                    model.all_effects, task.chains(batch), batch.contact_rate.shape
+                )
+            density = SitesInJax.of(model, batch, task.weight, drift)
+            drawn = run_nuts_of_sites(tried, task.seed + _RETRY * retries, density, task.watch)
         params, stats = drawn.params, _with_tree_depth(drawn.stats)
-        complaints = complaints_of(params, stats) if check else []
+        complaints = complaints_of(params, stats) if task.check else []
         places = {}
         if drift is not None:
-            shape, rng = stats["lp"].shape, np.random.default_rng([seed, 3])
+            shape, rng = stats["lp"].shape, np.random.default_rng([task.seed, 3])
             flat = {n: values.reshape(-1, *values.shape[2:]) for n, values in params.items()}
             effects = drift.named(flat, rng)
             places = {n: values.reshape(*shape, -1) for n, values in effects.items()}
@@ -264,58 +256,46 @@ def _sample_nuts(
         summary = {"retries": retries}
         return Draws(params, stats, summary, name, drawn.latents, places), complaints
 
-    return _retried(attempt, settings, watch)
+    return _retried(attempt, task)
 
 
-def _sample_nuts_of_scores(
-    model: TrustModel,
-    settings: NutsSettings,
-    seed: int,
-    targets: Sequence[Any],
-    reference: Mapping[str, np.ndarray],
-    watch: Watch,
-    *,
-    check: bool,
-) -> tuple[Draws, list[str]]:
-    """Draws of scores by NUTS, of all else given them by the evidence; see `_sample_nuts`.
-
-    `reference` are draws (draw, ...) that means are compared with, where there are some.
-    """
+def _sample_nuts_of_scores(task: _Task) -> tuple[Draws, list[str]]:
+    """Draws of scores by NUTS, of all else given them by the evidence; see `_sample_nuts`."""
+    targets: Sequence[Any] = task.targets
+    reference = _draws_by_sums(task) if task.check else {}
 
     def attempt(tried: NutsSettings, retries: int) -> tuple[Draws, list[str]]:
-        first = seed + _RETRY * retries
-        drawn = [_scores_by_nuts(tried, first + i, one, watch) for i, one in enumerate(targets)]
+        first = task.seed + _RETRY * retries
+        drawn = [
+            _scores_by_nuts(tried, first + i, one, task.watch) for i, one in enumerate(targets)
+        ]
         of_robots = {name: np.stack([one.stats[name] for one in drawn]) for name in drawn[0].stats}
         stats = {name: _OVER_ROBOTS[name](values, axis=0) for name, values in of_robots.items()}
-        apart = model.robot_sets == "each"
         params = {
-            name: np.stack([one.params[name] for one in drawn], axis=2) if apart else values
+            name: np.stack([one.params[name] for one in drawn], axis=2) if task.apart else values
             for name, values in drawn[0].params.items()
         }
         complaints = [moved for one in drawn for moved in one.moved]
         if reference:
             n = len(reference["beta0"])
             complaints = complaints_of_means(params, reference, np.full(n, 1.0 / n), 0.15)
-        complaints = [*complaints_of(params, stats), *complaints] if check else []
-        places, effects = _pop_effects(model, params)
+        complaints = [*complaints_of(params, stats), *complaints] if task.check else []
+        places, effects = _pop_effects(task.model, params)
         summary, stats = {"retries": retries}, _with_tree_depth(stats)
         return Draws(params, stats, summary, "nuts", places=places, effects=effects), complaints
 
-    return _retried(attempt, settings, watch)
+    return _retried(attempt, task)
 
 
-def _draws_by_sums(
-    model: TrustModel,
-    settings: NutsSettings,
-    seed: int,
-    batch: MissionBatch,
-    weight: np.ndarray,
-) -> dict[str, np.ndarray]:
-    """Draws (draw, ...) of the exact sampler by sums, which seeks all modes; none if it fails."""
-    if not by_sums(model):
+def _draws_by_sums(task: _Task) -> dict[str, np.ndarray]:
+    """Draws (draw, ...) of the exact sampler by sums, which seeks all modes; none if it fails.
+
+    Means of NUTS are compared with theirs.
+    """
+    if not by_sums(task.model):
         return {}
     try:
-        exact = _sample_exact(model, settings, seed, batch, weight)
+        exact = _sample_exact(task)
     except UnevenWeightsError:
         return {}
     return {name: values.reshape(-1, *values.shape[2:]) for name, values in exact.params.items()}
@@ -361,13 +341,11 @@ def _with_tree_depth(stats: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def _retried(
-    attempt: Callable[[NutsSettings, int], tuple[Draws, list[str]]],
-    settings: NutsSettings,
-    watch: Watch,
+    attempt: Callable[[NutsSettings, int], tuple[Draws, list[str]]], task: _Task
 ) -> tuple[Draws, list[str]]:
     """Draws of an attempt, or of a second, longer one where the diagnostics of the first fail."""
-    draws, complaints = attempt(settings, 0)
+    draws, complaints = attempt(task.settings, 0)
     if not complaints:
         return draws, complaints
-    watch.retry(settings.longer, complaints)
-    return attempt(settings.longer, 1)
+    task.watch.retry(task.settings.longer, complaints)
+    return attempt(task.settings.longer, 1)
