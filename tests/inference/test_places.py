@@ -1,6 +1,7 @@
 """Effects of places against dense joint normals, which share no code with them."""
 
 import itertools
+from dataclasses import replace
 from importlib import import_module
 
 import jax
@@ -600,6 +601,17 @@ def test_priors_from_earlier_campaigns_have_the_moments_of_an_equal_mixture(lear
     other.attrs["model"] = "HierarchicalTrust"  # sampled in no time
     with pytest.raises(TrustboError, match="takes posteriors of PooledTrust"):
         tb.inference.prior_from([other])
+
+
+def test_priors_from_posteriors_keep_the_default_of_a_predicted_contact_rate(missions):
+    """Of beta / (1 - beta0), in the mixture with N(1, .3^2) of line of sight."""
+    named = [replace(mission, features=("line_of_sight", "slope")) for mission in missions]
+    posterior = fit(named, whole=False)
+    priors = tb.inference.prior_from([posterior]).priors
+    draws = posterior["posterior"]
+    ratio = (draws["beta"] / (1.0 - draws["beta0"])).values[..., 0]
+    assert priors.stationary
+    assert float(priors.beta.loc[0]) == pytest.approx(0.5 + 0.5 * np.median(ratio), rel=1e-5)
 
 
 @pytest.mark.parametrize("name", ["cells", "bounds", "shared"])

@@ -78,10 +78,9 @@ def _require_alike(posteriors: Sequence[xr.DataTree]) -> tuple[str, ...]:
         require_posterior("prior_from", posterior)
     if not posteriors:
         raise TrustboError("there are no posteriors to learn priors from; give one at least.")
-    names = [
-        tuple(str(name) for name in posterior["posterior"].coords.get("feature", ()))
-        for posterior in posteriors
-    ]
+    none = xr.DataArray([])  # of a custom drift
+    features_of = [p["posterior"].coords.get("feature", none).values for p in posteriors]
+    names = [tuple(map(str, features)) for features in features_of]
     for j, (posterior, features) in enumerate(zip(posteriors, names, strict=True)):
         if posterior.attrs["model"] != "PooledTrust" or features != names[0]:
             raise TrustboError(
