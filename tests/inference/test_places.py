@@ -20,7 +20,6 @@ from trustbo.inference.place_maps import PlaceScales, draw_maps, nowhere, place_
 from trustbo.inference.samplers import scores
 from trustbo.inference.samplers.importance import sample_scores
 from trustbo.inference.samplers.posterior import posterior_of
-from trustbo.inference.samplers.student import Student, log_mixture
 from trustbo.models import CoupledTrust, HierarchicalTrust, PlaceEffect, PooledTrust, TrustParams
 from trustbo.models.effects.effect import Slots
 from trustbo.models.place import bounds_of, visited
@@ -268,22 +267,6 @@ def test_place_maps_are_the_moments_of_the_drawn_maps(place):
     if place.bounds:
         assert maps["move"].values.tolist() == ["nw", "n", "ne", "w", "e", "sw", "s", "se"]
         assert np.isnan(maps["place_bound_mean"].sel(row=0, move="s")).all()  # from row -1
-
-
-def test_student_t_densities_are_scipy_s():
-    rng = np.random.default_rng(0)
-    scale = np.tril(rng.uniform(0.5, 1.0, (4, 4)))
-    center = rng.standard_normal(4)
-    z = rng.standard_normal((20, 4))
-    one, other = Student(center, scale), Student(np.zeros(4), np.eye(4), 5.0)
-    reference = [
-        stats.multivariate_t(s.center, s.scale @ s.scale.T, s.nu).logpdf(z) for s in (one, other)
-    ]
-    np.testing.assert_allclose(one.log_density(z), reference[0], rtol=1e-10)
-    mixed = np.logaddexp(reference[0] + np.log(0.25), reference[1] + np.log(0.75))
-    np.testing.assert_allclose(log_mixture([one, other], [100, 300], z), mixed, rtol=1e-10)
-    drawn = one.draw(4096, 0)
-    np.testing.assert_allclose(drawn.mean(0), center, atol=0.05)
 
 
 @pytest.fixture(scope="module")

@@ -16,8 +16,6 @@ from trustbo.inference import diagnostics, fit
 from trustbo.inference.evidence.gram import sufficient_statistics
 from trustbo.inference.evidence.statistics import gather
 from trustbo.inference.samplers.exact import sample_exact
-from trustbo.inference.samplers.run import draw_posterior
-from trustbo.inference.samplers.settings import NutsSettings
 from trustbo.models import CoupledTrust, PooledTrust, Priors, TrustParams
 from trustbo.stacking import stack_missions
 
@@ -41,17 +39,6 @@ def test_the_quadratic_form_is_the_dense_joint_normal(seed):
             for r in range(3)
         )
         np.testing.assert_allclose(found, expected, rtol=1e-9)
-
-
-def test_statistics_of_missions_add_up():
-    missions = simulate_missions(6, lengths=(8,))
-    theta = np.array([[0.5, 0.01, 0.02]])
-    whole = sufficient_statistics(stack_missions(missions), 0.5).evaluate(theta, 0.5)
-    parts = [sufficient_statistics(stack_missions(m), 0.5) for m in (missions[:2], missions[2:])]
-    for a, b in zip(
-        whole, parts[0].evaluate(theta, 0.5) + parts[1].evaluate(theta, 0.5), strict=True
-    ):
-        np.testing.assert_allclose(a, b, rtol=1e-10)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -80,26 +67,6 @@ def test_exact_draws_are_those_of_a_quadrature(seed):
         assert abs(ours.mean() - centre) < 0.05 * spread, name
         assert abs(np.log(ours.std() / spread)) < 0.048, name
         assert stats.kstest(ours, cdf).pvalue > 0.01, name
-
-
-@pytest.mark.slow  # a grid, above, says the same
-@pytest.mark.parametrize("seed", range(3))
-def test_exact_draws_and_a_long_nuts_run_agree(seed):
-    missions = simulate_missions(6, seed)
-    batch = stack_missions(missions)
-    exact = sample_exact(sufficient_statistics(batch, 0.5), Priors(), 4000, seed).params
-    drawn, _ = draw_posterior(
-        PooledTrust(), "nuts", NutsSettings(draws=20_000), seed, batch, check=False
-    )
-    nuts = {name: a.reshape(80_000, -1) for name, a in drawn.params.items()}
-    for name, reference in nuts.items():
-        for ours, theirs in zip(exact[name].reshape(4000, -1).T, reference.T, strict=True):
-            sd = theirs.std()
-            # Quasi-random points of Kish size > 2000: standard errors below 0.022 sd and 1.6 %.
-            # NUTS of ESS > 40 000 adds 0.005 sd and 0.4 %, smoothing of a tail 3 % as above.
-            assert abs(ours.mean() - theirs.mean()) < 0.05 * sd, name
-            assert abs(np.log(ours.std() / sd)) < 0.048, name
-            assert stats.ks_2samp(ours, theirs[::4]).pvalue > 0.01, name
 
 
 def test_the_evidence_is_the_prior_mean_of_the_likelihood():
@@ -136,18 +103,6 @@ def test_fit_lays_exact_draws_out_as_it_does_nuts_s(missions, posterior):
     np.testing.assert_array_equal(
         exact["posterior"]["beta"].values, again["posterior"]["beta"].values
     )
-
-
-def test_gaps_and_single_bounds_are_no_obstacle():
-    missions = simulate_missions(4, lengths=(7, 1))
-    rates = missions[0].contact_rate.copy()
-    rates[2:4, 1] = np.nan
-    gap = Mission.from_arrays(missions[0].path, missions[0].awareness, rates)
-    exact = sample_exact(
-        sufficient_statistics(stack_missions([gap, *missions[1:]]), 0.5), Priors(), 1000, 0
-    )
-    assert exact.khat < 0.7
-    assert np.isfinite(exact.params["beta0"]).all()
 
 
 def test_other_priors_within_reach_move_the_posterior(missions):

@@ -11,7 +11,6 @@ from scipy.linalg import block_diag
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
 from trustbo.inference import complete, diagnostics, fit
-from trustbo.inference.samplers import scores
 from trustbo.inference.samplers.importance import sample_scores
 from trustbo.inference.samplers.posterior import posterior_of
 from trustbo.inference.updating import update_statistics
@@ -225,14 +224,6 @@ def test_what_it_cannot_treat_is_refused():
         fit(missions, heavy, "exact")
     with pytest.raises(TrustboError, match="has no sufficient statistics: its robots share some"):
         update_statistics(HierarchicalTrust(), None, missions)
-
-
-def test_half_normal_quantiles_are_scipy_s():
-    score = np.linspace(-4.0, 6.0, 11)
-    found = scores.quantile(dist.HalfNormal(0.3), score)
-    np.testing.assert_allclose(
-        found, stats.halfnorm(scale=0.3).isf(special.ndtr(-score)), rtol=1e-9
-    )
 
 
 @pytest.mark.slow  # the weighted prior, above, says the same for little data

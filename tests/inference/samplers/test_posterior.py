@@ -79,12 +79,6 @@ def test_draws_of_places_and_robots_are_those_of_many_wide_points(whole):
     assert abs(found.draws.log_evidence - evidence) < 0.3
 
 
-def test_a_fit_begun_from_an_earlier_one_has_the_same_evidence(whole):
-    cold = sample_scores(whole, 250, 0)
-    warm = sample_scores(whole, 250, 1, cold.proposal)
-    assert abs(cold.draws.log_evidence - warm.draws.log_evidence) < 0.3
-
-
 def test_draws_have_an_effect_of_each_mission_robot_cell_and_bound(whole):
     drawn = sample_scores(whole, 30, 0).draws.params
     places = whole.evidence.slots.places
