@@ -12,7 +12,7 @@ from numpyro import handlers
 
 from trustbo.data import as_array, default_features
 from trustbo.errors import ShapeError, TrustboError, require_whole
-from trustbo.models.backend import own_settings
+from trustbo.models.backend import in_batches, own_settings
 from trustbo.models.model import TrustModel, require_model
 from trustbo.models.params import Params
 from trustbo.models.state_space.generate import draw_missions
@@ -135,12 +135,9 @@ def _compiled_draws(
     model: TrustModel, shape: tuple[int, int], n_draws: int, seed: int
 ) -> dict[str, np.ndarray]:
     """Draws of the parameters by the model's sample statements, without those of places."""
-    # Whole batches: any number of draws meets one compiled program.
-    rows = np.minimum(np.arange(-(-n_draws // _BATCH) * _BATCH), n_draws - 1).reshape(-1, _BATCH)
     with own_settings():
         keys = random.split(random.key(seed), n_draws)
-        drawn = [_parameter_draws(model, shape, keys[row]) for row in rows]
-    return {name: np.concatenate([batch[name] for batch in drawn])[:n_draws] for name in drawn[0]}
+        return in_batches(partial(_parameter_draws, model, shape), keys, _BATCH)
 
 
 def _effect_draws(model: TrustModel, n_draws: int, seed: int) -> dict[str, np.ndarray]:

@@ -1,6 +1,5 @@
 """Latent trust under posterior draws, compiled for all models."""
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -9,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax, random
 
+from trustbo.models.backend import in_batches
 from trustbo.models.families import Family, Observed
 from trustbo.models.params import Params
 from trustbo.stacking import MissionBatch
@@ -38,7 +38,7 @@ def trust_draws(
     """One exact joint draw of latent trust per parameter draw, (draw, mission, bound, robot)."""
     keys = random.split(key, len(params.b))
     draw = partial(_trust_draws, family, lag, batch, latents.linearisation)
-    return _in_batches(draw, (params, latents.innovations, keys))
+    return in_batches(draw, (params, latents.innovations, keys), _BATCH)
 
 
 @partial(jax.jit, static_argnames=("family", "lag"))
@@ -74,18 +74,3 @@ def _trust_draws(
         return jnp.swapaxes(family.draw_trust(ssm, observed, e, key), 0, 1)
 
     return jax.vmap(one)(inputs)
-
-
-def _in_batches(compiled: Callable[[Any], Array], inputs: Any) -> np.ndarray:
-    """Results of a compiled function of draws, in batches of one size, for one compiled program.
-
-    Args:
-        compiled: Function of inputs with a leading axis (draw,).
-        inputs: Arrays with a leading axis (draw,).
-    """
-    n_draws = len(jax.tree.leaves(inputs)[0])
-    results = []
-    for first in range(0, n_draws, _BATCH):
-        rows = np.minimum(np.arange(first, first + _BATCH), n_draws - 1)
-        results.append(np.asarray(compiled(jax.tree.map(lambda a, rows=rows: a[rows], inputs))))
-    return np.concatenate(results)[:n_draws]

@@ -10,9 +10,7 @@ The first proposal is Laplace's at the best of the modes found from the best pri
 second mode matters, weights would not reveal it.
 """
 
-from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import jax
 import numpy as np
@@ -25,7 +23,7 @@ from trustbo.inference.samplers.laplace import laplace
 from trustbo.inference.samplers.posterior import Posterior
 from trustbo.inference.samplers.scores import Scores
 from trustbo.inference.samplers.student import Student
-from trustbo.models.backend import own_settings
+from trustbo.models.backend import in_batches, own_settings
 from trustbo.models.drift import DriftTrust
 from trustbo.models.drift_form import Drift
 from trustbo.models.effects.effect import Slots
@@ -48,7 +46,7 @@ class DriftScores(Scores):
 
     def theta(self, z: np.ndarray) -> dict[str, np.ndarray]:
         """See `Scores.theta`; with the drift (point, chain, bound)."""
-        drift = _in_chunks(partial(_drifts, self._model, self._z), self._of_drift(z))
+        drift = in_batches(partial(_drifts, self._model, self._z), self._of_drift(z), _CHUNK)
         slots, length = self._slots, self._slots.y.shape[1]
         drift = np.swapaxes(drift, 2, 3)[:, slots.mission, slots.robot, :length]
         return super().theta(z) | {"drift": drift}
@@ -57,7 +55,7 @@ class DriftScores(Scores):
         """See `Scores.named`."""
         at_scores = partial(self._model.parameters_at, shape=self._shape)
         shared = {name: values for name, values in Scores.theta(self, z).items() if name != "rest"}
-        return shared | _in_chunks(at_scores, self._of_drift(z))
+        return shared | in_batches(at_scores, self._of_drift(z), _CHUNK)
 
     def _of_drift(self, z: np.ndarray) -> np.ndarray:
         return z[:, Scores.n_core : self.n_core]
@@ -102,13 +100,6 @@ class DriftPosterior(Posterior):
                 "weights do not tell the shares of modes, of which the posterior has more than one"
             )
         return Student(modes[top], scale[top])
-
-
-def _in_chunks(function: Callable[[np.ndarray], Any], z: np.ndarray) -> Any:
-    """Results of compiled code of points z (point, score), `_CHUNK` at a time."""
-    rows = np.minimum(np.arange(max(1, -(-len(z) // _CHUNK)) * _CHUNK), max(len(z) - 1, 0))
-    parts = [function(z[part]) for part in rows.reshape(-1, _CHUNK)]
-    return jax.tree.map(lambda *arrays: np.concatenate(arrays)[: len(z)], *parts)
 
 
 def _drifts(model: DriftTrust, awareness: np.ndarray, z: np.ndarray) -> np.ndarray:
