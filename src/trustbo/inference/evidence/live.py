@@ -57,7 +57,7 @@ class ApartFilter:
         the bound's place.
         """
         ahead = kalman.update(self._beta0, self._Q, var, 0.0, 0.0)
-        return self._beta0 * mean + self._drift(z) + effect, ahead
+        return self._state(self._beta0 * mean + self._drift(z) + effect, z, effect), ahead
 
     def update(
         self, mean: np.ndarray, var: np.ndarray, z: np.ndarray, rates: Rates, effect: Effect = 0.0
@@ -85,7 +85,7 @@ class ApartFilter:
         gain = np.where(seen, C / S, 0.0)
         mean = self._beta0 * mean + drift + gain * e
         ahead = kalman.update(self._beta0, self._Q, var, gain, S - left)
-        return mean, ahead, log_density.sum(1)
+        return self._state(mean, z, effect), ahead, log_density.sum(1)
 
     def trust(
         self, mean: np.ndarray, z: np.ndarray | None = None, effect: Effect = 0.0
@@ -111,7 +111,11 @@ class ApartFilter:
         w, v = rng.standard_normal((2, *x.shape))
         now, sd = self._beta0 * x + drift + np.sqrt(self._Q) * w, np.sqrt(self._R)
         y = self._h * x + drift + np.sqrt(self._Q) * w + sd * v
-        return now, family.draw_rates(rng, now, y, sd, n_ticks)
+        return self._state(now, z, effect), family.draw_rates(rng, now, y, sd, n_ticks)
+
+    def _state(self, trust: np.ndarray, z: np.ndarray, effect: Effect) -> np.ndarray:
+        """State of trust after a bound of drift z: trust itself, where that lasts."""
+        return trust
 
     def _drift(self, z: np.ndarray) -> np.ndarray:
         beta = self._p.beta
@@ -132,38 +136,14 @@ class DeviationFilter(ApartFilter):
         mean, var = super().start()
         return np.zeros_like(mean), var
 
-    def predict(
-        self, mean: np.ndarray, var: np.ndarray, z: np.ndarray, effect: Effect = 0.0
-    ) -> Moments:
-        """See `ApartFilter.predict`."""
-        trust, ahead = super().predict(mean, var, z, effect)
-        return trust - self._drift(z) - effect, ahead
-
-    def update(
-        self, mean: np.ndarray, var: np.ndarray, z: np.ndarray, rates: Rates, effect: Effect = 0.0
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """See `ApartFilter.update`."""
-        trust, ahead, log_density = super().update(mean, var, z, rates, effect)
-        return trust - self._drift(z) - effect, ahead, log_density
-
     def trust(
         self, mean: np.ndarray, z: np.ndarray | None = None, effect: Effect = 0.0
     ) -> np.ndarray:
         """See `ApartFilter.trust`."""
         return mean + (self._x0[0][:, None] if z is None else self._drift(z) + effect)
 
-    def roll(
-        self,
-        rng: np.random.Generator,
-        family: Family,
-        x: np.ndarray,
-        z: np.ndarray,
-        effect: Effect,
-        n_ticks: np.ndarray,
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """See `ApartFilter.roll`."""
-        trust, rates = super().roll(rng, family, x, z, effect, n_ticks)
-        return trust - self._drift(z) - effect, rates
+    def _state(self, trust: np.ndarray, z: np.ndarray, effect: Effect) -> np.ndarray:
+        return trust - self._drift(z) - effect
 
 
 class DriftFilter(ApartFilter):
