@@ -47,16 +47,28 @@ def log_prior(model: TrustModel, sites: Mapping[str, np.ndarray]) -> dict[str, n
     }
 
 
+def model_of(posterior: xr.DataTree, model: TrustModel | None = None) -> TrustModel | None:
+    """Model of a posterior, with its family and priors; None if not on record, nor given.
+
+    Priors are not on record if they are custom ones, or the posterior is of an older version.
+    """
+    data = "constant_data" if "constant_data" in posterior.children else "posterior"
+    data = posterior[data].to_dataset()
+    features = [str(n) for n in data["feature"].values] if "feature" in data.coords else []
+    if model is None:
+        try:
+            record = json.loads(posterior.attrs["model_record"])
+            model = model_from_record(record, features=features)
+        except (KeyError, TrustboError):
+            return None
+    return model.observing(posterior.attrs["observation"]).for_features(features)
+
+
 def log_prior_group(posterior: xr.DataTree, model: TrustModel | None = None) -> xr.Dataset | None:
-    """Group `log_prior` of a posterior; None where its model is not given and not on record."""
-    draws = posterior["posterior"].to_dataset()
-    features = [str(n) for n in draws["feature"].values] if "feature" in draws else []
-    try:
-        record = json.loads(posterior.attrs["model_record"])
-        recorded = model or model_from_record(record, features=features)
-    except (KeyError, TrustboError):  # of an older version, or with custom priors
+    """Group `log_prior` of a posterior; None where `model_of` is."""
+    if (recorded := model_of(posterior, model)) is None:
         return None
-    recorded = recorded.observing(posterior.attrs["observation"]).for_features(features)
+    draws = posterior["posterior"].to_dataset()
     sites = {str(n): a.transpose("chain", "draw", ...).values for n, a in draws.items()}
     densities = log_prior(recorded, sites)
     index = {"chain": draws["chain"], "draw": draws["draw"]}

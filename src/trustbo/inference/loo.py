@@ -1,6 +1,5 @@
 """Leave-one-mission-out cross-validation of any posterior, weighted ones among them."""
 
-import json
 import warnings
 from dataclasses import replace
 from typing import Any, cast
@@ -12,11 +11,11 @@ from arviz_stats.utils import ELPDData
 
 from trustbo.errors import TrustboError
 from trustbo.inference.left_out import LeftOut, by_hyperparameters, by_refit, weights_of
+from trustbo.inference.log_prior import model_of
 from trustbo.inference.posterior_groups import LIKELIHOODS, complete
 from trustbo.inference.posterior_tree import missions_of, require_posterior
 from trustbo.models.families import FAMILIES
 from trustbo.models.model import TrustModel
-from trustbo.models.record import model_from_record
 from trustbo.stacking import stack_missions
 
 
@@ -51,7 +50,7 @@ def loo(posterior: xr.DataTree, *, model: TrustModel | None = None) -> ELPDData:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # missions may be refitted
         result = _by_draws(posterior, measured)
-    model = _model_of(posterior, model)
+    model = model_of(posterior, model)
     left_out: dict[int, LeftOut] = {}
     refitted = np.zeros(len(measured), dtype=bool)
     if model is not None:
@@ -110,19 +109,6 @@ def _tree(posterior: xr.DataTree, log_likelihood: xr.DataArray) -> xr.DataTree:
             "log_likelihood": log_likelihood.to_dataset(name="contact_rate"),
         }
     )
-
-
-def _model_of(posterior: xr.DataTree, model: TrustModel | None) -> TrustModel | None:
-    """Model of a posterior, with its family and priors; None where these are not on record."""
-    data = posterior["constant_data"].to_dataset()
-    features = [str(name) for name in data["feature"].values]
-    if model is None:
-        try:
-            record = json.loads(posterior.attrs["model_record"])
-            model = model_from_record(record, features=features)
-        except (KeyError, TrustboError):
-            return None
-    return model.observing(posterior.attrs["observation"]).for_features(features)
 
 
 def _log_resolution(posterior: xr.DataTree) -> np.ndarray:
