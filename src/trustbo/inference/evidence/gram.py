@@ -67,13 +67,14 @@ class LengthGram(NamedTuple):
         """The quadratic form at parameter values of shape (theta, 3)."""
         n_bounds, p = self.spectral.shape[:2]
         beta0, Q, R = theta.T
-        sines = sine_basis(n_bounds)
-        diagonal, beside = tridiagonal(beta0, Q, R, lag)
-        values = eigenvalues(diagonal[:, None], beside[:, None], cosines(n_bounds))
+        sines = _sine_basis(n_bounds)
+        diagonal, beside = Q * (1.0 + lag) + R * (1.0 + beta0**2), -lag * Q - beta0 * R  # of T
+        cosines = np.cos(np.pi * np.arange(1, n_bounds + 1) / (n_bounds + 1))
+        values = diagonal[:, None] + 2.0 * beside[:, None] * cosines  # its eigenvalues
         first = sines[0] / values
         g = first @ sines  # T^-1 e_1
         tau = first @ sines[0]  # e_1' T^-1 e_1
-        kappa = corner(beta0, beta0 - lag, Q, R, lag, x0_sd)
+        kappa = (beta0 - lag) ** 2 * x0_sd**2 - lag * Q - beta0**2 * R
         shrink = kappa / (1.0 + kappa * tau)
         M = (1.0 / values) @ self.spectral.reshape(n_bounds, p * p)
         # (k, j, column, column) and (j, k, column, column) have one transpose's sum: half will do.
@@ -273,7 +274,7 @@ def _length_gram(
     columns[:, 0, 2] = x0_mean
     columns[:, 1:, 3:] -= lag * u[:, :-1]
     columns *= np.sqrt(weight)[:, None, None]
-    transformed = np.einsum("kl,skp->slp", sine_basis(n_bounds), columns, optimize=True)
+    transformed = np.einsum("kl,skp->slp", _sine_basis(n_bounds), columns, optimize=True)
     return LengthGram(
         float(weight.sum()),
         np.einsum("slp,slq->lpq", transformed, transformed, optimize=True),
@@ -290,31 +291,7 @@ def _collapse_lag(
     return Quadratic((rows[:, :3] * v).sum(1), rows[:, 3:], M[:, 3:, 3:], log_det)
 
 
-def sine_basis(n: int) -> np.ndarray:
+def _sine_basis(n: int) -> np.ndarray:
     """Orthonormal, symmetric matrix of the type-I discrete sine transform, (n, n)."""
     k = np.arange(1, n + 1)
     return np.sqrt(2.0 / (n + 1)) * np.sin(np.pi * np.outer(k, k) / (n + 1))
-
-
-def cosines(n: int) -> np.ndarray:
-    """cos(pi k / (n + 1)), k = 1..n: the frequencies of the sine transform."""
-    return np.cos(np.pi * np.arange(1, n + 1) / (n + 1))
-
-
-def tridiagonal(
-    beta0: np.ndarray, Q: np.ndarray, R: np.ndarray, lag: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Diagonal of T, and minus its off-diagonal entry."""
-    return Q * (1.0 + lag) + R * (1.0 + beta0**2), lag * Q + beta0 * R
-
-
-def eigenvalues(diagonal: np.ndarray, beside: np.ndarray, cosine: np.ndarray) -> np.ndarray:
-    """Eigenvalues of T, one for each of the `cosines`."""
-    return diagonal - 2.0 * beside * cosine
-
-
-def corner(
-    beta0: np.ndarray, h: np.ndarray, Q: np.ndarray, R: np.ndarray, lag: float, x0_sd: float
-) -> np.ndarray:
-    """The corner entry kappa, with h = beta0 - lag."""
-    return h**2 * x0_sd**2 - lag * Q - beta0**2 * R
