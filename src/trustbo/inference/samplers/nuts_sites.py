@@ -89,6 +89,11 @@ class SitesInJax:
         return cls(model, batch, weight, None, means, drift=drift, complete=bool(together and over))
 
     @property
+    def has_level(self) -> bool:
+        """Whether a level takes the intercept's place: linear models of Gaussian rates."""
+        return self.means is not None
+
+    @property
     def innovations(self) -> tuple[int, int, int] | None:
         """Shape of the innovations of trust (bound, mission, robot), if they are sampled."""
         if self.model.family.integrates_out:
@@ -116,7 +121,7 @@ class SitesInJax:
                 name: total + 0.5 * jax.nn.log_sigmoid(sign * ratio)
                 for name, sign in zip(_NOISES, (2.0, -2.0), strict=True)
             }
-        if self.means is not None:
+        if self.has_level:
             site |= {"b": site["b"] - self._level(site)}
         if self.robots is None:
             return site, none
@@ -191,7 +196,7 @@ class SitesInJax:
         """
         start, unravel = self._flat
         site, names = unravel(start), _AUTOREGRESSIONS
-        if self.means is None or not site.keys() >= set(_NOISES):
+        if not self.has_level or not site.keys() >= set(_NOISES):
             return start[None]
         unit = self._support is constraints.unit_interval
         values = (-4.0, -1.5, 2.0) if unit else (-0.2, 0.2, 0.8)  # logits, or values
