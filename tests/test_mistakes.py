@@ -227,9 +227,6 @@ MISTAKES = {
     "no draws": (lambda c: fit([c.mission], draws=0), "draws must be a .* 1 on; got 0"),
     "no chains": (lambda c: fit([c.mission], n_chains=0), "n_chains must be a .* 1 on; got 0"),
     "a warm-up below 0": (lambda c: fit([c.mission], warmup=-1), "warmup must .*0 on; got -1"),
-    "half a trajectory": (
-        lambda c: fit([c.mission], n_trajectories=0.5), "n_trajectories must be .* 1 on; got 0.5"
-    ),
     "a fit's negative seed": (lambda c: fit([c.mission], seed=-1), "seed must be .* 0 on; got -1"),
     "a fit's broken seed": (lambda c: fit([c.mission], seed=1.5), "seed must be .* 0 on; got 1.5"),
     "no features": (

@@ -17,7 +17,8 @@ from scipy.special import logsumexp
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError, require_whole
-from trustbo.inference.evidence.evidence import ColumnEvidence
+from trustbo.inference.evidence.evidence import ColumnEvidence, at
+from trustbo.inference.fit import places_of
 from trustbo.inference.posterior_tree import missions_of, require_posterior
 from trustbo.inference.samplers.importance import sample_scores
 from trustbo.inference.samplers.posterior import evidence_of, posterior_of
@@ -25,7 +26,7 @@ from trustbo.inference.samplers.student import proposal_of
 from trustbo.models.effects.change import KINDS, Candidates, Change
 from trustbo.models.effects.effect import Slots, Theta, rest_of
 from trustbo.models.model import TrustModel
-from trustbo.models.place import PlaceEffect, bounds_of, visited
+from trustbo.models.place import PlaceEffect
 from trustbo.models.pooled import PooledTrust
 from trustbo.models.record import model_from_record
 from trustbo.models.ticks import weigh_ticks
@@ -177,9 +178,7 @@ def scan_posterior(
     weight[: len(missions)] = np.atleast_1d(attrs.get("weights", 1.0))
     model = model.for_features(features).at_resolution(weigh_ticks(batch, weight))
     place = PlaceEffect() if model.place is None else model.place
-    shape = None if workspace is None else workspace.passable.shape
-    bounds = bounds_of(missions, batch.contact_rate.shape[:2])
-    places = visited(bounds, place, batch.contact_rate.shape[2], shape)  # pyright: ignore
+    places = places_of(missions, batch, place, workspace)
     slots = Slots.of(batch, len(missions), features, weight, places)
     names = "beta0", "delta_w", "delta_v", *(name for e in model.all_effects for name in e.names)
 
@@ -227,8 +226,7 @@ def weigh(
     a, b = np.zeros((2, n, n_candidates))
 
     def scan(draws: slice, kept: np.ndarray) -> None:
-        some = {name: values[draws] for name, values in theta.items()}
-        a[draws, kept], b[draws, kept] = _scanned(evidence, some, candidates, kept)
+        a[draws, kept], b[draws, kept] = _scanned(evidence, at(theta, draws), candidates, kept)
         variance = (rest[draws] * candidates.sd) ** 2
         misfit = variance * b[draws] ** 2 / (1.0 + variance * a[draws])
         log_bf = 0.5 * (misfit - np.log1p(variance * a[draws]))

@@ -14,7 +14,7 @@ from trustbo.data import Mission, as_array
 from trustbo.display.bars import place_of
 from trustbo.errors import PosteriorError, ShapeError, TrustboError, require_kind, require_whole
 from trustbo.inference.place_maps import place_group
-from trustbo.inference.posterior_groups import Conditional, complete
+from trustbo.inference.posterior_groups import Conditional, add_weights, complete
 from trustbo.inference.posterior_tree import require_posterior, to_datatree
 from trustbo.inference.prior_predictive import draw_sites
 from trustbo.inference.samplers.choice import (
@@ -32,7 +32,7 @@ from trustbo.models.backend import VERSIONS
 from trustbo.models.effects.effect import Slots
 from trustbo.models.families import AUTO
 from trustbo.models.model import TrustModel, require_model
-from trustbo.models.place import Visited, bounds_of, visited
+from trustbo.models.place import PlaceEffect, Visited, bounds_of, visited
 from trustbo.models.pooled import PooledTrust
 from trustbo.models.record import model_to_record
 from trustbo.models.ticks import TickWeights, require_ticks, resolution, weigh_ticks
@@ -57,7 +57,6 @@ def fit(
     draws: int | None = None,
     target_accept: float = 0.9,
     max_tree_depth: int = 10,
-    n_trajectories: int = 200,
     check: bool = True,
     whole: bool = True,
     **former: int,
@@ -94,7 +93,6 @@ def fit(
         target_accept: Acceptance rate that NUTS adapts its steps to: towards 1, steps are
             smaller, and divergences fewer.
         max_tree_depth: Doublings of a trajectory of NUTS at most: 10 allow 1023 steps for a draw.
-        n_trajectories: Draws, spread evenly over the chains, for which latent trust is kept.
         check: Refuse a posterior with R-hat > 1.01, bulk ESS < 400 or a divergence that a longer
             run does not cure; `False` returns it unchecked.
         whole: Whether to add latent trust, log-likelihoods and predictions at once; `complete` adds
@@ -124,7 +122,6 @@ def fit(
     given = {"warmup": warmup, "draws": draws, "n_chains": n_chains}
     care = {"target_accept": target_accept, "max_tree_depth": max_tree_depth}
     settings = NutsSettings.of({**given, **care}, former)
-    n_trajectories = require_whole("n_trajectories", n_trajectories, 1)
     seed = require_whole("seed", seed, 0)
     if earlier is not None:
         require_posterior("earlier=", earlier)
@@ -132,7 +129,7 @@ def fit(
     batch = stack_missions(missions)
     asked = model
     model, family_reason = _of_rates(asked, batch, weighted=weights is not None)
-    places = _places(model, missions, batch, workspace)
+    places = places_of(missions, batch, model.place, workspace)
     require_ticks(model.family, batch)
     weight = _weights(weights, model, batch, len(missions))
     ticks = _weigh_rates(batch, weight)
@@ -150,7 +147,8 @@ def fit(
             warnings.warn(slow_places(reason), stacklevel=3)
         floored = model.at_resolution(ticks)
         prior = draw_sites(floored, batch.awareness.shape[2:], _N_PRIOR, seed + 2)
-        slots = _slots(model, chosen, missions, batch, weight, places)
+        chains = batch, len(missions), missions[0].features, weight, places
+        slots = Slots.of(*chains) if needs_evidence(model, chosen) else None
         sampled = draw_posterior(
             floored, chosen,
             settings if former or warmup is not None else with_warmup(settings, model),
@@ -184,22 +182,13 @@ def fit(
         "seed": seed,
     }
     if weights is not None:
-        _add_weights(posterior, weight[: len(missions)])
+        add_weights(posterior, weight[: len(missions)])
     if whole or not Conditional.of(posterior).keeps_trust:
         with watch:
             watch.stage("latent trust and predictions")
-            posterior = complete(
-                posterior, missions, model=model, n_trajectories=n_trajectories,
-                latents=sampled.latents,
-            )  # fmt: skip
+            posterior = complete(posterior, missions, model=model, latents=sampled.latents)
     posterior.attrs["seconds"] = time.perf_counter() - started
     return _require_sound(posterior, complaints)
-
-
-def _add_weights(posterior: xr.DataTree, weight: np.ndarray) -> None:
-    counted = xr.DataArray(weight, dims="mission")
-    posterior["constant_data"] = posterior["constant_data"].assign(weight=counted)
-    posterior.attrs["weights"] = weight.tolist()
 
 
 def _filled(missions: Sequence[Mission], workspace: Workspace | None) -> list[Mission]:
@@ -260,32 +249,18 @@ def _of_rates(model: TrustModel, batch: MissionBatch, *, weighted: bool) -> tupl
     return model.for_rates(batch)
 
 
-def _places(
-    model: TrustModel,
+def places_of(
     missions: Sequence[Mission],
     batch: MissionBatch,
-    workspace: Workspace | None,
+    place: PlaceEffect | None,
+    workspace: Workspace | None = None,
 ) -> Visited | None:
-    """Places of missions, where they have effects."""
-    if model.place is None:
+    """Places of missions, where they have effects; of a workspace, over its whole grid."""
+    if place is None:
         return None
     shape = None if workspace is None else workspace.passable.shape
     bounds = bounds_of(missions, batch.contact_rate.shape[:2])
-    return visited(bounds, model.place, batch.contact_rate.shape[2], shape)  # pyright: ignore
-
-
-def _slots(
-    model: TrustModel,
-    sampler: str,
-    missions: Sequence[Mission],
-    batch: MissionBatch,
-    weight: np.ndarray,
-    places: Visited | None,
-) -> Slots | None:
-    """Rates by chain, where the evidence of all effects is needed."""
-    if not needs_evidence(model, sampler):
-        return None
-    return Slots.of(batch, len(missions), missions[0].features, weight, places)
+    return visited(bounds, place, batch.contact_rate.shape[2], shape)  # pyright: ignore
 
 
 def _weigh_rates(batch: MissionBatch, weight: np.ndarray) -> TickWeights:

@@ -15,13 +15,12 @@ import numpy as np
 import xarray as xr
 
 from trustbo.inference.draws import params_of, sites_of, theta_of
-from trustbo.inference.fit import fit
+from trustbo.inference.fit import fit, places_of
 from trustbo.inference.posterior_tree import missions_of
 from trustbo.inference.samplers.posterior import evidence_of
 from trustbo.inference.samplers.weights import smoothed_weights
 from trustbo.models.effects.effect import Slots
 from trustbo.models.model import TrustModel
-from trustbo.models.place import bounds_of, visited
 from trustbo.parallel import one_blas_thread
 from trustbo.stacking import stack_missions
 
@@ -57,9 +56,8 @@ def by_hyperparameters(posterior: xr.DataTree, model: TrustModel) -> list[LeftOu
     if not model.all_effects or not exact or model.why_not_exact is not None:
         return None
     missions, weight = missions_of(posterior), weights_of(posterior)
-    batch, places = stack_missions(missions, pad=False), None
-    if model.place is not None:
-        places = visited(bounds_of(missions), model.place, batch.contact_rate.shape[2])
+    batch = stack_missions(missions, pad=False)
+    places = places_of(missions, batch, model.place)
     sites, names = sites_of(posterior), ("beta0", "delta_w", "delta_v", *model.effect_dims)
     points = np.column_stack([sites[name] for name in names])
     points, index = np.unique(points, axis=0, return_inverse=True)

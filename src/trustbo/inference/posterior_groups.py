@@ -8,7 +8,7 @@ import xarray as xr
 from jax import random
 
 from trustbo.data import Mission
-from trustbo.errors import TrustboError, require_whole
+from trustbo.errors import TrustboError
 from trustbo.inference.draws import (
     effects_of,
     is_of_people,
@@ -36,7 +36,7 @@ from trustbo.stacking import MissionBatch, stack_missions
 
 LIKELIHOODS = ("log_likelihood", "mission_log_likelihood")
 """Group of log p(rates of a mission | draw), without and with weights of missions."""
-_N_TRAJECTORIES = 200
+_N_TRAJECTORIES = 200  # draws, spread evenly over the chains, that latent trust is kept of
 
 
 _KEPT = ("posterior", "sample_stats", "prior", "places", "hazard")
@@ -80,7 +80,6 @@ def complete(
     missions: Sequence[Mission] | None = None,
     *,
     model: TrustModel | None = None,
-    n_trajectories: int = _N_TRAJECTORIES,
     latents: latent.Latents | None = None,
 ) -> xr.DataTree:
     """Add latent trust, log-likelihoods and predictions to a posterior of parameters alone.
@@ -92,7 +91,6 @@ def complete(
         posterior: DataTree from `fit`, or one of `Result.posteriors`.
         missions: Missions that it was fitted to; needed where it holds no data.
         model: Its model, for `log_prior`; needed with custom priors.
-        n_trajectories: Number of draws, spread evenly over the chains, to keep latent trust of.
         latents: Innovations of latent trust, where they were sampled with the parameters.
 
     Returns:
@@ -120,10 +118,7 @@ def complete(
             f'trust under observation "{conditional.family.name}" was sampled with the parameters '
             "and not kept; fit these missions anew."
         )
-    n_trajectories = require_whole("n_trajectories", n_trajectories, 1)
-    groups, data_name = _groups(
-        posterior, conditional, missions, n_trajectories, latents or latent.Latents()
-    )
+    groups, data_name = _groups(posterior, conditional, missions, latents or latent.Latents())
     added = to_datatree(groups, missions, {})
     parts = {**posterior.children, **added.children}
     whole = xr.DataTree.from_dict({name: part.to_dataset() for name, part in parts.items()})
@@ -131,21 +126,28 @@ def complete(
         whole["log_prior"] = xr.DataTree(densities)
     whole.attrs = posterior.attrs | {"log_likelihood_of": data_name}
     if "weights" in posterior.attrs:
-        weight = xr.DataArray(np.atleast_1d(posterior.attrs["weights"]), dims="mission")
-        whole["constant_data"] = whole["constant_data"].assign(weight=weight)
+        add_weights(whole, np.atleast_1d(posterior.attrs["weights"]))
     return whole
+
+
+def add_weights(posterior: xr.DataTree, weight: np.ndarray) -> None:
+    """Add the weights of missions (mission,) to their data, and as an attribute."""
+    counted = xr.DataArray(weight, dims="mission")
+    posterior["constant_data"] = posterior["constant_data"].assign(weight=counted)
+    posterior.attrs["weights"] = weight.tolist()
 
 
 def _groups(
     posterior: xr.DataTree,
     conditional: Conditional,
     missions: Sequence[Mission],
-    n_trajectories: int,
     latents: latent.Latents,
 ) -> tuple[dict[str, dict[str, Any]], str]:
     """Arrays by group and name, (chain, draw) leading, and the data of the log-likelihoods."""
     n_chains, n_draws = (posterior["posterior"].sizes[d] for d in ("chain", "draw"))
-    kept = np.linspace(0, n_draws - 1, min(n_draws, max(1, n_trajectories // n_chains))).astype(int)
+    kept = np.linspace(0, n_draws - 1, min(n_draws, max(1, _N_TRAJECTORIES // n_chains))).astype(
+        int
+    )
     if conditional.of_people:
         return groups_of_people(posterior, missions, kept), "contact_rate"
     # NumPy needs no padding.
@@ -170,7 +172,7 @@ def _groups(
         conditional.family, batch, arrays["log_likelihood"], len(missions)
     )
     return {
-        _likelihood_name(posterior): {"contact_rate": by_chain(likelihood)},
+        LIKELIHOODS[is_weighted(posterior)]: {"contact_rate": by_chain(likelihood)},
         "latent": {
             "trust": by_chain(arrays["trust"]),
             "trust_mean": arrays["trust_mean"],
@@ -180,11 +182,6 @@ def _groups(
         "posterior_predictive": {"contact_rate": by_chain(arrays["predicted"])},
         "prior_predictive": {"contact_rate": _predict(conditional, prior, batch, rng)[None]},
     }, data_name
-
-
-def _likelihood_name(posterior: xr.DataTree) -> str:
-    """Name that `az.loo` reads, unless missions have weights, which it would ignore."""
-    return LIKELIHOODS[is_weighted(posterior)]
 
 
 def is_weighted(posterior: xr.DataTree) -> bool:

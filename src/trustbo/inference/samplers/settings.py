@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, Self
 from trustbo.errors import TrustboError, require_whole, unknown
 
 _OTHERS = (
-    "workspace", "earlier", "weights", "seed", "progress", "n_trajectories", "check", "whole",
+    "workspace", "earlier", "weights", "seed", "progress", "check", "whole",
 )  # fmt: skip
 """Other keyword arguments of `fit`, to suggest for misspelt ones."""
 _FORMER = {"n_warmup": "warmup", "n_draws": "draws"}
