@@ -44,16 +44,14 @@ def prior_from(posteriors: Sequence[xr.DataTree], model: TrustModel | None = Non
     sites = [sites_of(posterior) for posterior in posteriors]
     if not isinstance(base.beta, dist.Normal) or not isinstance(base.b, dist.Normal):
         raise TrustboError("prior_from needs Normal priors of beta and b to mix with.")
+    coefficients = _stationary(sites, base.stationary)
     beta = _mixed(
-        [s["beta"] for s in _stationary(sites, base.stationary)],
+        [s["beta"] for s in coefficients],
         np.broadcast_to(numbers(base.beta, "loc"), len(features)),
         np.broadcast_to(numbers(base.beta, "scale"), len(features)),
     )
-    b = _mixed(
-        [s["b"] for s in _stationary(sites, base.stationary)],
-        numbers(base.b, "loc"),
-        numbers(base.b, "scale"),
-    )
+    of_b = numbers(base.b, "loc"), numbers(base.b, "scale")
+    b = _mixed([s["b"] for s in coefficients], *of_b)
     beta0 = _mixed([s["beta0"] for s in sites], *_moments(base.beta0))
     with own_settings():
         priors = replace(

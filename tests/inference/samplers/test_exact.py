@@ -15,7 +15,7 @@ from trustbo.errors import TrustboError
 from trustbo.inference import diagnostics, fit
 from trustbo.inference.evidence.gram import sufficient_statistics
 from trustbo.inference.evidence.statistics import gather
-from trustbo.inference.samplers.exact import sample_exact
+from trustbo.inference.samplers.exact import backward, forward, sample_exact, small_cholesky
 from trustbo.models import CoupledTrust, PooledTrust, Priors, TrustParams
 from trustbo.stacking import stack_missions
 
@@ -206,3 +206,19 @@ def test_uneven_weights_fall_back_on_nuts_and_say_so(missions, monkeypatch):
         posterior = fit(missions, sampler="exact")
     assert posterior.attrs["sampler"] == "nuts"
     assert "r_hat" in diagnostics(posterior)
+
+
+def test_factors_and_solutions_are_numpy_s_and_one_bad_matrix_spoils_no_other():
+    rng = np.random.default_rng(0)
+    roots = rng.normal(size=(6, 4, 4))
+    A = roots @ roots.mT + 0.1 * np.eye(4)
+    A[2] -= 10.0 * np.eye(4)
+    good, b = [0, 1, 3, 4, 5], rng.normal(size=(6, 4))
+    with np.errstate(invalid="ignore"):
+        L = small_cholesky(np.moveaxis(A, 0, -1))
+    assert np.isnan(L[..., 2]).any()
+    for i in good:
+        np.testing.assert_allclose(L[..., i], np.linalg.cholesky(A[i]), atol=1e-12)
+    lower = L[..., good]
+    solution = backward(lower, forward(lower, b[good].T)).T
+    np.testing.assert_allclose(solution, np.linalg.solve(A[good], b[good, :, None])[..., 0])

@@ -11,6 +11,7 @@ import numpy as np
 
 from trustbo.inference.evidence.block_draws import draw_blocks
 from trustbo.inference.evidence.block_sites import Given, Rows, log_evidence, moments_of, settle
+from trustbo.inference.evidence.evidence import at, repeated
 from trustbo.models.effects.effect import Group, Slots, Theta
 from trustbo.models.effects.person import PersonColumns
 from trustbo.models.families.terms import GAUSSIAN, INTERVAL, NONE
@@ -68,7 +69,7 @@ class Blocks:
         out = np.full(len(theta["beta0"]), np.nan)
         some = np.flatnonzero((theta["delta_w"] > _NOISE) & (theta["delta_v"] > _NOISE))
         if len(some):
-            given = self._given({name: values[some] for name, values in theta.items()})
+            given = self._given(at(theta, some))
             out[some] = log_evidence(
                 given, self.x0, self.lasting, self.rows, self.sites, self._sweeps
             )
@@ -95,7 +96,7 @@ class Blocks:
         c = rng.standard_normal((n, D))
         c /= np.sqrt(rng.chisquare(nu, (n, 1)) / nu) if not self.exact else 1.0
         _, _, own, log_weight = self._run(theta, count, c, rng, n_particles=_PARTICLES, nu=nu)
-        of_draw = {name: np.repeat(values, count, axis=0) for name, values in theta.items()}
+        of_draw = repeated(theta, count)
         named = self.shared.name(c, of_draw, rng) | self.own.name(own, of_draw)
         return named, None if self.exact else log_weight
 

@@ -7,6 +7,16 @@ import numpy as np
 from trustbo.models.effects.effect import Columns, Theta
 
 
+def at(theta: Theta, points: np.ndarray | slice) -> dict[str, np.ndarray]:
+    """Hyperparameters at some points."""
+    return {name: values[points] for name, values in theta.items()}
+
+
+def repeated(theta: Theta, count: np.ndarray) -> dict[str, np.ndarray]:
+    """Hyperparameters of each point as many times as there are draws of it."""
+    return {name: np.repeat(values, count, axis=0) for name, values in theta.items()}
+
+
 class Evidence(Protocol):
     """Density of rates given hyperparameters, and draws of the coefficients given both."""
 

@@ -37,6 +37,7 @@ from scipy import sparse
 from scipy.linalg.lapack import dpotrf, dtrtrs  # pyright: ignore
 
 from trustbo.errors import require_choice
+from trustbo.inference.evidence.evidence import at, repeated
 from trustbo.inference.evidence.fading import Eliminated, Sets, eliminate, spread
 from trustbo.inference.evidence.scan import Sums, take_projections, weigh_chains
 from trustbo.models.effects.effect import (
@@ -120,7 +121,7 @@ class Gaussian:
         """See `Evidence.log_density`."""
         n = len(theta["beta0"])
         with np.errstate(all="ignore"):  # far out noises under- and overflow: no density there
-            parts = [self._factors(_take(theta, i)).log_p for i in self._chunks(n)]
+            parts = [self._factors(at(theta, i)).log_p for i in self._chunks(n)]
         return np.concatenate([np.zeros(0), *parts])
 
     def recentre(self, theta: Theta) -> None:
@@ -135,8 +136,7 @@ class Gaussian:
     ) -> tuple[dict[str, np.ndarray], None]:
         """See `Evidence.draw`; no weights are needed."""
         c = self.coefficients(theta, count, rng)
-        of_draw = {name: np.repeat(values, count, axis=0) for name, values in theta.items()}
-        return named_effects(self.groups, c, of_draw, rng), None
+        return named_effects(self.groups, c, repeated(theta, count), rng), None
 
     def scan(
         self, theta: Theta, columns: Columns, run: np.ndarray | None = None
@@ -149,7 +149,7 @@ class Gaussian:
         start = np.searchsorted(atom, np.arange(shape[0] + 1))
         out = np.zeros((2, len(theta["beta0"]), columns.shape[1]))
         for i in self._chunks(len(theta["beta0"])):
-            some = _take(theta, i)
+            some = at(theta, i)
             factors = self._factors(some)
             N, E, _ = self._impulses(some)
             C = N if self.level else E
@@ -168,7 +168,7 @@ class Gaussian:
         """Coefficients (draw, column) in the order of the groups, see `draw`."""
         drawn = []
         for i in self._chunks(len(count)):
-            factors = self._factors(_take(theta, i))
+            factors = self._factors(at(theta, i))
             if self.joined or (count[i] != 1).any():
                 drawn += [self._draw(factors, t, int(n), rng) for t, n in enumerate(count[i])]
             else:  # of independent columns one draw each, as NUTS has thousands: all at once
@@ -482,7 +482,3 @@ def _residuals(y, expected, start, E, C, kind, weight, R, misfit):
 def _upper(S: np.ndarray) -> np.ndarray:
     """Upper triangles of S (point, kind, bound, bound), (point, pair of bounds of a kind)."""
     return S[:, :, *np.triu_indices(S.shape[2])].reshape(len(S), -1)
-
-
-def _take(theta: Theta, points: slice) -> dict[str, np.ndarray]:
-    return {name: values[points] for name, values in theta.items()}

@@ -23,6 +23,7 @@ from trustbo.errors import require_choice
 from trustbo.inference.evidence.ep import joint
 from trustbo.inference.evidence.ep.chains import chains_of
 from trustbo.inference.evidence.ep.draws import draw_weighted
+from trustbo.inference.evidence.evidence import at, repeated
 from trustbo.inference.evidence.gaussian import Gaussian, named_effects, prior_of
 from trustbo.models.effects.effect import MEMORIES, Columns, Group, Slots, Theta, dense_root
 from trustbo.models.families import Family
@@ -79,7 +80,7 @@ class Sites:
         some = np.flatnonzero((theta["delta_w"] > _NOISE) & (theta["delta_v"] > _NOISE))
         for i in range(0, len(some), self._chunk):
             points = some[i : i + self._chunk]
-            given, log_det = self._given({name: v[points] for name, v in theta.items()})
+            given, log_det = self._given(at(theta, points))
             args: tuple[Any, ...] = *given, self.chains, self.sites, self._sweeps
             out[points] = joint.log_evidence(*args) + 0.5 * log_det
         return out
@@ -105,16 +106,15 @@ class Sites:
 
         def points():
             for i in range(0, len(count), self._chunk):
-                some = {name: values[i : i + self._chunk] for name, values in theta.items()}
-                (beta0, delta_w, delta_v, x0, P, mean), log_det = self._given(some)
+                points = slice(i, i + self._chunk)
+                (beta0, delta_w, delta_v, x0, P, mean), log_det = self._given(at(theta, points))
                 log_dets.extend(log_det)
                 for t in range(len(log_det)):
                     yield beta0[t], delta_w[t], delta_v[t], x0, P[t], mean[t]
 
         fixed = self._nu, self.chains, self.sites, self._sweeps
         c, log_weight = draw_weighted(points(), count, *fixed, rng)
-        of_draw = {name: np.repeat(values, count, axis=0) for name, values in theta.items()}
-        named = named_effects(self.groups, c, of_draw, rng)
+        named = named_effects(self.groups, c, repeated(theta, count), rng)
         return named, log_weight + 0.5 * np.repeat(log_dets, count)
 
     def scan(

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.optimize import minimize
 
-from trustbo.inference.evidence.evidence import ColumnEvidence, Evidence
+from trustbo.inference.evidence.evidence import ColumnEvidence, Evidence, at, repeated
 from trustbo.inference.evidence.gaussian import Gaussian
 from trustbo.inference.evidence.sites import Sites
 from trustbo.inference.samplers.importance import ScoreTarget
@@ -18,7 +18,7 @@ from trustbo.inference.samplers.laplace import derivatives, inverse_hessian
 from trustbo.inference.samplers.per_robot import PerRobot
 from trustbo.inference.samplers.scores import Scores
 from trustbo.inference.samplers.student import Proposal, Spanning, Student
-from trustbo.models.effects.effect import Effect, Slots, Theta
+from trustbo.models.effects.effect import Effect, Slots
 from trustbo.models.effects.weights import Weights
 from trustbo.models.model import TrustModel
 
@@ -55,7 +55,7 @@ class Posterior(ScoreTarget):
             possible = np.isfinite(np.column_stack([*flat, log_prior])).all(1)
             possible &= (noise > _LEAST_NOISE) & (noise < _LARGEST_NOISE) & (theta["rest"] != 0.0)
             some = np.flatnonzero(possible)
-            out[some] = self.evidence.log_density(_take(theta, some)) + log_prior[some]
+            out[some] = self.evidence.log_density(at(theta, some)) + log_prior[some]
         return np.where(np.isfinite(out), out, -np.inf)
 
     def first(self) -> Student:
@@ -122,7 +122,7 @@ class Posterior(ScoreTarget):
         """Hyperparameters and effects at the points of sorted indices; see `ScoreTarget.draw`."""
         unique, count = np.unique(chosen, return_counts=True)
         theta = self.scores.theta(z[unique])
-        named = {n: np.repeat(v, count, axis=0) for n, v in self.scores.named(z[unique]).items()}
+        named = repeated(self.scores.named(z[unique]), count)
         effects, log_weight = self.evidence.draw(theta, count, rng)
         if log_weight is not None:
             log_weight = log_weight + self.scores.log_prior(z[chosen]) - log_p[chosen]
@@ -158,7 +158,3 @@ def evidence_of(model: TrustModel, slots: Slots, further: Sequence[Effect] = ())
     if model.family.integrates_out:
         return Gaussian(slots, groups, x0, model.memory, apart=by_robot, lag=model.lag)
     return Sites(slots, groups, model.family, x0, model.memory, apart=by_robot)
-
-
-def _take(theta: Theta, points: np.ndarray) -> dict[str, np.ndarray]:
-    return {name: values[points] for name, values in theta.items()}

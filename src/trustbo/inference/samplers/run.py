@@ -1,8 +1,8 @@
 """Draws from a model's posterior by the chosen sampler."""
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -261,7 +261,7 @@ def _sample_nuts(task: _Task) -> tuple[Draws, list[str]]:
 
 def _sample_nuts_of_scores(task: _Task) -> tuple[Draws, list[str]]:
     """Draws of scores by NUTS, of all else given them by the evidence; see `_sample_nuts`."""
-    targets: Sequence[Any] = task.targets
+    targets = cast(list[Posterior], task.targets)
     reference = _draws_by_sums(task) if task.check else {}
 
     def attempt(tried: NutsSettings, retries: int) -> tuple[Draws, list[str]]:

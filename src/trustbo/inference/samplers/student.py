@@ -1,25 +1,12 @@
 """Mixtures of multivariate Student-t densities, by components: proposals of any dimension."""
 
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol, Self
+from typing import NamedTuple, Self
 
 import numpy as np
 import xarray as xr
 from scipy import special, stats
 from scipy.linalg import solve_triangular
-
-
-class Proposal(Protocol):
-    """A density to draw from."""
-
-    def draw(self, n: int, seed: int) -> np.ndarray:
-        """Points (point, axis)."""
-        ...
-
-    def log_density(self, z: np.ndarray) -> np.ndarray:
-        """Log density (point,)."""
-        ...
-
 
 _SKEWS = np.linspace(-0.9, 0.9, 181)
 
@@ -140,6 +127,10 @@ class Spanning(NamedTuple):
         others = np.delete(z, self.axis, axis=1) - special.ndtr(score)[:, None] * self.slope
         marginal = -0.5 * (score / self.sd) ** 2 - np.log(self.sd * np.sqrt(2.0 * np.pi))
         return marginal + self.others.log_density(others)
+
+
+Proposal = Student | Spanning
+"""A density to draw from."""
 
 
 def log_mixture(components: Sequence[Proposal], sizes: Sequence[int], z: np.ndarray) -> np.ndarray:
