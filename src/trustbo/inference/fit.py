@@ -4,7 +4,6 @@ import json
 import time
 import warnings
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -138,7 +137,10 @@ def fit(
     # Of a campaign, only the first fit warns.
     watch = Watch(place_of(progress), estimates=earlier is None)
 
-    def draw(model: TrustModel, *, fallback: bool) -> _Drawn:
+    def draw(
+        model: TrustModel, *, fallback: bool
+    ) -> tuple[TrustModel, dict[str, np.ndarray], Draws, list[str], str]:
+        # Model, draws of its prior and of its posterior, complaints, and the sampler's reason.
         model = model.for_features(missions[0].features)
         chosen, reason = resolve_sampler(model, sampler)
         settings.require_sampler(chosen)
@@ -155,7 +157,7 @@ def fit(
             seed, batch, weight, places, proposal_of(earlier), slots,
             check=check, fallback=fallback, watch=watch,
         )  # fmt: skip
-        return _Drawn(model, prior, *sampled, sampled[0].fallback or reason)
+        return model, prior, *sampled, sampled[0].fallback or reason
 
     with watch:
         try:
@@ -208,17 +210,6 @@ def _require_sound(posterior: xr.DataTree, complaints: Sequence[str]) -> xr.Data
             "Give more missions or firmer priors, or pass check=False to have it as it is.",
         )
     return posterior
-
-
-class _Drawn(NamedTuple):
-    """Draws of a model's parameters, and the sampler that drew them."""
-
-    model: TrustModel
-    prior: dict[str, np.ndarray]
-    draws: Draws
-    complaints: list[str]
-    reason: str
-    """Reason of the sampler."""
 
 
 def _record(

@@ -9,7 +9,6 @@ from scipy import stats
 from trustbo.data import Mission
 from trustbo.inference.evidence import kalman_numpy
 from trustbo.inference.evidence.ep import draws, joint, trust
-from trustbo.inference.evidence.ep.chains import gather_chains
 from trustbo.models import TrustParams
 from trustbo.models.families import FAMILIES, terms
 from trustbo.stacking import MissionBatch, stack_missions
@@ -25,7 +24,7 @@ def known(p):
 def given_coefficients(family, p, z, y):
     """Chains of rates (chain, bound) whose drift is known, and their sites."""
     batch = MissionBatch(z[:, :, None], y[:, :, None], np.full((*y.shape, 1), N_TICKS))
-    chains, sites = gather_chains(FAMILIES[family], batch)
+    chains, sites = trust.gather_chains(FAMILIES[family], batch, np.full(len(y), y.shape[1]))
     return chains._replace(
         u=chains.u[..., :0], gamma_index=chains.gamma_index[:, :0], drift=z @ p.beta + p.b
     ), sites
@@ -60,7 +59,7 @@ def test_a_rate_within_the_limits_is_integrated_exactly_with_the_coefficients(lo
     z, y = rng.uniform(size=(4, 5, 2, 2)), rng.uniform(0.2, 0.8, (4, 5, 2))
     y[1, 2, 0] = y[3, 4, 1] = np.nan
     batch = MissionBatch(z, y, np.full(y.shape, np.nan))
-    chains, sites = gather_chains(FAMILIES["censored"], batch)
+    chains, sites = trust.gather_chains(FAMILIES["censored"], batch, np.full(4, 5))
     chains = chains._replace(lost=lost)
     mean, precision = np.array([0.1, 0.2, -0.1]), np.array([1.0, 4.0, 2.0])
     beta0, Q, R, x0 = 0.7, 0.02, 0.01, (0.5, 0.3)
@@ -93,7 +92,7 @@ def test_one_censored_rate_has_the_probability_of_its_side():
     for y, limit, side in ((1.0, 1.0, 1.0), (0.0, 0.0, -1.0)):
         z = np.array([[[[0.4, 0.9]]]])
         batch = MissionBatch(z, np.full((1, 1, 1), y), np.full((1, 1, 1), np.nan))
-        chains, sites = gather_chains(FAMILIES["censored"], batch)
+        chains, sites = trust.gather_chains(FAMILIES["censored"], batch, np.ones(1, dtype=int))
         point = np.array([[0.6]]), np.array([0.2]), np.array([0.1]), np.array([0.5, 0.4])
         P, g = np.diag([1.0, 2.0, 4.0])[None], np.array([[0.3, -0.1, 0.2]])
         (found,) = joint.log_evidence(*point, P, g, chains, sites, 12)
@@ -188,9 +187,9 @@ def test_a_mission_without_a_rate_leaves_the_evidence_as_it_is():
     none = Mission.from_arrays([(0, 0), (0, 1)], np.full((1, 1, 2), 0.5), [[np.nan]])
     args = *(np.asarray(a)[None] for a in known(OF_FAMILY["censored"])[:3]), np.array([0.5, 0.5])
     prior = np.eye(3)[None], np.zeros((1, 3))
-    found = [
-        joint.log_evidence(*args, *prior, *gather_chains(FAMILIES["censored"],
-                                                         stack_missions(some)), 4)
-        for some in (missions, [*missions, none])
-    ]  # fmt: skip
+    found = []
+    for some in (missions, [*missions, none]):
+        batch, n_bounds = stack_missions(some, pad=False), [len(m.bounds) for m in some]
+        chains = trust.gather_chains(FAMILIES["censored"], batch, np.array(n_bounds))
+        found.append(joint.log_evidence(*args, *prior, *chains, 4))
     np.testing.assert_allclose(found[0], found[1], rtol=1e-12)

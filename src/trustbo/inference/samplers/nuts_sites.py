@@ -11,7 +11,7 @@ places, with Jacobian 1. Start and metric are those of a Gaussian fit at the mod
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -253,18 +253,10 @@ class SitesInJax:
         numpyro.factor("contact_rate", log_p.sum(1) @ self.weight)  # pyright: ignore
 
 
-class SiteDraws(NamedTuple):
-    """Draws and statistics, each with leading axes (chain, draw)."""
-
-    params: dict[str, np.ndarray]
-    stats: dict[str, np.ndarray]
-    latents: Latents
-
-
 def run_nuts_of_sites(
     settings: NutsSettings, seed: int, density: SitesInJax, watch: Watch
-) -> SiteDraws:
-    """Draw from a model's posterior; call it in a float64 scope. See `nuts.run_nuts`."""
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], Latents]:
+    """Draws and statistics, each (chain, draw, ...); in a float64 scope. See `nuts.run_nuts`."""
     density, chain = _centred(density)
     rng = [np.random.default_rng([seed, i]) for i in range(settings.n_chains)]
     # Overdispersed starts (1.5 Laplace sd), so that R-hat means something.
@@ -278,7 +270,7 @@ def run_nuts_of_sites(
         name: np.asarray(values).reshape(*z["theta"].shape[:2], *values.shape[1:])
         for name, values in params.items()
     }
-    return SiteDraws(shaped, stats, Latents(z.get("innovations"), density.linearisation))
+    return shaped, stats, Latents(z.get("innovations"), density.linearisation)
 
 
 @jax.jit

@@ -243,8 +243,10 @@ def _sample_nuts(task: _Task) -> tuple[Draws, list[str]]:
                     model.all_effects, task.chains(batch), batch.contact_rate.shape
                 )
             density = SitesInJax.of(model, batch, task.weight, drift)
-            drawn = run_nuts_of_sites(tried, task.seed + _RETRY * retries, density, task.watch)
-        params, stats = drawn.params, _with_tree_depth(drawn.stats)
+            params, stats, latents = run_nuts_of_sites(
+                tried, task.seed + _RETRY * retries, density, task.watch
+            )
+        stats = _with_tree_depth(stats)
         complaints = complaints_of(params, stats) if task.check else []
         places = {}
         if drift is not None:
@@ -254,7 +256,7 @@ def _sample_nuts(task: _Task) -> tuple[Draws, list[str]]:
             places = {n: values.reshape(*shape, -1) for n, values in effects.items()}
             params = {n: values for n, values in params.items() if n not in drift.names}
         summary = {"retries": retries}
-        return Draws(params, stats, summary, name, drawn.latents, places), complaints
+        return Draws(params, stats, summary, name, latents, places), complaints
 
     return _retried(attempt, task)
 
@@ -269,13 +271,16 @@ def _sample_nuts_of_scores(task: _Task) -> tuple[Draws, list[str]]:
         drawn = [
             _scores_by_nuts(tried, first + i, one, task.watch) for i, one in enumerate(targets)
         ]
-        of_robots = {name: np.stack([one.stats[name] for one in drawn]) for name in drawn[0].stats}
-        stats = {name: _OVER_ROBOTS[name](values, axis=0) for name, values in of_robots.items()}
-        params = {
-            name: np.stack([one.params[name] for one in drawn], axis=2) if task.apart else values
-            for name, values in drawn[0].params.items()
+        draws, all_stats, moved = zip(*drawn, strict=True)
+        stats = {
+            name: over(np.stack([one[name] for one in all_stats]), axis=0)
+            for name, over in _OVER_ROBOTS.items()
         }
-        complaints = [moved for one in drawn for moved in one.moved]
+        params = {
+            name: np.stack([one[name] for one in draws], axis=2) if task.apart else values
+            for name, values in draws[0].items()
+        }
+        complaints = [complaint for of_robot in moved for complaint in of_robot]
         if reference:
             n = len(reference["beta0"])
             complaints = complaints_of_means(params, reference, np.full(n, 1.0 / n), 0.15)
@@ -301,15 +306,6 @@ def _draws_by_sums(task: _Task) -> dict[str, np.ndarray]:
     return {name: values.reshape(-1, *values.shape[2:]) for name, values in exact.params.items()}
 
 
-class _OfRobots(NamedTuple):
-    """Draws and statistics of robots alike, or of one, with leading axes (chain, draw)."""
-
-    params: dict[str, np.ndarray]
-    stats: dict[str, np.ndarray]
-    moved: list[str]
-    """Complaints of draws that the exact sampler's points contradict."""
-
-
 _OVER_ROBOTS: dict[str, Any] = {
     "lp": np.sum,
     "energy": np.sum,
@@ -323,8 +319,11 @@ _OVER_ROBOTS: dict[str, Any] = {
 
 def _scores_by_nuts(
     settings: NutsSettings, seed: int, target: Posterior, watch: Watch
-) -> _OfRobots:
-    """Draws of scores by NUTS, and of all else given them."""
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], list[str]]:
+    """Draws of scores by NUTS and of all else given them, and statistics, each (chain, draw, ...).
+
+    With them complaints of draws that the exact sampler's points contradict.
+    """
     z, stats, points = run_nuts_of_scores(settings, seed, target, watch)
     shape, n = z.shape[:2], z.shape[0] * z.shape[1]
     rng = np.random.default_rng([seed, 3])
@@ -333,7 +332,7 @@ def _scores_by_nuts(
     moved = []
     if points.khat <= MAX_KHAT:
         moved = complaints_of_means(params, target.scores.named(points.z), np.exp(points.log_w))
-    return _OfRobots(params, stats, moved)
+    return params, stats, moved
 
 
 def _with_tree_depth(stats: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -5,7 +5,6 @@ import numpy as np
 from trustbo.inference.evidence.ep.joint import Chains
 from trustbo.models.families import Family
 from trustbo.models.families.terms import AT_ONE, GAUSSIAN, count_tables
-from trustbo.stacking import MissionBatch
 
 
 def chains_of(
@@ -46,26 +45,3 @@ def chains_of(
         0.0,
     )
     return chains, np.stack([terms.lam, terms.eta])
-
-
-def gather_chains(
-    family: Family, batch: MissionBatch, whole: np.ndarray | None = None
-) -> tuple[Chains, np.ndarray]:
-    """Chains of a batch whose coefficients are (weights, intercept), and the sites to begin with.
-
-    Args:
-        family: Family of observations.
-        batch: Missions, padded with NaN.
-        whole: Bounds of each mission, (mission,): chains have these lengths, and those without a
-            rate are kept; by default they end at their last rate.
-    """
-    n_robots = batch.contact_rate.shape[2]
-    # One row per mission and robot: (chain, bound[, column]).
-    y = np.swapaxes(batch.contact_rate, 1, 2).reshape(-1, batch.contact_rate.shape[1])
-    n_ticks = np.swapaxes(np.broadcast_to(batch.n_ticks, batch.contact_rate.shape), 1, 2)
-    z = np.swapaxes(batch.awareness, 1, 2).reshape(*y.shape, -1)
-    u = np.concatenate([z, np.ones_like(z[..., :1])], axis=-1)
-    kept = np.arange(len(y)) if whole is not None else np.flatnonzero((~np.isnan(y)).any(1))
-    column = np.tile(np.arange(u.shape[2]), (len(kept), 1))
-    length = None if whole is None else np.repeat(whole, n_robots)
-    return chains_of(family, y[kept], n_ticks.reshape(y.shape)[kept], u[kept], column, length)

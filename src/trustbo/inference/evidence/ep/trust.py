@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from trustbo.inference.evidence.ep.chains import gather_chains
+from trustbo.inference.evidence.ep.chains import chains_of
 from trustbo.inference.evidence.ep.draws import N_CANDIDATES, draw_chain
 from trustbo.inference.evidence.ep.joint import Chains, copy, propagate, start_sites
 from trustbo.inference.evidence.kalman_numpy import TrustSummary
@@ -85,6 +85,27 @@ def sample(
     return trust
 
 
+def gather_chains(
+    family: Family, batch: MissionBatch, n_bounds: np.ndarray
+) -> tuple[Chains, np.ndarray]:
+    """Chains of a batch whose coefficients are (weights, intercept), and the sites to begin with.
+
+    Args:
+        family: Family of observations.
+        batch: Missions, padded with NaN.
+        n_bounds: Bounds of each mission, measured or not: the lengths of its chains.
+    """
+    n_robots = batch.contact_rate.shape[2]
+    # One row per mission and robot: (chain, bound[, column]).
+    y = np.swapaxes(batch.contact_rate, 1, 2).reshape(-1, batch.contact_rate.shape[1])
+    n_ticks = np.swapaxes(np.broadcast_to(batch.n_ticks, batch.contact_rate.shape), 1, 2)
+    z = np.swapaxes(batch.awareness, 1, 2).reshape(*y.shape, -1)
+    u = np.concatenate([z, np.ones_like(z[..., :1])], axis=-1)
+    column = np.tile(np.arange(u.shape[2]), (len(y), 1))
+    lengths = np.repeat(n_bounds, n_robots)
+    return chains_of(family, y, n_ticks.reshape(y.shape), u, column, lengths)
+
+
 class _Group(NamedTuple):
     """Chains of robots that share parameters, with their parameters."""
 
@@ -133,7 +154,7 @@ def _groups(
         names = ("beta0", "delta_w", "delta_v", "x0_mean", "x0_sd")
         rates = MissionBatch(*(a[:, :, members] for a in batch))
         mission, robot = (a.ravel() for a in np.indices((len(rates.contact_rate), len(members))))
-        chains, sites = gather_chains(family, rates, whole=n_bounds)
+        chains, sites = gather_chains(family, rates, n_bounds)
         robot, effects = np.asarray(members)[robot], None
         if of_bounds:
             effects = b[:, mission, :, np.minimum(robot, b.shape[3] - 1)].transpose(1, 0, 2)
