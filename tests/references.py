@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import shapely
 from scipy import special, stats
+from scipy.linalg import block_diag
 from scipy.stats import norm
 
 
@@ -357,3 +358,75 @@ def geometry_of_blob(blob):
     assert (magic, version, flags & 1) == (b"GP", 0, 1)
     doubles = {0: 0, 1: 4, 2: 6, 3: 6, 4: 8}[flags >> 1 & 7]
     return srs, shapely.from_wkb(blob[8 + 8 * doubles :])
+
+
+class DenseOfPlaces:
+    """Joint normal of all rates with effects of places, over missions, robots and bounds.
+
+    theta = beta0, noises, tau_s, length scale, tau_e.
+    """
+
+    def __init__(self, missions, place, theta, priors):
+        beta0, w, v, tau_s, ell, tau_e = theta
+        T, V, mean, U, rows = [], [], [], [], []
+        for m in missions:
+            K = len(m.bounds)
+            lag = np.subtract.outer(np.arange(K), np.arange(K))
+            t = np.where(lag >= 0, beta0 ** np.maximum(lag, 0.0), 0.0)
+            start = beta0 ** np.arange(1, K + 1)
+            cov = priors.x0_sd**2 * np.outer(start, start) + w**2 * t @ t.T + v**2 * np.eye(K)
+            for i in range(m.contact_rate.shape[1]):
+                T.append(t)
+                V.append(cov)
+                mean.append(priors.x0_mean * start)
+                U.append(np.column_stack([m.awareness[:, i], np.ones(K)]))
+                rows += [(i, a, c) for a, c in zip(m.path[:-1], m.path[1:], strict=True)]
+        self.rows, self.T = rows, block_diag(*T)
+        y = np.concatenate([m.contact_rate[:, i] for m in missions for i in range(3)])
+        self.seen, self.U = ~np.isnan(y), np.concatenate(U)
+        own = np.array([i for i, _, _ in rows]) * (not place.shared)
+        cells, before = (np.array([r[k] for r in rows]) for k in (2, 1))
+        same = own[:, None] == own[None]
+        gap = np.linalg.norm(cells[:, None] - cells[None], axis=2) * np.sqrt(3.0) / ell
+        self.K_s = place.cells * tau_s**2 * (1.0 + gap) * np.exp(-gap) * same
+        met = (cells[:, None] == cells[None]).all(2) & (before[:, None] == before[None]).all(2)
+        self.K_e = place.bounds * tau_e**2 * (met & same)
+        rest = 1.0 - beta0 if priors.stationary else 1.0
+        n = self.U.shape[1] - 1
+        self.c_mean = rest * np.append(np.broadcast_to(priors.beta.loc, n), priors.b.loc)
+        sd = rest * np.append(np.broadcast_to(priors.beta.scale, n), priors.b.scale)
+        self.c_cov = np.diag(sd**2)
+        inside = self.U @ self.c_cov @ self.U.T + self.K_s + self.K_e
+        full = block_diag(*V) + self.T @ inside @ self.T.T
+        self.cov = full[np.ix_(self.seen, self.seen)]
+        self.off = (y - np.concatenate(mean) - self.T @ self.U @ self.c_mean)[self.seen]
+
+    def log_likelihood(self):
+        return stats.multivariate_normal(cov=self.cov).logpdf(self.off)
+
+    def posterior(self, prior_cross, prior_cov, prior_mean):
+        """Moments of what has this prior covariance with T'y's argument."""
+        cross = prior_cross @ self.T.T[:, self.seen]
+        gain = np.linalg.solve(self.cov, cross.T).T
+        return prior_mean + gain @ self.off, prior_cov - gain @ cross.T
+
+
+def require_weighted(drawn, log_evidence, prior, log_weight, *, kish, nats, shift, log_ratio):
+    """Require draws and evidence to be those of draws from the prior, weighted by likelihood.
+
+    `kish` is the least effective number of the latter, `nats` the sampler's error of the evidence,
+    `shift` that of a mean, in sds, and `log_ratio` that of the log of an sd.
+    """
+    weight = np.exp(log_weight - log_weight.max())
+    effective = weight.sum() ** 2 / (weight**2).sum()
+    assert effective > kish
+    expected = special.logsumexp(log_weight) - np.log(len(weight))
+    assert abs(log_evidence - expected) < 4 / np.sqrt(effective) + nats
+    weight /= weight.sum()
+    for name, draws in drawn.items():
+        theirs = prior[name].reshape(len(weight), -1)
+        for a, b in zip(draws.reshape(len(draws), -1).T, theirs.T, strict=True):
+            mean = weight @ b
+            sd = np.sqrt(weight @ (b - mean) ** 2)
+            assert abs(a.mean() - mean) < shift * sd, name
+            assert abs(np.log(a.std() / sd)) < log_ratio, name

@@ -9,8 +9,9 @@ import numpy as np
 import numpyro.distributions as dist
 import pytest
 import xarray as xr
+from missions import walking_missions
+from references import DenseOfPlaces
 from scipy import stats
-from scipy.linalg import block_diag
 
 import trustbo as tb
 from trustbo.data import Mission
@@ -44,64 +45,8 @@ def walk(rng, n_bounds):
     return cells
 
 
-def random_missions(seed, n_missions=4, n_robots=3, gaps=True):
-    rng, missions = np.random.default_rng(seed), []
-    for _ in range(n_missions):
-        n = int(rng.integers(4, 9))
-        rates = rng.uniform(size=(n, n_robots))
-        if gaps:
-            rates[rng.uniform(size=rates.shape) < 0.2] = np.nan
-        z = rng.uniform(size=(n, n_robots, 2))
-        missions.append(Mission.from_arrays(walk(rng, n), z, rates))
-    return missions
-
-
-class Dense:
-    """Joint normal of all rates, by matrices over missions, robots and bounds."""
-
-    def __init__(self, missions, place, theta, priors):
-        beta0, w, v, tau_s, ell, tau_e = theta
-        T, V, mean, U, rows = [], [], [], [], []
-        for m in missions:
-            K = len(m.bounds)
-            lag = np.subtract.outer(np.arange(K), np.arange(K))
-            t = np.where(lag >= 0, beta0 ** np.maximum(lag, 0.0), 0.0)
-            start = beta0 ** np.arange(1, K + 1)
-            cov = priors.x0_sd**2 * np.outer(start, start) + w**2 * t @ t.T + v**2 * np.eye(K)
-            for i in range(m.contact_rate.shape[1]):
-                T.append(t)
-                V.append(cov)
-                mean.append(priors.x0_mean * start)
-                U.append(np.column_stack([m.awareness[:, i], np.ones(K)]))
-                rows += [(i, a, c) for a, c in zip(m.path[:-1], m.path[1:], strict=True)]
-        self.rows, self.T = rows, block_diag(*T)
-        y = np.concatenate([m.contact_rate[:, i] for m in missions for i in range(3)])
-        self.seen, self.U = ~np.isnan(y), np.concatenate(U)
-        own = np.array([i for i, _, _ in rows]) * (not place.shared)
-        cells, before = (np.array([r[k] for r in rows]) for k in (2, 1))
-        same = own[:, None] == own[None]
-        gap = np.linalg.norm(cells[:, None] - cells[None], axis=2) * np.sqrt(3.0) / ell
-        self.K_s = place.cells * tau_s**2 * (1.0 + gap) * np.exp(-gap) * same
-        met = (cells[:, None] == cells[None]).all(2) & (before[:, None] == before[None]).all(2)
-        self.K_e = place.bounds * tau_e**2 * (met & same)
-        rest = 1.0 - beta0 if priors.stationary else 1.0
-        n = self.U.shape[1] - 1
-        self.c_mean = rest * np.append(np.broadcast_to(priors.beta.loc, n), priors.b.loc)
-        sd = rest * np.append(np.broadcast_to(priors.beta.scale, n), priors.b.scale)
-        self.c_cov = np.diag(sd**2)
-        inside = self.U @ self.c_cov @ self.U.T + self.K_s + self.K_e
-        full = block_diag(*V) + self.T @ inside @ self.T.T
-        self.cov = full[np.ix_(self.seen, self.seen)]
-        self.off = (y - np.concatenate(mean) - self.T @ self.U @ self.c_mean)[self.seen]
-
-    def log_likelihood(self):
-        return stats.multivariate_normal(cov=self.cov).logpdf(self.off)
-
-    def posterior(self, prior_cross, prior_cov, prior_mean):
-        """Moments of what has this prior covariance with T'y's argument."""
-        cross = prior_cross @ self.T.T[:, self.seen]
-        gain = np.linalg.solve(self.cov, cross.T).T
-        return prior_mean + gain @ self.off, prior_cov - gain @ cross.T
+def random_missions(seed, n_missions=4, missing=0.2):
+    return walking_missions(seed, n_missions, n_bounds=(4, 9), missing=missing)
 
 
 NAMES = ("beta0", "delta_w", "delta_v", "tau_s", "length_scale", "tau_e")
@@ -131,7 +76,7 @@ def test_the_marginal_likelihood_is_that_of_a_dense_joint_normal(place, stationa
         target = target_of(missions, place, priors)
         rng = np.random.default_rng(seed)
         z = 0.7 * rng.standard_normal((4, target.n_scores))
-        dense = [Dense(missions, place, theta, priors) for theta in thetas(target, z)]
+        dense = [DenseOfPlaces(missions, place, theta, priors) for theta in thetas(target, z)]
         expected = scores.log_prior(z) + [each.log_likelihood() for each in dense]
         np.testing.assert_allclose(target.log_density(z), expected, rtol=1e-9)
         # No rate is at a limit: expectation propagation is exact.
@@ -170,7 +115,7 @@ def test_effects_given_hyperparameters_are_those_of_dense_conditioning(place):
     missions, n = random_missions(1), 20_000
     target = target_of(missions, place)
     z = np.array([[0.2, -0.5, 0.3, 0.4, 0.1, 0.2][: target.n_scores]])
-    dense = Dense(missions, place, thetas(target, z)[0], Priors())
+    dense = DenseOfPlaces(missions, place, thetas(target, z)[0], Priors())
     drawn, _ = target.draw(z, np.zeros(1), np.zeros(n, dtype=int), np.random.default_rng(0))
     there = visited(bounds_of(missions), place, 3, SHAPE)
     moves = {tuple(m): i for i, m in enumerate(tb.workspace.moves.MOVES[8])}
@@ -385,7 +330,7 @@ def test_the_exact_sampler_agrees_with_a_quadrature():
 
 def test_rates_within_the_limits_have_the_gaussian_effects_of_places():
     """Draws by expectation propagation and its weights, against those of the exact marginal."""
-    missions = random_missions(5, n_missions=5, gaps=False)
+    missions = random_missions(5, n_missions=5, missing=0.0)
     rng, place = np.random.default_rng(0), PlaceEffect()
     missions = [
         Mission.from_arrays(m.path, m.awareness, rng.normal(0.5, 0.1, m.contact_rate.shape))

@@ -1,78 +1,35 @@
 """Scores of predictions against joint normals written out, and against simulation."""
 
-import itertools
-
 import jax
 import numpy as np
 import pytest
-from missions import N_TICKS, OF_FAMILY, counted_missions, simulate_missions
-from references import dense_joint
+from missions import N_TICKS, OF_FAMILY, counted_missions, simulate_missions, walking_missions
+from references import DenseOfPlaces, dense_joint
 from scipy import stats
-from scipy.linalg import block_diag
 
 import trustbo as tb
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
 from trustbo.inference import fit, params_of, score
-from trustbo.models import CoupledTrust, HierarchicalTrust, PlaceEffect, PooledTrust
+from trustbo.models import CoupledTrust, HierarchicalTrust, PlaceEffect, PooledTrust, Priors
 
 SHAPE = (5, 5)
 
 
-def random_missions(seed, n_missions=4):
-    """Missions of three robots along random walks, whose rates no model has drawn."""
-    rng, missions = np.random.default_rng(seed), []
-    for _ in range(n_missions):
-        n = int(rng.integers(4, 9))
-        cells = [tuple(rng.integers(SHAPE).tolist())]
-        while len(cells) <= n:
-            cell = np.array(cells[-1]) + rng.integers(-1, 2, size=2)
-            if (cell >= 0).all() and (cell < SHAPE).all() and tuple(cell) != cells[-1]:
-                cells.append(tuple(cell.tolist()))
-        z, rates = rng.uniform(size=(n, 3, 2)), rng.uniform(size=(n, 3))
-        missions.append(Mission.from_arrays(cells, z, rates))
-    return missions
-
-
-def joint_with_places(missions, theta, x0_mean=0.5, x0_sd=0.5):
-    """Mean and covariance of all rates, (mission, robot, bound) flat, coefficients integrated out.
-
-    Priors beta ~ N(0, 1), b ~ N(0, 0.5^2); theta = beta0, noises, tau_s, length scale, tau_e.
-    """
-    beta0, w, v, tau_s, length, tau_e = theta
-    carry, noise, mean, U, bounds = [], [], [], [], []
-    for mission in missions:
-        k = np.arange(len(mission.bounds))
-        T = np.where(k[:, None] >= k, beta0 ** np.maximum(k[:, None] - k, 0), 0.0)
-        start = beta0 ** (k + 1.0)
-        for i in range(3):
-            carry.append(T)
-            noise.append(x0_sd**2 * np.outer(start, start) + w**2 * T @ T.T + v**2 * np.eye(len(k)))
-            mean.append(x0_mean * start)
-            U.append(np.column_stack([mission.awareness[:, i], 0.5 * np.ones(len(k))]))
-            bounds += itertools.pairwise(mission.path)
-    cells = np.array([entered for _, entered in bounds])
-    h = np.sqrt(3.0) * np.linalg.norm(cells[:, None] - cells, axis=2) / length
-    same = np.array([[one == other for other in bounds] for one in bounds])
-    U, T = np.concatenate(U), block_diag(*carry)
-    drift = U @ U.T + tau_s**2 * (1.0 + h) * np.exp(-h) + tau_e**2 * same
-    return np.concatenate(mean), block_diag(*noise) + T @ drift @ T.T
-
-
 def conditioned(missions, theta):
     """Mean and sd of the rates of the last mission given the others, (bound, robot)."""
-    mean, cov = joint_with_places(missions, theta)
-    y = np.concatenate([m.contact_rate.T.ravel() for m in missions])
-    n = len(y) - missions[-1].contact_rate.size
-    gain = np.linalg.solve(cov[:n, :n], cov[:n, n:]).T
-    mean, cov = mean[n:] + gain @ (y - mean)[:n], cov[n:, n:] - gain @ cov[:n, n:]
+    joint = DenseOfPlaces(missions, PlaceEffect(), theta, Priors())
+    n = len(joint.off) - missions[-1].contact_rate.size
+    gain = np.linalg.solve(joint.cov[:n, :n], joint.cov[:n, n:]).T
+    mean = missions[-1].contact_rate.T.ravel() - joint.off[n:] + gain @ joint.off[:n]
+    cov = joint.cov[n:, n:] - gain @ joint.cov[:n, n:]
     return [a.reshape(3, -1).T for a in (mean, np.sqrt(np.diag(cov)))]
 
 
 @pytest.fixture(scope="module")
 def placed():
     """Missions, the last to be predicted, a posterior of the others, and the exact prediction."""
-    missions, place = random_missions(2), PlaceEffect()
+    missions, place = walking_missions(2, n_bounds=(4, 9), missing=0.0), PlaceEffect()
     workspace = tb.Workspace.from_awareness(np.zeros((3, *SHAPE, 2)))
     posterior = fit(missions[:-1], PooledTrust(place=place), sampler="exact", workspace=workspace)
     draws = posterior["posterior"].to_dataset()
@@ -181,7 +138,7 @@ def test_pit_of_rates_that_the_model_draws_are_uniform_with_limits_of_censored_o
 
 
 def test_posteriors_of_a_campaign_predict_the_next_mission_on_bounds_seen_and_new():
-    missions = random_missions(3)
+    missions = walking_missions(3, n_bounds=(4, 9), missing=0.0)
     gap = missions[2].contact_rate.copy()
     gap[1, 0] = np.nan
     missions[2] = Mission.from_arrays(missions[2].path, missions[2].awareness, gap)

@@ -5,7 +5,7 @@ import numpy as np
 import numpyro.distributions as dist
 import pytest
 from missions import simulate_missions
-from references import pooled_posterior
+from references import pooled_posterior, require_weighted
 from scipy import special, stats
 
 from trustbo.data import Mission
@@ -81,21 +81,10 @@ def test_draws_and_evidence_are_those_of_the_weighted_prior(family):
     ]
     exact, log_evidence = sample_exactly(missions, model)
     prior, log_weight = from_the_prior(missions, family, 600_000)
-    weight = np.exp(log_weight - log_weight.max())
-    kish = weight.sum() ** 2 / (weight**2).sum()
-    assert kish > 400
-    expected = special.logsumexp(log_weight) - np.log(len(weight))
-    # The prior's average: 4 standard errors; three runs of some 400 points: 1 % each.
-    assert abs(log_evidence - expected) < 4 / np.sqrt(kish) + 0.03
-    weight /= weight.sum()
-    for name, draws in exact.items():
-        theirs = prior[name]
-        for a, b in zip(draws.reshape(6000, -1).T, theirs.reshape(len(weight), -1).T, strict=True):
-            mean = weight @ b
-            sd = np.sqrt(weight @ (b - mean) ** 2)
-            # Effective numbers of 400 and of 3 x 350: a standard error of .06 sd; 4 of it.
-            assert abs(a.mean() - mean) < 0.24 * sd, name
-            assert abs(np.log(a.std() / sd)) < 0.2, name
+    # The prior's average: 4 standard errors; three runs of some 400 points: 1 % each. Effective
+    # numbers of 400 and of 3 x 350: a standard error of .06 sd; 4 of it.
+    errors = {"kish": 400, "nats": 0.03, "shift": 0.24, "log_ratio": 0.2}
+    require_weighted(exact, log_evidence, prior, log_weight, **errors)
 
 
 def test_rates_within_the_limits_have_the_gaussian_posterior_thin_tails_included():

@@ -4,7 +4,7 @@ import numpy as np
 import numpyro.distributions as dist
 import pytest
 from missions import simulate_missions
-from references import named
+from references import named, require_weighted
 from scipy import special, stats
 from scipy.linalg import block_diag
 
@@ -158,20 +158,9 @@ def test_draws_and_evidence_are_those_of_the_weighted_prior():
     drawn = sample_scores(target_of(missions, HierarchicalTrust()), 4000, 0).draws
     assert drawn.khat < 0.5
     prior, log_weight = from_the_prior(missions, 600_000, np.random.default_rng(0))
-    weight = np.exp(log_weight - log_weight.max())
-    kish = weight.sum() ** 2 / (weight**2).sum()
-    assert kish > 1500
-    expected = special.logsumexp(log_weight) - np.log(len(weight))
-    assert abs(drawn.log_evidence - expected) < 4 / np.sqrt(kish) + 0.02
-    weight /= weight.sum()
-    for name, draws in drawn.params.items():
-        theirs = prior[name].reshape(len(weight), -1)
-        for a, b in zip(draws.reshape(4000, -1).T, theirs.T, strict=True):
-            mean = weight @ b
-            sd = np.sqrt(weight @ (b - mean) ** 2)
-            # Effective numbers above 1500 on both sides: a standard error of .036 sd; 4 of it.
-            assert abs(a.mean() - mean) < 0.15 * sd, name
-            assert abs(np.log(a.std() / sd)) < 0.12, name
+    # Effective numbers above 1500 on both sides: a standard error of .036 sd; 4 of it.
+    errors = {"kish": 1500, "nats": 0.02, "shift": 0.15, "log_ratio": 0.12}
+    require_weighted(drawn.params, drawn.log_evidence, prior, log_weight, **errors)
 
 
 def test_fit_takes_it_and_adds_trust_later():
