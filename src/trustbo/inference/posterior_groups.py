@@ -247,7 +247,7 @@ def _trust_compiled(
         few_latents = latents._replace(innovations=innovations[:, kept].reshape(shape))
     with own_settings():
         keys = random.split(random.fold_in(random.key(seed), 1))
-        moments = latent.trust_moments(conditional.family, conditional.lag, every, latents, batch)
+        mean, sd = latent.trust_moments(conditional.family, conditional.lag, every, latents, batch)
         arrays = {
             "log_likelihood": mission_log_likelihood(
                 conditional.family, conditional.lag, every, *batch, keys[0]
@@ -255,8 +255,8 @@ def _trust_compiled(
             "trust": latent.trust_draws(
                 conditional.family, conditional.lag, few, few_latents, batch, keys[1]
             ),
-            "trust_mean": moments.mean,
-            "trust_sd": moments.sd,
+            "trust_mean": mean,
+            "trust_sd": sd,
             "predicted": _predict(conditional, every, batch, np.random.default_rng([seed, 1])),
         }
         return {name: np.asarray(array) for name, array in arrays.items()}

@@ -25,13 +25,6 @@ class Latents(NamedTuple):
     """Linearisation point of the weights, see `families.family.Observed`."""
 
 
-class TrustMoments(NamedTuple):
-    """Posterior mean and standard deviation of latent trust, (mission, bound, robot)."""
-
-    mean: Array
-    sd: Array
-
-
 def trust_draws(
     family: Family, lag: float, params: Params, latents: Latents, batch: MissionBatch, key: Array
 ) -> np.ndarray:
@@ -44,8 +37,8 @@ def trust_draws(
 @partial(jax.jit, static_argnames=("family", "lag"))
 def trust_moments(
     family: Family, lag: float, params: Params, latents: Latents, batch: MissionBatch
-) -> TrustMoments:
-    """Moments of latent trust over all draws, by the law of total variance."""
+) -> tuple[Array, Array]:
+    """Mean and sd of latent trust (mission, bound, robot) over draws, by the total variance."""
     observed = Observed.of(batch.contact_rate, batch.n_ticks, latents.linearisation)  # pyright: ignore
 
     def add(carry, inputs):
@@ -58,7 +51,7 @@ def trust_moments(
     (total, total_squares), _ = lax.scan(add, (zero, zero), (params, latents.innovations))
     mean, mean_square = total / len(params.b), total_squares / len(params.b)
     sd = jnp.sqrt(jnp.maximum(mean_square - mean**2, 0.0))
-    return TrustMoments(jnp.swapaxes(mean, 0, 1), jnp.swapaxes(sd, 0, 1))
+    return jnp.swapaxes(mean, 0, 1), jnp.swapaxes(sd, 0, 1)
 
 
 @partial(jax.jit, static_argnames=("family", "lag"))
