@@ -21,7 +21,6 @@ from scipy import sparse
 
 from trustbo.errors import require_choice
 from trustbo.inference.evidence.ep import joint
-from trustbo.inference.evidence.ep.chains import chains_of
 from trustbo.inference.evidence.ep.draws import draw_weighted
 from trustbo.inference.evidence.evidence import at, repeated
 from trustbo.inference.evidence.gaussian import Gaussian, named_effects, prior_of
@@ -166,4 +165,4 @@ def _chains(slots: Slots, U: Columns, family: Family) -> tuple[joint.Chains, np.
         column[i, : len(of_chain)] = of_chain
         u[i, :, : len(of_chain)] = U[i * K : i * K + K][:, of_chain].toarray()
     n_ticks = np.full(slots.y.shape, np.nan) if slots.n_ticks is None else slots.n_ticks
-    return chains_of(family, slots.y, n_ticks, u, column)
+    return joint.chains_of(family, slots.y, n_ticks, u, column)

@@ -11,9 +11,14 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from trustbo.inference.evidence.ep.chains import chains_of
 from trustbo.inference.evidence.ep.draws import N_CANDIDATES, draw_chain
-from trustbo.inference.evidence.ep.joint import Chains, copy, propagate, start_sites
+from trustbo.inference.evidence.ep.joint import (
+    Chains,
+    chains_of,
+    copy,
+    propagate,
+    start_sites,
+)
 from trustbo.inference.evidence.kalman_numpy import TrustSummary
 from trustbo.models.families import Family
 from trustbo.models.families.terms import OPTIONS, concentration, constants, new_table, table_at
