@@ -51,8 +51,6 @@ class Weighed(NamedTuple):
     p_none: float
     effect: np.ndarray  # (candidate,), mean of d in units of contact, given the candidate
     sd: np.ndarray  # (candidate,), of d
-    largest_share: float
-    """Largest share of one draw of theta in all weights together: near 1, they are of one draw."""
     believed: Change | None
     """Change with which theta was drawn: the most probable one, if any is more probable than not;
     else None."""
@@ -253,9 +251,8 @@ def weigh(
     mean = posterior * b / rest
     effect = (share * mean).sum(0)
     sd = np.sqrt((share * (posterior / rest**2 + (mean - effect) ** 2)).sum(0))
-    largest = float(np.exp(logsumexp(log_w, axis=1).max() - total))
     change = None if believed is None else candidates.change(believed)
-    return Weighed(candidates, p[1:], float(p[0]), effect, sd, largest, change)
+    return Weighed(candidates, p[1:], float(p[0]), effect, sd, change)
 
 
 def _scanned(
