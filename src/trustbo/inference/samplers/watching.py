@@ -9,7 +9,6 @@ second half. The estimate is a rough one all the same, and the bar corrects it.
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
@@ -42,12 +41,7 @@ class Watch:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        at: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._end_stages()
 
     def stage(self, doing: str, *, slow: bool = False) -> None:
@@ -64,7 +58,7 @@ class Watch:
             self._stage.set_description_str(f"fit, after {seconds:.0f} s: {doing}")
         if self._place == FILE and seconds > LONG and not self._said:
             self._said = True
-            self._print(f"fit, after {seconds:.0f} s: {doing}")
+            say(self._place, f"fit, after {seconds:.0f} s: {doing}")
 
     def _end_stages(self) -> None:
         if self._stage is not None:
@@ -120,9 +114,10 @@ class Watch:
     def retry(self, settings: NutsSettings, complaints: Sequence[str]) -> None:
         """Print that NUTS runs again, and why."""
         more = f" and {len(complaints) - 1} more" if len(complaints) > 1 else ""
-        self._print(
+        say(
+            self._place,
             f"{self._name} again, for longer ({settings}, target_accept "
-            f"{settings.target_accept:g}): {complaints[0]}{more}."
+            f"{settings.target_accept:g}): {complaints[0]}{more}.",
         )
         self._name, self.faster = "NUTS, second run", ""
 
@@ -132,10 +127,7 @@ class Watch:
         seconds = self._seconds / self._n_steps.sum() * usual * self._of_chain
         if seconds > LONG:
             faster = f" Faster: {self.faster}." if self.faster else ""
-            self._print(f"{self._name}: {self._settings}, {about(seconds)}.{faster}")
-
-    def _print(self, line: str) -> None:
-        say(self._place, line)
+            say(self._place, f"{self._name}: {self._settings}, {about(seconds)}.{faster}")
 
 
 def about(seconds: float) -> str:
