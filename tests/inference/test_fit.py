@@ -246,20 +246,6 @@ def test_a_bad_posterior_is_refused_with_the_parameter_s_name(missions, monkeypa
     assert unchecked.attrs["retries"] == 0
 
 
-@pytest.mark.slow  # its program compiles for this alone
-def test_the_longer_run_samples_the_same_posterior(missions, posterior, monkeypatch):
-    monkeypatch.setattr(convergence, "MIN_ESS", 1e6)
-    with pytest.raises(PosteriorError) as error:
-        fit(missions, sampler="nuts")
-    longer = error.value.posterior["posterior"]
-    assert longer.sizes["draw"] == 2000
-    for name in SITES:
-        a, b = (p[name].values.reshape(-1, p[name].values[0, 0].size) for p in
-                (longer, posterior["posterior"]))  # fmt: skip
-        # ESS above 1000 in each: the difference of means has sd < 0.045 sd; 4 of these.
-        assert (np.abs(a.mean(0) - b.mean(0)) < 0.18 * b.std(0)).all(), name
-
-
 def test_params_come_out_of_the_posterior_and_go_through_its_draws(posterior):
     params = params_of(posterior)
     assert np.shape(params.beta) == (4000, 2)

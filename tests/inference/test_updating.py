@@ -97,16 +97,12 @@ def test_forgetting_is_a_weight_by_age():
     assert by_fit["constant_data"]["weight"].values.tolist() == weight[:4].tolist()
 
 
-def test_nuts_weighs_missions_as_the_exact_sampler_does():
-    missions, weights = simulate_missions(4), [0.2, 0.4, 0.7, 1.0]
-    exact = fit(missions, sampler="exact", weights=weights)["posterior"]
-    nuts = fit(missions, weights=weights)["posterior"]
-    plain = fit(missions, sampler="exact")["posterior"]
-    for name in ("beta0", "b", "delta_v"):
-        sd = float(nuts[name].std())
-        # ESS > 1500 each: 5 standard errors of a difference are 0.18 sd.
-        assert abs(float(exact[name].mean() - nuts[name].mean())) < 0.18 * sd, name
-    assert float(exact["delta_v"].std()) > 1.1 * float(plain["delta_v"].std())
+def test_missions_of_less_weight_leave_a_wider_posterior():
+    missions = simulate_missions(4)
+    weighted = fit(missions, weights=[0.2, 0.4, 0.7, 1.0])["posterior"]
+    assert float(weighted["delta_v"].std()) > 1.1 * float(
+        fit(missions)["posterior"]["delta_v"].std()
+    )
 
 
 def test_robots_with_nothing_in_common_are_so_many_pooled_fits():

@@ -64,10 +64,9 @@ def test_trust_is_that_of_dense_conditioning_where_no_rate_was_measured(with_los
             assert np.abs(off / np.outer(sd, sd)).max() < 5 * np.sqrt(2 / n)
 
 
-@pytest.mark.parametrize("sampler", ["exact", pytest.param("nuts", marks=pytest.mark.slow)])
-def test_a_posterior_knows_trust_where_no_rate_was_measured(with_losses, sampler):
+def test_a_posterior_knows_trust_where_no_rate_was_measured(with_losses):
     """The mean and variance over draws of dense conditioning given each, with one in forty."""
-    posterior = fit(with_losses, sampler=sampler)
+    posterior = fit(with_losses)
     draws = params_of(posterior)
     picked = [draws.draw(d) for d in range(0, 4000, 40)]
     latent = posterior["latent"]
