@@ -99,13 +99,7 @@ def moment_matched(params: TrustParams, priors: Priors) -> Priors:
         priors: Priors of that posterior; `x0_mean` and others that are not learned stay.
     """
     flat = params.flat()
+    names = ("beta0", "beta", "b", "delta_w", "delta_v")
     with own_settings():
-        return replace(
-            priors,
-            beta0=match_moments(flat.beta0, priors.beta0),
-            beta=match_moments(flat.beta, priors.beta),
-            b=match_moments(flat.b, priors.b),
-            delta_w=match_moments(flat.delta_w, priors.delta_w),
-            delta_v=match_moments(flat.delta_v, priors.delta_v),
-            stationary=False,
-        )
+        matched = {n: match_moments(getattr(flat, n), getattr(priors, n)) for n in names}
+        return replace(priors, **matched, stationary=False)

@@ -53,15 +53,11 @@ class LengthGram(NamedTuple):
 
     def scaled(self, factor: float) -> Self:
         """Multiply the weight of the data by a factor."""
-        return type(self)(factor * self.weight, factor * self.spectral, factor * self.corner)
+        return type(self)(*(factor * sums for sums in self))
 
     def plus(self, other: Self) -> Self:
         """Add the data of both."""
-        return type(self)(
-            self.weight + other.weight,
-            self.spectral + other.spectral,
-            self.corner + other.corner,
-        )
+        return type(self)(*(a + b for a, b in zip(self, other, strict=True)))
 
     def evaluate(self, theta: np.ndarray, x0_sd: float, lag: float) -> Quadratic:
         """The quadratic form at parameter values of shape (theta, 3)."""

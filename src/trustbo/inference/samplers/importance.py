@@ -275,19 +275,16 @@ class _Cloud:
 
     def __init__(self, target: ScoreTarget) -> None:
         self._target = target
-        self._proposals: list[Proposal] = []
-        self._z: list[np.ndarray] = []
-        self._log_p: list[np.ndarray] = []
+        self._drawn: list[tuple[Proposal, np.ndarray, np.ndarray]] = []
 
     def add(self, proposal: Proposal, n: int, seed: int) -> None:
         z = proposal.draw(n, seed)
-        self._proposals.append(proposal)
-        self._z.append(z)
-        self._log_p.append(self._target.log_density(z))
+        self._drawn.append((proposal, z, self._target.log_density(z)))
 
     def points(self) -> Points:
-        z, log_p = np.concatenate(self._z), np.concatenate(self._log_p)
-        raw = log_p - log_mixture(self._proposals, [len(drawn) for drawn in self._z], z)
+        proposals, parts, log_p = zip(*self._drawn, strict=True)
+        z, log_p = np.concatenate(parts), np.concatenate(log_p)
+        raw = log_p - log_mixture(proposals, [len(drawn) for drawn in parts], z)
         if not np.isfinite(raw).any():
             return Points(z, log_p, np.full(len(z), -np.log(len(z))), np.inf, -np.inf)
         return Points(z, log_p, *smoothed_weights(raw))
