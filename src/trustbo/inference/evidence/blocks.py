@@ -11,7 +11,7 @@ import numpy as np
 
 from trustbo.inference.evidence.block_draws import draw_blocks
 from trustbo.inference.evidence.block_sites import Given, Rows, log_evidence, moments_of, settle
-from trustbo.inference.evidence.evidence import at, repeated
+from trustbo.inference.evidence.evidence import Evidence, at, repeated
 from trustbo.models.effects.effect import Group, Slots, Theta
 from trustbo.models.effects.person import PersonColumns
 from trustbo.models.families.terms import GAUSSIAN, INTERVAL, NONE
@@ -24,7 +24,7 @@ _LEAST = 1e-4  # sd of a coefficient
 _NOISE = 1e-6
 
 
-class Blocks:
+class Blocks(Evidence):
     """Evidence by expectation propagation on blocks; exact where no report is an interval."""
 
     def __init__(

@@ -1,6 +1,6 @@
-"""The protocol of an evidence: log p(rates | theta), all but theta integrated out."""
+"""The base class of an evidence: log p(rates | theta), all but theta integrated out."""
 
-from typing import Protocol
+from abc import ABC, abstractmethod
 
 import numpy as np
 
@@ -17,24 +17,25 @@ def repeated(theta: Theta, count: np.ndarray) -> dict[str, np.ndarray]:
     return {name: np.repeat(values, count, axis=0) for name, values in theta.items()}
 
 
-class Evidence(Protocol):
+class Evidence(ABC):
     """Density of rates given hyperparameters, and draws of the coefficients given both."""
 
     exact: bool
     """Whether the density is that of the model, not an approximation to it."""
 
+    @abstractmethod
     def log_density(self, theta: Theta) -> np.ndarray:
         """Log density of the rates at each theta (point,), in nats; NaN where it is not finite."""
-        ...
 
     def recentre(self, theta: Theta) -> None:
         """Re-expand an approximate density around one theta, of a leading axis of length 1."""
-        ...
+        return
 
     def sharpen(self) -> bool:
         """Make an approximate density more accurate, at more cost; whether it could."""
-        ...
+        return False
 
+    @abstractmethod
     def draw(
         self, theta: Theta, count: np.ndarray, rng: np.random.Generator
     ) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
@@ -43,12 +44,12 @@ class Evidence(Protocol):
         With them, where the density is approximate, the log weight of each draw: its exponential
         averages to the density of the rates.
         """
-        ...
 
 
-class ColumnEvidence(Evidence, Protocol):
+class ColumnEvidence(Evidence):
     """Evidence of effects that are columns, which weighs further ones."""
 
+    @abstractmethod
     def scan(
         self, theta: Theta, columns: Columns, run: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
@@ -66,4 +67,3 @@ class ColumnEvidence(Evidence, Protocol):
                 of all later ones of its run, which may not share a chain. By default z is the
                 column.
         """
-        ...

@@ -37,7 +37,7 @@ from scipy import sparse
 from scipy.linalg.lapack import dpotrf, dtrtrs  # pyright: ignore
 
 from trustbo.errors import require_choice
-from trustbo.inference.evidence.evidence import at, repeated
+from trustbo.inference.evidence.evidence import ColumnEvidence, at, repeated
 from trustbo.inference.evidence.fading import Eliminated, Sets, eliminate, spread
 from trustbo.inference.evidence.scan import Sums, take_projections, weigh_chains
 from trustbo.models.effects.effect import (
@@ -56,7 +56,7 @@ _compiled = nb.njit(cache=True, error_model="numpy", fastmath={"reassoc", "contr
 _NUMBERS = 1e6  # kept at once, of all points of a chunk: about the cache
 
 
-class Gaussian:
+class Gaussian(ColumnEvidence):
     """Evidence of Gaussian rates; exact."""
 
     exact = True
@@ -123,13 +123,6 @@ class Gaussian:
         with np.errstate(all="ignore"):  # far out noises under- and overflow: no density there
             parts = [self._factors(at(theta, i)).log_p for i in self._chunks(n)]
         return np.concatenate([np.zeros(0), *parts])
-
-    def recentre(self, theta: Theta) -> None:
-        """No-op: the density is exact everywhere."""
-
-    def sharpen(self) -> bool:
-        """See `Evidence.sharpen`: the density is exact."""
-        return False
 
     def draw(
         self, theta: Theta, count: np.ndarray, rng: np.random.Generator

@@ -22,7 +22,7 @@ from scipy import sparse
 from trustbo.errors import require_choice
 from trustbo.inference.evidence.ep import joint
 from trustbo.inference.evidence.ep.draws import draw_weighted
-from trustbo.inference.evidence.evidence import at, repeated
+from trustbo.inference.evidence.evidence import ColumnEvidence, at, repeated
 from trustbo.inference.evidence.gaussian import Gaussian, named_effects, prior_of
 from trustbo.models.effects.effect import MEMORIES, Columns, Group, Slots, Theta, dense_root
 from trustbo.models.families import Family
@@ -34,7 +34,7 @@ _SCAN, _NOTHING = 4, 1e-12  # sweeps at each theta of a scan; precision of no ra
 _MEMORY = 4e6  # numbers of precisions at once
 
 
-class Sites:
+class Sites(ColumnEvidence):
     """Evidence by expectation propagation; draws of coefficients have weights."""
 
     exact = False
