@@ -53,11 +53,15 @@ class LengthGram(NamedTuple):
 
     def scaled(self, factor: float) -> Self:
         """Multiply the weight of the data by a factor."""
-        return type(self)(*(factor * sums for sums in self))
+        return type(self)(factor * self.weight, factor * self.spectral, factor * self.corner)
 
     def plus(self, other: Self) -> Self:
         """Add the data of both."""
-        return type(self)(*(a + b for a, b in zip(self, other, strict=True)))
+        return type(self)(
+            self.weight + other.weight,
+            self.spectral + other.spectral,
+            self.corner + other.corner,
+        )
 
     def evaluate(self, theta: np.ndarray, x0_sd: float, lag: float) -> Quadratic:
         """The quadratic form at parameter values of shape (theta, 3)."""

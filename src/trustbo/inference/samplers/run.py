@@ -191,7 +191,7 @@ _TARGETS: dict[str, Callable[[Any, MissionBatch, np.ndarray, Slots], ScoreTarget
     "coupled": lambda model, batch, weight, _: CoupledTarget(model, batch, weight),
     "people": lambda model, batch, weight, slots: PeoplePosterior(model, slots),
 }
-"""Scores and evidence of models by `TrustModel.robot_sets`; `posterior_of` all others."""
+"""Scores and evidence of models by `TrustModel.robot_sets`; `posterior_of` makes the others."""
 
 
 def summarize(posteriors: list[ExactDraws]) -> dict[str, Any]:
@@ -218,11 +218,11 @@ def join(
     Weights of robots multiply.
     """
 
-    def join(columns: list[np.ndarray]) -> np.ndarray:
-        joined = np.stack(columns, axis=1) if per_robot else columns[0]
-        return joined.reshape(*shape, *joined.shape[1:])
+    def joined(columns: list[np.ndarray]) -> np.ndarray:
+        draws = np.stack(columns, axis=1) if per_robot else columns[0]
+        return draws.reshape(*shape, *draws.shape[1:])
 
-    params = {name: join([e.params[name] for e in posteriors]) for name in posteriors[0].params}
+    params = {name: joined([e.params[name] for e in posteriors]) for name in posteriors[0].params}
     stats = {
         "lp": np.sum([e.lp for e in posteriors], axis=0).reshape(shape),
         "log_weight": np.sum([e.log_weight for e in posteriors], axis=0).reshape(shape),
