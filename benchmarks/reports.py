@@ -15,9 +15,9 @@ from scipy import stats
 import trustbo as tb
 from trustbo.errors import PosteriorError
 from trustbo.inference import expect_reports, fit_reports
-from trustbo.inference.operators import operator_model
 from trustbo.inference.people import draw_people
 from trustbo.inference.prior_predictive import draw_sites
+from trustbo.models import HumanTrust
 from trustbo.models.effects.effect import Slots
 from trustbo.stacking import stack_missions
 
@@ -59,7 +59,7 @@ def told(rates, reports=None, scale="unit", *, every=False):
 
 def from_prior(scale, rates, seed):
     """Parameters drawn from the prior, and missions with reports drawn under them."""
-    model = operator_model(scale).for_features(("success", "failure"))
+    model = HumanTrust.of_operators(scale).for_features(("success", "failure"))
     sites = draw_sites(model, (1, 2), 1, seed)
     units = [*tb.logs.reports_of(told(rates, scale=scale)).values()]
     slots = Slots.every(stack_missions(units, pad=False), len(units), model.names, None)
@@ -147,8 +147,9 @@ def ahead(n):
                     if np.isinf(levels)
                     else np.round(levels * reports[-1, -1]) / levels
                 )
-                q = next_one["quantile"].values
-                off = np.abs(q[2] - y).mean(), np.abs(next_one["last"].values - y).mean()
+                shares = [next_one["quantile"].values, next_one["last"].values]  # in [0, 1]
+                q, last = ((v - 1.0) / levels if np.isfinite(levels) else v for v in shares)
+                off = np.abs(q[2] - y).mean(), np.abs(last - y).mean()
                 inside = ((q[0] <= y + 1e-9) & (y <= q[4] + 1e-9)).mean()
                 found.append((drawn.mean() - gain.item(), drawn.std(), low <= gain.item() <= high,
                               *off, inside, seconds))  # fmt: skip

@@ -3,13 +3,15 @@
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal, Self, get_args
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from trustbo.answers import PERSON, Reports
-from trustbo.display.card import Card, Displayed, number
+from trustbo.answers import PERSON, Reports, levels_of
+from trustbo.arrays import as_array, as_names
+from trustbo.bound import NOWHERE, STATUSES, Bound, Cell
+from trustbo.display.card import Card, Displayed, joined, number
 from trustbo.display.svg import curve_picture
 from trustbo.errors import (
     ShapeError,
@@ -19,114 +21,10 @@ from trustbo.errors import (
     require_whole,
 )
 
-Cell = tuple[int, int]
-Status = Literal["ok", "stuck", "tipped", "timeout", "collision", "lost_contact", "aborted"]
-STATUSES: tuple[str, ...] = get_args(Status)
-NOWHERE: Cell = (-1, -1)
-"""Cell of a bound of a log without a map."""
 FEATURES = ("traversability", "visibility")
 """Names of the first two features, z1 and z2 of the paper."""
 LINE_OF_SIGHT = "line_of_sight"
 """Name of the predicted contact rate; `line_of_sight_1`, `_2`, ... where several are assumed."""
-_RATING = 10.0  # largest value that may be an answer on a scale from 1
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Bound(Displayed):
-    """Measurements of one bound, one row per overwatching robot.
-
-    Attributes:
-        cell: Planning cell entered, (row, col); `NOWHERE` in a log without a map.
-        awareness: Situational awareness, shape (robot, feature), in [0, 1], or of any finite values
-            in a log without a map; NaN where not measured.
-        contact_rate: Share of the running time in contact, shape (robot,); NaN where not measured.
-        duration: Running time of the bound, shape (robot,), s; NaN where not recorded.
-        status: Outcome of the bound, `"ok"` or the reason that ended the mission.
-        t0: Start of the bound, s since the mission's start.
-        poses: Shape (tick, 1 + robot, 3), the lead first: x and y in CRS metres, heading in rad
-            from east, anticlockwise. None where not recorded.
-        contact: Contact of each robot at each tick, shape (tick, robot). None where not recorded.
-        n_ticks: Number of ticks, shape (robot,), of which `contact_rate` is the share with contact;
-            NaN where not recorded.
-        states: Motion and sensing of each robot, shape (tick, robot, state): share of its speed on
-            level ground, pitch and roll (rad), mean range of returns (m), share of clear beams.
-            None where not recorded.
-
-    Raises:
-        ShapeError: The arrays disagree on the number of robots.
-        TrustboError: A value outside [0, 1], a duration that is not positive, an n_ticks below 1,
-            a rate that is not a share of the ticks, or an unknown status.
-    """
-
-    cell: Cell
-    awareness: np.ndarray
-    contact_rate: np.ndarray
-    duration: np.ndarray
-    status: str = "ok"
-    t0: float = 0.0
-    poses: np.ndarray | None = None
-    contact: np.ndarray | None = None
-    n_ticks: np.ndarray = None  # pyright: ignore[reportAssignmentType]
-    states: np.ndarray | None = None
-
-    def __post_init__(self) -> None:
-        for name, n_axes in (("awareness", 2), ("contact_rate", 1), ("duration", 1)):
-            array = as_array(name, getattr(self, name))
-            if array.ndim != n_axes:
-                axes = "(robot, feature)" if n_axes == 2 else "(robot,)"
-                raise ShapeError(f"{name} of a bound must be {axes}; got shape {array.shape}.")
-            object.__setattr__(self, name, array)
-        lengths = [len(self.awareness), len(self.contact_rate), len(self.duration)]
-        if len(set(lengths)) != 1:
-            raise ShapeError(
-                "awareness, contact_rate and duration must have one row per robot; "
-                f"got {lengths[0]}, {lengths[1]}, {lengths[2]}."
-            )
-        if not self.awareness.size:
-            raise ShapeError(
-                "a bound is of one robot and one feature at least; got awareness of shape "
-                f"{self.awareness.shape}. Without features, give one that is 0 everywhere."
-            )
-        require_choice("status", self.status, STATUSES)
-        ticks = np.full(lengths[0], np.nan) if self.n_ticks is None else self.n_ticks
-        object.__setattr__(self, "n_ticks", as_array("n_ticks", ticks))
-        mapped = self.cell != NOWHERE
-        where = f"the bound into cell {self.cell}" if mapped else "a bound of no map"
-        require_unit_interval(f"contact_rate of {where}", self.contact_rate)
-        if mapped:
-            require_unit_interval(f"awareness of {where}", self.awareness)
-        elif np.isinf(self.awareness).any():
-            raise TrustboError(f"awareness of {where} must be finite, or NaN where not measured.")
-        if (self.duration <= 0).any():
-            robot = int(np.argmax(self.duration <= 0))
-            raise TrustboError(f"duration[{robot}] = {self.duration[robot]:g} s must be positive.")
-        require_shares(self.contact_rate, self.n_ticks)
-
-    @property
-    def contact_time(self) -> np.ndarray:
-        """Time in contact with the lead, shape (robot,), s."""
-        return self.contact_rate * self.duration
-
-    @property
-    def t1(self) -> float:
-        """End of the bound, s since the mission's start."""
-        return self.t0 + float(np.nanmax(self.duration, initial=0.0))
-
-    def _card(self) -> Card:
-        return Card(
-            f"Bound into cell {self.cell}: {self.status}"
-            if self.cell != NOWHERE
-            else f"Bound of no map: {self.status}",
-            [
-                ("contact rate", np.array2string(self.contact_rate, precision=2)),
-                ("duration", f"{np.array2string(self.duration, precision=1)} s"),
-                ("begins", number(self.t0, "s", 4)),
-            ],
-            sections={
-                f"awareness of robot {i + 1}": [("features", np.array2string(z, precision=2))]
-                for i, z in enumerate(self.awareness)
-            },
-        )
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -143,11 +41,13 @@ class Mission(Displayed):
         posts: Planned places of the robots while the lead ran each bound of the path, shape
             (bound, robot, 2), x and y in CRS metres; None where they are those of the workspace.
         reports: Trust in each robot that a person reported, see `with_reports`; None without.
+        scale: Scale of the reports of a person that `contact_rate` holds in place of contact, such
+            as `"likert7"`, in missions of `logs.read_reports`; empty in all others.
 
     Raises:
         ShapeError: Bounds that do not fit the path, or disagree on robots or features; posts or
             reports of another shape.
-        TrustboError: An unknown status, or posts that are not finite.
+        TrustboError: An unknown status or scale, or posts that are not finite.
     """
 
     path: tuple[Cell, ...]
@@ -157,9 +57,12 @@ class Mission(Displayed):
     robots: tuple[str, ...] = ()
     posts: np.ndarray | None = None
     reports: Reports | None = None
+    scale: str = ""
 
     def __post_init__(self) -> None:
         require_choice("status", self.status, STATUSES)
+        if self.scale:
+            levels_of(self.scale)
         (self._require_path if self.path else self._require_no_map)()
         shapes = {bound.awareness.shape for bound in self.bounds}
         if len(shapes) != 1:
@@ -222,6 +125,14 @@ class Mission(Displayed):
     def _card(self) -> Card:
         rates = self.contact_rate
         measured = np.isfinite(rates)
+        if self.scale:
+            rows = [
+                ("trust reported", f"{measured.sum()} times, scale {self.scale}"),
+                ("steps", str(len(self.bounds))),
+                ("tasks", joined(self.robots)),
+                ("inputs", joined(self.features)),
+            ]
+            return Card("Reports of a person", rows)
         mean = f"{np.nanmean(rates):.3f}" if measured.any() else "not measured"
         took = self.bounds[-1].t1
         ends = f"{path_text(self.path[:1])} to {path_text(self.path[-1:])}"
@@ -517,17 +428,6 @@ def _require_none_after(last: int, what: str, values: np.ndarray) -> None:
         )
 
 
-def as_names(what: str, given: Iterable[str]) -> tuple[str, ...]:
-    """Names as a tuple; TrustboError where one is no text, or repeated."""
-    listed = isinstance(given, Iterable) and not isinstance(given, str)
-    names = tuple(given) if listed else ()
-    if not listed or not all(isinstance(name, str) for name in names):
-        raise TrustboError(f"{what} must be a list of names; got {given!r:.60}.")
-    if len(set(names)) < len(names):
-        raise TrustboError(f"{what} must be distinct names; got {names}.")
-    return names
-
-
 def _per_robot(what: str, values: ArrayLike | None, shape: tuple[int, ...]) -> np.ndarray:
     """Values per (bound, robot), from values per (bound, robot), per bound, or None."""
     array = as_array(what, np.nan if values is None else values)
@@ -537,36 +437,3 @@ def _per_robot(what: str, values: ArrayLike | None, shape: tuple[int, ...]) -> n
         return np.broadcast_to(array, shape)
     except ValueError:
         raise ShapeError(f"{what} must be {shape}; got {array.shape}.") from None
-
-
-def as_array(what: str, values: ArrayLike) -> np.ndarray:
-    """Return an array of floats; ShapeError if these are no numbers."""
-    try:
-        return np.asarray(values, dtype=float)
-    except (TypeError, ValueError):
-        raise ShapeError(f"{what} must be an array of numbers; got {values!r}.") from None
-
-
-def require_shares(rate: np.ndarray, ticks: np.ndarray) -> None:
-    """Refuse ticks that are not whole, and rates that are not a share of them; both (robot,)."""
-    if ticks.shape != rate.shape:
-        raise ShapeError(f"n_ticks of a bound must be {rate.shape}; got shape {ticks.shape}.")
-    for i in np.flatnonzero((ticks < 1.0) | (ticks != np.round(ticks)) & ~np.isnan(ticks)):
-        raise TrustboError(f"n_ticks[{i}] = {ticks[i]:g} must be a whole number of ticks.")
-    off = np.abs(rate * ticks - np.round(rate * ticks)) > 1e-6 * ticks
-    for i in np.flatnonzero(off):
-        raise TrustboError(
-            f"contact_rate[{i}] = {rate[i]:g} is no share of {ticks[i]:g} ticks (n_ticks)."
-        )
-
-
-def require_unit_interval(what: str, values: np.ndarray) -> None:
-    """Refuse values outside [0, 1], except NaN: TrustboError."""
-    bad = (values < 0.0) | (values > 1.0)
-    if bad.any():
-        index = ", ".join(str(i) for i in np.argwhere(bad)[0])
-        rating = (
-            "; rating from 1 to n? (rating - 1) / (n - 1)" if np.nanmax(values) <= _RATING else ""
-        )
-        hint = f" (percent? divide by 100{rating})" if np.nanmin(values) >= 0.0 else ""
-        raise TrustboError(f"{what}: [{index}] = {values[bad][0]:g} is outside [0, 1]{hint}.")

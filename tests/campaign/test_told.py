@@ -639,5 +639,5 @@ def test_reports_are_expected_along_the_recommended_path(workspace, tmp_path):
     from trustbo.report.summary import _reported
     from trustbo.report.tables import reports_table
 
-    assert [row[2] for row in reports_table(result).rows] == ["0.833", "\N{EN DASH}", "\N{EN DASH}"]
+    assert [row[2] for row in reports_table(result).rows] == ["6.00", "\N{EN DASH}", "\N{EN DASH}"]
     assert "3 reports by ann." in _reported(result).text

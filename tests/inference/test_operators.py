@@ -104,6 +104,12 @@ def test_the_gain_of_a_simulated_operator_is_found(posterior):
     assert abs(float(posterior["posterior"]["beta0"].mean()) - 0.8) < 0.1
 
 
+def test_memory_is_weighed_of_reports_as_of_contact(posterior, missions):
+    found = tb.inference.memory(posterior)
+    assert tb.inference.memory(posterior, missions) == found
+    assert found.p_none < 0.05  # beta0 is .8
+
+
 @pytest.mark.parametrize("memory", ["deviation", "level"])
 def test_expected_reports_are_those_of_the_dense_conditional_normal(memory):
     """At one draw of what persons share, repeated: own parts and trust given the reports."""
@@ -152,6 +158,9 @@ def test_levels_have_probabilities_and_robots_without_reports_too(missions):
     assert found["probability"].sizes == {"answer": 7, "person": 1, "bound": 5, "robot": 2}
     np.testing.assert_allclose(found["probability"].sum("answer"), 1.0)
     assert np.isnan(found["last"].sel(robot="r2", person="ann"))
+    assert found["last"].sel(robot="r1", person="ann") == told[-1].reports.answers[-1, 0]
+    mean = found["probability"].dot(found["answer"])  # answers are 1 to 7
+    np.testing.assert_allclose(found["mean"], mean.transpose(*found["mean"].dims), atol=1e-6)
     wide = found["quantile"].isel(level=-1) - found["quantile"].isel(level=0)
     assert (wide.sel(robot="r2") > wide.sel(robot="r1")).all()  # of which nothing is known
     same = expect_reports(tree, told, rates)

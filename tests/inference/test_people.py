@@ -1,5 +1,6 @@
 """HumanTrust: dense references, effects found, predictions, likelihoods of persons, refusals."""
 
+import dataclasses
 import itertools
 from dataclasses import replace
 
@@ -230,6 +231,10 @@ def test_predictions_are_conditional_frequencies(posterior):
 
 def test_own_reports_help_and_reports_may_come_at_the_end_only(persons, posterior):
     with_own = predict_reports(posterior, persons)
+    answers = np.array([1.0 + 6.0 * mission.contact_rate for mission in persons])
+    np.testing.assert_allclose(with_own["report"], answers)  # on the scale that was answered
+    mean = with_own["probability"].dot(with_own["answer"])
+    np.testing.assert_allclose(with_own["mean"], mean, atol=1e-6)  # answers have six places
     without = predict_reports(posterior, persons, given="none")
     assert with_own.attrs["mae"] < without.attrs["mae"]
     assert with_own.attrs["mean_log_score"] > without.attrs["mean_log_score"]
@@ -241,7 +246,9 @@ def test_own_reports_help_and_reports_may_come_at_the_end_only(persons, posterio
         y[:-1] = np.nan
         late.append(tb.Mission.from_arrays(None, mission.awareness, y, n_ticks=mission.n_ticks,
                                            features=FEATURES))  # fmt: skip
-    tree = fit(late, HumanTrust(scale="likert7"), progress=False)
+    late = [dataclasses.replace(mission, scale="likert7") for mission in late]
+    tree = fit(late, progress=False)  # of `HumanTrust`, as these are reports
+    assert (tree.attrs["model"], tree.attrs["scale"]) == ("HumanTrust", "likert7")
     assert np.isfinite(tree["latent"]["trust_mean"].values).all()
     gains = tree["posterior"]["beta"].mean(("chain", "draw")).values
     assert gains[0] > gains[1]
@@ -312,6 +319,8 @@ def test_the_model_refuses_what_it_is_not_for(posterior, persons):
         fit(persons, HumanTrust(), progress=False, whole=False)
     with pytest.raises(TrustboError, match="criticise is of robots' contact; of reports"):
         tb.criticise(posterior, persons)
+    with pytest.raises(TrustboError, match="this posterior is of reports of people, whose trust"):
+        tb.inference.changes(posterior)
     with pytest.raises(TrustboError, match=r"compare_people: got HumanTrust .*models by name"):
         compare_people(persons, HumanTrust())
     with pytest.raises(TrustboError, match=r"for reports use trustbo\.inference\.predict_reports"):

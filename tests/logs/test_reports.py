@@ -1,11 +1,20 @@
 """Tables of people's reports: what they become, and one line for each that is odd."""
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
 
 from trustbo.errors import TrustboError
-from trustbo.logs import read_azevedo_sa, read_du, read_reports, read_soh
+from trustbo.logs import (
+    read_azevedo_sa,
+    read_du,
+    read_missions,
+    read_reports,
+    read_soh,
+    write_missions,
+)
 
 GOOD = {
     "person": ["ann", "ann", "ann", "bob", "bob"],
@@ -45,6 +54,24 @@ def test_a_person_is_a_mission_and_outcomes_are_inputs(tmp_path):
     (first, _) = read_reports(np.asarray(records), inputs=["load"])
     assert first.features == ("load",)
     assert np.isnan(first.n_ticks).all()
+
+
+def test_missions_keep_that_they_are_reports_and_show_it(tmp_path):
+    people = read(table())
+    assert [one.scale for one in people] == ["likert7", "likert7"]
+    assert "Reports of a person" in repr(people[0])
+    assert "contact" not in repr(people[0])
+    write_missions(tmp_path / "people.nc", people)
+    assert [one.scale for one in read_missions(tmp_path / "people.nc")] == ["likert7", "likert7"]
+    with pytest.raises(TrustboError, match='scale must be "unit"'):
+        replace(people[0], scale="stars")
+
+
+def test_an_input_of_another_unit_is_refused_with_the_row():
+    good = table(age=[0.2, 0.2, 0.2, -1.1, -1.1])
+    assert read(good, inputs=["age"])[1].awareness[0, 0, -1] == -1.1
+    with pytest.raises(TrustboError, match=r"row 4: age = 61 is beyond 10; .*centre and scale"):
+        read(table(age=[9, 9, 9, 61, 61]), inputs=["age"])
 
 
 def test_tasks_are_rows_with_what_was_seen_at_the_step():

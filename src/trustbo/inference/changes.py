@@ -6,7 +6,6 @@ a large one, which inflates the noises and hides: once a change is more probable
 drawn again with the column of the most probable one, and every weight is relative to it.
 """
 
-import json
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -17,21 +16,19 @@ from scipy.special import logsumexp
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError, require_whole
+from trustbo.inference.draws import is_of_people
 from trustbo.inference.evidence.evidence import ColumnEvidence, at
-from trustbo.inference.fit import places_of
-from trustbo.inference.posterior_tree import missions_of, require_posterior
+from trustbo.inference.fit_data import FitData
+from trustbo.inference.posterior_tree import require_posterior
 from trustbo.inference.samplers.importance import sample_scores
 from trustbo.inference.samplers.posterior import evidence_of, posterior_of
 from trustbo.inference.samplers.student import proposal_of
 from trustbo.models.effects.change import KINDS, Candidates, Change
-from trustbo.models.effects.effect import Slots, Theta, rest_of
+from trustbo.models.effects.effect import Theta, rest_of
 from trustbo.models.model import TrustModel
 from trustbo.models.place import PlaceEffect
 from trustbo.models.pooled import PooledTrust
-from trustbo.models.record import model_from_record
-from trustbo.models.ticks import weigh_ticks
 from trustbo.parallel import one_blas_thread
-from trustbo.stacking import stack_missions
 from trustbo.workspace import Workspace
 
 ALARM = 0.9  # probability of a change
@@ -148,36 +145,25 @@ def scan_posterior(
     """Weigh the changes of `changes`."""
     seed = require_whole("seed", seed, 0)
     attrs = require_posterior("changes", posterior).attrs
-    if missions is None and "constant_data" not in posterior.children:
+    if is_of_people(posterior):
         raise TrustboError(
-            "this posterior holds parameters alone: give the missions it was fitted to, such as "
-            "changes(result.posteriors[-1], result.missions)."
+            "changes are of robots' contact, and this posterior is of reports of people, whose "
+            "trust moves by the gains beta and each person's; give one of the robots' missions."
         )
-    missions = missions_of(posterior) if missions is None else list(missions)
-    missions = missions if workspace is None else [workspace.fill(m) for m in missions]
-    n_fitted = len(missions)
+    data = FitData.of("changes", posterior, missions, workspace, model)
+    model, n_given, n_fitted = data.model, len(data.missions), len(data.missions)
     if "constant_data" in posterior.children:
         n_fitted = posterior["constant_data"].sizes["mission"]
     elif "missions" in attrs:
         n_fitted = len(np.atleast_1d(attrs["missions"]))
-    if len(missions) != n_fitted:
+    if n_given != n_fitted:
         raise TrustboError(
-            f"the posterior is of {n_fitted} missions; got {len(missions)}. Give those that it was "
+            f"the posterior is of {n_fitted} missions; got {n_given}. Give those that it was "
             'fitted to, of a campaign those of posterior.attrs["missions"].'
         )
-    features = missions[0].features
-    if model is None:
-        model = model_from_record(json.loads(attrs["model_record"]), features=features)
-    model = model.observing(attrs["observation"])
     if reason := why_no_changes(model):
         raise TrustboError(f"{reason} Fit the missions with PooledTrust().")
-    batch = stack_missions(missions)
-    weight = np.ones(len(batch.contact_rate))
-    weight[: len(missions)] = np.atleast_1d(attrs.get("weights", 1.0))
-    model = model.for_features(features).at_resolution(weigh_ticks(batch, weight))
-    place = PlaceEffect() if model.place is None else model.place
-    places = places_of(missions, batch, place, workspace)
-    slots = Slots.of(batch, len(missions), features, weight, places)
+    slots = data.slots(PlaceEffect() if model.place is None else model.place, workspace)
     names = "beta0", "delta_w", "delta_v", *(name for e in model.all_effects for name in e.names)
 
     def draw_theta(change: Change | None) -> Theta:

@@ -7,7 +7,9 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from trustbo.data import Cell, as_array, require_shares, require_unit_interval
+from trustbo.arrays import as_array, require_unit_interval
+from trustbo.bound import require_shares
+from trustbo.data import Cell
 from trustbo.errors import (
     ShapeError,
     TrustboError,

@@ -9,7 +9,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from trustbo.data import Mission, as_array
+from trustbo.arrays import as_array
+from trustbo.data import Mission
 from trustbo.display.bars import place_of
 from trustbo.errors import PosteriorError, ShapeError, TrustboError, require_kind, require_whole
 from trustbo.inference.place_maps import place_group
@@ -31,6 +32,7 @@ from trustbo.models.backend import VERSIONS
 from trustbo.models.effects.effect import Slots
 from trustbo.models.families import AUTO
 from trustbo.models.model import TrustModel, require_model
+from trustbo.models.people import HumanTrust
 from trustbo.models.place import PlaceEffect, Visited, bounds_of, visited
 from trustbo.models.pooled import PooledTrust
 from trustbo.models.record import model_to_record
@@ -64,7 +66,8 @@ def fit(
 
     Args:
         missions: All missions to learn from; contact rates that are NaN were not measured.
-        model: Trust model; by default `PooledTrust()`.
+        model: Trust model; by default `PooledTrust()`, and `HumanTrust` of their scale where the
+            missions are reports of people, as of `logs.read_reports`.
         sampler: `"auto"`: the exact sampler where it applies, else NUTS; the posterior's
             attributes record which, and why. `"exact"`: near-independent draws by importance
             sampling, without compiling, for robots that share their parameters, have nothing in
@@ -116,7 +119,8 @@ def fit(
             seed is no whole number, or a setting of NUTS is given and the sampler is another.
         PosteriorError: The diagnostics are beyond their limits.
     """
-    model = PooledTrust() if model is None else model
+    missions = _filled(missions, workspace)
+    model = default_model(missions) if model is None else model
     require_model(model)
     given = {"warmup": warmup, "draws": draws, "n_chains": n_chains}
     care = {"target_accept": target_accept, "max_tree_depth": max_tree_depth}
@@ -124,7 +128,6 @@ def fit(
     seed = require_whole("seed", seed, 0)
     if earlier is not None:
         require_posterior("earlier=", earlier)
-    missions = _filled(missions, workspace)
     batch = stack_missions(missions)
     asked = model
     model, family_reason = _of_rates(asked, batch, weighted=weights is not None)
@@ -191,6 +194,12 @@ def fit(
             posterior = complete(posterior, missions, model=model, latents=sampled.latents)
     posterior.attrs["seconds"] = time.perf_counter() - started
     return _require_sound(posterior, complaints)
+
+
+def default_model(missions: Sequence[Mission]) -> TrustModel:
+    """`HumanTrust` of reports that people gave, `PooledTrust` of contact."""
+    scale = missions[0].scale
+    return HumanTrust(scale=scale) if scale else PooledTrust()
 
 
 def _filled(missions: Sequence[Mission], workspace: Workspace | None) -> list[Mission]:

@@ -5,7 +5,6 @@ the model is the log Bayes factor. Both are means of importance weights. The den
 under its posterior and prior, whose ratio is the same factor, is not estimated well by draws there.
 """
 
-import json
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -15,19 +14,17 @@ from scipy.special import expit
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError, require_whole
-from trustbo.inference.posterior_tree import missions_of, require_posterior
+from trustbo.inference.draws import is_of_people
+from trustbo.inference.fit_data import FitData
+from trustbo.inference.posterior_tree import require_posterior
 from trustbo.inference.samplers.choice import resolve_sampler
 from trustbo.inference.samplers.importance import sample_scores
 from trustbo.inference.samplers.people import PeoplePosterior
 from trustbo.inference.samplers.posterior import posterior_of
-from trustbo.models.effects.effect import Slots
+from trustbo.logs.reports import reports_of
 from trustbo.models.model import TrustModel
 from trustbo.models.people import HumanTrust
-from trustbo.models.place import bounds_of, visited
 from trustbo.models.pooled import PooledTrust
-from trustbo.models.record import model_from_record
-from trustbo.models.ticks import weigh_ticks
-from trustbo.stacking import stack_missions
 from trustbo.workspace import Workspace
 
 _N_DRAWS = 400
@@ -74,7 +71,8 @@ def memory(
     Args:
         posterior: Posterior of `PooledTrust`, with any effects, or of `HumanTrust`, by the exact
             sampler.
-        missions: Missions that it was fitted to; by default those it holds.
+        missions: Missions that it was fitted to, or those of a campaign whose reports it is of; by
+            default those it holds.
         workspace: Workspace of the missions, to fill in awareness that they lack, as for `fit`.
         model: Model of the posterior; needed with custom priors.
         seed: Seed of the draws without memory.
@@ -89,32 +87,17 @@ def memory(
     """
     seed = require_whole("seed", seed, 0)
     attrs = require_posterior("memory", posterior).attrs
-    if missions is None and "constant_data" not in posterior.children:
-        raise TrustboError(
-            "this posterior holds parameters alone: give the missions it was fitted to, such as "
-            "memory(result.posteriors[-1], result.missions)."
-        )
-    missions = missions_of(posterior) if missions is None else list(missions)
-    missions = missions if workspace is None else [workspace.fill(m) for m in missions]
-    features = missions[0].features
-    if model is None:
-        model = model_from_record(json.loads(attrs["model_record"]), features=features)
-    model = model.observing(attrs["observation"])
+    if missions is not None and is_of_people(posterior) and any(m.reports for m in missions):
+        missions = [*reports_of(missions).values()]
+    data = FitData.of("memory", posterior, missions, workspace, model)
+    model = data.model
     exact = isinstance(model, PooledTrust) and "log_evidence" in attrs and not model.lag
     if not exact or resolve_sampler(model, "auto")[0] != "exact":
         raise TrustboError(
             "memory is weighed under PooledTrust for rates of trust, by the exact sampler; got "
             f'{model.describe()} by "{attrs.get("sampler")}".'
         )
-    batch = stack_missions(missions)
-    weight = np.ones(len(batch.contact_rate))
-    weight[: len(missions)] = np.atleast_1d(attrs.get("weights", 1.0))
-    model = model.for_features(features).at_resolution(weigh_ticks(batch, weight))
-    places = None
-    if model.place is not None:
-        bounds = bounds_of(missions, batch.contact_rate.shape[:2])
-        places = visited(bounds, model.place, batch.contact_rate.shape[2])
-    slots = Slots.of(batch, len(missions), features, weight, places)
+    slots = data.slots(model.place)
     if isinstance(model, HumanTrust):
         target = PeoplePosterior(model, slots, carries=False)
     else:

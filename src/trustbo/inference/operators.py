@@ -2,14 +2,14 @@
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import replace
 
 import numpy as np
-import numpyro.distributions as dist
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from trustbo.data import Mission, as_array, require_unit_interval
+from trustbo.answers import answer_of
+from trustbo.arrays import as_array, require_unit_interval
+from trustbo.data import Mission
 from trustbo.errors import PosteriorError, ShapeError, TrustboError, require_whole
 from trustbo.inference.draws import is_of_people, sites_of
 from trustbo.inference.fit import fit
@@ -17,13 +17,9 @@ from trustbo.inference.people import QUANTILES, draws_of, every_slot, model_of_p
 from trustbo.inference.posterior_tree import require_posterior
 from trustbo.inference.samplers.people import evidence_of
 from trustbo.logs.reports import OUTCOMES, reports_of, scale_of
-from trustbo.models.backend import own_settings
-from trustbo.models.effects.person import PersonEffect
 from trustbo.models.people import HumanTrust
 from trustbo.stacking import stack_missions
 
-_GAINS = 0.15
-"""Sd of the gains of a bound; those of a person are partially pooled around them by .1."""
 _RETRIES = 2
 _N_DRAWS = 1000
 _PARTICLES = 8  # of trust after the last bound
@@ -36,8 +32,8 @@ def fit_reports(
 
     Reports depend on the missions through measured contact alone: the joint posterior of robots and
     persons is that of contact times this one, and so are their evidences. Each person's trust in
-    each robot is a mission of `operator_model`, see `logs.reports_of`; start, level and gains are
-    partially pooled over all of these.
+    each robot is a mission of `HumanTrust.of_operators`, see `logs.reports_of`; start, level and
+    gains are partially pooled over all of these.
 
     Args:
         missions: Missions of one team, in order, see `Mission.with_reports`.
@@ -51,20 +47,12 @@ def fit_reports(
         TrustboError: No mission has reports, or they are on different scales.
         PosteriorError: The diagnostics are beyond their limits.
     """
-    model = operator_model(scale_of(missions))
+    model = HumanTrust.of_operators(scale_of(missions))
     units = [*reports_of(missions).values()]
     for shift in range(_RETRIES):  # as in campaigns
         with suppress(PosteriorError):
             return fit(units, model, seed=seed + shift, progress=progress, whole=False)
     return fit(units, model, seed=seed + _RETRIES, progress=progress, whole=False)
-
-
-def operator_model(scale: str = "unit") -> HumanTrust:
-    """`HumanTrust` with gains of half the size: outcomes are bounds, which come by the dozen."""
-    model = HumanTrust(scale=scale, effects=(PersonEffect(tau_gain=0.1),))
-    with own_settings():
-        gains = dist.Normal(0.0, _GAINS)
-    return replace(model, priors=replace(model.priors, beta=gains))
 
 
 def expect_reports(
@@ -81,8 +69,8 @@ def expect_reports(
 
     Returns:
         Dataset over (person, bound, robot), bound 0 being before the mission: `mean` and `quantile`
-        (also over `level`) of the report in [0, 1], the `last` that was given, (person, robot), and
-        with levels the `probability` of each `answer`.
+        (also over `level`) of the report on the scale that was answered, such as 1 to 7, the `last`
+        that was given, (person, robot), and with levels the `probability` of each `answer`.
 
     Raises:
         ShapeError: Contact of another shape.
@@ -110,18 +98,19 @@ def expect_reports(
     shape = len(people), len(robots)
     by_person = reports.reshape(*reports.shape[:2], *shape).transpose(0, 2, 1, 3)
     dims, levels = ("person", "bound", "robot"), model.levels.levels
+    by_person = answer_of(by_person, levels)
     variables = {
         "mean": (dims, by_person.mean(0)),
         "quantile": (("level", *dims), np.quantile(by_person, QUANTILES, axis=0)),
-        "last": (("person", "robot"), last.reshape(shape)),
+        "last": (("person", "robot"), answer_of(last.reshape(shape), levels)),
     }
     coords = {"person": people, "robot": list(robots), "level": list(QUANTILES)}
     coords["bound"] = list(range(reports.shape[1]))
     if levels:
-        answers = np.round(by_person * (levels - 1)) == np.arange(levels)[:, None, None, None, None]
-        variables["probability"] = (("answer", *dims), answers.mean(1))
         coords["answer"] = list(range(1, levels + 1))
-    return xr.Dataset(variables, coords)
+        answered = [(np.round(by_person) == answer).mean(0) for answer in coords["answer"]]
+        variables["probability"] = (("answer", *dims), np.array(answered))
+    return xr.Dataset(variables, coords, {"scale": model.scale})
 
 
 def _drawn(

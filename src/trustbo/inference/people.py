@@ -8,6 +8,7 @@ import numpy as np
 import xarray as xr
 from scipy import special
 
+from trustbo.answers import answer_of
 from trustbo.data import Mission
 from trustbo.errors import TrustboError, require_choice, require_whole
 from trustbo.inference.draws import effects_of, is_of_people, sites_of, theta_of, values_of
@@ -181,10 +182,11 @@ def predict_reports(
         seed: Seed of the draws.
 
     Returns:
-        Dataset over (mission, bound, robot): `report`, its `mean`, `quantile` (also over `level`),
-        `log_score`, nats, of the report's mass (on the unit scale its density, but at 0 and 1 its
-        mass), and with levels the `probability` of each `answer`. Attributes: the mean absolute
-        error `mae` of medians, `mean_log_score`, and `coverage_90` of central intervals.
+        Dataset over (mission, bound, robot): `report`, its `mean` and `quantile` (also over
+        `level`), on the scale that was answered, such as 1 to 7; `log_score`, nats, of the report's
+        mass (on the unit scale its density, but at 0 and 1 its mass), and with levels the
+        `probability` of each `answer`. Attributes: the mean absolute error `mae` of medians, the
+        `mean_log_score`, and `coverage_90` of central intervals.
 
     Raises:
         TrustboError: No posterior of `HumanTrust`; missions of other inputs, or of another scale.
@@ -224,7 +226,9 @@ def predict_reports(
     ended = np.arange(shape[1]) >= np.array([len(m.bounds) for m in missions])[:, None]
     for values in out.values():
         values[ended] = np.nan
-    return _dataset(batch.contact_rate, out, scale, missions[0].robots)
+    for name in ("mean", "quantile"):
+        out[name] = answer_of(out[name], scale.levels)
+    return _dataset(answer_of(batch.contact_rate, scale.levels), out, scale, missions[0].robots)
 
 
 def _of_person(

@@ -43,7 +43,7 @@ def compare_people(
 
     Returns:
         Table with a row for each method: the mean absolute error `mae`, of medians, the root mean
-        square error `rmse`, of means, both in the unit [0, 1] of reports, the mean `log_score`
+        square error `rmse`, of means, both on the scale that was answered, the mean `log_score`
         (nats a report; of its level, or density), `coverage_90`, and the number `n` of reports.
 
     Raises:
@@ -146,7 +146,8 @@ def _normal(y: np.ndarray, steps: np.ndarray, mean: np.ndarray, sd: float) -> _S
     density = -0.5 * ((y - mean) / sd) ** 2 - np.log(sd * np.sqrt(2.0 * np.pi))
     log_score = np.where(np.isnan(steps), density, np.log(np.maximum(mass, 1e-12)))
     within = np.abs(y - mean) <= 1.6449 * sd + np.nan_to_num(half)
-    return _Scored(y, mean, mean, log_score, within)
+    unit = np.nan_to_num(steps, nan=1.0)
+    return _Scored(unit * y, unit * mean, unit * mean, log_score, within)
 
 
 def _of_model(

@@ -10,7 +10,8 @@ from jax import Array, random
 from numpy.typing import ArrayLike
 from numpyro import handlers
 
-from trustbo.data import as_array, default_features
+from trustbo.arrays import as_array
+from trustbo.data import default_features
 from trustbo.errors import ShapeError, TrustboError, require_whole
 from trustbo.models.backend import in_batches, own_settings
 from trustbo.models.model import TrustModel, require_model

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
-from trustbo.data import as_array, as_names
+from trustbo.arrays import as_array, as_names
 from trustbo.display.card import Card, Displayed, joined, number
 from trustbo.errors import ShapeError, TrustboError, require_not_negative, require_positive
 from trustbo.files import FilePath

@@ -193,6 +193,8 @@ def _table(missions: Sequence[Mission]) -> xr.Dataset:
         status[j, :n] = [bound.status for bound in mission.bounds]
     dims = ("mission", "bound", "robot")
     own: dict[str, Any] = _reports(missions, n_steps)
+    if any(mission.scale for mission in missions):
+        own["scale"] = (dims[:1], [mission.scale for mission in missions])
     if not np.isnan(posts).all():
         own["posts"] = ((*dims, "xy"), posts, {"units": "m"})
     return xr.Dataset(
@@ -247,7 +249,8 @@ def _mission(table: dict[str, np.ndarray], j: int, ticks: xr.Dataset | None) -> 
     if "report" in table and (person := str(table["report_by"][j])):
         values, scale = table["report"][j, : len(bounds) + 1], str(table["report_scale"][j])
         reports = Reports(values, person, scale)
-    return Mission(path, tuple(bounds), str(table["status"][j]), features, robots, own, reports)
+    status, scale = str(table["status"][j]), str(table["scale"][j]) if "scale" in table else ""
+    return Mission(path, tuple(bounds), status, features, robots, own, reports, scale)
 
 
 def _ticks_of(ticks: xr.Dataset | None, k: int) -> tuple[np.ndarray | None, ...]:

@@ -6,6 +6,7 @@ in [0, 1]. Inputs of a step become features: what the person saw since the repor
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from os import PathLike
 from typing import Any, NamedTuple
 
@@ -20,6 +21,7 @@ from trustbo.stacking import require_same_team
 _YES = {"1", "1.0", "true", "yes", "success", "succeeded", "ok"}
 _NO = {"0", "0.0", "false", "no", "failure", "failed", "fail"}
 _TASK = "report"
+_LARGEST = 10.0  # input, in units of an outcome
 OUTCOMES = ("success", "failure")
 """Features of what a robot did."""
 
@@ -66,7 +68,8 @@ def read_reports(
             success at what is hard, and failure at what is easy.
         task: Column of the task that the report is about. Each becomes a row of the mission, its
             features `task_...` being 1; rows of one step are about different tasks.
-        inputs: Columns of further features, numbers.
+        inputs: Columns of further features, numbers of size 1, as the prior of their weights is
+            that of an outcome: centre and scale columns of other units.
         scale: `"unit"`, reports in [0, 1]; `"likert7"` (or `"ordinal7"`), whole numbers 1 to 7.
 
     Returns:
@@ -75,7 +78,8 @@ def read_reports(
 
     Raises:
         TrustboError: A missing file or column, a repeated row, a value of the wrong kind or off the
-            scale, a person without reports, or no outcome and no input at all.
+            scale, an input of values beyond 10, a person without reports, or no outcome and no
+            input at all.
     """
     columns = columns_of(table)
     levels = levels_of(scale)
@@ -116,7 +120,7 @@ def read_reports(
         tasks[about] = None
         steps[about] = _row(i + 1, text, named, inputs, levels)
     return [
-        _mission(who, steps, tuple(tasks), named, inputs, levels) for who, steps in people.items()
+        _mission(who, steps, tuple(tasks), named, inputs, scale) for who, steps in people.items()
     ]
 
 
@@ -139,7 +143,7 @@ def reports_of(missions: Sequence[Mission]) -> dict[tuple[str, str], Mission]:
         TrustboError: No mission has reports, or they are on different scales.
     """
     require_same_team(missions)
-    levels, who = levels_of(scale_of(missions)), _persons(missions)
+    scale, who = scale_of(missions), _persons(missions)
     found = {}
     for person in dict.fromkeys(who):
         seen = [m for m, name in zip(missions, who, strict=True) if name == person]
@@ -147,11 +151,8 @@ def reports_of(missions: Sequence[Mission]) -> dict[tuple[str, str], Mission]:
         rates = [np.pad(m.contact_rate, ((1, 0), (0, 0)), constant_values=np.nan) for m in seen]
         rate = np.concatenate(rates)
         z = np.nan_to_num(np.stack([rate, 1.0 - rate], axis=-1))
-        ticks = np.full((len(y), 1), levels - 1.0 if levels else np.nan)
         for i, robot in enumerate(missions[0].robots):
-            found[person, robot] = Mission.from_arrays(
-                None, z[:, [i]], y[:, [i]], n_ticks=ticks, features=OUTCOMES, robots=(_TASK,)
-            )
+            found[person, robot] = _reported(z[:, [i]], y[:, [i]], OUTCOMES, (_TASK,), scale)
     return found
 
 
@@ -255,7 +256,7 @@ def read_soh(file: str | PathLike[str]) -> list[Mission]:
             same = float((tasks[r] > 6) == (tasks[0] > 6))
             z[1, r, 12:14] = succeeded
             z[1, r, 14:] = same * np.array(succeeded)
-        missions.append(_made(f"person {i + 1}", z, y, features, tuple("ABCDE"), 7))
+        missions.append(_reported(z, y, features, tuple("ABCDE"), "likert7"))
     if not missions:
         raise TrustboError("the table has no rows.")
     return missions
@@ -326,9 +327,14 @@ def _row(
     if not 0.0 <= d <= 1.0:
         raise TrustboError(f"{where}: {demand} = {text[str(demand)]!r} must be in [0, 1].")
     given = tuple(number_of(where, name, text[name]) for name in inputs)
-    if any(map(math.isnan, given)):
-        blank = inputs[[math.isnan(v) for v in given].index(True)]
-        raise TrustboError(f"{where}: {blank} is blank; an input must be known at each step.")
+    for name, value in zip(inputs, given, strict=True):
+        if math.isnan(value):
+            raise TrustboError(f"{where}: {name} is blank; an input must be known at each step.")
+        if abs(value) > _LARGEST:
+            raise TrustboError(
+                f"{where}: {name} = {value:g} is beyond {_LARGEST:g}; inputs are of size 1: "
+                "centre and scale the column, such as (column - column.mean()) / column.std()."
+            )
     report = str(named["report"])
     return _Row(line, _report(where, report, text[report], levels), success, failure, d, given)
 
@@ -339,7 +345,7 @@ def _mission(
     tasks: tuple[str, ...],
     named: Mapping[str, str | None],
     inputs: Sequence[str],
-    levels: int,
+    scale: str,
 ) -> Mission:
     features = [f"task_{name}" for name in tasks] if named["task"] else []
     features += OUTCOMES if named["outcome"] else []
@@ -358,20 +364,23 @@ def _mission(
                 values += [row.success * row.demand, row.failure * (1.0 - row.demand)]
             z[k, r] = [*values, *row.inputs]
     names = tasks if named["task"] else (_TASK,)
-    return _made(f"person {who}", z, y, tuple(features), names, levels)
-
-
-def _made(
-    who: str, z: np.ndarray, y: np.ndarray, features: Sequence[str], tasks: Sequence[str], n: int
-) -> Mission:
-    """Mission of a person."""
     if np.isnan(y).all():
-        raise TrustboError(f"{who} has no report; leave out the rows of this person.")
-    ticks = np.full(y.shape, n - 1.0 if n else np.nan)
+        raise TrustboError(f"person {who} has no report; leave out the rows of this person.")
     try:
-        return Mission.from_arrays(None, z, y, n_ticks=ticks, features=features, robots=tasks)
+        return _reported(z, y, features, names, scale)
     except TrustboError as error:
-        raise TrustboError(f"{who}: {error}") from None
+        raise TrustboError(f"person {who}: {error}") from None
+
+
+def _reported(
+    z: np.ndarray, y: np.ndarray, features: Sequence[str], tasks: Sequence[str], scale: str
+) -> Mission:
+    """Mission of reports y (step, task) of a person, under inputs z (step, task, input)."""
+    levels = levels_of(scale)
+    made = Mission.from_arrays(
+        None, z, y, n_ticks=levels - 1.0 if levels else None, features=features, robots=tasks
+    )
+    return replace(made, scale=scale)
 
 
 def _report(where: str, name: str, text: str, levels: int) -> float:

@@ -141,15 +141,9 @@ def join_missions(missions: Sequence[Mission]) -> Mission:
                     f"{path[-1]}; only missions that continue each other are joined."
                 )
             path += mission.path[1:]
-        bounds += [_later(bound, start) for bound in mission.bounds]
+        bounds += [replace(bound, t0=bound.t0 + start) for bound in mission.bounds]
         start = bounds[-1].t1
-    last = missions[-1].status
-    return Mission(tuple(path), tuple(bounds), last, first.features, first.robots)
-
-
-def _later(bound: Bound, start: float) -> Bound:
-    """The bound, begun `start` seconds later."""
-    return replace(bound, t0=bound.t0 + start)
+    return replace(first, path=tuple(path), bounds=tuple(bounds), status=missions[-1].status)
 
 
 def _mission(

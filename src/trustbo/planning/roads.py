@@ -16,7 +16,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from trustbo.data import Mission, as_names
+from trustbo.arrays import as_names
+from trustbo.data import Mission
 from trustbo.display.card import Card, Displayed
 from trustbo.errors import TrustboError, require_choice, require_kind
 from trustbo.models.families import FAMILIES

@@ -91,8 +91,9 @@ def reports_table(result: Result) -> Table:
                 )
             )  # fmt: skip
     return Table(
-        "Trust in each robot that persons last reported, from 0 to 1, the report to be expected "
-        "after the recommended path, with its 90 % band, and trust by contact at its end.",
+        "Trust in each robot that persons last reported, on their scale "
+        f"({expected.attrs['scale']}), the report to be expected after the recommended path, with "
+        "its 90 % band, and trust by contact at its end, from 0 to 1.",
         ("person", "robot", "last report", "report after the path", "trust by contact"),
         rows,
         text_columns=(1,),

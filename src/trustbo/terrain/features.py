@@ -8,7 +8,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 from scipy import ndimage
 
-from trustbo.data import as_array
+from trustbo.arrays import as_array
 from trustbo.errors import ShapeError, TerrainError, require_whole
 from trustbo.terrain import fan, rays, stencil
 from trustbo.terrain.dataset import pixel_size

@@ -7,7 +7,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from trustbo.data import as_array
+from trustbo.arrays import as_array
 from trustbo.errors import ShapeError, TrustboError
 from trustbo.parallel import in_order
 from trustbo.team import Team
