@@ -20,7 +20,7 @@ from trustbo.errors import TrustboError
 from trustbo.inference.draws import effects_of, is_of_people, memory_of
 from trustbo.models.effects.robot import RobotEffect
 from trustbo.models.params import CoupledParams, Params, assemble_params
-from trustbo.models.place import PlaceEffect, Visited, bounds_of, correlation, visited
+from trustbo.models.place import PlaceEffect, Visited, correlation, places_of
 from trustbo.stacking import MissionBatch, stack_missions
 
 MOST_RATES = 2000
@@ -89,9 +89,7 @@ def gather(missions: Sequence[Mission], place: PlaceEffect | None, unit: float =
             f"{len(seen)} rates are more than the {MOST_RATES} that criticise takes; give the last "
             "missions that hold so many, missions=missions[-n:]."
         )
-    places = None
-    if place is not None:
-        places = visited(bounds_of(missions), place, n_robots)
+    places = places_of(missions, place, batch.contact_rate.shape)
     sight = tuple(m for m, name in enumerate(missions[0].features) if is_line_of_sight(name))
     y = rates[seen]
     return Data(batch, n_bounds, slots, seen, y, y, places, sight, unit)

@@ -33,7 +33,7 @@ from trustbo.models.effects.effect import Slots
 from trustbo.models.families import AUTO
 from trustbo.models.model import TrustModel, require_model
 from trustbo.models.people import HumanTrust
-from trustbo.models.place import PlaceEffect, Visited, bounds_of, visited
+from trustbo.models.place import places_of
 from trustbo.models.pooled import PooledTrust
 from trustbo.models.record import model_to_record
 from trustbo.models.ticks import TickWeights, require_ticks, resolution, weigh_ticks
@@ -131,7 +131,8 @@ def fit(
     batch = stack_missions(missions)
     asked = model
     model, family_reason = _of_rates(asked, batch, weighted=weights is not None)
-    places = places_of(missions, batch, model.place, workspace)
+    grid = None if workspace is None else workspace.passable.shape
+    places = places_of(missions, model.place, batch.contact_rate.shape, grid)
     require_ticks(model.family, batch)
     weight = _weights(weights, model, batch, len(missions))
     ticks = _weigh_rates(batch, weight)
@@ -247,20 +248,6 @@ def _of_rates(model: TrustModel, batch: MissionBatch, *, weighted: bool) -> tupl
     if weighted and model.observation == AUTO:
         return model.observing("gaussian"), "missions have weights"
     return model.for_rates(batch)
-
-
-def places_of(
-    missions: Sequence[Mission],
-    batch: MissionBatch,
-    place: PlaceEffect | None,
-    workspace: Workspace | None = None,
-) -> Visited | None:
-    """Places of missions, where they have effects; of a workspace, over its whole grid."""
-    if place is None:
-        return None
-    shape = None if workspace is None else workspace.passable.shape
-    bounds = bounds_of(missions, batch.contact_rate.shape[:2])
-    return visited(bounds, place, batch.contact_rate.shape[2], shape)  # pyright: ignore
 
 
 def _weigh_rates(batch: MissionBatch, weight: np.ndarray) -> TickWeights:

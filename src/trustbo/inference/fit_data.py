@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -12,7 +12,7 @@ from trustbo.errors import TrustboError
 from trustbo.inference.posterior_tree import missions_of
 from trustbo.models.effects.effect import Slots
 from trustbo.models.model import TrustModel
-from trustbo.models.place import PlaceEffect, bounds_of, visited
+from trustbo.models.place import PlaceEffect, places_of
 from trustbo.models.record import model_from_record
 from trustbo.models.ticks import weigh_ticks
 from trustbo.stacking import MissionBatch, stack_missions
@@ -58,10 +58,7 @@ class FitData(NamedTuple):
 
     def slots(self, place: PlaceEffect | None, workspace: Workspace | None = None) -> Slots:
         """Rates by chain, with the places that a model with effects of `place` has."""
-        shape, places = self.batch.contact_rate.shape, None
-        if place is not None:
-            grid = None if workspace is None else workspace.passable.shape
-            bounds = bounds_of(self.missions, shape[:2])
-            places = visited(bounds, place, shape[2], grid)  # pyright: ignore
+        grid: Any = None if workspace is None else workspace.passable.shape
+        places = places_of(self.missions, place, self.batch.contact_rate.shape, grid)
         features = self.missions[0].features
         return Slots.of(self.batch, len(self.missions), features, self.weight, places)

@@ -15,7 +15,7 @@ import numpy as np
 import xarray as xr
 
 from trustbo.inference.draws import params_of, sites_of, theta_of
-from trustbo.inference.fit import fit, places_of
+from trustbo.inference.fit import fit
 from trustbo.inference.posterior_tree import missions_of
 from trustbo.inference.samplers.posterior import evidence_of
 from trustbo.inference.samplers.weights import smoothed_weights
@@ -57,7 +57,7 @@ def by_hyperparameters(posterior: xr.DataTree, model: TrustModel) -> list[LeftOu
         return None
     missions, weight = missions_of(posterior), weights_of(posterior)
     batch = stack_missions(missions, pad=False)
-    places = places_of(missions, batch, model.place)
+    places = places_of(missions, model.place, batch.contact_rate.shape)
     sites, names = sites_of(posterior), ("beta0", "delta_w", "delta_v", *model.effect_dims)
     points = np.column_stack([sites[name] for name in names])
     points, index = np.unique(points, axis=0, return_inverse=True)

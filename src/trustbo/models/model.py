@@ -20,9 +20,10 @@ from trustbo.models.backend import own_settings
 from trustbo.models.effects.effect import Effect, Slots, rest_of
 from trustbo.models.effects.place import Place
 from trustbo.models.effects.sampled import SampledDrift
+from trustbo.models.exactness import why_no_statistics, why_not_exact
 from trustbo.models.families import AUTO, FAMILIES, Family, choose, family_of
 from trustbo.models.params import Params, assemble_params, check_params
-from trustbo.models.place import PlaceEffect, bounds_of, visited
+from trustbo.models.place import PlaceEffect, bounds_of, places_of
 from trustbo.models.priors import Priors
 from trustbo.models.priors_numpy import draw
 from trustbo.models.state_space.contact_rate import ContactRate, mission_log_likelihood
@@ -31,28 +32,6 @@ from trustbo.models.ticks import broadcast_ticks, require_ticks, resolution, wei
 from trustbo.stacking import MissionBatch, stack_missions
 
 RESPONSES = ("level", "change")
-_REFUSED: tuple[tuple[tuple[str, ...], set[str], str], ...] = (
-    (
-        ("drift",),
-        {"not Gaussian"},
-        "its drift is a function of your own, and its observations are not Gaussian",
-    ),
-    (
-        ("coupled",),
-        {"not Gaussian"},
-        "its robots influence each other, and its observations are not Gaussian",
-    ),
-    ((), {"not propagated"}, "expectation propagation does not know its observations"),
-    (("other",), set(), "its robots share some parameters only, or influence each other"),
-    (
-        ("all", "each", "pooled"),
-        {"not Gaussian", "changes"},
-        "it measures changes of trust, and its observations are not Gaussian",
-    ),
-    (("each",), {"places"}, "it has effects of places, and robots with nothing else in common"),
-    ((), {"effects", "changes"}, "it has effects of {0}, and rates measure changes"),
-)
-"""Models without an evidence: their `robot_sets`, () for any, what they have, and the reason."""
 _STREAM = 0x6D697373  # of `simulate`, among all that a seed gives
 
 
@@ -273,6 +252,7 @@ class TrustModel(Displayed, ABC):
         contact_rate: Array | None = None,
         *,
         n_ticks: Array | None = None,
+        drift: Callable[[Any], Array] | None = None,
     ) -> None:
         """The numpyro model.
 
@@ -280,8 +260,24 @@ class TrustModel(Displayed, ABC):
             awareness: Shape (mission, bound, robot, feature).
             contact_rate: Shape (mission, bound, robot), NaN where not measured; None draws it.
             n_ticks: Ticks, of that shape; the beta-binomial family needs them.
+            drift: Function of parameters, to what effects add to the drift, of that shape.
         """
-        self._program(awareness, contact_rate, n_ticks)
+        n_missions, n_bounds, n_robots, n_features = awareness.shape
+        params, innovations = self.sample_params(n_robots, n_features), None
+        if drift is not None:
+            params: Any = params._replace(b=params.b + drift(params))  # pyright: ignore
+        if not self.family.integrates_out:
+            innovations = sample_innovations((n_bounds, n_missions, n_robots))
+        rates = ContactRate(
+            params,
+            awareness,
+            n_ticks=n_ticks,
+            innovations=innovations,
+            observation=self.observation,
+            lag=self.lag,
+        )
+        with numpyro.plate("mission", n_missions):
+            numpyro.sample("contact_rate", rates, obs=contact_rate)
 
     def numpyro_model(self, missions: Sequence[Mission]) -> Callable[[], None]:
         """The numpyro model of missions, as a function without arguments.
@@ -303,49 +299,11 @@ class TrustModel(Displayed, ABC):
         require_ticks(model.family, batch)
         drift, shape = None, batch.contact_rate.shape
         if model.place is not None or model.effects:
-            places = None
-            if model.place is not None:
-                places = visited(bounds_of(missions, shape[:2]), model.place, shape[2])
+            places = places_of(missions, model.place, shape)
             slots = Slots.of(batch, len(missions), missions[0].features, places=places)
             drift = SampledDrift(model.all_effects, slots, shape, model.memory)
-        return partial(model._program, *batch, drift=drift)
-
-    def _program(
-        self,
-        awareness: Array,
-        contact_rate: Array | None,
-        n_ticks: Array | None,
-        *,
-        drift: Callable[[Any], Array] | None = None,
-    ) -> None:
-        """Sample statements; `drift`, of parameters, adds the effects."""
-        n_missions, n_bounds, n_robots, n_features = awareness.shape
-        params, innovations = self.sample_params(n_robots, n_features), None
-        if drift is not None:
-            params: Any = params._replace(b=params.b + drift(params))  # pyright: ignore
-        if not self.family.integrates_out:
-            innovations = sample_innovations((n_bounds, n_missions, n_robots))
-        self.sample_rates(params, awareness, contact_rate, n_ticks, innovations)
-
-    def sample_rates(
-        self,
-        params: Params,
-        awareness: Array,
-        contact_rate: Array | None = None,
-        n_ticks: Array | None = None,
-        innovations: Array | None = None,
-    ) -> None:
-        """Sample statement of the contact rates given parameters."""
-        rates = ContactRate(
-            params,
-            awareness,
-            n_ticks=n_ticks,
-            innovations=innovations,
-            observation=self.observation,
-            lag=self.lag,
-        )
-        with numpyro.plate("mission", len(awareness)):
-            numpyro.sample("contact_rate", rates, obs=contact_rate)
+        rates: Any = batch.awareness, batch.contact_rate
+        return partial(model, *rates, n_ticks=batch.n_ticks, drift=drift)
 
     def log_likelihood(
         self, params: Params, missions: Sequence[Mission], *, seed: int = 0
@@ -412,34 +370,13 @@ class TrustModel(Displayed, ABC):
 
     @property
     def why_no_statistics(self) -> str | None:
-        """Reason why no sufficient statistics of fixed size exist; None if they do.
-
-        They exist for Gaussian observations, common or separate parameters of robots, and no
-        effects of places.
-        """
-        if not self.family.integrates_out:
-            return "its observations are not Gaussian"
-        if self.why_not_exact or self.place or self.effects:
-            return self.why_not_exact or f"{self._effects[0]} have effects"
-        if self.robot_sets not in ("all", "each"):
-            return "its robots share some parameters only, or influence each other"
-        return None if self.memory == "level" else "what lasts is a deviation of trust"
+        """Reason why no sufficient statistics of fixed size exist; None if they do."""
+        return why_no_statistics(self)
 
     @property
     def why_not_exact(self) -> str | None:
         """Reason why the exact sampler cannot treat the model; None if it can."""
-        family, sets = self.family, self.robot_sets
-        traits = {
-            "not Gaussian": not family.integrates_out,
-            "not propagated": not (family.integrates_out or family.propagates),
-            "changes": bool(self.lag),
-            "places": self.place is not None,
-            "effects": bool(self.effects),
-        }
-        mine = {name for name, has in traits.items() if has}
-        reasons = (why for of, what, why in _REFUSED if sets in (of or (sets,)) and what <= mine)
-        reason = next(reasons, None)
-        return reason and reason.format(*self._effects)
+        return why_not_exact(self)
 
     def _card(self) -> Card:
         rows = [
@@ -464,16 +401,17 @@ class TrustModel(Displayed, ABC):
             for name, value in self.options().items()
             if name not in ("observation", "parameters") and value != usual.get(name)
         ]
-        return ", ".join([type(self).__name__, *self._effects, self.observation, *others])
+        return ", ".join([type(self).__name__, *self.nouns, self.observation, *others])
 
     @property
     def named_with_effects(self) -> str:
         """Name of the class, and what has effects."""
-        effects = " and ".join(self._effects)
+        effects = " and ".join(self.nouns)
         return type(self).__name__ + (f" with {effects}" if effects else "")
 
     @property
-    def _effects(self) -> list[str]:
+    def nouns(self) -> list[str]:
+        """Plural of what has effects."""
         return ["places"] * (self.place is not None) + [e.noun for e in self.effects]
 
     def describe(self) -> str:

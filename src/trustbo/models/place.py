@@ -145,6 +145,21 @@ def bounds_of(missions: Sequence[Mission], shape: tuple[int, int] | None = None)
     return bounds
 
 
+def places_of(
+    missions: Sequence[Mission],
+    place: PlaceEffect | None,
+    shape: tuple[int, ...],
+    grid: tuple[int, int] | None = None,
+) -> Visited | None:
+    """Places of missions, see `visited`; None where these have no effects.
+
+    `shape` is that of the rates, (mission, bound, robot), with the padding.
+    """
+    if place is None:
+        return None
+    return visited(bounds_of(missions, shape[:2]), place, shape[2], grid)  # pyright: ignore
+
+
 def visited(
     bounds: np.ndarray,
     place: PlaceEffect,

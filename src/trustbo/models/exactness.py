@@ -1,0 +1,60 @@
+"""Reasons why a model has no exact evidence, or no sufficient statistics."""
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from trustbo.models.model import TrustModel
+
+_REFUSED: tuple[tuple[tuple[str, ...], set[str], str], ...] = (
+    (
+        ("drift",),
+        {"not Gaussian"},
+        "its drift is a function of your own, and its observations are not Gaussian",
+    ),
+    (
+        ("coupled",),
+        {"not Gaussian"},
+        "its robots influence each other, and its observations are not Gaussian",
+    ),
+    ((), {"not propagated"}, "expectation propagation does not know its observations"),
+    (("other",), set(), "its robots share some parameters only, or influence each other"),
+    (
+        ("all", "each", "pooled"),
+        {"not Gaussian", "changes"},
+        "it measures changes of trust, and its observations are not Gaussian",
+    ),
+    (("each",), {"places"}, "it has effects of places, and robots with nothing else in common"),
+    ((), {"effects", "changes"}, "it has effects of {0}, and rates measure changes"),
+)
+"""Models without an evidence: their `robot_sets`, () for any, what they have, and the reason."""
+
+
+def why_not_exact(model: "TrustModel") -> str | None:
+    """Reason why the exact sampler cannot treat a model; None if it can."""
+    family, sets = model.family, model.robot_sets
+    traits = {
+        "not Gaussian": not family.integrates_out,
+        "not propagated": not (family.integrates_out or family.propagates),
+        "changes": bool(model.lag),
+        "places": model.place is not None,
+        "effects": bool(model.effects),
+    }
+    mine = {name for name, has in traits.items() if has}
+    reasons = (why for of, what, why in _REFUSED if sets in (of or (sets,)) and what <= mine)
+    reason = next(reasons, None)
+    return reason and reason.format(*model.nouns)
+
+
+def why_no_statistics(model: "TrustModel") -> str | None:
+    """Reason why no sufficient statistics of fixed size exist; None if they do.
+
+    They exist for Gaussian observations, common or separate parameters of robots, and no effects of
+    places.
+    """
+    if not model.family.integrates_out:
+        return "its observations are not Gaussian"
+    if model.why_not_exact or model.place or model.effects:
+        return model.why_not_exact or f"{model.nouns[0]} have effects"
+    if model.robot_sets not in ("all", "each"):
+        return "its robots share some parameters only, or influence each other"
+    return None if model.memory == "level" else "what lasts is a deviation of trust"
