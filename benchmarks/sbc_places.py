@@ -10,8 +10,9 @@ from trustbo.inference.prior_predictive import draw_sites
 from trustbo.inference.samplers.run import Draws
 from trustbo.inference.sbc import with_effects_drawn
 from trustbo.models.backend import own_settings
+from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.model import TrustModel
-from trustbo.models.place import PlaceEffect, Visited, visited
+from trustbo.models.place import Visited, visited
 from trustbo.stacking import MissionBatch
 from trustbo.workspace.moves import MOVES
 

@@ -16,7 +16,6 @@ from trustbo.inference.samplers.scores import Scores
 from trustbo.models import HierarchicalTrust, PlaceEffect, PooledTrust, Priors
 from trustbo.models.effects.change import SDS, Candidates, Change
 from trustbo.models.effects.effect import Slots
-from trustbo.models.effects.place import Place
 from trustbo.models.effects.robot import RobotEffect
 from trustbo.models.effects.weights import Weights
 from trustbo.models.place import bounds_of, visited
@@ -64,7 +63,9 @@ def changing_missions(seed, change=None, n_missions=11):
 
 def slots_of(missions):
     batch = stack_missions(missions)
-    places = visited(bounds_of(missions, batch.contact_rate.shape[:2]), Place(), 3, (SIDE, SIDE))
+    places = visited(
+        bounds_of(missions, batch.contact_rate.shape[:2]), PlaceEffect(), 3, (SIDE, SIDE)
+    )
     return Slots.of(batch, len(missions), FEATURES, None, places)
 
 
@@ -74,7 +75,7 @@ def evidence_of(slots, effects):
 
 def search(missions, further=()):
     """Changes found in missions."""
-    slots, effects = slots_of(missions), [Weights(PRIORS), Place(), *further]
+    slots, effects = slots_of(missions), [Weights(PRIORS), PlaceEffect(), *further]
 
     def draw_theta(change):
         some = effects if change is None else [*effects, change]
@@ -91,13 +92,13 @@ def search(missions, further=()):
 
 def random_theta(n, seed=0):
     rng = np.random.default_rng(seed)
-    theta = {"beta0": rng.uniform(0.1, 0.5, n)} | Place().scales(rng.standard_normal((n, 3)))
+    theta = {"beta0": rng.uniform(0.1, 0.5, n)} | PlaceEffect().scales(rng.standard_normal((n, 3)))
     theta |= {name: rng.uniform(0.03, 0.1, n) for name in ("delta_w", "delta_v")}
     return theta | {"rest": 1.0 - theta["beta0"]}
 
 
 def test_probabilities_are_in_proportion_to_prior_odds_and_evidences():
-    slots, effects = slots_of(changing_missions(0, n_missions=5)), [Weights(PRIORS), Place()]
+    slots, effects = slots_of(changing_missions(0, n_missions=5)), [Weights(PRIORS), PlaceEffect()]
     candidates, theta, evidence = Candidates.of(slots), random_theta(1), evidence_of(slots, effects)
     n = len(candidates.first)
     without = evidence.log_density(theta)[0]
@@ -116,7 +117,7 @@ def test_probabilities_are_in_proportion_to_prior_odds_and_evidences():
 
 @pytest.mark.parametrize("n", [4, 20])  # all draws weigh every candidate, or the first 4 of 20
 def test_weights_relative_to_a_change_are_means_of_ratios(n):
-    slots, effects = slots_of(changing_missions(0, n_missions=5)), [Weights(PRIORS), Place()]
+    slots, effects = slots_of(changing_missions(0, n_missions=5)), [Weights(PRIORS), PlaceEffect()]
     candidates, theta, evidence = Candidates.of(slots), random_theta(n), evidence_of(slots, effects)
     a, b = evidence.scan(theta, candidates.columns, candidates.run)
     a, b = a[:, candidates.first], b[:, candidates.first]
@@ -135,7 +136,10 @@ def test_weights_relative_to_a_change_are_means_of_ratios(n):
 
 
 def test_the_size_of_a_change_is_that_of_its_coefficient():
-    slots, effects = slots_of(changing_missions(1, PLANTED["robot"])), [Weights(PRIORS), Place()]
+    slots, effects = (
+        slots_of(changing_missions(1, PLANTED["robot"])),
+        [Weights(PRIORS), PlaceEffect()],
+    )
     candidates, theta = Candidates.of(slots), random_theta(1)
     weighed = weigh(evidence_of(slots, effects), theta, candidates)
     change = weighed.candidates.change(weighed.best)

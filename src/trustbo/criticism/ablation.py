@@ -16,8 +16,8 @@ from trustbo.errors import TrustboError
 from trustbo.inference.fit import fit
 from trustbo.inference.loo import loo
 from trustbo.inference.posterior_groups import complete
+from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.model import TrustModel
-from trustbo.models.place import PlaceEffect
 from trustbo.models.priors import Priors
 from trustbo.models.record import model_from_record
 

@@ -13,8 +13,9 @@ import numpy as np
 from trustbo.criticism.joint_normal import Data, Normal, Point
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
+from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.params import CoupledParams
-from trustbo.models.place import PlaceEffect, bounds_of, correlation, visited
+from trustbo.models.place import bounds_of, correlation, visited
 
 _LENGTH_SCALE = 2.0  # cells, the default of PlaceEffect
 _MEMORY = 0.7  # correlation of successive bounds, and of successive missions

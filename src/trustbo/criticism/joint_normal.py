@@ -18,9 +18,10 @@ from scipy.linalg import solve_triangular
 from trustbo.data import Mission, is_line_of_sight
 from trustbo.errors import TrustboError
 from trustbo.inference.draws import effects_of, is_of_people, memory_of
+from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.effects.robot import RobotEffect
 from trustbo.models.params import CoupledParams, Params, assemble_params
-from trustbo.models.place import PlaceEffect, Visited, correlation, places_of
+from trustbo.models.place import Visited, correlation, places_of
 from trustbo.stacking import MissionBatch, stack_missions
 
 MOST_RATES = 2000

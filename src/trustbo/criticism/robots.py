@@ -22,9 +22,10 @@ from trustbo.errors import TrustboError
 from trustbo.inference.changes import ALARM, changes
 from trustbo.inference.fit import fit
 from trustbo.models.effects.change import Change
+from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.effects.robot import RobotEffect
 from trustbo.models.families import FAMILIES
-from trustbo.models.place import PlaceEffect, bounds_of
+from trustbo.models.place import bounds_of
 from trustbo.models.pooled import PooledTrust
 
 SIZE = 0.1  # effect from which on a plan may change, in units of stationary trust

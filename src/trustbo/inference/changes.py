@@ -25,8 +25,8 @@ from trustbo.inference.samplers.posterior import evidence_of, posterior_of
 from trustbo.inference.samplers.student import proposal_of
 from trustbo.models.effects.change import KINDS, Candidates, Change
 from trustbo.models.effects.effect import Theta, rest_of
+from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.model import TrustModel
-from trustbo.models.place import PlaceEffect
 from trustbo.models.pooled import PooledTrust
 from trustbo.parallel import one_blas_thread
 from trustbo.workspace import Workspace

@@ -11,8 +11,9 @@ from trustbo.data import Mission
 from trustbo.errors import TrustboError
 from trustbo.inference.posterior_tree import missions_of
 from trustbo.models.effects.effect import Slots
+from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.model import TrustModel
-from trustbo.models.place import PlaceEffect, places_of
+from trustbo.models.place import places_of
 from trustbo.models.record import model_from_record
 from trustbo.models.ticks import weigh_ticks
 from trustbo.stacking import MissionBatch, stack_missions

@@ -21,6 +21,7 @@ from trustbo.inference.samplers.posterior import evidence_of
 from trustbo.inference.samplers.weights import smoothed_weights
 from trustbo.models.effects.effect import Slots
 from trustbo.models.model import TrustModel
+from trustbo.models.place import places_of
 from trustbo.parallel import one_blas_thread
 from trustbo.stacking import stack_missions
 

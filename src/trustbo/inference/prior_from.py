@@ -11,8 +11,8 @@ from trustbo.errors import TrustboError
 from trustbo.inference.draws import sites_of
 from trustbo.inference.posterior_tree import require_posterior
 from trustbo.models.backend import own_settings
+from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.model import TrustModel
-from trustbo.models.place import PlaceEffect
 from trustbo.models.pooled import PooledTrust
 from trustbo.models.priors_numpy import number, numbers
 

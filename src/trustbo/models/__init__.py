@@ -6,11 +6,11 @@ from trustbo.models import backend as backend  # first: it loads numpyro
 from trustbo.models.coupled import CoupledTrust
 from trustbo.models.drift import DriftTrust
 from trustbo.models.effects.person import PersonEffect
+from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.effects.robot import RobotEffect
 from trustbo.models.hierarchical import HierarchicalTrust
 from trustbo.models.params import CoupledParams, RobotParams, TrustParams
 from trustbo.models.people import HumanTrust
-from trustbo.models.place import PlaceEffect
 from trustbo.models.pooled import PooledTrust
 from trustbo.models.priors import Priors
 from trustbo.renamed import moved

@@ -18,12 +18,12 @@ from trustbo.display.card import Card, Displayed
 from trustbo.errors import ShapeError, TrustboError, require_choice
 from trustbo.models.backend import own_settings
 from trustbo.models.effects.effect import Effect, Slots, rest_of
-from trustbo.models.effects.place import Place
+from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.effects.sampled import SampledDrift
 from trustbo.models.exactness import why_no_statistics, why_not_exact
 from trustbo.models.families import AUTO, FAMILIES, Family, choose, family_of
 from trustbo.models.params import Params, assemble_params, check_params
-from trustbo.models.place import PlaceEffect, bounds_of, places_of
+from trustbo.models.place import bounds_of, places_of
 from trustbo.models.priors import Priors
 from trustbo.models.priors_numpy import draw
 from trustbo.models.state_space.contact_rate import ContactRate, mission_log_likelihood
@@ -102,8 +102,7 @@ class TrustModel(Displayed, ABC):
     @property
     def all_effects(self) -> list[Effect]:
         """All effects, those of places first, as columns of the evidence."""
-        place = [] if self.place is None else [Place(**self.place.to_record())]
-        return [*place, *self.effects]
+        return [*([] if self.place is None else [self.place]), *self.effects]
 
     @property
     def robot_sets(self) -> str:

@@ -1,107 +1,22 @@
-"""Effects of places on trust, and the index of the places that missions visited."""
+"""The index of the places that missions visited, and the correlation of places."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import numpyro.distributions as dist
 from numpy.typing import ArrayLike
 
 from trustbo.data import Mission, require_map
-from trustbo.errors import TrustboError, require_positive
+from trustbo.errors import TrustboError
 from trustbo.models.backend import namespace
 from trustbo.workspace.moves import MOVES, bounds_along
+
+if TYPE_CHECKING:
+    from trustbo.models.effects.place import PlaceEffect
 
 N_MOVES = len(MOVES[8])
 MAX_VISITED = 4000
 """Largest number of visited bounds: the effort grows with its cube."""
-
-_MOST = {
-    "length_scale": (1000.0, "cells, not metres"),
-    "length_scale_sd": (3.0, "the logarithm of a length scale"),
-}
-
-
-@dataclass(frozen=True)
-class PlaceEffect:
-    """Effect of a place on trust that awareness does not explain.
-
-    The drift of trust by the bound from cell a to cell c is u(a -> c) = beta . z(a -> c) + b + s(c)
-    + e(a -> c). s is a Gaussian process over cells, of sd tau_s and covariance Matern 3/2 with a
-    length scale in cells; e(a -> c) ~ N(0, tau_e^2), independent for each directed bound.
-
-    Attributes:
-        cells: Whether the model has s.
-        bounds: Whether the model has e.
-        shared: Whether all robots share s and e; else each robot has separate ones, with the same
-            tau_s, tau_e and length scale.
-        tau_s: Scale of the half-normal prior of the sd of s.
-        tau_e: Scale of the half-normal prior of the sd of e.
-        length_scale: Median of the log-normal prior of the length scale, in cells.
-        length_scale_sd: Its standard deviation, of the logarithm.
-
-    Raises:
-        TrustboError: Neither cells nor bounds have an effect, or a number is not positive or far
-            too large.
-    """
-
-    cells: bool = True
-    bounds: bool = True
-    shared: bool = True
-    tau_s: float = 0.2
-    tau_e: float = 0.2
-    length_scale: float = 2.0
-    length_scale_sd: float = 0.5
-
-    def __post_init__(self) -> None:
-        for name in ("cells", "bounds", "shared"):
-            if not isinstance(value := getattr(self, name), bool | np.bool_):
-                raise TrustboError(f"PlaceEffect.{name} must be True or False; got {value!r}.")
-        if not (self.cells or self.bounds):
-            raise TrustboError(
-                "PlaceEffect needs an effect of cells or of bounds; for neither, give place=None."
-            )
-        for name in ("tau_s", "tau_e", "length_scale", "length_scale_sd"):
-            value = require_positive(f"PlaceEffect.{name}", getattr(self, name))
-            most, scale = _MOST.get(name, (100.0, "trust, which is between 0 and 1"))
-            if value > most:
-                raise TrustboError(
-                    f"PlaceEffect.{name} = {value:g} exceeds {most:g}: it is of {scale}."
-                )
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the hyperparameters: tau_s and length_scale of s, tau_e of e."""
-        return ("tau_s", "length_scale") * self.cells + ("tau_e",) * self.bounds
-
-    def draw(self, n: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
-        """Draws of the hyperparameters from their prior, each (draw,), by name."""
-        scores = rng.standard_normal((3, n))
-        drawn = {
-            "tau_s": self.tau_s * np.abs(scores[0]),
-            "length_scale": self.length_scale * np.exp(self.length_scale_sd * scores[1]),
-            "tau_e": self.tau_e * np.abs(scores[2]),
-        }
-        return {name: drawn[name] for name in self.names}
-
-    def hyperpriors(self) -> dict[str, dist.Distribution]:
-        """Priors of the hyperparameters, by name."""
-        priors = {
-            "tau_s": dist.HalfNormal(self.tau_s),
-            "length_scale": dist.LogNormal(np.log(self.length_scale), self.length_scale_sd),
-            "tau_e": dist.HalfNormal(self.tau_e),
-        }
-        return {name: priors[name] for name in self.names}
-
-    def in_short(self) -> str:
-        """Places that have effects, and whether robots share them."""
-        places = " and ".join(["cells"] * self.cells + ["bounds"] * self.bounds)
-        return f"of {places}, {'shared by robots' if self.shared else 'by robot'}"
-
-    def to_record(self) -> dict[str, Any]:
-        """Fields by name, for JSON."""
-        return asdict(self)
 
 
 class Visited(NamedTuple):
@@ -147,7 +62,7 @@ def bounds_of(missions: Sequence[Mission], shape: tuple[int, int] | None = None)
 
 def places_of(
     missions: Sequence[Mission],
-    place: PlaceEffect | None,
+    place: "PlaceEffect | None",
     shape: tuple[int, ...],
     grid: tuple[int, int] | None = None,
 ) -> Visited | None:
@@ -162,7 +77,7 @@ def places_of(
 
 def visited(
     bounds: np.ndarray,
-    place: PlaceEffect,
+    place: "PlaceEffect",
     n_robots: int,
     shape: tuple[int, int] | None = None,
 ) -> Visited:

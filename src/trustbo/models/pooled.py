@@ -7,9 +7,9 @@ import jax.numpy as jnp
 
 from trustbo.errors import TrustboError, require_choice
 from trustbo.models.effects.effect import EFFECTS, MEMORIES, Effect
+from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.model import TrustModel, register, sample
 from trustbo.models.params import DeviationParams, TrustParams
-from trustbo.models.place import PlaceEffect
 
 
 @register
@@ -32,7 +32,7 @@ class PooledTrust(TrustModel):
     memory: str = "level"  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def __post_init__(self) -> None:
-        one = isinstance(self.effects, PlaceEffect | Effect)
+        one = isinstance(self.effects, Effect)
         effects: tuple[Any, ...] = (self.effects,) if one else tuple(self.effects)
         kinds = [type(effect).__name__ for effect in effects]
         if unknown := [e for e in effects if not isinstance(e, (PlaceEffect, *EFFECTS.values()))]:
@@ -46,7 +46,7 @@ class PooledTrust(TrustModel):
                 f"effects must be of different kinds; got {effects!r} and place={self.place!r}."
             )
         if places:
-            object.__setattr__(self, "place", PlaceEffect(**places[0].to_record()))
+            object.__setattr__(self, "place", places[0])
         others = tuple(effect for effect in effects if not isinstance(effect, PlaceEffect))
         object.__setattr__(self, "effects", others)
         require_choice("memory", self.memory, MEMORIES)

@@ -7,10 +7,10 @@ from typing import Any
 from trustbo.errors import TrustboError
 from trustbo.models.coupled import CoupledTrust
 from trustbo.models.effects.effect import EFFECTS, Effect
+from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.hierarchical import HierarchicalTrust
 from trustbo.models.model import TrustModel
 from trustbo.models.people import HumanTrust
-from trustbo.models.place import PlaceEffect
 from trustbo.models.pooled import PooledTrust
 from trustbo.models.priors import Priors
 

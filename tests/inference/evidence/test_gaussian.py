@@ -20,7 +20,6 @@ from trustbo.inference.samplers import exact
 from trustbo.models import PlaceEffect, PooledTrust, Priors
 from trustbo.models.backend import own_settings
 from trustbo.models.effects.effect import Prior, Slots
-from trustbo.models.effects.place import Place
 from trustbo.models.effects.robot import RobotEffect
 from trustbo.models.effects.weights import Weights
 from trustbo.models.place import bounds_of, visited
@@ -31,11 +30,11 @@ EFFECTS = {
     "weights": [],
     "robots": [RobotEffect()],
     "robots twice": [RobotEffect(rho=0.5), RobotEffect()],  # of shared chains: one set goes first
-    "places": [Place()],
-    "places and robots": [Place(), RobotEffect()],
-    "cells and robots": [RobotEffect(rho=0.5), Place(bounds=False)],
-    "bounds": [Place(cells=False)],
-    "places by robot, and robots": [Place(shared=False), RobotEffect()],
+    "places": [PlaceEffect()],
+    "places and robots": [PlaceEffect(), RobotEffect()],
+    "cells and robots": [RobotEffect(rho=0.5), PlaceEffect(bounds=False)],
+    "bounds": [PlaceEffect(cells=False)],
+    "places by robot, and robots": [PlaceEffect(shared=False), RobotEffect()],
 }
 X0 = 0.4, 0.6
 SCALES = {"tau_s", "tau_e", "tau_slow", "tau_day"}

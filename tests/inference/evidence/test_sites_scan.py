@@ -11,7 +11,7 @@ from trustbo.inference.evidence.gaussian import Gaussian
 from trustbo.inference.evidence.sites import Sites
 from trustbo.models import Priors
 from trustbo.models.effects.effect import Independent, Slots
-from trustbo.models.effects.place import Place
+from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.effects.robot import RobotEffect
 from trustbo.models.effects.weights import Weights
 from trustbo.models.families import FAMILIES
@@ -33,9 +33,9 @@ def sites_of(family, stretch, memory="level", *, apart=False):
         )
     batch, priors = stack_missions(missions), Priors.of(FEATURES, family)
     bounds = bounds_of(missions, batch.contact_rate.shape[:2])
-    places = visited(bounds, Place(), batch.contact_rate.shape[2], (5, 5))
+    places = visited(bounds, PlaceEffect(), batch.contact_rate.shape[2], (5, 5))
     slots = Slots.of(batch, len(missions), FEATURES, None, places)
-    groups = [effect.group(slots) for effect in (Weights(priors), Place(), RobotEffect())]
+    groups = [effect.group(slots) for effect in (Weights(priors), PlaceEffect(), RobotEffect())]
     x0 = float(priors.x0_mean), float(priors.x0_sd)
 
     def with_columns(*further):

@@ -11,7 +11,7 @@ from trustbo.inference.samplers.posterior import Posterior
 from trustbo.inference.samplers.scores import Scores
 from trustbo.models import Priors
 from trustbo.models.effects.effect import Slots
-from trustbo.models.effects.place import Place
+from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.effects.robot import RobotEffect
 from trustbo.models.effects.weights import Weights
 from trustbo.models.place import bounds_of, visited
@@ -20,7 +20,7 @@ from trustbo.stacking import stack_missions
 
 def posterior_of(missions, effects, priors):
     batch = stack_missions(missions)
-    places = visited(bounds_of(missions, batch.contact_rate.shape[:2]), Place(), 3)
+    places = visited(bounds_of(missions, batch.contact_rate.shape[:2]), PlaceEffect(), 3)
     slots = Slots.of(batch, len(missions), ("line_of_sight", "slope"), None, places)
     effects = [Weights(priors), *effects]
     x0 = float(priors.x0_mean), float(priors.x0_sd)
@@ -54,7 +54,7 @@ def test_pooled_draws_are_those_of_a_quadrature():
 def whole():
     """Posterior of places and robots."""
     return posterior_of(
-        walking_missions(0, 6), [Place(), RobotEffect()], Priors.of(("line_of_sight",))
+        walking_missions(0, 6), [PlaceEffect(), RobotEffect()], Priors.of(("line_of_sight",))
     )
 
 

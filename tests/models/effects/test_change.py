@@ -7,7 +7,7 @@ from missions import walking_missions
 from trustbo.data import Mission
 from trustbo.models.effects.change import RADII, RATE, Candidates, Change
 from trustbo.models.effects.effect import Slots
-from trustbo.models.effects.place import Place
+from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.place import bounds_of, visited
 from trustbo.stacking import stack_missions
 
@@ -21,7 +21,7 @@ def slots_of(missions, n_robots=3):
     ]
     batch = stack_missions(missions)
     bounds = bounds_of(missions, batch.contact_rate.shape[:2])
-    places = visited(bounds, Place(), n_robots, (SIDE, SIDE))
+    places = visited(bounds, PlaceEffect(), n_robots, (SIDE, SIDE))
     return Slots.of(batch, len(missions), ("line_of_sight", "slope"), None, places)
 
 

@@ -7,7 +7,7 @@ from missions import walking_missions
 from trustbo.errors import TrustboError
 from trustbo.models import Priors
 from trustbo.models.effects.effect import Slots, dense_root
-from trustbo.models.effects.place import Place
+from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.effects.robot import RobotEffect, next_mission
 from trustbo.models.effects.weights import Weights
 from trustbo.models.place import bounds_of, visited
@@ -42,7 +42,7 @@ def covariance(group, theta=THETA):
 @pytest.mark.parametrize("shared", [True, False])
 @pytest.mark.parametrize(("cells", "bounds"), [(True, True), (True, False), (False, True)])
 def test_places_have_the_covariance_of_cells_and_bounds(cells, bounds, shared):
-    missions, place = walking_missions(1), Place(cells=cells, bounds=bounds, shared=shared)
+    missions, place = walking_missions(1), PlaceEffect(cells=cells, bounds=bounds, shared=shared)
     slots = slots_of(missions, place)
     at = np.full((*slots.y.shape, 5), -1)
     for c, (j, i) in enumerate(zip(slots.mission, slots.robot, strict=True)):
@@ -61,7 +61,7 @@ def test_places_have_the_covariance_of_cells_and_bounds(cells, bounds, shared):
 
 
 def test_effects_of_cells_and_bounds_add_up_to_the_coefficients():
-    place, rng = Place(), np.random.default_rng(0)
+    place, rng = PlaceEffect(), np.random.default_rng(0)
     slots = slots_of(walking_missions(2), place)
     group = place.group(slots)
     n = 4000

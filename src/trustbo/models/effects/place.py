@@ -13,36 +13,111 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpyro.distributions as dist
 from scipy import sparse
 from scipy.linalg import helmert
 
-from trustbo.errors import TrustboError
+from trustbo.errors import TrustboError, require_positive
 from trustbo.models.backend import namespace
 from trustbo.models.effects.effect import Columns, Effect, Prior, Slots, Theta, hypot, share_of
-from trustbo.models.place import PlaceEffect, Visited, matern
+from trustbo.models.place import Visited, matern
 from trustbo.models.priors_numpy import half_normal
 
 _JITTER = 1e-12  # of a correlation, times the number of cells: below, rounding decides
 _TOGETHER = 16  # points whose cells are split at once
 _LENGTH_SCALES = 1e-6, 1e6  # cells: outside, cells are independent, or equal
+_MOST = {
+    "length_scale": (1000.0, "cells, not metres"),
+    "length_scale_sd": (3.0, "the logarithm of a length scale"),
+}
 
 
 @dataclass(frozen=True)
-class Place(PlaceEffect, Effect):  # pyright: ignore[reportIncompatibleVariableOverride]
-    """Effect of a place, see `PlaceEffect`, as an effect among others."""
+class PlaceEffect(Effect):
+    """Effect of a place on trust that awareness does not explain.
+
+    The drift of trust by the bound from cell a to cell c is u(a -> c) = beta . z(a -> c) + b + s(c)
+    + e(a -> c). s is a Gaussian process over cells, of sd tau_s and covariance Matern 3/2 with a
+    length scale in cells; e(a -> c) ~ N(0, tau_e^2), independent for each directed bound.
+
+    Attributes:
+        cells: Whether the model has s.
+        bounds: Whether the model has e.
+        shared: Whether all robots share s and e; else each robot has separate ones, with the same
+            tau_s, tau_e and length scale.
+        tau_s: Scale of the half-normal prior of the sd of s.
+        tau_e: Scale of the half-normal prior of the sd of e.
+        length_scale: Median of the log-normal prior of the length scale, in cells.
+        length_scale_sd: Its standard deviation, of the logarithm.
+
+    Raises:
+        TrustboError: Neither cells nor bounds have an effect, or a number is not positive or far
+            too large.
+    """
+
+    cells: bool = True
+    bounds: bool = True
+    shared: bool = True
+    tau_s: float = 0.2
+    tau_e: float = 0.2
+    length_scale: float = 2.0
+    length_scale_sd: float = 0.5
+
+    def __post_init__(self) -> None:
+        for name in ("cells", "bounds", "shared"):
+            if not isinstance(value := getattr(self, name), bool | np.bool_):
+                raise TrustboError(f"PlaceEffect.{name} must be True or False; got {value!r}.")
+        if not (self.cells or self.bounds):
+            raise TrustboError(
+                "PlaceEffect needs an effect of cells or of bounds; for neither, give place=None."
+            )
+        for name in ("tau_s", "tau_e", "length_scale", "length_scale_sd"):
+            value = require_positive(f"PlaceEffect.{name}", getattr(self, name))
+            most, scale = _MOST.get(name, (100.0, "trust, which is between 0 and 1"))
+            if value > most:
+                raise TrustboError(
+                    f"PlaceEffect.{name} = {value:g} exceeds {most:g}: it is of {scale}."
+                )
+
+    @property
+    def names(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Names of the hyperparameters: tau_s and length_scale of s, tau_e of e."""
+        return ("tau_s", "length_scale") * self.cells + ("tau_e",) * self.bounds
+
+    def draw(self, n: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
+        """See `Effect.draw`."""
+        scores = rng.standard_normal((3, n))
+        drawn = {
+            "tau_s": self.tau_s * np.abs(scores[0]),
+            "length_scale": self.length_scale * np.exp(self.length_scale_sd * scores[1]),
+            "tau_e": self.tau_e * np.abs(scores[2]),
+        }
+        return {name: drawn[name] for name in self.names}
+
+    def hyperpriors(self) -> dict[str, dist.Distribution]:
+        """See `Effect.hyperpriors`."""
+        priors = {
+            "tau_s": dist.HalfNormal(self.tau_s),
+            "length_scale": dist.LogNormal(np.log(self.length_scale), self.length_scale_sd),
+            "tau_e": dist.HalfNormal(self.tau_e),
+        }
+        return {name: priors[name] for name in self.names}
+
+    def in_short(self) -> str:
+        """Places that have effects, and whether robots share them."""
+        places = " and ".join(["cells"] * self.cells + ["bounds"] * self.bounds)
+        return f"of {places}, {'shared by robots' if self.shared else 'by robot'}"
 
     def scales(self, scores: np.ndarray) -> dict[str, np.ndarray]:
         """See `Effect.scales`."""
         xp: Any = namespace(scores)
-        taus = [i for i, name in enumerate(self.names) if name != "length_scale"]
-        values = half_normal(
-            scores[:, taus], np.array([getattr(self, self.names[i]) for i in taus])
-        )
-        named = {self.names[i]: value for i, value in zip(taus, values.T, strict=True)}
-        if self.cells:
-            score = scores[:, self.names.index("length_scale")]
-            length_scale = self.length_scale * xp.exp(self.length_scale_sd * score)
-            named["length_scale"] = xp.clip(length_scale, *_LENGTH_SCALES)
+        named = {}
+        for name, score in zip(self.names, scores.T, strict=True):
+            if name == "length_scale":
+                length_scale = self.length_scale * xp.exp(self.length_scale_sd * score)
+                named[name] = xp.clip(length_scale, *_LENGTH_SCALES)
+            else:
+                named[name] = half_normal(score, getattr(self, name))
         return named
 
     def group(self, slots: Slots) -> "PlaceColumns":
