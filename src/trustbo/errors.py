@@ -83,24 +83,24 @@ def require_whole(what: str, value: object, minimum: int) -> int:
 
 def require_positive(what: str, value: object) -> float:
     """Return `value` as a float if it is a positive, finite number, else raise TrustboError."""
-    try:
-        number = float(value)  # pyright: ignore[reportArgumentType]
-    except (TypeError, ValueError):
-        number = math.nan
-    if isinstance(value, str) or not 0.0 < number < math.inf:
+    if not 0.0 < (number := _number(value)) < math.inf:
         raise TrustboError(f"{what} must be positive and finite; got {value!r}.")
     return number
 
 
 def require_not_negative(what: str, value: object) -> float:
     """Return `value` as a float if it is a finite number of 0 or more, else raise TrustboError."""
-    try:
-        number = float(value)  # pyright: ignore[reportArgumentType]
-    except (TypeError, ValueError):
-        number = math.nan
-    if isinstance(value, str) or not 0.0 <= number < math.inf:
+    if not 0.0 <= (number := _number(value)) < math.inf:
         raise TrustboError(f"{what} must be 0 or more, and finite; got {value!r}.")
     return number
+
+
+def _number(value: Any) -> float:
+    """Number of a value, NaN of text and of what is none."""
+    try:
+        return math.nan if isinstance(value, str) else float(value)
+    except (TypeError, ValueError):
+        return math.nan
 
 
 def require_kind(what: str, value: Any, kind: Any, remedy: str) -> Any:

@@ -18,6 +18,7 @@ from trustbo.inference.loo import loo
 from trustbo.inference.posterior_groups import complete
 from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.model import TrustModel
+from trustbo.models.place import has_places
 from trustbo.models.priors import Priors
 from trustbo.models.record import model_from_record
 
@@ -68,7 +69,7 @@ def _rows(
         warnings.simplefilter("ignore", UserWarning)  # of single influential missions, by k-hat
         fitted = loo(posterior)
         for name, (data, other, how) in others.items():
-            if other.place is not None and model.place is None and not _has_places(missions):
+            if other.place is not None and model.place is None and not has_places(missions):
                 continue
             if other.why_not_exact and not model.why_not_exact:  # NUTS would take minutes
                 rows[name] = np.nan, np.nan, f"not compared: {other.why_not_exact}."
@@ -112,14 +113,6 @@ def _sensitivity(posterior: xr.DataTree) -> tuple[float, float, str]:
             f"; to priors and rates, a conflict of both: {', '.join(both)}." if both else "."
         )
     return float(by_prior.max()), np.nan, sentence
-
-
-def _has_places(missions: Sequence[Mission]) -> bool:
-    return all(
-        max(abs(a[0] - b[0]), abs(a[1] - b[1])) == 1
-        for mission in missions
-        for a, b in zip(mission.path[:-1], mission.path[1:], strict=True)
-    )
 
 
 def _without(mission: Mission, m: int) -> Mission:

@@ -12,10 +12,9 @@ import numpy as np
 
 from trustbo.criticism.joint_normal import Data, Normal, Point
 from trustbo.data import Mission
-from trustbo.errors import TrustboError
 from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.params import CoupledParams
-from trustbo.models.place import bounds_of, correlation, visited
+from trustbo.models.place import bounds_of, correlation, has_places, visited
 
 _LENGTH_SCALE = 2.0  # cells, the default of PlaceEffect
 _MEMORY = 0.7  # correlation of successive bounds, and of successive missions
@@ -75,11 +74,9 @@ def cell_columns(
 def _places(
     missions: Sequence[Mission], data: Data, normal: Normal, place: PlaceEffect | None
 ) -> dict[str, np.ndarray] | None:
-    try:
-        bounds = bounds_of(missions)
-    except TrustboError:
+    if not has_places(missions):
         return None
-    places = visited(bounds, PlaceEffect(), data.n_robots)
+    places = visited(bounds_of(missions), PlaceEffect(), data.n_robots)
     mission, bound, _ = data.slots.T
     unit = places.unit[mission, bound, 0]
     of_units = normal.carry @ (unit[:, None] == np.arange(len(places.units)))

@@ -25,7 +25,7 @@ from trustbo.models.effects.change import Change
 from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.effects.robot import RobotEffect
 from trustbo.models.families import FAMILIES
-from trustbo.models.place import bounds_of
+from trustbo.models.place import has_places
 from trustbo.models.pooled import PooledTrust
 
 SIZE = 0.1  # effect from which on a plan may change, in units of stationary trust
@@ -44,9 +44,7 @@ def with_robots(posterior: xr.DataTree, missions: Sequence[Mission]) -> xr.DataT
         return posterior
     record = posterior.attrs.get("place", "none")
     place = PlaceEffect() if record == "none" else PlaceEffect(**json.loads(record))
-    try:
-        bounds_of(missions)
-    except TrustboError:  # paths jump between cells
+    if not has_places(missions):
         place = None
     response, seed = str(posterior.attrs["response"]), int(posterior.attrs["seed"])
     model = PooledTrust(

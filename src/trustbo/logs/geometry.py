@@ -1,5 +1,6 @@
 """Geometry between the robots of a log, tick by tick: what a sensor's success depends on."""
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -66,7 +67,7 @@ def geometry(
     columns: dict[str, np.ndarray] = {
         "range": away,
         "bearing": np.where(known, (angle + np.pi) % (2.0 * np.pi) - np.pi, np.nan),
-        "hidden": _hidden(log, xy, across, away),
+        "hidden": hidden_by(xy, log.landmarks, log.robot_radius).astype(float),
         "turning": np.broadcast_to(np.nan_to_num(turning)[:, None], away.shape),
         "speed": np.broadcast_to(np.nan_to_num(speed)[None], away.shape),
         "contact": _contacts(log, time, tick),
@@ -82,14 +83,20 @@ def geometry(
     return xr.Dataset(variables, coords, {"tick": float(tick)})
 
 
-def _hidden(log: Log, xy: np.ndarray, across: np.ndarray, away: np.ndarray) -> np.ndarray:
-    """Whether a landmark or another robot is in the line between two, (watcher, seen, time)."""
+def hidden_by(xy: np.ndarray, landmarks: Iterable[np.ndarray], robot_radius: float) -> np.ndarray:
+    """Whether a landmark or another robot is in the line between two, (watcher, seen, time).
+
+    Robots are at xy (robot, time, 2), landmarks x, y and radius, all in m; a radius of 0 hides
+    nothing.
+    """
+    across = xy[None] - xy[:, None]
+    away = np.hypot(across[..., 0], across[..., 1])
     hidden = np.zeros(away.shape, dtype=bool)
     with np.errstate(invalid="ignore", divide="ignore"):
         unit = across / away[..., None]
-    landmarks = [(x, y, r, -1) for x, y, r in log.landmarks if r > 0.0]
-    bodies = [(*xy[k].T, log.robot_radius, k) for k in range(len(xy)) if log.robot_radius > 0.0]
-    for x, y, radius, k in (*landmarks, *bodies):
+    cylinders = [(x, y, r, -1) for x, y, r in landmarks if r > 0.0]
+    bodies = [(*xy[k].T, robot_radius, k) for k in range(len(xy)) if robot_radius > 0.0]
+    for x, y, radius, k in (*cylinders, *bodies):
         to = np.stack(np.broadcast_arrays(x - xy[..., 0], y - xy[..., 1]), axis=-1)[:, None]
         along = (to * unit).sum(-1)
         beside = np.abs(to[..., 0] * unit[..., 1] - to[..., 1] * unit[..., 0])
@@ -98,7 +105,7 @@ def _hidden(log: Log, xy: np.ndarray, across: np.ndarray, away: np.ndarray) -> n
         if k >= 0:  # a robot hides neither itself nor from itself
             between[k], between[:, k] = False, False
         hidden |= between
-    return hidden.astype(float)
+    return hidden
 
 
 def _contacts(log: Log, time: np.ndarray, tick: float) -> np.ndarray:

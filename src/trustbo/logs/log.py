@@ -14,7 +14,7 @@ from trustbo.errors import ShapeError, TrustboError, require_not_negative, requi
 from trustbo.files import FilePath
 from trustbo.logs.bagfile import opened
 from trustbo.logs.messages import POSE_TYPES, TEXT, Topics
-from trustbo.logs.rows import columns_of, number_of
+from trustbo.logs.rows import needed_columns, number_of
 
 _POSE, _DETECTION = ("t", "robot", "x", "y"), ("t", "watcher", "seen")
 _NS = 1e9  # in a second
@@ -226,13 +226,7 @@ def _columns(
     what: str, table: Any, needed: Sequence[str], others: Sequence[str] = ()
 ) -> dict[str, list[str]]:
     """Columns of a table by name; TrustboError: one that is needed is missing, or no rows."""
-    columns = columns_of(table)
-    if missing := [name for name in needed if name not in columns]:
-        raise TrustboError(
-            f"the table of {what} lacks {', '.join(missing)}; it has {', '.join(columns)}."
-        )
-    if not columns[needed[0]]:
-        raise TrustboError(f"the table of {what} has no rows.")
+    columns = needed_columns(table, needed, of=f" of {what}")
     return {name: columns[name] for name in (*needed, *others) if name in columns}
 
 

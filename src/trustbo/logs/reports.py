@@ -15,12 +15,13 @@ import numpy as np
 from trustbo.answers import levels_of, report_of
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
-from trustbo.logs.rows import columns_of, number_of
+from trustbo.logs.rows import columns_of, needed_columns, number_of
 from trustbo.stacking import require_same_team
 
 _YES = {"1", "1.0", "true", "yes", "success", "succeeded", "ok"}
 _NO = {"0", "0.0", "false", "no", "failure", "failed", "fail"}
 _TASK = "report"
+_STUDY = ": is it the study's?"
 _LARGEST = 10.0  # input, in units of an outcome
 OUTCOMES = ("success", "failure")
 """Features of what a robot did."""
@@ -81,20 +82,17 @@ def read_reports(
             scale, an input of values beyond 10, a person without reports, or no outcome and no
             input at all.
     """
-    columns = columns_of(table)
     levels = levels_of(scale)
     named = {"person": person, "step": step, "report": report}
     named |= {"outcome": outcome, "demand": demand, "task": task}
     wanted = [name for name in (*named.values(), *inputs) if name is not None]
-    if missing := [name for name in wanted if name not in columns]:
-        raise TrustboError(
-            f"the table lacks {', '.join(missing)}; it has {', '.join(columns) or 'no columns'}. "
-            f'Name its columns, such as read_reports(table, {_name_of(named, missing[0])}="...").'
-        )
     if len(set(wanted)) < len(wanted):
         raise TrustboError(f"one column has two meanings: {', '.join(wanted)}.")
-    if not columns[person]:
-        raise TrustboError("the table has no rows.")
+    columns = columns_of(table)
+    missing = next((name for name in wanted if name not in columns), "")
+    argument = next((name for name, column in named.items() if column == missing), "inputs")
+    remedy = f'. Name its columns, such as read_reports(table, {argument}="...").'
+    needed_columns(columns, wanted, remedy=remedy)
     if demand is not None and outcome is None:
         raise TrustboError(f"demand={demand!r} scales outcomes: name their column, outcome=.")
     if outcome is None and not inputs and task is None:
@@ -197,22 +195,21 @@ def read_azevedo_sa(file: str | PathLike[str]) -> list[Mission]:
     Raises:
         TrustboError: See `read_reports`.
     """
-    columns = columns_of(file)
-    _require(columns, ("person", "step", "success", "sensing", "processing", "asked_sensing",
-                       "asked_processing", "trust"))  # fmt: skip
+    needs = ("sensing", "processing", "asked_sensing", "asked_processing", "trust")
+    columns = needed_columns(file, ("person", "step", "success", *needs), remedy=_STUDY)
     number = {
         name: np.array(
             [number_of(f"row {i + 1}", name, text) for i, text in enumerate(columns[name])]
         )
-        for name in ("sensing", "processing", "asked_sensing", "asked_processing", "trust")
+        for name in needs
     }
     share = np.clip(number["trust"], 0.01, 0.99)
     rating = np.clip(np.round(np.log(share / (1.0 - share)) + 4.0), 1, 7)
-    needs = [(number[n], number[f"asked_{n}"]) for n in ("sensing", "processing")]
+    pairs = [(number[n], number[f"asked_{n}"]) for n in ("sensing", "processing")]
     table = {name: columns[name] for name in ("person", "step", "success")}
     table["report"] = rating.tolist()
-    table["demand"] = np.mean([seen >= asked for seen, asked in needs], axis=0).tolist()
-    table["need"] = np.mean([asked for _, asked in needs], axis=0).tolist()
+    table["demand"] = np.mean([seen >= asked for seen, asked in pairs], axis=0).tolist()
+    table["need"] = np.mean([asked for _, asked in pairs], axis=0).tolist()
     return read_reports(
         table, outcome="success", demand="demand", inputs=("need",), scale="likert7"
     )
@@ -234,10 +231,10 @@ def read_soh(file: str | PathLike[str]) -> list[Mission]:
     Raises:
         TrustboError: See `read_reports`.
     """
-    columns = columns_of(file)
     before = {t: f"{t}_rating" if t in "AB" else f"{t}1_rating" for t in "ABCDE"}
     names = (*(f"{t}_ID" for t in "ABCDE"), *before.values(), "B_SF")
-    _require(columns, (*names, "C2_rating", "D2_rating", "E2_rating"))
+    names += ("C2_rating", "D2_rating", "E2_rating")
+    columns = needed_columns(file, names, remedy=_STUDY)
     features = (*(f"task_{n}" for n in range(1, 13)), "success", "failure", "success_same",
                 "failure_same")  # fmt: skip
     missions = []
@@ -257,8 +254,6 @@ def read_soh(file: str | PathLike[str]) -> list[Mission]:
             z[1, r, 12:14] = succeeded
             z[1, r, 14:] = same * np.array(succeeded)
         missions.append(_reported(z, y, features, tuple("ABCDE"), "likert7"))
-    if not missions:
-        raise TrustboError("the table has no rows.")
     return missions
 
 
@@ -276,8 +271,8 @@ def read_du(file: str | PathLike[str], *, events: bool = False) -> list[Mission]
     Raises:
         TrustboError: See `read_reports`.
     """
-    columns = columns_of(file)
-    _require(columns, ("person", "step", "trust_before", "trust_after", "state", "task_result"))
+    names = ("person", "step", "trust_before", "trust_after", "state", "task_result")
+    columns = needed_columns(file, names, remedy=_STUDY)
     table: dict[str, list[Any]] = {name: [] for name in ("person", "step", "report", "outcome")}
     kinds = [
         f"{o}_{h}_{s}" for o in ("success", "failure") for h in ("high", "low") for s in (0, 1)
@@ -400,14 +395,3 @@ def _outcome(where: str, name: str, text: str) -> tuple[float, float]:
     raise TrustboError(
         f"{where}: {name} = {text!r} is no outcome; give 1 or 0, success or failure, or a blank."
     )
-
-
-def _require(columns: Mapping[str, object], names: Sequence[str]) -> None:
-    if missing := [name for name in names if name not in columns]:
-        raise TrustboError(
-            f"the table lacks {', '.join(missing)}; it has {', '.join(columns)}: is it the study's?"
-        )
-
-
-def _name_of(named: Mapping[str, str | None], column: str) -> str:
-    return next((name for name, given in named.items() if given == column), "inputs")

@@ -83,6 +83,23 @@ def read_columns(
     return columns
 
 
+def needed_columns(
+    table: Any, names: Sequence[str], *, of: str = "", remedy: str = "."
+) -> dict[str, list[str]]:
+    """Columns of a table, see `columns_of`, which has rows and those of some names.
+
+    TrustboError: one is missing, or there are no rows; `of` names what the table is of, and
+    `remedy` is the end of the message.
+    """
+    columns, what = columns_of(table), f"the table{of}"
+    if missing := [name for name in names if name not in columns]:
+        there = ", ".join(columns) or "no columns"
+        raise TrustboError(f"{what} lacks {', '.join(missing)}; it has {there}{remedy}")
+    if not columns[names[0]]:
+        raise TrustboError(f"{what} has no rows.")
+    return columns
+
+
 def columns_of(table: Any) -> dict[str, list[str]]:
     """Columns of a CSV file, a frame or a mapping as text, "" if blank.
 

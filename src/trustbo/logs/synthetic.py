@@ -6,6 +6,7 @@ import numpy as np
 from scipy.special import expit
 
 from trustbo.errors import require_positive, require_whole
+from trustbo.logs.geometry import hidden_by
 from trustbo.logs.log import Log
 
 _HALL = np.array([15.0, 8.0])  # m
@@ -13,22 +14,20 @@ _SPEED, _TURN = 0.15, 0.6  # m/s, rad/s
 _HALF_VIEW, _REACH = 0.55, 5.5  # rad, m
 _RADIUS = 0.17  # m
 _STEP = 0.5  # s between poses
+_LASTING = 0.95  # share of a deviation that lasts for a second
 
 
-def synthetic_log(
-    n_robots: int = 5, minutes: float = 10.0, *, seed: int = 0, lasting: float = 0.95
-) -> Log:
+def synthetic_log(n_robots: int = 5, minutes: float = 10.0, *, seed: int = 0) -> Log:
     """Make up a log of robots that wander in a hall and detect each other with a camera.
 
     A camera sees 31 degrees to each side, some 5 m far, and not through robots. A robot has a
     quality of its camera, N(0, .7^2) of log odds, which stays; and each pair a deviation from
-    what geometry expects, of sd 1, of which a share lasts from each second to the next.
+    what geometry expects, of sd 1, of which .95 lasts from each second to the next.
 
     Args:
         n_robots: Number of robots, r1, r2, ..., from 2.
         minutes: Length, min.
         seed: Seed.
-        lasting: Share of a deviation that lasts for a second, in [0, 1).
 
     Raises:
         TrustboError: Fewer than two robots, or a length that is not positive.
@@ -44,7 +43,7 @@ def synthetic_log(
     by_geometry = _log_odds(seconds)
     for k in range(seconds.shape[1]):
         noise = rng.standard_normal((n, n))
-        deviation = lasting * deviation + np.sqrt(1.0 - lasting**2) * noise
+        deviation = _LASTING * deviation + np.sqrt(1.0 - _LASTING**2) * noise
         odds = by_geometry[..., k] + quality[:, None] + deviation
         for i, j in np.argwhere(rng.random((n, n)) < expit(odds)):
             for name, value in zip(seen, (k + 0.5, names[i], names[j]), strict=True):
@@ -75,14 +74,7 @@ def _log_odds(poses: np.ndarray) -> np.ndarray:
     away = np.hypot(across[..., 0], across[..., 1])
     bearing = np.arctan2(across[..., 1], across[..., 0]) - poses[:, None, :, 2]
     bearing = np.abs((bearing + np.pi) % (2.0 * np.pi) - np.pi)
-    hidden = np.zeros(away.shape, dtype=bool)
-    for k in range(len(poses)):
-        to = (poses[k, :, :2] - poses[..., :2])[:, None]
-        along = (to * across).sum(-1) / np.maximum(away, 1e-9)
-        beside = np.abs(to[..., 0] * across[..., 1] - to[..., 1] * across[..., 0])
-        between = (along > 0.1) & (along < away - 0.1) & (beside < _RADIUS * away)
-        between[k], between[:, k] = False, False
-        hidden |= between
+    hidden = hidden_by(poses[..., :2], (), _RADIUS)
     odds = 1.5 - 12.0 * np.maximum(bearing - _HALF_VIEW, 0.0) - 1.5 * np.maximum(away - _REACH, 0.0)
     odds = np.maximum(odds - 0.15 * away - 3.0 * hidden, -9.0)
     odds[np.eye(len(poses), dtype=bool)] = -np.inf

@@ -154,19 +154,9 @@ class CoupledTrust(TrustModel):
         }
 
     @property
-    def robots_are_apart(self) -> bool:
-        """Whether `inter_robot` is `"none"`."""
-        return self.inter_robot == "none"
-
-    @property
-    def priors_are_independent(self) -> bool:
-        """Whether nothing couples the robots."""
-        return self.robots_are_apart
-
-    @property
     def robot_sets(self) -> str:
         """See `TrustModel.robot_sets`."""
-        return "each" if self.robots_are_apart else "coupled"
+        return "each" if self.inter_robot == "none" else "coupled"
 
 
 def _matrix(diagonal: Any, off_diagonal: Any) -> Any:

@@ -117,7 +117,7 @@ class TrustModel(Displayed, ABC):
     @property
     def priors_are_independent(self) -> bool:
         """Whether each field of the parameters has an independent prior of that name."""
-        return False
+        return self.robot_sets in ("all", "each")
 
     def prior_terms(self, sites: Mapping[str, np.ndarray]) -> dict[str, tuple[str, np.ndarray]]:
         """Field of `Priors` and values of each parameter with an independent prior, by label.

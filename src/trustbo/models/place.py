@@ -60,6 +60,15 @@ def bounds_of(missions: Sequence[Mission], shape: tuple[int, int] | None = None)
     return bounds
 
 
+def has_places(missions: Sequence[Mission]) -> bool:
+    """Whether bounds of missions have places: there is a map, and no path jumps."""
+    try:
+        bounds_of(missions)
+    except TrustboError:
+        return False
+    return True
+
+
 def places_of(
     missions: Sequence[Mission],
     place: "PlaceEffect | None",

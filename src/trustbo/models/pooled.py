@@ -78,8 +78,3 @@ class PooledTrust(TrustModel):
     def robot_sets(self) -> str:
         """See `TrustModel.robot_sets`."""
         return "all"
-
-    @property
-    def priors_are_independent(self) -> bool:
-        """True: each parameter has an independent prior."""
-        return True
