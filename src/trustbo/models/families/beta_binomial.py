@@ -13,11 +13,13 @@ import numpy as np
 import numpyro.distributions as dist
 from jax import Array, lax, random
 from jax.scipy.special import gammaln
+from numpy import ndarray
+from numpy.random import Generator
 from scipy.special import expit
 from scipy.stats import betabinom
 
 from trustbo.models.backend import own_settings
-from trustbo.models.families.family import SSM, Observed
+from trustbo.models.families.family import SSM, Moments, Observed
 from trustbo.models.families.linearised import Data, Linearised
 from trustbo.models.families.terms import COUNT, NONE, Terms, count_moments
 
@@ -100,22 +102,15 @@ class BetaBinomial(Linearised):
         N = lax.stop_gradient(jnp.where(n_ticks > 0.0, n_ticks, jnp.nan))
         return random.binomial(key_n, jnp.where(jnp.isnan(N), 0.0, N), p).astype(p.dtype) / N
 
-    def rate_moments(
-        self, trust: np.ndarray, noise_sd: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def rate_moments(self, trust: ndarray, noise_sd: ndarray) -> Moments:
         """See `Family.rate_moments`."""
         p, N = expit(trust), _N_TICKS
         excess = 1.0 / (1.0 + 1.0 / (noise_sd**2 + 1e-6))  # correlation of two ticks of a bound
         return p, p * (1.0 - p), p * (1.0 - p) * (1.0 + (N - 1.0) * excess) / N
 
     def draw_rates(
-        self,
-        rng: np.random.Generator,
-        trust: np.ndarray,
-        y: np.ndarray,
-        noise_sd: np.ndarray,
-        n_ticks: np.ndarray,
-    ) -> np.ndarray:
+        self, rng: Generator, trust: ndarray, y: ndarray, noise_sd: ndarray, n_ticks: ndarray
+    ) -> ndarray:
         """See `Family.draw_rates`."""
         phi = 1.0 / (noise_sd**2 + 1e-6)
         p = rng.beta(phi * expit(trust), phi * expit(-trust))
@@ -123,13 +118,8 @@ class BetaBinomial(Linearised):
         return rng.binomial(np.where(np.isnan(N), 0.0, N).astype(int), p) / N
 
     def observe(
-        self,
-        mean: np.ndarray,
-        var: np.ndarray,
-        y: np.ndarray,
-        n_ticks: np.ndarray,
-        noise_sd: np.ndarray,
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        self, mean: ndarray, var: ndarray, y: ndarray, n_ticks: ndarray, noise_sd: ndarray
+    ) -> Moments:
         """See `Family.observe`; by Gauss-Hermite nodes around the mode."""
         args = np.broadcast_arrays(mean, var, y, n_ticks, noise_sd)
         shape = args[0].shape

@@ -10,10 +10,12 @@ from typing import ClassVar
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from numpy import ndarray
+from numpy.random import Generator
 from scipy import special
 from scipy.stats import norm
 
-from trustbo.models.families.family import SSM, Observed
+from trustbo.models.families.family import SSM, Moments, Observed
 from trustbo.models.families.gaussian import Gaussian
 from trustbo.models.families.terms import AT_ONE, AT_ZERO, Terms
 from trustbo.models.state_space.scalar import Censoring, Filtered
@@ -41,9 +43,7 @@ class Censored(Gaussian):
         """See `Family.measure`: `y` clipped to [0, 1]."""
         return jnp.clip(y, 0.0, 1.0)
 
-    def rate_moments(
-        self, trust: np.ndarray, noise_sd: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def rate_moments(self, trust: ndarray, noise_sd: ndarray) -> Moments:
         """See `Family.rate_moments`: of a normal variable clipped to [0, 1] (Tobin 1958)."""
         low, high = -trust / noise_sd, (1.0 - trust) / noise_sd
         inside = norm.cdf(high) - norm.cdf(low)
@@ -55,24 +55,14 @@ class Censored(Gaussian):
         return mean, inside, np.maximum(square - mean**2, 1e-12)
 
     def draw_rates(
-        self,
-        rng: np.random.Generator,
-        trust: np.ndarray,
-        y: np.ndarray,
-        noise_sd: np.ndarray,
-        n_ticks: np.ndarray,
-    ) -> np.ndarray:
+        self, rng: Generator, trust: ndarray, y: ndarray, noise_sd: ndarray, n_ticks: ndarray
+    ) -> ndarray:
         """See `Family.draw_rates`."""
         return np.clip(y, 0.0, 1.0)
 
     def observe(
-        self,
-        mean: np.ndarray,
-        var: np.ndarray,
-        y: np.ndarray,
-        n_ticks: np.ndarray,
-        noise_sd: np.ndarray,
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        self, mean: ndarray, var: ndarray, y: ndarray, n_ticks: ndarray, noise_sd: ndarray
+    ) -> Moments:
         """See `Family.observe`: of a normal censored at a limit (Tobin 1958)."""
         value, zero, density = super().observe(mean, var, y, n_ticks, noise_sd)
         at_one, cut, S = y >= 1.0, (y >= 1.0) | (y <= 0.0), np.sqrt(var)

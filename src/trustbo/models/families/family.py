@@ -15,6 +15,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, random
+from numpy import ndarray
+from numpy.random import Generator
 
 from trustbo.errors import TrustboError
 from trustbo.models.families.terms import Terms
@@ -22,6 +24,7 @@ from trustbo.models.state_space.scalar import ScalarSSM
 from trustbo.models.state_space.vector import VectorSSM
 
 SSM = ScalarSSM | VectorSSM
+Moments = tuple[ndarray, ndarray, ndarray]
 N_IMPORTANCE = 32
 """Trajectories to average the likelihood over where trust does not integrate out."""
 
@@ -104,24 +107,14 @@ class Family(ABC):
 
     @abstractmethod
     def draw_rates(
-        self,
-        rng: np.random.Generator,
-        trust: np.ndarray,
-        y: np.ndarray,
-        noise_sd: np.ndarray,
-        n_ticks: np.ndarray,
-    ) -> np.ndarray:
+        self, rng: Generator, trust: ndarray, y: ndarray, noise_sd: ndarray, n_ticks: ndarray
+    ) -> ndarray:
         """`measure` in NumPy; `noise_sd` is delta_v, all arrays broadcast to trust."""
 
     @abstractmethod
     def observe(
-        self,
-        mean: np.ndarray,
-        var: np.ndarray,
-        y: np.ndarray,
-        n_ticks: np.ndarray,
-        noise_sd: np.ndarray,
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        self, mean: ndarray, var: ndarray, y: ndarray, n_ticks: ndarray, noise_sd: ndarray
+    ) -> Moments:
         """Moments given a rate that was predicted N(mean, var), and its log probability or density.
 
         Moments are of the rate before clipping, noise included, or of trust where `observes_trust`.
@@ -146,9 +139,7 @@ class Family(ABC):
         """Mask of the measured rates that have a density, not a probability."""
 
     @abstractmethod
-    def rate_moments(
-        self, trust: np.ndarray, noise_sd: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def rate_moments(self, trust: ndarray, noise_sd: ndarray) -> Moments:
         """Mean of a rate given trust, its slope in trust, and the variance of the rate.
 
         `noise_sd` is delta_v, broadcast to trust. For counts, the number of ticks is that of a rate

@@ -6,9 +6,11 @@ from typing import ClassVar
 
 import numpy as np
 from jax import Array, random
+from numpy import ndarray
+from numpy.random import Generator
 from scipy.stats import norm
 
-from trustbo.models.families.family import SSM, Family, Observed
+from trustbo.models.families.family import SSM, Family, Moments, Observed
 from trustbo.models.families.terms import GAUSSIAN, NONE, Terms
 from trustbo.models.state_space.scalar import Filtered
 
@@ -42,31 +44,19 @@ class Gaussian(Family):
         """See `Family.measure`: `y` unclipped, which may leave [0, 1]."""
         return y
 
-    def rate_moments(
-        self, trust: np.ndarray, noise_sd: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def rate_moments(self, trust: ndarray, noise_sd: ndarray) -> Moments:
         """See `Family.rate_moments`."""
         return trust, np.ones(trust.shape), np.broadcast_to(noise_sd**2, trust.shape)
 
     def draw_rates(
-        self,
-        rng: np.random.Generator,
-        trust: np.ndarray,
-        y: np.ndarray,
-        noise_sd: np.ndarray,
-        n_ticks: np.ndarray,
-    ) -> np.ndarray:
+        self, rng: Generator, trust: ndarray, y: ndarray, noise_sd: ndarray, n_ticks: ndarray
+    ) -> ndarray:
         """See `Family.draw_rates`."""
         return y
 
     def observe(
-        self,
-        mean: np.ndarray,
-        var: np.ndarray,
-        y: np.ndarray,
-        n_ticks: np.ndarray,
-        noise_sd: np.ndarray,
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        self, mean: ndarray, var: ndarray, y: ndarray, n_ticks: ndarray, noise_sd: ndarray
+    ) -> Moments:
         """See `Family.observe`; the density without its constant."""
         value = np.broadcast_to(y, mean.shape)
         return value, np.zeros(mean.shape), -0.5 * ((y - mean) ** 2 / var + np.log(var))

@@ -12,9 +12,11 @@ from typing import ClassVar
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, random
+from numpy import ndarray
+from numpy.random import Generator
 from scipy import special
 
-from trustbo.models.families.family import SSM, Observed
+from trustbo.models.families.family import SSM, Moments, Observed
 from trustbo.models.families.linearised import Data, Linearised
 
 NU = 4.0
@@ -56,32 +58,20 @@ class StudentT(Linearised):
         weight = random.gamma(key, 0.5 * NU, y.shape, y.dtype) / (0.5 * NU)
         return trust + (y - trust) / jnp.sqrt(weight)
 
-    def rate_moments(
-        self, trust: np.ndarray, noise_sd: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def rate_moments(self, trust: ndarray, noise_sd: ndarray) -> Moments:
         """See `Family.rate_moments`."""
         var = NU / (NU - 2.0) * noise_sd**2
         return trust, np.ones(trust.shape), np.broadcast_to(var, trust.shape)
 
     def draw_rates(
-        self,
-        rng: np.random.Generator,
-        trust: np.ndarray,
-        y: np.ndarray,
-        noise_sd: np.ndarray,
-        n_ticks: np.ndarray,
-    ) -> np.ndarray:
+        self, rng: Generator, trust: ndarray, y: ndarray, noise_sd: ndarray, n_ticks: ndarray
+    ) -> ndarray:
         """See `Family.draw_rates`."""
         return trust + noise_sd * rng.standard_t(NU, trust.shape)
 
     def observe(
-        self,
-        mean: np.ndarray,
-        var: np.ndarray,
-        y: np.ndarray,
-        n_ticks: np.ndarray,
-        noise_sd: np.ndarray,
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        self, mean: ndarray, var: ndarray, y: ndarray, n_ticks: ndarray, noise_sd: ndarray
+    ) -> Moments:
         """See `Family.observe`: a mixture of Gaussian rates, the weights on quadrature nodes."""
         weight, log_p = _nodes()
         mean, var, y, sd = np.broadcast_arrays(mean, var, y, noise_sd)
