@@ -1,7 +1,7 @@
 """Models of people's reports against baselines, on people who were left out."""
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -59,7 +59,7 @@ def compare_people(
         raise TrustboError(f"model {bad[0]!r} must be a HumanTrust; got {models[bad[0]]!r:.60}.")
     order = np.random.default_rng(seed).permutation(len(missions))
     names = [*(["persistence"] if given == "earlier" else []), "means", "ridge", *models]
-    parts: dict[str, list[_Scored]] = {name: [] for name in names}
+    parts: dict[str, list[pd.DataFrame]] = {name: [] for name in names}
     for test in np.array_split(order, folds):
         train = np.setdiff1d(order, test)
         table = _Table.of(batch, missions[0].features, given)
@@ -71,17 +71,10 @@ def compare_people(
                 parts[name].append(_of_model(tree, people, table.scored[test], given, seed))
             else:
                 parts[name].append(table.baseline(name, train, test))
-    return pd.DataFrame({name: _summary(found) for name, found in parts.items()}).T
-
-
-class _Scored(NamedTuple):
-    """Predictions of some reports, each (report,)."""
-
-    y: np.ndarray
-    mean: np.ndarray
-    median: np.ndarray
-    log_score: np.ndarray
-    covered: np.ndarray
+    found = pd.concat({name: pd.concat(of_folds) for name, of_folds in parts.items()})
+    by_name: Any = found.groupby(level=0, sort=False)
+    scores = by_name.mean()
+    return scores.assign(rmse=np.sqrt(scores["rmse"]), n=by_name.size().astype(float))
 
 
 class _Table(NamedTuple):
@@ -118,7 +111,7 @@ class _Table(NamedTuple):
             inputs += [own, own[..., :1] * (kind == 1)[..., None]]
         return cls(y, batch.n_ticks, kind, np.concatenate(inputs, -1), last, seen)
 
-    def baseline(self, name: str, train: np.ndarray, test: np.ndarray) -> _Scored:
+    def baseline(self, name: str, train: np.ndarray, test: np.ndarray) -> pd.DataFrame:
         """Predictions of a baseline."""
         a, b = (self.scored & np.isin(np.arange(len(self.y)), some)[:, None, None]
                 for some in (train, test))  # fmt: skip
@@ -138,7 +131,7 @@ class _Table(NamedTuple):
         return _normal(self.y[b], self.steps[b], mean, sd)
 
 
-def _normal(y: np.ndarray, steps: np.ndarray, mean: np.ndarray, sd: float) -> _Scored:
+def _normal(y: np.ndarray, steps: np.ndarray, mean: np.ndarray, sd: float) -> pd.DataFrame:
     """Normal predictions, of the level where reports have levels."""
     half = 0.5 / steps
     low, high = np.where(y <= 0.0, -np.inf, y - half), np.where(y >= 1.0, np.inf, y + half)
@@ -147,27 +140,26 @@ def _normal(y: np.ndarray, steps: np.ndarray, mean: np.ndarray, sd: float) -> _S
     log_score = np.where(np.isnan(steps), density, np.log(np.maximum(mass, 1e-12)))
     within = np.abs(y - mean) <= 1.6449 * sd + np.nan_to_num(half)
     unit = np.nan_to_num(steps, nan=1.0)
-    return _Scored(unit * y, unit * mean, unit * mean, log_score, within)
+    return _scored(unit * y, unit * mean, unit * mean, log_score, within)
 
 
 def _of_model(
     tree: object, people: Sequence[Mission], scored: np.ndarray, given: str, seed: int
-) -> _Scored:
+) -> pd.DataFrame:
     found = predict_reports(tree, people, given=given, seed=seed)  # pyright: ignore
     scored = scored[:, : found.sizes["bound"]]
     y, mean, log_score = (found[name].values[scored] for name in ("report", "mean", "log_score"))
     low, median, high = (found["quantile"].values[scored][:, i] for i in (0, 2, 4))
-    return _Scored(y, mean, median, log_score, (low <= y + 1e-9) & (y <= high + 1e-9))
+    return _scored(y, mean, median, log_score, (low <= y + 1e-9) & (y <= high + 1e-9))
 
 
-def _summary(parts: Sequence[_Scored]) -> dict[str, float]:
-    y, mean, median, log_score, covered = (
-        np.concatenate([getattr(part, name) for part in parts]) for name in _Scored._fields
-    )
-    return {
-        "mae": float(np.abs(y - median).mean()),
-        "rmse": float(np.sqrt(((y - mean) ** 2).mean())),
-        "log_score": float(log_score.mean()),
-        "coverage_90": float(covered.mean()),
-        "n": float(len(y)),
-    }
+def _scored(
+    y: np.ndarray,
+    mean: np.ndarray,
+    median: np.ndarray,
+    log_score: np.ndarray,
+    covered: np.ndarray,
+) -> pd.DataFrame:
+    """Errors and scores of some reports, a row for each."""
+    off = {"mae": np.abs(y - median), "rmse": (y - mean) ** 2}
+    return pd.DataFrame({**off, "log_score": log_score, "coverage_90": covered.astype(float)})

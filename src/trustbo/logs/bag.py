@@ -3,13 +3,12 @@
 Needs `pip install rosbags`, not ROS itself. All types are standard; topics, their types and
 times of publication are tabulated in docs/howto/your-own-robots.md, and can be renamed (`Topics`).
 
-All times are those of recording, whole nanoseconds. A bound lasts from its marker to its status,
-else to the last contact message before the next marker; a message at the time of the next marker
-belongs to the bound before. The contact rate is the share of a robot's ticks with contact, n_ticks
-their number; a contact of NaN was not measured, and is no tick. If robots have unequal numbers,
-`Bound.contact` has the ticks of the one with most. Poses and states are the last ones at each tick,
-x and y as recorded: in CRS metres if their frame is; headings have no jumps. Awareness that was not
-published is NaN, which `Campaign.tell` takes from the map.
+All times are those of recording, whole nanoseconds; bounds are cut as in `Recording`. The contact
+rate is the share of a robot's ticks with contact, n_ticks their number; a contact of NaN was not
+measured, and is no tick. If robots have unequal numbers, `Bound.contact` has the ticks of the one
+with most. Poses and states are the last ones at each tick, x and y as recorded: in CRS metres if
+their frame is; headings have no jumps. Awareness that was not published is NaN, which
+`Campaign.tell` takes from the map.
 """
 
 import json

@@ -64,7 +64,9 @@ class Sensor(Displayed):
     @cached_property
     def log_score(self) -> float:
         """Mean log score of contact in a tick, of ticks left out, nats."""
-        return _log_score(self._left_out, self._geometry)
+        p = np.clip(self._left_out.values, 1e-9, 1.0 - 1e-9)
+        contact = self._geometry["contact"].values
+        return float(np.nanmean(contact * np.log(p) + (1.0 - contact) * np.log1p(-p)))
 
     def _card(self) -> Card:
         geometry = self._geometry
@@ -147,9 +149,3 @@ def _back(geometry: xr.Dataset, known: np.ndarray, values: np.ndarray) -> xr.Dat
     chance = np.full(known.shape, np.nan)
     chance[known] = values
     return geometry["contact"].copy(data=chance).rename("chance")
-
-
-def _log_score(chance: xr.DataArray, geometry: xr.Dataset) -> float:
-    p = np.clip(chance.values, 1e-9, 1.0 - 1e-9)
-    contact = geometry["contact"].values
-    return float(np.nanmean(contact * np.log(p) + (1.0 - contact) * np.log1p(-p)))

@@ -1,15 +1,4 @@
-"""Missions as a table in long form: one row per mission, bound and robot.
-
-| column | required | |
-|---|---|---|
-| `mission` | yes | label |
-| `bound` | yes | 0 for the start cell, without measurements; then 1, 2, ... |
-| `robot` | yes | name; blank where nothing was measured |
-| `row`, `col` | no, or `x`, `y`, or `lon`, `lat` | cell of the bound, or a position in it |
-| `contact_rate` | yes, or `contact_time` and `duration` (s) | in [0, 1] |
-| `duration`, `t0` (s), `n_ticks`, `status`, `mission_status` | no | |
-| `report`, `report_by`, `report_scale` | no | trust in the robot that a person reported |
-| any other | no | awareness feature, in [0, 1] |
+"""Missions as a table in long form: one row per mission, bound and robot; columns in `read_table`.
 
 A report is given after its bound, before the mission at bound 0, on a scale such as "likert7".
 A table without places is of a log without a map: features are of any values. A blank
@@ -50,8 +39,9 @@ def read_table(
 
     Required columns are `mission`, `bound`, `robot`, the cell (`row` and `col`, or `x` and `y`, or
     `lon` and `lat`) and the contact (`contact_rate`, or `contact_time` and `duration`). Optional
-    ones are `duration`, `t0`, `n_ticks`, `status`, `mission_status` and a column for each awareness
-    feature: docs/howto/your-own-robots.md. A table without a cell is of a log without a map.
+    ones are `duration`, `t0`, `n_ticks`, `status`, `mission_status`, `report`, `report_by`,
+    `report_scale` and a column for each awareness feature: docs/howto/your-own-robots.md. Bound 0
+    is the start cell, without measurements. A table without a cell is of a log without a map.
 
     Args:
         table: Path of a CSV file with a header, separated by commas, semicolons or tabs, or a

@@ -13,7 +13,6 @@ from trustbo.logs.geometry import geometry as geometry_of
 from trustbo.logs.log import Log
 from trustbo.logs.sensor import Sensor
 from trustbo.workspace import Workspace
-from trustbo.workspace.moves import moves_along
 
 EACH = "each"
 EXPECTED = "expected"
@@ -93,7 +92,8 @@ def missions_of(
     missions = []
     for one, first, last in _leads(log, lead, known["time"].values - 0.5 * tick, n):
         if workspace is None:
-            stretches = _windows(one, first, last, _ticks_of(window, tick))
+            edges = np.arange(first, last + 1, _ticks_of(window, tick))
+            stretches = [_Stretch(one, edges, None)]
         else:
             stretches = _crossings(log, one, first, last, known["time"].values, workspace)
         for stretch in stretches:
@@ -240,12 +240,6 @@ def _ticks_of(window: float, tick: float) -> int:
     return n
 
 
-def _windows(lead: int, first: int, last: int, n: int) -> list[_Stretch]:
-    """One stretch of whole windows of n ticks."""
-    edges = np.arange(first, last + 1, n)
-    return [_Stretch(lead, edges, None)]
-
-
 def _crossings(
     log: Log, lead: int, first: int, last: int, time: np.ndarray, workspace: Workspace
 ) -> list[_Stretch]:
@@ -271,21 +265,13 @@ def _crossings(
 
     for k in changes.tolist():
         cell = (int(row[k]), int(col[k]))
-        if path and not (cell[0] >= 0 and _are_neighbours(path[-1], cell)):
+        if path and (cell[0] < 0 or np.abs(np.subtract(path[-1], cell)).max() > 1):
             close(k)
         if cell[0] >= 0:
             path.append(cell)
             edges.append(k)
     close(len(poses))
     return stretches
-
-
-def _are_neighbours(a: Cell, b: Cell) -> bool:
-    try:
-        moves_along([a, b])
-    except TrustboError:
-        return False
-    return True
 
 
 def _parts(stretch: _Stretch, length: int | None) -> list[_Stretch]:
