@@ -40,7 +40,7 @@ def test_it_adds_what_fit_adds_at_once(missions, model, tmp_path):
         {name: bare[name].to_dataset() for name in ("posterior", "sample_stats", "prior")}
     )
     alone.attrs = bare.attrs
-    with pytest.raises(TrustboError, match=r"give the missions it was fitted to, such as complete"):
+    with pytest.raises(TrustboError, match=r"give the missions it was fitted to"):
         complete(alone)
     xr.testing.assert_identical(
         complete(alone, missions)["latent"].to_dataset(), whole["latent"].to_dataset()

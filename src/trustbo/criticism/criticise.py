@@ -327,14 +327,7 @@ def _checked(posterior: xr.DataTree, missions: Sequence[Mission] | None) -> list
             f"this posterior lacks {what}, so that its residuals are not known; criticise takes "
             "posteriors of PooledTrust, HierarchicalTrust and CoupledTrust from trustbo.fit."
         )
-    if missions is not None:
-        return _learned(posterior, missions)
-    if "constant_data" not in posterior.children:
-        raise TrustboError(
-            "this posterior holds parameters alone: give the missions it was fitted to, such as "
-            "criticise(result.posteriors[j], result.missions[: j + 1])."
-        )
-    return missions_of(posterior)
+    return missions_of(posterior) if missions is None else _learned(posterior, missions)
 
 
 def _learned(posterior: xr.DataTree, missions: Sequence[Mission]) -> list[Mission]:

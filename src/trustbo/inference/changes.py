@@ -150,7 +150,7 @@ def scan_posterior(
             "changes are of robots' contact, and this posterior is of reports of people, whose "
             "trust moves by the gains beta and each person's; give one of the robots' missions."
         )
-    data = FitData.of("changes", posterior, missions, workspace, model)
+    data = FitData.of(posterior, missions, workspace, model)
     model, n_given, n_fitted = data.model, len(data.missions), len(data.missions)
     if "constant_data" in posterior.children:
         n_fitted = posterior["constant_data"].sizes["mission"]

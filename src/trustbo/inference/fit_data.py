@@ -8,7 +8,6 @@ import numpy as np
 import xarray as xr
 
 from trustbo.data import Mission
-from trustbo.errors import TrustboError
 from trustbo.inference.posterior_tree import missions_of
 from trustbo.models.effects.effect import Slots
 from trustbo.models.effects.place import PlaceEffect
@@ -31,21 +30,15 @@ class FitData(NamedTuple):
     @classmethod
     def of(
         cls,
-        what: str,
         posterior: xr.DataTree,
         missions: Sequence[Mission] | None,
         workspace: Workspace | None,
         model: TrustModel | None,
     ) -> "FitData":
-        """Fit of a posterior, its missions being given or in it, for a function called `what`.
+        """Fit of a posterior, its missions being given or in it.
 
         TrustboError: it holds no missions and none are given, or custom priors and no model.
         """
-        if missions is None and "constant_data" not in posterior.children:
-            raise TrustboError(
-                "this posterior holds parameters alone: give the missions it was fitted to, such "
-                f"as {what}(result.posteriors[-1], result.missions)."
-            )
         missions = missions_of(posterior) if missions is None else list(missions)
         missions = missions if workspace is None else [workspace.fill(m) for m in missions]
         features, attrs = missions[0].features, posterior.attrs

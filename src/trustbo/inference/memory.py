@@ -89,7 +89,7 @@ def memory(
     attrs = require_posterior("memory", posterior).attrs
     if missions is not None and is_of_people(posterior) and any(m.reports for m in missions):
         missions = [*reports_of(missions).values()]
-    data = FitData.of("memory", posterior, missions, workspace, model)
+    data = FitData.of(posterior, missions, workspace, model)
     model = data.model
     exact = isinstance(model, PooledTrust) and "log_evidence" in attrs and not model.lag
     if not exact or resolve_sampler(model, "auto")[0] != "exact":

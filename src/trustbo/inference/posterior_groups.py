@@ -106,13 +106,7 @@ def complete(
     if "latent" in require_posterior("complete", posterior).children:
         return posterior
     conditional = Conditional.of(posterior)
-    if missions is None:
-        if "constant_data" not in posterior.children:
-            raise TrustboError(
-                "this posterior holds parameters alone: give the missions it was fitted to, such "
-                "as complete(result.posteriors[j], result.missions[: j + 1])."
-            )
-        missions = missions_of(posterior)
+    missions = missions_of(posterior) if missions is None else missions
     if not conditional.keeps_trust and latents is None:
         raise TrustboError(
             f'trust under observation "{conditional.family.name}" was sampled with the parameters '

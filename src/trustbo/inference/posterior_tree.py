@@ -128,7 +128,12 @@ def of_no_map(posterior: xr.DataTree) -> bool:
 
 
 def missions_of(posterior: xr.DataTree) -> list[Mission]:
-    """Missions rebuilt from the data in a posterior."""
+    """Missions rebuilt from the data in a posterior; TrustboError: it holds parameters alone."""
+    if "constant_data" not in posterior.children:
+        raise TrustboError(
+            "this posterior holds parameters alone: give the missions it was fitted to, of "
+            "result.posteriors[j] those of result.missions[: j + 1]."
+        )
     data = posterior["constant_data"].to_dataset()
     data = data.assign(contact_rate=posterior["observed_data"].to_dataset()["contact_rate"])
     robots, features = ([str(n) for n in data[dim].values] for dim in ("robot", "feature"))

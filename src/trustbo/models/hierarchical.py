@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import numpyro
 import numpyro.distributions as dist
-from jax import Array
 from numpyro.distributions.transforms import biject_to
 
 from trustbo.models.model import TrustModel, register, sample
@@ -28,26 +27,22 @@ class HierarchicalTrust(TrustModel):
 
     def sample_params(self, n_robots: int, n_features: int) -> RobotParams:
         """Sample statements of means, spreads, and each robot's deviation."""
-        priors, unit = self.priors, dist.Normal(0.0, 1.0)
-        mean_beta0 = sample("mean_beta0", priors.beta0)
-        params = self._assemble(
-            {
-                "mean_beta0": mean_beta0,
-                "mean_beta": sample("mean_beta", priors.weights(mean_beta0), (n_features,)),
-                "mean_b": sample("mean_b", priors.intercept(mean_beta0)),
-                "tau_beta0": sample("tau_beta0", priors.tau),
-                "tau_beta": sample("tau_beta", priors.tau, (n_features,)),
-                "tau_b": sample("tau_b", priors.tau),
-                "e_beta0": sample("e_beta0", unit, (n_robots,)),
-                "e_beta": sample("e_beta", unit, (n_robots, n_features)),
-                "e_b": sample("e_b", unit, (n_robots,)),
-                "delta_w": sample("delta_w", priors.delta_w),
-                "delta_v": sample("delta_v", priors.delta_v),
-            }
-        )
-        for name in ("beta0", "beta", "b"):
-            numpyro.deterministic(name, getattr(params, name))
-        return params
+        priors, unit, noises = self.priors, dist.Normal(0.0, 1.0), ("delta_w", "delta_v")
+        size = {"beta0": (), "beta": (n_features,), "b": ()}
+        mean = {"beta0": sample("mean_beta0", priors.beta0)}
+        mean["beta"] = sample("mean_beta", priors.weights(mean["beta0"]), (n_features,))
+        mean["b"] = sample("mean_b", priors.intercept(mean["beta0"]))
+        tau = {name: sample(f"tau_{name}", priors.tau, shape) for name, shape in size.items()}
+        e = {name: sample(f"e_{name}", unit, (n_robots, *size[name])) for name in size}
+        noise = {name: sample(name, getattr(priors, name)) for name in noises}
+        line = biject_to(priors.beta0.support)
+        centre = mean | {"beta0": line.inv(mean["beta0"])}
+        own = {name: centre[name] + tau[name] * e[name] for name in size}
+        own["beta0"] = line(own["beta0"])
+        for name, value in own.items():
+            numpyro.deterministic(name, value)
+        noise = {name: jnp.broadcast_to(sd, (n_robots,)) for name, sd in noise.items()}
+        return RobotParams(**own, **noise, x0_mean=priors.x0_mean, x0_sd=priors.x0_sd)
 
     def draw_prior(
         self, shape: tuple[int, int], n: int, rng: np.random.Generator
@@ -88,21 +83,6 @@ class HierarchicalTrust(TrustModel):
     def robot_sets(self) -> str:
         """See `TrustModel.robot_sets`."""
         return "pooled"
-
-    def _assemble(self, sites: Mapping[str, Array]) -> RobotParams:
-        """Each robot's parameters."""
-        line = biject_to(self.priors.beta0.support)
-        own = line.inv(sites["mean_beta0"]) + sites["tau_beta0"] * sites["e_beta0"]
-        robot = own.shape
-        return RobotParams(
-            beta0=line(own),
-            beta=sites["mean_beta"][None] + sites["tau_beta"][None] * sites["e_beta"],
-            b=sites["mean_b"] + sites["tau_b"] * sites["e_b"],
-            delta_w=jnp.broadcast_to(sites["delta_w"], robot),
-            delta_v=jnp.broadcast_to(sites["delta_v"], robot),
-            x0_mean=self.priors.x0_mean,
-            x0_sd=self.priors.x0_sd,
-        )
 
     @property
     def dims(self) -> dict[str, tuple[str, ...]]:
