@@ -6,8 +6,9 @@ from trustbo.logs.log import Log, read_log
 from trustbo.logs.messages import Topics
 from trustbo.logs.mrclam import read_mrclam
 from trustbo.logs.netcdf import read_missions, write_missions
-from trustbo.logs.reports import read_azevedo_sa, read_du, read_reports, read_soh, reports_of
+from trustbo.logs.reports import read_reports, reports_of
 from trustbo.logs.sensor import Sensor, fit_sensor
+from trustbo.logs.studies import read_azevedo_sa, read_du, read_soh
 from trustbo.logs.synthetic import synthetic_log
 from trustbo.logs.table import read_table, write_table
 from trustbo.logs.windows import join_missions, missions_of
