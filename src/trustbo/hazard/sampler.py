@@ -25,7 +25,6 @@ from scipy import special, stats
 
 from trustbo.hazard.exposures import Exposures
 from trustbo.inference.samplers.laplace import laplace
-from trustbo.inference.samplers.student import Student
 from trustbo.inference.samplers.weights import smoothed_weights
 
 LIMIT = 0.7
@@ -310,7 +309,12 @@ class _Mixture(NamedTuple):
 
     def log_density(self, z: np.ndarray) -> np.ndarray:
         """Log density, shape (point,)."""
+        d, nu = z.shape[1], _DEGREES
         terms = [np.log(_DEFENCE) - (0.5 * z**2 + _NORMAL).sum(1)]
+        norm = special.gammaln(0.5 * (nu + d)) - special.gammaln(0.5 * nu)
+        norm -= 0.5 * d * np.log(nu * np.pi)
         for center, factor, share in zip(*self, strict=True):
-            terms.append(np.log(share) + Student(center, factor, _DEGREES).log_density(z))
+            r2 = (np.linalg.solve(factor, (z - center).T) ** 2).sum(0)
+            shape = norm - np.log(np.diag(factor)).sum() - 0.5 * (nu + d) * np.log1p(r2 / nu)
+            terms.append(np.log(share) + shape)
         return np.logaddexp.reduce(terms, axis=0)
