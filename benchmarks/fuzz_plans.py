@@ -5,7 +5,7 @@ Run: python benchmarks/fuzz_plans.py [-n N] [--first I] [--seed S] [--jobs J] [-
 
 Draws grids, strips and closed bounds, awareness of cells or bounds, effects of places, all models,
 objectives and families, tolls on length and on time unseen, limits on bounds from "shortest" to
-"shortest+300", walks without revisits, risks with limits, confidence and costs, and numbers that
+"shortest+300", risks with limits, confidence and costs, and numbers that
 are large, tied or 0. The compiled engine's plan, and where it is quick the reference engine's, must
 have the best score of all admissible paths (`peers.every_path`, which shares no code with the
 engines). Problem I of a seed is always the same. Chunks run in processes: one that crashes is
@@ -217,8 +217,7 @@ def draw_case(rng):
     case.most, case.longest, case.u_turns = draw_limit(rng, case)
     if case.longest > 30:
         case.beta0 = min(max(case.beta0, -1.0), 1.0)
-    case.revisit = bool(rng.random() < 0.7 or (case.dense and case.history))
-    case.simple = case.objective == "stationary" or (case.history and not case.revisit)
+    case.simple = case.objective == "stationary"
     if case.objective == "stationary":
         case.longest, case.u_turns = int(case.passable.sum()) - 1, True
     case.weight, case.unseen = float(pick(rng, 0.0, 0.0, 0.01, 0.1)), 0.0
@@ -298,7 +297,7 @@ class Problem:
         vars(workspace)["unseen_bounds"] = shares  # as if computed from a map, and cached
         planner = Planner(
             workspace, case.start, case.goal, case.objective, connectivity=case.connectivity,
-            max_bounds=case.most, revisit=case.revisit, team=case.team, length_weight=case.weight,
+            max_bounds=case.most, team=case.team, length_weight=case.weight,
             unseen_cost=case.unseen, engine=engine, observation=case.family,
             response="change" if case.lag else "level", **self.options,
         )  # fmt: skip

@@ -168,14 +168,6 @@ def test_planning_is_for_one_draw_and_evaluating_for_whole_paths(workspace, draw
         planner.evaluate([(4, 0), (3, 0)], PARAMS)
 
 
-def test_random_keeps_to_paths_without_revisits_where_asked(workspace, draws):
-    planner = Planner(workspace, (4, 0), (0, 5), "success", revisit=False)
-    for i in range(20):
-        plan = policies.random(jax.random.key(i), draws, planner)
-        assert plan.revisits == 0
-        assert len(plan.path) - 1 <= planner.longest
-
-
 def test_random_walks_long_corridors(draws):
     workspace = Workspace.from_awareness(np.full((1, 1, 600, 2), 0.5))
     planner = Planner(workspace, (0, 0), (0, 599))

@@ -1,8 +1,7 @@
 """Uniform sampling of admissible paths by counting.
 
 The number of walks from a cell to the goal with n bounds left follows by dynamic programming. A
-path drawn cell by cell with these numbers as weights is uniform over all walks; walks that enter a
-cell twice are rejected where revisits are forbidden, which leaves the rest uniform.
+path drawn cell by cell with these numbers as weights is uniform over all walks.
 """
 
 from weakref import WeakKeyDictionary
@@ -10,10 +9,8 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from trustbo.data import Cell
-from trustbo.errors import TrustboError
 from trustbo.planning.paths import AdmissiblePaths
 
-_TRIES = 10_000
 _Counts = list[dict[tuple[Cell | None, Cell], int]]
 
 _samplers: "WeakKeyDictionary[AdmissiblePaths, PathSampler]" = WeakKeyDictionary()
@@ -32,7 +29,7 @@ class PathSampler:
     def __init__(self, admissible: AdmissiblePaths) -> None:
         """Count backwards from the goal; slow for long walks on large grids."""
         self._graph, self._start = admissible.graph, admissible.start
-        self._u_turns, self._revisit = admissible.u_turns, admissible.revisit
+        self._u_turns = admissible.u_turns
         self._lengths = range(admissible.shortest, admissible.longest + 1)
         # counts[n][before, cell]: walks of n more bounds to the goal. `before` is the cell that the
         # last bound left, or None where U-turns are allowed.
@@ -53,23 +50,7 @@ class PathSampler:
             self._counts.append(now)
 
     def draw(self, rng: np.random.Generator) -> tuple[Cell, ...]:
-        """Draw one admissible path, each with equal probability.
-
-        TrustboError: revisits are forbidden, and each of 10 000 walks drawn had one.
-        """
-        for _ in range(_TRIES):
-            path = self._draw_walk(rng)
-            if self._revisit or len(set(path)) == len(path):
-                return tuple(path)
-        raise TrustboError(
-            f"no path without revisits among {_TRIES} walks of up to {self._lengths[-1]} "
-            "bounds; lower max_bounds."
-        )
-
-    def _befores(self, cell: Cell) -> list[Cell | None]:
-        return [None] if self._u_turns else [None, *self._graph.predecessors(cell)]
-
-    def _draw_walk(self, rng: np.random.Generator) -> list[Cell]:
+        """Draw one admissible path, each with equal probability."""
         counts, start = self._counts, self._start
         n_of_length = [counts[n].get((None, start), 0) for n in self._lengths]
         before, path = None, [start]
@@ -79,7 +60,10 @@ class PathSampler:
             others = [o for o in self._graph.successors(here) if before is None or o != before]
             path.append(others[_choose(rng, [counts[n].get((left, o), 0) for o in others])])
             before = left
-        return path
+        return tuple(path)
+
+    def _befores(self, cell: Cell) -> list[Cell | None]:
+        return [None] if self._u_turns else [None, *self._graph.predecessors(cell)]
 
 
 def _choose(rng: np.random.Generator, counts: list[int]) -> int:

@@ -43,7 +43,6 @@ class PathClass(NamedTuple):
     connectivity: int = 8
     max_bounds: int | str | None = None
     """None: shortest + `DEFAULT_EXTRA`."""
-    revisit: bool = True
 
     def longest(self, shortest: int) -> int:
         """Largest number of bounds where the fewest are `shortest`.
@@ -65,9 +64,9 @@ class PathClass(NamedTuple):
 class AdmissiblePaths:
     """Start, goal and the admissible paths between them, with the tables that engines need.
 
-    A path ends on entering the goal, and has `shortest` to `longest` bounds; `connectivity`,
-    `max_bounds` and `revisit` are those of its `path_class`. With `u_turns`, where `max_bounds` is
-    a number, a bound may lead back to the cell that the last one left. `steps` are the moves to
+    A path ends on entering the goal, and has `shortest` to `longest` bounds; `connectivity` and
+    `max_bounds` are those of its `path_class`. With `u_turns`, where `max_bounds` is a number, a
+    bound may lead back to the cell that the last one left. `steps` are the moves to
     neighbouring cells, shape (move, 2), `lengths` theirs in metres, shape (move,), and `bounds`
     those that a path may take, (move, row, col): the workspace's, less the `avoided`.
     """
@@ -107,7 +106,7 @@ class AdmissiblePaths:
         if self.u_turns:
             path_class = path_class._replace(max_bounds=self.longest)
         self.path_class = path_class
-        _, self.max_bounds, self.revisit = path_class
+        self.max_bounds = path_class.max_bounds
 
     def _require_way(self) -> None:
         """Refuse ends that are not connected: NoPathError, which counts the cells in reach."""

@@ -59,12 +59,10 @@ class Planner(Displayed):
         *,
         connectivity: int = 8,
         max_bounds: int | str | None = None,
-        revisit: bool = True,
         team: str = "mean",
         length_weight: float = 0.0,
         unseen_cost: float = 0.0,
         engine: str = "auto",
-        backend: str | None = None,
         observation: str = "gaussian",
         response: str = "level",
         max_failure: float | None = None,
@@ -87,8 +85,6 @@ class Planner(Displayed):
                 cells entered again for larger n. An int: walks of at most that many bounds
                 (default for success and bottleneck: shortest + 8). Without effect on stationary,
                 whose admissible paths are all simple paths.
-            revisit: True if walks of success, bottleneck, and lost_contact of other than Gaussian
-                rates may enter a cell twice; without effect on the other objectives.
             team: Trust of the team: `"mean"` or `"min"` (least) of that of its robots.
             length_weight: Cost of a metre of the path, for lost_contact (in bounds), terminal and
                 mean (in units of trust), success and stationary (in units of log probability).
@@ -97,7 +93,6 @@ class Planner(Displayed):
                 `Workspace.unseen_bounds` expects so.
             engine: `"numba"`, compiled, which `"auto"` takes; or `"networkx"`, the reference. Both
                 find paths of the same value.
-            backend: networkx backend for the shortest paths, e.g. `"parallel"`.
             observation: Family of the contact rates, that of the trust model; for lost_contact and
                 the policy `information`.
             response: Quantity that rates measure, that of the trust model; likewise.
@@ -119,13 +114,12 @@ class Planner(Displayed):
                 `team="mean"`.
             NoPathError: The goal cannot be reached.
         """
-        self.engine, self._engine = engine, solve.Engine(engine, backend)
+        self.engine = require_choice("engine", engine, solve.ENGINES)
         family = FAMILIES[require_choice("observation", observation, FAMILIES)]
         lag = float(require_choice("response", response, RESPONSES) == "change")
-        require_choice("engine", engine, solve.ENGINES)
         if max_bounds is None:
             max_bounds = DEFAULT_MAX_BOUNDS.get(objective, "shortest+2")
-        admitted = PathClass(connectivity, max_bounds, revisit)
+        admitted = PathClass(connectivity, max_bounds)
         paths = AdmissiblePaths(workspace, start, goal, admitted)
         rule = RiskRule(max_failure, confidence, failure_cost, infeasible)
         chosen = Objective(objective, length_weight, family, lag, unseen_cost)
@@ -291,14 +285,14 @@ class Planner(Displayed):
                 "params.draw(i) or params.mean(), or planner.plan_draws for all of them."
             )
         dynamics = self.problem.dynamics(params, x0)
-        best = solve.find_paths(self.problem, dynamics, self._engine)
+        best = solve.find_paths(self.problem, dynamics, self.engine)
         plan = evaluate(self.problem, self.paths.cells(best.paths[0]), params, x0)
         gap = float(best.gap[0])
         return replace(
             plan,
             exact=gap <= solve.EXACT,
             bound=solve.value_limit(self.objective, plan.value, gap),
-            engine=self._engine.used,
+            engine="networkx" if self.engine == "networkx" else "numba",
             seconds=time.perf_counter() - started,
         )
 
@@ -311,7 +305,7 @@ class Planner(Displayed):
         Raises:
             TrustboError: beta0 is outside the range the objective is exact for.
         """
-        best = solve.find_paths(self.problem, dynamics, self._engine)
+        best = solve.find_paths(self.problem, dynamics, self.engine)
         return self.paths.cells(best.paths[0])
 
     def plan_expected(self, posterior: Params | xr.DataTree) -> Plan:
@@ -350,7 +344,7 @@ class Planner(Displayed):
         """
         params, chosen = choose_draws(draws_of(posterior), n_draws, seed)
         dynamics = self.problem.dynamics(params, draws=chosen)
-        best = solve.find_paths(self.problem, dynamics, self._engine)
+        best = solve.find_paths(self.problem, dynamics, self.engine)
         return DrawnPaths(self.problem, dynamics, best.paths, best.gap, chosen)
 
     def evaluate(
@@ -371,10 +365,6 @@ class Planner(Displayed):
             TrustboError: A path that is broken, or does not lead from start to goal.
         """
         return evaluate(self.problem, self.require_path(path), draws_of(params, day=True), x0)
-
-    def bands(self, path: Sequence[Cell], posterior: Params | xr.DataTree) -> np.ndarray:
-        """`Plan.bands` of a path over draws, shape (quantile, bound, robot)."""
-        return self.evaluate(path, posterior).bands
 
     def trust_map(
         self, params: Params | xr.DataTree, *, per_robot: bool = False, x0: ArrayLike | None = None

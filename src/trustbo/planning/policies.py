@@ -86,7 +86,6 @@ def random(key: Array, posterior: Params, planner: Planner) -> Plan:
     the greedy path.
 
     Raises:
-        TrustboError: Revisits are forbidden, and each of 10 000 walks drawn had one.
         InfeasibleError: No path respects `max_failure`.
     """
     paths = _random_paths(planner, np.random.default_rng(seed_of(key)), 1)

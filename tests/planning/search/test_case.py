@@ -23,7 +23,6 @@ UNLIKE = RobotParams(np.array([0.3, 0.6]), np.full((2, 1), 0.4), np.zeros(2), *n
         ("lost_contact", ALIKE, {"observation": "censored"}, "history"),
         ("success", ALIKE, {}, "history"),
         ("bottleneck", ALIKE, {}, "history"),
-        ("success", ALIKE, {"revisit": False}, "vector"),
         ("success", UNLIKE, {}, "vector"),
         ("stationary", UNLIKE, {"team": "min"}, "free"),
     ],

@@ -81,20 +81,6 @@ def test_additive_objectives_are_exact_over_shortest_paths_and_over_walks(object
             np.testing.assert_allclose(plan.value, best, rtol=1e-9)
 
 
-@pytest.mark.parametrize("engine", ["networkx", "numba"])
-@pytest.mark.parametrize("objective", ["success", "bottleneck"])
-def test_walks_without_revisits_are_the_best_simple_paths(objective, engine):
-    for seed in range(6):
-        case = random_case(seed)
-        for beta0 in (0.3, 1.0, 1.3):
-            options = {"revisit": False, "max_bounds": 7, "engine": engine}
-            planner = make_planner(objective, 8, case, **options)
-            plan = planner.plan(make_params(beta0, case))
-            best = best_by_enumeration(objective, beta0, 7, 8, seed, simple=True)
-            np.testing.assert_allclose(plan.value, best, rtol=1e-9)
-            assert plan.revisits == 0
-
-
 @pytest.mark.parametrize("connectivity", [4, 8])
 def test_paths_of_two_more_bounds_without_u_turns_are_simple(connectivity):
     for seed in range(30):

@@ -8,6 +8,7 @@ from references import expected_rate
 from trustbo.planning.search.losses import (
     CLIPPED,
     LEAST,
+    LINEAR,
     LOGISTIC,
     NONE,
     SOFTPLUS,
@@ -24,6 +25,7 @@ DEFINITIONS = {
     SOFTPLUS: lambda x: np.logaddexp(0.0, -x),
     LEAST: lambda x: -x,
     NONE: np.zeros_like,
+    LINEAR: lambda x: -x,
 }
 
 

@@ -4,7 +4,7 @@
 |---|---|---|
 | `sum` | a sum of weights of its bounds | `terminal`, `mean`, Gaussian `lost_contact` |
 | `history` | losses of one trust along it | `success`, `bottleneck`, other `lost_contact` |
-| `vector` | any of these of several trusts, or without revisits | all but `stationary` |
+| `vector` | any of these of several trusts | all but `stationary` |
 | `free` | costs of its bounds, without history | `stationary` |
 """
 
@@ -36,8 +36,8 @@ class Case(NamedTuple):
             return "free"
         if not self.objective.has_labels:
             return "sum" if len(self.dynamics.views) == 1 else "vector"
-        scalar = self.dynamics.is_scalar and self.admissible.revisit
-        return "history" if scalar and self.admissible.can_unroll else "vector"
+        scalar = self.dynamics.is_scalar and self.admissible.can_unroll
+        return "history" if scalar else "vector"
 
     @property
     def tolls(self) -> np.ndarray:

@@ -18,7 +18,7 @@ from trustbo.planning.search.costs_to_go import safest_to_go
 from trustbo.planning.search.graph import Best, Graph, Resources, SearchProblem, no_resources
 from trustbo.planning.search.labels import solve
 from trustbo.planning.search.layers import Weights, best_additive
-from trustbo.planning.search.losses import EXPECTED, LEAST, NONE, SOFTPLUS, TINY_SD
+from trustbo.planning.search.losses import NONE, TINY_SD, loss_for
 from trustbo.planning.values import entry_cost
 
 
@@ -153,15 +153,8 @@ def best_history(
     trust[:, 0], trust[:, 1] = dynamics.transition[:, 0, 0], dynamics.start[:, 0]
     trust[:, 2] = np.maximum(dynamics.noise_sd, TINY_SD)
     drift = plain(dynamics.drift[:, 0].reshape(n_draws, -1))
-    loss = _loss_of(objective)
+    loss = loss_for(objective)
     return solve(SearchProblem(layers, tolls[None], drift, start_cost, trust, loss, resources))
-
-
-def _loss_of(objective: Objective) -> int:
-    """Loss of a bound for an objective of the whole history."""
-    if objective.name == "lost_contact":
-        return EXPECTED[objective.family.expected_rate]
-    return {"success": SOFTPLUS, "bottleneck": LEAST}[objective.name]
 
 
 def _resources(case: Case, graph: Graph) -> Resources:

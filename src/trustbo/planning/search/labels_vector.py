@@ -4,12 +4,11 @@ Method: best-first label setting for multi-criteria shortest paths, in the order
 (Martins 1984; Mandow and Perez de la Cruz 2010, NAMOA*).
 
 State of a label: cell, number of bounds, expected trust x of all states, cost so far, parent; the
-last move where U-turns are forbidden; the set of cells entered where revisits are forbidden.
+last move where U-turns are forbidden.
 
-Cost, to be minimised: `success` sum of softplus(-trust), `bottleneck` max of -trust,
-`lost_contact` sum of 1 - E[rate given trust], `terminal` last -trust, `mean` sum of -trust. The
-latter two are over paths of exactly `max_bounds` bounds, and `lost_contact` is like `mean` where
-rates are linear in trust. To all but `bottleneck` tolls are added. None rises if trust rises.
+Cost, to be minimised: the sum of losses of trust and tolls, or the largest loss, see `losses`; for
+`terminal`, whose loss is `NONE`, the last -trust and tolls. Those of `NONE` and `LINEAR` are over
+paths of exactly `max_bounds` bounds. None rises if trust rises.
 
 Invariant: a label leaves the queue in the order of a lower limit on the cost of its completions
 (`Heuristic`). It is expanded unless an expanded label of the same cell dominates it (see
@@ -37,38 +36,21 @@ from trustbo.planning.objectives import Objective
 from trustbo.planning.paths import AdmissiblePaths
 from trustbo.planning.search.dominance import Heuristic, build_heuristic, dominance_tests
 from trustbo.planning.search.graph import Best, Resources
-from trustbo.planning.search.losses import (
-    CLIPPED,
-    LOGISTIC,
-    SOFTPLUS,
-    TINY_SD,
-    expected_loss,
-    loss_of,
-)
+from trustbo.planning.search.losses import LEAST, NONE, TINY_SD, joined, loss_for, loss_of
 from trustbo.planning.search.room import with_room
 from trustbo.planning.tolls import tolls_of
 
 _compiled = njit(cache=True, nogil=True, error_model="numpy")
 _part = njit(nogil=True, error_model="numpy", **PART)
-SUCCESS, BOTTLENECK, LOGISTIC_LOSS, CLIPPED_LOSS, TERMINAL, MEAN = range(6)
-_LOSSES = {"identity": MEAN, "logistic": LOGISTIC_LOSS, "clipped": CLIPPED_LOSS}
 _TOLERANCES = (0.0, 1e-3, 1e-2, 3e-2, 0.1)
 MAX_LABELS = 300_000
 """Limit on the labels of a search."""
-_MODES = {"success": SUCCESS, "bottleneck": BOTTLENECK, "terminal": TERMINAL, "mean": MEAN}
-
-
-def mode_of(objective: Objective) -> int:
-    """Mode of the search for an objective."""
-    if objective.name == "lost_contact":
-        return _LOSSES[objective.family.expected_rate]
-    return _MODES[objective.name]
 
 
 class LabelSearch(NamedTuple):
     """Data of one search, for one draw."""
 
-    mode: int
+    loss: int  # of `losses`
     transition: np.ndarray  # (state, state)
     drift: np.ndarray  # (state, move, cell); one move where all into a cell are alike
     start_state: np.ndarray  # (state,)
@@ -80,9 +62,8 @@ class LabelSearch(NamedTuple):
     to_goal: np.ndarray  # (cell,), -1 where there is no way
     start: int
     goal: int
-    max_bounds: int  # for TERMINAL and MEAN, the exact number
+    max_bounds: int  # for NONE and LINEAR, the exact number
     u_turns: bool
-    revisit: bool
     noise_sd: float  # of a rate
     risk: Resources  # with the safest sums from each cell, (cell, resource)
 
@@ -150,7 +131,7 @@ def _problem(
     goal = admissible.flat(admissible.goal)
     at_goal = objective.name == "terminal"
     return LabelSearch(
-        mode_of(objective),
+        loss_for(objective),
         plain(dynamics.transition),
         plain(dynamics.drift.reshape(*dynamics.drift.shape[:2], -1)),
         plain(dynamics.start),
@@ -164,7 +145,6 @@ def _problem(
         goal,
         n_bounds,
         admissible.u_turns,
-        admissible.revisit or not objective.has_labels,
         max(float(dynamics.noise_sd), TINY_SD),
         resources,
     )
@@ -172,50 +152,31 @@ def _problem(
 
 def _within_limit(problem: LabelSearch) -> _OfDraw:
     """Search exactly, or with the least tolerance that stays within the limit on labels."""
-    if not len(problem.heuristic.powers) and problem.mode >= TERMINAL:
+    if not len(problem.heuristic.powers) and problem.loss >= NONE:
         raise TrustboError(
             f"a team's least trust over {problem.max_bounds} bounds on {len(problem.to_goal)} "
             "cells is too much for sums over paths; use larger cells, or team='mean'."
         )
-    if not problem.revisit:
-        # If the best walk of all enters no cell twice, it is the best simple path too.
-        free = search(problem._replace(revisit=True), 0.0, MAX_LABELS)
-        if free.path is not None and len(set(free.path.tolist())) == len(free.path):
-            return _OfDraw(free.path, free.cost, free.lower)
     for tolerance in _TOLERANCES:
-        found = search(problem, tolerance, MAX_LABELS)
-        if found.path is not None:
-            return _OfDraw(found.path, found.cost, found.lower)
+        path, cost, lower, complete = _search(problem, tolerance, MAX_LABELS)
+        if complete:
+            return _OfDraw(path, cost, lower)
     raise TrustboError(
         f"more than {MAX_LABELS} partial paths are worth keeping; lower max_bounds = "
         f"{problem.max_bounds}, use larger cells, or team='mean'."
     )
 
 
-class SearchResult(NamedTuple):
-    """Best label at the goal; `path` is None beyond the limit on labels, empty without a path."""
-
-    path: np.ndarray | None  # flat indices of cells
-    cost: float
-    lower: float
-    """Lower limit on the cost of every path."""
-
-
-def search(problem: LabelSearch, tolerance: float, max_labels: int) -> SearchResult:
-    """Find the path of least cost with at most `max_labels` labels.
+@_compiled
+def _search(problem, tolerance, max_labels):
+    """Find the path of least cost, a lower limit on all costs, and whether labels sufficed.
 
     A dropped label may be better by `tolerance` than the label that replaces it; 0 is exact.
     """
-    path, cost, lower, complete = _search(problem, tolerance, max_labels)
-    return SearchResult(path if complete else None, cost, lower)
-
-
-@_compiled
-def _search(problem, tolerance, max_labels):
-    mode, revisit, most, goal = problem.mode, problem.revisit, problem.max_bounds, problem.goal
+    loss, most, goal = problem.loss, problem.max_bounds, problem.goal
     neighbours, to_goal, u_turns = problem.neighbours, problem.to_goal, problem.u_turns
     (n_cells, n_moves), drift, tolls = neighbours.shape, problem.drift, problem.tolls
-    fixed, n_before = mode >= TERMINAL, 1 if u_turns else n_moves + 1
+    fixed, n_before = loss >= NONE, 1 if u_turns else n_moves + 1
     heads = np.full(n_cells * n_before * (most + 1 if fixed else 1), -1, np.int64)
     size = min(max_labels, 1024)
     # Of a label: cell, bounds, parent, move, next.
@@ -223,9 +184,8 @@ def _search(problem, tolerance, max_labels):
     n_tests, n_risks = len(problem.tests), len(problem.risk.limits)
     # Tests of trust, then minus the sums of risks.
     tested, state = np.zeros((size, n_tests + n_risks)), np.empty((size, len(problem.start_state)))
-    seen = np.zeros((size, 1 if revisit else n_cells // 64 + 1), np.uint64)
     _fill(labels[0], problem.start, 0, -1, -1)
-    cost[0, 0] = -np.inf if mode == BOTTLENECK else 0.0
+    cost[0, 0] = -np.inf if loss == LEAST else 0.0
     _copy(problem.start_state, state[0])
     n, least_dropped = 1, np.inf
     queue = [(-np.inf, np.int64(0))]
@@ -234,36 +194,33 @@ def _search(problem, tolerance, max_labels):
         cell, n_bounds, _, by, _ = labels[label]
         if cell == goal:
             return _path_of(labels, label), estimate, min(estimate, least_dropped), True
-        if not revisit:
-            seen[label, cell // 64] |= np.uint64(1) << np.uint64(cell % 64)
         _copy(problem.tests @ state[label], tested[label])
         key = (n_bounds * n_cells * fixed + cell) * n_before + (0 if u_turns else by + 1)
-        verdict = _dominance(label, heads[key], labels, cost, tested, seen, tolerance, revisit)
+        verdict = _dominance(label, heads[key], labels, cost, tested, tolerance)
         if verdict:
             least_dropped = min(least_dropped, estimate) if verdict == 2 else least_dropped
             continue
         labels[label, 4], heads[key] = heads[key], label
         for m in range(n_moves):
             other = neighbours[cell, m]
-            if not _is_open(problem, seen[label], m, by, n_bounds + 1, other):
+            if not _is_open(problem, m, by, n_bounds + 1, other):
                 continue
             if n == len(cost):
                 if n >= max_labels:
                     return np.empty(0, np.int64), np.inf, -np.inf, False
-                labels, cost, state, tested, seen = _with_room(
-                    labels, cost, state, tested, seen, n + 1
-                )
+                labels, cost = with_room(labels, n + 1), with_room(cost, n + 1)
+                state, tested = with_room(state, n + 1), with_room(tested, n + 1)
             if n_risks > 0 and not _spend(
                 problem.risk, tested, n, label, m * n_cells + other, other
             ):
                 continue
             x = problem.transition @ state[label] + drift[:, m * (drift.shape[1] > 1), other]
             total = _add_cost(
-                mode, cost[label, 0], _least(problem.views @ x),
+                loss, cost[label, 0], _least(problem.views @ x),
                 tolls[m, other * (tolls.shape[1] > 1)], problem.noise_sd,
             )  # fmt: skip
             left = most - n_bounds - 1 if fixed else to_goal[other]
-            reach = _estimate(mode, problem.heuristic, x, total, other, left, problem.noise_sd)
+            reach = _estimate(loss, problem.heuristic, x, total, other, left, problem.noise_sd)
             if n_risks > 0:
                 least = problem.risk.safest[other, 0] - tested[n, n_tests]
                 reach -= problem.risk.failure_cost * math.expm1(-least)
@@ -271,7 +228,6 @@ def _search(problem, tolerance, max_labels):
                 _fill(labels[n], other, n_bounds + 1, label, m)
                 cost[n, 0] = total
                 _copy(x, state[n])
-                _copy(seen[label], seen[n])
                 heapq.heappush(queue, (reach, np.int64(n)))
                 n += 1
     return np.empty(0, np.int64), np.inf, least_dropped, True
@@ -294,20 +250,13 @@ def _copy(source, target):
 
 
 @_part
-def _with_room(labels, cost, state, tested, seen, n):
-    """Labels with room for `n` of them."""
-    labels, cost, state = with_room(labels, n), with_room(cost, n), with_room(state, n)
-    return labels, cost, state, with_room(tested, n), with_room(seen, n)
-
-
-@_part
 def _fill(label, cell, n_bounds, parent, move):
     """Write down a label that no other follows yet."""
     label[0], label[1], label[2], label[3], label[4] = cell, n_bounds, parent, move, -1
 
 
 @_part
-def _is_open(problem, seen, move, by, n_bounds, other):
+def _is_open(problem, move, by, n_bounds, other):
     """Whether a move, after the move `by`, may enter a cell as bound number `n_bounds`."""
     if other < 0 or (
         not problem.u_turns and by >= 0 and move == problem.neighbours.shape[1] - 1 - by
@@ -316,9 +265,8 @@ def _is_open(problem, seen, move, by, n_bounds, other):
     to_goal = problem.to_goal[other]
     if to_goal < 0 or n_bounds + to_goal > problem.max_bounds:
         return False
-    if problem.mode >= TERMINAL and (other == problem.goal) != (n_bounds == problem.max_bounds):
-        return False
-    return problem.revisit or not seen[other // 64] >> np.uint64(other % 64) & np.uint64(1)
+    at_end = (other == problem.goal) == (n_bounds == problem.max_bounds)
+    return problem.loss < NONE or at_end
 
 
 @_part
@@ -334,29 +282,21 @@ def _spend(risk, tested, label, parent, bound, cell):
 
 
 @_part
-def _add_cost(mode, cost, trust, toll, noise_sd):
+def _add_cost(loss, cost, trust, toll, noise_sd):
     """Cost of a label after one more bound."""
-    if mode == LOGISTIC_LOSS:
-        return cost + toll + expected_loss(LOGISTIC, trust, noise_sd)
-    if mode == CLIPPED_LOSS:
-        return cost + toll + expected_loss(CLIPPED, trust, noise_sd)
-    if mode == SUCCESS:
-        return cost + toll + loss_of(SOFTPLUS, trust, noise_sd)
-    if mode == BOTTLENECK:
-        return max(cost, -trust)
-    return cost + toll - (trust if mode == MEAN else 0.0)
+    return joined(loss, cost + toll, loss_of(loss, trust, noise_sd))
 
 
 @_part
-def _estimate(mode, heuristic, x, cost, cell, left, noise_sd):
+def _estimate(loss, heuristic, x, cost, cell, left, noise_sd):
     """Lower limit on the cost of a label's completions."""
-    if mode == TERMINAL:
+    if loss == NONE:
         return cost - _max_trust(heuristic, x, left, cell)
     if len(heuristic.powers) == 0:
         return cost
     for j in range(1, left + 1):
         trust = _max_trust(heuristic, x, j, cell)
-        cost = _add_cost(mode, cost, trust, 0.0, noise_sd)
+        cost = _add_cost(loss, cost, trust, 0.0, noise_sd)
     return cost
 
 
@@ -374,7 +314,7 @@ def _max_trust(heuristic, x, j, cell):
 
 
 @_part
-def _dominance(label, other, labels, cost, tested, seen, tolerance, revisit):
+def _dominance(label, other, labels, cost, tested, tolerance):
     """1 if an expanded label dominates, 2 if one does up to the tolerance, 0 if none does."""
     verdict = 0
     while other >= 0:
@@ -383,11 +323,7 @@ def _dominance(label, other, labels, cost, tested, seen, tolerance, revisit):
             for k in range(tested.shape[1]):
                 shortfall = max(shortfall, tested[label, k] - tested[other, k])
             if shortfall <= tolerance:
-                same = shortfall == 0.0 and cost[other, 0] <= cost[label, 0]
-                if same and not revisit:
-                    for w in range(seen.shape[1]):
-                        same = same and (seen[other, w] & ~seen[label, w]) == 0
-                if same:
+                if shortfall == 0.0 and cost[other, 0] <= cost[label, 0]:
                     return 1
                 if tolerance > 0.0:
                     verdict = 2

@@ -5,15 +5,23 @@ import math
 from numba import njit
 
 from trustbo.parallel import PART
+from trustbo.planning.objectives import Objective
 
 _part = njit(nogil=True, error_model="numpy", **PART)
-LOGISTIC, CLIPPED, SOFTPLUS, LEAST, NONE = range(5)
+LOGISTIC, CLIPPED, SOFTPLUS, LEAST, NONE, LINEAR = range(6)
 """Losses l(x) of a bound that leaves trust x: 1 - sigma(x); 1 - E[y | x], y normal around x and cut
-to [0, 1]; -log sigma(x); -x, of which the largest counts and not the sum; and none."""
-EXPECTED = {"logistic": LOGISTIC, "clipped": CLIPPED}
-"""Losses of expected rates that are not linear in trust; see `Family.expected_rate`."""
+to [0, 1]; -log sigma(x); -x, of which the largest counts and not the sum; none; and -x."""
+_EXPECTED = {"identity": LINEAR, "logistic": LOGISTIC, "clipped": CLIPPED}
+_LOSSES = {"success": SOFTPLUS, "bottleneck": LEAST, "terminal": NONE, "mean": LINEAR}
 TINY_SD = 1e-9
 """Least sd of a rate, instead of 0."""
+
+
+def loss_for(objective: Objective) -> int:
+    """Loss of a bound for an objective; that of linear rates is less by 1, see `Family`."""
+    if objective.name == "lost_contact":
+        return _EXPECTED[objective.family.expected_rate]
+    return _LOSSES[objective.name]
 
 
 @_part
@@ -21,7 +29,7 @@ def loss_of(loss: int, x: float, sd: float) -> float:
     """Loss of a bound after which trust is x, of rates with that sd."""
     if loss == NONE:
         return 0.0
-    if loss == LEAST:
+    if loss == LEAST or loss == LINEAR:
         return -x
     if loss == SOFTPLUS:
         return max(-x, 0.0) + math.log1p(math.exp(-abs(x)))
@@ -44,7 +52,7 @@ def least_slope(loss: int, lo: float, hi: float, sd: float) -> float:
     """Least fall of a loss with trust, between lo and hi: at one end, as -l' has a single mode."""
     if loss == NONE:
         return 0.0
-    if loss == LEAST:
+    if loss == LEAST or loss == LINEAR:
         return 1.0
     if loss == SOFTPLUS:
         return 1.0 / (1.0 + math.exp(hi)) if hi < 700.0 else 0.0

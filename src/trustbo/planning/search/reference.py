@@ -32,14 +32,13 @@ from trustbo.planning.values import entry_cost, path_trust
 from trustbo.workspace.moves import MOVES
 
 Path = tuple[Cell, ...]
-_dijkstra: Any = nx.dijkstra_path  # annotations of networkx exclude `backend=None`
 
 
-def plan_networkx(case: Case, backend: str | None = None) -> Best | None:
-    """Find the best path of every draw; None if none is feasible. `backend` is networkx's."""
+def plan_networkx(case: Case) -> Best | None:
+    """Find the best path of every draw; None if none is feasible."""
     best = []
     for d in range(len(case.dynamics.start)):
-        if (path := _of_draw(case, case.dynamics.take(d), backend)) is None:
+        if (path := _of_draw(case, case.dynamics.take(d))) is None:
             return None
         best.append([case.admissible.flat(cell) for cell in path])
     paths = np.full((len(best), max(map(len, best))), -1)
@@ -48,7 +47,7 @@ def plan_networkx(case: Case, backend: str | None = None) -> Best | None:
     return Best(paths, np.zeros(len(best)), np.zeros(len(best)))
 
 
-def _of_draw(case: Case, dynamics: Dynamics, backend: str | None) -> Path | None:
+def _of_draw(case: Case, dynamics: Dynamics) -> Path | None:
     """Best path of one draw, `dynamics` without leading axes."""
     admissible, _, objective, risk = case
 
@@ -60,11 +59,11 @@ def _of_draw(case: Case, dynamics: Dynamics, backend: str | None) -> Path | None
     if risk is None:
         if objective.name == "stationary":
             cost = entry_cost(admissible.passable, dynamics)
-            return best_stationary(admissible, cost, case.tolls, backend)
+            return best_stationary(admissible, cost, case.tolls)
         if objective.has_labels:
             return best_labelled(case, dynamics)
         if len(dynamics.views) == 1:  # the least of several views is no sum of weights
-            return max(_best_sums(case, dynamics, backend), key=score)
+            return max(_best_sums(case, dynamics), key=score)
         nothing = np.zeros((0, len(admissible.steps), admissible.passable.size))
         risk = RiskTable(nothing, np.zeros(0), 0, 0.0)
     feasible = feasible_paths(case, dynamics, risk)
@@ -73,7 +72,7 @@ def _of_draw(case: Case, dynamics: Dynamics, backend: str | None) -> Path | None
     return feasible[int(np.argmax(np.subtract(scores, cost)))] if feasible else None
 
 
-def _best_sums(case: Case, dynamics: Dynamics, backend: str | None) -> list[Path]:
+def _best_sums(case: Case, dynamics: Dynamics) -> list[Path]:
     """Best path of each number of bounds, where the score is a sum of weights."""
     admissible, _, objective, _ = case
     weights = additive_weights(dynamics.flat(), dynamics.views[0], objective, admissible.longest)
@@ -85,7 +84,7 @@ def _best_sums(case: Case, dynamics: Dynamics, backend: str | None) -> list[Path
             trust = float(_of_bound(gains[n - k], before, cell) / weights.scale[n])
             return trust - float(_of_bound(tolls, before, cell))
 
-        path = best_additive(admissible, gain, n_bounds, backend)
+        path = best_additive(admissible, gain, n_bounds)
         if path is not None:
             paths.append(path)
     return paths
@@ -99,14 +98,11 @@ def _of_bound(values: np.ndarray, before: Cell, cell: Cell) -> Any:
 
 
 def best_additive(
-    admissible: AdmissiblePaths,
-    gain: Callable[[int, Cell, Cell], float],
-    n_bounds: int,
-    backend: str | None = None,
+    admissible: AdmissiblePaths, gain: Callable[[int, Cell, Cell], float], n_bounds: int
 ) -> Path | None:
     """Find the path, if any, of exactly `n_bounds` bounds with the largest sum of gains.
 
-    That of bound k is gain(k, path[k-1], path[k]), and `backend` networkx's.
+    That of bound k is gain(k, path[k-1], path[k]).
 
     The grid is unrolled over the bounds into a layered DAG. All paths through it are equally long,
     so each layer's weights may be shifted to be non-negative: Dijkstra then applies, to gains of
@@ -139,7 +135,7 @@ def best_additive(
         layer = list(entered)
     for node in layer:
         dag.add_edge(node, sink, weight=0.0)
-    nodes: list[Any] = _dijkstra(dag, source, sink, weight="weight", backend=backend)
+    nodes: list[Any] = nx.dijkstra_path(dag, source, sink, weight="weight")
     return tuple(node[2] for node in nodes[:-1])
 
 
@@ -147,8 +143,8 @@ def best_labelled(case: Case, dynamics: Dynamics) -> Path:
     """Find the walk with the best objective that has labels; TrustboError if none is short enough.
 
     Label setting: labels leave the queue in the order of their cost, which never falls along a
-    walk. A later label at a cell is settled only if no earlier one dominates it (see `dominance`)
-    with as few bounds and, without revisits, with a subset of its cells.
+    walk. A later label at a cell is settled only if no earlier one with as few bounds dominates it
+    (see `dominance`).
     """
 
     def combine(cost: float, x: float) -> float:
@@ -162,31 +158,27 @@ def best_labelled(case: Case, dynamics: Dynamics) -> Path:
     tolls = on_map(admissible, case.tolls)
     graph, to_goal, max_bounds = admissible.graph, admissible.to_goal, admissible.longest
     tests, u_turns = dominance_tests(dynamics, max_bounds), admissible.u_turns
-    bit = {cell: 1 << i for i, cell in enumerate(graph)} if not admissible.revisit else {}
-    settled: dict[object, list[tuple[np.ndarray, int, int]]] = {}
+    settled: dict[object, list[tuple[np.ndarray, int]]] = {}
     order = itertools.count()  # equal costs leave in the order of entry: deterministic
     first = -np.inf if objective.name == "bottleneck" else 0.0
-    queue: list[Any] = [(first, 0, next(order), dynamics.start, (admissible.start,), 0)]
+    queue: list[Any] = [(first, 0, next(order), dynamics.start, (admissible.start,))]
     while queue:
-        cost, n_bounds, _, x, path, seen = heapq.heappop(queue)
+        cost, n_bounds, _, x, path = heapq.heappop(queue)
         cell, before = path[-1], path[-2] if len(path) > 1 and not u_turns else None
         if cell == admissible.goal:
             return path
-        seen |= bit.get(cell, 0)
         earlier, tested = settled.setdefault((before, cell), []), tests @ x
-        if any((q >= tested).all() and n <= n_bounds and s & ~seen == 0 for q, n, s in earlier):
+        if any((q >= tested).all() and n <= n_bounds for q, n in earlier):
             continue
-        earlier.append((tested, n_bounds, seen))
+        earlier.append((tested, n_bounds))
         for other in graph.successors(cell):
-            if n_bounds + 1 + to_goal.get(other, np.inf) > max_bounds or seen & bit.get(other, 0):
-                continue
-            if other == before:
+            if n_bounds + 1 + to_goal.get(other, np.inf) > max_bounds or other == before:
                 continue
             reached = dynamics.transition @ x + _of_bound(dynamics.drift, cell, other)
             trust = float((dynamics.views @ reached).min())
             toll = float(_of_bound(tolls, cell, other))
             label = (combine(cost, trust) + toll, n_bounds + 1, next(order), reached)
-            heapq.heappush(queue, (*label, (*path, other), seen))
+            heapq.heappush(queue, (*label, (*path, other)))
     raise TrustboError(f"no path has at most {max_bounds} bounds.")
 
 
@@ -195,12 +187,10 @@ def _on_time(admissible: AdmissiblePaths, cell: Cell, left: int) -> bool:
     return admissible.to_goal.get(cell, np.inf) <= left and (cell == admissible.goal) == (left == 0)
 
 
-def best_stationary(
-    admissible: AdmissiblePaths, cost: np.ndarray, tolls: np.ndarray, backend: str | None
-) -> Path:
+def best_stationary(admissible: AdmissiblePaths, cost: np.ndarray, tolls: np.ndarray) -> Path:
     """Find the simple path with the least cost of bounds, (move, row, col), and their tolls."""
     graph, ends = with_costs(admissible, cost, tolls), (admissible.start, admissible.goal)
-    return tuple(_dijkstra(graph, *ends, weight="cost", backend=backend))
+    return tuple(nx.dijkstra_path(graph, *ends, weight="cost"))
 
 
 def with_costs(
@@ -241,8 +231,6 @@ def feasible_paths(case: Case, dynamics: Dynamics, risk: RiskTable) -> list[Path
         dynamics = dynamics._replace(transition=np.zeros((1, 1)), start=np.zeros(1), views=_ONE)
     else:
         tests = dominance_tests(dynamics, longest)
-    # As in every engine, `revisit` concerns the objectives that depend on the whole history.
-    simple = objective.has_labels and not admissible.revisit
     first = np.inf if objective.name == "bottleneck" else 0.0
     start = np.concatenate([[first, 0.0], np.zeros(len(risk.limits)), tests @ dynamics.start])
     labels = {(None, admissible.start): [_Label(start, dynamics.start, (admissible.start,))]}
@@ -257,7 +245,7 @@ def feasible_paths(case: Case, dynamics: Dynamics, risk: RiskTable) -> list[Path
                 step, risks = drift[:, by_move, *other], risk.of_bounds[:, m, flat]
                 toll = tolls[m, *other]
                 for label in here:
-                    if _excluded(admissible, label.path, other, simple=simple):
+                    if not admissible.u_turns and label.path[-2:-1] == (other,):
                         continue
                     x = dynamics.transition @ label.x + step
                     trust = float((dynamics.views @ x).min())
@@ -272,7 +260,7 @@ def feasible_paths(case: Case, dynamics: Dynamics, risk: RiskTable) -> list[Path
                         paths.append(new.path)
                     else:
                         before = None if admissible.u_turns else cell
-                        _keep_label(layer.setdefault((before, other), []), new, simple=simple)
+                        _keep_label(layer.setdefault((before, other), []), new)
         labels = layer
     return paths
 
@@ -284,12 +272,6 @@ def _successors(admissible: AdmissiblePaths, cell: Cell) -> list[tuple[int, Cell
     """Moves that lead from a cell, by index, and the cells entered."""
     steps = [(cell[0] + down, cell[1] + right) for down, right in admissible.steps.tolist()]
     return [(m, other) for m, other in enumerate(steps) if admissible.graph.has_edge(cell, other)]
-
-
-def _excluded(admissible: AdmissiblePaths, path: Path, other: Cell, *, simple: bool) -> bool:
-    """Whether a path may not go on to a cell, because of a U-turn or a revisit."""
-    u_turn = not admissible.u_turns and len(path) > 1 and path[-2] == other
-    return u_turn or (simple and other in path)
 
 
 def _score(objective: Objective, score: float, trust: float, noise_sd: np.ndarray) -> float:
@@ -304,13 +286,9 @@ def _score(objective: Objective, score: float, trust: float, noise_sd: np.ndarra
     return score if at_end else score + trust
 
 
-def _keep_label(labels: list[_Label], new: _Label, *, simple: bool) -> None:
+def _keep_label(labels: list[_Label], new: _Label) -> None:
     """Add a label unless another dominates it; drop those that it dominates."""
-    if any(_dominates(old, new, simple) for old in labels):
+    if any((old.criteria >= new.criteria).all() for old in labels):
         return
-    labels[:] = [old for old in labels if not _dominates(new, old, simple)]
+    labels[:] = [old for old in labels if not (new.criteria >= old.criteria).all()]
     labels.append(new)
-
-
-def _dominates(a: _Label, b: _Label, simple: bool) -> bool:
-    return bool((a.criteria >= b.criteria).all()) and not (simple and set(a.path) - set(b.path))

@@ -1,7 +1,6 @@
 """Search for the best path: validity of the objective, choice of the engine, upper limits."""
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import networkx as nx
 import numpy as np
@@ -27,28 +26,14 @@ EXACT = 1e-12
 """Largest optimality gap, in trust or log probability, of a path that counts as exact."""
 
 
-class Engine(NamedTuple):
-    """An engine by name, and the backend that networkx dispatches to."""
-
-    name: str = "auto"
-    backend: str | None = None
-
-    @property
-    def used(self) -> str:
-        """Name of what searches: networkx, or for `auto` too numba."""
-        return "networkx" if self.name == "networkx" else "numba"
-
-
-def find_paths(problem: PlanningProblem, dynamics: Dynamics, engine: Engine) -> Best:
+def find_paths(problem: PlanningProblem, dynamics: Dynamics, engine: str) -> Best:
     """Find the best path under every draw of `dynamics`, or the only one.
 
     InfeasibleError: no path respects `max_failure`, unless the rule is to plan the safest.
     """
     require_valid(dynamics, problem.objective)
     case = Case(problem.paths, problem.objective.capped(dynamics).flat(), problem.objective)
-    if engine.used == "networkx":
-        return _feasible(problem, case, lambda case: plan_networkx(case, engine.backend))
-    return _feasible(problem, case, plan_compiled)
+    return _feasible(problem, case, plan_networkx if engine == "networkx" else plan_compiled)
 
 
 def _feasible[T](problem: PlanningProblem, case: Case, search: Callable[[Case], T | None]) -> T:
