@@ -280,7 +280,7 @@ MISTAKES = {
         lambda c: prior_predictive(PooledTrust(), "x"), "awareness must be an array of numbers"
     ),
     "a tuple for parameters": (
-        lambda c: Planner(c.workspace, *ENDS).plan((0.5, 0.1)), "params: got tuple .0.5, 0.1.; give"
+        lambda c: Planner(c.workspace, *ENDS).plan((0.5, 0.1)), "posterior: got tuple .0.5, 0.1.; g"
     ),
     "a planner on text": (lambda c: Planner("x", *ENDS), "workspace: got str 'x'; give a trust"),
     "a campaign on a terrain": (
@@ -357,9 +357,7 @@ def test_a_mistake_gives_one_line_that_says_what_to_do(name, case, tmp_path, mon
     assert list(tmp_path.iterdir()) == []  # nothing was begun
 
 
-def test_a_posterior_is_no_single_set_of_parameters(case, posterior):
-    with pytest.raises(tb.TrustboError, match=r"of a posterior, params_of\(posterior\).mean\(\)"):
-        Planner(case.workspace, *ENDS).plan(posterior)
+def test_a_filter_of_parameters_needs_the_number_of_robots(posterior):
     with pytest.raises(tb.TrustboError, match="say how many robots: n_robots="):
         TrustFilter(params_of(posterior))
 

@@ -157,11 +157,15 @@ def test_bad_options_list_the_good_ones(workspace):
         resolve_policy(3)
 
 
-def test_planning_is_for_one_draw_and_evaluating_for_whole_paths(workspace, draws):
+def test_the_plan_of_draws_is_that_of_their_mean_with_their_bands(workspace, draws):
     planner = Planner(workspace, (4, 0), (0, 5))
-    for refused in (planner.plan,):
-        with pytest.raises(ShapeError, match=r"one draw at a time: .* axes \(300,\)"):
-            refused(draws)
+    plan, mean = planner.plan(draws), planner.plan(draws.mean())
+    assert (plan.path, plan.value, plan.exact) == (mean.path, mean.value, True)
+    np.testing.assert_array_equal(plan.bands, planner.evaluate(plan.path, draws).bands)
+
+
+def test_evaluating_is_for_whole_paths(workspace):
+    planner = Planner(workspace, (4, 0), (0, 5))
     with pytest.raises(TrustboError, match=r"no bound leads from \(4, 0\) to \(0, 5\)"):
         planner.evaluate([(4, 0), (0, 5)], PARAMS)
     with pytest.raises(TrustboError, match=r"must lead from \(4, 0\) to \(0, 5\)"):

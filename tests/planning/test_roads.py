@@ -179,6 +179,29 @@ def test_what_is_no_graph_of_bounds_is_refused_in_a_sentence():
     other = TrustParams(0.4, np.ones(3), 0.03, 0.1, 0.1, 0.5, 0.5)
     with pytest.raises(ShapeError, match="features"):
         RoadPlanner(graph, 0, 4).plan(other)
-    placed = TrustParams(0.4, np.ones(2), 0.03, 0.1, 0.1, 0.5, 0.5, place=np.zeros((1, 3, 3)))
-    with pytest.raises(TrustboError, match="effects of places are of the cells of a grid"):
-        RoadPlanner(graph, 0, 4).plan(placed)
+
+
+def test_the_posterior_of_a_campaign_plans_on_roads_without_its_effects_of_places():
+    graph, rng = roads(0), np.random.default_rng(0)
+    for _, _, edge in graph.edges(data=True):
+        edge["awareness"] = dict(
+            zip(("z1", "line_of_sight"), edge["awareness"].values(), strict=True)
+        )
+    path, names = (
+        [(2, 0), (1, 1), (0, 2)],
+        {"features": ("z1", "line_of_sight"), "robots": ("a", "b")},
+    )
+    missions = [
+        tb.Mission.from_arrays(path, rng.uniform(size=(2, 2, 2)), rng.uniform(size=(2, 2)), **names)
+        for _ in range(2)
+    ]
+    effects = [tb.models.PlaceEffect(), tb.models.RobotEffect()]  # the default of campaigns
+    posterior = tb.fit(missions, tb.models.PooledTrust(effects=effects), progress=False, seed=0)
+    planner, params = RoadPlanner(graph, 0, 4), tb.inference.params_of(posterior)
+    assert sorted(params.places) == ["place", "place_bound"]
+    plan = planner.plan(posterior)
+    bare = planner.plan(params._replace(place=None, place_bound=None).mean())
+    assert (plan.path, plan.value) == (bare.path, bare.value)
+    assert (plan.bands[-1] > plan.bands[0]).all()
+    with pytest.raises(TrustboError, match=r"give tb.fit\(result.missions, tb.models.PooledT"):
+        RoadPlanner(graph, 0, 4, "success").plan(posterior)

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from trustbo.data import Cell
 from trustbo.display.card import Card, Displayed
-from trustbo.errors import ShapeError, TrustboError, require_choice, require_kind
+from trustbo.errors import require_choice
 from trustbo.hazard.risk import Risk
 from trustbo.models.families import FAMILIES
 from trustbo.models.model import RESPONSES
@@ -23,7 +23,7 @@ from trustbo.planning.objectives import DEFAULT_MAX_BOUNDS, Objective
 from trustbo.planning.paths import AdmissiblePaths, PathClass
 from trustbo.planning.plan import Plan
 from trustbo.planning.posterior import DrawnPaths, choose_draws
-from trustbo.planning.problem import PlanningProblem, draws_of
+from trustbo.planning.problem import PlanningProblem, draws_of, mean_of
 from trustbo.planning.risk import RiskRule
 from trustbo.planning.search import solve
 from trustbo.planning.trust_map import cost_of, summary_of, trust_map
@@ -159,7 +159,7 @@ class Planner(Displayed):
         """Graph of passable cells; nodes with `x`, `y` (CRS metres), edges with `length` (m)."""
         return self.paths.graph
 
-    def graph_of(self, params: Params) -> nx.DiGraph:
+    def graph_of(self, params: Params | xr.DataTree) -> nx.DiGraph:
         """Build `graph` with the costs of its bounds, for any algorithm of networkx.
 
         Attributes of the edges: `length` (m); `drift` of the team's mean trust; `cost`, that of
@@ -168,12 +168,12 @@ class Planner(Displayed):
         would lose then, in bounds, and the toll; and with a risk `risk`, -log(1 - p_fail).
 
         Args:
-            params: Parameters of any model, without leading axes.
+            params: Posterior or parameters, whose mean is taken.
 
         Raises:
             TrustboError: abs(beta0) >= 1, for which trust settles nowhere.
         """
-        return solve.graph_of(self.problem, self.problem.dynamics(params))
+        return solve.graph_of(self.problem, self.problem.dynamics(mean_of(params)))
 
     @property
     def awareness(self) -> np.ndarray:
@@ -260,33 +260,25 @@ class Planner(Displayed):
         """Build the recursion of expected trust; see `PlanningProblem.dynamics`."""
         return self.problem.dynamics(params, x0, draws=draws)
 
-    def plan(self, params: Params, *, x0: ArrayLike | None = None) -> Plan:
-        """Find the best admissible path for given parameters.
+    def plan(self, params: Params | xr.DataTree, *, x0: ArrayLike | None = None) -> Plan:
+        """Find the best admissible path for given parameters, or for the mean of a posterior.
 
         Args:
-            params: Parameters of any model, without leading axes.
+            params: Posterior of `fit`, or parameters; of several draws, the path is that of their
+                mean, and the bands and the cover are over the draws, see `evaluate`.
             x0: Expected trust at the start, shape () or (robot,); by default `params.x0_mean`.
 
         Raises:
-            ShapeError: Parameters with leading axes, or of other robots or features.
-            TrustboError: A posterior instead of parameters; beta0 outside the range that the
-                objective is exact for.
+            ShapeError: Parameters of other robots or features.
+            TrustboError: beta0 outside the range that the objective is exact for.
             InfeasibleError: No path respects `max_failure`.
         """
         started = time.perf_counter()
-        if isinstance(params, xr.DataTree):
-            raise TrustboError(
-                "plan takes one set of parameters; of a posterior, params_of(posterior).mean()."
-            )
-        require_kind("params", params, Params, "give e.g. params_of(posterior).mean()")
-        if params.leading:
-            raise ShapeError(
-                f"give one draw at a time: the parameters have leading axes {params.leading}. Use "
-                "params.draw(i) or params.mean(), or planner.plan_draws for all of them."
-            )
-        dynamics = self.problem.dynamics(params, x0)
-        best = solve.find_paths(self.problem, dynamics, self.engine)
-        plan = evaluate(self.problem, self.paths.cells(best.paths[0]), params, x0)
+        mean = mean_of(params)
+        best = solve.find_paths(self.problem, self.problem.dynamics(mean, x0), self.engine)
+        plan = evaluate(self.problem, self.paths.cells(best.paths[0]), mean, x0)
+        if mean is not params:
+            plan = plan.with_draws(self.evaluate(plan.path, params, x0=x0))
         gap = float(best.gap[0])
         return replace(
             plan,

@@ -245,3 +245,9 @@ def draws_of(posterior: Params | xr.DataTree, *, day: bool = False) -> Params:
     if isinstance(posterior, xr.DataTree):
         return params_of(posterior, day=day)
     return require_kind("posterior", posterior, Params, "give one of fit, or draws of parameters")
+
+
+def mean_of(params: Params | xr.DataTree) -> Params:
+    """Return one draw of parameters unchanged, or the mean of several, or of a posterior."""
+    draws = draws_of(params)
+    return draws.mean() if draws.leading else draws

@@ -27,7 +27,7 @@ from trustbo.planning.dynamics import Dynamics, trust_dynamics
 from trustbo.planning.graph import NoPathError
 from trustbo.planning.objectives import DEFAULT_MAX_BOUNDS, Objective, softplus
 from trustbo.planning.paths import PathClass
-from trustbo.planning.problem import draws_of, require_objective
+from trustbo.planning.problem import draws_of, mean_of, require_objective
 from trustbo.planning.search import solve
 from trustbo.planning.search.compiled import best_history, best_sums
 from trustbo.planning.search.graph import Best, Graph, no_resources
@@ -97,6 +97,9 @@ class RoadPlan(Displayed):
 
 class RoadPlanner(Displayed):
     """Search for the most trustworthy path of a graph whose edges are bounds.
+
+    Effects of places in a posterior are left out: they are of the cells of a grid, and their
+    expectation elsewhere is 0. Bands of trust hence lack what roads differ by from one another.
 
     Attributes:
         graph: Directed graph of networkx.
@@ -219,13 +222,11 @@ class RoadPlanner(Displayed):
 
         Raises:
             ShapeError: Parameters of other robots or features.
-            TrustboError: Effects of places, which are of a grid; a team whose robots differ, for an
-                objective that depends on the whole history; or beta0 outside the range that the
-                objective is exact for.
+            TrustboError: A team whose robots differ, for an objective that depends on the whole
+                history; or beta0 outside the range that the objective is exact for.
         """
         started = time.perf_counter()
-        draws = self._require_params(params)
-        mean = draws.mean() if draws.leading else draws
+        mean = _without_places(mean_of(params))
         dynamics = self._dynamics(mean, self._awareness, x0)
         solve.require_valid(dynamics, self._objective)
         best = self._search(self._objective.capped(dynamics).flat())
@@ -238,7 +239,7 @@ class RoadPlanner(Displayed):
         plan, gap = self.evaluate(path, mean, x0=x0), float(best.gap[0])
         return replace(
             plan,
-            bands=self.evaluate(path, draws, x0=x0).bands,
+            bands=self.evaluate(path, params, x0=x0).bands,
             exact=gap <= solve.EXACT,
             bound=solve.value_limit(self._objective.name, plan.value, gap),
             seconds=time.perf_counter() - started,
@@ -256,9 +257,9 @@ class RoadPlanner(Displayed):
 
         Raises:
             ShapeError: Parameters of other robots or features.
-            TrustboError: No edge leads from a node to the next, or effects of places.
+            TrustboError: No edge leads from a node to the next.
         """
-        params = self._require_params(params)
+        params = _without_places(draws_of(params, day=True))
         if len(path) < 2:
             raise TrustboError(f"a path has two nodes at least; got {path!r}.")
         for edge in pairwise(path):
@@ -285,10 +286,10 @@ class RoadPlanner(Displayed):
             it, in bounds; tolls of length are in both.
 
         Raises:
-            TrustboError: abs(beta0) >= 1, for which trust settles nowhere; or effects of places.
+            TrustboError: abs(beta0) >= 1, for which trust settles nowhere.
         """
-        draws, graph = self._require_params(params), self.graph.copy()
-        dynamics = self._dynamics(draws.mean() if draws.leading else draws, self._awareness, None)
+        graph = self.graph.copy()
+        dynamics = self._dynamics(_without_places(mean_of(params)), self._awareness, None)
         solve.require_valid(dynamics, self._objective._replace(name="stationary"))
         values = {"cost": softplus(-dynamics.steady_state().ravel())}
         if self._objective.name == "lost_contact" and not self._objective.lag:
@@ -304,15 +305,6 @@ class RoadPlanner(Displayed):
         weight = self._objective.length_weight
         return weight * self._lengths if weight else np.zeros(len(self._edges))
 
-    def _require_params(self, params: Params | xr.DataTree) -> Params:
-        draws = draws_of(params)
-        if draws.places:
-            raise TrustboError(
-                "effects of places are of the cells of a grid, and a graph has none; fit without "
-                "them, such as PooledTrust()."
-            )
-        return draws
-
     def _dynamics(self, params: Params, z: np.ndarray, x0: ArrayLike | None) -> Dynamics:
         """Recursion of expected trust whose cells are the edges, in a row."""
         return trust_dynamics(params, z.swapaxes(0, 1)[:, None, None], self._team, x0)
@@ -325,7 +317,8 @@ class RoadPlanner(Displayed):
         if not (dynamics.is_scalar if objective.has_labels else len(dynamics.views) == 1):
             raise TrustboError(
                 f"on a graph, {objective.name!r} is planned for the mean of robots that share their"
-                " parameters; give a pooled model and team='mean', or 'stationary'."
+                " parameters; give tb.fit(result.missions, tb.models.PooledTrust()) and "
+                "team='mean', or plan 'stationary'."
             )
         graph, n = self._layers, len(self._edges)
         tolls, resources = tolls[graph.bound], no_resources(graph, n)
@@ -353,3 +346,8 @@ class RoadPlanner(Displayed):
         from_start = np.array([done.get(node, len(tail)) for node in self.graph])
         ends = index[self.start], index[self.goal]
         return unroll(tail, head, ends, from_start, self.longest, u_turns=self._u_turns)
+
+
+def _without_places(params: Params) -> Params:
+    """Parameters without effects of places, whose expectation is 0 on a road."""
+    return params._replace(**dict.fromkeys(params.places))  # pyright: ignore[reportArgumentType]
