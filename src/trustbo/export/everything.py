@@ -3,7 +3,7 @@
 from collections.abc import Callable, Collection, Sequence
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import xarray as xr
 
@@ -16,7 +16,7 @@ from trustbo.export.checks import (
     require_names_for_sql,
 )
 from trustbo.export.cot import write_cot
-from trustbo.export.foxglove_scene import require_foxglove, save_foxglove
+from trustbo.export.foxglove_scene import require_foxglove, write_foxglove
 from trustbo.export.frame import (
     AT_START,
     Frame,
@@ -27,22 +27,22 @@ from trustbo.export.frame import (
     require_fine,
     save_frame,
 )
-from trustbo.export.grid_map import save_grid_map
+from trustbo.export.grid_map import write_grid_map
 from trustbo.export.kmz import require_simplekml, write_kmz
-from trustbo.export.nav2 import save_waypoints, stops_of, write_costmap_filters
+from trustbo.export.nav2 import stops_of, write_costmap_filters, write_waypoints
 from trustbo.export.overwatch import require_overwatch, write_overwatch
 from trustbo.export.paths import write_path
 from trustbo.export.qgroundcontrol import save_qgc, warn_of_holds
 from trustbo.export.rasters import write_geotiff
-from trustbo.export.ros import occupancy, require_robots, save_ros_bag, save_ros_map
-from trustbo.export.route_graph import OBJECTIVES, RouteGraph, graph_of, summed
-from trustbo.export.route_graph_file import save_route_graph
+from trustbo.export.ros import occupancy, require_robots, write_ros_bag, write_ros_map
+from trustbo.export.route_graph import OBJECTIVES, graph_of, summed
+from trustbo.export.route_graph_file import write_route_graph
 from trustbo.export.schedule import schedule_of
 from trustbo.export.style import write_style
 from trustbo.export.tables import write_csv
 from trustbo.files import FilePath, require_file, require_folder
-from trustbo.inference import params_of
 from trustbo.logs.bagfile import require_new_bag
+from trustbo.planning.problem import mean_of
 
 
 class _Content(NamedTuple):
@@ -55,6 +55,11 @@ class _Content(NamedTuple):
     """Frame of all formats for robots."""
     resolution: float | None
     """Side of a pixel of their maps, m."""
+
+    @property
+    def placing(self) -> dict[str, Any]:
+        """Options of functions that write maps for robots."""
+        return {"resolution": self.resolution, "frame": self.frame}
 
 
 class _Format(NamedTuple):
@@ -206,42 +211,23 @@ def _write_maps(content: _Content, file: Path) -> None:
     write_style(file.with_suffix(".qml"), learned)
 
 
-def _write_bag(content: _Content, file: Path) -> None:
-    plan, cost = content.result.plan, content.maps()["cost"]
-    save_ros_bag(file, plan, cost, content.resolution, content.frame)
-
-
 def _write_path(content: _Content, file: Path) -> None:
     write_path(file, content.result)
 
 
 def _write_map(content: _Content, file: Path) -> None:
-    result, cost, place = content.result, content.maps()["cost"], content.frame
-    save_ros_map(file, cost, result.workspace, content.resolution, place)
-    write_costmap_filters(file, frame=Frame(name=place.name))
-
-
-def _write_grid_map(content: _Content, file: Path) -> None:
     result = content.result
-    save_grid_map(file, content.maps(), result.workspace, content.resolution, content.frame)
+    write_ros_map(file, content.maps()["cost"], result.workspace, **content.placing)
+    write_costmap_filters(file, frame=Frame(name=content.frame.name))
 
 
 def _write_nav2(content: _Content, file: Path) -> None:
-    result, place = content.result, content.frame
-    save_route_graph(file, _route_graph(result, place))
+    result = content.result
+    write_route_graph(file, result, objective=_summable(result), frame=content.frame)
     if result.workspace.ground is not None:
         for robot in (LEAD, *result.workspace.team.names):
             target = file.with_name(_WAYPOINTS.format(robot=robot))
-            save_waypoints(target, result.plan, robot, place)
-
-
-def _write_kmz(content: _Content, file: Path) -> None:
-    write_kmz(file, content.result, content.maps()["cost"])
-
-
-def _require_kmz(result: Result, place: PlacedFrame) -> None:
-    require_simplekml()
-    schedule_of(result.plan)
+            write_waypoints(target, result, robot=robot, frame=content.frame)
 
 
 def _write_missions(content: _Content, file: Path) -> None:
@@ -251,34 +237,19 @@ def _write_missions(content: _Content, file: Path) -> None:
     warn_of_holds(_MISSION.format(robot="*"))
 
 
-def _write_scene(content: _Content, file: Path) -> None:
-    plan, maps = content.result.plan, content.maps()
-    save_foxglove(file, plan, maps, content.resolution, content.frame)
-
-
-def _require_scene(result: Result, place: PlacedFrame) -> None:
-    require_foxglove()
-    schedule_of(result.plan)
-
-
-def _route_graph(result: Result, place: PlacedFrame) -> RouteGraph:
-    """Graph of the campaign's objective, or of lost_contact where its value is no sum."""
-    planner = result.planner
-    require_fine(place, result.workspace, "a route graph")
-    summable = planner if planner.objective in OBJECTIVES else summed(planner, "lost_contact")
-    return graph_of(summable, params_of(result.posterior).mean(), place)
+def _summable(result: Result) -> str:
+    """Objective of the campaign, or lost_contact where its value is no sum."""
+    name = result.planner.objective
+    return name if name in OBJECTIVES else "lost_contact"
 
 
 def _require_nav2(result: Result, place: PlacedFrame) -> None:
-    _require_topics(result, place)
-    _route_graph(result, place)
+    require_robots(result.workspace)
+    require_fine(place, result.workspace, "a route graph")
+    graph_of(summed(result.planner, _summable(result)), mean_of(result.posterior), place)
     if result.workspace.ground is not None:
         for robot in (LEAD, *result.workspace.team.names):
             stops_of(result.plan, robot, place)
-
-
-def _require_topics(result: Result, place: PlacedFrame) -> None:
-    require_robots(result.workspace)
 
 
 _BAGS = ("grid_map", "ros2_bag")
@@ -325,9 +296,9 @@ _FORMATS = {
     "kmz": _Format(
         "ways and posts with their times, and the cost map, for Google Earth and phones",
         ("mission.kmz",),
-        _write_kmz,
+        lambda content, file: write_kmz(file, content.result, content.maps()["cost"]),
         on_earth=True,
-        require=_require_kmz,
+        require=lambda result, _: (require_simplekml(), schedule_of(result.plan)),
     ),
     "qgc": _Format(
         "a mission of QGroundControl for each robot",
@@ -366,22 +337,28 @@ _FORMATS = {
     "grid_map": _Format(
         "all maps as layers of a GridMap in a bag of ROS 2 (mcap)",
         ("grid_map",),
-        _write_grid_map,
+        lambda content, file: write_grid_map(
+            file, content.maps(), content.result.workspace, **content.placing
+        ),
         in_frame=True,
     ),
     "foxglove": _Format(
         "maps, ways, posts and sight bound by bound as a scene for Foxglove (mcap)",
         ("scene.mcap",),
-        _write_scene,
+        lambda content, file: write_foxglove(
+            file, content.result, content.maps(), **content.placing
+        ),
         in_frame=True,
-        require=_require_scene,
+        require=lambda result, _: (require_foxglove(), schedule_of(result.plan)),
     ),
     "ros2_bag": _Format(
         "cost map, path, posts and ways as a bag of ROS 2 (mcap)",
         ("path_ros2",),
-        _write_bag,
+        lambda content, file: write_ros_bag(
+            file, content.result, content.maps()["cost"], **content.placing
+        ),
         in_frame=True,
-        require=_require_topics,
+        require=lambda result, _: require_robots(result.workspace),
     ),
 }
 FORMATS = {name: kind.text for name, kind in _FORMATS.items()}

@@ -28,7 +28,8 @@ def write_foxglove(
     plan: Plan | Result,
     maps: Maps | None = None,
     *,
-    frame: Frame = AT_START,
+    resolution: float | None = None,
+    frame: Frame | PlacedFrame = AT_START,
 ) -> None:
     """Write a plan as a scene that Foxglove plays in the 3D panel.
 
@@ -48,6 +49,7 @@ def write_foxglove(
         path: .mcap file to write, or to replace.
         plan: Plan, or result whose recommended path is meant, on a terrain in memory.
         maps: Maps (row, col), e.g. `Result.maps()`.
+        resolution: Side of a pixel of the maps, m, see `write_ros_map`.
         frame: Frame, by default at the start of the path.
 
     Raises:
@@ -60,20 +62,6 @@ def write_foxglove(
     frame_file(target)
     plan = plan_of(plan)
     place = placed(frame, plan.workspace, plan.path[0])
-    save_foxglove(target, plan, maps, None, place)
-    save_beside(target, place, plan.workspace)
-
-
-def require_foxglove() -> None:
-    """Refuse to go on without foxglove-sdk: TrustboError."""
-    if importlib.util.find_spec("foxglove") is None:
-        raise TrustboError(f"scenes need foxglove-sdk: {pip_install('foxglove-sdk')}")
-
-
-def save_foxglove(
-    target: Path, plan: Plan, maps: Maps | None, resolution: float | None, place: PlacedFrame
-) -> None:
-    """Write a scene in a frame, without the file of the frame; see `write_foxglove`."""
     schedule, raster, names = schedule_of(plan), None, []
     if maps is not None:
         bands = require_maps(maps, plan.workspace)
@@ -100,6 +88,13 @@ def save_foxglove(
                 updates.log(scene.bound(plan, k, at), log_time=at)
         content = file.read_bytes()
     write_file(target, lambda temporary: temporary.write_bytes(content))
+    save_beside(target, frame, place, plan.workspace)
+
+
+def require_foxglove() -> None:
+    """Refuse to go on without foxglove-sdk: TrustboError."""
+    if importlib.util.find_spec("foxglove") is None:
+        raise TrustboError(f"scenes need foxglove-sdk: {pip_install('foxglove-sdk')}")
 
 
 class _Scene:

@@ -95,12 +95,16 @@ class PlacedFrame(NamedTuple):
         return turned + self.origin
 
 
-def placed(frame: Frame, workspace: Workspace, start: tuple[int, int] | None = None) -> PlacedFrame:
-    """Place a user's frame; `start` is the cell of `"auto"`.
+def placed(
+    frame: Frame | PlacedFrame, workspace: Workspace, start: tuple[int, int] | None = None
+) -> PlacedFrame:
+    """Place a user's frame, unless it is placed; `start` is the cell of `"auto"`.
 
     TrustboError: no frame; an origin that is no position, or far from the grid; a rotation that is
     not finite; or a name that ROS has not.
     """
+    if isinstance(frame, PlacedFrame):
+        return frame
     origin, rotation, name = require_kind("frame", frame, Frame, "give export.Frame(name='odom')")
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z]\w*(/\w+)*", name):
         raise TrustboError(
@@ -152,10 +156,15 @@ def frame_file(path: Path) -> Path:
     return require_file(path.with_name(f"{path.stem}_frame.yaml"))
 
 
-def save_beside(path: Path, frame: PlacedFrame, workspace: Workspace) -> None:
-    """Write the frame of the map or bag at `path` to a file; nothing for that of the CRS."""
-    if not frame.is_default:
-        save_frame(frame_file(path), frame, workspace)
+def save_beside(
+    path: Path, frame: Frame | PlacedFrame, place: PlacedFrame, workspace: Workspace
+) -> None:
+    """Write the frame of the map or bag at `path` to a file, with its place.
+
+    Nothing for that of the CRS, nor for a frame that was placed before: it has a file.
+    """
+    if not place.is_default and frame is not place:
+        save_frame(frame_file(path), place, workspace)
 
 
 def save_frame(file: Path, frame: PlacedFrame, workspace: Workspace) -> None:

@@ -33,7 +33,7 @@ def write_grid_map(
     *,
     storage: str = "mcap",
     resolution: float | None = None,
-    frame: Frame = OF_CRS,
+    frame: Frame | PlacedFrame = OF_CRS,
 ) -> None:
     """Write maps as the layers of one grid_map_msgs/GridMap in a ROS bag.
 
@@ -55,22 +55,9 @@ def write_grid_map(
     """
     target = Path(path)
     require_choice("storage", storage, STORAGES)
-    require_new_bag(target)
+    version = require_new_bag(target)
     place = placed(frame, workspace)
     frame_file(target)
-    save_grid_map(target, maps, workspace, resolution, place, storage)
-    save_beside(target, place, workspace)
-
-
-def save_grid_map(
-    target: Path,
-    maps: Maps,
-    workspace: Workspace,
-    resolution: float | None,
-    place: PlacedFrame,
-    storage: str = "mcap",
-) -> None:
-    """Write maps in a frame, without the file of the frame; see `write_grid_map`."""
     bands = require_maps(maps, workspace)
     cells = np.stack([band.values for band in bands.data_vars.values()]).astype(np.float32)
     raster = sampled(cells, np.nan, workspace, resolution, place)
@@ -81,8 +68,8 @@ def save_grid_map(
         message = make.grid_map(now, layers, raster.resolution, raster.corner)
         return [static_transform(make, now, place), Record(now, TOPIC, GRID_MAP, message)]
 
-    version = require_new_bag(target)
     write_messages(target, version, storage, records, latched=True, frame=place.name)
+    save_beside(target, frame, place, workspace)
 
 
 def read_grid_map(path: FilePath, topic: str | None = None) -> xr.Dataset:

@@ -22,7 +22,7 @@ def write_waypoints(
     plan: Plan | Result,
     *,
     robot: str = LEAD,
-    frame: Frame = AT_START,
+    frame: Frame | PlacedFrame = AT_START,
 ) -> None:
     """Write the stops of a robot in order as a goal of the action FollowWaypoints of Nav2.
 
@@ -46,12 +46,6 @@ def write_waypoints(
     plan = plan_of(plan)
     require_choice("robot", robot, (LEAD, *plan.workspace.team.names))
     place = placed(frame, plan.workspace, plan.path[0])
-    save_waypoints(target, plan, robot, place)
-    save_beside(target, place, plan.workspace)
-
-
-def save_waypoints(target: Path, plan: Plan, robot: str, place: PlacedFrame) -> None:
-    """Write the stops of a robot, without the file of the frame; see `write_waypoints`."""
     poses = [
         {
             "header": {"frame_id": place.name},
@@ -71,6 +65,7 @@ def save_waypoints(target: Path, plan: Plan, robot: str, place: PlacedFrame) -> 
         "# It does not have the robot wait for the others.\n"
     )
     write_text(target, about + yaml.safe_dump({"poses": poses}, sort_keys=False))
+    save_beside(target, frame, place, plan.workspace)
 
 
 def stops_of(plan: Plan, robot: str, place: PlacedFrame) -> np.ndarray:

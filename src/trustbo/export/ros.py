@@ -56,19 +56,15 @@ def occupancy(
 def _raster(
     cost: xr.DataArray, workspace: Workspace, resolution: float | None, frame: PlacedFrame
 ) -> Raster:
-    """Map of a cost whose pixels lie along the axes of a frame."""
-    return sampled(_cells(cost, workspace), UNKNOWN, workspace, resolution, frame)
-
-
-def _cells(cost: xr.DataArray, workspace: Workspace) -> np.ndarray:
-    """Occupancy of the cells, (row, col), int8, the northern row first."""
+    """Occupancy, see `occupancy`, whose pixels lie along the axes of a frame."""
     (values,) = require_maps(cost.rename("cost"), workspace).data_vars.values()
     costs = values.values
     if (bad := (costs < 0.0) | (costs > 1.0)).any():
         cell = tuple(int(i) for i in np.argwhere(bad)[0])
         raise TrustboError(f"cost{list(cell)} = {costs[cell]:g} is outside [0, 1].")
     cells = np.where(np.isnan(costs), UNKNOWN, np.fmin(np.rint(100.0 * costs), WORST_PASSABLE))
-    return np.where(workspace.passable.values, cells, IMPASSABLE).astype(np.int8)
+    cells = np.where(workspace.passable.values, cells, IMPASSABLE).astype(np.int8)
+    return sampled(cells, UNKNOWN, workspace, resolution, frame)
 
 
 def write_ros_map(
@@ -77,7 +73,7 @@ def write_ros_map(
     workspace: Workspace,
     *,
     resolution: float | None = None,
-    frame: Frame = OF_CRS,
+    frame: Frame | PlacedFrame = OF_CRS,
 ) -> None:
     """Write a cost map for map_server of ROS 1 and of Nav2: a .yaml and a .pgm file.
 
@@ -99,22 +95,10 @@ def write_ros_map(
             that cannot be; or the file cannot be written.
     """
     target = require_file(path, ".yaml", ".yml")
-    require_file(target.with_suffix(".pgm"))
+    picture = require_file(target.with_suffix(".pgm"))
     place = placed(frame, workspace)
     frame_file(target)
-    save_ros_map(target, cost, workspace, resolution, place)
-    save_beside(target, place, workspace)
-
-
-def save_ros_map(
-    target: Path,
-    cost: xr.DataArray,
-    workspace: Workspace,
-    resolution: float | None,
-    place: PlacedFrame,
-) -> None:
-    """Write a map in a frame, without the file of the frame; see `write_ros_map`."""
-    raster, picture = _raster(cost, workspace, resolution, place), target.with_suffix(".pgm")
+    raster = _raster(cost, workspace, resolution, place)
     height, width = raster.values.shape
     # Pictures begin in the north. In raw mode, map_server takes the byte of a pixel as its value,
     # 255 as -1; Nav2 does so up to 100, and takes larger bytes as unknown.
@@ -133,6 +117,7 @@ def save_ros_map(
     write_file(picture, lambda file: file.write_bytes(head + pixels))
     # Last, as it names the picture.
     write_text(target, yaml.safe_dump(record, sort_keys=False, default_flow_style=None))
+    save_beside(target, frame, place, workspace)
 
 
 def write_ros_bag(
@@ -142,7 +127,7 @@ def write_ros_bag(
     *,
     storage: str = "mcap",
     resolution: float | None = None,
-    frame: Frame = OF_CRS,
+    frame: Frame | PlacedFrame = OF_CRS,
 ) -> None:
     """Write a cost map, a path, and all robots' posts and ways as a ROS bag.
 
@@ -174,26 +159,13 @@ def write_ros_bag(
     """
     target = Path(path)
     require_choice("storage", storage, STORAGES)
-    require_new_bag(target)
+    version = require_new_bag(target)
     plan = plan_of(plan)
     workspace = plan.workspace
     require_robots(workspace)
     place = placed(frame, workspace, plan.path[0])
     frame_file(target)
-    save_ros_bag(target, plan, cost, resolution, place, storage)
-    save_beside(target, place, workspace)
-
-
-def save_ros_bag(
-    target: Path,
-    plan: Plan,
-    cost: xr.DataArray,
-    resolution: float | None,
-    place: PlacedFrame,
-    storage: str = "mcap",
-) -> None:
-    """Write a bag in a frame, without the file of the frame; see `write_ros_bag`."""
-    raster, topics = _raster(cost, plan.workspace, resolution, place), _topics(plan, place)
+    raster, topics = _raster(cost, workspace, resolution, place), _topics(plan, place)
     of_kind = {PATH: Messages.path, POSES: Messages.poses}
 
     def records(make: Messages) -> list[Record]:
@@ -210,8 +182,8 @@ def save_ros_bag(
             ),
         ]
 
-    version = require_new_bag(target)
     write_messages(target, version, storage, records, latched=True, frame=place.name)
+    save_beside(target, frame, place, workspace)
 
 
 def static_transform(make: Messages, now: int, place: PlacedFrame) -> Record:

@@ -11,16 +11,25 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import xarray as xr
 import yaml
 
 from trustbo.campaign.result import Result
 from trustbo.errors import TrustboError, require_kind, require_not_negative
-from trustbo.export.frame import AT_START, Frame, frame_file, placed, require_fine, save_beside
+from trustbo.export.frame import (
+    AT_START,
+    Frame,
+    PlacedFrame,
+    frame_file,
+    placed,
+    require_fine,
+    save_beside,
+)
 from trustbo.export.route_graph import RouteGraph, graph_of, summed
 from trustbo.files import FilePath, interpreting, read_record, require_file, write_text
-from trustbo.inference import params_of
 from trustbo.models.params import Params
 from trustbo.planning import Planner
+from trustbo.planning.problem import mean_of
 
 _NEAR = 1e-6
 """Distance within which positions are the same, m."""
@@ -35,12 +44,12 @@ _SERVER = {
 def write_route_graph(
     path: FilePath,
     planner: Planner | Result,
-    params: Params | None = None,
+    params: Params | xr.DataTree | None = None,
     *,
     objective: str | None = None,
     tolerance: float | None = None,
     overridable: bool = True,
-    frame: Frame = AT_START,
+    frame: Frame | PlacedFrame = AT_START,
 ) -> RouteGraph:
     """Write the graph of all possible bounds, with their costs, for the route server of Nav2.
 
@@ -54,7 +63,7 @@ def write_route_graph(
     Args:
         path: .geojson or .json file to write, or to replace.
         planner: Result, whose planner and posterior mean are taken; or a planner.
-        params: Parameters without leading axes, for a planner.
+        params: Posterior or parameters, whose mean is taken, for a planner.
         objective: `"lost_contact"` or `"stationary"`; by default the planner's.
         tolerance: Largest distance of edges from the lead's way, m, which is a chain of straight
             ones; by default half a pixel. `inf`: each bound is one edge.
@@ -75,17 +84,17 @@ def write_route_graph(
     frame_file(target)
     require_kind("planner", planner, Planner | Result, "give a Result, or a Planner and parameters")
     if isinstance(planner, Result):
-        planner, params = planner.planner, params_of(planner.posterior).mean()
+        planner, params = planner.planner, planner.posterior
     if params is None:
-        raise TrustboError("a planner needs parameters, such as params_of(posterior).mean().")
+        raise TrustboError("a planner needs parameters, such as a posterior.")
     if tolerance is not None and tolerance != math.inf:
         tolerance = require_not_negative("tolerance", tolerance)
     planner = summed(planner, objective)
     place = placed(frame, planner.workspace, planner.start)
     require_fine(place, planner.workspace, "a route graph")
-    graph = graph_of(planner, params, place, tolerance)
+    graph = graph_of(planner, mean_of(params), place, tolerance)
     save_route_graph(target, graph, overridable=overridable)
-    save_beside(target, place, planner.workspace)
+    save_beside(target, frame, place, planner.workspace)
     return graph
 
 
