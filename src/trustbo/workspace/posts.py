@@ -37,7 +37,7 @@ from trustbo.workspace.bounding import legs_along, t2_cells
 from trustbo.workspace.formation import SPACING, Formation
 from trustbo.workspace.grid import Grid
 from trustbo.workspace.moves import MOVES
-from trustbo.workspace.regions import Window, are_linked, largest_region, linked_to
+from trustbo.workspace.regions import Window, largest_region, linked_to
 from trustbo.workspace.routes import Routes, at_times
 from trustbo.workspace.sight import Sight, detection_between, jittered, optics
 from trustbo.workspace.surface import Surface
@@ -98,8 +98,9 @@ class Posts:
         T2's posts in a cell are linked to its stop within half a cell around, so that one test,
         of the stops, holds for all robots and any next cell.
         """
-        ends = [self.surface.pixel_at(*self.stop(cell).tolist()) for cell in (a, c)]
-        return are_linked(self.surface.passable, self.window(a, c), ends[0], ends[1])
+        start, end = (self.surface.pixel_at(*self.stop(cell).tolist()) for cell in (a, c))
+        top, _, left, _ = window = self.window(a, c)
+        return bool(linked_to(self.surface.passable, window, start)[end[0] - top, end[1] - left])
 
     def is_linked(self, cell: Cell, position: np.ndarray) -> bool:
         """Whether robots can drive from the stop in a cell to a position near by, (2,)."""
