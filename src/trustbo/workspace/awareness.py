@@ -1,6 +1,6 @@
 """Awareness of cells, from the pixels of a terrain or from a user's arrays."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +17,7 @@ from trustbo.terrain.pixel_awareness import PixelAwareness
 from trustbo.terrain.strips import Strip
 from trustbo.workspace.grid import CellMeans, Grid, Sums
 from trustbo.workspace.moves import MOVES, existing_bounds
+from trustbo.workspace.survey import MAX_MISSING
 
 _AXES = "(robot, row, col, feature) or (robot, move, row, col, feature) with 8 moves"
 
@@ -30,6 +31,38 @@ class CellMaps(NamedTuple):
     features: tuple[str, ...]
     pixels: xr.Dataset | None
     """Awareness and passability of each pixel, dims (y, x), if kept."""
+
+    def of_team(self, grid: Grid, team: Team) -> tuple[xr.DataArray, xr.DataArray]:
+        """Awareness, the same for each robot, and passability of the cells, see `labelled`."""
+        passable = np.nan_to_num(self.passable_share) >= 1.0 - MAX_MISSING
+        passable &= np.isfinite(self.awareness).all(-1)
+        z = np.repeat(self.awareness[None], len(team.robots), axis=0)
+        return labelled(z, passable, grid, team, self.features)
+
+
+def labelled(
+    z: np.ndarray, passable: np.ndarray, grid: Grid, team: Team, features: Sequence[str]
+) -> tuple[xr.DataArray, xr.DataArray]:
+    """Label awareness (robot, row, col, feature) and passability (row, col) of a grid.
+
+    TrustboError: no cell is passable.
+    """
+    if not passable.any():
+        raise TrustboError(
+            "no cell is passable: more than half of every cell is missing or too steep. Use "
+            "other cells, or a team with a larger max_slope."
+        )
+    dims = ("robot", "row", "col", "feature")
+    cells = {
+        **{axis: np.arange(n) for axis, n in zip(dims[1:3], grid.shape, strict=True)},
+        "y": ("row", grid.y),
+        "x": ("col", grid.x),
+    }
+    coords = {"robot": list(team.names), **cells, "feature": list(features)}
+    return (
+        xr.DataArray(z, coords, dims, "awareness"),
+        xr.DataArray(passable, cells, dims[1:3], "passable"),
+    )
 
 
 def cell_maps(

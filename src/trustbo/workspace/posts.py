@@ -92,15 +92,21 @@ class Posts:
             min(cols, int(np.ceil((max(of_cols) + 1.5) * per_col))),
         )
 
-    def are_linked(self, a: Cell, c: Cell) -> bool:
-        """Whether the robots have a route from cell to cell: their posts are in one region.
+    def linked_bounds(self, exists: np.ndarray) -> np.ndarray:
+        """Bounds (move, row, col) that robots have a route for, of those that `exists`.
 
         T2's posts in a cell are linked to its stop within half a cell around, so that one test,
-        of the stops, holds for all robots and any next cell.
+        of the stops of both cells, holds for all robots, either way and any next cell.
         """
-        start, end = (self.surface.pixel_at(*self.stop(cell).tolist()) for cell in (a, c))
-        top, _, left, _ = window = self.window(a, c)
-        return bool(linked_to(self.surface.passable, window, start)[end[0] - top, end[1] - left])
+        linked, n_moves = np.zeros_like(exists), len(exists)
+        for m, (down, right) in enumerate(MOVES[8][: n_moves // 2]):
+            for row, col in np.argwhere(exists[m]).tolist():
+                a, c = (row - down, col - right), (row, col)
+                start, end = (self.surface.pixel_at(*self.stop(cell).tolist()) for cell in (a, c))
+                top, _, left, _ = window = self.window(a, c)
+                region = linked_to(self.surface.passable, window, start)
+                linked[m, *c] = linked[n_moves - 1 - m, *a] = region[end[0] - top, end[1] - left]
+        return linked
 
     def is_linked(self, cell: Cell, position: np.ndarray) -> bool:
         """Whether robots can drive from the stop in a cell to a position near by, (2,)."""

@@ -83,14 +83,16 @@ class WatchTable:
         given = geometry_along(rule, path, posts)
         return phases(rule.surface, sight or self._sight, rule.team, given)
 
-    def gain(self, path: tuple[Cell, ...], posts: ArrayLike, sight: Sight) -> np.ndarray:
-        """Line of sight gained on a path by posts over those of the rule, (bound, robot).
+    def gain(self, path: tuple[Cell, ...], posts: ArrayLike, sights: Sequence[Sight]) -> np.ndarray:
+        """Line of sight gained on a path by posts over those of the rule, (bound, robot, sight).
 
         TrustboError: a post that is farther from its cell than half a cell.
         """
-        given = self._ways.posts.require_near(path, posts)
-        both = (self.seen_along(path, one, sight) for one in (given, self.rule(path)))
-        seen, usual = (one.line_of_sight() for one in both)
+        both = self._ways.posts.require_near(path, posts), self.rule(path)
+        seen, usual = (
+            np.stack([self.seen_along(path, one, s).line_of_sight() for s in sights], axis=-1)
+            for one in both
+        )
         return seen - usual
 
     def unseen(self, passable: np.ndarray) -> np.ndarray:
@@ -155,9 +157,10 @@ class WatchTable:
         seen = detection_between(surface, self._sight, eyes, aims[0], optics(robot, team.lead))
         return robot.detection * seen.mean(-1)
 
-    def overwatch_map(self, a: Cell, c: Cell, robot: Robot) -> xr.DataArray:
-        """Map of `overwatch` near a bound, DataArray (y, x); NaN where robots cannot stand."""
-        surface, window = self._ways.posts.surface, self._ways.posts.window(a, c)
+    def overwatch_map(self, a: Cell, c: Cell, name: str) -> xr.DataArray:
+        """Map of `overwatch` of a robot near a bound, (y, x); NaN where robots cannot stand."""
+        rule = self._ways.posts
+        surface, window = rule.surface, rule.window(a, c)
         steps = [max(1, round(_APART / side)) for side in surface.pixel]
         # All maps are of one lattice, whatever their windows.
         rows, cols = (
@@ -168,6 +171,8 @@ class WatchTable:
         free = surface.passable[rows, cols]
         positions = np.stack(np.meshgrid(x, y), axis=-1)
         shares = np.full(free.shape, np.nan)
+        robot = rule.team.robots[rule.team.names.index(name)]
         shares[free] = self.overwatch(a, c, positions[free], robot)
-        axes = {"y": y, "x": x}
-        return xr.DataArray(shares, axes, ("y", "x"), "overwatch", {"units": "1"})
+        about = {"units": "1", "long_name": f"share of the lead's way {a} to {c} that {name} sees"}
+        made = xr.DataArray(shares, {"y": y, "x": x}, ("y", "x"), "overwatch", about)
+        return made if rule.grid.crs is None else made.rio.write_crs(rule.grid.require_crs())

@@ -22,7 +22,7 @@ from trustbo.data import (
 from trustbo.display.card import Card, Displayed
 from trustbo.display.compiling import compiling
 from trustbo.display.svg import map_picture
-from trustbo.errors import ShapeError, TrustboError, require_choice, require_positive
+from trustbo.errors import ShapeError, require_choice, require_positive
 from trustbo.renamed import former
 from trustbo.stacking import fill_awareness
 from trustbo.team import Team
@@ -33,7 +33,7 @@ from trustbo.terrain.features import (
     TRAVERSABILITY,
     VISIBILITY,
 )
-from trustbo.workspace.awareness import cell_maps, of_cells
+from trustbo.workspace.awareness import cell_maps, labelled, of_cells
 from trustbo.workspace.bound_awareness import (
     TRAVERSABLE,
     of_bounds,
@@ -43,11 +43,11 @@ from trustbo.workspace.bound_awareness import (
 from trustbo.workspace.formation import Formation
 from trustbo.workspace.grid import Grid
 from trustbo.workspace.location import Location, cell_of
-from trustbo.workspace.moves import MOVE_NAMES, MOVES, along, existing_bounds, moves_along
+from trustbo.workspace.moves import MOVE_NAMES, along, existing_bounds, moves_along
 from trustbo.workspace.posts import Posts
 from trustbo.workspace.sight import Sight, sights_of
 from trustbo.workspace.surface import Surface, surface_of
-from trustbo.workspace.survey import MAX_MISSING, reason_impassable
+from trustbo.workspace.survey import reason_impassable
 from trustbo.workspace.watch import WatchTable
 from trustbo.workspace.ways import Ways
 
@@ -164,19 +164,13 @@ class Workspace(Displayed):
             maps = cell_maps(
                 terrain, grid, features or defaults, team, observers=observers, scaling=scaling
             )
-            passable = np.nan_to_num(maps.passable_share) >= 1.0 - MAX_MISSING
-            workspace = cls._of_maps(
-                np.repeat(maps.awareness[None], len(team.robots), axis=0),
-                passable & np.isfinite(maps.awareness).all(-1),
+            workspace = cls(
+                *maps.of_team(grid, team),
                 grid,
                 team,
-                maps.features,
-            )
-            workspace = dataclasses.replace(
-                workspace,
-                terrain=terrain,
-                pixels=maps.pixels,
-                composites=maps.composites,
+                terrain,
+                maps.pixels,
+                maps.composites,
                 sights=sights,
                 formation=formation,
             )
@@ -217,32 +211,8 @@ class Workspace(Displayed):
         names = as_names("features", features) or default_features(z.shape[3])
         if len(names) != z.shape[3]:
             raise ShapeError(f"features must be {z.shape[3]} names; got {names}.")
-        made = cls._of_maps(z, free, grid, team, names)
+        made = cls(*labelled(z, free, grid, team, names), grid, team)
         return made if bounds is None else made.with_bounds(bounds)
-
-    @classmethod
-    def _of_maps(
-        cls, z: np.ndarray, passable: np.ndarray, grid: Grid, team: Team, features: tuple[str, ...]
-    ) -> Self:
-        """Label awareness (robot, row, col, feature); TrustboError if no cell is passable."""
-        if not passable.any():
-            raise TrustboError(
-                "no cell is passable: more than half of every cell is missing or too steep. Use "
-                "other cells, or a team with a larger max_slope."
-            )
-        dims = ("robot", "row", "col", "feature")
-        cells = {
-            **{axis: np.arange(n) for axis, n in zip(dims[1:3], grid.shape, strict=True)},
-            "y": ("row", grid.y),
-            "x": ("col", grid.x),
-        }
-        coords = {"robot": list(team.names), **cells, "feature": list(features)}
-        return cls(
-            xr.DataArray(z, coords, dims, "awareness"),
-            xr.DataArray(passable, cells, dims[1:3], "passable"),
-            grid,
-            team,
-        )
 
     @property
     def features(self) -> tuple[str, ...]:
@@ -314,13 +284,8 @@ class Workspace(Displayed):
         memory there is one between any two neighbours.
         """
         exists = existing_bounds(self.passable.values)
-        if (ground := self.ground) is not None:
-            n_moves = len(exists)
-            for m, (down, right) in enumerate(MOVES[8][: n_moves // 2]):
-                for row, col in np.argwhere(exists[m]).tolist():
-                    left = row - down, col - right
-                    linked = ground.posts.are_linked(left, (row, col))
-                    exists[m, row, col] = exists[n_moves - 1 - m, *left] = linked
+        if self.ground is not None:
+            exists = self.ground.posts.linked_bounds(exists)
         like = self.passable.expand_dims(move=list(MOVE_NAMES), axis=0)
         return like.copy(data=exists).rename("passable_bounds")
 
@@ -397,11 +362,7 @@ class Workspace(Displayed):
         a, c, _ = self._require_bound(*bound)
         name = self.team.names[0] if robot is None else robot
         require_choice("robot", name, self.team.names)
-        if (table := self.watch) is None or self.terrain is None:
-            return None
-        made = table.overwatch_map(a, c, self.team.robots[self.team.names.index(name)])
-        made.attrs["long_name"] = f"share of the lead's way {a} to {c} that {name} sees"
-        return made if self.terrain.rio.crs is None else made.rio.write_crs(self.terrain.rio.crs)
+        return None if self.watch is None else self.watch.overwatch_map(a, c, name)
 
     def ways(
         self, a: Cell, c: Cell, next_cell: Cell | None = None, before: Cell | None = None
@@ -461,9 +422,8 @@ class Workspace(Displayed):
         """
         cells = tuple(self.require_cell(f"path[{k}]", cell) for k, cell in enumerate(path))
         gain = np.zeros((len(cells) - 1, self.team.n_robots, len(self.features)))
-        if (table := self.watch) is not None and self.of_bounds is not None:
-            for n, sight in enumerate(self.sights, start=-len(self.sights)):
-                gain[..., n] = table.gain(cells, posts, sight)
+        if self.watch is not None and self.of_bounds is not None:
+            gain[..., -len(self.sights) :] = self.watch.gain(cells, posts, self.sights)
         return gain
 
     def in_order(self, mission: Mission) -> Mission:
