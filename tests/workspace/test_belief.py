@@ -139,23 +139,6 @@ def test_the_same_seed_draws_the_same_maps():
     assert (belief.draw(3, seed=7) != belief.draw(3, seed=8)).any()
 
 
-def test_scales_can_be_learned():
-    """Of a map whose errors are smaller and smoother than is believed at first."""
-    rng = np.random.default_rng(6)
-    workspace = Workspace.from_awareness(np.full((1, 12, 12, 1), 0.5))
-    path = [(r, c) for r in range(12) for c in (range(12) if r % 2 == 0 else range(11, -1, -1))]
-    errors = 0.02 * np.cos(np.arange(12) / 2)[:, None] + 0.001 * rng.standard_normal((12, 12))
-    z = np.array([0.5 + errors[cell] for cell in path[1:]])[:, None, None]
-    told = Mission.from_arrays(path, z, np.full((len(z), 1), 0.5))
-    sd = {}
-    for learns in (False, True):
-        belief = AwarenessBelief(workspace, learn_scales=learns)
-        belief.update(told)
-        drawn = belief.draw(50)[:, 0, ..., 0]
-        sd[learns] = drawn[:, 0, 0].std()  # of the start, where nothing was measured
-    assert sd[True] < 0.03 < sd[False]
-
-
 @pytest.mark.parametrize("name", ["sd", "length_scale", "noise"])
 @pytest.mark.parametrize("value", [0.0, -1.0, np.inf, "wide"])
 def test_scales_are_positive(name, value):

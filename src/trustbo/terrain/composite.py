@@ -15,7 +15,6 @@ from trustbo import zheng2023
 from trustbo.errors import TerrainError, TrustboError, require_choice, require_whole
 from trustbo.files import FilePath, interpreting, require_regular, write_file
 
-SCALINGS = ("percentile", "minmax", "logistic")
 METHODS = ("pca", "zheng2023")
 MAX_PIXELS = 1_000_000
 MIN_CALIBRATION = 200
@@ -33,7 +32,7 @@ class CompositeIndex(TransformerMixin, BaseEstimator):
 
     Each feature is winsorised at its 1st and 99th percentile and standardised; the first component
     is oriented so that the loadings agree with the declared signs (sum of loading x sign > 0),
-    independent of the solver; its score is mapped to [0, 1].
+    independent of the solver; the 2nd and 98th percentile of its score are mapped to 0 and 1.
 
     Attributes:
         loadings_: DataArray (feature), the oriented unit vector; 0 for a constant feature.
@@ -44,7 +43,6 @@ class CompositeIndex(TransformerMixin, BaseEstimator):
         self,
         signs: Mapping[str, int],
         *,
-        scaling: str = "percentile",
         robust: bool = False,
         method: str = "pca",
         min_samples: int = 1,
@@ -53,9 +51,6 @@ class CompositeIndex(TransformerMixin, BaseEstimator):
 
         Args:
             signs: Signs by feature: +1 if it raises the index, -1 if it lowers it.
-            scaling: `"percentile"` maps the 2nd and 98th percentile of the score to 0 and 1,
-                `"minmax"` its extremes, `"logistic"` passes the standardised score through the
-                logistic function.
             robust: Loadings from rank correlations (Spearman), robust to outliers and to monotone
                 transforms of the features.
             method: `"zheng2023"` is for comparison with the later code of the paper's authors:
@@ -64,10 +59,9 @@ class CompositeIndex(TransformerMixin, BaseEstimator):
             min_samples: Least number of samples to fit on.
 
         Raises:
-            TrustboError: An unknown scaling or method.
+            TrustboError: An unknown method.
         """
         self.signs = signs
-        self.scaling = require_choice("scaling", scaling, SCALINGS)
         self.robust = robust
         self.method = require_choice("method", method, METHODS)
         self.min_samples = require_whole("min_samples", min_samples, 1)
@@ -176,8 +170,6 @@ class CompositeIndex(TransformerMixin, BaseEstimator):
             return np.where(np.isfinite(score), 0.5, np.nan)
         if self.method == "zheng2023":
             return zheng2023.squash(score)
-        if self.scaling == "logistic":
-            return 1.0 / (1.0 + np.exp(-score / self._spread))
         ends = np.asarray([self._bottom, self._top], score.dtype)
         _to_unit(score.reshape(-1), *ends)
         return score
@@ -191,7 +183,6 @@ class CompositeIndex(TransformerMixin, BaseEstimator):
             | {"explained_variance_ratio": self.explained_variance_ratio_}
         )
         data.attrs = {
-            "scaling": self.scaling,
             "robust": int(self.robust),
             "method": self.method,
             "min_samples": self.min_samples,
@@ -201,12 +192,16 @@ class CompositeIndex(TransformerMixin, BaseEstimator):
 
     @classmethod
     def from_dataset(cls, data: xr.Dataset) -> Self:
-        """Make an index from the dataset of `to_dataset`."""
+        """Make an index from the dataset of `to_dataset`.
+
+        TrustboError: it is of version 0.2, whose logistic scaling is no more.
+        """
         names = [str(name) for name in data["feature"].values]
         attrs = data.attrs
+        if attrs.get("scaling") == "logistic" and attrs["method"] == "pca":
+            raise TrustboError("an index of scaling='logistic' is of version 0.2; fit it anew.")
         index = cls(
             dict(zip(names, data["sign"].values.astype(int).tolist(), strict=True)),
-            scaling=str(attrs["scaling"]),
             robust=bool(attrs["robust"]),
             method=str(attrs["method"]),
             min_samples=int(attrs["min_samples"]),
@@ -249,11 +244,9 @@ class CompositeIndex(TransformerMixin, BaseEstimator):
 
     def _scale(self, score: np.ndarray) -> None:
         """Fit the scores that become 0 and 1."""
-        ends = [2, 98] if self.scaling == "percentile" else [0, 100]
-        self._bottom, self._top = np.percentile(score, ends)
+        self._bottom, self._top = np.percentile(score, [2, 98])
         if self._top - self._bottom < 1e-9:  # nearly all pixels are alike: take the extremes
             self._bottom, self._top = float(score.min()), float(score.max())
-        self._spread = 1.0 if self.method == "zheng2023" else float(score.std()) or 1.0
 
     def _warn(self) -> None:
         loadings = zip(self.signs.items(), self.loadings_.values, strict=True)
@@ -273,7 +266,7 @@ class CompositeIndex(TransformerMixin, BaseEstimator):
 
 
 _COLUMNS = ("low", "high", "mean", "sd", "varies")
-_NUMBERS = ("bottom", "top", "spread")
+_NUMBERS = ("bottom", "top")
 
 
 def _components(z: np.ndarray, robust: bool) -> tuple[np.ndarray, np.ndarray]:

@@ -46,9 +46,8 @@ class PixelAwareness:
         *,
         reach: float = np.inf,
         observers: ArrayLike | None = None,
-        scaling: str = "percentile",
     ) -> None:
-        """Fit the composites; see `Workspace.from_terrain` for features, observers and scaling.
+        """Fit the composites; see `Workspace.from_terrain` for features and observers.
 
         Openness is over the range of the team's lidars, at most `reach` and half the terrain.
 
@@ -84,7 +83,7 @@ class PixelAwareness:
         for name, f in self._features.items():
             if isinstance(f, Mapping):
                 chosen = whole or sample_strips(terrain, around[name], SAMPLE)
-                self._fit(name, f, scaling, chosen)
+                self._fit(name, f, chosen)
 
     def features_of(self, strip: Strip) -> dict[str, np.ndarray]:
         """Features of a strip's pixels and "passable", valid until the thread's next strip.
@@ -110,9 +109,7 @@ class PixelAwareness:
             is_one = isinstance(f, PixelFeature)
             self._features[name] = fitting(f) if is_one else {n: fitting(p) for n, p in f.items()}
 
-    def _fit(
-        self, name: str, parts: Mapping[str, PixelFeature], scaling: str, chosen: Iterable[Strip]
-    ) -> None:
+    def _fit(self, name: str, parts: Mapping[str, PixelFeature], chosen: Iterable[Strip]) -> None:
         """Fit a composite on some strips, with the halo that its features need."""
         drawn = [self._columns(strip, name, parts) for strip in chosen]
         sample = xr.Dataset(
@@ -120,7 +117,7 @@ class PixelAwareness:
         )
         signs = {part: feature.sign for part, feature in parts.items()}
         try:
-            self.composites[name] = CompositeIndex(signs, scaling=scaling).fit(sample)
+            self.composites[name] = CompositeIndex(signs).fit(sample)
         except TerrainError as error:
             raise TerrainError(f"{name}: {error}") from None
 

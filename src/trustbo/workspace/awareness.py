@@ -72,7 +72,6 @@ def cell_maps(
     team: Team,
     *,
     observers: ArrayLike | None = None,
-    scaling: str = "percentile",
     keep_pixels: bool = True,
 ) -> CellMaps:
     """Compute awareness and passability of each cell; see `Workspace.from_terrain`.
@@ -82,8 +81,7 @@ def cell_maps(
     dem = terrain["dem"]
     cells = CellMeans(grid.shape, *grid.cells_along(dem["y"].values, dem["x"].values))
     diagonal = float(np.hypot(grid.cell_height, grid.cell_width))
-    options = {"reach": diagonal, "observers": observers, "scaling": scaling}
-    pixels = PixelAwareness(terrain, features, team, **options)
+    pixels = PixelAwareness(terrain, features, team, reach=diagonal, observers=observers)
     kept = (*pixels.names, "passable") if keep_pixels and not pixels.is_lazy else ()
     maps: dict[str, list[np.ndarray]] = {name: [] for name in kept}
 

@@ -5,13 +5,11 @@ errors are a Gaussian process over the cells, one for each feature, shared by al
 measurement in one cell informs about its neighbours, and little about cells far away.
 """
 
-import warnings
 from collections.abc import Sequence
 from typing import Any, cast
 
 import numpy as np
 from scipy.linalg import cholesky
-from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
 
@@ -38,7 +36,6 @@ class AwarenessBelief:
         sd: float = 0.15,
         length_scale: float = 2.0,
         noise: float = 0.05,
-        learn_scales: bool = False,
     ) -> None:
         """Set the prior of the errors.
 
@@ -47,8 +44,6 @@ class AwarenessBelief:
             sd: Prior standard deviation of the map's errors.
             length_scale: Length scale of the errors, cells (Matern 3/2 kernel).
             noise: Standard deviation of a measurement.
-            learn_scales: Fit these three to the measurements by maximum likelihood, from 10
-                measurements on.
 
         Raises:
             TrustboError: A value that is not positive, or a grid of over 4000 passable cells.
@@ -61,10 +56,8 @@ class AwarenessBelief:
                 f"{len(self._cells)}. Use larger cells, or awareness='map'."
             )
         scale = require_positive("length_scale", length_scale)
-        self._kernel = ConstantKernel(require_positive("sd", sd) ** 2, (1e-4, 1.0)) * Matern(
-            scale, (0.3, 100.0), nu=1.5
-        ) + WhiteKernel(require_positive("noise", noise) ** 2, (1e-6, 1.0))
-        self._learns = learn_scales
+        self._field: Any = ConstantKernel(require_positive("sd", sd) ** 2) * Matern(scale, nu=1.5)
+        self._noise = require_positive("noise", noise) ** 2
         self._map, self._bounds = workspace.awareness.values, workspace.bound_maps
         n_features = self._map.shape[-1]
         self._seen: list[list[tuple[int, int, float]]] = [[] for _ in range(n_features)]
@@ -136,24 +129,18 @@ class AwarenessBelief:
     def _error(self, m: int, *, with_cov: bool = True) -> tuple[np.ndarray, np.ndarray]:
         """Mean (cell,) and covariance (cell, cell) of a feature's errors in the passable cells."""
         seen = np.array(self._seen[m]).reshape(-1, 3)
-        field = self._kernel.k1  # the measurement noise is not part of the error
         if not len(seen):
             n = len(self._cells)
-            return np.zeros(n), field(self._cells) if with_cov else np.empty(0)
-        learns = self._learns and len(seen) >= 10
+            return np.zeros(n), self._field(self._cells) if with_cov else np.empty(0)
         # The annotations of scikit-learn lack `optimizer=None`, and the variants of the result.
-        regression: Any = GaussianProcessRegressor(
-            self._kernel, optimizer="fmin_l_bfgs_b" if learns else cast(Any, None)
-        )
-        with warnings.catch_warnings():
-            # A length scale at its limit is not an error.
-            warnings.simplefilter("ignore", ConvergenceWarning)
-            regression.fit(seen[:, :2], seen[:, 2])
+        kernel, none = self._field + WhiteKernel(self._noise), cast(Any, None)
+        regression: Any = GaussianProcessRegressor(kernel, optimizer=none)
+        regression.fit(seen[:, :2], seen[:, 2])
         if not with_cov:
             return regression.predict(self._cells), np.empty(0)
         mean, covariance = regression.predict(self._cells, return_cov=True)
-        noise = regression.kernel_.k2.noise_level
-        return mean, covariance - noise * np.eye(len(mean))
+        # The measurement noise is not part of the error.
+        return mean, covariance - self._noise * np.eye(len(mean))
 
     def _around(self, errors: np.ndarray) -> np.ndarray:
         """The map with errors (draw, cell, feature) added, kept within [0, 1]."""

@@ -91,7 +91,6 @@ class Workspace(Displayed):
         shape: tuple[int, int] = (10, 10),
         team: Team | None = None,
         *,
-        scaling: str = "percentile",
         features: Mapping[str, object] | None = None,
         observers: ArrayLike | None = None,
         bounds: bool = True,
@@ -120,7 +119,6 @@ class Workspace(Displayed):
                 strip is in memory at a time, and maps of pixels are not kept.
             shape: Rows and columns of the planning grid.
             team: Lead and robots; by default a lead and three robots.
-            scaling: See `CompositeIndex`.
             features: Definitions of the awareness features by name: names of pixel features for a
                 composite (see `terrain.FEATURES`), a mapping of names to `PixelFeature`, or one
                 `PixelFeature` in [0, 1] that is used unchanged. By default traversability and
@@ -161,9 +159,7 @@ class Workspace(Displayed):
             "visibility": VISIBILITY if bounds else PAPER_VISIBILITY,
         }
         with compiling():
-            maps = cell_maps(
-                terrain, grid, features or defaults, team, observers=observers, scaling=scaling
-            )
+            maps = cell_maps(terrain, grid, features or defaults, team, observers=observers)
             workspace = cls(
                 *maps.of_team(grid, team),
                 grid,
