@@ -51,7 +51,7 @@ def brute_force(planner, draws, objective="terminal"):
     values = []
     for d in range(draws.leading[0]):
         one = draws.draw(d)
-        u = of_bounds(drift(one, planner.awareness))
+        u = of_bounds(drift(one, planner.mean_awareness))
         values.append(path_values(objective, flat, n_cells, u, one.beta0 * np.eye(2), one.x0_mean))
     return paths, np.stack(values)
 

@@ -7,26 +7,20 @@ from numba import njit
 from trustbo.data import Cell
 from trustbo.errors import TrustboError
 from trustbo.workspace import Workspace
-from trustbo.workspace.moves import MOVES, move_indices, require_connectivity
+from trustbo.workspace.moves import MOVES
 
 
 class NoPathError(TrustboError, nx.NetworkXNoPath):
     """The goal cannot be reached from the start."""
 
 
-def cell_graph(
-    workspace: Workspace, connectivity: int = 8, bounds: np.ndarray | None = None
-) -> nx.DiGraph:
+def cell_graph(workspace: Workspace, connectivity: int, bounds: np.ndarray) -> nx.DiGraph:
     """Build the graph with passable cells `(row, col)` as nodes and possible bounds as edges.
 
-    Bounds (move, row, col) of a connectivity's moves are by default all that the robots have a way
-    for. A DiGraph with node attributes `x`, `y` (CRS metres) and edge attribute `length` (m).
-    TrustboError: a connectivity other than 4, or 8 to allow diagonal bounds too.
+    Bounds (move, row, col) are of a connectivity's moves. A DiGraph with node attributes `x`, `y`
+    (CRS metres) and edge attribute `length` (m).
     """
-    moves = MOVES[require_connectivity(connectivity)]
-    grid, passable = workspace.grid, workspace.passable.values
-    if bounds is None:
-        bounds = workspace.passable_bounds.values[move_indices(connectivity)]
+    moves, grid, passable = MOVES[connectivity], workspace.grid, workspace.passable.values
     graph = nx.DiGraph()
     for row, col in np.argwhere(passable).tolist():
         x, y = grid.center((row, col))

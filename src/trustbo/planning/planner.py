@@ -176,11 +176,6 @@ class Planner(Displayed):
         return solve.graph_of(self.problem, self.problem.dynamics(mean_of(params)))
 
     @property
-    def awareness(self) -> np.ndarray:
-        """Awareness of bounds; see `PlanningProblem.awareness`."""
-        return self.problem.awareness
-
-    @property
     def mean_awareness(self) -> np.ndarray:
         """Expected awareness of bounds, shape (robot, move, row, col, feature)."""
         return self.problem.mean_awareness

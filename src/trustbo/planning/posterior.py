@@ -94,7 +94,7 @@ class DrawnPaths:
 
     def _value(self, dynamics: Dynamics, path: Sequence[Cell]) -> np.ndarray:
         objective = self.problem.objective
-        toll = toll_along(self.problem.paths, objective, path).total
+        toll = toll_along(self.problem.paths, objective, path)
         trust = path_trust(dynamics.along(path), objective, toll)
         return OBJECTIVES[objective.name](trust) - self.problem.cost_of_failure(path)
 
@@ -103,7 +103,7 @@ class DrawnPaths:
         """Toll of the best path of each draw, (draw,)."""
         paths, objective = self.problem.paths, self.problem.objective
         unique, inverse, _ = self._unique
-        tolls = [toll_along(paths, objective, paths.cells(path)).total for path in unique]
+        tolls = [toll_along(paths, objective, paths.cells(path)) for path in unique]
         return np.array(tolls)[inverse]
 
     @cached_property

@@ -65,14 +65,6 @@ class PlanningProblem:
         return self.paths.workspace
 
     @property
-    def awareness(self) -> np.ndarray:
-        """Awareness of bounds, shape (robot, move, row, col, feature), see `Workspace.bound_maps`.
-
-        With a leading axis (draw,) where it is uncertain: 8 times as large as the maps of cells.
-        """
-        return self._of_bounds(self.cells)
-
-    @property
     def mean_awareness(self) -> np.ndarray:
         """Mean over draws of `cells`, as awareness of bounds (robot, move, row, col, feature)."""
         return self._of_bounds(self.mean_cells)

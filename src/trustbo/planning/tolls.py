@@ -5,7 +5,6 @@ on the bound alone, not on the way there.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -13,23 +12,6 @@ from trustbo.data import Cell
 from trustbo.planning.objectives import Objective
 from trustbo.planning.paths import AdmissiblePaths
 from trustbo.workspace.moves import bounds_along
-
-
-class Toll(NamedTuple):
-    """Toll of a path, by its parts."""
-
-    length: float = 0.0
-    """Length of the path, in metres, times `length_weight`."""
-    unseen: float = 0.0
-    """Expected time in which nobody sees anybody, in bounds, times `unseen_cost`."""
-
-    @property
-    def total(self) -> float:
-        """Sum of the parts."""
-        return self.length + self.unseen
-
-
-NO_TOLL = Toll()
 
 
 def tolls_of(admissible: AdmissiblePaths, objective: Objective) -> np.ndarray:
@@ -43,14 +25,20 @@ def tolls_of(admissible: AdmissiblePaths, objective: Objective) -> np.ndarray:
 
 def toll_along(
     admissible: AdmissiblePaths, objective: Objective, path: Sequence[Cell] | np.ndarray
-) -> Toll:
+) -> float:
     """Toll of a path."""
-    toll = NO_TOLL
+    toll = unseen_along(admissible, objective, path)
     if objective.length_weight:
-        toll = toll._replace(length=objective.length_weight * admissible.length_of(path))
-    if objective.unseen_cost:
-        shares = admissible.workspace.unseen_bounds
-        assert shares is not None  # noqa: S101  # `PlanningProblem` refuses a cost without
-        unseen = float(shares.values[*bounds_along(path).T].sum())
-        toll = toll._replace(unseen=objective.unseen_cost * unseen)
+        toll += objective.length_weight * admissible.length_of(path)
     return toll
+
+
+def unseen_along(
+    admissible: AdmissiblePaths, objective: Objective, path: Sequence[Cell] | np.ndarray
+) -> float:
+    """Part of a path's toll for the expected time in which nobody sees anybody."""
+    if not objective.unseen_cost:
+        return 0.0
+    shares = admissible.workspace.unseen_bounds
+    assert shares is not None  # noqa: S101  # `PlanningProblem` refuses a cost without
+    return objective.unseen_cost * float(shares.values[*bounds_along(path).T].sum())

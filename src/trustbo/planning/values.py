@@ -15,7 +15,7 @@ from trustbo.planning.dynamics import Dynamics, as_map, roll, trust_dynamics
 from trustbo.planning.objectives import OBJECTIVES, Objective, PathTrust, softplus
 from trustbo.planning.plan import QUANTILES, Plan
 from trustbo.planning.problem import PlanningProblem
-from trustbo.planning.tolls import toll_along
+from trustbo.planning.tolls import toll_along, unseen_along
 
 Path = Sequence[Cell] | np.ndarray
 """Cells, start first; or an array of them, shape (cell, 2)."""
@@ -107,9 +107,9 @@ def evaluate(
     cells = flat.reshape(-1, 2)
     rows, cols = cells.T
     z, along = problem.awareness_along(cells, params), params.along(cells)
-    tolls = toll_along(problem.paths, problem.objective, cells)
+    paid = problem.paths, problem.objective, cells
     kind = problem.objective, problem.team
-    found = value_along(along, z, *kind, tolls.total, x0, cap=cap)
+    found = value_along(along, z, *kind, toll_along(*paid), x0, cap=cap)
     cost, draws = problem.cost_of_failure(cells), found.draws
     risk = None if problem.risk is None else problem.risk.along(cells)
     plan = Plan(
@@ -130,7 +130,7 @@ def evaluate(
         risk=risk,
         infeasible=risk is not None and not problem.is_within_risk(cells),
         value_band=_value_band(found.values - cost),
-        unseen_toll=tolls.unseen,
+        unseen_toll=unseen_along(*paid),
     )
     if len(draws) == 1 or plan.posts is None:
         return plan

@@ -26,11 +26,10 @@ def random_case(seed, n=4, obstacles=0.15):
 
 
 @cache
-def paths_of(seed, max_bounds, connectivity, kind):
+def paths_of(seed, max_bounds):
     _, passable, _, _ = random_case(seed)
     n = len(passable)
-    kind = dict(kind)
-    return list(walks(passable.tolist(), (n - 1, 0), (0, n - 1), max_bounds, connectivity, **kind))
+    return list(walks(passable.tolist(), (n - 1, 0), (0, n - 1), max_bounds))
 
 
 def drifts(awareness, beta, b):
@@ -45,11 +44,10 @@ def drifts(awareness, beta, b):
     ]
 
 
-def best_by_enumeration(objective, beta0, max_bounds, connectivity, seed, **kind):
+def best_by_enumeration(objective, beta0, max_bounds, seed):
     awareness, _, beta, b = random_case(seed)
-    paths = paths_of(seed, max_bounds, connectivity, tuple(kind.items()))
     u = drifts(awareness, beta, b)
-    return max(path_value(objective, p, u, beta0, 0.5) for p in paths)
+    return max(path_value(objective, p, u, beta0, 0.5) for p in paths_of(seed, max_bounds))
 
 
 def make_planner(objective, connectivity, case, **options):
@@ -65,19 +63,18 @@ def make_params(beta0, case):
     return TrustParams(beta0, case[2], case[3], 0.1, 0.1)
 
 
-@pytest.mark.parametrize("engine", ["networkx", "numba"])
 @pytest.mark.parametrize("objective", ["terminal", "mean"])
 @pytest.mark.parametrize("slack", [0, 2])
-def test_additive_objectives_are_exact_over_shortest_paths_and_over_walks(objective, slack, engine):
+def test_additive_objectives_are_exact_over_shortest_paths_and_over_walks(objective, slack):
     for seed in range(6):
         case = random_case(seed)
         for beta0 in BETA0:
-            planner = make_planner(objective, 8, case, max_bounds="shortest", engine=engine)
+            planner = make_planner(objective, 8, case, max_bounds="shortest")
             cap = planner.shortest + slack
             if slack:
-                planner = make_planner(objective, 8, case, max_bounds=cap, engine=engine)
+                planner = make_planner(objective, 8, case, max_bounds=cap)
             plan = planner.plan(make_params(beta0, case))
-            best = best_by_enumeration(objective, beta0, cap, 8, seed)
+            best = best_by_enumeration(objective, beta0, cap, seed)
             np.testing.assert_allclose(plan.value, best, rtol=1e-9)
 
 

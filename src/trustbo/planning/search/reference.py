@@ -52,7 +52,7 @@ def _of_draw(case: Case, dynamics: Dynamics) -> Path | None:
     admissible, _, objective, risk = case
 
     def score(path: Path) -> float:
-        toll = toll_along(admissible, objective, path).total
+        toll = toll_along(admissible, objective, path)
         trust = path_trust(dynamics.along(path), objective, toll)
         return float(SCORES[objective.name](trust))
 
