@@ -131,8 +131,7 @@ def fit(
     batch = stack_missions(missions)
     asked = model
     model, family_reason = _of_rates(asked, batch, weighted=weights is not None)
-    grid = None if workspace is None else workspace.passable.shape
-    places = places_of(missions, model.place, batch.contact_rate.shape, grid)
+    places = places_of(missions, model.place, batch.contact_rate.shape, workspace)
     require_ticks(model.family, batch)
     weight = _weights(weights, model, batch, len(missions))
     ticks = _weigh_rates(batch, weight)

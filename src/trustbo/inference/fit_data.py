@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -52,7 +52,6 @@ class FitData(NamedTuple):
 
     def slots(self, place: PlaceEffect | None, workspace: Workspace | None = None) -> Slots:
         """Rates by chain, with the places that a model with effects of `place` has."""
-        grid: Any = None if workspace is None else workspace.passable.shape
-        places = places_of(self.missions, place, self.batch.contact_rate.shape, grid)
+        places = places_of(self.missions, place, self.batch.contact_rate.shape, workspace)
         features = self.missions[0].features
         return Slots.of(self.batch, len(self.missions), features, self.weight, places)

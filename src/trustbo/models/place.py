@@ -13,6 +13,7 @@ from trustbo.workspace.moves import MOVES, bounds_along
 
 if TYPE_CHECKING:
     from trustbo.models.effects.place import PlaceEffect
+    from trustbo.workspace import Workspace
 
 N_MOVES = len(MOVES[8])
 MAX_VISITED = 4000
@@ -73,14 +74,15 @@ def places_of(
     missions: Sequence[Mission],
     place: "PlaceEffect | None",
     shape: tuple[int, ...],
-    grid: tuple[int, int] | None = None,
+    workspace: "Workspace | None" = None,
 ) -> Visited | None:
-    """Places of missions, see `visited`; None where these have no effects.
+    """Places of missions, see `visited`, of a workspace over its whole grid; None without effects.
 
     `shape` is that of the rates, (mission, bound, robot), with the padding.
     """
     if place is None:
         return None
+    grid = None if workspace is None else workspace.passable.shape
     return visited(bounds_of(missions, shape[:2]), place, shape[2], grid)  # pyright: ignore
 
 
