@@ -39,12 +39,14 @@ STYLES = {
 def main() -> None:
     """Draw the panels."""
     folder, file = sys.argv[1:3]
-    results = complete(kept(Path(folder)))
+    results = kept(Path(folder))
+    names = [name for name in STYLES if name in results["method"].values]
+    results = complete(results, names)
     figure, axes = plt.subplots(
         2, 3, figsize=(9, 5.4), sharex=True, sharey=True, layout="constrained"
     )
     for ax, (title, chosen) in zip(axes.flat, KINDS.items(), strict=True):
-        n = draw(ax, {name: curves(results, name, chosen) for name in STYLES})
+        n = draw(ax, {name: curves(results, name, chosen) for name in names})
         ax.set_title(f"{title} ({n})", fontsize=9, loc="left")
     for ax in axes[-1]:
         ax.set_xlabel("missions learned from", fontsize=9)
@@ -52,7 +54,7 @@ def main() -> None:
         ax.set_ylabel("regret, % of the best contact", fontsize=9)
     handles = axes[0, 0].get_legend_handles_labels()
     figure.legend(
-        *handles, loc="outside lower center", ncols=len(STYLES), frameon=False, fontsize=9
+        *handles, loc="outside lower center", ncols=len(names), frameon=False, fontsize=9
     )
     figure.savefig(file, dpi=85)
 
@@ -73,12 +75,12 @@ def draw(ax: Axes, regrets: dict[str, np.ndarray]) -> int:
     return max(map(len, regrets.values()))
 
 
-def complete(runs: xr.Dataset) -> xr.Dataset:
-    """Runs of the worlds and courses that every method has run."""
+def complete(runs: xr.Dataset, methods: list[str]) -> xr.Dataset:
+    """Runs of the worlds and courses that all of these methods have run."""
     rows = runs[["world", "course", "method"]].to_dataframe()
-    rows = rows[rows["method"].isin(list(STYLES))]
+    rows = rows[rows["method"].isin(methods)]
     n = rows.groupby(["world", "course"])["method"].transform("nunique")
-    return runs.isel(run=rows.index[n == len(STYLES)].to_numpy())
+    return runs.isel(run=rows.index[n == len(methods)].to_numpy())
 
 
 def curves(runs: xr.Dataset, method: str, kinds: tuple[str, ...]) -> np.ndarray:
