@@ -28,9 +28,9 @@ _RULES = {"Seconds": "TimeLimit"}
 def migrate_state(record: dict[str, Any]) -> dict[str, Any]:
     """Convert the record of `campaign.json`."""
     options, notes = dict(record["options"]), record["notes"]
-    if options.pop("update", "refit") != "refit":  # of versions up to 0.3
+    if options.pop("update", "refit") != "refit":  # of version 0.2 and before
         raise TrustboError(
-            'the campaign was run with update="moment_matched", which 0.3 was the last version to '
+            'the campaign was run with update="moment_matched", which 0.2 was the last version to '
             "have: its result can be read, and its missions told to a new campaign."
         )
     if "replan" in notes:  # of version 0.1
