@@ -329,7 +329,7 @@ def draws_of(name, sampler, settings, seed):
     drawn = draw_posterior(model, sampler, settings, seed, batch, check=False)[0]
     if sampler == "exact" and drawn.sampler != "exact":
         sys.exit(f"{name}: {drawn.fallback}")
-    return unknowns(drawn.params).reshape(settings.n_chains * settings.n_draws, -1)
+    return unknowns(drawn.params).reshape(settings.n_chains * settings.draws, -1)
 
 
 def moments(draws):
