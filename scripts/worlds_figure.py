@@ -53,9 +53,7 @@ def main() -> None:
     for ax in axes[:, 0]:
         ax.set_ylabel("regret, % of the best contact", fontsize=9)
     handles = axes[0, 0].get_legend_handles_labels()
-    figure.legend(
-        *handles, loc="outside lower center", ncols=len(names), frameon=False, fontsize=9
-    )
+    figure.legend(*handles, loc="outside lower center", ncols=len(names), frameon=False, fontsize=9)
     figure.savefig(file, dpi=85)
 
 
