@@ -178,7 +178,8 @@ def test_a_missing_package_is_named_itself_and_is_one_of_an_extra():
     """pip finds `trustbo[ros]` only where trustbo is on an index."""
     sources = [file.read_text() for file in (ROOT / "src" / "trustbo").rglob("*.py")]
     assert [text for text in sources if re.search(r"pip install \S*trustbo\[", text)] == []
-    named = set(re.findall(r"pip_install\('([\w-]+)", "".join(sources)))
+    calls = r"(?:pip_install\(|require_package\(\"[^\"]+\", )['\"]([\w-]+)"
+    named = set(re.findall(calls, "".join(sources)))
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     offered = {
         re.match(r"[\w-]+", requirement)[0]

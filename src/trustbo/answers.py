@@ -7,7 +7,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from trustbo.errors import ShapeError, TrustboError, require_whole, unknown
+from trustbo.errors import ShapeError, TrustboError, require_known, require_whole
 
 PERSON = "operator"
 """Name of a person who is not named."""
@@ -82,9 +82,7 @@ class Reports:
         """Reports of answers on their scale, see `Mission.with_reports`."""
         levels = levels_of(scale)
         if isinstance(answers, Mapping):
-            for name in answers:
-                if name not in robots:
-                    raise unknown("robot", name, robots)
+            require_known("robot", answers, robots)
             answers = [answers.get(name, np.nan) for name in robots]
         try:
             given = np.array(answers, dtype=float)

@@ -57,9 +57,12 @@ def pip_install(*packages: str) -> str:
 
 
 def require_package(what: str, package: str, module: str) -> None:
-    """Refuse to go on without a package that `what` needs: TrustboError with the remedy."""
+    """Refuse to go on without a package: TrustboError, such as "KMZ needs PACKAGE: REMEDY".
+
+    `what` is the beginning of the sentence, with its verb.
+    """
     if importlib.util.find_spec(module) is None:
-        raise TrustboError(f"{what} needs {package}: {pip_install(package)}")
+        raise TrustboError(f"{what} {package}: {pip_install(package)}")
 
 
 def require_choice(what: str, value: object, choices: Iterable[str]) -> str:

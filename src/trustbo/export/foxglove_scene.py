@@ -1,6 +1,5 @@
 """A plan as a scene for Foxglove: maps, ways, posts, and sight bound by bound, in an MCAP."""
 
-import importlib.util
 import tempfile
 import time
 from pathlib import Path
@@ -9,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from trustbo.campaign.result import Result
-from trustbo.errors import TrustboError, pip_install
+from trustbo.errors import require_package
 from trustbo.export.checks import Maps, require_maps
 from trustbo.export.colours import Colour, of_robot, of_values
 from trustbo.export.frame import AT_START, Frame, PlacedFrame, frame_file, placed, save_beside
@@ -93,8 +92,7 @@ def write_foxglove(
 
 def require_foxglove() -> None:
     """Refuse to go on without foxglove-sdk: TrustboError."""
-    if importlib.util.find_spec("foxglove") is None:
-        raise TrustboError(f"scenes need foxglove-sdk: {pip_install('foxglove-sdk')}")
+    require_package("scenes need", "foxglove-sdk", "foxglove")
 
 
 class _Scene:

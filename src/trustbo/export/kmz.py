@@ -1,6 +1,5 @@
 """Ways, posts and times of a plan, and a map, as KMZ for Google Earth and phones; by simplekml."""
 
-import importlib.util
 import tempfile
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -12,7 +11,7 @@ import xarray as xr
 from PIL import Image, ImageDraw
 
 from trustbo.campaign.result import Result
-from trustbo.errors import TrustboError, pip_install
+from trustbo.errors import require_package
 from trustbo.export.checks import require_crs, require_maps
 from trustbo.export.colours import Colour, of_robot, of_values
 from trustbo.export.cot import begin_of, zulu
@@ -106,8 +105,7 @@ def _saved(image: Image.Image, folder: str, name: str) -> str:
 
 def require_simplekml() -> None:
     """Refuse to go on without simplekml: TrustboError."""
-    if importlib.util.find_spec("simplekml") is None:
-        raise TrustboError(f"KMZ needs simplekml: {pip_install('simplekml')}")
+    require_package("KMZ needs", "simplekml", "simplekml")
 
 
 def _picture(cost: xr.DataArray, plan: Plan) -> tuple[Image.Image, tuple[float, ...]]:

@@ -69,7 +69,7 @@ def serve(
     if bag is not None and not as_path(bag).exists():
         raise TrustboError(f"there is no bag {str(bag)!r}; check its path.")
     if foxglove is not None:
-        require_package("Foxglove", "foxglove-sdk", "foxglove")
+        require_package("Foxglove needs", "foxglove-sdk", "foxglove")
 
     def over(line: str) -> None:
         with suppress(OSError):  # a terminal that is gone ends no mission

@@ -1,6 +1,5 @@
 """Files of ROS bags: messages read and written by rosbags."""
 
-import importlib.util
 import os
 import re
 import tempfile
@@ -11,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from trustbo.errors import TrustboError, pip_install
+from trustbo.errors import TrustboError, require_package
 from trustbo.files import naming_refusal, require_regular
 from trustbo.logs.messages import (
     CONTACT_TYPES,
@@ -27,8 +26,7 @@ STORAGES = ("sqlite3", "mcap")
 
 
 def _require_rosbags() -> None:
-    if importlib.util.find_spec("rosbags") is None:
-        raise TrustboError(f"ROS bags need rosbags: {pip_install('rosbags')}")
+    require_package("ROS bags need", "rosbags", "rosbags")
 
 
 class Record(NamedTuple):

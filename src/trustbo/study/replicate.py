@@ -252,7 +252,7 @@ def _chosen(baselines: Sequence[str] | None) -> tuple[str, ...]:
     for name in baselines:
         require_choice("baseline", name, BASELINES)
         if package := _PACKAGES.get(name):
-            require_package(f"baseline {name!r}", package, package)
+            require_package(f"baseline {name!r} needs", package, package)
     return tuple(baselines)
 
 
