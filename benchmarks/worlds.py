@@ -29,6 +29,7 @@ from baselines import (
 )
 from common import arguments, parsed
 
+from trustbo.campaign.options import POLICY
 from trustbo.files import to_json
 from trustbo.study import run_worlds, worlds, worlds_table
 from trustbo.study.methods import BASELINE_ROWS
@@ -37,14 +38,15 @@ from trustbo.study.table import as_text, differences, to_dataset, worse_than
 
 OURS = "trustbo"
 METHODS: dict[str, Any] = {
-    OURS: {"model": "robots", "policy": "optimistic"},
+    OURS: {"model": "robots", "policy": POLICY},
+    "trustbo, optimistic": {"model": "robots", "policy": "optimistic"},
     "trustbo, no masks": {
         "model": "robots",
-        "policy": "optimistic",
+        "policy": POLICY,
         "options": {"changes": "ignore"},
     },
-    "trustbo, reset": {"model": "robots", "policy": "optimistic", "options": {"changes": "reset"}},
-    "trustbo, places": {"model": "places", "policy": "optimistic"},
+    "trustbo, reset": {"model": "robots", "policy": POLICY, "options": {"changes": "reset"}},
+    "trustbo, places": {"model": "places", "policy": POLICY},
     "trustbo, no places": {"model": "pooled", "policy": "greedy"},
     "running mean": running_mean.greedy,
     "running mean, optimistic": running_mean.optimistic,

@@ -246,7 +246,7 @@ def test_bad_input_is_refused_before_anything_is_written(workspace, tmp_path):
 def test_the_record_is_plain_json(result, tmp_path):
     result.save(tmp_path)
     record = json.loads((tmp_path / "result.json").read_text())
-    assert record["settings"]["policy"] == "optimistic"
+    assert record["settings"]["policy"] == "greedy"
     assert record["settings"]["start"] == [3, 0]
 
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     Callback = Callable[[Campaign, Mission], None]
 
-POLICY, OBJECTIVE, SAMPLER = "optimistic", "lost_contact", "auto"
+POLICY, OBJECTIVE, SAMPLER = "greedy", "lost_contact", "auto"
 """Defaults of keywords that are no options; commands and studies have the same."""
 PLANNING, LEARNING, RUNNING = "planning", "learning", "running"
 _CUSTOM = ("awareness", "callbacks")
@@ -47,8 +47,8 @@ class CampaignOptions:
             `Planner`; it needs a terrain.
         max_failure: Largest chance that a mission fails; where no path keeps within it, the
             safest is taken, with a warning. By default no limit.
-        failure_cost: Cost of a failure for lost_contact, in bounds. By default all bounds of the
-            shortest path, see `Planner`.
+        failure_cost: Cost of a failure for lost_contact, in bounds. By default 0 until a mission
+            has failed, then all bounds of the shortest path, see `Planner`.
         initial: Source of the first plan: prior_mean, or prior_draw (one random draw of the prior,
             as in the paper).
         forgetting: Weight of a mission relative to the next, in (0, 1]. Below 1, a change of the

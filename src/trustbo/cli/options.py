@@ -56,7 +56,7 @@ Benchmark
   kind NAME: Kind of worlds, may be repeated, such as right, aged, days, change or physics; by
     default all.
   worlds.policy NAME: Policy, may be repeated: a name as for [b]trustbo run[/b], or module:name;
-    by default optimistic.
+    by default greedy.
   worlds.model NAME: Model, may be repeated: robots (the default), places, pooled,
     hierarchical, coupled, or module:name.
   simulator NAME: Simulator of a world, module:name.

@@ -241,6 +241,19 @@ class Planner(Displayed):
         risk = Risk(np.asarray(p_fail, dtype=float), drawn, dict(causes or {}))
         return self._with(self.problem.with_risk(risk))
 
+    def with_failure_cost(self, failure_cost: float) -> Self:
+        """Return the planner with another cost of a failure, in bounds.
+
+        It is left as it is for other objectives than lost_contact, which have none.
+
+        Raises:
+            TrustboError: It is negative, or not finite.
+        """
+        if self.objective != "lost_contact":
+            return self
+        rule = self.problem.rule._replace(failure_cost=failure_cost)
+        return self._with(replace(self.problem, rule=rule))
+
     def of_draw(self, index: int) -> Self:
         """Return the planner with the awareness map of one draw, where awareness is uncertain."""
         return self._with(self.problem.of_draw(index))
