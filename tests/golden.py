@@ -8,7 +8,7 @@ Run by hand, on one machine, before and after such a change:
 `compare` prints for each campaign whether all numbers are bit-identical, else the largest relative
 difference. `tests/test_golden.py` compares a few of the exact sampler, which take seconds, with
 `golden.json`, which `python tests/golden.py write tests/golden.json` renews: paths, objectives and
-posterior means with their Monte Carlo standard errors, which hold on any processor.
+posterior means with their Monte Carlo standard errors.
 """
 
 import hashlib

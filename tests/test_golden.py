@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from golden import EXACT, STORED, campaign
 
+KEPT = json.loads(STORED.read_text(encoding="utf-8"))
 ROUNDING = 1e-6
 SHARE = 0.3
 """Largest difference of a posterior mean, in its Monte Carlo standard errors.
@@ -16,10 +17,10 @@ random numbers moves them by a median of .4 to 1.6.
 """
 
 
-@pytest.mark.parametrize("name", list(json.loads(STORED.read_text(encoding="utf-8"))))
+@pytest.mark.parametrize("name", KEPT)
 @pytest.mark.filterwarnings("ignore::UserWarning")  # of what is not recommended
 def test_seeded_campaign_takes_the_paths_and_learns_the_means_kept(name):
-    kept = json.loads(STORED.read_text(encoding="utf-8"))[name]
+    kept = KEPT[name]
     found = campaign(EXACT[name], sampler="exact", n_iterations=3)
     same = [a == b for a, b in zip(found["path"], kept["path"], strict=True)]
     if not all(same):

@@ -45,3 +45,18 @@ def test_chance_to_arrive_and_max_failure_go_by_the_hazard_without_a_price(works
 
 def test_other_objectives_have_no_price(workspace):
     assert price(tb.Campaign(workspace, (4, 0), (0, 4), objective="mean")) == 0.0
+
+
+def test_result_prices_failures_as_its_campaign_did(workspace):
+    simulator = tb.simulation.KinematicSimulator(workspace)
+    campaign = tb.Campaign(workspace, (4, 0), (0, 4), sampler="exact")
+    campaign.tell(simulator.run(campaign.ask().path, seed=0))
+    before = campaign.result()
+    assert price(campaign) == before.planner.problem.failure_cost == 0.0
+    assert before.plan.value == before.value
+
+    plan = campaign.ask()
+    campaign.fail("stuck", where=plan.path[1])
+    campaign.tell(simulator.run(campaign.ask().path, seed=1))
+    after = campaign.result()
+    assert price(campaign) == after.planner.problem.failure_cost == campaign.planner.shortest

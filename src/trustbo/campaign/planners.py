@@ -36,19 +36,12 @@ def planner_of(
 
 
 def planner_given(planner: Planner, learner: Learner, state: CampaignState, seed: int) -> Planner:
-    """Planner given the belief of a learner and the failures of a state, see `planner_now`.
-
-    The slope limit that the user states is believed until a failure contradicts it: before the
-    first one, a failure costs nothing unless the user gave `failure_cost`. Its price under the
-    prior alone would forbid the longer ways that keep contact, on which nothing ever fails.
-    """
+    """Planner given the belief of a learner and the failures of a state, see `planner_now`."""
     planner = planner.with_observation(learner.observation)
     if (awareness := learner.awareness) is not None:
         n_maps = min(_N_MAPS, learner.belief.leading[0])
         planner = planner.with_awareness(awareness.draw(n_maps, seed), awareness.mean())
-    hazard, risk = learner.hazard(state)
-    if learner.options.failure_cost is None and not hazard["failures_by_cause"].values.any():
-        planner = planner.with_failure_cost(0.0)
+    risk = learner.hazard(state)[1]
     if (state.entries or state.failures) and (avoid := to_avoid(risk)).any():
         planner = planner.avoiding(avoid, risk.mean)
     return under_risk(planner, risk)
@@ -66,7 +59,14 @@ def believed_of(planner: Planner) -> xr.Dataset | None:
 
 
 def under_risk(planner: Planner, risk: BoundRisk) -> Planner:
-    """Planner that takes the failure chances of bounds into account."""
+    """Planner that takes the failure chances of bounds into account.
+
+    The slope limit that the user states is believed until a failure contradicts it: before the
+    first one, a failure costs nothing unless the user gave `failure_cost`. Its price under the
+    prior alone would forbid longer paths that keep contact and on which nothing fails.
+    """
+    if planner.problem.rule.failure_cost is None and not risk.has_failures:
+        planner = planner.with_failure_cost(0.0)
     return planner.with_risk(risk.mean, risk.draw(_N_DRAWS), risk.causes)
 
 

@@ -99,6 +99,11 @@ class BoundRisk:
         """Posterior sd of the chance to fail, shape (move, row, col)."""
         return self._moments[1]
 
+    @property
+    def has_failures(self) -> bool:
+        """Whether a failure was recorded, at a known bound or a mission lost somewhere."""
+        return bool(self.failures.any()) or len(self.lost) > 0
+
     @cached_property
     def stopped(self) -> np.ndarray:
         """Posterior expected number of past failures, shape (move, row, col)."""

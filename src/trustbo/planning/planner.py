@@ -244,7 +244,7 @@ class Planner(Displayed):
     def with_failure_cost(self, failure_cost: float) -> Self:
         """Return the planner with another cost of a failure, in bounds.
 
-        It is left as it is for other objectives than lost_contact, which have none.
+        Objectives other than lost_contact have no such cost, and their planner is unchanged.
 
         Raises:
             TrustboError: It is negative, or not finite.
