@@ -484,6 +484,7 @@ import time
 import arviz, jax, numpy as np, numpyro, trustbo, trustbo.models
 from trustbo import Mission
 from trustbo.inference import fit
+from trustbo.models import PooledTrust
 rng = np.random.default_rng(0)
 path = [(0, k) for k in range(11)]
 missions = []
@@ -494,7 +495,7 @@ for _ in range(20):
         rates.append(x + rng.normal(0.0, 0.05, 3))
     missions.append(Mission.from_arrays(path, z, np.clip(rates, 0.0, 1.0)))
 started = time.perf_counter()
-fit(missions, sampler="exact")
+fit(missions, PooledTrust(), "exact")
 print(time.perf_counter() - started)
 """
 
@@ -509,7 +510,7 @@ def latency(quick):
         return sample_statistics(model, update_statistics(model, statistics, missions[-1:]))
 
     latency_row(table, "refit after one more mission, 20 before", median_seconds(refit, n), 50)
-    whole = median_seconds(lambda: fit(missions, sampler="exact"), n)
+    whole = median_seconds(lambda: fit(missions, model, "exact"), n)
     latency_row(table, "the whole fit(..., sampler='exact'), all groups", whole)
     for one in (model, CoupledTrust()):
         params = sample_prior(one, N_FEATURES, 1000, 0, n_robots=N_ROBOTS)

@@ -58,11 +58,11 @@ def main():
         -1 if given.quick else -4 :
     ]
     ours, exact, theirs = [], [], []
-    fit(same, sampler="exact")  # imports and caches
+    fit(same, PooledTrust(), "exact")  # imports and caches
     for n in range(1, len(same) + 1):
-        seconds, posterior = timed(lambda n=n: fit(same[:n], sampler="nuts", check=False))
+        seconds, posterior = timed(lambda n=n: fit(same[:n], PooledTrust(), "nuts", check=False))
         ours.append((seconds, diagnostics(posterior)["ess_bulk"]))
-        seconds, posterior = timed(lambda n=n: fit(same[:n], sampler="exact"))
+        seconds, posterior = timed(lambda n=n: fit(same[:n], PooledTrust(), "exact"))
         exact.append((seconds, posterior.attrs.get("kish", np.nan)))
         theirs.append(timed(lambda n=n: plain_numpyro(same[:n])))
     print("refit after each of the last missions (median seconds, smallest bulk ESS of 4000 draws;")

@@ -1,5 +1,7 @@
 """Missions of logs without a map: files, fits, scores, and what refuses them."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from trustbo.errors import ShapeError, TrustboError
 from trustbo.inference.posterior_tree import missions_of
 from trustbo.logs import read_missions, read_table, write_missions, write_table
 from trustbo.models import PlaceEffect, PooledTrust, RobotEffect
+from trustbo.models.record import model_from_record
 
 
 @pytest.fixture(scope="module")
@@ -46,6 +49,19 @@ def test_files_and_posteriors_give_them_back(missions, posterior, tmp_path):
     equal(read_table(tmp_path / "missions.csv"), missions)
     equal(missions_of(posterior), missions)
     assert "no map" in repr(missions[0])
+
+
+def test_the_default_model_has_effects_of_places_where_missions_have_places(missions):
+    z, y = np.random.default_rng(1).uniform(0.3, 0.9, (2, 3, 2, 2))
+    whole, jumps = [(0, 0), (0, 1), (1, 2), (1, 3)], [(0, 0), (0, 1), (2, 3), (1, 3)]
+    for given, place in (
+        (missions, None),
+        ([Mission.from_arrays(jumps, z, y[..., 0])], None),
+        ([Mission.from_arrays(whole, z, y[..., 0])], PlaceEffect()),
+    ):
+        posterior = tb.fit(given, draws=50, whole=False, check=False, progress=False)
+        model = model_from_record(json.loads(posterior.attrs["model_record"]))
+        assert (model.place, model.effects) == (place, (RobotEffect(),))
 
 
 def test_they_have_fits_and_scores(missions, posterior):

@@ -1,5 +1,6 @@
 """Ask and tell: whatever runs the missions."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +17,9 @@ from trustbo import (
 )
 from trustbo.inference import fit, sample_prior
 from trustbo.models import CoupledTrust, HierarchicalTrust, PooledTrust
+from trustbo.models.record import model_to_record
 from trustbo.planning import policies
+from trustbo.study.methods import MODELS, model_of
 
 ENDS = ((3, 0), (0, 3))
 
@@ -49,13 +52,24 @@ def test_the_first_plan_is_from_one_draw_of_the_prior_or_from_its_mean(workspace
     assert mean.beta.tolist() == [[0.0, 0.0]]
 
 
+def test_fits_and_studies_have_the_default_model_of_campaigns(workspace):
+    campaign = Campaign(workspace, *ENDS)
+    path = [(3, 0), (2, 1), (1, 2), (0, 3)]
+    missions = [ModelSimulator(workspace).run(path, seed=0)]
+    posterior = fit(missions, draws=50, whole=False, check=False, progress=False)
+    record = model_to_record(campaign.model)
+    assert record["place"] is not None
+    assert json.loads(posterior.attrs["model_record"]) == record
+    assert model_to_record(model_of(MODELS["robots"])) == record
+
+
 def test_the_posterior_is_that_of_all_missions_so_far(workspace):
     campaign = Campaign(workspace, *ENDS, model=PooledTrust(), sampler="exact")
     simulator = ModelSimulator(workspace)
     for j in range(2):
         seed = campaign.seed_of("fit")
         campaign.tell(simulator.run(campaign.ask().path, seed=j))
-    again = fit(campaign.missions, sampler="exact", seed=seed)
+    again = fit(campaign.missions, PooledTrust(), sampler="exact", seed=seed)
     np.testing.assert_array_equal(
         again["posterior"]["beta"].values, campaign.posterior["posterior"]["beta"].values
     )
@@ -167,6 +181,7 @@ def test_old_missions_can_be_forgotten(workspace):
     np.testing.assert_allclose(weight, [0.5, 1.0])
     expected = fit(
         campaign.missions,
+        PooledTrust(),
         sampler="exact",
         weights=[0.5, 1.0],
         seed=campaign.posterior.attrs["seed"],

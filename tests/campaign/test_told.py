@@ -166,7 +166,10 @@ def test_one_s_own_word_sets_aside_and_telling_again_takes_back(workspace):
     assert campaign.history["reason"].values[1] == "the lidar was covered"
     assert campaign.posterior["constant_data"]["mission"].values.tolist() == [0, 2]
     again = fit(
-        [campaign.missions[j] for j in (0, 2)], sampler="exact", seed=campaign.seed_of("fit")
+        [campaign.missions[j] for j in (0, 2)],
+        tb.models.PooledTrust(),
+        sampler="exact",
+        seed=campaign.seed_of("fit"),
     )
     np.testing.assert_array_equal(
         again["posterior"]["beta"], campaign.posterior["posterior"]["beta"]
@@ -605,7 +608,12 @@ def test_a_long_campaign_keeps_the_parameters_alone(workspace, tmp_path):
     assert max(files) < 0.5e6
     assert result.posterior["latent"].sizes["mission"] == 4
     again = tb.inference.complete(result.posteriors[1], result.missions[:2])
-    direct = fit(result.missions[:2], sampler="exact", seed=int(result.posteriors[1].attrs["seed"]))
+    direct = fit(
+        result.missions[:2],
+        tb.models.PooledTrust(),
+        sampler="exact",
+        seed=int(result.posteriors[1].attrs["seed"]),
+    )
     np.testing.assert_array_equal(again["latent"]["trust"], direct["latent"]["trust"])
 
 

@@ -4,6 +4,7 @@ import pytest
 from missions import simulate_missions
 
 from trustbo.inference import fit
+from trustbo.models import PooledTrust
 
 
 @pytest.fixture(scope="session")
@@ -13,4 +14,4 @@ def missions():
 
 @pytest.fixture(scope="session")
 def posterior(missions):
-    return fit(missions, sampler="nuts", seed=1)
+    return fit(missions, PooledTrust(), sampler="nuts", seed=1)

@@ -16,7 +16,7 @@ from trustbo.workspace import AwarenessBelief
 
 @pytest.fixture(scope="module")
 def posterior(missions):
-    return fit(missions, sampler="exact", seed=1)
+    return fit(missions, PooledTrust(), sampler="exact", seed=1)
 
 
 def mixture(n_draws=4, seed=0):

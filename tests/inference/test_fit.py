@@ -98,7 +98,7 @@ def test_latent_trust_agrees_with_its_moments(posterior):
 
 
 def test_the_same_seed_gives_the_same_posterior(posterior, missions):
-    again = fit(missions, sampler="nuts", seed=1)
+    again = fit(missions, PooledTrust(), sampler="nuts", seed=1)
     for name in SITES:
         np.testing.assert_array_equal(
             again["posterior"][name].values, posterior["posterior"][name].values
@@ -106,7 +106,7 @@ def test_the_same_seed_gives_the_same_posterior(posterior, missions):
     np.testing.assert_array_equal(
         again["latent"]["trust"].values, posterior["latent"]["trust"].values
     )
-    other = fit(missions, sampler="nuts", seed=2, draws=30, check=False, whole=False)
+    other = fit(missions, PooledTrust(), sampler="nuts", seed=2, draws=30, check=False, whole=False)
     assert (other["posterior"]["b"].values != posterior["posterior"]["b"].values[:, :30]).any()
 
 
@@ -153,7 +153,7 @@ def test_nuts_keeps_blas_to_one_thread(missions, monkeypatch):
 
     monkeypatch.setattr(watching.Watch, "compiled", look)
     with threadpool_limits(2, user_api="blas"):
-        fit(missions, sampler="nuts", draws=30, check=False, whole=False)
+        fit(missions, PooledTrust(), sampler="nuts", draws=30, check=False, whole=False)
     assert set(seen) == {1}
 
 
@@ -236,13 +236,13 @@ def test_a_bad_posterior_is_refused_with_the_parameter_s_name(missions, monkeypa
     monkeypatch.setattr(convergence, "MIN_ESS", 1e6)
     expected = r"bulk ESS of beta0 is \d{3,} \(at least 1000000\)"
     with pytest.raises(PosteriorError, match=expected) as error:
-        fit(missions, sampler="nuts", progress=True, whole=False)
+        fit(missions, PooledTrust(), sampler="nuts", progress=True, whole=False)
     assert capsys.readouterr().err.startswith(
         "NUTS again, for longer (4 chains of 300 + 2000 draws, target_accept 0.98): bulk ESS of b"
     )
     assert tried == [NutsSettings(150), NutsSettings(300, 2000, 4, 0.98)]
     assert error.value.posterior.attrs["retries"] == 1
-    unchecked = fit(missions, sampler="nuts", draws=30, check=False, whole=False)
+    unchecked = fit(missions, PooledTrust(), sampler="nuts", draws=30, check=False, whole=False)
     assert unchecked.attrs["retries"] == 0
 
 

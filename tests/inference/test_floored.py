@@ -95,7 +95,7 @@ def test_the_resolution_is_the_median_of_the_ticks_inverse():
 @pytest.mark.parametrize("rate", [1.0, 0.0, 0.7])
 def test_constant_rates_have_the_posterior_of_a_quadrature(rate):
     missions = constant_missions(rate)
-    exact = fit(missions, sampler="exact")
+    exact = fit(missions, PooledTrust(), sampler="exact")
     assert exact.attrs["k_hat"] < 0.5
     assert exact.attrs["delta_v_floor"] == 0.005
     sites = exact["posterior"]
@@ -115,7 +115,7 @@ def test_constant_rates_have_the_posterior_of_a_quadrature(rate):
 @pytest.mark.slow  # its program takes longest of all to compile
 def test_nuts_has_the_floor_of_the_exact_sampler():
     missions = constant_missions(1.0, n_ticks=40)
-    exact, nuts = (fit(missions, sampler=name) for name in ("exact", "nuts"))
+    exact, nuts = (fit(missions, PooledTrust(), sampler=name) for name in ("exact", "nuts"))
     for name in ("beta0", "delta_w", "delta_v"):
         one, other = (p["posterior"][name] for p in (exact, nuts))
         # ESS and Kish size > 1500: 5 standard errors of a difference are 0.18 sd.
@@ -135,7 +135,7 @@ def test_statistics_know_the_floor_of_their_missions():
     drawn = sample_statistics(model, statistics)
     assert drawn.params.delta_v.min() >= 0.025
     # Two sums over 4096 points.
-    evidence = fit(missions, sampler="exact").attrs["log_evidence"]
+    evidence = fit(missions, PooledTrust(), sampler="exact").attrs["log_evidence"]
     assert drawn.log_evidence == pytest.approx(evidence, abs=0.01)
 
 

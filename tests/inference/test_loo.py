@@ -118,7 +118,13 @@ def refitted(missions, weights):
     found = []
     for j, left_out in enumerate(missions):
         rest = [i for i in range(len(missions)) if i != j]
-        posterior = fit([missions[i] for i in rest], sampler="exact", weights=weights[rest], seed=1)
+        posterior = fit(
+            [missions[i] for i in rest],
+            PooledTrust(),
+            sampler="exact",
+            weights=weights[rest],
+            seed=1,
+        )
         each = PooledTrust().log_likelihood(params_of(posterior), [left_out])[:, 0]
         found.append(np.logaddexp.reduce(each) - np.log(len(each)))
     return np.array(found)
@@ -129,7 +135,7 @@ def refitted(missions, weights):
 def test_loo_is_what_refits_without_each_mission_give(forgetting):
     missions = simulate_missions(10, lengths=(8,))
     weights = forgetting ** np.arange(9.0, -1.0, -1.0)
-    result = loo(fit(missions, sampler="exact", weights=weights))
+    result = loo(fit(missions, PooledTrust(), sampler="exact", weights=weights))
     expected = refitted(missions, weights)
     good = result.pareto_k.values < 0.5
     assert good.sum() >= 7
@@ -140,7 +146,7 @@ def test_loo_is_what_refits_without_each_mission_give(forgetting):
 
 @of_few_missions
 def test_where_weights_of_draws_hold_it_is_arviz_s():
-    posterior = fit(simulate_missions(8), sampler="exact")
+    posterior = fit(simulate_missions(8), PooledTrust(), sampler="exact")
     ours, theirs = loo(posterior), az.loo(posterior, pointwise=True)
     held = theirs.pareto_k.values <= theirs.good_k
     assert held.sum() >= 6
@@ -153,7 +159,9 @@ def test_where_weights_of_draws_hold_it_is_arviz_s():
 @of_few_missions
 def test_arviz_does_not_read_a_weighted_posterior_and_compares_our_results():
     missions, weights = simulate_missions(8), np.linspace(0.0, 1.0, 8)
-    aged, other = (fit(missions, sampler="exact", weights=weights, seed=seed) for seed in (0, 1))
+    aged, other = (
+        fit(missions, PooledTrust(), sampler="exact", weights=weights, seed=seed) for seed in (0, 1)
+    )
     with pytest.raises(Exception, match=r"log[_ ]likelihood"):
         az.loo(aged)
     # The mission of weight 0 is left out already: its density is a plain average.
@@ -168,10 +176,10 @@ def test_a_mission_without_rates_is_left_out_of_the_sum():
     missions = simulate_missions(6)
     nothing = np.full_like(missions[2].contact_rate, np.nan)
     missions[2] = Mission.from_arrays(missions[2].path, missions[2].awareness, nothing)
-    result = loo(fit(missions, sampler="exact"))
+    result = loo(fit(missions, PooledTrust(), sampler="exact"))
     assert result.n_data_points == 5
     assert result.elpd_i["mission"].values.tolist() == [0, 1, 3, 4, 5]
-    alone = fit(missions[1:3], sampler="exact")
+    alone = fit(missions[1:3], PooledTrust(), sampler="exact")
     with pytest.raises(TrustboError, match="one of several missions; 1 of 2 have rates"):
         loo(alone)
 
@@ -180,13 +188,15 @@ def test_a_mission_without_rates_is_left_out_of_the_sum():
 def test_compare_ranks_as_arviz_does_and_refuses_other_missions():
     missions = simulate_missions(8)
     fits = {
-        "level": fit(missions, sampler="exact"),
+        "level": fit(missions, PooledTrust(), sampler="exact"),
         "wide": fit(missions, PooledTrust(Priors(x0_sd=3.0)), sampler="exact"),
     }
     table, theirs = compare(fits), az.compare({name: loo(tree) for name, tree in fits.items()})
     assert list(table.index) == list(theirs.index)
     np.testing.assert_allclose(table["elpd_diff"], theirs["elpd_diff"], atol=1e-9)
     with pytest.raises(TrustboError, match="'fewer' and 'level' are posteriors of different"):
-        compare({"level": fits["level"], "fewer": fit(missions[:5], sampler="exact")})
+        compare(
+            {"level": fits["level"], "fewer": fit(missions[:5], PooledTrust(), sampler="exact")}
+        )
     with pytest.raises(TrustboError, match="two or more posteriors by name"):
         compare({"level": fits["level"]})

@@ -534,7 +534,7 @@ def test_priors_from_earlier_campaigns_have_the_moments_of_an_equal_mixture(lear
 def test_priors_from_posteriors_keep_the_default_of_a_predicted_contact_rate(missions):
     """Of beta / (1 - beta0), in the mixture with N(1, .3^2) of line of sight."""
     named = [replace(mission, features=("line_of_sight", "slope")) for mission in missions]
-    posterior = fit(named, whole=False)
+    posterior = fit(named, PooledTrust(), whole=False)
     priors = tb.inference.prior_from([posterior]).priors
     draws = posterior["posterior"]
     ratio = (draws["beta"] / (1.0 - draws["beta0"])).values[..., 0]

@@ -145,7 +145,7 @@ def test_posteriors_of_a_campaign_predict_the_next_mission_on_bounds_seen_and_ne
     missions[3] = Mission.from_arrays(
         missions[0].path, missions[0].awareness, missions[0].contact_rate
     )
-    posteriors = [fit(missions[: j + 1], sampler="exact", seed=j) for j in range(4)]
+    posteriors = [fit(missions[: j + 1], PooledTrust(), sampler="exact", seed=j) for j in range(4)]
     scores = score(posteriors, missions)
     assert scores["mission"].values.tolist() == [1, 2, 3]
     n = len(missions[3].bounds)

@@ -99,9 +99,9 @@ def test_forgetting_is_a_weight_by_age():
 
 def test_missions_of_less_weight_leave_a_wider_posterior():
     missions = simulate_missions(4)
-    weighted = fit(missions, weights=[0.2, 0.4, 0.7, 1.0])["posterior"]
+    weighted = fit(missions, PooledTrust(), weights=[0.2, 0.4, 0.7, 1.0])["posterior"]
     assert float(weighted["delta_v"].std()) > 1.1 * float(
-        fit(missions)["posterior"]["delta_v"].std()
+        fit(missions, PooledTrust())["posterior"]["delta_v"].std()
     )
 
 
@@ -114,7 +114,7 @@ def test_robots_with_nothing_in_common_are_so_many_pooled_fits():
             Mission.from_arrays(m.path, m.awareness[:, [i]], m.contact_rate[:, [i]])
             for m in missions
         ]
-        one = fit(alone, sampler="exact", seed=3 + i)
+        one = fit(alone, PooledTrust(), sampler="exact", seed=3 + i)
         for name in ("beta0", "beta", "delta_w"):
             np.testing.assert_allclose(
                 apart["posterior"][name].isel(robot=i).values, one["posterior"][name].values
@@ -131,7 +131,7 @@ def test_robots_with_nothing_in_common_are_so_many_pooled_fits():
 
 
 def test_matched_priors_have_the_posterior_s_moments():
-    posterior = fit(simulate_missions(4), sampler="exact")
+    posterior = fit(simulate_missions(4), PooledTrust(), sampler="exact")
     draws = params_of(posterior)
     matched = moment_matched(draws, Priors())
     assert isinstance(matched.beta0, dist.Beta)

@@ -267,7 +267,7 @@ def require_trust_followed_in_real_time(posterior, model, mission):
 def test_families_are_compared_on_equal_terms_and_predict_in_their_own():
     """One test, not three: two workers would sample the posteriors twice."""
     missions = counted_missions()
-    families = {"gaussian": fit(missions, sampler="exact")} | {
+    families = {"gaussian": fit(missions, PooledTrust(), sampler="exact")} | {
         family: fit(missions, PooledTrust(observation=family))
         for family in ("censored", "beta_binomial")
     }

@@ -17,7 +17,7 @@ def found():
         z = rng.uniform(size=(6, 2, 2))
         rates = 0.3 + 0.3 * z[..., 0] + 0.03 * rng.standard_normal((6, 2)) + 0.2 * (j >= 4)
         missions.append(tb.Mission.from_arrays(path, z, rates))
-    return tb.criticise(tb.fit(missions, whole=False), compare=False)
+    return tb.criticise(tb.fit(missions, tb.models.PooledTrust(), whole=False), compare=False)
 
 
 def test_in_a_column_of_a_journal_panels_are_lower_and_labels_keep_apart(found):

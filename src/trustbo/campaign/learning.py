@@ -23,7 +23,7 @@ from trustbo.inference import diagnostics, fit, params_of, sample_prior
 from trustbo.inference.posterior_groups import parameters_alone
 from trustbo.inference.samplers.choice import resolve_sampler
 from trustbo.inference.samplers.settings import NutsSettings
-from trustbo.models import HumanTrust, PlaceEffect, PooledTrust, RobotEffect
+from trustbo.models import HumanTrust, default_model
 from trustbo.models.families import AUTO
 from trustbo.models.model import TrustModel, require_model
 from trustbo.models.params import Params
@@ -43,7 +43,7 @@ class Learner:
     Attributes:
         workspace: Workspace of the missions.
         options: Options of the campaign.
-        model: Trust model, by default with effects of places and of robots.
+        model: Trust model, by default `default_model()`.
         sampler: Sampler of the posterior.
         belief: Parameter draws: the posterior's, or, before the first mission, one from the prior.
         observation: Family of observations of the belief.
@@ -64,7 +64,7 @@ class Learner:
     ) -> None:
         """Begin with the prior, drawn by a seed; see `Campaign` for what is refused."""
         if model is None:
-            model = PooledTrust(place=PlaceEffect(), effects=(RobotEffect(),))
+            model = default_model()
         _require_learnable(model, sampler, options)
         all_alike = options.forgetting == 1.0
         self.changes = resolved(options.changes, model, all_alike=all_alike)

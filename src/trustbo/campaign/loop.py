@@ -46,7 +46,7 @@ def iterate(
             these names; see `Workspace.locate`.
         goal: Last cell, or a position in it.
         n_iterations: Largest number of missions.
-        model: Trust model; by default `PooledTrust` with effects of places and robots.
+        model: Trust model; by default `models.default_model()`, with effects of places and robots.
         policy: Name in `planning.POLICIES`, or a callable `policy(key, draws, planner) -> Plan`.
         objective: `"lost_contact"`, `"terminal"` (the paper's), `"mean"`, `"success"`,
             `"bottleneck"` or `"stationary"`; see `Planner`.

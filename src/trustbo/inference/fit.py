@@ -29,12 +29,12 @@ from trustbo.inference.samplers.settings import NutsSettings
 from trustbo.inference.samplers.student import proposal_of
 from trustbo.inference.samplers.watching import Watch
 from trustbo.models.backend import VERSIONS
+from trustbo.models.default import default_model
 from trustbo.models.effects.effect import Slots
 from trustbo.models.families import AUTO
 from trustbo.models.model import TrustModel, require_model
 from trustbo.models.people import HumanTrust
-from trustbo.models.place import places_of
-from trustbo.models.pooled import PooledTrust
+from trustbo.models.place import has_places, places_of
 from trustbo.models.record import model_to_record
 from trustbo.models.ticks import TickWeights, require_ticks, resolution, weigh_ticks
 from trustbo.stacking import MissionBatch, require_same_team, stack_missions
@@ -66,8 +66,10 @@ def fit(
 
     Args:
         missions: All missions to learn from; contact rates that are NaN were not measured.
-        model: Trust model; by default `PooledTrust()`, and `HumanTrust` of their scale where the
-            missions are reports of people, as of `logs.read_reports`.
+        model: Trust model; by default that of campaigns, `models.default_model()`, with effects of
+            places and robots. Missions without places, which are those of no map and those whose
+            paths jump, have effects of robots alone; reports of people, as of `logs.read_reports`,
+            have `HumanTrust` of their scale.
         sampler: `"auto"`: the exact sampler where it applies, else NUTS; the posterior's
             attributes record which, and why. `"exact"`: near-independent draws by importance
             sampling, without compiling, for robots that share their parameters, have nothing in
@@ -120,7 +122,7 @@ def fit(
         PosteriorError: The diagnostics are beyond their limits.
     """
     missions = _filled(missions, workspace)
-    model = default_model(missions) if model is None else model
+    model = _default_of(missions) if model is None else model
     require_model(model)
     given = {"warmup": warmup, "draws": draws, "n_chains": n_chains}
     care = {"target_accept": target_accept, "max_tree_depth": max_tree_depth}
@@ -196,10 +198,11 @@ def fit(
     return _require_sound(posterior, complaints)
 
 
-def default_model(missions: Sequence[Mission]) -> TrustModel:
-    """`HumanTrust` of reports that people gave, `PooledTrust` of contact."""
-    scale = missions[0].scale
-    return HumanTrust(scale=scale) if scale else PooledTrust()
+def _default_of(missions: Sequence[Mission]) -> TrustModel:
+    """`HumanTrust` of reports, else the default model, without places that missions lack."""
+    if scale := missions[0].scale:
+        return HumanTrust(scale=scale)
+    return default_model(places=has_places(missions))
 
 
 def _filled(missions: Sequence[Mission], workspace: Workspace | None) -> list[Mission]:

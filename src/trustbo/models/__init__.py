@@ -4,6 +4,7 @@ from trustbo.models import backend as backend  # first: it loads numpyro
 
 # isort: split
 from trustbo.models.coupled import CoupledTrust
+from trustbo.models.default import default_model
 from trustbo.models.drift import DriftTrust
 from trustbo.models.effects.person import PersonEffect
 from trustbo.models.effects.place import PlaceEffect
@@ -28,6 +29,7 @@ __all__ = [
     "RobotEffect",
     "RobotParams",
     "TrustParams",
+    "default_model",
 ]
 __dir__ = __all__.copy  # completion lists public names alone
 

@@ -28,11 +28,7 @@ from trustbo.workspace.location import Location
 MODELS: dict[str, dict[str, Any]] = {
     "pooled": {"kind": "PooledTrust"},
     "places": {"kind": "PooledTrust", "place": {"kind": "PlaceEffect"}},
-    "robots": {
-        "kind": "PooledTrust",
-        "place": {"kind": "PlaceEffect"},
-        "effects": [{"kind": "RobotEffect"}],
-    },
+    "robots": {"kind": "default_model"},
     "hierarchical": {"kind": "HierarchicalTrust"},
     "coupled": {"kind": "CoupledTrust"},
 }

@@ -8,7 +8,7 @@ from references import dense_posterior_of_trust
 from trustbo.data import Mission
 from trustbo.inference import fit, params_of
 from trustbo.inference.evidence import kalman_numpy as trajectories
-from trustbo.models import TrustParams
+from trustbo.models import PooledTrust, TrustParams
 from trustbo.stacking import stack_missions
 
 
@@ -66,7 +66,7 @@ def test_trust_is_that_of_dense_conditioning_where_no_rate_was_measured(with_los
 
 def test_a_posterior_knows_trust_where_no_rate_was_measured(with_losses):
     """The mean and variance over draws of dense conditioning given each, with one in forty."""
-    posterior = fit(with_losses)
+    posterior = fit(with_losses, PooledTrust())
     draws = params_of(posterior)
     picked = [draws.draw(d) for d in range(0, 4000, 40)]
     latent = posterior["latent"]

@@ -91,7 +91,7 @@ def test_the_evidence_is_the_prior_mean_of_the_likelihood():
 
 @pytest.mark.slow  # NUTS compiles for this alone
 def test_fit_lays_exact_draws_out_as_it_does_nuts_s(missions, posterior):
-    exact = fit(missions, sampler="exact", seed=1)
+    exact = fit(missions, PooledTrust(), sampler="exact", seed=1)
     assert set(exact.children) == set(posterior.children)
     assert exact["posterior"].sizes == posterior["posterior"].sizes
     assert exact["latent"]["trust"].dims == posterior["latent"]["trust"].dims
@@ -99,7 +99,7 @@ def test_fit_lays_exact_draws_out_as_it_does_nuts_s(missions, posterior):
     found = diagnostics(exact)
     assert found["k_hat"] < 0.7
     assert found["kish"] > 1000
-    again = fit(missions, sampler="exact", seed=1)
+    again = fit(missions, PooledTrust(), sampler="exact", seed=1)
     np.testing.assert_array_equal(
         exact["posterior"]["beta"].values, again["posterior"]["beta"].values
     )
@@ -203,7 +203,7 @@ def test_uneven_weights_fall_back_on_nuts_and_say_so(missions, monkeypatch):
         importlib.import_module("trustbo.inference.samplers.run"), "MAX_KHAT", -10.0
     )
     with pytest.warns(UserWarning, match=r"k-hat -?\d.\d\d, limit -10.0\); NUTS is used"):
-        posterior = fit(missions, sampler="exact")
+        posterior = fit(missions, PooledTrust(), sampler="exact")
     assert posterior.attrs["sampler"] == "nuts"
     assert "r_hat" in diagnostics(posterior)
 
