@@ -48,6 +48,7 @@ NAMESPACES = (
     "trustbo.criticism",
     "trustbo.planning",
     "trustbo.simulation",
+    "trustbo.paper",
     "trustbo.study",
     "trustbo.plots",
     "trustbo.export",

@@ -17,6 +17,7 @@ from trustbo.inference.samplers.choice import resolve_sampler
 from trustbo.models.model import TrustModel, require_model
 from trustbo.models.params import Params
 from trustbo.models.record import model_to_record
+from trustbo.paper import CAMPAIGN, WORKSPACE
 from trustbo.planning import POLICIES, Plan, Planner
 from trustbo.planning.path_sampling import path_sampler
 from trustbo.planning.paths import AdmissiblePaths, PathClass
@@ -148,12 +149,14 @@ BASELINE_ROWS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
     "random": ("random path", {"policy": random_path, "factory": True}),
     "shortest": ("shortest path", {"policy": shortest_path, "factory": True}),
     "paper": ("paper", {
-        "policy": "greedy", "objective": "terminal", "bounds": False,
-        "options": {"initial": "prior_draw", "max_bounds": "shortest+2"},
+        **{name: CAMPAIGN[name] for name in ("model", "policy", "objective")},
+        "bounds": WORKSPACE["bounds"],
+        "options": {"initial": CAMPAIGN["initial"], "max_bounds": "shortest+2"},
     }),
 }  # fmt: skip
 """Baselines by name: a random path, a random one of the shortest, and the paper's method. Each has
-the name of its row, and the settings of its `Case`."""
+the name of its row, and the settings of its `Case`. The sampler is that of all methods: NUTS, the
+paper's, has the same posterior as the exact one."""
 BASELINES = tuple(BASELINE_ROWS)
 _SETTINGS = ("model", "policy", "objective", "options", "bounds", "factory")
 """Settings of a method, those of a `Case`."""
