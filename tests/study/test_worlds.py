@@ -16,10 +16,12 @@ import trustbo as tb
 from trustbo.cli import app
 from trustbo.errors import TrustboError
 from trustbo.models import PlaceEffect, PooledTrust
+from trustbo.planning.paths import AdmissiblePaths, PathClass
 from trustbo.planning.policies import ucb
 from trustbo.simulation import Dust, KinematicSimulator, Threat, Truth
 from trustbo.study import load_study, run_worlds, worlds_table
 from trustbo.study.calls import identity_of
+from trustbo.study.kept import expected_loss, least_loss
 from trustbo.study.methods import cases_of
 from trustbo.study.world import COURSES, World, aged
 from trustbo.workspace.sight import Sight
@@ -164,6 +166,8 @@ def test_recommendations_are_judged_in_the_world_of_the_next_mission(tiny, tmp_p
     assert at[3] is at[2] is not at[1] is not at[0]
     best = [one.value(one.best((2, 0), (0, 2))).lost for one in at]
     assert len({*best[:3]}) == 3
+    admitted = PathClass(8, "shortest+4")
+    admissible = AdmissiblePaths(truth.workspace, (2, 0), (0, 2), admitted)
     for j in range(2):
         one = results.isel(run=j)
         np.testing.assert_allclose(one["best"], best[1:])
@@ -178,6 +182,8 @@ def test_recommendations_are_judged_in_the_world_of_the_next_mission(tiny, tmp_p
                 now, value = at[first + k], at[first + k].value(path)
                 assert float(one[f"lost{suffix}"][k]) == pytest.approx(value.lost)
                 assert float(one[f"regret{suffix}"][k]) == pytest.approx(now.regret(path))
+                loss = expected_loss(now, path) - least_loss(now, admissible)
+                assert float(one[f"loss{suffix}"][k]) == pytest.approx(loss, abs=1e-12)
 
 
 def test_a_world_of_four_ways_has_paths_and_an_oracle_of_four_ways(tiny, tmp_path, monkeypatch):

@@ -28,9 +28,11 @@ from trustbo.errors import TrustboError
 from trustbo.files import FilePath, interpreting
 from trustbo.models.backend import VERSIONS
 from trustbo.planning import Planner
+from trustbo.planning.paths import AdmissiblePaths, PathClass
 from trustbo.simulation import Truth
 from trustbo.simulation.protocol import Simulator
 from trustbo.study import executors
+from trustbo.study.kept import expected_loss, least_loss
 from trustbo.study.methods import Case
 from trustbo.study.store import Store
 from trustbo.study.table import to_dataset
@@ -205,14 +207,15 @@ def load_study(directory: FilePath) -> xr.Dataset:
         of its plan), `path` and `recommended` (row and col of each step, -1 after the goal),
         `regret` (true regret of the path recommended after it, in % of the contact that the best
         path keeps, see `Truth.regret`), `lost` (contact that it loses, in bounds), `p_arrive` (its
-        probability to arrive) and `best` (contact lost on the best path), in the world of the next
-        mission, the same with `_followed` for the path it followed, in the world that it was driven
-        in, `contact_rate` (mean), `status`, diagnostics of the posterior (see
-        `models.diagnostics`), and seconds. For each run: `oracle` (contact lost on the best path
-        before the first mission), the first three numbers with `_before` for the path recommended
-        before the first mission, `seconds` and `seconds_cpu` (of its process). NaN
-        where the truth is unknown, or where there is no such mission. Coordinates of run: its key,
-        and its label along each axis of the study. Attributes: the study's number of runs,
+        probability to arrive), `loss` (contact that it loses more than the path that loses least,
+        in bounds, those that fail or are not reached being lost) and `best` (contact lost on
+        the best path), in the world of the next mission, the same with `_followed` for the path it
+        followed, in the world that it was driven in, `contact_rate` (mean), `status`, diagnostics
+        of the posterior (see `models.diagnostics`), and seconds. For each run: `oracle` (contact
+        lost on the best path before the first mission), the first three numbers with `_before` for
+        the path recommended before the first mission, `seconds` and `seconds_cpu` (of its process).
+        NaN where the truth is unknown, or where there is no such mission. Coordinates of run: its
+        key, and its label along each axis of the study. Attributes: the study's number of runs,
         `n_runs`, and of failed ones, `n_failed`.
 
     Raises:
@@ -284,6 +287,8 @@ class _Referee:
     scene: Scene
     truth: Truth | None
     rows: list[dict[str, Any]] = field(default_factory=list)
+    least: dict[int, float] = field(default_factory=dict)
+    """Least expected loss of a path by the identity of the truth, which lives as long."""
 
     def __call__(self, campaign: Campaign, mission: Mission) -> None:
         followed = self.judge(campaign, mission.path, len(self.rows))
@@ -300,9 +305,11 @@ class _Referee:
     def judge(self, campaign: Campaign, path: tuple[Cell, ...], mission: int) -> dict[str, float]:
         """Value of a path in the world of a mission, and that of the best one.
 
-        Regret in % and contact lost in bounds, NaN if it does not lead from start to goal.
+        Regret in % and contact lost in bounds, also with what failures cost (`loss`), NaN if it
+        does not lead from start to goal.
         """
-        planner, unknown = campaign.planner, dict.fromkeys(("regret", "lost", "p_arrive"), math.nan)
+        planner = campaign.planner
+        unknown = dict.fromkeys(("regret", "lost", "loss", "p_arrive"), math.nan)
         if self.truth is None:
             return unknown | {"best": math.nan}
         truth, (start, goal) = self.truth.at(mission), (planner.start, planner.goal)
@@ -310,7 +317,21 @@ class _Referee:
         if (path[0], path[-1]) != (start, goal):
             return unknown | {"best": best}
         value, regret = truth.value(path), truth.regret(path, **self.class_of(planner))
-        return {"regret": regret, "lost": value.lost, "p_arrive": value.p_arrive, "best": best}
+        loss = expected_loss(truth, path) - self.least_of(truth, planner)
+        return {
+            "regret": regret, "lost": value.lost, "loss": loss, "p_arrive": value.p_arrive,
+            "best": best,
+        }  # fmt: skip
+
+    def least_of(self, truth: Truth, planner: Planner) -> float:
+        """Least expected loss of an admissible path."""
+        if id(truth) not in self.least:
+            judged = self.class_of(planner)
+            admitted = PathClass(judged["connectivity"], judged["max_bounds"])
+            ends = planner.start, planner.goal
+            paths = AdmissiblePaths(truth.workspace, *ends, admitted)
+            self.least[id(truth)] = least_loss(truth, paths)
+        return self.least[id(truth)]
 
     def class_of(self, planner: Planner) -> dict[str, Any]:
         """Paths that regret is held against."""

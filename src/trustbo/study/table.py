@@ -122,18 +122,19 @@ def worlds_table(dataset: xr.Dataset, by: str | Sequence[str] = "method") -> pd.
         `regret after n` missions in %, the median `lost after n` in bounds more than on the best
         path, both in the world of the next mission; means over campaigns of `regret now` (mean over
         all missions, likewise), `lost while learning` (the same for paths driven, in bounds and in
-        the world they were driven in), `missions to 1 %` (after which the recommended path stays
+        the world they were driven in), `lost with failures` (the same, where bounds that fail or
+        are not reached keep no contact), `missions to 1 %` (after which the recommended path stays
         within 1 %; one more than were driven if it does not), the share of missions that `arrive`,
         and of campaigns still `far` off, by more than 5 %, in the end, and processor `seconds` of a
         mission.
     """
     by = _of_run(dataset, by)
-    numbers, pairs = _numbers(dataset), _pairs(dataset)
+    numbers, pairs = numbers_of(dataset), _pairs(dataset)
     keys = list(zip(*(dataset[name].values for name in by), strict=True))
     rows = {}
     for key in dict.fromkeys(keys):
         mine = np.array([k == key for k in keys])
-        rows[key if len(by) > 1 else key[0]] = _summary(
+        rows[key if len(by) > 1 else key[0]] = bootstrap(
             {name: values[mine] for name, values in numbers.items()}, pairs[mine]
         )
     return _table(rows, by)
@@ -149,9 +150,9 @@ def differences(dataset: xr.Dataset, ours: str, by: str | Sequence[str] = ()) ->
 
     Returns:
         Table as of `worlds_table`: mean over campaigns of `regret after n`, `regret now`,
-        `lost while learning`, `missions to 1 %`, `arrive` and `seconds` of `ours` less those of
-        the other, with 95 % intervals of a bootstrap over pairs of world and course (NaN for one
-        pair); and their number, `pairs`. Less is better, but for `arrive`.
+        `lost while learning`, `lost with failures`, `missions to 1 %`, `arrive` and `seconds` of
+        `ours` less those of the other, with 95 % intervals of a bootstrap over pairs of world and
+        course (NaN for one pair); and their number, `pairs`. Less is better, but for `arrive`.
 
     Raises:
         TrustboError: An unknown method or coordinate, or no other method on the same worlds.
@@ -159,7 +160,7 @@ def differences(dataset: xr.Dataset, ours: str, by: str | Sequence[str] = ()) ->
     methods = list(dict.fromkeys(dataset["method"].values.tolist()))
     require_choice("method", ours, methods)
     by = _of_run(dataset, by) if by else []
-    numbers, pairs = _numbers(dataset), _pairs(dataset)
+    numbers, pairs = numbers_of(dataset), _pairs(dataset)
     compared = [name for name in numbers if not name.startswith(("lost after", "far"))]
     names = ["world", "course", "seed"]
     cases = list(zip(*(dataset[name].values.tolist() for name in names), strict=True))
@@ -176,7 +177,7 @@ def differences(dataset: xr.Dataset, ours: str, by: str | Sequence[str] = ()) ->
     for key, matched in sorted(rows.items(), key=lambda row: row[0][:-1]):
         one, other = np.array(matched).T
         less = {name: numbers[name][one] - numbers[name][other] for name in compared}
-        row = _summary(less, pairs[one], middle=np.nanmean)
+        row = bootstrap(less, pairs[one], middle=np.nanmean)
         if (n_pairs := len(np.unique(pairs[one]))) == 1:
             row |= {(name, limit): np.nan for name in compared for limit in ("low", "high")}
         table[key if by else key[0]] = {("pairs", "value"): float(n_pairs)} | row
@@ -213,7 +214,7 @@ def _pairs(dataset: xr.Dataset) -> np.ndarray:
     return dataset["world"].values + "/" + dataset["course"].values
 
 
-def _numbers(dataset: xr.Dataset) -> dict[str, np.ndarray]:
+def numbers_of(dataset: xr.Dataset) -> dict[str, np.ndarray]:
     """Numbers of each run, shape (run,)."""
     n_missions = dataset.sizes["mission"]
     oracle, driven = dataset["oracle"].values, np.isfinite(dataset["lost_followed"].values)
@@ -230,6 +231,8 @@ def _numbers(dataset: xr.Dataset) -> dict[str, np.ndarray]:
     numbers |= {f"lost after {n}": lost[:, n] for n in after}
     numbers["regret now"] = np.nanmean(regret, axis=1)
     numbers["lost while learning"] = np.nanmean(dataset["lost_followed"] - best_followed, axis=1)
+    if "loss_followed" in dataset:  # not in results of version 0.3
+        numbers["lost with failures"] = np.nanmean(dataset["loss_followed"], axis=1)
     numbers[f"missions to {NEAR:g} %"] = _until_near(regret)
     ran = dataset["status"].values != ""
     numbers["arrive"] = (dataset["status"].values == "ok").sum(1) / ran.sum(1)
@@ -244,13 +247,16 @@ def _until_near(regret: np.ndarray) -> np.ndarray:
     return np.where(away.any(1), last, 0).astype(float)
 
 
-def _summary(
+def bootstrap(
     numbers: Mapping[str, np.ndarray],
-    pairs: np.ndarray,
+    clusters: np.ndarray,
     middle: Callable[[np.ndarray], Any] | None = None,
 ) -> dict[tuple[str, str], float]:
-    """Value and interval of each quantity, by default a median of those after n missions."""
-    rng, (names, index) = np.random.default_rng(0), np.unique(pairs, return_inverse=True)
+    """Value and 95 % interval of each quantity, by default a median of those after n missions.
+
+    Runs of one cluster enter the bootstrap together, and all quantities have the same draws.
+    """
+    rng, (names, index) = np.random.default_rng(0), np.unique(clusters, return_inverse=True)
     members = [np.flatnonzero(index == i) for i in range(len(names))]
     drawn = [
         np.concatenate([members[i] for i in rng.integers(len(names), size=len(names))])
