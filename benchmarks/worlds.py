@@ -40,12 +40,6 @@ OURS = "trustbo"
 METHODS: dict[str, Any] = {
     OURS: {"model": "robots", "policy": POLICY},
     "trustbo, optimistic": {"model": "robots", "policy": "optimistic"},
-    "trustbo, no masks": {
-        "model": "robots",
-        "policy": POLICY,
-        "options": {"changes": "ignore"},
-    },
-    "trustbo, reset": {"model": "robots", "policy": POLICY, "options": {"changes": "reset"}},
     "trustbo, places": {"model": "places", "policy": POLICY},
     "trustbo, no places": {"model": "pooled", "policy": "greedy"},
     "running mean": running_mean.greedy,

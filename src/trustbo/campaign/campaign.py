@@ -12,7 +12,6 @@ import pandas as pd
 import xarray as xr
 from jax import random
 
-from trustbo.campaign.alarms import alarms_of
 from trustbo.campaign.checks import require_extra, require_mission, require_reason, require_where
 from trustbo.campaign.history import history_of, table_of
 from trustbo.campaign.learning import Learner
@@ -469,20 +468,6 @@ class Campaign(Displayed):
         whole = self._whole[1]
         whole["hazard"] = xr.DataTree(self.hazard)
         return whole
-
-    @property
-    def alarms(self) -> pd.DataFrame:
-        """Changes that are together more probable than not, as `Result.alarms`; in seconds.
-
-        Empty before anything is learned.
-
-        Raises:
-            TrustboError: Changes cannot be weighed under the model, see `inference.changes`.
-        """
-        last = self.state.last
-        if last is None:
-            return pd.DataFrame()
-        return alarms_of(last(), self.missions, self.workspace, self.model)
 
     @property
     def history(self) -> xr.Dataset:

@@ -16,7 +16,7 @@ from trustbo.workspace import Workspace
 RESERVED = (
     "objective", "path_changed", "contact_rate", "status", "state", "reason", "path", "trust_map",
     "seconds_plan", "seconds_run", "seconds_fit", "n_bounds", "k_hat", "kish", "r_hat", "ess_bulk",
-    "divergences", "n_masks", "iteration", "mission", "step", "axis", "robot", "row", "col", "x",
+    "divergences", "iteration", "mission", "step", "axis", "robot", "row", "col", "x",
     "y",
 )  # fmt: skip
 """Names of the history's columns and axes."""

@@ -7,10 +7,8 @@ import numpy as np
 import xarray as xr
 
 from trustbo.campaign.checks import never_to_be_learned
-from trustbo.campaign.masking import Mask, find_mask, masked, masks_of, mission_numbers, resolved
 from trustbo.campaign.options import CampaignOptions
 from trustbo.campaign.posteriors import Posterior
-from trustbo.campaign.resetting import chances, with_resets
 from trustbo.campaign.state import LEARNED, SET_ASIDE, TOLD, CampaignState
 from trustbo.data import Mission
 from trustbo.display.bars import place_of, say
@@ -30,7 +28,6 @@ from trustbo.models.params import Params
 from trustbo.workspace import AwarenessBelief, Workspace
 
 _N_DRAWS = 1000
-_MOST_MASKS = 3  # in a mission
 
 
 class CannotLearnError(TrustboError):
@@ -48,7 +45,6 @@ class Learner:
         belief: Parameter draws: the posterior's, or, before the first mission, one from the prior.
         observation: Family of observations of the belief.
         awareness: Belief about the awareness; None where the map is trusted.
-        changes: Treatment of changes of places, see `masking.resolved`.
         progress: Whether fits show their progress, see `tb.fit`.
     """
 
@@ -66,8 +62,6 @@ class Learner:
         if model is None:
             model = default_model()
         _require_learnable(model, sampler, options)
-        all_alike = options.forgetting == 1.0
-        self.changes = resolved(options.changes, model, all_alike=all_alike)
         self.workspace, self.options, self.model, self.sampler = workspace, options, model, sampler
         self._prior = _prior_belief(model, options.initial, workspace, seed)
         self._believe(None)
@@ -80,8 +74,6 @@ class Learner:
     def take(self, state: CampaignState, seed: int) -> None:
         """Learn from the last mission of a state, or exclude it where nothing can be learned."""
         entry = state.entries[-1]
-        if self.changes != "ignore":
-            entry.row["n_masks"] = len(masks_of(state.last_tree))
         if reason := never_to_be_learned(entry.mission):
             entry.become(SET_ASIDE, reason)
             warnings.warn(f"mission {len(state.entries)} is set aside: {reason}", stacklevel=4)
@@ -96,13 +88,10 @@ class Learner:
         numbers, last = state.numbers(TOLD, LEARNED), state.last
         if not numbers:
             entries[-1].posterior = None
-            self._believe(None, state)
+            self._believe(None)
             return
-        missions, masks = [entries[j].mission for j in numbers], masks_of(state.last_tree)
         try:
-            tree = self._fit(masked(missions, numbers, masks), state.last_tree, seed)
-            if self.changes != "ignore":
-                tree = self._fit_masked(tree, missions, numbers, masks, seed)
+            tree = self._fit([entries[j].mission for j in numbers], state.last_tree, seed)
         except CannotLearnError as error:
             for j in waiting:
                 entries[j].become(TOLD, str(error))
@@ -115,9 +104,6 @@ class Learner:
             )
             return
         tree.attrs["missions"] = numbers
-        if masks:
-            tree.attrs["masks"] = np.ravel(masks)
-            entries[-1].row["n_masks"] = len(masks)
         tree["hazard"] = xr.DataTree(self.hazard(state)[0])
         if "latent" not in tree.children:
             tree = parameters_alone(tree)
@@ -127,7 +113,7 @@ class Learner:
             entries[j].become(LEARNED)
         entries[-1].row |= diagnostics(tree)
         entries[-1].posterior = Posterior(len(entries), tree)
-        self._believe(tree, state)
+        self._believe(tree)
 
     def restore(self, state: CampaignState) -> None:
         """Restore the belief after the missions of a state that was read from files."""
@@ -137,17 +123,11 @@ class Learner:
         if (last := state.last) is not None:
             tree = last()
             with interpreting(last.file or ""):
-                self._believe(tree, state)
+                self._believe(tree)
 
-    def _believe(self, tree: xr.DataTree | None, state: CampaignState | None = None) -> None:
-        """Set the belief to a posterior after a state, or to the prior if there is none."""
+    def _believe(self, tree: xr.DataTree | None) -> None:
+        """Set the belief to a posterior, or to the prior if there is none."""
         self.belief = self._prior if tree is None else params_of(tree)
-        if tree is not None and state is not None and self.changes == "reset":
-            numbers = mission_numbers(tree)
-            learned = [state.entries[j].mission for j in numbers]
-            shape = self.workspace.passable.shape
-            chance = chances(learned, numbers, shape, len(state.entries))
-            self.belief = with_resets(self.belief, tree, chance, state.seed_of("reset"))
         family = self.model.family.name
         self.observation: str = family if tree is None else tree.attrs["observation"]
 
@@ -220,25 +200,6 @@ class Learner:
                     raise error.__cause__ from None
                 reason = f"{type(error).__name__}: {error}"
         raise CannotLearnError(reason)
-
-    def _fit_masked(
-        self,
-        tree: xr.DataTree,
-        missions: list[Mission],
-        numbers: list[int],
-        masks: list[Mask],
-        seed: int,
-    ) -> xr.DataTree:
-        """Add masks of areas that have changed to those so far, and fit again after each."""
-        for _ in range(_MOST_MASKS):
-            kept = masked(missions, numbers, masks)
-            mask = find_mask(tree, kept, numbers, self.workspace, self.model, masks)
-            if mask is None:
-                break
-            masks.append(mask)
-            say(place_of(self.progress), f"{mask}.")
-            tree = self._fit(masked(missions, numbers, masks), tree, seed)
-        return tree
 
     def _attempts(self) -> list[tuple[str, dict[str, Any]]]:
         """Sampler and sampling options of each attempt."""

@@ -53,11 +53,6 @@ class CampaignOptions:
             as in the paper).
         forgetting: Weight of a mission relative to the next, in (0, 1]. Below 1, a change of the
             environment is followed; for Gaussian observations.
-        changes: Rates of an area that has changed: ignore (they stay), mask (those before the
-            change are left out, once it is more probable than not), reset (mask, and places are
-            drawn from the prior with the chance that they changed since the last visit), or auto
-            (mask where the model has effects of places and changes can be weighed, else ignore).
-            See `Campaign.alarms`.
         awareness: Trust in the awareness map: map (blind; missions are learned from with it too) or
             belief (missions correct it). Under `"belief"`, or a given `AwarenessBelief`, policies
             draw from it too.
@@ -88,9 +83,6 @@ class CampaignOptions:
         default="prior_mean", metadata=_option(LEARNING, "prior_mean", "prior_draw")
     )
     forgetting: float = field(default=1.0, metadata=_option(LEARNING))
-    changes: str = field(
-        default="auto", metadata=_option(LEARNING, "auto", "ignore", "mask", "reset")
-    )
     awareness: "str | AwarenessBelief" = field(
         default="map", metadata=_option(LEARNING, "map", "belief")
     )

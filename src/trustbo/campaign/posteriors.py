@@ -4,10 +4,10 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import xarray as xr
 
 from trustbo.campaign.damage import naming_what_is_left
-from trustbo.campaign.masking import masked, masks_of, mission_numbers
 from trustbo.campaign.migrate import is_whole
 from trustbo.data import Mission
 from trustbo.errors import DamagedFileError
@@ -94,9 +94,8 @@ def whole_posterior(
     """
     if is_whole(stored):
         return stored
-    numbers = mission_numbers(stored)
-    learned = masked([missions[j] for j in numbers], numbers, masks_of(stored))
-    whole = complete(stored, learned, model=model)
+    numbers = np.atleast_1d(stored.attrs["missions"]).astype(int).tolist()
+    whole = complete(stored, [missions[j] for j in numbers], model=model)
     groups = {name: group.to_dataset() for name, group in whole.children.items()}
     for name, group in groups.items():
         if "mission" in group.dims:

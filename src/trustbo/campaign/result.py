@@ -11,7 +11,6 @@ import pandas as pd
 import rioxarray  # noqa: F401  (registers the .rio accessor)
 import xarray as xr
 
-from trustbo.campaign.alarms import alarms_of, sentences_of
 from trustbo.campaign.history import table_of
 from trustbo.campaign.options import PLANNING_OPTIONS, CampaignOptions
 from trustbo.campaign.planners import planner_of, under_risk
@@ -90,8 +89,6 @@ class Result(Displayed):
             ("contact rate", f"{self.history['contact_rate'].values[-1]:.3f} on the last mission"),
             ("outcomes", ", ".join(map(str, self.history["status"].values))),
         ]
-        if "alarms" in self.__dict__:  # a scan takes seconds: no display begins one
-            rows.append(("changes", " ".join(sentences_of(self.alarms)) or "none"))
         if "memory" in self.__dict__:
             rows.append(("memory", str(self.memory)))
         return summary_of(
@@ -124,20 +121,6 @@ class Result(Displayed):
                 f"from yet ({reasons[-1]}). They are kept; go on with more missions."
             )
         return whole_posterior(self.posteriors[-1], self.missions)
-
-    @cached_property
-    def alarms(self) -> pd.DataFrame:
-        """Changes of the world that are together more probable than not, by the last posterior.
-
-        Empty where none is. Columns are those of `inference.changes`, with missions by their
-        number, from 1, and robots by name; and `change`, kind, place and start as text. Computed
-        when first asked for, in seconds; the summary shows it from then on.
-
-        Raises:
-            TrustboError: Nothing could be learned yet; or changes cannot be weighed under the
-                model, whose rates may not be Gaussian, or have custom priors.
-        """
-        return alarms_of(self.posterior, self.missions, self.workspace)
 
     @cached_property
     def memory(self) -> Memory:

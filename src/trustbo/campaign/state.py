@@ -16,7 +16,7 @@ from trustbo.workspace import Workspace
 
 TOLD, LEARNED, SET_ASIDE = "told", "learned", "set aside"
 """States of a mission: on disk, in the posterior, or excluded from it."""
-_STREAMS = ("policy", "fit", "mission", "prior", "awareness", "hazard", "reset")
+_STREAMS = ("policy", "fit", "mission", "prior", "awareness", "hazard")
 """Streams of randomness; a seed depends on the place, so that names are added at the end."""
 
 

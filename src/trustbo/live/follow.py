@@ -21,7 +21,7 @@ _P_FALSE = 0.01
 """Chance of a false alarm in a bound, of the whole team."""
 _FIVE_PERCENT = -NormalDist().inv_cdf(0.05)
 _LEAST_LOSS = 0.1
-"""Share of contact below which a loss is no alarm, as for changes of the world."""
+"""Share of contact below which a loss is no alarm."""
 _LEAST_DRAWS = 20.0
 """Effective number of draws below which a forecast is too narrow for an alarm."""
 _LEAST_TICKS = 30

@@ -12,7 +12,6 @@ import numpy as np
 
 from trustbo.answers import levels_of
 from trustbo.campaign import Campaign
-from trustbo.campaign.alarms import sentences_of
 from trustbo.campaign.running import better_rest, weighted_mean
 from trustbo.campaign.state import LEARNED
 from trustbo.data import Cell
@@ -54,7 +53,6 @@ class _Opened(NamedTuple):
     mission: Underway
     follower: Follower
     plan: Plan
-    alarms: list[str]
 
 
 class Live:
@@ -70,7 +68,6 @@ class Live:
         number: Number of the mission, from 1; those given up count.
         follower: Trust of each robot during the mission.
         poses: Last position of each robot that was reported, CRS metres.
-        alarms: Changes of the world that are probable after the missions so far.
         log: Last lines about what happened, with their times, POSIX s.
         job: Work to be done before the mission goes on, see `take`; None if there is none.
         trouble: Reason why nothing more can be taken; empty while all is well.
@@ -382,9 +379,7 @@ class Live:
         campaign = self.campaign
         lost = sum(not failure.reported for failure in campaign.state.failures)
         number = len(campaign.state.entries) + lost + 1
-        plan, alarms, follower = campaign.ask(), [], Follower(campaign)
-        with suppress(TrustboError):  # a model under which changes cannot be weighed
-            alarms = sentences_of(campaign.alarms)
+        plan, follower = campaign.ask(), Follower(campaign)
         file = self._folder / f"{number:04d}.jsonl"
         if refused:
             os.replace(file, file.with_suffix(f".refused-{time.time_ns()}.jsonl"))
@@ -394,18 +389,16 @@ class Live:
             journal.sync()
         mission = _fold(journal, plan.path, campaign)
         follower.catch_up(mission)
-        return _Opened(number, journal, mission, follower, plan, alarms)
+        return _Opened(number, journal, mission, follower, plan)
 
     def _hold(self, opened: "_Opened") -> None:
         """Go on with a mission that was opened."""
         self.number, self.journal, self.mission = opened.number, opened.journal, opened.mission
-        self.follower, self.plan, self.alarms = opened.follower, opened.plan, opened.alarms
+        self.follower, self.plan = opened.follower, opened.plan
         self.journal.records.clear()
         self.maps: dict[str, Any] = {}
         self.posts: dict[tuple[Cell, Cell, Cell | None], list[list[float]]] = {}
         self.job, self.busy_with = None, ""
-        for alarm in self.alarms:
-            self.say(alarm)
         self._plan_work()
 
     def stopped(self, reason: str) -> None:

@@ -45,7 +45,7 @@ def state_of(live: "Live") -> dict[str, Any]:
         "reports": _plain(answer_of(mission.reports, live.reader.levels)),
         "levels": live.reader.levels,
         "idle": live.n_idle,
-        "alarms": [*(sentence_of(one, robots) for one in low), *live.alarms],
+        "alarms": [sentence_of(one, robots) for one in low],
         "log": [[round(t, 3), text] for t, text in live.log],
         "filter": follower.reason,
         "n_draws": round(follower.n_draws, 1),

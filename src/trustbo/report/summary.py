@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from trustbo.campaign.alarms import sentences_of
 from trustbo.campaign.result import Result
 from trustbo.data import path_text
 from trustbo.display.card import arrival, joined
@@ -32,13 +31,13 @@ _TOLLS = {"length_weight": "its length", "unseen_cost": "the time in which nobod
 
 
 def facts_of(result: Result, plan: Plan | None = None) -> list[Fact]:
-    """Return the facts of the summary: campaign, recommendation, value, diagnostics, changes.
+    """Return the facts of the summary: campaign, recommendation, value, diagnostics, memory.
 
-    The `plan` is that of the result; a running campaign passes it, and has no time for changes.
+    The `plan` is that of the result; a running campaign passes it, and has no time for more.
     """
-    changes = [_changes(result), _memory(result)] if plan is None else []
+    more = [_memory(result)] if plan is None else []
     if plan is None and any(mission.reports for mission in result.missions):
-        changes.append(_reported(result))
+        more.append(_reported(result))
     plan = result.plan if plan is None else plan
     return [
         Fact("The campaign", f"{_where(result)} {_missions(result)}"),
@@ -47,7 +46,7 @@ def facts_of(result: Result, plan: Plan | None = None) -> list[Fact]:
         *([] if plan.risk is None else [Fact("Arrival", _arrival(plan.risk))]),
         *([] if plan.cover is None else [Fact("Cover", _cover(plan.cover, plan.unseen_toll))]),
         _soundness(result),
-        *changes,
+        *more,
         Fact("Why it ended", _end(result)),
     ]
 
@@ -149,17 +148,6 @@ def _soundness(result: Result) -> Fact:
         return Fact("Posteriors", "Nothing could be learned yet.")
     verdict = "They are well sampled" if good else "Do not rely on them"
     return Fact("Posteriors", f"{verdict}: {'; '.join(sentences)}.", good)
-
-
-def _changes(result: Result) -> Fact:
-    """State which changes of the world are probable, or why they were not weighed."""
-    try:
-        alarms = result.alarms
-    except TrustboError as error:
-        return Fact("Changes", f"Not weighed: {error}")
-    if alarms.empty:
-        return Fact("Changes", "No change of a robot or an area is more probable than none.")
-    return Fact("Changes", " ".join(sentences_of(alarms)), good=False)
 
 
 def _memory(result: Result) -> Fact:
