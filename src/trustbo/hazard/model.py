@@ -6,9 +6,10 @@ follows from how difficult the way is, and how steep, t_e degrees beyond the ass
     1 - m_e = sigma(-logit_e) sigma(-(t_e + margin) / width),
     logit_e = intercept + sum_j coefficient_j (difficulty_ej - 1/2),
 
-where the margin, by which the true limit is below the assumed one, is not known: a bound that was
-never tried is judged by others like it, and one that was tried mostly by what happened there, the
-less strength s, the more. Derivation: docs/failures.md.
+where the margin, by which the true limit is below the assumed one, is not known. Its prior believes
+the assumed limit, with some doubt. A bound that was never tried is judged by others like it, and
+one that was tried mostly by what happened there, the less strength s, the more. Derivation:
+docs/failures.md.
 """
 
 import time
@@ -20,7 +21,13 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from trustbo.data import Mission
-from trustbo.errors import PosteriorError, TrustboError, require_positive, require_whole
+from trustbo.errors import (
+    PosteriorError,
+    TrustboError,
+    require_not_negative,
+    require_positive,
+    require_whole,
+)
 from trustbo.hazard.difficulty import difficulty_of
 from trustbo.hazard.exposures import CAUSES, Exposures, LostMission
 from trustbo.hazard.risk import BoundRisk
@@ -45,14 +52,18 @@ REFERENCE = 0.5
 class Hazard:
     """Priors of the chance that a bound ends the mission; normal ones are (mean, sd).
 
+    The prior of the margin is a mixture of two normals with the same mean. By default the stated
+    slope limit is right to half a degree with probability .9, and off by some 4 degrees with .1.
+
     Attributes:
         intercept: Prior of the logit of the mean chance at medium difficulty.
         coefficient: Prior of the weight of each measure of difficulty, from easy (0) to the robots'
             limit (1), but for the tilt.
         margin: Prior of the degrees by which the team's true slope limit is below the assumed one.
-            Bounds share it: a failure on one raises the chance of all that are as steep. By default
-            a correct limit and one that is 4 degrees too high are both plausible; a measured limit
-            takes a small sd.
+            Bounds share it: a failure on one raises the chance of all that are as steep. This is
+            the part of the prior for a limit that is right as stated.
+        doubt: Probability that the stated limit is wrong, and the sd of the margin then, degrees.
+            With a probability of 0 the prior is `margin` alone, as for a limit that was measured.
         log_width: Prior of the log of the width of the limit in degrees: the chance to fail rises
             from .1 to .9 within 4.4 widths of tilt.
         log_strength: Prior of the log of the strength s: the prior mean in units of observations,
@@ -60,12 +71,13 @@ class Hazard:
         cause: Concentration of the Dirichlet over the causes of failure, for each.
 
     Raises:
-        TrustboError: An sd or a concentration that is not positive.
+        TrustboError: An sd or a concentration that is not positive, or a share outside [0, 1).
     """
 
     intercept: tuple[float, float] = (-7.5, 1.5)
     coefficient: tuple[float, float] = (2.0, 2.0)
-    margin: tuple[float, float] = (1.0, 4.0)
+    margin: tuple[float, float] = (0.0, 0.5)
+    doubt: tuple[float, float] = (0.1, 4.0)
     log_width: tuple[float, float] = (0.0, 0.5)
     log_strength: tuple[float, float] = (-0.5, 1.0)
     cause: float = 0.2
@@ -75,6 +87,11 @@ class Hazard:
             mean, sd = getattr(self, name)
             value = float(mean), require_positive(f"sd of {name}", sd)
             object.__setattr__(self, name, value)
+        share, sd = self.doubt
+        doubt = require_not_negative("share of doubt", share), require_positive("sd of doubt", sd)
+        if doubt[0] >= 1.0:
+            raise TrustboError(f"share of doubt must be in [0, 1); got {share!r}.")
+        object.__setattr__(self, "doubt", doubt)
         require_positive("cause", self.cause)
 
     def beta_priors(
@@ -92,7 +109,8 @@ class Hazard:
             steepness = steepness_of(difficulty[:, list(measures).index(TILT)], max_slope)
         center, scale = np.array([self.intercept, *weights, *limit, self.log_strength]).T
         is_log = np.array([*[False] * (1 + len(weights)), *[False, True][: len(limit)], True])
-        return BetaPriors(center, scale, is_log, difficulty[:, has_weight] - REFERENCE, steepness)
+        difficulty = difficulty[:, has_weight] - REFERENCE
+        return BetaPriors(center, scale, is_log, difficulty, steepness, self.doubt)
 
     def prior(self, workspace: Workspace, *, seed: int = 0, n_draws: int = 1000) -> BoundRisk:
         """Risk of the bounds of a workspace before any mission."""
@@ -225,7 +243,7 @@ def _dataset(
             "seed": seed,
             "reference": REFERENCE,
             "cause_concentration": hazard.cause,
-            **{f"prior_{n}": list(getattr(hazard, n)) for n in _NORMALS},
+            **{f"prior_{n}": list(getattr(hazard, n)) for n in (*_NORMALS, "doubt")},
         },
     )
 

@@ -1,7 +1,8 @@
 """Importance sampling of a hazard's hyperparameters, and of where lost missions failed.
 
-Target: z, the hyperparameters in units of their normal priors, and the bound k_j at which each
-mission lost somewhere unknown failed, with the chances of all bounds integrated out:
+Target: z, the hyperparameters in coordinates whose priors are standard normal (see `BetaPriors`),
+and the bound k_j at which each mission lost somewhere unknown failed, with the chances of all
+bounds integrated out:
 
     p(z, k | data) ~ N(z; 0, I) prod_e B(a_e + f_e, b_e + n_e - f_e) / B(a_e, b_e),
 
@@ -24,6 +25,7 @@ import numpy as np
 from scipy import special, stats
 
 from trustbo.hazard.exposures import Exposures
+from trustbo.hazard.mixture import mixture_quantile
 from trustbo.inference.samplers.laplace import laplace
 from trustbo.inference.samplers.weights import smoothed_weights
 
@@ -57,13 +59,18 @@ class Points(NamedTuple):
 
 
 class BetaPriors(NamedTuple):
-    """Beta priors of the chances of the bounds met, as functions of the hyperparameters."""
+    """Beta priors of the chances of the bounds met, as functions of the hyperparameters.
+
+    Hyperparameters are center + scale z, or the exponential of it. The margin's prior has a second,
+    wider normal, so that it is a function of z that bends; see `mixture_quantile`.
+    """
 
     center: np.ndarray  # (parameter,), means of the priors
     scale: np.ndarray  # (parameter,), their sds
     is_log: np.ndarray  # (parameter,), whether the prior is of the log
     difficulty: np.ndarray  # (bound, measure)
     steepness: np.ndarray | None  # (bound,), degrees beyond the assumed limit; None: no limit
+    doubt: tuple[float, float]  # share and sd of the margin's wide normal
 
     def of(self, bounds: np.ndarray) -> Self:
         """Restrict to some of the bounds."""
@@ -85,6 +92,10 @@ class BetaPriors(NamedTuple):
         Shape (point, parameter); without a limit, margin and width are absent.
         """
         values = self.center + self.scale * z
+        if self.steepness is not None and self.doubt[0] > 0.0:
+            at = -1 - len(LIMIT_NAMES)
+            wide = mixture_quantile(z[:, at], float(self.scale[at]), *self.doubt)
+            values[:, at] = self.center[at] + wide
         values[:, self.is_log] = np.exp(np.clip(values[:, self.is_log], -_STRONGEST, _STRONGEST))
         return values
 
