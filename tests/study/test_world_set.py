@@ -7,9 +7,12 @@ import itertools
 import numpy as np
 import pytest
 
+from trustbo.planning.paths import AdmissiblePaths, PathClass
 from trustbo.simulation import KinematicSimulator, RadioSimulator
 from trustbo.simulation.events import Event
+from trustbo.simulation.replicates import KinematicReplicates, edges_of
 from trustbo.study import worlds
+from trustbo.study.kept import most_kept
 from trustbo.study.world import COURSES, REAL, SIMULATORS, drawn
 
 OLD = {"right": 7, "wall": 3, "bare": 3, "aged": 6, "canopy": 7, "slopes": 3}
@@ -31,6 +34,7 @@ def test_there_are_enough_worlds_of_every_kind(listed):
     assert all(len(by_kind[kind]) >= n for kind, n in OLD.items())
     assert by_kind.keys() == OLD.keys() | {
         "robots", "days", "foul", "change", "jammer", "physics", "shapes", "teams", "four-ways",
+        "limit",
     }  # fmt: skip
     assert len(COURSES) == 4
     assert all(name == world.name for name, world in listed.items())
@@ -59,11 +63,50 @@ def test_no_two_worlds_are_the_same(listed):
 def test_assumed_teams_differ_from_the_true_ones_where_robots_do(listed):
     for world in listed.values():
         unlike = world.kind == "robots"
-        assert unlike == (world.assumed_team is not None)
+        assert (unlike or world.kind == "limit") == (world.assumed_team is not None)
         assert unlike == (len({*world.team.robots}) > 1)
         if unlike:
             assert world.assumed_team.names == world.team.names
             assert len({*world.assumed_team.robots}) == 1
+
+
+def test_limits_are_assumed_too_high_for_all_robots_and_nothing_else_is_wrong(listed):
+    """By 4 degrees or by 1, as the case says."""
+    for world in (world for world in listed.values() if world.kind == "limit"):
+        (true,), (assumed,) = (
+            {*team.robots, team.lead} for team in (world.team, world.assumed_team)
+        )
+        excess = np.rad2deg(assumed.max_slope - true.max_slope)
+        assert world.case == f"limit-{excess:.0f}"
+        assert excess == pytest.approx(round(excess))
+        assert dataclasses.replace(true, max_slope=assumed.max_slope) == assumed
+        assert world.assumed is None
+        assert not world.aged
+        assert not world.events
+
+
+LIMITS = [world for world in worlds().values() if world.kind == "limit"]
+
+
+@pytest.mark.slow  # half a minute each
+@pytest.mark.parametrize("world", LIMITS, ids=lambda world: world.name)
+def test_under_the_true_limit_a_path_leads_to_the_goal_on_both_courses(world, request):
+    """Each bound is run once: by the true limit, bounds always fail or never do."""
+    if not world.is_packaged:
+        world = dataclasses.replace(world, data=str(request.getfixturevalue("real_data")))
+    workspace = world.workspace()
+    edges = edges_of(workspace)
+    passed = np.full((8, *world.shape, 9), np.nan)
+    runs = KinematicReplicates(world.simulator(workspace), 0, 0).run(edges, 0)
+    for edge, outcomes in zip(edges, runs, strict=True):
+        for after, (_, status) in zip(edge.next_moves, outcomes, strict=True):
+            passed[edge.move, *edge.cell, after] = status == "ok"
+    assert np.nanmin(passed) == 0.0
+    # Of contact on the last bound alone, a path keeps its chance to arrive.
+    last = np.where(np.arange(9) == 8, 1.0, 0.0) + 0.0 * passed
+    for course in ("sw-ne", "nw-se"):
+        paths = AdmissiblePaths(workspace, *world.ends(course), PathClass(8, "shortest+4"))
+        assert most_kept(last, passed, paths).max() == 1.0
 
 
 def test_at_least_half_of_the_new_worlds_are_drawn_by_rule(listed):
