@@ -8,7 +8,7 @@ other parts too: the tables are those of the chosen parts. BoTorch and Ax are le
 are not installed.
 `--targets` runs the objective and path class of the targets instead, mean contact on shortest+2.
 `--report` runs nothing, and prints the tables of what is in `--out`, for the worlds and courses
-that the default campaign has run.
+that the default campaign has run. `--csv` writes a row for each world, course and method.
 """
 
 from importlib.util import find_spec
@@ -28,6 +28,7 @@ from baselines import (
     standard_design,
 )
 from common import arguments, parsed
+from groups import KINDS, OURS, report_groups, rows_of
 
 from trustbo.campaign.options import POLICY
 from trustbo.files import to_json
@@ -36,7 +37,6 @@ from trustbo.study.methods import BASELINE_ROWS
 from trustbo.study.store import Store
 from trustbo.study.table import as_text, differences, to_dataset, worse_than
 
-OURS = "trustbo"
 METHODS: dict[str, Any] = {
     OURS: {"model": "robots", "policy": POLICY},
     "trustbo, optimistic": {"model": "robots", "policy": "optimistic"},
@@ -56,16 +56,15 @@ METHODS: dict[str, Any] = {
 """Methods by the names of their rows."""
 PACKAGES = {"BoTorch EI": "botorch", "BoTorch Thompson": "botorch", "Ax": "ax"}
 """Packages that methods need."""
-KINDS = ("right", "wall", "bare", "slopes", "aged", "canopy", "shapes", "teams", "four-ways",
-         "robots", "days", "foul", "change", "jammer", "physics")  # fmt: skip
-CASES = ("canopy", "robots", "days", "change", "jammer")
+CASES = ("canopy", "robots", "days", "change", "jammer", "limit")
 """Kinds of which each case has a table."""
 COLUMNS = ["regret after 0", "regret after 3", "regret after 8", "regret after 15", "regret now",
-           "lost while learning", "missions to 1 %", "arrive", "seconds"]  # fmt: skip
+           "lost while learning", "lost with failures", "missions to 1 %", "arrive",
+           "seconds"]  # fmt: skip
 OF_CASES = ["regret after 3", "regret after 8", "regret after 15", "regret now",
-            "lost while learning"]  # fmt: skip
+            "lost while learning", "lost with failures"]  # fmt: skip
 OF_DIFFERENCES = ["pairs", "regret after 15", "regret now", "lost while learning",
-                  "missions to 1 %", "seconds"]  # fmt: skip
+                  "lost with failures", "missions to 1 %", "seconds"]  # fmt: skip
 
 
 def main():
@@ -82,9 +81,10 @@ def main():
     parser.add_argument("--targets", action="store_true")
     parser.add_argument("--serial", action="store_true", help="one campaign after the other")
     parser.add_argument("--report", action="store_true", help="tables alone, of --out")
+    parser.add_argument("--csv", type=Path, help="file of the rows of all campaigns")
     given = parsed(parser)
     if given.report:
-        report(kept(given.out))
+        report(kept(given.out), given.csv)
         return
     objective, max_bounds = given.objective, given.max_bounds
     if given.targets:
@@ -108,7 +108,7 @@ def main():
         max_bounds=max_bounds, quick=given.quick, executor="serial" if given.serial else "loky",
         **courses,
     )  # fmt: skip
-    report(results)
+    report(results, given.csv)
 
 
 def kept(folder: Path) -> xr.Dataset:
@@ -120,8 +120,8 @@ def kept(folder: Path) -> xr.Dataset:
     return to_dataset(records, {key: record["labels"] for key, record in records.items()})
 
 
-def report(results: xr.Dataset):
-    """Print tables of all worlds, kinds and cases, and of the differences."""
+def report(results: xr.Dataset, csv: Path | None = None):
+    """Print tables of all worlds, kinds and cases, of the differences, and of the groups."""
     rows = results[["world", "course", "method", "seed"]].to_dataframe()
     if OURS in set(rows["method"]):
         ours = rows[rows["method"] == OURS].set_index(["world", "course", "seed"]).index
@@ -129,6 +129,8 @@ def report(results: xr.Dataset):
     order = [name for name in METHODS if name in set(rows["method"])]
     rows = rows.assign(rank=rows["method"].map(order.index)).sort_values("rank", kind="stable")
     results = results.isel(run=rows.index.to_numpy())
+    if csv is not None:
+        rows_of(results).round(4).to_csv(csv, index=False)
     kinds = results["kind"].values
     for kind in ("all worlds", *KINDS):
         runs = results if kind == "all worlds" else results.isel(run=kinds == kind)
@@ -146,6 +148,7 @@ def report(results: xr.Dataset):
         table = differences(results, OURS, by)
         print(f"\n{OURS} less each other method, same world, course and seed\n")
         print(f"{text(table, OF_DIFFERENCES)}\n\n" + "\n".join(worse_than(table)))
+    report_groups(rows_of(results))
 
 
 def text(table: pd.DataFrame, columns: list[str]) -> str:
