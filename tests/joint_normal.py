@@ -24,12 +24,8 @@ class Dense:
         x0: tuple[float, float] = (0.5, 0.5),
         memory: str = "level",
         lag: float = 0.0,
-        variances: np.ndarray | None = None,
     ) -> None:
-        """Form the joint normal; `theta` has one point, of beta0 maybe (point, robot).
-
-        `variances` (chain, bound) of the rates' noise take the place of delta_v^2.
-        """
+        """Form the joint normal; `theta` has one point, of beta0 maybe (point, robot)."""
         (delta_w,), (delta_v,) = (theta[name] for name in ("delta_w", "delta_v"))
         of_robot = np.resize(theta["beta0"][0], slots.n_robots)
         n_chains, K = slots.y.shape
@@ -74,8 +70,7 @@ class Dense:
         self._of_c, noise = of_c[seen], of_noise[seen].reshape(seen.sum(), -1)
         self._off = slots.y[seen] - mean[seen] - self._of_c @ self.prior_mean
         # A chain counts by its density to the power of its weight w: N(V / w) and a constant.
-        of_rates = np.full(seen.shape, delta_v**2) if variances is None else variances
-        V = noise @ noise.T + np.diag(of_rates[seen])
+        V = noise @ noise.T + delta_v**2 * np.eye(len(noise))
         w = np.broadcast_to(slots.weight[:, None], seen.shape)[seen]
         cov = self._of_c @ self.prior_cov @ self._of_c.T + V / np.sqrt(w[:, None] * w)
         self._factor = cho_factor(cov, lower=True)

@@ -319,8 +319,6 @@ def test_the_model_refuses_what_it_is_not_for(posterior, persons):
         fit(persons, HumanTrust(), progress=False, whole=False)
     with pytest.raises(TrustboError, match="criticise is of robots' contact; of reports"):
         tb.criticise(posterior, persons)
-    with pytest.raises(TrustboError, match="this posterior is of reports of people, whose trust"):
-        tb.inference.changes(posterior)
     with pytest.raises(TrustboError, match=r"compare_people: got HumanTrust .*models by name"):
         compare_people(persons, HumanTrust())
     with pytest.raises(TrustboError, match=r"for reports use trustbo\.inference\.predict_reports"):

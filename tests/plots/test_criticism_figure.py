@@ -11,11 +11,12 @@ import trustbo as tb
 
 @pytest.fixture(scope="module")
 def found():
-    """Missions whose contact is better from the fifth on."""
+    """Missions in which the second robot has less contact from the fifth on."""
     rng, path, missions = np.random.default_rng(0), [(0, k) for k in range(7)], []
     for j in range(8):
         z = rng.uniform(size=(6, 2, 2))
-        rates = 0.3 + 0.3 * z[..., 0] + 0.03 * rng.standard_normal((6, 2)) + 0.2 * (j >= 4)
+        rates = 0.5 + 0.3 * z[..., 0] + 0.03 * rng.standard_normal((6, 2))
+        rates[:, 1] -= 0.3 * (j >= 4)
         missions.append(tb.Mission.from_arrays(path, z, rates))
     return tb.criticise(tb.fit(missions, tb.models.PooledTrust(), whole=False), compare=False)
 
@@ -35,7 +36,7 @@ def test_the_fault_is_in_bold_and_groups_outside_their_band_are_marked(found):
     axes = tb.plots.criticism(replace(found, groups=groups), n_columns=3)
     assert axes.shape == (9,)
     bold = [label for label in axes[0].get_yticklabels() if label.get_fontweight() == "bold"]
-    assert [label.get_text() for label in bold] == [found.fault] == ["change"]
+    assert [label.get_text() for label in bold] == [found.fault] == ["robot in a mission"]
     missions = next(ax for ax in axes if ax.get_xlabel() == "mission")
     (marked,) = (line for line in missions.lines if line.get_color() == "#c1272d")
     assert list(marked.get_xdata()) == [3]

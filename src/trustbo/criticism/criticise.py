@@ -33,7 +33,6 @@ from trustbo.criticism.residuals import curves_of, groups_of, table_of_rates
 from trustbo.criticism.robots import (
     SIZE,
     effects_of_robots,
-    finding_on_changes,
     finding_on_robots,
     with_robots,
 )
@@ -48,6 +47,7 @@ from trustbo.parallel import one_blas_thread
 from trustbo.renamed import Former
 
 _LEVEL = 0.05
+_ROBOT = "robot in a mission"
 _LEAST = 1e-6
 """Lower limit of probabilities in tables; a smaller one is 0."""
 _SITES = ({"beta0", "beta", "b", "delta_w", "delta_v"}, {"B0", "B", "b", "Delta_w", "Delta_v"})
@@ -111,11 +111,9 @@ def criticise(
 ) -> Criticism:
     """Test a fitted model for what may be wrong with it, and name it.
 
-    Robots and changes come first, of a model with effects of robots and places, which is fitted if
-    the posterior is of another: a robot that stands out in a mission, `P(|d| > .1) > .95` for its
-    share d of line of sight, less the team's median, is the fault `"robot in a mission"`; a change
-    of all robots or an area from some mission on, by `inference.changes`, is `"change"`, where its
-    probability exceeds .9 and its size .1.
+    Robots come first, of a model with effects of robots and places, which is fitted if the
+    posterior is of another: a robot that stands out in a mission, `P(|d| > .1) > .95` for its share
+    d of line of sight, less the team's median, is the fault `"robot in a mission"`.
 
     Then effects of places, a response to a feature that bends, a prior in conflict with the rates,
     correlated noise, and the family of observations, each by a score test of the standardised
@@ -217,40 +215,32 @@ def _criticise(
     wrong = [name for name in clear if sizes[name] > LEAST[name]]
     wider = with_robots(posterior, missions)
     robots = effects_of_robots(wider)
-    of_team = {
-        "change": finding_on_changes(wider, missions, tested.data),
-        "robot in a mission": finding_on_robots(robots, tested.data),
-    }
-    after = {
-        name: _outcomes_with(departure, label, tested, seed)
-        for name, ((label, *_), departure) in of_team.items()
-        if departure is not None
-    }
-    if fault := next(iter(after), ""):
-        if of_team["change"][0][0] in missions[0].robots:
-            fault = next(reversed(after))  # the same robot, with its missions
+    (odd, effect, sentence), departure = finding_on_robots(robots, tested.data)
+    if departure is not None:
+        fault, left = _ROBOT, _outcomes_with(departure, odd, tested, seed)
     else:
-        for name in wrong:
-            after[name] = _outcomes_with(by_name.get(name), outcomes[name].label, tested, seed)
+        after = {
+            name: _outcomes_with(by_name.get(name), outcomes[name].label, tested, seed)
+            for name in wrong
+        }
         fault = _most_explaining(outcomes, after)
-    left = after.get(fault, {})
+        left = after.get(fault, {})
     rows = {}
     for (name, one), p in zip(outcomes.items(), adjusted, strict=True):
-        sentence = "nothing found."
+        words = "nothing found."
         if name in clear:
-            sentence = finding(name, one, innovations, tested.data, missions, by_name, coefficients)
+            words = finding(name, one, innovations, tested.data, missions, by_name, coefficients)
             if sizes[name] <= LEAST[name]:
-                sentence += " It is too small to be a fault."
+                words += " It is too small to be a fault."
         p_after = left[name].p if name in left else np.nan
         size = sizes[name], LEAST[name]
-        rows[name] = one.label, one.statistic, *size, one.p, p, p_after, sentence
+        rows[name] = one.label, one.statistic, *size, one.p, p, p_after, words
     rows |= {n: ("", *[np.nan] * 6, f"not tested: {why}") for n, why in tested.left_out.items()}
     rates = table_of_rates(missions, tested.data, innovations)
     groups = groups_of(rates, missions, tested.data, innovations)
     curves, rates["ahead"] = curves_of(tested.data, innovations, coefficients, tested.draws)
     rows["coverage"] = coverage_row(curves)
-    for name, ((label, effect, sentence), _) in of_team.items():
-        rows[name] = label, effect, abs(effect), SIZE, *[np.nan] * 3, sentence
+    rows[_ROBOT] = odd, effect, abs(effect), SIZE, *[np.nan] * 3, sentence
     head = ["label", "statistic", "size", "limit", "p", "p_adjusted", "p_after", "finding"]
     table = pd.DataFrame.from_dict(rows, orient="index", columns=head).rename_axis("check")
     chances = ["p", "p_adjusted", "p_after"]

@@ -1,9 +1,9 @@
-"""Findings on robots and on changes of the world: which robot, since when, and where.
+"""Findings on robots: which one, and in which missions.
 
-Both are read from a model with effects of places and robots (`RobotEffect`), fitted here where the
-posterior is of another. An alarm is a size in contact, never a p-value: a robot stands out in a
+They are read from a model with effects of places and robots (`RobotEffect`), fitted here where the
+posterior is of another. A finding is a size in contact, never a p-value: a robot stands out in a
 mission where P(|d| > .1) > .95 on one side, d its effect, a share of line of sight, less the median
-of all; a change is named where its probability exceeds .9 and its mean .1.
+of all.
 """
 
 import json
@@ -14,14 +14,11 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from trustbo.criticism.departures import Departure, cells_of
+from trustbo.criticism.departures import Departure
 from trustbo.criticism.joint_normal import Data
 from trustbo.data import Mission
 from trustbo.display.card import joined
-from trustbo.errors import TrustboError
-from trustbo.inference.changes import ALARM, changes
 from trustbo.inference.fit import fit
-from trustbo.models.effects.change import Change
 from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.effects.robot import RobotEffect
 from trustbo.models.families import FAMILIES
@@ -122,34 +119,3 @@ def _when(missions: np.ndarray, stands_out: np.ndarray, p: np.ndarray) -> str:
     if start < len(p):
         words.append(f"from mission {missions[start:][stands_out[start:]][0]} on")
     return joined(words)
-
-
-def finding_on_changes(posterior: xr.DataTree, missions: Sequence[Mission], data: Data) -> Finding:
-    """Find the most probable change of all robots, one or an area, see `inference.changes`."""
-    try:
-        table = changes(posterior, missions).to_dict(orient="records")
-    except TrustboError as error:
-        return ("", np.nan, f"not tested: {error}"), None
-    p = 1.0 - table[0]["probability"]
-    effect = table[1]["effect"] if len(table) > 1 else 0.0
-    if p <= ALARM:
-        return ("", p * effect, f"no change of the world: its probability is {p:.2f}."), None
-    change = Change(table[1]["kind"], table[1]["where"], table[1]["from_mission"])
-    mission, _, robot = data.slots.T
-    column = 1.0 * (mission >= change.from_mission)
-    if change.kind == "area":
-        label = f"cells within {change.where[2]} of {change.where[:2]}"
-        who, unit = f"bounds into {label} have", "contact"
-        column *= change.met(cells_of(missions, data))
-    else:
-        label, who, unit = "all robots", "all robots have", "contact in full sight"
-        column *= data.line_of_sight
-    if change.kind == "robot":
-        label = missions[0].robots[change.where[0]]
-        who, column = f"{label} has", column * (robot == change.where[0])
-    side = "less" if effect < 0.0 else "more"
-    sentence = f"from mission {change.from_mission} on {who} {abs(effect):.2f} {side} {unit}"
-    sentence += f" (probability of a change {p:.2f})."
-    if abs(effect) <= SIZE:
-        return ("", effect, f"{sentence} It is too small to be a fault."), None
-    return (label, effect, sentence), Departure("change", {label: column[:, None]})

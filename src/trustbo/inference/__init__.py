@@ -4,7 +4,6 @@ from trustbo.models import backend as backend  # first: it loads numpyro
 
 # isort: split
 from trustbo.inference.by_rate import by_rate
-from trustbo.inference.changes import changes
 from trustbo.inference.compare import compare
 from trustbo.inference.draws import params_of
 from trustbo.inference.filter import TrustFilter
@@ -26,7 +25,6 @@ from trustbo.inference.updating import sample_statistics, update_statistics
 __all__ = [
     "TrustFilter",
     "by_rate",
-    "changes",
     "compare",
     "compare_people",
     "complete",

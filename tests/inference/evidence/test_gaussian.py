@@ -267,33 +267,3 @@ class Further(NamedTuple):
 
     def name(self, c, theta, rng):
         return {}
-
-
-@pytest.mark.parametrize("memory", ["level", "deviation"])
-@pytest.mark.parametrize("name", EFFECTS)
-def test_the_rank_one_bayes_factor_is_the_difference_of_two_evidences(name, memory):
-    """Columns of one mission each, and the sum of all later ones of a run."""
-    rng, effects = np.random.default_rng(5), EFFECTS[name]
-    missions, weight = walking_missions(11, 5, missing=0.3), rng.uniform(0.2, 1.0, 5)
-    slots, groups = gathered(missions, effects, weight)
-    mission = np.repeat(slots.mission, slots.y.shape[1])
-    chosen = np.array([0, 2, 3, 4, 0, 1, 4])  # two runs of missions
-    dense = rng.uniform(size=(len(mission), 7)) * (rng.uniform(size=(len(mission), 7)) < 0.6)
-    dense *= mission[:, None] == chosen
-    run = np.array([0, 0, 0, 0, 3, 3, 3])
-    theta = random_theta(effects, rng, 4, memory)
-    evidence = Gaussian(slots, groups, X0, memory)
-    without = evidence.log_density(theta)
-    for runs in (run, None):
-        a, b = evidence.scan(theta, sparse.csc_array(dense), runs)
-        gain = -0.5 * np.log1p(0.09 * a) + 0.09 * b**2 / (2.0 + 0.18 * a)
-        for i in range(7):
-            z = dense[:, i] if runs is None else dense[:, i:][:, runs[i:] == runs[i]].sum(1)
-            more = [*groups, Further(sparse.csr_array(z[:, None]), 0.3)]
-            found = Gaussian(slots, more, X0, memory).log_density(theta) - without
-            np.testing.assert_allclose(gain[:, i], found, rtol=1e-10, atol=1e-10)
-            if i % 3 == 0:
-                t = i % 4
-                whole = [Dense(slots, g, point(theta, t), X0, memory) for g in (more, groups)]
-                difference = whole[0].log_density() - whole[1].log_density()
-                np.testing.assert_allclose(gain[t, i], difference, rtol=1e-10, atol=1e-10)

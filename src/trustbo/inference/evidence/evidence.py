@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 
 import numpy as np
 
-from trustbo.models.effects.effect import Columns, Theta
+from trustbo.models.effects.effect import Theta
 
 
 def at(theta: Theta, points: np.ndarray | slice) -> dict[str, np.ndarray]:
@@ -43,27 +43,4 @@ class Evidence(ABC):
 
         With them, where the density is approximate, the log weight of each draw: its exponential
         averages to the density of the rates.
-        """
-
-
-class ColumnEvidence(Evidence):
-    """Evidence of effects that are columns, which weighs further ones."""
-
-    @abstractmethod
-    def scan(
-        self, theta: Theta, columns: Columns, run: np.ndarray | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Products a = z'C^-1 z and b = z'C^-1 r of further columns z, each (point, column).
-
-        r are the rates less their mean and C is their covariance, of rates that are not Gaussian
-        those of the Gaussian ones that stand for them: with a coefficient N(0, t^2) of z, the log
-        evidence rises by -log(1 + t^2 a) / 2 + t^2 b^2 / (2 (1 + t^2 a)), and given the rates the
-        coefficient has variance 1 / (a + t^-2) and mean b times that.
-
-        Args:
-            theta: Hyperparameters, each (point,).
-            columns: Sparse matrix (slot, column).
-            run: Run of each column (column,), runs being contiguous: z is the sum of a column and
-                of all later ones of its run, which may not share a chain. By default z is the
-                column.
         """

@@ -37,9 +37,8 @@ from scipy import sparse
 from scipy.linalg.lapack import dpotrf, dtrtrs  # pyright: ignore
 
 from trustbo.errors import require_choice
-from trustbo.inference.evidence.evidence import ColumnEvidence, at, repeated
+from trustbo.inference.evidence.evidence import Evidence, at, repeated
 from trustbo.inference.evidence.fading import Eliminated, Sets, eliminate, spread
-from trustbo.inference.evidence.scan import Sums, take_projections, weigh_chains
 from trustbo.models.effects.effect import (
     MEMORIES,
     Columns,
@@ -56,7 +55,7 @@ _compiled = nb.njit(cache=True, error_model="numpy", fastmath={"reassoc", "contr
 _NUMBERS = 1e6  # kept at once, of all points of a chunk: about the cache
 
 
-class Gaussian(ColumnEvidence):
+class Gaussian(Evidence):
     """Evidence of Gaussian rates; exact."""
 
     exact = True
@@ -70,7 +69,6 @@ class Gaussian(ColumnEvidence):
         *,
         apart: bool = False,
         lag: float = 0.0,
-        by_slot: bool = False,
     ) -> None:
         """Sum products of columns over missions.
 
@@ -81,17 +79,14 @@ class Gaussian(ColumnEvidence):
             memory: `"level"`, trust is carried on, or `"deviation"` from what effects expect.
             apart: Whether theta has a beta0 of each robot, (point, robot).
             lag: 1 where rates measure the change of trust, else 0.
-            by_slot: Whether theta has the rates and the variances of their noise, `rates` and
-                `variances`, each (point, chain, bound), in place of those of slots and of delta_v.
         """
         self.slots, self.groups, self.x0, self.lag = slots, tuple(groups), x0, lag
         self.level = require_choice("memory", memory, MEMORIES) == "level"
         seen = ~np.isnan(slots.y)
         robot = slots.robot if apart else np.zeros_like(slots.robot)
-        chain = np.arange(len(seen)) if by_slot else np.zeros_like(robot)
-        alike = np.column_stack([chain, robot, seen])
+        alike = np.column_stack([robot, seen])
         kinds, kind = np.unique(alike, axis=0, return_inverse=True)
-        self.robot, self.seen, self.kind = kinds[:, 1], kinds[:, 2:] > 0, kind.ravel()
+        self.robot, self.seen, self.kind = kinds[:, 0], kinds[:, 1:] > 0, kind.ravel()
         self.n_measured = float(slots.weight @ seen.sum(1))
         self.mass = np.bincount(self.kind, slots.weight, len(self.seen))
         self.y = np.where(seen, slots.y, 0.0)
@@ -130,32 +125,6 @@ class Gaussian(ColumnEvidence):
         """See `Evidence.draw`; no weights are needed."""
         c = self.coefficients(theta, count, rng)
         return named_effects(self.groups, c, repeated(theta, count), rng), None
-
-    def scan(
-        self, theta: Theta, columns: Columns, run: np.ndarray | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """See `ColumnEvidence.scan`: C^-1 through L^-1 M z as above."""
-        run = np.arange(columns.shape[1]) if run is None else run
-        sums = Sums.of(sparse.csc_array(columns))
-        (atom, column), G = self._products(sums.atoms, self.U)
-        shape = sums.atoms.shape[1], len(self.order)
-        start = np.searchsorted(atom, np.arange(shape[0] + 1))
-        out = np.zeros((2, len(theta["beta0"]), columns.shape[1]))
-        for i in self._chunks(len(theta["beta0"])):
-            some = at(theta, i)
-            factors = self._factors(some)
-            N, E, _ = self._impulses(some)
-            C = N if self.level else E
-            S = np.swapaxes(C, 2, 3) @ C
-            R, _ = self._residual(some, N, E, factors.prior.mean)
-            values = (G @ _upper(S).T).T
-            for t in range(len(S)):
-                a, b = out[0, i.start + t], out[1, i.start + t]
-                weigh_chains(a, b, S[t], self.kind, self.slots.weight, R[t], *sums.slots, run)
-                half, right = self._half(factors, t)
-                T = sparse.csr_array((values[t], column, start), shape=shape) @ half
-                take_projections(a, b, T, right, *sums.of_atoms, run)
-        return out[0], out[1]
 
     def coefficients(self, theta: Theta, count: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Coefficients (draw, column) in the order of the groups, see `draw`."""
@@ -269,8 +238,7 @@ class Gaussian(ColumnEvidence):
 
     def _impulses(self, theta: Theta) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """See `impulses`."""
-        variances = theta.get("variances", theta["delta_v"][:, None, None] ** 2)
-        noises = theta["delta_w"], variances
+        noises = theta["delta_w"], theta["delta_v"]
         return impulses(self._beta0(theta), *noises, self.x0[1], self.seen, self.lag)
 
     def _beta0(self, theta: Theta) -> np.ndarray:
@@ -296,8 +264,8 @@ class Gaussian(ColumnEvidence):
             start = self._beta0(theta)[..., None] * self.x0[0] * N[..., 0]
             start -= self.lag * self.x0[0] * E[..., 0]
         R, misfit = np.zeros((n, n_chains, K)), np.zeros(n)
-        C, y = N if self.level else E, theta.get("rates", self.y[None])
-        _residuals(y, expected, start, E, C, self.kind, self.slots.weight, R, misfit)
+        C = N if self.level else E
+        _residuals(self.y, expected, start, E, C, self.kind, self.slots.weight, R, misfit)
         return R.reshape(n, -1), misfit
 
     def _whiten(self, P: np.ndarray, prior: Prior) -> None:
@@ -327,18 +295,9 @@ class Gaussian(ColumnEvidence):
             left *= factors.prior.sd[t, f:, None]
         return np.append(spread(factors.early, self.sets, t, white[: 2 * f], left), left, axis=0)
 
-    def _right(self, factors: "_Factors", t: int) -> np.ndarray:
-        """Means of the numbers that `_coloured` takes."""
-        return np.append(factors.early.Z[t, :, -1], factors.P[t, -1, :-1])
-
-    def _half(self, factors: "_Factors", t: int) -> tuple[np.ndarray, np.ndarray]:
-        """Matrix (column, number) of `_coloured` at the t-th theta, and the numbers' means."""
-        right = self._right(factors, t)
-        return self._coloured(factors, t, np.eye(len(right))), right
-
     def _draw(self, factors: "_Factors", t: int, n: int, rng: np.random.Generator) -> np.ndarray:
         """Step 5: coefficients (draw, column), in their order, at the t-th theta."""
-        right = self._right(factors, t)
+        right = np.append(factors.early.Z[t, :, -1], factors.P[t, -1, :-1])
         white = right[:, None] + rng.standard_normal((len(right), n))
         return factors.prior.mean[t] + self._coloured(factors, t, white).T
 
@@ -385,7 +344,7 @@ def named_effects(
 def impulses(
     b: np.ndarray,
     delta_w: np.ndarray,
-    variances: np.ndarray,
+    delta_v: np.ndarray,
     x0_sd: float,
     seen: np.ndarray,
     lag: float = 0.0,
@@ -395,15 +354,15 @@ def impulses(
     Args:
         b: Memory beta0, (point, kind) or (point, 1).
         delta_w: Process noise, (point,).
-        variances: Variances of the measurement noise, (point, kind, bound) or of length 1.
+        delta_v: Measurement noise, (point,).
         x0_sd: Sd of trust before the first bound.
         seen: Mask of the measured rates (kind, bound).
         lag: 1 where rates measure the change of trust, else 0.
     """
     n, (n_kinds, K) = len(b), seen.shape
     (N, E), log_det = np.zeros((2, n, n_kinds, K, K)), np.zeros((n, n_kinds))
-    b, R = np.broadcast_to(b, (n, n_kinds)), np.broadcast_to(variances, (n, n_kinds, K))
-    _impulses(b, delta_w**2, R, x0_sd**2, seen, float(lag), N, E, log_det)
+    b = np.broadcast_to(b, (n, n_kinds))
+    _impulses(b, delta_w**2, delta_v**2, x0_sd**2, seen, float(lag), N, E, log_det)
     return N, E, log_det
 
 
@@ -412,9 +371,7 @@ def _impulses(b, Q, R, x0_variance, seen, lag, N, E, log_det):
     gain = np.empty(seen.shape[1])
     for t in range(len(b)):
         for q in range(len(seen)):
-            log_det[t, q] = _filter(
-                b[t, q], Q[t], R[t, q], x0_variance, seen[q], lag, N[t, q], gain
-            )
+            log_det[t, q] = _filter(b[t, q], Q[t], R[t], x0_variance, seen[q], lag, N[t, q], gain)
             _whitening(b[t, q], gain, lag, N[t, q], E[t, q])
 
 
@@ -426,8 +383,8 @@ def _filter(b, Q, R, last, seen, lag, N, gain):
     for k in range(len(seen)):
         left, over, gain[k], m[k] = 1.0, 0.0, 0.0, 1.0
         if seen[k]:
-            F = P + R[k] + lag * (lag - 2.0 * b) * last
-            left, over, gain[k] = R[k] / F, lag / F, (P - lag * b * last) / F
+            F = P + R + lag * (lag - 2.0 * b) * last
+            left, over, gain[k] = R / F, lag / F, (P - lag * b * last) / F
             log_det += np.log(F)
             N[k, : k + 1] = m[: k + 1] / np.sqrt(F)
         m[:k] *= b * left + over * Q
@@ -453,19 +410,18 @@ def _whitening(b, gain, lag, N, E):
 def _residuals(y, expected, start, E, C, kind, weight, R, misfit):
     """R (point, chain, bound) and misfit (point,), see `Gaussian._residual`.
 
-    Rates y (point, chain, bound), the same at all points if of length 1. Expected rates (point,
-    chain, bound) but for the first trust, whose responses (point, kind, bound) are `start`.
+    Rates y (chain, bound). Expected rates (point, chain, bound) but for the first trust, whose
+    responses (point, kind, bound) are `start`.
     """
-    _, n_chains, K = y.shape
+    n_chains, K = y.shape
     r = np.empty(K)
     for t in range(len(expected)):
-        rates = y[t if len(y) > 1 else 0]
         for c in range(n_chains):
             q = kind[c]
             for k in range(K):
                 r[k] = -start[t, q, k]
                 for i in range(k + 1):
-                    r[k] += E[t, q, k, i] * rates[c, i] - C[t, q, k, i] * expected[t, c, i]
+                    r[k] += E[t, q, k, i] * y[c, i] - C[t, q, k, i] * expected[t, c, i]
             for i in range(K):
                 for k in range(i, K):
                     R[t, c, i] += weight[c] * C[t, q, k, i] * r[k]

@@ -5,15 +5,11 @@ gamma of `ep.joint`, in the chains of which a bound has the columns that touch i
 log p(rates | theta) to a few hundredths of a nat; draws of the coefficients come with weights that
 average to its ratio to the exact one (`ep.draws`).
 
-Scans of further columns take each theta's settled sites for Gaussian rates with noise by slot
-(`gaussian`): rank-one Bayes factors with the sites fixed, of which the evidence is stationary.
-
 EP inverts the prior, so that a scale is `_LEAST` at least: a coefficient of sd 1e-4 changes contact
 by less than any rate shows.
 """
 
 from collections.abc import Sequence
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -22,19 +18,18 @@ from scipy import sparse
 from trustbo.errors import require_choice
 from trustbo.inference.evidence.ep import joint
 from trustbo.inference.evidence.ep.draws import draw_weighted
-from trustbo.inference.evidence.evidence import ColumnEvidence, at, repeated
-from trustbo.inference.evidence.gaussian import Gaussian, named_effects, prior_of
+from trustbo.inference.evidence.evidence import Evidence, at, repeated
+from trustbo.inference.evidence.gaussian import named_effects, prior_of
 from trustbo.models.effects.effect import MEMORIES, Columns, Group, Slots, Theta, dense_root
 from trustbo.models.families import Family
 
 _LEAST = 1e-4  # sd of a coefficient
 _NOISE = 1e-6  # sd of a noise
 _SWEEPS, _MOST, _SETTLED = 1, 4, 8  # sweeps near the sites' mode, and to find it
-_SCAN, _NOTHING = 4, 1e-12  # sweeps at each theta of a scan; precision of no rate
 _MEMORY = 4e6  # numbers of precisions at once
 
 
-class Sites(ColumnEvidence):
+class Sites(Evidence):
     """Evidence by expectation propagation; draws of coefficients have weights."""
 
     exact = False
@@ -60,7 +55,6 @@ class Sites(ColumnEvidence):
             apart: Whether theta has a beta0 of each robot, (point, robot).
         """
         self.slots, self.groups, self.x0 = slots, tuple(groups), np.array(x0, dtype=float)
-        self.memory, self.apart = memory, apart
         U: Columns = sparse.hstack([group.columns for group in groups], format="csr")
         self.n_columns = U.shape[1]
         self.chains, self.sites = _chains(slots, U, family)
@@ -115,28 +109,6 @@ class Sites(ColumnEvidence):
         c, log_weight = draw_weighted(points(), count, *fixed, rng)
         named = named_effects(self.groups, c, repeated(theta, count), rng)
         return named, log_weight + 0.5 * np.repeat(log_dets, count)
-
-    def scan(
-        self, theta: Theta, columns: Columns, run: np.ndarray | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """See `ColumnEvidence.scan`, and the module."""
-        (beta0, *noises, x0, P, mean), _ = self._given(theta)
-        kept, sites, n_sweeps = self.sites, [], _SETTLED
-        for b, w, v, precision, center in zip(beta0, *noises, P, mean, strict=True):
-            kept = joint.settle(b, w, v, x0, precision, center, self.chains, kept, n_sweeps)
-            sites.append(kept)
-            n_sweeps = _SCAN
-        lam, eta = np.swapaxes(sites, 0, 1)
-        given = {"variances": 1.0 / np.maximum(lam, _NOTHING)}
-        given["rates"] = given["variances"] * eta
-        return self._pseudo.scan({**theta, **given}, columns, run)
-
-    @cached_property
-    def _pseudo(self) -> Gaussian:
-        """Evidence of Gaussian rates of the same slots and columns, with noise by slot."""
-        settings = {"apart": self.apart, "by_slot": True}
-        x0 = float(self.x0[0]), float(self.x0[1])
-        return Gaussian(self.slots, self.groups, x0, self.memory, **settings)
 
     def _given(self, theta: Theta) -> tuple[tuple[Any, ...], np.ndarray]:
         """Arguments of the kernels at each theta, and log |P| (point,)."""

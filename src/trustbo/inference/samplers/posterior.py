@@ -5,12 +5,10 @@ log p(rates | theta); all else is drawn given theta. A model and a family of obs
 one of each.
 """
 
-from collections.abc import Sequence
-
 import numpy as np
 from scipy.optimize import minimize
 
-from trustbo.inference.evidence.evidence import ColumnEvidence, Evidence, at, repeated
+from trustbo.inference.evidence.evidence import Evidence, at, repeated
 from trustbo.inference.evidence.gaussian import Gaussian
 from trustbo.inference.evidence.sites import Sites
 from trustbo.inference.samplers.importance import ScoreTarget
@@ -18,7 +16,7 @@ from trustbo.inference.samplers.laplace import derivatives, inverse_hessian
 from trustbo.inference.samplers.per_robot import PerRobot
 from trustbo.inference.samplers.scores import Scores
 from trustbo.inference.samplers.student import Proposal, Spanning, Student
-from trustbo.models.effects.effect import Effect, Slots
+from trustbo.models.effects.effect import Slots
 from trustbo.models.effects.weights import Weights
 from trustbo.models.model import TrustModel
 
@@ -129,30 +127,27 @@ class Posterior(ScoreTarget):
         return named | effects, log_weight
 
 
-def posterior_of(
-    model: TrustModel, slots: Slots, further: Sequence[Effect] = (), *, carries: bool = True
-) -> Posterior:
+def posterior_of(model: TrustModel, slots: Slots, *, carries: bool = True) -> Posterior:
     """Posterior of a model whose coefficients are columns.
 
     Args:
         model: Model, its priors of the weights Normal.
         slots: Rates of all chains.
-        further: Effects beyond those of the model.
         carries: Whether anything lasts from one bound to the next; else beta0 = 0, which all robots
             share.
     """
-    effects: list[Effect] = [*model.all_effects, *further]
+    effects = model.all_effects
     if model.robot_sets == "pooled":
         coordinates = PerRobot(model.priors, effects, slots.n_robots, slots.z.shape[2])
     else:
         coordinates = Scores(model.priors, effects, model.memory, carries=carries)
-    return Posterior(coordinates, evidence_of(model, slots, further), float(np.nanstd(slots.y)))
+    return Posterior(coordinates, evidence_of(model, slots), float(np.nanstd(slots.y)))
 
 
-def evidence_of(model: TrustModel, slots: Slots, further: Sequence[Effect] = ()) -> ColumnEvidence:
+def evidence_of(model: TrustModel, slots: Slots) -> Evidence:
     """Evidence of weights and effects, by the family of observations; see `posterior_of`."""
     by_robot = model.robot_sets == "pooled"
-    effects = Weights(model.priors, by_robot), *model.all_effects, *further
+    effects = Weights(model.priors, by_robot), *model.all_effects
     groups = [effect.group(slots) for effect in effects]
     x0 = model.x0["x0_mean"], model.x0["x0_sd"]
     if model.family.integrates_out:
