@@ -11,6 +11,9 @@ The part `reliability` compares the chance to arrive that a campaign's plan has 
 2, 5 and 15 with the share of runs of that plan which arrive. It has a file for each campaign:
 --jobs processes share the courses. With the source of another version in PYTHONPATH and another
 --out, it measures that version; `product` is of 1 - p_fail, all that 0.2 knew.
+
+The part `price` prints the chance to fail by which a plan on wellington is priced: by the product
+of means, by strata, and by all draws.
 """
 
 import csv
@@ -19,6 +22,7 @@ import multiprocessing
 import warnings
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -26,13 +30,13 @@ from common import Table, arguments, parsed, timed
 from scipy import sparse
 
 import trustbo as tb
-from trustbo.hazard import fit_hazard
+from trustbo.hazard import Hazard, fit_hazard
 from trustbo.hazard.exposures import CAUSES
-from trustbo.hazard.risk import BoundRisk
+from trustbo.hazard.risk import BoundRisk, Risk
 from trustbo.planning.path_sampling import path_sampler
 from trustbo.simulation import KinematicSimulator, MujocoSimulator, Truth
 from trustbo.study.world import COURSES, World
-from trustbo.workspace.moves import bounds_along
+from trustbo.workspace.moves import bounds_along, moves_along
 
 GROUNDS = (("topography", 18), ("tahoe", 18), ("synthetic-0", 14), ("wellington", 38))
 WORLDS = [f"{ground}:{limit}:{excess}" for ground, limit in GROUNDS for excess in (0, 4, 8, "aged")]
@@ -367,9 +371,38 @@ def print_reliability(gathered):
     print(f"\nlargest k-hat {k_hat:.2f}, refused {refused:.1%}; slowest fit {seconds:.2f} s")
 
 
+PRIORS = {
+    "N(1, 4²)": Hazard(margin=(1.0, 4.0), doubt=(0.0, 4.0)),
+    "N(0, .5²), N(0, 4²)": Hazard(),
+}
+"""Priors of the margin: that of version 0.3, and the default."""
+
+
+def print_price():
+    """Chance to fail of plans before any mission and after one failure, by three roads."""
+    table = Table("prior of the margin", "course", "plan", "product", "five strata", "draws")
+    workspace = tb.Workspace.from_terrain(tb.terrain.example(), (10, 10), tb.Team())
+    courses = {"sw-ne": ((9, 0), (0, 9)), "nw-se": ((0, 0), (9, 9))}
+    for (prior, hazard), (course, ends) in product(PRIORS.items(), courses.items()):
+        campaign = tb.Campaign(workspace, *ends, hazard=hazard)
+        path = campaign.ask().path
+        table.row(prior, course, "first", *chances(campaign.risk, path))
+        campaign.fail("stuck", where=path[len(path) // 2])
+        path = campaign.ask().path
+        table.row(prior, course, "after one failure", *chances(campaign.risk, path))
+
+
+def chances(risk, path):
+    """Chance that a path fails: product of means, strata, and mean over 20 000 draws."""
+    joint = [Risk(risk.mean, strata=strata).priced(path) for strata in (None, risk.strata())]
+    rows, cols = np.array(path[1:]).T
+    drawn = risk.draw(20_000, seed=1)[:, moves_along(path), rows, cols]
+    return [f"{p:.3f}" for p in (*joint, 1.0 - np.prod(1.0 - drawn, axis=1).mean())]
+
+
 def main():
     parser = arguments(
-        __doc__, names=[*PARTS, "reliability"], data=True, seeds=3, out="out/failures",
+        __doc__, names=[*PARTS, "reliability", "price"], data=True, seeds=3, out="out/failures",
         quick="one course and few missions of each world",
     )  # fmt: skip
     parser.add_argument("--csv", help="file of the bins of reliability")
@@ -389,6 +422,8 @@ def main():
         given.seeds, given.runs = 1, 10
     Path(given.out).mkdir(parents=True, exist_ok=True)
     names = [n for n in given.worlds if given.data or n.startswith("synthetic")]
+    if "price" in given.names:
+        print_price()
     if "reliability" in given.names:
         print_reliability(reliability([n for n in names if n.split(":")[2] in ("0", "4")], given))
     given.parts = [part for part in given.names if part in PARTS]

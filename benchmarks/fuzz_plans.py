@@ -5,7 +5,7 @@ Run: python benchmarks/fuzz_plans.py [-n N] [--first I] [--seed S] [--jobs J] [-
 
 Draws grids, strips and closed bounds, awareness of cells or bounds, effects of places, all models,
 objectives and families, tolls on length and on time unseen, limits on bounds from "shortest" to
-"shortest+300", risks with limits, confidence and costs, and numbers that
+"shortest+300", risks with limits, confidence, costs and strata, and numbers that
 are large, tied or 0. The compiled engine's plan, and where it is quick the reference engine's, must
 have the best score of all admissible paths (`peers.every_path`, which shares no code with the
 engines). Problem I of a seed is always the same. Chunks run in processes: one that crashes is
@@ -154,7 +154,7 @@ def draw_limit(rng, case):
 
 
 def draw_risk(rng, case):
-    """Chances (move, row, col), draws of them, the rule, and the unit of all risks."""
+    """Chances (move, row, col), draws of them, strata, the rule, and the unit of all risks."""
     shape, draws, unit, options = (8, *case.passable.shape), None, 1e-300, {}
     if case.dense:  # whole multiples of a unit
         unit = pick(rng, 0.01, 0.1)
@@ -171,17 +171,35 @@ def draw_risk(rng, case):
             options["confidence"] = float(pick(rng, 0.3, 0.5, 0.9, 1.0))
     if case.objective == "lost_contact" and rng.random() < 0.6:
         options["failure_cost"] = float(pick(rng, 0.0, 0.7, 3.0, 40.0))
-    return p, draws, options, unit
+    strata = None
+    if case.objective == "lost_contact" and not case.dense and rng.random() < 0.5:
+        strata = draw_strata(rng, p)
+        p = np.minimum(np.tensordot(strata.shares, strata.p_fail, 1), 1.0)
+    return p, draws, strata, options, unit
 
 
-def resources(p, draws, options):
-    """Risks (resource, move, cell), their limits, and how many must be kept."""
+def draw_strata(rng, p):
+    """Two to five strata around chances, all of them milder or more severe, or mixed."""
+    from trustbo.hazard.strata import Strata
+
+    n = int(rng.integers(2, 6))
+    severity = np.sort(rng.lognormal(0.0, pick(rng, 0.3, 1.5), n))[:, None, None, None]
+    noise = rng.lognormal(0.0, pick(rng, 0.0, 0.0, 1.0), (n, *p.shape))
+    return Strata(np.minimum(p * severity * noise, 1.0), rng.dirichlet(np.full(n, 0.7)))
+
+
+def resources(p, draws, strata, options):
+    """Risks (resource, move, cell) at the mean, of strata and draws; limits; how many to keep."""
     limit = -np.log1p(-options["max_failure"]) if "max_failure" in options else np.inf
     some, limits, needed = p[None], np.array([limit]), 1
     if "confidence" in options:
         some = np.concatenate([p[None], draws])
         limits = np.array([np.inf, *[limit] * len(draws)])
         needed = 1 + int(np.ceil(options["confidence"] * len(draws) - 1e-9))
+    if strata is not None:
+        n = len(strata.shares)
+        some = np.concatenate([some[:1], strata.p_fail, some[1:]])
+        limits, needed = np.concatenate([limits[:1], np.full(n, np.inf), limits[1:]]), needed + n
     with np.errstate(divide="ignore"):
         risk = np.minimum(-np.log1p(-some), 700.0)
     return risk.reshape(len(some), 8, -1), limits, needed
@@ -253,11 +271,13 @@ class Problem:
             u, x0, B0 = u.mean(0, keepdims=True), x0[:1], B0[:1, :1]
         if case.objective == "lost_contact" and case.family == "gaussian" and not case.lag:
             u, x0 = np.minimum(u, 1.0 - B0.sum(1)[:, None, None]), np.minimum(x0, 1.0)
-        self.p, self.draws, self.options, unit = None, None, {}, 0.0
+        self.p, self.draws, self.strata, self.options, unit = None, None, None, {}, 0.0
+        shares = np.empty(0)
         risk, limits, needed, cost = np.zeros((0, *u.shape[1:])), np.empty(0), 0, 0.0
         if rng.random() < 0.5:
-            self.p, self.draws, self.options, unit = draw_risk(rng, case)
-            risk, limits, needed = resources(self.p, self.draws, self.options)
+            self.p, self.draws, self.strata, self.options, unit = draw_risk(rng, case)
+            risk, limits, needed = resources(self.p, self.draws, self.strata, self.options)
+            shares = shares if self.strata is None else self.strata.shares
             if case.objective == "lost_contact":
                 cost = self.options.get("failure_cost", float(case.shortest))
         tolls = case.weight * CELL * np.hypot(*STEPS.T)[:, None]
@@ -265,7 +285,7 @@ class Problem:
         self.case, self.world = case, World(
             case.objective, *case.ends, case.into, tolls, u, B0, x0, case.team == "min",
             case.family, sd, case.lag, case.longest, case.u_turns, case.simple, risk, limits,
-            needed, cost, unit,
+            needed, cost, shares, unit,
         )  # fmt: skip
         return self._solve()
 
@@ -303,7 +323,9 @@ class Problem:
         )  # fmt: skip
         if case.closed.any():
             planner = planner.avoiding(case.closed, np.zeros(case.closed.shape))
-        return planner if self.p is None else planner.with_risk(self.p, self.draws)
+        if self.p is None:
+            return planner
+        return planner.with_risk(self.p, self.draws, None, self.strata)
 
     def engines(self):
         """Engines to compare: the reference where it takes no more than a second."""
@@ -321,14 +343,14 @@ class Problem:
         world, plan = self.world, self.planner(engine).plan(self.params)
         flat = [row * self.case.passable.shape[1] + col for row, col in plan.path]
         score, sums, admissible = along(world, flat)
-        cost = world.failure_cost * -np.expm1(-sums[0]) if len(sums) else 0.0
+        cost = world.failure(sums)
         got, tolerance, faults = score - cost, self.tolerance(), []
         if not admissible:
             faults.append("inadmissible")
         if len(sums):
-            slack = 1e-9 * np.maximum(1.0, world.limits)
+            slack = 1e-9 * np.maximum(1.0, np.where(world.limits < np.inf, world.limits, 0.0))
             kept = (sums <= world.limits + slack).sum() >= world.needed
-            if not kept and (not plan.infeasible or sums[0] > self.least + slack[-1]):
+            if not kept and (not plan.infeasible or sums[0] > self.least + slack.max()):
                 faults.append("risk")
         if got > self.best + tolerance:
             faults.append("better than the best")
@@ -358,6 +380,7 @@ def examine(seed, index):
     problem, outcome = Problem(seed, index), Counter(plans=1)
     outcome["by table" if problem.case.dense else "by walks"] += 1
     outcome["within a risk"] += problem.p is not None
+    outcome["in strata"] += problem.strata is not None
     outcome["longest over 250"] += problem.world.longest > 250
     wrong = []
     for engine in problem.engines():

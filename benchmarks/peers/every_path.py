@@ -39,7 +39,15 @@ class World(NamedTuple):
     limits: np.ndarray  # (resource,)
     needed: int
     failure_cost: float
+    shares: np.ndarray  # (stratum,), of the resources after the first; a failure costs by these
     unit: float  # of all risks, 0 if there is none
+
+    def failure(self, sums):
+        """Cost of failures of walks with sums (resource, ...): by the first without strata."""
+        if len(self.shares):
+            chances = -np.expm1(-sums[1 : 1 + len(self.shares)])
+            return self.failure_cost * np.tensordot(self.shares, chances, 1)
+        return self.failure_cost * -np.expm1(-sums[0]) if len(sums) else 0.0
 
     def trust(self, x):
         """Trust of the team, of states (state, ...)."""
@@ -161,7 +169,7 @@ def best_of(walks, world):
     sums, limits = walks.risk, world.limits[:, None]
     if not len(limits):
         return 0.0, walks.score.max()
-    least, values = sums[0].min(), walks.score + world.failure_cost * np.expm1(-sums[0])
+    least, values = sums[0].min(), walks.score - world.failure(sums)
     near = np.isfinite(limits) & (np.abs(sums - limits) < 1e-9 * np.maximum(1.0, limits))
     kept = (sums <= limits).sum(0) >= world.needed
     if not kept.any():

@@ -9,6 +9,7 @@ from references import of_bounds, path_values, sums_of, walks
 from worlds import with_unseen
 
 from trustbo.errors import ShapeError, TrustboError
+from trustbo.hazard.strata import Strata
 from trustbo.models import RobotParams, TrustParams
 from trustbo.planning import InfeasibleError, Planner
 from trustbo.planning.plan import plan_from_record, plan_to_record
@@ -212,6 +213,71 @@ def test_lost_contact_pays_for_a_failure_with_and_without_a_limit():
             np.testing.assert_allclose(planner.evaluate(plan.path, case.params).value, plan.value)
 
 
+def random_strata(p, seed):
+    """Two to five strata around chances, alike in their order, or mixed."""
+    rng = np.random.default_rng([seed, 7])
+    n = 2 + seed % 4
+    severity = np.sort(rng.lognormal(0.0, 1.2, n))[:, None, None, None]
+    mixed = rng.lognormal(0.0, (0.0, 0.8)[seed // 4 % 2], (n, *p.shape))
+    return Strata(np.minimum(p * severity * mixed, 1.0), rng.dirichlet(np.full(n, 0.8)))
+
+
+@pytest.mark.parametrize("family", ["gaussian", "censored", "beta_binomial"])
+@pytest.mark.parametrize("team", ["mean", "min"])
+def test_price_over_strata_is_planned_best_of_all_paths(family, team):
+    """F sum_m w_m (1 - prod (1 - p_m)) by its definition, with limits and without."""
+    for seed in range(12):
+        case = Case("lost_contact", 4 + (team == "mean"), seed, team=team, family=family)
+        strata = random_strata(case.p, seed)
+        case.p = np.tensordot(strata.shares, strata.p_fail, 1)
+        case.p_fail = failures(case.p, case.paths, case.n_cells)
+        joint = strata.shares @ [failures(p, case.paths, case.n_cells) for p in strata.p_fail]
+        drawn = np.stack([failures(p, case.paths, case.n_cells) for p in case.draws])
+        limit = max(case.limit(), case.p_fail.min())
+        held = case.p_fail <= limit + 1e-12, (drawn <= limit + 1e-12).mean(0) >= 0.5 - 1e-9
+        rules = [({}, np.ones(len(joint), bool))]
+        if limit < 1.0:
+            rules.append(({"max_failure": limit}, held[0]))
+            if held[1].any():
+                rules.append(({"max_failure": limit, "confidence": 0.5}, held[1]))
+        cost = (None, 0.7, 30.0)[seed % 3]
+        unit = case.failure_cost if cost is None else cost
+        for rule, feasible in rules:
+            for engine in ("numba", "networkx")[: 1 + (seed in (0, 5) and len(rule) < 2)]:
+                options = rule | {"failure_cost": cost, "engine": engine}
+                planner = case.planner(**options).with_risk(case.p, case.draws, {}, strata)
+                plan = planner.plan(case.params)
+                check(plan, (case.values - unit * joint)[feasible].max())
+                again = planner.evaluate(plan.path, case.params).value
+                np.testing.assert_allclose(again, plan.value, rtol=1e-9)
+
+
+def test_price_of_bounds_that_fail_together_is_of_one_failure():
+    """Half of the draws fail every bound: a price of .5, whatever the number of bounds."""
+    case = Case("lost_contact", 4, 1)
+    exists = existing_bounds(case.passable)
+    p = np.where(exists, np.array([0.0, 1.0])[:, None, None, None], np.nan)
+    strata = Strata(p, np.array([0.5, 0.5]))
+    planner = case.planner(failure_cost=8.0).with_risk(p.mean(0), None, {}, strata)
+    plan = planner.plan(case.params)
+    np.testing.assert_allclose(plan.value, case.values.max() - 4.0, rtol=1e-9)
+
+
+def test_safest_of_infeasible_paths_is_that_at_the_posterior_mean_with_strata_too():
+    for seed in range(4):
+        case = Case("lost_contact", 4, seed)
+        strata = random_strata(np.maximum(case.p, 0.03), seed)
+        case.p = np.tensordot(strata.shares, strata.p_fail, 1)
+        case.p_fail = failures(case.p, case.paths, case.n_cells)
+        joint = strata.shares @ [failures(p, case.paths, case.n_cells) for p in strata.p_fail]
+        least = case.p_fail.min()
+        planner = case.planner(max_failure=0.9 * least, infeasible="safest")
+        plan = planner.with_risk(case.p, None, {}, strata).plan(case.params)
+        np.testing.assert_allclose(1.0 - np.prod(1.0 - plan.p_fail), least, rtol=1e-9)
+        safest = case.p_fail <= least + 1e-12
+        check(plan, (case.values - case.failure_cost * joint)[safest].max())
+
+
 @pytest.mark.parametrize("objective", [name for name in CLASSES if name != "bottleneck"])
 @pytest.mark.parametrize("team", ["mean", "min"])
 def test_the_time_unseen_is_paid_within_a_limit_too(objective, team):
@@ -343,6 +409,10 @@ def test_what_cannot_be_is_refused():
     ):
         with pytest.raises(TrustboError, match=said):
             case.planner(**options)
+    for shares in ([1.0], [0.5, 0.6], [1.5, -0.5]):
+        strata = Strata(np.stack([case.p, case.p]), np.array(shares))
+        with pytest.raises(TrustboError, match="strata"):
+            case.planner().with_risk(case.p, None, {}, strata)
     with pytest.raises(ShapeError, match=r"p_fail must have shape \(8, 4, 4\); got \(8, 3, 3\)"):
         bare.with_risk(np.zeros((8, 3, 3)))
     with pytest.raises(ShapeError, match=r"draws of p_fail must have axes \(draw, move, row, col"):

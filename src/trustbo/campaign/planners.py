@@ -63,11 +63,13 @@ def under_risk(planner: Planner, risk: BoundRisk) -> Planner:
 
     The slope limit that the user states is believed until a failure contradicts it: before the
     first one, a failure costs nothing unless the user gave `failure_cost`. Its price under the
-    prior alone would forbid longer paths that keep contact and on which nothing fails.
+    prior alone would forbid longer paths that keep contact and on which nothing fails. From then on
+    it is joint over strata of the posterior, since bounds share the slope limit.
     """
     if planner.problem.rule.failure_cost is None and not risk.has_failures:
         planner = planner.with_failure_cost(0.0)
-    return planner.with_risk(risk.mean, risk.draw(_N_DRAWS), risk.causes)
+    strata = risk.strata() if planner.problem.failure_cost > 0.0 else None
+    return planner.with_risk(risk.mean, risk.draw(_N_DRAWS), risk.causes, strata)
 
 
 def to_avoid(risk: BoundRisk) -> np.ndarray:

@@ -233,13 +233,16 @@ def _costs(planner: Planner, params: Params) -> tuple[dict[Bound, float], tuple[
     graph, problem, plan = planner.graph_of(params), planner.problem, planner.plan(params)
     contact = 1.0
     if planner.objective == "lost_contact":
-        # A failure costs 1 - exp(-risk), which is concave: its tangent at the plan's risk lies
-        # above it elsewhere, so that no route is cheaper by the tangent and worse in truth.
-        slope = 0.0
-        if problem.risk is not None:
-            slope = problem.failure_cost * problem.risk.survival(plan.path)
-        for *_, edge in graph.edges(data=True):
-            edge["cost"] = edge["lost"] + slope * edge.get("risk", 0.0)
+        # A failure costs c (1 - exp(-risk)) in each stratum, which is concave: its tangents at the
+        # plan's risks lie above it elsewhere, so that no route is cheaper by them and worse in
+        # truth.
+        table, shape, slopes = problem.risk_table, problem.paths.passable.shape, np.empty(0)
+        if table is not None:
+            slopes = table.slopes(table.along(plan.path, shape))
+        for a, c, edge in graph.edges(data=True):
+            edge["cost"] = edge["lost"]
+            if table is not None:
+                edge["cost"] += float(slopes @ table.along((a, c), shape)[: len(slopes)])
         lost = -plan.value - problem.cost_of_failure(plan.path)
         contact = len(plan.path) - 1 - (lost - problem.objective.length_weight * plan.length)
     for *_, edge in graph.edges(data=True):

@@ -13,6 +13,7 @@ from trustbo.data import Cell
 from trustbo.errors import ShapeError, TrustboError, require_whole
 from trustbo.hazard.difficulty import difficulty_of
 from trustbo.hazard.sampler import LIMIT_NAMES, TILT, add_lost, prior_betas, steepness_of
+from trustbo.hazard.strata import MOST, Strata, partition
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import moves_along
 
@@ -129,12 +130,35 @@ class BoundRisk:
             out[block, self.exists] = rng.beta(*self._betas(chosen[block], every))
         return out
 
+    def strata(self, n: int = MOST) -> Strata:
+        """Chances under at most `n` groups of draws, from mild to severe; see `Strata`.
+
+        Their mean, by the shares, is that over all draws.
+        """
+        order = self._mildest_first
+        ends = partition(self._severity[order], require_whole("n", n, 1))
+        sizes = np.diff(ends, prepend=0)
+        member = np.empty(len(order), int)
+        member[order] = np.repeat(np.arange(len(ends)), sizes)
+        weights = (member == np.arange(len(ends))[:, None]) / sizes[:, None]
+        p_fail = np.full((len(ends), *self.exists.shape), np.nan)
+        draws, every = np.arange(len(order)), np.flatnonzero(self.exists)
+        for block in _blocks(len(every), len(draws)):
+            a, b = self._betas(draws, every[block])
+            p_fail.reshape(len(ends), -1)[:, every[block]] = weights @ (a / (a + b))
+        return Strata(p_fail, sizes / sizes.sum())
+
     @cached_property
     def _mildest_first(self) -> np.ndarray:
-        """Indices of the draws of the hyperparameters, by the mean chance of some of the bounds."""
+        """Indices of the draws of the hyperparameters, from mild to severe."""
+        return np.argsort(self._severity)
+
+    @cached_property
+    def _severity(self) -> np.ndarray:
+        """Mean chance of some of the bounds under each draw of the hyperparameters, (draw,)."""
         some = np.flatnonzero(self.exists)
         a, b = self._betas(np.arange(len(self.strength)), some[:: 1 + len(some) // _SOME])
-        return np.argsort((a / (a + b)).mean(1))
+        return (a / (a + b)).mean(1)
 
     @cached_property
     def _moments(self) -> tuple[np.ndarray, np.ndarray]:
@@ -188,33 +212,54 @@ class Risk:
         draws: Draws from its posterior, shape (draw, move, row, col), or None.
         causes: Shares of the causes of a failure, each a number or an array (move, row, col); they
             add up to 1.
+        strata: Chances under groups of draws, by which a failure is priced; None: by `p_fail`, as
+            if bounds were independent.
 
     Raises:
         ShapeError: Another shape.
-        TrustboError: A chance outside [0, 1].
+        TrustboError: A chance outside [0, 1], or shares that do not add up to 1.
     """
 
     p_fail: np.ndarray
     draws: np.ndarray | None = None
     causes: Mapping[str, ArrayLike] = field(default_factory=dict)
+    strata: Strata | None = None
 
     def __post_init__(self) -> None:
-        for name, p in (("p_fail", self.p_fail), ("draws of p_fail", self.draws)):
+        of_strata = None if self.strata is None else self.strata.p_fail
+        for name, p, axis in (
+            ("p_fail", self.p_fail, ""),
+            ("draws of p_fail", self.draws, "draw, "),
+            ("strata of p_fail", of_strata, "stratum, "),
+        ):
             if p is None:
                 continue
-            if p.shape[-3:] != self.p_fail.shape or p.ndim != 3 + (p is self.draws):
-                expected = ("draw, " if p is self.draws else "") + "move, row, col"
+            if p.shape[-3:] != self.p_fail.shape or p.ndim != 3 + bool(axis):
+                expected = axis + "move, row, col"
                 raise ShapeError(f"{name} must have axes ({expected}); got shape {p.shape}.")
             if ((p < 0.0) | (p > 1.0)).any():
                 worst = float(p[(p < 0.0) | (p > 1.0)][0])
                 raise TrustboError(f"{name} must be in [0, 1]; got {worst:g}.")
+        if self.strata is not None:
+            shares = np.asarray(self.strata.shares)
+            if shares.shape != self.strata.p_fail.shape[:1]:
+                raise ShapeError(f"strata need a share each; got shape {shares.shape}.")
+            if (shares < 0.0).any() or abs(shares.sum() - 1.0) > 1e-9:
+                raise TrustboError(f"shares of strata must add up to 1; got {shares}.")
 
     def survival(self, path: Sequence[Cell] | np.ndarray) -> float:
-        """Product of 1 - p_fail along a path, which limits and costs of plans use.
+        """Product of 1 - p_fail along a path, by which limits of plans go.
 
         The chance to arrive is larger where bounds fail together under the draws: see `along`.
         """
         return float(np.prod(1.0 - self.p_fail[_index_of(path)]))
+
+    def priced(self, path: Sequence[Cell] | np.ndarray) -> float:
+        """Chance that a path fails by which costs of plans go: the mean over the strata."""
+        if self.strata is None:
+            return 1.0 - self.survival(path)
+        p_fail, shares = self.strata
+        return float(shares @ (1.0 - np.prod(1.0 - p_fail[_index_of(path)], axis=1)))
 
     def share_within(self, path: Sequence[Cell] | np.ndarray, max_failure: float) -> float:
         """Share of the draws under which a path fails with a chance of at most `max_failure`."""

@@ -15,6 +15,7 @@ from trustbo.data import Cell
 from trustbo.display.card import Card, Displayed
 from trustbo.errors import require_choice
 from trustbo.hazard.risk import Risk
+from trustbo.hazard.strata import Strata
 from trustbo.models.families import FAMILIES
 from trustbo.models.model import RESPONSES
 from trustbo.models.params import Params
@@ -219,6 +220,7 @@ class Planner(Displayed):
         p_fail: ArrayLike | None,
         draws: ArrayLike | None = None,
         causes: Mapping[str, ArrayLike] | None = None,
+        strata: Strata | None = None,
     ) -> Self:
         """Return the planner with the chance of each bound to end the mission.
 
@@ -230,6 +232,8 @@ class Planner(Displayed):
             draws: Draws from its posterior, shape (draw, move, row, col), for bands of `p_arrive`
                 and for `confidence`.
             causes: Share of each cause of failure, numbers or arrays (move, row, col).
+            strata: Chances under groups of draws, such as `BoundRisk.strata()`, by which a failure
+                is priced; by default `p_fail`, as if bounds failed independently.
 
         Raises:
             ShapeError: Other shapes.
@@ -238,7 +242,7 @@ class Planner(Displayed):
         if p_fail is None:
             return self._with(self.problem.with_risk(None))
         drawn = None if draws is None else np.asarray(draws, dtype=float)
-        risk = Risk(np.asarray(p_fail, dtype=float), drawn, dict(causes or {}))
+        risk = Risk(np.asarray(p_fail, dtype=float), drawn, dict(causes or {}), strata)
         return self._with(self.problem.with_risk(risk))
 
     def with_failure_cost(self, failure_cost: float) -> Self:

@@ -156,7 +156,7 @@ class PlanningProblem:
         """`failure_cost` times the chance that a path fails, 0 without a risk."""
         if self.risk is None or self.failure_cost == 0.0:
             return 0.0
-        return self.failure_cost * (1.0 - self.risk.survival(path))
+        return self.failure_cost * self.risk.priced(path)
 
     def onward(self, done: Sequence[Cell]) -> Self:
         """Return the problem of the rest of a mission that entered the cells `done`, start first.

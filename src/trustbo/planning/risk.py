@@ -75,14 +75,15 @@ NO_RULE = RiskRule()
 class RiskTable(NamedTuple):
     """Risk -log(1 - p_fail) of bounds, which a path adds up, and its limits.
 
-    A path is feasible if at least `needed` of its sums are within their limits, and costs
-    `failure_cost` times the chance to fail at the posterior mean, the first of the sums.
+    A path is feasible if at least `needed` of its sums r are within their limits. It costs the sum
+    over the strata m, the first of the sums, of failure_costs[m] (1 - exp(-r_m)).
     """
 
     of_bounds: np.ndarray  # (resource, move, cell)
     limits: np.ndarray  # (resource,), inf where there is none
     needed: int
-    failure_cost: float
+    failure_costs: np.ndarray  # (stratum,), cost of a failure times the shares; none without a cost
+    at_mean: np.ndarray  # (move, cell), risk at the posterior mean
 
     def along(self, path: Sequence[Cell] | np.ndarray, shape: tuple[int, int]) -> np.ndarray:
         """Sums of a path on a grid of some shape, (resource,)."""
@@ -109,7 +110,20 @@ class RiskTable(NamedTuple):
 
     def cost(self, total: np.ndarray) -> float:
         """Cost of a failure times its chance, for sums (resource,); 0 without any."""
-        return float(-self.failure_cost * np.expm1(-total[:1].sum()))
+        of_strata = total[: len(self.failure_costs)]
+        return float(-(self.failure_costs * np.expm1(-of_strata)).sum())
+
+    def slopes(self, total: np.ndarray) -> np.ndarray:
+        """Rise of the cost with the sum of each stratum, (stratum,), at sums (resource,)."""
+        return self.failure_costs * np.exp(-total[: len(self.failure_costs)])
+
+    def within(self, limit: float) -> Self:
+        """Return the table with a limit on the risk at the posterior mean, and no other."""
+        n = len(self.failure_costs)
+        if n <= 1 and np.array_equal(self.of_bounds[0], self.at_mean):
+            return self._replace(of_bounds=self.at_mean[None], limits=np.array([limit]), needed=1)
+        sums = np.concatenate([self.of_bounds[:n], self.at_mean[None]])
+        return self._replace(of_bounds=sums, limits=np.array([np.inf] * n + [limit]), needed=n + 1)
 
 
 def risk_table(
@@ -121,19 +135,25 @@ def risk_table(
     """
     if rule.max_failure is None and failure_cost == 0.0:
         return None
-    resources, limits, needed = [risk.p_fail[None]], [np.inf], 1
+    mean = risk.p_fail[None]
+    strata = risk.strata if failure_cost > 0.0 else None
+    sums, shares = ([mean], np.ones(1)) if strata is None else ([strata.p_fail], strata.shares)
+    limits = [np.inf] * len(shares)
+    needed = len(limits)
     if rule.max_failure is not None:
         limit = -np.log1p(-rule.max_failure) + ROUNDING
-        if rule.confidence is None:
-            limits = [limit]
-        else:
+        if rule.confidence is not None:
             if risk.draws is None:
                 raise TrustboError("a confidence needs draws of the risk; give with_risk draws.")
             n = len(risk.draws)
-            resources, limits = [*resources, risk.draws], limits + [limit] * n
+            sums, limits = [*sums, risk.draws], limits + [limit] * n
             needed += int(np.ceil(rule.confidence * n - 1e-9))
+        elif strata is None:
+            limits = [limit]
+        else:
+            sums, limits, needed = [*sums, mean], [*limits, limit], needed + 1
     moves = move_indices(paths.connectivity)
-    p = np.concatenate(resources)[:, moves]
+    p = np.concatenate([*sums, mean])[:, moves]
     p = p.reshape(*p.shape[:2], -1)
     possible = np.zeros(p.shape[1:], bool)  # by the cell entered
     left, move = np.nonzero(paths.neighbours >= 0)
@@ -146,4 +166,5 @@ def risk_table(
         )
     with np.errstate(divide="ignore"):
         of_bounds = np.minimum(-np.log1p(-np.nan_to_num(p)), _CERTAIN)
-    return RiskTable(of_bounds, np.array(limits), needed, failure_cost)
+    costs = failure_cost * shares if failure_cost > 0.0 else np.empty(0)
+    return RiskTable(of_bounds[:-1], np.array(limits), needed, costs, of_bounds[-1])

@@ -32,8 +32,9 @@ def tight_problem(seed, failure_cost=0.0):
     used = (1.1 - toll + rng.uniform(0.0, 0.3, n))[:, None]
     limit = 0.55 * N_LAYERS
     resources = Resources(
-        used, np.array([limit]), 1, failure_cost, used[:, 0], limit, safest_to_go(graph, used)
-    )
+        used, np.array([limit]), 1, np.full(int(failure_cost > 0.0), failure_cost), used[:, 0],
+        limit, safest_to_go(graph, used),
+    )  # fmt: skip
     trust = np.array([[0.0, 0.0, 1.0]])
     return SearchProblem(
         graph, toll[None], np.zeros((1, 1)), np.zeros((1, 1)), trust, NONE, resources

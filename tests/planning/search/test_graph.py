@@ -62,18 +62,20 @@ def cost_of(problem, path, draw):
         x = BETA0 * x + float(problem.drift[min(draw, len(problem.drift) - 1), e])
         losses.append(loss(problem.loss, x))
     lost = max(losses) if problem.loss == LEAST else sum(losses)
-    failure = resources.failure_cost * (1 - np.exp(-used[0])) if len(used) else 0.0
+    strata = used[: len(resources.failure_costs)]
+    failure = (resources.failure_costs * (1 - np.exp(-strata))).sum()
     tolls = problem.toll[min(draw, len(problem.toll) - 1), list(path)].sum()
     return tolls + lost + failure
 
 
-def resources_of(graph, rng, n_resources, needed, failure_cost, limit):
+def resources_of(graph, rng, n_resources, needed, failure_costs, limit):
     of_bounds = rng.uniform(0.0, 0.3, (len(graph.head), n_resources))
     limits = np.full(n_resources, limit)
     least = np.sort(of_bounds, axis=1)[:, :needed].mean(1)
     return Resources(
-        of_bounds, limits, needed, failure_cost, least, limit, safest_to_go(graph, of_bounds)
-    )
+        of_bounds, limits, needed, np.array(failure_costs, float), least, limit,
+        safest_to_go(graph, of_bounds),
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("kind", [LOGISTIC, CLIPPED, SOFTPLUS, LEAST, NONE])
@@ -89,8 +91,9 @@ def test_the_best_path_of_an_acyclic_graph_is_that_of_enumeration(kind, n_resour
         resources = no_resources(graph, n)
         if n_resources:
             needed = min(2, n_resources)
-            cost = 0.0 if kind == LEAST else 1.5
-            resources = resources_of(graph, rng, n_resources, needed, cost, 0.4)
+            failure_costs = np.array([1.5, 0.2, 4.0])[: (1, 3)[seed % 2]][:n_resources]
+            failure_costs = failure_costs[: 0 if kind == LEAST else None]
+            resources = resources_of(graph, rng, n_resources, needed, failure_costs, 0.4)
         problem = SearchProblem(
             graph,
             np.zeros((1, n)) if kind == LEAST else rng.uniform(0.0, 0.3, (1, n)),
@@ -124,7 +127,7 @@ def test_the_best_path_of_a_graph_with_cycles_is_that_of_enumeration(n_resources
         n = len(graph.head)
         resources = no_resources(graph, n)
         if n_resources:
-            resources = resources_of(graph, rng, n_resources, min(2, n_resources), 0.0, 0.35)
+            resources = resources_of(graph, rng, n_resources, min(2, n_resources), [], 0.35)
         toll, trust = rng.uniform(0.01, 1.0, (2, n)), np.tile([0.0, 0.0, 1.0], (2, 1))
         problem = SearchProblem(
             graph, toll, np.zeros((1, n)), np.zeros((1, 1)), trust, NONE, resources

@@ -167,7 +167,7 @@ def _resources(case: Case, graph: Graph) -> Resources:
         of_bounds,
         risk.limits,
         risk.needed,
-        float(risk.failure_cost),
+        risk.failure_costs,
         *risk.priced(of_bounds),
         safest_to_go(graph, of_bounds),
     )

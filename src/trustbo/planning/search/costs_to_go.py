@@ -246,7 +246,7 @@ def with_safest(graph: Graph, costs: Costs, resources: Resources, need: np.ndarr
         resources.of_bounds,
         resources.limits,
         resources.needed,
-        resources.failure_cost,
+        resources.failure_costs,
         resources.priced,
         resources.priced_limit,
         safest,

@@ -6,7 +6,7 @@ Lower limits on the cost of a path's completions (Handler and Zang 1980; Beasley
 (a) at price 0, with the failure cost of the safest completion;
 (b) at the price lambda that maximises the dual function
 
-        root(lambda) = min over paths [cost + lambda r + chord(r_0)] - lambda limit,
+        root(lambda) = min over paths [cost + lambda r + sum_m chord_m(r_m)] - lambda limit,
 
     as a feasible path has lambda (r - limit) <= 0.
 
@@ -14,11 +14,11 @@ Lower limits on the cost of a path's completions (Handler and Zang 1980; Beasley
 |---|---|---|
 | r, limit | `priced`, `priced_limit` | sum of one resource whose limit every feasible path keeps |
 | lambda | `price` | price of r, >= 0 |
-| r_0 | `first` | sum of the first resource, which has the failure cost F (1 - exp(-r_0)) |
-| F | `failure_cost` | cost of a failure |
-| r_low, r_high | `low`, `high` | least r_0 of any path, and most of any that can still be best |
-| mu, base | `mu`, `base` | chord(r_0) = base + mu r_0 <= F (1 - exp(-r_0)) on [r_low, r_high] |
-| base - lambda limit | `offset` | what (b) adds to the priced cost of a completion |
+| r_m | `total[m]` | sum of stratum m, one of the first resources; it costs c_m (1 - exp(-r_m)) |
+| c_m | `failure_costs` | cost of a failure times the share of the stratum |
+| low_m, high_m | `low`, `high` | least r_m of any path, and most of any that can still be best |
+| mu_m, base_m | `mu`, `base` | chord_m(r_m) = base_m + mu_m r_m <= its cost on [low_m, high_m] |
+| sum_m base_m - lambda limit | `offset` | what (b) adds to the priced cost of a completion |
 | root | `root` | lower limit on the cost of every feasible path |
 
 Each price has a best path; the feasible one of least cost is known before any label is made.
@@ -66,18 +66,27 @@ class Dual(NamedTuple):
 
 
 class _Tried(NamedTuple):
-    """Path of some costs to go: its cost, first sum, priced sum and whether it is feasible."""
+    """Path of some costs to go: its cost, priced sum, feasibility and sums of the strata."""
 
     cost: float
-    first: float
     used: float
     feasible: bool
+    total: np.ndarray
 
 
 @_part
-def failure(F: float, total: float) -> float:
-    """Failure cost of a path whose first resource sums to `total`."""
-    return -F * math.expm1(-total) if F > 0.0 else 0.0
+def failure(cost: float, total: float) -> float:
+    """Failure cost of a stratum whose risk sums to `total`."""
+    return -cost * math.expm1(-total)
+
+
+@_part
+def _failure_of(failure_costs, total):
+    """Failure cost of a path with these sums of the strata."""
+    cost = 0.0
+    for m in range(len(failure_costs)):
+        cost += failure(failure_costs[m], total[m])
+    return cost
 
 
 @_inlined
@@ -85,34 +94,39 @@ def maximise_dual(
     graph: Graph, costs: Costs, resources: Resources, ahead: Ahead, below: float
 ) -> Dual:
     """Find the price of the best lower limit, and on the way paths that cost less than `below`."""
-    F = resources.failure_cost
+    failure_costs = resources.failure_costs
+    n_strata = len(failure_costs)
     path = np.empty(_most_cells(graph), np.int64)
     known = Found(np.empty(0, np.int64), below)
     free = pass_back(graph, costs, ahead, costs.toll)
     least, _ = _root(graph, costs, free)
-    low = _safest_of_all(graph, costs, resources) if F > 0.0 else 0.0
-    dual = Dual(known, free, free, 0.0, least + failure(resources.failure_cost, low))  # (a)
+    low = _safest_of_all(graph, costs, resources)
+    safe = _failure_of(failure_costs, low)
+    dual = Dual(known, free, free, 0.0, least + safe)  # (a)
     if len(resources.limits) == 0:  # a good path of every length, as this price is the only one
         for length in range(len(graph.starts)):
             start = graph.starts[length]
             if start >= 0 and costs.start_cost[length] + free.best[start] < known.cost:
                 known, _ = _try(graph, costs, resources, ahead, free, start, known, path)
         return Dual(known, free, free, 0.0, dual.root)
-    if F > 0.0:
+    if n_strata > 0:
         known = _follow_tangents(graph, costs, resources, ahead, known, low, path)
         dual = Dual(known, free, free, 0.0, dual.root)
-    high = resources.limits[0]
-    # Two rounds: the paths of the first lower `high`, so that the chord of the second is closer.
-    for _ in range(2 if F > 0.0 else 1):
-        if F > 0.0 and dual.known.cost < np.inf:
-            # least + F (1 - exp(-r_0)) <= known cost, for any path that is better.
-            share = (dual.known.cost - least) / F
-            if share < 1.0:
-                high = min(high, -math.log1p(-max(share, 0.0)))
-        mu, base = 0.0, failure(F, low)
-        if F > 0.0 and low < high < np.inf:
-            mu = F * (math.exp(-low) - math.exp(-high)) / (high - low)
-            base = -F * math.expm1(-low) - mu * low
+    high, mu = resources.limits[:n_strata].copy(), filled(n_strata, 0.0)
+    # Two rounds: the paths of the first lower `high`, so that the chords of the second are closer.
+    for _ in range(2 if n_strata > 0 else 1):
+        base = 0.0
+        for m in range(n_strata):
+            c, at_low = failure_costs[m], failure(failure_costs[m], low[m])
+            if dual.known.cost < np.inf:
+                # least + c (1 - exp(-r_m)) + least of other strata <= known cost, if better.
+                share = (dual.known.cost - least - (safe - at_low)) / c
+                if share < 1.0:
+                    high[m] = min(high[m], -math.log1p(-max(share, 0.0)))
+            mu[m] = 0.0
+            if low[m] < high[m] < np.inf:
+                mu[m] = c * (math.exp(-low[m]) - math.exp(-high[m])) / (high[m] - low[m])
+            base += at_low - mu[m] * low[m]
         dual = _raise_price(graph, costs, resources, ahead, dual, mu, base, path)
         if dual.root >= dual.known.cost:
             break
@@ -127,32 +141,38 @@ def _most_cells(graph):
 
 @_inlined
 def _safest_of_all(graph, costs, resources):
-    """Least sum of the first resource from the start."""
-    low = np.inf
+    """Least sum of each stratum from the start."""
+    low = filled(len(resources.failure_costs), np.inf)
     for length in range(len(graph.starts)):
         node = graph.starts[length]
         if node >= 0 and costs.start_cost[length] < np.inf:
-            low = min(low, resources.safest[node, 0])
+            for m in range(len(low)):
+                low[m] = min(low[m], resources.safest[node, m])
     return low
 
 
 @_inlined
 def _follow_tangents(graph, costs, resources, ahead, known, low, path):
-    """Improve the best path known where the first resource is priced at the failure cost's slope.
+    """Improve the best path known where each stratum is priced at the failure cost's slope.
 
-    The tangent of the concave cost at the last path's sum, F exp(-r_0), makes it linear; its best
-    path has another sum, and so on until the sum stays: no path then is worse than the last.
+    The tangent of the concave cost at the last path's sums, c_m exp(-r_m), makes it linear; its
+    best path has other sums, and so on until they stay: no path then is worse than the last.
     """
-    F = resources.failure_cost
-    tangent = F * math.exp(-low)
+    failure_costs = resources.failure_costs
+    tangent = np.empty(len(low))
+    for m in range(len(low)):
+        tangent[m] = failure_costs[m] * math.exp(-low[m])
     for _ in range(_PRICES):
         to_go = pass_back(graph, costs, ahead, _tolls(graph, costs, resources, 0.0, tangent))
         _, start = _root(graph, costs, to_go)
         known, tried = _try(graph, costs, resources, ahead, to_go, start, known, path)
-        following = F * math.exp(-tried.first)
-        if abs(following - tangent) <= 1e-9 * F:
+        settled = True
+        for m in range(len(low)):
+            following = failure_costs[m] * math.exp(-tried.total[m])
+            settled = settled and abs(following - tangent[m]) <= 1e-9 * failure_costs[m]
+            tangent[m] = following
+        if settled:
             break
-        tangent = following
     return known
 
 
@@ -160,17 +180,17 @@ def _follow_tangents(graph, costs, resources, ahead, known, low, path):
 def _raise_price(graph, costs, resources, ahead, dual, mu, base, path):
     """Maximise the dual function over lambda for one chord; see its paths.
 
-    It is concave and made of lines, one for each path: cost + mu r_0 + lambda (r - limit). The next
-    price is where the lines of the last paths within and beyond the limit meet, or a higher one
-    while there is none within. The maximum is reached when a path comes again.
+    It is concave and made of lines, one for each path: cost + sum_m mu_m r_m + lambda (r - limit).
+    The next price is where the lines of the last paths within and beyond the limit meet, or a
+    higher one while there is none within. The maximum is reached when a path comes again.
     """
     known, free, priced, offset, root = dual
     limit, price = resources.priced_limit, 0.0
-    within = beyond = np.inf  # cost + mu r_0 of the last paths
+    within = beyond = np.inf  # cost + sum_m mu_m r_m of the last paths
     within_used, beyond_used = np.inf, np.inf
     for _ in range(_PRICES if limit < np.inf else 1):
         to_go = free
-        if price > 0.0 or mu > 0.0:
+        if price > 0.0 or len(mu) > 0:
             to_go = pass_back(graph, costs, ahead, _tolls(graph, costs, resources, price, mu))
         least, start = _root(graph, costs, to_go)
         # root(lambda): of the least line of all paths, at this price; any price is a lower limit.
@@ -182,7 +202,9 @@ def _raise_price(graph, costs, resources, ahead, dual, mu, base, path):
             break
         # The path is a line in lambda with slope r - limit: it falls where r is within the limit,
         # rises beyond. The next price is where the last of both meet.
-        line = tried.cost + mu * tried.first
+        line = tried.cost
+        for m in range(len(mu)):
+            line += mu[m] * tried.total[m]
         if tried.used <= limit and (len(resources.limits) == 1 or tried.feasible):
             if line == within and tried.used == within_used:
                 break
@@ -212,11 +234,14 @@ def _next_price(price, excess, within, within_used, beyond, beyond_used):
 
 @_part
 def _tolls(graph, costs, resources, price, mu):
-    """Tolls of edges with prices on the priced resource and on the first one."""
+    """Tolls of edges with prices on the priced resource and on the strata."""
     tolls = np.empty(len(costs.toll))
     for e in range(len(tolls)):
         b = graph.bound[e]
-        tolls[e] = costs.toll[e] + (price * resources.priced[b] + mu * resources.of_bounds[b, 0])
+        paid = price * resources.priced[b]
+        for m in range(len(mu)):
+            paid += mu[m] * resources.of_bounds[b, m]
+        tolls[e] = costs.toll[e] + paid
     return tolls
 
 
@@ -243,16 +268,15 @@ def _try(graph, costs, resources, ahead, to_go, start, known, path):
         graph, costs, resources, ahead, to_go, start, first_cost, known.cost, total, path
     )
     if n == 0:
-        return known, _Tried(np.inf, np.inf, np.inf, False)
+        return known, _Tried(np.inf, np.inf, False, filled(len(total), np.inf))
     feasible = can_be_feasible(resources, total, 0)  # node 0 is the goal
-    first = total[0] if len(total) > 0 else 0.0
-    whole = cost + failure(resources.failure_cost, first)
+    whole = cost + _failure_of(resources.failure_costs, total)
     if feasible and whole < known.cost:
         copied = np.empty(n, np.int64)
         for k in range(n):
             copied[k] = path[k]
         known = Found(copied, whole)
-    return known, _Tried(cost, first, used, feasible)
+    return known, _Tried(cost, used, feasible, total)
 
 
 @_leaf

@@ -36,16 +36,16 @@ class Graph(NamedTuple):
 
 
 class Resources(NamedTuple):
-    """Sums over the edges of a path that have limits, and a cost of the first of them.
+    """Sums over the edges of a path that have limits, and a cost of the first few of them.
 
-    A path is feasible if `needed` of its sums are within their limits. With r the first of them, it
-    costs failure_cost * (1 - exp(-r)).
+    A path is feasible if `needed` of its sums are within their limits. With r_m the first of them,
+    the strata of a risk, it costs the sum of failure_costs[m] (1 - exp(-r_m)).
     """
 
     of_bounds: np.ndarray  # (bound, resource), not negative
     limits: np.ndarray  # (resource,), inf where there is none
     needed: int
-    failure_cost: float
+    failure_costs: np.ndarray  # (stratum,), positive
     priced: np.ndarray  # (bound,), one resource whose limit every feasible path keeps
     priced_limit: float
     safest: np.ndarray  # (node, resource), least sums from a node to the goal
@@ -98,7 +98,7 @@ class Costs(NamedTuple):
 
 def no_resources(graph: Graph, n_bounds: int) -> Resources:
     """Resources of a problem that has none."""
-    none = np.empty((n_bounds, 0)), np.empty(0), 0, 0.0
+    none = np.empty((n_bounds, 0)), np.empty(0), 0, np.empty(0)
     return Resources(*none, np.empty(0), np.inf, np.empty((len(graph.rank), 0)))
 
 

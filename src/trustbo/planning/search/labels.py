@@ -6,8 +6,9 @@ Irnich and Desaulniers 2005), pruned by the Lagrangian dual of `dual`.
 State: a label at a node has its cost so far, the trust x of the team, which follows x -> beta0 x +
 u, and the sum r of each resource along its edges. An edge costs its toll and a loss l(x) that falls
 in x; `NONE` has no loss and needs no trust, `LEAST` takes the largest loss instead of the sum. A
-path is feasible if enough of its r are within their limits, and costs in addition a failure cost F
-times 1 - exp(-r) of the first resource. Without resources every path is feasible.
+path is feasible if enough of its r are within their limits, and costs in addition the sum of
+failure costs c_m times 1 - exp(-r_m) over the first few resources, the strata of a risk. Without
+resources every path is feasible.
 
 A label is dropped if its cost with a lower limit on that of its completions, (a) or (b) of `dual`,
 cannot beat the best path known, or if the safest completion, resource by resource, exceeds the
@@ -227,7 +228,7 @@ def _expand_by_rank(
     Returns the node, -1 after the last, and its label to go on from, the number of labels, the best
     one at the goal, and its cost.
     """
-    F, rank, first = resources.failure_cost, graph.rank, graph.first
+    failure_costs, rank, first = resources.failure_costs, graph.rank, graph.first
     link, state, used = labels
     while True:
         while label < 0:
@@ -236,8 +237,9 @@ def _expand_by_rank(
                 return node, label, n, goal, best
             label = heads[node]
         if rank[node] == 0:
-            first_sum = used[label, 0] if len(resources.limits) > 0 else 0.0
-            cost = state[label, 0] + failure(F, first_sum)
+            cost = state[label, 0]
+            for k in range(len(failure_costs)):
+                cost += failure(failure_costs[k], used[label, k])
             if cost < best:
                 best, goal = cost, label
         elif not _is_dominated(graph, resources, labels, heads[node], label, costs.loss):
@@ -291,7 +293,8 @@ def _extend(graph, costs, resources, ahead, need, dual, best, label, labels, hea
     _, free, free_second, free_by = dual.free
     paid_toll, priced, priced_second, priced_by = dual.priced
     of_bounds, limits, safest = resources.of_bounds, resources.limits, resources.safest
-    loss, sd, F, n_resources = costs.loss, costs.noise_sd, resources.failure_cost, len(limits)
+    loss, sd, n_resources = costs.loss, costs.noise_sd, len(limits)
+    failure_costs = resources.failure_costs
     u_turns, last = graph.u_turns, graph.n_moves - 1
     node, came = link[label, 0], link[label, 1]
     cost, x, prices = state[label, 0], state[label, 1], state[label, 2]
@@ -317,10 +320,11 @@ def _extend(graph, costs, resources, ahead, need, dual, best, label, labels, hea
             if cost + toll[e] + own[h] + fall[h] * lack + to_come >= best:
                 continue
         now = joined(loss, cost, loss_of(loss, after, sd)) + toll[e]
-        # `paid` sums lambda r + mu r_0 over the edges: what (b) counts beyond the cost so far.
+        # `paid` sums lambda r + mu . r_m over the edges: what (b) counts beyond the cost so far.
         least, paid = joined(loss, now, to_come), prices + (paid_toll[e] - toll[e])
         if n_resources > 0:
-            least += failure(F, used[n, 0] + safest[h, 0])  # (a)
+            for k in range(len(failure_costs)):  # (a)
+                least += failure(failure_costs[k], used[n, k] + safest[h, k])
             if least >= best:
                 continue
             to_come = priced[h] if u_turns or priced_by[h] != last - m else priced_second[h]

@@ -222,8 +222,9 @@ def _search(problem, tolerance, max_labels):
             left = most - n_bounds - 1 if fixed else to_goal[other]
             reach = _estimate(loss, problem.heuristic, x, total, other, left, problem.noise_sd)
             if n_risks > 0:
-                least = problem.risk.safest[other, 0] - tested[n, n_tests]
-                reach -= problem.risk.failure_cost * math.expm1(-least)
+                for k in range(len(problem.risk.failure_costs)):
+                    least = problem.risk.safest[other, k] - tested[n, n_tests + k]
+                    reach -= problem.risk.failure_costs[k] * math.expm1(-least)
             if reach < np.inf:
                 _fill(labels[n], other, n_bounds + 1, label, m)
                 cost[n, 0] = total

@@ -65,7 +65,7 @@ def _of_draw(case: Case, dynamics: Dynamics) -> Path | None:
         if len(dynamics.views) == 1:  # the least of several views is no sum of weights
             return max(_best_sums(case, dynamics), key=score)
         nothing = np.zeros((0, len(admissible.steps), admissible.passable.size))
-        risk = RiskTable(nothing, np.zeros(0), 0, 0.0)
+        risk = RiskTable(nothing, np.zeros(0), 0, np.zeros(0), nothing[:0])
     feasible = feasible_paths(case, dynamics, risk)
     cost = [risk.cost(risk.along(path, admissible.passable.shape)) for path in feasible]
     scores = [score(path) for path in feasible]

@@ -12,7 +12,7 @@ from trustbo.hazard.risk import Risk
 from trustbo.planning.dynamics import Dynamics
 from trustbo.planning.objectives import Objective
 from trustbo.planning.problem import PlanningProblem
-from trustbo.planning.risk import InfeasibleError, RiskRule, RiskTable
+from trustbo.planning.risk import InfeasibleError, RiskRule
 from trustbo.planning.search.case import Case
 from trustbo.planning.search.compiled import expected_path, plan_compiled, safest_path
 from trustbo.planning.search.graph import Best
@@ -45,12 +45,11 @@ def _feasible[T](problem: PlanningProblem, case: Case, search: Callable[[Case], 
     if (best := search(case._replace(risk=risk))) is not None:
         return best
     assert risk is not None and problem.risk is not None  # noqa: S101, PT018
-    path, limit = safest_path(problem.paths, problem.objective.name, risk.of_bounds[0])
+    path, limit = safest_path(problem.paths, problem.objective.name, risk.at_mean)
     if problem.rule.infeasible == "refuse":
         raise _infeasible(problem.rule, problem.risk, path)
     # The best of those that are as safe, as rounding tells them apart.
-    limits = np.array([limit + 1e-12 * max(1.0, limit)])
-    safest = RiskTable(risk.of_bounds[:1], limits, 1, risk.failure_cost)
+    safest = risk.within(limit + 1e-12 * max(1.0, limit))
     best = search(case._replace(risk=safest))
     assert best is not None  # noqa: S101
     return best

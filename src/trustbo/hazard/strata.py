@@ -1,0 +1,54 @@
+"""Strata: the posterior of the chances to fail as a mixture of few, for the price of a failure.
+
+Bounds fail together where they share an uncertain slope limit. Given the hyperparameters their
+chances are independent, so that a path fails with the chance
+
+    E[1 - prod_k (1 - p_k)] = mean over draws of 1 - prod_k (1 - E[p_k | draw]).
+
+Strata are groups of draws, from mild to severe, each taken for one draw with the mean chances of
+its members: a sum over few of them, which a search can carry.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+MOST = 5
+"""Number of strata: labels of the path search carry a sum for each."""
+_SOME = 2000  # values that a partition looks at, which takes the square of their number
+
+
+class Strata(NamedTuple):
+    """Chances to fail under each of some groups of draws."""
+
+    p_fail: np.ndarray
+    """Mean chance of each bound, (stratum, move, row, col), NaN where there is no bound."""
+    shares: np.ndarray
+    """Share of the draws, (stratum,); they add up to 1."""
+
+
+def partition(values: np.ndarray, n: int) -> np.ndarray:
+    """Ends of at most `n` groups of sorted values (value,) with the least squares within groups.
+
+    The optimal partition in one dimension, by dynamic programming (Fisher 1958). Group k is
+    values[ends[k - 1] : ends[k]]; quantiles instead would mix a severe tail of few draws with mild
+    ones. Of more than 2000 values, every second, third and so on is looked at.
+    """
+    step = 1 + (len(values) - 1) // _SOME
+    n_values, values = len(values), values[::step]
+    size = len(values)
+    total, squares = (np.concatenate([[0.0], np.cumsum(v)]) for v in (values, values**2))
+    first, last = np.meshgrid(np.arange(size + 1), np.arange(size + 1), indexing="ij")
+    count = np.maximum(last - first, 1)
+    within = squares[last] - squares[first] - (total[last] - total[first]) ** 2 / count
+    within[first >= last] = np.inf
+    # least[j]: of values[:j] in the groups so far; cut[k, j]: where the last of them begins.
+    least, cuts = within[0], []
+    for _ in range(min(n, len(np.unique(values))) - 1):
+        with_one_more = least[:, None] + within
+        cuts.append(with_one_more.argmin(0))
+        least = with_one_more.min(0)
+    ends = [size]
+    for cut in reversed(cuts):
+        ends.append(int(cut[ends[-1]]))
+    return np.minimum(step * np.array(ends[::-1]), n_values)

@@ -1,0 +1,78 @@
+"""Strata of a posterior: optimal groups, and the chance that a path fails under them."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+import trustbo as tb
+from trustbo.hazard import fit_hazard
+from trustbo.hazard.exposures import LostMission
+from trustbo.hazard.risk import BoundRisk
+from trustbo.hazard.strata import partition
+
+
+def squares(values, ends):
+    groups = np.split(values, ends[:-1])
+    return sum(((group - group.mean()) ** 2).sum() for group in groups)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 5])
+def test_partition_has_the_least_squares_of_all_partitions(n):
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        values = np.sort(rng.lognormal(0.0, 1.5, 11))
+        ends = partition(values, n)
+        assert len(ends) == n
+        assert ends[-1] == 11
+        cuts = itertools.combinations(range(1, 11), n - 1)
+        least = min(squares(values, [*cut, 11]) for cut in cuts)
+        np.testing.assert_allclose(squares(values, ends), least, rtol=1e-9, atol=1e-12)
+
+
+def test_partition_of_many_values_is_nearly_the_best(monkeypatch):
+    values = np.sort(np.random.default_rng(0).lognormal(0.0, 1.5, 601))
+    least = squares(values, partition(values, 4))
+    monkeypatch.setattr("trustbo.hazard.strata._SOME", 200)
+    ends = partition(values, 4)
+    assert ends[-1] == 601
+    assert least < squares(values, ends) < 1.5 * least
+
+
+def test_partition_of_equal_values_is_one_group():
+    assert partition(np.full(7, 0.3), 5).tolist() == [7]
+
+
+@pytest.fixture(scope="module")
+def risk():
+    """Risk of steep ground after a failure, and a path over it."""
+    robot = tb.Robot(max_slope=np.deg2rad(11.0))
+    terrain = tb.terrain.synthetic_terrain((150.0, 150.0), resolution=2.0, seed=3, relief=8.0)
+    team = tb.Team(robots=(robot,), lead=robot)
+    workspace = tb.Workspace.from_terrain(terrain, (5, 5), team, bounds=False)
+    path = [(4, 0), (3, 1), (2, 2), (1, 3), (0, 4)]
+    lost = [LostMission(((4, 0), (3, 0), (2, 0)), "tipped")]
+    return BoundRisk.of(fit_hazard([], workspace, lost=lost), workspace), path
+
+
+def test_mean_over_strata_is_that_over_all_draws(risk):
+    risk, _ = risk
+    strata = risk.strata()
+    assert len(strata.shares) == 5
+    np.testing.assert_allclose(strata.shares.sum(), 1.0, rtol=1e-12)
+    mean = np.tensordot(strata.shares, strata.p_fail, 1)
+    np.testing.assert_allclose(mean, risk.mean, rtol=1e-9)
+    severity = np.nanmean(strata.p_fail.reshape(5, -1), axis=1)
+    assert (np.diff(severity) > 0.0).all()
+
+
+def test_few_strata_have_the_chance_to_fail_that_all_draws_have(risk):
+    """Against 10 000 draws of the chances themselves; the product of means is far above."""
+    risk, path = risk
+    planner_risks = [tb.hazard.risk.Risk(risk.mean, strata=risk.strata(n)) for n in (1, 5)]
+    product, five = (of_path.priced(path) for of_path in planner_risks)
+    rows, cols = np.array(path[1:]).T
+    drawn = 1.0 - np.prod(1.0 - risk.draw(10_000, seed=1)[:, 2, rows, cols], axis=1)
+    assert abs(five - drawn.mean()) < 0.02
+    assert product > drawn.mean() + 0.04
+    np.testing.assert_allclose(product, 1.0 - planner_risks[0].survival(path), rtol=1e-9)
