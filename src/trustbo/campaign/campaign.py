@@ -16,7 +16,7 @@ from trustbo.campaign.checks import require_extra, require_mission, require_reas
 from trustbo.campaign.history import history_of, table_of
 from trustbo.campaign.learning import Learner
 from trustbo.campaign.options import OBJECTIVE, POLICY, SAMPLER, CampaignOptions, arguments_of
-from trustbo.campaign.planners import believed_of, planner_given, planner_of
+from trustbo.campaign.planners import believed_of, planner_given, planner_of, unpriced_risk
 from trustbo.campaign.posteriors import Posterior, Posteriors, whole_posterior
 from trustbo.campaign.replacing import STATE
 from trustbo.campaign.result import Result
@@ -113,6 +113,7 @@ class Campaign(Displayed):
         self.storage: Storage | None = None
         self._planner_now: Planner | None = None
         self._whole: tuple[Posterior, xr.DataTree] | None = None
+        self._warned_of_risk = False
         self._asked = (0.0, 0.0)  # seconds that planning took, and the time when it was done
         name = getattr(policy, "__name__", type(policy).__name__)
         record = {
@@ -231,6 +232,9 @@ class Campaign(Displayed):
                 "it, or none was found.",
                 stacklevel=4,
             )
+        if not self._warned_of_risk and (warning := unpriced_risk(self.options, self.risk, given)):
+            self._warned_of_risk = True
+            warnings.warn(warning, stacklevel=4)
         self.state.suggested = accepted = plan.with_draws(given)
         if self.storage is not None:
             self.storage.write(self.state, None)

@@ -9,7 +9,7 @@ from trustbo.campaign.learning import Learner
 from trustbo.campaign.options import PLANNING_OPTIONS, CampaignOptions
 from trustbo.campaign.state import CampaignState
 from trustbo.hazard.risk import BoundRisk
-from trustbo.planning import Planner
+from trustbo.planning import Plan, Planner
 from trustbo.workspace import Workspace
 from trustbo.workspace.location import Location
 
@@ -18,6 +18,8 @@ _N_MAPS = 500
 """Draws of the awareness that plans are made with; the first `_N_DRAWS` are in the result."""
 _STOPPED, _RECOVERED = 2, 0.2
 """Number of failures that makes a bound avoided, and the failure chance below which it is not."""
+_ARRIVES = 0.9
+"""Chance to arrive of a plan below which a campaign without a price of failures warns."""
 
 
 def planner_of(
@@ -70,6 +72,18 @@ def under_risk(planner: Planner, risk: BoundRisk) -> Planner:
         planner = planner.with_failure_cost(0.0)
     strata = risk.strata() if planner.problem.failure_cost > 0.0 else None
     return planner.with_risk(risk.mean, risk.draw(_N_DRAWS), risk.causes, strata)
+
+
+def unpriced_risk(options: CampaignOptions, risk: BoundRisk, plan: Plan) -> str:
+    """Warning of a plan that may well fail although a failure costs nothing in it; else empty."""
+    limited = options.max_failure is not None or options.failure_cost is not None
+    if limited or risk.has_failures or plan.p_arrive is None or plan.p_arrive >= _ARRIVES:
+        return ""
+    return (
+        f"the plan arrives with a chance of {plan.p_arrive:.2f} only, and a failure costs nothing "
+        "in it as none was recorded yet; set max_failure or failure_cost, or lower max_slope of "
+        "the team's robots."
+    )
 
 
 def to_avoid(risk: BoundRisk) -> np.ndarray:
