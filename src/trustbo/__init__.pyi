@@ -18,6 +18,7 @@ from . import (
 from .campaign import (
     Campaign,
     CampaignOptions,
+    Follower,
     RegretBound,
     Result,
     TimeLimit,
@@ -38,6 +39,7 @@ __all__ = [
     "Campaign",
     "CampaignOptions",
     "DamagedFileError",
+    "Follower",
     "Mission",
     "NoPathError",
     "PosteriorError",

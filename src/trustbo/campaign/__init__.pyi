@@ -1,4 +1,5 @@
 from .campaign import Campaign
+from .follow import Follower
 from .loop import iterate, resume
 from .options import CampaignOptions
 from .result import Result
@@ -8,6 +9,7 @@ from .storage import load_result
 __all__ = [
     "Campaign",
     "CampaignOptions",
+    "Follower",
     "RegretBound",
     "Result",
     "TimeLimit",

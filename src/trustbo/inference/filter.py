@@ -320,7 +320,7 @@ class TrustFilter:
     def _commit(self, z: np.ndarray, effect: Effect, rates: Rates) -> None:
         predicted = self._mean, self._var, z, rates, effect
         self._mean, self._var, increment = self._core.update(*predicted)
-        self._log_weight += increment
+        self._log_weight = self._log_weight + increment  # a copy of the filter keeps its own
         self.weights = _normalised(self._log_weight)
         self.n_bounds, self._behind = self.n_bounds + 1, (z, effect)
 

@@ -1,0 +1,80 @@
+"""ROS 2 node that follows the missions of a campaign, and tells each to the campaign.
+
+It needs ROS 2 (rclpy, std_msgs) and trustbo in the same Python. Begin a campaign with a folder,
+`trustbo.Campaign(workspace, start, goal, directory="out/field")`, then start the node:
+
+    python3 ros2_node.py --ros-args -p folder:=out/field
+
+It subscribes to topics that `trustbo.logs.read_bag` reads from bags too:
+
+    /<robot>/contact  std_msgs/Bool    whether the robot has contact with the lead, at each tick
+    /mission/bound    std_msgs/String  {"bound": 2, "cell": [8, 1]} as bound 2 begins
+    /mission/status   std_msgs/String  ok, stuck, ... as a bound ends
+
+and publishes, after each of these messages:
+
+    /mission/trust    std_msgs/Float64MultiArray  mean of the trust of each robot, then its sd
+    /mission/path     std_msgs/String             cells of the mission as JSON
+"""
+
+import json
+
+import numpy as np
+
+import trustbo as tb
+
+
+def take(follower, robots, topic, data, t):
+    """Give a message to a follower; True if the mission is over.
+
+    The topic is "bound", "status", or a robot's name, of its contact. Contact between two bounds
+    is ignored. A bound that still runs when the next one begins is over, with status ok.
+    """
+    if topic == "bound":
+        marker = json.loads(data)
+        if follower.running:
+            follower.end(t)
+        if marker["bound"] > 0:  # bound 0 is the start
+            follower.begin(t, marker.get("cell"))
+    elif topic == "status":
+        follower.end(t, data)
+        return data != "ok" or len(follower.rest) == 1
+    elif follower.running:
+        follower.tick(t, np.where(np.array(robots) == topic, float(data), np.nan))
+    return False
+
+
+def main():
+    """Follow one mission after the other until the node is stopped."""
+    import rclpy
+    from std_msgs.msg import Bool, Float64MultiArray, String
+
+    rclpy.init()
+    node = rclpy.create_node("trustbo")
+    campaign = tb.Campaign.load(node.declare_parameter("folder", "out/field").value)
+    follower, robots = tb.Follower(campaign), campaign.workspace.team.names
+    trust = node.create_publisher(Float64MultiArray, "/mission/trust", 10)
+    path = node.create_publisher(String, "/mission/path", 10)
+
+    def on(topic, message):
+        nonlocal follower
+        t = node.get_clock().now().nanoseconds / 1e9
+        try:
+            if take(follower, robots, topic, message.data, t):
+                campaign.tell(follower.to_mission(), other_path=True)  # may take seconds
+                follower = tb.Follower(campaign)
+        except (tb.TrustboError, ValueError, KeyError) as error:
+            node.get_logger().warning(f"{topic}: {error}")
+        trust.publish(Float64MultiArray(data=[float(x) for x in np.ravel(follower.trust)]))
+        path.publish(String(data=json.dumps(follower.path)))
+
+    for name, kind in (("bound", String), ("status", String)):
+        node.create_subscription(kind, f"/mission/{name}", lambda m, n=name: on(n, m), 10)
+    for name in robots:
+        node.create_subscription(Bool, f"/{name}/contact", lambda m, n=name: on(n, m), 10)
+    with campaign:
+        rclpy.spin(node)
+
+
+if __name__ == "__main__":
+    main()

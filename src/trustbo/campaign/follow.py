@@ -1,0 +1,171 @@
+"""Trust of each robot while a mission is driven, and the mission that comes of it."""
+
+from collections.abc import Sequence
+from copy import copy
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from trustbo.arrays import as_array
+from trustbo.campaign.campaign import Campaign
+from trustbo.data import Bound, Cell, Mission
+from trustbo.errors import TrustboError, require_cells, require_pair
+from trustbo.inference import TrustFilter, sample_prior
+from trustbo.inference.filter import TrustForecast, TrustState
+
+
+class Follower:
+    """Follows a mission of a campaign bound by bound and tick by tick.
+
+    Each bound is begun, gets its ticks and is ended; after the last one `to_mission` gives the
+    mission for `Campaign.tell`. Times are in seconds, of any one clock. Trust is that of a
+    `TrustFilter` of the campaign's last posterior, or of its prior before there is one. Awareness
+    is that of the campaign, `Campaign.known_along`.
+
+    Attributes:
+        path: Cells of the mission, start first: those entered, then those planned.
+        bounds: Bounds that have ended.
+        trust: Trust now, shapes (robot,); while a bound runs, the trust if it ended now.
+        running: Whether a bound runs.
+    """
+
+    def __init__(self, campaign: Campaign, path: Sequence[Cell] | None = None) -> None:
+        """Start before the first bound.
+
+        Args:
+            campaign: Campaign whose mission is followed.
+            path: Planned cells, start first; by default those of `campaign.ask()`.
+
+        Raises:
+            TrustboError: Cells that are off the grid, or no neighbours of each other.
+        """
+        cells = campaign.ask().path if path is None else path
+        self.path: tuple[Cell, ...] = tuple(require_cells("path", cells))
+        campaign.known_along(self.path)  # refuses a path that cannot be
+        self._campaign, self._goal = campaign, self.path[-1]
+        self._n_robots = campaign.workspace.team.n_robots
+        self._filter = _filter_of(campaign)
+        self.bounds: tuple[Bound, ...] = ()
+        self.trust: TrustState = self._filter.state
+        self._started = self._begun = self._now = -np.inf  # of the mission, the bound, and now
+        self.running = False
+        self._counts = np.zeros((2, self._n_robots))  # ticks with contact, and ticks
+
+    @property
+    def rest(self) -> tuple[Cell, ...]:
+        """Cell where the lead is, or that it is entering, and the planned cells after it."""
+        return self.path[len(self.bounds) + self.running :]
+
+    def begin(self, t: float, cell: Cell | None = None) -> None:
+        """Begin the next bound at time `t`, into the planned cell or another one.
+
+        After another one no cell is planned, and each bound needs its cell.
+
+        Raises:
+            TrustboError: A bound runs, the mission is over, no cell is planned, the cell is no
+                neighbour, or the time is before the last one.
+        """
+        self._require(running=False, t=t)
+        if self.bounds and self.bounds[-1].status != "ok":
+            raise TrustboError(f"the mission is over: {self.bounds[-1].status}.")
+        here, planned = self.rest[0], self.rest[1:2]
+        if cell is None and not planned:
+            raise TrustboError(f"no cell is planned after {here}; give the cell of the bound.")
+        cell = planned[0] if cell is None else require_pair("cell", cell)
+        self._filter.begin_bound(self._campaign.known_along((here, cell))[0], (here, cell))
+        if planned != (cell,):
+            self.path = (*self.path[: len(self.bounds) + 1], cell)
+        self._started = self._started if self.bounds else t
+        self._begun = self._now = t
+        self.running, self._counts = True, np.zeros((2, self._n_robots))
+        self.trust = self._filter.update_ticks(*self._counts)  # as predicted
+
+    def tick(self, t: float, in_contact: ArrayLike) -> None:
+        """Add a tick to the bound that runs.
+
+        Args:
+            t: Time, s.
+            in_contact: Whether each robot has contact with the lead, shape (robot,); NaN where it
+                was not measured.
+
+        Raises:
+            ShapeError: Another number of robots.
+            TrustboError: No bound runs, a value other than 0, 1 and NaN, or a time before the last.
+        """
+        self._require(running=True, t=t)
+        seen = as_array("in_contact", in_contact)
+        measured = ~np.isnan(seen)
+        if not np.isin(seen[measured], (0.0, 1.0)).all():
+            raise TrustboError(f"in_contact must be 0, 1 or NaN for each robot; got {seen}.")
+        self.trust = self._filter.update_tick(seen)
+        self._counts += np.nan_to_num(seen), measured
+        self._now = t
+
+    def end(self, t: float, status: str = "ok") -> None:
+        """End the bound that runs; a status other than `"ok"` ends the mission.
+
+        Raises:
+            TrustboError: No bound runs, an unknown status, or a bound that takes no time.
+        """
+        self._require(running=True, t=t)
+        contacts, ticks = self._counts
+        n_ticks = np.where(ticks > 0.0, ticks, np.nan)
+        unknown = np.full((self._n_robots, len(self._campaign.workspace.features)), np.nan)
+        seconds = np.full(self._n_robots, t - self._begun)
+        since = self._begun - self._started
+        bound = Bound(
+            self.rest[0], unknown, contacts / n_ticks, seconds, status, since, n_ticks=n_ticks
+        )
+        self.trust = self._filter.end_bound()
+        self.running, self._now = False, t
+        self.bounds = (*self.bounds, bound)
+
+    def ahead(self) -> TrustForecast:
+        """Predict trust and contact rates in the bounds of `rest`, shapes (bound, robot).
+
+        The bound that runs counts as if it ended now.
+
+        Raises:
+            TrustboError: No bound is planned.
+        """
+        if len(self.rest) < 2:
+            raise TrustboError(f"no cell is planned after {self.rest[0]}.")
+        after = copy(self._filter)  # which replaces its arrays, and changes none of them
+        if self.running:
+            after.end_bound()
+        return after.predict(self._campaign.known_along(self.rest), self.rest)
+
+    def to_mission(self) -> Mission:
+        """Mission of the bounds that have ended, with awareness that is not measured (NaN).
+
+        Its status is that of the last bound; `"aborted"` if that is `"ok"` and not at the goal.
+
+        Raises:
+            TrustboError: A bound runs, or none was run; use `Campaign.fail` for that.
+        """
+        if self.running or not self.bounds:
+            state = "a bound runs: end it first" if self.running else "no bound was run"
+            raise TrustboError(f"there is no mission yet: {state}.")
+        status, workspace = self.bounds[-1].status, self._campaign.workspace
+        if status == "ok" and self.rest != (self._goal,):
+            status = "aborted"
+        return Mission(self.path, self.bounds, status, workspace.features, workspace.team.names)
+
+    def _require(self, *, running: bool, t: float) -> None:
+        """Refuse what needs another state, or a time before the last one: TrustboError."""
+        if running != self.running:
+            raise TrustboError(
+                "no bound runs: begin one first." if running else "a bound runs: end it first."
+            )
+        if not self._now <= t < np.inf:
+            raise TrustboError(f"t = {t} s must be finite, and not before {self._now} s.")
+
+
+def _filter_of(campaign: Campaign) -> TrustFilter:
+    """Filter of the last posterior of a campaign, or of the prior if nothing was learned yet."""
+    if (posterior := campaign.state.last_tree) is not None:
+        return TrustFilter(posterior)
+    names, n_robots = campaign.workspace.features, campaign.workspace.team.n_robots
+    model = campaign.model.observing("gaussian").for_features(names)
+    draws = sample_prior(model, len(names), 1000, campaign.seed_of("prior"), n_robots=n_robots)
+    return TrustFilter(draws, n_robots, response=model.response, observation=model.observation)
