@@ -53,7 +53,6 @@ NAMESPACES = (
     "trustbo.plots",
     "trustbo.export",
     "trustbo.report",
-    "trustbo.live",
 )
 BLOCK = re.compile(r"^```python\n(.*?)^```(?:\n+```text\n(.*?)^```)?", flags=re.S | re.M)
 """An example, and what the page says that it prints, if it does."""

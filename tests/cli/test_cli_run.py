@@ -11,8 +11,6 @@ import xarray as xr
 from rasterio.errors import NotGeoreferencedWarning
 
 import trustbo as tb
-from trustbo import files
-from trustbo.report import page
 
 
 def test_run_writes_every_file_and_says_where(finished):
@@ -53,25 +51,6 @@ def test_run_s_files_say_the_same(finished):
     line = json.loads((out / "path.geojson").read_text())["features"][0]
     assert len(line["geometry"]["coordinates"]) == len(record["path"])
     assert "after 2 missions" in (out / "report.html").read_text()
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("blank_figures")
-def test_a_page_that_became_the_report_is_not_written_again(invoke, flags, tmp_path, monkeypatch):
-    written = []
-
-    def write_text(path, text):
-        written.append(path.name)
-        files.write_text(path, text)
-
-    monkeypatch.setattr(page, "write_text", write_text)
-    short = ("--iterations", 1, "--quiet", "--page", "--out", tmp_path)
-    for words, n_reports in ((("run", *flags, *short), 1), (("resume", tmp_path, "--page"), 2)):
-        done = invoke(*words)
-        assert done.exit_code == 0, done.output
-        assert written == ["report.html"] * n_reports
-    assert invoke("resume", tmp_path, "--quiet").exit_code == 0
-    assert written == ["report.html"] * 3  # drawn again, as nothing else has
 
 
 @pytest.mark.usefixtures("blank_figures")

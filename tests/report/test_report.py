@@ -15,7 +15,7 @@ import trustbo as tb
 from trustbo.hazard.risk import PathRisk
 from trustbo.models import CoupledTrust, TrustParams
 from trustbo.models.params import CoupledParams
-from trustbo.report import LivePage, live, write_report
+from trustbo.report import write_report
 from trustbo.report.numbers import decimals_for, number
 from trustbo.report.summary import _arrival, facts_of
 from trustbo.report.tables import parameter_table
@@ -325,87 +325,6 @@ def test_numbers_have_the_digits_they_are_sure_of():
 
 def read(text):
     return float(text.replace("\N{MINUS SIGN}", "-"))
-
-
-def test_a_page_follows_a_campaign_and_becomes_its_report(result, tmp_path, monkeypatch):
-    file, pages = tmp_path / "kept" / "report.html", []
-    write_text = live.write_text
-
-    def keep(path, text):
-        pages.append(text)
-        write_text(path, text)
-
-    monkeypatch.setattr(live, "write_text", keep)
-    monkeypatch.setattr(live, "write_report", lambda path, _: path.write_text("the report"))
-    settings = {"n_iterations": 2, "sampler": "exact", "progress": "page"}
-    with pytest.raises(tb.TrustboError, match=r'progress="page" writes report.html into the check'):
-        tb.iterate(result.workspace, (2, 0), (0, 2), **settings)
-    tb.iterate(result.workspace, (2, 0), (0, 2), checkpoint=file.parent, seed=1, **settings)
-    assert [re.findall(r"as of mission (\d) of 2, at \d\d:\d\d", page) for page in pages] == [
-        ["0"], ["1"], ["2"],
-    ]  # fmt: skip
-    for page in map(Page, pages):
-        assert ("meta", {"http-equiv": "refresh", "content": "5"}) in page.tags
-    assert len(Page(pages[-1]).tables[0]) == 3  # of two missions
-    assert "Figure 2." in pages[-1]
-    assert file.read_text() == "the report"
-
-
-@pytest.mark.parametrize("progress", ["bar", pytest.param(False, marks=pytest.mark.slow)])
-def test_the_page_of_a_run_that_was_killed_says_so_and_resume_takes_it_over(
-    progress, result, tmp_path, monkeypatch
-):
-    file, pages = tmp_path / "report.html", []
-
-    class Killed(BaseException):
-        """Ends the run as SIGKILL does: nothing is written after it."""
-
-    def kill(campaign, mission):
-        monkeypatch.setattr(live, "write_text", lambda path, text: None)
-        raise Killed
-
-    ends = ((2, 0), (0, 2))
-    monkeypatch.setattr(live, "write_report", lambda path, _: path.write_text("the report"))
-    with pytest.raises(Killed):
-        tb.iterate(
-            result.workspace, *ends, n_iterations=2, sampler="exact", progress="page_alone",
-            checkpoint=tmp_path, callbacks=[kill],
-        )  # fmt: skip
-    text = " ".join(Page(file.read_text()).text)
-    assert re.search(r"Under way: as of mission 1 of 2, at \d\d:\d\d on \d\d \w+ \d{4}", text)
-    assert re.search(r"the last took \d+ s\. If its time is long ago, the run has died", text)
-    monkeypatch.setattr(live, "write_text", lambda path, text: pages.append(text))
-    tb.resume(tmp_path, progress=progress, callbacks=[lambda campaign, mission: None])
-    assert [re.findall(r"as of mission (\d) of 2", page) for page in pages] == [["1"], ["2"]]
-    assert file.read_text() == "the report"
-    assert tb.resume(tmp_path, progress=progress).stop_reason == "n_iterations"
-    assert len(pages) == 2  # of a campaign that ended, a page is made where it is asked for
-
-
-def test_a_page_alone_prints_nothing(result, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(live, "write_report", lambda path, _: path.write_text("the report"))
-    given = {"n_iterations": 1, "sampler": "exact", "checkpoint": tmp_path}
-    tb.iterate(result.workspace, (2, 0), (0, 2), progress="page_alone", **given)
-    assert capsys.readouterr() == ("", "")
-    assert (tmp_path / "report.html").read_text() == "the report"
-    tb.iterate(result.workspace, (2, 0), (0, 2), progress="page", **given)
-    assert capsys.readouterr().err.count("follow the campaign at file://") == 1
-
-
-def test_the_last_page_of_a_campaign_that_broke_is_readable_and_at_rest(result, tmp_path):
-    def broken(campaign, mission):
-        raise RuntimeError("out of battery")
-
-    def follow():
-        with LivePage(tmp_path / "page.html", 4) as page:
-            options = {"callbacks": [page, broken], "sampler": "exact", "progress": False}
-            tb.iterate(result.workspace, (2, 0), (0, 2), n_iterations=4, **options)
-
-    with pytest.raises(RuntimeError, match="out of battery"):
-        follow()
-    text = (tmp_path / "page.html").read_text()
-    assert "It was interrupted: as of mission 1 of 4, at " in text
-    assert "refresh" not in text
 
 
 def test_evidence_of_the_exact_sampler_is_k_hat_on_card_and_page(result, page):

@@ -6,11 +6,10 @@ from typing import Any
 from trustbo.campaign.campaign import Campaign
 from trustbo.campaign.migrate import migrate_notes
 from trustbo.campaign.options import OBJECTIVE, POLICY, SAMPLER, CampaignOptions
-from trustbo.campaign.progress import PAGE, PAGE_ALONE, continued
 from trustbo.campaign.result import Result
 from trustbo.campaign.stopping import Stop, require_stops, rules_of
 from trustbo.errors import TrustboError, require_whole
-from trustbo.files import FilePath, as_path, to_json
+from trustbo.files import FilePath, to_json
 from trustbo.models.model import TrustModel
 from trustbo.planning import Policy
 from trustbo.simulation import Truth
@@ -61,8 +60,7 @@ def iterate(
             If the process dies, `resume` goes on from it.
         seed: Seed of everything random.
         progress: Whether to show a progress bar, and in a notebook a map that follows the
-            missions; `"bar"` for the bar alone; `"page"` for report.html in the campaign's folder
-            too, a page that reloads itself while the campaign runs; `"page_alone"` for it alone.
+            missions; `"bar"` for the bar alone.
         **options: Fields of `CampaignOptions`, or a whole one as `options`.
 
     Returns:
@@ -73,10 +71,6 @@ def iterate(
         NoPathError: The goal cannot be reached.
     """
     n_iterations = require_whole("n_iterations", n_iterations, 1)
-    if progress in (PAGE, PAGE_ALONE) and checkpoint is None:
-        raise TrustboError(
-            f'progress="{progress}" writes report.html into the checkpoint; give one.'
-        )
     campaign = Campaign(
         workspace, start, goal, model=model, policy=policy, objective=objective, sampler=sampler,
         seed=seed, options=CampaignOptions.from_keywords(options, iterate),
@@ -115,8 +109,7 @@ def resume(
         model: The same model; see `Campaign.load`.
         policy: The same policy; see `Campaign.load`.
         stop: Rules that replace those it was started with; required if one of them was custom.
-        progress: Progress to show, as in `iterate`; an unfinished page in the folder is always
-            continued.
+        progress: Progress to show, as in `iterate`.
         **custom: The same `awareness` and `callbacks`; see `Campaign.load`.
 
     Raises:
@@ -132,8 +125,7 @@ def resume(
             return campaign.result()
         rules = rules_of(state.notes.get("stop", [])) if stop is None else require_stops(stop)
         before = dict(state.notes)
-        shown = continued(progress, as_path(directory))
-        steps = campaign.run(simulator, total, truth=truth, stop=rules, progress=shown)
+        steps = campaign.run(simulator, total, truth=truth, stop=rules, progress=progress)
         _require_same(before, state.notes)
         state.stop_reason = "interrupted"
         for _ in steps:

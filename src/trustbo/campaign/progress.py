@@ -1,50 +1,33 @@
 """Progress of a campaign: a bar in a terminal, lines in a file, a bar and a map in a notebook."""
 
 import logging
-from importlib import import_module
-from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 from trustbo.campaign.state import LEARNED
 from trustbo.display.bars import FILE, NOTEBOOK, bar_in, place_of, say
 from trustbo.display.compiling import compiling
-from trustbo.errors import TrustboError, require_choice
+from trustbo.errors import require_choice
 
 if TYPE_CHECKING:
     from trustbo.campaign.campaign import Campaign
 
 _log = logging.getLogger(__name__)
-PAGE, PAGE_ALONE = "page", "page_alone"
-_KINDS = ("bar", PAGE, PAGE_ALONE)
-_PAGE_NAME = "report.html"
-_NOT_ENDED = b'<meta name="trustbo-campaign" content="not ended">'
-"""Line in the head of the page of a campaign that did not end."""
 
 
 class Progress:
     """Shows the missions of a campaign while they are run.
 
-    See `iterate` for `progress`. The campaign that a notebook shows is gone at the end; the page in
-    the campaign's folder becomes the report.
+    See `iterate` for `progress`. The campaign that a notebook shows is gone at the end.
     """
 
     def __init__(self, campaign: "Campaign", total: int, progress: bool | str) -> None:
         """Show nothing yet, and nothing at all if `progress` is False."""
         if isinstance(progress, str):
-            require_choice("progress", progress, _KINDS)
+            require_choice("progress", progress, ("bar",))
         self._campaign, self._total = campaign, total
-        self._place = place_of(bool(progress) and progress != PAGE_ALONE)
+        self._place = place_of(bool(progress))
         self._map: Any = None
-        self._page: Any = None
-        if progress in (PAGE, PAGE_ALONE):
-            live = import_module("trustbo.report.live")  # by name: it lies above
-            if campaign.storage is None:
-                raise TrustboError(
-                    "a page is report.html in the campaign's folder; give directory=, or "
-                    "checkpoint= to iterate."
-                )
-            self._page = live.LivePage(campaign.storage.path / _PAGE_NAME, total)
         if self._place == NOTEBOOK and progress is True:
             from IPython.display import display
 
@@ -54,12 +37,6 @@ class Progress:
         done = len(self._campaign.missions)
         learner = self._campaign.learner
         self._before, learner.progress = learner.progress, bool(self._place)
-        if self._page is not None:
-            if done:
-                self._page(self._campaign)
-            else:
-                self._page.__enter__()
-            say(self._place, f"follow the campaign at {self._page.path.resolve().as_uri()}")
         self._bar = bar_in(self._place, total=self._total, initial=done, desc="missions")
         self._compiling = compiling(self._bar)
         self._compiling.__enter__()
@@ -76,10 +53,6 @@ class Progress:
         self._campaign.learner.progress = self._before
         if self._map is not None and kind is None:  # the result is what a cell shows afterwards
             self._map.update({"text/plain": "", "text/html": ""}, raw=True)
-        if self._page is not None:
-            self._page.__exit__(kind, error, traceback)
-            if kind is None:
-                self._page.finish(self._campaign.result())
 
     def step(self) -> None:
         """Show the last mission."""
@@ -91,18 +64,6 @@ class Progress:
             say(FILE, f"mission {number}/{self._total}: {report}")
         if self._map is not None:
             self._map.update(self._campaign)
-        if self._page is not None:
-            self._page(self._campaign)
-
-
-def continued(progress: bool | str, folder: Path) -> bool | str:
-    """Progress of a campaign that goes on, with its page, if the run before left one not ended."""
-    page = folder / _PAGE_NAME
-    if progress not in (PAGE, PAGE_ALONE) and page.is_file():
-        with page.open("rb") as file:
-            if _NOT_ENDED in file.read(2000):
-                return PAGE if progress else PAGE_ALONE
-    return progress
 
 
 def report_of(campaign: "Campaign") -> str:

@@ -1,4 +1,4 @@
-"""The command line: `trustbo demo`, `run`, `resume`, `live`, `report`, `export`, `study`, ..."""
+"""The command line: `trustbo demo`, `run`, `resume`, `report`, `export`, `study`, ..."""
 
 from trustbo.cli.program import app, main
 

@@ -41,7 +41,6 @@ def run(
     seed: int = 0,
     config: Path | None = None,
     out: Path = Path("out"),
-    page: bool = False,
     overwrite: bool = False,
     quiet: bool = False,
     **options: Any,
@@ -80,9 +79,9 @@ def run(
     result = iterate(
         workspace, *ends, n_iterations=iterations, model=trust_model, policy=policy,
         objective=objective, sampler=sampler, simulator=simulation.KinematicSimulator(workspace),
-        stop=stop, checkpoint=out, seed=seed, progress=_progress(page, quiet), options=chosen,
+        stop=stop, checkpoint=out, seed=seed, progress=not quiet, options=chosen,
     )  # fmt: skip
-    write_outputs(result, out, table=not quiet, report=not page)
+    write_outputs(result, out, table=not quiet)
 
 
 def demo(
@@ -123,7 +122,6 @@ def resume(
     folder: Path,
     iterations: int | None = None,
     stop_regret: float | None = None,
-    page: bool = False,
     quiet: bool = False,
 ) -> None:
     """Go on with a campaign that was interrupted, or with more missions.
@@ -131,8 +129,7 @@ def resume(
     Example: trustbo resume out/demo
     More missions, 12 in all: trustbo resume out/demo --iterations 12
 
-    The result is the same as without the interruption. The folder keeps all flags, and a page of
-    --page is renewed again.
+    The result is the same as without the interruption. The folder keeps all flags.
     A campaign that --stop-regret has ended goes on with another --stop-regret, which is asked
     before anything is driven.
     """
@@ -141,7 +138,6 @@ def resume(
     state = _state(folder)
     require_outputs(folder, overwrite=True)
     from trustbo.campaign.loop import resume as go_on
-    from trustbo.campaign.progress import PAGE, PAGE_ALONE, continued
     from trustbo.campaign.stopping import RegretBound
 
     stop = None if stop_regret is None else RegretBound(eps=stop_regret)
@@ -153,18 +149,14 @@ def resume(
             f"{done} done; for more, give --iterations. Figures and report are drawn again.",
             flush=True,
         )
-    progress = continued(_progress(page, quiet), folder)
     result = go_on(
         folder,
         simulator=_simulator(folder, state["notes"]),
         n_iterations=iterations,
         stop=stop,
-        progress=progress,
+        progress=not quiet,
     )
-    # A campaign that its rule had ended need not have gone on, and then made no page.
-    went_on = state["stop_reason"] in ("interrupted", "n_iterations")
-    made = went_on and progress in (PAGE, PAGE_ALONE)
-    write_outputs(result, folder, table=not quiet, report=not made)
+    write_outputs(result, folder, table=not quiet)
 
 
 def _require_flags(iterations: int, seed: int, **names: str) -> None:
@@ -173,13 +165,6 @@ def _require_flags(iterations: int, seed: int, **names: str) -> None:
         require_choice("sight mode" if flag == "sight" else flag, name, choices_of(flag))
     require_whole("n_iterations", iterations, 1)
     require_whole("seed", seed, 0)
-
-
-def _progress(page: bool, quiet: bool) -> bool | str:
-    """Kind of progress that flags ask for, as of `iterate`."""
-    if page:
-        return "page_alone" if quiet else "page"
-    return not quiet
 
 
 def _require_sampling(options: CampaignOptions, model: "TrustModel", sampler: str) -> None:

@@ -72,16 +72,6 @@ Missions
   stop_regret SHARE: Stop when the path is within this share of the best with probability 0.9, e.g.
     0.05.
   seed N: Seed of everything random.
-Field
-  port N: Port of the page; 0 for any that is free.
-  listen ADDRESS: Address to listen at, 0.0.0.0 for all of this machine; by default nobody else
-    reaches it.
-  udp N: Port of datagrams with messages; 0 for any that is free, and none by default.
-  stdin: Take messages from the standard input too.
-  bag FILE: ROS bag to replay; see docs/howto/your-own-robots.md for its topics.
-  rate X: Speed of the replay, 1 that of the bag; 0 for as fast as it is taken.
-  foxglove N: Port of a server for Foxglove, on this machine alone; none by default.
-  keep_path: Keep the path of each mission, whose rest is planned again after each bound otherwise.
 Program
   config FILE: Read flags from a YAML file, e.g. [b]max-slope: 30[/b]; flags given here win.
   out FOLDER: Folder for the results, made if need be; not one that holds a campaign.
@@ -90,7 +80,6 @@ Program
   report.out FILE: File of the page; by default report.html in the folder.
   export.out FOLDER: Folder for the files; by default the result's.
   info.out FILE: Picture of the grid, a .png.
-  page: Keep report.html up to date while the campaign runs; it reloads itself in a browser.
   overwrite: Replace the campaign that the folder holds; other files in it are kept.
   quiet: Show no progress bar and no table.
   debug: Show the whole traceback of an error.
@@ -120,11 +109,8 @@ Arguments
 """Flags by panel: name, placeholder and help; `command.name` where it differs by command."""
 _NAMES = {
     "overwrite": ("--overwrite",),  # without --no-overwrite
-    "page": ("--page",),
-    "keep_path": ("--keep-path",),
     "quick": ("--quick",),
     "quiet": ("--quiet", "-q"),
-    "stdin": ("--stdin",),
     "debug": ("--debug",),
     "formats": ("--format",),
 }

@@ -43,11 +43,11 @@ def require_outputs(out: Path, *others: str, overwrite: bool) -> None:
     require_ours(out, *_FILES)
 
 
-def write_outputs(result: "Result", out: Path, *, table: bool, report: bool = True) -> None:
+def write_outputs(result: "Result", out: Path, *, table: bool) -> None:
     """Write figures, report and maps to the folder `out` of a result, and print their names.
 
-    With `table`, a row for each mission is printed too; `report` is False where the page of the
-    campaign has become its report. TrustboError: the folder's name belongs to a file.
+    With `table`, a row for each mission is printed too. TrustboError: the folder's name belongs to
+    a file.
     """
     use_no_screen()
     from trustbo import plots
@@ -63,8 +63,7 @@ def write_outputs(result: "Result", out: Path, *, table: bool, report: bool = Tr
         from trustbo.export import export_result
 
         written += [file.name for file in export_result(result, out, ("geotiff", "geojson"))]
-    if report:
-        write_report(out / "report.html", result)
+    write_report(out / "report.html", result)
     if table:
         _print_table(result)
     print(f"results are in {out}/: {', '.join(written)},")

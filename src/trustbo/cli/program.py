@@ -10,7 +10,6 @@ from typer.core import TyperCommand, TyperGroup
 
 from trustbo.cli.campaigns import demo, resume, run
 from trustbo.cli.errors import BAD_INPUT, complain
-from trustbo.cli.field import live
 from trustbo.cli.options import with_flags
 from trustbo.cli.results import export, report
 from trustbo.cli.studies import study, worlds
@@ -24,7 +23,6 @@ measured missions are kept; 130 interrupted.
 _UsageError: Any = typer.BadParameter.__mro__[1]  # click's, wherever typer keeps it
 _PANELS = {
     "Campaigns": {demo: "out", info: "", run: "out", resume: "folder"},
-    "Field": {live: ""},
     "Results": {report: "", export: ""},
     "Studies": {study: "", worlds: ""},
 }

@@ -43,20 +43,6 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class Drawing:
-    """Small figure in the colours of the page's text, drawn in milliseconds.
-
-    Attributes:
-        caption: Caption, one sentence.
-        svg: Element of `display.svg`, its texts escaped.
-    """
-
-    caption: str
-    svg: str
-    kind: str = field(default="drawing", init=False)
-
-
-@dataclass(frozen=True)
 class Section:
     """Section of the page.
 
@@ -64,13 +50,13 @@ class Section:
         slug: Anchor of the section.
         title: Heading.
         text: Introduction of one or two sentences, or none.
-        blocks: Tables, pictures and drawings.
+        blocks: Tables and pictures.
     """
 
     slug: str
     title: str
     text: str
-    blocks: Sequence[Table | Picture | Drawing]
+    blocks: Sequence[Table | Picture]
 
 
 @dataclass(frozen=True)

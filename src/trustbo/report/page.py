@@ -57,7 +57,6 @@ def render(
     sections: Sequence[Section],
     *,
     explorer: str | None = None,
-    refresh: int | None = None,
     version: str = VERSIONS["trustbo"],
 ) -> str:
     """Fill the page.
@@ -67,11 +66,9 @@ def render(
         facts: Facts of the summary.
         sections: Sections below it.
         explorer: Name of the interactive page in the same folder; None without one.
-        refresh: Seconds after which the page of a campaign that did not end reloads itself, 0 for
-            never; None for the report of one that did.
         version: Version that made the result.
     """
-    filled = {"facts": facts, "sections": sections, "explorer": explorer, "refresh": refresh}
+    filled = {"facts": facts, "sections": sections, "explorer": explorer}
     return page_of("trustbo.report").render(title=title, version=version, **filled)
 
 
