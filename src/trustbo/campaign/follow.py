@@ -128,12 +128,13 @@ class Follower:
         Raises:
             TrustboError: No bound is planned.
         """
-        if len(self.rest) < 2:
-            raise TrustboError(f"no cell is planned after {self.rest[0]}.")
+        rest = list(self.rest)
+        if len(rest) < 2:
+            raise TrustboError(f"no cell is planned after {rest[0]}.")
         after = copy(self._filter)  # which replaces its arrays, and changes none of them
         if self.running:
             after.end_bound()
-        return after.predict(self._campaign.known_along(self.rest), self.rest)
+        return after.predict(self._campaign.known_along(rest), rest)
 
     def to_mission(self) -> Mission:
         """Mission of the bounds that have ended, with awareness that is not measured (NaN).
