@@ -57,7 +57,7 @@ def pip_install(*packages: str) -> str:
 
 
 def require_package(what: str, package: str, module: str) -> None:
-    """Refuse to go on without a package: TrustboError, such as "KMZ needs PACKAGE: REMEDY".
+    """Refuse to go on without a package: TrustboError, such as "ROS bags need PACKAGE: REMEDY".
 
     `what` is the beginning of the sentence, with its verb.
     """

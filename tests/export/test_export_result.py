@@ -20,9 +20,6 @@ FILES = {
     "geojson": ["path.geojson"],
     "geopackage": ["path.gpkg"],
     "overwatch": ["overwatch.tif"],
-    "kmz": ["mission.kmz"],
-    "qgc": [f"mission_{robot}.plan" for robot in ("lead", "r1", "r2", "r3")],
-    "cot": ["mission_tak.zip"],
     "csv": ["missions.csv"],
     "ros_map": ["cost_map.yaml", "cost_map.pgm", "cost_map_filters.yaml"],
     "nav2": [
@@ -34,16 +31,13 @@ FILES = {
     "foxglove": ["scene.mcap"],
     "ros2_bag": ["path_ros2"],
 }
-NEEDS_A_PLACE = (
-    "geotiff", "cog", "geojson", "geopackage", "overwatch", "kmz", "qgc", "cot"
-)  # fmt: skip
+NEEDS_A_PLACE = ("geotiff", "cog", "geojson", "geopackage", "overwatch")
 
 
 def test_every_format_is_written_under_its_name(result, tmp_path):
     pytest.importorskip("rosbags", reason="needs the extra ros")
     assert list(FORMATS) == list(FILES)
-    with pytest.warns(UserWarning, match=r"stops of mission_\*\.plan .* do not wait for each"):
-        written = export_result(result, tmp_path / "out", FORMATS)
+    written = export_result(result, tmp_path / "out", FORMATS)
     names = [name for names in FILES.values() for name in names]
     assert written == [tmp_path / "out" / name for name in (*names, "frame.yaml")]
     assert set((tmp_path / "out").iterdir()) == set(written)

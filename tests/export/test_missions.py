@@ -1,44 +1,23 @@
-"""A plan with its times for ground stations, TAK, Google Earth and Foxglove, as others read it."""
+"""A plan with its times for Foxglove, as others read it."""
 
 import dataclasses
-import io
-import json
-import math
-import re
 import sys
-import zipfile
-from datetime import datetime, timedelta, timezone
 from itertools import pairwise
 
 import numpy as np
 import pytest
-import shapely
-from jsonschema import Draft202012Validator
-from pyproj import Transformer
 
 import trustbo as tb
 from trustbo.errors import TrustboError
-from trustbo.export import Frame, export_result, write_cot, write_foxglove, write_kmz, write_qgc
+from trustbo.export import Frame, export_result, write_foxglove
 from trustbo.export.schedule import schedule_of
 
 ROBOTS = ("lead", "r1", "r2", "r3")
-START = datetime(2026, 5, 1, 6, 0, tzinfo=timezone(timedelta(hours=2)))
 
 
 @pytest.fixture(scope="module")
 def schedule(result):
     return schedule_of(result.plan)
-
-
-def to_degrees(result, positions):
-    crs = result.workspace.grid.crs
-    lon, lat = Transformer.from_crs(crs, 4326, always_xy=True).transform(*np.asarray(positions).T)
-    return np.column_stack([lon, lat])
-
-
-def near(result, degrees, positions):
-    """Distance on the ground of places in degrees from positions in the CRS, m."""
-    return np.abs((degrees - to_degrees(result, positions)) * [75_000.0, 111_000.0]).max()
 
 
 # --- times ---
@@ -95,245 +74,6 @@ def test_robots_stand_while_the_others_drive(result, schedule):
             np.testing.assert_array_equal(before.place, after.way[0])
     last = max(stands[-1].arrives for stands in others)
     assert schedule.begins[-1] == pytest.approx(last)
-
-
-# --- QGroundControl ---
-
-ITEM = {
-    "type": "object",
-    "required": ["type", "command", "frame", "params", "doJumpId", "autoContinue"],
-    "properties": {
-        "type": {"const": "SimpleItem"},
-        "command": {"const": 16},  # MAV_CMD_NAV_WAYPOINT
-        "frame": {"const": 3},  # MAV_FRAME_GLOBAL_RELATIVE_ALT
-        "autoContinue": {"type": "boolean"},
-        "doJumpId": {"type": "integer", "minimum": 1},
-        "AltitudeMode": {"type": "integer"},
-        "Altitude": {"type": "number"},
-        "AMSLAltAboveTerrain": {"type": ["number", "null"]},
-        "params": {
-            "prefixItems": [
-                {"type": "integer", "minimum": 0, "maximum": 65535},  # ArduPilot: uint16, s
-                {"type": "number"},
-                {"type": "number"},
-                {"type": ["number", "null"]},
-                {"type": "number", "minimum": -90, "maximum": 90},
-                {"type": "number", "minimum": -180, "maximum": 180},
-                {"type": "number"},
-            ],
-            "minItems": 7, "maxItems": 7,
-        },
-    },
-}  # fmt: skip
-OF_PLAN = {  # docs.qgroundcontrol.com: Plan File Format
-    "type": "object",
-    "required": ["version", "fileType", "groundStation", "mission"],
-    "properties": {
-        "version": {"const": 1},
-        "fileType": {"const": "Plan"},
-        "groundStation": {"type": "string"},
-        "geoFence": {
-            "required": ["circles", "polygons", "version"], "properties": {"version": {"const": 2}}
-        },
-        "rallyPoints": {
-            "required": ["points", "version"], "properties": {"version": {"const": 2}}
-        },
-        "mission": {
-            "required": ["version", "firmwareType", "globalPlanAltitudeMode", "vehicleType",
-                         "cruiseSpeed", "hoverSpeed", "items", "plannedHomePosition"],
-            "properties": {
-                "version": {"const": 2},
-                "firmwareType": {"enum": [3, 12]},  # MAV_AUTOPILOT
-                "vehicleType": {"const": 10},  # MAV_TYPE_GROUND_ROVER
-                "cruiseSpeed": {"type": "number", "exclusiveMinimum": 0},
-                "items": {"type": "array", "minItems": 1, "items": ITEM},
-                "plannedHomePosition": {
-                    "type": "array", "items": {"type": "number"}, "minItems": 3, "maxItems": 3
-                },
-            },
-        },
-    },
-}  # fmt: skip
-
-
-@pytest.mark.parametrize(("robot", "autopilot"), [("lead", "px4"), ("r2", "ardupilot")])
-def test_a_plan_of_qgroundcontrol_drives_the_ways_and_holds_at_the_stops(
-    result, schedule, tmp_path, robot, autopilot
-):
-    with pytest.warns(UserWarning, match=r"at the stops of r\.plan .* do not wait for each other"):
-        write_qgc(tmp_path / "r.plan", result, robot=robot, autopilot=autopilot)
-    record = json.loads((tmp_path / "r.plan").read_text())
-    Draft202012Validator(OF_PLAN).validate(record)
-    mission = record["mission"]
-    assert mission["firmwareType"] == {"px4": 12, "ardupilot": 3}[autopilot]
-    assert [item["doJumpId"] for item in mission["items"]] == list(
-        range(1, len(mission["items"]) + 1)
-    )
-    params = [item["params"] for item in mission["items"]]
-    places = np.array([(lon, lat) for *_, lat, lon, _ in params])
-    way = result.plan.ways
-    index = ROBOTS.index(robot)
-    line = shapely.LineString(np.concatenate([bound[index] for bound in way]))
-    crs = result.workspace.grid.crs
-    driven = np.column_stack(Transformer.from_crs(4326, crs, always_xy=True).transform(*places.T))
-    pixel = min(result.workspace.surface.pixel)
-    assert shapely.hausdorff_distance(shapely.LineString(driven), line, 0.01) <= 0.5 * pixel + 0.01
-    holds = [hold for hold, *_ in params if hold]
-    expected = [math.ceil(stand.hold) for stand in schedule.robots[robot][:-1]]
-    assert holds == [hold for hold in expected if hold]
-    assert params[-1][0] == 0
-    assert mission["plannedHomePosition"] == [*params[0][4:6], 0.0]
-
-
-# --- TAK ---
-
-COT = """<xs:schema xmlns:xs="http://www.w3.org/2001/XMLSchema">
-  <xs:simpleType name="latitude"><xs:restriction base="xs:decimal">
-    <xs:minInclusive value="-90"/><xs:maxInclusive value="90"/></xs:restriction></xs:simpleType>
-  <xs:simpleType name="longitude"><xs:restriction base="xs:decimal">
-    <xs:minInclusive value="-180"/><xs:maxInclusive value="180"/></xs:restriction></xs:simpleType>
-  <xs:element name="event"><xs:complexType><xs:all>
-      <xs:element name="point"><xs:complexType>
-        <xs:attribute name="lat" type="latitude" use="required"/>
-        <xs:attribute name="lon" type="longitude" use="required"/>
-        <xs:attribute name="hae" type="xs:decimal" use="required"/>
-        <xs:attribute name="ce" type="xs:decimal" use="required"/>
-        <xs:attribute name="le" type="xs:decimal" use="required"/>
-      </xs:complexType></xs:element>
-      <xs:element name="detail" minOccurs="0"><xs:complexType><xs:sequence>
-        <xs:any minOccurs="0" maxOccurs="unbounded" processContents="skip"/>
-      </xs:sequence></xs:complexType></xs:element>
-    </xs:all>
-    <xs:attribute name="version" use="required"><xs:simpleType>
-      <xs:restriction base="xs:decimal"><xs:enumeration value="2.0"/></xs:restriction>
-    </xs:simpleType></xs:attribute>
-    <xs:attribute name="type" use="required"><xs:simpleType><xs:restriction base="xs:string">
-      <xs:pattern value="\\w+(-\\w+)*(;[^;]*)?"/></xs:restriction></xs:simpleType></xs:attribute>
-    <xs:attribute name="uid" type="xs:string" use="required"/>
-    <xs:attribute name="time" type="xs:dateTime" use="required"/>
-    <xs:attribute name="start" type="xs:dateTime" use="required"/>
-    <xs:attribute name="stale" type="xs:dateTime" use="required"/>
-    <xs:attribute name="how" use="required"><xs:simpleType><xs:restriction base="xs:string">
-      <xs:pattern value="\\w(-\\w+)*"/></xs:restriction></xs:simpleType></xs:attribute>
-  </xs:complexType></xs:element>
-</xs:schema>"""
-"""Base fields of Cursor on Target 2.0, after MITRE's Event.xsd and point.xsd."""
-
-
-def package(file):
-    """Events of a data package by uid, as the manifest names them."""
-    from lxml import etree
-
-    with zipfile.ZipFile(file) as content:
-        manifest = etree.fromstring(content.read("MANIFEST/manifest.xml"))
-        assert (manifest.tag, manifest.get("version")) == ("MissionPackageManifest", "2")
-        names = {p.get("name") for p in manifest.find("Configuration")}
-        assert names == {"uid", "name"}
-        entries = [one.get("zipEntry") for one in manifest.find("Contents")]
-        assert sorted(content.namelist()) == sorted(["MANIFEST/manifest.xml", *entries])
-        events = [etree.fromstring(content.read(entry)) for entry in entries]
-    return {event.get("uid"): event for event in events}
-
-
-def test_events_of_tak_are_routes_and_posts(result, schedule, tmp_path):
-    from lxml import etree
-
-    write_cot(tmp_path / "a.zip", result, name="ridge", start=START)
-    events, schema = package(tmp_path / "a.zip"), etree.XMLSchema(etree.fromstring(COT))
-    for event in events.values():
-        schema.assertValid(event)
-    broken = next(iter(events.values()))
-    broken.find("point").set("lat", "91")
-    assert not schema.validate(broken)
-    assert {e.get("time") for e in events.values()} == {"2026-05-01T04:00:00.000Z"}
-    stale = START + timedelta(days=1, seconds=schedule.begins[-1])
-    for event in events.values():
-        assert abs(datetime.fromisoformat(event.get("stale")) - stale) < timedelta(milliseconds=2)
-    routes = [e for e in events.values() if e.get("type") == "b-m-r"]
-    assert [e.find("detail/contact").get("callsign") for e in routes] == [
-        f"ridge {robot}" for robot in ROBOTS
-    ]
-    for robot, event in zip(ROBOTS, routes, strict=True):
-        links = event.findall("detail/link")
-        assert len({link.get("uid") for link in links}) == len(links)
-        assert {link.get("relation") for link in links} == {"c"}
-        named = [link for link in links if link.get("type") == "b-m-p-w"]
-        stands = schedule.robots[robot]
-        assert [link.get("callsign") for link in named] == [stand.name for stand in stands]
-        points = np.array([[float(v) for v in link.get("point").split(",")] for link in named])
-        assert near(result, points[:, ::-1], [stand.place for stand in stands]) < 0.01
-        others = [link for link in links if link not in named]
-        assert {link.get("type") for link in others} <= {"b-m-p-c"}
-        assert len(links) == sum(len(stand.way) for stand in stands) - len(stands) + 1
-    posts = {e.find("detail/contact").get("callsign"): e for e in events.values()
-             if e.get("type") == "b-m-p-s-m"}  # fmt: skip
-    assert len(posts) == sum(len(stands) for stands in schedule.robots.values())
-    for robot, stands in schedule.robots.items():
-        for stand in stands:
-            event = posts[f"{robot} {stand.name}"]
-            point = event.find("point")
-            degrees = np.array([[float(point.get("lon")), float(point.get("lat"))]])
-            assert near(result, degrees, [stand.place]) < 0.01
-            since = datetime.fromisoformat(event.get("start")) - START
-            assert since.total_seconds() == pytest.approx(stand.arrives, abs=2e-3)
-    write_cot(tmp_path / "b.zip", result, name="ridge")
-    assert package(tmp_path / "b.zip").keys() == events.keys()
-    write_cot(tmp_path / "c.zip", result, name="valley")
-    assert not package(tmp_path / "c.zip").keys() & events.keys()
-
-
-# --- KMZ ---
-
-
-def test_gdal_reads_the_kmz_with_its_times(result, maps, schedule, tmp_path):
-    import geopandas as gpd
-    import matplotlib
-    import pyogrio
-    from PIL import Image
-
-    write_kmz(tmp_path / "a.kmz", result, maps["cost"], start=START)
-    layers = [name for name, _ in pyogrio.list_layers(tmp_path / "a.kmz")]
-    assert [name for name in layers if name in ROBOTS] == [*ROBOTS]
-    for i, robot in enumerate(ROBOTS):
-        table = gpd.read_file(tmp_path / "a.kmz", layer=robot)
-        assert table.crs.to_epsg() == 4326
-        stands = schedule.robots[robot]
-        places = table[table.geom_type == "Point"]
-        assert list(places["Name"]) == [f"{robot} {stand.name}" for stand in stands]
-        degrees = shapely.get_coordinates(places.geometry.to_numpy())[:, :2]
-        assert near(result, degrees, [stand.place for stand in stands]) < 0.01
-        for name, times in (("begin", "arrives"), ("end", "until")):
-            since = [(time.to_pydatetime() - START).total_seconds() for time in places[name]]
-            expected = [getattr(stand, times) for stand in stands]
-            np.testing.assert_allclose(since, expected, rtol=0.0, atol=1.5e-3)
-        ways = table[table.geom_type.isin(["LineString"])]
-        assert len(ways) == len(result.plan.path) - 1
-        for line, bound in zip(ways.geometry, result.plan.ways, strict=True):
-            ends = shapely.get_coordinates(line)[[0, -1], :2]
-            assert near(result, ends, bound[i][[0, -1]]) < 0.01
-    with zipfile.ZipFile(tmp_path / "a.kmz") as content:
-        assert sorted(content.namelist()) == ["doc.kml", "files/cost.png", "files/dot.png"]
-        text = content.read("doc.kml").decode()
-        picture = content.read("files/cost.png")
-    assert "http://maps.google.com" not in text  # in the field there is no network
-    box = {side: float(re.search(f"<{side}>(.*)</{side}>", text)[1])
-           for side in ("west", "south", "east", "north")}  # fmt: skip
-    left, bottom, right, top = result.workspace.grid.bounds
-    corners = to_degrees(result, [(left, bottom), (left, top), (right, bottom), (right, top)])
-    assert box["west"] == pytest.approx(corners[:, 0].min(), abs=1e-4)
-    assert box["north"] == pytest.approx(corners[:, 1].max(), abs=1e-4)
-    red, green, blue, alpha = np.moveaxis(np.asarray(Image.open(io.BytesIO(picture))), -1, 0)
-    for cell in ((1, 1), (2, 3), (0, 0)):
-        lon, lat = result.workspace.grid.lonlat(cell)
-        col = int((lon - box["west"]) / (box["east"] - box["west"]) * red.shape[1])
-        row = int((box["north"] - lat) / (box["north"] - box["south"]) * red.shape[0])
-        cost = float(maps["cost"].values[cell])
-        if np.isnan(cost):
-            assert alpha[row, col] == 0
-            continue
-        expected = np.array(matplotlib.colormaps["viridis"](cost)[:3]) * 255
-        shown = red[row, col], green[row, col], blue[row, col]
-        np.testing.assert_allclose(shown, expected, rtol=0.0, atol=15.0)
 
 
 # --- Foxglove ---
@@ -404,24 +144,11 @@ def test_a_scene_is_read_by_mcap_and_its_schemas(result, maps, schedule, tmp_pat
 def test_what_cannot_be_sent_is_refused_before_anything_is_written(
     result, nowhere, tmp_path, monkeypatch
 ):
-    for write, name in (
-        (write_kmz, "a.kmz"), (write_qgc, "a.plan"), (write_cot, "a.zip"),
-        (write_foxglove, "a.mcap"),
-    ):  # fmt: skip
-        with pytest.raises(TrustboError, match=r"has a CRS; use|a plan has posts and ways where"):
-            write(tmp_path / name, nowhere)
-        with pytest.raises(TrustboError, match=rf"must end in .*\{name[1:]}"):
-            write(tmp_path / "a.txt", result)
-    for start in (datetime(2026, 5, 1), "now"):
-        with pytest.raises(TrustboError, match="start must be a datetime with a time zone"):
-            write_cot(tmp_path / "a.zip", result, start=start)
-    with pytest.raises(TrustboError, match="unknown autopilot 'apm'; choose one of px4, ardupilot"):
-        write_qgc(tmp_path / "a.plan", result, autopilot="apm")
-    with pytest.raises(TrustboError, match="unknown robot 'r9'; choose one of lead, r1"):
-        write_qgc(tmp_path / "a.plan", result, robot="r9")
-    extras = (("simplekml", "simplekml", "kmz"), ("foxglove", "foxglove-sdk", "foxglove"))
-    for name, needed, kind in extras:
-        monkeypatch.setitem(sys.modules, name, None)
-        with pytest.raises(TrustboError, match=f"needs? {needed}: .* -m pip install {needed}"):
-            export_result(result, tmp_path / "out", ["csv", kind])
+    with pytest.raises(TrustboError, match="a plan has posts and ways where"):
+        write_foxglove(tmp_path / "a.mcap", nowhere)
+    with pytest.raises(TrustboError, match=r"must end in .*\.mcap"):
+        write_foxglove(tmp_path / "a.txt", result)
+    monkeypatch.setitem(sys.modules, "foxglove", None)
+    with pytest.raises(TrustboError, match=r"need foxglove-sdk: .* -m pip install foxglove-sdk"):
+        export_result(result, tmp_path / "out", ["csv", "foxglove"])
     assert list(tmp_path.iterdir()) == []

@@ -1,15 +1,12 @@
 """Results as files for other programs: GIS, robots, tables."""
 
-from trustbo.export.cot import write_cot
 from trustbo.export.everything import FORMATS, export_result
 from trustbo.export.foxglove_scene import write_foxglove
 from trustbo.export.frame import Frame, write_frame
 from trustbo.export.grid_map import read_grid_map, write_grid_map
-from trustbo.export.kmz import write_kmz
 from trustbo.export.nav2 import write_costmap_filters, write_waypoints
 from trustbo.export.overwatch import write_overwatch
 from trustbo.export.paths import path_frame, write_path
-from trustbo.export.qgroundcontrol import write_qgc
 from trustbo.export.rasters import write_geotiff
 from trustbo.export.roads import from_route_graph
 from trustbo.export.ros import write_ros_bag, write_ros_map
@@ -28,16 +25,13 @@ __all__ = [
     "read_grid_map",
     "read_route_graph",
     "write_costmap_filters",
-    "write_cot",
     "write_csv",
     "write_foxglove",
     "write_frame",
     "write_geotiff",
     "write_grid_map",
-    "write_kmz",
     "write_overwatch",
     "write_path",
-    "write_qgc",
     "write_ros_bag",
     "write_ros_map",
     "write_route_graph",

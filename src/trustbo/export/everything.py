@@ -15,7 +15,6 @@ from trustbo.export.checks import (
     require_lead_apart,
     require_names_for_sql,
 )
-from trustbo.export.cot import write_cot
 from trustbo.export.foxglove_scene import require_foxglove, write_foxglove
 from trustbo.export.frame import (
     AT_START,
@@ -28,11 +27,9 @@ from trustbo.export.frame import (
     save_frame,
 )
 from trustbo.export.grid_map import write_grid_map
-from trustbo.export.kmz import require_simplekml, write_kmz
 from trustbo.export.nav2 import stops_of, write_costmap_filters, write_waypoints
 from trustbo.export.overwatch import require_overwatch, write_overwatch
 from trustbo.export.paths import write_path
-from trustbo.export.qgroundcontrol import save_qgc, warn_of_holds
 from trustbo.export.rasters import write_geotiff
 from trustbo.export.ros import occupancy, require_robots, write_ros_bag, write_ros_map
 from trustbo.export.route_graph import OBJECTIVES, graph_of, summed
@@ -230,13 +227,6 @@ def _write_nav2(content: _Content, file: Path) -> None:
             write_waypoints(target, result, robot=robot, frame=content.frame)
 
 
-def _write_missions(content: _Content, file: Path) -> None:
-    plan = content.result.plan
-    for robot in (LEAD, *plan.workspace.team.names):
-        save_qgc(file.with_name(_MISSION.format(robot=robot)), plan, robot)
-    warn_of_holds(_MISSION.format(robot="*"))
-
-
 def _summable(result: Result) -> str:
     """Objective of the campaign, or lost_contact where its value is no sum."""
     name = result.planner.objective
@@ -255,7 +245,7 @@ def _require_nav2(result: Result, place: PlacedFrame) -> None:
 _BAGS = ("grid_map", "ros2_bag")
 _WITH_COST = ("ros_map", *_BAGS)
 """Formats with the cost map, as occupancy or at the same resolution."""
-_WAYPOINTS, _MISSION = "waypoints_{robot}.yaml", "mission_{robot}.plan"
+_WAYPOINTS = "waypoints_{robot}.yaml"
 _FRAME = "frame.yaml"
 """File with the frame of all formats for ROS."""
 _FORMATS = {
@@ -292,28 +282,6 @@ _FORMATS = {
         lambda content, file: write_overwatch(file, content.result.plan),
         on_earth=True,
         require=lambda result, _: require_overwatch(result.workspace),
-    ),
-    "kmz": _Format(
-        "ways and posts with their times, and the cost map, for Google Earth and phones",
-        ("mission.kmz",),
-        lambda content, file: write_kmz(file, content.result, content.maps()["cost"]),
-        on_earth=True,
-        require=lambda result, _: (require_simplekml(), schedule_of(result.plan)),
-    ),
-    "qgc": _Format(
-        "a mission of QGroundControl for each robot",
-        (_MISSION.format(robot=LEAD),),
-        _write_missions,
-        on_earth=True,
-        require=lambda result, _: schedule_of(result.plan),
-        on_terrain=(_MISSION,),
-    ),
-    "cot": _Format(
-        "routes and posts as Cursor on Target, a data package of TAK",
-        ("mission_tak.zip",),
-        lambda content, file: write_cot(file, content.result),
-        on_earth=True,
-        require=lambda result, _: schedule_of(result.plan),
     ),
     "csv": _Format(
         "a table of all bounds that were run",

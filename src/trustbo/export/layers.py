@@ -9,10 +9,9 @@ import shapely
 
 from trustbo.campaign.result import Result
 from trustbo.errors import TrustboError, require_kind
-from trustbo.export.checks import LEAD, find_crs, require_crs, require_lead_apart
+from trustbo.export.checks import LEAD, find_crs, require_lead_apart
 from trustbo.planning import Plan
 from trustbo.planning.plan import QUANTILES
-from trustbo.workspace import Workspace
 
 _BAND = {"low": QUANTILES.index(0.05), "high": QUANTILES.index(0.95)}
 _LEAST = 1e-6
@@ -98,15 +97,6 @@ def routes_of(plan: Plan) -> dict[str, list[np.ndarray]]:
         ]
         for robot, robot_ways in zip(names, ways, strict=True)
     }
-
-
-def degrees_of(workspace: Workspace, positions: np.ndarray) -> np.ndarray:
-    """Longitude and latitude (WGS 84) of positions (point, 2) in CRS metres, (point, 2).
-
-    TrustboError: the workspace has no CRS.
-    """
-    points = gpd.points_from_xy(*np.asarray(positions).T, crs=require_crs(workspace).to_wkt())
-    return shapely.get_coordinates(points.to_crs("EPSG:4326"))
 
 
 def _required[T](plan: Plan, values: T | None) -> T:
