@@ -21,13 +21,12 @@ FILES = {
     "geopackage": ["path.gpkg"],
     "overwatch": ["overwatch.tif"],
     "csv": ["missions.csv"],
-    "ros_map": ["cost_map.yaml", "cost_map.pgm", "cost_map_filters.yaml"],
+    "ros_map": ["cost_map.yaml", "cost_map.pgm"],
     "nav2": [
         "route_graph.geojson",
         "route_graph_params.yaml",
         *(f"waypoints_{robot}.yaml" for robot in ("lead", "r1", "r2", "r3")),
     ],
-    "grid_map": ["grid_map"],
     "foxglove": ["scene.mcap"],
     "ros2_bag": ["path_ros2"],
 }
@@ -133,11 +132,11 @@ def test_maps_are_made_for_formats_that_have_maps_and_once(result, tmp_path):
 def test_what_cannot_be_written_is_said_beforehand(result, nowhere, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rosbags", None)
     absent = left_out(nowhere, tmp_path)
-    assert list(absent) == [*NEEDS_A_PLACE, "grid_map", "foxglove", "ros2_bag"]
+    assert list(absent) == [*NEEDS_A_PLACE, "foxglove", "ros2_bag"]
     assert "only a workspace made from a terrain has a CRS" in absent["geojson"]
     assert "pip install rosbags" in absent["ros2_bag"]
     (tmp_path / "missions.csv").mkdir()
-    assert list(left_out(result, tmp_path)) == ["csv", "grid_map", "ros2_bag"]
+    assert list(left_out(result, tmp_path)) == ["csv", "ros2_bag"]
     (tmp_path / "file").touch()
     with pytest.raises(TrustboError, match=r"cannot write to '.*file': .* is a file"):
         left_out(result, tmp_path / "file")

@@ -1,4 +1,4 @@
-"""Waypoints and filters of costmaps for Nav2."""
+"""Waypoints for Nav2."""
 
 import math
 
@@ -7,7 +7,7 @@ import pytest
 import yaml
 
 from trustbo.errors import TrustboError
-from trustbo.export import Frame, write_costmap_filters, write_ros_map, write_waypoints
+from trustbo.export import Frame, write_waypoints
 from trustbo.export.frame import OF_CRS
 from trustbo.export.poses import onward
 
@@ -51,41 +51,11 @@ def test_waypoints_are_the_stops_of_a_robot_in_the_frame(result, tmp_path, robot
     np.testing.assert_allclose(headings, ahead / np.linalg.norm(ahead, axis=1)[:, None], atol=1e-9)
 
 
-def test_filters_heed_the_map_by_the_rules_of_the_costmap(result, maps, tmp_path):
-    """SpeedFilter: base + multiplier x mask, in percent; 0 is no limit. KeepoutFilter: the mask."""
-    cost, workspace = maps["cost"], result.workspace
-    odom = Frame((380000, 5224910), name="odom")
-    write_ros_map(tmp_path / "map.yaml", cost, workspace, frame=odom)
-    write_costmap_filters(tmp_path / "map.yaml", slowest=0.4, frame=odom)
-    nodes = {
-        name: values["ros__parameters"]
-        for name, values in yaml.safe_load((tmp_path / "map_filters.yaml").read_text()).items()
-    }
-    for name, kind in (("keepout", 0), ("speed", 1)):  # filter_values.hpp
-        mask = nodes[f"{name}_filter_mask_server"]
-        info = nodes[f"{name}_costmap_filter_info_server"]
-        assert (tmp_path / mask["yaml_filename"]).exists()
-        assert mask["frame_id"] == "odom"
-        assert mask["topic_name"] == info["mask_topic"]
-        assert info["type"] == kind
-        assert all(isinstance(info[key], float) for key in ("base", "multiplier"))
-    info = nodes["keepout_costmap_filter_info_server"]
-    assert (info["base"], info["multiplier"]) == (0.0, 1.0)
-    info = nodes["speed_costmap_filter_info_server"]
-    limits = info["base"] + info["multiplier"] * np.arange(1, 101)
-    assert limits.max() < 100.0
-    assert limits.min() == pytest.approx(40.0)
-    assert limits[49] == pytest.approx(70.0)
-
-
 def test_what_cannot_be_followed_is_refused(result, nowhere, tmp_path):
     with pytest.raises(TrustboError, match="unknown robot 'r9'; choose one of lead, r1, r2, r3"):
         write_waypoints(tmp_path / "w.yaml", result, robot="r9")
     with pytest.raises(TrustboError, match="a plan has posts and ways where its workspace was"):
         write_waypoints(tmp_path / "w.yaml", nowhere, frame=OF_CRS)
-    for slowest in (0.0, 1.1):
-        with pytest.raises(TrustboError, match=r"slowest must be a share in \(0, 1\]; got"):
-            write_costmap_filters(tmp_path / "map.yaml", slowest=slowest)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -3,8 +3,7 @@
 from trustbo.export.everything import FORMATS, export_result
 from trustbo.export.foxglove_scene import write_foxglove
 from trustbo.export.frame import Frame, write_frame
-from trustbo.export.grid_map import read_grid_map, write_grid_map
-from trustbo.export.nav2 import write_costmap_filters, write_waypoints
+from trustbo.export.nav2 import write_waypoints
 from trustbo.export.overwatch import write_overwatch
 from trustbo.export.paths import path_frame, write_path
 from trustbo.export.rasters import write_geotiff
@@ -22,14 +21,11 @@ __all__ = [
     "export_result",
     "from_route_graph",
     "path_frame",
-    "read_grid_map",
     "read_route_graph",
-    "write_costmap_filters",
     "write_csv",
     "write_foxglove",
     "write_frame",
     "write_geotiff",
-    "write_grid_map",
     "write_overwatch",
     "write_path",
     "write_ros_bag",

@@ -26,8 +26,7 @@ from trustbo.export.frame import (
     require_fine,
     save_frame,
 )
-from trustbo.export.grid_map import write_grid_map
-from trustbo.export.nav2 import stops_of, write_costmap_filters, write_waypoints
+from trustbo.export.nav2 import stops_of, write_waypoints
 from trustbo.export.overwatch import require_overwatch, write_overwatch
 from trustbo.export.paths import write_path
 from trustbo.export.rasters import write_geotiff
@@ -213,9 +212,7 @@ def _write_path(content: _Content, file: Path) -> None:
 
 
 def _write_map(content: _Content, file: Path) -> None:
-    result = content.result
-    write_ros_map(file, content.maps()["cost"], result.workspace, **content.placing)
-    write_costmap_filters(file, frame=Frame(name=content.frame.name))
+    write_ros_map(file, content.maps()["cost"], content.result.workspace, **content.placing)
 
 
 def _write_nav2(content: _Content, file: Path) -> None:
@@ -242,7 +239,7 @@ def _require_nav2(result: Result, place: PlacedFrame) -> None:
             stops_of(result.plan, robot, place)
 
 
-_BAGS = ("grid_map", "ros2_bag")
+_BAGS = ("ros2_bag",)
 _WITH_COST = ("ros_map", *_BAGS)
 """Formats with the cost map, as occupancy or at the same resolution."""
 _WAYPOINTS = "waypoints_{robot}.yaml"
@@ -289,8 +286,8 @@ _FORMATS = {
         lambda content, file: write_csv(file, content.result),
     ),
     "ros_map": _Format(
-        "the cost map for map_server and Nav2, and filters of costmaps",
-        ("cost_map.yaml", "cost_map.pgm", "cost_map_filters.yaml"),
+        "the cost map for map_server and Nav2",
+        ("cost_map.yaml", "cost_map.pgm"),
         _write_map,
         in_frame=True,
     ),
@@ -301,14 +298,6 @@ _FORMATS = {
         in_frame=True,
         require=_require_nav2,
         on_terrain=(_WAYPOINTS,),
-    ),
-    "grid_map": _Format(
-        "all maps as layers of a GridMap in a bag of ROS 2 (mcap)",
-        ("grid_map",),
-        lambda content, file: write_grid_map(
-            file, content.maps(), content.result.workspace, **content.placing
-        ),
-        in_frame=True,
     ),
     "foxglove": _Format(
         "maps, ways, posts and sight bound by bound as a scene for Foxglove (mcap)",

@@ -19,23 +19,9 @@ GRID = "nav_msgs/msg/OccupancyGrid"
 PATH = "nav_msgs/msg/Path"
 POSES = "geometry_msgs/msg/PoseArray"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
-GRID_MAP = "grid_map_msgs/msg/GridMap"
-_GRID_MAP_INFO = "float64 resolution\nfloat64 length_x\nfloat64 length_y\ngeometry_msgs/Pose pose\n"
-_GRID_MAP = """grid_map_msgs/GridMapInfo info
-string[] layers
-string[] basic_layers
-std_msgs/Float32MultiArray[] data
-uint16 outer_start_index
-uint16 inner_start_index
-"""
-_HEADER = "std_msgs/Header header\n"
 DEFINITIONS: Mapping[int, Mapping[str, str]] = {
-    1: {
-        TRANSFORMS: "geometry_msgs/TransformStamped[] transforms\n",
-        "grid_map_msgs/msg/GridMapInfo": _HEADER + _GRID_MAP_INFO,
-        GRID_MAP: _GRID_MAP,
-    },
-    2: {"grid_map_msgs/msg/GridMapInfo": _GRID_MAP_INFO, GRID_MAP: _HEADER + _GRID_MAP},
+    1: {TRANSFORMS: "geometry_msgs/TransformStamped[] transforms\n"},
+    2: {},
 }
 """Definitions of types that rosbags has not, by the version of ROS."""
 
@@ -171,45 +157,6 @@ class Messages:
         )
         data = np.ascontiguousarray(values, dtype=np.int8).ravel()
         return self._types[GRID](header=self._header(time), info=info, data=data)
-
-    def grid_map(
-        self,
-        time: int,
-        layers: Mapping[str, np.ndarray],
-        resolution: float,
-        corner: tuple[float, float],
-    ) -> Any:
-        """Make a map of float32 layers (row, col) in the frame, the southern row first.
-
-        Time in ns, side of a pixel and the lower left corner in m. In the message rows run along
-        -x and columns along -y, in column-major order.
-        """
-        n_y, n_x = next(iter(layers.values())).shape
-        x, y = corner[0] + 0.5 * n_x * resolution, corner[1] + 0.5 * n_y * resolution
-        header, info = {"header": self._header(time)}, self._types["grid_map_msgs/msg/GridMapInfo"]
-        of_info = header if "header" in info.__dataclass_fields__ else {}  # of ROS 1
-        axes = [("column_index", n_y, n_x * n_y), ("row_index", n_x, n_x)]
-        axis = self._types["std_msgs/msg/MultiArrayDimension"]
-        layout = self._types["std_msgs/msg/MultiArrayLayout"](
-            dim=[axis(label=label, size=n, stride=stride) for label, n, stride in axes],
-            data_offset=0,
-        )
-        data = [
-            self._types["std_msgs/msg/Float32MultiArray"](
-                # [i, j] at x falling in i and y in j, flattened column by column.
-                layout=layout, data=np.ascontiguousarray(values[::-1, ::-1], np.float32).ravel()
-            )
-            for values in layers.values()
-        ]  # fmt: skip
-        return self._types[GRID_MAP](
-            **({} if of_info else header),
-            info=info(
-                **of_info, resolution=resolution, length_x=n_x * resolution,
-                length_y=n_y * resolution, pose=self._pose(np.array([x, y, 0.0])),
-            ),
-            layers=list(layers), basic_layers=[], data=data,
-            outer_start_index=0, inner_start_index=0,
-        )  # fmt: skip
 
     def _stamp(self, time: int) -> Any:
         return self._types["builtin_interfaces/msg/Time"](
