@@ -103,8 +103,7 @@ NAMES_OF_0_2 = {
     "pixel_features pixel_size read_lidar read_terrain register_feature slope synthetic_terrain "
     "vegetation_density",
     "trustbo.workspace": "SIGHT_MODES AwarenessBelief Grid Sight Workspace",
-    "trustbo.logs": "STATES Topics read_bag read_missions read_table write_bag write_missions "
-    "write_table",
+    "trustbo.logs": "STATES Topics read_bag read_missions read_table write_missions write_table",
     "trustbo.models": "CAUSES BoundRisk ContactRate CoupledParams CoupledTrust Criticism "
     "DriftParams DriftTrust ExactPosterior Hazard HierarchicalTrust LostMission PlaceEffect "
     "PooledTrust Priors RobotParams TrustFilter TrustForecast TrustModel TrustParams TrustSample "
@@ -121,7 +120,7 @@ NAMES_OF_0_2 = {
     "place_map plan_map plan_trust regret_curves robot_maps terrain_maps trust_maps",
     "trustbo.export": "FORMATS export_result path_frame write_csv write_geotiff "
     "write_overwatch "
-    "write_path write_ros_bag write_ros_map",
+    "write_path write_ros_map",
     "trustbo.report": "write_report",
 }
 

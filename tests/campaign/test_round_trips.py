@@ -8,7 +8,7 @@ from worlds import ModelSimulator
 
 import trustbo as tb
 from trustbo.data import Bound
-from trustbo.logs import read_bag, read_missions, read_table, write_bag, write_missions, write_table
+from trustbo.logs import read_missions, read_table, write_missions, write_table
 from trustbo.terrain import CompositeIndex
 
 ENDS = ((1, 0), (0, 1))
@@ -132,22 +132,6 @@ def test_missions(kept, tmp_path, write, read, name, exact):
     if exact:
         same_missions(missions, once)
     same_missions(once, twice)
-
-
-def test_missions_in_a_bag(tmp_path, terrain):
-    """Headings are quaternions there, and come back to the last bit but one."""
-    pytest.importorskip("rosbags")
-    workspace = tb.Workspace.from_terrain(terrain, (2, 2), tb.Team(2))
-    simulator = tb.simulation.KinematicSimulator(workspace)
-    before = [simulator.run([(1, 0), (0, 1)], seed=1)]
-    for n in range(2):
-        write_bag(before, tmp_path / f"{n}.bag")
-        (again,) = read_bag(tmp_path / f"{n}.bag")
-        assert again.path == before[0].path
-        for name in ("contact_rate", "poses", "contact", "n_ticks", "awareness"):
-            expected = getattr(before[0].bounds[0], name)
-            np.testing.assert_allclose(getattr(again.bounds[0], name), expected, rtol=1e-12)
-        before = [again]
 
 
 def test_two_files_of_missions_in_a_folder_keep_their_own_ticks(tmp_path, terrain):

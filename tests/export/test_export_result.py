@@ -1,7 +1,6 @@
 """All formats at once."""
 
 import dataclasses
-import sys
 import xml.etree.ElementTree as ET
 
 import numpy as np
@@ -27,20 +26,17 @@ FILES = {
         "route_graph_params.yaml",
         *(f"waypoints_{robot}.yaml" for robot in ("lead", "r1", "r2", "r3")),
     ],
-    "foxglove": ["scene.mcap"],
-    "ros2_bag": ["path_ros2"],
 }
 NEEDS_A_PLACE = ("geotiff", "cog", "geojson", "geopackage", "overwatch")
 
 
 def test_every_format_is_written_under_its_name(result, tmp_path):
-    pytest.importorskip("rosbags", reason="needs the extra ros")
     assert list(FORMATS) == list(FILES)
     written = export_result(result, tmp_path / "out", FORMATS)
     names = [name for names in FILES.values() for name in names]
     assert written == [tmp_path / "out" / name for name in (*names, "frame.yaml")]
     assert set((tmp_path / "out").iterdir()) == set(written)
-    assert all(file.is_dir() or file.stat().st_size for file in written)
+    assert all(file.stat().st_size for file in written)
 
 
 def test_by_default_it_is_what_a_gis_takes_and_a_second_time_replaces_it(result, tmp_path):
@@ -77,19 +73,19 @@ def test_maps_for_ros_have_the_frame_that_is_asked_for(result, tmp_path):
 
 
 def test_files_for_robots_in_one_folder_have_one_frame(result, tmp_path):
-    pytest.importorskip("rosbags", reason="needs the extra ros")
-    export_result(result, tmp_path, ["ros_map", "nav2"])
-    with pytest.raises(TrustboError, match=r"holds cost_map.yaml, .*geojson, .* in another frame"):
-        export_result(result, tmp_path, "ros2_bag", frame=OF_CRS)
-    assert not (tmp_path / "path_ros2").exists()
-    export_result(result, tmp_path, "ros2_bag")
+    odom, start = Frame(name="odom"), result.workspace.grid.center(result.path[0])
+    export_result(result, tmp_path, "nav2")
+    with pytest.raises(TrustboError, match=r"holds .*route_graph.geojson, .* in another frame"):
+        export_result(result, tmp_path, "ros_map", frame=odom)
+    assert not (tmp_path / "cost_map.yaml").exists()
+    export_result(result, tmp_path, "ros_map", frame=Frame(start))
     export_result(result, tmp_path / "b", "ros_map", frame=OF_CRS)
     export_result(result, tmp_path / "b", "ros_map")  # alone, it is replaced
     export_result(result, tmp_path / "b", "ros_map", frame=OF_CRS)
     (tmp_path / "b" / "frame.yaml").unlink()  # as an export of version 0.2
     with pytest.raises(TrustboError, match=r"asked for, 'map' at x 380015, y 5224925 of the"):
-        export_result(result, tmp_path / "b", "ros2_bag")
-    export_result(result, tmp_path / "b", "ros2_bag", frame=OF_CRS)
+        export_result(result, tmp_path / "b", "nav2")
+    export_result(result, tmp_path / "b", ["ros_map", "nav2"])
     with pytest.raises(TrustboError, match=r"float32, in steps of 0.5 m .* origin='auto' is the"):
         export_result(result, tmp_path / "c", "nav2", frame=OF_CRS)
 
@@ -129,33 +125,28 @@ def test_maps_are_made_for_formats_that_have_maps_and_once(result, tmp_path):
     assert made == [{}]
 
 
-def test_what_cannot_be_written_is_said_beforehand(result, nowhere, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "rosbags", None)
+def test_what_cannot_be_written_is_said_beforehand(result, nowhere, tmp_path):
     absent = left_out(nowhere, tmp_path)
-    assert list(absent) == [*NEEDS_A_PLACE, "foxglove", "ros2_bag"]
+    assert list(absent) == [*NEEDS_A_PLACE]
     assert "only a workspace made from a terrain has a CRS" in absent["geojson"]
-    assert "pip install rosbags" in absent["ros2_bag"]
     (tmp_path / "missions.csv").mkdir()
-    assert list(left_out(result, tmp_path)) == ["csv", "ros2_bag"]
+    assert list(left_out(result, tmp_path)) == ["csv"]
     (tmp_path / "file").touch()
     with pytest.raises(TrustboError, match=r"cannot write to '.*file': .* is a file"):
         left_out(result, tmp_path / "file")
 
 
 def test_without_a_terrain_there_are_tables_and_ros(nowhere, tmp_path):
-    pytest.importorskip("rosbags", reason="needs the extra ros")
     for name in NEEDS_A_PLACE:
         with pytest.raises(TrustboError, match="only a workspace made from a terrain has a CRS"):
             export_result(nowhere, tmp_path / "out", ["csv", name])
     assert list(tmp_path.iterdir()) == []
-    with pytest.raises(TrustboError, match="a plan has posts and ways where its workspace was"):
-        export_result(nowhere, tmp_path, ["csv", "foxglove"])
-    rest = [name for name in FORMATS if name not in (*NEEDS_A_PLACE, "foxglove")]
+    rest = [name for name in FORMATS if name not in NEEDS_A_PLACE]
     written = export_result(nowhere, tmp_path, rest)
     assert set(tmp_path.iterdir()) == set(written)
 
 
-def test_what_one_format_refuses_keeps_all_from_being_written(result, tmp_path, monkeypatch):
+def test_what_one_format_refuses_keeps_all_from_being_written(result, tmp_path):
     with pytest.raises(
         TrustboError, match="unknown format 'kml'; choose one of geotiff, cog, geoj"
     ):
@@ -166,32 +157,28 @@ def test_what_one_format_refuses_keeps_all_from_being_written(result, tmp_path, 
         TrustboError, match=r"resolution=5 is of files for robots; leave it out, or"
     ):
         export_result(result, tmp_path, ["csv", "geojson"], resolution=5)
-    monkeypatch.setitem(sys.modules, "rosbags", None)
-    with pytest.raises(TrustboError, match="pip install rosbags"):
-        export_result(result, tmp_path, ["csv", "ros2_bag"])
     assert list(tmp_path.iterdir()) == []
 
 
 def test_what_is_in_the_way_is_named_before_anything_is_written(result, tmp_path):
-    pytest.importorskip("rosbags", reason="needs the extra ros")
     (tmp_path / "missions.csv").mkdir()
-    (tmp_path / "path_ros2").touch()
+    (tmp_path / "file").touch()
     with pytest.raises(TrustboError, match=r"missions\.csv': it is a folder"):
         export_result(result, tmp_path, ["geojson", "csv"])
-    with pytest.raises(TrustboError, match=r"path_ros2' exists; bags are not overwritten"):
-        export_result(result, tmp_path, ["geojson", "ros2_bag"])
-    with pytest.raises(TrustboError, match=r"cannot write to '.*path_ros2': .* is a file"):
-        export_result(result, tmp_path / "path_ros2")
-    assert {file.name for file in tmp_path.iterdir()} == {"missions.csv", "path_ros2"}
+    with pytest.raises(TrustboError, match=r"cannot write to '.*file': .* is a file"):
+        export_result(result, tmp_path / "file")
+    assert {file.name for file in tmp_path.iterdir()} == {"missions.csv", "file"}
 
 
 def test_names_that_a_format_cannot_hold_are_refused_before_anything_is_written(result, tmp_path):
     workspace = result.workspace
-    team = tb.Team(3, names=("R1", "r1", "r2"))
+    team = tb.Team(3, names=("R1", "r1", "r/2"))
     awareness = workspace.awareness.assign_coords(robot=list(team.names), feature=["a/b", "x", "y"])
     odd = dataclasses.replace(workspace, team=team, awareness=awareness, of_bounds=None)
     odd = dataclasses.replace(result, workspace=odd)
-    with pytest.raises(TrustboError, match=r"does not tell capitals .* \('R1', 'r1', 'r2'\)"):
+    with pytest.raises(TrustboError, match=r"does not tell capitals .* \('R1', 'r1', 'r/2'\)"):
         export_result(odd, tmp_path, ["geojson", "geopackage"])
+    with pytest.raises(TrustboError, match=r"robot 'r/2' cannot be in a topic"):
+        export_result(odd, tmp_path, ["geojson", "nav2"])
     assert list(tmp_path.iterdir()) == []
     assert "geopackage" in left_out(odd, tmp_path)

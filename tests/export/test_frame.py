@@ -1,4 +1,4 @@
-"""The frame that exports for robots share: as YAML, as a static transform, as a datum for GPS."""
+"""The frame that exports for robots share: a static transform in YAML, and a datum for GPS."""
 
 import math
 
@@ -9,47 +9,36 @@ from pyproj import CRS, Geod, Transformer
 
 import trustbo as tb
 from trustbo.errors import TrustboError
-from trustbo.export import Frame, write_frame, write_ros_bag, write_ros_map
+from trustbo.export import Frame, write_frame, write_ros_map, write_waypoints
 from trustbo.export.frame import OF_CRS
 
 ASK = Frame("auto", 0.4, "odom")
 
 
-def test_one_transform_is_in_the_file_and_in_the_bag(result, maps, tmp_path):
+def test_one_transform_is_in_the_files_of_all_exports(result, maps, tmp_path):
     """As tf2 applies it: position in the parent = rotation by the quaternion, then translation."""
-    pytest.importorskip("rosbags", reason="needs the extra ros")
-    from mcap.reader import make_reader
-    from mcap_ros2.decoder import DecoderFactory
-
     write_frame(tmp_path / "frame.yaml", result, frame=ASK)
     text = (tmp_path / "frame.yaml").read_text()
     record = yaml.safe_load(text)
-    write_ros_bag(tmp_path / "bag", result, maps["cost"], frame=ASK)
-    assert (tmp_path / "bag_frame.yaml").read_text() == text
+    write_waypoints(tmp_path / "lead.yaml", result, frame=ASK)
+    assert (tmp_path / "lead_frame.yaml").read_text() == text
     of_map = ASK._replace(origin=result.workspace.grid.center(result.path[0]))
     write_ros_map(tmp_path / "map.yaml", maps["cost"], result.workspace, frame=of_map)
     assert (tmp_path / "map_frame.yaml").read_text() == text
-    with (tmp_path / "bag" / "bag.mcap").open("rb") as stream:
-        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        found = {c.topic: (c, m) for _, c, _, m in reader.iter_decoded_messages()}
-    channel, message = found["/tf_static"]
-    assert "durability: 1" in channel.metadata["offered_qos_profiles"]  # transient local
-    (static,) = message.transforms
-    assert (static.header.frame_id, static.child_frame_id) == (record["parent"], record["frame"])
-    shift, turn = static.transform.translation, static.transform.rotation
-    written = record["transform"]
-    assert written["translation"] == {"x": shift.x, "y": shift.y, "z": shift.z}
-    assert written["rotation"] == {"x": turn.x, "y": turn.y, "z": turn.z, "w": turn.w}
+    assert record["frame"] == "odom"
     assert CRS.from_user_input(record["parent"].replace("_", ":")) == CRS.from_epsg(32616)
-    yaw = 2.0 * math.atan2(turn.z, turn.w)
+    shift, turn = (record["transform"][name] for name in ("translation", "rotation"))
+    yaw = 2.0 * math.atan2(turn["z"], turn["w"])
     assert yaw == pytest.approx(record["rotation"]) == pytest.approx(0.4)
-    for pose, cell in zip(found["/trustbo/path"][1].poses, result.path, strict=True):
-        x, y = pose.pose.position.x, pose.pose.position.y
+    waypoints = yaml.safe_load((tmp_path / "lead.yaml").read_text())["poses"]
+    for one, stop in zip(waypoints, result.plan.stops, strict=True):
+        assert one["header"]["frame_id"] == "odom"
+        x, y = (one["pose"]["position"][axis] for axis in "xy")
         in_parent = (
-            shift.x + x * math.cos(yaw) - y * math.sin(yaw),
-            shift.y + x * math.sin(yaw) + y * math.cos(yaw),
+            shift["x"] + x * math.cos(yaw) - y * math.sin(yaw),
+            shift["y"] + x * math.sin(yaw) + y * math.cos(yaw),
         )
-        assert in_parent == pytest.approx(result.workspace.grid.center(cell), abs=1e-6)
+        assert in_parent == pytest.approx(tuple(stop), abs=1e-6)
     command = text[text.index("ros2 run") :].splitlines()[0]
     assert command.endswith("--yaw 0.4 --frame-id epsg_32616 --child-frame-id odom")
 

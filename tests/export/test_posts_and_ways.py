@@ -2,21 +2,19 @@
 
 import itertools
 import json
-import math
 import sqlite3
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import shapely
-import yaml
 from pyproj import Transformer
 from references import geometry_of_blob
 from worlds import Steady, hillside
 
 import trustbo as tb
 from trustbo.errors import TrustboError
-from trustbo.export import Frame, path_frame, write_path, write_ros_bag
+from trustbo.export import path_frame, write_path, write_waypoints
 
 ROBOTS = ("lead", "r1", "r2", "r3")
 FROM_DEGREES = Transformer.from_crs(4326, 32616, always_xy=True)
@@ -141,104 +139,6 @@ def test_a_post_says_what_it_watches(plan, workspace):
         path_frame(plan, layer="post")
 
 
-def test_a_bag_has_posts_towards_the_lead_s_stop_and_whole_ways(
-    plan, planner, params, workspace, tmp_path
-):
-    pytest.importorskip("rosbags", reason="needs the extra ros")
-    from mcap.reader import make_reader
-    from mcap_ros2.decoder import DecoderFactory
-
-    def read(folder):
-        with (folder / "path.mcap").open("rb") as stream:
-            reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-            return {c.topic: (s.name, m) for s, c, _, m in reader.iter_decoded_messages()}
-
-    def poses(found, topic, kind):
-        name, message = found[f"/trustbo/{topic}"]
-        assert name == kind
-        assert message.header.frame_id == "map"
-        own = [pose.pose if kind.endswith("Path") else pose for pose in message.poses]
-        turns = [2.0 * math.atan2(p.orientation.z, p.orientation.w) for p in own]
-        return np.array([(p.position.x, p.position.y) for p in own]), np.array(turns)
-
-    def assert_says_what_is_planned(found):
-        stops, _ = poses(found, "lead/waypoints", "geometry_msgs/msg/PoseArray")
-        points = [workspace.ground.posts.stop(cell) for cell in plan.path]
-        np.testing.assert_array_equal(stops, points)
-        bounds = list(itertools.pairwise(plan.path))
-        for i, robot in enumerate(ROBOTS[1:]):
-            where, turns = poses(found, f"{robot}/posts", "geometry_msgs/msg/PoseArray")
-            own = np.array([workspace.posts(a, c)[i] for a, c in bounds])
-            np.testing.assert_array_equal(where, own)
-            x, y = (stops[1:] - own).T
-            np.testing.assert_allclose(np.exp(1j * turns), (x + 1j * y) / np.hypot(x, y))
-        for i, robot in enumerate(ROBOTS):
-            way, turns = poses(found, f"{robot}/way", "nav_msgs/msg/Path")
-            own = [
-                workspace.ways(a, c, ahead)[i]
-                for (a, c), ahead in zip(bounds, (*plan.path[2:], None), strict=True)
-            ]
-            whole = np.concatenate([own[0][:1], *(part[1:] for part in own)])
-            np.testing.assert_array_equal(way, whole)
-            x, y = np.diff(whole, axis=0).T
-            np.testing.assert_allclose(np.exp(1j * turns[:-1]), (x + 1j * y) / np.hypot(x, y))
-
-    cost = planner.cost_map(params)
-    write_ros_bag(tmp_path / "path", plan, cost)
-    assert_says_what_is_planned(read(tmp_path / "path"))
-    for n, wrong in enumerate(faults(plan).values()):
-        broken = replace(plan)
-        vars(broken).update(stops=plan.stops, posts=plan.posts, ways=plan.ways)
-        vars(broken).update(wrong)
-        write_ros_bag(tmp_path / str(n) / "path", broken, cost)
-        with pytest.raises(AssertionError):
-            assert_says_what_is_planned(read(tmp_path / str(n) / "path"))
-    named = replace(workspace, team=tb.Team(3, names=("r 1", "r2", "r3")))
-    with pytest.raises(TrustboError, match="robot 'r 1' cannot be in a topic"):
-        write_ros_bag(tmp_path / "new", replace(plan, workspace=named), cost)
-
-
-def test_a_bag_in_a_frame_of_its_own_keeps_millimetres_in_float32(
-    plan, planner, params, workspace, tmp_path
-):
-    """RViz draws in float32: northings in steps of .5 m; pyproj's affine operation turns back."""
-    pytest.importorskip("rosbags", reason='needs pip install "trustbo[ros]"')
-    from mcap.reader import make_reader
-    from mcap_ros2.decoder import DecoderFactory
-
-    cost, options = planner.cost_map(params), {"frame": Frame("auto", 0.4, "odom")}
-    write_ros_bag(tmp_path / "path", plan, cost, **options)
-    frame = yaml.safe_load((tmp_path / "path_frame.yaml").read_text())
-    c, s, (east, north) = math.cos(0.4), math.sin(0.4), frame["origin"]
-    to_crs = Transformer.from_pipeline(
-        f"+proj=affine +xoff={east!r} +yoff={north!r} +s11={c} +s12={-s} +s21={s} +s22={c}"
-    )
-    with (tmp_path / "path" / "path.mcap").open("rb") as stream:
-        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        found = {c.topic: m for _, c, _, m in reader.iter_decoded_messages()}
-    (static,) = found.pop("/tf_static").transforms
-    assert (static.header.frame_id, static.child_frame_id) == ("epsg_32616", "odom")
-    assert {message.header.frame_id for message in found.values()} == {"odom"}
-    poses = [pose.pose for pose in found["/trustbo/path"].poses]
-    drawn = np.array([(p.position.x, p.position.y) for p in poses], np.float32)
-    assert drawn[0].tolist() == [0.0, 0.0]
-    centers = np.array([workspace.grid.center(cell) for cell in plan.path])
-    back = np.column_stack(to_crs.transform(*drawn.astype(float).T))
-    np.testing.assert_allclose(back, centers, rtol=0.0, atol=1e-3)
-    assert np.spacing(np.float32(centers[0, 1])) == 0.5  # without a frame
-    turns = np.array([2.0 * math.atan2(p.orientation.z, p.orientation.w) for p in poses])
-    x, y = np.diff(centers, axis=0).T
-    np.testing.assert_allclose(np.exp(1j * (turns[:-1] + 0.4)), (x + 1j * y) / np.hypot(x, y))
-    grid = found["/trustbo/cost"]
-    corner = grid.info.origin.position
-    x, y = to_crs.transform(
-        corner.x + 0.5 * grid.info.resolution * grid.info.width,
-        corner.y + 0.5 * grid.info.resolution * grid.info.height,
-    )
-    left, bottom, right, top = workspace.grid.bounds
-    assert (x, y) == pytest.approx(((left + right) / 2, (bottom + top) / 2), abs=3.0)
-
-
 def test_where_a_robot_has_no_way_it_has_no_line(plan, tmp_path):
     lead, r1, _, r3 = plan.ways[1]
     broken = replace(plan)
@@ -248,6 +148,9 @@ def test_where_a_robot_has_no_way_it_has_no_line(plan, tmp_path):
         _, ways = READERS[suffix](tmp_path / f"path.{suffix}")
         assert {robot for k, robot in ways if k == 2} == {"lead", "r1", "r3"}
         assert (3, "r2") in ways
+    with pytest.raises(TrustboError, match="r2 has no way in bound 2, so that it cannot be sent"):
+        write_waypoints(tmp_path / "r1.yaml", broken, robot="r1")
+    assert not (tmp_path / "r1.yaml").exists()
 
 
 @pytest.mark.parametrize("slip", [False, True])

@@ -4,86 +4,13 @@ import json
 
 import numpy as np
 import pytest
+from bags import Log
 
 import trustbo as tb
 from trustbo.errors import TrustboError
 from trustbo.logs.bag import Topics, read_bag
 
 rosbags = pytest.importorskip("rosbags", reason="needs the extra ros")
-S = 1_000_000_000  # ns
-
-
-class Log:
-    """A log as robots write it, with rosbags alone: nothing of trustbo's own writer."""
-
-    def __init__(self, version=2):
-        from rosbags.typesys import Stores, get_typestore
-
-        self.version, self.messages = version, []
-        self.store = get_typestore(Stores.ROS2_HUMBLE if version == 2 else Stores.ROS1_NOETIC)
-
-    def type(self, name):
-        return self.store.types[name]
-
-    def say(self, seconds, topic, kind, **fields):
-        self.messages.append((round(seconds * S), topic, kind, self.type(kind)(**fields)))
-
-    def bound(self, seconds, *values):
-        layout = self.type("std_msgs/msg/MultiArrayLayout")(dim=[], data_offset=0)
-        data = np.array(values, np.int32)
-        kind = "std_msgs/msg/Int32MultiArray"
-        self.say(seconds, "/mission/bound", kind, layout=layout, data=data)
-
-    def text(self, seconds, topic, text):
-        self.say(seconds, topic, "std_msgs/msg/String", data=text)
-
-    def contact(self, robot, *looks, kind="std_msgs/msg/Bool"):
-        for seconds, value in looks:
-            self.say(seconds, f"/{robot}/contact", kind, data=value)
-
-    def awareness(self, seconds, robot, values, label=None):
-        dim = []
-        if label is not None:
-            make = self.type("std_msgs/msg/MultiArrayDimension")
-            dim = [make(label=label, size=len(values), stride=len(values))]
-        layout = self.type("std_msgs/msg/MultiArrayLayout")(dim=dim, data_offset=0)
-        data, kind = np.array(values, np.float32), "std_msgs/msg/Float32MultiArray"
-        self.say(seconds, f"/{robot}/awareness", kind, layout=layout, data=data)
-
-    def odometry(self, seconds, robot, x, y, quaternion=(0.0, 0.0, 0.0, 1.0), stamp=None):
-        t, make = round((seconds if stamp is None else stamp) * S), self.type
-        time = make("builtin_interfaces/msg/Time")(sec=t // S, nanosec=t % S)
-        seq = {"seq": 0} if self.version == 1 else {}
-        q = dict(zip("xyzw", quaternion, strict=True))
-        pose = make("geometry_msgs/msg/Pose")(
-            position=make("geometry_msgs/msg/Point")(x=x, y=y, z=1.0),
-            orientation=make("geometry_msgs/msg/Quaternion")(**q),
-        )
-        still = make("geometry_msgs/msg/Vector3")(x=0.0, y=0.0, z=0.0)
-        twist = make("geometry_msgs/msg/Twist")(linear=still, angular=still)
-        unknown = np.zeros(36)
-        self.say(
-            seconds,
-            f"/{robot}/odom",
-            "nav_msgs/msg/Odometry",
-            header=make("std_msgs/msg/Header")(stamp=time, frame_id="odom", **seq),
-            child_frame_id="base",
-            pose=make("geometry_msgs/msg/PoseWithCovariance")(pose=pose, covariance=unknown),
-            twist=make("geometry_msgs/msg/TwistWithCovariance")(twist=twist, covariance=unknown),
-        )
-
-    def save(self, path):
-        from rosbags import rosbag1, rosbag2
-
-        writer = rosbag2.Writer(path, version=8) if self.version == 2 else rosbag1.Writer(path)
-        serialize = self.store.serialize_cdr if self.version == 2 else self.store.serialize_ros1
-        topics = {}
-        with writer:
-            for time, topic, kind, message in self.messages:
-                if topic not in topics:
-                    topics[topic] = writer.add_connection(topic, kind, typestore=self.store)
-                writer.write(topics[topic], time, serialize(message, kind))
-        return path
 
 
 def markers(log, ends=(10.0, 14.0, 20.0)):

@@ -46,9 +46,9 @@ def export(
     All formats: trustbo export out/demo --format all --out for-the-field
     For robots: trustbo export out/demo --format nav2 --format ros_map --out robots
 
-    With all, formats that cannot be written (a place on Earth without a terrain, a
-    bag that exists already) are left out, each with a line that gives the reason; a
-    format asked for by name is an error then.
+    With all, formats that cannot be written (a place on Earth without a terrain) are
+    left out, each with a line that gives the reason; a format asked for by name is an
+    error then.
     """
     _require_result(folder)
     from trustbo.campaign.storage import load_result

@@ -1,14 +1,13 @@
 """Results as files for other programs: GIS, robots, tables."""
 
 from trustbo.export.everything import FORMATS, export_result
-from trustbo.export.foxglove_scene import write_foxglove
 from trustbo.export.frame import Frame, write_frame
 from trustbo.export.nav2 import write_waypoints
 from trustbo.export.overwatch import write_overwatch
 from trustbo.export.paths import path_frame, write_path
 from trustbo.export.rasters import write_geotiff
 from trustbo.export.roads import from_route_graph
-from trustbo.export.ros import write_ros_bag, write_ros_map
+from trustbo.export.ros import write_ros_map
 from trustbo.export.route_graph import RouteGraph
 from trustbo.export.route_graph_file import edge_updates, read_route_graph, write_route_graph
 from trustbo.export.tables import write_csv
@@ -23,12 +22,10 @@ __all__ = [
     "path_frame",
     "read_route_graph",
     "write_csv",
-    "write_foxglove",
     "write_frame",
     "write_geotiff",
     "write_overwatch",
     "write_path",
-    "write_ros_bag",
     "write_ros_map",
     "write_route_graph",
     "write_waypoints",

@@ -15,7 +15,6 @@ from trustbo.export.checks import (
     require_lead_apart,
     require_names_for_sql,
 )
-from trustbo.export.foxglove_scene import require_foxglove, write_foxglove
 from trustbo.export.frame import (
     AT_START,
     Frame,
@@ -30,14 +29,13 @@ from trustbo.export.nav2 import stops_of, write_waypoints
 from trustbo.export.overwatch import require_overwatch, write_overwatch
 from trustbo.export.paths import write_path
 from trustbo.export.rasters import write_geotiff
-from trustbo.export.ros import occupancy, require_robots, write_ros_bag, write_ros_map
+from trustbo.export.ros import occupancy, write_ros_map
 from trustbo.export.route_graph import OBJECTIVES, graph_of, summed
 from trustbo.export.route_graph_file import write_route_graph
-from trustbo.export.schedule import schedule_of
 from trustbo.export.style import write_style
 from trustbo.export.tables import write_csv
 from trustbo.files import FilePath, require_file, require_folder
-from trustbo.logs.bagfile import require_new_bag
+from trustbo.logs.messages import require_topic_names
 from trustbo.planning.problem import mean_of
 
 
@@ -92,21 +90,20 @@ def export_result(
 
     Args:
         result: Result of a campaign.
-        folder: Folder to write to; files in it are replaced, bags are not.
+        folder: Folder to write to; files in it are replaced.
         formats: Names of formats, keys of `FORMATS`.
         resolution: Side of a pixel of the maps for ROS, m; by default that of a cell, or a tenth of
             its shorter side if cells are not square.
         frame: Frame of the files for robots.
 
     Returns:
-        Files written; the folder of a ROS 2 bag. With files for robots, the last is
-        `frame.yaml`, the one frame of them all, see `write_frame`.
+        Files written. With files for robots, the last is `frame.yaml`, the one frame of them all,
+        see `write_frame`.
 
     Raises:
-        TrustboError: A format is unknown, or needs a CRS that the result lacks; a bag exists, or
-            rosbags is not installed; the resolution is not positive, far too fine, or given
-            without a format for robots; a cost is outside [0, 1]; or a file cannot be written. Then
-            nothing is written.
+        TrustboError: A format is unknown, or needs a CRS that the result lacks; the resolution is
+            not positive, far too fine, or given without a format for robots; a cost is outside
+            [0, 1]; or a file cannot be written. Then nothing is written.
     """
     names = [formats] if isinstance(formats, str) else dict.fromkeys(formats)
     chosen = {name: _FORMATS[require_choice("format", name, _FORMATS)] for name in names}
@@ -127,7 +124,7 @@ def export_result(
     if for_robots:
         _require_frame(place, target, chosen)
     content = _Content(result, cache(result.maps), place, resolution)
-    if not chosen.keys().isdisjoint(_WITH_COST):
+    if "ros_map" in chosen:
         occupancy(content.maps()["cost"], result.workspace, resolution=resolution)
     for kind in chosen.values():
         kind.write(content, target / kind.files[0])
@@ -181,8 +178,8 @@ def left_out(
 def _require_possible(name: str, result: Result, target: Path, place: PlacedFrame) -> None:
     """Refuse a format that cannot be written: TrustboError.
 
-    It needs a CRS that the result lacks, or cannot hold one of its names, or its frame; a bag
-    exists, or rosbags is not installed; or a folder has the name of a file.
+    It needs a CRS that the result lacks, or cannot hold one of its names, or its frame; or a folder
+    has the name of a file.
     """
     kind = _FORMATS[name]
     if kind.on_earth:
@@ -192,10 +189,7 @@ def _require_possible(name: str, result: Result, target: Path, place: PlacedFram
     if kind.require is not None:
         kind.require(result, place)
     for file in kind.files_in(target, result):
-        if name in _BAGS:
-            require_new_bag(file)
-        else:
-            require_file(file)
+        require_file(file)
 
 
 def _write_maps(content: _Content, file: Path) -> None:
@@ -231,17 +225,14 @@ def _summable(result: Result) -> str:
 
 
 def _require_nav2(result: Result, place: PlacedFrame) -> None:
-    require_robots(result.workspace)
     require_fine(place, result.workspace, "a route graph")
     graph_of(summed(result.planner, _summable(result)), mean_of(result.posterior), place)
     if result.workspace.ground is not None:
+        require_topic_names(LEAD, result.workspace.team.names)
         for robot in (LEAD, *result.workspace.team.names):
             stops_of(result.plan, robot, place)
 
 
-_BAGS = ("ros2_bag",)
-_WITH_COST = ("ros_map", *_BAGS)
-"""Formats with the cost map, as occupancy or at the same resolution."""
 _WAYPOINTS = "waypoints_{robot}.yaml"
 _FRAME = "frame.yaml"
 """File with the frame of all formats for ROS."""
@@ -298,24 +289,6 @@ _FORMATS = {
         in_frame=True,
         require=_require_nav2,
         on_terrain=(_WAYPOINTS,),
-    ),
-    "foxglove": _Format(
-        "maps, ways, posts and sight bound by bound as a scene for Foxglove (mcap)",
-        ("scene.mcap",),
-        lambda content, file: write_foxglove(
-            file, content.result, content.maps(), **content.placing
-        ),
-        in_frame=True,
-        require=lambda result, _: (require_foxglove(), schedule_of(result.plan)),
-    ),
-    "ros2_bag": _Format(
-        "cost map, path, posts and ways as a bag of ROS 2 (mcap)",
-        ("path_ros2",),
-        lambda content, file: write_ros_bag(
-            file, content.result, content.maps()["cost"], **content.placing
-        ),
-        in_frame=True,
-        require=lambda result, _: require_robots(result.workspace),
     ),
 }
 FORMATS = {name: kind.text for name, kind in _FORMATS.items()}

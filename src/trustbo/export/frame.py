@@ -1,7 +1,6 @@
 """Frame of robots: an origin and a direction in the CRS, subtracted in float64.
 
-One frame serves all exports for robots. Its pose in the CRS is a static transform, in a YAML file,
-and in bags on `/tf_static`.
+One frame serves all exports for robots. Its pose in the CRS is a static transform, in a YAML file.
 """
 
 import math
@@ -152,14 +151,14 @@ def write_frame(
 
 
 def frame_file(path: Path) -> Path:
-    """Return the file with the frame of a map or a bag, in the same folder."""
+    """Return the file with the frame of a map, in the same folder."""
     return require_file(path.with_name(f"{path.stem}_frame.yaml"))
 
 
 def save_beside(
     path: Path, frame: Frame | PlacedFrame, place: PlacedFrame, workspace: Workspace
 ) -> None:
-    """Write the frame of the map or bag at `path` to a file, with its place.
+    """Write the frame of the map at `path` to a file, with its place.
 
     Nothing for that of the CRS, nor for a frame that was placed before: it has a file.
     """

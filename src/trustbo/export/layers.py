@@ -1,7 +1,5 @@
 """Layers of a plan as tables: its bounds, the posts of T2, and the ways of all robots."""
 
-from itertools import takewhile
-
 import geopandas as gpd
 import numpy as np
 import pandas as pd
@@ -84,19 +82,22 @@ def ways_layer(plan: Plan) -> gpd.GeoDataFrame:
     return gpd.GeoDataFrame(table, geometry=list(lines), crs=_crs(plan))
 
 
-def routes_of(plan: Plan) -> dict[str, list[np.ndarray]]:
-    """Return the ways of each robot, bound by bound, the lead first, up to the first missing one.
+def complete_routes(plan: Plan) -> dict[str, list[np.ndarray]]:
+    """Return the ways of each robot, bound by bound, the lead first.
 
-    After it the robot has no route, and must not drive.
+    TrustboError: a robot that has no way in a bound, or no terrain in memory.
     """
     names = (LEAD, *plan.workspace.team.names)
-    ways = zip(*_required(plan, plan.ways), strict=True)
-    return {
-        robot: [
-            way for way in takewhile(lambda way: way is not None, robot_ways) if way is not None
-        ]
-        for robot, robot_ways in zip(names, ways, strict=True)
-    }
+    routes: dict[str, list[np.ndarray]] = {robot: [] for robot in names}
+    for k, ways in enumerate(_required(plan, plan.ways), start=1):
+        for robot, way in zip(names, ways, strict=True):
+            if way is None:
+                raise TrustboError(
+                    f"{robot} has no way in bound {k}, so that it cannot be sent along the path; "
+                    "plan another, or give it a larger max_slope."
+                )
+            routes[robot].append(way)
+    return routes
 
 
 def _required[T](plan: Plan, values: T | None) -> T:

@@ -9,9 +9,8 @@ from trustbo.campaign.result import Result
 from trustbo.errors import require_choice
 from trustbo.export.checks import LEAD
 from trustbo.export.frame import AT_START, Frame, PlacedFrame, frame_file, placed, save_beside
-from trustbo.export.layers import plan_of
+from trustbo.export.layers import complete_routes, plan_of
 from trustbo.export.poses import onward, towards
-from trustbo.export.schedule import complete_routes
 from trustbo.files import FilePath, require_file, write_text
 from trustbo.planning import Plan
 

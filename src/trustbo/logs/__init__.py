@@ -1,6 +1,6 @@
 """Missions in files, and logs of robots as missions (README.md: which file holds what)."""
 
-from trustbo.logs.bag import read_bag, write_bag
+from trustbo.logs.bag import read_bag
 from trustbo.logs.geometry import geometry
 from trustbo.logs.log import Log, read_log
 from trustbo.logs.messages import Topics
@@ -17,7 +17,7 @@ from trustbo.renamed import moved
 __all__ = [
     "Log", "Sensor", "Topics", "fit_sensor", "geometry", "join_missions", "missions_of",
     "read_azevedo_sa", "read_bag", "read_du", "read_log", "read_missions", "read_mrclam",
-    "read_reports", "read_soh", "read_table", "reports_of", "synthetic_log", "write_bag",
+    "read_reports", "read_soh", "read_table", "reports_of", "synthetic_log",
     "write_missions", "write_table",
 ]  # fmt: skip
 __dir__ = __all__.copy  # completion lists public names alone

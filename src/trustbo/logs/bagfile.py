@@ -1,42 +1,22 @@
-"""Files of ROS bags: messages read and written by rosbags."""
+"""Files of ROS bags: messages read by rosbags."""
 
-import os
 import re
-import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from trustbo.errors import TrustboError, require_package
-from trustbo.files import naming_refusal, require_regular
+from trustbo.files import require_regular
 from trustbo.logs.messages import (
     CONTACT_TYPES,
-    DEFINITIONS,
     POSE_TYPES,
     READERS,
-    Messages,
     stamp_of,
 )
 from trustbo.logs.recording import Series
-
-STORAGES = ("sqlite3", "mcap")
-
-
-def _require_rosbags() -> None:
-    require_package("ROS bags need", "rosbags", "rosbags")
-
-
-class Record(NamedTuple):
-    """Message and its time of recording."""
-
-    time: int
-    """ns."""
-    topic: str
-    kind: str
-    message: Any
 
 
 class Bag:
@@ -118,8 +98,9 @@ class Bag:
 @contextmanager
 def opened(path: Path) -> Iterator[Bag]:
     """Open a bag for reading; TrustboError: no rosbags, no such file or folder, or not a bag."""
-    _require_rosbags()
+    require_package("ROS bags need", "rosbags", "rosbags")
     from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
 
     if not path.exists():
         raise TrustboError(f"there is no bag {str(path)!r}; check its path.")
@@ -127,7 +108,7 @@ def opened(path: Path) -> Iterator[Bag]:
         require_regular(path)
     try:
         # Bags of ROS 2 before Iron do not define their types.
-        reader = AnyReader([path], default_typestore=_types(2))
+        reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
         reader.open()
     except Exception as error:  # as above
         raise _unreadable(path, error) from None
@@ -135,93 +116,6 @@ def opened(path: Path) -> Iterator[Bag]:
         yield Bag(path, reader)
     finally:
         reader.close()
-
-
-def require_new_bag(path: Path) -> int:
-    """Version of ROS of a new bag, by its path: .bag for 1.
-
-    TrustboError: no rosbags; the path exists.
-    """
-    _require_rosbags()
-    if path.exists():
-        raise TrustboError(
-            f"{str(path)!r} exists; bags are not overwritten: remove it, or give another path."
-        )
-    return 1 if path.suffix == ".bag" else 2
-
-
-def write_messages(
-    path: Path,
-    version: int,
-    storage: str,
-    records: Callable[[Messages], Iterable[Record]],
-    *,
-    latched: bool = False,
-    frame: str = "map",
-) -> None:
-    """Write a bag, which `require_new_bag` allowed, whole or not at all.
-
-    The path is a file or folder; its parent is made if need be. `version` of ROS is 1
-    or 2, `storage` of ROS 2 one of `STORAGES`. `records` makes records in order of time with the
-    given `Messages`, in `frame`. If `latched`, late subscribers get the messages played before.
-    """
-    from rosbags import rosbag1, rosbag2
-
-    store = _types(version)
-    serialize = store.serialize_ros1 if version == 1 else store.serialize_cdr
-    with naming_refusal(path.parent):
-        path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
-        file = Path(folder) / path.name  # files within a bag are named after it
-        if version == 1:
-            writer: Any = rosbag1.Writer(file)
-        else:
-            plugin = rosbag2.StoragePlugin[storage.upper()]
-            writer = rosbag2.Writer(file, version=8, storage_plugin=plugin)
-        options = _latch(version) if latched else {}
-        connections: dict[str, Any] = {}
-        with writer:
-            for time, topic, kind, message in records(Messages(store.types, frame)):
-                if topic not in connections:
-                    connections[topic] = writer.add_connection(
-                        topic, kind, typestore=store, **options
-                    )
-                writer.write(connections[topic], time, serialize(message, kind))
-        os.replace(file, path)
-
-
-def _types(version: int) -> Any:
-    """Types of a version of ROS, those of `DEFINITIONS` included."""
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
-    store = get_typestore(Stores.ROS1_NOETIC if version == 1 else Stores.ROS2_HUMBLE)
-    for kind, text in DEFINITIONS[version].items():
-        store.register(get_types_from_msg(text, kind))
-    return store
-
-
-def _latch(version: int) -> dict[str, Any]:
-    """Options of rosbags' writer that offer a topic to late subscribers."""
-    from rosbags import interfaces as ros
-
-    if version == 1:
-        return {"latching": 1}
-    ever = ros.QosTime(9_223_372_036, 854_775_807)  # how ROS 2 writes "no limit"
-    return {
-        "offered_qos_profiles": [
-            ros.Qos(
-                history=ros.QosHistory.KEEP_LAST,
-                depth=1,
-                reliability=ros.QosReliability.RELIABLE,
-                durability=ros.QosDurability.TRANSIENT_LOCAL,
-                deadline=ever,
-                lifespan=ever,
-                liveliness=ros.QosLiveliness.AUTOMATIC,
-                liveliness_lease_duration=ever,
-                avoid_ros_namespace_conventions=False,
-            )
-        ]
-    }
 
 
 def _as_array(values: Sequence[Any], types: tuple[str, ...]) -> np.ndarray:

@@ -1,9 +1,9 @@
-"""ROS messages of standard types: topics, writers and readers."""
+"""ROS messages of standard types: topics and readers."""
 
 import json
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,15 +15,6 @@ TEXT = "std_msgs/msg/String"
 FLAG = "std_msgs/msg/Bool"
 NUMBERS = "std_msgs/msg/Float64MultiArray"
 POSE = "geometry_msgs/msg/PoseStamped"
-GRID = "nav_msgs/msg/OccupancyGrid"
-PATH = "nav_msgs/msg/Path"
-POSES = "geometry_msgs/msg/PoseArray"
-TRANSFORMS = "tf2_msgs/msg/TFMessage"
-DEFINITIONS: Mapping[int, Mapping[str, str]] = {
-    1: {TRANSFORMS: "geometry_msgs/TransformStamped[] transforms\n"},
-    2: {},
-}
-"""Definitions of types that rosbags has not, by the version of ROS."""
 
 MARKER_TYPES = (TEXT, "std_msgs/msg/Int32MultiArray")
 STATUS_TYPES = (TEXT,)
@@ -81,100 +72,6 @@ def require_topic_names(lead: str, robots: Sequence[str]) -> None:
             )
     if lead in robots:
         raise TrustboError(f"a robot is called as the lead, {lead!r}; see Topics.lead.")
-
-
-class Messages:
-    """Factory of messages of one version of ROS."""
-
-    def __init__(self, types: Mapping[str, Any], frame: str = "map") -> None:
-        """Hold the message classes by name, as rosbags has them, and the frame of positions."""
-        self._types, self._frame = types, frame
-
-    def text(self, text: str) -> Any:
-        """Make a string."""
-        return self._types[TEXT](data=text)
-
-    def flag(self, value: bool) -> Any:
-        """Make a boolean."""
-        return self._types[FLAG](data=bool(value))
-
-    def numbers(self, values: np.ndarray, names: Sequence[str]) -> Any:
-        """Make a vector; the label of its axis holds the names of the entries."""
-        axis = self._types["std_msgs/msg/MultiArrayDimension"](
-            label=",".join(names), size=len(values), stride=len(values)
-        )
-        layout = self._types["std_msgs/msg/MultiArrayLayout"](dim=[axis], data_offset=0)
-        return self._types[NUMBERS](layout=layout, data=np.asarray(values, dtype=np.float64))
-
-    def pose(self, time: int, pose: np.ndarray) -> Any:
-        """Make a pose (x, y, heading) at a time in ns, in the frame."""
-        return self._types[POSE](header=self._header(time), pose=self._pose(pose))
-
-    def path(self, time: int, poses: np.ndarray) -> Any:
-        """Make a path through poses, shape (pose, 3), in the frame."""
-        stamped = [self.pose(time, pose) for pose in poses]
-        return self._types[PATH](header=self._header(time), poses=stamped)
-
-    def poses(self, time: int, poses: np.ndarray) -> Any:
-        """Make an array of poses, shape (pose, 3), in the frame."""
-        return self._types[POSES](header=self._header(time), poses=[self._pose(p) for p in poses])
-
-    def transform(
-        self,
-        time: int,
-        parent: str,
-        origin: tuple[float, float],
-        turn: tuple[float, float, float, float],
-    ) -> Any:
-        """Make the transform with the pose of the frame in its parent.
-
-        `origin` is x and y in the parent, m, `turn` a quaternion x, y, z, w.
-        """
-        x, y = origin
-        shift = self._types["geometry_msgs/msg/Vector3"](x=x, y=y, z=0.0)
-        rotation = self._types["geometry_msgs/msg/Quaternion"](*turn)
-        one = self._types["geometry_msgs/msg/TransformStamped"](
-            header=self._header(time, parent),
-            child_frame_id=self._frame,
-            transform=self._types["geometry_msgs/msg/Transform"](
-                translation=shift, rotation=rotation
-            ),
-        )
-        return self._types[TRANSFORMS](transforms=[one])
-
-    def grid(self, time: int, values: np.ndarray, resolution: float, corner: np.ndarray) -> Any:
-        """Make a map in the frame from int8 values (row, col), the southern row first.
-
-        Time in ns, side of a pixel in m, and the pose of the lower left corner.
-        """
-        height, width = values.shape
-        info = self._types["nav_msgs/msg/MapMetaData"](
-            map_load_time=self._stamp(time),
-            resolution=resolution,
-            width=width,
-            height=height,
-            origin=self._pose(corner),
-        )
-        data = np.ascontiguousarray(values, dtype=np.int8).ravel()
-        return self._types[GRID](header=self._header(time), info=info, data=data)
-
-    def _stamp(self, time: int) -> Any:
-        return self._types["builtin_interfaces/msg/Time"](
-            sec=time // 1_000_000_000, nanosec=time % 1_000_000_000
-        )
-
-    def _header(self, time: int, frame: str = "") -> Any:
-        head = self._types["std_msgs/msg/Header"]
-        number = {"seq": 0} if "seq" in head.__dataclass_fields__ else {}  # of ROS 1 alone
-        return head(stamp=self._stamp(time), frame_id=frame or self._frame, **number)
-
-    def _pose(self, pose: np.ndarray) -> Any:
-        x, y, heading = (float(value) for value in pose)
-        turn = self._types["geometry_msgs/msg/Quaternion"](
-            x=0.0, y=0.0, z=math.sin(heading / 2.0), w=math.cos(heading / 2.0)
-        )
-        place = self._types["geometry_msgs/msg/Point"](x=x, y=y, z=0.0)
-        return self._types["geometry_msgs/msg/Pose"](position=place, orientation=turn)
 
 
 def read_marker(message: Any) -> dict[str, Any]:

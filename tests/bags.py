@@ -1,0 +1,126 @@
+"""ROS bags as robots write them, by rosbags alone: the reader of trustbo has no part in them."""
+
+import json
+import math
+
+import numpy as np
+
+S = 1_000_000_000  # ns
+STATES = ("speed_ratio", "pitch", "roll", "return_range", "visible_share")
+
+
+class Log:
+    """A log of standard messages, in the order in which they are said."""
+
+    def __init__(self, version=2):
+        from rosbags.typesys import Stores, get_typestore
+
+        self.version, self.messages = version, []
+        self.store = get_typestore(Stores.ROS2_HUMBLE if version == 2 else Stores.ROS1_NOETIC)
+
+    def type(self, name):
+        return self.store.types[name]
+
+    def say(self, seconds, topic, kind, **fields):
+        self.messages.append((round(seconds * S), topic, kind, self.type(kind)(**fields)))
+
+    def bound(self, seconds, *values):
+        layout = self.type("std_msgs/msg/MultiArrayLayout")(dim=[], data_offset=0)
+        data = np.array(values, np.int32)
+        kind = "std_msgs/msg/Int32MultiArray"
+        self.say(seconds, "/mission/bound", kind, layout=layout, data=data)
+
+    def text(self, seconds, topic, text):
+        self.say(seconds, topic, "std_msgs/msg/String", data=text)
+
+    def contact(self, robot, *looks, kind="std_msgs/msg/Bool"):
+        for seconds, value in looks:
+            self.say(seconds, f"/{robot}/contact", kind, data=value)
+
+    def vector(self, seconds, topic, values, label=None, bits=64):
+        dim = []
+        if label is not None:
+            make = self.type("std_msgs/msg/MultiArrayDimension")
+            dim = [make(label=label, size=len(values), stride=len(values))]
+        layout = self.type("std_msgs/msg/MultiArrayLayout")(dim=dim, data_offset=0)
+        data, kind = np.array(values, f"f{bits // 8}"), f"std_msgs/msg/Float{bits}MultiArray"
+        self.say(seconds, topic, kind, layout=layout, data=data)
+
+    def awareness(self, seconds, robot, values, label=None):
+        self.vector(seconds, f"/{robot}/awareness", values, label, bits=32)
+
+    def odometry(self, seconds, robot, x, y, quaternion=(0.0, 0.0, 0.0, 1.0), stamp=None):
+        t, make = round((seconds if stamp is None else stamp) * S), self.type
+        time = make("builtin_interfaces/msg/Time")(sec=t // S, nanosec=t % S)
+        seq = {"seq": 0} if self.version == 1 else {}
+        q = dict(zip("xyzw", quaternion, strict=True))
+        pose = make("geometry_msgs/msg/Pose")(
+            position=make("geometry_msgs/msg/Point")(x=x, y=y, z=1.0),
+            orientation=make("geometry_msgs/msg/Quaternion")(**q),
+        )
+        still = make("geometry_msgs/msg/Vector3")(x=0.0, y=0.0, z=0.0)
+        twist = make("geometry_msgs/msg/Twist")(linear=still, angular=still)
+        unknown = np.zeros(36)
+        self.say(
+            seconds,
+            f"/{robot}/odom",
+            "nav_msgs/msg/Odometry",
+            header=make("std_msgs/msg/Header")(stamp=time, frame_id="odom", **seq),
+            child_frame_id="base",
+            pose=make("geometry_msgs/msg/PoseWithCovariance")(pose=pose, covariance=unknown),
+            twist=make("geometry_msgs/msg/TwistWithCovariance")(twist=twist, covariance=unknown),
+        )
+
+    def save(self, path, storage="sqlite3"):
+        from rosbags import rosbag1, rosbag2
+
+        if self.version == 1:
+            writer = rosbag1.Writer(path)
+        else:
+            plugin = rosbag2.StoragePlugin[storage.upper()]
+            writer = rosbag2.Writer(path, version=8, storage_plugin=plugin)
+        serialize = self.store.serialize_cdr if self.version == 2 else self.store.serialize_ros1
+        topics = {}
+        with writer:
+            for time, topic, kind, message in self.messages:
+                if topic not in topics:
+                    topics[topic] = writer.add_connection(topic, kind, typestore=self.store)
+                writer.write(topics[topic], time, serialize(message, kind))
+        return path
+
+
+def record(missions, path, *, storage="sqlite3", names=None):
+    """Write what robots publish on missions; `names` has other topics. Missions are 1 s apart."""
+    log, now = Log(1 if path.suffix == ".bag" else 2), S
+    for mission in missions:
+        start = end = now
+        cells = [[int(row), int(col)] for row, col in mission.path]
+        plan = {"path": cells, "robots": mission.robots, "features": mission.features}
+        log.text(start / S, "/mission/bound", json.dumps({"bound": 0, "cell": cells[0], **plan}))
+        for k, bound in enumerate(mission.bounds, start=1):
+            begin, end = max(end, start + round(bound.t0 * S)), start + round(bound.t1 * S)
+            marker = {"bound": k, "cell": cells[k]}
+            log.text(begin / S, "/mission/bound", json.dumps(marker))
+            for tick in range(len(bound.contact)):
+                time = (begin + (end - begin) * (tick + 1) // len(bound.contact)) / S
+                _say_tick(log, time, mission.robots, bound, tick)
+            for robot, values in zip(mission.robots, bound.awareness, strict=True):
+                log.vector(end / S, f"/{robot}/awareness", values, ",".join(mission.features))
+            log.text(end / S, "/mission/status", bound.status)
+        if mission.status != mission.bounds[-1].status:
+            log.text((end + 1) / S, "/mission/status", mission.status)
+        now = end + S
+    log.messages = [(time, (names or {}).get(on, on), *rest) for time, on, *rest in log.messages]
+    return log.save(path, storage)
+
+
+def _say_tick(log, seconds, robots, bound, tick):
+    for i, robot in enumerate(robots):
+        log.contact(robot, (seconds, bool(bound.contact[tick, i])))
+        if bound.states is not None:
+            log.vector(seconds, f"/{robot}/state", bound.states[tick, i], ",".join(STATES))
+    if bound.poses is not None:
+        for robot, pose in zip(("lead", *robots), bound.poses[tick].tolist(), strict=True):
+            x, y, heading = pose
+            turn = 0.0, 0.0, math.sin(heading / 2.0), math.cos(heading / 2.0)
+            log.odometry(seconds, robot, x, y, turn)
