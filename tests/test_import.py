@@ -119,7 +119,6 @@ NAMES_OF_0_2 = {
     "draw_path draw_scale hazard_map loadings mission_trust parameter_history path_posterior "
     "place_map plan_map plan_trust regret_curves robot_maps terrain_maps trust_maps",
     "trustbo.export": "FORMATS export_result path_frame write_csv write_geotiff "
-    "write_overwatch "
     "write_path write_ros_map",
     "trustbo.report": "write_report",
 }

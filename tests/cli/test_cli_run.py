@@ -24,7 +24,6 @@ def test_run_writes_every_file_and_says_where(finished):
         "report.html",
         "explore.html",
         "maps.tif",
-        "maps.qml",
         "path.geojson",
         "result.json",
         "campaign.json",

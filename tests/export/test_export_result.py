@@ -1,7 +1,6 @@
 """All formats at once."""
 
 import dataclasses
-import xml.etree.ElementTree as ET
 
 import numpy as np
 import pytest
@@ -14,11 +13,9 @@ from trustbo.export.everything import left_out
 from trustbo.export.frame import OF_CRS
 
 FILES = {
-    "geotiff": ["maps.tif", "maps.qml"],
-    "cog": ["maps_cog.tif"],
+    "geotiff": ["maps.tif"],
     "geojson": ["path.geojson"],
     "geopackage": ["path.gpkg"],
-    "overwatch": ["overwatch.tif"],
     "csv": ["missions.csv"],
     "ros_map": ["cost_map.yaml", "cost_map.pgm"],
     "nav2": [
@@ -27,7 +24,7 @@ FILES = {
         *(f"waypoints_{robot}.yaml" for robot in ("lead", "r1", "r2", "r3")),
     ],
 }
-NEEDS_A_PLACE = ("geotiff", "cog", "geojson", "geopackage", "overwatch")
+NEEDS_A_PLACE = ("geotiff", "geojson", "geopackage")
 
 
 def test_every_format_is_written_under_its_name(result, tmp_path):
@@ -42,8 +39,8 @@ def test_every_format_is_written_under_its_name(result, tmp_path):
 def test_by_default_it_is_what_a_gis_takes_and_a_second_time_replaces_it(result, tmp_path):
     for _ in range(2):
         written = export_result(result, tmp_path)
-        assert [file.name for file in written] == ["maps.tif", "maps.qml", "path.geojson"]
-    assert len(list(tmp_path.iterdir())) == 3
+        assert [file.name for file in written] == ["maps.tif", "path.geojson"]
+    assert len(list(tmp_path.iterdir())) == 2
     assert export_result(result, tmp_path, "geopackage") == [tmp_path / "path.gpkg"]
 
 
@@ -90,15 +87,6 @@ def test_files_for_robots_in_one_folder_have_one_frame(result, tmp_path):
         export_result(result, tmp_path / "c", "nav2", frame=OF_CRS)
 
 
-def test_the_assumed_trust_of_the_start_does_not_stretch_the_colours(result, tmp_path):
-    export_result(result, tmp_path, ["geotiff"])
-    stops = [float(i.get("value")) for i in ET.parse(tmp_path / "maps.qml").iter("item")]
-    learned = result.maps()["trust_mean"].values
-    assert learned[result.path[0]] == pytest.approx(0.5, abs=0.1)
-    learned[result.path[0]] = np.nan
-    assert (stops[0], stops[-1]) == (np.nanmin(learned), np.nanmax(learned))
-
-
 def test_a_result_read_from_disk_is_exported_alike(result, tmp_path):
     result.save(tmp_path / "result")
     again = tb.load_result(tmp_path / "result")
@@ -121,7 +109,7 @@ def test_maps_are_made_for_formats_that_have_maps_and_once(result, tmp_path):
     watched = Watched(**fields)
     export_result(watched, tmp_path, ["geojson", "geopackage", "csv"])
     assert made == []
-    export_result(watched, tmp_path, ["geotiff", "cog", "ros_map"])
+    export_result(watched, tmp_path, ["geotiff", "ros_map"])
     assert made == [{}]
 
 
@@ -147,9 +135,7 @@ def test_without_a_terrain_there_are_tables_and_ros(nowhere, tmp_path):
 
 
 def test_what_one_format_refuses_keeps_all_from_being_written(result, tmp_path):
-    with pytest.raises(
-        TrustboError, match="unknown format 'kml'; choose one of geotiff, cog, geoj"
-    ):
+    with pytest.raises(TrustboError, match="unknown format 'kml'; choose one of geotiff, geojson"):
         export_result(result, tmp_path, ["csv", "kml"])
     with pytest.raises(TrustboError, match=r"resolution must be positive and finite; got 0"):
         export_result(result, tmp_path, ["csv", "ros_map"], resolution=0)

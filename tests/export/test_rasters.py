@@ -22,7 +22,7 @@ def geokey(page, number):
 
 def test_each_map_is_a_band_where_it_belongs(result, maps, tmp_path):
     path = tmp_path / "maps.tif"
-    write_geotiff(path, maps, result.workspace, style=False)
+    write_geotiff(path, maps, result.workspace)
     assert [file.name for file in tmp_path.iterdir()] == ["maps.tif"]
     with tifffile.TiffFile(path) as tiff:
         page = tiff.pages[0]
@@ -65,43 +65,7 @@ def test_one_map_is_one_band_however_its_dims_are_ordered(result, tmp_path):
     with rasterio.open(path) as source:
         assert source.descriptions == ("map",)
         assert source.read(1).sum() == 11.0
-    assert {file.name for file in path.parent.iterdir()} == {"trust.TIF", "trust.qml"}
-
-
-def test_a_small_cloud_optimized_geotiff_holds_the_same(result, maps, tmp_path):
-    write_geotiff(tmp_path / "maps.tif", maps, result.workspace, cog=True)
-    assert {file.name for file in tmp_path.iterdir()} == {"maps.tif", "maps.qml"}
-    with rasterio.open(tmp_path / "maps.tif") as source:
-        assert source.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
-        assert source.descriptions == tuple(maps.data_vars)
-        assert source.tags(1)["long_name"] == "mean expected trust"
-        np.testing.assert_array_equal(source.read(), maps.to_dataarray().astype(np.float32))
-        assert source.bounds == pytest.approx(result.workspace.terrain.rio.bounds())
-
-
-def test_a_large_one_is_laid_out_for_the_cloud(result, tmp_path):
-    rng, shape = np.random.default_rng(0), (600, 1100)
-    grid = dataclasses.replace(result.workspace.grid, shape=shape, cell_width=3.0, cell_height=2.0)
-    workspace = dataclasses.replace(result.workspace, grid=grid)
-    cost = xr.DataArray(rng.random(shape), dims=("row", "col"), name="cost")
-    write_geotiff(tmp_path / "cost.tif", cost, workspace, cog=True, style=False)
-    assert b"LAYOUT=IFDS_BEFORE_DATA" in (tmp_path / "cost.tif").read_bytes()[:300]
-    with tifffile.TiffFile(tmp_path / "cost.tif") as tiff:
-        full, *overviews = tiff.pages
-        assert full.is_tiled
-        assert full.tags["ModelPixelScaleTag"].value == (3.0, 2.0, 0.0)
-        assert full.shape == shape
-        assert [page.shape for page in overviews] == [(300, 550), (150, 275)]
-        assert all(page.is_tiled and page.is_reduced for page in overviews)
-        # Directories first, full size first; then the data, coarse to fine.
-        offsets = [page.offset for page in tiff.pages]
-        assert offsets == sorted(offsets)
-        first = [min(page.dataoffsets) for page in tiff.pages]
-        assert first == sorted(first, reverse=True)
-        assert max(offsets) < min(first)
-        np.testing.assert_array_equal(full.asarray(), cost.astype(np.float32))
-        means = cost.values.reshape(300, 2, 550, 2).mean((1, 3))
-        np.testing.assert_allclose(overviews[0].asarray(), means, rtol=1e-6)
+    assert {file.name for file in path.parent.iterdir()} == {"trust.TIF"}
 
 
 def test_what_is_no_map_of_the_cells_is_refused(result, maps, nowhere, tmp_path):
@@ -121,19 +85,15 @@ def test_what_is_no_map_of_the_cells_is_refused(result, maps, nowhere, tmp_path)
 
 def test_a_file_that_cannot_be_is_refused_before_anything_is_written(result, maps, tmp_path):
     (tmp_path / "folder.tif").mkdir()
-    (tmp_path / "styled.qml").mkdir()
     (tmp_path / "text").write_text("")
     for name, message in (
         ("folder.tif", r"cannot write '.*folder\.tif': it is a folder; name a file in it"),
-        ("styled.tif", r"cannot write '.*styled\.qml': it is a folder"),
         ("text/maps.tif", r"'.*text' is a file"),
         ("maps.png", r"maps\.png' must end in \.tif or \.tiff"),
     ):
         with pytest.raises(TrustboError, match=message):
             write_geotiff(tmp_path / name, maps, result.workspace)
-    names = {"folder.tif", "styled.qml", "text"}
-    assert {file.name for file in tmp_path.iterdir()} == names
-    write_geotiff(tmp_path / "styled.tif", maps, result.workspace, style=False)
+    assert {file.name for file in tmp_path.iterdir()} == {"folder.tif", "text"}
 
 
 def test_a_workspace_of_a_lazy_terrain_keeps_its_place_when_saved(result, tmp_path):

@@ -52,11 +52,11 @@ def run(
     Ends where a map has them: --start lon=175.4007,lat=-40.9204 --goal x=1802403,y=5467480
 
     The folder gets report.html (read this first), explore.html (interactive),
-    maps.png, terrain.png, maps.tif with its style maps.qml and path.geojson (for
-    QGIS; with each robot's posts and ways), posterior.nc (for ArviZ), history.csv,
-    and the other files that trustbo.load_result reads in Python. After Ctrl-C or
-    a power cut, trustbo resume goes on. A campaign in the folder is not replaced:
-    give another --out, or --overwrite.
+    maps.png, terrain.png, maps.tif and path.geojson (for QGIS; with each robot's
+    posts and ways), posterior.nc (for ArviZ), history.csv, and the other files that
+    trustbo.load_result reads in Python. After Ctrl-C or a power cut, trustbo resume
+    goes on. A campaign in the folder is not replaced: give another --out, or
+    --overwrite.
     """
     _require_flags(
         iterations, seed, policy=policy, objective=objective, model=model, sampler=sampler,

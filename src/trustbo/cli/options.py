@@ -85,9 +85,8 @@ Program
   debug: Show the whole traceback of an error.
   title TEXT: Title of the page.
 Options
-  formats NAME: Format, may be repeated: geotiff, cog (maps); geojson, geopackage (the
-    path); overwatch (what one would see of its bounds); csv (missions); ros_map, nav2
-    (route graph and waypoints); or all that can be written.
+  formats NAME: Format, may be repeated: geotiff (maps); geojson, geopackage (the path);
+    csv (missions); ros_map, nav2 (route graph and waypoints); or all that can be written.
   export.resolution M: Pixel size of maps for ROS; by default a cell, or a tenth of its shorter side
     where cells are not square.
   origin PLACE: Position in the terrain's CRS that is 0,0 of files for robots, as x,y in metres

@@ -14,7 +14,6 @@ _FILES = (
     "maps.png",
     "terrain.png",
     "maps.tif",
-    "maps.qml",
     "path.geojson",
 )
 

@@ -3,7 +3,6 @@
 from trustbo.export.everything import FORMATS, export_result
 from trustbo.export.frame import Frame, write_frame
 from trustbo.export.nav2 import write_waypoints
-from trustbo.export.overwatch import write_overwatch
 from trustbo.export.paths import path_frame, write_path
 from trustbo.export.rasters import write_geotiff
 from trustbo.export.roads import from_route_graph
@@ -24,7 +23,6 @@ __all__ = [
     "write_csv",
     "write_frame",
     "write_geotiff",
-    "write_overwatch",
     "write_path",
     "write_ros_map",
     "write_route_graph",

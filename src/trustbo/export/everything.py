@@ -26,13 +26,11 @@ from trustbo.export.frame import (
     save_frame,
 )
 from trustbo.export.nav2 import stops_of, write_waypoints
-from trustbo.export.overwatch import require_overwatch, write_overwatch
 from trustbo.export.paths import write_path
 from trustbo.export.rasters import write_geotiff
 from trustbo.export.ros import occupancy, write_ros_map
 from trustbo.export.route_graph import OBJECTIVES, graph_of, summed
 from trustbo.export.route_graph_file import write_route_graph
-from trustbo.export.style import write_style
 from trustbo.export.tables import write_csv
 from trustbo.files import FilePath, require_file, require_folder
 from trustbo.logs.messages import require_topic_names
@@ -192,15 +190,6 @@ def _require_possible(name: str, result: Result, target: Path, place: PlacedFram
         require_file(file)
 
 
-def _write_maps(content: _Content, file: Path) -> None:
-    maps = content.maps()
-    write_geotiff(file, maps, content.result.workspace, style=False)
-    row, col = content.result.path[0]
-    # The trust of the start cell is assumed; it must not set the limits of the colours.
-    learned = maps.where((maps["y"] != maps["y"][row]) | (maps["x"] != maps["x"][col]))
-    write_style(file.with_suffix(".qml"), learned)
-
-
 def _write_path(content: _Content, file: Path) -> None:
     write_path(file, content.result)
 
@@ -238,17 +227,9 @@ _FRAME = "frame.yaml"
 """File with the frame of all formats for ROS."""
 _FORMATS = {
     "geotiff": _Format(
-        "all maps as bands of a GeoTIFF, with a style for QGIS",
-        ("maps.tif", "maps.qml"),
-        _write_maps,
-        on_earth=True,
-    ),
-    "cog": _Format(
-        "all maps as a Cloud Optimized GeoTIFF",
-        ("maps_cog.tif",),
-        lambda content, file: write_geotiff(
-            file, content.maps(), content.result.workspace, cog=True, style=False
-        ),
+        "all maps as bands of a GeoTIFF",
+        ("maps.tif",),
+        lambda content, file: write_geotiff(file, content.maps(), content.result.workspace),
         on_earth=True,
     ),
     "geojson": _Format(
@@ -263,13 +244,6 @@ _FORMATS = {
         _write_path,
         on_earth=True,
         require=lambda result, _: require_names_for_sql(result.workspace.team.names),
-    ),
-    "overwatch": _Format(
-        "how much of each bound of the path one would see from each point, as GeoTIFF",
-        ("overwatch.tif",),
-        lambda content, file: write_overwatch(file, content.result.plan),
-        on_earth=True,
-        require=lambda result, _: require_overwatch(result.workspace),
     ),
     "csv": _Format(
         "a table of all bounds that were run",

@@ -1,21 +1,17 @@
 """Maps as GeoTIFF, one band each."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import rasterio
 from rasterio.transform import from_origin
 
 from trustbo.export.checks import Maps, require_crs, require_maps
-from trustbo.export.style import write_style
 from trustbo.files import FilePath, require_file, write_file
 from trustbo.workspace import Workspace
 
 
-def write_geotiff(
-    path: FilePath, maps: Maps, workspace: Workspace, *, cog: bool = False, style: bool = True
-) -> None:
+def write_geotiff(path: FilePath, maps: Maps, workspace: Workspace) -> None:
     """Write maps of the planning cells as the bands of a GeoTIFF in the terrain's CRS.
 
     Bands are float32, named after their variables, with the long name as metadata; NaN is nodata.
@@ -24,8 +20,6 @@ def write_geotiff(
         path: .tif or .tiff file to write, or to replace.
         maps: Maps (row, col), e.g. `Result.maps()`.
         workspace: Workspace of the cells, made from a terrain.
-        cog: Whether to write a Cloud Optimized GeoTIFF, for maps on a web server.
-        style: Whether to write a style for QGIS too, the .qml file of the same name.
 
     Raises:
         ShapeError: The dims or the number of cells differ.
@@ -33,19 +27,14 @@ def write_geotiff(
     """
     crs, bands = require_crs(workspace), require_maps(maps, workspace)
     target = require_file(path, ".tif", ".tiff")
-    legend = target.with_suffix(".qml")
-    if style:
-        require_file(legend)
     grid = workspace.grid
-    # Averages stay within the range of the values; cubic resampling, GDAL's default, does not.
-    layout: dict[str, Any] = {"driver": "GTiff", "interleave": "band"}
-    layout = {"driver": "COG", "overview_resampling": "average"} if cog else layout
 
     def write(file: Path) -> None:
         with rasterio.open(
             file,
             "w",
-            **layout,
+            driver="GTiff",
+            interleave="band",
             height=grid.shape[0],
             width=grid.shape[1],
             count=len(bands),
@@ -62,5 +51,3 @@ def write_geotiff(
                     raster.update_tags(i, long_name=str(values.attrs["long_name"]))
 
     write_file(target, write)
-    if style:
-        write_style(legend, bands)
