@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from trustbo.inference import sample_prior
 from trustbo.models import PooledTrust, TrustParams
-from trustbo.planning import Planner, RoadPlanner
+from trustbo.planning import Planner
 from trustbo.planning.paths import AdmissiblePaths, PathClass
 from trustbo.planning.search.buckets import best_stationary
 from trustbo.planning.values import entry_cost
@@ -192,27 +192,6 @@ def large(n, kind, peers):
         table.line("networkx, graph built", took, ours, target(took / ours, 500) if asked else "")
 
 
-def roads(n):
-    """Plans on the graph of n x n cells, given edge by edge."""
-    workspace, ends = workspace_of(n), ((n - 1, 0), (0, n - 1))
-    params = TrustParams(0.4, np.array([0.35, 0.2]), 0.03, 0.1, 0.1)
-    planner = Planner(workspace, *ends, connectivity=4)
-    graph, values = planner.graph.copy(), workspace.awareness.values[0]
-    graph.graph["robots"] = workspace.team.names
-    for _, cell, edge in graph.edges(data=True):
-        edge["awareness"] = dict(zip(workspace.features, values[cell].tolist(), strict=True))
-    print(f"\n## lost_contact on {graph.number_of_edges()} edges of roads\n")
-    table = Times("one plan")
-    took, on_roads = timed(lambda: RoadPlanner(graph, *ends))
-    table.line("trustbo, RoadPlanner made of a graph", took)
-    took, first = timed(lambda: on_roads.plan(params))
-    table.line("trustbo, the first plan", took, None, f"{len(first.path)} nodes")
-    ours = median_seconds(lambda: on_roads.plan(params))
-    table.line("trustbo, a plan", ours)
-    table.line("trustbo, Planner of the cells", median_seconds(lambda: planner.plan(params)), ours)
-    np.testing.assert_allclose(first.value, planner.plan(params).value, rtol=1e-12)
-
-
 def networkx_plan(cost, start, goal):
     rows, cols = cost.shape
     graph = nx.DiGraph()
@@ -271,7 +250,6 @@ def main():
     given = parsed(arguments(__doc__, quick="a smaller map, without networkx on it"))
     many_draws(10, 200)
     many_draws(100, 5)
-    roads(60)
     for kind in ("open", "maze"):
         large(300 if given.quick else 1000, kind, peers=not given.quick)
 

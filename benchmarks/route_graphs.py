@@ -7,9 +7,7 @@ written for both objectives, loaded by the rules of Nav2's loader (`peers.nav2_l
 no code with trustbo), and searched by networkx's Dijkstra. Lost is the contact that the route of
 lost_contact loses beyond the exact plan, in % of the contact expected on the plan. A route may have
 more bounds than `max_bounds` admits, and lose less: "admitted" compares it with the exact plan of
-as many bounds as it has. Stationary: whether the route is the plan, or one of equal value. Read
-back: whether the plan of lost_contact on the roads of the file, by `RoadPlanner`, has the value of
-the planner's, without effects of places and risk, which roads have not.
+as many bounds as it has. Stationary: whether the route is the plan, or one of equal value.
 """
 
 import tempfile
@@ -22,7 +20,7 @@ from peers.nav2_loader import load
 
 import trustbo as tb
 from trustbo.inference import params_of
-from trustbo.planning import Planner, RoadPlanner
+from trustbo.planning import Planner
 from trustbo.study import worlds
 from trustbo.study.world import COURSES, World
 
@@ -41,7 +39,7 @@ def main() -> None:
     }
     table = Table(
         "world", "course", "beta0", "largest id", "lost, %", "more bounds", "admitted, %",
-        "stationary", "read back", "s", first=28,
+        "stationary", "s", first=28,
     )  # fmt: skip
     rows = []
     for name, world in chosen.items():
@@ -50,12 +48,12 @@ def main() -> None:
             for seed in range(given.seeds):
                 row = one(world, workspace, course, given.n, seed)
                 rows.append(row)
-                lost, more, admitted, same, back, largest, beta0, seconds = row
+                lost, more, admitted, same, largest, beta0, seconds = row
                 table.row(
                     name, course, f"{beta0:.2f}", largest, f"{lost:.3f}", more,
-                    f"{admitted:.3f}", verdict(same), verdict(back), f"{seconds:.2f}",
+                    f"{admitted:.3f}", verdict(same), f"{seconds:.2f}",
                 )  # fmt: skip
-    lost, _, admitted, same, back, *_ = (np.array(column) for column in zip(*rows, strict=True))
+    lost, _, admitted, same, *_ = (np.array(column) for column in zip(*rows, strict=True))
     for what, values in (("the plan", lost), ("that of as many bounds", admitted)):
         middle, most = np.median(values), values.max()
         print(
@@ -64,12 +62,11 @@ def main() -> None:
             f"{verdict(most <= MOST)})"
         )
     print(f"stationary is the plan in {same.sum()} of {len(same)}: {verdict(same.all())}")
-    print(f"read back it is the plan in {back.sum()} of {len(back)}: {verdict(back.all())}")
 
 
 def one(
     world: World, workspace: tb.Workspace, course: str, n: int, seed: int
-) -> tuple[float, int, float, bool, bool, int, float, float]:
+) -> tuple[float, int, float, bool, int, float, float]:
     """Figures of a campaign; seconds are those of a file."""
     start, goal = world.ends(course)
     with warnings.catch_warnings():
@@ -87,7 +84,6 @@ def one(
                 lambda kind=objective: tb.export.write_route_graph(file, result, objective=kind)
             )
             route[objective] = cells_of(file, workspace, start, goal)
-        roads = tb.export.from_route_graph(file)
     plan = planner.plan(params)
     found = planner.evaluate(route["lost_contact"], params)
     contact = len(plan.path) - 1 + plan.value + planner.problem.cost_of_failure(plan.path)
@@ -106,11 +102,7 @@ def one(
     largest = int(max(graph["lost_contact"].edges.max(), graph["lost_contact"].nodes.max()))
     lost, admitted = (100.0 * (value - found.value) / contact for value in (plan.value, best))
     same = scores[0] - scores[1] <= EQUAL
-    alone, bare = planner.with_risk(None), params._replace(**dict.fromkeys(params.places))
-    ends = (graph["lost_contact"].node_of(cell) for cell in (start, goal))
-    on_roads, exact = RoadPlanner(roads, *ends).plan(bare), alone.plan(bare)
-    back = abs(on_roads.value - exact.value) <= EQUAL
-    return lost, more, admitted, bool(same), back, largest, float(np.mean(params.beta0)), seconds
+    return lost, more, admitted, bool(same), largest, float(np.mean(params.beta0)), seconds
 
 
 def cells_of(

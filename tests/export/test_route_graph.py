@@ -14,8 +14,8 @@ from peers.nav2_loader import GraphError, load
 from worlds import unequal_robots
 
 import trustbo as tb
-from trustbo.errors import DamagedFileError, TrustboError
-from trustbo.export import Frame, edge_updates, read_route_graph, write_frame, write_route_graph
+from trustbo.errors import TrustboError
+from trustbo.export import Frame, edge_updates, write_frame, write_route_graph
 from trustbo.export.frame import OF_CRS
 from trustbo.models import TrustParams
 from trustbo.planning import Planner
@@ -204,13 +204,15 @@ def test_updates_make_the_old_graph_the_new_one(planner, tmp_path):
     avoided = np.zeros((8, 3, 4), bool)
     avoided[4, 2, 1] = True  # from (2, 0) to (2, 1)
     risk = np.where(planner.workspace.passable_bounds.values, 0.01, np.nan)
-    for file, b, one in zip(
-        files, (0.02, 0.5, -0.2), (planner, planner.avoiding(avoided, risk), planner), strict=True
-    ):
+    planners = (planner, planner.avoiding(avoided, risk), planner)
+    first, *others = graphs = [
         write_route_graph(file, one, params._replace(b=b))
+        for file, b, one in zip(files, (0.02, 0.5, -0.2), planners, strict=True)
+    ]
     server = load(files[0])
-    for file in files[1:]:  # the second update holds whatever the first one was
-        request = edge_updates(files[0], file)
+    # The second update holds whatever the first one was.
+    for file, graph in zip(files[1:], others, strict=True):
+        request = edge_updates(first, graph)
         assert json.loads(json.dumps(request)) == yaml.safe_load(yaml.safe_dump(request)) == request
         server.adjust(request)
         new = load(file)
@@ -219,10 +221,10 @@ def test_updates_make_the_old_graph_the_new_one(planner, tmp_path):
         for number, cost in expected.items():
             assert costs[number] == pytest.approx(cost, rel=1e-12, abs=1e-15)
         assert server.route(8, 3) == new.route(8, 3)
-    assert edge_updates(files[0], files[1])["closed_edges"]
-    assert not edge_updates(files[0], files[2])["closed_edges"]
+    assert edge_updates(first, graphs[1])["closed_edges"]
+    assert not edge_updates(first, graphs[2])["closed_edges"]
     with pytest.raises(TrustboError, match=r"9 nodes and 10 edges of the graph after are not in"):
-        edge_updates(files[1], files[0])
+        edge_updates(graphs[1], first)
 
 
 def test_updates_of_graphs_that_do_not_fit_are_refused(planner, tmp_path):
@@ -238,14 +240,7 @@ def test_updates_of_graphs_that_do_not_fit_are_refused(planner, tmp_path):
         other = write_route_graph(tmp_path / "b.json", *planner, **options)
         with pytest.raises(TrustboError, match=message):
             edge_updates(first, other)
-    again = read_route_graph(tmp_path / "a.json")
-    for name in ("nodes", "positions", "cells", "edges", "ends", "costs"):
-        np.testing.assert_array_equal(getattr(again, name), getattr(first, name))
-    assert "of a file, unknown" in str(again)
     assert "bounds; it loses" in str(first)
-    (tmp_path / "a.json").write_text('{"features": []}')
-    with pytest.raises(DamagedFileError, match=r"a\.json' is damaged"):
-        read_route_graph(tmp_path / "a.json")
 
 
 def test_a_route_beyond_the_limit_on_risk_is_said(tmp_path):

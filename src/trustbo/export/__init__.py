@@ -5,10 +5,9 @@ from trustbo.export.frame import Frame, write_frame
 from trustbo.export.nav2 import write_waypoints
 from trustbo.export.paths import path_frame, write_path
 from trustbo.export.rasters import write_geotiff
-from trustbo.export.roads import from_route_graph
 from trustbo.export.ros import write_ros_map
 from trustbo.export.route_graph import RouteGraph
-from trustbo.export.route_graph_file import edge_updates, read_route_graph, write_route_graph
+from trustbo.export.route_graph_file import edge_updates, write_route_graph
 from trustbo.export.tables import write_csv
 
 __all__ = [
@@ -17,9 +16,7 @@ __all__ = [
     "RouteGraph",
     "edge_updates",
     "export_result",
-    "from_route_graph",
     "path_frame",
-    "read_route_graph",
     "write_csv",
     "write_frame",
     "write_geotiff",

@@ -6,8 +6,8 @@ those of nodes and edges differ, and its costs are positive.
 
 import math
 import warnings
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -21,7 +21,7 @@ from trustbo.errors import TrustboError, require_choice
 from trustbo.export.frame import PlacedFrame
 from trustbo.models.params import Params
 from trustbo.planning import Planner
-from trustbo.workspace.moves import MOVES, along, move_indices
+from trustbo.workspace.moves import MOVES, move_indices
 
 OBJECTIVES = ("lost_contact", "stationary")
 """Objectives whose values are sums over bounds, or nearly."""
@@ -32,7 +32,6 @@ LEAST_COST = 1e-9
 _FIRST = 1 + len(MOVES[8])
 """Ids of stops and of first edges, by the number of cells; those within chains follow."""
 Bound = tuple[Cell, Cell]
-Awareness = Mapping[str, float | list[float]]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -50,14 +49,11 @@ class RouteGraph(Displayed):
         costs: Cost of each, positive, (edge,): of stationary -log sigma of trust, of lost_contact
             the contact lost, in bounds.
         frame: Name of the frame.
-        objective: Objective of the costs; empty where the graph was read from a file.
-        route: Cells of the cheapest route from start to goal; empty from a file.
+        objective: Objective of the costs.
+        route: Cells of the cheapest route from start to goal.
         gap: Loss of the route beyond that of the exact plan, as a share of the contact expected on
             the plan; negative where it loses less, as routes are not limited to `max_bounds`. 0 for
-            stationary, NaN from a file.
-        awareness: Awareness of each bound, by the id of its first edge: for each feature a number,
-            or one for each robot.
-        robots: Names of the robots; empty where they are not known.
+            stationary.
     """
 
     nodes: np.ndarray
@@ -67,21 +63,18 @@ class RouteGraph(Displayed):
     ends: np.ndarray
     costs: np.ndarray
     frame: str
-    objective: str = ""
-    route: tuple[Cell, ...] = ()
-    gap: float = np.nan
-    awareness: Mapping[int, Awareness] = field(default_factory=dict)
-    robots: tuple[str, ...] = ()
+    objective: str
+    route: tuple[Cell, ...]
+    gap: float
 
     def _card(self) -> Card:
         low, high = self.costs.min(), self.costs.max()
         rows = [
             ("nodes", f"{len(self.nodes)}, positions in {self.frame!r}"),
             ("edges", f"{len(self.edges)}, costs {low:.3g} to {high:.3g}"),
-            ("objective", self.objective or "of a file, unknown"),
+            ("objective", self.objective),
+            ("cheapest route", f"{len(self.route) - 1} bounds; {self.compared()}"),
         ]
-        if self.route:
-            rows.append(("cheapest route", f"{len(self.route) - 1} bounds; {self.compared()}"))
         return Card("RouteGraph", rows)
 
     def node_of(self, cell: Cell) -> int:
@@ -116,17 +109,10 @@ def graph_of(
     """
     chains = _chains(planner, tolerance)
     costs, route, gap = _costs(planner, params)
-    edges, positions, awareness = [], {}, {}
-    maps, features = planner.mean_awareness, planner.workspace.features
+    edges, positions = [], {}
     for bound, cost in costs.items():
         edges += chains[bound].edges(cost)
         positions.update(chains[bound].nodes())
-        values = along(maps, bound)[:, 0].T
-        alike = (values == values[:, :1]).all(1)
-        awareness[chains[bound].edge_ids[0]] = {
-            name: v[0].item() if same else v.tolist()
-            for name, v, same in zip(features, values, alike, strict=True)
-        }
     edges.sort()
     nodes = np.array(sorted(positions))
     shape = planner.paths.passable.shape
@@ -143,8 +129,6 @@ def graph_of(
         planner.objective,
         route,
         gap,
-        awareness,
-        planner.workspace.team.names,
     )
 
 

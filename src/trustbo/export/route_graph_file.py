@@ -26,14 +26,13 @@ from trustbo.export.frame import (
     save_beside,
 )
 from trustbo.export.route_graph import RouteGraph, graph_of, summed
-from trustbo.files import FilePath, interpreting, read_record, require_file, write_text
+from trustbo.files import FilePath, require_file, write_text
 from trustbo.models.params import Params
 from trustbo.planning import Planner
 from trustbo.planning.problem import mean_of
 
 _NEAR = 1e-6
 """Distance within which positions are the same, m."""
-_ENDS = "startid", "endid"
 _SERVER = {
     "edge_cost_functions": ["PenaltyScorer", "DynamicEdgesScorer"],
     "PenaltyScorer": {"plugin": "nav2_route::PenaltyScorer"},
@@ -116,67 +115,24 @@ def save_route_graph(target: Path, graph: RouteGraph, *, overridable: bool = Tru
     rows = zip(graph.edges.tolist(), graph.ends.tolist(), graph.costs.tolist(), strict=True)
     for edge, (start, end), cost in rows:
         about = {"id": edge, "startid": start, "endid": end, "cost": cost}
-        metadata: dict[str, Any] = {"penalty": cost}
-        if edge in graph.awareness:
-            metadata["awareness"] = graph.awareness[edge]
-        about |= {"overridable": overridable, "metadata": metadata}
+        about |= {"overridable": overridable, "metadata": {"penalty": cost}}
         lines.append(_feature("MultiLineString", [[where[start], where[end]]], about))
-    head = f'{{"type": "FeatureCollection", "robots": {_json(list(graph.robots))}, "features": [\n'
-    text = head + ",\n".join(lines) + "\n]}\n"
+    text = '{"type": "FeatureCollection", "features": [\n' + ",\n".join(lines) + "\n]}\n"
     server = {"graph_filepath": target.name, "route_frame": graph.frame, **_SERVER}
     settings = params_file(target)
     head = (
         "# Parameters of the route server of Nav2; give graph_filepath as a path on the robot:\n"
         f"#   ros2 run nav2_route route_server --ros-args --params-file {settings.name}\n"
     )
-    if graph.route:
-        first, last = (graph.node_of(graph.route[end]) for end in (0, -1))
-        head += (
-            f"# Costs are of {graph.objective}. The cheapest route from node {first} to {last}:\n"
-        )
-        head += f"# {graph.compared()}.\n"
+    first, last = (graph.node_of(graph.route[end]) for end in (0, -1))
+    head += f"# Costs are of {graph.objective}. The cheapest route from node {first} to {last}:\n"
+    head += f"# {graph.compared()}.\n"
     record = {"route_server": {"ros__parameters": server}}
     write_text(settings, head + yaml.safe_dump(record, sort_keys=False))
     write_text(target, text)
 
 
-def read_route_graph(path: FilePath) -> RouteGraph:
-    """Read the nodes, edges and costs of a file of `write_route_graph`, or another for Nav2.
-
-    A cost is the `penalty` in the metadata of an edge, else its `cost`, else 0.
-
-    Raises:
-        DamagedFileError: There is no such file, or it is no route graph.
-    """
-    with interpreting(path):
-        record = read_record(path, checked=False)
-        kinds = [(f["geometry"]["type"], f) for f in record["features"]]
-        points = [f for kind, f in kinds if kind == "Point"]
-        nodes, places = zip(
-            *((f["properties"], f["geometry"]["coordinates"][:2]) for f in points), strict=True
-        )
-        edges = [f["properties"] for kind, f in kinds if kind in ("LineString", "MultiLineString")]
-        cells = [node.get("metadata") or {} for node in nodes]
-        about = {edge["id"]: edge.get("metadata") or {} for edge in edges}
-        known = {node["id"] for node in nodes}
-        if not known or not {edge[end] for edge in edges for end in _ENDS} <= known:
-            raise KeyError("an edge without its nodes")
-        return RouteGraph(
-            np.array([node["id"] for node in nodes]),
-            np.array(places, dtype=float),
-            np.array([(cell.get("row", -1), cell.get("col", -1)) for cell in cells]),
-            np.array([edge["id"] for edge in edges]),
-            np.array([[edge[end] for end in _ENDS] for edge in edges]),
-            np.array([about[e["id"]].get("penalty", e.get("cost", 0.0)) for e in edges], float),
-            nodes[0].get("frame", "map"),
-            awareness={n: one["awareness"] for n, one in about.items() if "awareness" in one},
-            robots=tuple(record.get("robots", ())),
-        )
-
-
-def edge_updates(
-    before: RouteGraph | FilePath, after: RouteGraph | FilePath
-) -> dict[str, list[Any]]:
+def edge_updates(before: RouteGraph, after: RouteGraph) -> dict[str, list[Any]]:
     """Make the request by which a route server has the costs of another graph.
 
     It is that of the service `/route_server/DynamicEdgesScorer/adjust_edges`
@@ -185,8 +141,8 @@ def edge_updates(
     graph that the server has loaded, not the last update.
 
     Args:
-        before: Graph that the server has loaded, or its file.
-        after: Graph after further missions, or its file.
+        before: Graph that the server has loaded, as `write_route_graph` returned it.
+        after: Graph after further missions.
 
     Returns:
         `closed_edges` (ids that `after` lacks), `opened_edges` (those that it has), and
@@ -196,25 +152,21 @@ def edge_updates(
         TrustboError: The graphs are of different workspaces or ways, or objectives; or `after` has
             an edge that `before` lacks, which needs SetRouteGraph.
     """
-    old, new = (
-        graph if isinstance(graph, RouteGraph) else read_route_graph(graph)
-        for graph in (before, after)
-    )
-    if old.objective and new.objective and old.objective != new.objective:
+    if before.objective != after.objective:
         raise TrustboError(
-            f"costs are of {old.objective!r} before, and of {new.objective!r} after; give graphs "
-            "of one objective."
+            f"costs are of {before.objective!r} before, and of {after.objective!r} after; give "
+            "graphs of one objective."
         )
-    rows = zip(old.edges.tolist(), old.ends.tolist(), old.costs.tolist(), strict=True)
+    rows = zip(before.edges.tolist(), before.ends.tolist(), before.costs.tolist(), strict=True)
     known = {edge: (ends, cost) for edge, ends, cost in rows}
-    places = dict(zip(old.nodes.tolist(), old.positions, strict=True))
+    places = dict(zip(before.nodes.tolist(), before.positions, strict=True))
     nowhere = np.full(2, np.nan)
     moved = [
         node
-        for node, place in zip(new.nodes.tolist(), new.positions, strict=True)
+        for node, place in zip(after.nodes.tolist(), after.positions, strict=True)
         if not np.abs(places.get(node, nowhere) - place).max() < _NEAR
     ]
-    edges = list(zip(new.edges.tolist(), new.ends.tolist(), new.costs.tolist(), strict=True))
+    edges = list(zip(after.edges.tolist(), after.ends.tolist(), after.costs.tolist(), strict=True))
     changed = [edge for edge, ends, _ in edges if known.get(edge, (None,))[0] != ends]
     if moved or changed:
         raise TrustboError(

@@ -7,12 +7,11 @@ from trustbo.planning.plan import Plan
 from trustbo.planning.planner import Planner
 from trustbo.planning.policies import POLICIES, Policy
 from trustbo.planning.risk import InfeasibleError
-from trustbo.planning.roads import RoadPlan, RoadPlanner
 from trustbo.renamed import moved
 
 __all__ = [
-    "OBJECTIVES", "POLICIES", "InfeasibleError", "Plan", "Planner", "Policy", "RoadPlan",
-    "RoadPlanner", "policies", "roll_trust",
+    "OBJECTIVES", "POLICIES", "InfeasibleError", "Plan", "Planner", "Policy", "policies",
+    "roll_trust",
 ]  # fmt: skip
 __dir__ = __all__.copy  # completion lists public names alone
 __getattr__ = moved(__name__, {
