@@ -48,6 +48,8 @@ from trustbo.renamed import Former
 
 _LEVEL = 0.05
 _ROBOT = "robot in a mission"
+_ALIKE = 1e-9
+"""Range of rates below which they are all but equal."""
 _LEAST = 1e-6
 """Lower limit of probabilities in tables; a smaller one is 0."""
 _SITES = ({"beta0", "beta", "b", "delta_w", "delta_v"}, {"B0", "B", "b", "Delta_w", "Delta_v"})
@@ -144,13 +146,18 @@ def criticise(
     """
     require_whole("n_replicates", n_replicates, 100)
     missions = _checked(posterior, missions)
+    rates = np.concatenate([mission.contact_rate for mission in missions])
+    rates = rates[np.isfinite(rates)]
+    alike = TrustboError(
+        "the rates are all but equal, so that residuals say nothing of the model; criticise "
+        "missions that differ."
+    )
+    if rates.size and np.ptp(rates) < _ALIKE:
+        raise alike
     try:
         return _criticise(posterior, missions, model, compare, n_replicates, seed)
     except np.linalg.LinAlgError:
-        raise TrustboError(
-            "the rates are all but equal, so that residuals say nothing of the model; criticise "
-            "missions that differ."
-        ) from None
+        raise alike from None
 
 
 class _Tested(NamedTuple):
