@@ -162,7 +162,7 @@ MISTAKES = {
     "no missions at all": (lambda c: c.iterate(n_iterations=0), "from 1 on; got 0"),
     "a kind of progress": (
         lambda c: c.iterate(progress="pgae"),
-        "unknown progress 'pgae'; choose one of bar, page",
+        "unknown progress 'pgae'; choose one of bar",
     ),
     "too many bounds": (
         lambda c: c.iterate(max_bounds=10**9),

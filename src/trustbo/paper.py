@@ -5,7 +5,7 @@
 
 Of the paper are the model, the objective, the policy, the first path and the sampler. Not of it are
 the prior of trust before the first bound, which it does not give, and the integration of trust,
-which leaves the posterior as it is.
+which leaves the posterior unchanged.
 """
 
 from collections.abc import Mapping

@@ -101,7 +101,7 @@ def test_the_more_the_time_unseen_costs_the_less_of_it_there_is(workspace):
         assert ("on the time unseen" in repr(plan)) == (cost > 0.0)
     assert unseen == sorted(unseen, reverse=True)
     assert unseen[-1] < unseen[0]
-    assert lost == sorted(lost)
+    assert (np.diff(lost) > -1e-12).all()  # but for rounding, of paths that lose the same
     assert plan.exact
 
 

@@ -4,7 +4,7 @@ A prior (1 - share) N(0, narrow^2) + share N(0, wide^2) becomes that of x(z) wit
 
     x(z) = F^-1(Phi(z)),    F(x) = (1 - share) Phi(x / narrow) + share Phi(x / wide),
 
-which rises in z: samplers keep their standard-normal coordinates, whatever the prior is.
+which rises in z: samplers keep their standard-normal coordinates for any prior.
 """
 
 from functools import cache

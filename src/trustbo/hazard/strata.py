@@ -32,7 +32,7 @@ def partition(values: np.ndarray, n: int) -> np.ndarray:
 
     The optimal partition in one dimension, by dynamic programming (Fisher 1958). Group k is
     values[ends[k - 1] : ends[k]]; quantiles instead would mix a severe tail of few draws with mild
-    ones. Of more than 2000 values, every second, third and so on is looked at.
+    ones. Of more than 2000 values, every second, third and so on is used.
     """
     step = 1 + (len(values) - 1) // _SOME
     n_values, values = len(values), values[::step]
