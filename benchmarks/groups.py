@@ -35,15 +35,8 @@ COLUMNS = ["lost_while_learning", "regret_now", "arrive", LOST, "arrive_first_3"
 REFERENCES = [
     Path(__file__).parent / "reference" / name for name in ("worlds_0.3.csv", "limits_0.3.csv")
 ]
-NAMED = {
-    "robots": ("robots", ""),
-    "change": ("change", ""),
-    "change: dead-detector": ("change", "dead-detector"),
-    "jammer": ("jammer", ""),
-    "physics": ("physics", ""),
-    "limit": ("limit", ""),
-}
-"""Kinds, and ends of the names of worlds, that are compared with version 0.3 by name."""
+DEAD = "dead-detector"
+"""Case of kind `change` that is compared with version 0.3 by name."""
 
 
 def rows_of(results: xr.Dataset) -> pd.DataFrame:
@@ -181,9 +174,8 @@ def beside(rows: pd.DataFrame, reference: pd.DataFrame) -> pd.DataFrame:
     both["before"] = old.where(known, both["lost_while_learning_0.3"])
     table = []
     selected = {name: (kinds, "") for name, kinds in GROUPS.items()}
-    selected |= {kind: ((kind,), "") for kind in KINDS} | {
-        name: ((kind,), case) for name, (kind, case) in NAMED.items()
-    }
+    selected |= {kind: ((kind,), "") for kind in KINDS}
+    selected[f"change: {DEAD}"] = ("change",), DEAD
     for name, (kinds, case) in selected.items():
         some = both[both["kind"].isin(kinds) & both["world"].str.endswith(case)]
         if some.empty:

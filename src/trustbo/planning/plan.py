@@ -15,7 +15,6 @@ from trustbo.planning.assignment import robots_along
 from trustbo.planning.cover import PathCover
 from trustbo.renamed import Former
 from trustbo.workspace import Workspace
-from trustbo.workspace.bounding import legs_along
 
 QUANTILES = (0.05, 0.25, 0.75, 0.95)
 """Quantiles of `Plan.bands`: ends of the 90 % and of the 50 % band."""
@@ -196,12 +195,6 @@ class Plan(Displayed):
         """
         ground = self.workspace.ground
         return None if ground is None else tuple(ground.along(self.path, self.own_posts))
-
-    @property
-    def lead_first(self) -> np.ndarray:
-        """Whether the lead drives before T2 in a bound, or alone, (bound,)."""
-        moves = legs_along(self.workspace.formation.bounding, self.path)
-        return np.array([of_bound[0].of_lead for of_bound in moves])
 
 
 def unseen_text(cover: PathCover) -> str:

@@ -30,15 +30,9 @@ _MEANS = {
 _TOLLS = {"length_weight": "its length", "unseen_cost": "the time in which nobody sees anybody"}
 
 
-def facts_of(result: Result, plan: Plan | None = None) -> list[Fact]:
-    """Return the facts of the summary: campaign, recommendation, value, diagnostics, memory.
-
-    The `plan` is that of the result; a running campaign passes it, and has no time for more.
-    """
-    more = [_memory(result)] if plan is None else []
-    if plan is None and any(mission.reports for mission in result.missions):
-        more.append(_reported(result))
-    plan = result.plan if plan is None else plan
+def facts_of(result: Result) -> list[Fact]:
+    """Return the facts of the summary: campaign, recommendation, value, diagnostics, memory."""
+    plan, has_reports = result.plan, any(mission.reports for mission in result.missions)
     return [
         Fact("The campaign", f"{_where(result)} {_missions(result)}"),
         Fact("Recommended", _path(result, plan)),
@@ -46,7 +40,8 @@ def facts_of(result: Result, plan: Plan | None = None) -> list[Fact]:
         *([] if plan.risk is None else [Fact("Arrival", _arrival(plan.risk))]),
         *([] if plan.cover is None else [Fact("Cover", _cover(plan.cover, plan.unseen_toll))]),
         _soundness(result),
-        *more,
+        _memory(result),
+        *([_reported(result)] if has_reports else []),
         Fact("Why it ended", _end(result)),
     ]
 
