@@ -246,7 +246,7 @@ def nuts(given):
         moments(tb.fit(missions, PLACES, "exact", workspace=workspace, seed=seed))
         for seed in range(12)
     ]
-    longer = {"n_warmup": 600, "n_draws": 6000, "check": False}
+    longer = {"warmup": 600, "draws": 6000, "check": False}
     posterior = tb.fit(missions, PLACES, "nuts", workspace=workspace, **longer)
     print("largest differences: of means in sd; of sds, with NUTS's own error there and at most\n")
     for name, (mean, square) in moments(posterior).items():

@@ -6,7 +6,6 @@ import sys
 import tomllib
 from importlib import import_module, resources
 from pathlib import Path
-from pkgutil import resolve_name
 
 import pytest
 
@@ -93,78 +92,12 @@ def test_numpyro_works_whatever_was_imported_first(before):
     assert printed(program) == "False float32\n(1, 3, 2)"
 
 
-NAMES_OF_0_2 = {
-    "trustbo": "Bound Campaign CampaignOptions DamagedFileError Mission NoPathError PosteriorError "
-    "RegretBound Result Robot Seconds ShapeError Team TerrainError TrustboError Workspace export "
-    "iterate load_result logs missions models planning plots report resume simulation study "
-    "terrain workspace",
-    "trustbo.terrain": "FEATURES PAPER_VISIBILITY TRAVERSABILITY VISIBILITY CompositeIndex "
-    "PixelFeature aspect assemble_terrain canopy_cover canopy_height example exposure openness "
-    "pixel_features pixel_size read_lidar read_terrain register_feature slope synthetic_terrain "
-    "vegetation_density",
-    "trustbo.workspace": "SIGHT_MODES AwarenessBelief Grid Sight Workspace",
-    "trustbo.logs": "STATES Topics read_bag read_missions read_table write_missions write_table",
-    "trustbo.models": "CAUSES BoundRisk ContactRate CoupledParams CoupledTrust Criticism "
-    "DriftParams DriftTrust ExactPosterior Hazard HierarchicalTrust LostMission PlaceEffect "
-    "PooledTrust Priors RobotParams TrustFilter TrustForecast TrustModel TrustParams TrustSample "
-    "TrustState by_rate complete criticise diagnostics fit fit_hazard loo moment_matched params_of "
-    "place_maps prior_from prior_predictive sample_prior sample_statistics sbc",
-    "trustbo.planning": "OBJECTIVES POLICIES QUANTILES DrawnPaths Dynamics InfeasibleError "
-    "NoPathError PathRisk Plan Planner Policy policies roll_trust",
-    "trustbo.simulation": "BoundSimulator Degradation KinematicSimulator ModelSimulator "
-    "MujocoSimulator ReplaySimulator Simulator Threat Truth",
-    "trustbo.study": "Study World failures load_study read_study run_study run_worlds summary "
-    "worlds worlds_table",
-    "trustbo.plots": "Explorer animate_mission calibration campaign_history cell_map criticism "
-    "draw_path draw_scale hazard_map loadings mission_trust parameter_history path_posterior "
-    "place_map plan_map plan_trust regret_curves robot_maps terrain_maps trust_maps",
-    "trustbo.export": "FORMATS export_result path_frame write_csv write_geotiff "
-    "write_path write_ros_map",
-    "trustbo.report": "write_report",
-}
-
-
-@pytest.mark.parametrize("room", NAMES_OF_0_2)
-def test_names_of_version_0_2_are_found_with_a_warning_if_they_are_no_longer_public(room):
-    module = import_module(room)
-    for name in NAMES_OF_0_2[room].split():
-        if name in module.__all__:
-            assert getattr(module, name) is not None
-            continue
-        said = rf"{room}\.{name} is (trustbo\.[\w.]+) since version 0\.3"
-        with pytest.warns(FutureWarning, match=said) as warned:
-            thing = getattr(module, name)
-        place, today = re.search(said, str(warned[0].message))[1].rsplit(".", 1)
-        assert getattr(resolve_name(place), today) is thing
-    with pytest.raises(AttributeError, match=r"no attribute '?absent|No trustbo attribute absent"):
-        _ = module.absent
-
-
 @pytest.mark.parametrize("name", ["trustbo", *(f"trustbo.{part}" for part in PARTS)])
 def test_completion_lists_public_names_alone(name):
     module = import_module(name)
     for public in module.__all__:
         assert getattr(module, public) is not None  # loads what is loaded lazily
     assert sorted(dir(module)) == sorted(module.__all__)
-
-
-@pytest.mark.parametrize(
-    ("package", "name", "room"),
-    [
-        ("models", "fit", "inference"),
-        ("models", "Hazard", "hazard"),
-        ("terrain", "assemble_terrain", "terrain.dataset"),
-        ("terrain", "slope", "terrain.features"),
-        ("workspace", "Grid", "workspace.grid"),
-        ("workspace", "SIGHT_MODES", "workspace.sight"),
-        ("simulation", "Simulator", "simulation.protocol"),
-    ],
-)
-def test_a_name_of_version_0_2_is_found_in_its_new_room_with_a_warning(package, name, room):
-    old, new = import_module(f"trustbo.{package}"), import_module(f"trustbo.{room}")
-    with pytest.warns(FutureWarning, match=f"trustbo.{package}.{name} is trustbo.{room}.{name}"):
-        assert getattr(old, name) is getattr(new, name)
-    assert name not in dir(old)
 
 
 def test_a_name_that_never_was_is_refused():

@@ -7,8 +7,6 @@ Multi-robot Bounding Overwatch" (2021). Names are loaded at first use; `__init__
 import lazy_loader
 
 _getattr, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
-_RENAMED = {"missions": "Campaign.run", "Seconds": "TimeLimit"}
-"""Names of version 0.2, by those of now."""
 
 
 def __getattr__(name: str) -> object:
@@ -16,8 +14,4 @@ def __getattr__(name: str) -> object:
         from importlib.metadata import version
 
         return version("trustbo")
-    if name in _RENAMED:
-        from trustbo.renamed import former
-
-        return former(f"trustbo.{name}", "trustbo", _RENAMED[name])
     return _getattr(name)

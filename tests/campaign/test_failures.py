@@ -1,7 +1,6 @@
 """Failures in the loop: learned beside trust, kept, resumed, and bounds that are avoided."""
 
 import itertools
-import json
 
 import numpy as np
 import pandas as pd
@@ -277,14 +276,6 @@ def test_priors_of_the_hazard_are_an_option_that_is_kept(workspace, tmp_path):
     with tb.Campaign.load(tmp_path) as again:
         assert again.options.hazard == prior
         assert again.risk.mean[4, 0, 1] == campaign.risk.mean[4, 0, 1]
-    state = json.loads((tmp_path / "campaign.json").read_text())
-    priors = state["options"]["hazard"]
-    priors["log_tilt"] = [0.7, 1.0]  # of version 0.2, which had no margin
-    del priors["margin"], priors["log_width"]
-    (tmp_path / "campaign.json").write_text(json.dumps(state))
-    (tmp_path / ".campaign.json.sha256").unlink()
-    with tb.Campaign.load(tmp_path) as again:
-        assert again.options.hazard == prior
     with pytest.raises(tb.TrustboError, match="unknown prior of the hazard 'intercpt'; did you"):
         begin(workspace, hazard={"intercpt": (0.0, 1.0)})
     with pytest.raises(tb.TrustboError, match=r"hazard must be a hazard\.Hazard"):

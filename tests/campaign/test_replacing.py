@@ -285,17 +285,6 @@ def test_without_hard_links_files_are_copied(folder, other, monkeypatch):
     assert numbers(folder) == numbers(other)
 
 
-def test_a_folder_of_version_0_1_is_replaced_and_what_has_gone_is_gone(workspace, tmp_path):
-    folder = tmp_path / "old"
-    shutil.copytree(Path(__file__).parents[1] / "data" / "campaign_0.1", folder)
-    (folder / "posteriors" / "mine.nc").write_text("mine")
-    with tb.Campaign(workspace, *ENDS) as campaign:
-        campaign.save(folder, keep=True)
-    names = {f.relative_to(folder).as_posix() for f in folder.rglob("*") if f.is_file()}
-    shown = {name for name in names if not Path(name).name.startswith(".")}
-    assert shown == {"campaign.json", "workspace.nc", "posteriors/mine.nc"}
-
-
 def test_a_replacement_cut_off_in_a_process_that_goes_on_loses_no_mission(tmp_path, monkeypatch):
     """The successor is read from its name on: what is told then must not be written beside it."""
     workspace = random_cells(3, 3)
@@ -352,39 +341,6 @@ def test_saving_to_its_own_folder_keeps_hold_of_it_when_it_fails(tmp_path, monke
         tb.Campaign.load(tmp_path / "kept")
     with campaign:
         pass
-
-
-def test_properties_of_version_0_2_are_found_and_name_the_part_that_has_them():
-    campaign = tb.Campaign(random_cells(3, 3), (2, 0), (0, 2), sampler="exact", seed=4)
-    found = {
-        "log": campaign.state,
-        "seed": 4,
-        "plans": [],
-        "waiting": [],
-        "awareness": None,
-        "observation": "gaussian",
-    }
-    for name, value in found.items():
-        with pytest.warns(
-            FutureWarning, match=rf"Campaign\.{name} is .*state|learner.* since version 0.3"
-        ):
-            assert getattr(campaign, name) == value
-    with pytest.warns(FutureWarning, match=r"Campaign\.summary is table since"):
-        assert campaign.summary().equals(campaign.table())
-    with pytest.raises(AttributeError, match="'Campaign' object has no attribute 'sede'"):
-        _ = campaign.sede
-
-
-def test_keep_and_close_of_version_0_2_are_found_and_name_what_replaced_them(tmp_path):
-    campaign = tb.Campaign(random_cells(3, 3), (2, 0), (0, 2))
-    with pytest.warns(FutureWarning, match=r"save\(folder, keep=True\)"):
-        campaign.keep(tmp_path / "kept")
-    with pytest.raises(tb.TrustboError, match="another campaign is at work"):
-        tb.Campaign.load(tmp_path / "kept")
-    with pytest.warns(FutureWarning, match="with campaign:"):
-        campaign.close()
-    with tb.Campaign.load(tmp_path / "kept") as again:
-        assert again.missions == []
 
 
 def test_a_copy_that_is_saved_is_not_held_and_one_that_is_kept_follows(tmp_path):

@@ -288,24 +288,6 @@ def test_failing_keeps_the_bounds_there_are(workspace):
     assert campaign.state.failures[-1] == (1, "tipped", (), None, True)
 
 
-def test_a_folder_of_version_0_1_is_read_and_goes_on(tmp_path):
-    """One mission, by `iterate(replan="bound", team="min", ...)`; its draws are thinned to 100."""
-    shutil.copytree(Path(__file__).parents[1] / "data" / "campaign_0.1", tmp_path / "kept")
-    result = tb.load_result(tmp_path / "kept")
-    assert result.planner.team == "min"
-    assert list(result.plan.path) == result.path
-    with tb.Campaign.load(tmp_path / "kept") as campaign:
-        assert campaign.options == tb.CampaignOptions(
-            team="min", max_bounds="shortest", initial="prior_draw", replan="bound"
-        )
-        assert (campaign.settings["policy"], campaign.state.seed) == ("thompson", 3)
-        assert [mission.path for mission in campaign.missions] == [tuple(result.path)]
-        assert (
-            campaign.state.entries[0].plan.success_index == 0.6837119175124123
-        )  # `success` in its file
-        assert (campaign.ask().path[0], campaign.ask().path[-1]) == ((2, 0), (0, 2))
-
-
 def test_options_are_checked_recorded_and_given_as_one_object(workspace, tmp_path):
     with pytest.raises(tb.TrustboError, match="unknown option 'forgeting'; did you mean forge"):
         tb.iterate(workspace, *ENDS, forgeting=0.5)

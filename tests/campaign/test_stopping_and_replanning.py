@@ -246,12 +246,3 @@ def test_no_mission_no_result(workspace):
     with pytest.raises(tb.TrustboError, match="the campaign has no mission yet"):
         campaign.result()
     assert len(campaign.history) == 0
-
-
-def test_missions_and_seconds_of_version_0_2_are_found_and_name_what_replaced_them(workspace):
-    campaign = tb.Campaign(workspace, *ENDS, sampler="exact")
-    with pytest.warns(FutureWarning, match=r"trustbo\.missions is trustbo\.Campaign\.run since"):
-        steps = tb.missions(campaign, ModelSimulator(workspace), n_iterations=1)
-    assert [mission.path for _, mission in steps] == [campaign.missions[0].path]
-    with pytest.warns(FutureWarning, match=r"trustbo\.Seconds is trustbo\.TimeLimit since"):
-        assert tb.Seconds(60.0).limit == 60.0

@@ -300,25 +300,6 @@ def test_what_is_told_beside_the_mission_is_checked_before(workspace, tmp_path, 
     assert not (tmp_path / "measured.nc").exists()
 
 
-def test_a_campaign_told_numbers_by_names_reserved_since_is_loaded(
-    workspace, tmp_path, monkeypatch
-):
-    """`robot` and `x` were free in version 0.2; one mission is on disk and not learned from yet."""
-    with monkeypatch.context() as older:
-        older.setattr("trustbo.campaign.campaign.require_extra", dict)
-        with tb.Campaign(workspace, *ENDS, sampler="exact", directory=tmp_path) as campaign:
-            rates = np.random.default_rng(4).uniform(0.4, 0.9, (len(campaign.ask().path) - 1, 3))
-            measured = np.full((*rates.shape, 2), np.nan)
-            mission = tb.Mission.from_arrays(campaign.ask().path, measured, rates)
-            campaign.tell(mission, robot=2.0, x=3.0)
-    with tb.Campaign.load(tmp_path) as again:
-        assert again.state.entries[0].extra == {"robot": 2.0, "x": 3.0}
-        row = again.table().loc[1]
-        assert (row["robot"], row["told_x"]) == (2.0, 3.0)
-        with pytest.raises(tb.TrustboError, match="'robot' is a column of the history"):
-            again.tell(mission, again=True, other_path=True, robot=2.0)
-
-
 def test_the_error_of_a_model_of_one_s_own_is_none_of_the_file(workspace, tmp_path):
     class Broken(tb.models.PooledTrust):
         """Fails from the second campaign on."""

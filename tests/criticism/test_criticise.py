@@ -397,9 +397,3 @@ def test_rates_that_are_all_alike_are_refused():
     same = [Mission.from_arrays(path, np.full((5, 3, 2), 0.5), np.ones((5, 3))) for _ in range(3)]
     with pytest.raises(tb.TrustboError, match="the rates are all but equal"):
         tb.criticise(tb.fit(same, model), compare=False)
-
-
-def test_the_former_name_of_the_ablation_warns(with_places):
-    _, found = with_places
-    with pytest.warns(FutureWarning, match=r"Criticism\.worth is Criticism\.ablation since"):
-        assert found.worth is found.ablation

@@ -1,7 +1,6 @@
 """Difficulty of bounds, from the ways that robots drive."""
 
 import numpy as np
-import pytest
 from worlds import random_cells, terrain_of
 
 import trustbo as tb
@@ -37,9 +36,3 @@ def test_difficulty_is_that_of_the_largest_tilt_and_the_least_room():
 
 def test_without_a_terrain_there_is_no_measure():
     assert difficulty_of(random_cells()).shape == (8, 4, 4, 0)
-
-
-def test_the_name_of_version_0_2_is_found_with_a_warning():
-    workspace = random_cells()
-    with pytest.warns(FutureWarning, match=r"trustbo\.hazard\.difficulty\.difficulty_of since"):
-        assert workspace.difficulty is difficulty_of(workspace)

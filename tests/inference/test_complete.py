@@ -26,8 +26,8 @@ def same(one, other):
 
 @pytest.mark.parametrize("model", [PooledTrust(), CoupledTrust(inter_robot="none")])
 def test_it_adds_what_fit_adds_at_once(missions, model, tmp_path):
-    whole = fit(missions, model, "exact", seed=4, n_draws=250)
-    bare = fit(missions, model, "exact", seed=4, n_draws=250, whole=False)
+    whole = fit(missions, model, "exact", seed=4, draws=250)
+    bare = fit(missions, model, "exact", seed=4, draws=250, whole=False)
     assert "latent" not in bare.children
     assert complete(whole) is whole
     same(complete(bare), whole)

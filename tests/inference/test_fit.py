@@ -157,28 +157,13 @@ def test_nuts_keeps_blas_to_one_thread(missions, monkeypatch):
     assert set(seen) == {1}
 
 
-def test_a_setting_by_its_former_and_its_present_name_is_refused(missions):
-    for now in (700, 300):  # the default too
-        expected = f"n_warmup is the former name of warmup: give one of n_warmup=5 and warmup={now}"
-        with pytest.raises(TrustboError, match=expected):
-            fit(missions, sampler="nuts", n_warmup=5, warmup=now)
-    with pytest.raises(TrustboError, match="give one of n_draws=7 and draws=1000"):
-        fit(missions, n_draws=7, draws=1000)
-
-
-def test_settings_have_the_names_of_before_too_and_those_of_nuts_are_for_nuts(missions):
-    now, before = (
-        fit(missions, sampler="exact", whole=False, n_chains=2, **{name: 60})["posterior"]
-        for name in ("draws", "n_draws")
-    )
-    xr.testing.assert_identical(now.to_dataset(), before.to_dataset())
-    assert (now.sizes["chain"], now.sizes["draw"]) == (2, 60)
+def test_settings_of_nuts_are_for_nuts_alone(missions):
+    drawn = fit(missions, sampler="exact", whole=False, n_chains=2, draws=60)["posterior"]
+    assert (drawn.sizes["chain"], drawn.sizes["draw"]) == (2, 60)
     for name, value in {"warmup": 50, "target_accept": 0.95, "max_tree_depth": 8}.items():
         expected = f'{name} is for NUTS, and the sampler is "exact": give sampler "nuts"'
         with pytest.raises(TrustboError, match=expected):
             fit(missions, **{name: value})
-    with pytest.raises(TrustboError, match="argument of fit 'n_wamup'; did you mean warmup"):
-        fit(missions, n_wamup=3)
     for wrong in (0, 1.0, "0.9", True, np.nan):
         with pytest.raises(TrustboError, match="target_accept must be between 0 and 1; got"):
             fit(missions, sampler="nuts", target_accept=wrong)

@@ -365,7 +365,7 @@ def test_families_have_effects_of_places(family):
         rates = np.round(np.clip(mean, 0.0, 1.0) * 20) / 20
         missions.append(Mission.from_arrays(path, z, rates, n_ticks=np.full((6, 3), 20)))
     model = PooledTrust(observation=family, place=PlaceEffect())
-    bare = fit(missions, model, n_draws=100, whole=False)
+    bare = fit(missions, model, draws=100, whole=False)
     assert bare.attrs["sampler"] == "exact"
     whole = complete(bare)
     assert whole["latent"]["trust_mean"].notnull().all()
@@ -373,7 +373,7 @@ def test_families_have_effects_of_places(family):
     cells = np.array(sorted({c for m in missions for c in m.path[1:]}))
     south = cells[:, 0] > 2
     assert place[tuple(cells[south].T)].mean() > place[tuple(cells[~south].T)].mean()
-    again = fit(missions, model, earlier=bare, n_draws=100, whole=False)
+    again = fit(missions, model, earlier=bare, draws=100, whole=False)
     for name in ("beta0", "delta_w", "b"):
         one, other = (p["posterior"][name].values for p in (bare, again))
         assert abs(one.mean() - other.mean()) < 0.4 * one.std()

@@ -94,30 +94,6 @@ def test_states_of_another_number_of_ticks_are_refused(driven, tmp_path):
     assert not list(tmp_path.rglob("*.nc"))
 
 
-def test_a_file_of_version_0_1_is_read(driven, tmp_path):
-    """Ticks of all missions in a group of the same file, and `n_ticks` called `exposure`."""
-    write_missions(tmp_path / "missions.nc", driven)
-    table = read_tree(tmp_path / "missions.nc")["missions"].to_dataset()
-    ticks = [
-        read_tree(tmp_path / "ticks" / f"000{j}.nc")
-        .to_dataset()
-        .drop_vars("states", errors="ignore")
-        for j in (1, 2)
-    ]
-    ticks = [t.assign(mission=("tick", np.full(t.sizes["tick"], j))) for j, t in enumerate(ticks)]
-    old = {
-        "missions": table.rename(n_ticks="exposure"),
-        "ticks": xr.concat([t.drop_vars("state", errors="ignore") for t in ticks], dim="tick"),
-    }
-    xr.DataTree.from_dict(old).to_netcdf(tmp_path / "old.nc")
-    for one, other in zip(read_missions(tmp_path / "old.nc"), driven, strict=True):
-        np.testing.assert_array_equal(one.n_ticks, other.n_ticks)
-        np.testing.assert_array_equal(one.contact_rate, other.contact_rate)
-    np.testing.assert_array_equal(
-        read_missions(tmp_path / "old.nc")[1].bounds[0].poses, driven[1].bounds[0].poses
-    )
-
-
 class Pressed(xr.DataTree):
     """A tree during whose serialisation Ctrl-C is pressed."""
 

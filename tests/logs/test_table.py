@@ -79,17 +79,6 @@ def test_a_feature_may_be_called_as_a_column(tmp_path):
     assert_same(read_table(tmp_path / "missions.csv", features=("visibility", "exposure")), named)
 
 
-def test_the_column_exposure_of_version_0_1_is_read_as_n_ticks():
-    """Its tables had no feature of that name, but for one with the prefix."""
-    old = rows(exposure=[None, 8, 4], contact_rate=[None, 0.5, 0.75])
-    (mission,) = read_table(old)
-    np.testing.assert_array_equal(mission.n_ticks, [[8.0], [4.0]])
-    assert mission.features == ("visibility",)
-    (mission,) = read_table(rows(n_ticks=[None, 8, 4], exposure=[None, 0.1, 0.2]))
-    np.testing.assert_array_equal(mission.n_ticks, [[8.0], [4.0]])
-    assert mission.features == ("visibility", "exposure")
-
-
 def test_robots_and_features_come_in_the_order_asked_for():
     one = read_table(
         rows(

@@ -1,6 +1,5 @@
 """A plan's stops, posts and ways are the workspace's, also of one read from a record."""
 
-import importlib
 import itertools
 import json
 
@@ -64,24 +63,6 @@ def test_without_a_terrain_there_are_none():
     bare = tb.Workspace.from_awareness(np.full((2, 3, 3, 3), 0.5))
     plan = tb.planning.Planner(bare, (2, 0), (0, 2)).plan(PARAMS)
     assert (plan.stops, plan.posts, plan.ways) == (None, None, None)
-    with pytest.warns(FutureWarning, match=r"Plan.waypoints is Plan.stops since version 0.3"):
-        assert plan.waypoints is None
-
-
-@pytest.mark.parametrize(
-    ("name", "module"),
-    [
-        ("Dynamics", "trustbo.planning.dynamics"),
-        ("QUANTILES", "trustbo.planning.plan"),
-        ("DrawnPaths", "trustbo.planning.posterior"),
-        ("PathRisk", "trustbo.hazard.risk"),
-        ("NoPathError", "trustbo"),
-    ],
-)
-def test_a_name_of_version_0_2_warns_where_it_is_now(name, module):
-    assert name not in tb.planning.__all__
-    with pytest.warns(FutureWarning, match=rf"planning\.{name} is {module}\.{name} since"):
-        assert getattr(tb.planning, name) is getattr(importlib.import_module(module), name)
 
 
 def test_an_unknown_name_of_a_room_is_an_attribute_error():

@@ -228,7 +228,7 @@ def test_maps_of_places_have_the_mean_the_sd_and_an_arrow_for_each_bound_made(re
 def test_robots_of_their_own_places_have_two_panels_each(result):
     missions = [result.workspace.fill(mission) for mission in result.missions]
     model = PooledTrust(place=PlaceEffect(cells=False, shared=False))
-    own = fit(missions, model, workspace=result.workspace, n_draws=50, whole=False)
+    own = fit(missions, model, workspace=result.workspace, draws=50, whole=False)
     axes = tb.plots.place_map(own, result.workspace)
     assert [ax.get_title() for ax in axes[::2]] == [
         f"{name}: better (+) or worse (\N{MINUS SIGN})" for name in result.workspace.team.names

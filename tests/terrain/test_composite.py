@@ -115,9 +115,6 @@ def test_a_fitted_index_is_read_back_as_it_was(tmp_path, robust, method):
     assert again.get_params() == index.get_params()
     xr.testing.assert_identical(again.loadings_, index.loadings_)
     xr.testing.assert_identical(again.transform(features), index.transform(features))
-    old = index.to_dataset().assign_attrs(scaling="logistic", method="pca")  # as 0.2 wrote it
-    with pytest.raises(TrustboError, match="scaling='logistic' is of version 0"):
-        CompositeIndex.from_dataset(old)
 
 
 def test_it_keeps_scikit_learn_s_conventions():

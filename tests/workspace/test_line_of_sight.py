@@ -231,10 +231,6 @@ def test_the_rules_of_posts_survive_a_file_and_missions_lose_less(by_end, wooded
         again = workspace_from_tree(workspace_to_tree(workspace))
         assert again.formation == workspace.formation
         np.testing.assert_array_equal(again.posts(A, C), workspace.posts(A, C))
-    tree = workspace_to_tree(by_end)
-    del tree.attrs["formation"]
-    tree.attrs["formation_radius"] = 5.0  # as version 0.2 wrote it
-    assert workspace_from_tree(tree).formation == replace(by_end.formation, radius=5.0)
     rates = [
         np.mean([b.contact_rate.mean() for m in
                  KinematicSimulator(w).run_batch([A, C, NEXT, (0, 3)], range(4)) for b in m.bounds])

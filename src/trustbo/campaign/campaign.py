@@ -3,7 +3,6 @@
 import time
 import warnings
 from collections.abc import Iterator, Sequence
-from functools import partial
 from typing import Any, Self
 
 import jax
@@ -38,7 +37,6 @@ from trustbo.models.params import Params
 from trustbo.models.record import model_from_record, model_to_record
 from trustbo.planning import Plan, Planner, Policy
 from trustbo.planning.policies import resolve_policy
-from trustbo.renamed import Former
 from trustbo.simulation import Truth
 from trustbo.simulation.protocol import Simulator
 from trustbo.stacking import fill_awareness, replace_awareness
@@ -587,20 +585,3 @@ class Campaign(Displayed):
         if self.storage is not None:
             self.storage.release()
             self.storage = None
-
-    # --- names of version 0.2 ---
-
-    log = Former("state", lambda campaign: campaign.state)
-    seed = Former("state.seed", lambda campaign: campaign.state.seed)
-    plans = Former(
-        "state.entries[j].plan", lambda campaign: [e.plan for e in campaign.state.entries]
-    )
-    waiting = Former(
-        'those of state.numbers("told")',
-        lambda campaign: [campaign.state.measured[j] for j in campaign.state.numbers(TOLD)],
-    )
-    awareness = Former("learner.awareness", lambda campaign: campaign.learner.awareness)
-    observation = Former("learner.observation", lambda campaign: campaign.learner.observation)
-    summary = Former("table", lambda campaign: campaign.table)
-    keep = Former("save(folder, keep=True)", lambda campaign: partial(campaign.save, keep=True))
-    close = Former("the end of `with campaign:`", lambda campaign: campaign.__exit__)

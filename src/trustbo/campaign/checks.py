@@ -2,7 +2,7 @@
 
 import difflib
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -48,17 +48,15 @@ def require_mission(
     return mission
 
 
-def require_extra(
-    extra: Mapping[str, Any], reserved: Collection[str] = RESERVED
-) -> dict[str, float]:
+def require_extra(extra: Mapping[str, Any]) -> dict[str, float]:
     """Return extra numbers of a mission as floats; NaN stands for a missing one.
 
-    TrustboError: a value that is infinite or not a number, or a name that is `reserved` or no
+    TrustboError: a value that is infinite or not a number, or a name that is reserved or no
     identifier, which files could not store.
     """
     checked = {}
     for name, value in extra.items():
-        if name in reserved:
+        if name in RESERVED:
             raise TrustboError(f"{name!r} is a column of the history; give {value!r} another name.")
         if not name.isidentifier():
             raise TrustboError(f"{name!r} cannot name a column; use letters, digits and _.")

@@ -5,10 +5,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from trustbo.campaign.migrate import migrate_result, migrate_state
 from trustbo.campaign.replacing import MEASURED, MISSIONS, RESULT, STATE
 from trustbo.errors import DamagedFileError
-from trustbo.files import interpreting, read_record
+from trustbo.files import read_record
 
 MISSIONS_AS_TOLD = (
     "All missions as they were told can be read: trustbo.logs.read_missions({!r}); tell them, in "
@@ -30,12 +29,12 @@ _CHOSEN = {
     "start": [int, int], "goal": [int, int], "objective": str, "sampler": str, "policy": str,
     "connectivity": int, "max_bounds": (int, str, None), "team": str, "length_weight": float,
     "unseen_cost": float, "max_failure": (float, None), "failure_cost": (float, None),
-    "initial": str, "update": str, "forgetting": float, "awareness": str, "replan": str,
+    "initial": str, "forgetting": float, "awareness": str, "replan": str,
     "hazard": dict,
 }  # fmt: skip
 _PLAN = {
     "path": _PATH, "positions": [[float, float]], "length": float, "trust": [[float]],
-    "bands": [[[float]]], "value": float, "success": float, "success_index": float,
+    "bands": [[[float]]], "value": float, "success_index": float,
     "objective": str, "exact": bool, "bound": float, "revisits": int, "engine": str,
     "seconds": float, "infeasible": bool, "value_band": ([float, float], None),
     "cover": (None, {"unseen": float, "band": [float, float], "by_bound": [float]}),
@@ -46,12 +45,30 @@ _PLAN = {
     }),
 }  # fmt: skip
 _FAILURE = [int, str, _PATH, ([int, int], None), bool]
-_FAILURES = [(_FAILURE, _FAILURE[:4], _FAILURE[:2])]  # the latter of older versions
+_FAILURES = [_FAILURE]
 _COLUMNS = "objective", "path_changed", "contact_rate", "status"
 _ROW = {"status": str, "state": str, "reason": str, str: (float, bool)}
 _NEEDED = {
-    STATE: ("n_missions", "options", "plans", "rows", "failures", "notes", "stop_reason"),
-    RESULT: ("n_missions", "path", "trust", "value", "settings", "stop_reason"),
+    STATE: (
+        "n_missions",
+        "options",
+        "plans",
+        "rows",
+        "posterior_after",
+        "failures",
+        "notes",
+        "stop_reason",
+    ),
+    RESULT: (
+        "n_missions",
+        "path",
+        "trust",
+        "value",
+        "settings",
+        "posterior_after",
+        "failures",
+        "stop_reason",
+    ),
 }
 _FIELDS: dict[str, dict[Any, Any]] = {
     STATE: {
@@ -79,7 +96,7 @@ _FIELDS: dict[str, dict[Any, Any]] = {
 
 
 def read_fields(file: Path) -> dict[str, Any]:
-    """Read `campaign.json` or `result.json`, converted from older versions.
+    """Read `campaign.json` or `result.json`.
 
     DamagedFileError: the file is missing or damaged, or a field is missing or no such value.
     """
@@ -102,8 +119,7 @@ def read_fields(file: Path) -> dict[str, Any]:
     for name in ("plans", "rows", "posterior_after"):
         if len(record.get(name, range(n))) != n:
             raise damaged(f"{name} has {len(record[name])} entries for {n} missions.")
-    with interpreting(file):
-        return migrate_state(record) if file.name == STATE else migrate_result(record)
+    return record
 
 
 def _fits(value: Any, kind: Any) -> bool:

@@ -28,14 +28,12 @@ def history_of(entries: Sequence[Entry]) -> xr.Dataset:
     for i, plan in enumerate(plans):
         steps[i, : len(plan.path)] = plan.path
     trust_map = entries[0].trust_map
-    # Older campaigns have numbers by names that are those of axes.
-    axes = {*map(str, trust_map.coords), *map(str, trust_map.dims), "axis", "step", "iteration"}
     variables: dict[str, Any] = {}
     for name in {name: None for row in rows for name in row}:
         # The exact sampler may have fallen back on NUTS, whose diagnostics are others: NaN then.
         values = [row.get(name, np.nan) for row in rows]
         units = {"units": "%"} if name == "regret" else {}
-        variables[f"told_{name}" if name in axes else name] = "iteration", values, units
+        variables[name] = "iteration", values, units
     variables["path"] = ("iteration", "step", "axis"), steps
     maps = np.stack([entry.trust_map.values for entry in entries])
     variables["trust_map"] = ("iteration", "row", "col"), maps, trust_map.attrs

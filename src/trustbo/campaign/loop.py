@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from typing import Any
 
 from trustbo.campaign.campaign import Campaign
-from trustbo.campaign.migrate import migrate_notes
 from trustbo.campaign.options import OBJECTIVE, POLICY, SAMPLER, CampaignOptions
 from trustbo.campaign.result import Result
 from trustbo.campaign.stopping import Stop, require_stops, rules_of
@@ -135,7 +134,6 @@ def resume(
 
 def _require_same(before: dict[str, Any], now: dict[str, Any]) -> None:
     """Refuse a simulator that differs from the one the campaign was started with."""
-    before = migrate_notes(before, now)
     for name in now.keys() - {"n_iterations", "stop"}:
         if to_json(old := before.get(name)) != to_json(now[name]):  # as text: NaN equals itself
             raise TrustboError(

@@ -8,7 +8,6 @@ import numpy as np
 import xarray as xr
 
 from trustbo.campaign.damage import naming_what_is_left
-from trustbo.campaign.migrate import is_whole
 from trustbo.data import Mission
 from trustbo.errors import DamagedFileError
 from trustbo.files import checksum
@@ -92,8 +91,6 @@ def whole_posterior(
     `missions` are all recorded so far. The model, for `log_prior`, is needed where its priors are
     not the default.
     """
-    if is_whole(stored):
-        return stored
     numbers = np.atleast_1d(stored.attrs["missions"]).astype(int).tolist()
     whole = complete(stored, [missions[j] for j in numbers], model=model)
     groups = {name: group.to_dataset() for name, group in whole.children.items()}

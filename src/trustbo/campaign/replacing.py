@@ -19,7 +19,6 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from trustbo.campaign.migrate import posterior_after
 from trustbo.errors import DamagedFileError, TrustboError
 from trustbo.files import (
     FilePath,
@@ -149,8 +148,7 @@ def warn_of_others(folder: Path) -> None:
 def own_files(folder: Path) -> list[Path]:
     """Files of a campaign or result in a folder that this library wrote, its records last.
 
-    Our names in a folder of ours; numbered ones if they have a sum, or a record counts them, for
-    version 0.1 wrote no sums.
+    Our names in a folder of ours; numbered ones if they have a sum, or a record counts them.
     """
     ours, counted = _is_ours(folder), _counted(folder)
 
@@ -193,7 +191,7 @@ def _counted(folder: Path) -> set[tuple[str, str]]:
     files = set()
     for record in _records(folder):
         with suppress(TypeError):  # of a damaged record
-            numbers = [after for after in posterior_after(record) if isinstance(after, int)]
+            numbers = [n for n in record.get("posterior_after", ()) if isinstance(n, int)]
             files |= {(POSTERIORS, f"{after:04d}.nc") for after in numbers}
     return files
 

@@ -8,9 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from trustbo.campaign.checks import require_extra
 from trustbo.campaign.damage import MISSIONS_AS_TOLD, naming_what_is_left, read_fields
-from trustbo.campaign.migrate import extras_of, migrate_result
 from trustbo.campaign.posteriors import Posterior, Posteriors
 from trustbo.campaign.replacing import (
     BELIEVED,
@@ -175,11 +173,7 @@ class Storage:
                 tree = read_tree(file)
                 measured = missions_of_tree(tree, file)
                 with interpreting(file):
-                    # Names that are reserved by now were free once.
-                    extras = [
-                        require_extra(extra, reserved=())
-                        for extra in extras_of(tree["missions"].attrs, len(measured))
-                    ]
+                    extras = json.loads(tree["missions"].attrs["extra"])
                     if len(extras) != len(measured):
                         raise ValueError(f"{len(extras)} extras of {len(measured)} missions")
             if len(measured) < n:
@@ -314,13 +308,13 @@ def _record_of(result: Result) -> dict[str, Any]:
         "settings": result.settings,
         "stop_reason": result.stop_reason,
         "posterior_after": Posteriors.from_trees(result.posteriors).after,
-        **({"failures": result.failures} if result.failures else {}),
+        "failures": result.failures,
     }
 
 
 def _is_in(result: Result, folder: Path) -> bool:
     """Whether a folder holds this very result."""
-    record = migrate_result(json.loads(to_json(_record_of(result))))
+    record = json.loads(to_json(_record_of(result)))
     try:
         return to_json(read_fields(folder / RESULT)) == to_json(record)
     except DamagedFileError:

@@ -1,6 +1,5 @@
 """`trustbo run`, `demo` and `resume`: campaigns on a terrain of the user or of the package."""
 
-import dataclasses
 from functools import partial
 from pathlib import Path
 from shutil import copyfile
@@ -222,7 +221,4 @@ def _simulator(folder: Path, notes: dict[str, Any]) -> "KinematicSimulator":
     workspace = read_workspace(current(folder))
     with interpreting(folder / STATE):
         sight = Sight(notes["sight"], notes["extinction"], notes["crown_base"])
-        if order := notes.get("bounding"):  # of version 0.2, where it was the simulator's
-            rules = dataclasses.replace(workspace.formation, bounding=order)
-            workspace = dataclasses.replace(workspace, formation=rules)
         return KinematicSimulator(workspace, sight=sight, tick=notes["tick"])

@@ -44,7 +44,6 @@ from trustbo.inference.posterior_tree import missions_of
 from trustbo.models.families import FAMILIES
 from trustbo.models.model import TrustModel
 from trustbo.parallel import one_blas_thread
-from trustbo.renamed import Former
 
 _LEVEL = 0.05
 _ROBOT = "robot in a mission"
@@ -92,8 +91,6 @@ class Criticism(Displayed):
     curves: xr.Dataset
     robots: pd.DataFrame
     ablation: pd.DataFrame
-
-    worth = Former("Criticism.ablation", lambda found: found.ablation)
 
     def _card(self) -> Card:
         rows = [(str(name), str(row["finding"])) for name, row in self.table.iterrows()]

@@ -337,12 +337,12 @@ class PathRisk(NamedTuple):
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> Self:
         """Convert the record of `to_record` back."""
-        (low, high), p_fail = record["p_arrive_band"], np.array(record["p_fail"])
+        low, high = record["p_arrive_band"]
         return cls(
-            p_fail,
+            np.array(record["p_fail"]),
             np.array(record["p_fail_band"]),
             record["p_arrive"],
             (low, high),
             {cause: np.array(p) for cause, p in record["by_cause"].items()},
-            np.array(record.get("p_reach", np.cumprod(1.0 - p_fail))),  # not in version 0.2
+            np.array(record["p_reach"]),
         )

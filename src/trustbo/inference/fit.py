@@ -60,7 +60,6 @@ def fit(
     max_tree_depth: int = 10,
     check: bool = True,
     whole: bool = True,
-    **former: int,
 ) -> xr.DataTree:
     """Posterior of the trust model's parameters, and of latent trust, given missions.
 
@@ -101,7 +100,6 @@ def fit(
             run does not cure; `False` returns it unchecked.
         whole: Whether to add latent trust, log-likelihoods and predictions at once; `complete` adds
             them later, where trust follows from the parameters.
-        **former: Numbers `n_warmup` and `n_draws`, the names of `warmup` and `draws` until 0.2.
 
     Returns:
         An ArviZ DataTree with the groups `posterior` (for `PooledTrust` beta0, beta[feature], b,
@@ -126,7 +124,7 @@ def fit(
     require_model(model)
     given = {"warmup": warmup, "draws": draws, "n_chains": n_chains}
     care = {"target_accept": target_accept, "max_tree_depth": max_tree_depth}
-    settings = NutsSettings.of({**given, **care}, former)
+    settings = NutsSettings.of({**given, **care})
     seed = require_whole("seed", seed, 0)
     if earlier is not None:
         require_posterior("earlier=", earlier)
@@ -158,7 +156,7 @@ def fit(
         slots = Slots.of(*chains) if needs_evidence(model, chosen) else None
         sampled = draw_posterior(
             floored, chosen,
-            settings if former or warmup is not None else with_warmup(settings, model),
+            settings if warmup is not None else with_warmup(settings, model),
             seed, batch, weight, places, proposal_of(earlier), slots,
             check=check, fallback=fallback, watch=watch,
         )  # fmt: skip

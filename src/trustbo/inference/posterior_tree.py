@@ -144,10 +144,7 @@ def missions_of(posterior: xr.DataTree) -> list[Mission]:
         has_map = bool(made.any())
         one = one.isel(bound=made if has_map else slice(int(one["n_bounds"])))
         cells = list(zip(one["row"].values, one["col"].values, strict=True))
-        # Posteriors of version 0.1 do not hold the first cell.
-        start = cells[0]
-        if "start_row" in one:
-            start = (int(one["start_row"]), int(one["start_col"]))
+        start = (int(one["start_row"]), int(one["start_col"]))
         z, y, seconds = (one[name].values for name in ("awareness", "contact_rate", "duration"))
         missions.append(
             Mission.from_arrays(

@@ -12,7 +12,6 @@ from trustbo.logs.studies import read_azevedo_sa, read_du, read_soh
 from trustbo.logs.synthetic import synthetic_log
 from trustbo.logs.table import read_table, write_table
 from trustbo.logs.windows import join_missions, missions_of
-from trustbo.renamed import moved
 
 __all__ = [
     "Log", "Sensor", "Topics", "fit_sensor", "geometry", "join_missions", "missions_of",
@@ -21,4 +20,3 @@ __all__ = [
     "write_missions", "write_table",
 ]  # fmt: skip
 __dir__ = __all__.copy  # completion lists public names alone
-__getattr__ = moved(__name__, {"trustbo.logs.netcdf": ["STATES"]})  # name of version 0.2

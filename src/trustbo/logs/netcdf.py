@@ -156,15 +156,11 @@ def missions_of_tree(tree: xr.DataTree, path: FilePath) -> list[Mission]:
         try:
             kept = tree["missions"].to_dataset()
             table = {str(n): a.values for n, a in kept.variables.items()}
-            folder = str(kept.attrs.get(_TICKS, _TICKS))  # files of version 0.2 do not name it
-            if "exposure" in table:  # its name in version 0.1
-                table["n_ticks"] = table.pop("exposure")
-            old = tree["ticks"].to_dataset() if "ticks" in tree.children else None
+            folder = str(kept.attrs[_TICKS])
             missions = []
             for j in range(len(table["status"])):
-                ticks = None if old is None else old.isel(tick=old["mission"].values == j)
-                if ticks is None and (file := ticks_file(path, folder, j)).exists():
-                    ticks = read_tree(file).to_dataset()
+                file = ticks_file(path, folder, j)
+                ticks = read_tree(file).to_dataset() if file.exists() else None
                 missions.append(_mission(table, j, ticks))
             return missions
         except KeyError as error:

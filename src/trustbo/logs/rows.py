@@ -21,9 +21,6 @@ COLUMNS = (*KEYS, *NUMBERS, *TEXTS)
 """Columns with a fixed meaning; any other is an awareness feature."""
 POSITIONS = (("row", "col"), ("x", "y"), ("lon", "lat"))
 """Pairs of columns with the cell, or with a position in it."""
-_TICKS_BEFORE = "exposure"
-"""Name of the column `n_ticks` in version 0.1."""
-_RESERVED = (*COLUMNS, _TICKS_BEFORE)
 _PREFIX = "awareness_"
 _SEPARATORS = ",;\t"
 _BLANK = {"", "nan", "none", "null", "<na>", "nat"}
@@ -68,9 +65,6 @@ def read_columns(
     for name in (ignore,) if isinstance(ignore, str) else ignore:
         if columns.pop(name, None) is None:
             raise TrustboError(f"ignore has {name!r}; the table has {', '.join(names)}.")
-    if _TICKS_BEFORE in columns:
-        other = "n_ticks" if "n_ticks" not in columns else f"{_PREFIX}{_TICKS_BEFORE}"
-        columns[other] = columns.pop(_TICKS_BEFORE)
     place = position_of(columns) or (POSITIONS[0] if mapped else ())
     missing = [n for n in (*KEYS[:3], *place) if n not in columns]
     if "contact_rate" not in columns and not {"contact_time", "duration"} <= columns.keys():
@@ -156,13 +150,13 @@ def features_of(columns: Mapping[str, object]) -> tuple[str, ...]:
     place = position_of(columns)
     others = [name for name in columns if name not in (*COLUMNS, *place)]
     bare = [name.removeprefix(_PREFIX) for name in others]
-    features = tuple(b if b in _RESERVED else name for b, name in zip(bare, others, strict=True))
+    features = tuple(b if b in COLUMNS else name for b, name in zip(bare, others, strict=True))
     return features or FEATURES
 
 
 def column_of(feature: str) -> str:
     """Column of a feature: its name, with a prefix if another column has it."""
-    return f"{_PREFIX}{feature}" if feature in _RESERVED else feature
+    return f"{_PREFIX}{feature}" if feature in COLUMNS else feature
 
 
 def _parse(

@@ -4,8 +4,7 @@ A report is given after its bound, before the mission at bound 0, on a scale suc
 A table without places is of a log without a map: features are of any values. A blank
 means "not measured". Bounds after the last one with a measurement were planned, not run. A feature
 with the name of one of these columns takes the prefix `awareness_`, e.g.
-`awareness_status`; so does `exposure`, which was the name of `n_ticks` in version 0.1 and is still
-read as such.
+`awareness_status`.
 """
 
 import math

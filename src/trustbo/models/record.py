@@ -42,7 +42,6 @@ def model_from_record(
     `features` are those of the posterior, for default priors by feature. TrustboError: it has to be
     passed and was not, or another was passed.
     """
-    record = {"place": None, **record}  # version 0.1 had none
     if given is not None:
         if model_to_record(given) != record:
             raise TrustboError(

@@ -13,7 +13,6 @@ from trustbo.display.svg import curve_picture
 from trustbo.hazard.risk import PathRisk
 from trustbo.planning.assignment import robots_along
 from trustbo.planning.cover import PathCover
-from trustbo.renamed import Former
 from trustbo.workspace import Workspace
 
 QUANTILES = (0.05, 0.25, 0.75, 0.95)
@@ -157,8 +156,6 @@ class Plan(Displayed):
         ground = self.workspace.ground
         return None if ground is None else ground.posts.places(self.path)[0]
 
-    waypoints = Former("Plan.stops", lambda plan: plan.stops)
-
     @cached_property
     def posts(self) -> np.ndarray | None:
         """Posts where T2 stands before each bound, shape (bound, robot, 2)."""
@@ -214,15 +211,13 @@ def plan_to_record(plan: Plan) -> dict[str, Any]:
 def plan_from_record(record: dict[str, Any], workspace: Workspace) -> Plan:
     """Convert the record of `plan_to_record` to a plan of a workspace."""
     values: dict[str, Any] = {**record, "workspace": workspace}
-    if "success" in values:  # its name in version 0.1
-        values["success_index"] = values.pop("success")
     for name in ("positions", "trust", "bands"):
         values[name] = np.array(record[name])
     if record.get("value_band"):
         values["value_band"] = tuple(record["value_band"])
-    if record.get("risk"):  # unknown to version 0.1
+    if record["risk"]:
         values["risk"] = PathRisk.from_record(record["risk"])
-    if record.get("cover"):  # unknown to version 0.2
+    if record["cover"]:
         values["cover"] = PathCover.from_record(record["cover"])
     values["path"] = tuple((row, col) for row, col in record["path"])
     return Plan(**values)

@@ -19,7 +19,6 @@ from trustbo.plots.plan import plan_map
 from trustbo.plots.regret import regret_curves
 from trustbo.plots.style import DARK
 from trustbo.plots.terrain import loadings, terrain_maps
-from trustbo.renamed import moved
 
 __all__ = [
     "DARK", "animate_mission", "calibration", "campaign_history", "cell_map", "criticism",
@@ -28,4 +27,3 @@ __all__ = [
     "terrain_maps", "trust_maps",
 ]  # fmt: skip
 __dir__ = __all__.copy  # completion lists public names alone
-__getattr__ = moved(__name__, {"trustbo.plots.explorer": ["Explorer"]})  # name of version 0.2

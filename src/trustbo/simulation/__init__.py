@@ -1,6 +1,5 @@
 """Simulators of bounding overwatch, and replay of recorded missions."""
 
-from trustbo.renamed import moved
 from trustbo.simulation.events import Degradation, Dust, Fouling, Season, Threat, Vegetation
 from trustbo.simulation.model import ModelSimulator
 from trustbo.simulation.mujoco import MujocoSimulator
@@ -14,4 +13,3 @@ __all__ = [
     "RadioSimulator", "ReplaySimulator", "Season", "Threat", "Truth", "Vegetation",
 ]  # fmt: skip
 __dir__ = __all__.copy  # completion lists public names alone
-__getattr__ = moved(__name__, {"trustbo.simulation.protocol": ("BoundSimulator", "Simulator")})

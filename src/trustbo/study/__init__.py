@@ -1,6 +1,5 @@
 """Studies: many campaigns as a table of runs, on as many cores as there are."""
 
-from trustbo.renamed import moved
 from trustbo.study.benchmark import run_worlds
 from trustbo.study.configuration import Study, run_study
 from trustbo.study.experiment import failures, load_study
@@ -13,7 +12,3 @@ __all__ = [
     "worlds_table",
 ]  # fmt: skip
 __dir__ = __all__.copy  # completion lists public names alone
-# Names of version 0.2.
-__getattr__ = moved(
-    __name__, {"trustbo.study.configuration": ["read_study"], "trustbo.study.world": ["World"]}
-)

@@ -1,6 +1,5 @@
 """Rasters of terrain and features of their pixels."""
 
-from trustbo.renamed import moved
 from trustbo.terrain.composite import CompositeIndex
 from trustbo.terrain.dataset import read_terrain
 from trustbo.terrain.example import example
@@ -15,10 +14,3 @@ __all__ = [
     "synthetic_terrain",
 ]  # fmt: skip
 __dir__ = __all__.copy  # completion lists public names alone
-__getattr__ = moved(__name__, {
-    "trustbo.terrain.dataset": ("assemble_terrain", "pixel_size"),
-    "trustbo.terrain.features": (
-        "aspect", "canopy_cover", "canopy_height", "exposure", "openness", "slope",
-        "vegetation_density",
-    ),
-})  # fmt: skip

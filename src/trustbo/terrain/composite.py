@@ -192,14 +192,9 @@ class CompositeIndex(TransformerMixin, BaseEstimator):
 
     @classmethod
     def from_dataset(cls, data: xr.Dataset) -> Self:
-        """Make an index from the dataset of `to_dataset`.
-
-        TrustboError: it is of version 0.2, whose logistic scaling is no more.
-        """
+        """Make an index from the dataset of `to_dataset`."""
         names = [str(name) for name in data["feature"].values]
         attrs = data.attrs
-        if attrs.get("scaling") == "logistic" and attrs["method"] == "pca":
-            raise TrustboError("an index of scaling='logistic' is of version 0.2; fit it anew.")
         index = cls(
             dict(zip(names, data["sign"].values.astype(int).tolist(), strict=True)),
             robust=bool(attrs["robust"]),

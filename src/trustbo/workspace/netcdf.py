@@ -69,7 +69,5 @@ def workspace_from_tree(tree: xr.DataTree) -> Workspace:
 
 
 def _formation_of(attrs: Mapping[Any, Any]) -> Formation:
-    """Formation of a file; those of version 0.2 have its radius alone."""
-    if "formation" in attrs:
-        return Formation(**json.loads(attrs["formation"]))
-    return Formation.of("end", "centre", attrs.get("formation_radius"), None)
+    """Formation of a file."""
+    return Formation(**json.loads(attrs["formation"]))

@@ -23,7 +23,6 @@ from trustbo.display.card import Card, Displayed
 from trustbo.display.compiling import compiling
 from trustbo.display.svg import map_picture
 from trustbo.errors import ShapeError, require_choice, require_positive
-from trustbo.renamed import former
 from trustbo.stacking import fill_awareness
 from trustbo.team import Team
 from trustbo.terrain.composite import CompositeIndex
@@ -68,8 +67,7 @@ class Workspace(Displayed):
         of_bounds: DataArray (robot, move, row, col, feature) of what the bound into a cell by a
             move meets, in [0, 1], NaN where there is no such bound; None where awareness is that of
             the cell entered, for any move.
-        sights: Assumed models of sight; posts go by the first. Empty without a terrain, and in
-            files of version 0.1.
+        sights: Assumed models of sight; posts go by the first. Empty without a terrain.
         formation: Order of moves, and rules of the lead's stops and of T2's posts.
     """
 
@@ -308,11 +306,6 @@ class Workspace(Displayed):
             return None
         like = self.passable.expand_dims(move=list(MOVE_NAMES), axis=0)
         return like.copy(data=table.unseen(self.passable.values)).rename("unseen")
-
-    @property
-    def difficulty(self) -> xr.DataArray:
-        """Difficulty of bounds, as version 0.2 had it: see `hazard.difficulty.difficulty_of`."""
-        return former("Workspace.difficulty", "trustbo.hazard.difficulty", "difficulty_of")(self)
 
     def ways_over(self, surface: Surface, sight: Sight | None = None) -> Ways:
         """Posts and ways over another surface of the same terrain, such as one with closed areas.

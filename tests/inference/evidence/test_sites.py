@@ -142,7 +142,7 @@ def test_odd_data_have_a_posterior(family, rates):
 def test_robots_apart_are_each_sampled_alone(family):
     missions = counted(family, 4, 5, seed=3)
     model = CoupledTrust(observation=family, inter_robot="none")
-    posterior = fit(missions, model, seed=3, n_draws=250)
+    posterior = fit(missions, model, seed=3, draws=250)
     assert posterior.attrs["sampler"] == "exact"
     assert "by expectation propagation" in posterior.attrs["sampler_reason"]
     alone = [
@@ -163,8 +163,8 @@ def test_robots_apart_are_each_sampled_alone(family):
 def test_trust_can_be_added_later_and_is_the_same():
     missions = counted("censored", 3, 4)
     model = PooledTrust(observation="censored")
-    whole = fit(missions, model, seed=4, n_draws=100)
-    bare = fit(missions, model, seed=4, n_draws=100, whole=False)
+    whole = fit(missions, model, seed=4, draws=100)
+    bare = fit(missions, model, seed=4, draws=100, whole=False)
     assert "latent" not in bare.children
     again = complete(bare)
     for group in ("latent", "log_likelihood", "posterior_predictive", "prior_predictive"):
@@ -204,7 +204,7 @@ def test_draws_and_a_long_run_of_nuts_agree(family):
     model = PooledTrust(observation=family)
     model = model.at_resolution({float(N): 1.0})
     exact, _ = sample_exactly(missions, model, n_seeds=5)
-    nuts = fit(missions, model, "joint", n_draws=4000, n_warmup=1000)
+    nuts = fit(missions, model, "joint", draws=4000, warmup=1000)
     for name, draws in exact.items():
         theirs = nuts["posterior"][name].values.reshape(16_000, -1)
         for a, b in zip(draws.reshape(10_000, -1).T, theirs.T, strict=True):

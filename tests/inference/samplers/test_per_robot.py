@@ -170,7 +170,7 @@ def test_fit_takes_it_and_adds_trust_later():
     gap = Mission.from_arrays(missions[0].path, missions[0].awareness, rates)
     model = HierarchicalTrust()
     weights = 0.9 ** np.arange(5)[::-1]
-    bare = fit([gap, *missions[1:]], model, weights=weights, n_draws=100, whole=False)
+    bare = fit([gap, *missions[1:]], model, weights=weights, draws=100, whole=False)
     assert bare.attrs["sampler"] == "exact"
     assert diagnostics(bare)["k_hat"] < 0.5
     assert bare["posterior"]["beta"].dims == ("chain", "draw", "robot", "feature")

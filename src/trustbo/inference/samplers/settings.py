@@ -4,14 +4,8 @@ from collections.abc import Mapping
 from numbers import Real
 from typing import Any, NamedTuple, Self
 
-from trustbo.errors import TrustboError, require_whole, unknown
+from trustbo.errors import TrustboError, require_whole
 
-_OTHERS = (
-    "workspace", "earlier", "weights", "seed", "progress", "check", "whole",
-)  # fmt: skip
-"""Other keyword arguments of `fit`, to suggest for misspelt ones."""
-_FORMER = {"n_warmup": "warmup", "n_draws": "draws"}
-"""Names until version 0.2, still accepted."""
 _OF_ALL = ("n_chains", "draws")
 """Settings that the exact sampler takes too: the number and the shape of its draws."""
 
@@ -26,26 +20,16 @@ class NutsSettings(NamedTuple):
     max_tree_depth: int = 10
 
     @classmethod
-    def of(cls, given: Mapping[str, Any], former: Mapping[str, Any] | None = None) -> Self:
+    def of(cls, given: Mapping[str, Any]) -> Self:
         """Settings by name, checked.
 
         Args:
             given: Values by name; None leaves a default.
-            former: Values by the names of version 0.2.
 
         Raises:
-            TrustboError: An unknown name, or a number outside its range.
+            TrustboError: A number outside its range.
         """
         values = {name: value for name, value in given.items() if value is not None}
-        for name, value in (former or {}).items():
-            if name not in _FORMER:
-                raise unknown("argument of fit", name, (*SETTINGS, *_OTHERS))
-            if (now := _FORMER[name]) in values:
-                raise TrustboError(
-                    f"{name} is the former name of {now}: give one of {name}={value!r} and "
-                    f"{now}={values[now]!r}, not both."
-                )
-            values[now] = value
         settings = cls(**values)
         accept = settings.target_accept
         if not isinstance(accept, Real) or isinstance(accept, bool) or not 0.0 < accept < 1.0:
