@@ -1,6 +1,8 @@
 """Workspaces, terrains and simulators made for tests."""
 
 import dataclasses
+import os
+import shutil
 from pathlib import Path
 
 import jax
@@ -91,6 +93,32 @@ def resume_or_begin(workspace, folder, n):
         return begin(workspace, folder, n)
     simulator = ModelSimulator(workspace, blind=True)
     return tb.resume(folder, simulator=simulator, n_iterations=n, progress=False)
+
+
+def moments_of(folder, copies, monkeypatch):
+    """Copy the folder just before each file of it appears or goes, as a kill then leaves it.
+
+    A file that is being written has half of its bytes under its temporary name. Returned is the
+    name of the file of each copy, with whether it appears.
+    """
+    names = [None]
+
+    def watched(change):
+        def changes(file, *target, **options):
+            if folder in Path(file).parents and Path(file).exists():
+                copies.append(copies[0].with_name(f"moment{len(copies)}"))
+                shutil.copytree(folder, copies[-1], ignore=shutil.ignore_patterns(".lock"))
+                if target:
+                    half = Path(file).stat().st_size // 2
+                    os.truncate(copies[-1] / Path(file).relative_to(folder), half)
+                names.append((Path(*target or [file]).name, bool(target)))
+            change(file, *target, **options)
+
+        return changes
+
+    monkeypatch.setattr(os, "replace", watched(os.replace))
+    monkeypatch.setattr(Path, "unlink", watched(Path.unlink))
+    return names
 
 
 class Steady:

@@ -1,13 +1,11 @@
-"""Atomic writes with checksums, and errors for files that cannot be written or read."""
+"""Atomic writes, and errors for files that cannot be written or read."""
 
 import errno
-import hashlib
 import json
 import os
 import re
 import shutil
 import signal
-import stat
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -24,8 +22,6 @@ _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _REFUSED = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT, errno.ENOTDIR, errno.ELOOP)
 _LEAST_FREE = 1 << 20
 """Free bytes below which a failed write is blamed on the disk: libraries give no reason."""
-_MOST, _MOST_TEXT, _MOST_YAML = 1 << 35, 1 << 28, 1 << 22
-"""Upper limits in bytes of a file that is read, a record, and a configuration."""
 
 FilePath = str | PathLike[str]
 
@@ -54,6 +50,7 @@ def write_file(path: FilePath, write: Callable[[Path], object]) -> None:
             write(temporary)
             _to_disk(temporary)
             os.replace(temporary, path)
+            _folder_to_disk(path.parent)
     except Exception as error:
         full = isinstance(error, OSError) and error.errno in _FULL
         disk = shutil.disk_usage(path.parent)
@@ -82,7 +79,7 @@ def _to_disk(file: Path) -> None:
         os.fsync(stream.fileno())
 
 
-def folder_to_disk(folder: Path) -> None:
+def _folder_to_disk(folder: Path) -> None:
     """Flush a folder's entries to disk, where the system supports it."""
     with suppress(OSError):  # folders cannot be opened everywhere
         opened = os.open(folder, os.O_RDONLY)
@@ -93,7 +90,7 @@ def folder_to_disk(folder: Path) -> None:
 
 
 @contextmanager
-def naming_refusal(folder: Path, file: Path | None = None, remedy: str = "") -> Iterator[None]:
+def naming_refusal(folder: Path, file: Path | None = None) -> Iterator[None]:
     """Convert the system's refusal to write to a folder to a TrustboError with the remedy.
 
     With `file`, only refusals of that file: others may be read meanwhile.
@@ -110,7 +107,7 @@ def naming_refusal(folder: Path, file: Path | None = None, remedy: str = "") -> 
             raise
         raise TrustboError(
             f"cannot write to {str(folder)!r}: {error.strerror}; give a folder that may be "
-            f"written to.{remedy}"
+            "written to."
         ) from error
 
 
@@ -140,84 +137,31 @@ def defer_interrupt() -> Iterator[None]:
             before[seen[0]](seen[0], None)
 
 
-def write_checked(path: FilePath, content: bytes) -> None:
-    """Write a file atomically and durably, and its SHA-256 to a hidden file in the same folder.
-
-    The hidden file, which is written first, also keeps the sum of the previous file: if the process
-    dies between the two writes, the pair still agrees.
-    """
-    path = Path(path)
-    # Of the file that is there: its kept sum may be that of one whose writing died.
-    contents = [content, *([read_file(path)] if path.is_file() else [])]
-    sums = "\n".join(hashlib.sha256(one).hexdigest() for one in contents)
-    write_file(sum_file(path), lambda file: file.write_text(sums, encoding="utf-8"))
-    write_file(path, lambda file: file.write_bytes(content))
-    folder_to_disk(path.parent)
-
-
-def read_checked(path: FilePath, most: int = _MOST) -> bytes:
-    """Read a file of `write_checked`, or any other file, which then has no sum to be checked.
-
-    Raises:
-        DamagedFileError: There is no such file, `read_file` refuses it, or its bytes are not those
-            that were written.
-    """
-    path = Path(path)
-    content = read_file(path, most)
-    sums = _sums(path)
-    if sums and hashlib.sha256(content).hexdigest() not in sums:
-        raise DamagedFileError(
-            f"{str(path)!r} is damaged: its bytes are not those that were written."
-        )
-    return content
-
-
-def require_regular(path: FilePath, most: int = _MOST) -> Path:
-    """Return a file to read; pipes, devices and files above a size limit are refused.
-
-    Raises:
-        DamagedFileError: There is no such file, it is not regular, or it has more than `most`
-            bytes.
-    """
+def read_file(path: FilePath) -> bytes:
+    """Read a file whole; DamagedFileError if it is missing or cannot be read."""
     path = as_path(path)
     try:
-        status = path.stat()
+        return path.read_bytes()
     except FileNotFoundError:
         raise DamagedFileError(f"{str(path)!r} is missing.") from None
     except OSError as error:
         raise DamagedFileError(f"{str(path)!r} cannot be read: {error.strerror}.") from None
-    if not stat.S_ISREG(status.st_mode):
-        kind = "a folder" if stat.S_ISDIR(status.st_mode) else "a pipe or a device"
-        raise DamagedFileError(f"{str(path)!r} cannot be read: it is {kind}, not a file.")
-    if status.st_size > most:
-        raise DamagedFileError(
-            f"{str(path)!r} cannot be read: it has {status.st_size} bytes, more than {most}."
-        )
-    return path
 
 
-def read_file(path: FilePath, most: int = _MOST) -> bytes:
-    """Read a file whole; DamagedFileError as of `require_regular`, or if it cannot be read."""
-    path = require_regular(path, most)
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise DamagedFileError(f"{str(path)!r} cannot be read: {error.strerror}.") from None
-    except MemoryError:
-        raise DamagedFileError(f"{str(path)!r} cannot be read: too large for memory.") from None
-
-
-def read_record(path: FilePath, *, checked: bool = True) -> Any:
-    """Read a JSON file, by default against the sum that `write_checked` kept.
+def read_record(path: FilePath) -> dict[str, Any]:
+    """Read a JSON file of fields by name.
 
     Raises:
-        DamagedFileError: The file is missing, damaged, no JSON, or nested too deeply.
+        DamagedFileError: The file is missing, damaged, no JSON, or holds no fields.
     """
-    content = read_checked(path, _MOST_TEXT) if checked else read_file(path, _MOST_TEXT)
+    content = read_file(path)
     try:
-        return json.loads(content)
+        record = json.loads(content)
     except (ValueError, RecursionError) as error:
         raise DamagedFileError(f"{str(path)!r} is damaged: no JSON ({error}).") from None
+    if not isinstance(record, dict):
+        raise DamagedFileError(f"{str(path)!r} is damaged: no record of fields.")
+    return record
 
 
 @contextmanager
@@ -240,27 +184,6 @@ def interpreting(path: FilePath) -> Iterator[None]:
         ) from error
 
 
-def not_ours(path: Path) -> TrustboError:
-    """Error for a file of another program under one of our names."""
-    return TrustboError(
-        f"{str(path)!r} was not written by trustbo, and would be replaced; move it, or choose "
-        "another folder."
-    )
-
-
-def checksum(path: Path) -> str | None:
-    """Return the sum that `write_checked` kept of a file; None where there is none."""
-    return next(iter(_sums(path)), None)
-
-
-def remove_checked(path: Path) -> None:
-    """Remove a file of `write_checked` and its sum; a file without a sum is foreign, and stays."""
-    with naming_refusal(path.parent):
-        if sum_file(path).is_file():
-            path.unlink(missing_ok=True)
-            sum_file(path).unlink(missing_ok=True)
-
-
 def remove_leftovers(folder: Path) -> None:
     """Remove temporary files of a dead process; no other process may write there.
 
@@ -272,16 +195,6 @@ def remove_leftovers(folder: Path) -> None:
         ours = re.fullmatch(r"\..+\.trustbo-\d+(\.[^.]*)?", file.name)
         if ours and file.is_file() and not file.is_symlink():
             file.unlink(missing_ok=True)
-
-
-def sum_file(path: Path) -> Path:
-    """Name of the hidden file that `write_checked` keeps a file's sums in."""
-    return path.with_name(f".{path.name}.sha256")
-
-
-def _sums(path: Path) -> list[str]:
-    file = sum_file(path)
-    return read_file(file).decode(errors="replace").split() if file.exists() else []
 
 
 def write_text(path: FilePath, text: str) -> None:
@@ -350,7 +263,7 @@ def read_yaml(file: Path) -> Any:
     if not file.exists():
         raise TrustboError(f"cannot read {str(file)!r}: No such file or directory.")
     try:
-        return yaml.safe_load(read_file(file, _MOST_YAML).decode("utf-8"))
+        return yaml.safe_load(read_file(file).decode("utf-8"))
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         if isinstance(error, TrustboError):
             raise

@@ -369,18 +369,14 @@ FILES = (
 
 
 @pytest.mark.parametrize("name", FILES)
-@pytest.mark.parametrize("damage", ["missing", "empty", "noise", "half"])
-def test_a_damaged_file_is_named_with_what_can_still_be_read(folder, tmp_path, name, damage):
+@pytest.mark.parametrize("damage", ["missing", "empty", "half"])
+def test_a_damaged_file_is_named(folder, tmp_path, name, damage):
     copy = tmp_path / "copy"
     shutil.copytree(folder, copy)
     file = copy / name
     content = file.read_bytes()
     if damage == "missing":
         file.unlink()
-    elif damage == "noise":  # 2 kB of it, or less in a small file
-        size = min(2000, len(content) // 4)
-        noise = np.random.default_rng(0).bytes(size)
-        file.write_bytes(content[:size] + noise + content[2 * size :])
     else:
         file.write_bytes(content[: len(content) // 2] if damage == "half" else b"")
     opens = {"result.json": [tb.load_result], "campaign.json": [tb.Campaign.load]}
@@ -393,8 +389,6 @@ def test_a_damaged_file_is_named_with_what_can_still_be_read(folder, tmp_path, n
         else:
             assert isinstance(error.value, tb.DamagedFileError)
             assert name in str(error.value)
-        if not (name == "result.json" and damage == "missing"):
-            assert "trustbo.logs.read_missions(" in str(error.value)
     if name != "measured.nc":  # which alone rebuilds the campaign, as the next test does
         kept, left = (tb.logs.read_missions(path / "measured.nc") for path in (folder, copy))
         for one, other in zip(kept, left, strict=True):
@@ -412,27 +406,14 @@ def test_awareness_along_a_path_fits_missions_and_filters(workspace):
             campaign.known_along([(3, 0), off])
 
 
-def test_the_advice_says_where_awareness_is_filled_in(folder, tmp_path):
-    copy = tmp_path / "copy"
-    shutil.copytree(folder, copy)
-    (copy / "measured.nc").unlink()
-    with pytest.raises(tb.DamagedFileError) as error:
-        tb.Campaign.load(copy)
-    assert "missions.nc'); tell them, in order" in str(error.value)
-    assert "as they were told can be read" not in str(error.value)
-    assert "awareness that was not measured is filled in there" in str(error.value)
-
-
 def test_a_folder_that_may_not_be_written_to_is_named(workspace, folder, monkeypatch):
     def refuse_lock(self, *args, **kwargs):
         raise PermissionError(13, "Permission denied", self.lock_file)
 
-    monkeypatch.setattr("trustbo.campaign.replacing.FileLock.acquire", refuse_lock)
+    monkeypatch.setattr("trustbo.campaign.storage.FileLock.acquire", refuse_lock)
     with pytest.raises(tb.TrustboError, match=r"cannot write to .*: Permission denied; give a fol"):
         begin(workspace, folder.parent / "new")
-    with pytest.raises(
-        tb.TrustboError, match=r"written to\. tb\.load_result reads one that may not"
-    ):
+    with pytest.raises(tb.TrustboError, match="cannot write to"):
         tb.Campaign.load(folder)
 
 
@@ -446,7 +427,7 @@ def test_a_campaign_is_rebuilt_from_the_missions_measured(folder):
     )
 
 
-def test_leftovers_of_dead_runs_are_removed_and_sums_kept(folder, tmp_path):
+def test_leftovers_of_dead_runs_are_removed(folder, tmp_path):
     copy = tmp_path / "copy"
     shutil.copytree(folder, copy)
     dead = [
@@ -455,11 +436,9 @@ def test_leftovers_of_dead_runs_are_removed_and_sums_kept(folder, tmp_path):
     ]
     for file in dead:
         file.write_text("half")
-    sums = sorted(copy.rglob(".*.sha256"))
     with tb.Campaign.load(copy):
         pass
     assert not any(file.exists() for file in dead)
-    assert sorted(copy.rglob(".*.sha256")) == sums
 
 
 # --- resuming means the same ---
@@ -481,7 +460,6 @@ def test_a_campaign_that_its_rule_has_ended_gives_back_its_result(workspace, tmp
     # Killed before its verdict was written: asked before anything is driven.
     state = json.loads((tmp_path / "campaign.json").read_text())
     (tmp_path / "campaign.json").write_text(json.dumps(state | {"stop_reason": "interrupted"}))
-    (tmp_path / ".campaign.json.sha256").unlink()
     again = tb.resume(tmp_path, **options)
     assert (len(again.missions), again.stop_reason) == (n, ended.stop_reason)
     # The rule, given again, begun with, or another that is satisfied, ends it before it drives.
@@ -570,7 +548,6 @@ def test_a_simulator_of_version_0_1_is_known_by_its_name_then(workspace, tmp_pat
     file = tmp_path / "campaign.json"
     text = file.read_text().replace('"MujocoSimulator"', '"MujocoBackend"')
     file.write_text(text)
-    (tmp_path / ".campaign.json.sha256").unlink()
     assert (
         len(tb.resume(tmp_path, simulator=simulator, n_iterations=2, progress=False).missions) == 2
     )

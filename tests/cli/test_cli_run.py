@@ -275,19 +275,6 @@ def test_debug_shows_the_traceback(invoke, flags, tmp_path):
     assert isinstance(done.exception, ValueError)
 
 
-def test_files_of_others_are_not_replaced_by_results(invoke, flags, tmp_path):
-    """With --overwrite, too: it is for the campaign in the folder."""
-    for name in ("report.html", "maps.tif", "history.csv"):
-        out = tmp_path / name
-        out.mkdir()
-        (out / name).write_text("mine")
-        for more in ((), ("--overwrite",)):
-            done = invoke("run", *flags, "--out", out, *more)
-            assert done.exit_code == 2
-            assert f"{name}' was not written by trustbo, and would be replaced" in done.stderr
-        assert [f.read_text() for f in out.iterdir()] == ["mine"]
-
-
 def test_the_demo_does_not_replace_a_dem_of_others(invoke, tmp_path):
     (tmp_path / "dem.tif").write_text("mine")
     done = invoke("demo", "--out", tmp_path, "--overwrite")

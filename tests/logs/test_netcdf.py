@@ -1,4 +1,4 @@
-"""Missions in netCDF files: as they were, also those of version 0.1; damage is an error."""
+"""Missions in netCDF files: as they were; damage is an error."""
 
 import signal
 from dataclasses import replace
@@ -120,13 +120,8 @@ def test_damage_is_named_with_its_file(driven, tmp_path):
     with pytest.raises(DamagedFileError, match=r"missions.nc' is missing"):
         read_missions(file)
     write_missions(file, driven)
-    content = bytearray(file.read_bytes())
-    content[len(content) // 2] ^= 1  # one bit
-    file.write_bytes(content)
-    with pytest.raises(DamagedFileError, match=r"missions.nc' is damaged: its bytes are not those"):
-        read_missions(file)
     other = tmp_path / "other.nc"
-    other.write_bytes(content[:1000])  # written by someone else: it has no checksum
+    other.write_bytes(file.read_bytes()[:1000])
     with pytest.raises(DamagedFileError, match=r"other.nc' is damaged, or no netCDF"):
         read_missions(other)
     write_tree(other, xr.DataTree(xr.Dataset({"x": 1})))

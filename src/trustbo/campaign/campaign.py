@@ -17,12 +17,11 @@ from trustbo.campaign.learning import Learner
 from trustbo.campaign.options import OBJECTIVE, POLICY, SAMPLER, CampaignOptions, arguments_of
 from trustbo.campaign.planners import believed_of, planner_given, planner_of, unpriced_risk
 from trustbo.campaign.posteriors import Posterior, Posteriors, whole_posterior
-from trustbo.campaign.replacing import STATE
 from trustbo.campaign.result import Result
 from trustbo.campaign.running import run_missions
 from trustbo.campaign.state import SET_ASIDE, TOLD, CampaignState, Failure
 from trustbo.campaign.stopping import Stop
-from trustbo.campaign.storage import Storage
+from trustbo.campaign.storage import STATE, Storage
 from trustbo.campaign.summary import summary_of
 from trustbo.data import Cell, Mission
 from trustbo.display.card import Card, Displayed
@@ -134,7 +133,7 @@ class Campaign(Displayed):
             "own_awareness": self.options.own_awareness,
         }
         if directory is not None:
-            self._save_to(Storage(directory, begun=False), keep=True)
+            self._save_to(Storage(directory), keep=True)
 
     def _card(self) -> Card:
         n, settings, state = len(self.missions), self.settings, self.state
@@ -313,8 +312,8 @@ class Campaign(Displayed):
         entry.become(SET_ASIDE, str(reason))
         self.learner.learn(self.state, self.seed_of("fit"))
         self.state.suggested = self._planner_now = None
-        if self.storage is not None:  # the last posterior is another now
-            self.storage.replace(self.workspace, self.state, self.result())
+        if self.storage is not None:
+            self.storage.write(self.state, self.result())
         return self.state.last_tree
 
     def fail(
@@ -506,28 +505,28 @@ class Campaign(Displayed):
 
     # --- the folder ---
 
-    def save(self, directory: FilePath, *, keep: bool = False) -> None:
+    def save(self, directory: FilePath, *, keep: bool = False, overwrite: bool = False) -> None:
         """Write everything to a folder that `Campaign.load` reads.
-
-        Another campaign in it is replaced.
 
         Args:
             directory: Folder to write to.
             keep: Whether to go on writing there after each mission, as with a `directory`, until
                 the end of `with campaign:`.
+            overwrite: Whether to remove another campaign or result in the folder first.
 
         Raises:
-            TrustboError: Another campaign has locked the folder, or its name belongs to a file.
+            TrustboError: The folder holds another campaign or result, without `overwrite`; another
+                campaign has locked it; or its name belongs to a file.
         """
         storage, path = self.storage, as_path(directory).resolve()
         if storage is None or storage.path.resolve() != path:
-            storage = Storage(directory)
+            storage = Storage(directory, overwrite=overwrite)
         self._save_to(storage, keep)
 
     def _save_to(self, storage: Storage, keep: bool) -> None:
         before = self.storage
         try:
-            storage.replace(self.workspace, self.state, self._result_so_far())
+            storage.write_whole(self.workspace, self.state, self._result_so_far())
             if keep:
                 self.storage = storage
         finally:

@@ -112,7 +112,9 @@ class Learner:
         for j in waiting:
             entries[j].become(LEARNED)
         entries[-1].row |= diagnostics(tree)
-        entries[-1].posterior = Posterior(len(entries), tree)
+        excluded = len(entries) - len(numbers)
+        name = f"{len(entries):04d}" + (f"-{excluded}" if excluded else "")
+        entries[-1].posterior = Posterior(name, tree)
         self._believe(tree)
 
     def restore(self, state: CampaignState) -> None:

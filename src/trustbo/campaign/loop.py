@@ -31,6 +31,7 @@ def iterate(
     truth: Truth | None = None,
     stop: Stop | Sequence[Stop] | None = None,
     checkpoint: FilePath | None = None,
+    overwrite: bool = False,
     seed: int = 0,
     progress: bool | str = True,
     **options: Any,
@@ -55,8 +56,9 @@ def iterate(
             goes into the history, in % of the contact that the best admissible path keeps.
         stop: Rules to end before `n_iterations`, asked between missions: a `RegretBound`,
             `TimeLimit`, a callable `stop(campaign) -> reason or None`, or several of them.
-        checkpoint: Folder that is updated after each mission; another campaign in it is replaced.
-            If the process dies, `resume` goes on from it.
+        checkpoint: Folder that is updated after each mission. If the process dies, `resume` goes on
+            from it.
+        overwrite: Whether to remove another campaign or result in that folder first.
         seed: Seed of everything random.
         progress: Whether to show a progress bar, and in a notebook a map that follows the
             missions; `"bar"` for the bar alone.
@@ -66,7 +68,7 @@ def iterate(
         Result of all missions.
 
     Raises:
-        TrustboError: Bad input, before any work starts.
+        TrustboError: Bad input, or a folder that holds a campaign, before any work starts.
         NoPathError: The goal cannot be reached.
     """
     n_iterations = require_whole("n_iterations", n_iterations, 1)
@@ -77,7 +79,7 @@ def iterate(
     steps = campaign.run(simulator, n_iterations, truth=truth, stop=stop, progress=progress)
     with campaign:
         if checkpoint is not None:
-            campaign.save(checkpoint, keep=True)
+            campaign.save(checkpoint, keep=True, overwrite=overwrite)
         for _ in steps:
             pass
         return campaign.result()

@@ -7,10 +7,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from trustbo.campaign.damage import naming_what_is_left
 from trustbo.data import Mission
-from trustbo.errors import DamagedFileError
-from trustbo.files import checksum
 from trustbo.inference import complete
 from trustbo.inference.posterior_groups import parameters_alone
 from trustbo.logs.netcdf import read_tree
@@ -21,28 +18,24 @@ class Posterior:
     """A posterior in memory, or in a file until it is asked for.
 
     Attributes:
-        after: Number of missions recorded when it was fitted; also that of its file.
+        name: Name of its file: the number of missions recorded when it was fitted, and, where some
+            were excluded from it, their number, such as `"0003-1"`.
         file: File that holds it; None where it is in memory only.
     """
 
     def __init__(
-        self, after: int, tree: xr.DataTree | None = None, file: Path | None = None
+        self, name: str, tree: xr.DataTree | None = None, file: Path | None = None
     ) -> None:
         """Hold a tree, or the name of a file of `logs.netcdf.write_tree`."""
-        self.after, self.file, self._tree = after, file, tree
-        self._sum = None if file is None else checksum(file)
+        self.name, self.file, self._tree = name, file, tree
 
     def __call__(self) -> xr.DataTree:
         """Posterior as stored: parameters alone, unless its trust was sampled too.
 
-        DamagedFileError: its file is missing, damaged or replaced.
+        DamagedFileError: its file is missing or damaged.
         """
         if self._tree is None:
-            file = Path(self.file or "")
-            with naming_what_is_left(file.parent.parent):
-                if checksum(file) != self._sum:
-                    raise DamagedFileError(f"{str(file)!r} was replaced since it was opened.")
-                self._tree = read_tree(file)
+            self._tree = read_tree(self.file or "")
         return self._tree
 
     def shrink(self) -> None:
@@ -63,12 +56,13 @@ class Posteriors(Sequence[xr.DataTree]):
         """Posteriors of a result, whose trees may be in a plain list."""
         if isinstance(posteriors, Posteriors):
             return posteriors
-        return cls(t if t is None else Posterior(j, t) for j, t in enumerate(posteriors, start=1))
+        numbered = enumerate(posteriors, start=1)
+        return cls(None if tree is None else Posterior(f"{j:04d}", tree) for j, tree in numbered)
 
     @property
-    def after(self) -> list[int | None]:
-        """Number of missions after which the posterior of each was fitted."""
-        return [posterior and posterior.after for posterior in self.stored]
+    def names(self) -> list[str | None]:
+        """Name of the posterior after each mission."""
+        return [posterior and posterior.name for posterior in self.stored]
 
     def __len__(self) -> int:
         return len(self.stored)

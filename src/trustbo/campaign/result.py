@@ -283,18 +283,21 @@ class Result(Displayed):
         exploring = import_module("trustbo.report.exploring")  # by name: it lies above
         return draw_explorer(exploring.scene_of(self, self.maps()))
 
-    def save(self, directory: FilePath) -> None:
+    def save(self, directory: FilePath, *, overwrite: bool = False) -> None:
         """Write everything to a folder that `load_result` reads.
 
         Each file is written whole or not at all: `posteriors/` (one per mission), `posterior.nc`
         (the last of them), `missions.nc`, `workspace.nc`, `history.nc`, `history.csv` and
-        `result.json`. Another result in the folder is replaced as a whole; files of other programs
-        stay.
+        `result.json`.
+
+        Args:
+            directory: Folder to write to.
+            overwrite: Whether to remove another campaign or result in it first.
 
         Raises:
-            TrustboError: The folder's name belongs to a file, a file in it that trustbo did not
-                write would be replaced, or it holds another campaign.
+            TrustboError: The folder holds a campaign or a result, without `overwrite`; or its name
+                belongs to a file.
         """
         from trustbo.campaign.storage import save_result  # it reads results too
 
-        save_result(self, directory)
+        save_result(self, directory, overwrite=overwrite)

@@ -169,7 +169,7 @@ class CampaignState:
             "n_missions": len(self.entries),
             "plans": [plan_to_record(entry.plan) for entry in self.entries],
             "rows": [entry.row for entry in self.entries],
-            "posterior_after": self.posteriors.after,
+            "posteriors": self.posteriors.names,
             "failures": self.failures,
             "notes": self.notes,
             "stop_reason": self.stop_reason,
@@ -188,6 +188,6 @@ class CampaignState:
             None if suggested is None else plan_from_record(suggested, workspace),
             entries,
             [Failure.restore(failure) for failure in record["failures"]],
-            record["notes"],
-            record["stop_reason"],
+            dict(record["notes"]),
+            str(record["stop_reason"]),
         )

@@ -1,46 +1,29 @@
-"""Files of campaigns and results, written atomically with checksums, and read back."""
+"""Files of campaigns and results, written atomically and read back."""
 
 import json
-from collections.abc import Mapping, Sequence
+import shutil
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import xarray as xr
+from filelock import FileLock, Timeout
 
-from trustbo.campaign.damage import MISSIONS_AS_TOLD, naming_what_is_left, read_fields
 from trustbo.campaign.posteriors import Posterior, Posteriors
-from trustbo.campaign.replacing import (
-    BELIEVED,
-    HISTORY,
-    MEASURED,
-    MISSIONS,
-    POSTERIOR,
-    POSTERIORS,
-    RESULT,
-    STATE,
-    TABLE,
-    TICKS,
-    WORKSPACE,
-    current,
-    finish_replacing,
-    hold,
-    replacing,
-    require_ours,
-    warn_of_others,
-)  # fmt: skip
 from trustbo.campaign.result import Result
 from trustbo.campaign.state import CampaignState, Entry, Failure
 from trustbo.data import Mission
-from trustbo.errors import DamagedFileError, TrustboError
+from trustbo.errors import DamagedFileError, TrustboError, require_whole
 from trustbo.files import (
     FilePath,
     as_path,
     interpreting,
-    remove_checked,
+    naming_refusal,
+    read_record,
+    remove_leftovers,
     require_folder,
     to_json,
-    write_checked,
     write_text,
 )  # fmt: skip
 from trustbo.logs.netcdf import (
@@ -56,6 +39,16 @@ from trustbo.workspace import Workspace
 from trustbo.workspace import netcdf as archive
 from trustbo.workspace.moves import require_on_grid
 
+STATE, RESULT, WORKSPACE, MEASURED = "campaign.json", "result.json", "workspace.nc", "measured.nc"
+MISSIONS, HISTORY, TABLE = "missions.nc", "history.nc", "history.csv"
+BELIEVED, POSTERIOR = "believed.nc", "posterior.nc"
+POSTERIORS, TICKS = "posteriors", "ticks"
+"""Folders of numbered files."""
+_FILES = (
+    STATE, RESULT, MEASURED, MISSIONS, HISTORY, TABLE, BELIEVED, POSTERIOR, WORKSPACE,
+)  # fmt: skip
+"""Files of a campaign, the records first: what they describe is removed after them."""
+
 _Extras = Sequence[Mapping[str, float]]
 
 
@@ -70,70 +63,52 @@ class Storage:
         path: Path of the folder.
     """
 
-    def __init__(self, directory: FilePath, *, begun: bool | None = None) -> None:
+    def __init__(
+        self, directory: FilePath, *, begun: bool = False, overwrite: bool = False
+    ) -> None:
         """Lock the folder, until `release` or the end of the process.
 
         Args:
             directory: Path of the folder.
-            begun: Whether it must hold a campaign already, or must not; None for either.
+            begun: Whether it holds the campaign already.
+            overwrite: Whether `write_whole` may replace another campaign or result in it.
 
         Raises:
             TrustboError: The folder holds no campaign and must, or one and must not; it is locked
                 by another process or not writable; or its name belongs to a file.
         """
         self.path = as_path(directory)
-        if begun and not self._is_used:
-            measured = self.path / MEASURED
-            reason = f"{str(directory)!r} holds no campaign;"
-            if measured.exists():
-                remedy = MISSIONS_AS_TOLD.format(str(measured))
-                raise DamagedFileError(f"{reason} {STATE!r} is missing. {remedy}")
-            raise TrustboError(f"{reason} give a folder that one was saved to.")
-        remedy = " tb.load_result reads one that may not." if begun else ""
-        self._lock = hold(directory, remedy)
-        self._target = self.path  # or the folder that its successor is being written to
-        self._n_ticks = 0  # missions whose ticks are in separate files
-        if begun is False and self._is_used:
-            self.release()
+        if begun and not (self.path / STATE).exists():
             raise TrustboError(
-                f"{str(self.path)!r} holds a campaign already: go on with it by Campaign.load, or "
-                "choose another folder."
+                f"{str(directory)!r} holds no campaign; give a folder that one was saved to."
             )
-
-    @property
-    def _is_used(self) -> bool:
-        return (current(self.path) / STATE).exists()
+        if not (begun or overwrite):
+            require_free(self.path)
+        self._lock = _locked(self.path)
+        self._overwrite = overwrite
+        self._n_ticks = 0  # missions whose ticks are in separate files
 
     def release(self) -> None:
         """Release the lock of the folder."""
         self._lock.release()
 
-    def replace(self, workspace: Workspace, state: CampaignState, result: Result | None) -> None:
-        """Write a whole campaign, which then replaces the content of the folder at once.
-
-        TrustboError: a file of another program would be replaced, see `require_ours`.
-        """
-        require_ours(self.path)
-        warn_of_others(self.path)
-        n_ticks, self._n_ticks = self._n_ticks, 0
-        try:
-            with replacing(self.path) as self._target:
-                write_tree(self._target / WORKSPACE, archive.workspace_to_tree(workspace))
-                if state.entries:
-                    self.write_measured(state.measured, [entry.extra for entry in state.entries])
-                self.write(state, result, whole=True)
-                n_ticks = self._n_ticks
-        finally:
-            self._target, self._n_ticks = self.path, n_ticks
-        if result is not None:
-            _mark_stored(result, self.path)
+    def write_whole(
+        self, workspace: Workspace, state: CampaignState, result: Result | None
+    ) -> None:
+        """Write a whole campaign; with `overwrite`, another one is removed first."""
+        if self._overwrite:
+            _clear(self.path, state.posteriors.stored)
+        self._overwrite, self._n_ticks = False, 0
+        write_tree(self.path / WORKSPACE, archive.workspace_to_tree(workspace))
+        if state.entries:
+            self.write_measured(state.measured, [entry.extra for entry in state.entries])
+        self.write(state, result, whole=True)
 
     def write_measured(self, missions: Sequence[Mission], extras: _Extras) -> None:
         """Write missions as measured, the new one included, and their extra numbers."""
-        finish_replacing(self.path)
         since, self._n_ticks = min(self._n_ticks, len(missions) - 1), len(missions)
         notes = {"extra": json.dumps(list(extras))}
-        write_missions(self._target / MEASURED, missions, since=since, notes=notes)
+        write_missions(self.path / MEASURED, missions, since=since, notes=notes)
 
     def write(
         self,
@@ -148,38 +123,33 @@ class Storage:
         By default only what the last mission added to the result is written. Without a `result`,
         that in the folder stays. With `ended`, `posterior.nc` with all groups is written too.
         """
-        finish_replacing(self.path)
         if result is not None:
-            _write_result(result, self._target, whole=whole, home=self.path)
+            _write_result(result, self.path, whole=whole)
             if ended and result.has_posterior:
-                write_tree(self._target / POSTERIOR, result.posterior)
-            elif not whole:
-                remove_checked(self._target / POSTERIOR)  # of the missions before
-        write_checked(self._target / STATE, to_json(state.to_record()).encode())
+                write_tree(self.path / POSTERIOR, result.posterior)
+            else:
+                (self.path / POSTERIOR).unlink(missing_ok=True)  # of the missions before
+        write_text(self.path / STATE, to_json(state.to_record()))
 
     def read(self) -> tuple[CampaignState, Workspace, list[tuple[Mission, dict[str, float]]]]:
         """Read the state, the workspace, and missions that the state does not count yet.
 
-        Those have their extra numbers with them. DamagedFileError: a file is missing or damaged;
-        the message names what can be read.
+        Those have their extra numbers with them. DamagedFileError: a file is missing or damaged.
         """
+        record, file = read_record(self.path / STATE), self.path / MEASURED
         measured: list[Mission] = []
         extras: list[dict[str, float]] = []
-        file = self.path / MEASURED
-        with naming_what_is_left(self.path):
-            record = read_fields(self.path / STATE)
-            n = record["n_missions"]
-            if n or file.exists():
-                tree = read_tree(file)
-                measured = missions_of_tree(tree, file)
-                with interpreting(file):
-                    extras = json.loads(tree["missions"].attrs["extra"])
-                    if len(extras) != len(measured):
-                        raise ValueError(f"{len(extras)} extras of {len(measured)} missions")
-            if len(measured) < n:
-                raise DamagedFileError(f"{str(file)!r} holds {len(measured)} missions of {n}.")
-            stored = _read_missions(self.path, record) if n else None
-            workspace = read_workspace(self.path)
+        with interpreting(self.path / STATE):
+            n = require_whole("n_missions", record["n_missions"], 0)
+        if n or file.exists():
+            tree = read_tree(file)
+            measured = missions_of_tree(tree, file)
+            with interpreting(file):
+                extras = json.loads(tree["missions"].attrs["extra"])
+        if len(measured) < n:
+            raise DamagedFileError(f"{str(file)!r} holds {len(measured)} missions of {n}.")
+        stored = _read_missions(self.path / STATE, record) if n else None
+        workspace = read_workspace(self.path)
         self._n_ticks = len(measured) if (self.path / TICKS).exists() else 0
         entries: list[Entry] = []
         with interpreting(self.path / STATE):
@@ -193,30 +163,70 @@ class Storage:
         return state, workspace, list(zip(measured[n:], extras[n:], strict=True))
 
 
-def save_result(result: Result, directory: FilePath) -> None:
+def require_free(folder: Path) -> None:
+    """Refuse a folder that holds a campaign, or a file of such a name: TrustboError.
+
+    The workspace alone is that of a campaign whose first write was interrupted.
+    """
+    if (folder / STATE).exists():
+        raise TrustboError(
+            f"{str(folder)!r} holds a campaign already: go on with it by Campaign.load, choose "
+            "another folder, or replace it with overwrite=True."
+        )
+    for name in _FILES:
+        if name != WORKSPACE and (folder / name).exists():
+            raise TrustboError(
+                f"{str(folder)!r} holds {name}, which would be replaced; choose another folder, or "
+                "replace it with overwrite=True."
+            )
+
+
+def _locked(directory: FilePath) -> FileLock:
+    """Lock a folder, made if need be; TrustboError if another process has locked it."""
+    folder = require_folder(directory)
+    lock = FileLock(folder / ".trustbo.lock", timeout=0)
+    with naming_refusal(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            lock.acquire()
+        except Timeout:
+            raise TrustboError(
+                f"another campaign is at work in {str(folder)!r}; close it first, or choose "
+                "another folder."
+            ) from None
+        for room in (folder, folder / POSTERIORS, folder / TICKS):
+            remove_leftovers(room)
+    return lock
+
+
+def _clear(folder: Path, posteriors: Iterable[Posterior | None]) -> None:
+    """Remove a campaign from a folder; `posteriors` to be written may be among its files."""
+    for posterior in posteriors:
+        if posterior is not None:
+            posterior()  # into memory
+    with naming_refusal(folder):
+        for name in _FILES:
+            (folder / name).unlink(missing_ok=True)
+        for room in (POSTERIORS, TICKS):
+            if (folder / room).is_dir():
+                shutil.rmtree(folder / room)
+
+
+def save_result(result: Result, directory: FilePath, *, overwrite: bool = False) -> None:
     """Write a result to a folder, see `Result.save`."""
     folder = require_folder(directory)
-    present = current(folder)
-    if (present / STATE).exists():
-        if not _is_in(result, present):
-            raise TrustboError(
-                f"{str(folder)!r} holds a campaign, with missions as they were told, which a "
-                "result does not have; give another folder."
-            )
-        whole = present / POSTERIOR
-        if result.has_posterior and not whole.exists():  # written when a campaign ends
-            write_tree(whole, result.posterior)
-        return
-    lock = hold(folder)
+    if not overwrite:
+        require_free(folder)
+    lock = _locked(folder)
     try:
-        with replacing(folder) as new:
-            write_tree(new / WORKSPACE, archive.workspace_to_tree(result.workspace))
-            _write_result(result, new, whole=True, home=folder)
-            if result.has_posterior:
-                write_tree(new / POSTERIOR, result.posterior)
+        if overwrite:
+            _clear(folder, Posteriors.from_trees(result.posteriors).stored)
+        write_tree(folder / WORKSPACE, archive.workspace_to_tree(result.workspace))
+        if result.has_posterior:
+            write_tree(folder / POSTERIOR, result.posterior)
+        _write_result(result, folder, whole=True)
     finally:
         lock.release()
-    _mark_stored(result, folder)
 
 
 def load_result(directory: FilePath) -> Result:
@@ -227,31 +237,33 @@ def load_result(directory: FilePath) -> Result:
 
     Raises:
         TrustboError: The folder holds no result.
-        DamagedFileError: A file is missing or damaged; the message names what can be read.
+        DamagedFileError: A file is missing or damaged.
     """
-    folder = current(as_path(directory))
+    folder = as_path(directory)
     if not (folder / RESULT).exists():
         raise TrustboError(f"{str(directory)!r} holds no result; give a folder written by save().")
-    with naming_what_is_left(folder):
-        record = read_fields(folder / RESULT)
-        # A run killed while it saved may have left one mission more than the record counts.
-        missions, posteriors, history = _read_missions(folder, record)
-        workspace, believed = read_workspace(folder), None
-        if record["settings"].get("awareness") == "belief":
-            believed = read_tree(folder / BELIEVED).to_dataset()
-        with interpreting(folder / HISTORY):
-            trust_map = history["final_trust_map"].rename("trust")
-            history = history.drop_vars("final_trust_map")
-        with interpreting(folder / RESULT):
-            trust = np.array(record["trust"], dtype=float)
-            path = require_on_grid(record["path"], workspace.grid.shape)
-            if trust.shape != (len(path) - 1, workspace.awareness.sizes["robot"]):
-                raise ValueError(f"trust of shape {trust.shape} along {len(path)} cells")
-            failures = tuple(Failure.restore(failure) for failure in record["failures"])
-        return Result(
-            workspace, missions, posteriors, list(path), trust, record["value"], trust_map,
-            history, record["settings"], record["stop_reason"], believed, failures,
-        )  # fmt: skip
+    record = read_record(folder / RESULT)
+    # A run killed while it saved may have left one mission more than the record counts.
+    with interpreting(folder / RESULT):
+        settings = dict(record["settings"])
+    missions, posteriors, history = _read_missions(folder / RESULT, record)
+    workspace, believed = read_workspace(folder), None
+    if settings.get("awareness") == "belief":
+        believed = read_tree(folder / BELIEVED).to_dataset()
+    with interpreting(folder / HISTORY):
+        trust_map = history["final_trust_map"].rename("trust")
+        history = history.drop_vars("final_trust_map")
+    with interpreting(folder / RESULT):
+        trust = np.array(record["trust"], dtype=float)
+        path = require_on_grid(record["path"], workspace.grid.shape)
+        if trust.shape != (len(path) - 1, workspace.awareness.sizes["robot"]):
+            raise ValueError(f"trust of shape {trust.shape} along {len(path)} cells")
+        failures = tuple(Failure.restore(failure) for failure in record["failures"])
+        value, reason = float(record["value"]), str(record["stop_reason"])
+    return Result(
+        workspace, missions, posteriors, list(path), trust, value, trust_map, history, settings,
+        reason, believed, failures,
+    )  # fmt: skip
 
 
 def read_workspace(folder: Path) -> Workspace:
@@ -261,21 +273,19 @@ def read_workspace(folder: Path) -> Workspace:
         return archive.workspace_from_tree(tree)
 
 
-def _write_result(result: Result, folder: Path, *, whole: bool, home: Path) -> None:
+def _write_result(result: Result, folder: Path, *, whole: bool) -> None:
     """Write all but the workspace of a result.
 
     Not `whole`, only the last mission is written, to a folder that has all before it: earlier
-    posteriors never change. The files will be in `home`; where that is not the folder, they replace
-    what is there, and `_mark_stored` is to be called once they did.
+    posteriors never change.
     """
     stored = Posteriors.from_trees(result.posteriors).stored
-    files = list({posterior.after: posterior for posterior in stored if posterior}.values())
+    files = list({posterior.name: posterior for posterior in stored if posterior}.values())
     for posterior in files if whole else files[-2:]:  # the last but one may have shrunk
-        name = _posterior_file(posterior.after)
-        if whole or home / name != posterior.file:
-            write_tree(folder / name, posterior())
-            if folder == home:
-                posterior.file = home / name
+        file = _posterior_file(folder, posterior.name)
+        if whole or posterior.file != file:
+            write_tree(file, posterior())
+            posterior.file = file
     since = 0 if whole else len(result.missions)  # whose ticks are there
     write_missions(folder / MISSIONS, result.missions, since=since)
     history = result.history.assign(final_trust_map=result.trust_map)
@@ -284,18 +294,11 @@ def _write_result(result: Result, folder: Path, *, whole: bool, home: Path) -> N
         write_tree(folder / BELIEVED, xr.DataTree(result.believed))
     write_text(folder / TABLE, frame_as_csv(result.table()))
     # Written last: its presence means that the rest is complete.
-    write_checked(folder / RESULT, to_json(_record_of(result)).encode())
+    write_text(folder / RESULT, to_json(_record_of(result)))
 
 
-def _mark_stored(result: Result, home: Path) -> None:
-    """Record that the posteriors are in a folder, all of them, from where they are read."""
-    for posterior in Posteriors.from_trees(result.posteriors).stored:
-        if posterior:
-            posterior.file = home / _posterior_file(posterior.after)
-
-
-def _posterior_file(after: int) -> Path:
-    return Path(POSTERIORS) / f"{after:04d}.nc"
+def _posterior_file(folder: Path, name: str) -> Path:
+    return folder / POSTERIORS / f"{name}.nc"
 
 
 def _record_of(result: Result) -> dict[str, Any]:
@@ -307,31 +310,25 @@ def _record_of(result: Result) -> dict[str, Any]:
         "value": result.value,
         "settings": result.settings,
         "stop_reason": result.stop_reason,
-        "posterior_after": Posteriors.from_trees(result.posteriors).after,
+        "posteriors": Posteriors.from_trees(result.posteriors).names,
         "failures": result.failures,
     }
 
 
-def _is_in(result: Result, folder: Path) -> bool:
-    """Whether a folder holds this very result."""
-    record = json.loads(to_json(_record_of(result)))
-    try:
-        return to_json(read_fields(folder / RESULT)) == to_json(record)
-    except DamagedFileError:
-        return False
-
-
 def _read_missions(
-    folder: Path, record: dict[str, Any]
+    file: Path, record: dict[str, Any]
 ) -> tuple[list[Mission], Posteriors, xr.Dataset]:
-    """Read the missions that a record counts, their posteriors and the history."""
-    n, order = record["n_missions"], record["posterior_after"]
-    posteriors: dict[int | None, Posterior] = {}
-    for after in {*order} - {None}:
-        file = folder / _posterior_file(after)
-        if not file.exists():
-            raise DamagedFileError(f"{str(file)!r} is missing.")
-        posteriors[after] = Posterior(after, file=file)
+    """Read the missions that the record of a file counts, their posteriors and the history."""
+    folder = file.parent
+    with interpreting(file):
+        n = require_whole("n_missions", record["n_missions"], 1)
+        order = [None if name is None else str(name) for name in record["posteriors"]]
+    posteriors: dict[str | None, Posterior] = {}
+    for name in filter(None, order):
+        stored = _posterior_file(folder, name)
+        if not stored.exists():
+            raise DamagedFileError(f"{str(stored)!r} is missing.")
+        posteriors[name] = posteriors.get(name) or Posterior(name, file=stored)
     history, missions = read_tree(folder / HISTORY).to_dataset(), folder / MISSIONS
     with interpreting(folder / HISTORY):
         history = history.isel(iteration=slice(n))
@@ -340,4 +337,4 @@ def _read_missions(
     filled = read_missions(missions)[:n]
     if len(filled) != n:
         raise DamagedFileError(f"{str(missions)!r} holds {len(filled)} missions of {n}.")
-    return filled, Posteriors(posteriors.get(after) for after in order), history
+    return filled, Posteriors(posteriors.get(name) for name in order), history

@@ -78,7 +78,8 @@ def run(
     result = iterate(
         workspace, *ends, n_iterations=iterations, model=trust_model, policy=policy,
         objective=objective, sampler=sampler, simulator=simulation.KinematicSimulator(workspace),
-        stop=stop, checkpoint=out, seed=seed, progress=not quiet, options=chosen,
+        stop=stop, checkpoint=out, overwrite=overwrite, seed=seed, progress=not quiet,
+        options=chosen,
     )  # fmt: skip
     write_outputs(result, out, table=not quiet)
 
@@ -192,15 +193,16 @@ def _require_same(file: Path, example: Path) -> None:
 
 def _state(folder: Path) -> dict[str, Any]:
     """Read the state of a campaign from its folder."""
-    from trustbo.campaign.damage import naming_what_is_left, read_fields
-    from trustbo.campaign.replacing import STATE, current
+    from trustbo.campaign.storage import STATE
+    from trustbo.files import interpreting, read_record
 
-    kept = current(folder)
-    if not (kept / STATE).exists():
+    if not (folder / STATE).exists():
         raise TrustboError(f"{str(folder)!r} holds no campaign; give the --out of trustbo run.")
-    with naming_what_is_left(kept):
-        state = read_fields(kept / STATE)
-    name = state["notes"].get("simulator")
+    state = read_record(folder / STATE)
+    with interpreting(folder / STATE):
+        name = state["notes"].get("simulator")
+        require_whole("n_missions", state["n_missions"], 0)
+        require_whole("n_iterations", state["notes"]["n_iterations"], 1)
     if name != "KinematicSimulator":
         raise TrustboError(
             f"the campaign in {str(folder)!r} was run by {name or 'robots of your own'}, not by "
@@ -212,13 +214,12 @@ def _state(folder: Path) -> dict[str, Any]:
 
 def _simulator(folder: Path, notes: dict[str, Any]) -> "KinematicSimulator":
     """Make the simulator that the campaign was begun with."""
-    from trustbo.campaign.replacing import STATE, current
-    from trustbo.campaign.storage import read_workspace
+    from trustbo.campaign.storage import STATE, read_workspace
     from trustbo.files import interpreting
     from trustbo.simulation import KinematicSimulator
     from trustbo.workspace import Sight
 
-    workspace = read_workspace(current(folder))
+    workspace = read_workspace(folder)
     with interpreting(folder / STATE):
         sight = Sight(notes["sight"], notes["extinction"], notes["crown_base"])
         return KinematicSimulator(workspace, sight=sight, tick=notes["tick"])

@@ -80,7 +80,7 @@ Program
   report.out FILE: File of the page; by default report.html in the folder.
   export.out FOLDER: Folder for the files; by default the result's.
   info.out FILE: Picture of the grid, a .png.
-  overwrite: Replace the campaign that the folder holds; other files in it are kept.
+  overwrite: Remove the campaign that the folder holds first; other files in it are kept.
   quiet: Show no progress bar and no table.
   debug: Show the whole traceback of an error.
   title TEXT: Title of the page.

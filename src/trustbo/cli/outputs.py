@@ -23,23 +23,22 @@ def require_outputs(out: Path, *others: str, overwrite: bool) -> None:
 
     It need not exist yet; `others` are files written there in addition to those of `write_outputs`.
     TrustboError: it holds a campaign or a result, unless `overwrite`; its name belongs to a file,
-    or the name of a file to a folder, or to a file that trustbo did not write.
+    or the name of a file to a folder.
     """
-    from trustbo.campaign.replacing import RESULT, STATE, current, require_ours
+    from trustbo.campaign.storage import RESULT, STATE
     from trustbo.files import require_file
 
-    if not overwrite and (current(out) / STATE).exists():
+    if not overwrite and (out / STATE).exists():
         raise TrustboError(
             f"{str(out)!r} holds a campaign: trustbo resume {out} goes on with it; give another "
             "--out, or --overwrite to replace it."
         )
-    if not overwrite and (current(out) / RESULT).exists():
+    if not overwrite and (out / RESULT).exists():
         raise TrustboError(
             f"{str(out)!r} holds a result; give another --out, or --overwrite to replace it."
         )
     for name in (*_FILES, *others):
         require_file(out / name)
-    require_ours(out, *_FILES)
 
 
 def write_outputs(result: "Result", out: Path, *, table: bool) -> None:

@@ -73,9 +73,9 @@ def export(
 
 def _require_result(folder: Path) -> None:
     """Refuse a folder without a result (TrustboError) before heavy imports."""
-    from trustbo.campaign.replacing import RESULT, current
+    from trustbo.campaign.storage import RESULT
 
-    if not (current(folder) / RESULT).exists():
+    if not (folder / RESULT).exists():
         raise TrustboError(
             f"{str(folder)!r} holds no result; give the --out of trustbo run or trustbo demo, once "
             "a mission is done."

@@ -248,8 +248,8 @@ def _uniformity(ranks: np.ndarray, n_ranked: int) -> float:
 def _read(checkpoint: FilePath | None, asked: str) -> list[dict[str, int]]:
     if checkpoint is None or not Path(checkpoint).exists():
         return []
-    kept = read_record(checkpoint, checked=False)
-    if not isinstance(kept, dict) or not {"asked", "ranks"} <= kept.keys():
+    kept = read_record(checkpoint)
+    if not {"asked", "ranks"} <= kept.keys():
         raise TrustboError(f"{str(checkpoint)!r} holds no ranks; give another file, or delete it.")
     if kept["asked"] != asked:
         raise TrustboError(

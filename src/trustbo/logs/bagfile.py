@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from trustbo.errors import TrustboError, require_package
-from trustbo.files import require_regular
 from trustbo.logs.messages import (
     CONTACT_TYPES,
     POSE_TYPES,
@@ -104,8 +103,6 @@ def opened(path: Path) -> Iterator[Bag]:
 
     if not path.exists():
         raise TrustboError(f"there is no bag {str(path)!r}; check its path.")
-    if not path.is_dir():
-        require_regular(path)
     try:
         # Bags of ROS 2 before Iron do not define their types.
         reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))

@@ -1,6 +1,5 @@
 """Missions as trees of arrays, for netCDF files."""
 
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,58 +16,36 @@ from trustbo.files import (
     FilePath,
     defer_interrupt,
     interpreting,
-    read_checked,
-    remove_checked,
-    write_checked,
+    read_file,
+    write_file,
 )
 from trustbo.stacking import require_same_team
 
 STATES = ("speed_ratio", "pitch", "roll", "return_range", "visible_share")
 """State of a robot at a tick: share of its speed on level ground; rad; rad; m; share of beams."""
 _TICKS = "ticks"
-_PACKED, _SMALL = 100, 1 << 28
-"""Bytes that a byte of a file may unpack to, and bytes that any file may."""
 
 
 def read_tree(path: FilePath) -> xr.DataTree:
     """Read a netCDF file of groups into memory.
 
     Raises:
-        DamagedFileError: There is no such file, it was changed, or it is no netCDF.
+        DamagedFileError: There is no such file, it is damaged, or it is no netCDF.
     """
-    content = read_checked(path)
+    content = read_file(path)
     try:
         with defer_interrupt():
-            _require_size(content)
             with xr.open_datatree(content, engine="netcdf4") as tree:
                 return tree.load()
-    except MemoryError as error:
-        raise DamagedFileError(f"{str(path)!r} is too large for memory {error}.") from None
     except Exception:  # the library raises many kinds for bytes that are no netCDF
         raise DamagedFileError(f"{str(path)!r} is damaged, or no netCDF file.") from None
 
 
-def _require_size(content: bytes) -> None:
-    """Raise MemoryError for a file whose arrays have far more bytes than it."""
-    import netCDF4  # loaded only where netCDF is read
-
-    most = _PACKED * len(content) + _SMALL
-    with netCDF4.Dataset("a file", memory=content) as data:
-        size, groups = 0, [data]
-        while groups:
-            group = groups.pop()
-            groups += group.groups.values()
-            for array in group.variables.values():
-                kind = array.dtype  # str, for texts of any length
-                size += math.prod(array.shape) * (kind.itemsize if kind is not str else 8)
-    if size > most:
-        raise MemoryError(f"({len(content)} bytes unpack to {size})")
-
-
 def write_tree(path: FilePath, tree: xr.DataTree) -> None:
-    """Write a netCDF file of groups, with its checksum."""
+    """Write a netCDF file of groups."""
     with defer_interrupt():  # which could leave the netCDF library locked, in memory too
-        write_checked(path, _encode(tree))
+        content = _encode(tree)
+        write_file(path, lambda file: file.write_bytes(content))
 
 
 def _encode(tree: xr.DataTree) -> bytes:
@@ -120,7 +97,7 @@ def write_missions(
     for j in range(since, len(missions)):
         file, recorded = ticks_file(path, _ticks_name(path), j), _ticks(missions[j])
         if recorded is None:
-            remove_checked(file)
+            file.unlink(missing_ok=True)
         else:
             write_tree(file, xr.DataTree(recorded))
     table = _table(missions).assign_attrs({_TICKS: _ticks_name(path), **(notes or {})})
@@ -145,7 +122,7 @@ def read_missions(path: FilePath) -> list[Mission]:
         path: File of missions; ticks are read from the folder next to it, if any.
 
     Raises:
-        DamagedFileError: There is no such file, it was changed, or it holds no missions.
+        DamagedFileError: There is no such file, it is damaged, or it holds no missions.
     """
     return missions_of_tree(read_tree(path), path)
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from trustbo.errors import DamagedFileError, TrustboError
-from trustbo.files import FilePath, not_ours, read_record, require_file, require_folder, write_text
+from trustbo.files import FilePath, read_record, require_file, require_folder, write_text
 
 
 class Store:
@@ -26,7 +26,9 @@ class Store:
         for name in names:
             file = require_file(self.folder / name)
             if file.exists() and not (self.folder / "study.json").is_file():
-                raise not_ours(file)
+                raise TrustboError(
+                    f"{str(file)!r} would be replaced; move it, or choose another folder."
+                )
 
     def write_study(self, settings: dict[str, Any], table: dict[str, dict[str, Any]]) -> None:
         """Write `study.json`: the settings, and the labels of each run by key."""
@@ -83,10 +85,7 @@ def _now_named(labels: dict[str, Any]) -> dict[str, Any]:
 
 
 def _read(file: Path) -> dict[str, Any]:
-    record = read_record(file, checked=False)
-    if not isinstance(record, dict):
-        raise DamagedFileError(f"{str(file)!r} is damaged: no record of fields.")
-    return record
+    return read_record(file)
 
 
 def _plain(value: Any) -> Any:

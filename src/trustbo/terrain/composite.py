@@ -13,7 +13,7 @@ from sklearn.decomposition import PCA
 
 from trustbo import zheng2023
 from trustbo.errors import TerrainError, TrustboError, require_choice, require_whole
-from trustbo.files import FilePath, interpreting, require_regular, write_file
+from trustbo.files import FilePath, interpreting, read_file, write_file
 
 METHODS = ("pca", "zheng2023")
 MAX_PIXELS = 1_000_000
@@ -217,7 +217,7 @@ class CompositeIndex(TransformerMixin, BaseEstimator):
     @classmethod
     def load(cls, path: FilePath) -> Self:
         """Read an index that `save` wrote."""
-        with interpreting(require_regular(path)), xr.open_dataset(path) as data:
+        with interpreting(path), xr.open_dataset(read_file(path), engine="netcdf4") as data:
             return cls.from_dataset(data.load())
 
     def _columns(self, features: xr.Dataset) -> Sequence[np.ndarray]:
