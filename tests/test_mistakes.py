@@ -188,16 +188,6 @@ MISTAKES = {
         lambda c: c.iterate(simulator=Own(run=lambda path: c.mission)),
         "needs run.path, .*, seed.; the call of Own.run fails: got an unexpected .* 'seed'",
     ),
-    "a bound that is none": (
-        lambda c: c.iterate(
-            simulator=Own(
-                run=print, reset=lambda start, seed: None,
-                run_bound=lambda k, cell: None,
-            ),
-            replan="bound",
-        ),
-        "run_bound.1, .*. must return a trustbo.Bound; got None",
-    ),
     "a report in another format": (
         lambda c: write_report("rep.pdf", None), "'rep.pdf' must end in .html or .htm"
     ),

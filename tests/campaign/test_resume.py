@@ -265,8 +265,8 @@ def test_options_are_checked_recorded_and_given_as_one_object(workspace, tmp_pat
     with pytest.raises(tb.TrustboError, match="unknown option 'polcy'; did you mean policy"):
         tb.Campaign(workspace, *ENDS, polcy="random")
     options = tb.CampaignOptions(team="min", forgetting=0.9, connectivity=4)
-    with pytest.raises(tb.TrustboError, match=r"or options one by one; got options=.* and replan"):
-        tb.Campaign(workspace, *ENDS, options=options, replan="bound")
+    with pytest.raises(tb.TrustboError, match=r"or options one by one; got options=.* and draws"):
+        tb.Campaign(workspace, *ENDS, options=options, draws=500)
     with pytest.raises(tb.TrustboError, match="callbacks must be callables; got 3"):
         tb.CampaignOptions(callbacks=[3])
     with tb.Campaign(workspace, *ENDS, sampler="exact", options=options, directory=tmp_path):

@@ -55,7 +55,7 @@ def test_run_s_files_say_the_same(finished):
 @pytest.mark.usefixtures("blank_figures")
 def test_run_passes_every_choice_on_and_resume_drives_nothing_again(invoke, flags, tmp_path):
     done = invoke(
-        *("run", *flags, "--iterations", 9, "--awareness", "belief", "--replan", "bound"),
+        *("run", *flags, "--iterations", 9, "--awareness", "belief"),
         *("--max-bounds", "shortest", "--objective", "mean", "--stop-regret", 0.9, "--quiet"),
         *("--out", tmp_path),
     )
@@ -63,7 +63,6 @@ def test_run_passes_every_choice_on_and_resume_drives_nothing_again(invoke, flag
     record = json.loads((tmp_path / "result.json").read_text())
     chosen = {
         "awareness": "belief",
-        "replan": "bound",
         "max_bounds": "shortest",
         "objective": "mean",
     }
@@ -162,7 +161,6 @@ def test_a_dem_alone_is_enough_and_its_feet_are_read(invoke, rasters, flags, tmp
             "unknown observation 'odd'; choose one of gaussian, censored",
         ),
         (("--awareness", "none"), "unknown awareness 'none'; choose one of map, belief"),
-        (("--replan", "tick"), "unknown replan 'tick'; choose one of mission, bound"),
         (("--team", "max"), "unknown team 'max'; choose one of mean, min"),
         (("--stop-regret", "2"), "--stop-regret must be in (0, 1); got 2.0"),
         (

@@ -90,11 +90,6 @@ def test_a_campaign_learns_from_a_log_whatever_it_would_have_run(workspace, reco
     assert result.settings["recorded_missions"] == 2
 
 
-def test_what_needs_bounds_one_by_one_refuses_a_replay(workspace):
-    with pytest.raises(TrustboError, match="ReplaySimulator has no reset and no run_bound"):
-        run(workspace, simulator=ReplaySimulator([mission(LEFT)]), replan="bound")
-
-
 def test_a_replayed_table_gives_the_posterior_of_the_run_that_wrote_it(
     workspace, recorded, tmp_path
 ):

@@ -527,7 +527,6 @@ def test_regret_curves_show_each_policy_s_median(serial):
         ({"options": {"seed": 3}}, "unknown option 'seed'; choose one of .*initial"),
         ({"options": {"forgetting": float("nan")}}, "option 'forgetting' must be a number, a name"),
         ({"options": {"forgetting": 7}}, "the run seed=0.*forgetting"),
-        ({"options": {"replan": "bound"}}, "the run seed=0.*reset"),
         ({"options": {"stop": {"epsilon": 1}}}, "the run seed=0.*epsilon"),
     ],
 )

@@ -63,8 +63,6 @@ class CampaignOptions:
         draws: Draws kept of each chain, 1000 by default; 250 of the exact sampler with places.
         target_accept: Acceptance rate of NUTS, .9 by default; towards 1 it takes smaller steps.
         max_tree_depth: Doublings of a trajectory of NUTS at most, 10 by default.
-        replan: Replanning after each mission or after each bound. Under `"bound"` the rest is
-            planned again from the current trust; for `iterate` and `Campaign.run`.
         callbacks: Functions `callback(campaign, mission)`, called after each mission by `iterate`
             and `Campaign.run`.
 
@@ -92,7 +90,6 @@ class CampaignOptions:
     draws: int | None = field(default=None, metadata=_option(LEARNING))
     target_accept: float | None = field(default=None, metadata=_option(LEARNING))
     max_tree_depth: int | None = field(default=None, metadata=_option(LEARNING))
-    replan: str = field(default="mission", metadata=_option(RUNNING, "mission", "bound"))
     callbacks: "Sequence[Callback]" = field(default=(), metadata=_option(RUNNING))
 
     def __post_init__(self) -> None:

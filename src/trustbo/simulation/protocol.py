@@ -27,7 +27,7 @@ class Simulator(Protocol):
 
 
 class BoundSimulator(Simulator, Protocol):
-    """Simulator that can also run bound by bound, for `iterate(..., replan="bound")`.
+    """Simulator that can also run bound by bound, for `Truth.of`.
 
     If `reset` and `run_bound` take a keyword `next_cell`, they are given the cell after the bound,
     so that the robots can take positions that see it.

@@ -1,4 +1,4 @@
-"""When a campaign ends early, and how a mission changes its mind."""
+"""When a campaign ends early, and what its loop shows."""
 
 import itertools
 import logging
@@ -7,15 +7,12 @@ import time
 import numpy as np
 import pytest
 from missions import TRUTH
-from worlds import ModelSimulator, hillside, random_cells
+from worlds import ModelSimulator, random_cells
 
 import trustbo as tb
 from trustbo import simulation
-from trustbo.campaign.running import better_rest, weighted_mean
 from trustbo.campaign.stopping import reason_to_stop
-from trustbo.data import Bound
 from trustbo.errors import TrustboError
-from trustbo.inference import TrustFilter, sample_prior
 from trustbo.inference.draws import params_of
 from trustbo.planning import Planner
 
@@ -127,70 +124,6 @@ def test_bad_rules_are_refused_before_work(workspace):
         tb.TimeLimit(-1.0)
     with pytest.raises(tb.TrustboError, match=r"stop must be callables .* got 7"):
         iterate(workspace, stop=[7])
-    with pytest.raises(
-        tb.TrustboError, match="unknown replan 'tick'; choose one of mission, bound"
-    ):
-        iterate(workspace, replan="tick")
-    with pytest.raises(tb.TrustboError, match="ModelSimulator has no reset and no run_bound"):
-        iterate(workspace, replan="bound")
-
-
-class BoundByBound:
-    """Answers bound by bound with given rates; knows nothing of what comes next."""
-
-    def __init__(self, workspace, rates):
-        self.workspace, self.rates, self.k = workspace, rates, 0
-
-    def run(self, path, *, seed):
-        self.reset(path[0], seed)
-        bounds = tuple(self.run_bound(k, cell) for k, cell in enumerate(path[1:], start=1))
-        return tb.Mission(tuple(path), bounds)
-
-    def reset(self, start, seed):
-        self.rng = np.random.default_rng(seed)
-
-    def run_bound(self, k, cell):
-        z = self.workspace.awareness.values[:, *cell]
-        y = np.clip(self.rates(k) + 0.01 * self.rng.standard_normal(3), 0.0, 1.0)
-        return Bound(cell, z, y, np.full(3, 30.0))
-
-
-def test_the_rest_is_the_best_rest_under_the_filter(workspace):
-    draws = sample_prior(tb.models.PooledTrust(), 2, 400, seed=0)
-    live = TrustFilter(draws, n_robots=3)
-    planner = Planner(workspace, *ENDS)
-    path = planner.plan(draws.mean()).path
-    z = workspace.awareness.values[:, *path[1]]
-    live.update(z, [0.1, 0.2, 0.1])
-    rest = better_rest(planner.onward(path[:2]), live, path[1:], 0.0)
-    params, now = weighted_mean(live.params, live.weights), live.state.mean
-    np.testing.assert_allclose(params.beta, live.weights @ live.params.beta)
-    onward = planner.onward(path[:2])
-    best = onward.plan(params, x0=now)
-    assert onward.evaluate(rest, params, x0=now).value == pytest.approx(best.value)
-    # Nothing is that much better: the old rest stays.
-    assert better_rest(onward, live, path[1:], 10.0) == tuple(path[1:])
-
-
-def test_missions_are_replanned_between_bounds(workspace):
-    simulator = BoundByBound(workspace, lambda k: 0.9 if k % 2 else 0.1)
-    result = tb.iterate(
-        workspace, *ENDS, n_iterations=3, simulator=simulator, replan="bound", **QUIET
-    )
-    planner = Planner(workspace, *ENDS)
-    for mission in result.missions:
-        assert planner.require_path(mission.path) == mission.path
-    assert result.settings["replan"] == "bound"
-    # Before the first posterior there is nothing to replan with.
-    steps = [tuple(c) for c in result.history["path"].values[0].tolist() if c[0] >= 0]
-    assert tuple(steps) == result.missions[0].path
-
-
-def test_kinematic_missions_can_be_replanned_too():
-    terrain = hillside(120.0, 120.0)
-    workspace = tb.Workspace.from_terrain(terrain, (4, 4))
-    result = tb.iterate(workspace, *ENDS, n_iterations=2, replan="bound", **QUIET)
-    assert all(mission.status == "ok" for mission in result.missions)
 
 
 def test_the_generator_gives_each_mission_as_it_is_learned(workspace):
