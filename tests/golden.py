@@ -38,7 +38,6 @@ EXACT = {
     },
     "team min": {"team": "min"},
     "belief": {"awareness": "belief", "policy": "thompson"},
-    "forgetting": {"forgetting": 0.8},
     "length": {"length_weight": 1e-4, "connectivity": 4},
     "prior mean": {"initial": "prior_mean"},
     "bounds": {"initial": "prior_mean", "bounds": True},

@@ -173,34 +173,11 @@ def test_bad_names_and_ends_are_refused_at_once(workspace):
         Campaign(closed, *ENDS)
 
 
-def test_old_missions_can_be_forgotten(workspace):
-    campaign = Campaign(workspace, *ENDS, model=PooledTrust(), sampler="exact", forgetting=0.5)
-    for seed in range(2):
-        campaign.tell(ModelSimulator(workspace).run(campaign.ask().path, seed=seed))
-    weight = campaign.posterior["constant_data"]["weight"]
-    np.testing.assert_allclose(weight, [0.5, 1.0])
-    expected = fit(
-        campaign.missions,
-        PooledTrust(),
-        sampler="exact",
-        weights=[0.5, 1.0],
-        seed=campaign.posterior.attrs["seed"],
-    )
-    np.testing.assert_array_equal(
-        campaign.posterior["posterior"]["b"].values, expected["posterior"]["b"].values
-    )
-
-
 def test_what_cannot_be_planned_or_updated_with_is_refused_at_once(workspace):
     with pytest.raises(TrustboError, match="unknown awareness 'guess'; choose one of map, belief"):
         Campaign(workspace, *ENDS, awareness="guess")
     with pytest.raises(TrustboError, match="model must be a trust model"):
         Campaign(workspace, *ENDS, model="pooled")
-    with pytest.raises(TrustboError, match=r"forgetting must be in \(0, 1\]; got 1.5"):
-        Campaign(workspace, *ENDS, forgetting=1.5)
-    censored = PooledTrust(observation="censored")
-    with pytest.raises(TrustboError, match=r"forgetting = 0\.9 needs Gaussian"):
-        Campaign(workspace, *ENDS, model=censored, forgetting=0.9)
     changes = PooledTrust(observation="censored", response="change")
     with pytest.raises(TrustboError, match="it measures changes of trust, and its observations"):
         Campaign(workspace, *ENDS, model=changes, sampler="exact")

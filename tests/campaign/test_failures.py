@@ -256,14 +256,6 @@ def test_a_mission_set_aside_by_hand_is_forgotten(workspace):
     assert campaign.hazard["failures"].values.sum() == 1
 
 
-def test_older_failures_weigh_less_under_forgetting(workspace):
-    campaign = begin(workspace, forgetting=0.5)
-    for seed, fail_at in enumerate((1, None, None)):
-        simulator = ModelSimulator(workspace, fail_at=fail_at)
-        campaign.tell(simulator.run(campaign.ask().path, seed=seed))
-    assert campaign.hazard["failures"].values.sum() == 0.25
-
-
 def test_priors_of_the_hazard_are_an_option_that_is_kept(workspace, tmp_path):
     prior = Hazard(intercept=(-3.0, 1.0), cause=0.5)
     campaign = begin(workspace, hazard=prior, directory=tmp_path)

@@ -260,11 +260,11 @@ def test_failing_keeps_the_bounds_there_are(workspace):
 
 
 def test_options_are_checked_recorded_and_given_as_one_object(workspace, tmp_path):
-    with pytest.raises(tb.TrustboError, match="unknown option 'forgeting'; did you mean forge"):
-        tb.iterate(workspace, *ENDS, forgeting=0.5)
+    with pytest.raises(tb.TrustboError, match="unknown option 'conectivity'; did you mean conn"):
+        tb.iterate(workspace, *ENDS, conectivity=4)
     with pytest.raises(tb.TrustboError, match="unknown option 'polcy'; did you mean policy"):
         tb.Campaign(workspace, *ENDS, polcy="random")
-    options = tb.CampaignOptions(team="min", forgetting=0.9, connectivity=4)
+    options = tb.CampaignOptions(team="min", initial="prior_draw", connectivity=4)
     with pytest.raises(tb.TrustboError, match=r"or options one by one; got options=.* and draws"):
         tb.Campaign(workspace, *ENDS, options=options, draws=500)
     with pytest.raises(tb.TrustboError, match="callbacks must be callables; got 3"):

@@ -130,10 +130,6 @@ def test_a_campaign_plans_for_the_family_of_its_posterior(tmp_path):
         assert again.planner_now().family.name == "censored"
 
 
-def test_what_is_for_gaussian_rates_refuses_it():
-    workspace = tb.Workspace.from_awareness(np.full((2, 3, 3, 1), 0.5))
-    model = PooledTrust(observation="auto")
-    with pytest.raises(tb.TrustboError, match="needs Gaussian observations"):
-        tb.Campaign(workspace, (2, 0), (0, 2), model=model, forgetting=0.9)
+def test_an_unknown_family_is_refused():
     with pytest.raises(tb.TrustboError, match="unknown observation 'normal'; choose one of auto"):
         CoupledTrust(observation="normal")

@@ -127,12 +127,12 @@ def test_every_option_is_crossed_with_every_other():
             "objectives": ["terminal", "mean"],
             "models": ["pooled", "hierarchical"],
             "samplers": "nuts",
-            "options": {"forgetting": [1.0, 0.8], "connectivity": 4},
+            "options": {"length_weight": [0.0, 0.1], "connectivity": 4},
         }
     )
     assert len(table) == 3 * 2 * 2 * 2 * 2
     assert len({one.key for one in table}) == len(table)
-    assert {one.labels["forgetting"] for one in table[:16]} == {1.0, 0.8}
+    assert {one.labels["length_weight"] for one in table[:16]} == {0.0, 0.1}
 
 
 def test_a_file_s_content_decides_and_not_its_name(tmp_path):
@@ -525,8 +525,8 @@ def test_regret_curves_show_each_policy_s_median(serial):
             "model 'coupled': sampler \"exact\" cannot treat",
         ),
         ({"options": {"seed": 3}}, "unknown option 'seed'; choose one of .*initial"),
-        ({"options": {"forgetting": float("nan")}}, "option 'forgetting' must be a number, a name"),
-        ({"options": {"forgetting": 7}}, "the run seed=0.*forgetting"),
+        ({"options": {"max_failure": float("nan")}}, "option 'max_failure' must be a number, a n"),
+        ({"options": {"draws": 0}}, "the run seed=0.*draws"),
         ({"options": {"stop": {"epsilon": 1}}}, "the run seed=0.*epsilon"),
     ],
 )

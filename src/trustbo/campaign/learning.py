@@ -22,7 +22,6 @@ from trustbo.inference.posterior_groups import parameters_alone
 from trustbo.inference.samplers.choice import resolve_sampler
 from trustbo.inference.samplers.settings import NutsSettings
 from trustbo.models import HumanTrust, default_model
-from trustbo.models.families import AUTO
 from trustbo.models.model import TrustModel, require_model
 from trustbo.models.params import Params
 from trustbo.workspace import AwarenessBelief, Workspace
@@ -155,19 +154,16 @@ class Learner:
         A mission excluded because it measured no contact rate still shows where it failed.
         None, with a warning, where the posterior is refused.
         """
-        n, lost = len(state.entries), [failure for failure in state.failures if failure.path]
-        measured = {
-            j: entry.measured
-            for j, entry in enumerate(state.entries)
+        measured = [
+            entry.measured
+            for entry in state.entries
             if entry.state != SET_ASIDE or never_to_be_learned(entry.mission)
-        }
-        ages = [n - 1 - j for j in measured], [n - failure.after for failure in lost]
-        weights = [self.options.forgetting ** np.array(age, dtype=float) for age in ages]
+        ]
+        lost = [LostMission(f.path, f.reason, f.where) for f in state.failures if f.path]
         try:
             return fit_hazard(
-                list(measured.values()), self.workspace, self.options.prior_hazard,
-                lost=[LostMission(f.path, f.reason, f.where) for f in lost],
-                weights=weights[0], lost_weights=weights[1], seed=state.seed_of("hazard"),
+                measured, self.workspace, self.options.prior_hazard, lost=lost,
+                seed=state.seed_of("hazard"),
             )  # fmt: skip
         except PosteriorError as error:
             warnings.warn(f"{error} The campaign goes on with the hazard before.", stacklevel=5)
@@ -178,9 +174,6 @@ class Learner:
 
         One that is refused is tried again in other ways. CannotLearnError: every attempt failed.
         """
-        weights, forgetting = None, self.options.forgetting
-        if forgetting < 1.0:
-            weights = forgetting ** np.arange(len(missions) - 1, -1, -1)
         reason = ""
         for shift, (sampler, sampling) in enumerate(self._attempts()):
             if reason:
@@ -190,8 +183,7 @@ class Learner:
             try:
                 return fit(
                     missions, self.model, sampler, workspace=self.workspace, earlier=last,
-                    weights=weights, seed=seed + shift, progress=self.progress, whole=False,
-                    **sampling,
+                    seed=seed + shift, progress=self.progress, whole=False, **sampling,
                 )  # fmt: skip
             except PosteriorError as error:
                 reason = error.reason
@@ -228,12 +220,6 @@ def _require_learnable(model: TrustModel, sampler: str, options: CampaignOptions
         )
     resolved, _ = resolve_sampler(model, sampler)
     NutsSettings.of(options.sampling).require_sampler(resolved)
-    gaussian = model.family.integrates_out and model.observation != AUTO
-    if options.forgetting < 1.0 and not gaussian:
-        raise TrustboError(
-            f"forgetting = {options.forgetting:g} needs Gaussian observations; got "
-            f'"{model.observation}".'
-        )
 
 
 def _prior_belief(model: TrustModel, initial: str, workspace: Workspace, seed: int) -> Params:

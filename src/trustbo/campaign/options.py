@@ -51,8 +51,6 @@ class CampaignOptions:
             has failed, then all bounds of the shortest path, see `Planner`.
         initial: Source of the first plan: prior_mean, or prior_draw (one random draw of the prior,
             as in the paper).
-        forgetting: Weight of a mission relative to the next, in (0, 1]. Below 1, a change of the
-            environment is followed; for Gaussian observations.
         awareness: Trust in the awareness map: map (blind; missions are learned from with it too) or
             belief (missions correct it). Under `"belief"`, or a given `AwarenessBelief`, policies
             draw from it too.
@@ -80,7 +78,6 @@ class CampaignOptions:
     initial: str = field(
         default="prior_mean", metadata=_option(LEARNING, "prior_mean", "prior_draw")
     )
-    forgetting: float = field(default=1.0, metadata=_option(LEARNING))
     awareness: "str | AwarenessBelief" = field(
         default="map", metadata=_option(LEARNING, "map", "belief")
     )
@@ -93,14 +90,12 @@ class CampaignOptions:
     callbacks: "Sequence[Callback]" = field(default=(), metadata=_option(RUNNING))
 
     def __post_init__(self) -> None:
-        from trustbo.inference.evidence.gram import require_forgetting
         from trustbo.inference.samplers.settings import NutsSettings
 
         for option in fields(self):
             choices = option.metadata["choices"]
             if choices and not (option.name == "awareness" and self.own_awareness):
                 require_choice(option.name, getattr(self, option.name), choices)
-        require_forgetting(self.forgetting)
         NutsSettings.of(self.sampling)
         object.__setattr__(self, "hazard", _hazard_of(self.hazard))
         object.__setattr__(self, "callbacks", tuple(self.callbacks))
