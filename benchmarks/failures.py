@@ -154,7 +154,7 @@ def one_campaign(world, simulator, course, n_missions, options, n_after=0):
         if stopped:
             again.append(bool(bounds & stopped))
         mission = simulator.run(plan.path, seed=campaign.seed_of("mission"))
-        campaign.tell(mission, again=True)
+        campaign.tell(mission)
         seconds.append(campaign.hazard.attrs["seconds"])
         ok.append(mission.status == "ok")
         if not ok[-1]:
@@ -210,7 +210,7 @@ def judged_plans(world, simulator, course, seed, given):
             )
         if number < max(ASKED):
             mission = simulator.run(plan.path, seed=campaign.seed_of("mission"))
-            campaign.tell(mission, again=True)
+            campaign.tell(mission)
     return gathered
 
 

@@ -61,7 +61,7 @@ def main():
         t = node.get_clock().now().nanoseconds / 1e9
         try:
             if take(follower, robots, topic, message.data, t):
-                campaign.tell(follower.to_mission(), other_path=True)  # may take seconds
+                campaign.tell(follower.to_mission())  # may take seconds
                 follower = tb.Follower(campaign)
         except (tb.TrustboError, ValueError, KeyError) as error:
             node.get_logger().warning(f"{topic}: {error}")

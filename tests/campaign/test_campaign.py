@@ -227,7 +227,7 @@ def test_a_belief_learns_the_awareness_that_missions_measure(workspace):
     assert campaign.settings["awareness"] == "belief"
     # What was not measured comes from what is believed, not from the map.
     blind = ModelSimulator(truth, blind=True).run(plan.path, seed=1)
-    campaign.tell(blind, other_path=True)
+    campaign.tell(blind)
     np.testing.assert_allclose(campaign.missions[1].awareness[0], believed[:, *cell])
 
 

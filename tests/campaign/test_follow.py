@@ -182,7 +182,7 @@ def test_robots_that_leave_the_path_are_followed_where_they_go():
     assert (mission.path, mission.status) == (DETOUR, "ok")
     assert [bound.t0 for bound in mission.bounds] == [0.0, 10.0, 20.0, 30.0]
     np.testing.assert_array_equal(mission.duration, np.full((4, 3), 8.0))
-    campaign.tell(mission, other_path=True)
+    campaign.tell(mission)
     assert len(campaign.missions) == 2
 
 

@@ -77,13 +77,13 @@ def test_no_campaign_ends_on_a_path_of_which_a_bound_was_never_completed(workspa
     campaign = tb.Campaign(workspace, *ENDS, sampler="exact")
     for seed in range(2):
         other = ((3, 0), (2, 1), (1, 2), (0, 2), (0, 3))
-        campaign.tell(ModelSimulator(workspace).run(other, seed=seed), other_path=True)
+        campaign.tell(ModelSimulator(workspace).run(other, seed=seed))
     path = campaign.recommend().path
     assert path == ((3, 0), (2, 1), (1, 2), (0, 3))
     assert min(rule.probability(campaign, n) for n in (1, 2)) == 1.0  # of the regret it is sure
     assert rule(campaign) is None
     driven = ModelSimulator(workspace, fail_at=3 if fails else None)
-    campaign.tell(driven.run(path, seed=2), other_path=True)
+    campaign.tell(driven.run(path, seed=2))
     assert rule(campaign).startswith("regret_bound")
     assert (campaign.recommend().path == path) is not fails
 

@@ -149,7 +149,7 @@ def test_a_cell_without_awareness_sets_its_mission_aside(tmp_path):
     with pytest.warns(
         UserWarning, match=r"awareness of bound 1, robot r1, .* cell \(2, 1\) has no"
     ):
-        campaign.tell(blind, other_path=True)
+        campaign.tell(blind)
     with campaign:
         pass
     with tb.Campaign.load(tmp_path):
@@ -160,7 +160,7 @@ def test_one_s_own_word_sets_aside_and_telling_again_takes_back(workspace):
     campaign, only = begin(workspace, seed=1), begin(workspace, seed=1)
     missions = [rates(workspace, DIAGONAL, seed=j) for j in range(3)]
     for mission in missions:
-        campaign.tell(mission, other_path=True)
+        campaign.tell(mission)
     campaign.set_aside("the lidar was covered", 2)
     assert campaign.history["state"].values.tolist() == ["learned", "set aside", "learned"]
     assert campaign.history["reason"].values[1] == "the lidar was covered"
@@ -181,9 +181,9 @@ def test_one_s_own_word_sets_aside_and_telling_again_takes_back(workspace):
     assert "3 told, 0 not learned from yet, 1 set aside" in repr(campaign)
     campaign.fail("rain")
     assert "1 set aside, 1 given up" in repr(campaign)
-    campaign.tell(missions[1], other_path=True)
+    campaign.tell(missions[1])
     assert campaign.posterior["constant_data"].sizes["mission"] == 3
-    only.tell(missions[0], other_path=True)
+    only.tell(missions[0])
     assert only.set_aside("wrong field") is None
     assert only.posterior is None
 
@@ -191,14 +191,12 @@ def test_one_s_own_word_sets_aside_and_telling_again_takes_back(workspace):
 @pytest.mark.parametrize(
     ("path", "said"),
     [
-        ([(0, 3), (1, 2), (2, 1), (3, 0)], "was asked for; were row and col swapped?"),
-        ([(2, 0), (1, 1), (0, 2), (0, 3)], r"it starts at \(2, 0\), not at \(3, 0\)"),
-        ([(3, 0), (1, 2), (0, 3)], r"jumps from \(3, 0\) to \(1, 2\), which are no neighbours"),
-        ([(3, 0), (2, 0), (1, 1), (0, 2), (0, 3)], r"tell\(mission, other_path=True\)"),
-        ([(3, 0), (2, 1), (9, 9)], r"enters \(9, 9\), outside the grid of 4 rows and 4 columns"),
+        ([(0, 3), (1, 2), (2, 1), (3, 0)], r"starts at \(0, 3\), not at \(3, 0\)"),
+        ([(3, 0), (1, 2), (0, 3)], r"no bound leads from"),
+        ([(3, 0), (2, 1), (9, 9)], r"\(9, 9\) is outside the grid of 4 rows and 4 columns"),
     ],
 )
-def test_another_path_than_the_one_asked_for_is_refused_with_the_likely_reason(
+def test_a_path_from_another_start_with_a_jump_or_off_the_grid_is_refused(
     workspace, tmp_path, path, said
 ):
     campaign = begin(workspace, tmp_path)
@@ -209,6 +207,14 @@ def test_another_path_than_the_one_asked_for_is_refused_with_the_likely_reason(
         campaign.tell(mission)
     assert campaign.missions == []
     assert not (tmp_path / "measured.nc").exists()
+
+
+def test_another_path_than_the_one_asked_for_is_learned_from_too(workspace):
+    campaign = begin(workspace)
+    campaign.suggest(DIAGONAL)
+    other = [(3, 0), (2, 0), (1, 1), (0, 2), (0, 3)]
+    assert campaign.tell(rates(workspace, other)) is not None
+    assert list(campaign.missions[0].path) == other
 
 
 def test_a_mission_that_failed_on_its_way_is_of_the_path_asked_for(workspace):
@@ -229,8 +235,8 @@ def test_robots_and_features_are_put_in_order_by_their_names(workspace):
         features=names[::-1], robots=["r3", "r1", "r2"],
     )  # fmt: skip
     one = Mission.from_arrays(DIAGONAL, z, y, duration=10.0 + np.arange(9).reshape(3, 3))
-    campaign.tell(one, other_path=True)
-    shuffled.tell(other, other_path=True)
+    campaign.tell(one)
+    shuffled.tell(other)
     for name in ("awareness", "contact_rate", "duration"):
         np.testing.assert_array_equal(
             getattr(shuffled.missions[0], name), getattr(campaign.missions[0], name)
@@ -239,7 +245,7 @@ def test_robots_and_features_are_put_in_order_by_their_names(workspace):
     with pytest.raises(
         tb.ShapeError, match=r"has robots \('r1', 'r2', 'r9'\), not \('r1', 'r2', 'r3'\)"
     ):
-        campaign.tell(stranger, other_path=True)
+        campaign.tell(stranger)
 
 
 def test_poses_and_states_follow_their_robots():
@@ -257,26 +263,6 @@ def test_poses_and_states_follow_their_robots():
     np.testing.assert_array_equal(back.poses, a.poses)
     with pytest.raises(tb.ShapeError, match="the mission has"):
         mission.in_order(["r1", "r2"], mission.features)
-
-
-def test_the_same_mission_told_twice_is_recognised(workspace):
-    campaign = begin(workspace)
-    campaign.suggest(DIAGONAL)
-    mission = rates(workspace, DIAGONAL)
-    campaign.tell(mission)
-    campaign.suggest(DIAGONAL)
-    with pytest.raises(tb.TrustboError, match="told already: it is mission 1, number by number"):
-        campaign.tell(rates(workspace, DIAGONAL))
-    assert len(campaign.missions) == 1
-    campaign.tell(mission, again=True)
-    # Perfect contact twice is no sign of one mission.
-    perfect = [
-        Mission.from_arrays(DIAGONAL, np.full((3, 3, 2), np.nan), np.ones((3, 3)), np.full(3, 30.0))
-        for _ in range(2)
-    ]
-    for one in perfect:
-        campaign.tell(one, other_path=True)
-    assert len(campaign.missions) == 4
 
 
 @pytest.mark.parametrize(
@@ -421,7 +407,7 @@ def test_a_campaign_is_rebuilt_from_the_missions_measured(folder):
     old = tb.load_result(folder)
     again = begin(old.workspace, objective="terminal", model=None)
     for mission in tb.logs.read_missions(folder / "measured.nc"):
-        again.tell(mission, other_path=True)
+        again.tell(mission)
     np.testing.assert_array_equal(
         again.posterior["posterior"]["b"], old.posterior["posterior"]["b"]
     )

@@ -237,19 +237,16 @@ class Campaign(Displayed):
             self.storage.write(self.state, None)
         return accepted
 
-    def tell(
-        self, mission: Mission, *, other_path: bool = False, again: bool = False, **extra: float
-    ) -> xr.DataTree | None:
+    def tell(self, mission: Mission, **extra: float) -> xr.DataTree | None:
         """Record a mission and learn from it.
 
         It is learned from with the awareness of the map; with a belief about the awareness, with
         what robots measured, filled in from the belief.
-        Robots and features may be in any order of their names.
+        Robots and features may be in any order of their names. The path may differ from the one
+        asked for.
 
         Args:
             mission: Mission as measured, whether or not the goal was reached.
-            other_path: Whether it really followed another path than the one asked for.
-            again: Whether a mission equal to an earlier one in every number is another one.
             **extra: More numbers for its row of the history, such as its regret.
 
         Returns:
@@ -258,13 +255,11 @@ class Campaign(Displayed):
 
         Raises:
             ShapeError: Robots or features differ from the workspace's.
-            TrustboError: The path leaves the grid, jumps or is not the one asked for; the mission
-                was recorded before; its reports are on another scale than those before; or an
-                extra is no number. Nothing is stored then.
+            TrustboError: The path leaves the grid, jumps or begins in another cell than the one
+                asked for; its reports are on another scale than those before; or an extra is no
+                number. Nothing is stored then.
         """
-        earlier = [] if again else [e.measured for e in self.state.entries if e.state != SET_ASIDE]
-        asked = self.ask().path
-        mission = require_mission(mission, self.workspace, asked, earlier, other_path=other_path)
+        mission = require_mission(mission, self.workspace, self.ask().path)
         if mission.reports is not None:
             scale_of([*self.state.measured, mission])
         self._take(mission, require_extra(extra))
@@ -322,8 +317,6 @@ class Campaign(Displayed):
         mission: Mission | None = None,
         *,
         where: Cell | None = None,
-        other_path: bool = False,
-        again: bool = False,
     ) -> xr.DataTree | None:
         """Give up the mission that was asked for; the next plan takes it into account.
 
@@ -332,35 +325,24 @@ class Campaign(Displayed):
                 bound of the plan failed, and is learned from as a hazard.
             mission: Bounds that were run, to learn from; None if there are none.
             where: Cell that it failed to enter, if that is certain though it did not report.
-            other_path: Whether it really followed another path, as for `tell`.
-            again: Whether another mission failed alike, with no `ask` in between; or one equal to
-                an earlier one in every number, as for `tell`.
 
         Returns:
             Posterior of the parameters, if there was something to learn.
 
         Raises:
             TrustboError: The mission is one that `tell` refuses, or reached the goal in spite of
-                a cause; a reason that is empty, or nearly a cause; a `where` that the plan does
-                not enter, together with a mission, or for another reason; or a second failure of
-                the mission that was asked for.
+                a cause; a reason that is empty; or a `where` that the plan does not enter, together
+                with a mission, or for another reason.
         """
         if mission is not None and where is not None:
             raise TrustboError(f"the mission tells where it failed; leave where = {where}.")
         require_reason(reason, mission)
         state, posterior, path = self.state, None, ()
         if mission is not None:
-            posterior = self.tell(mission, other_path=other_path, again=again)
-        else:
-            last = state.failures[-1] if state.failures and state.suggested is None else None
-            if last is not None and last.after == len(state.entries) and not again:
-                raise TrustboError(
-                    f"the mission that was asked for was given up already: {last.reason!r}. Ask "
-                    "for the next one; or, if another really failed too, fail(reason, again=True)."
-                )
-            if where is not None or reason in CAUSES:
-                path = self.ask().path
-                where = None if where is None else require_where(where, reason, path)
+            posterior = self.tell(mission)
+        elif where is not None or reason in CAUSES:
+            path = self.ask().path
+            where = None if where is None else require_where(where, reason, path)
         failure = Failure(len(state.entries), reason, tuple(path), where, mission is not None)
         state.failures.append(failure)
         self._go_on()

@@ -13,7 +13,7 @@ from trustbo.data import Mission
 from trustbo.errors import TrustboError, require_whole
 from trustbo.files import to_json
 from trustbo.planning import Plan
-from trustbo.simulation import KinematicSimulator, ReplaySimulator, Truth
+from trustbo.simulation import KinematicSimulator, Truth
 from trustbo.simulation.protocol import Simulator, require_call, takes
 from trustbo.workspace import Workspace
 
@@ -80,10 +80,7 @@ def _run_missions(
             extra = {}
             if truth is not None:
                 extra["regret"] = truth.at(n).regret(plan, **path_class(campaign.planner))
-            # Deviations from the plan, and repetitions, are expected here; only another start
-            # suggests that row and col are swapped.
-            other = mission.path[:1] == plan.path[:1] or isinstance(runner, ReplaySimulator)
-            campaign.tell(mission, other_path=other, again=True, **extra)
+            campaign.tell(mission, **extra)
             shown.step()
             for callback in campaign.options.callbacks:
                 callback(campaign, mission)
