@@ -1,16 +1,12 @@
-"""Trust that people report: scales of answers, and the reports of a mission."""
+"""Scales of the trust that people report."""
 
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
-from trustbo.errors import ShapeError, TrustboError, require_known, require_whole
+from trustbo.errors import TrustboError, require_whole
 
-PERSON = "operator"
-"""Name of a person who is not named."""
 _NAMED = re.compile(r"(likert|ordinal)(\d*)")
 
 
@@ -44,66 +40,6 @@ def report_of(what: str, answer: float, levels: int) -> float:
         hint = '; give its scale, such as scale="likert7"' if 1 < answer <= 11 else hint
         raise TrustboError(f"{what} = {answer:g} is outside [0, 1]{hint}.")
     return float(answer)
-
-
-@dataclass(frozen=True, eq=False)
-class Reports:
-    """Trust in each robot that a person reported before, during and after a mission.
-
-    Attributes:
-        values: Reports in [0, 1], shape (1 + bound, robot): before the mission, and after each
-            bound that was run; NaN where none was given.
-        person: Name of the person.
-        scale: `"unit"`, numbers in [0, 1]; `"likert7"` or `"ordinal7"`, so many levels, of which
-            the values are (answer - 1) / 6. See `HumanTrust`.
-
-    Raises:
-        TrustboError: A value that is not on the scale, or a person without a name.
-    """
-
-    values: np.ndarray
-    person: str = PERSON
-    scale: str = "unit"
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.person, str) or not self.person.strip():
-            raise TrustboError(f"person must be a name; got {self.person!r}.")
-        answers, given = self.answers, ~np.isnan(self.values)
-        off = (self.values < 0.0) | (self.values > 1.0)
-        if levels := levels_of(self.scale):
-            off |= given & (answers != np.round(answers))
-        for k, i in np.argwhere(off):
-            report_of(f"report [{k}, {i}]", float(answers[k, i]), levels)
-
-    @classmethod
-    def of(
-        cls, answers: Any, robots: Sequence[str], n_bounds: int, person: str, scale: str
-    ) -> Self:
-        """Reports of answers on their scale, see `Mission.with_reports`."""
-        levels = levels_of(scale)
-        if isinstance(answers, Mapping):
-            require_known("robot", answers, robots)
-            answers = [answers.get(name, np.nan) for name in robots]
-        try:
-            given = np.array(answers, dtype=float)
-        except (TypeError, ValueError):
-            raise TrustboError(f"reports must be numbers; got {answers!r:.80}.") from None
-        n, full = len(robots), np.full((1 + n_bounds, len(robots)), np.nan)
-        if given.shape not in ((n,), (n_bounds, n), full.shape):
-            raise ShapeError(
-                f"reports must be ({n},), of each robot after the mission, ({n_bounds}, {n}), "
-                f"after each bound, or ({n_bounds + 1}, {n}), before the first too; got "
-                f"{given.shape}."
-            )
-        rows = full[len(full) - len(np.atleast_2d(given)) :]
-        for (k, i), answer in np.ndenumerate(np.atleast_2d(given)):
-            rows[k, i] = report_of(f"report about {robots[i]}", answer, levels)
-        return cls(full, person, scale)
-
-    @property
-    def answers(self) -> np.ndarray:
-        """Answers on the scale, of the shape of `values`."""
-        return answer_of(self.values, levels_of(self.scale))
 
 
 def answer_of(report: Any, levels: int) -> Any:

@@ -1,6 +1,6 @@
 """Missions of a team of robots, bound by bound."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self
@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from trustbo.answers import PERSON, Reports, levels_of
+from trustbo.answers import levels_of
 from trustbo.arrays import as_array, as_names
 from trustbo.bound import NOWHERE, STATUSES, Bound, Cell
 from trustbo.display.card import Card, Displayed, joined, number
@@ -40,13 +40,12 @@ class Mission(Displayed):
         robots: Names of the overwatching robots.
         posts: Planned places of the robots while the lead ran each bound of the path, shape
             (bound, robot, 2), x and y in CRS metres; None where they are those of the workspace.
-        reports: Trust in each robot that a person reported, see `with_reports`; None without.
         scale: Scale of the reports of a person that `contact_rate` holds in place of contact, such
             as `"likert7"`, in missions of `logs.read_reports`; empty in all others.
 
     Raises:
-        ShapeError: Bounds that do not fit the path, or disagree on robots or features; posts or
-            reports of another shape.
+        ShapeError: Bounds that do not fit the path, or disagree on robots or features; or posts
+            of another shape.
         TrustboError: An unknown status or scale, or posts that are not finite.
     """
 
@@ -56,7 +55,6 @@ class Mission(Displayed):
     features: tuple[str, ...] = ()
     robots: tuple[str, ...] = ()
     posts: np.ndarray | None = None
-    reports: Reports | None = None
     scale: str = ""
 
     def __post_init__(self) -> None:
@@ -79,13 +77,6 @@ class Mission(Displayed):
         if self.posts is not None:
             shape = len(self.path) - 1, n_robots, 2
             object.__setattr__(self, "posts", require_posts(self.posts, shape))
-        if self.reports is not None:
-            shape = len(self.bounds) + 1, n_robots
-            if self.reports.values.shape != shape:
-                raise ShapeError(
-                    f"reports must be {shape}, (1 + bound, robot); got "
-                    f"{self.reports.values.shape}. Make them by mission.with_reports."
-                )
 
     def _require_path(self) -> None:
         """Refuse bounds that do not fit the path."""
@@ -146,9 +137,6 @@ class Mission(Displayed):
             *((f"  {name}", f"{rate:.3f}") for name, rate in zip(self.robots, means, strict=True)),
             ("takes", number(took, "s", 4) if took > 0.0 else "not measured"),
         ]
-        if self.reports is not None:
-            n = int(np.isfinite(self.reports.values).sum())
-            rows.append(("trust reported", f"{n} times by {self.reports.person}"))
 
         def picture() -> str:
             team = np.where(measured.any(1), np.where(measured, rates, 0.0).sum(1), np.nan)
@@ -290,37 +278,8 @@ class Mission(Displayed):
             z = np.pad(b.awareness, ((0, 0), (0, len(lacks))), constant_values=np.nan)
             bounds.append(replace(b, awareness=z[np.ix_(i, m)], **rates, **optional))
         names = {"robots": tuple(robots), "features": tuple(features)}
-        posts, reports = None if self.posts is None else self.posts[:, i], self.reports
-        if reports is not None:
-            reports = replace(reports, values=reports.values[:, i])
-        return replace(self, bounds=tuple(bounds), posts=posts, reports=reports, **names)
-
-    def with_reports(
-        self,
-        answers: Mapping[str, float] | ArrayLike,
-        *,
-        person: str = PERSON,
-        scale: str = "unit",
-    ) -> Self:
-        """The mission with the trust in each robot that a person reported.
-
-        `mission.with_reports({"r1": 6, "r2": 3}, person="ann", scale="likert7")` is of answers
-        after the mission.
-
-        Args:
-            answers: Answers by robot, or of shape (robot,), after the mission; (bound, robot),
-                after each bound that was run; or (1 + bound, robot), with those before the mission
-                first. NaN where none was given.
-            person: Name of the person.
-            scale: `"unit"`, numbers in [0, 1]; `"likert7"` or `"ordinal7"`, whole numbers 1 to 7;
-                see `HumanTrust`.
-
-        Raises:
-            ShapeError: Answers of another shape.
-            TrustboError: An answer that is not on the scale, or an unknown robot or scale.
-        """
-        reports = Reports.of(answers, self.robots, len(self.bounds), person, scale)
-        return replace(self, reports=reports)
+        posts = None if self.posts is None else self.posts[:, i]
+        return replace(self, bounds=tuple(bounds), posts=posts, **names)
 
     # Stacked once: every refit reads these of every mission.
 

@@ -559,37 +559,3 @@ def test_a_long_campaign_keeps_the_parameters_alone(workspace, tmp_path):
         seed=int(result.posteriors[1].attrs["seed"]),
     )
     np.testing.assert_array_equal(again["latent"]["trust"], direct["latent"]["trust"])
-
-
-def reports_of_ann(workspace, folder):
-    """Write a campaign of three missions with reports."""
-    with begin(workspace, folder) as campaign:
-        for seed, answer in enumerate((4, 5, 6)):
-            mission = rates(workspace, campaign.ask().path, seed)
-            campaign.tell(mission.with_reports({"r1": answer}, person="ann", scale="likert7"))
-
-
-def test_reports_of_trust_are_kept_and_of_one_scale(workspace, tmp_path):
-    reports_of_ann(workspace, tmp_path)
-    with tb.Campaign.load(tmp_path) as campaign:
-        other = rates(workspace, campaign.ask().path, 7).with_reports([0.5, 0.5, 0.5])
-        with pytest.raises(tb.errors.TrustboError, match="reports are on one scale; got likert7"):
-            campaign.tell(other)
-        assert len(campaign.missions) == 3
-        assert campaign.state.measured[1].reports.person == "ann"
-    result = tb.load_result(tmp_path)
-    assert [m.reports.answers[-1, 0] for m in result.missions] == [4.0, 5.0, 6.0]
-
-
-@pytest.mark.slow  # compiles NUTS; docs/people.md has the same calls
-def test_reports_are_expected_along_the_recommended_path(workspace, tmp_path):
-    reports_of_ann(workspace, tmp_path)
-    result = tb.load_result(tmp_path)
-    found = result.expected_reports
-    assert found["mean"].sizes == {"person": 1, "bound": len(result.path), "robot": 3}
-    assert result.reported.attrs["model"] == "HumanTrust"
-    from trustbo.report.summary import _reported
-    from trustbo.report.tables import reports_table
-
-    assert [row[2] for row in reports_table(result).rows] == ["6.00", "\N{EN DASH}", "\N{EN DASH}"]
-    assert "3 reports by ann." in _reported(result).text

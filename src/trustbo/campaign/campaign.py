@@ -29,7 +29,6 @@ from trustbo.errors import TrustboError, require_kind, require_whole
 from trustbo.files import FilePath, as_path, interpreting
 from trustbo.hazard.exposures import CAUSES
 from trustbo.hazard.risk import BoundRisk
-from trustbo.logs.reports import scale_of
 from trustbo.models.backend import VERSIONS
 from trustbo.models.model import TrustModel
 from trustbo.models.params import Params
@@ -256,12 +255,9 @@ class Campaign(Displayed):
         Raises:
             ShapeError: Robots or features differ from the workspace's.
             TrustboError: The path leaves the grid, jumps or begins in another cell than the one
-                asked for; its reports are on another scale than those before; or an extra is no
-                number. Nothing is stored then.
+                asked for; or an extra is no number. Nothing is stored then.
         """
         mission = require_mission(mission, self.workspace, self.ask().path)
-        if mission.reports is not None:
-            scale_of([*self.state.measured, mission])
         self._take(mission, require_extra(extra))
         return self.state.last_tree
 

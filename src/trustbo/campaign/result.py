@@ -24,9 +24,6 @@ from trustbo.files import FilePath
 from trustbo.hazard.model import measures_of
 from trustbo.hazard.risk import BoundRisk
 from trustbo.inference import (
-    TrustFilter,
-    expect_reports,
-    fit_reports,
     memory,
     params_of,
     place_maps,
@@ -34,7 +31,6 @@ from trustbo.inference import (
 from trustbo.inference.memory import Memory
 from trustbo.planning import Plan, Planner
 from trustbo.workspace import Workspace
-from trustbo.workspace.moves import along
 
 if TYPE_CHECKING:
     from trustbo.plots.explorer import Explorer
@@ -132,31 +128,6 @@ class Result(Displayed):
             TrustboError: Nothing could be learned yet; or memory cannot be weighed under the model.
         """
         return memory(self.posterior, self.missions, self.workspace)
-
-    @cached_property
-    def reported(self) -> xr.DataTree:
-        """Posterior of the trust that persons reported, see `inference.fit_reports`.
-
-        Computed when first asked for, in a second.
-
-        Raises:
-            TrustboError: No mission has reports.
-        """
-        return fit_reports(self.missions)
-
-    @cached_property
-    def expected_reports(self) -> xr.Dataset:
-        """Reports to be expected along the recommended path, see `inference.expect_reports`.
-
-        Contact is drawn from the posterior's predictions.
-
-        Raises:
-            TrustboError: No mission has reports, or nothing could be learned yet.
-        """
-        known = np.swapaxes(along(self.planner.mean_awareness, self.path), 0, 1)
-        ahead = TrustFilter(self.posterior).predict(known, self.path)
-        contact = np.clip(ahead.draws, 0.0, 1.0)
-        return expect_reports(self.reported, self.missions, contact)
 
     def table(self) -> pd.DataFrame:
         """Table with a row for each mission, labelled by its number, from 1; also `history.csv`.

@@ -10,7 +10,6 @@ from trustbo.inference.filter import TrustFilter
 from trustbo.inference.fit import fit
 from trustbo.inference.loo import loo
 from trustbo.inference.memory import memory
-from trustbo.inference.operators import expect_reports, fit_reports
 from trustbo.inference.people import predict_reports
 from trustbo.inference.people_scores import compare_people
 from trustbo.inference.place_maps import place_maps
@@ -29,9 +28,7 @@ __all__ = [
     "compare_people",
     "complete",
     "diagnostics",
-    "expect_reports",
     "fit",
-    "fit_reports",
     "loo",
     "memory",
     "params_of",

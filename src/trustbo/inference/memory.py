@@ -14,14 +14,12 @@ from scipy.special import expit
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError, require_whole
-from trustbo.inference.draws import is_of_people
 from trustbo.inference.fit_data import FitData
 from trustbo.inference.posterior_tree import require_posterior
 from trustbo.inference.samplers.choice import resolve_sampler
 from trustbo.inference.samplers.importance import sample_scores
 from trustbo.inference.samplers.people import PeoplePosterior
 from trustbo.inference.samplers.posterior import posterior_of
-from trustbo.logs.reports import reports_of
 from trustbo.models.model import TrustModel
 from trustbo.models.people import HumanTrust
 from trustbo.models.pooled import PooledTrust
@@ -87,8 +85,6 @@ def memory(
     """
     seed = require_whole("seed", seed, 0)
     attrs = require_posterior("memory", posterior).attrs
-    if missions is not None and is_of_people(posterior) and any(m.reports for m in missions):
-        missions = [*reports_of(missions).values()]
     data = FitData.of(posterior, missions, workspace, model)
     model = data.model
     exact = isinstance(model, PooledTrust) and "log_evidence" in attrs and not model.lag

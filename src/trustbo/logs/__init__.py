@@ -6,7 +6,7 @@ from trustbo.logs.log import Log, read_log
 from trustbo.logs.messages import Topics
 from trustbo.logs.mrclam import read_mrclam
 from trustbo.logs.netcdf import read_missions, write_missions
-from trustbo.logs.reports import read_reports, reports_of
+from trustbo.logs.reports import read_reports
 from trustbo.logs.sensor import Sensor, fit_sensor
 from trustbo.logs.studies import read_azevedo_sa, read_du, read_soh
 from trustbo.logs.synthetic import synthetic_log
@@ -16,7 +16,7 @@ from trustbo.logs.windows import join_missions, missions_of
 __all__ = [
     "Log", "Sensor", "Topics", "fit_sensor", "geometry", "join_missions", "missions_of",
     "read_azevedo_sa", "read_bag", "read_du", "read_log", "read_missions", "read_mrclam",
-    "read_reports", "read_soh", "read_table", "reports_of", "synthetic_log",
+    "read_reports", "read_soh", "read_table", "synthetic_log",
     "write_missions", "write_table",
 ]  # fmt: skip
 __dir__ = __all__.copy  # completion lists public names alone

@@ -9,7 +9,6 @@ import xarray as xr
 from xarray.backends import NetCDF4DataStore
 from xarray.conventions import encode_dataset_coordinates
 
-from trustbo.answers import Reports
 from trustbo.data import NOWHERE, Bound, Mission
 from trustbo.errors import DamagedFileError, TrustboError
 from trustbo.files import (
@@ -165,7 +164,7 @@ def _table(missions: Sequence[Mission]) -> xr.Dataset:
         start[j, :n] = [bound.t0 for bound in mission.bounds]
         status[j, :n] = [bound.status for bound in mission.bounds]
     dims = ("mission", "bound", "robot")
-    own: dict[str, Any] = _reports(missions, n_steps)
+    own: dict[str, Any] = {}
     if any(mission.scale for mission in missions):
         own["scale"] = (dims[:1], [mission.scale for mission in missions])
     if not np.isnan(posts).all():
@@ -187,22 +186,6 @@ def _table(missions: Sequence[Mission]) -> xr.Dataset:
     )
 
 
-def _reports(missions: Sequence[Mission], n_steps: int) -> dict[str, Any]:
-    """Arrays of the reports of trust; none where there are none."""
-    given = [mission.reports for mission in missions]
-    if not any(given):
-        return {}
-    values = np.full((len(missions), n_steps, len(missions[0].robots)), np.nan)
-    for j, reports in enumerate(given):
-        if reports is not None:
-            values[j, : len(reports.values)] = reports.values
-    texts = {
-        f"report_{name}": (("mission",), [getattr(one, field) if one else "" for one in given])
-        for name, field in (("by", "person"), ("scale", "scale"))
-    }
-    return {"report": (("mission", "step", "robot"), values), **texts}
-
-
 def _mission(table: dict[str, np.ndarray], j: int, ticks: xr.Dataset | None) -> Mission:
     """Mission j of a table, with the ticks of its bounds if they were recorded."""
     robots, features = (tuple(map(str, table[d])) for d in ("robot", "feature"))
@@ -218,12 +201,8 @@ def _mission(table: dict[str, np.ndarray], j: int, ticks: xr.Dataset | None) -> 
         bounds.append(Bound(cell, z, y, seconds, status, t0, poses, contact, n, states))
     posts = table["posts"][j, : len(path) - 1] if "posts" in table and path else np.full(1, np.nan)
     own = None if np.isnan(posts).any() else posts
-    reports = None
-    if "report" in table and (person := str(table["report_by"][j])):
-        values, scale = table["report"][j, : len(bounds) + 1], str(table["report_scale"][j])
-        reports = Reports(values, person, scale)
     status, scale = str(table["status"][j]), str(table["scale"][j]) if "scale" in table else ""
-    return Mission(path, tuple(bounds), status, features, robots, own, reports, scale)
+    return Mission(path, tuple(bounds), status, features, robots, own, scale)
 
 
 def _ticks_of(ticks: xr.Dataset | None, k: int) -> tuple[np.ndarray | None, ...]:

@@ -15,7 +15,6 @@ from trustbo.answers import levels_of, report_of
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
 from trustbo.logs.rows import columns_of, needed_columns, number_of
-from trustbo.stacking import require_same_team
 
 _YES = {"1", "1.0", "true", "yes", "success", "succeeded", "ok"}
 _NO = {"0", "0.0", "false", "no", "failure", "failed", "fail"}
@@ -118,66 +117,6 @@ def read_reports(
     return [
         _mission(who, steps, tuple(tasks), named, inputs, scale) for who, steps in people.items()
     ]
-
-
-def reports_of(missions: Sequence[Mission]) -> dict[tuple[str, str], Mission]:
-    """Reports of trust in the robots of a campaign, as those of persons.
-
-    Trust in a robot has its inputs from what the robot did: after each bound, `success` is its
-    contact rate, and `failure` the rest of 1. A rate that was not measured was not shown either:
-    both are 0, as in the step before each mission. Missions continue each other, so that a report
-    bears on all that came before. A mission without reports was seen by the person of the one
-    before it, those at the beginning by the first person.
-
-    Args:
-        missions: Missions of one team, in order, see `Mission.with_reports`.
-
-    Returns:
-        A mission without a map for each person and robot, for `fit` with `HumanTrust`.
-
-    Raises:
-        TrustboError: No mission has reports, or they are on different scales.
-    """
-    require_same_team(missions)
-    scale, who = scale_of(missions), _persons(missions)
-    found = {}
-    for person in dict.fromkeys(who):
-        seen = [m for m, name in zip(missions, who, strict=True) if name == person]
-        y = np.concatenate([_answered(mission) for mission in seen])
-        rates = [np.pad(m.contact_rate, ((1, 0), (0, 0)), constant_values=np.nan) for m in seen]
-        rate = np.concatenate(rates)
-        z = np.nan_to_num(np.stack([rate, 1.0 - rate], axis=-1))
-        for i, robot in enumerate(missions[0].robots):
-            found[person, robot] = person_mission(z[:, [i]], y[:, [i]], OUTCOMES, (_TASK,), scale)
-    return found
-
-
-def scale_of(missions: Sequence[Mission]) -> str:
-    """Scale of the reports of missions; TrustboError: there are none, or on several scales."""
-    scales = dict.fromkeys(m.reports.scale for m in missions if m.reports is not None)
-    if not scales:
-        raise TrustboError(
-            "no mission has reports of trust; give them by mission.with_reports(answers)."
-        )
-    if len(scales) > 1:
-        raise TrustboError(f"reports are on one scale; got {', '.join(scales)}.")
-    return next(iter(scales))
-
-
-def _persons(missions: Sequence[Mission]) -> list[str]:
-    """Person who saw each mission."""
-    last = next(m.reports.person for m in missions if m.reports is not None)
-    who = []
-    for mission in missions:
-        last = last if mission.reports is None else mission.reports.person
-        who.append(last)
-    return who
-
-
-def _answered(mission: Mission) -> np.ndarray:
-    if mission.reports is not None:
-        return mission.reports.values
-    return np.full((len(mission.bounds) + 1, len(mission.robots)), np.nan)
 
 
 def _row(

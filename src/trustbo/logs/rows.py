@@ -15,8 +15,8 @@ from trustbo.spreadsheet import meant
 from trustbo.workspace.grid import Grid
 
 KEYS = ("mission", "bound", "robot", "row", "col")
-NUMBERS = ("contact_rate", "contact_time", "duration", "n_ticks", "t0", "report")
-TEXTS = ("status", "mission_status", "report_by", "report_scale")
+NUMBERS = ("contact_rate", "contact_time", "duration", "n_ticks", "t0")
+TEXTS = ("status", "mission_status")
 COLUMNS = (*KEYS, *NUMBERS, *TEXTS)
 """Columns with a fixed meaning; any other is an awareness feature."""
 POSITIONS = (("row", "col"), ("x", "y"), ("lon", "lat"))
@@ -42,8 +42,6 @@ class Row(NamedTuple):
     """Awareness by feature; NaN if blank."""
     status: str
     mission_status: str
-    report_by: str
-    report_scale: str
 
     @property
     def is_blank(self) -> bool:

@@ -1,6 +1,5 @@
 """Missions as a table in long form: one row per mission, bound and robot; columns in `read_table`.
 
-A report is given after its bound, before the mission at bound 0, on a scale such as "likert7".
 A table without places is of a log without a map: features are of any values. A blank
 means "not measured". Bounds after the last one with a measurement were planned, not run. A feature
 with the name of one of these columns takes the prefix `awareness_`, e.g.
@@ -13,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from trustbo.answers import PERSON, Reports
 from trustbo.data import NOWHERE, Bound, Cell, Mission
 from trustbo.errors import TrustboError, require_pair
 from trustbo.files import FilePath, write_text
@@ -21,8 +19,6 @@ from trustbo.logs.rows import KEYS, Row, column_of, features_of, parse_rows, rea
 from trustbo.spreadsheet import rows_as_csv
 from trustbo.stacking import require_same_team
 from trustbo.workspace import Workspace
-
-_REPORTED = ("report", "report_by", "report_scale")
 
 
 def read_table(
@@ -38,9 +34,9 @@ def read_table(
 
     Required columns are `mission`, `bound`, `robot`, the cell (`row` and `col`, or `x` and `y`, or
     `lon` and `lat`) and the contact (`contact_rate`, or `contact_time` and `duration`). Optional
-    ones are `duration`, `t0`, `n_ticks`, `status`, `mission_status`, `report`, `report_by`,
-    `report_scale` and a column for each awareness feature: docs/howto/your-own-robots.md. Bound 0
-    is the start cell, without measurements. A table without a cell is of a log without a map.
+    ones are `duration`, `t0`, `n_ticks`, `status`, `mission_status` and a column for each awareness
+    feature: docs/howto/your-own-robots.md. Bound 0 is the start cell, without measurements. A table
+    without a cell is of a log without a map.
 
     Args:
         table: Path of a CSV file with a header, separated by commas, semicolons or tabs, or a
@@ -95,18 +91,17 @@ def write_table(missions: Sequence[Mission], path: FilePath) -> None:
     require_same_team(missions)
     features = [column_of(name) for name in missions[0].features]
     measured = ["contact_rate", "duration", "n_ticks", "t0", "status", "mission_status", *features]
-    reported = any(mission.reports is not None for mission in missions)
     mapped = [mission.has_map for mission in missions]
     if any(mapped) and not all(mapped):
         raise TrustboError(
             f"mission {mapped.index(False)} has no path, and others have; write these apart."
         )
     keys = KEYS if all(mapped) else KEYS[:3]
-    lines: list[list[object]] = [[*keys, *measured, *(_REPORTED if reported else ())]]
+    lines: list[list[object]] = [[*keys, *measured]]
     for j, mission in enumerate(missions):
         steps = mission.path or [()] * (len(mission.bounds) + 1)
         for k, cell in enumerate(steps):
-            if not k and not mission.has_map and mission.reports is None:
+            if not k and not mission.has_map:
                 continue
             bound = mission.bounds[k - 1] if 1 <= k <= len(mission.bounds) else None
             for i, robot in enumerate(mission.robots):
@@ -116,17 +111,8 @@ def write_table(missions: Sequence[Mission], path: FilePath) -> None:
                     cells = [*map(_text, rates), bound.status, mission.status]
                     cells += map(_text, bound.awareness[i])
                 lines.append([j + 1, k, robot, *cell, *cells])
-                if reported:
-                    lines[-1] += _answer(mission.reports, k, i)
 
     write_text(path, rows_as_csv(lines))
-
-
-def _answer(reports: Reports | None, k: int, i: int) -> list[object]:
-    """Report after bound k about robot i, its person and its scale, as cells of a table."""
-    if reports is None or k >= len(reports.values):
-        return [""] * len(_REPORTED)
-    return [_text(reports.answers[k, i]), reports.person, reports.scale]
 
 
 def _mission(
@@ -157,30 +143,9 @@ def _mission(
     statuses = [row.mission_status for robots in rows.values() for row in robots.values()]
     status = _agreed(f"mission {label}", "mission_status", statuses) or bounds[-1].status
     try:
-        reports = _reports(f"mission {label}", rows, team, len(bounds))
-        return Mission(cells, tuple(bounds), status, features, team, reports=reports)
+        return Mission(cells, tuple(bounds), status, features, team)
     except TrustboError as error:
         raise TrustboError(f"mission {label}: {error}") from None
-
-
-def _reports(
-    where: str, rows: dict[int, dict[str, Row]], team: tuple[str, ...], n_bounds: int
-) -> Reports | None:
-    """Reports of trust in the rows of a mission; None where there are none."""
-    every = [row for of_bound in rows.values() for row in of_bound.values()]
-    person, scale = (
-        _agreed(where, name, [getattr(row, name) for row in every])
-        for name in ("report_by", "report_scale")
-    )
-    answers = np.array(
-        [
-            [rows[k][n].numbers["report"] if n in rows.get(k, ()) else math.nan for n in team]
-            for k in range(n_bounds + 1)
-        ]
-    )
-    if np.isnan(answers).all() and not person:
-        return None
-    return Reports.of(answers, team, n_bounds, person or PERSON, scale or "unit")
 
 
 def _cells(label: str, rows: dict[int, dict[str, Row]], start: Cell | None) -> tuple[Cell, ...]:

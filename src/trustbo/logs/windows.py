@@ -115,7 +115,7 @@ def join_missions(missions: Sequence[Mission]) -> Mission:
             goals; with a map, each begins in the cell in which the one before ended.
 
     Raises:
-        TrustboError: Missions that do not continue each other; or with posts or reports.
+        TrustboError: Missions that do not continue each other; or with posts.
     """
     first = missions[0] if missions else None
     if first is None:
@@ -126,10 +126,6 @@ def join_missions(missions: Sequence[Mission]) -> Mission:
             raise TrustboError(f"mission {j} has other robots or features than mission 0.")
         if mission.has_map != first.has_map or mission.posts is not None:
             raise TrustboError(f"mission {j} has a path, or posts, that mission 0 has not.")
-        if mission.reports is not None:
-            raise TrustboError(
-                f"mission {j} has reports, which carry over as they are: reports_of."
-            )
         if j and missions[j - 1].status != "ok":
             raise TrustboError(
                 f"mission {j - 1} ended {missions[j - 1].status!r}: no other continues it."

@@ -88,20 +88,6 @@ class HumanTrust(PooledTrust):
         object.__setattr__(self, "effects", (effect,))
         super().__post_init__()
 
-    @classmethod
-    def of_operators(cls, scale: str = "unit") -> Self:
-        """Model of `inference.fit_reports`, trust in robots that operators of a campaign report.
-
-        Gains are of half the size, as outcomes are bounds, which come by the dozen.
-
-        Args:
-            scale: Scale of the reports.
-        """
-        model = cls(scale=scale, effects=(PersonEffect(tau_gain=0.1),))
-        with own_settings():
-            gains = dist.Normal(0.0, 0.15)
-        return replace(model, priors=replace(model.priors, beta=gains))
-
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the features."""

@@ -58,8 +58,6 @@ def model_from_record(
         fixed = replace(Priors.default(record["observation"]))
         of_features = Priors.of(features, record["observation"])
         known = [None, fixed, of_features, Priors.zheng2023()]
-        if kind is HumanTrust:
-            known.append(HumanTrust.of_operators().priors)
         for priors in known:
             model = kind(priors=priors, place=place, **options)  # pyright: ignore
             if model_to_record(model) == record:

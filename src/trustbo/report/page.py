@@ -92,8 +92,6 @@ def _sections(result: Result) -> Iterator[Section]:
             "Where contact is better or worse than the terrain says, and how sure we are.",
             [figures.places(result)],
         )
-    if any(mission.reports for mission in result.missions):
-        yield _reported(result)
     if result.planner.problem.risk is not None:
         yield Section(
             "hazard",
@@ -124,15 +122,6 @@ def _criticism(result: Result) -> Section:
     sentence = outcome.verdict[0].upper() + outcome.verdict[1:]
     blocks = [figures.criticism(outcome), tables.criticism_table(outcome)]
     return Section("criticism", "Criticism of the model", sentence, blocks)
-
-
-def _reported(result: Result) -> Section:
-    """Section of the trust that persons reported, or of the reason why it is not fitted."""
-    title = "Reported trust"
-    try:
-        return Section("reported", title, "", [tables.reports_table(result)])
-    except TrustboError as error:
-        return Section("reported", title, f"Not fitted: {error}", [])
 
 
 def _meaning_of_parameters(result: Result) -> str:

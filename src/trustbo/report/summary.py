@@ -7,7 +7,6 @@ from trustbo.data import path_text
 from trustbo.display.card import arrival, joined
 from trustbo.errors import TrustboError
 from trustbo.hazard.risk import PathRisk
-from trustbo.inference.draws import sites_of
 from trustbo.inference.samplers.convergence import GOOD_KHAT, MAX_KHAT, MAX_RHAT, MIN_ESS
 from trustbo.planning import Plan
 from trustbo.planning.cover import PathCover
@@ -32,7 +31,7 @@ _TOLLS = {"length_weight": "its length", "unseen_cost": "the time in which nobod
 
 def facts_of(result: Result) -> list[Fact]:
     """Return the facts of the summary: campaign, recommendation, value, diagnostics, memory."""
-    plan, has_reports = result.plan, any(mission.reports for mission in result.missions)
+    plan = result.plan
     return [
         Fact("The campaign", f"{_where(result)} {_missions(result)}"),
         Fact("Recommended", _path(result, plan)),
@@ -41,7 +40,6 @@ def facts_of(result: Result) -> list[Fact]:
         *([] if plan.cover is None else [Fact("Cover", _cover(plan.cover, plan.unseen_toll))]),
         _soundness(result),
         _memory(result),
-        *([_reported(result)] if has_reports else []),
         Fact("Why it ended", _end(result)),
     ]
 
@@ -152,24 +150,6 @@ def _memory(result: Result) -> Fact:
     except TrustboError as error:
         return Fact("Memory", f"Not weighed: {error}")
     return Fact("Memory", f"{finding[0].upper()}{finding[1:]}.")
-
-
-def _reported(result: Result) -> Fact:
-    """State how contact moves the trust that persons report, or why that is not known."""
-    try:
-        success, failure = sites_of(result.reported)["beta"].T
-    except TrustboError as error:
-        return Fact("Reported trust", f"Not fitted: {error}")
-    low, middle, high = np.quantile(success - failure, (0.05, 0.5, 0.95))
-    given = [mission.reports for mission in result.missions if mission.reports]
-    n = int(sum(np.isfinite(reports.values).sum() for reports in given))
-    people = joined(list(dict.fromkeys(reports.person for reports in given)))
-    return Fact(
-        "Reported trust",
-        f"{counted(n, 'report')} by {people}. A bound of full contact raises reported trust by "
-        f"{number(middle)} ({number(low)} to {number(high)}) over one without, on a scale from 0 "
-        "to 1.",
-    )
 
 
 def _end(result: Result) -> str:

@@ -74,32 +74,6 @@ def parameter_table(result: Result) -> Table:
     return Table(f"{caption}.", head, rows)
 
 
-def reports_table(result: Result) -> Table:
-    """Tabulate the trust that persons reported, and will after the recommended path."""
-    expected, trust = result.expected_reports, result.plan.trust[-1]
-    after = expected.isel(bound=-1)
-    rows = []
-    for person in expected["person"].values:
-        for i, robot in enumerate(expected["robot"].values):
-            one = after.sel(person=person, robot=robot)
-            low, high = (number(float(one["quantile"][level])) for level in (0, -1))
-            last = float(one["last"])
-            rows.append(
-                (
-                    str(person), str(robot), number(last) if np.isfinite(last) else NONE,
-                    f"{number(float(one['mean']))} ({low} to {high})", number(float(trust[i])),
-                )
-            )  # fmt: skip
-    return Table(
-        "Trust in each robot that persons last reported, on their scale "
-        f"({expected.attrs['scale']}), the report to be expected after the recommended path, with "
-        "its 90 % band, and trust by contact at its end, from 0 to 1.",
-        ("person", "robot", "last report", "report after the path", "trust by contact"),
-        rows,
-        text_columns=(1,),
-    )
-
-
 def history_table(result: Result) -> Table:
     """Tabulate the missions, one per row."""
     table = result.table()
