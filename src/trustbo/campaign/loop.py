@@ -6,7 +6,7 @@ from typing import Any
 from trustbo.campaign.campaign import Campaign
 from trustbo.campaign.options import OBJECTIVE, POLICY, SAMPLER, CampaignOptions
 from trustbo.campaign.result import Result
-from trustbo.campaign.stopping import Stop, require_stops, rules_of
+from trustbo.campaign.stopping import Stop
 from trustbo.errors import TrustboError, require_whole
 from trustbo.files import FilePath, to_json
 from trustbo.models.model import TrustModel
@@ -100,7 +100,7 @@ def resume(
     """Go on with a campaign that `iterate(checkpoint=directory)` began, with identical results.
 
     If a rule has ended the campaign, its result is returned, unless `stop` or more missions are
-    requested. Rules, new or restored, are evaluated before the first mission.
+    requested. Rules are not stored: give them again. They are evaluated before the first mission.
 
     Args:
         directory: Folder of its checkpoint.
@@ -109,7 +109,7 @@ def resume(
         n_iterations: Number of missions in all; by default the number it was started with.
         model: The same model; see `Campaign.load`.
         policy: The same policy; see `Campaign.load`.
-        stop: Rules that replace those it was started with; required if one of them was custom.
+        stop: Rules to end before `n_iterations`, as in `iterate`.
         progress: Progress to show, as in `iterate`.
         **custom: The same `awareness` and `callbacks`; see `Campaign.load`.
 
@@ -124,9 +124,8 @@ def resume(
         ended = state.stop_reason not in ("interrupted", "n_iterations")
         if ended and stop is None and total <= max(done, state.notes.get("n_iterations", 8)):
             return campaign.result()
-        rules = rules_of(state.notes.get("stop", [])) if stop is None else require_stops(stop)
         before = dict(state.notes)
-        steps = campaign.run(simulator, total, truth=truth, stop=rules, progress=progress)
+        steps = campaign.run(simulator, total, truth=truth, stop=stop, progress=progress)
         _require_same(before, state.notes)
         state.stop_reason = "interrupted"
         for _ in steps:
@@ -136,7 +135,7 @@ def resume(
 
 def _require_same(before: dict[str, Any], now: dict[str, Any]) -> None:
     """Refuse a simulator that differs from the one the campaign was started with."""
-    for name in now.keys() - {"n_iterations", "stop"}:
+    for name in now.keys() - {"n_iterations"}:
         if to_json(old := before.get(name)) != to_json(now[name]):  # as text: NaN equals itself
             raise TrustboError(
                 f"the campaign was begun with {name} = {old!r}, not {now[name]!r}; give the same "

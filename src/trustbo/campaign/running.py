@@ -8,7 +8,7 @@ import numpy as np
 
 from trustbo.campaign.planners import path_class
 from trustbo.campaign.progress import Progress
-from trustbo.campaign.stopping import Stop, reason_to_stop, require_stops, rules_to_record
+from trustbo.campaign.stopping import Stop, reason_to_stop, require_stops
 from trustbo.data import Mission
 from trustbo.errors import TrustboError, require_whole
 from trustbo.files import to_json
@@ -47,8 +47,7 @@ def run_missions(
     describe = getattr(runner, "describe", lambda: {"simulator": type(runner).__name__})
     # As a file gives them back: tuples are lists there, and arrays too.
     simulated = json.loads(to_json(describe()))
-    asked = {"n_iterations": n_iterations, "stop": rules_to_record(rules)}
-    campaign.state.notes = {**simulated, **asked}
+    campaign.state.notes = {**simulated, "n_iterations": n_iterations}
     return _run_missions(campaign, runner, n_iterations, truth, rules, progress)
 
 

@@ -1,9 +1,9 @@
 """Rules that end a campaign which has learned enough."""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -102,9 +102,6 @@ class TimeLimit:
         return f"seconds: {self.limit:g}" if time.monotonic() - self._start > self.limit else None
 
 
-_OURS = {"RegretBound": RegretBound, "TimeLimit": TimeLimit}
-
-
 def require_stops(stop: Stop | Sequence[Stop] | None) -> list[Stop]:
     """List the rules; TrustboError if one of them is not callable."""
     rules: list[Stop] = [] if stop is None else [stop] if callable(stop) else list(stop)
@@ -113,32 +110,6 @@ def require_stops(stop: Stop | Sequence[Stop] | None) -> list[Stop]:
             raise TrustboError(
                 f"stop must be callables stop(campaign) -> reason or None; got {rule!r}."
             )
-    return rules
-
-
-def rules_to_record(rules: Sequence[Stop]) -> list[dict[str, Any]]:
-    """JSON-serialisable rules: those of this module by value, custom ones by name."""
-    record = []
-    for rule in rules:
-        custom, values = True, {}
-        if isinstance(rule, RegretBound | TimeLimit):
-            custom, values = False, {f.name: getattr(rule, f.name) for f in fields(rule) if f.repr}
-        record.append({"rule": _name(rule), "own": custom, **values})
-    return record
-
-
-def rules_of(record: Sequence[Mapping[str, Any]]) -> list[Stop]:
-    """Restore rules; a `TimeLimit` starts anew. TrustboError: a custom rule is missing."""
-    rules: list[Stop] = []
-    for rule in record:
-        values = dict(rule)
-        name, custom = values.pop("rule"), values.pop("own")
-        if custom:
-            raise TrustboError(
-                f"the campaign's rule to stop, {name!r}, was your own; give all rules again with "
-                "stop=, or stop=[] to go on without."
-            )
-        rules.append(_OURS[name](**values))
     return rules
 
 

@@ -129,8 +129,8 @@ def resume(
     Example: trustbo resume out/demo
     More missions, 12 in all: trustbo resume out/demo --iterations 12
 
-    The result is the same as without the interruption. The folder keeps all flags.
-    A campaign that --stop-regret has ended goes on with another --stop-regret, which is asked
+    The result is the same as without the interruption. The folder keeps all flags but
+    --stop-regret: give it again. A campaign that --stop-regret has ended goes on with another --stop-regret, which is asked
     before anything is driven.
     """
     if iterations is not None:
