@@ -28,7 +28,6 @@ ENDS, MISSIONS = ((2, 0), (0, 2)), 3
 TRUTH = TrustParams(0.6, np.array([0.3, 0.2]), 0.05, 0.05, 0.05)
 FILES = (
     "posteriors/0001.nc", "posteriors/0002.nc", "posteriors/0003.nc", "posterior.nc",
-    "posteriors/.0002.nc.sha256", "posteriors/.0003.nc.sha256", ".posterior.nc.sha256",
     "report.html", "explore.html", "result.json",
 )  # fmt: skip
 MOMENTS = [(name, whole) for name in FILES for whole in (False, True)]

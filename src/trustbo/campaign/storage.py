@@ -14,7 +14,7 @@ from trustbo.campaign.posteriors import Posterior, Posteriors
 from trustbo.campaign.result import Result
 from trustbo.campaign.state import CampaignState, Entry, Failure
 from trustbo.data import Mission
-from trustbo.errors import DamagedFileError, TrustboError, require_whole
+from trustbo.errors import DamagedFileError, TrustboError
 from trustbo.files import (
     FilePath,
     as_path,
@@ -140,7 +140,7 @@ class Storage:
         measured: list[Mission] = []
         extras: list[dict[str, float]] = []
         with interpreting(self.path / STATE):
-            n = require_whole("n_missions", record["n_missions"], 0)
+            n = int(record["n_missions"])
         if n or file.exists():
             tree = read_tree(file)
             measured = missions_of_tree(tree, file)
@@ -321,7 +321,7 @@ def _read_missions(
     """Read the missions that the record of a file counts, their posteriors and the history."""
     folder = file.parent
     with interpreting(file):
-        n = require_whole("n_missions", record["n_missions"], 1)
+        n = int(record["n_missions"])
         order = [None if name is None else str(name) for name in record["posteriors"]]
     posteriors: dict[str | None, Posterior] = {}
     for name in filter(None, order):

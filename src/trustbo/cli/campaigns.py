@@ -130,8 +130,8 @@ def resume(
     More missions, 12 in all: trustbo resume out/demo --iterations 12
 
     The result is the same as without the interruption. The folder keeps all flags but
-    --stop-regret: give it again. A campaign that --stop-regret has ended goes on with another --stop-regret, which is asked
-    before anything is driven.
+    --stop-regret: give it again. A campaign that it has ended goes on with another
+    --stop-regret, which is asked before anything is driven.
     """
     if iterations is not None:
         require_whole("n_iterations", iterations, 1)
@@ -201,14 +201,15 @@ def _state(folder: Path) -> dict[str, Any]:
     state = read_record(folder / STATE)
     with interpreting(folder / STATE):
         name = state["notes"].get("simulator")
-        require_whole("n_missions", state["n_missions"], 0)
-        require_whole("n_iterations", state["notes"]["n_iterations"], 1)
     if name != "KinematicSimulator":
         raise TrustboError(
             f"the campaign in {str(folder)!r} was run by {name or 'robots of your own'}, not by "
             "trustbo run; go on with it in Python: trustbo.resume(folder, simulator=...), or, of "
             "ask and tell, trustbo.Campaign.load(folder)."
         )
+    with interpreting(folder / STATE):
+        state["n_missions"] = int(state["n_missions"])
+        state["notes"]["n_iterations"] = int(state["notes"]["n_iterations"])
     return state
 
 
