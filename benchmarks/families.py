@@ -83,7 +83,7 @@ def driven(world: World, course: str, n: int, family: str, out) -> dict[str, Any
     scores = tb.inference.score(campaign.posteriors, missions, workspace=workspace)
     far = np.abs(scores["pit"].values - 0.5)
     inside = [float((far[np.isfinite(far)] <= 0.5 * p).mean()) for p in (0.5, 0.9)]
-    campaign.save(out / "campaigns" / f"{world.name} {course} {n} {family}")
+    campaign.save(out / "campaigns" / f"{world.name} {course} {n} {family}", overwrite=True)
     return {"regret": regret, "lost": lost, "seconds": seconds, "observed": observed,
             "coverage": inside, "log": float(np.nanmean(scores["log_score"].values))}  # fmt: skip
 
