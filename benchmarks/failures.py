@@ -34,7 +34,7 @@ from trustbo.hazard import Hazard, fit_hazard
 from trustbo.hazard.exposures import CAUSES
 from trustbo.hazard.risk import BoundRisk, Risk
 from trustbo.planning.path_sampling import path_sampler
-from trustbo.simulation import KinematicSimulator, MujocoSimulator, Truth
+from trustbo.simulation import KinematicSimulator, Truth
 from trustbo.study.world import COURSES, World
 from trustbo.workspace.moves import bounds_along, moves_along
 
@@ -53,13 +53,13 @@ ASKED = (1, 2, 5, 15)
 """Missions before which the reliability of the plan is judged."""
 
 
-def world_of(name, data, simulate=KinematicSimulator):
+def world_of(name, data):
     """World with the assumed slope limit, and the simulator of the true one."""
     ground, limit, excess = name.split(":")
     kind, more = ("aged", 0.0) if excess == "aged" else ("slopes", float(excess))
     assumed, team = (climbing(float(limit) + excess) for excess in (more, 0.0))
     world = World(name, kind, ground, team=assumed, aged=kind == "aged", data=data)
-    return world, simulate(world.workspace(), terrain=world.true_terrain(), team=team)
+    return world, KinematicSimulator(world.workspace(), terrain=world.true_terrain(), team=team)
 
 
 def climbing(degrees):
@@ -248,8 +248,7 @@ def measure(name, given):
     file = Path(given.out) / f"{name.replace(':', '_')}.json"
     kept = json.loads(file.read_text()) if file.exists() else {}
     if missing := [part for part in given.parts if part not in kept]:
-        simulate = MujocoSimulator if given.simulator == "mujoco" else KinematicSimulator
-        world, simulator = world_of(name, given.data, simulate)
+        world, simulator = world_of(name, given.data)
         for part in missing:
             seconds, kept[part] = timed(lambda p=part: PARTS[p](world, simulator, given))
             print(f"{name} {part}: {seconds:.0f} s", flush=True)
@@ -408,7 +407,6 @@ def main():
     parser.add_argument("--csv", help="file of the bins of reliability")
     parser.add_argument("--worlds", nargs="*", default=WORLDS)
     parser.add_argument("--courses", nargs="*", default=COURSES, choices=COURSES)
-    parser.add_argument("--simulator", default="kinematic", choices=["kinematic", "mujoco"])
     parser.add_argument("--unseen", type=int, default=5000)
     parser.add_argument("--missions", type=int, default=15)
     parser.add_argument("--after", type=int, default=200)

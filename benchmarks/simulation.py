@@ -3,8 +3,8 @@
 Run: python benchmarks/simulation.py [--data DIR] [--quick]
 
 Rays: pairs of points up to 100 m apart, sensor and target 1 m above ground, on 1000 x 1000 pixels
-of 1 m; the same pairs for all. `embree` (embreex, a triangle mesh of the ground) and MuJoCo (a
-heightfield) know opaque ground only, as does our mode "bare"; "wall" blocks at the surface;
+of 1 m; the same pairs for all. `embree` (embreex, a triangle mesh of the ground) knows
+opaque ground only, as does our mode "bare"; "wall" blocks at the surface;
 "transmittance" also measures the metres inside the canopy. Agreement is with "bare". The
 real scene is steep New Zealand bush at 1 m (DIR/wellington), mirrored until it is as large.
 All on one core; seconds are medians of 5 (the NumPy loop: of 1, on 2000 pairs). Missing tools are
@@ -110,39 +110,6 @@ def embree(surface, a, b):
     return cast
 
 
-def mujoco_rays(surface, a, b, n=2000):
-    """MuJoCo's rays against its heightfield."""
-    import mujoco
-
-    size = len(surface.ground)
-    low, high = surface.ground.min(), surface.ground.max()
-    xml = f"""<mujoco><asset><hfield name="h" nrow="{size}" ncol="{size}"
-      size="{(size - 1) / 2} {(size - 1) / 2} {high - low} 1"/></asset>
-      <worldbody><geom type="hfield" hfield="h"/></worldbody></mujoco>"""
-    model = mujoco.MjModel.from_xml_string(xml)
-    model.hfield_data[:] = ((surface.ground[::-1] - low) / (high - low)).ravel()
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    half = (size - 1) / 2
-
-    def place(p):
-        z = heights(surface.ground, p) - low
-        return np.column_stack([p[:, 0] - half, half - p[:, 1], z])
-
-    start, end = place(a[:n]), place(b[:n])
-    way = end - start
-    hit = np.zeros(1, np.int32)
-
-    def cast():
-        clear = np.empty(n, bool)
-        for i in range(n):
-            t = mujoco.mj_ray(model, data, start[i], way[i], None, 1, -1, hit)
-            clear[i] = t < 0 or t >= 1
-        return clear
-
-    return cast
-
-
 class Rays(Table):
     """Speed of each caster, and its agreement with the reference."""
 
@@ -166,9 +133,6 @@ def rays(name, terrain):
     if importlib.util.find_spec("embreex"):
         cast = embree(surface, a, b)
         table.line("embree, opaque ground", N_PAIRS, median_seconds(cast), cast(), bare)
-    if importlib.util.find_spec("mujoco"):
-        cast = mujoco_rays(surface, a, b)
-        table.line("MuJoCo, heightfield, one by one", 2000, median_seconds(cast, 3), cast(), bare)
     table.line(
         "NumPy loop",
         2000,

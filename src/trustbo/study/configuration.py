@@ -39,7 +39,7 @@ OPTIONS = (
 )
 """Names in `Study.options`."""
 TERRAINS = ("synthetic_terrain", "read_terrain", "read_lidar", "example", "random_workspace")
-SIMULATORS = ("KinematicSimulator", "ModelSimulator", "MujocoSimulator")
+SIMULATORS = ("KinematicSimulator", "ModelSimulator")
 MODEL_KINDS = ("PooledTrust", "HierarchicalTrust", "CoupledTrust")
 _GRID = tuple(inspect.signature(Workspace.from_terrain).parameters)[1:]
 """Keywords of the planning grid, which a terrain has in addition to those of its constructor."""

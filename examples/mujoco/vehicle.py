@@ -2,12 +2,11 @@
 
 import math
 from collections.abc import Sequence
-from types import ModuleType
 from typing import NamedTuple
 
+import mujoco
 import numpy as np
 
-from trustbo.errors import TrustboError, pip_install
 from trustbo.team import Robot
 from trustbo.workspace.surface import Surface, filled
 
@@ -98,12 +97,12 @@ class Physics:
     ) -> None:
         """Build the model of robots, whose `max_slope` sets the centre of mass, for steps in s.
 
-        `grip` is the friction coefficient of each robot's wheels. TrustboError: no MuJoCo.
+        `grip` is the friction coefficient of each robot's wheels.
         """
-        self._mujoco, self._ground, self._step = require_mujoco(), ground, step
-        self.model = self._mujoco.MjModel.from_xml_string(_model(ground, robots, grip, step))
+        self._ground, self._step = ground, step
+        self.model = mujoco.MjModel.from_xml_string(_model(ground, robots, grip, step))
         self.model.hfield_data[:] = (ground.heights / _relief(ground)).ravel()
-        self.data = self._mujoco.MjData(self.model)
+        self.data = mujoco.MjData(self.model)
         self._bodies = [self.model.body(f"robot{i}").id for i in range(len(robots))]
         # Views of MuJoCo's arrays, one row per robot.
         self._qpos = self.data.qpos.reshape(len(robots), -1)
@@ -133,7 +132,7 @@ class Physics:
 
     def advance(self, n_steps: int) -> None:
         """Advance by a number of physics steps."""
-        self._mujoco.mj_step(self.model, self.data, n_steps)
+        mujoco.mj_step(self.model, self.data, n_steps)
 
     @property
     def poses(self) -> np.ndarray:
@@ -195,7 +194,7 @@ class Physics:
         ahead = np.array([*turn[:, 0], slope @ turn[:, 0]])
         ahead /= np.linalg.norm(ahead)
         rotation, quaternion = np.column_stack([ahead, np.cross(up, ahead), up]), np.empty(4)
-        self._mujoco.mju_mat2Quat(quaternion, rotation.ravel())
+        mujoco.mju_mat2Quat(quaternion, rotation.ravel())
         return np.array([x, y, base + (WHEEL_RADIUS + 0.005) / up[2], *quaternion])
 
 
@@ -203,15 +202,6 @@ def wheel_speeds(speed: np.ndarray, yaw_rate: np.ndarray) -> np.ndarray:
     """Speeds of the left and right wheels, (robot, 2), m/s, for a speed and a yaw rate."""
     aside = 0.5 * _YAW_TRACK * yaw_rate
     return np.column_stack([speed - aside, speed + aside])
-
-
-def require_mujoco() -> ModuleType:
-    """The MuJoCo package; TrustboError if it is not installed."""
-    try:
-        import mujoco
-    except ImportError:
-        raise TrustboError(f"MujocoSimulator needs MuJoCo: {pip_install('mujoco')}") from None
-    return mujoco
 
 
 def _spread(xy: np.ndarray) -> np.ndarray:

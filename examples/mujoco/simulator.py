@@ -1,15 +1,26 @@
-"""Simulator with the physics of MuJoCo: robots slip, get stuck, tip over and collide."""
+"""A simulator of one's own: robots slip, get stuck, tip over and collide in MuJoCo.
+
+    pip install mujoco
+    python examples/mujoco/simulator.py
+
+It inherits bounds, formations and contacts from `KinematicSimulator` and replaces the motion.
+Import it with this folder on the path, for example
+
+    result = tb.iterate(workspace, start, goal, simulator=MujocoSimulator(workspace))
+"""
 
 import math
 from collections.abc import Sequence
 from typing import Any
 
+import mujoco
 import numpy as np
+from vehicle import Physics, crop, grip_of, wheel_speeds
 
+import trustbo as tb
 from trustbo.errors import require_positive
 from trustbo.simulation.motion import ARRIVED, LOOKAHEAD
 from trustbo.simulation.overwatch import KinematicSimulator
-from trustbo.simulation.vehicle import Physics, crop, grip_of, require_mujoco, wheel_speeds
 from trustbo.team import Robot
 from trustbo.workspace import Workspace
 from trustbo.workspace.routes import SLOWEST
@@ -74,10 +85,8 @@ class MujocoSimulator(KinematicSimulator):
             **options: Options of `KinematicSimulator`, such as `sight` and `tick`.
 
         Raises:
-            TrustboError: MuJoCo is not installed, a value that is not positive, or what
-                `KinematicSimulator` refuses.
+            TrustboError: A value that is not positive, or what `KinematicSimulator` refuses.
         """
-        require_mujoco()
         super().__init__(workspace, **options)
         self.friction = None if friction is None else require_positive("friction", friction)
         self.stuck_after = require_positive("stuck_after", stuck_after)
@@ -90,7 +99,7 @@ class MujocoSimulator(KinematicSimulator):
             "friction": self.friction,
             "stuck_after": self.stuck_after,
             "step": self.step,
-            "mujoco": require_mujoco().__version__,
+            "mujoco": mujoco.__version__,
         }
 
     def _move(
@@ -268,3 +277,10 @@ def _around(bearing: float, left: float, others: np.ndarray) -> float:
 
 def _wrapped(angle: float) -> float:
     return (angle + math.pi) % (2.0 * math.pi) - math.pi
+
+
+if __name__ == "__main__":
+    hills = tb.terrain.synthetic_terrain(size=(150.0, 150.0), resolution=1.0, seed=3)
+    workspace = tb.Workspace.from_terrain(hills, (3, 3))
+    mission = MujocoSimulator(workspace).run([(2, 0), (1, 1)], seed=0)
+    print(mission.status, mission.contact_rate)
