@@ -39,8 +39,7 @@ Paths
     the paper), mean (on the way), success (of every bound), bottleneck (the least on the way),
     stationary.
 Learning
-  policy NAME: Choice of the next path: greedy, optimistic, thompson, information, ucb,
-    random.
+  policy NAME: Choice of the next path: greedy, optimistic, thompson, ucb, random.
   model NAME: Trust model: robots (places differ, and a robot from mission to mission: damage, bad
     days), places (robots are alike), pooled (places are too, as in the paper), hierarchical
     (robots are similar), coupled (they influence each other).

@@ -94,8 +94,8 @@ class Planner(Displayed):
                 `Workspace.unseen_bounds` expects so.
             engine: `"numba"`, compiled, which `"auto"` takes; or `"networkx"`, the reference. Both
                 find paths of the same value.
-            observation: Family of the contact rates, that of the trust model; for lost_contact and
-                the policy `information`.
+            observation: Family of the contact rates, that of the trust model; for
+                lost_contact.
             response: Quantity that rates measure, that of the trust model; likewise.
             max_failure: Largest chance that a path fails, in [0, 1), under the risk of `with_risk`;
                 by default no limit.

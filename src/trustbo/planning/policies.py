@@ -16,7 +16,6 @@ from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_choice
 from trustbo.models.params import Params
 from trustbo.planning.dynamics import Dynamics
-from trustbo.planning.information import information_gain
 from trustbo.planning.path_sampling import path_sampler
 from trustbo.planning.plan import Plan
 from trustbo.planning.planner import Planner
@@ -65,19 +64,6 @@ def ucb(key: Array, posterior: Params, planner: Planner, *, kappa: float = 1.0) 
     return planner.evaluate(drawn.candidates[chosen], posterior.mean())
 
 
-def information(key: Array, posterior: Params, planner: Planner, *, n_random: int = 50) -> Plan:
-    """Path that most reduces the entropy of the parameters (see `information_gain`).
-
-    Candidates are the draws' best paths and `n_random` random ones that respect `max_failure`.
-    """
-    drawn = planner.plan_draws(posterior, n_draws=N_DRAWS, seed=seed_of(key))
-    rng = np.random.default_rng(seed_of(key))
-    paths = list(drawn.candidates) + _random_paths(planner, rng, n_random)
-    params, _ = choose_draws(posterior, N_DRAWS, seed_of(key))
-    gains = information_gain(params, planner.mean_awareness, paths, planner.family, planner.lag)
-    return planner.evaluate(paths[int(np.argmax(gains))], posterior.mean())
-
-
 def random(key: Array, posterior: Params, planner: Planner) -> Plan:
     """Path drawn uniformly from the admissible ones, independent of the posterior.
 
@@ -88,17 +74,14 @@ def random(key: Array, posterior: Params, planner: Planner) -> Plan:
     Raises:
         InfeasibleError: No path respects `max_failure`.
     """
-    paths = _random_paths(planner, np.random.default_rng(seed_of(key)), 1)
-    return (
-        planner.evaluate(paths[0], posterior.mean()) if paths else greedy(key, posterior, planner)
-    )
+    path = _random_path(planner, np.random.default_rng(seed_of(key)))
+    return planner.evaluate(path, posterior.mean()) if path else greedy(key, posterior, planner)
 
 
 POLICIES: Mapping[str, Policy] = {
     "greedy": greedy,
     "optimistic": optimistic,
     "thompson": thompson,
-    "information": information,
     "ucb": ucb,
     "random": random,
 }
@@ -133,16 +116,11 @@ def _require_arguments(policy: Policy) -> None:
         ) from None
 
 
-def _random_paths(planner: Planner, rng: np.random.Generator, n: int) -> list[tuple[Cell, ...]]:
-    """Draw up to n paths that respect `max_failure`, each equally likely, in `_TRIES` tries."""
-    sampler, problem, paths = path_sampler(planner.paths), planner.problem, []
-    for _ in range(n if problem.rule.max_failure is None else _TRIES):
-        path = sampler.draw(rng)
-        if problem.is_within_risk(path):
-            paths.append(path)
-            if len(paths) == n:
-                break
-    return paths
+def _random_path(planner: Planner, rng: np.random.Generator) -> tuple[Cell, ...] | None:
+    """Draw a path that respects `max_failure`, each equally likely; None if `_TRIES` do not."""
+    sampler, problem = path_sampler(planner.paths), planner.problem
+    tries = (sampler.draw(rng) for _ in range(_TRIES))
+    return next((path for path in tries if problem.is_within_risk(path)), None)
 
 
 def seed_of(key: Array) -> int:

@@ -152,3 +152,24 @@ def test_ticks_are_whole_and_rates_are_shares_of_them():
     with pytest.raises(ShapeError, match=r"n_ticks must be \(1, 1\); got \(3, 1\)"):
         Mission.from_arrays(path, z, [[0.5]], n_ticks=[1, 2, 3])
     assert Mission.from_arrays(path, z, [[0.5]], n_ticks=10).n_ticks[0, 0] == 10
+
+
+@pytest.mark.parametrize("name", list(FAMILIES))
+@pytest.mark.parametrize("trust", [-1.3, 0.2, 0.95])
+def test_moments_of_a_rate_are_those_of_simulated_ones(name, trust):
+    """1e5 rates: mean and variance within 5 standard errors; the slope by differences."""
+    family, sd, n = FAMILIES[name], np.array(0.15), 100_000
+    mean, slope, variance = family.rate_moments(np.array(trust), sd)
+    rng = np.random.default_rng(1)
+    if name == "beta_binomial":
+        p, phi = special.expit(trust), 1.0 / (sd**2 + 1e-6)
+        y = rng.binomial(200, rng.beta(phi * p, phi * (1.0 - p), n)) / 200
+    else:
+        t = rng.standard_t(4, n) if name == "student_t" else rng.standard_normal(n)
+        y = trust + sd * t
+        y = np.clip(y, 0.0, 1.0) if name == "censored" else y
+    assert abs(y.mean() - mean) <= 5.0 * y.std() / np.sqrt(n) + 1e-15
+    fourth = ((y - y.mean()) ** 4).mean() - y.var() ** 2
+    assert abs(y.var() - variance) <= 5.0 * np.sqrt(fourth / n) + 1e-11
+    ends = [family.rate_moments(np.array(trust + h), sd)[0] for h in (-1e-5, 1e-5)]
+    np.testing.assert_allclose(slope, (ends[1] - ends[0]) / 2e-5, rtol=1e-6, atol=1e-9)
