@@ -37,7 +37,6 @@ EXACT = {
         "failure_cost": 0.0,
     },
     "team min": {"team": "min"},
-    "belief": {"awareness": "belief", "policy": "thompson"},
     "length": {"length_weight": 1e-4, "connectivity": 4},
     "prior mean": {"initial": "prior_mean"},
     "bounds": {"initial": "prior_mean", "bounds": True},

@@ -279,9 +279,6 @@ MISTAKES = {
     "no path to suggest": (
         lambda c: tb.Campaign(c.workspace, *ENDS).suggest(None), "path must be cells .* got None"
     ),
-    "a filter's belief": (
-        lambda c: TrustFilter(TRUTH, 3, belief=3), "belief: got int 3; give an AwarenessBelief"
-    ),
     "features by number": (
         lambda c: tb.Workspace.from_awareness(np.ones((3, 6, 6, 2)) / 2, features=(1, 2)),
         r"features must be a list of names; got \(1, 2\)",

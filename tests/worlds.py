@@ -82,7 +82,7 @@ def begin(workspace, folder, n):
     """A campaign of n missions in a folder; its robots measure no awareness."""
     return tb.iterate(
         workspace, (3, 0), (0, 3), n_iterations=n, checkpoint=folder, sampler="exact",
-        policy="thompson", awareness="belief", simulator=ModelSimulator(workspace, blind=True),
+        policy="thompson", simulator=ModelSimulator(workspace, blind=True),
         progress=False,
     )  # fmt: skip
 

@@ -57,7 +57,7 @@ def line_of_sight(planner: Planner) -> np.ndarray:
     """Predicted rates of all bounds, mean over robots and assumed sights, (move, row, col)."""
     names = planner.workspace.features
     columns = [k for k, name in enumerate(names) if name.startswith(LINE_OF_SIGHT)]
-    rates = planner.mean_awareness[..., columns].mean((0, -1))
+    rates = planner.workspace.bound_maps[..., columns].mean((0, -1))
     return np.broadcast_to(rates, (8, *rates.shape[1:]))
 
 
@@ -151,7 +151,7 @@ def candidates(planner: Planner, n: int = N_CANDIDATES, seed: int = 0) -> list[P
 
 def features(planner: Planner, paths: Sequence[Path]) -> np.ndarray:
     """Sums over bounds of each feature, mean over robots, and the number of bounds, (path, sum)."""
-    maps = planner.mean_awareness
+    maps = planner.workspace.bound_maps
     return np.stack([
         np.append(along(maps, path).mean(0).sum(0), len(path) - 1.0) for path in paths
     ])  # fmt: skip

@@ -84,7 +84,7 @@ def test_unmeasured_awareness_comes_from_the_map(workspace):
     )
 
 
-def test_where_the_map_is_trusted_missions_are_learned_from_with_it(workspace):
+def test_missions_are_learned_from_with_the_awareness_of_the_map(workspace):
     # Awareness is measured lower than the map has it, everywhere: plans go by the map, and must
     # predict what was measured on the path.
     lower = Workspace.from_awareness(0.5 * workspace.awareness.values)
@@ -174,8 +174,6 @@ def test_bad_names_and_ends_are_refused_at_once(workspace):
 
 
 def test_what_cannot_be_planned_or_updated_with_is_refused_at_once(workspace):
-    with pytest.raises(TrustboError, match="unknown awareness 'guess'; choose one of map, belief"):
-        Campaign(workspace, *ENDS, awareness="guess")
     with pytest.raises(TrustboError, match="model must be a trust model"):
         Campaign(workspace, *ENDS, model="pooled")
     changes = PooledTrust(observation="censored", response="change")
@@ -211,24 +209,6 @@ def test_plans_carry_bands_over_the_draws_they_are_made_from(workspace):
     plan = campaign.ask()
     assert plan.bands.shape == (4, *plan.trust.shape)
     assert (plan.bands[-1] > plan.bands[0]).all()
-
-
-def test_a_belief_learns_the_awareness_that_missions_measure(workspace):
-    truth = Workspace.from_awareness(np.clip(workspace.awareness.values + 0.2, 0.0, 1.0))
-    campaign = Campaign(workspace, *ENDS, sampler="exact", awareness="belief")
-    plan = campaign.ask()
-    campaign.tell(ModelSimulator(truth).run(plan.path, seed=0))
-    cell = plan.path[1]
-    before = np.abs(workspace.awareness.values - truth.awareness.values)[:, *cell].mean()
-    believed = campaign.learner.awareness.mean()
-    after = np.abs(believed - truth.awareness.values)[:, *cell].mean()
-    assert after < 0.5 * before
-    assert campaign.ask().path[0] == ENDS[0]
-    assert campaign.settings["awareness"] == "belief"
-    # What was not measured comes from what is believed, not from the map.
-    blind = ModelSimulator(truth, blind=True).run(plan.path, seed=1)
-    campaign.tell(blind)
-    np.testing.assert_allclose(campaign.missions[1].awareness[0], believed[:, *cell])
 
 
 def test_settings_of_draws_are_options_and_go_to_every_fit(workspace):

@@ -16,13 +16,8 @@ PASSABLE = np.ones((4, 4), bool)
 PASSABLE[1, 1] = False
 
 
-@pytest.fixture(
-    scope="module",
-    params=[("terminal", "map"), ("success", "map"), ("mean", "belief")],
-    ids=lambda p: "-".join(p),
-)
+@pytest.fixture(scope="module", params=["terminal", "success", "mean"])
 def result(request):
-    objective, awareness = request.param
     workspace = tb.Workspace.from_awareness(AWARENESS, PASSABLE)
     truth = tb.models.TrustParams(0.4, np.array([0.5, 0.2]), 0.1, 0.05, 0.05)
     return tb.iterate(
@@ -30,8 +25,7 @@ def result(request):
         (3, 0),
         (0, 3),
         n_iterations=2,
-        objective=objective,
-        awareness=awareness,
+        objective=request.param,
         sampler="exact",
         simulator=tb.simulation.ModelSimulator(workspace, truth),
         progress=False,
@@ -69,8 +63,8 @@ def test_its_maps_are_over_the_posterior(result):
     # derivative is at most .1, and the sd of trust with effects of robots some .4.
     np.testing.assert_allclose(maps["cost"], 1.0 - expit(maps["trust_mean"]), atol=1e-2)
     assert result.maps(n_draws=300).identical(maps)
-    believed = result.workspace.awareness if result.believed is None else result.believed["mean"]
-    expected = np.where(PASSABLE, believed.sel(feature="visibility").mean("robot"), np.nan)
+    known = result.workspace.awareness
+    expected = np.where(PASSABLE, known.sel(feature="visibility").mean("robot"), np.nan)
     np.testing.assert_allclose(maps["visibility"], expected)
 
 
@@ -109,7 +103,6 @@ def test_maps_on_terrain_are_rasters_of_their_place(tmp_path):
 def test_a_loaded_result_plans_alike(result, tmp_path):
     result.save(tmp_path)
     loaded = tb.load_result(tmp_path)
-    assert (loaded.believed is None) == (result.believed is None)
     assert loaded.plan.path == result.plan.path
     np.testing.assert_array_equal(loaded.plan.bands, result.plan.bands)
     assert loaded.plan.value_band == result.plan.value_band
@@ -140,11 +133,6 @@ def test_a_damaged_result_is_refused(result, tmp_path):
     (tmp_path / "result.json").write_text(whole[:40])
     with pytest.raises(tb.TrustboError, match=r"result\.json' is damaged"):
         tb.load_result(tmp_path)
-    if result.believed is not None:
-        (tmp_path / "result.json").write_text(whole)
-        (tmp_path / "believed.nc").unlink()
-        with pytest.raises(tb.TrustboError, match=r"believed\.nc' is missing"):
-            tb.load_result(tmp_path)
 
 
 def test_settings_that_lack_something_are_named(result):

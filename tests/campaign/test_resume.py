@@ -125,7 +125,7 @@ def test_a_mission_told_but_not_learned_from_is_not_lost(workspace, begun, tmp_p
     simulator = ModelSimulator(workspace, blind=True)
     whole, _ = begun(2)
     campaign = tb.Campaign(
-        workspace, *ENDS, sampler="exact", policy="thompson", awareness="belief",
+        workspace, *ENDS, sampler="exact", policy="thompson",
         directory=tmp_path / "half",
     )  # fmt: skip
     campaign.tell(simulator.run(campaign.ask().path, seed=campaign.seed_of("mission")))

@@ -76,7 +76,7 @@ def kept(workspace, tmp_path_factory):
     simulator = None if on_terrain else ModelSimulator(workspace, truth)
     tb.iterate(
         workspace, *ENDS, n_iterations=2, simulator=simulator, checkpoint=folder / "kept",
-        sampler="exact", awareness="belief", progress=False,
+        sampler="exact", progress=False,
     )  # fmt: skip
     return folder / "kept"
 

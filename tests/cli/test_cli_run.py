@@ -55,14 +55,13 @@ def test_run_s_files_say_the_same(finished):
 @pytest.mark.usefixtures("blank_figures")
 def test_run_passes_every_choice_on_and_resume_drives_nothing_again(invoke, flags, tmp_path):
     done = invoke(
-        *("run", *flags, "--iterations", 9, "--awareness", "belief"),
+        *("run", *flags, "--iterations", 9),
         *("--max-bounds", "shortest", "--objective", "mean", "--stop-regret", 0.9, "--quiet"),
         *("--out", tmp_path),
     )
     assert done.exit_code == 0, done.output
     record = json.loads((tmp_path / "result.json").read_text())
     chosen = {
-        "awareness": "belief",
         "max_bounds": "shortest",
         "objective": "mean",
     }
@@ -160,7 +159,6 @@ def test_a_dem_alone_is_enough_and_its_feet_are_read(invoke, rasters, flags, tmp
             ("--observation", "odd"),
             "unknown observation 'odd'; choose one of gaussian, censored",
         ),
-        (("--awareness", "none"), "unknown awareness 'none'; choose one of map, belief"),
         (("--team", "max"), "unknown team 'max'; choose one of mean, min"),
         (("--stop-regret", "2"), "--stop-regret must be in (0, 1); got 2.0"),
         (

@@ -5,13 +5,11 @@ import pytest
 from missions import N_TICKS, OF_FAMILY, counted_missions, random_params
 from references import dense_log_likelihood, dense_posterior_of_trust, on_a_grid
 from scipy import stats
-from worlds import random_cells
 
 import trustbo as tb
 from trustbo.errors import ShapeError, TrustboError
 from trustbo.inference import TrustFilter, fit, params_of
-from trustbo.models import CoupledParams, PooledTrust, RobotParams, TrustParams
-from trustbo.workspace import AwarenessBelief
+from trustbo.models import CoupledParams, PooledTrust, TrustParams
 
 
 @pytest.fixture(scope="module")
@@ -151,41 +149,6 @@ def test_bounds_that_cannot_be_are_named():
         live.predict([z, z], [(0, 0), (0, 1)])
     assert live.n_bounds == 0
     np.testing.assert_array_equal(live.predict([z], np.array([(4, 4), (4, 5)])).mean.shape, (1, 3))
-
-
-@pytest.mark.parametrize("kind", ["pooled", "apart", "coupled"])
-def test_awareness_that_was_not_measured_is_integrated_over_its_belief(kind):
-    """A filter for each map of the belief, and the mixture of them all."""
-    workspace = random_cells(3, 3)
-    belief, n, cell = AwarenessBelief(workspace, sd=0.2), 40, (1, 2)
-    rng = np.random.default_rng(1)
-    if kind == "pooled":
-        params = mixture(n)[1]
-    elif kind == "apart":
-        coefficients = rng.uniform(0.1, 0.5, (n, 3)), rng.uniform(size=(n, 3, 2))
-        params = RobotParams(*coefficients, *rng.uniform(0.1, 0.2, (3, n, 3)))
-    else:
-        B0, B = 0.1 + 0.4 * np.eye(3), rng.uniform(0.0, 0.3, (n, 2, 3, 3))
-        noises = 0.01 * np.tile(np.eye(3) + 0.2, (2, n, 1, 1))
-        params = CoupledParams(np.tile(B0, (n, 1, 1)), B, rng.uniform(0.1, 0.2, (n, 3)), *noises)
-    params = params.flat()
-    z = np.array([[0.4, np.nan], [np.nan, np.nan], [0.5, 0.6]])
-    y, bound = [0.7, 0.8, np.nan], ((1, 1), cell)
-    live = TrustFilter(params, 3, belief=belief)
-    ahead = live.predict(z[None], [(1, 1), cell])
-    live.update(z, y, bound)
-    means, densities, first = [], [], []
-    for d, own in enumerate(belief.draw(n)[:, :, *cell]):
-        one = TrustFilter(params.map(lambda value, _, d=d: value[d : d + 1]), 3)
-        known = np.where(np.isnan(z), own, z)
-        first.append(one.predict(known[None]).mean)
-        means.append(one.update(known, y).mean)
-        densities.append(one._log_weight[0])
-    weights = np.exp(densities) / np.exp(densities).sum()
-    np.testing.assert_allclose(live.state.mean, weights @ means, rtol=1e-9)  # rounding
-    np.testing.assert_allclose(ahead.mean, np.mean(first, 0), rtol=1e-9)
-    with pytest.raises(TrustboError, match="say which cells the bounds lead over"):
-        live.update(z, y)
 
 
 def constant(p, n=2):

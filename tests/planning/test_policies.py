@@ -11,7 +11,7 @@ from trustbo.models import CoupledTrust, HierarchicalTrust, PooledTrust, TrustPa
 from trustbo.planning import POLICIES, Planner, policies
 from trustbo.planning.dynamics import drift
 from trustbo.planning.policies import resolve_policy
-from trustbo.workspace import AwarenessBelief, Workspace
+from trustbo.workspace import Workspace
 
 ENDS = ((3, 0), (0, 3))
 N_DRAWS = 60
@@ -34,11 +34,6 @@ def prior_draws(model=None, n_draws=N_DRAWS):
     return sample_prior(model or PooledTrust(), 2, n_draws, seed=1, n_robots=2)
 
 
-def uncertain(planner, n_maps=20):
-    """The planner, its map in doubt."""
-    return planner.with_awareness(AwarenessBelief(planner.workspace, sd=0.3).draw(n_maps))
-
-
 def brute_force(planner, draws, objective="terminal"):
     """Every admissible path, and its value under every draw, shape (draw, path)."""
     passable = planner.workspace.passable.values.tolist()
@@ -50,7 +45,7 @@ def brute_force(planner, draws, objective="terminal"):
     values = []
     for d in range(draws.leading[0]):
         one = draws.draw(d)
-        u = of_bounds(drift(one, planner.mean_awareness))
+        u = of_bounds(drift(one, planner.workspace.bound_maps))
         values.append(path_values(objective, flat, n_cells, u, one.beta0 * np.eye(2), one.x0_mean))
     return paths, np.stack(values)
 
@@ -93,15 +88,14 @@ def test_ucb_weighs_mean_against_spread_as_told(planner):
 @pytest.mark.parametrize("name", list(POLICIES))
 def test_every_policy_plans_an_admissible_path_and_repeats_it(name, model, objective, workspace):
     planner, draws = Planner(workspace, *ENDS, objective), prior_draws(model)
-    for going_by in (planner, uncertain(planner)):
-        plans = [POLICIES[name](jax.random.key(2), draws, going_by) for _ in range(2)]
-        assert planner.require_path(plans[0].path) == plans[0].path
-        if objective == "terminal":
-            assert len(plans[0].path) - 1 <= planner.shortest + 2
-        assert plans[0].path == plans[1].path
-        # What it says of the path is under the posterior mean, whatever it was chosen by.
-        mean = going_by.evaluate(plans[0].path, draws.mean())
-        np.testing.assert_allclose(plans[0].trust, mean.trust)
+    plans = [POLICIES[name](jax.random.key(2), draws, planner) for _ in range(2)]
+    assert planner.require_path(plans[0].path) == plans[0].path
+    if objective == "terminal":
+        assert len(plans[0].path) - 1 <= planner.shortest + 2
+    assert plans[0].path == plans[1].path
+    # What it says of the path is under the posterior mean, whatever it was chosen by.
+    mean = planner.evaluate(plans[0].path, draws.mean())
+    np.testing.assert_allclose(plans[0].trust, mean.trust)
 
 
 def test_greedy_is_the_best_under_the_mean_and_thompson_under_single_draws(planner):
@@ -135,25 +129,12 @@ def test_optimistic_is_drawn_to_cells_it_knows_nothing_of(workspace):
     passable[1, 1:4] = False
     known = Workspace.from_awareness(z, passable)
     planner = Planner(known, (1, 0), (1, 4), "mean", connectivity=4)
-    maps = np.repeat(z[None], 50, axis=0)
-    maps[:, 0, 2, 1:4, 0] += np.linspace(-0.4, 0.39, 50)[:, None]
+    place = np.zeros((50, 1, 3, 5))
+    place[:, 0, 2, 1:4] = np.linspace(-0.2, 0.195, 50)[:, None]
     one = TrustParams(0.5, np.array([0.5]), 0.0, 0.1, 0.1)
-    draws = TrustParams(*(np.stack([np.asarray(v)] * 50) for v in one[:5]))
-    planner = planner.with_awareness(maps)
+    draws = TrustParams(*(np.stack([np.asarray(v)] * 50) for v in one[:5]), place=place)
     assert (0, 2) in policies.greedy(jax.random.key(0), draws, planner).path
     assert (2, 2) in policies.optimistic(jax.random.key(0), draws, planner).path
-
-
-def test_thompson_goes_by_the_map_of_its_draw(planner):
-    draws = prior_draws(n_draws=4)
-    maps = np.random.default_rng(0).uniform(size=(2, 2, 4, 4, 2))
-    one_of = [planner.with_awareness(z) for z in maps]
-    right = {one_of[i % 2].plan(draws.draw(i)).path for i in range(4)}
-    wrong = {one_of[1 - i % 2].plan(draws.draw(i)).path for i in range(4)}
-    assert wrong - right  # so that the test can tell
-    both = planner.with_awareness(maps)
-    drawn = [policies.thompson(jax.random.key(i), draws, both) for i in range(30)]
-    assert {plan.path for plan in drawn} == right
 
 
 def test_random_ignores_what_was_learned(planner):

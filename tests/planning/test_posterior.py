@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from references import walks
 
-from trustbo.errors import ShapeError, TrustboError
+from trustbo.errors import TrustboError
 from trustbo.inference import sample_prior
 from trustbo.models import HierarchicalTrust, PooledTrust
-from trustbo.planning import Planner, problem, roll_trust
+from trustbo.planning import Planner, roll_trust
 from trustbo.planning.graph import NoPathError
 from trustbo.planning.objectives import OBJECTIVES
 from trustbo.workspace import Workspace
@@ -180,57 +180,6 @@ def test_onward_plans_what_is_left_from_the_trust_of_now(workspace, draws):
         planner.onward([])
     with pytest.raises(NoPathError, match=r"it takes 3 bounds, but 2 are left"):
         planner.onward([(3, 0), (2, 0), (3, 0), (2, 0)])
-
-
-def test_awareness_of_its_own_goes_with_each_draw(workspace, draws):
-    planner = Planner(workspace, (3, 0), (0, 3), "terminal")
-    rng = np.random.default_rng(0)
-    maps = rng.uniform(size=(200, 2, N, N, 2))
-    uncertain = planner.with_awareness(maps)
-    drawn = uncertain.plan_draws(draws)
-    for d in (0, 7, 199):
-        alone = planner.with_awareness(maps[d]).plan(draws.draw(d))
-        np.testing.assert_allclose(drawn.values[d], alone.value, rtol=1e-12)
-        assert uncertain.of_draw(d).plan(draws.draw(d)).path == alone.path
-    mean = uncertain.plan(draws.mean())
-    assert mean.path == planner.with_awareness(maps.mean(0)).plan(draws.mean()).path
-    with pytest.raises(ShapeError, match=r"awareness must end in \(2, 4, 4, 2\)"):
-        planner.with_awareness(maps[:, :1])
-    maps[3, 0, 0, 0, 1] = np.nan
-    with pytest.raises(TrustboError, match=r"awareness of the passable cell \(0, 0\) is NaN"):
-        planner.with_awareness(maps)
-
-
-@pytest.mark.parametrize("connectivity", [4, 8])
-@pytest.mark.parametrize("model", [PooledTrust(), HierarchicalTrust()])
-def test_what_cells_are_believed_to_differ_in_goes_to_all_bounds_into_them(
-    model, connectivity, monkeypatch
-):
-    monkeypatch.setattr(problem, "_ENTRIES", 2000)  # a few draws at a time
-    rng = np.random.default_rng(8)
-    workspace = Workspace.from_awareness(rng.uniform(size=(2, 8, N, N, 2)))
-    draws = sample_prior(model, 2, 30, seed=4, n_robots=2)
-    maps = rng.uniform(size=(7, 2, N, N, 2))
-    planner = Planner(
-        workspace, (3, 0), (0, 3), "terminal", connectivity=connectivity
-    ).with_awareness(maps)
-    drawn = planner.plan_draws(draws)
-    bounds, cells = workspace.bound_maps, workspace.awareness.values
-    for d in (0, 13, 29):
-        believed = np.clip(bounds + (maps[d % 7] - cells)[:, None], 0.0, 1.0)
-        own = Planner(
-            workspace.with_bounds(believed), (3, 0), (0, 3), "terminal", connectivity=connectivity
-        )
-        alone = own.plan(draws.draw(d))
-        np.testing.assert_allclose(drawn.values[d], alone.value, rtol=1e-12)
-        assert planner.of_draw(d).plan(draws.draw(d)).path == alone.path
-        bands = planner.evaluate(alone.path, draws).bands
-    everyone = np.clip(bounds + (maps - cells)[:, :, None], 0.0, 1.0)
-    rolled = [
-        roll_trust(draws.draw(d), np.swapaxes(along(everyone[d % 7], alone.path), 0, 1))
-        for d in range(30)
-    ]
-    np.testing.assert_allclose(bands[-1], np.quantile(rolled, 0.95, axis=0), rtol=1e-12)
 
 
 def test_the_expected_contact_lost_is_planned_without_the_cap_and_valued_so(workspace, draws):

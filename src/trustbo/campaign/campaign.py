@@ -15,7 +15,7 @@ from trustbo.campaign.checks import require_extra, require_mission, require_reas
 from trustbo.campaign.history import history_of, table_of
 from trustbo.campaign.learning import Learner
 from trustbo.campaign.options import OBJECTIVE, POLICY, SAMPLER, CampaignOptions, arguments_of
-from trustbo.campaign.planners import believed_of, planner_given, planner_of, unpriced_risk
+from trustbo.campaign.planners import planner_given, planner_of, unpriced_risk
 from trustbo.campaign.posteriors import Posterior, Posteriors, whole_posterior
 from trustbo.campaign.result import Result
 from trustbo.campaign.running import run_missions
@@ -37,7 +37,7 @@ from trustbo.planning import Plan, Planner, Policy
 from trustbo.planning.policies import resolve_policy
 from trustbo.simulation import Truth
 from trustbo.simulation.protocol import Simulator
-from trustbo.stacking import fill_awareness, replace_awareness
+from trustbo.stacking import replace_awareness
 from trustbo.workspace import Workspace
 from trustbo.workspace.location import Location
 from trustbo.workspace.moves import along, moves_along, require_on_grid
@@ -129,7 +129,6 @@ class Campaign(Displayed):
         self.state.options = record | {
             "model": model_to_record(model),
             "own_policy": not isinstance(policy, str),
-            "own_awareness": self.options.own_awareness,
         }
         if directory is not None:
             self._save_to(Storage(directory), keep=True)
@@ -359,8 +358,7 @@ class Campaign(Displayed):
         to fail fell below 0.2.
         """
         if self._planner_now is None:
-            seed = self.seed_of("awareness")
-            self._planner_now = planner_given(self.planner, self.learner, self.state, seed)
+            self._planner_now = planner_given(self.planner, self.learner, self.state)
         return self._planner_now
 
     def known_along(self, path: Sequence[Cell]) -> np.ndarray:
@@ -377,21 +375,19 @@ class Campaign(Displayed):
         """
         cells = require_on_grid(path, self.workspace.grid.shape)
         moves_along(cells)
-        return np.swapaxes(along(self.planner_now().mean_awareness, cells), 0, 1)
+        return np.swapaxes(along(self.workspace.bound_maps, cells), 0, 1)
 
     def as_learned(self, mission: Mission) -> Mission:
         """Return a mission with the awareness that it is learned from.
 
-        It is what plans go by. Where the map is trusted, that is the map's: weights fitted to what
-        robots measured would be applied to other numbers, and plans be off by the difference. With
-        a belief, it is what robots measured, filled in from the belief.
+        It is the map's, which plans go by: weights fitted to what robots measured would be applied
+        to other numbers, and plans be off by the difference.
         """
         known = self.known_along(mission.path)
         if mission.posts is not None:
             gain = self.workspace.gain_of(mission.path, mission.posts)
             known = np.clip(known + gain, 0.0, 1.0)
-        trusted = self.learner.awareness is None
-        return (replace_awareness if trusted else fill_awareness)(mission, known)
+        return replace_awareness(mission, known)
 
     # --- results ---
 
@@ -403,12 +399,12 @@ class Campaign(Displayed):
         """
         if not self.state.entries:
             raise TrustboError("the campaign has no mission yet; tell it one first.")
-        best, planner = self.recommend(), self.planner_now()
+        best = self.recommend()
         return Result(
             self.workspace, self.missions, self.posteriors, list(best.path), best.trust, best.value,
             self.trust_map(), self.history,
             {**self.settings, **self.state.notes, "trustbo_version": VERSIONS["trustbo"]},
-            self.state.stop_reason, believed_of(planner), tuple(self.state.failures),
+            self.state.stop_reason, tuple(self.state.failures),
         )  # fmt: skip
 
     def _result_so_far(self) -> Result | None:
@@ -529,8 +525,7 @@ class Campaign(Displayed):
             directory: Folder that was passed as `directory`, or to `save`.
             model: The same model, if it or its priors are custom.
             policy: The same policy, if it is custom.
-            **custom: The same `callbacks`, and the same `awareness` if it is custom, in its state
-                before the first mission.
+            **custom: The same `callbacks`.
 
         Raises:
             TrustboError: There is no campaign; another process has locked it; or a custom object

@@ -24,7 +24,7 @@ from trustbo.inference.samplers.settings import NutsSettings
 from trustbo.models import HumanTrust, default_model
 from trustbo.models.model import TrustModel, require_model
 from trustbo.models.params import Params
-from trustbo.workspace import AwarenessBelief, Workspace
+from trustbo.workspace import Workspace
 
 _N_DRAWS = 1000
 
@@ -43,7 +43,6 @@ class Learner:
         sampler: Sampler of the posterior.
         belief: Parameter draws: the posterior's, or, before the first mission, one from the prior.
         observation: Family of observations of the belief.
-        awareness: Belief about the awareness; None where the map is trusted.
         progress: Whether fits show their progress, see `tb.fit`.
     """
 
@@ -64,10 +63,6 @@ class Learner:
         self.workspace, self.options, self.model, self.sampler = workspace, options, model, sampler
         self._prior = _prior_belief(model, options.initial, workspace, seed)
         self._believe(None)
-        self.awareness: AwarenessBelief | None = None
-        if options.awareness != "map":
-            given = options.awareness
-            self.awareness = AwarenessBelief(workspace) if isinstance(given, str) else given
         self._hazard: tuple[object, xr.Dataset, BoundRisk] | None = None
 
     def take(self, state: CampaignState, seed: int) -> None:
@@ -78,8 +73,6 @@ class Learner:
             warnings.warn(f"mission {len(state.entries)} is set aside: {reason}", stacklevel=4)
         else:
             self.learn(state, seed)
-        if self.awareness is not None:
-            self.awareness.update(entry.measured)
 
     def learn(self, state: CampaignState, seed: int) -> None:
         """Fit the posterior of all missions that are not excluded; if it is refused, go on."""
@@ -118,9 +111,6 @@ class Learner:
 
     def restore(self, state: CampaignState) -> None:
         """Restore the belief after the missions of a state that was read from files."""
-        if self.awareness is not None:
-            for mission in state.measured:
-                self.awareness.update(mission)
         if (last := state.last) is not None:
             tree = last()
             with interpreting(last.file or ""):

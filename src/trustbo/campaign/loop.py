@@ -111,7 +111,7 @@ def resume(
         policy: The same policy; see `Campaign.load`.
         stop: Rules to end before `n_iterations`, as in `iterate`.
         progress: Progress to show, as in `iterate`.
-        **custom: The same `awareness` and `callbacks`; see `Campaign.load`.
+        **custom: The same `callbacks`; see `Campaign.load`.
 
     Raises:
         TrustboError: There is no campaign; another process has locked it; or a custom object is

@@ -14,15 +14,14 @@ if TYPE_CHECKING:
     from trustbo.data import Mission
     from trustbo.hazard import Hazard
     from trustbo.planning import Policy
-    from trustbo.workspace import AwarenessBelief
 
     Callback = Callable[[Campaign, Mission], None]
 
 POLICY, OBJECTIVE, SAMPLER = "greedy", "lost_contact", "auto"
 """Defaults of keywords that are no options; commands and studies have the same."""
 PLANNING, LEARNING, RUNNING = "planning", "learning", "running"
-_CUSTOM = ("awareness", "callbacks")
-"""Options that may be objects which a folder cannot hold."""
+_CUSTOM = ("callbacks",)
+"""Options that are objects which a folder cannot hold."""
 
 
 def _option(group: str, *choices: str) -> dict[str, Any]:
@@ -51,9 +50,6 @@ class CampaignOptions:
             has failed, then all bounds of the shortest path, see `Planner`.
         initial: Source of the first plan: prior_mean, or prior_draw (one random draw of the prior,
             as in the paper).
-        awareness: Trust in the awareness map: map (blind; missions are learned from with it too) or
-            belief (missions correct it). Under `"belief"`, or a given `AwarenessBelief`, policies
-            draw from it too.
         hazard: Priors of the chance that a bound fails. A `hazard.Hazard`, or some of its fields
             by name.
         n_chains: Number of chains of NUTS; draws of other samplers are divided among them.
@@ -78,9 +74,6 @@ class CampaignOptions:
     initial: str = field(
         default="prior_mean", metadata=_option(LEARNING, "prior_mean", "prior_draw")
     )
-    awareness: "str | AwarenessBelief" = field(
-        default="map", metadata=_option(LEARNING, "map", "belief")
-    )
     hazard: "Hazard | Mapping[str, Any]" = field(default_factory=dict, metadata=_option(LEARNING))
     n_chains: int | None = field(default=None, metadata=_option(LEARNING))
     warmup: int | None = field(default=None, metadata=_option(LEARNING))
@@ -94,7 +87,7 @@ class CampaignOptions:
 
         for option in fields(self):
             choices = option.metadata["choices"]
-            if choices and not (option.name == "awareness" and self.own_awareness):
+            if choices:
                 require_choice(option.name, getattr(self, option.name), choices)
         NutsSettings.of(self.sampling)
         object.__setattr__(self, "hazard", _hazard_of(self.hazard))
@@ -139,21 +132,12 @@ class CampaignOptions:
         given = {name: getattr(self, name) for name in names}
         return {name: value for name, value in given.items() if value is not None}
 
-    @property
-    def own_awareness(self) -> bool:
-        """Whether the user gave a belief about the awareness."""
-        if isinstance(self.awareness, str):
-            return False
-        from trustbo.workspace import AwarenessBelief
-
-        return isinstance(self.awareness, AwarenessBelief)
-
     def to_record(self) -> dict[str, Any]:
         """JSON-serialisable options, without callbacks."""
         record = {o.name: getattr(self, o.name) for o in fields(self) if o.name != "callbacks"}
         priors = asdict(self.prior_hazard).items()
         record["hazard"] = {n: list(v) if isinstance(v, tuple) else v for n, v in priors}
-        return record | ({"awareness": "belief"} if self.own_awareness else {})
+        return record
 
 
 PLANNING_OPTIONS = [o.name for o in fields(CampaignOptions) if o.metadata["part"] == PLANNING]
@@ -177,17 +161,14 @@ def arguments_of(
     """Restore the arguments of `Campaign`, and the record of its model.
 
     `record` is the field `options` of `CampaignState`; a missing option has its default. A custom
-    policy or awareness must be passed again, any other is refused; callbacks are optional.
+    policy must be passed again, any other is refused; callbacks are optional.
     """
     require_known("option of one's own", custom, _CUSTOM)
     record = dict(record)
     given: dict[str, Any] = {name: tuple(record.pop(name)) for name in ("start", "goal")}
     given["policy"] = _restored("policy", record.pop("policy"), policy, record.pop("own_policy"))
     given |= {name: record.pop(name) for name in ("objective", "sampler", "seed")}
-    model, custom_awareness = record.pop("model"), record.pop("own_awareness")
-    custom["awareness"] = _restored(
-        "awareness", record["awareness"], custom.get("awareness"), custom_awareness
-    )
+    model = record.pop("model")
     return given | {"options": CampaignOptions.from_keywords({**record, **custom})}, model
 
 

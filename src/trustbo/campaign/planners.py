@@ -3,7 +3,6 @@
 from typing import Any
 
 import numpy as np
-import xarray as xr
 
 from trustbo.campaign.learning import Learner
 from trustbo.campaign.options import PLANNING_OPTIONS, CampaignOptions
@@ -14,8 +13,6 @@ from trustbo.workspace import Workspace
 from trustbo.workspace.location import Location
 
 _N_DRAWS = 200
-_N_MAPS = 500
-"""Draws of the awareness that plans are made with; the first `_N_DRAWS` are in the result."""
 _STOPPED, _RECOVERED = 2, 0.2
 """Number of failures that makes a bound avoided, and the failure chance below which it is not."""
 _ARRIVES = 0.9
@@ -37,27 +34,13 @@ def planner_of(
     return Planner(workspace, start, goal, objective, **chosen, infeasible="safest")
 
 
-def planner_given(planner: Planner, learner: Learner, state: CampaignState, seed: int) -> Planner:
+def planner_given(planner: Planner, learner: Learner, state: CampaignState) -> Planner:
     """Planner given the belief of a learner and the failures of a state, see `planner_now`."""
     planner = planner.with_observation(learner.observation)
-    if (awareness := learner.awareness) is not None:
-        n_maps = min(_N_MAPS, learner.belief.leading[0])
-        planner = planner.with_awareness(awareness.draw(n_maps, seed), awareness.mean())
     risk = learner.hazard(state)[1]
     if (state.entries or state.failures) and (avoid := to_avoid(risk)).any():
         planner = planner.avoiding(avoid, risk.mean)
     return under_risk(planner, risk)
-
-
-def believed_of(planner: Planner) -> xr.Dataset | None:
-    """Belief about the awareness that a planner has, as `Result.believed`."""
-    problem, like = planner.problem, planner.workspace.awareness
-    if problem.cells is None:
-        return None
-    # Single precision: they are written after every mission.
-    maps = problem.cells[:_N_DRAWS].astype(np.float32)
-    draws = xr.DataArray(maps, like.coords, ("draw", *like.dims))
-    return xr.Dataset({"mean": like.copy(data=problem.mean_cells), "draws": draws})
 
 
 def under_risk(planner: Planner, risk: BoundRisk) -> Planner:

@@ -58,8 +58,6 @@ class Result(Displayed):
             fitting.
         settings: Options of the campaign, and the settings of its model and simulator.
         stop_reason: Reason of the end.
-        believed: Belief about the awareness at the end, for `awareness="belief"`: its `mean`
-            (robot, row, col, feature) and `draws` of it (draw, robot, row, col, feature).
         failures: Missions that were given up, see `Campaign.fail`.
     """
 
@@ -73,7 +71,6 @@ class Result(Displayed):
     history: xr.Dataset
     settings: dict[str, Any]
     stop_reason: str
-    believed: xr.Dataset | None = None
     failures: Sequence[Failure] = ()
 
     def _card(self) -> Card:
@@ -142,7 +139,7 @@ class Result(Displayed):
 
     @cached_property
     def planner(self) -> Planner:
-        """Planner as the campaign's, with the awareness believed in at the end."""
+        """Planner as the campaign's at the end."""
         needed = ("start", "goal", "objective", *PLANNING_OPTIONS)
         missing = [name for name in needed if name not in self.settings]
         if missing:
@@ -162,9 +159,7 @@ class Result(Displayed):
             # The workspace has no measures where the terrain was taken away.
             if {*hazard["measure"].values.tolist()} <= {*measures_of(self.workspace)}:
                 planner = under_risk(planner, BoundRisk.of(hazard, self.workspace))
-        if self.believed is None:
-            return planner
-        return planner.with_awareness(self.believed["draws"].values, self.believed["mean"].values)
+        return planner
 
     @cached_property
     def plan(self) -> Plan:
@@ -209,7 +204,7 @@ class Result(Displayed):
         summary = self.planner.trust_summary(self.posterior, n_draws=n_draws, seed=seed)
         maps = summary.rename(mean="trust_mean", sd="trust_sd")
         share = self.planner.path_posterior(self.posterior, n_draws=n_draws, seed=seed)
-        awareness = self.workspace.awareness if self.believed is None else self.believed["mean"]
+        awareness = self.workspace.awareness
         places = self._places()
         taken = {*maps.variables, *maps.dims, "path_probability", "x", "y", "spatial_ref", *places}
         for name in [str(feature) for feature in awareness["feature"].values]:

@@ -247,9 +247,7 @@ def load_result(directory: FilePath) -> Result:
     with interpreting(folder / RESULT):
         settings = dict(record["settings"])
     missions, posteriors, history = _read_missions(folder / RESULT, record)
-    workspace, believed = read_workspace(folder), None
-    if settings.get("awareness") == "belief":
-        believed = read_tree(folder / BELIEVED).to_dataset()
+    workspace = read_workspace(folder)
     with interpreting(folder / HISTORY):
         trust_map = history["final_trust_map"].rename("trust")
         history = history.drop_vars("final_trust_map")
@@ -262,7 +260,7 @@ def load_result(directory: FilePath) -> Result:
         value, reason = float(record["value"]), str(record["stop_reason"])
     return Result(
         workspace, missions, posteriors, list(path), trust, value, trust_map, history, settings,
-        reason, believed, failures,
+        reason, failures,
     )  # fmt: skip
 
 
@@ -290,8 +288,6 @@ def _write_result(result: Result, folder: Path, *, whole: bool) -> None:
     write_missions(folder / MISSIONS, result.missions, since=since)
     history = result.history.assign(final_trust_map=result.trust_map)
     write_tree(folder / HISTORY, xr.DataTree(history))
-    if result.believed is not None:
-        write_tree(folder / BELIEVED, xr.DataTree(result.believed))
     write_text(folder / TABLE, frame_as_csv(result.table()))
     # Written last: its presence means that the rest is complete.
     write_text(folder / RESULT, to_json(_record_of(result)))

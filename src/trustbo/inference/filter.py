@@ -15,7 +15,6 @@ from trustbo.errors import (
     TrustboError,
     one_line,
     require_choice,
-    require_kind,
     require_pair,
     require_whole,
 )
@@ -27,7 +26,6 @@ from trustbo.models.families import FAMILIES, Family
 from trustbo.models.model import RESPONSES
 from trustbo.models.params import Params, check_params
 from trustbo.models.ticks import broadcast_ticks
-from trustbo.workspace.belief import AwarenessBelief
 from trustbo.workspace.moves import bounds_along, moves_along, require_on_grid
 
 
@@ -84,7 +82,6 @@ class TrustFilter:
         response: str | None = None,
         observation: str | None = None,
         max_draws: int = 1000,
-        belief: AwarenessBelief | None = None,
     ) -> None:
         """Start before the first bound of a mission.
 
@@ -96,11 +93,9 @@ class TrustFilter:
             observation: Family of observations, with draws; `"gaussian"` by default. A posterior
                 records it.
             max_draws: Largest number of draws to follow; they are evenly spaced.
-            belief: Belief about awareness: a map drawn from it goes with each draw, and gives what
-                was not measured in a bound.
 
         Raises:
-            ShapeError: Draws, a posterior or a belief of another number of robots or features.
+            ShapeError: Draws or a posterior of another number of robots or features.
             TrustboError: No posterior, `TrustParams` without `n_robots`, an unknown response or
                 family, or one that is not the posterior's.
         """
@@ -139,18 +134,7 @@ class TrustFilter:
         self._family = FAMILIES[family]
         lag = float(require_choice("response", response or "level", RESPONSES) == "change")
         self._core = live_filter(self.params, lag, n_robots)
-        if belief is not None:
-            require_kind("belief", belief, AwarenessBelief, "give an AwarenessBelief")
-        self._maps = None if belief is None else belief.draw(len(kept))
         self._grids = {np.shape(value)[-2:] for value in self.params.places.values()}
-        if self._maps is not None:
-            of_belief = self._maps.shape[1], self._maps.shape[-1]
-            if of_belief != (n_robots, self._n_features):
-                raise ShapeError(
-                    f"the belief is of {of_belief} (robot, feature), the parameters are of "
-                    f"{(n_robots, self._n_features)}; give the belief of the same workspace."
-                )
-            self._grids.add(self._maps.shape[2:4])
         self.reset()
 
     def reset(self) -> None:
@@ -178,10 +162,9 @@ class TrustFilter:
         """Take in one bound.
 
         Args:
-            awareness: Shape (robot, feature); NaN, where there is a `belief`, if not measured.
+            awareness: Shape (robot, feature).
             contact_rate: Shape (robot,); NaN where not measured.
-            bound: Cell left and cell entered; needed where places have effects, or awareness is
-                NaN.
+            bound: Cell left and cell entered; needed where places have effects.
             n_ticks: Ticks of the bound, () or (robot,); the beta-binomial family needs them.
 
         Returns:
@@ -282,9 +265,9 @@ class TrustFilter:
         Rates are drawn, one for each parameter draw.
 
         Args:
-            awareness: Shape (bound, robot, feature); NaN as for `update`.
+            awareness: Shape (bound, robot, feature).
             path: The cell where the team is and the cells to be entered; needed where places have
-                effects, or awareness is NaN.
+                effects.
             n_ticks: Ticks of the bounds, (), (bound,) or (bound, robot), where rates are counts.
 
         Returns:
@@ -299,9 +282,8 @@ class TrustFilter:
         given, rng = self._checked(awareness, 3), np.random.default_rng(self.n_bounds)
         ticks = ticks_ahead(n_ticks, given.shape[:2])
         cells = self._cells(path, len(given))
-        zs = [self._filled(z, None if cells is None else cells[k + 1]) for k, z in enumerate(given)]
         x, drawn = self._core.draw(rng, mean, var), []
-        for z, effect, n in zip(zs, self._effects(cells, len(zs)), ticks, strict=True):
+        for z, effect, n in zip(given, self._effects(cells, len(given)), ticks, strict=True):
             mean, var = self._core.predict(mean, var, z, effect)
             x, rates = self._core.roll(rng, self._family, x, z, effect, n)
             drawn.append(rates)
@@ -377,9 +359,9 @@ class TrustFilter:
                 f"awareness must be {'(bound, ' if n_axes == 3 else '('}{expected[0]} robots, "
                 f"{expected[1]} features); got shape {z.shape}."
             )
-        if np.isnan(z).any() and self._maps is None:
+        if np.isnan(z).any():
             raise TrustboError(
-                "awareness must not be NaN without a belief=; take unmeasured values from the map: "
+                "awareness must not be NaN; take unmeasured values from the map: "
                 "campaign.known_along(path), or workspace.along(path), (bound, robot, feature)."
             )
         if self._bounded:
@@ -397,18 +379,8 @@ class TrustFilter:
     def _bound(
         self, awareness: ArrayLike, bound: tuple[Cell, Cell] | None
     ) -> tuple[np.ndarray, np.ndarray | float]:
-        """Awareness of a bound, (robot, feature) or, filled in, (draw, robot, feature); effect."""
-        z, cells = self._checked(awareness, 2), self._cells(bound, 1)
-        return self._filled(z, None if cells is None else cells[1]), self._effects(cells, 1)[0]
-
-    def _filled(self, z: np.ndarray, cell: Cell | None) -> np.ndarray:
-        """Awareness with that of each draw's map in the place of NaN."""
-        missing = np.isnan(z)
-        if self._maps is None or not missing.any():
-            return z
-        if cell is None:
-            raise TrustboError("awareness is NaN: say which cells the bounds lead over.")
-        return np.where(missing, self._maps[:, :, *cell], z)
+        """Awareness of a bound, (robot, feature), and its effect."""
+        return self._checked(awareness, 2), self._effects(self._cells(bound, 1), 1)[0]
 
 
 class _Running(NamedTuple):

@@ -81,11 +81,10 @@ def trust_dynamics(
 ) -> Dynamics:
     """Build the recursion of expected trust under parameters with leading axes (...,).
 
-    Awareness has shape (robot, move, row, col, feature), or (draw, robot, move, row, col, feature)
-    with one map for each draw. Its moves are those of the drift, or `moves`, their indices in
-    `MOVES[8]` (by default all), where awareness is that of cells and places have effects. `x0`,
-    expected trust before the first bound, () or (robot,), with leading axes or not, is by default
-    `params.x0_mean`.
+    Awareness has shape (robot, move, row, col, feature). Its moves are those of the drift, or
+    `moves`, their indices in `MOVES[8]` (by default all), where awareness is that of cells and
+    places have effects. `x0`, expected trust before the first bound, () or (robot,), with leading
+    axes or not, is by default `params.x0_mean`.
     ShapeError: other numbers of robots or features.
     """
     z = np.asarray(awareness, dtype=float)

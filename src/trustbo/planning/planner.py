@@ -176,11 +176,6 @@ class Planner(Displayed):
         """
         return solve.graph_of(self.problem, self.problem.dynamics(mean_of(params)))
 
-    @property
-    def mean_awareness(self) -> np.ndarray:
-        """Expected awareness of bounds, shape (robot, move, row, col, feature)."""
-        return self.problem.mean_awareness
-
     def require_path(self, path: Sequence[Cell]) -> tuple[Cell, ...]:
         """Return a path as a tuple of cells; refuse a broken one, or one between other ends."""
         return self.paths.require_path(path)
@@ -188,10 +183,6 @@ class Planner(Displayed):
     def avoiding(self, bounds: np.ndarray, risk: np.ndarray) -> Self:
         """Return the planner of paths without some bounds; see `AdmissiblePaths.avoiding`."""
         return self._with(replace(self.problem, paths=self.paths.avoiding(bounds, risk)))
-
-    def with_awareness(self, awareness: ArrayLike, mean: ArrayLike | None = None) -> Self:
-        """Return the planner with other awareness of cells; see `PlanningProblem`."""
-        return self._with(self.problem.with_awareness(awareness, mean))
 
     def with_observation(self, observation: str) -> Self:
         """Return the planner for contact rates of another family, see `Planner`."""
@@ -258,19 +249,13 @@ class Planner(Displayed):
         rule = self.problem.rule._replace(failure_cost=failure_cost)
         return self._with(replace(self.problem, rule=rule))
 
-    def of_draw(self, index: int) -> Self:
-        """Return the planner with the awareness map of one draw, where awareness is uncertain."""
-        return self._with(self.problem.of_draw(index))
-
     def onward(self, done: Sequence[Cell]) -> Self:
         """Return a planner for the rest of a mission; see `PlanningProblem.onward`."""
         return self._with(self.problem.onward(done))
 
-    def dynamics(
-        self, params: Params, x0: ArrayLike | None = None, *, draws: np.ndarray | None = None
-    ) -> Dynamics:
+    def dynamics(self, params: Params, x0: ArrayLike | None = None) -> Dynamics:
         """Build the recursion of expected trust; see `PlanningProblem.dynamics`."""
-        return self.problem.dynamics(params, x0, draws=draws)
+        return self.problem.dynamics(params, x0)
 
     def plan(self, params: Params | xr.DataTree, *, x0: ArrayLike | None = None) -> Plan:
         """Find the best admissible path for given parameters, or for the mean of a posterior.
@@ -347,7 +332,7 @@ class Planner(Displayed):
             TrustboError: beta0 of a draw is outside the range the objective is exact for.
         """
         params, chosen = choose_draws(draws_of(posterior), n_draws, seed)
-        dynamics = self.problem.dynamics(params, draws=chosen)
+        dynamics = self.problem.dynamics(params)
         best = solve.find_paths(self.problem, dynamics, self.engine)
         return DrawnPaths(self.problem, dynamics, best.paths, best.gap, chosen)
 
@@ -408,8 +393,8 @@ class Planner(Displayed):
             n_draws: Number of draws, taken at random without replacement.
             seed: Seed of the choice of draws.
         """
-        params, chosen = choose_draws(draws_of(posterior), n_draws, seed)
-        return summary_of(trust_map(self.problem, params, draws=chosen))
+        params, _ = choose_draws(draws_of(posterior), n_draws, seed)
+        return summary_of(trust_map(self.problem, params))
 
     def path_posterior(
         self, posterior: Params | xr.DataTree, *, n_draws: int | None = 1000, seed: int = 0

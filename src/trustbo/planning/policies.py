@@ -1,8 +1,7 @@
 """Policies: from posterior draws to the next plan.
 
 A policy is any callable `policy(key, posterior, planner) -> Plan`, and may be passed in place of a
-name. Trust and value of every plan are expectations under the posterior mean, for each policy. With
-uncertain awareness, the planner holds one map for each draw of the parameters.
+name. Trust and value of every plan are expectations under the posterior mean, for each policy.
 """
 
 import inspect
@@ -38,14 +37,14 @@ def greedy(key: Array, posterior: Params, planner: Planner) -> Plan:
 def thompson(key: Array, posterior: Params, planner: Planner) -> Plan:
     """Best path under one posterior draw taken at random (probability matching)."""
     index = int(jax.random.randint(key, (), 0, posterior.leading[0], np.int32))
-    plan = planner.of_draw(index).plan(posterior.draw(index))
+    plan = planner.plan(posterior.draw(index))
     return planner.evaluate(plan.path, posterior.mean())
 
 
 def optimistic(key: Array, posterior: Params, planner: Planner, *, quantile: float = 0.9) -> Plan:
     """Best path under the upper quantile over draws of each bound's drift u."""
-    params, chosen = choose_draws(posterior, 1000, seed_of(key))
-    dynamics = planner.dynamics(params, draws=chosen)
+    params, _ = choose_draws(posterior, 1000, seed_of(key))
+    dynamics = planner.dynamics(params)
     best = Dynamics(
         dynamics.transition.mean(0),
         np.quantile(dynamics.drift, quantile, axis=0),

@@ -1,4 +1,4 @@
-"""The planning problem: workspace, admissible paths, objective, team and the awareness assumed."""
+"""The planning problem: workspace, admissible paths, objective and team."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -27,18 +27,12 @@ from trustbo.planning.risk import NO_RULE, RiskRule, RiskTable, risk_table
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import MOVES, along, move_indices
 
-_ALL = slice(None)
-_ENTRIES = 1 << 22  # of awareness of bounds at a time
-
 
 @dataclass(frozen=True, eq=False)
 class PlanningProblem:
-    """Workspace, admissible paths, objective and awareness: the data of a `Planner`.
+    """Workspace, admissible paths and objective: the data of a `Planner`.
 
-    Trust of the `team` is the `"mean"` or the least (`"min"`) of its robots'. Where the awareness
-    is not the workspace's, `cells` has that of cells, (robot, row, col, feature), with a leading
-    axis (draw,) where it is uncertain, and `mean_cells` the mean over these. Their difference from
-    the workspace's awareness of a cell is added to that of all bounds into it. `rule` limits the
+    Trust of the `team` is the `"mean"` or the least (`"min"`) of its robots'. `rule` limits the
     chance that a plan fails, and `risk` has the chances that its bounds do.
 
     TrustboError: unknown team or objective; a length weight that is negative, or for success or
@@ -48,8 +42,6 @@ class PlanningProblem:
     paths: AdmissiblePaths
     objective: Objective
     team: str
-    cells: np.ndarray | None = None
-    mean_cells: np.ndarray | None = None
     rule: RiskRule = NO_RULE
     risk: Risk | None = None
 
@@ -64,57 +56,9 @@ class PlanningProblem:
         """Workspace of the admissible paths."""
         return self.paths.workspace
 
-    @property
-    def mean_awareness(self) -> np.ndarray:
-        """Mean over draws of `cells`, as awareness of bounds (robot, move, row, col, feature)."""
-        return self._of_bounds(self.mean_cells)
-
-    def awareness_along(self, path: Sequence[Cell] | np.ndarray, params: Params) -> np.ndarray:
-        """Awareness of a path's bounds, shape (bound, robot, feature).
-
-        With a leading axis (draw,) where it is uncertain, and the parameters have draws.
-        """
-        cells = self.cells if params.leading else self.mean_cells
-        if cells is None or self.workspace.of_bounds is None:
-            z = along(self.workspace.bound_maps if cells is None else _any_move(cells), path)
-        else:
-            rows, cols = np.asarray(path)[1:].T
-            z = along(self.workspace.bound_maps, path)
-            error = cells[..., rows, cols, :] - self.workspace.awareness.values[:, rows, cols]
-            z = np.clip(z + error, 0.0, 1.0)
-        if z.ndim == 4:
-            z = z[np.arange(params.leading[0]) % len(z)]
-        return np.swapaxes(z, -3, -2)
-
-    def _of_bounds(self, cells: np.ndarray | None, moves: slice | np.ndarray = _ALL) -> np.ndarray:
-        """Awareness of bounds, by all or some moves, from that of cells."""
-        if cells is None:
-            maps = self.workspace.bound_maps
-            return maps if maps.shape[1] == 1 else maps[:, moves]
-        if self.workspace.of_bounds is None:
-            return _any_move(cells)
-        error = cells - self.workspace.awareness.values
-        return np.clip(self.workspace.bound_maps[:, moves] + _any_move(error), 0.0, 1.0)
-
-    def with_awareness(self, awareness: ArrayLike, mean: ArrayLike | None = None) -> Self:
-        """Return the problem with another awareness of cells, or one map for each draw.
-
-        Shape (robot, row, col, feature) or (draw, robot, row, col, feature); `mean` is the map for
-        parameters without draws, by default the mean. ShapeError: other numbers of robots, cells or
-        features than the workspace's. TrustboError: NaN in a passable cell.
-        """
-        z = np.asarray(awareness, dtype=float)
-        expected = self.workspace.awareness.shape
-        if z.ndim not in (4, 5) or z.shape[-4:] != expected:
-            raise ShapeError(f"awareness must end in {expected}; got shape {z.shape}.")
-        missing = np.isnan(z).any(-1).reshape(-1, *expected[1:3]).any(0) & self.paths.passable
-        if missing.any():
-            cell = tuple(int(i) for i in np.argwhere(missing)[0])
-            raise TrustboError(
-                f"awareness of the passable cell {cell} is NaN; fill it, or mark it impassable."
-            )
-        mean = z.reshape(-1, *expected).mean(0) if mean is None else np.asarray(mean)
-        return replace(self, cells=z, mean_cells=mean)
+    def awareness_along(self, path: Sequence[Cell] | np.ndarray) -> np.ndarray:
+        """Awareness of a path's bounds, shape (bound, robot, feature)."""
+        return np.swapaxes(along(self.workspace.bound_maps, path), 0, 1)
 
     def with_risk(self, risk: Risk | None) -> Self:
         """Return the problem with a risk; ShapeError if it is not of the workspace's cells."""
@@ -171,46 +115,16 @@ class PlanningProblem:
             rule = rule._replace(max_failure=max(0.0, 1.0 - (1.0 - most) / max(survived, 1e-300)))
         return replace(self, paths=paths, rule=rule)
 
-    def of_draw(self, index: int) -> Self:
-        """Return the problem with the awareness map of one draw, where awareness is uncertain."""
-        if self.cells is None or self.cells.ndim == 4:
-            return self
-        return self.with_awareness(self.cells[index % len(self.cells)])
-
     def dynamics(
-        self,
-        params: Params,
-        x0: ArrayLike | None = None,
-        *,
-        draws: np.ndarray | None = None,
-        team: str | None = None,
+        self, params: Params, x0: ArrayLike | None = None, *, team: str | None = None
     ) -> Dynamics:
-        """Build the recursion of expected trust; params without draws get the mean awareness.
+        """Build the recursion of expected trust.
 
-        `x0` is by default `params.x0_mean`, `draws` (indices in the posterior) 0, 1, 2, ..., and
-        `team` the problem's.
+        `x0` is by default `params.x0_mean`, and `team` the problem's.
         """
-        cells, team = self.cells, team or self.team
-        moves = move_indices(self.paths.connectivity)
-        if cells is None or cells.ndim == 4 or not params.leading:
-            cells = cells if params.leading else self.mean_cells
-            return trust_dynamics(params, self._of_bounds(cells, moves), team, x0, moves)
-        which = (np.arange(params.leading[0]) if draws is None else draws) % len(cells)
-        if self.workspace.of_bounds is None:
-            return trust_dynamics(params, _any_move(cells[which]), team, x0, moves)
-        # Awareness of all robots, moves and features is large: only drift is kept for all draws.
-        whole = trust_dynamics(params, self._of_bounds(None, moves), team, x0, moves)
-        n = max(1, _ENTRIES // (len(moves) * cells[0].size))
-        for block in (slice(i, i + n) for i in range(0, len(which), n)):
-            z = self._of_bounds(cells[which[block]], moves)
-            some: Params = params.draw(block)  # pyright: ignore[reportArgumentType]
-            whole.drift[block] = trust_dynamics(some, z, team, moves=moves).drift
-        return whole
-
-
-def _any_move(cells: np.ndarray) -> np.ndarray:
-    """Awareness of cells with an axis of moves of length 1."""
-    return cells[..., None, :, :, :]
+        maps, moves = self.workspace.bound_maps, move_indices(self.paths.connectivity)
+        z = maps if maps.shape[1] == 1 else maps[:, moves]
+        return trust_dynamics(params, z, team or self.team, x0, moves)
 
 
 def require_objective(objective: Objective, team: str) -> None:

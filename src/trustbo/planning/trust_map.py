@@ -23,11 +23,10 @@ def trust_map(
     *,
     per_robot: bool = False,
     x0: ArrayLike | None = None,
-    draws: np.ndarray | None = None,
 ) -> xr.DataArray:
-    """Compute the map of `Planner.trust_map`; `draws` are the indices in the posterior."""
+    """Compute the map of `Planner.trust_map`."""
     team = "min" if per_robot else None
-    dynamics = problem.dynamics(params, x0, draws=draws, team=team).flat()
+    dynamics = problem.dynamics(params, x0, team=team).flat()
     like = problem.workspace.awareness.isel(feature=0, drop=True)
     if per_robot:
         robots = [_of_robot(dynamics, i) for i in range(dynamics.start.shape[-1])]

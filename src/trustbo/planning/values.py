@@ -106,7 +106,7 @@ def evaluate(
     flat, grid = np.fromiter(itertools.chain.from_iterable(path), int), problem.workspace.grid
     cells = flat.reshape(-1, 2)
     rows, cols = cells.T
-    z, along = problem.awareness_along(cells, params), params.along(cells)
+    z, along = problem.awareness_along(cells), params.along(cells)
     paid = problem.paths, problem.objective, cells
     kind = problem.objective, problem.team
     found = value_along(along, z, *kind, toll_along(*paid), x0, cap=cap)

@@ -10,14 +10,13 @@ from trustbo.campaign.result import Result
 from trustbo.data import Cell, Mission
 from trustbo.inference import params_of, place_maps
 from trustbo.planning.plan import QUANTILES
-from trustbo.planning.posterior import choose_draws
 from trustbo.planning.values import path_trust
 from trustbo.plots.explorer import Layer, Overwatch, Scene, Step
 from trustbo.plots.places import BETTER_WORSE
 from trustbo.report.numbers import MINUS, counted
 from trustbo.team import Robot
 from trustbo.workspace import Workspace
-from trustbo.workspace.moves import bounds_along
+from trustbo.workspace.moves import along, bounds_along
 
 _FIVE = (*QUANTILES[:2], 0.5, *QUANTILES[2:])
 _Moments = dict[str, tuple[np.ndarray, np.ndarray]]
@@ -78,10 +77,10 @@ def _failure(bound_maps: _Moments) -> list[Layer]:
 
 def _awareness(result: Result, there: Mapping[str, np.ndarray]) -> list[Layer]:
     """Awareness by feature and robot; one map for all robots where they are alike."""
-    believed = result.workspace.awareness if result.believed is None else result.believed["mean"]
+    known = result.workspace.awareness
     layers = []
-    for name in [str(feature) for feature in believed["feature"].values]:
-        by_robot = believed.sel(feature=name).transpose("robot", "row", "col").values
+    for name in [str(feature) for feature in known["feature"].values]:
+        by_robot = known.sel(feature=name).transpose("robot", "row", "col").values
         text = name.replace("_", " ")
         if np.allclose(by_robot, by_robot[:1], equal_nan=True):
             layers.append((name, text, by_robot[0]))
@@ -132,12 +131,10 @@ def _mission_step(result: Result, j: int, bound_maps: _Moments) -> Step:
 def _last_step(result: Result, bound_maps: _Moments) -> Step:
     """Recommended path, with the trust expected along it."""
     path, planner = result.path, result.planner
-    params, chosen = choose_draws(params_of(result.posterior, day=True), None, 0)
-    along = planner.dynamics(params, draws=chosen).along(path)
-    expected = path_trust(along, planner.problem.objective, 0.0, cap=False).trust
+    rolled = planner.dynamics(params_of(result.posterior, day=True).flat()).along(path)
+    expected = path_trust(rolled, planner.problem.objective, 0.0, cap=False).trust
     stops, posts = _planned(path, result.workspace, result.plan.own_posts)
-    moves, rows, cols = bounds_along(path).T
-    z = planner.mean_awareness[:, moves if planner.mean_awareness.shape[1] > 1 else 0, rows, cols]
+    z = along(result.workspace.bound_maps, path)
     return Step(
         "recommended",
         f"Recommended after {counted(len(result.missions), 'mission')}: {len(path) - 1} bounds, "
