@@ -1,7 +1,6 @@
-"""Comparison with the 2023 code of the paper's authors: its priors, learning and composites.
+"""Comparison with the 2023 code of the paper's authors: its priors and learning.
 
-Nothing here is recommended. The public entries are `Priors.zheng2023()`, `moment_matched` and
-`CompositeIndex(method="zheng2023")`.
+Nothing here is recommended. The public entries are `Priors.zheng2023()` and `moment_matched`.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -38,15 +37,3 @@ def match_moments(draws: np.ndarray, prior: "Distribution") -> "Distribution":
         log_var = np.log1p(var / mean**2)
         return dist.LogNormal(np.log(mean) - 0.5 * log_var, np.sqrt(log_var))
     return dist.Normal(mean, np.sqrt(var))
-
-
-def robust_scale(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Scale of each column of x (row, column): no clipping, median, interquartile range."""
-    low, high = (np.full(x.shape[1], end) for end in (-np.inf, np.inf))
-    quartiles = np.percentile(x, [25, 50, 75], axis=0)
-    return low, high, quartiles[1], quartiles[2] - quartiles[0]
-
-
-def squash(score: np.ndarray) -> np.ndarray:
-    """Logistic function of a composite's score."""
-    return 1.0 / (1.0 + np.exp(-score))

@@ -7,15 +7,12 @@ from typing import Self
 import numpy as np
 import xarray as xr
 from numba import njit
-from scipy import stats
 from sklearn.base import BaseEstimator, TransformerMixin
 from sklearn.decomposition import PCA
 
-from trustbo import zheng2023
 from trustbo.errors import TerrainError, TrustboError, require_choice, require_whole
 from trustbo.files import FilePath, interpreting, read_file, write_file
 
-METHODS = ("pca", "zheng2023")
 MAX_PIXELS = 1_000_000
 MIN_CALIBRATION = 200
 """Least number of samples to fit a real-time index on: with fewer, its loadings are unstable."""
@@ -39,31 +36,14 @@ class CompositeIndex(TransformerMixin, BaseEstimator):
         explained_variance_ratio_: DataArray (component), shares of the variance, largest first.
     """
 
-    def __init__(
-        self,
-        signs: Mapping[str, int],
-        *,
-        robust: bool = False,
-        method: str = "pca",
-        min_samples: int = 1,
-    ) -> None:
+    def __init__(self, signs: Mapping[str, int], *, min_samples: int = 1) -> None:
         """Declare the features.
 
         Args:
             signs: Signs by feature: +1 if it raises the index, -1 if it lowers it.
-            robust: Loadings from rank correlations (Spearman), robust to outliers and to monotone
-                transforms of the features.
-            method: `"zheng2023"` is for comparison with the later code of the paper's authors:
-                features scaled by median and interquartile range, uncut, the component's sign as
-                returned by the solver, the score mapped by the logistic function.
             min_samples: Least number of samples to fit on.
-
-        Raises:
-            TrustboError: An unknown method.
         """
         self.signs = signs
-        self.robust = robust
-        self.method = require_choice("method", method, METHODS)
         self.min_samples = require_whole("min_samples", min_samples, 1)
 
     @classmethod
@@ -110,10 +90,10 @@ class CompositeIndex(TransformerMixin, BaseEstimator):
         z = ((x - self._mean) / np.where(self._varies, self._sd, 1.0))[:, self._varies]
         weights, ratios = np.zeros(len(self.signs)), np.array([1.0])
         if self._varies.any():
-            vectors, ratios = _components(z, self.robust)
+            pca = PCA(svd_solver="covariance_eigh").fit(z)
+            first, ratios = pca.components_[0], pca.explained_variance_ratio_
             signs = np.array(list(self.signs.values()), dtype=float)[self._varies]
-            turn = 1.0 if self.method == "zheng2023" else np.sign(vectors[0] @ signs) or 1.0
-            weights[self._varies] = turn * vectors[0]
+            weights[self._varies] = (np.sign(first @ signs) or 1.0) * first
         self.loadings_ = xr.DataArray(
             weights, {"feature": list(self.signs)}, dims="feature", name="loading"
         )
@@ -121,8 +101,7 @@ class CompositeIndex(TransformerMixin, BaseEstimator):
             ratios, {"component": np.arange(1, len(ratios) + 1)}, dims="component"
         )
         self._scale(z @ weights[self._varies])
-        if self.method == "pca":
-            self._warn()
+        self._warn()
         return self
 
     def transform(self, features: xr.Dataset) -> xr.DataArray:
@@ -168,8 +147,6 @@ class CompositeIndex(TransformerMixin, BaseEstimator):
             raise TrustboError("a CompositeIndex needs a feature at least; signs is empty.")
         if self._top - self._bottom < 1e-9:
             return np.where(np.isfinite(score), 0.5, np.nan)
-        if self.method == "zheng2023":
-            return zheng2023.squash(score)
         ends = np.asarray([self._bottom, self._top], score.dtype)
         _to_unit(score.reshape(-1), *ends)
         return score
@@ -183,8 +160,6 @@ class CompositeIndex(TransformerMixin, BaseEstimator):
             | {"explained_variance_ratio": self.explained_variance_ratio_}
         )
         data.attrs = {
-            "robust": int(self.robust),
-            "method": self.method,
             "min_samples": self.min_samples,
             **{name: float(getattr(self, f"_{name}")) for name in _NUMBERS},
         }
@@ -197,8 +172,6 @@ class CompositeIndex(TransformerMixin, BaseEstimator):
         attrs = data.attrs
         index = cls(
             dict(zip(names, data["sign"].values.astype(int).tolist(), strict=True)),
-            robust=bool(attrs["robust"]),
-            method=str(attrs["method"]),
             min_samples=int(attrs["min_samples"]),
         )
         index.loadings_ = data["loading"].load()
@@ -228,12 +201,9 @@ class CompositeIndex(TransformerMixin, BaseEstimator):
 
     def _standardise(self, x: np.ndarray) -> None:
         """Fit the limits, centre and scale of each column."""
-        if self.method == "zheng2023":
-            self._low, self._high, self._mean, self._sd = zheng2023.robust_scale(x)
-        else:
-            self._low, self._high = np.percentile(x, [1, 99], axis=0)
-            x = np.clip(x, self._low, self._high)
-            self._mean, self._sd = x.mean(0), x.std(0)
+        self._low, self._high = np.percentile(x, [1, 99], axis=0)
+        x = np.clip(x, self._low, self._high)
+        self._mean, self._sd = x.mean(0), x.std(0)
         # A (nearly) constant feature carries no information, and has no z-score.
         self._varies = self._sd > 1e-9 * np.maximum(1.0, np.abs(self._mean))
 
@@ -262,16 +232,6 @@ class CompositeIndex(TransformerMixin, BaseEstimator):
 
 _COLUMNS = ("low", "high", "mean", "sd", "varies")
 _NUMBERS = ("bottom", "top")
-
-
-def _components(z: np.ndarray, robust: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Unit vectors (component, feature) and shares of the variance, largest first."""
-    if robust and z.shape[1] > 1:
-        ranks = stats.rankdata(z, axis=0)
-        values, vectors = np.linalg.eigh(np.corrcoef(ranks.T))
-        return vectors.T[::-1], values[::-1] / values.sum()
-    pca = PCA(svd_solver="covariance_eigh").fit(z)
-    return np.asarray(pca.components_), np.asarray(pca.explained_variance_ratio_)
 
 
 @njit(cache=True, nogil=True, fastmath={"contract", "nsz", "arcp", "reassoc"})
