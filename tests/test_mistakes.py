@@ -311,9 +311,6 @@ MISTAKES = {
     ),
     "a number exported": (lambda c: write_path("p.csv", 3), "plan: got int 3; give a Plan"),
     "a table of a number": (lambda c: write_csv("p.csv", 3), "result: got int 3; give a Result"),
-    "observers as text": (
-        lambda c: tb.Workspace.from_terrain(tb.terrain.example(), observers="x"), "array of numbers"
-    ),
     "latitude first": (
         lambda c: GRID.cell_at_lonlat(46.5, 200.0),
         r"'lon=46.5,lat=200' .*no place of the CRS.*outside the grid",

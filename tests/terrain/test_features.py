@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import rasterio
 import xarray as xr
-from worlds import CORNER, terrain_of
+from worlds import terrain_of
 
-from trustbo.errors import ShapeError, TerrainError, TrustboError
+from trustbo.errors import TerrainError, TrustboError
 from trustbo.terrain import FEATURES, pixel_features, rays, register_feature
 from trustbo.terrain.dataset import assemble_terrain
 from trustbo.terrain.features import (
@@ -16,7 +16,6 @@ from trustbo.terrain.features import (
     canopy_cover,
     canopy_height,
     curvature,
-    exposure,
     openness,
     roughness,
     slope,
@@ -185,25 +184,6 @@ def test_openness_is_the_mean_of_single_rays(pixel, reach, n_rays):
         expected = np.mean(passed) if passed else np.nan
         # float32 heights: a ray that grazes the ground to 1e-6 m may fall on either side.
         np.testing.assert_allclose(ours[i, j], expected, atol=2e-5)
-
-
-def test_exposure_is_the_share_of_observers_that_see_a_pixel():
-    dem = np.zeros((30, 30))
-    dem[:, 15] = 10.0  # a wall
-    terrain = terrain_of(dem)
-    west, east = CORNER + np.array([[2.5, -14.5], [27.5, -14.5]])
-    seen = exposure(terrain, [west, east], eye=2.0, target=1.0).values
-    np.testing.assert_allclose(seen[:, :14], 0.5)
-    np.testing.assert_allclose(seen[:, 17:], 0.5)
-    np.testing.assert_allclose(exposure(terrain, [west], reach=5.0).values[:, 8:], 0.0)
-    near = exposure(terrain, [west], reach=5.0).values
-    assert near[14, 2] == 1.0
-    with pytest.raises(
-        TerrainError, match=r"observer \(0, 0\) is off the terrain, which covers x 100 "
-    ):
-        exposure(terrain, [(0.0, 0.0)])
-    with pytest.raises(ShapeError, match=r"must be \(observer, 2\)"):
-        exposure(terrain, [1.0, 2.0])
 
 
 def test_features_keep_missing_pixels_missing():

@@ -16,7 +16,7 @@ from trustbo.terrain import (
     strips,
     synthetic_terrain,
 )
-from trustbo.terrain.features import canopy_cover, exposure, slope
+from trustbo.terrain.features import canopy_cover, slope
 from trustbo.workspace import Workspace
 from trustbo.workspace.awareness import cell_maps
 from trustbo.workspace.grid import Grid
@@ -101,19 +101,6 @@ def test_features_of_one_s_own_and_one_used_as_it_is(terrain):
     np.testing.assert_allclose(
         workspace.awareness.sel(robot="r1", feature="cover"), mean, atol=1e-6
     )
-
-
-def test_observers_become_a_third_feature(terrain, thin):
-    left, bottom, right, top = terrain.rio.bounds()
-    posts = [(left + 10.0, top - 10.0), (right - 10.0, bottom + 10.0)]
-    workspace = Workspace.from_terrain(terrain, (4, 3), observers=posts)
-    assert list(workspace.awareness["feature"].values)[2] == "exposure"
-    mean = workspace.grid.cell_means(exposure(terrain, posts))
-    np.testing.assert_allclose(
-        workspace.awareness.sel(robot="r1", feature="exposure"), mean, atol=1e-6
-    )
-    with pytest.raises(TerrainError, match="is off the terrain"):
-        Workspace.from_terrain(terrain, (4, 3), observers=[(0.0, 0.0)])
 
 
 @pytest.mark.parametrize(

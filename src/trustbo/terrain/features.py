@@ -5,12 +5,10 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import ArrayLike
 from scipy import ndimage
 
-from trustbo.arrays import as_array
-from trustbo.errors import ShapeError, TerrainError, require_whole
-from trustbo.terrain import fan, rays, stencil
+from trustbo.errors import require_whole
+from trustbo.terrain import fan, stencil
 from trustbo.terrain.dataset import pixel_size
 from trustbo.terrain.pixel_feature import (
     FEATURES,
@@ -136,71 +134,6 @@ def openness(
 
 
 FEATURES["openness"] = PixelFeature(openness, +1, REACH, by_rows=True)
-
-
-def exposure(
-    terrain: xr.Dataset,
-    observers: ArrayLike,
-    reach: float = np.inf,
-    *,
-    eye: float = 2.0,
-    target: float = 1.0,
-    extinction: float = 0.1,
-    crown_base: float = 0.3,
-    rows: slice | None = None,
-) -> xr.DataArray:
-    """Expected share of some observers, such as enemy posts, that see a pixel: (y, x), in [0, 1].
-
-    Args:
-        terrain: DEM and DSM.
-        observers: Positions of the observers, shape (observer, 2), x and y in CRS metres.
-        reach: Range of the observers, m.
-        eye: Height of the observers above ground, m.
-        target: Height of their targets above ground, m.
-        extinction: Extinction coefficient of the canopy, 1/m.
-        crown_base: Lower edge of the canopy layer as a share of its height.
-        rows: Rows of pixels to compute; the others are NaN.
-
-    Raises:
-        ShapeError: Observers that are no list of positions.
-        TerrainError: An observer off the terrain.
-    """
-    place = require_observers(terrain, observers)
-    height, width = pixel_size(terrain)
-    row = (float(terrain["y"][0]) - place[:, 1]) / height
-    col = (place[:, 0] - float(terrain["x"][0])) / width
-    values = rays.exposure(
-        terrain["dem"].values,
-        terrain["dsm"].values,
-        (height, width),
-        np.stack([row, col], axis=1),
-        reach,
-        (eye, target),
-        (extinction, crown_base),
-        rows or slice(None),
-    )
-    return _named(terrain["dem"].copy(deep=False, data=values), "exposure", "1")
-
-
-def require_observers(terrain: xr.Dataset, observers: ArrayLike) -> np.ndarray:
-    """Check that positions are on the terrain, and return them as an array (observer, 2).
-
-    ShapeError: no list of positions. TerrainError: one is off the terrain.
-    """
-    place = as_array("observers", observers)
-    if place.ndim != 2 or place.shape[1] != 2 or not len(place):
-        raise ShapeError(
-            f"observers must be (observer, 2), x and y in CRS metres; got shape {place.shape}."
-        )
-    left, bottom, right, top = terrain.rio.bounds(recalc=True)
-    inside = (place >= (left, bottom)).all(1) & (place <= (right, top)).all(1)
-    if not inside.all():
-        x, y = place[~inside][0]
-        raise TerrainError(
-            f"observer ({x:g}, {y:g}) is off the terrain, which covers x {left:g} to {right:g} and "
-            f"y {bottom:g} to {top:g}."
-        )
-    return place
 
 
 TRAVERSABILITY = ("slope", "roughness", "tri", "step_height")

@@ -6,14 +6,13 @@ from functools import partial
 
 import numpy as np
 import xarray as xr
-from numpy.typing import ArrayLike
 
 from trustbo.errors import TerrainError, TrustboError, require_kind
 from trustbo.team import Team
 from trustbo.terrain import stencil
 from trustbo.terrain.composite import MAX_PIXELS, CompositeIndex
 from trustbo.terrain.dataset import is_lazy, pixel_size
-from trustbo.terrain.features import exposure, openness, require_observers
+from trustbo.terrain.features import openness
 from trustbo.terrain.pixel_feature import FEATURES, PixelFeature, feature_named
 from trustbo.terrain.strips import Strip, sample_strips, strips
 
@@ -45,14 +44,12 @@ class PixelAwareness:
         team: Team,
         *,
         reach: float = np.inf,
-        observers: ArrayLike | None = None,
     ) -> None:
-        """Fit the composites; see `Workspace.from_terrain` for features and observers.
+        """Fit the composites; see `Workspace.from_terrain` for features.
 
         Openness is over the range of the team's lidars, at most `reach` and half the terrain.
 
-        TrustboError: an unknown feature. TerrainError: an observer off the terrain, or too few
-        pixels.
+        TrustboError: an unknown feature. TerrainError: too few pixels.
         """
         remedy = "give definitions by name, e.g. {'slope': 'slope'}"
         features = require_kind("features", features, Mapping, remedy)
@@ -60,9 +57,6 @@ class PixelAwareness:
         height, width = pixel_size(terrain)
         n_rows, n_cols = terrain["dem"].shape
         self._use_lidar(team, min(reach, 0.5 * min(n_rows * height, n_cols * width)))
-        if observers is not None:
-            compute = partial(exposure, observers=require_observers(terrain, observers))
-            self._features["exposure"] = PixelFeature(compute, 1, np.inf, by_rows=True)
         # Rows on both sides on which each feature depends.
         around = {
             name: int(min(n_rows, np.ceil(max(part.halo for part in _parts(f)) / height) + 2))

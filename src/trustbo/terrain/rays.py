@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numba import njit
 
-from trustbo.parallel import PART, over_rows
+from trustbo.parallel import PART
 
 # A division that checks for 0 takes as long as the rest.
 _compiled = njit(
@@ -190,62 +190,6 @@ def share_inside(a0, a1, b0, b1):
     low = low_a if low_a > low_b else low_b
     high = high_a if high_a < high_b else high_b
     return high - low if high > low else zero
-
-
-def exposure(
-    ground: np.ndarray,
-    surface: np.ndarray,
-    pixel: tuple[float, float],
-    observers: np.ndarray,
-    reach: float,
-    heights: tuple[float, float],
-    canopy: tuple[float, float],
-    rows: slice,
-) -> np.ndarray:
-    """Mean transmittance from observers to every pixel, shape (row, col); 0 beyond their reach.
-
-    Observers are (observer, 2), row and column in fractions of pixels; `heights` those of observers
-    and targets above ground, m; `canopy` its extinction, 1/m, and crown base. NaN in other rows
-    than `rows`.
-    """
-    result = np.full(ground.shape, np.nan)
-    top, bottom, _ = rows.indices(len(ground))
-
-    def work(first: int, last: int) -> None:
-        limits = (top + first, top + last)
-        _exposure(ground, surface, pixel, observers, reach, heights, canopy, result, *limits)
-
-    over_rows(work, bottom - top)
-    return result
-
-
-@_compiled
-def _exposure(ground, surface, pixel, observers, reach, heights, canopy, result, first, last):
-    n_rows, n_cols = ground.shape
-    work = work_space()
-    for i in range(first, last):
-        for j in range(n_cols):
-            if not ground[i, j] == ground[i, j]:
-                continue
-            total = 0.0
-            for k in range(len(observers)):
-                r, c = observers[k, 0], observers[k, 1]
-                if math.hypot((i - r) * pixel[0], (j - c) * pixel[1]) > reach:
-                    continue
-                # The outer half of an edge pixel has the height of its centre.
-                r, c = min(max(r, 0.0), n_rows - 1.0), min(max(c, 0.0), n_cols - 1.0)
-                total += ray_transmittance(
-                    ground,
-                    surface,
-                    pixel,
-                    (r, c, ground_height(ground, r, c) + heights[0]),
-                    (float(i), float(j), ground[i, j] + heights[1]),
-                    TRANSMITTANCE,
-                    canopy[0],
-                    canopy[1],
-                    work,
-                )
-            result[i, j] = total / len(observers)
 
 
 @_compiled

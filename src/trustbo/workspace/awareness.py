@@ -71,7 +71,6 @@ def cell_maps(
     features: Mapping[str, object],
     team: Team,
     *,
-    observers: ArrayLike | None = None,
     keep_pixels: bool = True,
 ) -> CellMaps:
     """Compute awareness and passability of each cell; see `Workspace.from_terrain`.
@@ -81,7 +80,7 @@ def cell_maps(
     dem = terrain["dem"]
     cells = CellMeans(grid.shape, *grid.cells_along(dem["y"].values, dem["x"].values))
     diagonal = float(np.hypot(grid.cell_height, grid.cell_width))
-    pixels = PixelAwareness(terrain, features, team, reach=diagonal, observers=observers)
+    pixels = PixelAwareness(terrain, features, team, reach=diagonal)
     kept = (*pixels.names, "passable") if keep_pixels and not pixels.is_lazy else ()
     maps: dict[str, list[np.ndarray]] = {name: [] for name in kept}
 

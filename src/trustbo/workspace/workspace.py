@@ -90,7 +90,6 @@ class Workspace(Displayed):
         team: Team | None = None,
         *,
         features: Mapping[str, object] | None = None,
-        observers: ArrayLike | None = None,
         bounds: bool = True,
         sight: Sight | str | Sequence[Sight | str] = "transmittance",
         posts: str = "way",
@@ -121,8 +120,6 @@ class Workspace(Displayed):
                 composite (see `terrain.FEATURES`), a mapping of names to `PixelFeature`, or one
                 `PixelFeature` in [0, 1] that is used unchanged. By default traversability and
                 visibility, of `terrain.TRAVERSABILITY` and `terrain.VISIBILITY`.
-            observers: Positions of enemies, shape (observer, 2), x and y in CRS metres: the share
-                of them that see a pixel becomes one more feature, `exposure`.
             bounds: False for awareness of cells alone, as in the paper: traversability, and the
                 visibility of `terrain.PAPER_VISIBILITY`.
             sight: Assumed model of sight, or its mode: `"bare"`, `"wall"` or `"transmittance"`; of
@@ -140,10 +137,10 @@ class Workspace(Displayed):
                 `"alternate"`, it passes the lead in the next, so that they lead by turns.
 
         Raises:
-            TerrainError: A grid too fine for the raster, an observer off the terrain, a cell
-                without standing room for the team, a DSM without the canopy that a sight needs, a
-                terrain that is read lazily, unless `bounds` is False, or a dataset that is no
-                terrain: without dem, dsm or a metric CRS, or with irregular coordinates.
+            TerrainError: A grid too fine for the raster, a cell without standing room for the team,
+                a DSM without the canopy that a sight needs, a terrain that is read lazily, unless
+                `bounds` is False, or a dataset that is no terrain: without dem, dsm or a metric
+                CRS, or with irregular coordinates.
             TrustboError: No cell is passable, or an unknown name of a rule.
         """
         terrain, sights = require_terrain(terrain), sights_of(sight)
@@ -157,7 +154,7 @@ class Workspace(Displayed):
             "visibility": VISIBILITY if bounds else PAPER_VISIBILITY,
         }
         with compiling():
-            maps = cell_maps(terrain, grid, features or defaults, team, observers=observers)
+            maps = cell_maps(terrain, grid, features or defaults, team)
             workspace = cls(
                 *maps.of_team(grid, team),
                 grid,
