@@ -11,10 +11,6 @@ are 95 %, bootstrap over worlds.
 `cover`: the same by `unseen_cost`, of the first plan and of that after eight missions of the
 default campaign, in the worlds of wellington; with the share unseen by the map, which is paid.
 
-`alternate`: by the order of moves, on the first plan of each, in worlds whose map is right or old.
-In alternate bounding at its own posts, and at those of successive bounding, which look at the
-lead's way from their own cell on. `predicted` is lost by the map.
-
 `robots`: the same of robots that differ (r1 has its lidar on a mast of 3 m, r3 one that finds 60 %
 within 40 m), given to the posts of the path by the plan, or not.
 """
@@ -43,7 +39,7 @@ RULES: dict[str, dict[str, Any]] = {
 }
 FIRST = "0.2"
 N, MISSION = 16, 7
-PARTS = "rules", "cover", "alternate", "robots"
+PARTS = "rules", "cover", "robots"
 UNLIKE = Team(robots=(Robot(sensor_height=3.0), Robot(), Robot(detection=0.6, lidar_range=40.0)))
 KINDS = "right", "aged"
 COSTS = 0.0, 1.0, 3.0, 10.0
@@ -67,9 +63,6 @@ def main() -> None:
     if "cover" in given.names:
         here = [w for w in chosen if w.name.startswith(PLACE)]
         show_cover(records_of(given.out / "cover.jsonl", here, courses, N, covered))
-    if "alternate" in given.names:
-        known = [w for w in chosen if w.kind in KINDS]
-        show_orders(records_of(given.out / "alternate.jsonl", known, courses, N, by_order))
     if "robots" in given.names:
         show_robots([w for w in chosen if w.kind in KINDS], courses)
 
@@ -133,48 +126,6 @@ def show_cover(records: Sequence[dict[str, Any]]) -> None:
             f"{100.0 * mean['map']:.2f}", f"{mean['bounds']:.2f}", f"{np.nanmean(longer):.2f}",
             f"{mean['arrive']:.3f}", f"{changed:.0%}",
         )  # fmt: skip
-
-
-def by_order(world: World, course: str, n: int) -> dict[str, Any]:
-    """Means over missions on the first plan, by the order of moves and the posts."""
-    rules = {}
-    for bounding in ("successive", "alternate"):
-        workspace = world.workspace(bounding=bounding)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # of cells that have no room
-            campaign = Campaign(
-                workspace, *world.ends(course), connectivity=world.connectivity, seed=0
-            )
-        path, simulator = campaign.recommend().path, world.simulator(workspace)
-        own = workspace.ground.posts.along(path)
-        seen = workspace.watch.seen_along(path, own).line_of_sight().mean(1)
-        predicted = {"predicted": float((1.0 - seen).sum())}
-        rules[bounding] = summed(driven(simulator, path, n)) | predicted
-        if bounding == "alternate":
-            stands = [path[k - k % 2 :][:2] for k in range(len(path) - 1)]  # T2 passes in each 2nd
-            posts = [workspace.posts(*bound) for bound in stands]
-            missions = simulator.run_batch(path, range(n), mission=MISSION, posts=posts)
-            rules["alternate, posts of successive"] = summed(missions)
-    return {"world": world.name, "kind": world.kind, "course": course, "n": n, "rules": rules}
-
-
-def show_orders(records: Sequence[dict[str, Any]]) -> None:
-    """Print a row for each order of moves and posts."""
-    print("\nBy the order of moves, and in alternate bounding by the rule of posts\n")
-    table = Table("bounding", "lost", "predicted", "unseen", "seconds", "arrive", first=32)
-    for rule in records[0]["rules"]:
-        predicted = np.mean([r["rules"][rule].get("predicted", np.nan) for r in records])
-        lost, unseen, duration, arrive = (
-            np.nanmean([_of(r, rule, what) for r in records])
-            for what in ("lost", "unseen", "duration", "arrive")
-        )
-        table.row(
-            rule, f"{lost:.3f}", f"{predicted:.3f}", f"{unseen:.4f}", f"{duration:.0f}",
-            f"{arrive:.3f}",
-        )  # fmt: skip
-    rules = "alternate, posts of successive", "alternate"
-    for name, some in {**_by(records, "kind"), "all": records}.items():
-        print(f"Saved by its own posts, %, {name}: {_interval(some, rules[1], rules[0])}")
 
 
 def show_robots(chosen: Sequence[World], courses: Sequence[str]) -> None:

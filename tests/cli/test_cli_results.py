@@ -16,7 +16,6 @@ from trustbo.inference.samplers.choice import SAMPLERS
 from trustbo.models.families import AUTO, FAMILIES
 from trustbo.planning import OBJECTIVES, POLICIES
 from trustbo.study.methods import MODELS
-from trustbo.workspace.bounding import BOUNDING
 from trustbo.workspace.sight import SIGHT_MODES
 
 COMMANDS = ("demo", "run", "resume", "report", "export", "study")
@@ -228,7 +227,7 @@ def test_shells_complete_commands_flags_and_names():
     [
         ("policy", POLICIES), ("objective", OBJECTIVES), ("sampler", SAMPLERS),
         ("model", MODELS), ("observation", [AUTO, *FAMILIES]),
-        ("sight", SIGHT_MODES), ("bounding", BOUNDING),
+        ("sight", SIGHT_MODES),
     ],
 )  # fmt: skip
 def test_the_names_that_shells_complete_are_all_there_are(option, names):

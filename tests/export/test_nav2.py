@@ -60,6 +60,5 @@ def test_what_cannot_be_followed_is_refused(result, nowhere, tmp_path):
 
 
 def test_a_robot_that_stands_faces_its_next_place():
-    """In alternate bounding it is in one place before and after a bound of the others."""
     places = np.array([[0.0, 0.0], [0.0, 0.0], [0.0, 2.0], [3.0, 2.0]])
     np.testing.assert_allclose(onward(places)[:, 2], [np.pi / 2, np.pi / 2, 0.0, 0.0])

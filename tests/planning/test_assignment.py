@@ -236,12 +236,3 @@ def test_posts_that_no_one_can_have_stood_at_are_refused(unlike):
     np.testing.assert_array_equal(
         campaign.as_learned(told).awareness, campaign.as_learned(mission).awareness
     )
-
-
-def test_robots_are_not_assigned_in_alternate_bounding(unlike):
-    workspace, _, plan = unlike
-    rules = replace(workspace.formation, bounding="alternate")
-    by_turns = replace(plan, workspace=replace(workspace, formation=rules))
-    assert plan.robots is not None
-    assert by_turns.robots is None
-    assert KinematicSimulator(by_turns.workspace).run(by_turns, seed=0).posts is None

@@ -258,19 +258,6 @@ def test_measured_awareness_can_be_fused_with_the_robots_states(wooded):
         KinematicSimulator(wooded, realtime={"trust": indices["visibility"]})
 
 
-def test_alternate_bounding_leads_by_turns(wooded):
-    path = [(2, 0), (2, 1), (1, 1), (0, 2)]
-    workspace = Workspace.from_terrain(wooded.terrain, (3, 3), bounding="alternate")
-    mission = KinematicSimulator(workspace).run(path, seed=0)
-    assert mission.status == "ok"
-    moving = [(np.ptp(b.poses[..., :2], axis=0) > 1e-9).any(-1) for b in mission.bounds]
-    assert moving[0].tolist() == [True, False, False, False]  # the lead
-    assert moving[1].tolist() == [False, True, True, True]  # T2 passes it
-    assert moving[2].all()  # the lead reaches the goal, and T2 closes up
-    ends = [wooded.grid.cell_at(x, y) for x, y in mission.bounds[-1].poses[-1, :, :2]]
-    assert ends == [(0, 2)] * 4
-
-
 def test_iterate_tells_the_simulator_which_mission_it_is(flat):
     jam = Threat("jam", flat.grid.center((1, 1)), 60.0, first_mission=1, strength=0.9)
     # Rates that are all 1 would be refused.

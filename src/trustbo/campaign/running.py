@@ -42,7 +42,6 @@ def run_missions(
         if not isinstance(truth, Truth):
             raise TrustboError(f"truth must be Truth.of(simulator); got {truth!r}.")
         truth.require_workspace(campaign.workspace)
-        truth.require_best()
     rules = require_stops(stop)
     describe = getattr(runner, "describe", lambda: {"simulator": type(runner).__name__})
     # As a file gives them back: tuples are lists there, and arrays too.

@@ -41,11 +41,11 @@ from trustbo.workspace.moves import require_on_grid
 
 STATE, RESULT, WORKSPACE, MEASURED = "campaign.json", "result.json", "workspace.nc", "measured.nc"
 MISSIONS, HISTORY, TABLE = "missions.nc", "history.nc", "history.csv"
-BELIEVED, POSTERIOR = "believed.nc", "posterior.nc"
+POSTERIOR = "posterior.nc"
 POSTERIORS, TICKS = "posteriors", "ticks"
 """Folders of numbered files."""
 _FILES = (
-    STATE, RESULT, MEASURED, MISSIONS, HISTORY, TABLE, BELIEVED, POSTERIOR, WORKSPACE,
+    STATE, RESULT, MEASURED, MISSIONS, HISTORY, TABLE, POSTERIOR, WORKSPACE,
 )  # fmt: skip
 """Files of a campaign, the records first: what they describe is removed after them."""
 

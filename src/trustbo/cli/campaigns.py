@@ -29,7 +29,6 @@ def run(
     max_slope: float = 45.0,
     lidar_range: float = 100.0,
     sight: str = "transmittance",
-    bounding: str = "successive",
     objective: str = OBJECTIVE,
     policy: str = POLICY,
     model: str = "robots",
@@ -59,7 +58,7 @@ def run(
     """
     _require_flags(
         iterations, seed, policy=policy, objective=objective, model=model, sampler=sampler,
-        sight=sight, bounding=bounding, observation=observation,
+        sight=sight, observation=observation,
     )  # fmt: skip
     cells, team = pair("shape", shape), team_of(max_slope, robots, lidar_range)
     chosen = CampaignOptions(**options)
@@ -73,7 +72,7 @@ def run(
     stop = None if stop_regret is None else RegretBound(eps=stop_regret)
     read = reader_of(dem, dsm, crs, resolution, nodata)
     workspace, ends = workspace_with(
-        start, goal, read, cells, team, progress=not quiet, sight=sight, bounding=bounding
+        start, goal, read, cells, team, progress=not quiet, sight=sight
     )
     result = iterate(
         workspace, *ends, n_iterations=iterations, model=trust_model, policy=policy,

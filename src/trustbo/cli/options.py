@@ -30,8 +30,6 @@ Robots and sight
   robots N: Number of robots that overwatch the lead.
   max_slope DEG: Steepest slope that robots can drive.
   lidar_range M: Range within which robots track each other.
-  bounding NAME: Order of the moves: successive (T2 closes up to the lead in each bound), alternate
-    (it passes the lead in the next).
   sight MODE: Obstacles to sight: bare (the ground), wall (canopy too), transmittance (canopy dims
     it).
 Paths

@@ -1,8 +1,7 @@
 """Difficulty of bounds: measures of their routes relative to the robots' limits.
 
 Each measure is 0 on easy routes and about 1 at the robots' limit; a bound has the maximum over the
-routes of the lead and of T2. T2's routes assume the next cell straight ahead, and those of
-alternate bounding the cell before straight behind.
+routes of the lead and of T2. T2's routes assume the next cell straight ahead.
 """
 
 import math
@@ -75,9 +74,7 @@ def _measure(workspace: Workspace, ways: Ways, exists: np.ndarray, out: np.ndarr
             left, ahead = (row - down, col - right), (row + down, col + right)
             inside = 0 <= ahead[0] < exists.shape[1] and 0 <= ahead[1] < exists.shape[2]
             onward = ahead if inside and exists[m, *ahead] else None
-            before = (row - 2 * down, col - 2 * right) if exists[m, *left] else None
-            bound = ways.bound(left, cell, onward, before)
-            out[m, row, col] = _of_bound(ways, easy, room, bound)
+            out[m, row, col] = _of_bound(ways, easy, room, ways.bound(left, cell, onward))
 
     for _ in in_order(work, batched(np.argwhere(exists).tolist(), _BLOCK)):
         pass

@@ -37,8 +37,6 @@ def robots_along(
     team, table = workspace.team, workspace.watch
     if table is None or workspace.of_bounds is None or not 1 < team.n_robots <= MAX_ROBOTS:
         return None
-    if workspace.formation.bounding != "successive":  # whose phases a state is of
-        return None
     sight = workspace.along(path)[..., -len(workspace.sights)].sum(0)
     weights = np.clip(trust, 0.0, 1.0).sum(0) / np.maximum(sight, 1e-6)
     weights = weights / weights.max(initial=1e-6)

@@ -148,11 +148,7 @@ class Plan(Displayed):
 
     @cached_property
     def stops(self) -> np.ndarray | None:
-        """Stops of the lead before each bound and at the goal, shape (bound + 1, 2).
-
-        In successive bounding those in the cells of the path; in alternate bounding it stays where
-        it is while T2 passes.
-        """
+        """Stops of the lead in the cells of the path, shape (bound + 1, 2)."""
         ground = self.workspace.ground
         return None if ground is None else ground.posts.places(self.path)[0]
 
@@ -188,7 +184,7 @@ class Plan(Displayed):
         """Ways of each bound: the lead's, then each of T2's, polylines of shape (point, 2).
 
         T2 closes up to its posts for the next bound, at the goal around the lead. None for a robot
-        that has no way; that of one that does not move in the bound is its place, twice.
+        that has no way.
         """
         ground = self.workspace.ground
         return None if ground is None else tuple(ground.along(self.path, self.own_posts))

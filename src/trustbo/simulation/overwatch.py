@@ -22,7 +22,6 @@ from trustbo.team import Robot, Team
 from trustbo.terrain import CompositeIndex
 from trustbo.terrain.dataset import digest_of
 from trustbo.workspace import Workspace
-from trustbo.workspace.bounding import Leg, after, legs, t2_cells
 from trustbo.workspace.sight import Sight, sights_of
 
 
@@ -32,8 +31,7 @@ class KinematicSimulator(DescribedSimulator):
     In the first phase of a bound the lead drives to its stop in the next cell while T2 watches from
     its posts in the last; in the second, T2 closes up to its next posts while the lead watches. The
     contact rate of a robot of T2 is the share of ticks, of both phases, in which it is in contact
-    with the lead. In a workspace of alternate bounding T2 does not close up but passes the lead in
-    the next bound, so that they lead by turns; at the goal the one behind closes up.
+    with the lead.
 
     `run` runs a path, `run_batch` many missions over one; `reset`, `run_bound` and `close` run one
     bound by bound.
@@ -104,11 +102,6 @@ class KinematicSimulator(DescribedSimulator):
         self._watchers = self.team.robots, (self.team.lead,) * len(self.team.robots)
         self._state: State | None = None
         self._enter(0)
-
-    @property
-    def bounding(self) -> str:
-        """Mode of bounding, the workspace's."""
-        return self.workspace.formation.bounding
 
     def describe(self) -> dict[str, object]:
         """Return the settings that decide what a mission measures."""
@@ -206,10 +199,9 @@ class KinematicSimulator(DescribedSimulator):
         ground = self.workspace.ground
         assert ground is not None  # noqa: S101  # `true_surface` has refused others
         for k, i in np.argwhere(~ground.posts.are_reached(path, given)).tolist():
-            cell = t2_cells(self.bounding, path)[k]
             raise TrustboError(
                 f"posts[{k}, {i}] = {given[k, i].round(1).tolist()} cannot be reached from the "
-                f"lead's stop in cell {cell} over passable ground at most half a cell around "
+                f"lead's stop in cell {path[k]} over passable ground at most half a cell around "
                 "it; Workspace.posts has posts that can."
             )
         return given
@@ -267,21 +259,18 @@ class KinematicSimulator(DescribedSimulator):
         independent; where tracks outlast misses, that of simulated scans. Fouling is as in the long
         run.
         """
-        moves: dict[tuple[Leg, bytes], int] = {}  # by their goals
-        drives, runs = [], []
+        lead = self._advance(state, cell, self._max_ticks, rng)
+        now, left = _after(state, lead), self._max_ticks - len(lead.poses)
+        drives, runs = [lead], []
+        moves: dict[bytes, int] = {}  # by their goals
         for next_cell in ahead:
-            now, run = state, list[int]()
-            for leg in legs(self.bounding, k, state.cells, cell, next_cell is None):
-                goals = self._goals(leg, next_cell)
-                key = leg, goals.tobytes()
-                if key not in moves:
-                    left = self._max_ticks - sum(len(drives[i].poses) for i in run)
+            run = [0]
+            if lead.status == "ok":
+                goals = self._ways.posts.watching(cell, next_cell)
+                if (key := goals.tobytes()) not in moves:
                     moves[key] = len(drives)
-                    drives.append(self._move_leg(now, leg, goals, left, rng))
+                    drives.append(self._close_up(now, cell, goals, left, rng))
                 run.append(moves[key])
-                now = _after(now, drives[run[-1]])
-                if drives[run[-1]].status != "ok":
-                    break
             runs.append(run)
         lidars = self.team.lead, *self.team.robots
         independent = all(robot.acquire == robot.drop == 1 for robot in lidars)
@@ -292,7 +281,7 @@ class KinematicSimulator(DescribedSimulator):
         outcomes = []
         for run in runs:
             whole = _joined([drives[i] for i in run])
-            then = _after(state, whole)
+            then = _after(state, whole, cell)
             then.tracks = state.tracks.copy()
             probability = np.concatenate([seen[i] for i in run])
             if not independent:
@@ -347,7 +336,7 @@ class KinematicSimulator(DescribedSimulator):
         first = rule.watching(cell, next_cell) if posts is None else posts[0]
         stops = np.concatenate([rule.stop(cell)[None], first])
         poses = np.concatenate([stops, np.zeros((len(stops), 1))], axis=1)
-        return State((cell, cell), poses, stops, 0.0, seed, new_tracks(len(first)), posts)
+        return State(cell, poses, stops, 0.0, seed, new_tracks(len(first)), posts)
 
     def _bounds(
         self, states: Sequence[State], k: int, cell: Cell, next_cell: Cell | None
@@ -382,58 +371,69 @@ class KinematicSimulator(DescribedSimulator):
             kept = x if self.record_states else None
             of_bound = cell, z, contact.mean(0), duration, drive.status, state.time
             bounds.append(Bound(*of_bound, drive.poses, contact, ticks, kept))
-            state.cells, state.poses, state.stops = drive.cells, drive.poses[-1], drive.stops
-            state.time = bounds[-1].t1
+            state.poses, state.stops, state.time = drive.poses[-1], drive.stops, bounds[-1].t1
+            state.cell = cell if drive.status == "ok" else state.cell
         return bounds
 
     def _drive(
         self, state: State, k: int, cell: Cell, next_cell: Cell | None, rng: np.random.Generator
     ) -> Drive:
-        """Drive the lead, then T2; or in alternate bounding one of them, by turns."""
-        now, drives, left = state, list[Drive](), self._max_ticks
-        for leg in legs(self.bounding, k, state.cells, cell, next_cell is None):
-            goals = self._goals(leg, next_cell)
-            if not leg.of_lead and state.posts is not None and k < len(state.posts):
-                goals = state.posts[k]
-            drives.append(self._move_leg(now, leg, goals, left, rng))
-            now, left = _after(now, drives[-1]), left - len(drives[-1].poses)
-            if drives[-1].status != "ok":
-                break
-        return _joined(drives)
+        """Drive the lead, then T2."""
+        lead = self._advance(state, cell, self._max_ticks, rng)
+        if lead.status != "ok":
+            return lead
+        own = state.posts is not None and k < len(state.posts)
+        goals = state.posts[k] if own else self._ways.posts.watching(cell, next_cell)
+        left = self._max_ticks - len(lead.poses)
+        return _joined([lead, self._close_up(_after(state, lead), cell, goals, left, rng)])
 
-    def _goals(self, leg: Leg, next_cell: Cell | None) -> np.ndarray:
-        """Stops of those who move, shape (robot, 2)."""
-        posts = self._ways.posts
-        if leg.of_lead:
-            return posts.stop(leg.end)[None]
-        return posts.watching(leg.end, next_cell, leg.watched_from)
+    def _advance(self, state: State, cell: Cell, max_ticks: int, rng: np.random.Generator) -> Drive:
+        """Drive the lead to its stop in a cell while T2 stands."""
+        robots = [self.team.lead], [self.workspace.team.lead]
+        goals = self._ways.posts.stop(cell)[None]
+        return self._move_part(state, cell, slice(0, 1), robots, goals, max_ticks, rng)
 
-    def _move_leg(
-        self, state: State, leg: Leg, goals: np.ndarray, max_ticks: int, rng: np.random.Generator
+    def _close_up(
+        self,
+        state: State,
+        cell: Cell,
+        goals: np.ndarray,
+        max_ticks: int,
+        rng: np.random.Generator,
     ) -> Drive:
-        """Drive the lead or T2 to goals while the others stand.
+        """Drive T2 to goals (robot, 2) in a cell while the lead stands."""
+        robots = self.team.robots, self.workspace.team.robots
+        return self._move_part(state, cell, slice(1, None), robots, goals, max_ticks, rng)
+
+    def _move_part(
+        self,
+        state: State,
+        cell: Cell,
+        members: slice,
+        robots: tuple[Sequence[Robot], Sequence[Robot]],
+        goals: np.ndarray,
+        max_ticks: int,
+        rng: np.random.Generator,
+    ) -> Drive:
+        """Drive part of the team, the true `robots` as those that were planned for, to goals.
 
         Routes start at the planned posts, robots at their current poses.
         """
-        team, workspace, now = self.team, self.workspace, state.poses
-        if leg.of_lead:
-            members, robots, planned = slice(0, 1), [team.lead], [workspace.team.lead]
-        else:
-            members, robots, planned = slice(1, None), team.robots, workspace.team.robots
-        window = self._ways.posts.window(*leg.cells)
+        true, planned = robots
+        now, window = state.poses, self._ways.posts.window(state.cell, cell)
         routes: list[np.ndarray | None] = []
         for robot, start, goal, pose in zip(
             planned, state.stops[members], goals, now[members], strict=True
         ):
             route = self._ways.routes.find(robot, start, goal, window)
             routes.append(None if route is None else np.concatenate([pose[None, :2], route[1:]]))
-        moved, status = self._move(now[members], robots, routes, window, max_ticks, rng)
+        moved, status = self._move(now[members], true, routes, window, max_ticks, rng)
         poses = np.repeat(now[None], len(moved), axis=0)
         poses[:, members] = moved
-        cells, stops = state.cells, state.stops.copy()
+        stops = state.stops.copy()
         if status == "ok":
-            cells, stops[members] = after(cells, [leg]), goals
-        return Drive(poses, np.full(len(poses), leg.of_lead), status, cells, stops)
+            stops[members] = goals
+        return Drive(poses, np.full(len(poses), members.start == 0), status, stops)
 
     def _move(
         self,
@@ -462,9 +462,10 @@ class KinematicSimulator(DescribedSimulator):
         return contact
 
 
-def _after(state: State, drive: Drive) -> State:
-    """State after movements, of the same tracks."""
-    return dataclasses.replace(state, cells=drive.cells, poses=drive.poses[-1], stops=drive.stops)
+def _after(state: State, drive: Drive, cell: Cell | None = None) -> State:
+    """State after movements, of the same tracks; in a cell if the bound into it is over."""
+    moved = dataclasses.replace(state, poses=drive.poses[-1], stops=drive.stops)
+    return moved if cell is None else dataclasses.replace(moved, cell=cell)
 
 
 def _joined(drives: Sequence[Drive]) -> Drive:

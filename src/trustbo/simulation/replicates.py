@@ -64,7 +64,7 @@ class KinematicReplicates:
     """
 
     def __init__(self, simulator: KinematicSimulator, mission: int, seed: int) -> None:
-        """Take a simulator of successive bounding in the world of a mission."""
+        """Take a simulator in the world of a mission."""
         self._simulator, self._seed, self.most = copy(simulator), seed, 64
         self._edges = edges_of(simulator.workspace)
         self._ends: dict[tuple[Cell, Cell | None], dict[int, State]] = {}

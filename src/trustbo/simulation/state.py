@@ -12,7 +12,7 @@ from trustbo.data import Cell
 class State:
     """Positions of the team between two bounds; positions in CRS metres, headings in rad."""
 
-    cells: tuple[Cell, Cell]  # of the lead, and of T2
+    cell: Cell
     poses: np.ndarray  # (1 + robot, 3), the lead first
     stops: np.ndarray  # (1 + robot, 2), planned posts: the routes start there
     time: float
@@ -27,7 +27,6 @@ class Drive(NamedTuple):
     poses: np.ndarray  # (tick, 1 + robot, 3)
     lead_moves: np.ndarray  # (tick,), else T2 does
     status: str
-    cells: tuple[Cell, Cell]
     stops: np.ndarray  # (1 + robot, 2)
 
     @property

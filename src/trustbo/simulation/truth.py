@@ -57,14 +57,13 @@ class Truth(Displayed):
     Attributes:
         workspace: Workspace of the paths.
         bounds: Expected contact of bounds: a `BoundTable`, whose `data` has it all, or a
-            `ModelContact`; None in alternate bounding, where that of a bound depends on those
-            before.
+            `ModelContact`.
     """
 
     def __init__(
         self,
         workspace: Workspace,
-        bounds: BoundTable | ModelContact | None,
+        bounds: BoundTable | ModelContact,
         at_mission: "Callable[[int], Truth] | None" = None,
         run: Callable[[Sequence[Cell], np.ndarray | None], list[Mission]] | None = None,
     ) -> None:
@@ -78,10 +77,8 @@ class Truth(Displayed):
 
     def _card(self) -> Card:
         grid = self.workspace.grid
-        source, error = "missions over each path", "that of 64 missions"
-        if self.bounds is not None:
-            source = f"{type(self.bounds).__name__}, of {grid.shape[0]} x {grid.shape[1]} cells"
-            error = f"{self.bounds.standard_error:.2g} of a bound's contact, mean over robots"
+        source = f"{type(self.bounds).__name__}, of {grid.shape[0]} x {grid.shape[1]} cells"
+        error = f"{self.standard_error:.2g} of a bound's contact, mean over robots"
         rows = [
             ("bounds", source),
             ("standard error", error),
@@ -107,9 +104,6 @@ class Truth(Displayed):
         standard error is reached; the result is cached on disk under a hash of the world's
         settings (`describe_mission(mission)`, else `describe()`), the workspace and the code. Of
         what varies within a mission (`Fouling`), contact is the expectation in the long run.
-
-        In alternate bounding contact depends on who moves and on five cells in a row: the truth has
-        the value of paths, each from 64 missions, but no best path, and so no regret.
 
         Args:
             simulator: Simulator with a `workspace`, and with `reset` and `run_bound`.
@@ -137,10 +131,7 @@ class Truth(Displayed):
         def of_mission(number: int) -> Self:
             world = _world(simulator, require_whole("mission", number, 0))
             if (key := to_json(world)) not in cached:
-                by_turns = workspace.formation.bounding == "alternate"
-                by_turns &= isinstance(simulator, KinematicSimulator)
-                asked = simulator, number, world, *numbers, folder, progress
-                table = None if by_turns else _table(*asked)
+                table = _table(simulator, number, world, *numbers, folder, progress)
                 run = partial(_runs, simulator, number) if takes(simulator.run, "posts") else None
                 cached[key] = cls(workspace, table, of_mission, run)
             return cached[key]
@@ -149,11 +140,8 @@ class Truth(Displayed):
 
     @property
     def standard_error(self) -> float:
-        """Standard error of the contact of a bound, mean over robots: root mean square over all.
-
-        NaN without contact of bounds.
-        """
-        return np.nan if self.bounds is None else self.bounds.standard_error
+        """Standard error of the contact of a bound, mean over robots: root mean square over all."""
+        return self.bounds.standard_error
 
     def at(self, mission: int) -> "Truth":
         """Truth of the world of another mission, counted from 0."""
@@ -178,36 +166,34 @@ class Truth(Displayed):
             connectivity: moves, both as for `Planner`.
 
         Raises:
-            TrustboError: An unknown name; a cell off the grid, or impassable; alternate bounding.
+            TrustboError: An unknown name; a cell off the grid, or impassable.
             NoPathError: The goal cannot be reached.
         """
         require_choice("objective of a truth", objective, OBJECTIVES)
-        bounds = self.require_best()
         a, b = (self.workspace.require_cell(*e) for e in (("start", start), ("goal", goal)))
         key = a, b, objective, max_bounds, connectivity
         if key not in self._best:
             paths = AdmissiblePaths(self.workspace, a, b, PathClass(connectivity, max_bounds))
-            self._best[key] = bounds.best(paths, objective)
+            self._best[key] = self.bounds.best(paths, objective)
         return self._best[key]
 
     def value(self, path: Plan | Sequence[Cell]) -> PathContact:
         """Expected contact of a path, or of a plan, and its probability to arrive.
 
-        From the table of bounds; of a plan that assigns robots to posts (`Plan.robots`), and in
-        alternate bounding, the mean of 64 missions of the simulator, NaN if none arrives.
+        From the table of bounds; of a plan that assigns robots to posts (`Plan.robots`), the mean
+        of 64 missions of the simulator, NaN if none arrives.
 
         Raises:
             TrustboError: A cell is off the grid or impassable, or no neighbour of the last.
         """
         cells = self._cells(path)
         posts = path.own_posts if isinstance(path, Plan) else None
-        if self._run is not None and (posts is not None or self.bounds is None):
+        if self._run is not None and posts is not None:
             missions = self._run(cells, posts)
             arrived = [m.contact_rate.mean(1) for m in missions if m.status == "ok"]
             rates = np.mean(arrived, axis=0) if arrived else np.full(len(cells) - 1, np.nan)
             share = len(arrived) / len(missions)
             return PathContact(float((1.0 - rates).sum()), float(rates.mean()), share)
-        assert self.bounds is not None  # noqa: S101  # else it runs missions
         rates = self.bounds.contact(cells).mean(1)
         arrives = float(np.prod(1.0 - self.bounds.failure(cells)))
         return PathContact(float((1.0 - rates).sum()), float(rates.mean()), arrives)
@@ -248,19 +234,6 @@ class Truth(Displayed):
                 f"the truth is of another workspace: its {name} is {mine}, the campaign's {other}; "
                 "make it with Truth.of(simulator) of this workspace's simulator."
             )
-
-    def require_best(self) -> BoundTable | ModelContact:
-        """Return the contact of bounds; refuse a truth without a best path.
-
-        Raises:
-            TrustboError: It is of alternate bounding.
-        """
-        if self.bounds is None:
-            raise TrustboError(
-                "alternate bounding has no best path, and so no regret: contact depends on whose "
-                "turn it is, and on the cells before. Compare paths by Truth.value."
-            )
-        return self.bounds
 
     def _cells(self, path: Plan | Sequence[Cell]) -> tuple[Cell, ...]:
         cells = path.path if isinstance(path, Plan) else path

@@ -18,7 +18,7 @@ def expected_loss(truth: Truth, path: Sequence[Cell]) -> float:
     c_k is the true contact of bound k, mean over robots, and S_k the chance to complete it and all
     bounds before. Where nothing fails, it is the contact lost, `Truth.value(path).lost`.
     """
-    bounds = truth.require_best()
+    bounds = truth.bounds
     reached = np.cumprod(1.0 - bounds.failure(path))
     return float((1.0 - reached * bounds.contact(path).mean(1)).sum())
 
@@ -30,7 +30,7 @@ def least_loss(truth: Truth, paths: AdmissiblePaths) -> float:
     contact, which is the same where nothing fails.
     """
     if not isinstance(truth.bounds, BoundTable):
-        return expected_loss(truth, truth.require_best().best(paths, "lost_contact"))
+        return expected_loss(truth, truth.bounds.best(paths, "lost_contact"))
     data = truth.bounds.data
     passed = data["outcome"].sel(status="ok").values
     most = most_kept(data["contact"].values.mean(0), passed, paths)

@@ -1,4 +1,4 @@
-"""Formation: the order of moves, and the rules of the lead's stops and of the posts of T2."""
+"""Formation: the rules of the lead's stops and of the posts of T2."""
 
 from dataclasses import dataclass
 from typing import Self
@@ -6,7 +6,6 @@ from typing import Self
 import numpy as np
 
 from trustbo.errors import TrustboError, require_choice, require_not_negative, require_positive
-from trustbo.workspace.bounding import BOUNDING
 
 SPACING = 2.0
 """Least distance between two robots of T2, m."""
@@ -18,7 +17,7 @@ _DOUBT, _DOUBT_REACH = 0.1, 40.0  # share of the unexpected that is seen at 0 m;
 
 @dataclass(frozen=True)
 class Formation:
-    """Order of moves, and rules of the lead's stops and of the posts of T2, see `posts`.
+    """Rules of the lead's stops and of the posts of T2, see `posts`.
 
     Attributes:
         posts: `"end"`: where T2 sees the lead's next stop, inside the lead's cell. `"way"`: where
@@ -28,25 +27,15 @@ class Formation:
         radius: Largest distance of T2 from the lead's stop, m.
         discount: Rate at which sight is taken to fall with distance in the choice of posts and
             stops, 1/m: maps lack things that block sight.
-        bounding: `"successive"`: T2 closes up to the lead after each of its moves. `"alternate"`:
-            it passes the lead in the next bound, so that they lead by turns.
     """
 
     posts: str = "way"
     stops: str = "sight"
     radius: float = _RADII["way"]
     discount: float = _DISCOUNT
-    bounding: str = BOUNDING[0]
 
     @classmethod
-    def of(
-        cls,
-        posts: str,
-        stops: str,
-        radius: float | None,
-        discount: float | None,
-        bounding: str = BOUNDING[0],
-    ) -> Self:
+    def of(cls, posts: str, stops: str, radius: float | None, discount: float | None) -> Self:
         """Check the options of `Workspace.from_terrain`; None for the rules' own.
 
         Raises:
@@ -55,7 +44,6 @@ class Formation:
         """
         require_choice("posts", posts, POSTS)
         require_choice("stops", stops, STOPS)
-        require_choice("bounding", bounding, BOUNDING)
         radius = _RADII[posts] if radius is None else require_positive("formation_radius", radius)
         if radius < SPACING:
             raise TrustboError(
@@ -65,7 +53,7 @@ class Formation:
         if discount is None:
             discount = 0.0 if (posts, stops) == ("end", "centre") else _DISCOUNT
         kept = require_not_negative("sight_discount", discount)
-        return cls(posts, stops, radius, kept, bounding)
+        return cls(posts, stops, radius, kept)
 
     def doubted(self, seen: np.ndarray, distance: np.ndarray) -> np.ndarray:
         """Chance of detection where maps may be wrong; that of the map without a discount.

@@ -12,9 +12,6 @@ p the probability of detection under the assumed sight, T_1 the lead's driving t
 the slowest robot; one that arrives before it is seen at its post until then. The next cell changes
 from sample to sample, over all that a path may go on to; at the goal T2 stands around the lead.
 
-In alternate bounding one of them moves, from the cell before a, so that the share is that of one
-phase; it is the mean over who moves and over the cells that the path may come from.
-
 The lead's way is the fastest route, as the simulator drives it. T2's is that route shifted to T2's
 posts: it differs from T2's fastest route by some metres, over which sight hardly changes, and saves
 the search of some 50 routes for each bound.
@@ -23,7 +20,7 @@ the search of some 50 routes for each bound.
 import math
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from itertools import batched
+from itertools import batched, pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -31,7 +28,6 @@ import numpy as np
 from trustbo.data import Cell
 from trustbo.parallel import in_order
 from trustbo.team import Robot, Team
-from trustbo.workspace.bounding import legs_along
 from trustbo.workspace.formation import Formation
 from trustbo.workspace.moves import MOVES, existing_bounds
 from trustbo.workspace.posts import Posts
@@ -47,109 +43,41 @@ _AHEAD = 0.5  # cosine of the largest turn that is expected where turns lead to 
 
 
 class Geometry(NamedTuple):
-    """Places and ways of the robots in some bounds, a row each; positions are x, y in CRS metres.
-
-    A row may be one of several cases of a bound, see `by_bound`.
-    """
+    """Places and ways of the robots in some bounds; positions are x, y in CRS metres."""
 
     ways: list[np.ndarray]  # of the lead, (point, 2) each
-    posts: np.ndarray  # (row, robot, 2), from which T2 watches the lead
-    routes: list[np.ndarray]  # of a lead that moves as T2 does, (point, 2) each
-    starts: np.ndarray  # (row, robot, 2), from which T2 moves
-    ends: np.ndarray  # (row, sample, robot, 2), to which it moves
-    stops: np.ndarray  # (row, 2), from which the lead watches T2
+    posts: np.ndarray  # (bound, robot, 2), from which T2 watches the lead
+    ends: np.ndarray  # (bound, sample, robot, 2), to which T2 closes up
+    stops: np.ndarray  # (bound, 2), from which the lead watches T2
     is_wide: bool  # whether T2's posts are far from the lead's stops
-    first: np.ndarray  # (bound,), index of the first row of each
-
-    def by_bound(self, values: np.ndarray) -> np.ndarray:
-        """Mean over the rows of each bound, (row, ...) to (bound, ...)."""
-        n_rows = np.diff(np.append(self.first, len(values)))
-        sums = np.add.reduceat(values, self.first, axis=0)
-        return sums / n_rows.reshape(-1, *(1,) * (values.ndim - 1))
-
-
-class _Case(NamedTuple):
-    """Row of a `Geometry`."""
-
-    way: np.ndarray
-    post: np.ndarray
-    route: np.ndarray
-    start: np.ndarray
-    ends: np.ndarray
-    stop: np.ndarray
-
-
-def _stacked(posts: Posts, cases: Sequence[_Case], first: np.ndarray) -> Geometry:
-    ways, post, routes, start, ends, stop = zip(*cases, strict=True)
-    places = np.array(post), list(routes), np.array(start), np.array(ends), np.array(stop)
-    return Geometry(list(ways), *places, posts.formation.is_wide, first)
 
 
 def geometry(ways: Ways, bounds: Sequence[tuple[Cell, Cell]], passable: np.ndarray) -> Geometry:
-    """Collect the cases of bounds (a, c) between cells that are `passable`, (row, col)."""
-    posts, cases, first = ways.posts, [], []
+    """Collect the bounds (a, c) between cells that are `passable`, (row, col)."""
+    posts, ends = ways.posts, []
     for a, c in bounds:
-        first.append(len(cases))
-        if posts.formation.bounding == "successive":
-            cases.append(_closing_up(posts, a, c, passable))
-        else:
-            cases += _by_turns(posts, a, c, passable)
-    return _stacked(posts, cases, np.array(first))
+        ahead = [posts.watching(c, b) for b in _cells_ahead(posts, passable, a, c)]
+        ends.append([ahead[k % len(ahead)] for k in range(N_SAMPLES)])
+    return Geometry(
+        [posts.lead_line(a, c) for a, c in bounds],
+        np.array([posts.watching(a, c) for a, c in bounds]),
+        np.array(ends),
+        np.array([posts.stop(c) for _, c in bounds]),
+        posts.formation.is_wide,
+    )
 
 
 def geometry_along(posts: Posts, path: Sequence[Cell], own: np.ndarray | None = None) -> Geometry:
     """Collect the bounds of a path, T2 at its `own` posts (bound, robot, 2), or the rule's."""
     lead, t2 = posts.places(path, own)
-    cases = []
-    for k, moves in enumerate(legs_along(posts.formation.bounding, path)):
-        lines = {leg.of_lead: posts.lead_line(*leg.cells) for leg in moves}
-        stay = np.stack([lead[k], lead[k]])
-        # Who moves second watches from its old place, and is watched from the other's new one.
-        post, stop = (t2[k], lead[k + 1]) if moves[0].of_lead else (t2[k + 1], lead[k])
-        ends = np.repeat(t2[k + 1][None], N_SAMPLES, axis=0)
-        case = lines.get(True, stay), post, lines.get(False, stay), t2[k], ends, stop
-        cases.append(_Case(*case))
-    return _stacked(posts, cases, np.arange(len(cases)))
-
-
-def _closing_up(posts: Posts, a: Cell, c: Cell, passable: np.ndarray) -> _Case:
-    """Bound of successive bounding, which may go on to the cells ahead."""
-    way, start = posts.lead_line(a, c), posts.watching(a, c)
-    ahead = _cells_ahead(posts, passable, a, c)
-    ends = _in_turn([posts.watching(c, b) for b in ahead])
-    return _Case(way, start, way, start, ends, posts.stop(c))
-
-
-def _by_turns(posts: Posts, a: Cell, c: Cell, passable: np.ndarray) -> list[_Case]:
-    """Cases of a bound of alternate bounding: by its mover, and the cell that this comes from."""
-    stop = posts.stop(a)
-    stay, cases = np.stack([stop, stop]), []
-    for before in _cells_ahead(posts, passable, c, a):
-        before = a if before is None else before
-        line = posts.lead_line(before, a, c)
-        post = posts.watching(a, c, before)
-        cases.append(_Case(line, post, stay, post, _in_turn([post]), posts.stop(c)))
-        start = posts.watching(before, a, _behind(passable, before, a))
-        ends = _in_turn([posts.watching(c, b, a) for b in _cells_ahead(posts, passable, a, c)])
-        cases.append(_Case(stay, start, line, start, ends, stop))
-    return cases
-
-
-def _in_turn(ends: Sequence[np.ndarray]) -> np.ndarray:
-    """One of some places for each sample, (sample, robot, 2)."""
-    return np.array([ends[k % len(ends)] for k in range(N_SAMPLES)])
+    lines = [posts.lead_line(a, c) for a, c in pairwise(path)]
+    ends = np.repeat(t2[1:, None], N_SAMPLES, axis=1)
+    return Geometry(lines, t2[:-1], ends, lead[1:], posts.formation.is_wide)
 
 
 def _cells_ahead(posts: Posts, passable: np.ndarray, a: Cell, c: Cell) -> list[Cell | None]:
     """Cells expected after the bound a -> c, see `_onward`."""
     return _onward(passable, a, c, _AHEAD if posts.is_wide else -1.0 - _AHEAD)
-
-
-def _behind(passable: np.ndarray, a: Cell, c: Cell) -> Cell | None:
-    """Cell from which the bound a -> c goes straight on, if it is passable."""
-    (row, col), (rows, cols) = (2 * a[0] - c[0], 2 * a[1] - c[1]), passable.shape
-    inside = 0 <= row < rows and 0 <= col < cols
-    return (row, col) if inside and passable[row, col] else None
 
 
 def over_bounds[R](
@@ -229,21 +157,21 @@ def phases(
 ) -> Phases:
     """Compute sight at times of both phases of bounds, doubted as by a formation."""
     lead = _timed(surface, team.lead, given.ways)
-    first = np.stack([route[0] for route in given.routes])
-    last = np.stack([route[-1] for route in given.routes])
+    first = np.stack([way[0] for way in given.ways])
+    last = np.stack([way[-1] for way in given.ways])
     share = ((np.arange(N_SAMPLES) + 0.5) / N_SAMPLES)[:, None]
-    drives = [_timed(surface, robot, given.routes) for robot in team.robots]
+    drives = [_timed(surface, robot, given.ways) for robot in team.robots]
     wander = jittered(N_SAMPLES) if given.is_wide else 0.0
     if given.is_wide:  # T2's ways may be much longer or shorter than the lead's
         bound = np.linalg.norm(last - first, axis=1)
-        gaps = np.linalg.norm(given.ends - given.starts[:, None], axis=-1).mean(1)
+        gaps = np.linalg.norm(given.ends - given.posts[:, None], axis=-1).mean(1)
         longer = gaps / np.maximum(bound, 1.0)[:, None]
         drives = [(route, time * longer[:, i]) for i, (route, time) in enumerate(drives)]
     shape = (*given.posts.shape[:2], N_SAMPLES)
     watched, closing, waiting = (np.empty(shape) for _ in range(3))
     tracks = np.empty((*shape, 2))
     for i, (robot, (route, _)) in enumerate(zip(team.robots, drives, strict=True)):
-        shift = (1.0 - share) * (given.starts[:, i, None] - first[:, None])
+        shift = (1.0 - share) * (given.posts[:, i, None] - first[:, None])
         tracks[:, i] = route + shift + share * (given.ends[:, :, i] - last[:, None])
         stop, end = given.stops[:, None], given.ends[:, :, i]
         seen = partial(_seen, surface, sight, formation)
@@ -271,7 +199,7 @@ def bound_features(
     """
     seen = phases(surface, sight, team, given)
     easy = index[surface.nearest(seen.tracks[..., 0], seen.tracks[..., 1])]
-    return given.by_bound(seen.line_of_sight()), given.by_bound(_mean(easy))
+    return seen.line_of_sight(), _mean(easy)
 
 
 def _seen(

@@ -11,10 +11,8 @@ lattice around the stop, those are taken with the largest
 
 s the probability of detection under the assumed sight. T2 is within `formation.radius` of the
 stop, also beyond the edge of the cell, out of the lead's way, on ground that is well below the
-slope limit and linked to the stop over such ground. In alternate bounding the lead passes T2 on its
-way from the cell before to c, and it is from the stop there that it has watched T2 come: in place
-of the way from a, and of the stop in a. By the rule "sight", the lead stops where the ways from the
-cell to the stops around are seen best.
+slope limit and linked to the stop over such ground. By the rule "sight", the lead stops where the
+ways from the cell to the stops around are seen best.
 
 Maps lack things that block sight, and have things that do not, so that sight is doubted
 (`Formation.doubted`) where posts and stops are chosen, and nowhere else: the path's line of sight
@@ -22,7 +20,6 @@ is as predicted.
 """
 
 from collections.abc import Sequence
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -33,7 +30,6 @@ from scipy import ndimage
 from trustbo.data import Cell, require_posts
 from trustbo.errors import TerrainError, TrustboError
 from trustbo.team import Robot, Team
-from trustbo.workspace.bounding import legs_along, t2_cells
 from trustbo.workspace.formation import SPACING, Formation
 from trustbo.workspace.grid import Grid
 from trustbo.workspace.moves import MOVES
@@ -76,7 +72,7 @@ class Posts:
         self._safe = self._standable & (steep <= _SAFE * team.max_slope)
         self._central: dict[Cell, np.ndarray] = {}
         self._stops: dict[Cell, np.ndarray] = {}
-        self._cached: dict[tuple[Cell, Cell], dict[Cell | None, np.ndarray]] = {}
+        self._cached: dict[Cell, dict[Cell | None, np.ndarray]] = {}
         # Row and column of the cell that each row and column of pixels belongs to, ascending.
         self._cells = grid.cells_along(*surface.axes)
 
@@ -122,37 +118,32 @@ class Posts:
     def are_reached(self, path: Sequence[Cell], posts: np.ndarray) -> np.ndarray:
         """Whether robots can drive to posts (bound, robot, 2) from the stops, (bound, robot)."""
         linked = np.empty(posts.shape[:2], bool)
-        for (k, cell), i in product(
-            enumerate(t2_cells(self.formation.bounding, path)), range(posts.shape[1])
-        ):
-            linked[k, i] = self.is_linked(cell, posts[k, i])
+        for k, i in np.ndindex(linked.shape):
+            linked[k, i] = self.is_linked(path[k], posts[k, i])
         return linked
 
     def require_near(self, path: Sequence[Cell], posts: ArrayLike) -> np.ndarray:
         """Refuse posts (bound, robot, 2) that are not near the cells that T2 stands in."""
         given = require_posts(posts, (len(path) - 1, self.team.n_robots, 2))
-        cells = t2_cells(self.formation.bounding, path)
-        centres = np.array([self.grid.center(cell) for cell in cells])[:, None]
+        centres = np.array([self.grid.center(cell) for cell in path[:-1]])[:, None]
         # Half a cell from its edge, by whole pixels: the window that the rule's posts are in.
         high, wide = self.surface.pixel
         most = self.grid.cell_width + wide, self.grid.cell_height + high
         for k, i in np.argwhere(~(np.abs(given - centres) <= most).all(-1)).tolist():
             raise TrustboError(
-                f"posts[{k}, {i}] = {given[k, i].round(1).tolist()} is not near cell {cells[k]}, "
+                f"posts[{k}, {i}] = {given[k, i].round(1).tolist()} is not near cell {path[k]}, "
                 f"whose centre is {centres[k, 0].round(1).tolist()}; give x and y in CRS metres."
             )
         return given
 
-    def lead_way(self, *cells: Cell) -> np.ndarray | None:
-        """Way of the lead from stop to stop, the first to the last, (point, 2); None if none."""
-        ends = self.stop(cells[0]), self.stop(cells[-1])
-        return self.routes.find(self.team.lead, *ends, self.window(*cells))
+    def lead_way(self, a: Cell, c: Cell) -> np.ndarray | None:
+        """Way of the lead from stop to stop, (point, 2); None if none."""
+        return self.routes.find(self.team.lead, self.stop(a), self.stop(c), self.window(a, c))
 
-    def lead_line(self, *cells: Cell) -> np.ndarray:
+    def lead_line(self, a: Cell, c: Cell) -> np.ndarray:
         """Way of the lead, or the straight line where there is none, (point, 2)."""
-        way = self.lead_way(*cells)
-        ends = cells[0], cells[-1]
-        return np.stack([self.stop(end) for end in ends]) if way is None else way
+        way = self.lead_way(a, c)
+        return np.stack([self.stop(a), self.stop(c)]) if way is None else way
 
     # --- stops of the lead ---
 
@@ -192,21 +183,16 @@ class Posts:
 
     # --- posts of T2 ---
 
-    def watching(
-        self, cell: Cell, next_cell: Cell | None, lead_from: Cell | None = None
-    ) -> np.ndarray:
+    def watching(self, cell: Cell, next_cell: Cell | None) -> np.ndarray:
         """Posts of T2 in a cell, shape (robot, 2), from which it watches the lead's next move.
 
-        The lead moves to the next cell from `lead_from`, by default the same cell; in alternate
-        bounding from the one before. Without a next cell, T2 is around the lead at the goal.
+        Without a next cell, T2 is around the lead at the goal.
         """
-        lead_from = cell if lead_from is None or next_cell is None else lead_from
-        posts = self._cached.setdefault((cell, lead_from), {})
+        posts = self._cached.setdefault(cell, {})
         if next_cell not in posts:  # those of all neighbours cost little more than one
             around = [c for c in self._around(cell) if self._is_in_region(self.stop(c))]
             ahead = list(dict.fromkeys([None, *around, next_cell]))
-            aimed = self._aimed(cell, ahead, lead_from)
-            posts |= dict(zip(ahead, aimed, strict=True))
+            posts |= dict(zip(ahead, self._aimed(cell, ahead), strict=True))
         return posts[next_cell]
 
     def along(self, path: Sequence[Cell]) -> np.ndarray:
@@ -221,16 +207,8 @@ class Posts:
         Before each bound of a path, and at the goal; T2 at its `own` posts (bound, robot, 2), or by
         the rule.
         """
-        lead, t2 = [self.stop(path[0])], [self.watching(path[0], path[1])]
-        moves = legs_along(self.formation.bounding, path)
-        for of_bound, next_cell in zip(moves, [*path[2:], None], strict=True):
-            lead.append(lead[-1])
-            t2.append(t2[-1])
-            for leg in of_bound:
-                if leg.of_lead:
-                    lead[-1] = self.stop(leg.end)
-                else:
-                    t2[-1] = self.watching(leg.end, next_cell, leg.watched_from)
+        lead = [self.stop(cell) for cell in path]
+        t2 = [self.watching(a, c) for a, c in zip(path, [*path[1:], None], strict=True)]
         return np.stack(lead), np.stack(t2 if own is None else [*own, t2[-1]])
 
     def candidates(self, cell: Cell, next_cell: Cell | None, n: int) -> np.ndarray:
@@ -240,7 +218,7 @@ class Posts:
         """
         posts = self.watching(cell, next_cell)
         position, gap = self._standing(cell)
-        score = self._scores(cell, [next_cell], position, cell).mean(0)[0]
+        score = self._scores(cell, [next_cell], position).mean(0)[0]
         while len(posts) < n:
             gaps = np.linalg.norm(position[:, None] - posts, axis=-1).min(1)
             if not (gaps >= gap).any():
@@ -249,12 +227,12 @@ class Posts:
             posts = np.concatenate([posts, position[best, None]])
         return posts
 
-    def _aimed(self, cell: Cell, ahead: list[Cell | None], lead_from: Cell) -> np.ndarray:
+    def _aimed(self, cell: Cell, ahead: list[Cell | None]) -> np.ndarray:
         """Posts of T2 by the next cell, (next cell, robot, 2), with a least distance."""
         here, n_robots = self.stop(cell), len(self.team.robots)
         position, gap = self._standing(cell)
         posts = np.empty((len(ahead), n_robots, 2))
-        for i, score in enumerate(self._scores(cell, ahead, position, lead_from)):
+        for i, score in enumerate(self._scores(cell, ahead, position)):
             if i:
                 gaps = np.linalg.norm(position - posts[:, :i, None], axis=-1).min(1)
                 score = score - 10.0 * (gaps < gap)
@@ -273,33 +251,28 @@ class Posts:
                 return position, max(SPACING, _GAP * self.formation.radius)
         return self._pixels_near(cell, here), SPACING
 
-    def _scores(
-        self, cell: Cell, ahead: list[Cell | None], position: np.ndarray, lead_from: Cell
-    ) -> np.ndarray:
+    def _scores(self, cell: Cell, ahead: list[Cell | None], position: np.ndarray) -> np.ndarray:
         """Sight from positions, the nearer the better, (robot, next cell, position)."""
         distance = np.linalg.norm(position - self.stop(cell), axis=1)
         if self.formation.is_wide:
-            seen = self._seen_in_phases(cell, ahead, position, lead_from)
+            seen = self._seen_in_phases(cell, ahead, position)
         else:
             seen = self._seen_at_end(cell, ahead, position)
         return np.array(seen) - _NEARER * distance
 
     def _seen_in_phases(
-        self, cell: Cell, ahead: list[Cell | None], position: np.ndarray, lead_from: Cell
+        self, cell: Cell, ahead: list[Cell | None], position: np.ndarray
     ) -> list[np.ndarray]:
         """Sight that counts in all phases, (next cell, position) for each robot."""
         here, lead = self.stop(cell), self.team.lead
         goals = [here if c is None else self.stop(c) for c in ahead]
-        routes = [
-            np.stack([here, here]) if c is None else self.lead_line(lead_from, cell, c)
-            for c in ahead
-        ]
+        routes = [np.stack([here, here]) if c is None else self.lead_line(cell, c) for c in ahead]
         first = np.cumsum([0, *map(len, routes)])
         aims, _ = at_times(self.surface, lead, np.concatenate(routes), first, _N_AIMS)
         far = np.linalg.norm(position - here, axis=1)
         rows: dict[Robot, np.ndarray] = {}
         for robot in dict.fromkeys(self.team.robots):
-            stops = np.stack([self.stop(lead_from), *goals])[:, None]
+            stops = np.stack([here, *goals])[:, None]
             closing = 0.25 * self._seen(stops, position, optics(lead, robot))
             seen = closing[0] + closing[1:]
             best = np.argsort(_NEARER * far - seen, axis=1, kind="stable")[:, :_N_WATCHED]

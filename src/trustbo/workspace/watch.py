@@ -104,7 +104,7 @@ class WatchTable:
         rule = self._ways.posts
 
         def work(given: Geometry) -> np.ndarray:
-            return given.by_bound(phases(rule.surface, self._sight, rule.team, given).unseen())
+            return phases(rule.surface, self._sight, rule.team, given).unseen()
 
         shares = np.full((len(MOVES[8]), *passable.shape), np.nan)
         for bounds, some in over_bounds(self._ways, passable, work):
@@ -135,8 +135,7 @@ class WatchTable:
         ends = np.broadcast_to(ends[j, None, None], (len(j), N_SAMPLES, robot, 2))
         posts = np.repeat(starts[i, None], robot, axis=1)
         lines, stops = [rule.lead_line(a, c)] * len(i), np.tile(rule.stop(c), (len(i), 1))
-        bounds = np.arange(len(i))
-        given = Geometry(lines, posts, lines, posts, ends, stops, rule.is_wide, bounds)
+        given = Geometry(lines, posts, ends, stops, rule.is_wide)
         seen = phases(rule.surface, self._sight, rule.team, given, rule.formation)
 
         def by_pair(values: np.ndarray) -> np.ndarray:

@@ -4,11 +4,11 @@ The simulator drives them, exports contain them, and line of sight is computed a
 """
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 
 from trustbo.data import Cell
-from trustbo.workspace.bounding import legs_along
 from trustbo.workspace.posts import Posts
 
 
@@ -19,39 +19,23 @@ class Ways:
         """Take the routes over the posts' surface."""
         self.posts, self.routes = posts, posts.routes
 
-    def bound(
-        self, a: Cell, c: Cell, next_cell: Cell | None, before: Cell | None = None
-    ) -> list[np.ndarray | None]:
-        """Ways in the bound a -> c: the lead's, then that of each robot of T2 to watch the next.
-
-        In alternate bounding those of either, which come from the cell `before`, if there is one.
-        """
-        start, watched, lead_from = a, c, c
-        if self.posts.formation.bounding == "alternate" and before is not None:
-            start, watched, lead_from = before, a, a
-        posts = self.posts.watching(start, watched), self.posts.watching(c, next_cell, lead_from)
-        return [self.posts.lead_way(start, a, c), *self.between((start, a, c), *posts)]
+    def bound(self, a: Cell, c: Cell, next_cell: Cell | None) -> list[np.ndarray | None]:
+        """Ways in the bound a -> c: the lead's, then that of each robot of T2 to watch the next."""
+        posts = self.posts.watching(a, c), self.posts.watching(c, next_cell)
+        return [self.posts.lead_way(a, c), *self.between((a, c), *posts)]
 
     def along(
         self, path: Sequence[Cell], own: np.ndarray | None = None
     ) -> list[tuple[np.ndarray | None, ...]]:
         """Ways in each bound of a path: the lead's, then that of each robot of T2.
 
-        T2 goes between its `own` posts (bound, robot, 2), or those of the rule. The way of a robot
-        that does not move is its place, twice.
+        T2 goes between its `own` posts (bound, robot, 2), or those of the rule.
         """
-        lead, t2 = self.posts.places(path, own)
-        ways = []
-        for k, moves in enumerate(legs_along(self.posts.formation.bounding, path)):
-            of_lead: np.ndarray | None = np.stack([lead[k], lead[k + 1]])
-            of_t2: Sequence[np.ndarray | None] = list(np.stack([t2[k], t2[k + 1]], axis=1))
-            for leg in moves:
-                if leg.of_lead:
-                    of_lead = self.posts.lead_way(*leg.cells)
-                else:
-                    of_t2 = self.between(leg.cells, t2[k], t2[k + 1])
-            ways.append((of_lead, *of_t2))
-        return ways
+        t2 = self.posts.places(path, own)[1]
+        return [
+            (self.posts.lead_way(a, c), *self.between((a, c), t2[k], t2[k + 1]))
+            for k, (a, c) in enumerate(pairwise(path))
+        ]
 
     def between(
         self, cells: Sequence[Cell], starts: np.ndarray, goals: np.ndarray

@@ -68,7 +68,7 @@ class Workspace(Displayed):
             move meets, in [0, 1], NaN where there is no such bound; None where awareness is that of
             the cell entered, for any move.
         sights: Assumed models of sight; posts go by the first. Empty without a terrain.
-        formation: Order of moves, and rules of the lead's stops and of T2's posts.
+        formation: Rules of the lead's stops and of T2's posts.
     """
 
     awareness: xr.DataArray
@@ -96,7 +96,6 @@ class Workspace(Displayed):
         stops: str = "sight",
         formation_radius: float | None = None,
         sight_discount: float | None = None,
-        bounding: str = "successive",
     ) -> Self:
         """Derive traversability, visibility and line of sight from a DEM and a DSM.
 
@@ -133,8 +132,6 @@ class Workspace(Displayed):
                 8 of the rule `"end"`.
             sight_discount: Rate at which sight is taken to fall with distance in the choice of
                 posts and stops, 1/m; by default 0.005, 0 of `"end"` with `"centre"`.
-            bounding: Order of moves: `"successive"`, T2 closes up to the lead in each bound;
-                `"alternate"`, it passes the lead in the next, so that they lead by turns.
 
         Raises:
             TerrainError: A grid too fine for the raster, a cell without standing room for the team,
@@ -144,7 +141,7 @@ class Workspace(Displayed):
             TrustboError: No cell is passable, or an unknown name of a rule.
         """
         terrain, sights = require_terrain(terrain), sights_of(sight)
-        formation = Formation.of(posts, stops, formation_radius, sight_discount, bounding)
+        formation = Formation.of(posts, stops, formation_radius, sight_discount)
         team = Team.of(team)
         grid = Grid.over(terrain, shape)
         if bounds:
@@ -227,7 +224,6 @@ class Workspace(Displayed):
             ("awareness", "of each bound" if self.of_bounds is not None else "of cells"),
             *((f"  {name}", f"{values} (middle 80 % of cells)") for name, values in spread),
             ("sight", ", ".join(sight.mode for sight in self.sights) or "none assumed"),
-            *([("bounding", "alternate")] if self.formation.bounding == "alternate" else []),
             ("terrain", " x ".join(map(str, n_pixels)) + " pixels" if n_pixels else "none"),
         ]
         sections = {"grid": grid._card().rows, "team": team._card().rows}
@@ -314,17 +310,16 @@ class Workspace(Displayed):
         easy = self.pixels[TRAVERSABLE].values if TRAVERSABLE in self.pixels else surface.passable
         return Ways(Posts(self.grid, self.team, surface, assumed, easy, self.formation))
 
-    def posts(self, a: Cell, c: Cell, before: Cell | None = None) -> np.ndarray | None:
+    def posts(self, a: Cell, c: Cell) -> np.ndarray | None:
         """Overwatch points of T2 in cell a while the lead moves to c, shape (robot, 2).
 
-        X and y in CRS metres; None without a terrain. In alternate bounding the lead comes from the
-        cell `before` a, by default from a, the start; in successive bounding it is in a.
+        X and y in CRS metres; None without a terrain.
 
         Raises:
             TrustboError: A cell that is off the grid or impassable, or two that are no neighbours.
         """
-        a, c, before = self._require_bound(a, c, before)
-        return None if self.ground is None else self.ground.posts.watching(a, c, before)
+        a, c = self._require_bound(a, c)
+        return None if self.ground is None else self.ground.posts.watching(a, c)
 
     def overwatch_map(
         self, bound: tuple[Cell, Cell], *, robot: str | None = None
@@ -345,19 +340,18 @@ class Workspace(Displayed):
             TrustboError: A cell that is off the grid or impassable, two that are no neighbours, or
                 an unknown robot.
         """
-        a, c, _ = self._require_bound(*bound)
+        a, c = self._require_bound(*bound)
         name = self.team.names[0] if robot is None else robot
         require_choice("robot", name, self.team.names)
         return None if self.watch is None else self.watch.overwatch_map(a, c, name)
 
     def ways(
-        self, a: Cell, c: Cell, next_cell: Cell | None = None, before: Cell | None = None
+        self, a: Cell, c: Cell, next_cell: Cell | None = None
     ) -> tuple[np.ndarray | None, ...] | None:
         """Ways that the robots drive in the bound a -> c: the lead's, then each of T2's.
 
         The lead drives to its stop in c, then T2 from its posts in a to those from which it watches
-        the bound from c to `next_cell`; at the goal (None) it closes up around the lead. In
-        alternate bounding either of them comes from the cell `before` a, if there is one; see
+        the bound from c to `next_cell`; at the goal (None) it closes up around the lead. See
         `Plan.ways` for those of a path.
 
         Returns:
@@ -367,18 +361,15 @@ class Workspace(Displayed):
         Raises:
             TrustboError: A cell that is off the grid or impassable, or two that are no neighbours.
         """
-        a, c, before = self._require_bound(a, c, before)
+        a, c = self._require_bound(a, c)
         if next_cell is not None:
             next_cell = self._require_bound(c, next_cell)[1]
-        return None if self.ground is None else tuple(self.ground.bound(a, c, next_cell, before))
+        return None if self.ground is None else tuple(self.ground.bound(a, c, next_cell))
 
-    def _require_bound(
-        self, a: Cell, c: Cell, before: Cell | None = None
-    ) -> tuple[Cell, Cell, Cell | None]:
+    def _require_bound(self, a: Cell, c: Cell) -> tuple[Cell, Cell]:
         a, c = self.require_cell("cell", a), self.require_cell("cell", c)
-        before = None if before is None else self.require_cell("before", before)
-        moves_along([a, c] if before is None else [before, a, c])
-        return a, c, before if self.formation.bounding == "alternate" else None
+        moves_along([a, c])
+        return a, c
 
     def along(self, path: Sequence[Cell], posts: ArrayLike | None = None) -> np.ndarray:
         """Awareness of the bounds of a path, shape (bound, robot, feature), in [0, 1].
