@@ -1,18 +1,16 @@
-"""Contact lost by the rule of posts and stops, under the simulators of all worlds.
+"""Contact lost and time unseen on first plans, under the simulators of worlds.
 
     python benchmarks/posts.py --data DIR --out out/posts
 
-For each world, course and rule, the first plan of the default campaign is driven 16 times, as
-mission 7, when worlds that change have changed. Lost is the contact lost on it, in bounds; unseen
-the share of the time in which nobody sees anybody. Saved is the contact that a rule saves of that
-lost by the posts and stops of version 0.2. Called again, it goes on where it stopped. Intervals
-are 95 %, bootstrap over worlds.
+Plans are driven 16 times, as mission 7, when worlds that change have changed. Lost is the contact
+lost, in bounds; unseen the share of the time in which nobody sees anybody. Called again, it goes
+on where it stopped.
 
-`cover`: the same by `unseen_cost`, of the first plan and of that after eight missions of the
-default campaign, in the worlds of wellington; with the share unseen by the map, which is paid.
+`cover`: by `unseen_cost`, of the first plan and of that after eight missions of the default
+campaign, in the worlds of wellington; with the share unseen by the map, which is paid.
 
-`robots`: the same of robots that differ (r1 has its lidar on a mast of 3 m, r3 one that finds 60 %
-within 40 m), given to the posts of the path by the plan, or not.
+`robots`: contact lost of robots that differ (r1 has its lidar on a mast of 3 m, r3 one that finds
+60 % within 40 m), given to the posts of the path by the plan, or not; 95 % intervals.
 """
 
 import warnings
@@ -32,14 +30,8 @@ from trustbo.study.world import COURSES, World
 from trustbo.team import Robot, Team
 from trustbo.workspace.moves import bounds_along
 
-RULES: dict[str, dict[str, Any]] = {
-    "0.2": {"posts": "end", "stops": "centre"},
-    "posts": {"stops": "centre"},
-    "posts and stops": {},
-}
-FIRST = "0.2"
 N, MISSION = 16, 7
-PARTS = "rules", "cover", "robots"
+PARTS = "cover", "robots"
 UNLIKE = Team(robots=(Robot(sensor_height=3.0), Robot(), Robot(detection=0.6, lidar_range=40.0)))
 KINDS = "right", "aged"
 COSTS = 0.0, 1.0, 3.0, 10.0
@@ -58,28 +50,11 @@ def main() -> None:
     courses = given.courses[:1] if given.quick else given.courses
     names = ("synthetic-0", "wellington", "wellington-aged") if given.quick else given.only
     chosen = [w for w in usable if not names or w.name in names]
-    if "rules" in given.names:
-        show(records_of(given.out / "posts.jsonl", chosen, courses, N, judged))
     if "cover" in given.names:
         here = [w for w in chosen if w.name.startswith(PLACE)]
         show_cover(records_of(given.out / "cover.jsonl", here, courses, N, covered))
     if "robots" in given.names:
         show_robots([w for w in chosen if w.kind in KINDS], courses)
-
-
-def judged(world: World, course: str, n: int) -> dict[str, Any]:
-    """Means over missions on the first plan of each rule."""
-    rules = {}
-    for rule, options in RULES.items():
-        workspace = world.workspace(**options)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # of cells that have no room
-            campaign = Campaign(
-                workspace, *world.ends(course), connectivity=world.connectivity, seed=0
-            )
-        path = campaign.recommend().path
-        rules[rule] = summed(driven(world.simulator(workspace), path, n))
-    return {"world": world.name, "kind": world.kind, "course": course, "n": n, "rules": rules}
 
 
 def covered(world: World, course: str, n: int) -> dict[str, Any]:
@@ -181,74 +156,8 @@ def summed(missions: Sequence[Mission]) -> dict[str, float]:
     }  # fmt: skip
 
 
-def show(records: Sequence[dict[str, Any]]) -> None:
-    """Print a row for each rule, and the contact saved by kind of world and world by world."""
-    names = [rule for rule in RULES if rule != FIRST]
-    table = Table(
-        "rule", "lost", "saved, %", "median world", "duration", "unseen", "arrive", first=16
-    )
-    for rule in RULES:
-        saved = {w: _saved(some, rule) for w, some in _by(records, "world").items()}
-        ratio = np.nanmedian(
-            [_of(r, rule, "duration") / _of(r, FIRST, "duration") for r in records]
-        )
-        table.row(
-            rule, f"{np.nanmean([_of(r, rule, 'lost') for r in records]):.3f}",
-            _interval(records, rule), f"{np.nanmedian(list(saved.values())):.0f}", f"{ratio:.2f}",
-            f"{np.nanmean([_of(r, rule, 'unseen') for r in records]):.4f}",
-            f"{np.mean([_of(r, rule, 'arrive') for r in records]):.3f}",
-        )  # fmt: skip
-    print("\nSaved, %, by kind of world; and the arrivals\n")
-    table = Table("kind", "worlds", *names, "arrive, 0.2", *names, first=16)
-    for kind, some in _by(records, "kind").items():
-        table.row(
-            kind, len(_by(some, "world")), *(_interval(some, rule) for rule in names),
-            *(f"{np.mean([_of(r, rule, 'arrive') for r in some]):.3f}" for rule in RULES),
-        )  # fmt: skip
-    print("\nWorst worlds: contact lost, bounds\n")
-    table = Table("world", *RULES, "saved, %", first=28)
-    rule = names[-1]
-    by_world = [(w, some) for w, some in _by(records, "world").items() if _arrived(some)]
-    by_world.sort(key=lambda pair: _saved(pair[1], rule))
-    for world, some in by_world[:8]:
-        lost = [f"{np.nanmean([_of(r, name, 'lost') for r in some]):.3f}" for name in RULES]
-        table.row(world, *lost, f"{_saved(some, rule):.0f}")
-
-
-def _by(records: Sequence[dict[str, Any]], key: str) -> dict[str, list[dict[str, Any]]]:
-    return {
-        name: [r for r in records if r[key] == name]
-        for name in dict.fromkeys(r[key] for r in records)
-    }
-
-
 def _of(record: dict[str, Any], rule: str, what: str) -> float:
     return record["rules"][rule][what]
-
-
-def _arrived(records: Sequence[dict[str, Any]]) -> bool:
-    """Whether on some course missions arrived by every rule."""
-    rules = records[0]["rules"]
-    return any(np.isfinite([_of(r, rule, "lost") for rule in rules]).all() for r in records)
-
-
-def _saved(records: Sequence[dict[str, Any]], rule: str, first: str = FIRST) -> float:
-    """Contact saved of that lost by the first rule, in all courses, %."""
-    lost = np.array([[_of(r, name, "lost") for name in (first, rule)] for r in records])
-    both = lost[np.isfinite(lost).all(1)].sum(0)
-    return float(100.0 * (1.0 - both[1] / both[0]))
-
-
-def _interval(records: Sequence[dict[str, Any]], rule: str, first: str = FIRST) -> str:
-    by_world = [some for some in _by(records, "world").values() if _arrived(some)]
-    rng = np.random.default_rng(0)
-    draws = [
-        _saved([r for i in rng.integers(len(by_world), size=len(by_world)) for r in by_world[i]],
-               rule, first)
-        for _ in range(500)
-    ]  # fmt: skip
-    low, high = np.percentile(draws, [2.5, 97.5])
-    return f"{_saved(records, rule, first):.0f} [{low:.0f}, {high:.0f}]"
 
 
 if __name__ == "__main__":

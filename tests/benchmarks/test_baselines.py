@@ -47,7 +47,7 @@ LEARNERS = [
 @pytest.fixture(scope="module")
 def workspace():
     terrain = tb.terrain.synthetic_terrain((80.0, 80.0), seed=3, relief=5.0)
-    return tb.Workspace.from_terrain(terrain, (4, 4), posts="end", stops="centre")  # less is seen
+    return tb.Workspace.from_terrain(terrain, (4, 4))
 
 
 @pytest.fixture(scope="module", params=[8, 4])

@@ -52,7 +52,7 @@ EVENTS = {
 @pytest.fixture(scope="module")
 def wooded():
     # By posts that see all, vegetation would hide nothing.
-    return Workspace.from_terrain(hillside(60.0, 90.0), (2, 3), posts="end", stops="centre")
+    return Workspace.from_terrain(hillside(60.0, 90.0), (2, 3))
 
 
 @pytest.fixture(scope="module")

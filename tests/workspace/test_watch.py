@@ -40,7 +40,7 @@ def test_a_watch_is_the_line_of_sight_of_every_pair_of_posts(wooded):
         ends = np.broadcast_to(after[k], (1, 16, 2, 2))
         line, stops = [ground.lead_way(a, c)], ground.stop(c)[None]
         given = Geometry(line, starts, line, starts, ends, stops, True, np.array([0]))
-        seen = phases(ground.surface, wooded.sights[0], wooded.team, given, ground.formation)
+        seen = phases(ground.surface, wooded.sights[0], wooded.team, given, doubt=True)
         np.testing.assert_allclose(watch.watched[:, j], seen.watched.mean(-1)[0])
         np.testing.assert_allclose(watch.closing[:, j, k], seen.closing.mean(-1)[0])
         np.testing.assert_allclose(watch.waiting[:, k], seen.waiting.mean(-1)[0])
@@ -74,7 +74,7 @@ def test_a_bound_with_one_way_on_is_unseen_as_its_path_is():
 def test_posts_of_the_table_are_near_their_cells_of_a_broken_number_of_pixels():
     """A campaign with a poor watcher once ended here: its plan's post was refused as too far."""
     terrain = synthetic_terrain((78.0, 78.0), seed=3, relief=8.0)
-    small = Workspace.from_terrain(terrain, (4, 4), Team(n_robots=2), sight_discount=0.0)
+    small = Workspace.from_terrain(terrain, (4, 4), Team(n_robots=2))
     farthest = 0.0
     for a, c in pairwise([(3, 0), (2, 0), (1, 0), (0, 0), (0, 1), (0, 2), (1, 2), (2, 2), (2, 3)]):
         posts = small.watch.posts(a, c)

@@ -113,7 +113,6 @@ class KinematicSimulator(DescribedSimulator):
             "extinction": self.sight.extinction,
             "crown_base": self.sight.crown_base,
             "tick": self.tick,
-            "formation": dataclasses.asdict(self.workspace.formation),
             "bound_timeout": self.bound_timeout,
             "threats": [dataclasses.asdict(threat) for threat in self.threats],
             "degradations": [dataclasses.asdict(degradation) for degradation in self.degradations],

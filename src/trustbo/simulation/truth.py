@@ -301,7 +301,7 @@ def _table(
 def _content(simulator: Any) -> list[bytes]:
     """Contents of the workspace on which contact depends."""
     workspace: Workspace = simulator.workspace
-    settings = [workspace.grid, workspace.team, workspace.sights, workspace.formation]
+    settings = [workspace.grid, workspace.team, workspace.sights]
     contents = [to_json(settings).encode(), _bytes(workspace.passable)]
     if workspace.terrain is None or workspace.pixels is None:
         return [*contents, _bytes(workspace.awareness)]

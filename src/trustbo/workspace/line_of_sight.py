@@ -28,9 +28,8 @@ import numpy as np
 from trustbo.data import Cell
 from trustbo.parallel import in_order
 from trustbo.team import Robot, Team
-from trustbo.workspace.formation import Formation
 from trustbo.workspace.moves import MOVES, existing_bounds
-from trustbo.workspace.posts import Posts
+from trustbo.workspace.posts import Posts, doubted
 from trustbo.workspace.routes import at_times
 from trustbo.workspace.sight import Sight, detection_between, jittered, optics
 from trustbo.workspace.surface import Surface
@@ -39,7 +38,7 @@ from trustbo.workspace.ways import Ways
 _BLOCK = 256  # bounds computed at a time: they share calls, and bound the memory
 N_SAMPLES = 16
 """Times in each phase at which sight is computed."""
-_AHEAD = 0.5  # cosine of the largest turn that is expected where turns lead to other posts
+_AHEAD = 0.5  # cosine of the largest turn that is expected: turns lead to other posts
 
 
 class Geometry(NamedTuple):
@@ -49,21 +48,19 @@ class Geometry(NamedTuple):
     posts: np.ndarray  # (bound, robot, 2), from which T2 watches the lead
     ends: np.ndarray  # (bound, sample, robot, 2), to which T2 closes up
     stops: np.ndarray  # (bound, 2), from which the lead watches T2
-    is_wide: bool  # whether T2's posts are far from the lead's stops
 
 
 def geometry(ways: Ways, bounds: Sequence[tuple[Cell, Cell]], passable: np.ndarray) -> Geometry:
     """Collect the bounds (a, c) between cells that are `passable`, (row, col)."""
     posts, ends = ways.posts, []
     for a, c in bounds:
-        ahead = [posts.watching(c, b) for b in _cells_ahead(posts, passable, a, c)]
+        ahead = [posts.watching(c, b) for b in _cells_ahead(passable, a, c)]
         ends.append([ahead[k % len(ahead)] for k in range(N_SAMPLES)])
     return Geometry(
         [posts.lead_line(a, c) for a, c in bounds],
         np.array([posts.watching(a, c) for a, c in bounds]),
         np.array(ends),
         np.array([posts.stop(c) for _, c in bounds]),
-        posts.formation.is_wide,
     )
 
 
@@ -72,12 +69,7 @@ def geometry_along(posts: Posts, path: Sequence[Cell], own: np.ndarray | None = 
     lead, t2 = posts.places(path, own)
     lines = [posts.lead_line(a, c) for a, c in pairwise(path)]
     ends = np.repeat(t2[1:, None], N_SAMPLES, axis=1)
-    return Geometry(lines, t2[:-1], ends, lead[1:], posts.formation.is_wide)
-
-
-def _cells_ahead(posts: Posts, passable: np.ndarray, a: Cell, c: Cell) -> list[Cell | None]:
-    """Cells expected after the bound a -> c, see `_onward`."""
-    return _onward(passable, a, c, _AHEAD if posts.is_wide else -1.0 - _AHEAD)
+    return Geometry(lines, t2[:-1], ends, lead[1:])
 
 
 def over_bounds[R](
@@ -98,8 +90,8 @@ def over_bounds[R](
     return in_order(of_block, batched(np.argwhere(existing_bounds(passable)), _BLOCK))
 
 
-def _onward(passable: np.ndarray, a: Cell, c: Cell, least: float) -> list[Cell | None]:
-    """Cells that a path goes on to, if it can by turns of that cosine at least; None if none."""
+def _cells_ahead(passable: np.ndarray, a: Cell, c: Cell) -> list[Cell | None]:
+    """Cells expected after the bound a -> c: without sharp turns if there are some; else None."""
     (rows, cols), (down, right) = passable.shape, (c[0] - a[0], c[1] - a[1])
     onward: list[Cell | None] = []
     ahead: list[Cell | None] = []
@@ -107,7 +99,7 @@ def _onward(passable: np.ndarray, a: Cell, c: Cell, least: float) -> list[Cell |
         b = c[0] + i, c[1] + j
         if b != a and 0 <= b[0] < rows and 0 <= b[1] < cols and passable[b]:
             onward.append(b)
-            if i * down + j * right >= least * math.hypot(i, j) * math.hypot(down, right):
+            if i * down + j * right >= _AHEAD * math.hypot(i, j) * math.hypot(down, right):
                 ahead.append(b)
     return ahead or onward or [None]
 
@@ -149,24 +141,19 @@ class Phases(NamedTuple):
 
 
 def phases(
-    surface: Surface,
-    sight: Sight,
-    team: Team,
-    given: Geometry,
-    formation: Formation | None = None,
+    surface: Surface, sight: Sight, team: Team, given: Geometry, *, doubt: bool = False
 ) -> Phases:
-    """Compute sight at times of both phases of bounds, doubted as by a formation."""
+    """Compute sight at times of both phases of bounds, as predicted or as `doubted`."""
     lead = _timed(surface, team.lead, given.ways)
     first = np.stack([way[0] for way in given.ways])
     last = np.stack([way[-1] for way in given.ways])
     share = ((np.arange(N_SAMPLES) + 0.5) / N_SAMPLES)[:, None]
     drives = [_timed(surface, robot, given.ways) for robot in team.robots]
-    wander = jittered(N_SAMPLES) if given.is_wide else 0.0
-    if given.is_wide:  # T2's ways may be much longer or shorter than the lead's
-        bound = np.linalg.norm(last - first, axis=1)
-        gaps = np.linalg.norm(given.ends - given.posts[:, None], axis=-1).mean(1)
-        longer = gaps / np.maximum(bound, 1.0)[:, None]
-        drives = [(route, time * longer[:, i]) for i, (route, time) in enumerate(drives)]
+    # T2's ways may be much longer or shorter than the lead's.
+    bound = np.linalg.norm(last - first, axis=1)
+    gaps = np.linalg.norm(given.ends - given.posts[:, None], axis=-1).mean(1)
+    longer = gaps / np.maximum(bound, 1.0)[:, None]
+    drives = [(route, time * longer[:, i]) for i, (route, time) in enumerate(drives)]
     shape = (*given.posts.shape[:2], N_SAMPLES)
     watched, closing, waiting = (np.empty(shape) for _ in range(3))
     tracks = np.empty((*shape, 2))
@@ -174,8 +161,9 @@ def phases(
         shift = (1.0 - share) * (given.posts[:, i, None] - first[:, None])
         tracks[:, i] = route + shift + share * (given.ends[:, :, i] - last[:, None])
         stop, end = given.stops[:, None], given.ends[:, :, i]
-        seen = partial(_seen, surface, sight, formation)
-        watched[:, i] = seen(robot, team.lead, given.posts[:, i, None] + wander, lead[0])
+        seen = partial(_seen, surface, sight, doubt)
+        eyes = given.posts[:, i, None] + jittered(N_SAMPLES)
+        watched[:, i] = seen(robot, team.lead, eyes, lead[0])
         closing[:, i] = seen(team.lead, robot, stop, tracks[:, i])
         waiting[:, i] = seen(team.lead, robot, stop, end)
     times = np.stack([time for _, time in drives], axis=1)
@@ -205,7 +193,7 @@ def bound_features(
 def _seen(
     surface: Surface,
     sight: Sight,
-    formation: Formation | None,
+    doubt: bool,
     watcher: Robot,
     watched: Robot,
     eye: np.ndarray,
@@ -213,8 +201,8 @@ def _seen(
 ) -> np.ndarray:
     """Probability of detection at the samples of bounds, shape (bound, sample)."""
     seen = detection_between(surface, sight, eye, targets, optics(watcher, watched))
-    if formation is not None:
-        seen = formation.doubted(seen, np.linalg.norm(targets - eye, axis=-1))
+    if doubt:
+        seen = doubted(seen, np.linalg.norm(targets - eye, axis=-1))
     return watcher.detection * seen
 
 

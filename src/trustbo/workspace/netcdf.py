@@ -1,16 +1,13 @@
 """Workspaces as trees of arrays, for files."""
 
 import json
-from collections.abc import Mapping
 from dataclasses import asdict
-from typing import Any
 
 import xarray as xr
 
 from trustbo.files import to_json
 from trustbo.team import Robot, Team
 from trustbo.terrain import CompositeIndex
-from trustbo.workspace.formation import Formation
 from trustbo.workspace.grid import Grid
 from trustbo.workspace.sight import Sight
 from trustbo.workspace.workspace import Workspace
@@ -31,7 +28,6 @@ def workspace_to_tree(workspace: Workspace) -> xr.DataTree:
         "grid": to_json(asdict(workspace.grid)),
         "team": to_json(asdict(workspace.team)),
         "sights": to_json([asdict(sight) for sight in workspace.sights]),
-        "formation": to_json(asdict(workspace.formation)),
     }
     return result
 
@@ -64,10 +60,4 @@ def workspace_from_tree(tree: xr.DataTree) -> Workspace:
         },
         cells.get("bound_awareness"),
         tuple(Sight(**sight) for sight in json.loads(tree.attrs.get("sights", "[]"))),
-        _formation_of(tree.attrs),
     )
-
-
-def _formation_of(attrs: Mapping[Any, Any]) -> Formation:
-    """Formation of a file."""
-    return Formation(**json.loads(attrs["formation"]))

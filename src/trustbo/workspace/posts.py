@@ -1,22 +1,19 @@
 """Stops and posts: where the lead stops in a cell, and where T2 stands to watch it go to the next.
 
-By the rule "end", T2 stands in the lead's cell where it sees the lead's next stop best.
-
-By the rule "way", all of a bound a -> c counts (docs/concepts.md, "Why bounds"): T2 watches the
-lead's way from its posts in a, then the lead watches from its stop in c how T2 leaves them; and in
-the bound before, it has watched from its stop in a how T2 closed up to them. Of positions p on a
-lattice around the stop, those are taken with the largest
+All of a bound a -> c counts (docs/concepts.md, "Why bounds"): T2 watches the lead's way from its
+posts in a, then the lead watches from its stop in c how T2 leaves them; and in the bound before, it
+has watched from its stop in a how T2 closed up to them. Of positions p on a lattice around the
+stop, those are taken with the largest
 
     1/2 mean_k s(p, lead at t_k) + 1/4 s(stop in a, p) + 1/4 s(stop in c, p),
 
-s the probability of detection under the assumed sight. T2 is within `formation.radius` of the
-stop, also beyond the edge of the cell, out of the lead's way, on ground that is well below the
-slope limit and linked to the stop over such ground. By the rule "sight", the lead stops where the
-ways from the cell to the stops around are seen best.
+s the probability of detection under the assumed sight. T2 is within `RADIUS` of the stop, also
+beyond the edge of the cell, out of the lead's way, on ground that is well below the slope limit and
+linked to the stop over such ground. The lead stops where the ways from the cell to the stops around
+are seen best.
 
-Maps lack things that block sight, and have things that do not, so that sight is doubted
-(`Formation.doubted`) where posts and stops are chosen, and nowhere else: the path's line of sight
-is as predicted.
+Maps lack things that block sight, and have things that do not, so that sight is doubted (`doubted`)
+where posts and stops are chosen, and nowhere else: the path's line of sight is as predicted.
 """
 
 from collections.abc import Sequence
@@ -30,7 +27,6 @@ from scipy import ndimage
 from trustbo.data import Cell, require_posts
 from trustbo.errors import TerrainError, TrustboError
 from trustbo.team import Robot, Team
-from trustbo.workspace.formation import SPACING, Formation
 from trustbo.workspace.grid import Grid
 from trustbo.workspace.moves import MOVES
 from trustbo.workspace.regions import Window, largest_region, linked_to
@@ -38,6 +34,10 @@ from trustbo.workspace.routes import Routes, at_times
 from trustbo.workspace.sight import Sight, detection_between, jittered, optics
 from trustbo.workspace.surface import Surface
 
+SPACING, RADIUS = 2.0, 25.0
+"""Least distance between two robots of T2, and largest distance of T2 from the lead's stop, m."""
+_DISCOUNT = 0.005  # 1/m, rate at which sight is taken to fall with distance
+_DOUBT, _DOUBT_REACH = 0.1, 40.0  # share of the unexpected that is seen at 0 m; its reach, m
 _SAFE = 0.7
 """Steepest ground of posts and of the ways to them, as a share of the slope limit."""
 _STEP, _STOP_RADIUS = 4.0, 16.0  # m: of the lattice; of the lead's stop from the centre's
@@ -59,13 +59,11 @@ class Posts:
         surface: Surface,
         sight: Sight,
         traversability: np.ndarray,
-        formation: Formation,
     ) -> None:
         """Prepare the maps of pixels; `traversability` has shape (row, col) of pixels."""
         self.grid, self.team, self.surface = grid, team, surface
-        self.routes = Routes(surface, clear=formation.is_wide)
-        self._sight, self.formation = sight, formation
-        self.is_wide = formation.is_wide
+        self.routes = Routes(surface, clear=True)
+        self._sight = sight
         self._traversability = _smoothed(traversability, surface.pixel)
         self._standable = largest_region(surface.passable)
         steep = np.arctan(np.hypot(*surface.gradient))
@@ -150,8 +148,7 @@ class Posts:
     def stop(self, cell: Cell) -> np.ndarray:
         """Stop of the lead in a cell, shape (2,): a traversable pixel."""
         if cell not in self._stops:
-            by_sight = self.formation.stops == "sight"
-            self._stops[cell] = (self._seeing_stop if by_sight else self._central_stop)(cell)
+            self._stops[cell] = self._seeing_stop(cell)
         return self._stops[cell]
 
     def _central_stop(self, cell: Cell) -> np.ndarray:
@@ -237,28 +234,22 @@ class Posts:
                 gaps = np.linalg.norm(position - posts[:, :i, None], axis=-1).min(1)
                 score = score - 10.0 * (gaps < gap)
             posts[:, i] = position[np.argmax(score, axis=1)]
-        if self.formation.is_wide:
-            for of_next, c in zip(posts, ahead, strict=True):
-                self._abreast(of_next, np.array([0.0, 1.0]) if c is None else self.stop(c) - here)
+        for of_next, c in zip(posts, ahead, strict=True):
+            self._abreast(of_next, np.array([0.0, 1.0]) if c is None else self.stop(c) - here)
         return posts
 
     def _standing(self, cell: Cell) -> tuple[np.ndarray, float]:
         """Positions around a stop where T2 may stand, (position, 2), and their least distance."""
         here = self.stop(cell)
-        if self.formation.is_wide:
-            position = self._lattice(cell, here, self.formation.radius)
-            if len(position) >= len(self.team.robots):
-                return position, max(SPACING, _GAP * self.formation.radius)
+        position = self._lattice(cell, here, RADIUS)
+        if len(position) >= len(self.team.robots):
+            return position, max(SPACING, _GAP * RADIUS)
         return self._pixels_near(cell, here), SPACING
 
     def _scores(self, cell: Cell, ahead: list[Cell | None], position: np.ndarray) -> np.ndarray:
         """Sight from positions, the nearer the better, (robot, next cell, position)."""
         distance = np.linalg.norm(position - self.stop(cell), axis=1)
-        if self.formation.is_wide:
-            seen = self._seen_in_phases(cell, ahead, position)
-        else:
-            seen = self._seen_at_end(cell, ahead, position)
-        return np.array(seen) - _NEARER * distance
+        return np.array(self._seen_in_phases(cell, ahead, position)) - _NEARER * distance
 
     def _seen_in_phases(
         self, cell: Cell, ahead: list[Cell | None], position: np.ndarray
@@ -284,17 +275,6 @@ class Posts:
         in_the_way = np.array([_is_near(position, here, route) for route in routes])
         return [rows[robot] - _IN_THE_WAY * in_the_way for robot in self.team.robots]
 
-    def _seen_at_end(
-        self, cell: Cell, ahead: list[Cell | None], position: np.ndarray
-    ) -> list[np.ndarray]:
-        """Sight of the lead's next stop, (next cell, position) for each robot."""
-        goals = np.stack([self.stop(cell) if c is None else self.stop(c) for c in ahead])
-        rows: dict[Robot, np.ndarray] = {}
-        for robot in dict.fromkeys(self.team.robots):
-            lidar = optics(robot, self.team.lead)
-            rows[robot] = self._seen(position, goals[:, None], lidar)
-        return [rows[robot] for robot in self.team.robots]
-
     def _abreast(self, posts: np.ndarray, direction: np.ndarray) -> None:
         """Sort equal robots from left to right, so that they keep their sides: shorter ways."""
         robots = self.team.robots
@@ -306,7 +286,7 @@ class Posts:
     def _seen(self, eye: np.ndarray, target: np.ndarray, lidar: np.ndarray) -> np.ndarray:
         """Probability of detection of targets (..., 2) where maps may be wrong; broadcasts."""
         seen = detection_between(self.surface, self._sight, eye, target, lidar)
-        return self.formation.doubted(seen, np.linalg.norm(target - eye, axis=-1))
+        return doubted(seen, np.linalg.norm(target - eye, axis=-1))
 
     # --- pixels ---
 
@@ -339,10 +319,10 @@ class Posts:
         return self._position(row, col)
 
     def _pixels_near(self, cell: Cell, here: np.ndarray) -> np.ndarray:
-        """Positions in a cell that are linked to its stop, at most 0.2's radius from it."""
+        """Positions in a cell that are linked to its stop, near it where there are enough."""
         position = self._position(*self._linked(cell))
         distance = np.linalg.norm(position - here, axis=1)
-        near = np.flatnonzero((distance <= self.formation.radius) & (distance >= SPACING))
+        near = np.flatnonzero((distance <= RADIUS) & (distance >= SPACING))
         if len(near) < len(self.team.robots):  # few passable pixels, or large ones
             order = np.argsort(distance, kind="stable")
             near = order[distance[order] > 0.0][: len(self.team.robots)]
@@ -385,6 +365,16 @@ class Posts:
     def _position(self, row: np.ndarray, col: np.ndarray) -> np.ndarray:
         y, x = self.surface.axes
         return np.stack([x[col], y[row]], axis=-1)
+
+
+def doubted(seen: np.ndarray, distance: np.ndarray) -> np.ndarray:
+    """Chance of detection where maps may be wrong, from that of the map and the distance, m.
+
+    A share exp(-discount x distance) of what is expected to be seen is, and of the rest a share
+    that falls with distance.
+    """
+    kept = seen * np.exp(-_DISCOUNT * distance)
+    return kept + _DOUBT * np.exp(-distance / _DOUBT_REACH) * (1.0 - kept)
 
 
 def _is_near(position: np.ndarray, here: np.ndarray, route: np.ndarray) -> np.ndarray:

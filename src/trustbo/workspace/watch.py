@@ -37,7 +37,7 @@ _APART = 2.0
 class Watch(NamedTuple):
     """Sight in a bound a -> c from each post in a, and of robots on the way to each post in c.
 
-    Doubted, see `Formation.doubted`: it is what posts are chosen by.
+    Doubted, see `posts.doubted`: it is what posts are chosen by.
     """
 
     watched: np.ndarray  # share of the lead's way that a robot sees, (robot, post)
@@ -135,8 +135,8 @@ class WatchTable:
         ends = np.broadcast_to(ends[j, None, None], (len(j), N_SAMPLES, robot, 2))
         posts = np.repeat(starts[i, None], robot, axis=1)
         lines, stops = [rule.lead_line(a, c)] * len(i), np.tile(rule.stop(c), (len(i), 1))
-        given = Geometry(lines, posts, ends, stops, rule.is_wide)
-        seen = phases(rule.surface, self._sight, rule.team, given, rule.formation)
+        given = Geometry(lines, posts, ends, stops)
+        seen = phases(rule.surface, self._sight, rule.team, given, doubt=True)
 
         def by_pair(values: np.ndarray) -> np.ndarray:
             return np.moveaxis(values.reshape(*pair, robot), -1, 0)

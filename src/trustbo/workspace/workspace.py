@@ -39,7 +39,6 @@ from trustbo.workspace.bound_awareness import (
     require_sight,
     sight_features,
 )
-from trustbo.workspace.formation import Formation
 from trustbo.workspace.grid import Grid
 from trustbo.workspace.location import Location, cell_of
 from trustbo.workspace.moves import MOVE_NAMES, along, existing_bounds, moves_along
@@ -68,7 +67,6 @@ class Workspace(Displayed):
             move meets, in [0, 1], NaN where there is no such bound; None where awareness is that of
             the cell entered, for any move.
         sights: Assumed models of sight; posts go by the first. Empty without a terrain.
-        formation: Rules of the lead's stops and of T2's posts.
     """
 
     awareness: xr.DataArray
@@ -80,7 +78,6 @@ class Workspace(Displayed):
     composites: dict[str, CompositeIndex] = field(default_factory=dict)
     of_bounds: xr.DataArray | None = None
     sights: tuple[Sight, ...] = ()
-    formation: Formation = field(default_factory=Formation)
 
     @classmethod
     def from_terrain(
@@ -92,10 +89,6 @@ class Workspace(Displayed):
         features: Mapping[str, object] | None = None,
         bounds: bool = True,
         sight: Sight | str | Sequence[Sight | str] = "transmittance",
-        posts: str = "way",
-        stops: str = "sight",
-        formation_radius: float | None = None,
-        sight_discount: float | None = None,
     ) -> Self:
         """Derive traversability, visibility and line of sight from a DEM and a DSM.
 
@@ -123,25 +116,15 @@ class Workspace(Displayed):
                 visibility of `terrain.PAPER_VISIBILITY`.
             sight: Assumed model of sight, or its mode: `"bare"`, `"wall"` or `"transmittance"`; of
                 several, features `line_of_sight_1`, `line_of_sight_2`, ...
-            posts: Rule of T2's posts: `"way"`, where it sees the lead's whole way and is seen from
-                its stops; `"end"`, that of version 0.2, where it sees the lead's next stop, in the
-                lead's cell.
-            stops: Rule of the lead's stops: `"sight"`, where the ways around are seen best;
-                `"centre"`, that of version 0.2, near the centre of the cell.
-            formation_radius: Largest distance of T2's posts from the lead's stop, m; by default 25,
-                8 of the rule `"end"`.
-            sight_discount: Rate at which sight is taken to fall with distance in the choice of
-                posts and stops, 1/m; by default 0.005, 0 of `"end"` with `"centre"`.
 
         Raises:
             TerrainError: A grid too fine for the raster, a cell without standing room for the team,
                 a DSM without the canopy that a sight needs, a terrain that is read lazily, unless
                 `bounds` is False, or a dataset that is no terrain: without dem, dsm or a metric
                 CRS, or with irregular coordinates.
-            TrustboError: No cell is passable, or an unknown name of a rule.
+            TrustboError: No cell is passable, or an unknown mode of sight.
         """
         terrain, sights = require_terrain(terrain), sights_of(sight)
-        formation = Formation.of(posts, stops, formation_radius, sight_discount)
         team = Team.of(team)
         grid = Grid.over(terrain, shape)
         if bounds:
@@ -160,7 +143,6 @@ class Workspace(Displayed):
                 maps.pixels,
                 maps.composites,
                 sights=sights,
-                formation=formation,
             )
             return workspace._with_line_of_sight() if bounds else workspace
 
@@ -308,7 +290,7 @@ class Workspace(Displayed):
         assumed = (*self.sights, sight or Sight())[0]
         assert self.pixels is not None  # noqa: S101  # there is a surface
         easy = self.pixels[TRAVERSABLE].values if TRAVERSABLE in self.pixels else surface.passable
-        return Ways(Posts(self.grid, self.team, surface, assumed, easy, self.formation))
+        return Ways(Posts(self.grid, self.team, surface, assumed, easy))
 
     def posts(self, a: Cell, c: Cell) -> np.ndarray | None:
         """Overwatch points of T2 in cell a while the lead moves to c, shape (robot, 2).
