@@ -28,8 +28,7 @@ def plan_of(plan: Plan | Result) -> Plan:
 def bounds_layer(plan: Plan) -> gpd.GeoDataFrame:
     """Return a point for each cell, the centre, with the trust after the bound into it.
 
-    Where the plan has a risk, also with the bound's chance to fail; where it has a cover, with the
-    share of the bound's time in which nobody sees anybody.
+    Where the plan has a risk, also with the bound's chance to fail.
     """
     row, col = np.array(plan.path).T
     x, y = np.array([plan.workspace.grid.center(cell) for cell in plan.path]).T
@@ -46,8 +45,6 @@ def bounds_layer(plan: Plan) -> gpd.GeoDataFrame:
         seen = {name: np.where(p < _LEAST, 0.0, p) for name, p in chances.items()}
         columns |= {name: np.insert(p, 0, np.nan) for name, p in seen.items()}
         columns["p_arrive"] = np.insert(plan.risk.p_reach, 0, 1.0)
-    if plan.cover is not None:
-        columns["unseen"] = np.insert(plan.cover.by_bound, 0, np.nan)
     return _frame(plan, columns, x, y)
 
 

@@ -75,8 +75,8 @@ def write_path(path: FilePath, plan: Plan | Result) -> None:
     ======== ========================================================================
 
     Columns and properties are those of `path_frame`; those of the whole path are its name, number
-    of bounds, length, value and objective, and where known `unseen`, the share of the time in which
-    nobody sees anybody, and the toll on it, `unseen_toll`. Posts and ways are left out where the
+    of bounds, length, value and objective, and the toll on the time in which
+    nobody sees anybody, `unseen_toll`, if there is one. Posts and ways are left out where the
     workspace has no terrain in memory.
 
     Args:
@@ -100,7 +100,6 @@ def _facts(plan: Plan) -> dict[str, object]:
         "value": float(plan.value),
         "objective": plan.objective,
         "length_m": float(plan.length),
-        **({} if plan.unseen is None else {"unseen": plan.unseen}),
         **({"unseen_toll": plan.unseen_toll} if plan.unseen_toll else {}),
     }
 

@@ -12,7 +12,6 @@ from trustbo.display.card import Card, Displayed, arrival
 from trustbo.display.svg import curve_picture
 from trustbo.hazard.risk import PathRisk
 from trustbo.planning.assignment import robots_along
-from trustbo.planning.cover import PathCover
 from trustbo.workspace import Workspace
 
 QUANTILES = (0.05, 0.25, 0.75, 0.95)
@@ -51,8 +50,6 @@ class Plan(Displayed):
             safest where no admissible path respects the limit.
         value_band: Ends of the 90 % band of the value over draws of the parameters, at the chance
             to fail expected; None where the plan is for one draw. Noise of rates is not in it.
-        cover: Share of the time in which nobody sees anybody; None where the plan is for one draw,
-            or on no terrain.
         unseen_toll: Part of the value that is paid for the time in which nobody sees anybody:
             `unseen_cost` times that expected by the map, in bounds.
     """
@@ -74,13 +71,11 @@ class Plan(Displayed):
     risk: PathRisk | None = None
     infeasible: bool = False
     value_band: tuple[float, float] | None = None
-    cover: PathCover | None = None
     unseen_toll: float = 0.0
 
     def with_draws(self, given: Self) -> Self:
-        """Return the plan with the bands and the cover of another of its path, for many draws."""
-        of_draws = {name: getattr(given, name) for name in ("bands", "value_band", "cover")}
-        return replace(self, **of_draws)
+        """Return the plan with the bands of another of its path, for many draws."""
+        return replace(self, bands=given.bands, value_band=given.value_band)
 
     def _card(self) -> Card:
         best = "no path is better" if self.exact else f"at most {self.bound:.3g} can be had"
@@ -103,8 +98,6 @@ class Plan(Displayed):
         if self.p_arrive is not None:
             beyond = "; fails beyond max_failure" if self.infeasible else ""
             rows.append(("chance to arrive", arrival(self.p_arrive, self.p_arrive_band) + beyond))
-        if self.cover is not None:
-            rows.append(("nobody sees anybody", unseen_text(self.cover)))
         if self.engine != "given":
             rows.append(("search", f"{self.engine}, {1e3 * self.seconds:.1f} ms"))
 
@@ -135,16 +128,6 @@ class Plan(Displayed):
     def p_arrive_band(self) -> tuple[float, float] | None:
         """Ends of the 90 % band of `p_arrive` over draws of the risk; None without draws."""
         return None if self.risk is None else self.risk.p_arrive_band
-
-    @property
-    def unseen(self) -> float | None:
-        """Share of the time in which nobody sees anybody, expected; see `planning.cover`."""
-        return None if self.cover is None else self.cover.unseen
-
-    @property
-    def unseen_band(self) -> tuple[float, float] | None:
-        """Ends of the 90 % band of `unseen` over draws of the parameters."""
-        return None if self.cover is None else self.cover.band
 
     @cached_property
     def stops(self) -> np.ndarray | None:
@@ -190,17 +173,10 @@ class Plan(Displayed):
         return None if ground is None else tuple(ground.along(self.path, self.own_posts))
 
 
-def unseen_text(cover: PathCover) -> str:
-    """Share of the time in which nobody sees anybody as text, with its 90 % band."""
-    low, high = cover.band
-    return f"{cover.unseen:.1%} of the time, {low:.1%} to {high:.1%} in 90 % of the draws"
-
-
 def plan_to_record(plan: Plan) -> dict[str, Any]:
     """Convert a plan, without its workspace, to plain lists and numbers."""
     values = {f.name: getattr(plan, f.name) for f in fields(plan) if f.name != "workspace"}
-    for name in ("risk", "cover"):
-        values[name] = None if values[name] is None else values[name].to_record()
+    values["risk"] = None if plan.risk is None else plan.risk.to_record()
     return {n: v.tolist() if isinstance(v, np.ndarray) else v for n, v in values.items()}
 
 
@@ -213,7 +189,5 @@ def plan_from_record(record: dict[str, Any], workspace: Workspace) -> Plan:
         values["value_band"] = tuple(record["value_band"])
     if record["risk"]:
         values["risk"] = PathRisk.from_record(record["risk"])
-    if record["cover"]:
-        values["cover"] = PathCover.from_record(record["cover"])
     values["path"] = tuple((row, col) for row, col in record["path"])
     return Plan(**values)

@@ -262,7 +262,7 @@ class Planner(Displayed):
 
         Args:
             params: Posterior of `fit`, or parameters; of several draws, the path is that of their
-                mean, and the bands and the cover are over the draws, see `evaluate`.
+                mean, and the bands are over the draws, see `evaluate`.
             x0: Expected trust at the start, shape () or (robot,); by default `params.x0_mean`.
 
         Raises:

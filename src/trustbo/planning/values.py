@@ -2,7 +2,6 @@
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +9,6 @@ from numpy.typing import ArrayLike
 
 from trustbo.data import Cell
 from trustbo.models.params import Params
-from trustbo.planning.cover import cover_along
 from trustbo.planning.dynamics import Dynamics, as_map, roll, trust_dynamics
 from trustbo.planning.objectives import OBJECTIVES, Objective, PathTrust, softplus
 from trustbo.planning.plan import QUANTILES, Plan
@@ -112,7 +110,7 @@ def evaluate(
     found = value_along(along, z, *kind, toll_along(*paid), x0, cap=cap)
     cost, draws = problem.cost_of_failure(cells), found.draws
     risk = None if problem.risk is None else problem.risk.along(cells)
-    plan = Plan(
+    return Plan(
         path=path,
         positions=np.stack([grid.x[cols], grid.y[rows]], axis=1),
         length=problem.paths.length_of(cells),
@@ -132,9 +130,6 @@ def evaluate(
         value_band=_value_band(found.values - cost),
         unseen_toll=unseen_along(*paid),
     )
-    if len(draws) == 1 or plan.posts is None:
-        return plan
-    return replace(plan, cover=cover_along(plan.workspace, path, plan.posts, draws))
 
 
 def bands_of(trust: np.ndarray) -> np.ndarray:

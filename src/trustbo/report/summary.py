@@ -9,8 +9,6 @@ from trustbo.errors import TrustboError
 from trustbo.hazard.risk import PathRisk
 from trustbo.inference.samplers.convergence import GOOD_KHAT, MAX_KHAT, MAX_RHAT, MIN_ESS
 from trustbo.planning import Plan
-from trustbo.planning.cover import PathCover
-from trustbo.planning.plan import unseen_text
 from trustbo.report.blocks import Fact
 from trustbo.report.numbers import counted, number
 
@@ -37,7 +35,6 @@ def facts_of(result: Result) -> list[Fact]:
         Fact("Recommended", _path(result, plan)),
         Fact("Value", f"{_value(result)} {_exactness(plan)}", plan.exact or None),
         *([] if plan.risk is None else [Fact("Arrival", _arrival(plan.risk))]),
-        *([] if plan.cover is None else [Fact("Cover", _cover(plan.cover, plan.unseen_toll))]),
         _soundness(result),
         _memory(result),
         Fact("Why it ended", _end(result)),
@@ -105,15 +102,6 @@ def _arrival(risk: PathRisk) -> str:
     if len(likeliest) == 1:
         sentence += f" The likeliest cause is {likeliest[0].replace('_', ' ')}."
     return sentence
-
-
-def _cover(cover: PathCover, toll: float) -> str:
-    worst = int(np.argmax(cover.by_bound))
-    paid = f" Its value pays a toll of {number(toll)} on that time, as the map has it."
-    return (
-        f"On it nobody sees anybody {unseen_text(cover)}; longest in bound {worst + 1}, "
-        f"{cover.by_bound[worst]:.1%} of its time.{paid if toll else ''}"
-    )
 
 
 def _soundness(result: Result) -> Fact:

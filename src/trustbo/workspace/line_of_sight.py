@@ -123,19 +123,14 @@ class Phases(NamedTuple):
         total = lead_time * watched + self.times * closing + (slowest - self.times) * waiting
         return total / (lead_time + slowest)
 
-    def unseen(self, factor: np.ndarray | float = 1.0) -> np.ndarray:
-        """Share of the time in which nobody sees anybody, (..., bound).
-
-        Args:
-            factor: By which contact is less, or more, than sight, (..., bound, robot).
-        """
-        factor = np.asarray(factor)[..., None]
+    def unseen(self) -> np.ndarray:
+        """Share of the time in which nobody sees anybody, (bound,)."""
         lead_time, slowest = self.lead_time[:, None], self.times.max(1)[:, None]
-        of_lead = 1.0 - np.clip(factor * self.watched, 0.0, 1.0)
+        of_lead = 1.0 - np.clip(self.watched, 0.0, 1.0)
         share = (np.arange(N_SAMPLES) + 0.5) / N_SAMPLES
         arrived = (share * slowest)[:, None] >= self.times[..., None]  # and waits at its post
         seen = np.where(arrived, self.waiting, self.closing)
-        of_t2 = 1.0 - np.clip(factor * seen, 0.0, 1.0)
+        of_t2 = 1.0 - np.clip(seen, 0.0, 1.0)
         both = lead_time * of_lead.prod(-2) + slowest * of_t2.prod(-2)
         return (both / (lead_time + slowest)).mean(-1)
 
