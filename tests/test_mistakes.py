@@ -104,7 +104,7 @@ MISTAKES = {
         lambda c: fit([c.z]), r"mission 0 is no Mission; got array.\[\[\[.{10,60}\.$"
     ),
     "missions for a posterior": (
-        lambda c: Planner(c.workspace, *ENDS).plan_expected([c.mission]), "posterior: got list .Mis"
+        lambda c: Planner(c.workspace, *ENDS).plan([c.mission]), "posterior: got list .Mis"
     ),
     "draws of missions": (
         lambda c: Planner(c.workspace, *ENDS).path_posterior([c.mission]), "got list .*; give one"

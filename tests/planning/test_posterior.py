@@ -11,7 +11,6 @@ from trustbo.planning import Planner, roll_trust
 from trustbo.planning.graph import NoPathError
 from trustbo.planning.objectives import OBJECTIVES
 from trustbo.workspace import Workspace
-from trustbo.workspace.moves import along
 
 N = 4
 
@@ -37,32 +36,6 @@ def terminal_trust(workspace, draws, path):
     """E[x^K] of the team under every draw, by rolling it."""
     z = workspace.awareness.values[:, *zip(*path[1:], strict=True)]
     return roll_trust(draws, np.swapaxes(z, 0, 1))[:, -1].mean(-1)
-
-
-@pytest.mark.parametrize("model", [PooledTrust(), HierarchicalTrust()])
-def test_the_expected_plan_has_the_best_expectation_of_all_paths(workspace, model):
-    draws = sample_prior(model, 2, 200, seed=4, n_robots=2)
-    planner = Planner(workspace, (3, 0), (0, 3), "terminal")
-    plan = planner.plan_expected(draws)
-    assert plan.exact
-    expected = {p: terminal_trust(workspace, draws, p).mean() for p in all_paths(workspace)}
-    np.testing.assert_allclose(expected[plan.path], max(expected.values()), rtol=1e-12)
-    np.testing.assert_allclose(plan.trust[-1].mean(), expected[plan.path], rtol=1e-12)
-    # Not what the posterior mean of the parameters gives: x^K is no linear function of beta0.
-    mean = Planner(workspace, (3, 0), (0, 3), "mean").plan_expected(draws)
-    rolled = {
-        p: roll_trust(
-            draws,
-            np.swapaxes(workspace.awareness.values[:, *zip(*p[1:], strict=True)], 0, 1),
-        ).mean()
-        for p in all_paths(workspace)
-    }
-    np.testing.assert_allclose(mean.value, max(rolled.values()), rtol=1e-12)
-
-
-def test_expectations_are_planned_for_linear_objectives_only(workspace, draws):
-    with pytest.raises(TrustboError, match="is planned exactly for 'terminal', 'mean' and"):
-        Planner(workspace, (3, 0), (0, 3), "success").plan_expected(draws)
 
 
 def test_regret_and_the_value_of_information_are_what_enumeration_says(workspace, draws):
@@ -180,21 +153,6 @@ def test_onward_plans_what_is_left_from_the_trust_of_now(workspace, draws):
         planner.onward([])
     with pytest.raises(NoPathError, match=r"it takes 3 bounds, but 2 are left"):
         planner.onward([(3, 0), (2, 0), (3, 0), (2, 0)])
-
-
-def test_the_expected_contact_lost_is_planned_without_the_cap_and_valued_so(workspace, draws):
-    planner = Planner(workspace, (3, 0), (0, 3), max_bounds="shortest+2")
-    plan = planner.plan_expected(draws)
-    z = workspace.bound_maps
-    lost = {
-        p: (1.0 - roll_trust(draws, np.swapaxes(along(z, p), 0, 1)).mean(-1)).sum(-1).mean()
-        for p in all_paths(workspace)
-    }
-    np.testing.assert_allclose(plan.value, -min(lost.values()), rtol=1e-12)
-    np.testing.assert_allclose(lost[plan.path], min(lost.values()), rtol=1e-12)
-    counts = Planner(workspace, (3, 0), (0, 3), observation="beta_binomial")
-    with pytest.raises(TrustboError, match=r"got 'lost_contact' of 'beta_binomial' rates"):
-        counts.plan_expected(draws)
 
 
 def test_regret_is_a_share_of_the_contact_that_the_best_path_keeps(workspace, draws):

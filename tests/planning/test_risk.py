@@ -315,7 +315,7 @@ def test_an_infeasible_limit_is_said_with_the_least_there_is_or_the_safest_is_pl
         check(plan, case.best(case.p_fail <= least + 1e-12))
 
 
-def test_all_draws_are_planned_and_the_expectation_is_within_the_limit():
+def test_all_draws_are_planned_within_the_limit():
     case = Case("terminal", 4, 3)
     rng = np.random.default_rng(0)
     draws = TrustParams(
@@ -328,8 +328,6 @@ def test_all_draws_are_planned_and_the_expectation_is_within_the_limit():
         drawn = planner.plan_draws(draws)
         alone = [planner.plan(draws.draw(d)).value for d in range(5)]
         np.testing.assert_allclose(drawn.values, alone, rtol=1e-9)
-    expected = planner.plan_expected(draws)
-    assert 1.0 - np.prod(1.0 - expected.p_fail) <= limit + 1e-9
 
 
 def test_bounds_that_fail_together_are_one_chance_to_fail_not_many():

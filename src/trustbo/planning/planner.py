@@ -297,27 +297,6 @@ class Planner(Displayed):
         best = solve.find_paths(self.problem, dynamics, self.engine)
         return self.paths.cells(best.paths[0])
 
-    def plan_expected(self, posterior: Params | xr.DataTree) -> Plan:
-        """Find the path with the best expectation over draws of terminal, mean or lost contact.
-
-        Exact for the given draws, correlations between parameters included, because these are
-        linear in the bounds' drifts; for lost_contact, these are not capped here. `value` is that
-        of the mean terminal trust, the mean of mean trust, or minus the mean of lost contact.
-
-        Args:
-            posterior: Posterior of `fit`, or draws with leading axis (draw,).
-
-        Raises:
-            TrustboError: Another objective, rates that are not linear in trust for lost_contact,
-                or `team="min"`.
-        """
-        started = time.perf_counter()
-        params = draws_of(posterior)
-        path = solve.find_expected(self.problem, self.problem.dynamics(params))
-        plan = evaluate(self.problem, path, params, cap=False)
-        seconds = time.perf_counter() - started
-        return replace(plan, exact=True, bound=plan.value, engine="numba", seconds=seconds)
-
     def plan_draws(
         self, posterior: Params | xr.DataTree, *, n_draws: int | None = None, seed: int = 0
     ) -> DrawnPaths:

@@ -66,12 +66,10 @@ def value_along(
     team: str,
     toll: float,
     x0: ArrayLike | None = None,
-    *,
-    cap: bool = True,
 ) -> Value:
     """Compute the value of a path from the parameters and awareness of its bounds.
 
-    Awareness (bound, robot, feature), or with a leading axis (draw,); `cap`: see `path_trust`.
+    Awareness (bound, robot, feature), or with a leading axis (draw,).
     """
     z = as_map(awareness)
     draws = roll(trust_dynamics(params, z, "min", x0))
@@ -80,7 +78,7 @@ def value_along(
     of_team, teams = (t.mean(-1) if team == "mean" else t.min(-1) for t in (trust, draws))
     if objective.name in ("stationary", "lost_contact"):
         dynamics = trust_dynamics(params, z, team, x0)
-        value = value_of(path_trust(dynamics, objective, toll, cap=cap)).mean()
+        value = value_of(path_trust(dynamics, objective, toll)).mean()
         # Trust capped draw by draw is biased, so that the band is of trust as it is; but no path
         # loses less than nothing.
         values = value_of(path_trust(dynamics, objective, toll, cap=False))
@@ -97,17 +95,15 @@ def evaluate(
     path: tuple[Cell, ...],
     params: Params,
     x0: ArrayLike | None = None,
-    *,
-    cap: bool = True,
 ) -> Plan:
-    """Evaluate a path that is not checked; see `Planner.evaluate` and `Objective.capped`."""
+    """Evaluate a path that is not checked; see `Planner.evaluate`."""
     flat, grid = np.fromiter(itertools.chain.from_iterable(path), int), problem.workspace.grid
     cells = flat.reshape(-1, 2)
     rows, cols = cells.T
     z, along = problem.awareness_along(cells), params.along(cells)
     paid = problem.paths, problem.objective, cells
     kind = problem.objective, problem.team
-    found = value_along(along, z, *kind, toll_along(*paid), x0, cap=cap)
+    found = value_along(along, z, *kind, toll_along(*paid), x0)
     cost, draws = problem.cost_of_failure(cells), found.draws
     risk = None if problem.risk is None else problem.risk.along(cells)
     return Plan(

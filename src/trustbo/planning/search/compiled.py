@@ -217,31 +217,6 @@ SEARCHES = {
 """Search by the kind of a problem, and whether there is a risk."""
 
 
-def expected_path(case: Case) -> np.ndarray | None:
-    """Find the path with the best *expectation* of terminal or mean trust, or of lost contact.
-
-    These are linear in u with weights that do not depend on the path, so the expectation of weight
-    times u, per bound and bounds left, replaces them: exact, with no assumption on the posterior.
-
-    Returns:
-        Flat indices of cells, filled with -1; None if no path is feasible under a risk.
-    """
-    weights, dynamics = case.weights, case.dynamics
-    u = dynamics.drift.reshape(*dynamics.drift.shape[:3], -1)
-    # E[w_j . u] for every number of bounds left j, move and cell: one state for every j.
-    gain = np.einsum("djs,dsmc->jmc", weights.per_bound, np.nan_to_num(u)) / len(u)
-    pick = np.eye(case.admissible.longest + 1)[None]
-    averaged = Weights(pick, weights.constant.mean(0, keepdims=True), weights.scale)
-    if case.risk is None:
-        return _best_of_lengths(case, gain[None], averaged).paths[0]
-    best = _best_sums(case, [gain.reshape(len(gain), -1)], averaged)
-    if best.paths[0, 0] >= 0:
-        return best.paths[0]
-    if best.lower[0] < np.inf:
-        raise _too_many_labels(case)
-    return None
-
-
 def safest_path(
     admissible: AdmissiblePaths, objective: str, of_bounds: np.ndarray
 ) -> tuple[tuple[Cell, ...], float]:

@@ -1,7 +1,5 @@
 """Search for the best path: validity of the objective, choice of the engine, upper limits."""
 
-from collections.abc import Callable
-
 import networkx as nx
 import numpy as np
 from scipy.special import expit, logit
@@ -14,7 +12,7 @@ from trustbo.planning.objectives import Objective
 from trustbo.planning.problem import PlanningProblem
 from trustbo.planning.risk import InfeasibleError, RiskRule
 from trustbo.planning.search.case import Case
-from trustbo.planning.search.compiled import expected_path, plan_compiled, safest_path
+from trustbo.planning.search.compiled import plan_compiled, safest_path
 from trustbo.planning.search.graph import Best
 from trustbo.planning.search.reference import on_map, plan_networkx, with_costs
 from trustbo.planning.tolls import tolls_of
@@ -33,14 +31,7 @@ def find_paths(problem: PlanningProblem, dynamics: Dynamics, engine: str) -> Bes
     """
     require_valid(dynamics, problem.objective)
     case = Case(problem.paths, problem.objective.capped(dynamics).flat(), problem.objective)
-    return _feasible(problem, case, plan_networkx if engine == "networkx" else plan_compiled)
-
-
-def _feasible[T](problem: PlanningProblem, case: Case, search: Callable[[Case], T | None]) -> T:
-    """Find the best under the planner's risk, or under that of the safest path.
-
-    InfeasibleError: no path respects `max_failure`, unless the rule is to plan the safest.
-    """
+    search = plan_networkx if engine == "networkx" else plan_compiled
     risk = problem.risk_table
     if (best := search(case._replace(risk=risk))) is not None:
         return best
@@ -68,24 +59,6 @@ def _infeasible(rule: RiskRule, risk: Risk, path: tuple[Cell, ...]) -> Infeasibl
         path,
         p_fail,
     )
-
-
-def find_expected(problem: PlanningProblem, dynamics: Dynamics) -> tuple[Cell, ...]:
-    """Find the path with the best expectation over draws of the objective, trust not capped.
-
-    InfeasibleError: no path respects `max_failure`, unless the rule is to plan the safest.
-    TrustboError: another objective than terminal, mean or, where rates are linear in trust,
-    lost_contact; or `team="min"`.
-    """
-    paths, objective = problem.paths, problem.objective
-    linear = objective.name in ("terminal", "mean", "lost_contact") and not objective.has_labels
-    if not linear or len(dynamics.views) > 1:
-        raise TrustboError(
-            "an expectation over draws is planned exactly for 'terminal', 'mean' and, with rates "
-            "linear in trust, 'lost_contact' of a team's mean trust; got "
-            f"{objective.name!r} of {objective.family.name!r} rates with team={problem.team!r}."
-        )
-    return paths.cells(_feasible(problem, Case(paths, dynamics, objective), expected_path))
 
 
 def graph_of(problem: PlanningProblem, dynamics: Dynamics) -> nx.DiGraph:
