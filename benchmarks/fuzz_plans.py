@@ -5,7 +5,7 @@ Run: python benchmarks/fuzz_plans.py [-n N] [--first I] [--seed S] [--jobs J] [-
 
 Draws grids, strips and closed bounds, awareness of cells or bounds, effects of places, all models,
 objectives and families, tolls on length and on time unseen, limits on bounds from "shortest" to
-"shortest+300", risks with limits, confidence, costs and strata, and numbers that
+"shortest+300", risks with limits, costs and strata, and numbers that
 are large, tied or 0. The compiled engine's plan, and where it is quick the reference engine's, must
 have the best score of all admissible paths (`peers.every_path`, which shares no code with the
 engines). Problem I of a seed is always the same. Chunks run in processes: one that crashes is
@@ -167,8 +167,6 @@ def draw_risk(rng, case):
     if rng.random() < 0.8:
         limit = (rng.integers(0, 30) + 0.5) * unit if case.dense else rng.exponential(0.5)
         options = {"max_failure": float(-np.expm1(-limit)), "infeasible": "safest"}
-        if draws is not None and rng.random() < 0.6:
-            options["confidence"] = float(pick(rng, 0.3, 0.5, 0.9, 1.0))
     if case.objective == "lost_contact" and rng.random() < 0.6:
         options["failure_cost"] = float(pick(rng, 0.0, 0.7, 3.0, 40.0))
     strata = None
@@ -188,14 +186,10 @@ def draw_strata(rng, p):
     return Strata(np.minimum(p * severity * noise, 1.0), rng.dirichlet(np.full(n, 0.7)))
 
 
-def resources(p, draws, strata, options):
-    """Risks (resource, move, cell) at the mean, of strata and draws; limits; how many to keep."""
+def resources(p, strata, options):
+    """Risks (resource, move, cell) at the mean and of strata; limits; how many to keep."""
     limit = -np.log1p(-options["max_failure"]) if "max_failure" in options else np.inf
     some, limits, needed = p[None], np.array([limit]), 1
-    if "confidence" in options:
-        some = np.concatenate([p[None], draws])
-        limits = np.array([np.inf, *[limit] * len(draws)])
-        needed = 1 + int(np.ceil(options["confidence"] * len(draws) - 1e-9))
     if strata is not None:
         n = len(strata.shares)
         some = np.concatenate([some[:1], strata.p_fail, some[1:]])
@@ -276,7 +270,7 @@ class Problem:
         risk, limits, needed, cost = np.zeros((0, *u.shape[1:])), np.empty(0), 0, 0.0
         if rng.random() < 0.5:
             self.p, self.draws, self.strata, self.options, unit = draw_risk(rng, case)
-            risk, limits, needed = resources(self.p, self.draws, self.strata, self.options)
+            risk, limits, needed = resources(self.p, self.strata, self.options)
             shares = shares if self.strata is None else self.strata.shares
             if case.objective == "lost_contact":
                 cost = self.options.get("failure_cost", float(case.shortest))

@@ -172,29 +172,6 @@ def test_vector_trust(objective):
         check(case.planner(max_failure=limit, engine="numba").plan(case.params), best, limit)
 
 
-@pytest.mark.parametrize("objective", list(CLASSES))
-def test_with_a_confidence_enough_draws_keep_the_limit(objective):
-    for seed in range(10):
-        case = Case(objective, 4, seed)
-        drawn = np.stack([failures(p, case.paths, case.n_cells) for p in case.draws])
-        confidence = (0.5, 0.7, 0.9, 1.0)[seed % 4]
-        limit = float(np.quantile(np.quantile(drawn, confidence, axis=0), 0.1))
-        held = (drawn <= limit + 1e-12).mean(0) >= confidence - 1e-9
-        # Few of the simple paths dominate another by 12 draws, which is slow in plain Python.
-        both = seed == 0 and objective != "stationary"
-        for engine in ("numba", "networkx")[: 1 + both]:
-            options = {"max_failure": limit, "confidence": confidence, "engine": engine}
-            planner = case.planner(**options)
-            if not held.any():
-                with pytest.raises(InfeasibleError, match=f"with confidence {confidence:g}"):
-                    planner.plan(case.params)
-                continue
-            plan = planner.plan(case.params)
-            check(plan, case.best(held))
-            share = planner.problem.risk.share_within(plan.path, limit)
-            assert share >= confidence - 1e-9
-
-
 def test_lost_contact_pays_for_a_failure_with_and_without_a_limit():
     for seed in range(12):
         case = Case(
@@ -232,14 +209,10 @@ def test_price_over_strata_is_planned_best_of_all_paths(family, team):
         case.p = np.tensordot(strata.shares, strata.p_fail, 1)
         case.p_fail = failures(case.p, case.paths, case.n_cells)
         joint = strata.shares @ [failures(p, case.paths, case.n_cells) for p in strata.p_fail]
-        drawn = np.stack([failures(p, case.paths, case.n_cells) for p in case.draws])
         limit = max(case.limit(), case.p_fail.min())
-        held = case.p_fail <= limit + 1e-12, (drawn <= limit + 1e-12).mean(0) >= 0.5 - 1e-9
         rules = [({}, np.ones(len(joint), bool))]
         if limit < 1.0:
-            rules.append(({"max_failure": limit}, held[0]))
-            if held[1].any():
-                rules.append(({"max_failure": limit, "confidence": 0.5}, held[1]))
+            rules.append(({"max_failure": limit}, case.p_fail <= limit + 1e-12))
         cost = (None, 0.7, 30.0)[seed % 3]
         unit = case.failure_cost if cost is None else cost
         for rule, feasible in rules:
@@ -391,12 +364,8 @@ def test_what_cannot_be_is_refused():
     bare = Planner(case.workspace, *case.ends, max_failure=0.1)
     with pytest.raises(TrustboError, match=r"max_failure = 0.1 needs the chance of each bound"):
         bare.plan(case.params)
-    with pytest.raises(TrustboError, match="a confidence needs draws"):
-        case.planner(max_failure=0.1, confidence=0.9).with_risk(case.p).plan(case.params)
     for options, said in (
         ({"max_failure": 1.0}, r"max_failure must be in \[0, 1\); got 1.0"),
-        ({"confidence": 0.9}, "confidence = 0.9 needs a max_failure"),
-        ({"max_failure": 0.1, "confidence": 2.0}, r"confidence must be in \(0, 1\]; got 2.0"),
         ({"failure_cost": -1.0}, "failure_cost must be finite and >= 0; got -1.0"),
         ({"failure_cost": 1.0, "objective": "mean"}, "failure_cost is for lost_contact"),
         ({"infeasible": "ignore"}, "unknown infeasible 'ignore'"),
@@ -435,10 +404,9 @@ def test_a_search_that_is_cut_short_keeps_the_limit_and_its_bound_holds(
     for _ in range(4):
         workspace = Workspace.from_awareness(rng.uniform(size=(1, 8, n, n, 2)))
         p = rng.uniform(0.0, 0.6 / n, (8, n, n))
-        draws = rng.beta(6.0 * p + 0.1, 6.0 * (1.0 - p) + 0.1, (10, 8, n, n))
-        options = {"max_bounds": max_bounds, "max_failure": most, "confidence": 0.6}
+        options = {"max_bounds": max_bounds, "max_failure": most}
         planner = Planner(workspace, (n - 1, 0), (0, n - 1), objective, engine="numba", **options)
-        planner = planner.with_risk(p, draws)
+        planner = planner.with_risk(p)
         whole = planner.plan(params)
         monkeypatch.setattr("trustbo.planning.search.labels.MAX_LABELS", 1)
         try:
@@ -448,7 +416,7 @@ def test_a_search_that_is_cut_short_keeps_the_limit_and_its_bound_holds(
         finally:
             monkeypatch.undo()
         assert whole.exact
-        assert planner.problem.risk.share_within(plan.path, most) >= 0.6
+        assert 1.0 - plan.p_arrive <= most + 1e-9
         assert plan.value <= whole.value + 1e-9 <= plan.bound + 2e-9
         cut += not plan.exact
     assert cut > 0

@@ -261,13 +261,6 @@ class Risk:
         p_fail, shares = self.strata
         return float(shares @ (1.0 - np.prod(1.0 - p_fail[_index_of(path)], axis=1)))
 
-    def share_within(self, path: Sequence[Cell] | np.ndarray, max_failure: float) -> float:
-        """Share of the draws under which a path fails with a chance of at most `max_failure`."""
-        if self.draws is None:
-            return np.nan
-        p_fail = 1.0 - np.prod(1.0 - self.draws[_index_of(path)], axis=1)
-        return float((p_fail <= max_failure + ROUNDING).mean())
-
     def along(self, path: Sequence[Cell] | np.ndarray) -> "PathRisk":
         """Select the bounds of a path."""
         index = _index_of(path)

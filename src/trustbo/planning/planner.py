@@ -67,7 +67,6 @@ class Planner(Displayed):
         observation: str = "gaussian",
         response: str = "level",
         max_failure: float | None = None,
-        confidence: float | None = None,
         failure_cost: float | None = None,
         infeasible: str = "refuse",
     ) -> None:
@@ -99,8 +98,6 @@ class Planner(Displayed):
             response: Quantity that rates measure, that of the trust model; likewise.
             max_failure: Largest chance that a path fails, in [0, 1), under the risk of `with_risk`;
                 by default no limit.
-            confidence: Least share of the draws of the risk under which a path must respect
-                `max_failure`; by default it must at their posterior mean.
             failure_cost: Cost of a failure for lost_contact, in bounds: its value is less by this
                 times the chance to fail. By default the fewest bounds from start to goal, so that
                 a mission that fails counts as one that lost all contact.
@@ -122,7 +119,7 @@ class Planner(Displayed):
             max_bounds = DEFAULT_MAX_BOUNDS.get(objective, "shortest+2")
         admitted = PathClass(connectivity, max_bounds)
         paths = AdmissiblePaths(workspace, start, goal, admitted)
-        rule = RiskRule(max_failure, confidence, failure_cost, infeasible)
+        rule = RiskRule(max_failure, failure_cost, infeasible)
         chosen = Objective(objective, length_weight, family, lag, unseen_cost)
         self._hold(PlanningProblem(paths, chosen, team, rule=rule))
 
@@ -220,8 +217,7 @@ class Planner(Displayed):
         Args:
             p_fail: Posterior mean, shape (move, row, col) with the moves of `workspace.moves.MOVES`
                 for connectivity 8; NaN where there is no bound. None: no risk.
-            draws: Draws from its posterior, shape (draw, move, row, col), for bands of `p_arrive`
-                and for `confidence`.
+            draws: Draws from its posterior, shape (draw, move, row, col), for bands of `p_arrive`.
             causes: Share of each cause of failure, numbers or arrays (move, row, col).
             strata: Chances under groups of draws, such as `BoundRisk.strata()`, by which a failure
                 is priced; by default `p_fail`, as if bounds failed independently.

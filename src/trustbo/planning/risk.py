@@ -35,9 +35,6 @@ class RiskRule(NamedTuple):
 
     max_failure: float | None = None
     """Largest chance that a path fails, in [0, 1); None for no limit."""
-    confidence: float | None = None
-    """Least share of the draws of the risk under which it is within `max_failure`; None for the
-    limit at the posterior mean."""
     failure_cost: float | None = None
     """Cost of a failure for lost_contact, in bounds; None: the fewest bounds to the goal."""
     infeasible: str = "refuse"
@@ -46,17 +43,12 @@ class RiskRule(NamedTuple):
     def checked(self, objective: str) -> Self:
         """Return the rule; TrustboError if a number is out of its range or of no use."""
         require_choice("infeasible", self.infeasible, INFEASIBLE)
-        for name in ("max_failure", "confidence", "failure_cost"):
+        for name in ("max_failure", "failure_cost"):
             value = getattr(self, name)
             if value is not None and (not isinstance(value, Real) or isinstance(value, bool)):
                 raise TrustboError(f"{name} must be a number; got {value!r}.")
         if self.max_failure is not None and not 0.0 <= self.max_failure < 1.0:
             raise TrustboError(f"max_failure must be in [0, 1); got {self.max_failure!r}.")
-        if self.confidence is not None:
-            if not 0.0 < self.confidence <= 1.0:
-                raise TrustboError(f"confidence must be in (0, 1]; got {self.confidence!r}.")
-            if self.max_failure is None:
-                raise TrustboError(f"confidence = {self.confidence:g} needs a max_failure.")
         if self.failure_cost is not None:
             if objective != "lost_contact":
                 raise TrustboError(
@@ -131,7 +123,7 @@ def risk_table(
 ) -> RiskTable | None:
     """Build the table for admissible paths, None where risk does not matter to a planner.
 
-    TrustboError: p_fail of a possible bound is NaN, or a confidence without draws.
+    TrustboError: p_fail of a possible bound is NaN.
     """
     if rule.max_failure is None and failure_cost == 0.0:
         return None
@@ -139,19 +131,12 @@ def risk_table(
     strata = risk.strata if failure_cost > 0.0 else None
     sums, shares = ([mean], np.ones(1)) if strata is None else ([strata.p_fail], strata.shares)
     limits = [np.inf] * len(shares)
-    needed = len(limits)
     if rule.max_failure is not None:
         limit = -np.log1p(-rule.max_failure) + ROUNDING
-        if rule.confidence is not None:
-            if risk.draws is None:
-                raise TrustboError("a confidence needs draws of the risk; give with_risk draws.")
-            n = len(risk.draws)
-            sums, limits = [*sums, risk.draws], limits + [limit] * n
-            needed += int(np.ceil(rule.confidence * n - 1e-9))
-        elif strata is None:
+        if strata is None:
             limits = [limit]
         else:
-            sums, limits, needed = [*sums, mean], [*limits, limit], needed + 1
+            sums, limits = [*sums, mean], [*limits, limit]
     moves = move_indices(paths.connectivity)
     p = np.concatenate([*sums, mean])[:, moves]
     p = p.reshape(*p.shape[:2], -1)
@@ -167,4 +152,4 @@ def risk_table(
     with np.errstate(divide="ignore"):
         of_bounds = np.minimum(-np.log1p(-np.nan_to_num(p)), _CERTAIN)
     costs = failure_cost * shares if failure_cost > 0.0 else np.empty(0)
-    return RiskTable(of_bounds[:-1], np.array(limits), needed, costs, of_bounds[-1])
+    return RiskTable(of_bounds[:-1], np.array(limits), len(limits), costs, of_bounds[-1])

@@ -235,7 +235,7 @@ def _too_many_labels(case: Case) -> TrustboError:
     """Error of a search that reached the limit on labels without a path."""
     where, instead = "", "team='mean'"
     if case.risk is not None:
-        where, instead = " under max_failure", "no confidence"
+        where, instead = " under max_failure", "a higher limit"
     return TrustboError(
         f"more than {labels.MAX_LABELS} partial paths are worth keeping{where}; lower max_bounds = "
         f"{case.admissible.longest}, use larger cells, or {instead}."

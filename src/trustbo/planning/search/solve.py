@@ -48,13 +48,9 @@ def find_paths(problem: PlanningProblem, dynamics: Dynamics, engine: str) -> Bes
 
 def _infeasible(rule: RiskRule, risk: Risk, path: tuple[Cell, ...]) -> InfeasibleError:
     p_fail, most = 1.0 - risk.survival(path), rule.max_failure or 0.0
-    sure, held = "", ""
-    if rule.confidence is not None:
-        sure = f" with confidence {rule.confidence:g}"
-        held = f", which holds the limit under {risk.share_within(path, most):.3g} of the draws"
     return InfeasibleError(
         f"no admissible path from {path[0]} to {path[-1]} fails with a chance of at most "
-        f"max_failure = {most:g}{sure}; the least is {p_fail:.4g}, on the path {path}{held}. Raise "
+        f"max_failure = {most:g}; the least is {p_fail:.4g}, on the path {path}. Raise "
         "max_failure, admit more paths by max_bounds, or plan the safest, infeasible='safest'.",
         path,
         p_fail,
