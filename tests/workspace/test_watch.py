@@ -39,7 +39,7 @@ def test_a_watch_is_the_line_of_sight_of_every_pair_of_posts(wooded):
         starts = np.repeat(posts[None, j, None], 2, axis=1)
         ends = np.broadcast_to(after[k], (1, 16, 2, 2))
         line, stops = [ground.lead_way(a, c)], ground.stop(c)[None]
-        given = Geometry(line, starts, line, starts, ends, stops, True, np.array([0]))
+        given = Geometry(line, starts, ends, stops)
         seen = phases(ground.surface, wooded.sights[0], wooded.team, given, doubt=True)
         np.testing.assert_allclose(watch.watched[:, j], seen.watched.mean(-1)[0])
         np.testing.assert_allclose(watch.closing[:, j, k], seen.closing.mean(-1)[0])
