@@ -381,8 +381,9 @@ class KinematicSimulator(DescribedSimulator):
         lead = self._advance(state, cell, self._max_ticks, rng)
         if lead.status != "ok":
             return lead
-        own = state.posts is not None and k < len(state.posts)
-        goals = state.posts[k] if own else self._ways.posts.watching(cell, next_cell)
+        goals = self._ways.posts.watching(cell, next_cell)
+        if state.posts is not None and k < len(state.posts):
+            goals = state.posts[k]
         left = self._max_ticks - len(lead.poses)
         return _joined([lead, self._close_up(_after(state, lead), cell, goals, left, rng)])
 
