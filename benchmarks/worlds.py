@@ -4,29 +4,19 @@
     python benchmarks/worlds.py --kind aged --kind wall --method trustbo --method "running mean"
 
 All worlds x 4 courses x methods, 15 missions each; called again, it goes on where it stopped, with
-other parts too: the tables are those of the chosen parts. BoTorch and Ax are left out where they
-are not installed.
+other parts too: the tables are those of the chosen parts.
 `--targets` runs the objective and path class of the targets instead, mean contact on shortest+2.
 `--report` runs nothing, and prints the tables of what is in `--out`, for the worlds and courses
 that the default campaign has run. `--csv` writes a row for each world, course and method.
 """
 
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import xarray as xr
-from baselines import (
-    ax_default,
-    botorch,
-    line_of_sight,
-    oracle,
-    residual_process,
-    running_mean,
-    standard_design,
-)
+from baselines import line_of_sight, oracle, residual_process, running_mean
 from common import arguments, parsed
 from groups import KINDS, OURS, report_groups, rows_of
 
@@ -45,17 +35,11 @@ METHODS: dict[str, Any] = {
     "running mean": running_mean.greedy,
     "running mean, optimistic": running_mean.optimistic,
     "residual process": residual_process.ResidualProcess,
-    "BoTorch EI": botorch.expected_improvement,
-    "BoTorch Thompson": botorch.thompson,
-    "Ax": ax_default.AxDefault,
     "line of sight": line_of_sight.LineOfSight,
-    "standard design": standard_design.StandardDesign,
     "oracle": oracle.Oracle,
     **dict(BASELINE_ROWS.values()),
 }
 """Methods by the names of their rows."""
-PACKAGES = {"BoTorch EI": "botorch", "BoTorch Thompson": "botorch", "Ax": "ax"}
-"""Packages that methods need."""
 CASES = ("canopy", "robots", "days", "change", "jammer", "limit")
 """Kinds of which each case has a table."""
 COLUMNS = ["regret after 0", "regret after 3", "regret after 8", "regret after 15", "regret now",
@@ -96,11 +80,7 @@ def main():
         and (given.kind is None or world.kind in given.kind)
         and (given.world is None or world.name in given.world)
     ]
-    methods = {
-        name: METHODS[name]
-        for name in given.method or METHODS
-        if name not in PACKAGES or find_spec(PACKAGES[name])
-    }
+    methods = {name: METHODS[name] for name in given.method or METHODS}
     courses = {} if given.course is None else {"courses": given.course}
     results = run_worlds(
         given.out, data=given.data, only=names, methods=methods, baselines=(), policies=(),

@@ -2,8 +2,6 @@
 
 They are those of docs/gallery.md by its own code, and a few more. A diagram is an SVG.
 
-The figures of long campaigns and of reliability are of the tables in docs/figures/tables, which
-`benchmarks/campaigns.py --out` and `benchmarks/failures.py learn --csv` wrote.
 Run: python scripts/docs_figures.py [name ...]
 """
 
@@ -28,7 +26,6 @@ from trustbo.plots.style import LIGHT, theme
 
 mpl.use("Agg")
 FIGURES = Path(__file__).resolve().parents[1] / "docs" / "figures"
-TABLES = FIGURES / "tables"
 STEP = re.compile(r"^```python\n(.*?)^```|^!\[[^]]*\]\(figures/(\w+)\.png\)", flags=re.S | re.M)
 PAPERS = {"": LIGHT._replace(paper="#ffffff"), "dark": plots.DARK._replace(paper="#131416")}
 """Themes by folder; their papers are those of the pages of the documentation."""
@@ -47,8 +44,6 @@ def main(wanted: list[str]) -> None:
             draw(name, wanted, lambda code=code: exec(code, names))
             code = ""
     draw("criticism", wanted, criticism)
-    draw("long_campaigns", wanted, long_campaigns)
-    draw("reliability", wanted, reliability)
     draw("animate_mission", wanted, lambda: frame(names["result"]))
     draw("architecture", wanted, architecture, "svg")
 
@@ -80,54 +75,6 @@ def criticism() -> None:
     namespace: dict[str, Any] = {}
     exec(page.split("```python\n")[1].split("```")[0], namespace)
     plots.criticism(namespace["found"])
-
-
-def long_campaigns() -> Figure:
-    """Draw seconds, memory and disk over 200 missions, by version 0.1 and now."""
-    figure, axes = plt.subplots(1, 3, figsize=(7.6, 2.6), layout="constrained")
-    styles = {"0.1": ("#D55E00", "--", "version 0.1"), "0.2": ("#0072B2", "-", "now")}
-    for version, (color, line, label) in styles.items():
-        table = np.genfromtxt(TABLES / f"campaigns_{version}.csv", delimiter=",", names=True)
-        memory = (table["memory_mb"] - table["memory_mb"][0]) / 1e3
-        for ax, values in zip(
-            axes, (table["seconds"], memory, table["disk_mb"] / 1e3), strict=True
-        ):
-            ax.plot(table["mission"], values, line, color=color, label=label)
-    for ax, name in zip(axes, ("seconds a mission", "memory gained, GB", "disk, GB"), strict=True):
-        ax.set(xlabel="mission", ylabel=name, ylim=(0, None), xlim=(0, 200))
-        ax.spines[["top", "right"]].set_visible(False)
-    axes[0].legend(frameon=False)
-    return figure
-
-
-def reliability() -> Figure:
-    """Draw the share of missions that arrived by the chance predicted, after 15 and 60 missions."""
-    table = np.genfromtxt(
-        TABLES / "failures_reliability.csv", delimiter=",", names=True, dtype=None, encoding=None
-    )
-    figure, axes = plt.subplots(1, 2, figsize=(7, 3.3), layout="constrained", sharey=True)
-    styles = {
-        "topography": ("#0072B2", "o"),
-        "tahoe": ("#D55E00", "s"),
-        "synthetic-0": ("#009E73", "^"),
-    }
-    for ax, missions in zip(axes, (15, 60), strict=True):
-        ax.fill_between([0, 1], [-0.05, 0.95], [0.05, 1.05], color="0.5", alpha=0.25, linewidth=0,
-                        label="off by .05")  # fmt: skip
-        ax.plot([0, 1], [0, 1], color="0.5", linewidth=0.8)
-        for name, (color, marker) in styles.items():
-            of = table[np.char.startswith(table["world"], name) & (table["missions"] == missions)]
-            many, few = of[of["n"] >= 100], of[(of["n"] < 100) & (of["n"] > 0)]
-            ax.plot(many["predicted"], many["arrived"], marker, color=color, label=name)
-            ax.plot(
-                few["predicted"], few["arrived"], marker, color=color, fillstyle="none", alpha=0.6
-            )
-        ax.set(xlabel="predicted chance to arrive", title=f"after {missions} missions")
-        ax.set(xlim=(0, 1), ylim=(0, 1.02))
-        ax.spines[["top", "right"]].set_visible(False)
-    axes[0].set_ylabel("share that arrived")
-    axes[0].legend(frameon=False)
-    return figure
 
 
 ROOMS = {

@@ -30,7 +30,6 @@ STYLES = {
     "trustbo": ("#0072B2", "-"),
     "residual process": ("#CC79A7", (0, (6, 1.5, 1, 1.5))),
     "running mean": ("#009E73", (0, (1, 1))),
-    "BoTorch EI": ("#D55E00", "--"),
     "line of sight": ("0.45", (0, (3, 1, 1, 1))),
 }
 """Colours and lines of methods, by the names of their rows."""

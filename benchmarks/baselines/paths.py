@@ -1,4 +1,4 @@
-"""Shared by the baselines: line of sight of bounds, best paths on a table of rates, candidates.
+"""Shared by the baselines: line of sight of bounds, and best paths on a table of rates.
 
 Rates of bounds are tables (..., move, row, col) of the eight `MOVES`: the expected contact rate of
 the bound that enters a cell by a move, mean over robots; NaN where there is no bound.
@@ -15,14 +15,9 @@ from trustbo.models.params import Params
 from trustbo.planning import Plan, Planner
 from trustbo.planning.policies import seed_of
 from trustbo.planning.search.layers import Weights, best_additive
-from trustbo.workspace.moves import along, bounds_along, move_indices
+from trustbo.workspace.moves import bounds_along, move_indices
 
 Path = tuple[Cell, ...]
-N_CANDIDATES = 200
-_JITTER = 0.3, 0.15
-"""Largest sd of the jitter of line of sight, multiplied by it and added to it."""
-_MOST_DRAWS = 10
-"""Draws for each candidate after which there are no more."""
 
 
 class PathPolicy:
@@ -93,21 +88,6 @@ def predicted(planner: Planner, path: Path) -> float:
     return value(planner, line_of_sight(planner)[tuple(bounds_along(path).T)])
 
 
-def measured(planner: Planner, mission: Mission) -> float | None:
-    """Value of a mission; None where no rate was measured.
-
-    Bounds that were not driven, or failed, kept no contact; a rate that is missing is the mean.
-    """
-    rates = [rate for _, rate in rates_of(mission)]
-    if not rates:
-        return None
-    n = len(mission.path) - 1
-    driven = len(mission.bounds)
-    return value(
-        planner, [*rates, *[np.mean(rates)] * (driven - len(rates)), *[0.0] * (n - driven)]
-    )
-
-
 def rates_of(mission: Mission) -> list[tuple[tuple[int, int, int], float]]:
     """Measured bounds of a mission, (move, row, col), each with its rate, mean over robots.
 
@@ -122,36 +102,3 @@ def rates_of(mission: Mission) -> list[tuple[tuple[int, int, int], float]]:
         elif measured.any():
             rates.append((tuple(where), float(bound.contact_rate[measured].mean())))
     return rates
-
-
-def jittered(rates: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:
-    """Tables of jittered rates, (draw, move, row, col): more and more of it, none in the first."""
-    factor, shift = (
-        most
-        * np.linspace(0.0, 1.0, n)[:, None, None, None]
-        * rng.standard_normal((n, *rates.shape))
-        for most in _JITTER
-    )
-    return np.clip(rates * (1.0 + factor) + shift, 0.0, 1.0)
-
-
-def candidates(planner: Planner, n: int = N_CANDIDATES, seed: int = 0) -> list[Path]:
-    """Draw n different admissible paths, each the best under jittered line of sight.
-
-    The first is the best by line of sight; there are fewer where the grid has not as many.
-    """
-    sight, rng = line_of_sight(planner), np.random.default_rng(seed)
-    paths: dict[Path, None] = {}
-    for _ in range(_MOST_DRAWS):
-        paths |= dict.fromkeys(best_paths(planner, jittered(sight, n, rng)))
-        if len(paths) >= n:
-            break
-    return list(paths)[:n]
-
-
-def features(planner: Planner, paths: Sequence[Path]) -> np.ndarray:
-    """Sums over bounds of each feature, mean over robots, and the number of bounds, (path, sum)."""
-    maps = planner.workspace.bound_maps
-    return np.stack([
-        np.append(along(maps, path).mean(0).sum(0), len(path) - 1.0) for path in paths
-    ])  # fmt: skip

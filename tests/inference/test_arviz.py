@@ -1,7 +1,5 @@
 """Groups of a posterior that ArviZ's functions read, against numpyro and dense normals."""
 
-import re
-import runpy
 from dataclasses import replace
 from pathlib import Path
 
@@ -226,29 +224,3 @@ def test_what_has_no_single_predictions_is_named(missions):
     counted.attrs |= {"x0_mean": 0.5, "x0_sd": 0.5}
     with pytest.raises(tb.TrustboError, match='observation "censored" and inter_robot="none"'):
         tb.inference.by_rate(counted)
-
-
-@pytest.mark.slow  # 200 calls, most of them figures
-def test_the_page_names_every_call_that_fails(missions, posterior):
-    script = runpy.run_path(str(ROOT / "benchmarks" / "arviz_calls.py"))
-    page = (ROOT / "docs" / "howto" / "use-arviz.md").read_text()
-    table = page.partition("| fail | on |")[2].partition("\n\n")[0]
-    named = set(
-        re.findall(r"`(\w+)[`(]", "\n".join(r.split("|")[1] for r in table.splitlines()[2:]))
-    )
-    assert {"plot_energy", "plot_loo_pit"} <= named  # and groups
-    given = {name: script[name] for name in ("written", "density")}
-    given |= {"az": az, "np": np, "tb": tb, "names": ["beta0", "beta", "b"]}
-    given |= {"other": tb.fit(missions, CoupledTrust(inter_robot="none"))}
-    given |= {"half": tb.fit(missions[::2], PooledTrust())}
-    calls = script["CALLS"].split("\n")[1:-1]
-    failed = {
-        call: said for call in calls if (said := script["failure"](call, given | {"dt": posterior}))
-    }
-    assert {re.search(r"az\.(\w+)", call)[1] for call in failed} <= named, failed
-    assert "az.plot_energy(dt)" in failed
-    assert "az.plot_loo_pit(dt)" in failed
-    assert (
-        script["failure"]("az.plot_loo_pit(dt)", given | {"dt": tb.inference.by_rate(posterior)})
-        == ""
-    )
