@@ -3,7 +3,6 @@
 import re
 import shlex
 import shutil
-import sys
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -14,30 +13,22 @@ import trustbo as tb
 from trustbo.cli import app
 
 ROOT = Path(__file__).resolve().parents[1]
-BLOCKS = re.compile(r"^```(sh|yaml)\n(.*?)^```", flags=re.S | re.M)
+BLOCKS = re.compile(r"^```sh\n(.*?)^```", flags=re.S | re.M)
 SETUP = ("git", "cd", "make", "pip", "python", ".venv/bin/python")  # what CI does to get here
 
 
-def steps_of(page):
-    """What to type, and the files to make before: (command, None) or (name, content)."""
-    for kind, text in BLOCKS.findall(page.read_text()):
-        if kind == "yaml":
-            if name := re.match(r"# (\S+\.yaml)\n", text):
-                yield name[1], text
-            continue
-        for line in text.splitlines():
-            words = shlex.split(line, comments=True)
-            if words and words[0] not in SETUP:
-                yield words, None
+def commands_of(page):
+    """Words of each command that a page shows."""
+    lines = "\n".join(BLOCKS.findall(page.read_text())).splitlines()
+    commands = [shlex.split(line, comments=True) for line in lines]
+    return [words for words in commands if words and words[0] not in SETUP]
 
 
 PAGES = {
-    str(page.relative_to(ROOT)): steps
+    str(page.relative_to(ROOT)): commands
     for page in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
-    if (steps := list(steps_of(page))) and any(content is None for _, content in steps)
+    if (commands := commands_of(page))
 }
-
-_, STUDY = next(steps_of(ROOT / "docs" / "howto" / "run-a-study.md"))
 
 
 @pytest.fixture(scope="module")
@@ -56,11 +47,6 @@ def campaign(terrain, tmp_path_factory):
         progress=False,
     )  # fmt: skip
     return folder
-
-
-def short(yaml):
-    """A study of few runs; any other file as it is."""
-    return re.sub(r"(seeds|n_iterations): \d+", r"\1: 2", yaml)
 
 
 def shorter(words, page):
@@ -84,17 +70,12 @@ def test_the_commands_of_a_page_run_from_top_to_bottom(
     page, terrain, campaign, tmp_path, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setitem(sys.modules, "loky", None)  # studies run here, not in processes of loky
     for name in ("dem", "dsm"):
         terrain[name].astype("float32").rio.to_raster(f"{name}.tif")
-    commands = [words for words, content in PAGES[page] if content is None]
+    commands = PAGES[page]
     for name in () if commands[0][1] in ("run", "demo", "info") else ("mine", "demo"):
         shutil.copytree(campaign, Path("out") / name, ignore=shutil.ignore_patterns(".lock"))
-    Path("config.yaml").write_text(short(STUDY))  # a user's own
-    for words, content in PAGES[page]:
-        if content is not None:
-            Path(words).write_text(short(content))
-            continue
+    for words in commands:
         assert words[0].removeprefix(".venv/bin/") == "trustbo", words
         done = CliRunner().invoke(app, [*words[1:], *shorter(words[1:], page)])
         assert done.exit_code == 0, f"{shlex.join(words)}\n{done.output}"
@@ -102,7 +83,7 @@ def test_the_commands_of_a_page_run_from_top_to_bottom(
 
 
 def test_a_newcomer_s_figure_takes_four_commands_of_the_readme():
-    block = BLOCKS.search((ROOT / "README.md").read_text())[2]
+    block = BLOCKS.search((ROOT / "README.md").read_text())[1]
     commands = [shlex.split(line, comments=True) for line in block.splitlines() if line.strip()]
     assert [words[0] for words in commands] == ["git", "cd", "make", ".venv/bin/trustbo"]
     assert commands[3][1] == "run"

@@ -322,7 +322,7 @@ def test_the_page_of_the_command_line_has_every_flag_with_its_help():
         for option in command.params:
             help_text = re.sub(r"\[/?b\]", "`", option.help)
             flag = option.metavar if option.param_type_name == "argument" else option.opts[0]
-            assert texts.pop(flag).replace("[studies](studies.md)", "docs/studies.md") == help_text
+            assert texts.pop(flag) == help_text
         assert texts == {}, f"trustbo {name} has no such flags"
 
 

@@ -36,21 +36,12 @@ def flags(rasters):
 
 
 @pytest.fixture(scope="session")
-def finished(invoke, rasters, tmp_path_factory, leave_figures_blank):
-    """The folder of a run of two missions, and what it printed; its figures are blank.
-
-    Its flags are in a file, but for two, which are given in spite of it, and --out.
-    """
+def finished(invoke, flags, tmp_path_factory, leave_figures_blank):
+    """The folder of a run of two missions, and what it printed; its figures are blank."""
     out = tmp_path_factory.mktemp("runs") / "mine"
-    (rasters / "mission.yaml").write_text(
-        "dem: dem.tif\ndsm: dsm.tif\nstart: [2, 0]\ngoal: 0,2\nshape: 3,3\nsampler: exact\n"
-        "iterations: 5\nmax-slope: 40\nlidar_range: 80\nseed: 3\nmax-failure: 0.5\n"
-        "failure-cost: 2.5\n"
-    )
-    given = "--config", rasters / "mission.yaml", "--iterations", 2, "--seed", 1
+    given = *flags, "--max-slope", 40, "--lidar-range", 80, "--iterations", 2, "--seed", 1
     with pytest.MonkeyPatch.context() as patch:
         leave_figures_blank(patch)
-        patch.chdir(out.parent)  # rasters are found beside the file
         done = invoke("run", *given, "--out", out)
     assert done.exit_code == 0, done.output
     return out, done

@@ -7,7 +7,6 @@ import rioxarray
 from pyproj import Transformer
 from rasterio.transform import rowcol
 
-from trustbo.cli.config import flags_of
 from trustbo.plots.grid import grid_map
 from trustbo.terrain import synthetic_terrain
 from trustbo.workspace import survey
@@ -101,11 +100,3 @@ def test_run_refuses_ends_before_it_computes_awareness(
     assert done.exit_code == 2
     assert "no cell is passable" in done.output
     assert not (tmp_path / "o").exists()
-
-
-def test_a_file_gives_ends_as_mappings(tmp_path):
-    file = tmp_path / "a.yaml"
-    file.write_text("start: {lon: 174.7, lat: -41.3}\ngoal: [1748000.5, 5427000]\n")
-    assert flags_of(file, ("start", "goal")) == {
-        "start": "lon=174.7,lat=-41.3", "goal": "1748000.5,5427000"
-    }  # fmt: skip

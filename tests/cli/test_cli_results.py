@@ -1,4 +1,4 @@
-"""`trustbo report` and `export`, the help of all commands, and how fast it comes."""
+"""`trustbo export`, the help of all commands, and how fast it comes."""
 
 import os
 import re
@@ -18,19 +18,7 @@ from trustbo.planning import OBJECTIVES, POLICIES
 from trustbo.study.methods import MODELS
 from trustbo.workspace.sight import SIGHT_MODES
 
-COMMANDS = ("demo", "run", "resume", "report", "export", "study")
-
-
-@pytest.mark.usefixtures("blank_figures")
-def test_report_writes_a_page_and_an_interactive_one_beside_it(invoke, finished, tmp_path):
-    folder, _ = finished
-    page = tmp_path / "mine.html"
-    done = invoke("report", folder, "--out", page, "--title", "Two missions")
-    assert done.exit_code == 0, done.output
-    interactive = tmp_path / "mine-explore.html"
-    assert done.output == f"the report is {page}\nthe interactive page is {interactive}\n"
-    assert interactive.exists()
-    assert "<h1>Two missions</h1>" in page.read_text()
+COMMANDS = ("demo", "info", "run", "resume", "export", "worlds")
 
 
 def test_export_writes_what_is_asked_for(invoke, finished, tmp_path):
@@ -41,18 +29,6 @@ def test_export_writes_what_is_asked_for(invoke, finished, tmp_path):
     names = ["path.geojson", "missions.csv"]
     assert done.output.splitlines() == [str(tmp_path / name) for name in names]
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted(names)
-
-
-@pytest.mark.parametrize("target", [".", "folder", "file/report.html"])
-def test_report_says_at_once_where_it_cannot_write(target, invoke, finished, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "file").touch()
-    (tmp_path / "folder").mkdir()
-    done = invoke("report", finished[0], "--out", target)
-    assert done.exit_code == 2
-    assert done.stderr.startswith("error: cannot write ")
-    assert done.stderr.count("\n") == 1
-    assert {file.name for file in tmp_path.rglob("*")} == {"file", "folder"}
 
 
 def test_export_puts_maps_for_ros_into_a_frame(invoke, finished, tmp_path):
@@ -119,9 +95,8 @@ def test_an_unknown_format_lists_the_choices(invoke, finished, tmp_path):
     assert not (tmp_path / "never").exists()
 
 
-@pytest.mark.parametrize("command", [("report",), ("export", "--format", "csv")])
-def test_a_folder_without_a_result_is_refused(command, invoke, tmp_path):
-    done = invoke(*command, tmp_path)
+def test_a_folder_without_a_result_is_refused(invoke, tmp_path):
+    done = invoke("export", "--format", "csv", tmp_path)
     assert done.exit_code == 2
     assert "holds no result" in done.stderr
 
@@ -163,13 +138,12 @@ def test_help_of_export_names_every_format(invoke):
         ),
         (["run"], 2, "error: missing options --dem, --start, --goal.\nhint: trustbo run "),
         (["export"], 2, "error: missing arguments FOLDER, --format.\nhint: trustbo export "),
-        (["report"], 2, "error: missing argument FOLDER.\nhint: trustbo report --help "),
         (["run", "--robots", "two"], 2, "error: --robots must be a whole number; got 'two'.\n"),
         (["run", "--max-slope", "a"], 2, "error: --max-slope must be a number; got 'a'.\n"),
         (
-            ["run", "--max-failure", "5%"],
+            ["run", "--stop-regret", "5%"],
             2,
-            "error: --max-failure must be a number, such as 0.05; got '5%'.\n",
+            "error: --stop-regret must be a number, such as 0.05; got '5%'.\n",
         ),
         (
             ["resume", "--out", "x"],
@@ -184,7 +158,7 @@ def test_help_of_export_names_every_format(invoke):
         (["run", "--dme", "x"], 2, "error: unknown option --dme; did you mean --dem?\n"),
         (["run", "--zz"], 2, "error: unknown option --zz.\nhint: trustbo run --help "),
         (["fly"], 2, "error: No such command 'fly'.\nhint: trustbo --help "),
-        (["report", "nowhere"], 2, "error: 'nowhere' holds no result;"),
+        (["resume", "nowhere"], 2, "error: 'nowhere' holds no campaign;"),
         (["--version"], 0, ""),
         ([], 0, ""),
     ],
@@ -214,7 +188,7 @@ def complete(line, **more):
 
 
 def test_shells_complete_commands_flags_and_names():
-    assert complete("trustbo re") == ["resume", "report"]
+    assert complete("trustbo re") == ["resume"]
     assert complete("trustbo run --pol") == ["--policy"]
     assert complete("trustbo run --policy ") == [*POLICIES]
     assert complete("trustbo demo --policy g") == ["greedy"]
@@ -247,7 +221,7 @@ def test_what_the_words_alone_tell_imports_nothing_heavy():
         f"run {ENDS} --policy fly": "unknown policy 'fly'; choose one of greedy, optimistic, ",
         f"run {ENDS} --shape 10": "--shape must be rows and columns, such as 10,12; got '10'",
         f"run {ENDS} --max-slope 90": "--max-slope must be between 0 and 90 degrees; got 90",
-        "report nowhere": "'nowhere' holds no result; give the --out of trustbo run",
+        "export nowhere --format csv": "'nowhere' holds no result; give the --out of trustbo run",
     }
     program = (
         "import sys\nfrom trustbo.cli import main\nfor words in sys.argv[1:]:\n"

@@ -55,16 +55,13 @@ def test_run_s_files_say_the_same(finished):
 @pytest.mark.usefixtures("blank_figures")
 def test_run_passes_every_choice_on_and_resume_drives_nothing_again(invoke, flags, tmp_path):
     done = invoke(
-        *("run", *flags, "--iterations", 9),
-        *("--max-bounds", "shortest", "--objective", "mean", "--stop-regret", 0.9, "--quiet"),
+        *("run", *flags, "--iterations", 9, "--model", "pooled", "--policy", "optimistic"),
+        *("--objective", "mean", "--stop-regret", 0.9, "--quiet"),
         *("--out", tmp_path),
     )
     assert done.exit_code == 0, done.output
     record = json.loads((tmp_path / "result.json").read_text())
-    chosen = {
-        "max_bounds": "shortest",
-        "objective": "mean",
-    }
+    chosen = {"policy": "optimistic", "objective": "mean"}
     assert {name: record["settings"][name] for name in chosen} == chosen
     assert record["stop_reason"].startswith("regret_bound: P(regret <= 0.9)")
     assert record["n_missions"] == 3  # the fewest that the rule asks for
@@ -159,7 +156,6 @@ def test_a_dem_alone_is_enough_and_its_feet_are_read(invoke, rasters, flags, tmp
             ("--observation", "odd"),
             "unknown observation 'odd'; choose one of gaussian, censored",
         ),
-        (("--team", "max"), "unknown team 'max'; choose one of mean, min"),
         (("--stop-regret", "2"), "--stop-regret must be in (0, 1); got 2.0"),
         (
             ("--model", "coupled", "--observation", "censored"),
@@ -171,7 +167,6 @@ def test_a_dem_alone_is_enough_and_its_feet_are_read(invoke, rasters, flags, tmp
         (("--max-slope", "95"), "--max-slope must be between 0 and 90 degrees; got 95"),
         (("--max-slope", "0.1"), "no cell is passable"),
         (("--robots", "0"), "--robots must be a whole number from 1 on; got 0"),
-        (("--max-bounds", "1"), "--max-bounds = 1 is below the fewest possible"),
         (("--dsm", "absent.tif"), "dsm: there is no file 'absent.tif'"),
         (("--resolution", "60"), "90 x 90 pixels, too few to average 60 x 60 of them"),
         (("--resolution", "0"), "resolution must be positive and finite; got 0.0"),

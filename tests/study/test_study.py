@@ -15,15 +15,12 @@ from shutil import copy
 import jax
 import matplotlib.pyplot as plt
 import numpy as np
-import pandas as pd
 import pytest
 import xarray as xr
 from distributed import Client, LocalCluster
-from typer.testing import CliRunner
 
 import trustbo as tb
 from trustbo import study
-from trustbo.cli import app
 from trustbo.study import executors, experiment
 from trustbo.study.configuration import read_study
 
@@ -566,23 +563,12 @@ n_iterations: 2
 """
 
 
-def test_the_command_runs_a_study_and_shows_its_regret(serial, tmp_path, monkeypatch):
+def test_a_study_is_read_from_yaml_and_its_names_are_checked(serial, tmp_path):
     (tmp_path / "config.yaml").write_text(YAML)
-    monkeypatch.setitem(sys.modules, "loky", None)  # serial, as it is not there
-    arguments = ["study", str(tmp_path / "config.yaml")]
-    done = CliRunner().invoke(app, [*arguments, "--out", str(tmp_path / "out")])
-    assert done.exit_code == 0, done.output
-    assert "median regret after each mission" in done.output
-    assert "6/6" in done.output
-    assert_same(study.load_study(tmp_path / "out"), serial)
-    table = pd.read_csv(tmp_path / "out" / "summary.csv")
-    assert list(table) == ["policy", "mission", "median", "low", "high", "n"]
-    assert (tmp_path / "out" / "regret.png").read_bytes().startswith(b"\x89PNG")
+    assert_same(study.run_study(tmp_path / "config.yaml", tmp_path / "out", "serial"), serial)
     (tmp_path / "config.yaml").write_text(YAML.replace("greedy", "gredy"))
-    refused = CliRunner().invoke(app, arguments)
-    assert refused.exit_code == 2
-    assert "unknown policy 'gredy'; choose one of" in refused.output
-    plt.close("all")
+    with pytest.raises(tb.TrustboError, match="unknown policy 'gredy'"):
+        study.run_study(tmp_path / "config.yaml", tmp_path / "other", "serial")
 
 
 # --- the simulator ---

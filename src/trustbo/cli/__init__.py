@@ -1,4 +1,4 @@
-"""The command line: `trustbo demo`, `run`, `resume`, `report`, `export`, `study`, ..."""
+"""The command line: `trustbo demo`, `info`, `run`, `resume`, `export`, `worlds`."""
 
 from trustbo.cli.program import app, main
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from shutil import copyfile
 from typing import TYPE_CHECKING, Any
 
-from trustbo.campaign.options import OBJECTIVE, POLICY, SAMPLER, CampaignOptions
+from trustbo.campaign.options import OBJECTIVE, POLICY, SAMPLER
 from trustbo.cli.options import choices_of
 from trustbo.cli.outputs import require_outputs, write_outputs
 from trustbo.cli.terrains import pair, reader_of, team_of, workspace_with
@@ -37,16 +37,13 @@ def run(
     iterations: int = 8,
     stop_regret: float | None = None,
     seed: int = 0,
-    config: Path | None = None,
     out: Path = Path("out"),
     overwrite: bool = False,
     quiet: bool = False,
-    **options: Any,
 ) -> None:
     """Run a campaign on a terrain of yours: plan, simulate, learn, and plan again.
 
     Example: trustbo run --dem dem.tif --dsm dsm.tif --start 9,0 --goal 0,9
-    The same, with flags in a file: trustbo run --config mission.yaml --seed 2 --out out/second
     Ends where a map has them: --start lon=175.4007,lat=-40.9204 --goal x=1802403,y=5467480
 
     The folder gets report.html (read this first), explore.html (interactive),
@@ -61,10 +58,9 @@ def run(
         sight=sight, observation=observation,
     )  # fmt: skip
     cells, team = pair("shape", shape), team_of(max_slope, robots, lidar_range)
-    chosen = CampaignOptions(**options)
     require_outputs(out, overwrite=overwrite)
     trust_model = _model(model, observation)
-    _require_sampling(chosen, trust_model, sampler)
+    _require_sampler(trust_model, sampler)
     from trustbo import simulation
     from trustbo.campaign.loop import iterate
     from trustbo.campaign.stopping import RegretBound
@@ -78,7 +74,6 @@ def run(
         workspace, *ends, n_iterations=iterations, model=trust_model, policy=policy,
         objective=objective, sampler=sampler, simulator=simulation.KinematicSimulator(workspace),
         stop=stop, checkpoint=out, overwrite=overwrite, seed=seed, progress=not quiet,
-        options=chosen,
     )  # fmt: skip
     write_outputs(result, out, table=not quiet)
 
@@ -90,7 +85,6 @@ def demo(
     sampler: str = SAMPLER,
     iterations: int = 8,
     seed: int = 0,
-    config: Path | None = None,
     out: Path = Path("out/demo"),
     overwrite: bool = False,
     quiet: bool = False,
@@ -166,12 +160,11 @@ def _require_flags(iterations: int, seed: int, **names: str) -> None:
     require_whole("seed", seed, 0)
 
 
-def _require_sampling(options: CampaignOptions, model: "TrustModel", sampler: str) -> None:
-    """Refuse settings of NUTS (TrustboError) for another sampler before a raster is read."""
+def _require_sampler(model: "TrustModel", sampler: str) -> None:
+    """Refuse a sampler that the model does not have (TrustboError) before a raster is read."""
     from trustbo.inference.samplers.choice import resolve_sampler
-    from trustbo.inference.samplers.settings import NutsSettings
 
-    NutsSettings.of(options.sampling).require_sampler(resolve_sampler(model, sampler)[0])
+    resolve_sampler(model, sampler)
 
 
 def _model(name: str, observation: str) -> "TrustModel":

@@ -4,14 +4,11 @@ import inspect
 import re
 from collections.abc import Callable
 from copy import copy
-from dataclasses import fields
 from functools import wraps
 from typing import Annotated, Any
 
 import typer
 
-from trustbo.campaign.options import LEARNING, PLANNING, RUNNING, CampaignOptions
-from trustbo.cli.config import read_config
 from trustbo.cli.errors import one_line_errors
 
 _HELP = """
@@ -70,17 +67,13 @@ Missions
     0.05.
   seed N: Seed of everything random.
 Program
-  config FILE: Read flags from a YAML file, e.g. [b]max-slope: 30[/b]; flags given here win.
   out FOLDER: Folder for the results, made if need be; not one that holds a campaign.
-  study.out FOLDER: Folder for the results, made if need be.
   worlds.out FOLDER: Folder for the results, made if need be.
-  report.out FILE: File of the page; by default report.html in the folder.
   export.out FOLDER: Folder for the files; by default the result's.
   info.out FILE: Picture of the grid, a .png.
   overwrite: Remove the campaign that the folder holds first; other files in it are kept.
   quiet: Show no progress bar and no table.
   debug: Show the whole traceback of an error.
-  title TEXT: Title of the page.
 Options
   formats NAME: Format, may be repeated: geotiff (maps); geojson, geopackage (the path);
     csv (missions); ros_map, nav2 (route graph and waypoints); or all that can be written.
@@ -98,7 +91,6 @@ Arguments
   folder FOLDER: Folder of the campaign's results.
   info.dem DEM: Heights of the ground (DEM), e.g. a GeoTIFF.
   info.dsm DSM: Heights of the canopy (DSM) of the same place.
-  study.config CONFIG: Study in YAML; see docs/studies.md.
 """
 """Flags by panel: name, placeholder and help; `command.name` where it differs by command."""
 _NAMES = {
@@ -108,9 +100,7 @@ _NAMES = {
     "debug": ("--debug",),
     "formats": ("--format",),
 }
-_PANELS = {PLANNING: "Paths", LEARNING: "Learning", RUNNING: "Missions"}
 _ALONE = inspect.Parameter.KEYWORD_ONLY
-_METAVARS = {int: "N", float: "X", str: "NAME", type(None): "VALUE"}
 
 
 def _flags() -> dict[str, Any]:
@@ -122,8 +112,6 @@ def _flags() -> dict[str, Any]:
             continue
         name, metavar, text = re.findall(r"  ([\w.]+) ?(\S*): (.+)", line)[0]
         about = {"help": text, "metavar": metavar or None}
-        if name == "config":
-            about |= {"callback": read_config, "is_eager": True}
         if panel == "Arguments":
             flags[name] = typer.Argument(**about)
         else:
@@ -152,7 +140,7 @@ def choices_of(flag: str) -> list[str]:
 
 
 def with_flags(command: Callable[..., None], campaign: str = "") -> Callable[..., None]:
-    """Give a command's parameters their flags, `**options` those of `CampaignOptions`, and --debug.
+    """Give a command's parameters their flags, and --debug.
 
     `campaign` is the parameter with the folder of the campaign at work, see `one_line_errors`.
     """
@@ -160,14 +148,11 @@ def with_flags(command: Callable[..., None], campaign: str = "") -> Callable[...
     debug = inspect.Parameter("debug", _ALONE, default=False, annotation=bool)
     parameters = []
     for p in (*signature.parameters.values(), debug):
-        if p.kind is p.VAR_KEYWORD:
-            parameters += _campaign_flags()
-        else:
-            flag = _FLAGS.get(f"{command.__name__}.{p.name}") or _FLAGS[p.name]
-            if p.annotation in _PARSERS:
-                flag = copy(flag)
-                flag.parser = _PARSERS[p.annotation]
-            parameters.append(p.replace(annotation=Annotated[p.annotation, flag], kind=_ALONE))
+        flag = _FLAGS.get(f"{command.__name__}.{p.name}") or _FLAGS[p.name]
+        if p.annotation in _PARSERS:
+            flag = copy(flag)
+            flag.parser = _PARSERS[p.annotation]
+        parameters.append(p.replace(annotation=Annotated[p.annotation, flag], kind=_ALONE))
 
     @wraps(command)
     def run(*, debug: bool, **given: Any) -> None:
@@ -176,29 +161,6 @@ def with_flags(command: Callable[..., None], campaign: str = "") -> Callable[...
 
     run.__signature__ = signature.replace(parameters=parameters)  # pyright: ignore
     return run
-
-
-def _campaign_flags() -> list[inspect.Parameter]:
-    """Flags of the fields of `CampaignOptions` that can be typed."""
-    entries = re.findall(
-        r"^    (\w+): (.+?\.)(?=\s)", inspect.cleandoc(CampaignOptions.__doc__ or ""), re.M | re.S
-    )
-    texts = {name: " ".join(text.split()) for name, text in entries}
-    parameters = []
-    for option in fields(CampaignOptions):
-        kind = type(option.default)
-        if kind not in _METAVARS:
-            continue
-        typed, parser = _OPTIONAL.get(option.type, (kind, None))
-        flag = typer.Option(
-            help=texts.get(option.name, ""),
-            rich_help_panel=_PANELS[option.metadata["part"]],
-            metavar=_METAVARS[typed],
-            parser=parser,
-        )
-        of_flag: Any = {"default": option.default, "annotation": Annotated[kind, flag]}
-        parameters.append(inspect.Parameter(option.name, _ALONE, **of_flag))
-    return parameters
 
 
 def _number(text: str) -> float:
@@ -216,10 +178,6 @@ def _share(text: str) -> str:
         return ""
 
 
-def _whole_or_name(text: str) -> int | str:
-    return int(text) if text.isdigit() else text
-
-
 def _whole(text: str) -> int:
     try:
         return int(text)
@@ -231,9 +189,3 @@ _PARSERS: dict[Any, Callable[[str], Any]] = {
     float: _number, float | None: _number, int: _whole, int | None: _whole
 }  # fmt: skip
 """Parsers of numbers, by the annotations of commands; Typer's own speak of its insides."""
-_OPTIONAL: dict[Any, tuple[type, Callable[[str], Any]]] = {
-    float | None: (float, _number),
-    int | None: (int, _whole),
-    int | str | None: (type(None), _whole_or_name),
-}
-"""Placeholders and parsers of options that are None by default, by their types."""

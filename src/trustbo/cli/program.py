@@ -11,20 +11,20 @@ from typer.core import TyperCommand, TyperGroup
 from trustbo.cli.campaigns import demo, resume, run
 from trustbo.cli.errors import BAD_INPUT, complain
 from trustbo.cli.options import with_flags
-from trustbo.cli.results import export, report
-from trustbo.cli.studies import study, worlds
+from trustbo.cli.results import export
+from trustbo.cli.studies import worlds
 from trustbo.cli.terrains import info
 
 EPILOG = """
-Exit codes: 0 done; 1 done, but some of a study's runs failed, or an
-unforeseen error (with a traceback); 2 bad input; 3 a posterior was refused,
+Exit codes: 0 done; 1 done, but some runs failed, or an unforeseen
+error (with a traceback); 2 bad input; 3 a posterior was refused,
 measured missions are kept; 130 interrupted.
 """
 _UsageError: Any = typer.BadParameter.__mro__[1]  # click's, wherever typer keeps it
 _PANELS = {
     "Campaigns": {demo: "out", info: "", run: "out", resume: "folder"},
-    "Results": {report: "", export: ""},
-    "Studies": {study: "", worlds: ""},
+    "Results": {export: ""},
+    "Studies": {worlds: ""},
 }
 """Commands by panel, and the parameter with the folder of the campaign that a command works on."""
 
@@ -98,7 +98,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     except _UsageError as error:
         where = getattr(error, "ctx", None)
         name = where.command_path if where else "trustbo"
-        reason = _missing(error) or _of_file(error) or _unknown_option(error) or _no_number(error)
+        reason = _missing(error) or _unknown_option(error) or _no_number(error)
         complain(reason or str(error.format_message()), f"{name} --help lists commands and flags.")
         sys.exit(BAD_INPUT)
     sys.exit(code or 0)
@@ -108,11 +108,11 @@ def _missing(error: Any) -> str:
     """Name all required options that are missing, not only the first, which the error names."""
     if not hasattr(error, "param_type") or error.ctx is None:
         return ""
-    given, defaults = error.ctx.params, error.ctx.default_map or {}
+    given = error.ctx.params
     lacking = [
         option.metavar if option.param_type_name == "argument" else option.opts[0]
         for option in error.ctx.command.params
-        if option.required and given.get(option.name) is None and option.name not in defaults
+        if option.required and given.get(option.name) is None
     ]
     kind = "argument" if any(not name.startswith("-") for name in lacking) else "option"
     return f"missing {kind}{'s' * (len(lacking) > 1)} {', '.join(lacking)}."
@@ -141,17 +141,3 @@ def _no_number(error: Any) -> str:
     return (
         f"{param.opts[0]} {message}" if param is not None and message.startswith("must be ") else ""
     )
-
-
-def _of_file(error: Any) -> str:
-    """Name the file and its value where that of a flag cannot be used; else nothing."""
-    param, context = getattr(error, "param", None), getattr(error, "ctx", None)
-    if param is None or context is None or param.name not in (context.default_map or {}):
-        return ""
-    source = context.get_parameter_source(param.name)
-    if source is None or source.name != "DEFAULT_MAP":
-        return ""
-    flag, value = param.name.replace("_", "-"), context.default_map[param.name]
-    message = str(error.message)
-    reason = message if message.startswith("must be ") else f"cannot be {value!r}: {message}"
-    return f"{context.params['config']}: {flag} {reason}"

@@ -1,34 +1,11 @@
-"""`trustbo report` and `trustbo export`: a result as one page, or as files for other programs."""
+"""`trustbo export`: a result as files for other programs."""
 
 import sys
 from math import radians
 from pathlib import Path
 
 from trustbo.cli.errors import in_flags
-from trustbo.cli.outputs import use_no_screen
 from trustbo.errors import TrustboError, require_choice
-
-
-def report(folder: Path, out: Path | None = None, title: str | None = None) -> None:
-    """Write a result as one HTML page, with all its figures and tables.
-
-    Example: trustbo report out/demo --out demo.html
-
-    The page needs no network and no other file. For a campaign that was
-    interrupted, it shows the missions learned from until then. It links to an
-    interactive page in the same folder, explore.html (demo-explore.html for demo.html).
-    """
-    _require_result(folder)
-    from trustbo.campaign.storage import load_result
-
-    result = load_result(folder)
-    use_no_screen()
-    from trustbo.report import write_report
-
-    file = folder / "report.html" if out is None else Path(out)
-    _, explorer = write_report(file, result, title=title)
-    print(f"the report is {file}")
-    print(f"the interactive page is {explorer}")
 
 
 def export(

@@ -1,4 +1,4 @@
-"""`trustbo study` and `trustbo worlds`: many campaigns, on all cores."""
+"""`trustbo worlds`: many campaigns, on all cores."""
 
 from importlib.util import find_spec
 from pathlib import Path
@@ -8,50 +8,9 @@ import typer
 
 from trustbo.campaign.options import OBJECTIVE, POLICY
 from trustbo.cli.errors import FAILED
-from trustbo.cli.outputs import use_no_screen, write_figure
 
 if TYPE_CHECKING:
     import xarray as xr
-
-
-def study(
-    config: Path,
-    out: Path = Path("out/study"),
-    executor: str | None = None,
-    workers: int | None = None,
-    quiet: bool = False,
-) -> None:
-    """Run a study: policies x objectives x models x seeds x terrains, on all cores.
-
-    Example: trustbo study config.yaml --out out/study
-
-    The folder gets a file for each run, summary.csv (for each policy and mission the
-    regret, or the plan's value where no truth is known) and regret.png. Run the
-    command again to resume.
-    """
-    use_no_screen()
-    from trustbo import plots
-    from trustbo.files import write_text
-    from trustbo.spreadsheet import frame_as_csv
-    from trustbo.study import run_study, summary
-    from trustbo.study.store import Store
-    from trustbo.study.table import axes_of
-
-    Store(out).require_free("summary.csv", "regret.png")
-    results = run_study(
-        config, out, executor or _usual_executor(), n_workers=workers, progress=not quiet
-    )
-    has_regret = bool(results["regret"].notnull().any())
-    table = summary(results, variable="regret" if has_regret else "value")
-    write_text(out / "summary.csv", frame_as_csv(table))
-    if has_regret:
-        others = [name for name in axes_of(results) if name != "policy"]
-        axes = plots.regret_curves(results, panels=others[0] if others else None)
-        write_figure(out / "regret.png", axes)
-    if not quiet:
-        print(f"median {'regret' if has_regret else 'value'} after each mission")
-        print(table["median"].unstack("mission").round(4).to_string())
-    _end(results, out)
 
 
 def worlds(
