@@ -14,7 +14,6 @@ from typing import Any
 
 import matplotlib as mpl
 import matplotlib.pyplot as plt
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
@@ -44,7 +43,6 @@ def main(wanted: list[str]) -> None:
             draw(name, wanted, lambda code=code: exec(code, names))
             code = ""
     draw("criticism", wanted, criticism)
-    draw("animate_mission", wanted, lambda: frame(names["result"]))
     draw("architecture", wanted, architecture, "svg")
 
 
@@ -57,16 +55,6 @@ def draw(name: str, wanted: list[str], drawing: Callable[[], Any], suffix: str =
             drawing()
             save(plt.gcf(), FIGURES / folder / f"{name}.{suffix}", colours.paper)
         plt.close("all")
-
-
-def frame(result: Any) -> None:
-    """Draw the frame of the last mission's film at which contact is most divided."""
-    mission = result.missions[-1]
-    film = plots.animate_mission(mission, result.workspace)
-    contact = np.concatenate([bound.contact for bound in mission.bounds])
-    divided = np.flatnonzero(contact.any(1) & ~contact.all(1))
-    film._draw_frame(divided[len(divided) // 2])  # matplotlib has no public way to one frame
-    film._draw_was_started = True
 
 
 def criticism() -> None:

@@ -93,7 +93,6 @@ def test_what_needs_a_map_refuses_them_in_a_sentence(missions, posterior):
         lambda: tb.fit(missions, PooledTrust(place=PlaceEffect())),
         lambda: tb.fit(missions, PooledTrust(), workspace=workspace),
         lambda: tb.simulation.ReplaySimulator(missions),
-        lambda: tb.plots.animate_mission(missions[0], workspace),
         lambda: tb.Campaign(workspace, (0, 0), (2, 2)).tell(missions[0]),
     ):
         with pytest.raises(TrustboError, match=r"needs the cells of a map, and mission 0 is of"):

@@ -1,8 +1,5 @@
 """Names as users give them, and numbers that cannot be."""
 
-from dataclasses import replace
-
-import numpy as np
 import pytest
 
 import trustbo as tb
@@ -27,15 +24,3 @@ def test_maps_of_robots_need_no_names(result):
 def test_a_mission_is_a_whole_number(result):
     with pytest.raises(tb.TrustboError, match=r"mission must be one of 2, .*; got 0\.5"):
         tb.plots.mission_trust(result.posterior, 0.5)
-
-
-def test_a_film_wants_known_poses_and_positive_numbers(result, tmp_path):
-    mission = result.missions[0]
-    poses = mission.bounds[0].poses.copy()
-    poses[3, 1] = np.nan
-    lost = replace(mission, bounds=(replace(mission.bounds[0], poses=poses), *mission.bounds[1:]))
-    with pytest.raises(tb.TrustboError, match="bound 1 has a pose that is not known"):
-        tb.plots.animate_mission(lost, result.workspace, tmp_path / "film.gif")
-    with pytest.raises(tb.TrustboError, match="dpi must be"):
-        tb.plots.animate_mission(mission, result.workspace, tmp_path / "film.gif", dpi=-1)
-    assert list(tmp_path.iterdir()) == []

@@ -26,7 +26,6 @@ def figures(result):
     share = result.planner.path_posterior(posterior, n_draws=100)
     p_fail = result.planner.problem.risk.p_fail
     found = tb.criticise(posterior, result.missions, compare=False)
-    ranks = tb.inference.sbc(n_datasets=5, shape=(2, 4, 2, 2), n_ranked=40, progress=False)
     names = workspace.team.names
     rng = np.random.default_rng(0)
     study = xr.Dataset(
@@ -51,7 +50,6 @@ def figures(result):
         "parameter_history": (lambda **o: plots.parameter_history(result.posteriors, **o), 12),
         "campaign_history": (lambda **o: plots.campaign_history(result.history, **o), 2),
         "criticism": (lambda **o: plots.criticism(found, **o), 9),
-        "calibration": (lambda **o: plots.calibration(ranks, **o), 2),
         "regret_curves": (lambda **o: plots.regret_curves(study, panels="terrain", **o), 2),
     }
     return drawn
@@ -75,7 +73,7 @@ def drawn(figures):
 NAMES = (
     "trust_maps", "robot_maps", "path_posterior", "hazard_map", "terrain_maps", "loadings",
     "place_map", "plan_map", "plan_trust", "mission_trust", "parameter_history",
-    "campaign_history", "criticism", "calibration", "regret_curves",
+    "campaign_history", "criticism", "regret_curves",
 )  # fmt: skip
 MAPS = NAMES[:5]
 
@@ -263,9 +261,7 @@ def test_a_wrong_argument_is_said_in_a_line(result):
         "terrain_maps": (result,),
         "loadings": (result.workspace,),
         "criticism": (result,),
-        "calibration": (result,),
         "regret_curves": (result,),
-        "animate_mission": (result.workspace, result.missions[0]),
     }
     for name, arguments in wrong.items():
         said = rf"^plots\.{name}: got {type(arguments[0]).__name__} .*; give [^\n]*\.$"

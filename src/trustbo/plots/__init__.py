@@ -1,7 +1,5 @@
 """Figures. Each function takes data and returns Axes; only the layout is computed here."""
 
-from trustbo.plots.animation import animate_mission
-from trustbo.plots.calibration import calibration
 from trustbo.plots.campaign import campaign_history, parameter_history
 from trustbo.plots.criticism import criticism
 from trustbo.plots.maps import (
@@ -21,7 +19,7 @@ from trustbo.plots.style import DARK
 from trustbo.plots.terrain import loadings, terrain_maps
 
 __all__ = [
-    "DARK", "animate_mission", "calibration", "campaign_history", "cell_map", "criticism",
+    "DARK", "campaign_history", "cell_map", "criticism",
     "draw_path", "draw_scale", "hazard_map", "loadings", "mission_trust", "parameter_history",
     "path_posterior", "place_map", "plan_map", "plan_trust", "regret_curves", "robot_maps",
     "terrain_maps", "trust_maps",
