@@ -3,7 +3,6 @@
 With a network, signatures also link to the pages of other projects.
 """
 
-import re
 import shutil
 import sys
 from importlib.metadata import version as installed_version
@@ -14,8 +13,6 @@ from sphinx.application import Sphinx
 
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE / "extensions"))
-
-FIGURE = re.compile(r"!\[([^]]*)\]\(((?:\.\./)?figures/)(\w+\.(?:png|svg))\)")
 
 project = "trustbo"
 author = "The trustbo developers"
@@ -92,19 +89,6 @@ def point_to_copies(app: Sphinx, docname: str, source: list[str]) -> None:
     source[0] = source[0].replace("../notebooks/", "notebooks/").replace("../docs/", "../")
 
 
-def show_dark_figures(app: Sphinx, docname: str, source: list[str]) -> None:
-    """Show the dark form of a figure where the reader's page is dark, if there is one."""
-
-    def both(image: re.Match[str]) -> str:
-        alt, folder, name = image.groups()
-        if not (HERE / "figures" / "dark" / name).exists():
-            return image[0]
-        light = f"![{alt}]({folder}{name}){{.only-light}}"
-        return f"{light} ![{alt}]({folder}dark/{name}){{.only-dark}}"  # notebooks are JSON
-
-    source[0] = FIGURE.sub(both, source[0])
-
-
 def drop_words_of_python(
     app: Sphinx, kind: str, name: str, value: object, options: Any, lines: list[str]
 ) -> None:
@@ -118,5 +102,4 @@ def setup(app: Sphinx) -> None:
     """Connect the above."""
     app.connect("builder-inited", copy_notebooks)
     app.connect("source-read", point_to_copies)
-    app.connect("source-read", show_dark_figures)
     app.connect("autodoc-process-docstring", drop_words_of_python)

@@ -1,4 +1,4 @@
-"""Draw the figures of the documentation on light and dark paper.
+"""Draw the figures of the documentation.
 
 They are those of docs/gallery.md by its own code, and a few more. A diagram is an SVG.
 
@@ -21,13 +21,11 @@ from PIL import Image
 
 from trustbo import plots
 from trustbo.plots.plan import COLOURS
-from trustbo.plots.style import LIGHT, theme
+from trustbo.plots.style import theme
 
 mpl.use("Agg")
 FIGURES = Path(__file__).resolve().parents[1] / "docs" / "figures"
 STEP = re.compile(r"^```python\n(.*?)^```|^!\[[^]]*\]\(figures/(\w+)\.png\)", flags=re.S | re.M)
-PAPERS = {"": LIGHT._replace(paper="#ffffff"), "dark": plots.DARK._replace(paper="#131416")}
-"""Themes by folder; their papers are those of the pages of the documentation."""
 
 
 def main(wanted: list[str]) -> None:
@@ -47,14 +45,12 @@ def main(wanted: list[str]) -> None:
 
 
 def draw(name: str, wanted: list[str], drawing: Callable[[], Any], suffix: str = "png") -> None:
-    """Draw a figure on each paper."""
+    """Draw a figure and write it."""
     if wanted and name not in wanted:
         return
-    for folder, colours in PAPERS.items():
-        with plt.rc_context(colours.settings()):
-            drawing()
-            save(plt.gcf(), FIGURES / folder / f"{name}.{suffix}", colours.paper)
-        plt.close("all")
+    drawing()
+    save(plt.gcf(), FIGURES / f"{name}.{suffix}", "white")
+    plt.close("all")
 
 
 def criticism() -> None:

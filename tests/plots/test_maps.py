@@ -119,8 +119,6 @@ def test_every_map_has_contour_lines_and_the_first_a_scale(result):
         assert len(ax.images) == 1
         (lines,) = ax.collections
         assert len(lines.get_segments()) == len(contours(result.workspace)) > 0
-    flat = result.plot_maps(relief=False)
-    assert not any(ax.collections for ax in flat)
 
 
 def pixels_of(ax):

@@ -100,10 +100,7 @@ def test_wide_tables_scroll_on_their_own(seen):
     assert set(overflow) == {"auto"}
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_text_stands_out_in_light_and_dark_and_so_do_figures(scheme, chromium, page):
-    features = [{"name": "prefers-color-scheme", "value": scheme}]
-    chromium.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": features})
+def test_text_stands_out_and_so_do_figures(chromium, page):
     chromium.get(page)
 
     def style(selector, name):
@@ -114,7 +111,6 @@ def test_text_stands_out_in_light_and_dark_and_so_do_figures(scheme, chromium, p
         )
 
     ground = luminance(style("body", "backgroundColor"))
-    assert (ground > 0.5) == (scheme == "light")
     for selector in ("body", "a", "figcaption", "caption", ".kind", ".good", "footer"):
         text = luminance(style(selector, "color"))
         high, low = max(text, ground) + 0.05, min(text, ground) + 0.05

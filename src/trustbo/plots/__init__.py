@@ -15,11 +15,10 @@ from trustbo.plots.mission import mission_trust, plan_trust
 from trustbo.plots.places import place_map
 from trustbo.plots.plan import plan_map
 from trustbo.plots.regret import regret_curves
-from trustbo.plots.style import DARK
 from trustbo.plots.terrain import loadings, terrain_maps
 
 __all__ = [
-    "DARK", "campaign_history", "cell_map", "criticism",
+    "campaign_history", "cell_map", "criticism",
     "draw_path", "draw_scale", "hazard_map", "loadings", "mission_trust", "parameter_history",
     "path_posterior", "place_map", "plan_map", "plan_trust", "regret_curves", "robot_maps",
     "terrain_maps", "trust_maps",

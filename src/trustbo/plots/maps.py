@@ -218,7 +218,7 @@ def _draw_maps(
     """Draw maps on one scale of colours, each with its path, and their colour bar."""
     made, colours = map_panels(workspace.grid, len(maps), options, width=width), options.colours()
     for ax, values, path in zip(made.panels, maps, paths, strict=True):
-        draw_cells(ax, values, workspace, norm, colours, relief=options.relief)
+        draw_cells(ax, values, workspace, norm, colours)
         if path is not None:
             draw_path(ax, path, workspace.grid)
     made.titles(titles)
@@ -240,7 +240,6 @@ def cell_map(
     low: float | None = None,
     high: float | None = None,
     cmap: str | Colormap = COLOURS,
-    relief: bool = True,
 ) -> AxesImage:
     """Draw a map of the planning cells in the colours of its bar; impassable cells are grey.
 
@@ -251,12 +250,11 @@ def cell_map(
         low: Value of the first colour.
         high: Value of the last colour.
         cmap: Colours, a name or a `Colormap` of matplotlib.
-        relief: Whether to draw contour lines of the terrain.
 
     Returns:
         Image, for a colour bar.
     """
-    return draw_cells(ax, values, workspace, Normalize(low, high), cmap, relief=relief)
+    return draw_cells(ax, values, workspace, Normalize(low, high), cmap)
 
 
 def draw_cells(
@@ -265,8 +263,6 @@ def draw_cells(
     workspace: Workspace,
     norm: Normalize,
     cmap: str | Colormap,
-    *,
-    relief: bool,
 ) -> AxesImage:
     """Draw a map of the planning cells, see `cell_map`."""
     shown = over_cells(values).transpose("row", "col").values
@@ -274,8 +270,7 @@ def draw_cells(
     ax.set_facecolor(theme().closed)
     extent = extent_of(workspace.grid)
     image = ax.imshow(data, cmap=cmap, norm=norm, extent=extent, interpolation="nearest")
-    if relief:
-        draw_relief(ax, workspace)
+    draw_relief(ax, workspace)
     return image
 
 
@@ -341,9 +336,7 @@ def contour_interval(relief: float) -> float | None:
     )
 
 
-def draw_ground(
-    ax: Axes, workspace: Workspace, heights: str = "dsm", *, relief: bool = True
-) -> None:
+def draw_ground(ax: Axes, workspace: Workspace, heights: str = "dsm") -> None:
     """Draw vegetation and contour lines on a plain ground, or the grid without a terrain.
 
     Contour lines are those of the surface, `"dsm"`, or of the ground, `"dem"`; axes have no ticks.
@@ -358,8 +351,7 @@ def draw_ground(
     grown = np.where((terrain["dsm"] - terrain["dem"]).values > _GROWN, 1.0, np.nan)
     green, extent = ListedColormap([VEGETATION]), (left, right, bottom, top)
     ax.imshow(grown, cmap=green, extent=extent, interpolation="nearest")
-    if relief:
-        draw_relief(ax, workspace, heights, colours.contour, 1.0)
+    draw_relief(ax, workspace, heights, colours.contour, 1.0)
 
 
 def draw_scale(

@@ -76,7 +76,7 @@ def place_map(
     for i, name in enumerate(names):
         maps_of_robot = maps.isel(robot=i)
         for ax, (kind, drawn) in zip(made.panels[2 * i : 2 * i + 2], colours.items(), strict=True):
-            _draw(ax, maps_of_robot, kind, units, i, workspace, *drawn, relief=options.relief)
+            _draw(ax, maps_of_robot, kind, units, i, workspace, *drawn)
             titles.append(f"{name}: {wording[kind]}" if name else wording[kind])
         if "place_mean" in maps_of_robot:
             _signs(made.panels[2 * i], maps_of_robot, workspace, top)
@@ -112,8 +112,6 @@ def _draw(
     workspace: Workspace,
     norm: Normalize,
     colours: Colormap,
-    *,
-    relief: bool,
 ) -> None:
     """Draw cells and visited bounds of one robot, or of all of them."""
     data = np.full(workspace.passable.shape, np.nan)
@@ -123,7 +121,7 @@ def _draw(
     elif kind == "mean":
         data[:] = 0.0
     cells = workspace.passable.copy(data=data)
-    draw_cells(ax, cells, workspace, norm, colours, relief=relief)
+    draw_cells(ax, cells, workspace, norm, colours)
     if f"place_bound_{kind}" in maps:
         mine = units["bound_effect"].values == effect
         move, row, col = (units[f"bound_{n}"].values[mine] for n in _OF_BOUND[1:])

@@ -65,7 +65,7 @@ def plan_map(
     whole, *others = made.panels
     titles = [f"path of {n_bounds} bounds"]
     for ax in made.panels:
-        draw_ground(ax, plan.workspace, "dem", relief=options.relief)
+        draw_ground(ax, plan.workspace, "dem")
     draw_path(whole, plan.path, plan.workspace.grid)
     draw_scale(whole, plan.workspace.grid)
     for ax, k in zip(others, shown, strict=True):

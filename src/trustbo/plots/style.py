@@ -1,4 +1,4 @@
-"""Appearance that all figures share: colours on light and dark paper, and the options of a user."""
+"""Appearance that all figures share: colours, and the options of a user."""
 
 from dataclasses import dataclass, fields
 from typing import Any, NamedTuple, Self, TypedDict
@@ -18,7 +18,7 @@ SMALL, MEDIUM = 8.0, 9.0
 
 
 class Theme(NamedTuple):
-    """Colours of all but data values: hexadecimal, and distinct so that themes can be swapped."""
+    """Colours of all but data values, hexadecimal."""
 
     ink: str
     """Colour of text, frames and measurements."""
@@ -43,34 +43,17 @@ class Theme(NamedTuple):
     closed: str
     """Cells and pixels that cannot be entered."""
 
-    def settings(self) -> dict[Any, Any]:
-        """Settings for `matplotlib.rc_context` or `plt.style.use`."""
-        inked = (
-            "text.color", "axes.edgecolor", "axes.labelcolor", "axes.titlecolor", "xtick.color",
-            "ytick.color", "xtick.labelcolor", "ytick.labelcolor", "hatch.color",
-        )  # fmt: skip
-        papers = "figure.facecolor", "axes.facecolor", "savefig.facecolor", "legend.facecolor"
-        return {name: self.ink for name in inked} | {name: self.paper for name in papers}
-
 
 LIGHT = Theme(
     "#1c1f22", "#fcfcfa", "#8c9196", "#dfe2e4", "#00416b", "#7fb2d6", "#c6dcec", "#c1272d",
     "#f1f0ec", "#a9aaa4", "#bcbfc2",
 )  # fmt: skip
-DARK = Theme(
-    "#e6e7e8", "#16181a", "#8f959b", "#34393e", "#d8ecfb", "#4c86b0", "#23455e", "#ff6b5e",
-    "#26282a", "#57595a", "#5b6066",
-)  # fmt: skip
 
 
 def theme() -> Theme:
-    """Theme of the figure to be drawn: that of the background in matplotlib's settings.
-
-    Text and frames follow the settings themselves, such as those of `plt.style.use`.
-    """
-    paper = to_rgb(mpl.rcParams["axes.facecolor"])
-    ours = LIGHT if luminance(paper) > 0.5 else DARK
-    return ours._replace(ink=to_hex(mpl.rcParams["text.color"]), paper=to_hex(paper))
+    """Colours of the figure to be drawn: ink and paper are those of matplotlib's settings."""
+    ink, paper = (to_hex(mpl.rcParams[name]) for name in ("text.color", "axes.facecolor"))
+    return LIGHT._replace(ink=ink, paper=paper)
 
 
 def luminance(colour: Any) -> float:
@@ -87,7 +70,6 @@ class StyleOptions(TypedDict, total=False):
     cmap: str | Colormap | None
     title: str | None
     legend: bool
-    relief: bool
 
 
 @dataclass(frozen=True)
@@ -102,7 +84,6 @@ class Style:
         cmap: Colours of values or curves, a name or a `Colormap` of matplotlib.
         title: Title of a figure of one panel, or above all panels of a new figure; `""` for none.
         legend: Whether to draw the legend or the colour bar.
-        relief: Whether to draw contour lines of the terrain on maps.
 
     Raises:
         TrustboError: An option is unknown, or its value invalid.
@@ -114,16 +95,14 @@ class Style:
     cmap: str | Colormap | None = None
     title: str | None = None
     legend: bool = True
-    relief: bool = True
 
     def __post_init__(self) -> None:
         if self.n_columns is not None:
             require_whole("n_columns", self.n_columns, 1)
         if self.width is not None:
             require_positive("width", self.width)
-        for name in ("legend", "relief"):
-            if not isinstance(getattr(self, name), bool | np.bool_):
-                raise TrustboError(f"{name} must be True or False; got {getattr(self, name)!r}.")
+        if not isinstance(self.legend, bool | np.bool_):
+            raise TrustboError(f"legend must be True or False; got {self.legend!r}.")
         if self.title is not None and not isinstance(self.title, str):
             raise TrustboError(f"title must be text; got {self.title!r}.")
         self.colours()

@@ -57,8 +57,7 @@ def terrain_maps(workspace: Workspace, **style: Unpack[StyleOptions]) -> np.ndar
         ax.set_facecolor(theme().closed)
         ax.imshow(index, cmap=colours, vmin=0, vmax=1, extent=extent, interpolation="nearest")
     for ax in made.panels:
-        if options.relief:
-            draw_relief(ax, workspace)
+        draw_relief(ax, workspace)
         grid_lines(ax, grid)
     draw_scale(surface, grid)
     made.titles(["surface (DSM)", *(name.replace("_", " ") for name in names)])

@@ -1,4 +1,4 @@
-"""Figures as images embedded in a page, dark where the reader's page is dark."""
+"""Figures as images embedded in a page."""
 
 import base64
 import io
@@ -13,7 +13,7 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from PIL import Image as Raster
 from PIL import features
 
-from trustbo.plots.style import DARK, LIGHT
+from trustbo.plots.style import LIGHT
 from trustbo.report.blocks import Picture
 
 _PIXELS = 96
@@ -25,14 +25,18 @@ _BETWEEN = re.compile(r">\s+<")
 _STYLE: dict[Any, Any] = {
     "svg.fonttype": "path",
     "svg.hashsalt": "trustbo",
+    "figure.facecolor": LIGHT.paper,
+    "axes.facecolor": LIGHT.paper,
+    "savefig.facecolor": LIGHT.paper,
+    "legend.facecolor": LIGHT.paper,
 }
-"""Fonts as outlines, equal on all machines; names of elements equal in all runs."""
+"""Fonts as outlines and names of elements are equal in all runs; paper is that of the page."""
 
 
 def picture(draw: Callable[[], Axes | np.ndarray], alt: str, caption: str) -> Picture:
     """Make a picture of the figure that `draw` draws; `alt` is for those who cannot see it."""
     file = io.BytesIO()
-    with plt.rc_context(LIGHT.settings() | _STYLE):
+    with plt.rc_context(_STYLE):
         axes = draw()
         first = axes if isinstance(axes, Axes) else axes.ravel()[0]
         figure = first.get_figure(root=True)
@@ -43,21 +47,9 @@ def picture(draw: Callable[[], Axes | np.ndarray], alt: str, caption: str) -> Pi
     plt.close(figure)
     width, height = (round(_PIXELS * inches) for inches in figure.get_size_inches())
     svg = _PNG.sub(_smaller, file.getvalue().decode("utf-8"))
-    svg = themed(_BETWEEN.sub("><", _DIGITS.sub(r"\1", svg)))
+    svg = _BETWEEN.sub("><", _DIGITS.sub(r"\1", svg))
     text = base64.b64encode(svg.encode("utf-8")).decode("ascii")
     return Picture(alt, caption, f"data:image/svg+xml;base64,{text}", width, height)
-
-
-def themed(svg: str) -> str:
-    """Replace colours of the light theme by CSS variables, which follow the reader's setting."""
-    light, dark = (
-        "".join(f"--{name}:{colour};" for name, colour in theme._asdict().items())
-        for theme in (LIGHT, DARK)
-    )
-    for name, colour in LIGHT._asdict().items():
-        svg = svg.replace(f": {colour}", f": var(--{name})")
-    style = f":root{{{light}}}@media (prefers-color-scheme: dark){{:root{{{dark}}}}}"
-    return svg.replace("<defs>", f"<style>{style}</style><defs>", 1)
 
 
 def _smaller(png: re.Match[str]) -> str:
