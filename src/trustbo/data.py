@@ -12,7 +12,6 @@ from trustbo.answers import levels_of
 from trustbo.arrays import as_array, as_names
 from trustbo.bound import NOWHERE, STATUSES, Bound, Cell
 from trustbo.display.card import Card, Displayed, joined, number
-from trustbo.display.svg import curve_picture
 from trustbo.errors import (
     ShapeError,
     TrustboError,
@@ -138,18 +137,11 @@ class Mission(Displayed):
             ("takes", number(took, "s", 4) if took > 0.0 else "not measured"),
         ]
 
-        def picture() -> str:
-            team = np.where(measured.any(1), np.where(measured, rates, 0.0).sum(1), np.nan)
-            curves = np.vstack([team / np.maximum(measured.sum(1), 1), rates.T])
-            return curve_picture(
-                curves, label="contact rate of the team, and each", x_label="bound"
-            )
-
         sections = {
             **({"cells": [("path", path_text(self.path))]} if self.path else {}),
             "features": [("", ", ".join(self.features))],
         }
-        return Card(f"Mission: {self.status}, contact {mean}", rows, [picture], sections)
+        return Card(f"Mission: {self.status}, contact {mean}", rows, sections)
 
     @classmethod
     def from_arrays(

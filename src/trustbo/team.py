@@ -127,4 +127,4 @@ class Team(Displayed):
         alike = "all alike" if len(set(members.values())) == 1 else "not all alike"
         rows = [("robots", f"{', '.join(self.names)} ({alike})"), ("slope limit", limit)]
         sections = {name: robot._card().rows for name, robot in members.items()}
-        return Card(f"Team: a lead and {self.n_robots} overwatching robots", rows, (), sections)
+        return Card(f"Team: a lead and {self.n_robots} overwatching robots", rows, sections)

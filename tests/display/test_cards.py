@@ -1,18 +1,14 @@
 """What a cell of a notebook, and a terminal, show of an object."""
 
-import base64
-import io
 import re
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from PIL import Image
 
 import trustbo as tb
 from trustbo.display.bars import NOTEBOOK, bar_in
 from trustbo.display.card import Card
-from trustbo.display.svg import curve_picture, map_picture
 from trustbo.models import (
     CoupledTrust,
     HierarchicalTrust,
@@ -88,7 +84,6 @@ def test_params_show_each_coefficient_with_its_spread():
 def test_a_mission_without_any_rate_is_shown():
     mission = tb.Mission.from_arrays([(1, 0), (0, 0)], np.zeros((1, 2, 2)), np.full((1, 2), np.nan))
     assert "not measured" in repr(mission)
-    assert "<svg" in mission._repr_html_()
 
 
 def test_a_plan_that_was_only_evaluated_says_so():
@@ -110,57 +105,6 @@ def test_text_of_the_user_cannot_break_the_page():
     card = Card("<b>&", [("<script>", "</td>")])
     ElementTree.fromstring(f"<div>{card.html()}</div>")
     assert "<script>" not in card.html()
-
-
-# --- pictures ---
-
-
-def pixels_of(picture):
-    (data,) = re.findall(r"base64,([^\"]+)", picture)
-    return np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB")).astype(int)
-
-
-def test_a_map_has_a_pixel_for_each_cell_and_grey_where_nothing_is_known():
-    values = np.array([[0.0, 0.5, 1.0], [np.nan, 1.0, 0.0]])
-    pixels = pixels_of(map_picture(values, label="trust"))
-    assert pixels.shape == (2, 3, 3)
-    assert (pixels[1, 0] == 128).all()
-    assert (pixels[0, 0] == pixels[1, 2]).all()
-    assert (pixels[0, 0] == (68, 1, 84)).all()  # viridis from dark violet ...
-    assert (pixels[0, 2] == (253, 231, 36)).all()  # ... to yellow
-    assert "trust: 0 to 1" in map_picture(values, label="trust")
-
-
-def test_a_cell_apart_is_grey_and_does_not_set_the_limits():
-    picture = map_picture(np.array([[0.5, 0.9], [1.0, 0.9]]), label="trust", apart=(0, 0))
-    assert (pixels_of(picture)[0, 0] == 128).all()
-    assert "trust: 0.9 to 1" in picture
-
-
-def test_a_path_goes_through_the_centres_of_its_cells():
-    picture = map_picture(np.zeros((2, 4)), [(1, 0), (0, 1)], aspect=0.5)
-    (line, _) = re.findall(r'<polyline points="([^"]+)"', picture)
-    assert line == "30.0,45.0 90.0,15.0"  # cells of 60 x 30 px
-    assert "<polyline" not in map_picture(np.zeros((2, 4)), [(1, 0), (0, 1)], line=False)
-
-
-def test_a_curve_breaks_where_a_number_is_missing():
-    picture = curve_picture([1.0, 2.0, np.nan, 3.0, 4.0])
-    lines = [line.split() for line in re.findall(r'<polyline points="([^"]+)"', picture)]
-    heights = [[float(point.split(",")[1]) for point in line] for line in lines]
-    assert [len(line) for line in lines] == [2, 2]
-    assert heights[0][0] > heights[0][1] > heights[1][0] > heights[1][1]  # upwards
-
-
-def test_the_axis_of_a_curve_names_its_first_and_last_point():
-    for values, texts in (([0.3], ["mission 1"]), ([0.3, 0.5], ["mission 1", "2"])):
-        picture = curve_picture(values, x_label="mission")
-        assert re.findall(r"<text[^>]*>([^<]*)</text>", picture)[2:] == texts
-
-
-@pytest.mark.parametrize("values", [[], [np.nan], [0.3], [0.3, 0.3]])
-def test_little_can_be_drawn_too(values):
-    ElementTree.fromstring(curve_picture(values))
 
 
 # --- the live map of a notebook ---

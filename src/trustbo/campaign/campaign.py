@@ -144,10 +144,7 @@ class Campaign(Displayed):
             ("model", self.model.in_short()),
             ("policy", f"{settings['policy']}, objective {settings['objective']}"),
         ]
-        return summary_of(
-            f"Campaign: {n} mission{'s' * (n != 1)}", rows, self.workspace, settings, self.history,
-            self.trust_map if n else None, lambda: self.recommend().path,
-        )  # fmt: skip
+        return summary_of(f"Campaign: {n} mission{'s' * (n != 1)}", rows, settings, self.history)
 
     # --- ask and tell ---
 

@@ -84,10 +84,7 @@ class Result(Displayed):
         ]
         if "memory" in self.__dict__:
             rows.append(("memory", str(self.memory)))
-        return summary_of(
-            f"Result: {n} mission{'s' * (n != 1)}", rows, self.workspace, self.settings,
-            self.history, lambda: self.trust_map, lambda: self.path,
-        )  # fmt: skip
+        return summary_of(f"Result: {n} mission{'s' * (n != 1)}", rows, self.settings, self.history)
 
     @property
     def has_posterior(self) -> bool:

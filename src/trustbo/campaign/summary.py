@@ -1,17 +1,13 @@
-"""Summary of a campaign or a result for display: map of trust, and contact over missions."""
+"""Summary of a campaign or a result for display."""
 
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
-from trustbo.data import Cell
 from trustbo.display.card import Card
-from trustbo.display.svg import curve_picture, map_picture
 from trustbo.inference.samplers.convergence import GOOD_KHAT, MAX_RHAT
-from trustbo.workspace import Workspace
 
 _DIAGNOSTICS = ("k_hat", "kish", "r_hat", "ess_bulk", "divergences")
 
@@ -19,29 +15,13 @@ _DIAGNOSTICS = ("k_hat", "kish", "r_hat", "ess_bulk", "divergences")
 def summary_of(
     title: str,
     rows: Sequence[tuple[str, str]],
-    workspace: Workspace,
     settings: Mapping[str, Any],
     history: xr.Dataset,
-    trust_map: Callable[[], xr.DataArray] | None,
-    path: Callable[[], Sequence[Cell]],
 ) -> Card:
-    """Summary with the map of trust, if there is one, the path on it, and contact of missions."""
-    pictures = []
-    if trust_map is not None:
-        aspect = workspace.grid.cell_height / workspace.grid.cell_width
-
-        def area() -> str:
-            cells = path()
-            trust = trust_map().values  # assumed in the first cell
-            label = "expected trust"
-            return map_picture(trust, cells, aspect=aspect, label=label, apart=cells[0])
-
-        rates = history["contact_rate"].values
-        curve = partial(curve_picture, rates, label="contact rate", x_label="mission")
-        pictures = [area, curve]
+    """Summary with the diagnostics of the last posterior and the settings."""
     rows = [*rows, *_evidence(history)]
     options = [(name, str(value)) for name, value in settings.items() if len(str(value)) < 200]
-    return Card(title, rows, pictures, {"options": options})
+    return Card(title, rows, {"options": options})
 
 
 def _evidence(history: xr.Dataset) -> list[tuple[str, str]]:

@@ -95,7 +95,7 @@ class Criticism(Displayed):
     def _card(self) -> Card:
         rows = [(str(name), str(row["finding"])) for name, row in self.table.iterrows()]
         ablation = [(str(name), str(row["finding"])) for name, row in self.ablation.iterrows()]
-        return Card(f"Criticism: {self.verdict}", rows, (), {"without each component": ablation})
+        return Card(f"Criticism: {self.verdict}", rows, {"without each component": ablation})
 
 
 @one_blas_thread()

@@ -1,7 +1,7 @@
-"""Summary of an object for display: its main numbers, a picture, and sections that unfold."""
+"""Summary of an object for display: its main numbers, and sections that unfold."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
 from typing import NamedTuple
 
@@ -11,8 +11,6 @@ _STYLE = (
     ".tb-card table{border-collapse:collapse;margin:.2em 1.2em .2em 0}"
     ".tb-card td{padding:.05em .9em .05em 0;text-align:left;vertical-align:top;border:0;"
     "background:none}.tb-card td:first-child{opacity:.65;white-space:nowrap}"
-    ".tb-card .tb-body{display:flex;flex-wrap:wrap;align-items:flex-start;gap:.6em}"
-    ".tb-card svg{max-width:100%;height:auto;margin-right:1em}"
     ".tb-card summary{cursor:pointer}</style>"
 )
 
@@ -23,13 +21,11 @@ class Card(NamedTuple):
     Attributes:
         title: Name of the object, in a line.
         rows: Names and values with their units.
-        pictures: Functions that draw pictures, as SVG; called for a notebook only.
         sections: Rows, or text, that open on a click, by their titles.
     """
 
     title: str
     rows: Sequence[tuple[str, str]] = ()
-    pictures: Sequence[Callable[[], str]] = ()
     sections: Mapping[str, Sequence[tuple[str, str]]] = {}
 
     def text(self) -> str:
@@ -43,8 +39,7 @@ class Card(NamedTuple):
         return "\n".join([_short(self.title, 100), *lines])
 
     def html(self) -> str:
-        """Title, pictures, table and sections, for a notebook; it takes the page's colours."""
-        pictures = "".join(draw() for draw in self.pictures)
+        """Title, table and sections, for a notebook; it takes the page's colours."""
         folded = "".join(
             f"<details><summary>{escape(name)}</summary>{_table(rows)}</details>"
             for name, rows in self.sections.items()
@@ -52,7 +47,7 @@ class Card(NamedTuple):
         )
         return (
             f'{_STYLE}<div class="tb-card"><b>{escape(self.title)}</b>'
-            f'<div class="tb-body">{pictures}<div>{_table(self.rows)}{folded}</div></div></div>'
+            f"{_table(self.rows)}{folded}</div>"
         )
 
 

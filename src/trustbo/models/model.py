@@ -390,7 +390,7 @@ class TrustModel(Displayed, ABC):
             ("sampler", "exact" if self.why_not_exact is None else f"nuts: {self.why_not_exact}"),
         ]
         priors = () if self.priors is None else self.priors._card().rows
-        return Card(type(self).__name__, rows, (), {"priors": priors})
+        return Card(type(self).__name__, rows, {"priors": priors})
 
     def in_short(self) -> str:
         """Name, effects of places, family, and the options that differ from their defaults."""

@@ -9,7 +9,6 @@ import numpy as np
 
 from trustbo.data import Cell, path_text
 from trustbo.display.card import Card, Displayed, arrival
-from trustbo.display.svg import curve_picture
 from trustbo.hazard.risk import PathRisk
 from trustbo.planning.assignment import robots_along
 from trustbo.workspace import Workspace
@@ -101,16 +100,8 @@ class Plan(Displayed):
         if self.engine != "given":
             rows.append(("search", f"{self.engine}, {1e3 * self.seconds:.1f} ms"))
 
-        def area() -> str:
-            return self.workspace.picture(self.path)
-
-        def along() -> str:
-            curves = np.vstack([self.trust.mean(1), self.trust.T])
-            band = self.bands[0].mean(1), self.bands[-1].mean(1)
-            return curve_picture(curves, band=band, label="trust along the path", x_label="bound")
-
         return Card(
-            f"Plan: {self.path[0]} to {self.path[-1]}", rows, [area, along],
+            f"Plan: {self.path[0]} to {self.path[-1]}", rows,
             {"cells (row, col)": [("path", path_text(self.path))]},
         )  # fmt: skip
 

@@ -133,10 +133,7 @@ class Planner(Displayed):
             ("engine", self.engine),
         ]
 
-        def area() -> str:
-            return self.workspace.picture([self.start, self.goal], line=False)
-
-        return Card(f"Planner: {self.start} to {self.goal}", rows, [area])
+        return Card(f"Planner: {self.start} to {self.goal}", rows)
 
     def _hold(self, problem: PlanningProblem) -> None:
         paths = problem.paths

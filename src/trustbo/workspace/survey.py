@@ -8,7 +8,6 @@ import xarray as xr
 
 from trustbo.data import Cell
 from trustbo.display.card import Card, Displayed
-from trustbo.display.svg import map_picture
 from trustbo.errors import TrustboError
 from trustbo.team import Team
 from trustbo.terrain.dataset import is_lazy, pixel_size, require_terrain
@@ -104,12 +103,7 @@ class Survey(Displayed):
                 text = f"{row},{col} or x={east:.1f},y={north:.1f} or lon={lon:.6f},lat={lat:.6f}"
                 rows_of.append((f"e.g. {name}", text))
 
-        def picture() -> str:
-            values = self.cells["height"].where(self.cells["passable"]).values
-            aspect = grid.cell_height / grid.cell_width
-            return map_picture(values, (), aspect=aspect, label="height")
-
-        return Card(f"Terrain: {rows} x {cols} cells", rows_of, [picture])
+        return Card(f"Terrain: {rows} x {cols} cells", rows_of)
 
 
 def survey(

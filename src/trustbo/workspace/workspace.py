@@ -21,7 +21,6 @@ from trustbo.data import (
 )
 from trustbo.display.card import Card, Displayed
 from trustbo.display.compiling import compiling
-from trustbo.display.svg import map_picture
 from trustbo.errors import ShapeError, require_choice, require_positive
 from trustbo.stacking import fill_awareness
 from trustbo.team import Team
@@ -210,13 +209,7 @@ class Workspace(Displayed):
         ]
         sections = {"grid": grid._card().rows, "team": team._card().rows}
         title = f"Workspace: {grid.shape[0]} x {grid.shape[1]} cells"
-        return Card(title, rows, [self.picture], sections)
-
-    def picture(self, path: Sequence[Cell] = (), *, line: bool = True) -> str:
-        """Draw the last feature, mean over robots, as a small SVG with a path, or its ends."""
-        shown = self.awareness.isel(feature=-1).mean("robot").where(self.passable)
-        aspect = self.grid.cell_height / self.grid.cell_width
-        return map_picture(shown.values, path, aspect=aspect, label=self.features[-1], line=line)
+        return Card(title, rows, sections)
 
     def _with_line_of_sight(self) -> Self:
         ways, pixels = self.ground, self.pixels
