@@ -63,11 +63,8 @@ def cases():
     for scale in ("unit", "likert7", "ordinal7"):
         people = HumanTrust(scale=scale).for_features(("success", "failure"))
         yield people, "exact", 200, PEOPLE
-    yield PooledTrust(observation="student_t"), "joint", 200, SMALL
-    for observation in ("gaussian", "censored", "beta_binomial"):
-        sampler = "nuts" if observation == "gaussian" else "joint"
-        for model in (PooledTrust, HierarchicalTrust, CoupledTrust):
-            yield model(observation=observation), sampler, 200, SMALL
+    for model in (PooledTrust, HierarchicalTrust, CoupledTrust):
+        yield model(), "nuts", 200, SMALL
     yield PooledTrust(response="change"), "nuts", 200, SMALL
     yield CoupledTrust(inter_robot="ordered"), "nuts", 200, SMALL
     yield PooledTrust(place=PlaceEffect()), "nuts", 200, SMALL
@@ -77,7 +74,7 @@ def cases():
 
 def main():
     parser = arguments(
-        __doc__, names=("exact", "nuts", "joint"), out="out/calibration", quick="2 data sets each"
+        __doc__, names=("exact", "nuts"), out="out/calibration", quick="2 data sets each"
     )
     parser.add_argument("--only", default="", help="rows whose label has this text")
     parser.add_argument("--share", type=float, default=1.0, help="share of the data sets")

@@ -28,7 +28,7 @@ from trustbo.study import worlds
 from trustbo.study.world import World
 
 FAMILIES = ("gaussian", "auto")
-LOO = ("gaussian", "censored", "beta_binomial", "student_t")
+LOO = ("gaussian", "censored", "beta_binomial")
 TERRAINS = ("synthetic-0", "synthetic-1", "synthetic-2", "wellington", "tahoe", "bcts",
             "topography", "synthetic-0-wall", "tahoe-wall")  # fmt: skip
 DRIVEN = ("synthetic-0", "synthetic-1", "wellington", "synthetic-0-aged", "synthetic-0-wall",

@@ -12,7 +12,6 @@ OF_FAMILY = {
     "gaussian": TrustParams(0.6, np.array([0.5, 0.3]), -0.1, 0.1, 0.1),
     "censored": TrustParams(0.6, np.array([0.5, 0.3]), -0.1, 0.15, 0.1),
     "beta_binomial": TrustParams(0.6, np.array([2.0, 1.0]), -0.6, 0.4, 0.25, 0.0, 1.5),
-    "student_t": TrustParams(0.6, np.array([0.5, 0.3]), -0.1, 0.1, 0.1),
 }
 
 

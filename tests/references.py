@@ -317,8 +317,6 @@ def on_a_grid(family, p, z, y, n_points=1201, *, n_ticks=20, last_trust=False):
             likelihood = stats.betabinom.pmf(
                 round(y[k] * n_ticks), n_ticks, phi * share, phi * (1 - share)
             )
-        elif family == "student_t":
-            likelihood = stats.t.pdf(y[k], 4, x, p.delta_v)
         elif y[k] <= 0.0:
             likelihood = norm.cdf(0.0, x, p.delta_v)
         elif y[k] >= 1.0:

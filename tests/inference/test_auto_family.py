@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import trustbo as tb
+from trustbo.errors import PosteriorError
 from trustbo.inference import fit
 from trustbo.inference.samplers import run
 from trustbo.models import CoupledTrust, HierarchicalTrust, PooledTrust, Priors
@@ -90,14 +91,11 @@ def test_uneven_weights_leave_gaussian_rates_where_nobody_asked_for_others(monke
     assert found["posterior"].to_dataset().drop_attrs().identical(gaussian.drop_attrs())
 
 
-@pytest.mark.slow  # NUTS compiles for this alone
-def test_uneven_weights_of_a_family_that_was_asked_for_are_said_and_left_to_nuts(monkeypatch):
+def test_uneven_weights_of_a_family_that_was_asked_for_are_refused(monkeypatch):
     force_uneven_weights(monkeypatch)
     model = PooledTrust(observation="censored")
-    with pytest.warns(UserWarning, match="weights are too uneven .k-hat 0.83.*NUTS is used inst"):
-        found = fit(missions(0.5, n=3), model, n_draws=50, whole=False, check=False)
-    assert found.attrs["sampler"] == "joint"
-    assert found.attrs["sampler_reason"] == "weights are too uneven (k-hat 0.83, limit 0.7)"
+    with pytest.raises(PosteriorError, match=r"weights are too uneven .k-hat 0.83, limit 0.7"):
+        fit(missions(0.5, n=3), model, n_draws=50, whole=False, check=False)
 
 
 def test_priors_of_one_s_own_are_kept():

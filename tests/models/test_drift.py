@@ -243,16 +243,6 @@ def test_nuts_finds_the_same_posterior(missions, posterior):
 
 
 @pytest.mark.slow
-def test_other_families_are_left_to_nuts(missions):
-    model = DriftTrust(saturating, OWN.parameters, observation="censored")
-    posterior = fit(missions, model, seed=1, check=False)
-    assert "drift is a function of your own" in posterior.attrs["sampler_reason"]
-    assert np.isfinite(posterior["log_likelihood"]["contact_rate"]).all()
-    top = posterior["posterior"]["top"]
-    assert abs(float(top.mean()) - TRUTH["top"]) < 4 * float(top.std())
-
-
-@pytest.mark.slow
 def test_ranks_of_the_truth_are_uniform():
     result = sbc(OWN, "exact", n_datasets=100, shape=(3, 6, 2, 2), progress=False)
     assert (result["p_value"] > 0.01 / result.sizes["parameter"]).all(), result["p_value"].values
@@ -434,7 +424,7 @@ def test_a_drift_that_is_none_is_refused_before_work_starts(drift, error, messag
 
 def test_what_a_sampler_or_a_function_cannot_treat_says_so(missions, posterior):
     counts = DriftTrust(saturating, OWN.parameters, observation="censored")
-    with pytest.raises(TrustboError, match=r'"exact" cannot treat .* not Gaussian. Use sampler'):
+    with pytest.raises(TrustboError, match=r'"exact" cannot treat .* not Gaussian'):
         fit(missions, counts, "exact")
     with pytest.raises(TrustboError, match="no sufficient statistics: its drift is a function of"):
         update_statistics(OWN, None, missions)

@@ -49,7 +49,7 @@ def iterate(
         policy: Name in `planning.POLICIES`, or a callable `policy(key, draws, planner) -> Plan`.
         objective: `"lost_contact"`, `"terminal"` (the paper's), `"mean"`, `"success"`,
             `"bottleneck"` or `"stationary"`; see `Planner`.
-        sampler: `"auto"`, `"exact"`, `"nuts"` or `"joint"`; see `trustbo.fit`.
+        sampler: `"auto"`, `"exact"` or `"nuts"`; see `trustbo.fit`.
         simulator: Simulator with `run(path, *, seed) -> Mission`; by default
             `KinematicSimulator(workspace)`.
         truth: Truth of the simulator, `simulation.Truth.of(simulator)`: the regret of each plan

@@ -39,10 +39,9 @@ Learning
     days), places (robots are alike), pooled (places are too, as in the paper), hierarchical
     (robots are similar), coupled (they influence each other).
   observation NAME: Family of contact rates: gaussian (as in the paper), censored, beta_binomial,
-    student_t, auto (the one that suits them).
+    auto (the one that suits them).
   sampler NAME: Sampler of the posterior: auto (exact where it applies, else nuts); exact
-    (importance sampling, which need not compile); nuts;
-    joint (nuts, for other than gaussian).
+    (importance sampling, which need not compile); nuts.
 Benchmark
   data FOLDER: Folder of the real terrains, tahoe/dem.tif and so on; without it, synthetic ones and
     wellington.

@@ -14,7 +14,7 @@ from trustbo.data import Mission
 from trustbo.display.bars import place_of
 from trustbo.errors import PosteriorError, ShapeError, TrustboError, require_kind, require_whole
 from trustbo.inference.place_maps import place_group
-from trustbo.inference.posterior_groups import Conditional, add_weights, complete
+from trustbo.inference.posterior_groups import add_weights, complete
 from trustbo.inference.posterior_tree import require_posterior, to_datatree
 from trustbo.inference.prior_predictive import draw_sites
 from trustbo.inference.samplers.choice import (
@@ -74,9 +74,7 @@ def fit(
             sampling, without compiling, for robots that share their parameters, have nothing in
             common, are partially pooled or influence each other; where its weights are too uneven,
             rates are taken for Gaussian ones if observation is `"auto"`, else NUTS is used, with a
-            warning. `"nuts"`. Or `"joint"`: NUTS on
-            parameters and latent trust together, which `"nuts"` is too where trust does not
-            integrate out.
+            warning. `"nuts"`, for Gaussian rates.
         workspace: Workspace of the missions. Their features and robots are then in its order, and
             awareness that they lack, such as line of sight, is filled in, see `Workspace.fill`. A
             model with effects of places has them over the whole grid, else up to the last row and
@@ -188,10 +186,10 @@ def fit(
     }
     if weights is not None:
         add_weights(posterior, weight[: len(missions)])
-    if whole or not Conditional.of(posterior).keeps_trust:
+    if whole:
         with watch:
             watch.stage("latent trust and predictions")
-            posterior = complete(posterior, missions, model=model, latents=sampled.latents)
+            posterior = complete(posterior, missions, model=model)
     posterior.attrs["seconds"] = time.perf_counter() - started
     return _require_sound(posterior, complaints)
 

@@ -8,7 +8,6 @@ import xarray as xr
 from jax import random
 
 from trustbo.data import Mission
-from trustbo.errors import TrustboError
 from trustbo.inference.draws import (
     effects_of,
     is_of_people,
@@ -66,13 +65,7 @@ class Conditional(NamedTuple):
         family = FAMILIES[posterior.attrs["observation"]]
         apart = posterior.attrs["inter_robot"] == "none"
         lag = float(posterior.attrs["response"] == "change")
-        by_numpy = apart and (family.integrates_out or (family.propagates and not lag))
-        return cls(family, lag, by_numpy, is_of_people(posterior))
-
-    @property
-    def keeps_trust(self) -> bool:
-        """Whether latent trust can be redrawn from the parameters alone."""
-        return self.by_numpy or self.family.integrates_out or self.of_people
+        return cls(family, lag, apart, is_of_people(posterior))
 
 
 def complete(
@@ -80,7 +73,6 @@ def complete(
     missions: Sequence[Mission] | None = None,
     *,
     model: TrustModel | None = None,
-    latents: latent.Latents | None = None,
 ) -> xr.DataTree:
     """Add latent trust, log-likelihoods and predictions to a posterior of parameters alone.
 
@@ -91,7 +83,6 @@ def complete(
         posterior: DataTree from `fit`, or one of `Result.posteriors`.
         missions: Missions that it was fitted to; needed where it holds no data.
         model: Its model, for `log_prior`; needed with custom priors.
-        latents: Innovations of latent trust, where they were sampled with the parameters.
 
     Returns:
         The posterior with the groups `latent`, `posterior_predictive`, `prior_predictive`,
@@ -100,19 +91,13 @@ def complete(
         posterior; use `trustbo.inference.loo`.
 
     Raises:
-        TrustboError: The posterior holds no data and no missions are given; or its trust does not
-            integrate out, so that only `fit` can compute it.
+        TrustboError: The posterior holds no data and no missions are given.
     """
     if "latent" in require_posterior("complete", posterior).children:
         return posterior
     conditional = Conditional.of(posterior)
     missions = missions_of(posterior) if missions is None else missions
-    if not conditional.keeps_trust and latents is None:
-        raise TrustboError(
-            f'trust under observation "{conditional.family.name}" was sampled with the parameters '
-            "and not kept; fit these missions anew."
-        )
-    groups, data_name = _groups(posterior, conditional, missions, latents or latent.Latents())
+    groups, data_name = _groups(posterior, conditional, missions)
     added = to_datatree(groups, missions, {})
     parts = {**posterior.children, **added.children}
     whole = xr.DataTree.from_dict({name: part.to_dataset() for name, part in parts.items()})
@@ -132,10 +117,7 @@ def add_weights(posterior: xr.DataTree, weight: np.ndarray) -> None:
 
 
 def _groups(
-    posterior: xr.DataTree,
-    conditional: Conditional,
-    missions: Sequence[Mission],
-    latents: latent.Latents,
+    posterior: xr.DataTree, conditional: Conditional, missions: Sequence[Mission]
 ) -> tuple[dict[str, dict[str, Any]], str]:
     """Arrays by group and name, (chain, draw) leading, and the data of the log-likelihoods."""
     n_chains, n_draws = (posterior["posterior"].sizes[d] for d in ("chain", "draw"))
@@ -154,7 +136,7 @@ def _groups(
         n_bounds = np.array([len(mission.bounds) for mission in missions])
         arrays = _trust_by_numpy(conditional, every, few, batch, n_bounds, seed)
     else:
-        arrays = _trust_compiled(conditional, every, few, latents, kept, batch, seed)
+        arrays = _trust_compiled(conditional, every, few, batch, seed)
     prior = _prior_of(posterior, missions, batch)
 
     rng = np.random.default_rng(seed + 3)
@@ -228,27 +210,18 @@ def _trust_compiled(
     conditional: Conditional,
     every: Params,
     few: Params,
-    latents: latent.Latents,
-    kept: np.ndarray,
     batch: MissionBatch,
     seed: int,
 ) -> dict[str, np.ndarray]:
-    """Latent trust, log-likelihood and predictions of the other models, compiled by JAX."""
-    few_latents = latents
-    if (innovations := latents.innovations) is not None:
-        shape = (-1, *innovations.shape[2:])
-        latents = latents._replace(innovations=innovations.reshape(shape))
-        few_latents = latents._replace(innovations=innovations[:, kept].reshape(shape))
+    """Latent trust, log-likelihood and predictions of coupled robots, compiled by JAX."""
     with own_settings():
         keys = random.split(random.fold_in(random.key(seed), 1))
-        mean, sd = latent.trust_moments(conditional.family, conditional.lag, every, latents, batch)
+        mean, sd = latent.trust_moments(conditional.lag, every, batch)
         arrays = {
             "log_likelihood": mission_log_likelihood(
                 conditional.family, conditional.lag, every, *batch, keys[0]
             ),
-            "trust": latent.trust_draws(
-                conditional.family, conditional.lag, few, few_latents, batch, keys[1]
-            ),
+            "trust": latent.trust_draws(conditional.lag, few, batch, keys[1]),
             "trust_mean": mean,
             "trust_sd": sd,
             "predicted": _predict(conditional, every, batch, np.random.default_rng([seed, 1])),

@@ -71,7 +71,7 @@ def sbc(
 
     Args:
         model: Trust model; by default `PooledTrust()`.
-        sampler: `"exact"`, `"nuts"` or `"joint"`.
+        sampler: `"exact"` or `"nuts"`.
         n_datasets: Number of data sets.
         shape: Missions, bounds, robots and features of each.
         n_ticks: Ticks per bound: what the beta-binomial family counts, and the resolution that

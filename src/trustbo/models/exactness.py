@@ -16,7 +16,6 @@ _REFUSED: tuple[tuple[tuple[str, ...], set[str], str], ...] = (
         {"not Gaussian"},
         "its robots influence each other, and its observations are not Gaussian",
     ),
-    ((), {"not propagated"}, "expectation propagation does not know its observations"),
     (("other",), set(), "its robots share some parameters only, or influence each other"),
     (
         ("all", "each", "pooled"),
@@ -34,7 +33,6 @@ def why_not_exact(model: "TrustModel") -> str | None:
     family, sets = model.family, model.robot_sets
     traits = {
         "not Gaussian": not family.integrates_out,
-        "not propagated": not (family.integrates_out or family.propagates),
         "changes": bool(model.lag),
         "places": model.place is not None,
         "effects": bool(model.effects),

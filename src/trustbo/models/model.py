@@ -44,8 +44,7 @@ class TrustModel(Displayed, ABC):
             names of the features, see `Priors.of`.
         observation: Family of observations: `"gaussian"`, the paper's; `"censored"`, rates of 0
             and 1 being limits; `"beta_binomial"`, ticks in contact out of `Bound.n_ticks` ticks,
-            trust being a logit; `"student_t"`, rates with outliers, 4 degrees of freedom; `"auto"`:
-            that which suits the rates of a fit, see `for_rates`.
+            trust being a logit; `"auto"`: that which suits the rates of a fit, see `for_rates`.
         response: Quantity that a rate measures: trust, `"level"`, or its `"change"` over the bound.
         place: Effects of places that awareness does not explain; None is the paper's model.
 

@@ -106,7 +106,7 @@ class Study:
         policies: Names in `planning.POLICIES`.
         objectives: Names in `planning.OBJECTIVES`.
         models: Models, or the names `robots`, `places`, `pooled`, `hierarchical`, `coupled`.
-        samplers: `"auto"`, `"exact"`, `"nuts"`, `"joint"`.
+        samplers: `"auto"`, `"exact"`, `"nuts"`.
         simulators: Simulators, with `known_truth` where regret is asked for.
         seeds: Seeds, or their number: 0, 1, ...
         n_iterations: Missions of a run.

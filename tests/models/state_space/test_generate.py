@@ -92,7 +92,7 @@ SLOW = pytest.mark.slow  # JAX's samplers of counts and of odd rates compile for
     ("family", "coupled"),
     [
         *(("gaussian", False), pytest.param("gaussian", True, marks=SLOW)),
-        *(pytest.param(f, False, marks=SLOW) for f in ("censored", "beta_binomial", "student_t")),
+        *(pytest.param(f, False, marks=SLOW) for f in ("censored", "beta_binomial")),
     ],
 )
 def test_numpyro_draws_the_same_missions(family, coupled):

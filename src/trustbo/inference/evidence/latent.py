@@ -1,7 +1,7 @@
-"""Latent trust under posterior draws, compiled for all models."""
+"""Latent trust under posterior draws of Gaussian models, compiled; for coupled robots."""
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,61 +9,43 @@ import numpy as np
 from jax import Array, lax, random
 
 from trustbo.models.backend import in_batches
-from trustbo.models.families import Family, Observed
 from trustbo.models.params import Params
 from trustbo.stacking import MissionBatch
 
 _BATCH = 64  # draws computed at once
 
 
-class Latents(NamedTuple):
-    """Innovations of latent trust sampled with the parameters, where it does not integrate out."""
-
-    innovations: Array | np.ndarray | None = None
-    """Standard normal numbers, (draw, bound, mission, robot)."""
-    linearisation: Array | None = None
-    """Linearisation point of the weights, see `families.family.Observed`."""
-
-
-def trust_draws(
-    family: Family, lag: float, params: Params, latents: Latents, batch: MissionBatch, key: Array
-) -> np.ndarray:
+def trust_draws(lag: float, params: Params, batch: MissionBatch, key: Array) -> np.ndarray:
     """One exact joint draw of latent trust per parameter draw, (draw, mission, bound, robot)."""
     keys = random.split(key, len(params.b))
-    draw = partial(_trust_draws, family, lag, batch, latents.linearisation)
-    return in_batches(draw, (params, latents.innovations, keys), _BATCH)
+    return in_batches(partial(_trust_draws, lag, batch), (params, keys), _BATCH)
 
 
-@partial(jax.jit, static_argnames=("family", "lag"))
-def trust_moments(
-    family: Family, lag: float, params: Params, latents: Latents, batch: MissionBatch
-) -> tuple[Array, Array]:
+@partial(jax.jit, static_argnames=("lag",))
+def trust_moments(lag: float, params: Params, batch: MissionBatch) -> tuple[Array, Array]:
     """Mean and sd of latent trust (mission, bound, robot) over draws, by the total variance."""
-    observed = Observed.of(batch.contact_rate, batch.n_ticks, latents.linearisation)  # pyright: ignore
+    y = jnp.swapaxes(batch.contact_rate, 0, 1)
 
-    def add(carry, inputs):
-        p, e = inputs
-        e = jnp.zeros_like(observed.y) if e is None else e
-        mean, var = family.trust_moments(p.ssm(batch.awareness, lag), observed, e)
+    def add(carry, p):
+        ssm: Any = p.ssm(batch.awareness, lag)
+        mean, var = ssm.smooth(ssm.filter(y))
         return (carry[0] + mean, carry[1] + var + mean**2), None
 
-    zero = jnp.zeros_like(observed.y)
-    (total, total_squares), _ = lax.scan(add, (zero, zero), (params, latents.innovations))
+    zero = jnp.zeros_like(y)
+    (total, total_squares), _ = lax.scan(add, (zero, zero), params)
     mean, mean_square = total / len(params.b), total_squares / len(params.b)
     sd = jnp.sqrt(jnp.maximum(mean_square - mean**2, 0.0))
     return jnp.swapaxes(mean, 0, 1), jnp.swapaxes(sd, 0, 1)
 
 
-@partial(jax.jit, static_argnames=("family", "lag"))
-def _trust_draws(
-    family: Family, lag: float, batch: MissionBatch, linearisation: Array | None, inputs: Any
-) -> Array:
-    observed = Observed.of(batch.contact_rate, batch.n_ticks, linearisation)  # pyright: ignore
+@partial(jax.jit, static_argnames=("lag",))
+def _trust_draws(lag: float, batch: MissionBatch, inputs: Any) -> Array:
+    y = jnp.swapaxes(batch.contact_rate, 0, 1)
 
     def one(inputs: Any) -> Array:
-        p, e, key = inputs
-        e = jnp.zeros_like(observed.y) if e is None else e
+        p, key = inputs
         ssm = p.ssm(batch.awareness, lag)
-        return jnp.swapaxes(family.draw_trust(ssm, observed, e, key), 0, 1)
+        trust = ssm.sample_backward(ssm.filter(y), random.normal(key, y.shape, y.dtype))
+        return jnp.swapaxes(trust, 0, 1)
 
     return jax.vmap(one)(inputs)

@@ -6,7 +6,7 @@ from trustbo.inference.samplers.scores import why_no_quantiles
 from trustbo.inference.samplers.settings import NutsSettings
 from trustbo.models.model import TrustModel
 
-SAMPLERS = ("auto", "exact", "nuts", "joint")
+SAMPLERS = ("auto", "exact", "nuts")
 
 
 def require_sampler(model: TrustModel, sampler: str) -> None:
@@ -14,25 +14,22 @@ def require_sampler(model: TrustModel, sampler: str) -> None:
 
     Raises:
         TrustboError: The sampler is `"exact"`, and `TrustModel.why_not_exact` or a prior gives a
-            reason; or it is `"joint"`, and trust integrates out.
+            reason; or it is `"nuts"`, and the rates are not Gaussian.
     """
     if sampler == "exact" and (reason := model.why_not_exact):
-        raise TrustboError(
-            f'sampler "exact" cannot treat {model.describe()}: {reason}. Use sampler="auto".'
-        )
+        remedy = ' Use sampler="auto".' if model.family.integrates_out else ""
+        raise TrustboError(f'sampler "exact" cannot treat {model.describe()}: {reason}.{remedy}')
     alone = model.effects or model.memory != "level"  # the evidence alone has these
     if sampler == "exact" and (reason := why_not_priors(model)):
         remedy = "Give others" if alone else 'Use sampler="nuts", which takes any'
         raise TrustboError(f'sampler "exact": {reason}. {remedy}.')
-    if sampler in ("nuts", "joint") and alone and (reason := why_not_scores(model)):
+    if sampler == "nuts" and alone and (reason := why_not_scores(model)):
         remedy = "" if model.why_not_exact or why_not_priors(model) else ' Use sampler="exact".'
+        raise TrustboError(f'sampler "nuts" cannot treat {model.describe()}: {reason}.{remedy}')
+    if sampler == "nuts" and not model.family.integrates_out:
         raise TrustboError(
-            f'sampler "{sampler}" cannot treat {model.describe()}: {reason}.{remedy}'
-        )
-    if sampler == "joint" and model.family.integrates_out:
-        raise TrustboError(
-            'sampler "joint" is for observations that trust does not integrate out of; with '
-            'Gaussian ones use "nuts" or "exact".'
+            f'sampler "nuts" is for Gaussian rates, and observation is "{model.observation}". Use '
+            'sampler="exact", or MCMC(NUTS(model.numpyro_model(missions))) of NumPyro.'
         )
 
 
@@ -61,7 +58,12 @@ def resolve_sampler(model: TrustModel, sampler: str) -> tuple[str, str]:
             f"no sampler can treat {model.describe()}: {reason}. Give a model without effects of "
             f"{model.effects[0].noun}, or other priors."
         )
-    return ("nuts" if model.family.integrates_out else "joint"), reason
+    if not model.family.integrates_out:
+        raise TrustboError(
+            f"no sampler can treat {model.describe()}: {reason}. Use "
+            "MCMC(NUTS(model.numpyro_model(missions))) of NumPyro."
+        )
+    return "nuts", reason
 
 
 def why_not_scores(model: TrustModel) -> str | None:
@@ -104,7 +106,7 @@ def needs_evidence(model: TrustModel, sampler: str) -> bool:
     """Whether a sampler integrates effects out by the evidence of all of them."""
     if model.effects or model.memory != "level":
         return True
-    return sampler != "joint" and model.place is not None and why_not_scores(model) is None
+    return model.place is not None and why_not_scores(model) is None
 
 
 def slow_places(reason: str) -> str:

@@ -7,7 +7,6 @@ Python: for a bar, an estimate of the time, and Ctrl-C. A callback from compiled
 program out of JAX's cache on disk.
 """
 
-import math
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -40,7 +39,7 @@ class Density(Protocol):
     """Whether warm-up learns a metric, if it is long enough; else that of `Chain` is good."""
 
     def potential(self, site: dict[str, Array]) -> Array:
-        """Minus the log density of sites: `theta`, and maybe `innovations`, standard normal."""
+        """Minus the log density of the sites, `theta`."""
         ...
 
 
@@ -171,21 +170,17 @@ def _kernel(
         return density.potential(z | {"theta": chain.theta(z["theta"])})
 
     sites = z.z if isinstance(z, ParamInfo) else z
-    n_unknowns, joint = len(sites["theta"]), "innovations" in sites
+    n_unknowns = len(sites["theta"])
     enough = _DRAWS_PER_UNKNOWN * n_unknowns <= settings.warmup
-    # Innovations are close to standard normal by construction: their mass starts as the identity.
-    mass = {("theta",): jnp.eye(n_unknowns)}
-    if joint:
-        mass[("innovations",)] = jnp.ones(math.prod(sites["innovations"].shape))
     init, step = hmc(potential, algo="NUTS")
     state = init(
         z,
         settings.warmup,
         step_size=0.5,
-        inverse_mass_matrix=mass,
+        inverse_mass_matrix={("theta",): jnp.eye(n_unknowns)},
         dense_mass=[("theta",)],  # pyright: ignore[reportArgumentType]
         target_accept_prob=settings.target_accept,
-        adapt_mass_matrix=joint or (density.learns and enough),
+        adapt_mass_matrix=density.learns and enough,
         max_tree_depth=settings.max_tree_depth,
         rng_key=key,
     )

@@ -1,12 +1,12 @@
 """NUTS on a model's sample statements, for what no evidence integrates out.
 
-These are coupled robots, custom drifts, priors without quantiles, and rates that are not Gaussian,
-whose innovations of trust are sampled too. The numpyro model itself stays plain: here its sample
-statements stand with a likelihood that takes the weight of each mission and the linearisation
-point. The unknowns are the sites on the real line, but for the noises and the intercept: data fix
-the total of the noises well and their ratio badly, and the mean level of trust, b + beta0 mean(y) +
-beta . mean(z), better than its parts. The logs of total and ratio, and the level, stand in their
-places, with Jacobian 1. Start and metric are those of a Gaussian fit at the mode (Laplace).
+These are coupled robots, custom drifts and priors without quantiles, all of Gaussian rates. The
+numpyro model itself stays plain: here its sample statements stand with a likelihood that takes the
+weight of each mission. The unknowns are the sites on the real line, but for the noises and the
+intercept: data fix the total of the noises well and their ratio badly, and the mean level of trust,
+b + beta0 mean(y) + beta . mean(z), better than its parts. The logs of total and ratio, and the
+level, stand in their places, with Jacobian 1. Start and metric are those of a Gaussian fit at the
+mode (Laplace).
 """
 
 from dataclasses import dataclass, field, replace
@@ -24,15 +24,13 @@ from numpyro.distributions import constraints
 from numpyro.distributions.transforms import biject_to
 from numpyro.infer.util import constrain_fn, potential_energy
 
-from trustbo.inference.evidence.latent import Latents
 from trustbo.inference.samplers.laplace import inverse_hessian, newton
 from trustbo.inference.samplers.nuts import Chain, run_nuts
 from trustbo.inference.samplers.partial_centring import RobotFit, centre, fit_robots
 from trustbo.inference.samplers.settings import NutsSettings
 from trustbo.inference.samplers.watching import Watch
 from trustbo.models.effects.sampled import SampledDrift
-from trustbo.models.families import Observed
-from trustbo.models.model import TrustModel, sample_innovations
+from trustbo.models.model import TrustModel
 from trustbo.models.params import Params
 from trustbo.models.state_space.vector import VectorSSM
 from trustbo.stacking import MissionBatch
@@ -51,7 +49,6 @@ class SitesInJax:
         model: Model.
         batch: Missions, padded.
         weight: Weight of each mission, (mission,).
-        linearisation: Linearisation point of families that have one, once it is known.
         means: Mean rate () and awareness (robot, feature), where the level replaces `b`.
         robots: Fit of each robot's likelihood, once it is known, where robots are partially pooled.
         drift: Sampled effects of places.
@@ -62,7 +59,6 @@ class SitesInJax:
     model: TrustModel
     batch: MissionBatch
     weight: Array | np.ndarray
-    linearisation: Array | None = None
     means: tuple[Array | np.ndarray, Array | np.ndarray] | None = None
     robots: RobotFit | None = None
     drift: SampledDrift | None = field(default=None, metadata={"static": True})
@@ -82,24 +78,16 @@ class SitesInJax:
         over = (np.diff(seen.any(2).astype(int), axis=1) <= 0).all()
         means = None
         linear = model.robot_sets not in ("drift", "pooled") and model.memory == "level"
-        if linear and model.family.integrates_out and model.priors.b.support is constraints.real:
+        if linear and model.priors.b.support is constraints.real:
             n = np.maximum(seen.sum((0, 1)), 1)[:, None]
             z = np.where(seen[..., None], batch.awareness, 0.0).sum((0, 1)) / n
             means = np.asarray(batch.contact_rate[seen].mean()), z
-        return cls(model, batch, weight, None, means, drift=drift, complete=bool(together and over))
+        return cls(model, batch, weight, means, drift=drift, complete=bool(together and over))
 
     @property
     def has_level(self) -> bool:
-        """Whether a level takes the intercept's place: linear models of Gaussian rates."""
+        """Whether a level takes the intercept's place: linear models."""
         return self.means is not None
-
-    @property
-    def innovations(self) -> tuple[int, int, int] | None:
-        """Shape of the innovations of trust (bound, mission, robot), if they are sampled."""
-        if self.model.family.integrates_out:
-            return None
-        n_missions, n_bounds, n_robots = self.batch.contact_rate.shape
-        return n_bounds, n_missions, n_robots
 
     @cached_property
     def _priors(self) -> dict[str, Any]:
@@ -159,11 +147,9 @@ class SitesInJax:
         holds no mass: each location parameter takes a power of the noise away. That is added for
         the search, as in REML.
         """
-        shape = self.innovations
-        zeros = {} if shape is None else {"innovations": jnp.zeros(shape)}
 
         def cost(density: SitesInJax, theta: Array) -> Array:
-            energy, noise = density.potential({"theta": theta, **zeros}), density._flat[1](theta)
+            energy, noise = density.potential({"theta": theta}), density._flat[1](theta)
             total = noise.get("delta_w", jnp.zeros(()))
             return energy - (len(theta) - 2 * total.size) * total.mean()
 
@@ -178,21 +164,18 @@ class SitesInJax:
         pooled = self.model.robot_sets == "pooled" and all(
             prior.support is constraints.real for prior in means
         )
-        if pooled or self.model.family.linearises:
-            values, start = self._values(self.sites(mode)[0]), mode
-            if self.model.family.linearises:
-                density = replace(density, linearisation=self._refined(values))
-            if pooled:
-                robots = fit_robots(values, self._support, density._of_robots)
-                density, start = replace(density, robots=robots), self._flat[0]
-            mode, hessian = newton(lambda theta: cost(density, theta), start)
+        if pooled:
+            values = self._values(self.sites(mode)[0])
+            robots = fit_robots(values, self._support, self._of_robots)
+            density = replace(density, robots=robots)
+            mode, hessian = newton(lambda theta: cost(density, theta), self._flat[0])
         return density, Chain(mode, jnp.linalg.cholesky(inverse_hessian(jnp, hessian, 0.1)))
 
     @property
     def _starts(self) -> Array:
         """Points to search the mode from, (start, unknown): the priors' means, and further ones.
 
-        Of Gaussian rates these have noises of the rates' scatter, and several autoregressions.
+        These have noises of the rates' scatter, and several autoregressions.
         """
         start, unravel = self._flat
         site, names = unravel(start), _AUTOREGRESSIONS
@@ -231,46 +214,35 @@ class SitesInJax:
     def _at(self, values: Sites) -> Any:
         return self._ssm(handlers.substitute(self._params, values)())  # pyright: ignore
 
-    def _refined(self, values: Sites) -> Array | None:
-        return self.model.family.refine(self._at(values), self._observed).linearisation
-
     def _of_robots(self, values: Sites) -> Array:
-        """Log density of each robot's rates, at innovations 0."""
-        observed = self._observed
-        nothing, family = jnp.zeros_like(observed.y), self.model.family
-        return self.weight @ family.log_density(self._at(values), observed, nothing, False)  # pyright: ignore
+        """Log density of each robot's rates."""
+        return self.weight @ self._at(values).log_likelihood(self._rates)  # pyright: ignore
 
     @property
-    def _observed(self) -> Observed:
-        _, rates, ticks = self.batch
-        return Observed.of(rates, ticks, self.linearisation)  # pyright: ignore
+    def _rates(self) -> Array:
+        """Contact rates, (bound, mission, robot)."""
+        return jnp.swapaxes(self.batch.contact_rate, 0, 1)
 
     def _program(self) -> None:
-        params, observed, shape = self._params(), self._observed, self.innovations
-        innovations = jnp.zeros_like(observed.y) if shape is None else sample_innovations(shape)
-        family = self.model.family
-        log_p = family.log_density(self._ssm(params), observed, innovations, self.complete)
+        log_p = self._ssm(self._params()).log_likelihood(self._rates, complete=self.complete)
         numpyro.factor("contact_rate", log_p.sum(1) @ self.weight)  # pyright: ignore
 
 
 def run_nuts_of_sites(
     settings: NutsSettings, seed: int, density: SitesInJax, watch: Watch
-) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], Latents]:
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Draws and statistics, each (chain, draw, ...); in a float64 scope. See `nuts.run_nuts`."""
     density, chain = _centred(density)
     rng = [np.random.default_rng([seed, i]) for i in range(settings.n_chains)]
     # Overdispersed starts (1.5 Laplace sd), so that R-hat means something.
     starts = [{"theta": jnp.asarray(1.5 * one.standard_normal(len(chain.center)))} for one in rng]
-    if (shape := density.innovations) is not None:
-        innovations = [{"innovations": jnp.asarray(one.standard_normal(shape))} for one in rng]
-        starts = [a | b for a, b in zip(starts, innovations, strict=True)]
     z, stats = run_nuts(settings, seed, density, chain, starts, watch)
     params = _named(density, chain, z["theta"].reshape(-1, len(chain.center)))
     shaped = {
         name: np.asarray(values).reshape(*z["theta"].shape[:2], *values.shape[1:])
         for name, values in params.items()
     }
-    return shaped, stats, Latents(z.get("innovations"), density.linearisation)
+    return shaped, stats
 
 
 @jax.jit

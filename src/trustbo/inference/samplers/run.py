@@ -7,7 +7,6 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 
 from trustbo.errors import PosteriorError
-from trustbo.inference.evidence.latent import Latents
 from trustbo.inference.evidence.statistics import gather, split_robots
 from trustbo.inference.samplers.choice import by_sums, why_not_scores
 from trustbo.inference.samplers.convergence import (
@@ -48,8 +47,6 @@ class Draws(NamedTuple):
     stats: dict[str, np.ndarray]
     summary: dict[str, Any]
     sampler: str
-    latents: Latents = Latents()
-    """Innovations of latent trust, with the same leading axes, if it was sampled."""
     places: Mapping[str, np.ndarray] = {}
     """Effects of visited places, see `place_maps.place_group`."""
     effects: Mapping[str, Mapping[str, np.ndarray]] = {}
@@ -77,7 +74,7 @@ def draw_posterior(
 
     Args:
         model: Trust model.
-        sampler: `"nuts"`, `"exact"` or `"joint"`.
+        sampler: `"nuts"` or `"exact"`.
         settings: Length of the run.
         seed: Seed; the same seed gives the same draws.
         batch: Missions, padded.
@@ -104,7 +101,7 @@ def draw_posterior(
         except UnevenWeightsError as error:
             if not fallback:
                 raise
-            if slots is not None and why_not_scores(model):
+            if not model.family.integrates_out or (slots is not None and why_not_scores(model)):
                 raise PosteriorError(f"the exact sampler's {error}.") from None
             failure = str(error)
             warnings.warn(f"the exact sampler's {failure}; NUTS is used instead.", stacklevel=4)
@@ -233,7 +230,6 @@ def join(
 def _sample_nuts(task: _Task) -> tuple[Draws, list[str]]:
     """Draws by NUTS, rerun for longer if diagnostics fail, and the failures of the last run."""
     model, batch = task.model, task.batch
-    name = "nuts" if model.family.integrates_out else "joint"
 
     def attempt(tried: NutsSettings, retries: int) -> tuple[Draws, list[str]]:
         with own_settings(), one_blas_thread():
@@ -243,7 +239,7 @@ def _sample_nuts(task: _Task) -> tuple[Draws, list[str]]:
                     model.all_effects, task.chains(batch), batch.contact_rate.shape
                 )
             density = SitesInJax.of(model, batch, task.weight, drift)
-            params, stats, latents = run_nuts_of_sites(
+            params, stats = run_nuts_of_sites(
                 tried, task.seed + _RETRY * retries, density, task.watch
             )
         stats = _with_tree_depth(stats)
@@ -256,7 +252,7 @@ def _sample_nuts(task: _Task) -> tuple[Draws, list[str]]:
             places = {n: values.reshape(*shape, -1) for n, values in effects.items()}
             params = {n: values for n, values in params.items() if n not in drift.names}
         summary = {"retries": retries}
-        return Draws(params, stats, summary, name, latents, places), complaints
+        return Draws(params, stats, summary, "nuts", places), complaints
 
     return _retried(attempt, task)
 

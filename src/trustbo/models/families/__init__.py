@@ -11,10 +11,9 @@ from trustbo.models.families.beta_binomial import BetaBinomial
 from trustbo.models.families.censored import Censored
 from trustbo.models.families.family import Family, Observed
 from trustbo.models.families.gaussian import Gaussian
-from trustbo.models.families.student_t import StudentT
 
 FAMILIES: dict[str, Family] = {
-    family.name: family for family in (Gaussian(), Censored(), BetaBinomial(), StudentT())
+    family.name: family for family in (Gaussian(), Censored(), BetaBinomial())
 }
 
 AUTO = "auto"

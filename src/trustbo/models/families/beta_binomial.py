@@ -2,6 +2,11 @@
 
 Trust is a logit. The ticks of a bound are not independent: delta_v^2 is the ratio of the excess to
 the binomial variance.
+
+Around a linearisation point the log probability is a parabola: Gaussian rates with a variance each.
+Trust is drawn from the smoother of these rates as a function of the innovations, and weighted by
+the ratio of the two likelihoods, so the result is exact for any point (importance sampling from the
+Laplace approximation of a state space; Durbin and Koopman 1997).
 """
 
 from dataclasses import dataclass
@@ -19,15 +24,17 @@ from scipy.special import expit
 from scipy.stats import betabinom
 
 from trustbo.models.backend import own_settings
-from trustbo.models.families.family import SSM, Moments, Observed
-from trustbo.models.families.linearised import Data, Linearised
+from trustbo.models.families.family import SSM, Family, Moments, Observed
 from trustbo.models.families.terms import COUNT, NONE, Terms, count_moments
+from trustbo.models.state_space.scalar import Filtered, log_normal
 
+Data = tuple[Array, Array]
 _N_TICKS = 200.0  # of future missions, whose number of ticks is unknown
+_N_STEPS = 6  # passes of the smoother after which the linearisation point moves no more
 
 
 @dataclass(frozen=True)
-class BetaBinomial(Linearised):
+class BetaBinomial(Family):
     """Ticks in contact out of all ticks of a bound."""
 
     name: ClassVar[str] = "beta_binomial"
@@ -54,45 +61,23 @@ class BetaBinomial(Linearised):
                 "x0_sd": 1.5,
             }
 
-    def log_prob(self, ssm: SSM, data: Data, trust: Array) -> Array:
-        """See `Linearised.log_prob`."""
-        (n, N), phi = data, _concentration(ssm)
-        a, b = phi * jax.nn.sigmoid(trust), phi * jax.nn.sigmoid(-trust)
-        choose = gammaln(N + 1.0) - gammaln(n + 1.0) - gammaln(N - n + 1.0)
-        total = gammaln(N + phi) - gammaln(phi)
-        return choose + gammaln(n + a) - gammaln(a) + gammaln(N - n + b) - gammaln(b) - total
+    def log_density(self, ssm: SSM, observed: Observed, e: Array, complete: bool = False) -> Array:
+        """See `Family.log_density`; each rate has a separate variance, complete or not."""
+        approximate, filtered = _approximate(ssm, observed)
+        trust = approximate.sample_backward(filtered, e)
+        R = approximate.rate_variance
+        gap = _log_prob(ssm, _counts(observed), trust) - log_normal(filtered.y - trust, R)
+        return ssm.per_sequence(filtered.log_likelihood + jnp.where(filtered.seen > 0.0, gap, 0.0))
 
-    def derivatives(self, ssm: SSM, data: Data, trust: Array) -> tuple[Array, Array]:
-        """See `Linearised.derivatives`.
+    def refine(self, ssm: SSM, observed: Observed) -> Observed:
+        """Move the linearisation point to the most likely trust (Laplace, by smoothing)."""
 
-        digamma(n + a) - digamma(a) is a sum of 1 / (a + j): its first term, and the midpoint rule
-        for the others. Special functions would take ten times as long.
-        """
-        (n, N), phi = data, _concentration(ssm)
-        p = jax.nn.sigmoid(trust)
+        def step(_, trust: Array) -> Array:
+            approximate, filtered = _approximate(ssm, observed._replace(linearisation=trust))
+            return approximate.smooth(filtered).mean
 
-        def sums(n: Array, a: Array) -> tuple[Array, Array]:
-            n, some = jnp.maximum(n, 1.0), jnp.where(n > 0.0, 1.0, 0.0)
-            first = jnp.log((n + a - 0.5) / (a + 0.5)) + 1.0 / a
-            second = 1.0 / (a + 0.5) - 1.0 / (n + a - 0.5) + 1.0 / a**2
-            return some * first, some * second
-
-        A, A2 = sums(n, phi * p)
-        B, B2 = sums(N - n, phi * (1.0 - p))
-        rate = p * (1.0 - p) * phi
-        slope = rate * (A - B)
-        return slope, (1.0 - 2.0 * p) * slope - rate**2 * (A2 + B2)
-
-    def start(self, observed: Observed) -> Array:
-        """See `Linearised.start`: empirical logits."""
-        n, N = self.read(observed)
-        return jnp.log((n + 0.5) / (N - n + 0.5))
-
-    def read(self, observed: Observed) -> Data:
-        """See `Linearised.read`: ticks in contact, and ticks."""
-        measured = ~jnp.isnan(observed.y) & (observed.n_ticks > 0.0)
-        N = jnp.where(measured, observed.n_ticks, 0.0)
-        return jnp.where(measured, jnp.round(observed.y * N), 0.0), N
+        point = lax.fori_loop(0, _N_STEPS, step, _empirical_logits(observed))
+        return observed._replace(linearisation=point)
 
     def measure(self, key: Array, ssm: SSM, trust: Array, y: Array, n_ticks: Array) -> Array:
         """See `Family.measure`."""
@@ -159,3 +144,58 @@ def _concentration(ssm: SSM) -> Array:
     At most 1e6, where counts are binomial for all purposes and log-gamma still has digits to give.
     """
     return 1.0 / (jnp.reshape(ssm.rate_variance, (1, 1, -1)) + 1e-6)
+
+
+def _counts(observed: Observed) -> Data:
+    """Ticks in contact, and ticks; both 0 where not measured."""
+    measured = ~jnp.isnan(observed.y) & (observed.n_ticks > 0.0)
+    N = jnp.where(measured, observed.n_ticks, 0.0)
+    return jnp.where(measured, jnp.round(observed.y * N), 0.0), N
+
+
+def _empirical_logits(observed: Observed) -> Array:
+    """Trust equivalent of each rate alone, finite where not measured too."""
+    n, N = _counts(observed)
+    return jnp.log((n + 0.5) / (N - n + 0.5))
+
+
+def _approximate(ssm: SSM, observed: Observed) -> tuple[SSM, Filtered]:
+    """The state space with Gaussian rates in place of counts, and their filter."""
+    data, point = _counts(observed), observed.linearisation
+    point = _empirical_logits(observed) if point is None else point
+    slope, curvature = _derivatives(ssm, data, point)
+    var = 1.0 / jnp.maximum(-curvature, 1e-3)
+    y = point + jnp.clip(var * slope, -3.0, 3.0)
+    approximate = ssm.with_rate_variance(var)
+    return approximate, approximate.filter(jnp.where(data[1] > 0.0, y, jnp.nan))
+
+
+def _log_prob(ssm: SSM, data: Data, trust: Array) -> Array:
+    """Log probability of each count given trust; any finite number where not measured."""
+    (n, N), phi = data, _concentration(ssm)
+    a, b = phi * jax.nn.sigmoid(trust), phi * jax.nn.sigmoid(-trust)
+    choose = gammaln(N + 1.0) - gammaln(n + 1.0) - gammaln(N - n + 1.0)
+    total = gammaln(N + phi) - gammaln(phi)
+    return choose + gammaln(n + a) - gammaln(a) + gammaln(N - n + b) - gammaln(b) - total
+
+
+def _derivatives(ssm: SSM, data: Data, trust: Array) -> tuple[Array, Array]:
+    """First and second derivative of `_log_prob` in trust, approximately.
+
+    digamma(n + a) - digamma(a) is a sum of 1 / (a + j): its first term, and the midpoint rule for
+    the others. Special functions would take ten times as long.
+    """
+    (n, N), phi = data, _concentration(ssm)
+    p = jax.nn.sigmoid(trust)
+
+    def sums(n: Array, a: Array) -> tuple[Array, Array]:
+        n, some = jnp.maximum(n, 1.0), jnp.where(n > 0.0, 1.0, 0.0)
+        first = jnp.log((n + a - 0.5) / (a + 0.5)) + 1.0 / a
+        second = 1.0 / (a + 0.5) - 1.0 / (n + a - 0.5) + 1.0 / a**2
+        return some * first, some * second
+
+    A, A2 = sums(n, phi * p)
+    B, B2 = sums(N - n, phi * (1.0 - p))
+    rate = p * (1.0 - p) * phi
+    slope = rate * (A - B)
+    return slope, (1.0 - 2.0 * p) * slope - rate**2 * (A2 + B2)

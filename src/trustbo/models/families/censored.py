@@ -18,7 +18,7 @@ from scipy.stats import norm
 from trustbo.models.families.family import SSM, Moments, Observed
 from trustbo.models.families.gaussian import Gaussian
 from trustbo.models.families.terms import AT_ONE, AT_ZERO, Terms
-from trustbo.models.state_space.scalar import Censoring, Filtered
+from trustbo.models.state_space.scalar import Censoring
 
 
 @dataclass(frozen=True)
@@ -31,13 +31,9 @@ class Censored(Gaussian):
 
     def log_density(self, ssm: SSM, observed: Observed, e: Array, complete: bool = False) -> Array:
         """See `Family.log_density`."""
-        filtered = self.filter(ssm, observed, e, complete)
-        return ssm.per_sequence(filtered.log_likelihood)
-
-    def filter(self, ssm: SSM, observed: Observed, e: Array, complete: bool = False) -> Filtered:
-        """Moments of trust given the rates so far, the censored ones drawn."""
         side = jnp.where(observed.y >= 1.0, 1.0, jnp.where(observed.y <= 0.0, -1.0, 0.0))
-        return ssm.filter(observed.y, complete=complete, censoring=Censoring(side, e))
+        filtered = ssm.filter(observed.y, complete=complete, censoring=Censoring(side, e))
+        return ssm.per_sequence(filtered.log_likelihood)
 
     def measure(self, key: Array, ssm: SSM, trust: Array, y: Array, n_ticks: Array) -> Array:
         """See `Family.measure`: `y` clipped to [0, 1]."""

@@ -18,7 +18,6 @@ from jax import Array, random
 from numpy import ndarray
 from numpy.random import Generator
 
-from trustbo.errors import TrustboError
 from trustbo.models.families.terms import Terms
 from trustbo.models.state_space.scalar import ScalarSSM
 from trustbo.models.state_space.vector import VectorSSM
@@ -56,8 +55,6 @@ class Family(ABC):
     """Whether latent trust integrates out in closed form: rates are linear in it, and Gaussian."""
     needs_ticks: ClassVar[bool] = False
     """Whether each measured rate needs its number of ticks."""
-    linearises: ClassVar[bool] = False
-    """Whether the density is weighted around a linearisation point, found by `refine`."""
     allows_change: ClassVar[bool] = True
     """Whether rates may measure the change of trust (`response="change"`)."""
     rounds: ClassVar[bool] = True
@@ -66,9 +63,6 @@ class Family(ABC):
     """Whether `observe` maps moments of trust, not of the rate before clipping."""
     correlates: ClassVar[bool] = True
     """Whether observation noise may be correlated between robots."""
-
-    propagates: ClassVar[bool] = True
-    """Whether expectation propagation has its `terms`, hence the exact sampler applies."""
 
     log_constant: ClassVar[float] = 0.0
     """Term that the log density of `observe` lacks, nats."""
@@ -92,14 +86,6 @@ class Family(ABC):
         Returns:
             Nats, shape (mission, robot) where robots are independent, else (mission, 1).
         """
-
-    @abstractmethod
-    def draw_trust(self, ssm: SSM, observed: Observed, e: Array, key: Array) -> Array:
-        """One joint draw of latent trust, given the innovations sampled with the parameters."""
-
-    @abstractmethod
-    def trust_moments(self, ssm: SSM, observed: Observed, e: Array) -> tuple[Array, Array]:
-        """Mean and variance of latent trust given parameters and innovations."""
 
     @abstractmethod
     def measure(self, key: Array, ssm: SSM, trust: Array, y: Array, n_ticks: Array) -> Array:
@@ -127,12 +113,9 @@ class Family(ABC):
     ) -> tuple[np.ndarray, np.ndarray]:
         """Probabilities of a rate below y, and of one up to y, given trust; arrays broadcast."""
 
+    @abstractmethod
     def terms(self, y: np.ndarray, n_ticks: np.ndarray) -> Terms:
-        """Terms of measured rates of any shape, for expectation propagation; see `ep.terms`.
-
-        TrustboError: the family has none (`propagates` is False).
-        """
-        raise TrustboError(f'expectation propagation does not know observation "{self.name}".')
+        """Terms of measured rates of any shape, for expectation propagation; see `ep.terms`."""
 
     @abstractmethod
     def is_density(self, y: np.ndarray) -> np.ndarray:

@@ -5,14 +5,13 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from jax import Array, random
+from jax import Array
 from numpy import ndarray
 from numpy.random import Generator
 from scipy.stats import norm
 
 from trustbo.models.families.family import SSM, Family, Moments, Observed
 from trustbo.models.families.terms import GAUSSIAN, NONE, Terms
-from trustbo.models.state_space.scalar import Filtered
 
 
 @dataclass(frozen=True)
@@ -26,19 +25,6 @@ class Gaussian(Family):
     def log_density(self, ssm: SSM, observed: Observed, e: Array, complete: bool = False) -> Array:
         """See `Family.log_density`; innovations are not read."""
         return ssm.log_likelihood(observed.y, complete=complete)
-
-    def filter(self, ssm: SSM, observed: Observed, e: Array, complete: bool = False) -> Filtered:
-        """Moments of trust given the rates so far."""
-        return ssm.filter(observed.y, complete=complete)
-
-    def draw_trust(self, ssm: SSM, observed: Observed, e: Array, key: Array) -> Array:
-        """See `Family.draw_trust`; a separate draw, from `key`."""
-        filtered = self.filter(ssm, observed, e)
-        return ssm.sample_backward(filtered, random.normal(key, e.shape, e.dtype))
-
-    def trust_moments(self, ssm: SSM, observed: Observed, e: Array) -> tuple[Array, Array]:
-        """See `Family.trust_moments`; by the smoother."""
-        return ssm.smooth(self.filter(ssm, observed, e))
 
     def measure(self, key: Array, ssm: SSM, trust: Array, y: Array, n_ticks: Array) -> Array:
         """See `Family.measure`: `y` unclipped, which may leave [0, 1]."""
