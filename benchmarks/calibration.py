@@ -1,22 +1,19 @@
 """Simulation-based calibration of every model, family and sampler; prints the table of the docs.
 
-Run: python benchmarks/calibration.py [exact] [nuts] [joint] [--share 1] [--out out/calibration]
+Run: python benchmarks/calibration.py [exact] [nuts] [--share 1] [--out out/calibration]
 
 Ranks are kept in the folder after each data set: a run that was stopped goes on where it was.
 """
 
 import sys
 
-import jax.numpy as jnp
 from common import Table, arguments, parsed, timed
-from numpyro.distributions import HalfNormal, LogNormal, Normal
 from sbc_places import Walks
 
 from trustbo.inference import sbc
 from trustbo.inference.samplers.choice import why_not_scores
 from trustbo.models import (
     CoupledTrust,
-    DriftTrust,
     HierarchicalTrust,
     HumanTrust,
     PlaceEffect,
@@ -27,16 +24,6 @@ from trustbo.models import (
 SMALL = (3, 6, 2, 2)  # missions, bounds, robots, features
 LOG = (2, 40, 3, 1)  # missions of a log, trust carried over all of it
 PEOPLE = (12, 5, 1, 2)  # persons, steps, tasks, success and failure
-OWN = {
-    "top": HalfNormal(1.0),
-    "slope": LogNormal(1.0, 0.7),
-    "own": (Normal(0.0, 0.3), "robot"),
-}
-
-
-def saturating(z, top, slope, own):
-    """A drift of the user's own: sight that saturates, and a weight of each robot."""
-    return top * (1.0 - jnp.exp(-slope * z[:, 0])) + own * z[:, 1]
 
 
 def cases():
@@ -56,7 +43,6 @@ def cases():
         yield PooledTrust(memory="deviation", **robots), "exact", 200, LOG
     yield HierarchicalTrust(observation="beta_binomial"), "exact", 200, LOG
     yield HierarchicalTrust(), "exact", 300, SMALL
-    yield DriftTrust(saturating, OWN), "exact", 300, SMALL
     yield CoupledTrust(), "exact", 200, SMALL
     yield CoupledTrust(inter_robot="ordered"), "exact", 200, SMALL
     yield PooledTrust(place=PlaceEffect()), "exact", 300, SMALL
@@ -89,7 +75,6 @@ def main():
         n = 2 if given.quick else max(2, round(n * given.share))
         name = type(model).__name__
         detail = getattr(model, "inter_robot", model.response)
-        detail = "saturating" if isinstance(model, DriftTrust) else detail
         effects = ["places"] * (model.place is not None) + ["robots"] * bool(model.effects)
         detail = " and ".join(effects) or detail
         detail = getattr(model, "scale", detail)

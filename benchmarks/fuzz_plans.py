@@ -21,7 +21,6 @@ import sys
 import tempfile
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -93,7 +92,7 @@ def draw_model(rng, z, beta0, kind):
     n, sd = len(z), pick(rng, 0.0, 0.1, 0.4)
     x0, model = (
         float(numbers(rng, pick(rng, "usual", kind))),
-        pick(rng, "pooled", "robots", "coupled", "own"),
+        pick(rng, "pooled", "robots", "coupled"),
     )
     b = numbers(rng, kind, n) * 0.5 - pick(rng, 0.0, 0.3)
     if model == "coupled":
@@ -118,29 +117,9 @@ def draw_model(rng, z, beta0, kind):
         sds = sd * rng.uniform(0.5, 1.0, n)
         params = RobotParams(own, beta, b, np.full(n, 0.1), sds, x0, **places)
         return params, u, np.diag(own), float(sds.mean()), False
-    if model == "own":
-        top, slope = float(numbers(rng, kind)), float(rng.normal(2.0, 1.0))
-        values = {"beta0": beta0, "top": top, "slope": slope, "delta_w": 0.1, "delta_v": sd}
-        params = own_drift().params(values, 2)._replace(x0_mean=x0, **places)
-        u = u + top * (1.0 - np.exp(-slope * z[..., 0])) - z[..., 1] ** 2
-        return params, u, beta0 * np.eye(n), sd, True
     beta = numbers(rng, kind, 2)
     params = TrustParams(beta0, beta, b[0], 0.1, sd, x0, **places)
     return params, u + z @ beta + b[0], beta0 * np.eye(n), sd, True
-
-
-@cache
-def own_drift():
-    """A model with a drift of its own form, made once."""
-    import jax.numpy as jnp
-    from numpyro.distributions import Normal
-
-    from trustbo.models import DriftTrust
-
-    def saturating(z, top, slope):
-        return top * (1.0 - jnp.exp(-slope * z[:, 0])) - z[:, 1] ** 2
-
-    return DriftTrust(saturating, {"top": Normal(0.0, 1.0), "slope": Normal(2.0, 1.0)})
 
 
 def draw_limit(rng, case):

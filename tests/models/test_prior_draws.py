@@ -13,7 +13,6 @@ from trustbo.errors import ShapeError, TrustboError
 from trustbo.inference import prior_predictive, sample_prior
 from trustbo.models import (
     CoupledTrust,
-    DriftTrust,
     HierarchicalTrust,
     PlaceEffect,
     PooledTrust,
@@ -160,16 +159,6 @@ def test_draws_have_the_moments_of_the_numpyro_program(model):
         error = np.sqrt((one.var(0) + other.var(0)) / N) + 1e-12
         # Some 600 moments, products of normals with heavy tails among them.
         assert (np.abs(one.mean(0) - other.mean(0)) < 5.5 * error).all()
-
-
-def test_a_prior_without_quantiles_is_drawn_from_too():
-    """By the model's own sample statements, in batches of which the last is not full."""
-    model = DriftTrust(lambda z, top: top * z[:, 0], {"top": dist.Gamma(4.0, 2.0)})
-    assert model.draw_prior((2, 1), 10, np.random.default_rng(0)) is None
-    drawn = prior_predictive(model, np.full((1, 2, 2, 1), 0.5), n_draws=1200, seed=3)["prior"]
-    assert drawn["top"].sizes["draw"] == 1200
-    # One chance in a hundred thousand of a false alarm.
-    assert stats.kstest(drawn["top"].values.ravel(), stats.gamma(4.0, scale=0.5).cdf).pvalue > 1e-5
 
 
 def test_what_the_prior_cannot_predict_is_refused():

@@ -3,14 +3,12 @@
 import heapq
 from functools import cache
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from numpyro.distributions import Normal
 from references import of_bounds, path_values, sums_of, walks
 from worlds import with_unseen
 
-from trustbo.models import CoupledParams, DriftTrust, RobotParams, TrustParams
+from trustbo.models import CoupledParams, RobotParams, TrustParams
 from trustbo.planning import Planner
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import MOVES
@@ -24,13 +22,6 @@ BETA0 = {
     "stationary": (-0.8, 0.0, 0.3, 0.7),
 }
 CELL = 20.0
-
-
-def saturating(z, top, slope):
-    return top * (1.0 - jnp.exp(-slope * z[:, 0])) - z[:, 1] ** 2
-
-
-OWN = DriftTrust(saturating, {"top": Normal(0.0, 1.0), "slope": (Normal(2.0, 1.0), "robot")})
 
 
 @cache
@@ -78,17 +69,6 @@ def random_problem(model, n, n_robots, beta0, rng, *, moves=()):
         beta, b = rng.normal(size=2), rng.normal(-0.3, 0.5)
         params = TrustParams(beta0, beta, b, 0.1, 0.1)
         return z, params, of_bounds(z @ beta + b), beta0 * np.eye(n_robots)
-    if model == "own":
-        params = OWN.params(
-            {"beta0": beta0, "top": 1.2, "slope": rng.normal(2.0, 1.0, n_robots), "delta_w": 0.1,
-             "delta_v": 0.1}, 2,
-        )  # fmt: skip
-        slope = params.drift.theta["slope"]
-        u = np.stack([
-            1.2 * (1.0 - np.exp(-slope[i] * z[i, ..., 0])) - z[i, ..., 1] ** 2
-            for i in range(n_robots)
-        ])  # fmt: skip
-        return z, params, of_bounds(u), beta0 * np.eye(n_robots)
     if model == "hierarchical":
         own = beta0 * rng.uniform(0.7, 1.0, n_robots)
         beta, b = rng.normal(size=(n_robots, 2)), rng.normal(-0.3, 0.5, n_robots)
@@ -135,9 +115,7 @@ def problem(
         shares = rng.uniform(size=(8, n, n))
         workspace = with_unseen(workspace, shares)
         toll = toll + unseen * sums_of(shares, paths, n_cells)
-    if (
-        model in ("pooled", "own") and team == "mean"
-    ):  # one state, whose drift is capped for lost_contact
+    if model == "pooled" and team == "mean":  # one state, whose drift is capped for lost_contact
         u, transition = u.mean(0, keepdims=True), transition[:1, :1]
     rates = family, np.sqrt(0.1) if model == "coupled" else 0.1
     values = path_values(
@@ -234,8 +212,6 @@ def test_dijkstra_with_trust_on_arrival_as_label_is_wrong_on_the_same_maps(objec
         ("pooled", "min"),
         ("hierarchical", "mean"),
         ("hierarchical", "min"),
-        ("own", "mean"),
-        ("own", "min"),
         ("coupled", "mean"),
         ("coupled", "min"),
     ],

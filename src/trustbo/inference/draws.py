@@ -53,14 +53,13 @@ def params_of(posterior: xr.DataTree, *, day: bool = False) -> Params:
             plans. Without effects other than of places there is no difference.
 
     Returns:
-        `TrustParams`, `RobotParams`, `CoupledParams` or `DriftParams`, according to the model. With
+        `TrustParams`, `RobotParams` or `CoupledParams`, according to the model. With
         effects other than of places, `RobotParams` of the next mission: with `RobotEffect`, weights
         of line of sight have the effect of each robot, in which the last bad day is gone and what
         stays fades.
 
     Raises:
-        TrustboError: No posterior of `fit`; or one with the drift of a `DriftTrust` that this
-            process has not made.
+        TrustboError: No posterior of `fit`.
     """
     if is_of_people(require_posterior("params_of", posterior)):
         raise TrustboError(

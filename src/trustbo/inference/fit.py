@@ -230,7 +230,6 @@ def _record(
         **model.options(),
         "place": "none" if model.place is None else json.dumps(model.place.to_record()),
         "model_record": json.dumps(model_to_record(model)),
-        **model.marks(batch.awareness.shape[2:]),
         "n_robots": batch.awareness.shape[2],
         **({"n_missions": n_missions} if model.effects else {}),
         "x0_mean": float(model.priors.x0_mean),

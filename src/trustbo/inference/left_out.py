@@ -51,7 +51,7 @@ def by_hyperparameters(posterior: xr.DataTree, model: TrustModel) -> list[LeftOu
 
     Returns:
         One for each mission; None where the model has no effects, or where only approximations
-        integrate these out (rates not Gaussian, a custom drift).
+        integrate these out (rates not Gaussian).
     """
     exact = model.robot_sets == "all" and model.family.integrates_out
     if not model.all_effects or not exact or model.why_not_exact is not None:

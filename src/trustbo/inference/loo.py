@@ -31,7 +31,7 @@ def loo(posterior: xr.DataTree, *, model: TrustModel | None = None) -> ELPDData:
 
     Args:
         posterior: DataTree from `fit`.
-        model: Its model; needed where it has custom priors or a custom drift. Without it, a mission
+        model: Its model; needed where it has custom priors. Without it, a mission
             that needs a refit keeps the density by weights of draws, with a warning.
 
     Returns:

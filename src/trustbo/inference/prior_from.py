@@ -76,7 +76,7 @@ def _require_alike(posteriors: Sequence[xr.DataTree]) -> tuple[str, ...]:
         require_posterior("prior_from", posterior)
     if not posteriors:
         raise TrustboError("there are no posteriors to learn priors from; give one at least.")
-    none = xr.DataArray([])  # of a custom drift
+    none = xr.DataArray([])
     features_of = [p["posterior"].coords.get("feature", none).values for p in posteriors]
     names = [tuple(map(str, features)) for features in features_of]
     for j, (posterior, features) in enumerate(zip(posteriors, names, strict=True)):

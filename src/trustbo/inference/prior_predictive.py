@@ -128,7 +128,6 @@ def draw_sites(
     sites = model.draw_prior(shape, n_draws, np.random.default_rng(seed))
     if sites is None:
         sites = _compiled_draws(model, shape, n_draws, seed)
-    model.check(sites, shape)
     return sites | _effect_draws(model, n_draws, seed)
 
 

@@ -3,9 +3,9 @@
 from trustbo.models import backend as backend  # first: it loads numpyro
 
 # isort: split
+from trustbo.models.contact_rate import ContactRate
 from trustbo.models.coupled import CoupledTrust
 from trustbo.models.default import default_model
-from trustbo.models.drift import DriftTrust
 from trustbo.models.effects.person import PersonEffect
 from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.effects.robot import RobotEffect
@@ -16,9 +16,9 @@ from trustbo.models.pooled import PooledTrust
 from trustbo.models.priors import Priors
 
 __all__ = [
+    "ContactRate",
     "CoupledParams",
     "CoupledTrust",
-    "DriftTrust",
     "HierarchicalTrust",
     "HumanTrust",
     "PersonEffect",

@@ -7,11 +7,6 @@ if TYPE_CHECKING:
 
 _REFUSED: tuple[tuple[tuple[str, ...], set[str], str], ...] = (
     (
-        ("drift",),
-        {"not Gaussian"},
-        "its drift is a function of your own, and its observations are not Gaussian",
-    ),
-    (
         ("coupled",),
         {"not Gaussian"},
         "its robots influence each other, and its observations are not Gaussian",

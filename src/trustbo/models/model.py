@@ -26,7 +26,7 @@ from trustbo.models.params import Params, assemble_params, check_params
 from trustbo.models.place import bounds_of, places_of
 from trustbo.models.priors import Priors
 from trustbo.models.priors_numpy import draw
-from trustbo.models.state_space.contact_rate import ContactRate, mission_log_likelihood
+from trustbo.models.state_space.contact_rate import ModelRates, mission_log_likelihood
 from trustbo.models.state_space.generate import TrustSample, draw_missions
 from trustbo.models.ticks import broadcast_ticks, require_ticks, resolution, weigh_ticks
 from trustbo.stacking import MissionBatch, stack_missions
@@ -109,7 +109,7 @@ class TrustModel(Displayed, ABC):
 
         `"all"` robots share them, `"each"` has separate ones; these two have sufficient statistics.
         Those of `"pooled"` robots have a common distribution, `"coupled"` robots influence each
-        other, `"drift"` is a custom function. Only NUTS takes any `"other"`.
+        other. Only NUTS takes any `"other"`.
         """
         return "other"
 
@@ -145,18 +145,6 @@ class TrustModel(Displayed, ABC):
             for name, size in self.sizes(*shape).items()
         }
         return priors.of_stationary(drawn, rest_of(drawn["beta0"], self.memory))
-
-    def check(self, sites: Mapping[str, np.ndarray], shape: tuple[int, int]) -> None:
-        """Refuse a model that is invalid at draws from its prior: TrustboError.
-
-        Args:
-            sites: Draws by name, leading axis (draw,).
-            shape: Number of robots and of features.
-        """
-
-    def marks(self, shape: tuple[int, int]) -> dict[str, Any]:
-        """Attributes that identify the model in a posterior of that many robots and features."""
-        return {}
 
     def for_features(self, features: Sequence[str]) -> Self:
         """The model with default priors for features of these names; custom priors stay.
@@ -266,7 +254,7 @@ class TrustModel(Displayed, ABC):
             params: Any = params._replace(b=params.b + drift(params))  # pyright: ignore
         if not self.family.integrates_out:
             innovations = sample_innovations((n_bounds, n_missions, n_robots))
-        rates = ContactRate(
+        rates = ModelRates(
             params,
             awareness,
             n_ticks=n_ticks,

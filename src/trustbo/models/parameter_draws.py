@@ -7,7 +7,6 @@ import numpy as np
 
 from trustbo.data import Cell
 from trustbo.display.card import Card, Displayed
-from trustbo.models.drift_form import Drift
 from trustbo.workspace.moves import bounds_along
 
 if TYPE_CHECKING:
@@ -32,8 +31,6 @@ class ParameterDraws(Displayed):
     """Name of the field with the weights of features."""
     BY_ROBOT: ClassVar[bool] = False
     """Whether coefficients differ by robot; b then has the axis (robot,)."""
-    LINEAR: ClassVar[bool] = True
-    """Whether drift is linear in awareness: the mean over robots alike then has their equation."""
     _fields: ClassVar[tuple[str, ...]]
 
     def _card(self) -> Card:
@@ -54,11 +51,8 @@ class ParameterDraws(Displayed):
 
     @property
     def by_name(self) -> dict[str, Numbers]:
-        """Values by name, those of a drift among them; fields that are None left out."""
-        values: dict[str, Numbers] = {}
-        for name in self._fields:
-            value = getattr(self, name)
-            values |= dict(value.theta) if isinstance(value, Drift) else {name: value}
+        """Values by name; fields that are None left out."""
+        values = {name: getattr(self, name) for name in self._fields}
         return {name: value for name, value in values.items() if value is not None}
 
     @property
@@ -197,11 +191,9 @@ class ParameterDraws(Displayed):
 
     def map(self, function: Callable[[Numbers, int], Numbers]) -> Self:
         """Apply a function to each field and the number of its trailing axes."""
-        core = {name: len(self.AXES.get(name, ())) for name in self._fields}
         values = {
-            name: value.map(function) if isinstance(value, Drift) else function(value, n)
-            for name, n in core.items()
-            if (value := getattr(self, name)) is not None
+            name: function(value, len(self.AXES.get(name, ())))
+            for name, value in self.by_name.items()
         }
         return self._replace(**values)  # pyright: ignore[reportAttributeAccessIssue]
 

@@ -8,7 +8,6 @@ import numpy as np
 from jax import Array
 
 from trustbo.errors import ShapeError, TrustboError
-from trustbo.models.drift_form import Drift, find_drift
 from trustbo.models.parameter_draws import PLACES, Numbers, ParameterDraws
 from trustbo.models.state_space.scalar import ScalarSSM
 from trustbo.models.state_space.vector import VectorSSM
@@ -193,68 +192,7 @@ class CoupledParams(ParameterDraws, _Coupled):
         return VectorSSM(p.B0, drift, p.Delta_w, p.Delta_v, p.x0_mean, p.x0_sd, lag)
 
 
-class _OwnDrift(NamedTuple):
-    beta0: Numbers
-    drift: Drift
-    delta_w: Numbers
-    delta_v: Numbers
-    x0_mean: Numbers = 0.5
-    x0_sd: Numbers = 0.5
-    b: Numbers = 0.0
-    place: Numbers | None = None
-    place_bound: Numbers | None = None
-
-
-class DriftParams(_Apart, _OwnDrift):
-    """Parameters of `DriftTrust`; made by its `params`.
-
-    Fields: beta0 (...,), the drift with its parameters, delta_w and delta_v (...,), x0_mean, x0_sd,
-    place and place_bound as in `TrustParams`; b is 0, for effects of places to enter by.
-    """
-
-    __slots__ = ()
-    LINEAR: ClassVar = False
-    AXES: ClassVar = {"beta0": (), **PLACES}
-
-    @property
-    def n_features(self) -> int:
-        """Number of features."""
-        return self.drift.n_features
-
-    def _drift(self, awareness: Array) -> Array:
-        return self.drift.at(awareness) + self.b
-
-    def increments(self, awareness: np.ndarray) -> np.ndarray:
-        """See `ParameterDraws.increments`."""
-        leading, shape = self.leading, awareness.shape[-4:-1]
-
-        def flat(value: np.ndarray, n: int) -> np.ndarray:
-            core = np.shape(value)[np.ndim(value) - n :]
-            return np.broadcast_to(value, leading + core).reshape(-1, *core)
-
-        drift = self.drift.map(flat) if leading else self.drift
-        bounds = np.moveaxis(awareness, -5, -2)  # (..., move, row, col, robot, feature)
-        bounds = bounds.reshape(*awareness.shape[:-5], -1, *bounds.shape[-2:])
-        u = np.swapaxes(drift.values(bounds, many=bool(leading)), -1, -2)
-        return u.reshape(*leading, -1, *shape)
-
-    def with_drift(self, awareness: np.ndarray) -> "TrustParams":
-        """See `ParameterDraws.with_drift`: the drift of each bound is its intercept."""
-        n_draws, n_features = len(self.beta0), awareness.shape[-1]
-        u = self.drift.values(awareness.reshape(-1, *awareness.shape[2:]), many=True)
-        u = u.reshape(n_draws, *awareness.shape[:3])
-        b = np.asarray(self.b)
-        fields = {
-            name: getattr(self, name)
-            for name in ("beta0", "delta_w", "delta_v", "x0_mean", "x0_sd")
-        }
-        zero = np.zeros((n_draws, n_features))
-        return TrustParams(
-            beta=zero, b=u + (b if b.ndim == 4 else b[:, None, None, None]), **fields
-        )
-
-
-Params = TrustParams | RobotParams | CoupledParams | DriftParams
+Params = TrustParams | RobotParams | CoupledParams
 
 
 def ordered_params(sites: Mapping[str, Numbers], x0_mean: Numbers, x0_sd: Numbers) -> CoupledParams:
@@ -286,15 +224,9 @@ def ordered_params(sites: Mapping[str, Numbers], x0_mean: Numbers, x0_sd: Number
 
 
 def params_from(sites: Mapping[str, np.ndarray], about: Mapping[Any, Any]) -> Params:
-    """Parameters from draws by name, leading axis (draw,), and the attributes of a posterior.
-
-    TrustboError: the drift was not built in this process.
-    """
+    """Parameters from draws by name, leading axis (draw,), and the attributes of a posterior."""
     x0 = {name: about[name] for name in ("x0_mean", "x0_sd")}
-    if "drift" not in about:
-        return assemble_params(sites, x0, about.get("memory", "level"))
-    shared = {name: sites[name] for name in ("beta0", "delta_w", "delta_v")}
-    return DriftParams(drift=find_drift(about, sites), **shared, **x0)
+    return assemble_params(sites, x0, about.get("memory", "level"))
 
 
 def assemble_params(
@@ -326,9 +258,6 @@ def check_params(params: Params, n_robots: int | None, n_features: int) -> None:
     for field, value in params.places.items():
         if (n := value.shape[-len(PLACES[field])]) not in (1, n_robots or n):
             raise ShapeError(f"params.{field} is of {n} robots, but the missions have {n_robots}.")
-    if isinstance(params, DriftParams):
-        params.drift.require(n_robots, n_features)
-        return
     name = params.WEIGHTS
     axes, shape = params.AXES[name], np.shape(getattr(params, name))
     if len(shape) < len(axes):

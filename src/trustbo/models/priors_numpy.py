@@ -41,23 +41,6 @@ def log_prob(prior: Distribution, x: np.ndarray) -> np.ndarray:
         return np.asarray(call(prior, "log_prob", jax.numpy.asarray(x)), dtype=float)
 
 
-def quantile_at(prior: Distribution, score: jax.Array) -> jax.Array:
-    """Quantile of a prior of independent numbers at Phi(score), in JAX; shape of the scores.
-
-    NotImplementedError: it has no quantiles.
-    """
-    one: Any = prior
-    while isinstance(one, dist.Independent | dist.ExpandedDistribution):
-        one = one.base_dist
-    if one.event_shape:
-        raise NotImplementedError
-    if isinstance(prior := one, dist.Normal | dist.LogNormal):  # to the far tails
-        line = jax.numpy.asarray(prior.loc) + jax.numpy.asarray(prior.scale) * score
-        return line if isinstance(prior, dist.Normal) else jax.numpy.exp(line)
-    share = jax.numpy.clip(jax.scipy.special.ndtr(score), 1e-300, 1.0 - 1e-16)
-    return jax.numpy.asarray(one.icdf(share))
-
-
 class Table(NamedTuple):
     """A function of a number by its cubic spline; JAX lacks or slowly compiles many quantiles."""
 

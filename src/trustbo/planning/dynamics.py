@@ -102,7 +102,7 @@ def trust_dynamics(
         transition = params.expected_transition(n_robots)
         return Dynamics(transition, drift(params, z, moves), start, views, sd)
     # The mean over robots obeys the same equation.
-    z = z.mean(-5, keepdims=True) if n_robots > 1 and params.LINEAR else z
+    z = z.mean(-5, keepdims=True) if n_robots > 1 else z
     u = drift(params, z, moves).mean(-4, keepdims=True)  # robots may differ in effects of places
     start = start.mean(-1, keepdims=True)
     return Dynamics(params.expected_transition(1), u, start, np.eye(1), sd)
@@ -110,8 +110,6 @@ def trust_dynamics(
 
 def drift(params: Params, awareness: ArrayLike, moves: np.ndarray | None = None) -> np.ndarray:
     """Increment of trust by one bound, u = sum_m beta_m z_m + b, (..., robot, move, row, col).
-
-    Of `DriftParams`, the values of their drift instead.
 
     Awareness (robot, move, row, col, feature), or with a leading axis (draw,) like the parameters'.
     Effects of places are added, those of bounds for the given `moves`, by default all; or those of

@@ -126,7 +126,6 @@ def _criticism(result: Result) -> Section:
 
 def _meaning_of_parameters(result: Result) -> str:
     itself, awareness = ("B0", "B") if "B0" in result.posterior["posterior"] else ("beta0", "beta")
-    awareness = result.posterior.attrs.get("drift", awareness)  # a custom function
     return (
         f"The parameters of the model, {result.settings['model']}: trust follows itself by "
         f"{itself}, and the awareness of the bound by {awareness}."

@@ -86,16 +86,14 @@ def test_the_evidence_is_that_of_the_joint_normal(name, memory):
 @pytest.mark.parametrize("lag", [0.0, 1.0])
 @pytest.mark.parametrize("name", ["weights", "places and robots"])
 def test_robots_of_separate_memory_and_changes_of_trust_have_the_joint_normal_too(name, lag):
-    """With gaps, of which robots share some, and drifts that are no column."""
+    """With gaps, of which robots share some."""
     rng, effects = np.random.default_rng(3), EFFECTS[name]
     slots, groups = gathered(walking_missions(1, 5, missing=0.3), effects)
     theta = random_theta(effects, rng, 5)
     theta["beta0"] = rng.uniform(0.0, 1.1, (5, slots.n_robots))
-    theta["drift"] = 0.2 * rng.standard_normal((5, *slots.y.shape))
     found = Gaussian(slots, groups, X0, apart=True, lag=lag).log_density(theta)
     for t in range(5):
-        drift = Further(sparse.csr_array(theta["drift"][t].reshape(-1, 1)), 0.0, mean=1.0)
-        dense = Dense(slots, [*groups, drift], point(theta, t), X0, lag=lag)
+        dense = Dense(slots, groups, point(theta, t), X0, lag=lag)
         np.testing.assert_allclose(found[t], dense.log_density(), rtol=1e-10)
 
 

@@ -10,7 +10,7 @@ from references import dense_joint
 from trustbo.models import CoupledParams, RobotParams, TrustParams
 from trustbo.models.backend import own_settings
 from trustbo.models.families import FAMILIES
-from trustbo.models.state_space.contact_rate import ContactRate
+from trustbo.models.state_space.contact_rate import ModelRates
 from trustbo.models.state_space.generate import draw_missions
 
 GAUSSIAN, N = FAMILIES["gaussian"], 40
@@ -96,14 +96,14 @@ SLOW = pytest.mark.slow  # JAX's samplers of counts and of odd rates compile for
     ],
 )
 def test_numpyro_draws_the_same_missions(family, coupled):
-    """`ContactRate`, by which numpyro draws from a model, against NumPy: two codes of one law."""
+    """`ModelRates`, by which numpyro draws from a model, against NumPy: two codes of one law."""
     rng, n = np.random.default_rng(3), 4000
     p = TrustParams(0.6, np.array([0.5, 0.3]), -0.05, 0.1, 0.2, 0.5, 0.5)
     if coupled:
         p = coupled_draws(rng).draw(0)
     z, ticks = rng.uniform(size=(1, 4, 2, 2)), np.full((1, 4, 2), float(N))
     with own_settings():
-        law = ContactRate(p.map(lambda v, _: jnp.asarray(v, float)), jnp.asarray(z),
+        law = ModelRates(p.map(lambda v, _: jnp.asarray(v, float)), jnp.asarray(z),
                           n_ticks=jnp.asarray(ticks), observation=family, lag=0.0)  # fmt: skip
         theirs = np.asarray(law.sample(jax.random.key(0), (n,)))
     many = p.map(lambda v, _: np.repeat(np.asarray(v, dtype=float)[None], n, 0))

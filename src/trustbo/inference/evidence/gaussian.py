@@ -258,7 +258,6 @@ class Gaussian(Evidence):
         n, (n_chains, K) = len(mean), self.y.shape
         on = np.flatnonzero((mean != 0.0).any(0))
         expected = (self.U[:, on] @ mean[:, on].T).T.reshape(n, n_chains, K)
-        expected = expected + theta.get("drift", 0.0)
         start = np.zeros(N.shape[:3])
         if self.level:
             start = self._beta0(theta)[..., None] * self.x0[0] * N[..., 0]

@@ -9,7 +9,6 @@ from trustbo.models.params import (
     CoupledParams,
     DeviationParams,
     DeviationRobotParams,
-    DriftParams,
     Params,
     RobotParams,
     TrustParams,
@@ -32,9 +31,7 @@ class Rates(NamedTuple):
 class ApartFilter:
     """Robots that do not influence each other; arrays are (draw, robot)."""
 
-    def __init__(
-        self, params: TrustParams | RobotParams | DriftParams, lag: float, n_robots: int
-    ) -> None:
+    def __init__(self, params: TrustParams | RobotParams, lag: float, n_robots: int) -> None:
         self._p: Any = params
         self._n_robots = n_robots
         columns = (params.beta0, params.b, params.delta_w**2, params.delta_v**2)
@@ -146,14 +143,6 @@ class DeviationFilter(ApartFilter):
         return trust - self._drift(z) - effect
 
 
-class DriftFilter(ApartFilter):
-    """Robots with a custom drift."""
-
-    def _drift(self, z: np.ndarray) -> np.ndarray:
-        inputs = z[:, None] if z.ndim == 3 else z[None]
-        return self._p.drift.values(inputs, many=True)[:, 0] + self._b
-
-
 class CoupledFilter:
     """Coupled robots; means (draw, robot), covariances (draw, robot, robot).
 
@@ -248,4 +237,4 @@ def live_filter(params: Params, lag: float, n_robots: int) -> ApartFilter | Coup
         return CoupledFilter(params, lag, n_robots)
     if isinstance(params, DeviationParams | DeviationRobotParams):
         return DeviationFilter(params, lag, n_robots)
-    return (DriftFilter if isinstance(params, DriftParams) else ApartFilter)(params, lag, n_robots)
+    return ApartFilter(params, lag, n_robots)

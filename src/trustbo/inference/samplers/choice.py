@@ -45,9 +45,7 @@ def resolve_sampler(model: TrustModel, sampler: str) -> tuple[str, str]:
     reason = model.why_not_exact or why_not_priors(model)
     if reason is None:
         by = "" if model.family.integrates_out else " by expectation propagation, and weights"
-        linear = model.robot_sets != "drift"
-        what = "trust and coefficients integrate out" if linear else "trust integrates out"
-        return "exact", f"{what}{by}"
+        return "exact", f"trust and coefficients integrate out{by}"
     if model.memory != "level":
         raise TrustboError(
             f'no sampler can treat {model.describe()}: {reason}. Give memory="level", or others of '
@@ -76,7 +74,7 @@ def why_not_scores(model: TrustModel) -> str | None:
     if not model.family.integrates_out:
         return "its observations are not Gaussian"
     if model.robot_sets not in ("all", "each", "pooled"):
-        return "its drift is a function of your own, or its robots influence each other"
+        return "its robots influence each other"
     pooled = model.robot_sets == "pooled"
     return why_not_conjugate(model.priors) or why_no_quantiles(model.priors, partial_pooling=pooled)
 
@@ -89,9 +87,8 @@ def with_warmup(settings: NutsSettings, model: TrustModel) -> NutsSettings:
 
 def why_not_priors(model: TrustModel) -> str | None:
     """Reason why a model's priors do not suit its evidence or scores; None if they do."""
-    sets, linear = model.robot_sets, model.robot_sets != "drift"
-    coupled, pooled = sets == "coupled", sets == "pooled"
-    if linear and (reason := why_not_conjugate(model.priors, coupled=coupled)):
+    coupled, pooled = model.robot_sets == "coupled", model.robot_sets == "pooled"
+    if reason := why_not_conjugate(model.priors, coupled=coupled):
         return reason
     return None if by_sums(model) else why_no_quantiles(model.priors, partial_pooling=pooled)
 

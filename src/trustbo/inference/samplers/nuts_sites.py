@@ -1,6 +1,6 @@
 """NUTS on a model's sample statements, for what no evidence integrates out.
 
-These are coupled robots, custom drifts and priors without quantiles, all of Gaussian rates. The
+These are coupled robots and priors without quantiles, all of Gaussian rates. The
 numpyro model itself stays plain: here its sample statements stand with a likelihood that takes the
 weight of each mission. The unknowns are the sites on the real line, but for the noises and the
 intercept: data fix the total of the noises well and their ratio badly, and the mean level of trust,
@@ -77,7 +77,7 @@ class SitesInJax:
         together = (seen.any(2) == seen.all(2)).all()
         over = (np.diff(seen.any(2).astype(int), axis=1) <= 0).all()
         means = None
-        linear = model.robot_sets not in ("drift", "pooled") and model.memory == "level"
+        linear = model.robot_sets != "pooled" and model.memory == "level"
         if linear and model.priors.b.support is constraints.real:
             n = np.maximum(seen.sum((0, 1)), 1)[:, None]
             z = np.where(seen[..., None], batch.awareness, 0.0).sum((0, 1)) / n

@@ -15,7 +15,6 @@ from trustbo.inference.samplers.convergence import (
     complaints_of_means,
 )
 from trustbo.inference.samplers.coupled_target import CoupledTarget
-from trustbo.inference.samplers.drift_scores import DriftPosterior
 from trustbo.inference.samplers.exact import ExactDraws, sample_exact
 from trustbo.inference.samplers.importance import (
     ScoreTarget,
@@ -184,7 +183,6 @@ def _pop_effects(
 
 
 _TARGETS: dict[str, Callable[[Any, MissionBatch, np.ndarray, Slots], ScoreTarget]] = {
-    "drift": lambda model, batch, _, slots: DriftPosterior.of(model, batch, slots),
     "coupled": lambda model, batch, weight, _: CoupledTarget(model, batch, weight),
     "people": lambda model, batch, weight, slots: PeoplePosterior(model, slots),
 }

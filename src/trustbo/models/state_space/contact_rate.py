@@ -15,8 +15,8 @@ from trustbo.models.params import Params
 _BATCH = 256  # draws computed at once
 
 
-class ContactRate(dist.Distribution):
-    """Joint distribution of a batch of missions' contact rates.
+class ModelRates(dist.Distribution):
+    """Joint distribution of a batch of missions' contact rates under a trust model.
 
     Batch shape (mission,), event shape (bound, robot). A rate that is NaN counts as not measured.
     Latent trust is integrated out where its family allows; else `log_prob` is a weight that depends
