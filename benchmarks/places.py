@@ -1,11 +1,10 @@
-"""Effects of places: what they cost, what they cost where there are none, and learned priors.
+"""Effects of places: what they cost, and what they cost where there are none.
 
-Run: python benchmarks/places.py [times|nuts|absent|terrains|sights|stopping ...] [--data DIR]
+Run: python benchmarks/places.py [times|nuts|absent|sights|stopping ...] [--data DIR]
 
 - times: refits and draws by effects and family, medians of three, one core; NUTS (the peer).
 - nuts: means and sds of twelve seeds together, beside long NUTS (the peer); fifteen minutes.
 - absent: truths without effects of places; regret with them in the model and without.
-- terrains: priors from campaigns on the other terrains, leave-one-terrain-out.
 - sights: line of sight under one wrong assumption, and under three that bracket the truth.
 - stopping: campaigns that `RegretBound(eps=.05)` stopped, and how many of them were wrong.
 """
@@ -23,11 +22,11 @@ from common import Table, arguments, median_processor_seconds, parsed, timed
 from scipy.stats import binomtest
 
 import trustbo as tb
-from trustbo.inference import params_of, prior_from
+from trustbo.inference import params_of
 from trustbo.models import PlaceEffect, PooledTrust, RobotEffect, TrustParams
 from trustbo.simulation import ModelSimulator, Truth
 from trustbo.study import worlds
-from trustbo.study.world import COURSES, REAL
+from trustbo.study.world import COURSES
 from trustbo.terrain import synthetic_terrain
 from trustbo.workspace.sight import Sight
 
@@ -168,31 +167,6 @@ def absent(given):
           f"(prior {PlaceEffect().tau_s * 0.674:.3f})")  # fmt: skip
 
 
-def terrains(given):
-    """Priors of the other terrains, on worlds of an old survey."""
-    grounds = ("synthetic-0", "synthetic-1", *(REAL if given.data else ()))
-    chosen = [worlds(given.data)[f"{ground}-aged"] for ground in grounds]
-
-    def run(world, course, model, n):
-        return campaign(world, world.workspace(), course, n, seed=1, model=model)
-
-    posteriors = [run(world, "nw-se", PLACES, 15)[0].posterior for world in chosen]
-    head = "world", "course", "regret after 1, default", "learned prior", "after 3", "learned"
-    table = Table(*head)
-    rows = []
-    for i, world in enumerate(chosen):
-        learned = prior_from([p for j, p in enumerate(posteriors) if j != i])
-        for course in COURSES:
-            row = []
-            for model in (PLACES, learned):
-                row += [*run(world, course, model, 3)[1][[0, 2]]]
-            rows.append(row)
-            table.row(world.name, course, *(f"{row[i]:.2f}" for i in (0, 2, 1, 3)))
-    after = np.array(rows)
-    print(f"\nmedians {np.median(after, axis=0).round(2)}, means {after.mean(0).round(2)} "
-          "(default after 1, 3; learned after 1, 3)")  # fmt: skip
-
-
 def sights(given):
     """Wrong canopy: one assumption of sight, and three that bracket the truth."""
     three = [Sight(extinction=0.3), Sight(extinction=0.1 / 3.0), Sight(crown_base=0.0)]
@@ -273,7 +247,7 @@ def moments(posterior):
 
 
 def main():
-    parts = {f.__name__: f for f in (times, nuts, absent, terrains, sights, stopping)}
+    parts = {f.__name__: f for f in (times, nuts, absent, sights, stopping)}
     parser = arguments(__doc__, names=parts, data=True, quick="one row, two campaigns")
     parser.set_defaults(names=["times", "absent"])
     given = parsed(parser)

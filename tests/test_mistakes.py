@@ -17,7 +17,6 @@ from trustbo.inference import (
     loo,
     params_of,
     place_maps,
-    prior_from,
     prior_predictive,
     sample_prior,
 )
@@ -117,12 +116,6 @@ MISTAKES = {
     ),
     "places of missions": (
         lambda c: place_maps([c.mission]), "posterior: got list .Mission.*; give one of trust"
-    ),
-    "a prior from missions": (
-        lambda c: prior_from([c.mission]), "prior_from takes a posterior from fit; got a Mission"
-    ),
-    "a prior from one posterior": (
-        lambda c: prior_from(c.result.posterior), "a list of posteriors; got one. Write .posterior"
     ),
     "a filter over a model": (lambda c: TrustFilter(PooledTrust()), "got PooledTrust rates gauss"),
     # places

@@ -11,7 +11,7 @@ from scipy import stats
 
 import trustbo as tb
 from trustbo.errors import TrustboError
-from trustbo.inference import compare_people, fit, loo, predict_reports, sbc
+from trustbo.inference import fit, loo, predict_reports, sbc
 from trustbo.inference.people import draw_people, model_of_people
 from trustbo.inference.prior_predictive import draw_sites
 from trustbo.inference.samplers.people import evidence_of
@@ -282,14 +282,6 @@ def test_numbers_at_the_ends_are_limits():
     assert np.isfinite(found["log_score"].values).all()
 
 
-def test_models_are_compared_with_baselines_on_people_left_out(persons):
-    table = compare_people(persons[:30], {"HumanTrust": HumanTrust(scale="likert7")}, folds=2)
-    assert list(table.index) == ["persistence", "means", "ridge", "HumanTrust"]
-    assert table["log_score"]["HumanTrust"] > table["log_score"]["persistence"]
-    table = compare_people(persons[:12], {}, given="none", folds=2)
-    assert list(table.index) == ["means", "ridge"]
-
-
 def test_ranks_of_people_are_of_the_model_s_parameters():
     model = HumanTrust(scale="ordinal7").for_features(("success", "failure"))
     found = sbc(model, n_datasets=2, shape=(4, 3, 1, 2), progress=False)
@@ -319,8 +311,6 @@ def test_the_model_refuses_what_it_is_not_for(posterior, persons):
         fit(persons, HumanTrust(), progress=False, whole=False)
     with pytest.raises(TrustboError, match="criticise is of robots' contact; of reports"):
         tb.criticise(posterior, persons)
-    with pytest.raises(TrustboError, match=r"compare_people: got HumanTrust .*models by name"):
-        compare_people(persons, HumanTrust())
     with pytest.raises(TrustboError, match=r"for reports use trustbo\.inference\.predict_reports"):
         tb.inference.params_of(posterior)
     with pytest.raises(TrustboError, match="HumanTrust has no likelihoods of parameters"):
@@ -340,7 +330,3 @@ def test_the_model_refuses_what_it_is_not_for(posterior, persons):
     pooled = fit(persons, progress=False, whole=False)
     with pytest.raises(TrustboError, match="takes a posterior of HumanTrust; got one of Pooled"):
         predict_reports(pooled, persons)
-    with pytest.raises(TrustboError, match="3 folds need as many people; got 2"):
-        compare_people(persons[:2], {}, folds=3)
-    with pytest.raises(TrustboError, match="model 'pooled' must be a HumanTrust"):
-        compare_people(persons, {"pooled": tb.models.PooledTrust()})

@@ -1,7 +1,6 @@
 """Effects of places against dense joint normals, which share no code with them."""
 
 import itertools
-from dataclasses import replace
 from importlib import import_module
 
 import jax
@@ -499,47 +498,6 @@ def walks(n, start, goal, longest):
             elif len(path) < longest:
                 open_paths.append((*path, cell))
     return found
-
-
-def test_priors_from_earlier_campaigns_have_the_moments_of_an_equal_mixture(learned):
-    _, missions, _, posterior = learned
-    draws, base = posterior["posterior"], Priors()
-    model = tb.inference.prior_from([posterior])
-    b = draws["b"].values.ravel()
-    center, spread = np.median(b), 0.5 * np.subtract(*np.quantile(b, [0.841, 0.159]))
-    assert float(model.priors.b.loc) == pytest.approx(0.5 * center, rel=1e-5)
-    # Variance of a mixture of two: the mean of theirs, and a quarter of the squared distance.
-    variance = 0.5 * (spread**2 + 0.5**2) + 0.25 * center**2
-    assert float(model.priors.b.scale) == pytest.approx(np.sqrt(variance), rel=1e-5)
-    tau = draws["tau_e"].values
-    square = 0.5 * ((tau**2).mean() + 0.2**2)
-    assert model.place.tau_e == pytest.approx(np.sqrt(square), rel=1e-12)
-    # What is expected of beta0 lies between its posterior and the default's mean.
-    mean = float(np.asarray(model.priors.beta0.mean))
-    assert min(0.5, float(draws["beta0"].mean())) < mean < 0.5
-    again = fit(missions[:3], model, whole=False)
-    assert again.attrs["k_hat"] < 0.7
-    assert base.b.scale == 0.5
-    with pytest.raises(TrustboError, match="there are no posteriors"):
-        tb.inference.prior_from([])
-    wide = PooledTrust(Priors(b=dist.StudentT(4.0, 0.0, 0.5)))
-    with pytest.raises(TrustboError, match="needs Normal priors of beta and b"):
-        tb.inference.prior_from([posterior], wide)
-    other = fit(missions[:2], PooledTrust(), whole=False)
-    other.attrs["model"] = "HierarchicalTrust"  # sampled in no time
-    with pytest.raises(TrustboError, match="takes posteriors of PooledTrust"):
-        tb.inference.prior_from([other])
-
-
-def test_priors_from_posteriors_keep_the_default_of_a_predicted_contact_rate(missions):
-    """Of beta / (1 - beta0), in the mixture with N(1, .3^2) of line of sight."""
-    named = [replace(mission, features=("line_of_sight", "slope")) for mission in missions]
-    posterior = fit(named, PooledTrust(), whole=False)
-    priors = tb.inference.prior_from([posterior]).priors
-    draws = posterior["posterior"]
-    ratio = (draws["beta"] / (1.0 - draws["beta0"])).values[..., 0]
-    assert priors.stationary
-    assert float(priors.beta.loc[0]) == pytest.approx(0.5 + 0.5 * np.median(ratio), rel=1e-5)
 
 
 @pytest.mark.parametrize("name", ["cells", "bounds", "shared"])

@@ -105,7 +105,7 @@ def posterior_point(posterior: xr.DataTree) -> tuple[Point, PlaceEffect | None]:
     if is_of_people(posterior):
         raise TrustboError(
             "criticise is of robots' contact; of reports of people, trustbo.compare ranks forms of "
-            "HumanTrust, and trustbo.inference.compare_people scores their predictions."
+            "HumanTrust, and trustbo.inference.predict_reports scores its predictions."
         )
     if (memory := memory_of(posterior)) != "level":
         raise TrustboError(f'criticise takes memory="level"; this model has "{memory}".')

@@ -11,10 +11,8 @@ from trustbo.inference.fit import fit
 from trustbo.inference.loo import loo
 from trustbo.inference.memory import memory
 from trustbo.inference.people import predict_reports
-from trustbo.inference.people_scores import compare_people
 from trustbo.inference.place_maps import place_maps
 from trustbo.inference.posterior_groups import complete
-from trustbo.inference.prior_from import prior_from
 from trustbo.inference.prior_predictive import prior_predictive, sample_prior
 from trustbo.inference.samplers.convergence import diagnostics
 from trustbo.inference.sbc import sbc
@@ -25,7 +23,6 @@ __all__ = [
     "TrustFilter",
     "by_rate",
     "compare",
-    "compare_people",
     "complete",
     "diagnostics",
     "fit",
@@ -34,7 +31,6 @@ __all__ = [
     "params_of",
     "place_maps",
     "predict_reports",
-    "prior_from",
     "prior_predictive",
     "sample_prior",
     "sample_statistics",
