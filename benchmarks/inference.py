@@ -30,19 +30,19 @@ from jax import lax
 from threadpoolctl import threadpool_limits
 
 from trustbo import Mission
-from trustbo.inference import TrustFilter, fit, sample_prior, sample_statistics
+from trustbo.inference import TrustFilter, fit, sample_prior
 from trustbo.inference.evidence.statistics import gather
 from trustbo.inference.samplers.choice import why_not_scores, with_warmup
-from trustbo.inference.samplers.exact import _matched, _modes, _target
+from trustbo.inference.samplers.exact import _matched, _modes, _target, sample_exact
 from trustbo.inference.samplers.nuts_scores import ScoresInJax
 from trustbo.inference.samplers.nuts_sites import SitesInJax
 from trustbo.inference.samplers.posterior import posterior_of
 from trustbo.inference.samplers.run import draw_posterior
 from trustbo.inference.samplers.settings import NutsSettings
-from trustbo.inference.updating import update_statistics
 from trustbo.models import CoupledParams, CoupledTrust, HierarchicalTrust, PooledTrust, TrustParams
 from trustbo.models.backend import own_settings
 from trustbo.models.effects.effect import Slots
+from trustbo.models.ticks import weigh_ticks
 from trustbo.stacking import stack_missions
 
 N_BOUNDS, N_ROBOTS, N_FEATURES = 10, 3, 2
@@ -120,12 +120,11 @@ def trustbo_exact(missions):
     model = PooledTrust()
 
     def sampler(seed):
-        drawn = sample_statistics(
-            model, update_statistics(model, None, missions), n_draws=4000, seed=seed
-        )
-        names = model.dims
-        sites = {name: np.asarray(getattr(drawn.params, name))[None] for name in names}
-        return Exact(sites, min(drawn.kish, 4000.0), drawn.k_hat)
+        batch = stack_missions(missions)
+        floored = model.at_resolution(weigh_ticks(batch, np.ones(len(batch.contact_rate))))
+        drawn = sample_exact(gather(floored, batch)[0], floored.priors, 4000, seed)
+        sites = {name: drawn.params[name][None] for name in model.dims}
+        return Exact(sites, min(drawn.kish, 4000.0), drawn.khat)
 
     return sampler
 
@@ -448,7 +447,7 @@ def exact_cost(data):
     return (
         density,
         gathering,
-        median_seconds(lambda: update_statistics(model, None, data.missions), 5),
+        median_seconds(lambda: gather(model, stack_missions(data.missions)), 5),
     )
 
 
@@ -508,12 +507,6 @@ def latency(quick):
     print("\n## latency\n")
     table = aligned("", "median ms", "target ms", "reached")
     n, model, missions = 5 if quick else 20, PooledTrust(), pooled_data(21).missions
-    statistics = update_statistics(model, None, missions[:-1])
-
-    def refit():
-        return sample_statistics(model, update_statistics(model, statistics, missions[-1:]))
-
-    latency_row(table, "refit after one more mission, 20 before", median_seconds(refit, n), 50)
     whole = median_seconds(lambda: fit(missions, model, "exact"), n)
     latency_row(table, "the whole fit(..., sampler='exact'), all groups", whole)
     for one in (model, CoupledTrust()):

@@ -11,8 +11,7 @@ from scipy import integrate, stats
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
-from trustbo.inference import fit, prior_predictive, sample_prior, sample_statistics, sbc
-from trustbo.inference.updating import update_statistics
+from trustbo.inference import fit, prior_predictive, sample_prior, sbc
 from trustbo.models import PooledTrust, Priors
 from trustbo.models.backend import call
 from trustbo.models.priors_numpy import draw, floored, log_prob
@@ -125,18 +124,6 @@ def test_nuts_has_the_floor_of_the_exact_sampler():
         assert posterior.attrs["prior_delta_v"] == "HalfNormal(scale=0.2)"
         for group in ("posterior", "prior"):
             assert float(posterior[group]["delta_v"].min()) >= 0.025
-
-
-def test_statistics_know_the_floor_of_their_missions():
-    model, missions = PooledTrust(), constant_missions(1.0, n_ticks=40)
-    statistics = update_statistics(
-        model, update_statistics(model, None, missions[:3]), missions[3:]
-    )
-    drawn = sample_statistics(model, statistics)
-    assert drawn.params.delta_v.min() >= 0.025
-    # Two sums over 4096 points.
-    evidence = fit(missions, PooledTrust(), sampler="exact").attrs["log_evidence"]
-    assert drawn.log_evidence == pytest.approx(evidence, abs=0.01)
 
 
 def test_the_evidence_is_that_of_the_normalised_prior():

@@ -218,8 +218,6 @@ def test_what_cannot_treat_deviations_refuses_them(deviations, of_deviations):
         tb.fit(deviations, censored, "nuts")
     with pytest.raises(TrustboError, match='criticise takes memory="level"'):
         tb.criticise(of_deviations)
-    with pytest.raises(TrustboError, match="what lasts is a deviation of trust"):
-        tb.inference.update_statistics(PooledTrust(memory="deviation"), None, deviations)
 
 
 def test_deviations_are_found_in_counts_and_through_limits():

@@ -313,8 +313,6 @@ def test_what_has_no_effects_of_robots_refuses_them(missions):
         tb.fit(missions, changes, "exact")
     with pytest.raises(TrustboError, match="effects of robots"):
         tb.inference.prior_predictive(model, np.zeros((1, 2, 3, 2)))
-    with pytest.raises(TrustboError, match="robots have effects"):
-        tb.inference.update_statistics(model, None, missions)
     with pytest.raises(TypeError, match="effects"):
         HierarchicalTrust(effects=[RobotEffect()])
 

@@ -98,7 +98,7 @@ def test_priors_of_one_s_own_stay():
     change = PooledTrust(response="change")
     assert change.for_features(FEATURES) is change
     assert PooledTrust().for_features(FEATURES).priors.stationary
-    for model in (PooledTrust(), own, PooledTrust(Priors.zheng2023())):
+    for model in (PooledTrust(), own):
         again = model_from_record(model_to_record(model))
         assert again.for_features(FEATURES).priors.stationary == (
             model.for_features(FEATURES).priors.stationary

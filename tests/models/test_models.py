@@ -20,13 +20,11 @@ from trustbo.inference import (
     prior_predictive,
     sample_prior,
 )
-from trustbo.inference.evidence.statistics import require_statistics
 from trustbo.inference.samplers.nuts_sites import SitesInJax
 from trustbo.models import (
     CoupledParams,
     CoupledTrust,
     HierarchicalTrust,
-    PlaceEffect,
     PooledTrust,
     Priors,
     RobotParams,
@@ -340,9 +338,7 @@ def test_any_number_of_robots_and_features(name, n_robots, n_features):
     assert sample.trust.shape == (1, 3, n_robots)
 
 
-def test_vague_priors_and_priors_by_feature():
-    vague = Priors.zheng2023()
-    assert vague.describe()["beta"] == "Normal(loc=0, scale=10)"
+def test_priors_by_feature():
     by_feature = Priors(beta=dist.Normal(np.array([1.0, -1.0]), np.array([0.1, 0.2])))
     assert by_feature.describe()["beta"] == "Normal(loc=[1, -1], scale=[0.1, 0.2])"
     drawn = sample_prior(PooledTrust(by_feature), 2, 2000, 0).beta
@@ -396,22 +392,3 @@ def test_covariances_and_sizes_that_do_not_fit_are_named():
         fit(missions, "pooled")
     with pytest.raises(TrustboError, match=r'"exact" cannot treat CoupledTrust.*influence'):
         fit(missions, CoupledTrust(observation="censored"), sampler="exact")
-
-
-@pytest.mark.parametrize(
-    ("model", "reason"),
-    [
-        (PooledTrust(observation="censored"), "its observations are not Gaussian"),
-        (PooledTrust(place=PlaceEffect()), "places have effects"),
-        (CoupledTrust(), "its robots share some parameters only, or influence each other"),
-        (
-            CoupledTrust(place=PlaceEffect(), inter_robot="none"),
-            "robots with nothing else in common",
-        ),
-        (PooledTrust(place=PlaceEffect(), response="change"), "places have effects"),
-        (HierarchicalTrust(place=PlaceEffect()), "places have effects"),
-    ],
-)
-def test_models_without_sufficient_statistics_say_why(model, reason):
-    with pytest.raises(TrustboError, match=f"has no sufficient statistics: .*{reason}"):
-        require_statistics(model)

@@ -17,7 +17,6 @@ from trustbo.inference.prior_predictive import prior_predictive, sample_prior
 from trustbo.inference.samplers.convergence import diagnostics
 from trustbo.inference.sbc import sbc
 from trustbo.inference.score import score
-from trustbo.inference.updating import sample_statistics, update_statistics
 
 __all__ = [
     "TrustFilter",
@@ -33,9 +32,7 @@ __all__ = [
     "predict_reports",
     "prior_predictive",
     "sample_prior",
-    "sample_statistics",
     "sbc",
     "score",
-    "update_statistics",
 ]
 __dir__ = __all__.copy  # completion lists public names alone

@@ -1,4 +1,4 @@
-"""Reasons why a model has no exact evidence, or no sufficient statistics."""
+"""Reasons why a model has no exact evidence."""
 
 from typing import TYPE_CHECKING
 
@@ -36,18 +36,3 @@ def why_not_exact(model: "TrustModel") -> str | None:
     reasons = (why for of, what, why in _REFUSED if sets in (of or (sets,)) and what <= mine)
     reason = next(reasons, None)
     return reason and reason.format(*model.nouns)
-
-
-def why_no_statistics(model: "TrustModel") -> str | None:
-    """Reason why no sufficient statistics of fixed size exist; None if they do.
-
-    They exist for Gaussian observations, common or separate parameters of robots, and no effects of
-    places.
-    """
-    if not model.family.integrates_out:
-        return "its observations are not Gaussian"
-    if model.why_not_exact or model.place or model.effects:
-        return model.why_not_exact or f"{model.nouns[0]} have effects"
-    if model.robot_sets not in ("all", "each"):
-        return "its robots share some parameters only, or influence each other"
-    return None if model.memory == "level" else "what lasts is a deviation of trust"

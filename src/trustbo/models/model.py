@@ -20,7 +20,7 @@ from trustbo.models.backend import own_settings
 from trustbo.models.effects.effect import Effect, Slots, rest_of
 from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.effects.sampled import SampledDrift
-from trustbo.models.exactness import why_no_statistics, why_not_exact
+from trustbo.models.exactness import why_not_exact
 from trustbo.models.families import AUTO, FAMILIES, Family, choose, family_of
 from trustbo.models.params import Params, assemble_params, check_params
 from trustbo.models.place import bounds_of, places_of
@@ -353,11 +353,6 @@ class TrustModel(Displayed, ABC):
         rng = np.random.default_rng([*np.asarray(jax.random.key_data(key)).ravel(), _STREAM])
         drawn = draw_missions(self.family, one, self.lag, z, ticks, rng)
         return TrustSample(*(values[0] for values in drawn))
-
-    @property
-    def why_no_statistics(self) -> str | None:
-        """Reason why no sufficient statistics of fixed size exist; None if they do."""
-        return why_no_statistics(self)
 
     @property
     def why_not_exact(self) -> str | None:

@@ -11,7 +11,6 @@ import numpyro.distributions as dist
 from jax import Array
 from numpyro.distributions import Distribution, constraints
 
-from trustbo import zheng2023
 from trustbo.data import is_line_of_sight
 from trustbo.display.card import Card, Displayed
 from trustbo.errors import TrustboError, require_positive
@@ -169,16 +168,6 @@ class Priors(Displayed):
             return log_prob(prior, values)
         rest = 1.0 - (beta0[..., None] if name == "beta" else beta0)
         return log_prob(prior, values / rest) - np.log(rest)
-
-    @classmethod
-    def zheng2023(cls) -> Self:
-        """Vague priors in the manner of the authors' later code, for comparison.
-
-        All are normal with sd 10, noises half-Cauchy. With few missions the posterior is
-        multimodal in practice (beta0 near 1 with small weights, or near 0 with large ones): check
-        R-hat.
-        """
-        return cls(**zheng2023.vague_priors())
 
     def above_resolution(self, resolution: float) -> Self:
         """The same priors with delta_v truncated below at the resolution of a rate."""

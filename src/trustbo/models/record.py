@@ -57,7 +57,7 @@ def model_from_record(
     if kind is not None:
         fixed = replace(Priors.default(record["observation"]))
         of_features = Priors.of(features, record["observation"])
-        known = [None, fixed, of_features, Priors.zheng2023()]
+        known = [None, fixed, of_features]
         for priors in known:
             model = kind(priors=priors, place=place, **options)  # pyright: ignore
             if model_to_record(model) == record:

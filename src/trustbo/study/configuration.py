@@ -276,9 +276,8 @@ def migrate(what: str, settings: Mapping[str, Any]) -> dict[str, Any]:
     if kind == "places":
         names = [name for name in ("cells", "bounds") if name in new]
         new["place"] = {"kind": "PlaceEffect", **{name: new.pop(name) for name in names}}
-    if what == "model" and (priors := new.get("priors")) in ("default", "zheng2023"):
+    if what == "model" and new.get("priors") == "default":
         del new["priors"]
-        new |= {"priors": {"kind": "Priors.zheng2023"}} if priors == "zheng2023" else {}
     if kind == "model":
         observation = new.pop("observation", "gaussian")
         n_ticks = {"n_ticks": new.pop("n_ticks")} if "n_ticks" in new else {}

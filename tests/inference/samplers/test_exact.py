@@ -141,9 +141,7 @@ ODD = {
 }
 
 
-@pytest.mark.parametrize(
-    "priors", [Priors(), VAGUE, Priors.zheng2023()], ids=["ours", "1e6", "2023"]
-)
+@pytest.mark.parametrize("priors", [Priors(), VAGUE], ids=["ours", "1e6"])
 @pytest.mark.parametrize("name", list(ODD))
 def test_odd_data_have_a_posterior(name, priors):
     floored = PooledTrust(priors).at_resolution({})

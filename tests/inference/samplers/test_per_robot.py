@@ -13,7 +13,6 @@ from trustbo.errors import TrustboError
 from trustbo.inference import complete, diagnostics, fit
 from trustbo.inference.samplers.importance import sample_scores
 from trustbo.inference.samplers.posterior import posterior_of
-from trustbo.inference.updating import update_statistics
 from trustbo.models import HierarchicalTrust, PlaceEffect, Priors
 from trustbo.models.effects.effect import Slots
 from trustbo.models.model import TrustModel
@@ -211,8 +210,6 @@ def test_what_it_cannot_treat_is_refused():
     heavy = HierarchicalTrust(Priors(beta=dist.StudentT(3.0, 0.0, 0.5)))
     with pytest.raises(TrustboError, match=r"it needs the prior of beta to be a Normal.*StudentT"):
         fit(missions, heavy, "exact")
-    with pytest.raises(TrustboError, match="has no sufficient statistics: its robots share some"):
-        update_statistics(HierarchicalTrust(), None, missions)
 
 
 @pytest.mark.slow  # the weighted prior, above, says the same for little data

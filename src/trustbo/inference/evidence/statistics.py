@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from trustbo.errors import TrustboError
 from trustbo.inference.evidence.gram import Statistics, sufficient_statistics
 from trustbo.models.model import TrustModel
 from trustbo.stacking import MissionBatch
@@ -29,13 +28,3 @@ def split_robots(model: TrustModel, batch: MissionBatch) -> list[MissionBatch]:
         return [batch]
     n_robots = batch.contact_rate.shape[2]
     return [MissionBatch(*(a[:, :, i : i + 1] for a in batch)) for i in range(n_robots)]
-
-
-def require_statistics(model: TrustModel) -> None:
-    """Refuse a model without sufficient statistics of fixed size.
-
-    Raises:
-        TrustboError: See `TrustModel.why_no_statistics`.
-    """
-    if reason := model.why_no_statistics:
-        raise TrustboError(f"{model.describe()} has no sufficient statistics: {reason}.")
