@@ -5,8 +5,7 @@
 
 `campaigns`: the default campaign under each family, with the same seed; after each mission the
 regret of the path that it would recommend, and the contact that the path driven lost beyond the
-best one's, both by the truth of the world; coverage one mission ahead; processor seconds, and
-missions whose rates `auto` took for Gaussian ones as the weights of censored ones were too uneven.
+best one's, both by the truth of the world; coverage one mission ahead; processor seconds.
 `criticise`: the verdicts on these campaigns. `loo`: every family on the missions of one campaign of
 each terrain, along random paths; the log density of a mission left out, in nats of counts of ticks,
 less that of the best family. The first two go on where they stopped. Differences are paired by
@@ -27,7 +26,7 @@ from trustbo.models import PlaceEffect, PooledTrust, RobotEffect
 from trustbo.study import worlds
 from trustbo.study.world import World
 
-FAMILIES = ("gaussian", "auto")
+FAMILIES = ("gaussian", "censored")
 LOO = ("gaussian", "censored", "beta_binomial")
 TERRAINS = ("synthetic-0", "synthetic-1", "synthetic-2", "wellington", "tahoe", "bcts",
             "topography", "synthetic-0-wall", "tahoe-wall")  # fmt: skip
@@ -69,7 +68,7 @@ def driven(world: World, course: str, n: int, family: str, out) -> dict[str, Any
     workspace, truth, ends = world.workspace(), world.truth(), world.ends(course)
     model = PooledTrust(place=PlaceEffect(), effects=(RobotEffect(),), observation=family)
     campaign = tb.Campaign(workspace, *ends, model=model, seed=0)
-    regret, lost, seconds, observed = [], [], [], []
+    regret, lost, seconds = [], [], []
     run = campaign.run(world.simulator(workspace), n)
     for j in range(n):
         started = time.process_time()
@@ -78,13 +77,12 @@ def driven(world: World, course: str, n: int, family: str, out) -> dict[str, Any
         now, best = truth.at(j), truth.at(j).best(*ends)
         regret.append(now.regret(campaign.recommend()))
         lost.append(now.value(mission.path).lost - now.value(best).lost)
-        observed.append(campaign.learner.observation)
     missions = [workspace.fill(mission) for mission in campaign.missions]
     scores = tb.inference.score(campaign.posteriors, missions, workspace=workspace)
     far = np.abs(scores["pit"].values - 0.5)
     inside = [float((far[np.isfinite(far)] <= 0.5 * p).mean()) for p in (0.5, 0.9)]
     campaign.save(out / "campaigns" / f"{world.name} {course} {n} {family}", overwrite=True)
-    return {"regret": regret, "lost": lost, "seconds": seconds, "observed": observed,
+    return {"regret": regret, "lost": lost, "seconds": seconds,
             "coverage": inside, "log": float(np.nanmean(scores["log_score"].values))}  # fmt: skip
 
 
@@ -107,13 +105,11 @@ def show(records: Sequence[dict[str, Any]]) -> None:
     table = Table("family", *columns)
     for family, rows in values.items():
         table.row(family, *(_interval(column) for column in rows.T))
-    table.row("difference", *(_interval(c) for c in (values["auto"] - values["gaussian"]).T))
-    fell = [o == "gaussian" for r in records for o in r["auto"]["observed"][2:]]
-    print(f"\nauto: Gaussian in {np.mean(fell):.0%} of {len(fell)} missions from the third on.")
+    table.row("difference", *(_interval(c) for c in (values["censored"] - values["gaussian"]).T))
     for name in dict.fromkeys(r["world"] for r in records):
         some = [r for r in records if r["world"] == name]
         lost = [np.mean([np.mean(r[family]["lost"]) for r in some]) for family in FAMILIES]
-        print(f"{name}: lost a mission {lost[0]:.3f} gaussian, {lost[1]:.3f} auto")
+        print(f"{name}: lost a mission {lost[0]:.3f} gaussian, {lost[1]:.3f} censored")
 
 
 def _interval(values: np.ndarray) -> str:

@@ -317,17 +317,6 @@ def test_what_has_no_effects_of_robots_refuses_them(missions):
         HierarchicalTrust(effects=[RobotEffect()])
 
 
-def test_rates_at_their_limits_are_taken_for_censored_ones_with_robots(missions):
-    rates = [np.where(m.contact_rate > 0.4, 1.0, m.contact_rate) for m in missions]
-    limits = [
-        Mission.from_arrays(m.path, m.awareness, y, features=FEATURES)
-        for m, y in zip(missions, rates, strict=True)
-    ]
-    model = PooledTrust(effects=[RobotEffect()], observation="auto")
-    posterior = tb.fit(limits, model, draws=25, whole=False)
-    assert posterior.attrs["observation"] == "censored"
-
-
 def test_missions_left_out_by_hyperparameters_have_the_effects_of_robots(posterior):
     model = PooledTrust(effects=[PlaceEffect(), RobotEffect()]).for_features(FEATURES)
     left_out = by_hyperparameters(posterior, model)

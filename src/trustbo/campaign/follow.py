@@ -167,6 +167,6 @@ def _filter_of(campaign: Campaign) -> TrustFilter:
     if (posterior := campaign.state.last_tree) is not None:
         return TrustFilter(posterior)
     names, n_robots = campaign.workspace.features, campaign.workspace.team.n_robots
-    model = campaign.model.observing("gaussian").for_features(names)
+    model = campaign.model.for_features(names)
     draws = sample_prior(model, len(names), 1000, campaign.seed_of("prior"), n_robots=n_robots)
     return TrustFilter(draws, n_robots, response=model.response, observation=model.observation)

@@ -215,7 +215,7 @@ def _require_learnable(model: TrustModel, sampler: str, options: CampaignOptions
 def _prior_belief(model: TrustModel, initial: str, workspace: Workspace, seed: int) -> Params:
     """Draw from the prior, or take its mean, with a leading axis (draw,) of length 1."""
     n_robots, n_features = len(workspace.team.robots), len(workspace.features)
-    model = model.observing("gaussian").for_features(workspace.features)
+    model = model.for_features(workspace.features)
     if initial == "prior_mean" and model.priors_are_independent:
         values = model.priors.mean(n_features)
         sizes = model.sizes(n_robots, n_features)

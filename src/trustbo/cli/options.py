@@ -38,8 +38,8 @@ Learning
   model NAME: Trust model: robots (places differ, and a robot from mission to mission: damage, bad
     days), places (robots are alike), pooled (places are too, as in the paper), hierarchical
     (robots are similar), coupled (they influence each other).
-  observation NAME: Family of contact rates: gaussian (as in the paper), censored, beta_binomial,
-    auto (the one that suits them).
+  observation NAME: Family of contact rates: gaussian (as in the paper), censored,
+    beta_binomial.
   sampler NAME: Sampler of the posterior: auto (exact where it applies, else nuts); exact
     (importance sampling, which need not compile); nuts.
 Benchmark

@@ -24,14 +24,13 @@ from trustbo.inference.samplers.choice import (
     slow_places,
     with_warmup,
 )
-from trustbo.inference.samplers.run import Draws, UnevenWeightsError, draw_posterior
+from trustbo.inference.samplers.run import draw_posterior
 from trustbo.inference.samplers.settings import NutsSettings
 from trustbo.inference.samplers.student import proposal_of
 from trustbo.inference.samplers.watching import Watch
 from trustbo.models.backend import VERSIONS
 from trustbo.models.default import default_model
 from trustbo.models.effects.effect import Slots
-from trustbo.models.families import AUTO
 from trustbo.models.model import TrustModel, require_model
 from trustbo.models.people import HumanTrust
 from trustbo.models.place import has_places, places_of
@@ -73,8 +72,7 @@ def fit(
             attributes record which, and why. `"exact"`: near-independent draws by importance
             sampling, without compiling, for robots that share their parameters, have nothing in
             common, are partially pooled or influence each other; where its weights are too uneven,
-            rates are taken for Gaussian ones if observation is `"auto"`, else NUTS is used, with a
-            warning. `"nuts"`, for Gaussian rates.
+            NUTS is used for Gaussian rates, with a warning. `"nuts"`, for Gaussian rates.
         workspace: Workspace of the missions. Their features and robots are then in its order, and
             awareness that they lack, such as line of sight, is filled in, see `Workspace.fill`. A
             model with effects of places has them over the whole grid, else up to the last row and
@@ -127,46 +125,30 @@ def fit(
     if earlier is not None:
         require_posterior("earlier=", earlier)
     batch = stack_missions(missions)
-    asked = model
-    model, family_reason = _of_rates(asked, batch, weighted=weights is not None)
     places = places_of(missions, model.place, batch.contact_rate.shape, workspace)
     require_ticks(model.family, batch)
     weight = _weights(weights, model, batch, len(missions))
     ticks = _weigh_rates(batch, weight)
     started = time.perf_counter()
 
+    model = model.for_features(missions[0].features)
+    chosen, reason = resolve_sampler(model, sampler)
+    settings.require_sampler(chosen)
+    if sampler == "auto" and chosen != "exact" and model.place is not None:
+        warnings.warn(slow_places(reason), stacklevel=2)
+    floored = model.at_resolution(ticks)
     # Of a campaign, only the first fit warns.
     watch = Watch(place_of(progress), estimates=earlier is None)
-
-    def draw(
-        model: TrustModel, *, fallback: bool
-    ) -> tuple[TrustModel, dict[str, np.ndarray], Draws, list[str], str]:
-        # Model, draws of its prior and of its posterior, complaints, and the sampler's reason.
-        model = model.for_features(missions[0].features)
-        chosen, reason = resolve_sampler(model, sampler)
-        settings.require_sampler(chosen)
-        watch.faster = "" if chosen == "exact" else faster_than_nuts(model)
-        if sampler == "auto" and chosen != "exact" and model.place is not None:
-            warnings.warn(slow_places(reason), stacklevel=3)
-        floored = model.at_resolution(ticks)
+    watch.faster = "" if chosen == "exact" else faster_than_nuts(model)
+    with watch:
         prior = draw_sites(floored, batch.awareness.shape[2:], _N_PRIOR, seed + 2)
         chains = batch, len(missions), missions[0].features, weight, places
         slots = Slots.of(*chains) if needs_evidence(model, chosen) else None
-        sampled = draw_posterior(
+        sampled, complaints = draw_posterior(
             floored, chosen,
             settings if warmup is not None else with_warmup(settings, model),
-            seed, batch, weight, places, proposal_of(earlier), slots,
-            check=check, fallback=fallback, watch=watch,
+            seed, batch, weight, places, proposal_of(earlier), slots, check=check, watch=watch,
         )  # fmt: skip
-        return model, prior, *sampled, sampled[0].fallback or reason
-
-    with watch:
-        try:
-            drawn = draw(model, fallback=asked.observation != AUTO or model.family.integrates_out)
-        except UnevenWeightsError as error:
-            family_reason += f", but the {model.observation} ones' {error}: Gaussian ones instead"
-            drawn = draw(asked.observing("gaussian"), fallback=True)
-    model, prior, sampled, complaints, reason = drawn
     groups = {
         "posterior": {name: sampled.params[name] for name in model.dims},
         "sample_stats": sampled.stats,
@@ -179,9 +161,8 @@ def fit(
     posterior.attrs |= {
         **_record(model, batch, len(missions), resolution(ticks)),
         **sampled.summary,
-        "observation_reason": family_reason,
         "sampler": sampled.sampler,
-        "sampler_reason": reason,
+        "sampler_reason": sampled.fallback or reason,
         "seed": seed,
     }
     if weights is not None:
@@ -238,13 +219,6 @@ def _record(
         **{f"prior_{name}": text for name, text in model.priors.describe().items()},
         **{f"{name}_version": version for name, version in VERSIONS.items()},
     }
-
-
-def _of_rates(model: TrustModel, batch: MissionBatch, *, weighted: bool) -> tuple[TrustModel, str]:
-    """Model with the family that suits the rates, and why; weights require Gaussian rates."""
-    if weighted and model.observation == AUTO:
-        return model.observing("gaussian"), "missions have weights"
-    return model.for_rates(batch)
 
 
 def _weigh_rates(batch: MissionBatch, weight: np.ndarray) -> TickWeights:

@@ -47,7 +47,7 @@ class FitData(NamedTuple):
         batch = stack_missions(missions)
         weight = np.ones(len(batch.contact_rate))
         weight[: len(missions)] = np.atleast_1d(attrs.get("weights", 1.0))
-        model = model.observing(attrs["observation"]).for_features(features)
+        model = model.for_features(features)
         return cls(model.at_resolution(weigh_ticks(batch, weight)), missions, batch, weight)
 
     def slots(self, place: PlaceEffect | None, workspace: Workspace | None = None) -> Slots:

@@ -61,7 +61,7 @@ def model_of(posterior: xr.DataTree, model: TrustModel | None = None) -> TrustMo
             model = model_from_record(record, features=features)
         except (KeyError, TrustboError):
             return None
-    return model.observing(posterior.attrs["observation"]).for_features(features)
+    return model.for_features(features)
 
 
 def log_prior_group(posterior: xr.DataTree, model: TrustModel | None = None) -> xr.Dataset | None:

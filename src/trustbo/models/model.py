@@ -21,7 +21,7 @@ from trustbo.models.effects.effect import Effect, Slots, rest_of
 from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.effects.sampled import SampledDrift
 from trustbo.models.exactness import why_not_exact
-from trustbo.models.families import AUTO, FAMILIES, Family, choose, family_of
+from trustbo.models.families import FAMILIES, Family, family_of
 from trustbo.models.params import Params, assemble_params, check_params
 from trustbo.models.place import bounds_of, places_of
 from trustbo.models.priors import Priors
@@ -29,7 +29,7 @@ from trustbo.models.priors_numpy import draw
 from trustbo.models.state_space.contact_rate import ModelRates, mission_log_likelihood
 from trustbo.models.state_space.generate import TrustSample, draw_missions
 from trustbo.models.ticks import broadcast_ticks, require_ticks, resolution, weigh_ticks
-from trustbo.stacking import MissionBatch, stack_missions
+from trustbo.stacking import stack_missions
 
 RESPONSES = ("level", "change")
 _STREAM = 0x6D697373  # of `simulate`, among all that a seed gives
@@ -44,7 +44,7 @@ class TrustModel(Displayed, ABC):
             names of the features, see `Priors.of`.
         observation: Family of observations: `"gaussian"`, the paper's; `"censored"`, rates of 0
             and 1 being limits; `"beta_binomial"`, ticks in contact out of `Bound.n_ticks` ticks,
-            trust being a logit; `"auto"`: that which suits the rates of a fit, see `for_rates`.
+            trust being a logit.
         response: Quantity that a rate measures: trust, `"level"`, or its `"change"` over the bound.
         place: Effects of places that awareness does not explain; None is the paper's model.
 
@@ -61,7 +61,7 @@ class TrustModel(Displayed, ABC):
     memory: ClassVar[str] = "level"  # see `PooledTrust`
 
     def __post_init__(self) -> None:
-        require_choice("observation", self.observation, (AUTO, *FAMILIES))
+        require_choice("observation", self.observation, FAMILIES)
         require_choice("response", self.response, RESPONSES)
         if self.lag and self.memory != "level":
             raise TrustboError(f'memory "{self.memory}" is for rates that measure trust.')
@@ -153,30 +153,7 @@ class TrustModel(Displayed, ABC):
         """
         if self.priors is not Priors.default(self.observation) or self.lag:
             return self
-        if self.observation == AUTO:  # of the fit's family, which is not known yet
-            return self
         return replace(self, priors=Priors.of(tuple(features), self.observation))
-
-    def for_rates(self, batch: MissionBatch) -> tuple[Self, str]:
-        """The model with the family of observations that suits measured rates, and the reason.
-
-        With `observation="auto"`: censored rates if 5 % of them are 0 or 1; else Gaussian ones,
-        also where the exact sampler applies to these alone. Any other model is returned unchanged.
-        """
-        if self.observation != AUTO:
-            return self, "asked for"
-        name, reason = choose(batch.contact_rate)
-        chosen = self.observing(name)
-        if chosen.why_not_exact and not self.why_not_exact:
-            return self.observing("gaussian"), f"{reason}, but {chosen.why_not_exact}"
-        return chosen, reason
-
-    def observing(self, observation: str) -> Self:
-        """The model with that family of observations if `"auto"`, else unchanged."""
-        if self.observation != AUTO:
-            return self
-        custom_priors = self.priors is not Priors.default(AUTO)
-        return replace(self, observation=observation, priors=self.priors if custom_priors else None)
 
     def at_resolution(self, ticks: Mapping[float, float]) -> Self:
         """The model whose delta_v is no less than the resolution of rates of so many ticks.
@@ -281,7 +258,7 @@ class TrustModel(Displayed, ABC):
         ticks = weigh_ticks(batch, np.ones(len(batch.contact_rate)))
         if not ticks:
             raise TrustboError("every contact rate is NaN: nothing was measured.")
-        model = self.for_rates(batch)[0].for_features(missions[0].features).at_resolution(ticks)
+        model = self.for_features(missions[0].features).at_resolution(ticks)
         require_ticks(model.family, batch)
         drift, shape = None, batch.contact_rate.shape
         if model.place is not None or model.effects:

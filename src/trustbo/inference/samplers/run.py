@@ -66,7 +66,6 @@ def draw_posterior(
     slots: Slots | None = None,
     *,
     check: bool,
-    fallback: bool = True,
     watch: Watch = SILENT,
 ) -> tuple[Draws, list[str]]:
     """Draws given a batch, and their failed diagnostics.
@@ -83,11 +82,12 @@ def draw_posterior(
             posterior.
         slots: Rates by chain, where robots have effects; `places` are among them.
         check: Whether to check the diagnostics, and try again for longer if they are bad.
-        fallback: Whether NUTS takes over, with a warning, where the exact sampler fails.
         watch: Observer of the progress.
 
+    Where the exact sampler fails, NUTS takes over with a warning if it can treat the model.
+
     Raises:
-        UnevenWeightsError: The exact sampler fails, and there is no fallback.
+        PosteriorError: The exact sampler fails, and NUTS cannot treat the model.
     """
     weight = np.ones(len(batch.contact_rate)) if weight is None else weight
     task = _Task(model, settings, seed, batch, weight, places, slots, watch, check)
@@ -98,12 +98,10 @@ def draw_posterior(
                 return _sample_exact(task), []
             return _sample_scores(task, start), []
         except UnevenWeightsError as error:
-            if not fallback:
-                raise
             if not model.family.integrates_out or (slots is not None and why_not_scores(model)):
                 raise PosteriorError(f"the exact sampler's {error}.") from None
             failure = str(error)
-            warnings.warn(f"the exact sampler's {failure}; NUTS is used instead.", stacklevel=4)
+            warnings.warn(f"the exact sampler's {failure}; NUTS is used instead.", stacklevel=3)
     by_scores = slots is not None or why_not_scores(model) is None
     draws, complaints = (_sample_nuts_of_scores if by_scores else _sample_nuts)(task)
     return draws._replace(fallback=failure), complaints
