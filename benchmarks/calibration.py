@@ -51,7 +51,6 @@ def cases():
         yield people, "exact", 200, PEOPLE
     for model in (PooledTrust, HierarchicalTrust, CoupledTrust):
         yield model(), "nuts", 200, SMALL
-    yield PooledTrust(response="change"), "nuts", 200, SMALL
     yield CoupledTrust(inter_robot="ordered"), "nuts", 200, SMALL
     yield PooledTrust(place=PlaceEffect()), "nuts", 200, SMALL
     yield PooledTrust(effects=[RobotEffect()]), "nuts", 200, SMALL
@@ -74,11 +73,11 @@ def main():
             continue
         n = 2 if given.quick else max(2, round(n * given.share))
         name = type(model).__name__
-        detail = getattr(model, "inter_robot", model.response)
+        detail = getattr(model, "inter_robot", "full")
         effects = ["places"] * (model.place is not None) + ["robots"] * bool(model.effects)
         detail = " and ".join(effects) or detail
         detail = getattr(model, "scale", detail)
-        label = name if detail in ("full", "level") else f"{name}, {detail}"
+        label = name if detail == "full" else f"{name}, {detail}"
         if shape is LOG:
             detail, label = f"{detail}-log", f"{label}, of a log"
         if model.memory != "level" and not isinstance(model, HumanTrust):

@@ -190,11 +190,9 @@ def draw_case(rng):
     case.shortest = int(to_goal(case.into, case.ends[1])[case.ends[0]])
     if case.shortest > 10**5:
         return None
-    case.family, case.lag = "gaussian", 0.0
+    case.family = "gaussian"
     if case.objective == "lost_contact":
         case.family = pick(rng, "gaussian", "gaussian", "censored", "beta_binomial")
-        linear = case.family == "gaussian" and case.team == "mean"
-        case.lag = float(linear and rng.random() < 0.2)
     case.history = case.objective in ("success", "bottleneck") or case.family != "gaussian"
     least = case.team == "min" and case.n_robots > 1
     case.dense &= not least or case.history or case.objective == "stationary"
@@ -242,7 +240,7 @@ class Problem:
         u, x0 = u.reshape(n, 8, -1), np.full(n, float(self.params.x0_mean))
         if alike and case.team == "mean":
             u, x0, B0 = u.mean(0, keepdims=True), x0[:1], B0[:1, :1]
-        if case.objective == "lost_contact" and case.family == "gaussian" and not case.lag:
+        if case.objective == "lost_contact" and case.family == "gaussian":
             u, x0 = np.minimum(u, 1.0 - B0.sum(1)[:, None, None]), np.minimum(x0, 1.0)
         self.p, self.draws, self.strata, self.options, unit = None, None, None, {}, 0.0
         shares = np.empty(0)
@@ -257,7 +255,7 @@ class Problem:
         tolls = tolls + case.unseen * case.shares.reshape(8, -1)
         self.case, self.world = case, World(
             case.objective, *case.ends, case.into, tolls, u, B0, x0, case.team == "min",
-            case.family, sd, case.lag, case.longest, case.u_turns, case.simple, risk, limits,
+            case.family, sd, case.longest, case.u_turns, case.simple, risk, limits,
             needed, cost, shares, unit,
         )  # fmt: skip
         return self._solve()
@@ -292,7 +290,7 @@ class Problem:
             workspace, case.start, case.goal, case.objective, connectivity=case.connectivity,
             max_bounds=case.most, team=case.team, length_weight=case.weight,
             unseen_cost=case.unseen, engine=engine, observation=case.family,
-            response="change" if case.lag else "level", **self.options,
+            **self.options,
         )  # fmt: skip
         if case.closed.any():
             planner = planner.avoiding(case.closed, np.zeros(case.closed.shape))

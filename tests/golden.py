@@ -24,7 +24,6 @@ import trustbo as tb
 STORED = Path(__file__).parent / "golden.json"
 EXACT = {
     "pooled exact": {},
-    "pooled exact change": {"model": ("PooledTrust", {"response": "change"})},
     "apart exact": {"model": ("CoupledTrust", {"inter_robot": "none"})},
     **{f"policy {name}": {"policy": name} for name in tb.planning.POLICIES},
     **{f"objective {name}": {"objective": name} for name in tb.planning.OBJECTIVES},
@@ -43,7 +42,6 @@ EXACT = {
 }
 NUTS = {
     "pooled nuts": {"sampler": "nuts"},
-    "pooled nuts change": {"sampler": "nuts", "model": ("PooledTrust", {"response": "change"})},
     "pooled censored": {"model": ("PooledTrust", {"observation": "censored"})},
     "pooled beta_binomial": {"model": ("PooledTrust", {"observation": "beta_binomial"})},
     "hierarchical": {"model": ("HierarchicalTrust", {})},

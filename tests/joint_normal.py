@@ -23,7 +23,6 @@ class Dense:
         theta: Theta,
         x0: tuple[float, float] = (0.5, 0.5),
         memory: str = "level",
-        lag: float = 0.0,
     ) -> None:
         """Form the joint normal; `theta` has one point, of beta0 maybe (point, robot)."""
         (delta_w,), (delta_v,) = (theta[name] for name in ("delta_w", "delta_v"))
@@ -38,7 +37,6 @@ class Dense:
             last_mean, last_c, last_noise = x0[0], np.zeros(m), np.zeros((n_chains, K + 1))
             last_noise[c, 0], beta0 = x0[1], of_robot[slots.robot[c]]
             for k in range(K):
-                before = last_mean, last_c, last_noise
                 last_mean, last_c, last_noise = (
                     beta0 * last_mean,
                     beta0 * last_c,
@@ -50,10 +48,7 @@ class Dense:
                     last_mean -= 0.0 if k else beta0 * x0[0]
                 last_noise = last_noise.copy()
                 last_noise[c, k + 1] = delta_w
-                mean[c, k], of_c[c, k], of_noise[c, k] = (
-                    now - lag * then
-                    for now, then in zip((last_mean, last_c, last_noise), before, strict=True)
-                )
+                mean[c, k], of_c[c, k], of_noise[c, k] = last_mean, last_c, last_noise
         priors = [group.prior(theta) for group in groups]
         self.prior_mean = np.concatenate([np.broadcast_to(p.mean, p.sd.shape)[0] for p in priors])
         self.prior_cov = np.zeros((m, m))

@@ -60,11 +60,10 @@ class Joint(NamedTuple):
     cov_y: np.ndarray
 
 
-def dense_joint(B0, drift, Q, R, x0_mean, x0_sd, lag=0.0):
+def dense_joint(B0, drift, Q, R, x0_mean, x0_sd):
     """Moments of a mission's trust and rates, drift (bound, robot).
 
-    Trust as one vector of all bounds and robots: A x = d + B0 x_0 e_1 + w; rates y = x - lag x_prev
-    + v.
+    Trust as one vector of all bounds and robots: A x = d + B0 x_0 e_1 + w; rates y = x + v.
     """
     K, n = drift.shape
     eye, first = np.eye(K), np.eye(K)[:, :1]
@@ -73,21 +72,15 @@ def dense_joint(B0, drift, Q, R, x0_mean, x0_sd, lag=0.0):
     x0 = np.full(n, x0_mean)
     mean_x = inverse @ (drift.ravel() + start @ x0)
     cov_x = inverse @ (np.kron(eye, Q) + start @ start.T * x0_sd**2) @ inverse.T
-    cov_x_x0 = inverse @ start * x0_sd**2
-    # Rates are linear in (x, x_0).
-    H = np.eye(K * n) - lag * np.kron(np.eye(K, k=-1), np.eye(n))
-    G = -lag * np.kron(first, np.eye(n))
-    cross = H @ cov_x_x0 @ G.T
-    cov_y = H @ cov_x @ H.T + cross + cross.T + G @ G.T * x0_sd**2 + np.kron(eye, R)
-    return Joint(mean_x, cov_x, cov_x @ H.T + cov_x_x0 @ G.T, H @ mean_x + G @ x0, cov_y)
+    return Joint(mean_x, cov_x, cov_x, mean_x, cov_x + np.kron(eye, R))
 
 
-def dense_coupled(B0, drift, Q, R, x0_mean, x0_sd, contact_rate, lag=0.0):
+def dense_coupled(B0, drift, Q, R, x0_mean, x0_sd, contact_rate):
     """Log density of a mission's rates, and moments of its trust, from one joint normal.
 
     drift, contact_rate: (bound, robot), rates NaN where not measured.
     """
-    mean_x, cov_x, cov_xy, mean_y, cov_y = dense_joint(B0, drift, Q, R, x0_mean, x0_sd, lag)
+    mean_x, cov_x, cov_xy, mean_y, cov_y = dense_joint(B0, drift, Q, R, x0_mean, x0_sd)
     y = contact_rate.ravel()
     seen = ~np.isnan(y)
     cov, residual = cov_y[np.ix_(seen, seen)], (y - mean_y)[seen]

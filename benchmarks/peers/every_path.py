@@ -31,7 +31,6 @@ class World(NamedTuple):
     least: bool  # trust of the team: the least state, else their mean
     family: str
     sd: float
-    lag: float
     longest: int
     u_turns: bool
     simple: bool
@@ -116,9 +115,8 @@ def every_walk(world, most):
         total += len(m)
         if total > most:
             raise TooManyError
-        before = world.trust(x[:, walk])
         x = world.B0 @ x[:, walk] + world.u[:, m, other]
-        t = world.trust(x) - world.lag * before
+        t = world.trust(x)
         if settled is not None:
             t = settled[m, other]
         if world.objective == "terminal":
@@ -152,9 +150,9 @@ def along(world, path):
         entering = np.flatnonzero(world.into[:, a] == c)
         if not len(entering) or (not world.u_turns and came != NONE and entering[0] == 7 - came):
             return -np.inf, risk, False
-        came, before = entering[0], world.trust(x)
+        came = entering[0]
         x = world.B0 @ x + world.u[:, came, c]
-        t = world.trust(x) - world.lag * before if settled is None else settled[came, c]
+        t = world.trust(x) if settled is None else settled[came, c]
         costs.append(-t if world.objective in ("terminal", "mean") else world.loss(t))
         risk, toll = risk + world.risk[:, came, c], toll + world.tolls[came, c]
     cost = {"terminal": costs[-1], "mean": np.mean(costs), "bottleneck": max(costs)}
@@ -199,11 +197,9 @@ def dense_weights(world):
     for j in range(1, n):
         w[j] = w[j - 1] @ world.B0
     constant = w @ world.x0
-    if world.objective == "mean" or (world.objective == "lost_contact" and not world.lag):
+    if world.objective in ("mean", "lost_contact"):
         constant[0] = 0.0
         constant, w = constant.cumsum(), w.cumsum(0)
-    elif world.objective == "lost_contact":
-        constant = constant - constant[0]
     return w, constant - (np.arange(n) if world.objective == "lost_contact" else 0.0)
 
 

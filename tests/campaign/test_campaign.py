@@ -176,9 +176,6 @@ def test_bad_names_and_ends_are_refused_at_once(workspace):
 def test_what_cannot_be_planned_or_updated_with_is_refused_at_once(workspace):
     with pytest.raises(TrustboError, match="model must be a trust model"):
         Campaign(workspace, *ENDS, model="pooled")
-    changes = PooledTrust(observation="censored", response="change")
-    with pytest.raises(TrustboError, match="it measures changes of trust, and its observations"):
-        Campaign(workspace, *ENDS, model=changes, sampler="exact")
     with pytest.raises(TrustboError, match="unknown option 'update'"):
         Campaign(workspace, *ENDS, update="refit")
 

@@ -79,18 +79,17 @@ def test_the_joint_normal_is_the_product_of_the_robots_densities():
     np.testing.assert_allclose(log_normal(normal, data.y), expected, rtol=1e-10)
 
 
-@pytest.mark.parametrize("lag", [0.0, 1.0])
-def test_the_joint_normal_of_robots_that_influence_each_other(lag):
+def test_the_joint_normal_of_robots_that_influence_each_other():
     missions = missions_of_shape(2, 3)
     Q, R = np.array([[0.04, 0.01], [0.01, 0.03]]), np.array([[0.02, -0.01], [-0.01, 0.05]])
     B0, B = np.array([[0.5, 0.1], [-0.2, 0.4]]), np.array([0.3 * np.eye(2), 0.2 * np.ones((2, 2))])
     params = CoupledParams(B0, B, np.array([0.1, 0.0]), Q, R, 0.4, 0.3)
     data = dense.gather(missions, None)
-    normal = dense.joint_normal(dense.Point(params, {}, lag, None), data)
+    normal = dense.joint_normal(dense.Point(params, {}, None), data)
     expected = 0.0
     for mission in missions:
         drift = np.einsum("kim,mai->ka", mission.awareness, B) + params.b
-        expected += dense_coupled(B0, drift, Q, R, 0.4, 0.3, mission.contact_rate, lag)[0]
+        expected += dense_coupled(B0, drift, Q, R, 0.4, 0.3, mission.contact_rate)[0]
     np.testing.assert_allclose(log_normal(normal, data.y), expected, rtol=1e-10)
 
 
@@ -315,8 +314,8 @@ def test_what_cannot_be_criticised_says_why(with_places, planted):
     with pytest.raises(TrustboError, match="give the missions it was fitted to"):
         criticise(alone)
     alone = posterior.copy()
-    alone.attrs = {k: v for k, v in posterior.attrs.items() if k != "response"}
-    with pytest.raises(TrustboError, match="lacks the attribute 'response'"):
+    alone.attrs = {k: v for k, v in posterior.attrs.items() if k != "observation"}
+    with pytest.raises(TrustboError, match="lacks the attribute 'observation'"):
         criticise(alone)
     first = planted("none")[0]
     short = replace(first, path=first.path[:5], bounds=first.bounds[:4])

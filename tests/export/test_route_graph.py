@@ -258,7 +258,6 @@ def test_what_no_route_graph_can_hold_is_refused(planner, tmp_path):
     many = tb.Workspace.from_awareness(np.full((1, 86, 86, 2), 0.5), cell_size=5.0)
     large = Planner(many, (85, 0), (0, 85))
     terminal = Planner(planner.workspace, (2, 0), (0, 3), "terminal")
-    change = Planner(planner.workspace, (2, 0), (0, 3), response="change")
     for given, options, message in (
         ((planner, params), {"frame": OF_CRS}, r"float32, in steps of 0.5 m .* origin='auto' is"),
         (
@@ -268,7 +267,6 @@ def test_what_no_route_graph_can_hold_is_refused(planner, tmp_path):
         ),
         ((terminal, params), {}, "the value of 'terminal' is no sum of costs of bounds"),
         ((planner, params), {"objective": "mean"}, "unknown objective 'mean'; choose one of lost"),
-        ((change, params), {}, "rates that measure the change of trust"),
         ((planner, params._replace(beta0=1.0)), {}, r"abs\(beta0\) < 1; got 1"),
         (
             (planner, params),

@@ -220,7 +220,7 @@ def test_every_draw_has_predictions(posterior):
 
 def test_what_has_no_single_predictions_is_named(missions):
     counted = xr.DataTree.from_dict({"posterior": xr.Dataset()})
-    counted.attrs = {"observation": "censored", "inter_robot": "none", "response": "level"}
+    counted.attrs = {"observation": "censored", "inter_robot": "none"}
     counted.attrs |= {"x0_mean": 0.5, "x0_sd": 0.5}
     with pytest.raises(tb.TrustboError, match='observation "censored" and inter_robot="none"'):
         tb.inference.by_rate(counted)

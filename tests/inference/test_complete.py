@@ -47,13 +47,6 @@ def test_it_adds_what_fit_adds_at_once(missions, model, tmp_path):
     )
 
 
-def test_trust_that_was_sampled_cannot_be_added_later(missions):
-    bare = fit(missions, PooledTrust(), sampler="exact", n_draws=100, whole=False)
-    bare.attrs |= {"observation": "censored", "response": "change"}
-    with pytest.raises(TrustboError, match='under observation "censored" was sampled with'):
-        complete(bare)
-
-
 def test_the_caller_s_jax_flags_do_not_matter(missions):
     plain = fit(missions, PooledTrust(), sampler="exact", n_draws=100)
     shared = HierarchicalTrust(Priors(tau=HalfCauchy(0.3)))  # whose draws are JAX's

@@ -166,8 +166,6 @@ def test_what_cannot_treat_it_refuses_it_by_its_noun(missions):
     censored = PooledTrust(effects=Daylight(HOURS), observation="censored")
     with pytest.raises(TrustboError, match=r'"nuts" cannot treat.*observations are not Gaussian'):
         tb.fit(missions, censored, "nuts")
-    with pytest.raises(TrustboError, match="effects of daylight, and rates measure changes"):
-        tb.fit(missions, PooledTrust(effects=Daylight(HOURS), response="change"))
     with pytest.raises(TrustboError, match="effects of daylight are of fitted missions"):
         tb.inference.prior_predictive(PooledTrust(effects=Daylight(HOURS)), np.ones((1, 2, 3, 2)))
     with pytest.raises(TrustboError, match="Daylight has 1 hours, of 8 missions"):

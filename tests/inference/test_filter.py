@@ -125,7 +125,7 @@ def test_impossible_values_leave_the_filter_as_it_was(posterior):
         TrustFilter(posterior, 2)
     with pytest.raises(TrustboError, match=r"has observation='gaussian'; got 'censored'\. Leave"):
         TrustFilter(posterior, observation="censored")
-    TrustFilter(posterior, 3, observation="gaussian", response="level")
+    TrustFilter(posterior, 3, observation="gaussian")
     for most in (0, 2.5):
         with pytest.raises(TrustboError, match="max_draws must be a whole number from 1 on"):
             TrustFilter(params, 3, max_draws=most)

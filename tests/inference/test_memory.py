@@ -211,8 +211,6 @@ def test_records_of_the_usual_memory_are_as_before():
 def test_what_cannot_treat_deviations_refuses_them(deviations, of_deviations):
     with pytest.raises(TrustboError, match=r"'trust'.*level"):
         PooledTrust(memory="trust")
-    with pytest.raises(TrustboError, match='"deviation" is for rates that measure trust'):
-        PooledTrust(memory="deviation", response="change")
     censored = PooledTrust(memory="deviation", observation="censored")
     with pytest.raises(TrustboError, match="observations are not Gaussian"):
         tb.fit(deviations, censored, "nuts")
@@ -281,9 +279,6 @@ def test_what_has_no_such_evidence_is_refused():
     missions = missions_with(0.3, 2)
     with pytest.raises(TrustboError, match=r"memory is weighed under PooledTrust.*Hierarchical"):
         tb.inference.memory(tb.fit(missions, HierarchicalTrust(), whole=False, check=False))
-    posterior = tb.fit(missions, PooledTrust(response="change"), whole=False, check=False)
-    with pytest.raises(TrustboError, match='response="change"'):
-        tb.inference.memory(posterior)
     with pytest.raises(TrustboError, match="takes a posterior from fit"):
         tb.inference.memory(missions)
 

@@ -308,9 +308,6 @@ def test_what_has_no_effects_of_robots_refuses_them(missions):
     censored = PooledTrust(effects=[RobotEffect()], observation="censored")
     with pytest.raises(TrustboError, match=r'"nuts" cannot treat.*observations are not Gaussian'):
         tb.fit(missions, censored, "nuts")
-    changes = PooledTrust(effects=[RobotEffect()], response="change")
-    with pytest.raises(TrustboError, match="effects of robots, and rates measure changes"):
-        tb.fit(missions, changes, "exact")
     with pytest.raises(TrustboError, match="effects of robots"):
         tb.inference.prior_predictive(model, np.zeros((1, 2, 3, 2)))
     with pytest.raises(TypeError, match="effects"):

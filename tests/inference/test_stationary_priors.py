@@ -95,8 +95,6 @@ def test_several_sights_share_the_slope():
 def test_priors_of_one_s_own_stay():
     own = PooledTrust(Priors())
     assert own.for_features(FEATURES) is own
-    change = PooledTrust(response="change")
-    assert change.for_features(FEATURES) is change
     assert PooledTrust().for_features(FEATURES).priors.stationary
     for model in (PooledTrust(), own):
         again = model_from_record(model_to_record(model))

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from missions import simulate_missions
-from references import dense_coupled
 
 from trustbo.data import Mission
 from trustbo.errors import ShapeError, TrustboError
@@ -27,32 +26,6 @@ def with_a_gap(mission):
     rates = mission.contact_rate.copy()
     rates[1, 2] = np.nan
     return Mission.from_arrays(mission.path, mission.awareness, rates)
-
-
-def test_the_quadratic_form_of_changes_is_the_dense_joint_normal():
-    missions = simulate_missions(3)
-    missions[0] = with_a_gap(missions[0])
-    model = PooledTrust(response="change")
-    (statistics,) = gather(model, stack_missions(missions))
-    q = statistics.evaluate(THETA, 0.5)
-    c = np.array([0.3, 0.2, 0.05])
-    for i, (beta0, Q, R) in enumerate(THETA):
-        found = q.alpha[i] - 2 * c @ q.h[i] + c @ q.P[i] @ c + q.log_det[i]
-        found = -0.5 * (found + statistics.n_measured * np.log(2 * np.pi))
-        expected = sum(
-            dense_coupled(
-                np.diag([beta0] * 3),
-                m.awareness @ c[:2] + c[2],
-                np.eye(3) * Q,
-                np.eye(3) * R,
-                0.5,
-                0.5,
-                m.contact_rate,
-                model.lag,
-            )[0]
-            for m in missions
-        )
-        np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
 def test_a_weight_is_a_number_of_missions():

@@ -38,9 +38,8 @@ MODELS = {
     "pooled": PooledTrust(),
     "hierarchical": HierarchicalTrust(),
     "coupled": CoupledTrust(),
-    "apart": CoupledTrust(inter_robot="none", response="change"),
+    "apart": CoupledTrust(inter_robot="none"),
     "ordered": CoupledTrust(inter_robot="ordered"),
-    "change": CoupledTrust(response="change"),
     "censored": CoupledTrust(observation="censored"),
     "counts": HierarchicalTrust(observation="beta_binomial"),
 }
@@ -85,8 +84,7 @@ def coupled_params(rng, n=3, m=2):
     )
 
 
-@pytest.mark.parametrize("response", ["level", "change"])
-def test_coupled_log_likelihood_is_equations_1_and_2(response):
+def test_coupled_log_likelihood_is_equations_1_and_2():
     rng = np.random.default_rng(0)
     params, missions = coupled_params(rng), simulate_missions(3)
     rates = missions[0].contact_rate.copy()
@@ -97,8 +95,8 @@ def test_coupled_log_likelihood_is_equations_1_and_2(response):
         z = mission.awareness
         drift = params.b + sum(z[:, :, m] @ params.B[m].T for m in range(2))
         args = (params.B0, drift, params.Delta_w, params.Delta_v, 0.4, 0.3)
-        expected.append(dense_coupled(*args, mission.contact_rate, float(response == "change"))[0])
-    found = CoupledTrust(response=response).log_likelihood(params, missions)
+        expected.append(dense_coupled(*args, mission.contact_rate)[0])
+    found = CoupledTrust().log_likelihood(params, missions)
     np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
@@ -384,8 +382,6 @@ def test_covariances_and_sizes_that_do_not_fit_are_named():
         model.log_likelihood(params, [])
     with pytest.raises(TrustboError, match="unknown inter_robot 'half'; choose one of full, none"):
         CoupledTrust(inter_robot="half")
-    with pytest.raises(TrustboError, match="unknown response 'slope'"):
-        PooledTrust(response="slope")
     with pytest.raises(TrustboError, match=r"priors must be a trustbo.models.Priors; got 3"):
         PooledTrust(3)
     with pytest.raises(TrustboError, match="model must be a trust model"):

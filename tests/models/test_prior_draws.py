@@ -146,7 +146,7 @@ def test_draws_have_the_moments_of_the_numpyro_program(model):
     assert {name: value.shape[1:] for name, value in ours.items()} == model.sizes(2, 2)
     theirs = {name: np.asarray(value, dtype=float) for name, value in theirs.items()}
     params, rng = model.params(ours, 2).flat(), np.random.default_rng(2)
-    missions = draw_missions(model.family, params, model.lag, z, ticks, rng)
+    missions = draw_missions(model.family, params, z, ticks, rng)
     ours["contact_rate"] = missions.contact_rate
     both = [
         np.concatenate([each[name].reshape(N, -1) for name in names], axis=1)

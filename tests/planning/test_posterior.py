@@ -166,15 +166,3 @@ def test_regret_is_a_share_of_the_contact_that_the_best_path_keeps(workspace, dr
         nothing = np.inf if regret > 1e-12 else 0.0
         expected = regret / kept if kept > 0.0 else nothing
         np.testing.assert_allclose(drawn.relative_regret(path)[d], expected, rtol=1e-9, atol=1e-12)
-
-
-def test_contact_lost_by_rates_of_change_is_what_trust_does_not_gain(workspace, draws):
-    planner = Planner(workspace, (3, 0), (0, 3), response="change")
-    params = draws.draw(3)
-    plan = planner.plan(params)
-    gained = plan.trust[-1].mean() - 0.5
-    np.testing.assert_allclose(plan.value, gained - (len(plan.path) - 1), rtol=1e-12)
-    numba = Planner(workspace, (3, 0), (0, 3), response="change", engine="numba").plan(params)
-    np.testing.assert_allclose(plan.value, numba.value, rtol=1e-12)
-    with pytest.raises(TrustboError, match="of rates that measure the change of trust is for"):
-        Planner(workspace, (3, 0), (0, 3), response="change", team="min")

@@ -315,8 +315,6 @@ def test_impossible_truths_are_refused(of_wooded, wooded):
         of_wooded.value([(2, 0), (0, 2)])
     with pytest.raises(TrustboError, match="a path needs at least two cells"):
         of_wooded.regret([(2, 0)])
-    with pytest.raises(TrustboError, match="measures changes of trust"):
-        Truth.of(ModelSimulator(grid(), PARAMS["pooled"], PooledTrust(response="change")))
     falling = ModelSimulator(grid(), PARAMS["pooled"]._replace(beta0=-0.5))
     with pytest.raises(TrustboError, match="trust that rises with the trust before it"):
         Truth.of(falling).best((2, 0), (0, 2), max_bounds="shortest")

@@ -109,7 +109,7 @@ def test_a_key_depends_on_what_decides_the_numbers_and_on_nothing_else():
     for change in (
         {"terrains": {"cells": cells | {"n_robots": 2}}},
         {"simulators": {"truth": truth | {"params": truth["params"] | {"b": 0.06}}}},
-        {"models": {"PooledTrust": {"response": "change"}}},
+        {"models": {"PooledTrust": {"observation": "censored"}}},
         {"objectives": ["mean"]},
         {"options": {"connectivity": 4}},
         {"n_iterations": 3},

@@ -104,7 +104,7 @@ class Campaign(Displayed):
         self.learner = Learner(workspace, self.options, model, sampler, self.seed_of("prior"))
         model = self.model
         self.planner = planner_of(
-            self.options, workspace, start, goal, objective, model.family.name, model.response
+            self.options, workspace, start, goal, objective, model.family.name
         )
         self.storage: Storage | None = None
         self._planner_now: Planner | None = None
@@ -123,7 +123,6 @@ class Campaign(Displayed):
         self.settings = record | {
             "model": model.named_with_effects,
             "observation": model.observation,
-            "response": model.response,
             "max_bounds": self.planner.max_bounds,
         }
         self.state.options = record | {

@@ -169,4 +169,4 @@ def _filter_of(campaign: Campaign) -> TrustFilter:
     names, n_robots = campaign.workspace.features, campaign.workspace.team.n_robots
     model = campaign.model.for_features(names)
     draws = sample_prior(model, len(names), 1000, campaign.seed_of("prior"), n_robots=n_robots)
-    return TrustFilter(draws, n_robots, response=model.response, observation=model.observation)
+    return TrustFilter(draws, n_robots, observation=model.observation)

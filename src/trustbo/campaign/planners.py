@@ -26,11 +26,10 @@ def planner_of(
     goal: Location,
     objective: str,
     observation: str,
-    response: str,
 ) -> Planner:
-    """Planner from the options of a campaign, for the observation and response of its model."""
+    """Planner from the options of a campaign, for the observation of its model."""
     chosen: dict[str, Any] = {name: getattr(options, name) for name in PLANNING_OPTIONS}
-    chosen |= {"observation": observation, "response": response}
+    chosen["observation"] = observation
     return Planner(workspace, start, goal, objective, **chosen, infeasible="safest")
 
 

@@ -149,7 +149,6 @@ class Result(Displayed):
         observation = self.posterior.attrs.get("observation", "gaussian")
         planner = planner_of(
             options, self.workspace, start, goal, self.settings["objective"], observation,
-            self.settings.get("response", "level"),
         )  # fmt: skip
         if "hazard" in self.posterior.children:
             hazard = self.posterior["hazard"].to_dataset()

@@ -52,7 +52,7 @@ _ALIKE = 1e-9
 _LEAST = 1e-6
 """Lower limit of probabilities in tables; a smaller one is 0."""
 _SITES = ({"beta0", "beta", "b", "delta_w", "delta_v"}, {"B0", "B", "b", "Delta_w", "Delta_v"})
-_ATTRIBUTES = ("observation", "response", "x0_mean", "x0_sd", "seed")
+_ATTRIBUTES = ("observation", "x0_mean", "x0_sd", "seed")
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -71,7 +71,6 @@ class Point(NamedTuple):
 
     params: Params
     scales: Mapping[str, float]
-    lag: float
     rho: float | None  # of robots, see `RobotEffect`
 
 
@@ -112,11 +111,10 @@ def posterior_point(posterior: xr.DataTree) -> tuple[Point, PlaceEffect | None]:
     x0 = {name: float(posterior.attrs[name]) for name in ("x0_mean", "x0_sd")}
     params = assemble_params({n: np.asarray(m)[None] for n, m in means.items()}, x0).draw(0)
     scales = {name: float(means[name]) for name in _SCALES if name in means}
-    lag = float(posterior.attrs["response"] == "change")
     record = posterior.attrs.get("place", "none")
     place = None if record == "none" else PlaceEffect(**json.loads(record))
     robots = (e for e in effects_of(posterior) if isinstance(e, RobotEffect))
-    return Point(params, scales, lag, next((e.rho for e in robots), None)), place
+    return Point(params, scales, next((e.rho for e in robots), None)), place
 
 
 def joint_normal(point: Point, data: Data) -> Normal:
@@ -125,7 +123,7 @@ def joint_normal(point: Point, data: Data) -> Normal:
     B0, Q, R, drift = _state_space(params, data)
     n_slots = len(data.slots)
     carry, cov, mean = np.zeros((n_slots, n_slots)), np.zeros((n_slots, n_slots)), np.empty(n_slots)
-    blocks = {int(K): _mission(int(K), B0, Q, R, params, point.lag) for K in set(data.n_bounds)}
+    blocks = {int(K): _mission(int(K), B0, Q, R, params) for K in set(data.n_bounds)}
     end = 0
     for K in data.n_bounds:
         block = slice(end, end + K * n)
@@ -205,14 +203,12 @@ def _state_space(params: Params, data: Data):
     return np.diag(beta0), np.diag(w**2), np.diag(v**2), drift
 
 
-def _mission(K: int, B0, Q, R, params: Params, lag: float):
+def _mission(K: int, B0, Q, R, params: Params):
     """Propagation of drifts, covariance, and the mean from x_0, of one mission of K bounds."""
     n = len(B0)
     eye, down = np.eye(K * n), np.eye(K, k=-1)
-    change = eye - lag * np.kron(down, np.eye(n))
-    carry = change @ np.linalg.inv(eye - np.kron(down, B0))
-    first = np.kron(np.eye(K)[:, :1], np.eye(n))
-    start = carry[:, :n] @ B0 - lag * first
+    carry = np.linalg.inv(eye - np.kron(down, B0))
+    start = carry[:, :n] @ B0
     cov = carry @ np.kron(np.eye(K), Q) @ carry.T + np.kron(np.eye(K), R)
     cov += float(params.x0_sd) ** 2 * start @ start.T
     return carry, cov, float(params.x0_mean) * start.sum(1)

@@ -14,7 +14,6 @@ from scipy import special
 
 from trustbo.criticism.joint_normal import Data, Point
 from trustbo.data import Mission
-from trustbo.errors import TrustboError
 from trustbo.inference.draws import params_of_missions
 from trustbo.inference.evidence.ep import trust
 from trustbo.models.families import FAMILIES
@@ -36,17 +35,10 @@ def with_normal_rates(
         data: Their rates.
         point: Posterior mean of the parameters.
         seed: Seed of the draw of trust and of the scores.
-
-    Raises:
-        TrustboError: Rates that are not Gaussian measure changes of trust.
     """
     family = FAMILIES[posterior.attrs["observation"]]
     if family.integrates_out:
         return data, point
-    if point.lag:
-        raise TrustboError(
-            f"criticise takes {family.name} rates that measure trust; these measure its change."
-        )
     rng = np.random.default_rng([seed, 2])
     every = params_of_missions(posterior, missions, data.batch)
     if "latent" in posterior.children:

@@ -43,9 +43,9 @@ def with_robots(posterior: xr.DataTree, missions: Sequence[Mission]) -> xr.DataT
     place = PlaceEffect() if record == "none" else PlaceEffect(**json.loads(record))
     if not has_places(missions):
         place = None
-    response, seed = str(posterior.attrs["response"]), int(posterior.attrs["seed"])
+    seed = int(posterior.attrs["seed"])
     model = PooledTrust(
-        effects=(RobotEffect(),), place=place, response=response,
+        effects=(RobotEffect(),), place=place,
         observation=posterior.attrs["observation"],
     )  # fmt: skip
     if model.why_not_exact:

@@ -144,11 +144,6 @@ def summed(planner: Planner, objective: str | None) -> Planner:
             "objective='lost_contact' or 'stationary'."
         )
     require_choice("objective", name, OBJECTIVES)
-    if name == "lost_contact" and planner.lag:
-        raise TrustboError(
-            "rates that measure the change of trust have no loss of each bound; give "
-            "objective='stationary'."
-        )
     return planner if name == planner.objective else planner.with_objective(name)
 
 

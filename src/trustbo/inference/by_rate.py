@@ -51,7 +51,7 @@ def by_rate(posterior: xr.DataTree, missions: Sequence[Mission] | None = None) -
     batch = stack_missions(missions, pad=False)
     params = params_of_missions(posterior, missions, batch)
     measured = np.isfinite(batch.contact_rate)
-    mean, sd = (a[:, measured] for a in kalman_numpy.one_step(params, conditional.lag, batch))
+    mean, sd = (a[:, measured] for a in kalman_numpy.one_step(params, batch))
     y = batch.contact_rate[measured]
     rng = np.random.default_rng([posterior.attrs["seed"], 2])
     drawn = mean + sd * rng.standard_normal(mean.shape)

@@ -23,7 +23,6 @@ from trustbo.inference.evidence.live import Effect, Rates, live_filter
 from trustbo.inference.posterior_tree import of_no_map, require_posterior
 from trustbo.inference.samplers.weights import systematic
 from trustbo.models.families import FAMILIES, Family
-from trustbo.models.model import RESPONSES
 from trustbo.models.params import Params, check_params
 from trustbo.models.ticks import broadcast_ticks
 from trustbo.workspace.moves import bounds_along, moves_along, require_on_grid
@@ -79,7 +78,6 @@ class TrustFilter:
         posterior: xr.DataTree | Params,
         n_robots: int | None = None,
         *,
-        response: str | None = None,
         observation: str | None = None,
         max_draws: int = 1000,
     ) -> None:
@@ -88,15 +86,13 @@ class TrustFilter:
         Args:
             posterior: DataTree from `fit`, or draws with leading axis (draw,).
             n_robots: Number of robots; needed with `TrustParams`, which all robots share.
-            response: `"level"` or `"change"`, with draws; `"level"` by default. A posterior records
-                it.
             observation: Family of observations, with draws; `"gaussian"` by default. A posterior
                 records it.
             max_draws: Largest number of draws to follow; they are evenly spaced.
 
         Raises:
             ShapeError: Draws or a posterior of another number of robots or features.
-            TrustboError: No posterior, `TrustParams` without `n_robots`, an unknown response or
+            TrustboError: No posterior, `TrustParams` without `n_robots`, an unknown
                 family, or one that is not the posterior's.
         """
         self._bounded = True
@@ -110,7 +106,6 @@ class TrustFilter:
                     "Leave it out."
                 )
             n_robots = n_robots if recorded is None else recorded
-            response = _of_posterior(posterior, "response", response)
             observation = _of_posterior(posterior, "observation", observation)
             posterior = params_of(posterior, day=True)
         elif not isinstance(posterior, Params):
@@ -132,8 +127,7 @@ class TrustFilter:
         self._n_robots = n_robots
         family = require_choice("observation", observation or "gaussian", FAMILIES)
         self._family = FAMILIES[family]
-        lag = float(require_choice("response", response or "level", RESPONSES) == "change")
-        self._core = live_filter(self.params, lag, n_robots)
+        self._core = live_filter(self.params, n_robots)
         self._grids = {np.shape(value)[-2:] for value in self.params.places.values()}
         self.reset()
 
@@ -405,7 +399,7 @@ def _robots_of(posterior: xr.DataTree) -> int | None:
 
 
 def _of_posterior(posterior: xr.DataTree, name: str, given: str | None) -> str:
-    """Response or observation of the posterior; TrustboError if another is given."""
+    """Observation of the posterior; TrustboError if another is given."""
     recorded = posterior.attrs[name]
     if given not in (None, recorded):
         raise TrustboError(f"the posterior has {name}={recorded!r}; got {given!r}. Leave it out.")

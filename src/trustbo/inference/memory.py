@@ -87,7 +87,7 @@ def memory(
     attrs = require_posterior("memory", posterior).attrs
     data = FitData.of(posterior, missions, workspace, model)
     model = data.model
-    exact = isinstance(model, PooledTrust) and "log_evidence" in attrs and not model.lag
+    exact = isinstance(model, PooledTrust) and "log_evidence" in attrs
     if not exact or resolve_sampler(model, "auto")[0] != "exact":
         raise TrustboError(
             "memory is weighed under PooledTrust for rates of trust, by the exact sampler; got "

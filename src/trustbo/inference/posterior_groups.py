@@ -54,7 +54,6 @@ class Conditional(NamedTuple):
     """Conditional distribution of contact rates given parameters."""
 
     family: Family
-    lag: float
     by_numpy: bool
     """Whether scalar recursions suffice, which run faster than JAX compiles them."""
     of_people: bool = False
@@ -64,8 +63,7 @@ class Conditional(NamedTuple):
         """Read the conditional distribution from the attributes of a posterior."""
         family = FAMILIES[posterior.attrs["observation"]]
         apart = posterior.attrs["inter_robot"] == "none"
-        lag = float(posterior.attrs["response"] == "change")
-        return cls(family, lag, apart, is_of_people(posterior))
+        return cls(family, apart, is_of_people(posterior))
 
 
 def complete(
@@ -192,8 +190,8 @@ def _trust_by_numpy(
     """Latent trust, log-likelihood and predictions of robots apart, without JAX."""
     rng = np.random.default_rng([seed, 1])
     if conditional.family.integrates_out:
-        summary = kalman_numpy.summarize(every, conditional.lag, batch, n_bounds)
-        trajectories = kalman_numpy.sample(few, conditional.lag, batch, rng, n_bounds)
+        summary = kalman_numpy.summarize(every, batch, n_bounds)
+        trajectories = kalman_numpy.sample(few, batch, rng, n_bounds)
     else:
         summary = trust.summarize(conditional.family, every, batch, n_bounds, rng)
         trajectories = trust.sample(conditional.family, few, batch, n_bounds, rng)
@@ -216,12 +214,10 @@ def _trust_compiled(
     """Latent trust, log-likelihood and predictions of coupled robots, compiled by JAX."""
     with own_settings():
         keys = random.split(random.fold_in(random.key(seed), 1))
-        mean, sd = latent.trust_moments(conditional.lag, every, batch)
+        mean, sd = latent.trust_moments(every, batch)
         arrays = {
-            "log_likelihood": mission_log_likelihood(
-                conditional.family, conditional.lag, every, *batch, keys[0]
-            ),
-            "trust": latent.trust_draws(conditional.lag, few, batch, keys[1]),
+            "log_likelihood": mission_log_likelihood(conditional.family, every, *batch, keys[0]),
+            "trust": latent.trust_draws(few, batch, keys[1]),
             "trust_mean": mean,
             "trust_sd": sd,
             "predicted": _predict(conditional, every, batch, np.random.default_rng([seed, 1])),
@@ -233,9 +229,7 @@ def _predict(
     conditional: Conditional, params: Params, batch: MissionBatch, rng: np.random.Generator
 ) -> np.ndarray:
     """Contact rates of missions drawn anew, one set per draw: (draw, mission, bound, robot)."""
-    drawn = draw_missions(
-        conditional.family, params, conditional.lag, batch.awareness, batch.n_ticks, rng
-    )
+    drawn = draw_missions(conditional.family, params, batch.awareness, batch.n_ticks, rng)
     return drawn.contact_rate
 
 

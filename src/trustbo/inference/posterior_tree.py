@@ -17,7 +17,7 @@ _DIMS = {
     "trust_sd": ("mission", "bound", "robot"),
     "contact_rate": ("mission", "bound", "robot"),
 }
-_ATTRIBUTES = "observation", "response", "x0_mean", "x0_sd"
+_ATTRIBUTES = "observation", "x0_mean", "x0_sd"
 
 
 def require_posterior(who: str, value: object) -> xr.DataTree:

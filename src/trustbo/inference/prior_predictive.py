@@ -75,7 +75,7 @@ def prior_predictive(
     )
     drawn = draw_sites(model, z.shape[2:], n_draws, seed)
     params, rng = model.params(drawn, z.shape[3]).flat(), np.random.default_rng(seed + 1)
-    missions = draw_missions(model.family, params, model.lag, z, ticks, rng)
+    missions = draw_missions(model.family, params, z, ticks, rng)
     drawn["contact_rate"] = missions.contact_rate
     dims = {**model.dims, "contact_rate": ("mission", "bound", "robot")}
     robots = [f"r{i + 1}" for i in range(z.shape[2])]

@@ -89,7 +89,7 @@ def score(
         y = one.contact_rate[0]
         log_scores, drawn = _bound_by_bound(conditional, params, mission, one, filtered, rng)
         if drawn is None:
-            drawn = draw_missions(conditional.family, there, conditional.lag, one.awareness,
+            drawn = draw_missions(conditional.family, there, one.awareness,
                                   one.n_ticks, rng).contact_rate[:, 0]  # fmt: skip
         columns["mean"][j, k] = np.where(np.isnan(y), np.nan, drawn.mean(0))
         columns["pit"][j, k] = _pit(drawn, y, rng)
@@ -187,7 +187,7 @@ def _bound_by_bound(
     """
     z, y, ticks = (a[0] for a in batch)
     family, n_robots = conditional.family, y.shape[1]
-    core = live_filter(params, conditional.lag, n_robots)
+    core = live_filter(params, n_robots)
     effects = [0.0] * len(y)
     if params.places:
         effects = np.moveaxis(params.of_places(bounds_of([mission])[0]), -2, 0)

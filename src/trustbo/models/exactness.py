@@ -12,13 +12,7 @@ _REFUSED: tuple[tuple[tuple[str, ...], set[str], str], ...] = (
         "its robots influence each other, and its observations are not Gaussian",
     ),
     (("other",), set(), "its robots share some parameters only, or influence each other"),
-    (
-        ("all", "each", "pooled"),
-        {"not Gaussian", "changes"},
-        "it measures changes of trust, and its observations are not Gaussian",
-    ),
     (("each",), {"places"}, "it has effects of places, and robots with nothing else in common"),
-    ((), {"effects", "changes"}, "it has effects of {0}, and rates measure changes"),
 )
 """Models without an evidence: their `robot_sets`, () for any, what they have, and the reason."""
 
@@ -26,13 +20,7 @@ _REFUSED: tuple[tuple[tuple[str, ...], set[str], str], ...] = (
 def why_not_exact(model: "TrustModel") -> str | None:
     """Reason why the exact sampler cannot treat a model; None if it can."""
     family, sets = model.family, model.robot_sets
-    traits = {
-        "not Gaussian": not family.integrates_out,
-        "changes": bool(model.lag),
-        "places": model.place is not None,
-        "effects": bool(model.effects),
-    }
+    traits = {"not Gaussian": not family.integrates_out, "places": model.place is not None}
     mine = {name for name, has in traits.items() if has}
     reasons = (why for of, what, why in _REFUSED if sets in (of or (sets,)) and what <= mine)
-    reason = next(reasons, None)
-    return reason and reason.format(*model.nouns)
+    return next(reasons, None)

@@ -31,7 +31,6 @@ from trustbo.models.state_space.generate import TrustSample, draw_missions
 from trustbo.models.ticks import broadcast_ticks, require_ticks, resolution, weigh_ticks
 from trustbo.stacking import stack_missions
 
-RESPONSES = ("level", "change")
 _STREAM = 0x6D697373  # of `simulate`, among all that a seed gives
 
 
@@ -45,31 +44,21 @@ class TrustModel(Displayed, ABC):
         observation: Family of observations: `"gaussian"`, the paper's; `"censored"`, rates of 0
             and 1 being limits; `"beta_binomial"`, ticks in contact out of `Bound.n_ticks` ticks,
             trust being a logit.
-        response: Quantity that a rate measures: trust, `"level"`, or its `"change"` over the bound.
         place: Effects of places that awareness does not explain; None is the paper's model.
 
     Raises:
-        TrustboError: A name is unknown, the family does not allow `"change"`, or robots that
-            influence each other are to have effects of places.
+        TrustboError: A name is unknown, or robots that influence each other are to have effects of
+            places.
     """
 
     priors: Priors = None  # pyright: ignore[reportAssignmentType]
     observation: str = "gaussian"
-    response: str = "level"
     place: PlaceEffect | None = None
     effects: ClassVar[tuple[Effect, ...]] = ()  # see `PooledTrust`
     memory: ClassVar[str] = "level"  # see `PooledTrust`
 
     def __post_init__(self) -> None:
         require_choice("observation", self.observation, FAMILIES)
-        require_choice("response", self.response, RESPONSES)
-        if self.lag and self.memory != "level":
-            raise TrustboError(f'memory "{self.memory}" is for rates that measure trust.')
-        if self.lag and not self.family.allows_change:
-            raise TrustboError(
-                'response "change" is not a share of ticks: use observation "gaussian" or '
-                '"censored".'
-            )
         if self.priors is None:
             object.__setattr__(self, "priors", Priors.default(self.observation))
         elif not isinstance(self.priors, Priors):
@@ -151,7 +140,7 @@ class TrustModel(Displayed, ABC):
 
         See `Priors.of`. `fit` and campaigns call it.
         """
-        if self.priors is not Priors.default(self.observation) or self.lag:
+        if self.priors is not Priors.default(self.observation):
             return self
         return replace(self, priors=Priors.of(tuple(features), self.observation))
 
@@ -204,11 +193,6 @@ class TrustModel(Displayed, ABC):
         """Mean and sd of trust before the first bound, by name."""
         return {name: float(getattr(self.priors, name)) for name in ("x0_mean", "x0_sd")}
 
-    @property
-    def lag(self) -> float:
-        """1 where the rate measures the change of trust, else 0."""
-        return float(self.response == "change")
-
     def __call__(
         self,
         awareness: Array,
@@ -237,7 +221,6 @@ class TrustModel(Displayed, ABC):
             n_ticks=n_ticks,
             innovations=innovations,
             observation=self.observation,
-            lag=self.lag,
         )
         with numpyro.plate("mission", n_missions):
             numpyro.sample("contact_rate", rates, obs=contact_rate)
@@ -291,7 +274,7 @@ class TrustModel(Displayed, ABC):
             flat = flat.on(bounds_of(missions, batch.contact_rate.shape[:2]))
         with own_settings():
             key = jax.random.key(seed)
-            values = mission_log_likelihood(self.family, self.lag, flat, *batch, key)
+            values = mission_log_likelihood(self.family, flat, *batch, key)
         return np.asarray(values)[:, : len(missions)].reshape(*leading, len(missions))
 
     def simulate(
@@ -328,7 +311,7 @@ class TrustModel(Displayed, ABC):
         # The last number: else key 0 would give the stream of `default_rng(0)`, which awareness
         # may well have been drawn from.
         rng = np.random.default_rng([*np.asarray(jax.random.key_data(key)).ravel(), _STREAM])
-        drawn = draw_missions(self.family, one, self.lag, z, ticks, rng)
+        drawn = draw_missions(self.family, one, z, ticks, rng)
         return TrustSample(*(values[0] for values in drawn))
 
     @property
@@ -338,12 +321,8 @@ class TrustModel(Displayed, ABC):
 
     def _card(self) -> Card:
         rows = [
-            ("rates", f"{self.observation}, of the {self.response} of trust"),
-            *(
-                (n, str(v))
-                for n, v in self.options().items()
-                if n not in ("observation", "response")
-            ),
+            ("rates", self.observation),
+            *((n, str(v)) for n, v in self.options().items() if n != "observation"),
             ("places", "no effects" if self.place is None else self.place.in_short()),
             *(("effects", effect.in_short()) for effect in self.effects),
             ("sampler", "exact" if self.why_not_exact is None else f"nuts: {self.why_not_exact}"),

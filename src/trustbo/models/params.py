@@ -22,11 +22,11 @@ class _Apart(ParameterDraws):
         """Drift of bounds with awareness (mission, bound, robot, feature), without that axis."""
         raise NotImplementedError
 
-    def ssm(self, awareness: Array, lag: float = 0.0) -> ScalarSSM:
+    def ssm(self, awareness: Array) -> ScalarSSM:
         """The state space of missions with awareness (mission, bound, robot, feature)."""
         p: Any = self
         drift = jnp.swapaxes(self._drift(awareness), 0, 1)
-        return ScalarSSM(p.beta0, drift, p.delta_w, p.delta_v, p.x0_mean, p.x0_sd, lag)
+        return ScalarSSM(p.beta0, drift, p.delta_w, p.delta_v, p.x0_mean, p.x0_sd)
 
 
 class _Trust(NamedTuple):
@@ -185,11 +185,11 @@ class CoupledParams(ParameterDraws, _Coupled):
         """See `ParameterDraws.increments`."""
         return np.einsum("...mai,...idrcm->...adrc", np.asarray(self.B, dtype=float), awareness)
 
-    def ssm(self, awareness: Array, lag: float = 0.0) -> VectorSSM:
+    def ssm(self, awareness: Array) -> VectorSSM:
         """The state space of missions with awareness (mission, bound, robot, feature)."""
         drift = jnp.einsum("jkim,mai->kja", awareness, self.B) + jnp.reshape(self.b, (1, 1, -1))
         p = self
-        return VectorSSM(p.B0, drift, p.Delta_w, p.Delta_v, p.x0_mean, p.x0_sd, lag)
+        return VectorSSM(p.B0, drift, p.Delta_w, p.Delta_v, p.x0_mean, p.x0_sd)
 
 
 Params = TrustParams | RobotParams | CoupledParams

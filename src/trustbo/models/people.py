@@ -75,10 +75,10 @@ class HumanTrust(PooledTrust):
         given: Any = self.effects
         effects = [given] if isinstance(given, Effect) else [*given]
         others = [e for e in effects if not isinstance(e, PersonEffect)]
-        if others or len(effects) > 1 or self.place is not None or self.response != "level":
+        if others or len(effects) > 1 or self.place is not None:
             raise TrustboError(
                 "HumanTrust has effects of persons alone, and its reports are of trust; got "
-                f"effects={self.effects!r}, place={self.place!r}, response={self.response!r}."
+                f"effects={self.effects!r}, place={self.place!r}."
             )
         first = cast(PersonEffect, effects[0]) if effects else PersonEffect()
         success, failure = (_first(self.names, start) for start in (SUCCESS, FAILURE))

@@ -19,8 +19,6 @@ class Objective(NamedTuple):
     """Cost of a metre of the path, in units of trust, of lost bounds or of log probability."""
     family: Family = FAMILIES["gaussian"]
     """Family of the contact rates."""
-    lag: float = 0.0
-    """0 where rates measure trust, 1 where they measure its change over a bound."""
     unseen_cost: float = 0.0
     """Cost of a bound in which nobody sees anybody, in the same units as that of a metre."""
 
@@ -43,22 +41,19 @@ class Objective(NamedTuple):
         so that trust is at most 1 if B0 >= 0: no bound gains contact, and a loop never pays. Other
         dynamics are returned unchanged.
         """
-        if self.name != "lost_contact" or self.has_labels or self.lag:
+        if self.name != "lost_contact" or self.has_labels:
             return dynamics
         most = 1.0 - dynamics.transition.sum(-1)[..., None, None, None]
         drift, start = np.minimum(dynamics.drift, most), np.minimum(dynamics.start, 1.0)
         return dynamics._replace(drift=drift, start=start)
 
-    def contact_lost(
-        self, trust: np.ndarray, before: ArrayLike, noise_sd: np.ndarray
-    ) -> np.ndarray:
+    def contact_lost(self, trust: np.ndarray, noise_sd: np.ndarray) -> np.ndarray:
         """Expected contact lost in each bound, 1 - E[rate], shape (..., bound).
 
-        From the team's trust after each bound, that `before` the first (...,), and the sd of a rate
-        (...,). It is not negative, but where a linear rate of uncapped trust exceeds 1.
+        From the team's trust after each bound and the sd of a rate (...,). It is not negative, but
+        where a linear rate of uncapped trust exceeds 1.
         """
-        earlier = np.concatenate([np.asarray(before)[..., None], trust[..., :-1]], axis=-1)
-        return 1.0 - self.family.rate_moments(trust - self.lag * earlier, noise_sd[..., None])[0]
+        return 1.0 - self.family.rate_moments(trust, noise_sd[..., None])[0]
 
 
 class PathTrust(NamedTuple):

@@ -17,7 +17,6 @@ from trustbo.errors import require_choice
 from trustbo.hazard.risk import Risk
 from trustbo.hazard.strata import Strata
 from trustbo.models.families import FAMILIES
-from trustbo.models.model import RESPONSES
 from trustbo.models.params import Params
 from trustbo.planning.dynamics import Dynamics
 from trustbo.planning.objectives import DEFAULT_MAX_BOUNDS, Objective
@@ -65,7 +64,6 @@ class Planner(Displayed):
         unseen_cost: float = 0.0,
         engine: str = "auto",
         observation: str = "gaussian",
-        response: str = "level",
         max_failure: float | None = None,
         failure_cost: float | None = None,
         infeasible: str = "refuse",
@@ -95,7 +93,6 @@ class Planner(Displayed):
                 find paths of the same value.
             observation: Family of the contact rates, that of the trust model; for
                 lost_contact.
-            response: Quantity that rates measure, that of the trust model; likewise.
             max_failure: Largest chance that a path fails, in [0, 1), under the risk of `with_risk`;
                 by default no limit.
             failure_cost: Cost of a failure for lost_contact, in bounds: its value is less by this
@@ -107,20 +104,17 @@ class Planner(Displayed):
         Raises:
             TrustboError: Start or goal off the grid, impassable, or equal; an unknown name;
                 `max_bounds` below the fewest possible; a length weight or an unseen cost that is
-                negative, or for bottleneck; an unseen cost without a terrain in memory;
-                lost_contact of rates that measure the change of trust, but for Gaussian rates and
-                `team="mean"`.
+                negative, or for bottleneck; an unseen cost without a terrain in memory.
             NoPathError: The goal cannot be reached.
         """
         self.engine = require_choice("engine", engine, solve.ENGINES)
         family = FAMILIES[require_choice("observation", observation, FAMILIES)]
-        lag = float(require_choice("response", response, RESPONSES) == "change")
         if max_bounds is None:
             max_bounds = DEFAULT_MAX_BOUNDS.get(objective, "shortest+2")
         admitted = PathClass(connectivity, max_bounds)
         paths = AdmissiblePaths(workspace, start, goal, admitted)
         rule = RiskRule(max_failure, failure_cost, infeasible)
-        chosen = Objective(objective, length_weight, family, lag, unseen_cost)
+        chosen = Objective(objective, length_weight, family, unseen_cost)
         self._hold(PlanningProblem(paths, chosen, team, rule=rule))
 
     def _card(self) -> Card:
@@ -128,7 +122,7 @@ class Planner(Displayed):
             ("from", f"{self.start} to {self.goal}, {self.connectivity} directions"),
             ("objective", f"{self.objective}, {self.team} of the robots"),
             ("paths", f"{self.shortest} to {self.longest} bounds ({self.max_bounds})"),
-            ("rates", f"{self.family.name}, of the {'change' if self.lag else 'level'} of trust"),
+            ("rates", self.family.name),
             ("risk", "of each bound" if self.problem.risk is not None else "not known"),
             ("engine", self.engine),
         ]
@@ -141,7 +135,7 @@ class Planner(Displayed):
         self.start, self.goal = paths.start, paths.goal
         self.shortest, self.longest = paths.shortest, paths.longest
         self.max_bounds, self.connectivity = paths.max_bounds, paths.connectivity
-        self.objective, _, self.family, self.lag, _ = problem.objective
+        self.objective, _, self.family, _ = problem.objective
         self.team = problem.team
 
     def _with(self, problem: PlanningProblem) -> Self:

@@ -129,18 +129,13 @@ class PlanningProblem:
 
 def require_objective(objective: Objective, team: str) -> None:
     """Refuse an objective or a team that is unknown, or that cannot be together: TrustboError."""
-    name, _, family, lag, _ = objective
+    name = objective.name
     require_choice("objective", name, OBJECTIVES)
     require_choice("team", team, TEAMS)
     for weight in ("length_weight", "unseen_cost"):
         per_unit = require_not_negative(weight, getattr(objective, weight))
         if per_unit and name not in TOLLED:
             raise TrustboError(f"{weight} is for {', '.join(TOLLED)}; the objective is {name!r}.")
-    if name == "lost_contact" and lag and (team == "min" or objective.has_labels):
-        raise TrustboError(
-            "'lost_contact' of rates that measure the change of trust is for Gaussian rates "
-            f"and team='mean'; got {family.name!r} and {team!r}. Use 'terminal' or 'mean'."
-        )
 
 
 def draws_of(posterior: Params | xr.DataTree, *, day: bool = False) -> Params:

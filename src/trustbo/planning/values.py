@@ -36,8 +36,7 @@ def path_trust(
     if objective.name == "stationary":
         steady_state = along.steady_state()[..., 0, 0, :]
     if objective.name == "lost_contact":
-        before = (along.start @ along.views.T).min(-1)
-        lost = objective.contact_lost(trust, before, along.noise_sd)
+        lost = objective.contact_lost(trust, along.noise_sd)
     return PathTrust(trust, steady_state, toll, lost)
 
 

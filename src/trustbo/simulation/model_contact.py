@@ -41,12 +41,7 @@ class ModelContact:
         awareness: np.ndarray,
         p_fail: np.ndarray | None = None,
     ) -> None:
-        """Take one draw of parameters, awareness as `Workspace.bound_maps`, and chances to fail.
-
-        TrustboError: rates that measure the change of trust, which is no contact.
-        """
-        if model.lag:
-            raise TrustboError('response="change" measures changes of trust; contact has no truth.')
+        """Take one draw of parameters, awareness as `Workspace.bound_maps`, and chances to fail."""
         self._p_fail = p_fail
         self._counts = model.family.needs_ticks
         self._awareness, self._params, n_robots = awareness, params, len(awareness)

@@ -83,17 +83,16 @@ def test_the_evidence_is_that_of_the_joint_normal(name, memory):
         np.testing.assert_allclose(found, expected, rtol=1e-10)
 
 
-@pytest.mark.parametrize("lag", [0.0, 1.0])
 @pytest.mark.parametrize("name", ["weights", "places and robots"])
-def test_robots_of_separate_memory_and_changes_of_trust_have_the_joint_normal_too(name, lag):
+def test_robots_of_separate_memory_have_the_joint_normal_too(name):
     """With gaps, of which robots share some."""
     rng, effects = np.random.default_rng(3), EFFECTS[name]
     slots, groups = gathered(walking_missions(1, 5, missing=0.3), effects)
     theta = random_theta(effects, rng, 5)
     theta["beta0"] = rng.uniform(0.0, 1.1, (5, slots.n_robots))
-    found = Gaussian(slots, groups, X0, apart=True, lag=lag).log_density(theta)
+    found = Gaussian(slots, groups, X0, apart=True).log_density(theta)
     for t in range(5):
-        dense = Dense(slots, groups, point(theta, t), X0, lag=lag)
+        dense = Dense(slots, groups, point(theta, t), X0)
         np.testing.assert_allclose(found[t], dense.log_density(), rtol=1e-10)
 
 

@@ -186,7 +186,6 @@ def test_priors_of_ones_own_move_the_posterior_and_those_without_quantiles_are_r
 @pytest.mark.parametrize(
     ("model", "reason"),
     [
-        (PooledTrust(observation="censored", response="change"), "it measures changes of trust"),
         (CoupledTrust(observation="censored"), "its robots influence each other, and its observ"),
     ],
 )

@@ -21,7 +21,6 @@ WIDE = Priors(delta_w=LogNormal(-2.0, 0.5))
 
 MODELS = {
     "weights": PooledTrust(),
-    "changes": PooledTrust(response="change"),
     "places and robots": PooledTrust(effects=[PlaceEffect(), RobotEffect()]),
     "by robot": HierarchicalTrust(),
     "by robot, places": HierarchicalTrust(place=PlaceEffect()),

@@ -178,14 +178,6 @@ def test_fit_takes_it_and_adds_trust_later():
     assert trust.sel(mission=0).notnull().sum() == 7 * 3
 
 
-def test_changes_of_trust_and_real_beta0_are_no_obstacle():
-    missions = simulate_missions(4)
-    priors = Priors(beta0=dist.Normal(0.3, 0.3), tau=dist.HalfCauchy(0.1))
-    posterior = fit(missions, HierarchicalTrust(priors, response="change"), n_draws=100,
-                    whole=False)  # fmt: skip
-    assert posterior.attrs["sampler"] == "exact"
-
-
 @pytest.mark.parametrize("rates", ["equal", "one robot", "one rate"])
 def test_odd_data_have_a_posterior(rates):
     missions = small(3, 4, 3)
@@ -204,9 +196,6 @@ def test_odd_data_have_a_posterior(rates):
 
 def test_what_it_cannot_treat_is_refused():
     missions = small()
-    change = HierarchicalTrust(observation="censored", response="change")
-    with pytest.raises(TrustboError, match="it measures changes of trust, and its observations"):
-        fit(missions, change, "exact")
     heavy = HierarchicalTrust(Priors(beta=dist.StudentT(3.0, 0.0, 0.5)))
     with pytest.raises(TrustboError, match=r"it needs the prior of beta to be a Normal.*StudentT"):
         fit(missions, heavy, "exact")

@@ -131,8 +131,6 @@ def test_families_that_do_not_suit_are_refused():
     expected = "mission 0, bound 1, robot 0 has a contact rate but no n_ticks. .* give n_ticks"
     with pytest.raises(TrustboError, match=expected):
         fit(bare, counted)
-    with pytest.raises(TrustboError, match="not a share of ticks"):
-        PooledTrust(observation="beta_binomial", response="change")
     with pytest.raises(TrustboError, match="unknown observation 'poisson'"):
         PooledTrust(observation="poisson")
     with pytest.raises(TrustboError, match='sampler "nuts" is for Gaussian rates'):

@@ -29,16 +29,15 @@ def coupled_draws(rng, n=2, m=2):
     )
 
 
-@pytest.mark.parametrize("lag", [0.0, 1.0])
-def test_coupled_missions_have_the_moments_of_the_dense_joint_normal(lag):
+def test_coupled_missions_have_the_moments_of_the_dense_joint_normal():
     rng, n = np.random.default_rng(0), 40_000
     params, z = coupled_draws(rng), rng.uniform(size=(3, 2, 2))
     many = np.broadcast_to(z, (n, *z.shape))
-    sample = draw_missions(GAUSSIAN, params, lag, many, np.asarray(np.nan), rng)
+    sample = draw_missions(GAUSSIAN, params, many, np.asarray(np.nan), rng)
     for d in range(2):
         p = params.draw(d)
         drift = p.b + np.einsum("kim,mai->ka", z, p.B)
-        joint = dense_joint(p.B0, drift, p.Delta_w, p.Delta_v, p.x0_mean, p.x0_sd, lag)
+        joint = dense_joint(p.B0, drift, p.Delta_w, p.Delta_v, p.x0_mean, p.x0_sd)
         mean = np.concatenate([joint.mean_x, joint.mean_y])
         cov = np.block([[joint.cov_x, joint.cov_xy], [joint.cov_xy.T, joint.cov_y]])
         drawn = np.concatenate([a[d].reshape(n, -1) for a in sample], axis=1)
@@ -104,7 +103,7 @@ def test_numpyro_draws_the_same_missions(family, coupled):
     z, ticks = rng.uniform(size=(1, 4, 2, 2)), np.full((1, 4, 2), float(N))
     with own_settings():
         law = ModelRates(p.map(lambda v, _: jnp.asarray(v, float)), jnp.asarray(z),
-                          n_ticks=jnp.asarray(ticks), observation=family, lag=0.0)  # fmt: skip
+                          n_ticks=jnp.asarray(ticks), observation=family)  # fmt: skip
         theirs = np.asarray(law.sample(jax.random.key(0), (n,)))
     many = p.map(lambda v, _: np.repeat(np.asarray(v, dtype=float)[None], n, 0))
     ours = draw_missions(FAMILIES[family], many, 0.0, z, ticks, rng).contact_rate

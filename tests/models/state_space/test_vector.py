@@ -13,7 +13,7 @@ from trustbo.models.state_space.scalar import ScalarSSM
 from trustbo.models.state_space.vector import VectorSSM
 
 
-def random_vector_ssm(rng, n_bounds=6, n_missions=3, n_robots=3, lag=0.0):
+def random_vector_ssm(rng, n_bounds=6, n_missions=3, n_robots=3):
     return VectorSSM(
         rng.normal(0.0, 0.3, (n_robots, n_robots)) + 0.4 * np.eye(n_robots),
         rng.normal(0.0, 0.3, (n_bounds, n_missions, n_robots)),
@@ -21,7 +21,6 @@ def random_vector_ssm(rng, n_bounds=6, n_missions=3, n_robots=3, lag=0.0):
         random_covariance(rng, n_robots, 0.1),
         0.4,
         rng.uniform(0.1, 0.6),
-        lag,
     )
 
 
@@ -51,14 +50,13 @@ def of_complete(ssm, y):
 
 def by_hand(ssm, y, j):
     args = [np.asarray(a) for a in (ssm.B0, ssm.drift[:, j], ssm.Q, ssm.R)]
-    return dense_coupled(*args, float(ssm.x0_mean), float(ssm.x0_sd), y[:, j], float(ssm.lag))
+    return dense_coupled(*args, float(ssm.x0_mean), float(ssm.x0_sd), y[:, j])
 
 
-@pytest.mark.parametrize("lag", [0.0, 1.0])
 @pytest.mark.parametrize("seed", range(4))
-def test_coupled_filter_smoother_and_sampling_are_the_joint_normal_s(seed, lag):
+def test_coupled_filter_smoother_and_sampling_are_the_joint_normal_s(seed):
     rng = np.random.default_rng(seed)
-    ssm = random_vector_ssm(rng, lag=lag)
+    ssm = random_vector_ssm(rng)
     y = random_rates(rng, ssm, missing=0.25 * (seed % 2))
     with jax.enable_x64(True):
         filtered, smoothed, centre, spread = jax.tree.map(np.asarray, posterior_of(ssm, y))
@@ -75,10 +73,9 @@ def test_coupled_filter_smoother_and_sampling_are_the_joint_normal_s(seed, lag):
         np.testing.assert_allclose(factor @ factor.T, covariance, rtol=1e-7, atol=1e-10)
 
 
-@pytest.mark.parametrize("lag", [0.0, 1.0])
-def test_complete_missions_of_any_length_need_one_factor_or_one_covariance(lag):
+def test_complete_missions_of_any_length_need_one_factor_or_one_covariance():
     rng = np.random.default_rng(0)
-    ssm = random_vector_ssm(rng, n_bounds=7, lag=lag)
+    ssm = random_vector_ssm(rng, n_bounds=7)
     y = random_rates(rng, ssm, missing=0.0)
     y[5:, 1] = np.nan
     with jax.enable_x64(True):
@@ -90,19 +87,18 @@ def test_complete_missions_of_any_length_need_one_factor_or_one_covariance(lag):
     np.testing.assert_allclose(at_once[:, 0], expected, rtol=1e-9)
 
 
-@pytest.mark.parametrize("lag", [0.0, 1.0])
 @pytest.mark.parametrize("own", [False, True])
-def test_robots_apart_are_coupled_ones_with_diagonal_matrices(lag, own):
+def test_robots_apart_are_coupled_ones_with_diagonal_matrices(own):
     rng = np.random.default_rng(5)
     shape = (3,) if own else ()
     beta0, w, v = (rng.uniform(0.1, 0.8, shape) for _ in range(3))
     drift = rng.normal(size=(6, 4, 3))
     y = rng.uniform(size=drift.shape)
     y[rng.uniform(size=y.shape) < 0.2] = np.nan
-    apart = ScalarSSM(beta0, drift, w, v, 0.5, 0.3, lag)
+    apart = ScalarSSM(beta0, drift, w, v, 0.5, 0.3)
     matrices = (np.diag(np.broadcast_to(p, 3)) for p in (beta0, w**2, v**2))
     B0, Q, R = matrices
-    coupled = VectorSSM(B0, drift, Q, R, 0.5, 0.3, lag)
+    coupled = VectorSSM(B0, drift, Q, R, 0.5, 0.3)
     with jax.enable_x64(True):
         results = []
         for ssm in (apart, coupled):
@@ -135,7 +131,7 @@ def test_log_likelihood_equals_statsmodels():
 
 def test_simulated_missions_have_the_right_moments():
     rng = np.random.default_rng(1)
-    ssm = random_vector_ssm(rng, n_bounds=3, n_missions=1, n_robots=2, lag=1.0)
+    ssm = random_vector_ssm(rng, n_bounds=3, n_missions=1, n_robots=2)
     n = 40_000
     with jax.enable_x64(True):
         many = ssm._replace(drift=np.repeat(ssm.drift, n, axis=1))

@@ -36,7 +36,6 @@ class Sequences(NamedTuple):
     kind: np.ndarray  # (mission,), missions of one kind have the same gaps up to their lengths
     robot: np.ndarray  # (coefficient,), whose trust it moves
     x0: tuple[float, float]  # mean and sd of trust before the first bound
-    lag: float
 
 
 class Dynamics(NamedTuple):
@@ -57,7 +56,6 @@ def gather_sequences(
     robot: np.ndarray,
     source: np.ndarray,
     x0: tuple[float, float],
-    lag: float,
 ) -> Sequences:
     """Missions of awareness (mission, bound, robot, feature) and rates (mission, bound, robot).
 
@@ -83,7 +81,6 @@ def gather_sequences(
         kind=plain(kind),
         robot=plain(robot),
         x0=x0,
-        lag=float(lag),
     )
 
 
@@ -115,7 +112,7 @@ def _integrate(data, dynamics, first, last, value, factor):
         for s in range(n_missions):
             if s == 0 or data.kind[s] != data.kind[s - 1]:
                 _filter(data.seen[s], data.length[s], dynamics.B0[t], dynamics.Q[t],
-                        dynamics.R[t], data.x0[1], data.lag, gain, scale, of_bound)  # fmt: skip
+                        dynamics.R[t], data.x0[1], gain, scale, of_bound)  # fmt: skip
             total += data.weight[s] * of_bound[: data.length[s]].sum()
             n_rows = _whiten(data, s, dynamics.B0[t], spread, gain, scale, m, J, rows, n_rows)
         A = factor[t]
@@ -134,7 +131,7 @@ def _integrate(data, dynamics, first, last, value, factor):
 
 
 @nb.njit(error_model="numpy", **PART)
-def _filter(seen, length, B0, Q, R, x0_sd, lag, gain, scale, of_bound):
+def _filter(seen, length, B0, Q, R, x0_sd, gain, scale, of_bound):
     """Gains and inverse scales of innovations of each bound, robot by robot (`vector`)."""
     n = len(B0)
     F, J = np.empty((2 * n, n)), np.empty((2 * n, 2 * n))
@@ -142,7 +139,6 @@ def _filter(seen, length, B0, Q, R, x0_sd, lag, gain, scale, of_bound):
     copy(B0, F[n:])
     P = np.zeros((n, n))
     for i in range(n):
-        F[n + i, i] -= lag
         P[i, i] = x0_sd**2
     half = np.empty((2 * n, n))
     for k in range(length):
@@ -190,7 +186,7 @@ def _whiten(data, s, B0, spread, gain, scale, m, J, rows, n_rows):
                 for c in range(q):
                     J[a, c] += f * m[j, c]
             for c in range(q):
-                J[n + a, c] = J[a, c] - data.lag * m[a, c]
+                J[n + a, c] = J[a, c]
         for i in range(n):
             if data.seen[s, k, i]:
                 e, row = J[n + i], rows[n_rows]

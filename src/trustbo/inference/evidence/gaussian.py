@@ -2,11 +2,10 @@
 
 A chain (mission, robot) has x_k = beta0 x_{k-1} + u_k + w_k ("level"), or the same of x - u with
 u_0 = E x_0 ("deviation": what lasts is the departure from what effects expect), u = U c, and rates
-y_k = x_k + v_k, or x_k - x_{k-1} + v_k where they measure changes. Given theta, y = M U c + mean +
-noise, M = D T, T = (I - beta0 Lag)^-1, D = I - lag Lag, or M = I, and the noise's covariance is V =
-L L'. The steps, named at the lines of the code:
+y_k = x_k + v_k. Given theta, y = M U c + mean + noise, M = T = (I - beta0 Lag)^-1, or M = I, and
+the noise's covariance is V = L L'. The steps, named at the lines of the code:
 
-1. Impulse filter: a scalar Kalman filter of unit impulses gives N = L^-1 D T, a missing rate being
+1. Impulse filter: a scalar Kalman filter of unit impulses gives N = L^-1 T, a missing rate being
    a row of zeros, and E = L^-1. With C = N (level) or E (deviation), L^-1 M U = C U. Chains with
    the same gaps, of robots of one beta0, are of one kind and share these.
 2. Gram: A = sum_chains U' S U with S = C'C. The sums of products of columns by pair of bounds, G,
@@ -68,7 +67,6 @@ class Gaussian(Evidence):
         memory: str = "level",
         *,
         apart: bool = False,
-        lag: float = 0.0,
     ) -> None:
         """Sum products of columns over missions.
 
@@ -78,9 +76,8 @@ class Gaussian(Evidence):
             x0: Mean and sd of trust before the first bound.
             memory: `"level"`, trust is carried on, or `"deviation"` from what effects expect.
             apart: Whether theta has a beta0 of each robot, (point, robot).
-            lag: 1 where rates measure the change of trust, else 0.
         """
-        self.slots, self.groups, self.x0, self.lag = slots, tuple(groups), x0, lag
+        self.slots, self.groups, self.x0 = slots, tuple(groups), x0
         self.level = require_choice("memory", memory, MEMORIES) == "level"
         seen = ~np.isnan(slots.y)
         robot = slots.robot if apart else np.zeros_like(slots.robot)
@@ -239,7 +236,7 @@ class Gaussian(Evidence):
     def _impulses(self, theta: Theta) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """See `impulses`."""
         noises = theta["delta_w"], theta["delta_v"]
-        return impulses(self._beta0(theta), *noises, self.x0[1], self.seen, self.lag)
+        return impulses(self._beta0(theta), *noises, self.x0[1], self.seen)
 
     def _beta0(self, theta: Theta) -> np.ndarray:
         """Memory (point, kind), or (point, 1) where robots share it."""
@@ -261,7 +258,6 @@ class Gaussian(Evidence):
         start = np.zeros(N.shape[:3])
         if self.level:
             start = self._beta0(theta)[..., None] * self.x0[0] * N[..., 0]
-            start -= self.lag * self.x0[0] * E[..., 0]
         R, misfit = np.zeros((n, n_chains, K)), np.zeros(n)
         C = N if self.level else E
         _residuals(self.y, expected, start, E, C, self.kind, self.slots.weight, R, misfit)
@@ -346,7 +342,6 @@ def impulses(
     delta_v: np.ndarray,
     x0_sd: float,
     seen: np.ndarray,
-    lag: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Step 1: N and E (point, kind, bound, bound) and log |V| (point, kind).
 
@@ -356,53 +351,47 @@ def impulses(
         delta_v: Measurement noise, (point,).
         x0_sd: Sd of trust before the first bound.
         seen: Mask of the measured rates (kind, bound).
-        lag: 1 where rates measure the change of trust, else 0.
     """
     n, (n_kinds, K) = len(b), seen.shape
     (N, E), log_det = np.zeros((2, n, n_kinds, K, K)), np.zeros((n, n_kinds))
     b = np.broadcast_to(b, (n, n_kinds))
-    _impulses(b, delta_w**2, delta_v**2, x0_sd**2, seen, float(lag), N, E, log_det)
+    _impulses(b, delta_w**2, delta_v**2, x0_sd**2, seen, N, E, log_det)
     return N, E, log_det
 
 
 @_compiled
-def _impulses(b, Q, R, x0_variance, seen, lag, N, E, log_det):
+def _impulses(b, Q, R, x0_variance, seen, N, E, log_det):
     gain = np.empty(seen.shape[1])
     for t in range(len(b)):
         for q in range(len(seen)):
-            log_det[t, q] = _filter(b[t, q], Q[t], R[t], x0_variance, seen[q], lag, N[t, q], gain)
-            _whitening(b[t, q], gain, lag, N[t, q], E[t, q])
+            log_det[t, q] = _filter(b[t, q], Q[t], R[t], x0_variance, seen[q], N[t, q], gain)
+            _whitening(b[t, q], gain, N[t, q], E[t, q])
 
 
 @_compiled
-def _filter(b, Q, R, last, seen, lag, N, gain):
+def _filter(b, Q, R, last, seen, N, gain):
     """Set N and gains of a chain; its log |V|."""
-    log_det, P = 0.0, b * b * last + Q  # variances of trust: after a rate, before the next
+    log_det, P = 0.0, b * b * last + Q  # P: variance of trust before the next rate
     m = np.empty(len(seen))  # response of the rate to come
     for k in range(len(seen)):
-        left, over, gain[k], m[k] = 1.0, 0.0, 0.0, 1.0
+        left, gain[k], m[k] = 1.0, 0.0, 1.0
         if seen[k]:
-            F = P + R + lag * (lag - 2.0 * b) * last
-            left, over, gain[k] = R / F, lag / F, (P - lag * b * last) / F
+            F = P + R
+            left, gain[k] = R / F, P / F
             log_det += np.log(F)
             N[k, : k + 1] = m[: k + 1] / np.sqrt(F)
-        m[:k] *= b * left + over * Q
-        m[k] = (b - lag) * (left + (lag - b) * over * last)
-        more = over * lag * last * Q
-        last, P = P * left + more, b * b * (P * left + more) + Q
+        m[: k + 1] *= b * left
+        P = b * b * (P * left) + Q
     return log_det
 
 
 @_compiled
-def _whitening(b, gain, lag, N, E):
+def _whitening(b, gain, N, E):
     """Set E of a chain."""
     for k in range(len(N)):
         for i in range(k):
             E[k, i] = -b * gain[i] * N[k, i + 1]
         E[k, k] = N[k, k]
-    if lag != 0.0:  # trust after a bound is in the rate of the next
-        for i in range(len(N) - 2, -1, -1):
-            E[:, i] += lag * gain[i] * E[:, i + 1]
 
 
 @_compiled

@@ -52,7 +52,6 @@ class Sums(NamedTuple):
     entry: tuple[np.ndarray, np.ndarray]  # row and column of each entry
     order: np.ndarray  # (column,), index among those of the groups
     x0: tuple[float, float]
-    lag: float
 
     @classmethod
     def of(cls, evidence: Gaussian) -> Self:
@@ -79,22 +78,19 @@ class Sums(NamedTuple):
             (entry[0], entry[1]),
             evidence.order,
             evidence.x0,
-            evidence.lag,
         )
 
 
 def _columns_of_rates(evidence: Gaussian) -> Columns:
     """Further columns (slot, column): of rates, and where trust is carried on, of those before.
 
-    With E of `gaussian`, E y = C (y - beta0 y_before) if rates measure trust, and the same of the
-    running sums of y if they measure its changes. The third column is of trust before the first
-    bound. Each is one for every robot with a separate memory.
+    With E of `gaussian`, E y = C (y - beta0 y_before). The third column is of trust before the
+    first bound. Each is one for every robot with a separate memory.
     """
     y, columns = evidence.y, [evidence.y]
     if evidence.level:
-        first = np.full(y.shape, evidence.lag)
+        first = np.zeros(y.shape)
         first[:, 0] = 1.0
-        y = np.cumsum(y, axis=1) if evidence.lag else y
         columns = [y, np.pad(y, ((0, 0), (1, 0)))[:, :-1], first]
     apart = evidence.robot[evidence.kind][:, None] == np.arange(evidence.robot.max() + 1)
     values = np.stack(columns, axis=2)[..., None] * apart[:, None, None]
@@ -158,7 +154,7 @@ class GaussianJax:
         entries = G.times(upper, len(row)) if isinstance(G, Entries) else jnp.dot(G, upper)
         loadings = [jnp.ones_like(beta0)]
         if self.level:
-            loadings += [-beta0, (sums.lag - beta0) * sums.x0[0]]
+            loadings += [-beta0, -beta0 * sums.x0[0]]
         loadings = jnp.concatenate([-mean, *loadings])
         P = jnp.zeros((len(loadings), len(loadings)))
         P = P.at[row, column].set(entries).at[column, row].set(entries)
@@ -190,39 +186,36 @@ def impulses(theta: Mapping[str, Array], sums: Sums, *, level: bool) -> tuple[Ar
     noises = (jnp.broadcast_to(theta[name], memory.shape) for name in ("delta_w", "delta_v"))
     core = jnp.stack([memory, *noises], axis=1)
     whitened = _level_impulses if level else _deviation_impulses
-    return jax.vmap(whitened, in_axes=(0, None, None, 0))(core, sums.x0[1], sums.lag, sums.seen)
+    return jax.vmap(whitened, in_axes=(0, None, 0))(core, sums.x0[1], sums.seen)
 
 
-def _filtered(core: Array, x0_sd: Array, lag: Array, seen: Array) -> tuple[Array, Array, Array]:
+def _filtered(core: Array, x0_sd: Array, seen: Array) -> tuple[Array, Array, Array]:
     """N (bound, bound), the gains (bound,) and log |V| of a kind, as `gaussian` has them."""
     b, Q, R = core[0], core[1] ** 2, core[2] ** 2
-    over_b = lag - b
 
     def step(carry, inputs):
-        m, P, last = carry
+        m, P = carry
         seen, impulse = inputs
-        F, m = P + R + lag * (lag - 2.0 * b) * last, m + impulse
-        left, over = jnp.where(seen, R / F, 1.0), jnp.where(seen, lag / F, 0.0)
-        gain = jnp.where(seen, (P - lag * b * last) / F, 0.0)
+        F, m = P + R, m + impulse
+        left, gain = jnp.where(seen, R / F, 1.0), jnp.where(seen, P / F, 0.0)
         row = m * jnp.where(seen, F**-0.5, 0.0)
-        before = m * (b * left + over * Q)
-        m = jnp.where(impulse > 0.0, -over_b * (left + over_b * over * last), before)
-        last = P * left + over * lag * last * Q
-        return (m, b * b * last + Q, last), (row, gain, jnp.where(seen, jnp.log(F), 0.0))
+        return (m * (b * left), b * b * (P * left) + Q), (
+            row, gain, jnp.where(seen, jnp.log(F), 0.0)
+        )  # fmt: skip
 
-    K, last = len(seen), x0_sd**2 + 0.0 * b
-    start = jnp.zeros(K), b * b * last + Q, last
+    K = len(seen)
+    start = jnp.zeros(K), b * b * (x0_sd**2 + 0.0 * b) + Q
     _, (N, gain, log_F) = lax.scan(step, start, (seen, jnp.eye(K)))
     return N, gain, log_F.sum()
 
 
-def _level(core: Array, x0_sd: Array, lag: Array, seen: Array) -> tuple[Array, Array]:
-    N, _, log_det = _filtered(core, x0_sd, lag, seen)
+def _level(core: Array, x0_sd: Array, seen: Array) -> tuple[Array, Array]:
+    N, _, log_det = _filtered(core, x0_sd, seen)
     return N, log_det
 
 
-def _deviation(core: Array, x0_sd: Array, lag: Array, seen: Array) -> tuple[Array, Array]:
-    N, gain, log_det = _filtered(core, x0_sd, lag, seen)
+def _deviation(core: Array, x0_sd: Array, seen: Array) -> tuple[Array, Array]:
+    N, gain, log_det = _filtered(core, x0_sd, seen)
     later = jnp.pad(-core[0] * gain[None, :-1] * N[:, 1:], ((0, 0), (0, 1)))
     return later + jnp.eye(len(N)) * N, log_det
 

@@ -1,11 +1,10 @@
 """The marginal likelihood of the pooled model as a quadratic form in its linear coefficients.
 
 Method: generalised least squares for an MA(1), by the discrete sine transform. With c = (beta, b),
-one robot's mission is r = y - beta0 y_lag - h x0_mean e_1 - (U - lag U_lag) c, with h = beta0 - lag
-and lag 0 or 1 as in `scalar`. Its entries are an MA(1), for lag 0 w_k + v_k - beta0 v_{k-1}, so r
-is normal with covariance
+one robot's mission is r = y - beta0 y_lag - beta0 x0_mean e_1 - U c. Its entries are an MA(1),
+w_k + v_k - beta0 v_{k-1}, so r is normal with covariance
 
-    Sigma = T + kappa e_1 e_1',   T tridiagonal Toeplitz,   kappa = h^2 x0_sd^2 - lag Q - beta0^2 R.
+    Sigma = T + kappa e_1 e_1',   T tridiagonal Toeplitz,   kappa = beta0^2 (x0_sd^2 - R).
 
 Why exact: y -> r is unit triangular, so its Jacobian is 1; the type-I sine transform diagonalises T
 for every parameter value (Strang 1999); the corner is a rank-one update (Sherman and Morrison
@@ -42,8 +41,7 @@ class Quadratic(NamedTuple):
 class LengthGram(NamedTuple):
     """Weighted sums over the complete sequences of one length.
 
-    Products of the columns (y, y_lag, x0_mean e_1, features, 1), the last two less `lag` times
-    their values at the bound before.
+    Products of the columns (y, y_lag, x0_mean e_1, features, 1).
     """
 
     weight: float
@@ -63,18 +61,18 @@ class LengthGram(NamedTuple):
             self.corner + other.corner,
         )
 
-    def evaluate(self, theta: np.ndarray, x0_sd: float, lag: float) -> Quadratic:
+    def evaluate(self, theta: np.ndarray, x0_sd: float) -> Quadratic:
         """The quadratic form at parameter values of shape (theta, 3)."""
         n_bounds, p = self.spectral.shape[:2]
         beta0, Q, R = theta.T
         sines = _sine_basis(n_bounds)
-        diagonal, beside = Q * (1.0 + lag) + R * (1.0 + beta0**2), -lag * Q - beta0 * R  # of T
+        diagonal, beside = Q + R * (1.0 + beta0**2), -beta0 * R  # of T
         cosines = np.cos(np.pi * np.arange(1, n_bounds + 1) / (n_bounds + 1))
         values = diagonal[:, None] + 2.0 * beside[:, None] * cosines  # its eigenvalues
         first = sines[0] / values
         g = first @ sines  # T^-1 e_1
         tau = first @ sines[0]  # e_1' T^-1 e_1
-        kappa = (beta0 - lag) ** 2 * x0_sd**2 - lag * Q - beta0**2 * R
+        kappa = beta0**2 * x0_sd**2 - beta0**2 * R
         shrink = kappa / (1.0 + kappa * tau)
         M = (1.0 / values) @ self.spectral.reshape(n_bounds, p * p)
         # (k, j, column, column) and (j, k, column, column) have one transpose's sum: half will do.
@@ -83,7 +81,7 @@ class LengthGram(NamedTuple):
         outer = g[:, k] * g[:, j]
         M -= shrink[:, None] * (outer @ both.reshape(len(k), p * p))
         log_det = np.log(values).sum(1) + np.log1p(kappa * tau)
-        return _collapse_lag(M.reshape(-1, p, p), beta0, beta0 - lag, self.weight * log_det)
+        return _collapse_lag(M.reshape(-1, p, p), beta0, self.weight * log_det)
 
 
 class GapSequences(NamedTuple):
@@ -98,7 +96,7 @@ class GapSequences(NamedTuple):
         """Multiply the weight of the data by a factor."""
         return self._replace(weight=factor * self.weight)
 
-    def evaluate(self, theta: np.ndarray, x0_sd: float, lag: float) -> Quadratic:
+    def evaluate(self, theta: np.ndarray, x0_sd: float) -> Quadratic:
         """The quadratic form at parameter values of shape (theta, 3), by the Kalman filter.
 
         The state's mean is linear in c: column 0 carries what comes from x_0 and the rates, column
@@ -112,9 +110,9 @@ class GapSequences(NamedTuple):
         M, log_det = np.zeros((n, 1 + d, 1 + d)), np.zeros(n)
         for k in range(n_bounds):
             seen = ~np.isnan(self.y[:, k])
-            predicted = (beta0 - lag)[..., None] * m
+            predicted = beta0[..., None] * m
             predicted[..., 1:] += self.u[:, k]
-            S, C = innovation(beta0, beta0 - lag, Q, R, variance)
+            S, C = innovation(beta0, Q, R, variance)
             e = -predicted
             e[..., 0] += np.where(seen, self.y[:, k], 0.0)
             precision = np.where(seen, 1.0 / S, 0.0)
@@ -143,16 +141,15 @@ class SufficientStatistics(NamedTuple):
     sums: tuple[float, float]
     """Sums of the rates and of their squares, weighted."""
     x0_mean: float
-    lag: float
     ticks: TickWeights
     """Weight of the rates by their number of ticks."""
     n_features: int
 
     def __add__(self, other: Self) -> Self:  # pyright: ignore[reportIncompatibleMethodOverride]
-        if (self.x0_mean, self.lag) != (other.x0_mean, other.lag):
+        if self.x0_mean != other.x0_mean:
             raise TrustboError(
-                "statistics gathered under different x0_mean or response do not add up: "
-                f"{(self.x0_mean, self.lag)} and {(other.x0_mean, other.lag)}."
+                "statistics gathered under different x0_mean do not add up: "
+                f"{self.x0_mean} and {other.x0_mean}."
             )
         if self.n_features != other.n_features:
             raise ShapeError(
@@ -168,7 +165,6 @@ class SufficientStatistics(NamedTuple):
             self.n_measured + other.n_measured,
             (self.sums[0] + other.sums[0], self.sums[1] + other.sums[1]),
             self.x0_mean,
-            self.lag,
             add_ticks([self.ticks, other.ticks]),
             self.n_features,
         )
@@ -196,7 +192,7 @@ class SufficientStatistics(NamedTuple):
         n, d = len(theta), self.n_features + 1
         total = Quadratic(np.zeros(n), np.zeros((n, d)), np.zeros((n, d, d)), np.zeros(n))
         for part in (*self.grams.values(), *self.gaps):
-            total = total + part.evaluate(theta, x0_sd, self.lag)
+            total = total + part.evaluate(theta, x0_sd)
         return total
 
 
@@ -216,14 +212,13 @@ def require_forgetting(forgetting: float) -> float:
 
 
 def sufficient_statistics(
-    batch: MissionBatch, x0_mean: float, lag: float = 0.0, weight: np.ndarray | None = None
+    batch: MissionBatch, x0_mean: float, weight: np.ndarray | None = None
 ) -> SufficientStatistics:
     """Gather the statistics of a batch; rates missing at a mission's end only shorten it.
 
     Args:
         batch: Missions, padded with NaN.
         x0_mean: Mean of trust before the first bound.
-        lag: 0 where rates measure trust, 1 where they measure its change.
         weight: Weight of each mission, shape (mission,); 1 by default.
     """
     z, y = batch.awareness, batch.contact_rate
@@ -236,7 +231,7 @@ def sufficient_statistics(
     length, complete = lengths(seen)
     counted = (length > 0) & (row_weight > 0.0)
     grams = {
-        int(n): _length_gram(y[rows, :n], u[rows, :n], row_weight[rows], x0_mean, lag)
+        int(n): _length_gram(y[rows, :n], u[rows, :n], row_weight[rows], x0_mean)
         for n in np.unique(length[counted & complete])
         for rows in [counted & complete & (length == n)]
     }
@@ -249,7 +244,7 @@ def sufficient_statistics(
     sums = (float(weights @ rates), float(weights @ rates**2))
     ticks, n_features = weigh_ticks(batch, weight), z.shape[-1]
     total = float(weights.sum())
-    return SufficientStatistics(grams, gaps, total, sums, x0_mean, lag, ticks, n_features)
+    return SufficientStatistics(grams, gaps, total, sums, x0_mean, ticks, n_features)
 
 
 def lengths(seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -265,14 +260,11 @@ def lengths(seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return length, seen.sum(1) == length
 
 
-def _length_gram(
-    y: np.ndarray, u: np.ndarray, weight: np.ndarray, x0_mean: float, lag: float
-) -> LengthGram:
+def _length_gram(y: np.ndarray, u: np.ndarray, weight: np.ndarray, x0_mean: float) -> LengthGram:
     n_sequences, n_bounds, _ = u.shape
     columns = np.concatenate([y[..., None], np.zeros((n_sequences, n_bounds, 2)), u], axis=-1)
     columns[:, 1:, 1] = y[:, :-1]
     columns[:, 0, 2] = x0_mean
-    columns[:, 1:, 3:] -= lag * u[:, :-1]
     columns *= np.sqrt(weight)[:, None, None]
     transformed = np.einsum("kl,skp->slp", _sine_basis(n_bounds), columns, optimize=True)
     return LengthGram(
@@ -282,11 +274,9 @@ def _length_gram(
     )
 
 
-def _collapse_lag(
-    M: np.ndarray, beta0: np.ndarray, h: np.ndarray, log_det: np.ndarray
-) -> Quadratic:
-    """From columns (y, y_lag, x0_mean e_1, u) to y - beta0 y_lag - h x0_mean e_1 and u."""
-    v = np.stack([np.ones_like(beta0), -beta0, -h], axis=1)
+def _collapse_lag(M: np.ndarray, beta0: np.ndarray, log_det: np.ndarray) -> Quadratic:
+    """From columns (y, y_lag, x0_mean e_1, u) to y - beta0 y_lag - beta0 x0_mean e_1 and u."""
+    v = np.stack([np.ones_like(beta0), -beta0, -beta0], axis=1)
     rows = (v[:, None] @ M[:, :3])[:, 0]
     return Quadratic((rows[:, :3] * v).sum(1), rows[:, 3:], M[:, 3:, 3:], log_det)
 

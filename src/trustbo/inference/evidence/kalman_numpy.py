@@ -27,13 +27,12 @@ class TrustSummary(NamedTuple):
 
 
 def summarize(
-    params: Params, lag: float, batch: MissionBatch, n_bounds: np.ndarray | None = None
+    params: Params, batch: MissionBatch, n_bounds: np.ndarray | None = None
 ) -> TrustSummary:
     """Mean and sd of latent trust over all draws, and each mission's log-likelihood per draw.
 
     Args:
         params: Draws with leading axis (draw,).
-        lag: 0 where rates measure trust, 1 where they measure its change.
         batch: Missions, padded with NaN.
         n_bounds: Bounds of each mission, measured or not; by default all of the batch.
     """
@@ -46,12 +45,12 @@ def summarize(
         for start in range(0, n, step):
             draws = slice(start, start + step)
             p = _Draws(*(column[..., draws] for column in group.draws))
-            f = _filter(p, lag, group)
+            f = _filter(p, group)
             np.add.at(log_likelihood[draws].T, group.mission, f.log_likelihood)
             m, P = f.mean[-1], f.var[-1]
             for k in range(len(group.y) - 1, -1, -1):
                 if k < len(group.y) - 1:
-                    A, a, V = _backward(p, lag, group, f, k)
+                    A, a, V = _backward(p, f, k)
                     m, P = A * m + a, V + A**2 * P
                 total[group.mission, k, group.robot] += m.sum(-1)
                 spread = np.broadcast_to(P, m.shape)
@@ -61,7 +60,7 @@ def summarize(
 
 
 def one_step(
-    params: Params, lag: float, batch: MissionBatch, n_bounds: np.ndarray | None = None
+    params: Params, batch: MissionBatch, n_bounds: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Mean and sd of each rate given the draw and the rates of bounds before.
 
@@ -70,7 +69,7 @@ def one_step(
     mean = np.full((len(params.b), *batch.contact_rate.shape), np.nan)
     sd = mean.copy()
     for group in _groups(params, batch, n_bounds):
-        f = _filter(group.draws, lag, group)
+        f = _filter(group.draws, group)
         for k, (expected, variance) in enumerate(zip(f.rate_mean, f.rate_var, strict=True)):
             mean[:, group.mission, k, group.robot] = expected.T
             spread = np.broadcast_to(np.sqrt(variance), expected.shape)
@@ -80,7 +79,6 @@ def one_step(
 
 def sample(
     params: Params,
-    lag: float,
     batch: MissionBatch,
     rng: np.random.Generator,
     n_bounds: np.ndarray | None = None,
@@ -89,11 +87,11 @@ def sample(
     trust = np.zeros((len(params.b), *batch.contact_rate.shape))
     for group in _groups(params, batch, n_bounds):
         p, e = group.draws, rng.standard_normal((*group.y.shape, len(params.b)))
-        f = _filter(p, lag, group)
+        f = _filter(p, group)
         x = f.mean[-1] + np.sqrt(f.var[-1]) * e[-1]
         for k in range(len(group.y) - 1, -1, -1):
             if k < len(group.y) - 1:
-                A, a, V = _backward(p, lag, group, f, k)
+                A, a, V = _backward(p, f, k)
                 x = A * x + a + np.sqrt(V) * e[k]
             trust[:, group.mission, k, group.robot] = x.T
     return trust
@@ -178,17 +176,17 @@ def _draws_last(params: Params) -> _Draws:
     return _Draws(*(column(getattr(params, name)) for name in _Draws._fields))
 
 
-def _filter(p: _Draws, lag: float, group: _Group) -> _Filtered:
-    h, Q, R = p.beta0 - lag, p.delta_w**2, p.delta_v**2
+def _filter(p: _Draws, group: _Group) -> _Filtered:
+    Q, R = p.delta_w**2, p.delta_v**2
     m = np.broadcast_to(p.x0_mean, (len(group.mission), len(p.beta0)))
     P = np.broadcast_to(p.x0_sd**2, (group.seen.shape[1], len(p.beta0)))
     means, variances, drifts, expected, spreads = [], [], [], [], []
     log_likelihood = np.zeros(m.shape)
     for k, (y, z, seen) in enumerate(zip(group.y, group.z, group.seen, strict=True)):
         drift = p.drift(z, k)
-        S, C = innovation(p.beta0, h, Q, R, P)
+        S, C = innovation(p.beta0, Q, R, P)
         gain = np.where(seen, C / S, 0.0)
-        expected.append(h * m + drift)
+        expected.append(p.beta0 * m + drift)
         spreads.append(S)
         e = y[:, None] - expected[-1]
         m = p.beta0 * m + drift + gain * e
@@ -201,13 +199,10 @@ def _filter(p: _Draws, lag: float, group: _Group) -> _Filtered:
     return _Filtered(means, variances, drifts, expected, spreads, log_likelihood)
 
 
-def _backward(p: _Draws, lag: float, group: _Group, f: _Filtered, k: int):
+def _backward(p: _Draws, f: _Filtered, k: int):
     """A, a, V with x_k | x_{k+1}, y ~ N(A x_{k+1} + a, V), see `kalman.look_back`."""
     # A far draw's process noise may be so small that its square is 0, where Q would divide.
     Q, P = np.maximum(p.delta_w**2, _LEAST_VARIANCE), np.maximum(f.var[k], _LEAST_VARIANCE)
-    of_rate = np.where(group.seen[k + 1], lag / p.delta_v**2, 0.0)
-    A, V = look_back(p.beta0, Q, P, lag, of_rate)
+    A, V = look_back(p.beta0, Q, P)
     a = V / P * f.mean[k] - V * p.beta0 / Q * f.drift[k + 1]
-    if lag:
-        a = a - V * of_rate * group.y[k + 1][:, None]
     return A, a, V

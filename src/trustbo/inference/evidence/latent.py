@@ -15,19 +15,19 @@ from trustbo.stacking import MissionBatch
 _BATCH = 64  # draws computed at once
 
 
-def trust_draws(lag: float, params: Params, batch: MissionBatch, key: Array) -> np.ndarray:
+def trust_draws(params: Params, batch: MissionBatch, key: Array) -> np.ndarray:
     """One exact joint draw of latent trust per parameter draw, (draw, mission, bound, robot)."""
     keys = random.split(key, len(params.b))
-    return in_batches(partial(_trust_draws, lag, batch), (params, keys), _BATCH)
+    return in_batches(partial(_trust_draws, batch), (params, keys), _BATCH)
 
 
-@partial(jax.jit, static_argnames=("lag",))
-def trust_moments(lag: float, params: Params, batch: MissionBatch) -> tuple[Array, Array]:
+@jax.jit
+def trust_moments(params: Params, batch: MissionBatch) -> tuple[Array, Array]:
     """Mean and sd of latent trust (mission, bound, robot) over draws, by the total variance."""
     y = jnp.swapaxes(batch.contact_rate, 0, 1)
 
     def add(carry, p):
-        ssm: Any = p.ssm(batch.awareness, lag)
+        ssm: Any = p.ssm(batch.awareness)
         mean, var = ssm.smooth(ssm.filter(y))
         return (carry[0] + mean, carry[1] + var + mean**2), None
 
@@ -38,13 +38,13 @@ def trust_moments(lag: float, params: Params, batch: MissionBatch) -> tuple[Arra
     return jnp.swapaxes(mean, 0, 1), jnp.swapaxes(sd, 0, 1)
 
 
-@partial(jax.jit, static_argnames=("lag",))
-def _trust_draws(lag: float, batch: MissionBatch, inputs: Any) -> Array:
+@jax.jit
+def _trust_draws(batch: MissionBatch, inputs: Any) -> Array:
     y = jnp.swapaxes(batch.contact_rate, 0, 1)
 
     def one(inputs: Any) -> Array:
         p, key = inputs
-        ssm = p.ssm(batch.awareness, lag)
+        ssm = p.ssm(batch.awareness)
         trust = ssm.sample_backward(ssm.filter(y), random.normal(key, y.shape, y.dtype))
         return jnp.swapaxes(trust, 0, 1)
 

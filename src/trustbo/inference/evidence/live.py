@@ -31,12 +31,11 @@ class Rates(NamedTuple):
 class ApartFilter:
     """Robots that do not influence each other; arrays are (draw, robot)."""
 
-    def __init__(self, params: TrustParams | RobotParams, lag: float, n_robots: int) -> None:
+    def __init__(self, params: TrustParams | RobotParams, n_robots: int) -> None:
         self._p: Any = params
         self._n_robots = n_robots
         columns = (params.beta0, params.b, params.delta_w**2, params.delta_v**2)
         self._beta0, self._b, self._Q, self._R = (p.reshape(len(p), -1) for p in columns)
-        self._h = self._beta0 - lag
         self._x0 = params.x0_mean, params.x0_sd
 
     def start(self) -> Moments:
@@ -63,24 +62,23 @@ class ApartFilter:
         family, y, n_ticks = rates
         seen, drift = ~np.isnan(y), self._drift(z) + effect
         if family.observes_trust:
-            h, S = self._beta0, kalman.update(self._beta0, self._Q, var, 0.0, 0.0)
-            C = S
+            S = C = kalman.update(self._beta0, self._Q, var, 0.0, 0.0)
         else:
-            h = self._h
-            S, C = kalman.innovation(self._beta0, h, self._Q, self._R, var)
+            S, C = kalman.innovation(self._beta0, self._Q, self._R, var)
+        expected = self._beta0 * mean + drift
         left = log_density = np.zeros(mean.shape)
         if family.integrates_out:  # all robots at once
-            e = np.where(seen, y - h * mean - drift, 0.0)
+            e = np.where(seen, y - self._beta0 * mean - drift, 0.0)
             log_density = np.where(seen, -0.5 * (e**2 / S + np.log(S)), 0.0)
         else:
             e, left, log_density = (np.zeros(mean.shape) for _ in range(3))
-            predicted, sd = h * mean + drift, np.broadcast_to(np.sqrt(self._R), mean.shape)
+            sd = np.broadcast_to(np.sqrt(self._R), mean.shape)
             moments, left[:, seen], log_density[:, seen] = family.observe(
-                predicted[:, seen], S[:, seen], y[seen], n_ticks[seen], sd[:, seen]
+                expected[:, seen], S[:, seen], y[seen], n_ticks[seen], sd[:, seen]
             )
-            e[:, seen] = moments - predicted[:, seen]
+            e[:, seen] = moments - expected[:, seen]
         gain = np.where(seen, C / S, 0.0)
-        mean = self._beta0 * mean + drift + gain * e
+        mean = expected + gain * e
         ahead = kalman.update(self._beta0, self._Q, var, gain, S - left)
         return self._state(mean, z, effect), ahead, log_density.sum(1)
 
@@ -107,8 +105,8 @@ class ApartFilter:
         drift = self._drift(z) + effect
         w, v = rng.standard_normal((2, *x.shape))
         now, sd = self._beta0 * x + drift + np.sqrt(self._Q) * w, np.sqrt(self._R)
-        y = self._h * x + drift + np.sqrt(self._Q) * w + sd * v
-        return self._state(now, z, effect), family.draw_rates(rng, now, y, sd, n_ticks)
+        rates = family.draw_rates(rng, now, now + sd * v, sd, n_ticks)
+        return self._state(now, z, effect), rates
 
     def _state(self, trust: np.ndarray, z: np.ndarray, effect: Effect) -> np.ndarray:
         """State of trust after a bound of drift z: trust itself, where that lasts."""
@@ -149,10 +147,10 @@ class CoupledFilter:
     Rates enter one robot at a time, see `vector`.
     """
 
-    def __init__(self, params: CoupledParams, lag: float, n_robots: int) -> None:
+    def __init__(self, params: CoupledParams, n_robots: int) -> None:
         self._p, self._n_robots = params, n_robots
         # Of trust and rate together, (draw, 2 robot, ...).
-        self._F = np.concatenate([params.B0, params.B0 - lag * np.eye(n_robots)], axis=1)
+        self._F = np.concatenate([params.B0, params.B0], axis=1)
         self._F_T = np.ascontiguousarray(np.swapaxes(self._F, 1, 2))
         self._noise = np.tile(params.Delta_w, (1, 2, 2))
         self._noise[:, n_robots:, n_robots:] += params.Delta_v
@@ -231,10 +229,10 @@ class CoupledFilter:
         return (self._B @ flat[..., None])[..., 0] + self._p.b
 
 
-def live_filter(params: Params, lag: float, n_robots: int) -> ApartFilter | CoupledFilter:
+def live_filter(params: Params, n_robots: int) -> ApartFilter | CoupledFilter:
     """Build the filter of one bound under parameters with the leading axis (draw,)."""
     if isinstance(params, CoupledParams):
-        return CoupledFilter(params, lag, n_robots)
+        return CoupledFilter(params, n_robots)
     if isinstance(params, DeviationParams | DeviationRobotParams):
-        return DeviationFilter(params, lag, n_robots)
-    return ApartFilter(params, lag, n_robots)
+        return DeviationFilter(params, n_robots)
+    return ApartFilter(params, n_robots)

@@ -18,7 +18,7 @@ def gather(model: TrustModel, batch: MissionBatch, weight: np.ndarray | None = N
     Returns:
         Statistics of all robots together, or of each where they have nothing in common.
     """
-    args = (model.priors.x0_mean, model.lag, weight)
+    args = (model.priors.x0_mean, weight)
     return tuple(sufficient_statistics(one, *args) for one in split_robots(model, batch))
 
 

@@ -49,7 +49,7 @@ class CoupledTarget(ScoreTarget):
             )
         self.data: Sequences = gather_sequences(
             batch.awareness, batch.contact_rate, weight, robot, source,
-            (float(priors.x0_mean), float(priors.x0_sd)), model.lag,
+            (float(priors.x0_mean), float(priors.x0_sd)),
         )  # fmt: skip
         self._own, self._feature = diagonal | free, np.where(free, n_features, source % n_features)
         pairs = n * (n - 1) // 2

@@ -121,7 +121,7 @@ class SitesInJax:
         none = {"b": jnp.zeros_like(site["b"])}
         params: Any = handlers.substitute(self._of_model, self._values(site) | none)()
         y, z = self.means  # pyright: ignore[reportGeneralTypeIssues]
-        ssm = params.ssm(z[None, None], self.model.lag)
+        ssm = params.ssm(z[None, None])
         carried = ssm.B0.sum(-1) if isinstance(ssm, VectorSSM) else ssm.beta0
         level = carried * y + ssm.drift[0, 0]
         return level if site["b"].ndim else level.mean()
@@ -209,7 +209,7 @@ class SitesInJax:
         return self.model.sample_params(*self.batch.awareness.shape[2:])
 
     def _ssm(self, params: Params) -> Any:
-        return params.ssm(self.batch.awareness, self.model.lag)  # pyright: ignore
+        return params.ssm(self.batch.awareness)  # pyright: ignore
 
     def _at(self, values: Sites) -> Any:
         return self._ssm(handlers.substitute(self._params, values)())  # pyright: ignore

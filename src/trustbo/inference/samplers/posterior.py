@@ -151,5 +151,5 @@ def evidence_of(model: TrustModel, slots: Slots) -> Evidence:
     groups = [effect.group(slots) for effect in effects]
     x0 = model.x0["x0_mean"], model.x0["x0_sd"]
     if model.family.integrates_out:
-        return Gaussian(slots, groups, x0, model.memory, apart=by_robot, lag=model.lag)
+        return Gaussian(slots, groups, x0, model.memory, apart=by_robot)
     return Sites(slots, groups, model.family, x0, model.memory, apart=by_robot)

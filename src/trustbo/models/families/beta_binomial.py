@@ -39,7 +39,6 @@ class BetaBinomial(Family):
 
     name: ClassVar[str] = "beta_binomial"
     needs_ticks: ClassVar[bool] = True
-    allows_change: ClassVar[bool] = False
     rounds: ClassVar[bool] = False
     correlates: ClassVar[bool] = False
     observes_trust: ClassVar[bool] = True

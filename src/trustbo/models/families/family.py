@@ -55,8 +55,6 @@ class Family(ABC):
     """Whether latent trust integrates out in closed form: rates are linear in it, and Gaussian."""
     needs_ticks: ClassVar[bool] = False
     """Whether each measured rate needs its number of ticks."""
-    allows_change: ClassVar[bool] = True
-    """Whether rates may measure the change of trust (`response="change"`)."""
     rounds: ClassVar[bool] = True
     """Whether delta_v is the sd of a rate, recorded to the resolution of its ticks."""
     observes_trust: ClassVar[bool] = False

@@ -25,7 +25,7 @@ class ModelRates(dist.Distribution):
 
     support = constraints.independent(constraints.real, 2)  # pyright: ignore
     pytree_data_fields = ("params", "awareness", "n_ticks", "innovations")
-    pytree_aux_fields = ("observation", "lag")
+    pytree_aux_fields = ("observation",)
 
     def __init__(
         self,
@@ -35,7 +35,6 @@ class ModelRates(dist.Distribution):
         n_ticks: Array | None = None,
         innovations: Array | None = None,
         observation: str = "gaussian",
-        lag: float = 0.0,
     ) -> None:
         """Take parameters and awareness.
 
@@ -46,10 +45,9 @@ class ModelRates(dist.Distribution):
             innovations: Standard normal numbers that latent trust is a function of where it does
                 not integrate out, shape (bound, mission, robot); 0 by default.
             observation: Name of the family, such as `"gaussian"`.
-            lag: 0 where rates measure trust, 1 where they measure its change.
         """
         self.params, self.awareness, self.n_ticks = params, awareness, n_ticks
-        self.innovations, self.observation, self.lag = innovations, observation, lag
+        self.innovations, self.observation = innovations, observation
         super().__init__(awareness.shape[:1], awareness.shape[1:3])
 
     @property
@@ -62,14 +60,14 @@ class ModelRates(dist.Distribution):
         observed = Observed.of(value, self.n_ticks)
         innovations = self.innovations
         innovations = jnp.zeros_like(observed.y) if innovations is None else innovations
-        ssm = self.params.ssm(self.awareness, self.lag)
+        ssm = self.params.ssm(self.awareness)
         return self.family.log_density(ssm, observed, innovations).sum(1)
 
     def sample(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, key: Array, sample_shape: tuple[int, ...] = ()
     ) -> Array:
         """Contact rates, shape `(*sample_shape, mission, bound, robot)`."""
-        ssm = self.params.ssm(self.awareness, self.lag)
+        ssm = self.params.ssm(self.awareness)
         ticks = jnp.full(self.event_shape, jnp.nan) if self.n_ticks is None else self.n_ticks
         ticks = jnp.broadcast_to(ticks, self.awareness.shape[:3])
 
@@ -84,10 +82,9 @@ class ModelRates(dist.Distribution):
         return one(jax.random.split(key, sample_shape))
 
 
-@partial(jax.jit, static_argnames=("family", "lag"))
+@partial(jax.jit, static_argnames=("family",))
 def mission_log_likelihood(
     family: Family,
-    lag: float,
     params: Params,
     awareness: Array,
     contact_rate: Array,
@@ -99,7 +96,7 @@ def mission_log_likelihood(
     def one(p: Params) -> Array:
         observed = Observed.of(contact_rate, n_ticks)
         # The same innovations for every draw: common random numbers.
-        return family.marginal_log_likelihood(p.ssm(awareness, lag), observed, key)
+        return family.marginal_log_likelihood(p.ssm(awareness), observed, key)
 
     n_draws = len(params.b)
     if n_draws < _BATCH:

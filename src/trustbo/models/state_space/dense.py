@@ -1,9 +1,9 @@
 """The likelihood of coupled robots' complete missions, by one Cholesky factor for all of them.
 
-r_k = y_k - B0 y_{k-1} - (c_k - lag c_{k-1}) = w_k - lag w_{k-1} + v_k - B0 v_{k-1} is a block
-MA(1): its covariance is block tridiagonal and does not depend on the data. A mission that ends
-early needs the leading part of the factor only. Without a loop over bounds this is faster than the
-filter, as long as the matrix is small.
+r_k = y_k - B0 y_{k-1} - c_k = w_k + v_k - B0 v_{k-1} is a block MA(1): its covariance is block
+tridiagonal and does not depend on the data. A mission that ends early needs the leading part of the
+factor only. Without a loop over bounds this is faster than the filter, as long as the matrix is
+small.
 """
 
 from typing import TYPE_CHECKING
@@ -44,17 +44,16 @@ def log_likelihood(ssm: "VectorSSM", y: Array) -> Array:
 def _whiten(ssm: "VectorSSM", y: Array) -> tuple[Array, Array]:
     """Independent standard normal residuals, and the log of their scales (bound, robot)."""
     n_bounds, n_sequences, p = y.shape
-    B0, Q, R, lag = ssm.B0, ssm.Q, ssm.R, ssm.lag
-    H = B0 - lag * jnp.eye(p)
+    B0, Q, R = ssm.B0, ssm.Q, ssm.R
     BR = B0 @ R
-    usual = (1.0 + lag) * Q + R + BR @ B0.T
-    first = ssm.x0_sd**2 * H @ H.T + Q + R
-    beside = jnp.kron(jnp.eye(n_bounds, k=-1), -lag * Q - BR)
+    usual = Q + R + BR @ B0.T
+    first = ssm.x0_sd**2 * B0 @ B0.T + Q + R
+    beside = jnp.kron(jnp.eye(n_bounds, k=-1), -BR)
     covariance = jnp.kron(jnp.eye(n_bounds), usual) + beside + beside.T
     covariance = covariance.at[:p, :p].set(first)
     L = jnp.linalg.cholesky(covariance)
-    start = jnp.broadcast_to(H.sum(1) * ssm.x0_mean, (1, n_sequences, p))
-    lagged = jnp.concatenate([start, y[:-1] @ B0.T + ssm.drift[1:] - lag * ssm.drift[:-1]])
+    start = jnp.broadcast_to(B0.sum(1) * ssm.x0_mean, (1, n_sequences, p))
+    lagged = jnp.concatenate([start, y[:-1] @ B0.T + ssm.drift[1:]])
     r = y - lagged - jnp.concatenate([ssm.drift[:1], jnp.zeros_like(ssm.drift[1:])])
     flat = jnp.swapaxes(r, 1, 2).reshape(n_bounds * p, n_sequences)
     white = solve_triangular(L, flat, lower=True).reshape(n_bounds, p, n_sequences)

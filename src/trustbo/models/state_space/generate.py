@@ -25,7 +25,6 @@ class TrustSample(NamedTuple):
 def draw_missions(
     family: Family,
     params: Params,
-    lag: float,
     awareness: np.ndarray,
     n_ticks: np.ndarray,
     rng: np.random.Generator,
@@ -35,7 +34,6 @@ def draw_missions(
     Args:
         family: Family of observations.
         params: Draws with leading axis (draw,).
-        lag: 0 where rates measure trust, 1 where they measure its change.
         awareness: Shape (mission, bound, robot, feature).
         n_ticks: Ticks, broadcast to (mission, bound, robot).
         rng: Random number generator.
@@ -50,9 +48,9 @@ def draw_missions(
         w, v = rng.standard_normal((2, n_bounds, n_missions, len(robots), len(params.b)))
         x = dynamics.x0_mean + dynamics.x0_sd * rng.standard_normal(w.shape[1:])
         for k in range(n_bounds):
-            before, drift = x, dynamics.drift(awareness[:, k, robots], k)
+            drift = dynamics.drift(awareness[:, k, robots], k)
             x = _times(dynamics.B0, x) + drift + _times(dynamics.w, w[k])
-            y = x - lag * before + _times(dynamics.v, v[k])
+            y = x + _times(dynamics.v, v[k])
             y = family.draw_rates(rng, x, y, dynamics.delta_v, n_ticks[:, k, robots, None])
             trust[:, :, k, robots] = np.moveaxis(x, -1, 0)
             rates[:, :, k, robots] = np.moveaxis(y, -1, 0)

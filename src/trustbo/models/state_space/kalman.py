@@ -1,7 +1,7 @@
 """One step of the scalar Kalman recursions, written once for NumPy and JAX arrays.
 
-Symbols of `scalar`: x_k = beta0 x_{k-1} + c_k + w_k and y_k = h x_{k-1} + c_k + w_k + v_k, with
-h = beta0 - lag, P = var(x_{k-1} | y_1..y_{k-1}), Q = delta_w^2 and R = delta_v^2. Arrays broadcast.
+Symbols of `scalar`: x_k = beta0 x_{k-1} + c_k + w_k and y_k = x_k + v_k, with
+P = var(x_{k-1} | y_1..y_{k-1}), Q = delta_w^2 and R = delta_v^2. Arrays broadcast.
 """
 
 from typing import Any
@@ -9,11 +9,10 @@ from typing import Any
 Numbers = Any
 
 
-def innovation(
-    beta0: Numbers, h: Numbers, Q: Numbers, R: Numbers, P: Numbers
-) -> tuple[Numbers, Numbers]:
+def innovation(beta0: Numbers, Q: Numbers, R: Numbers, P: Numbers) -> tuple[Numbers, Numbers]:
     """Variance S of y_k and its covariance C with x_k, given y_1..y_{k-1}; the gain is C / S."""
-    return h**2 * P + Q + R, beta0 * h * P + Q
+    C = beta0**2 * P + Q
+    return C + R, C
 
 
 def update(beta0: Numbers, Q: Numbers, P: Numbers, gain: Numbers, S: Numbers) -> Numbers:
@@ -21,13 +20,10 @@ def update(beta0: Numbers, Q: Numbers, P: Numbers, gain: Numbers, S: Numbers) ->
     return beta0**2 * P + Q - gain**2 * S
 
 
-def look_back(
-    beta0: Numbers, Q: Numbers, P: Numbers, lag: Numbers, of_rate: Numbers
-) -> tuple[Numbers, Numbers]:
+def look_back(beta0: Numbers, Q: Numbers, P: Numbers) -> tuple[Numbers, Numbers]:
     """A and V of the backward conditional x_k | x_{k+1}, y ~ N(A x_{k+1} + a, V).
 
-    P is var(x_k | y_1..y_k). In information form, which cannot turn a variance negative. `of_rate`
-    is lag / R where y_{k+1} was measured, else 0.
+    P is var(x_k | y_1..y_k). In information form, which cannot turn a variance negative.
     """
-    V = 1.0 / (1.0 / P + beta0**2 / Q + lag * of_rate)
-    return V * (beta0 / Q + of_rate), V
+    V = 1.0 / (1.0 / P + beta0**2 / Q)
+    return V * (beta0 / Q), V

@@ -2,12 +2,11 @@
 
 Every robot of every mission is one independent sequence
 
-    x_k = beta0 x_{k-1} + c_k + w_k,   y_k = x_k - lag x_{k-1} + v_k,   k = 1..K,
+    x_k = beta0 x_{k-1} + c_k + w_k,   y_k = x_k + v_k,   k = 1..K,
 
-with x_0 ~ N(x0_mean, x0_sd^2), the drift c_k = sum_m beta_m z_{m,k} + b, and lag 0 where the rate
-measures trust, 1 where it measures the change of trust. A rate that is NaN was not measured: the
-filter predicts through it. Sequences run side by side, so arrays are (bound, mission, robot) with
-the bound first, the axis `lax.scan` walks.
+with x_0 ~ N(x0_mean, x0_sd^2) and the drift c_k = sum_m beta_m z_{m,k} + b. A rate that is NaN was
+not measured: the filter predicts through it. Sequences run side by side, so arrays are (bound,
+mission, robot) with the bound first, the axis `lax.scan` walks.
 """
 
 from collections.abc import Sequence
@@ -61,7 +60,6 @@ class ScalarSSM(NamedTuple):
     delta_v: Array  # or (bound, mission, robot)
     x0_mean: Array
     x0_sd: Array
-    lag: Array | float = 0.0
 
     @property
     def rate_variance(self) -> Array:
@@ -95,11 +93,11 @@ class ScalarSSM(NamedTuple):
         # NaN must not reach the arithmetic even where its result is discarded: its gradient would.
         y = jnp.where(seen > 0.0, y, 0.0)
         beta0, Q, x0_mean = (row(p) for p in (self.beta0, self.delta_w**2, self.x0_mean))
-        h, R = beta0 - self.lag, self.delta_v**2
+        R = self.delta_v**2
 
         def advance(P, inputs):
             R_k, seen_k = inputs
-            S, C = innovation(beta0, h, Q, R_k, P)
+            S, C = innovation(beta0, Q, R_k, P)
             gain = C / S * seen_k
             P_k = update(beta0, Q, P, gain, S)
             return P_k, (S, gain, P_k)
@@ -111,7 +109,7 @@ class ScalarSSM(NamedTuple):
 
         def step(m, inputs):
             y_k, seen_k, c_k, S_k, gain_k, *rest = inputs
-            predicted = h * m + c_k
+            predicted = beta0 * m + c_k
             completed = ()
             if rest:
                 completed = draw_censored(y_k, predicted, jnp.sqrt(S_k), Censoring(*rest))
@@ -168,7 +166,7 @@ class ScalarSSM(NamedTuple):
         def step(x, inputs):
             c_k, w, v = inputs
             x_k = beta0 * x + c_k + delta_w * w
-            return x_k, (x_k, x_k - self.lag * x + delta_v * v)
+            return x_k, (x_k, x_k + delta_v * v)
 
         x0 = row(self.x0_mean) + row(self.x0_sd) * random.normal(key_x0, shape[1:], dtype)
         w, v = (random.normal(key, shape, dtype) for key in (key_w, key_v))
@@ -176,15 +174,10 @@ class ScalarSSM(NamedTuple):
 
     def _backward(self, filtered: Filtered) -> tuple[Array, Array, Array]:
         """A, a, V with x_k | x_{k+1}, y ~ N(A x_{k+1} + a, V), for each bound but the last."""
-        beta0, Q, R = (
-            row(p)[None] if jnp.ndim(p) < 3 else p
-            for p in (self.beta0, self.delta_w**2, self.delta_v**2)
-        )
-        R = jnp.broadcast_to(R, filtered.y.shape)
-        of_rate = self.lag * filtered.seen[1:] / R[1:]
+        beta0, Q = (row(p)[None] for p in (self.beta0, self.delta_w**2))
         m, P = filtered.mean[:-1], filtered.var[:-1]
-        A, V = look_back(beta0, Q, P, self.lag, of_rate)
-        a = V * (m / P - beta0 / Q * self.drift[1:] - of_rate * filtered.y[1:])
+        A, V = look_back(beta0, Q, P)
+        a = V * (m / P - beta0 / Q * self.drift[1:])
         return A, a, V
 
 

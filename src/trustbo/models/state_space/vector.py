@@ -2,7 +2,7 @@
 
 With the robots' trust as one vector,
 
-    x_k = B0 x_{k-1} + c_k + w_k,   y_k = x_k - lag x_{k-1} + v_k,   w ~ N(0, Q), v ~ N(0, R),
+    x_k = B0 x_{k-1} + c_k + w_k,   y_k = x_k + v_k,   w ~ N(0, Q), v ~ N(0, R),
 
 and each mission one sequence. Rates enter one robot at a time, as rank-one updates of the joint
 covariance of (x_k, y_k): no matrix is factorised, and a missing rate is skipped.
@@ -35,7 +35,6 @@ class VectorSSM(NamedTuple):
     R: Array  # (robot, robot'), or (bound, mission, robot, robot')
     x0_mean: Array  # ()
     x0_sd: Array  # ()
-    lag: Array | float = 0.0
 
     @property
     def rate_variance(self) -> Array:
@@ -64,7 +63,7 @@ class VectorSSM(NamedTuple):
         y = jnp.where(seen > 0.0, y, 0.0)
         n = y.shape[-1]
         mask = jnp.ones_like(y[:, :1]) if complete else seen
-        F = jnp.concatenate([self.B0, self.B0 - self.lag * jnp.eye(n)])
+        F = jnp.concatenate([self.B0, self.B0])
         R = jnp.broadcast_to(self.R, (*mask.shape, n)) if jnp.ndim(self.R) < 4 else self.R
 
         def advance(P, inputs):
@@ -150,29 +149,19 @@ class VectorSSM(NamedTuple):
         def step(x, inputs):
             c_k, w_k = inputs
             x_k = x @ self.B0.T + c_k + w_k
-            return x_k, (x_k, x_k - self.lag * x)
+            return x_k, x_k
 
         x0 = self.x0_mean + self.x0_sd * random.normal(key_x0, shape[1:], dtype)
-        _, (trust, signal) = lax.scan(step, x0, (self.drift, w))
-        return trust, signal + v
+        trust = lax.scan(step, x0, (self.drift, w))[1]
+        return trust, trust + v
 
     def _backward(self, filtered: Filtered) -> tuple[Array, Array, Array]:
         """A, a and the Cholesky factor of V^-1, with x_k | x_{k+1}, y ~ N(A x_{k+1} + a, V)."""
-        n = len(self.B0)
-        eye, both = (
-            jnp.eye(n)[None, None],
-            filtered.seen[1:, :, :, None] * filtered.seen[1:, :, None, :],
-        )
-        # Robots that were not measured get independent unit noise, then weight 0.
-        R = jnp.broadcast_to(self.R, (*filtered.y.shape, n)) if self.R.ndim < 4 else self.R
-        of_rate = self.lag * both * jnp.linalg.inv(R[1:] * both + eye * (1.0 - both))
         Q_inverse, P_inverse = jnp.linalg.inv(self.Q), jnp.linalg.inv(filtered.var[:-1])
         BQ = self.B0.T @ Q_inverse
-        L = jnp.linalg.cholesky(P_inverse + (BQ @ self.B0)[None, None] + self.lag * of_rate)
-        A = cho_solve((L, True), BQ[None, None] + of_rate)
+        L = jnp.linalg.cholesky(P_inverse + (BQ @ self.B0)[None, None])
+        A = cho_solve((L, True), jnp.broadcast_to(BQ, L.shape))
         information = (
-            jnp.einsum("ksij,ksj->ksi", P_inverse, filtered.mean[:-1])
-            - self.drift[1:] @ BQ.T
-            - jnp.einsum("ksij,ksj->ksi", of_rate, filtered.y[1:])
+            jnp.einsum("ksij,ksj->ksi", P_inverse, filtered.mean[:-1]) - self.drift[1:] @ BQ.T
         )
         return A, cho_solve((L, True), information[..., None])[..., 0], L

@@ -111,9 +111,8 @@ def additive_weights(
     """Compute the weights of an additive objective for one view (state,) of the states.
 
     terminal: view . x^K = view . B0^K x0 + sum_j (view . B0^j) . u, with j bounds left. mean: the
-    average of view . x^k over k = 1..K. lost_contact: their sum less K; where rates measure the
-    change of trust, view . (x^K - x0) - K. For dynamics with a leading axis (draw,), up to
-    `longest` bounds.
+    average of view . x^k over k = 1..K. lost_contact: their sum less K. For dynamics with a leading
+    axis (draw,), up to `longest` bounds.
     """
     n_draws, n_states = dynamics.start.shape
     powers = np.empty((n_draws, longest + 1, n_states))
@@ -123,9 +122,7 @@ def additive_weights(
     constant = (powers @ dynamics.start[..., None])[..., 0]
     scale = np.ones(longest + 1)
     n_bounds = np.arange(longest + 1.0)
-    if objective.name == "lost_contact" and objective.lag:
-        constant = constant - constant[:, :1]
-    elif objective.name in ("mean", "lost_contact"):
+    if objective.name in ("mean", "lost_contact"):
         constant[:, 0] = 0.0
         constant = constant.cumsum(1)
         powers = powers.cumsum(1)

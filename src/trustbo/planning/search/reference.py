@@ -152,7 +152,7 @@ def best_labelled(case: Case, dynamics: Dynamics) -> Path:
             return max(cost, -x)
         if objective.name == "success":
             return cost + float(softplus(-x))
-        return cost + float(objective.contact_lost(np.array([x]), x, dynamics.noise_sd)[0])
+        return cost + float(objective.contact_lost(np.array([x]), dynamics.noise_sd)[0])
 
     admissible, _, objective, _ = case
     tolls = on_map(admissible, case.tolls)
@@ -281,9 +281,8 @@ def _score(objective: Objective, score: float, trust: float, noise_sd: np.ndarra
     if objective.name in ("success", "stationary"):
         return score - float(softplus(-trust))
     if objective.name == "lost_contact" and objective.has_labels:
-        return score - float(objective.contact_lost(np.array([trust]), trust, noise_sd)[0])
-    at_end = objective.name == "terminal" or (objective.name == "lost_contact" and objective.lag)
-    return score if at_end else score + trust
+        return score - float(objective.contact_lost(np.array([trust]), noise_sd)[0])
+    return score if objective.name == "terminal" else score + trust
 
 
 def _keep_label(labels: list[_Label], new: _Label) -> None:

@@ -67,7 +67,7 @@ def graph_of(problem: PlanningProblem, dynamics: Dynamics) -> nx.DiGraph:
             values["risk"] = -np.log1p(-p_fail)
     values["drift"] = np.tensordot(dynamics.views.mean(0), dynamics.drift, 1)
     tolls = tolls_of(paths, problem.objective)
-    if problem.objective.name == "lost_contact" and not problem.objective.lag:
+    if problem.objective.name == "lost_contact":
         values["lost"] = settled_loss(problem.objective, dynamics) + on_map(paths, tolls)
     return with_costs(paths, entry_cost(paths.passable, dynamics), tolls, **values)
 
