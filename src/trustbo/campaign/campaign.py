@@ -12,6 +12,7 @@ import xarray as xr
 from jax import random
 
 from trustbo.campaign.checks import require_extra, require_mission, require_reason, require_where
+from trustbo.campaign.folder import STATE
 from trustbo.campaign.history import history_of, table_of
 from trustbo.campaign.learning import Learner
 from trustbo.campaign.options import OBJECTIVE, POLICY, SAMPLER, CampaignOptions, arguments_of
@@ -21,7 +22,7 @@ from trustbo.campaign.result import Result
 from trustbo.campaign.running import run_missions
 from trustbo.campaign.state import SET_ASIDE, TOLD, CampaignState, Failure
 from trustbo.campaign.stopping import Stop
-from trustbo.campaign.storage import STATE, Storage
+from trustbo.campaign.storage import Storage
 from trustbo.campaign.summary import summary_of
 from trustbo.data import Cell, Mission
 from trustbo.display.card import Card, Displayed

@@ -10,6 +10,21 @@ import numpy as np
 import xarray as xr
 from filelock import FileLock, Timeout
 
+from trustbo.campaign.folder import (
+    BELIEVED,
+    FILES,
+    HISTORY,
+    MEASURED,
+    MISSIONS,
+    POSTERIOR,
+    POSTERIORS,
+    RESULT,
+    STATE,
+    TABLE,
+    TICKS,
+    WORKSPACE,
+    require_free,
+)
 from trustbo.campaign.posteriors import Posterior, Posteriors
 from trustbo.campaign.result import Result
 from trustbo.campaign.state import CampaignState, Entry, Failure
@@ -38,16 +53,6 @@ from trustbo.spreadsheet import frame_as_csv
 from trustbo.workspace import Workspace
 from trustbo.workspace import netcdf as archive
 from trustbo.workspace.moves import require_on_grid
-
-STATE, RESULT, WORKSPACE, MEASURED = "campaign.json", "result.json", "workspace.nc", "measured.nc"
-MISSIONS, HISTORY, TABLE = "missions.nc", "history.nc", "history.csv"
-POSTERIOR = "posterior.nc"
-POSTERIORS, TICKS = "posteriors", "ticks"
-"""Folders of numbered files."""
-_FILES = (
-    STATE, RESULT, MEASURED, MISSIONS, HISTORY, TABLE, POSTERIOR, WORKSPACE,
-)  # fmt: skip
-"""Files of a campaign, the records first: what they describe is removed after them."""
 
 _Extras = Sequence[Mapping[str, float]]
 
@@ -163,24 +168,6 @@ class Storage:
         return state, workspace, list(zip(measured[n:], extras[n:], strict=True))
 
 
-def require_free(folder: Path) -> None:
-    """Refuse a folder that holds a campaign, or a file of such a name: TrustboError.
-
-    The workspace alone is that of a campaign whose first write was interrupted.
-    """
-    if (folder / STATE).exists():
-        raise TrustboError(
-            f"{str(folder)!r} holds a campaign already: go on with it by Campaign.load, choose "
-            "another folder, or replace it with overwrite=True."
-        )
-    for name in _FILES:
-        if name != WORKSPACE and (folder / name).exists():
-            raise TrustboError(
-                f"{str(folder)!r} holds {name}, which would be replaced; choose another folder, or "
-                "replace it with overwrite=True."
-            )
-
-
 def _locked(directory: FilePath) -> FileLock:
     """Lock a folder, made if need be; TrustboError if another process has locked it."""
     folder = require_folder(directory)
@@ -205,7 +192,7 @@ def _clear(folder: Path, posteriors: Iterable[Posterior | None]) -> None:
         if posterior is not None:
             posterior()  # into memory
     with naming_refusal(folder):
-        for name in _FILES:
+        for name in FILES:
             (folder / name).unlink(missing_ok=True)
         for room in (POSTERIORS, TICKS):
             if (folder / room).is_dir():

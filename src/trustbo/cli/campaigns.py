@@ -185,7 +185,7 @@ def _require_same(file: Path, example: Path) -> None:
 
 def _state(folder: Path) -> dict[str, Any]:
     """Read the state of a campaign from its folder."""
-    from trustbo.campaign.storage import STATE
+    from trustbo.campaign.folder import STATE
     from trustbo.files import interpreting, read_record
 
     if not (folder / STATE).exists():
@@ -207,7 +207,8 @@ def _state(folder: Path) -> dict[str, Any]:
 
 def _simulator(folder: Path, notes: dict[str, Any]) -> "KinematicSimulator":
     """Make the simulator that the campaign was begun with."""
-    from trustbo.campaign.storage import STATE, read_workspace
+    from trustbo.campaign.folder import STATE
+    from trustbo.campaign.storage import read_workspace
     from trustbo.files import interpreting
     from trustbo.simulation import KinematicSimulator
     from trustbo.workspace import Sight

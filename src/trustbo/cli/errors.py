@@ -90,7 +90,7 @@ def complain(error: str, hint: str = "") -> None:
 def _way_on(campaign: Path | None) -> str:
     if campaign is None:
         return "the same command runs the rest."
-    from trustbo.campaign.storage import STATE
+    from trustbo.campaign.folder import STATE
 
     if (campaign / STATE).exists():
         return f"all missions so far are kept: trustbo resume {campaign} goes on."
@@ -98,7 +98,7 @@ def _way_on(campaign: Path | None) -> str:
 
 
 def _after_refusal(campaign: Path | None) -> str:
-    from trustbo.campaign.storage import MEASURED
+    from trustbo.campaign.folder import MEASURED
 
     kept = "" if campaign is None else f"the measured missions are kept in {campaign / MEASURED}. "
     return (

@@ -25,7 +25,7 @@ def require_outputs(out: Path, *others: str, overwrite: bool) -> None:
     TrustboError: it holds a campaign or a result, unless `overwrite`; its name belongs to a file,
     or the name of a file to a folder.
     """
-    from trustbo.campaign.storage import RESULT, STATE
+    from trustbo.campaign.folder import RESULT, STATE
     from trustbo.files import require_file
 
     if not overwrite and (out / STATE).exists():

@@ -50,7 +50,7 @@ def export(
 
 def _require_result(folder: Path) -> None:
     """Refuse a folder without a result (TrustboError) before heavy imports."""
-    from trustbo.campaign.storage import RESULT
+    from trustbo.campaign.folder import RESULT
 
     if not (folder / RESULT).exists():
         raise TrustboError(
