@@ -1,0 +1,250 @@
+"""Share of 25 planted faults that the tests catch.
+
+Each fault changes one place of the source so that results are wrong and nothing crashes. It is
+planted in a copy of the repository, never in the repository. The tests of its room then run up to
+the first that fails, and, where none does, those of the neighbouring rooms. A test that also fails
+without the fault is left out. A fault whose text is no longer in the source is not planted, and
+does not count as caught: whoever changed the code plants it anew, in the code that took its place.
+
+The text of a fault is sought in its file, else in all of the source, as files may have moved.
+Kernels that call others from a cache would not notice a change there, so that a fault in a file
+with kernels runs with an empty cache.
+"""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from queue import Queue
+from typing import NamedTuple
+
+from common import Table, arguments, parsed, timed
+
+ROOT = Path(__file__).resolve().parents[1]
+SOURCE = "src/trustbo"
+NEIGHBOURS = {
+    "models": ("inference", "criticism", "campaign"),
+    "inference": ("models", "criticism", "campaign"),
+    "hazard": ("campaign", "planning"),
+    "planning": ("campaign", "simulation"),
+    "workspace": ("planning", "simulation", "terrain"),
+    "terrain": ("workspace", "simulation"),
+    "simulation": ("campaign", "study"),
+    "campaign": ("cli", "study"),
+    "export": ("cli",),
+}
+"""Folders of tests by room, in `src/trustbo` and in `tests`: those of its neighbours."""
+
+
+class Fault(NamedTuple):
+    """Change of the source that makes results wrong."""
+
+    name: str
+    file: str
+    before: str
+    after: str
+
+
+MEASURED = """\
+        if self.storage is not None:
+            extras = [*(entry.extra for entry in self.state.entries), extra]
+            self.storage.write_measured([*self.state.measured, mission], extras)
+"""
+LEARNED = """\
+        seconds = {"seconds_plan": self._asked[0], "seconds_run": started - self._asked[1]}
+        entry = self.state.add(mission, learned, plan, trust_map, extra, **seconds)
+        self.learner.take(self.state, seed)
+"""
+FAULTS = (
+    Fault("the evidence has the wrong sign of beta0", "inference/evidence/gaussian.py",
+          "E[k, i] = -b * gain[i] * N[k, i + 1]", "E[k, i] = b * gain[i] * N[k, i + 1]"),
+    Fault("the evidence leaves out the mean of x0", "inference/evidence/gaussian.py",
+          "self._beta0(theta)[..., None] * self.x0[0] * N",
+          "self._beta0(theta)[..., None] * 0.0 * N"),
+    Fault("draws of trust take a variance for an sd", "inference/evidence/kalman_numpy.py",
+          "x = A * x + a + np.sqrt(V) * e[k]", "x = A * x + a + V * e[k]"),
+    Fault("trust is drawn towards 0 where a rate is missing", "inference/evidence/kalman_numpy.py",
+          "gain = np.where(seen, C / S, 0.0)", "gain = C / S"),
+    Fault("effects of robots belong to the robots in reverse", "models/effects/robot.py",
+          "index = slots.robot * slots.n_missions",
+          "index = (slots.n_robots - 1 - slots.robot) * slots.n_missions"),
+    Fault("the prior scale of effects of places is doubled", "models/effects/place.py",
+          "half_normal(score, getattr(self, name))",
+          "half_normal(score, 2.0 * getattr(self, name))"),
+    Fault("shares of a mixture of proposals do not add up to 1", "inference/samplers/student.py",
+          "np.log(np.asarray(sizes, dtype=float) / sum(sizes))",
+          "np.log(np.asarray(sizes, dtype=float))"),
+    Fault("weights that leave out a mission have the wrong sign", "inference/left_out.py",
+          "smoothed_weights(without - whole)", "smoothed_weights(whole - without)"),
+    Fault("a bound that failed is also counted as passed", "hazard/risk.py",
+          "a, b = a + failed, b + n - failed", "a, b = a + failed, b + n"),
+    Fault("the margin raises the slope limit", "hazard/sampler.py",
+          "beyond = (steepness + limit[:, :1])", "beyond = (steepness - limit[:, :1])"),
+    Fault("the loss of a bound is clipped a second time", "planning/objectives.py",
+          "noise_sd[..., None])[0]", "noise_sd[..., None])[0].clip(0.0, 1.0)"),
+    Fault("'shortest+4' admits 3 more bounds only", "planning/paths.py",
+          "return shortest + int(named[1] or 0)",
+          "return shortest + max(int(named[1] or 0) - 1, 0)"),
+    Fault("moves along a path have rows and columns transposed", "workspace/moves.py",
+          "index = 3 * (steps[:, 0] + 1) + steps[:, 1] + 1",
+          "index = 3 * (steps[:, 1] + 1) + steps[:, 0] + 1"),
+    Fault("strata count alike in the price of a failure", "planning/risk.py",
+          "costs = failure_cost * shares if",
+          "costs = failure_cost * np.full(len(shares), 1.0 / len(shares)) if"),
+    Fault("of equally good paths the longest is planned", "planning/search/layers.py",
+          "if score > scores[d]:", "if score >= scores[d]:"),
+    Fault("a bound has the awareness of the cell that it leaves", "workspace/moves.py",
+          "rows, cols = np.asarray(path)[1:].T\n    moves = moves_along(path) if maps",
+          "rows, cols = np.asarray(path)[:-1].T\n    moves = moves_along(path) if maps"),
+    Fault("heights of sensor and target are exchanged", "workspace/sight.py",
+          "watcher.sensor_height,\n        watched.target_height,",
+          "watched.target_height,\n        watcher.sensor_height,"),
+    Fault("missing pixels count as 0 in the mean of a cell", "workspace/grid.py",
+          "edges[cell + 1] - edges[cell] - n_missing", "edges[cell + 1] - edges[cell]"),
+    Fault("canopy attenuates by pixels, not by metres", "terrain/rays.py",
+          "math.sqrt(((r1 - r0) * pixel[0]) ** 2 + ((c1 - c0) * pixel[1]) ** 2 + dz**2)",
+          "math.sqrt((r1 - r0) ** 2 + (c1 - c0) ** 2 + dz**2)"),
+    Fault("the sign of an index is not the declared one", "terrain/composite.py",
+          "np.sign(vectors[0] @ signs) or 1.0", "np.sign(vectors[0].sum()) or 1.0"),
+    Fault("the truth's best path is that of the robot seen most", "simulation/bound_table.py",
+          'loss = 1.0 - self.data["contact"].values.mean(0)',
+          'loss = 1.0 - self.data["contact"].values.max(0)'),
+    Fault("a fit takes the seeds of the policy", "campaign/campaign.py",
+          'self.trust_map(), self.seed_of("fit")', 'self.trust_map(), self.seed_of("policy")'),
+    Fault("a mission is learned from before it is on disk", "campaign/campaign.py",
+          MEASURED + LEARNED,
+          LEARNED + MEASURED.replace(", mission]", "]").replace(", extra]", "]")),
+    Fault("the y axis of a map for ROS is flipped", "export/ros.py",
+          "raster.values[::-1].astype(np.uint8)", "raster.values.astype(np.uint8)"),
+    Fault("frames are rotated the other way", "export/frame.py",
+          "np.array([[c, s], [-s, c]])", "np.array([[c, -s], [s, c]])"),
+)  # fmt: skip
+
+
+def place_of(fault: Fault, root: Path = ROOT) -> Path | None:
+    """File that has the text of a fault exactly once; None if there is none, or several."""
+    source = root / SOURCE
+    for files in ([source / fault.file], sorted(source.rglob("*.py"))):
+        found = {f: f.read_text().count(fault.before) for f in files if f.is_file()}
+        found = {file: n for file, n in found.items() if n}
+        if found:
+            return next(iter(found)) if list(found.values()) == [1] else None
+    return None
+
+
+def copy_to(folder: Path) -> Path:
+    """Copy all tracked files, as they are now."""
+    listed = subprocess.check_output(["git", "ls-files", "-z"], cwd=ROOT, text=True)
+    for name in filter(None, listed.split("\0")):
+        if (ROOT / name).is_file():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / name, folder / name)
+    return folder
+
+
+def first_failure(copy: Path, kernels: Path, tests: Sequence[str], minutes: float) -> str | None:
+    """First of some tests that fails in a copy, None if all pass; RuntimeError: pytest did not run.
+
+    Compiled kernels are in the folder `kernels`.
+    """
+    paths = [str(copy / folder) for folder in ("src", "tests", "benchmarks")]
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join(paths),
+        "XLA_FLAGS": "--xla_backend_optimization_level=0",
+        "NUMBA_CACHE_DIR": str(kernels),
+        "XDG_CACHE_HOME": str(copy / ".cache"),
+    }
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-m", "not slow", "--no-header"]
+    try:
+        done = subprocess.run(
+            [*command, "--tb=no", "-p", "no:cacheprovider", *tests], cwd=copy, env=environment,
+            capture_output=True, text=True, timeout=60.0 * minutes, check=False,
+        )  # fmt: skip
+    except subprocess.TimeoutExpired:
+        raise RuntimeError(f"no test failed within {minutes:g} minutes") from None
+    if failed := re.search(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", done.stdout, re.MULTILINE):
+        return failed[1]
+    if done.returncode not in (0, 5):  # 5: the tests are all slow
+        raise RuntimeError(f"pytest did not run: {(done.stdout + done.stderr)[-300:]}")
+    return None
+
+
+def stages(fault: Fault, copy: Path, reach: str) -> Iterator[list[str]]:
+    """Folders of tests to run one after the other."""
+    room = fault.file.split("/")[0]
+    for folders in ((room,), NEIGHBOURS[room] if reach != "room" else ()):
+        if there := [f"tests/{name}" for name in folders if (copy / "tests" / name).is_dir()]:
+            yield there
+    if reach == "whole":
+        yield ["tests"]
+
+
+def caught_by(fault: Fault, copy: Path, reach: str, minutes: float) -> tuple[bool, str]:
+    """Whether a fault is caught in a copy, and by which test, or what became of it."""
+    if (file := place_of(fault, copy)) is None:
+        return False, "not planted: the code has changed"
+    text, ran, unfit = file.read_text(), [], []
+    kernels = copy / ".kernels"
+    if "njit" in text:
+        kernels = Path(tempfile.mkdtemp(dir=copy))
+    try:
+        for folders in stages(fault, copy, reach):
+            while True:
+                left_out = [f"--deselect={test}" for test in unfit]
+                file.write_text(text.replace(fault.before, fault.after))
+                failed = first_failure(copy, kernels, [*folders, *left_out], minutes)
+                file.write_text(text)
+                if failed is None:
+                    break
+                if first_failure(copy, copy / ".kernels", [failed], minutes) is None:
+                    return True, failed
+                unfit.append(failed)
+            ran += folders
+    except RuntimeError as error:
+        return False, f"NOT CAUGHT: {error}"
+    finally:
+        file.write_text(text)
+    return False, f"NOT CAUGHT by {', '.join(ran)}"
+
+
+def main() -> None:
+    parser = arguments(__doc__, quick="only find the faults in the source; run no tests")
+    parser.add_argument("--only", action="append", metavar="NAME",
+                        help="faults whose names contain this; may be repeated")  # fmt: skip
+    parser.add_argument("--reach", choices=("room", "near", "whole"), default="near",
+                        help="tests of the room, of its neighbours too, or all")  # fmt: skip
+    parser.add_argument("--jobs", type=int, default=1, help="faults at a time, default 1")
+    parser.add_argument("--minutes", type=float, default=30.0, help="limit of a run of tests")
+    given = parsed(parser)
+    faults = [f for f in FAULTS if not given.only or any(name in f.name for name in given.only)]
+    table, n_caught = Table("fault", "caught by", "seconds", first=54), 0
+    if given.quick:
+        for fault in faults:
+            table.row(fault.name, place_of(fault) or "not planted: the code has changed", "")
+        return
+    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(given.jobs) as pool:
+        copies: Queue[Path] = Queue()
+        for job in range(given.jobs):
+            copies.put(copy_to(Path(folder) / str(job)))
+
+        def run(fault: Fault) -> tuple[float, tuple[bool, str]]:
+            copy = copies.get()
+            try:
+                return timed(lambda: caught_by(fault, copy, given.reach, given.minutes))
+            finally:
+                copies.put(copy)
+
+        for fault, (seconds, (caught, how)) in zip(faults, pool.map(run, faults), strict=True):
+            n_caught += caught
+            table.row(fault.name, how, f"{seconds:.0f}")
+    print(f"caught {n_caught} of {len(faults)}")
+
+
+if __name__ == "__main__":
+    main()
