@@ -207,7 +207,7 @@ def caught_by(fault: Fault, copy: Path, reach: str, minutes: float) -> tuple[boo
                 unfit.append(failed)
             ran += folders
     except RuntimeError as error:
-        return False, f"NOT CAUGHT: {error}"
+        return False, f"not known: {error}"
     finally:
         file.write_text(text)
     return False, f"NOT CAUGHT by {', '.join(ran)}"
