@@ -6,9 +6,9 @@ from trustbo.errors import TrustboError
 
 STATE, RESULT, WORKSPACE, MEASURED = "campaign.json", "result.json", "workspace.nc", "measured.nc"
 MISSIONS, HISTORY, TABLE = "missions.nc", "history.nc", "history.csv"
-BELIEVED, POSTERIOR = "believed.nc", "posterior.nc"
+POSTERIOR = "posterior.nc"
 FILES = (
-    STATE, RESULT, MEASURED, MISSIONS, HISTORY, TABLE, BELIEVED, POSTERIOR, WORKSPACE,
+    STATE, RESULT, MEASURED, MISSIONS, HISTORY, TABLE, POSTERIOR, WORKSPACE,
 )  # fmt: skip
 """All of these, the records first: what they describe is removed after them."""
 POSTERIORS, TICKS = "posteriors", "ticks"

@@ -11,7 +11,6 @@ import xarray as xr
 from filelock import FileLock, Timeout
 
 from trustbo.campaign.folder import (
-    BELIEVED,
     FILES,
     HISTORY,
     MEASURED,
