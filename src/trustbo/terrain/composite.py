@@ -91,7 +91,7 @@ class CompositeIndex(TransformerMixin, BaseEstimator):
         weights, ratios = np.zeros(len(self.signs)), np.array([1.0])
         if self._varies.any():
             pca = PCA(svd_solver="covariance_eigh").fit(z)
-            first, ratios = pca.components_[0], pca.explained_variance_ratio_
+            first, ratios = np.asarray(pca.components_)[0], pca.explained_variance_ratio_
             signs = np.array(list(self.signs.values()), dtype=float)[self._varies]
             weights[self._varies] = (np.sign(first @ signs) or 1.0) * first
         self.loadings_ = xr.DataArray(
