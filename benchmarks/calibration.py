@@ -44,14 +44,12 @@ def cases():
     yield HierarchicalTrust(observation="beta_binomial"), "exact", 200, LOG
     yield HierarchicalTrust(), "exact", 300, SMALL
     yield CoupledTrust(), "exact", 200, SMALL
-    yield CoupledTrust(inter_robot="ordered"), "exact", 200, SMALL
     yield PooledTrust(place=PlaceEffect()), "exact", 300, SMALL
     for scale in ("unit", "likert7", "ordinal7"):
         people = HumanTrust(scale=scale).for_features(("success", "failure"))
         yield people, "exact", 200, PEOPLE
     for model in (PooledTrust, HierarchicalTrust, CoupledTrust):
         yield model(), "nuts", 200, SMALL
-    yield CoupledTrust(inter_robot="ordered"), "nuts", 200, SMALL
     yield PooledTrust(place=PlaceEffect()), "nuts", 200, SMALL
     yield PooledTrust(effects=[RobotEffect()]), "nuts", 200, SMALL
     yield PooledTrust(effects=[PlaceEffect(), RobotEffect()]), "nuts", 200, SMALL

@@ -49,7 +49,6 @@ NUTS = {
         "model": ("HierarchicalTrust", {"observation": "beta_binomial"})
     },
     "coupled full": {"model": ("CoupledTrust", {})},
-    "coupled ordered": {"model": ("CoupledTrust", {"inter_robot": "ordered"})},
     "apart nuts": {"model": ("CoupledTrust", {"inter_robot": "none"})},
 }
 

@@ -287,10 +287,7 @@ def test_the_architecture_says_which_sampler_auto_takes():
         ),
         "`CoupledTrust`, none": (partial(CoupledTrust, inter_robot="none"),),
         "`CoupledTrust`, none, places": (partial(CoupledTrust, inter_robot="none", place=place),),
-        "`CoupledTrust`, ordered or full": (
-            partial(CoupledTrust, inter_robot="ordered"),
-            CoupledTrust,
-        ),
+        "`CoupledTrust`": (CoupledTrust,),
     }
     table = ARCHITECTURE.split("| model | gaussian |")[1].split("\n\n")[0].splitlines()
     families = [("gaussian",), ("censored", "beta_binomial")]

@@ -50,11 +50,10 @@ def posterior(missions):
     [
         (PooledTrust(place=PlaceEffect()), True),
         pytest.param(CoupledTrust(inter_robot="none"), True, marks=pytest.mark.slow),
-        pytest.param(CoupledTrust(inter_robot="ordered"), False, marks=pytest.mark.slow),
         pytest.param(CoupledTrust(), False, marks=pytest.mark.slow),
         (HierarchicalTrust(), True),
     ],
-    ids=["places", "none", "ordered", "full", "hierarchical"],
+    ids=["places", "none", "full", "hierarchical"],
 )
 def test_log_priors_are_those_of_the_sample_statements(model, stationary):
     """Each site's own log density in a numpyro trace; of correlations, differences of draws."""

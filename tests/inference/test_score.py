@@ -91,9 +91,7 @@ def test_log_scores_are_shares_of_simulated_rates(family):
         assert below - 0.05 <= float(scores["pit"][0, k, 0]) <= below + equal + 0.05
 
 
-@pytest.mark.parametrize(
-    "model", [HierarchicalTrust(), CoupledTrust(inter_robot="ordered")], ids=["apart", "ordered"]
-)
+@pytest.mark.parametrize("model", [HierarchicalTrust(), CoupledTrust()], ids=["apart", "coupled"])
 @pytest.mark.filterwarnings("ignore")
 def test_log_scores_of_robots_that_differ_are_marginals_of_their_joint_normal(model):
     missions = simulate_missions(5)

@@ -30,7 +30,6 @@ from trustbo.models import (
     RobotParams,
     TrustParams,
 )
-from trustbo.models.params import ordered_params
 from trustbo.stacking import stack_missions
 
 N = 40
@@ -39,7 +38,6 @@ MODELS = {
     "hierarchical": HierarchicalTrust(),
     "coupled": CoupledTrust(),
     "apart": CoupledTrust(inter_robot="none"),
-    "ordered": CoupledTrust(inter_robot="ordered"),
     "censored": CoupledTrust(observation="censored"),
     "counts": HierarchicalTrust(observation="beta_binomial"),
 }
@@ -113,32 +111,6 @@ def test_robots_with_equal_parameters_are_pooled():
     expected = PooledTrust().log_likelihood(p, missions)
     np.testing.assert_allclose(HierarchicalTrust().log_likelihood(each, missions), expected)
     np.testing.assert_allclose(CoupledTrust().log_likelihood(together, missions), expected)
-
-
-def test_robots_in_order_follow_the_one_before_at_the_same_bound():
-    rng = np.random.default_rng(1)
-    sites = {
-        "beta0": rng.uniform(size=3),
-        "beta": rng.normal(size=(3, 2)),
-        "gamma": rng.normal(size=2),
-        "b": rng.normal(size=3),
-        "delta_w": rng.uniform(0.1, 0.3, 3),
-        "delta_v": rng.uniform(0.1, 0.3, 3),
-    }
-    p = ordered_params(sites, 0.5, 0.5)
-    x, z, w = rng.normal(size=3), rng.uniform(size=(3, 2)), rng.normal(size=3)
-    by_hand = np.zeros(3)
-    for i in range(3):
-        before = sites["gamma"][i - 1] * by_hand[i - 1] if i else 0.0
-        mine = sites["beta0"][i] * x[i] + sites["beta"][i] @ z[i] + sites["b"][i]
-        by_hand[i] = mine + before + sites["delta_w"][i] * w[i]
-    drift = p.b + sum(p.B[m] @ z[:, m] for m in range(2))
-    without_noise = p.B0 @ x + drift
-    T = np.linalg.inv(np.eye(3) - np.diag(sites["gamma"], -1))
-    np.testing.assert_allclose(without_noise + T @ (sites["delta_w"] * w), by_hand)
-    np.testing.assert_allclose(p.Delta_w, T @ np.diag(sites["delta_w"] ** 2) @ T.T)
-    many = {name: np.stack([value, 2 * value]) for name, value in sites.items()}
-    np.testing.assert_allclose(ordered_params(many, 0.5, 0.5).draw(0).B, p.B)
 
 
 def density_of(name, missions):
@@ -314,7 +286,6 @@ def test_the_prior_predicts_in_one_call(name):
     [
         *(("pooled", 1, 1), ("hierarchical", 2, 4)),
         *fast([("coupled", 2, 1), ("pooled", 2, 4), ("hierarchical", 1, 1), ("coupled", 1, 4)]),
-        *fast([("ordered", 1, 4), ("ordered", 2, 1)]),
     ],
 )
 def test_any_number_of_robots_and_features(name, n_robots, n_features):

@@ -109,16 +109,6 @@ def test_coupled_matrices_have_the_priors_of_their_entries():
     assert (counts["Delta_w"][:, others] != 0.0).all()
 
 
-def test_robots_in_order_have_the_priors_of_the_coupled():
-    p = CoupledTrust(inter_robot="ordered").draw_prior((3, 2), N, np.random.default_rng(0))
-    assert p["gamma"].shape == (N, 2)
-    assert stats.kstest(p["gamma"].ravel(), stats.norm(0.0, 0.1).cdf).pvalue > 1e-4
-    sight = CoupledTrust(inter_robot="ordered").for_features(SIGHTED)
-    p = sight.draw_prior((3, 2), N, np.random.default_rng(0))
-    slope = (p["beta"][..., 1] / (1.0 - p["beta0"])).ravel()
-    assert stats.kstest(slope, stats.norm(1.0, 0.3).cdf).pvalue > 1e-4
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "model",
@@ -129,7 +119,6 @@ def test_robots_in_order_have_the_priors_of_the_coupled():
         CoupledTrust(BY_FEATURE),
         CoupledTrust(observation="beta_binomial"),
         CoupledTrust().for_features(SIGHTED),
-        CoupledTrust(inter_robot="ordered").for_features(SIGHTED),
         CoupledTrust(inter_robot="none"),
     ],
     ids=lambda model: model.describe() + "-sighted" * model.priors.stationary,

@@ -313,7 +313,7 @@ def _checked(posterior: xr.DataTree, missions: Sequence[Mission] | None) -> list
         )
     missing = [name for name in _ATTRIBUTES if name not in posterior.attrs]
     sites = set(posterior["posterior"].data_vars)
-    linear = "gamma" in sites or any(sites_of <= sites for sites_of in _SITES)
+    linear = any(sites_of <= sites for sites_of in _SITES)
     if missing or not linear or "prior" not in posterior.children:
         what = f"the attribute {missing[0]!r}" if missing else "the group 'prior'"
         what = what if linear else "beta0, beta, b, delta_w and delta_v of a linear drift"

@@ -60,7 +60,6 @@ def to_datatree(
         "bound": np.arange(1, n_bounds + 1),
         "robot": list(missions[0].robots),
         "robot_": list(missions[0].robots),
-        "follower": list(missions[0].robots[1:]),
         "feature": list(missions[0].features),
     }
     dims_of = _DIMS | site_dims

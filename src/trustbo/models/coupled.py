@@ -12,10 +12,10 @@ from numpyro.distributions import Distribution, LKJCholesky
 
 from trustbo.errors import TrustboError, require_choice
 from trustbo.models.model import TrustModel, register, sample
-from trustbo.models.params import CoupledParams, Params, RobotParams, ordered_params
+from trustbo.models.params import CoupledParams, Params, RobotParams
 from trustbo.models.priors_numpy import draw, draw_lkj_cholesky
 
-INTER_ROBOT = ("full", "none", "ordered")
+INTER_ROBOT = ("full", "none")
 
 
 @register
@@ -26,8 +26,7 @@ class CoupledTrust(TrustModel):
     Attributes:
         inter_robot: `"full"`, the paper's: matrices B0 and B_m, shrunk towards their diagonals by
             `Priors.coupling`, and covariances diag(sd) LKJ diag(sd). `"none"`: diagonals only,
-            robots apart. `"ordered"`, the later code's: robots apart, but robot i follows robot i-1
-            at the same bound with weight gamma_i.
+            robots apart.
     """
 
     inter_robot: str = "full"
@@ -35,7 +34,7 @@ class CoupledTrust(TrustModel):
     def __post_init__(self) -> None:
         super().__post_init__()
         require_choice("inter_robot", self.inter_robot, INTER_ROBOT)
-        if self.place is not None and self.inter_robot != "none":
+        if self.place is not None and self.inter_robot == "full":
             raise TrustboError(
                 f'effects of places need inter_robot="none"; got {self.inter_robot!r}. Give '
                 "place=None."
@@ -47,18 +46,15 @@ class CoupledTrust(TrustModel):
             return self._sample_full(n_robots, n_features)
         priors, robot = self.priors, (n_robots,)
         beta0 = sample("beta0", priors.beta0, robot)
-        sites = {
-            "beta0": beta0,
-            "beta": sample("beta", priors.weights(beta0), (n_robots, n_features)),
-            "b": sample("b", priors.intercept(beta0), robot),
-            "delta_w": sample("delta_w", priors.delta_w, robot),
-            "delta_v": sample("delta_v", priors.delta_v, robot),
-        }
-        x0 = {"x0_mean": priors.x0_mean, "x0_sd": priors.x0_sd}
-        if self.inter_robot == "none":
-            return RobotParams(**sites, **x0)
-        sites["gamma"] = sample("gamma", priors.coupling, (n_robots - 1,))
-        return ordered_params(sites, **x0)
+        return RobotParams(
+            beta0=beta0,
+            beta=sample("beta", priors.weights(beta0), (n_robots, n_features)),
+            b=sample("b", priors.intercept(beta0), robot),
+            delta_w=sample("delta_w", priors.delta_w, robot),
+            delta_v=sample("delta_v", priors.delta_v, robot),
+            x0_mean=priors.x0_mean,
+            x0_sd=priors.x0_sd,
+        )
 
     def _sample_full(self, n_robots: int, n_features: int) -> CoupledParams:
         priors, off = self.priors, n_robots * (n_robots - 1)
@@ -91,13 +87,10 @@ class CoupledTrust(TrustModel):
     ) -> dict[str, np.ndarray]:
         """See `TrustModel.draw_prior`."""
         (n_robots, n_features), priors = shape, self.priors
-        fields = {name: name for name in RobotParams._fields[:5]}
-        if self.inter_robot == "ordered":
-            fields["gamma"] = "coupling"
-        shapes = {"beta": (n_robots, n_features), "gamma": (n_robots - 1,)}
+        shapes = {"beta": (n_robots, n_features)}
         drawn = priors.of_stationary({
-            name: draw(getattr(priors, field), (n, *shapes.get(name, (n_robots,))), rng)
-            for name, field in fields.items()
+            name: draw(getattr(priors, name), (n, *shapes.get(name, (n_robots,))), rng)
+            for name in RobotParams._fields[:5]
         })  # fmt: skip
         if self.inter_robot != "full":
             return drawn
@@ -126,20 +119,12 @@ class CoupledTrust(TrustModel):
         """Axes of the matrices, or of each robot's coefficients if robots are apart."""
         if self.inter_robot == "full":
             return {name: CoupledParams.AXES[name] for name in CoupledParams._fields[:5]}
-        gamma = {"gamma": ("follower",)} if self.inter_robot == "ordered" else {}
-        return (
-            {name: RobotParams.AXES[name] for name in RobotParams._fields[:5]}
-            | gamma
-            | self.place_dims
-        )
+        return {name: RobotParams.AXES[name] for name in RobotParams._fields[:5]} | self.place_dims
 
     def prior_terms(self, sites: Mapping[str, np.ndarray]) -> dict[str, tuple[str, np.ndarray]]:
         """See `TrustModel.prior_terms`: diagonals, off-diagonals and noises, correlations apart."""
         if self.inter_robot == "none":
             return super().prior_terms(sites)
-        if self.inter_robot == "ordered":
-            terms = {name: (name, sites[name]) for name in RobotParams._fields[:5]}
-            return terms | {"gamma": ("coupling", sites["gamma"])}
         n = sites["b"].shape[-1]
         off = ~np.eye(n, dtype=bool)
         diagonal = {name: np.einsum("...ii->...i", sites[name]) for name in sites if name != "b"}

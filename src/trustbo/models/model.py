@@ -162,7 +162,7 @@ class TrustModel(Displayed, ABC):
 
     def sizes(self, n_robots: int, n_features: int) -> dict[str, tuple[int, ...]]:
         """Shape of each parameter in a posterior, without those of effects."""
-        length = {"robot": n_robots, "robot_": n_robots, "follower": n_robots - 1}
+        length = {"robot": n_robots, "robot_": n_robots}
         length["feature"] = n_features
         dims = {name: axes for name, axes in self.dims.items() if name not in self.effect_dims}
         return {name: tuple(length[axis] for axis in axes) for name, axes in dims.items()}

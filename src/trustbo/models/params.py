@@ -195,34 +195,6 @@ class CoupledParams(ParameterDraws, _Coupled):
 Params = TrustParams | RobotParams | CoupledParams
 
 
-def ordered_params(sites: Mapping[str, Numbers], x0_mean: Numbers, x0_sd: Numbers) -> CoupledParams:
-    """The coupled form of robots in order, each following the one before it at the same bound.
-
-    x_i^k = beta0_i x_i^{k-1} + gamma_i x_{i-1}^k + sum_m beta_{i,m} z_{i,m}^k + b_i + w_i, hence
-    x^k = T (diag(beta0) x^{k-1} + ... + w) with T = (I - G)^-1, gamma on G's lower off-diagonal.
-    Sites: beta0 (..., robot), beta (..., robot, feature), gamma (..., robot - 1), b, delta_w and
-    delta_v (..., robot); x0_mean and x0_sd of trust before the first bound.
-    """
-    xp = np if isinstance(sites["gamma"], np.ndarray) else jnp
-    gamma, beta = sites["gamma"], sites["beta"]
-    n = gamma.shape[-1] + 1
-    eye = xp.eye(n)
-    lower = (gamma[..., None] * xp.eye(n - 1))[..., :, :]
-    G = xp.pad(lower, [(0, 0)] * (gamma.ndim - 1) + [(1, 0), (0, 1)])
-    T = xp.linalg.inv(xp.broadcast_to(eye, G.shape) - G)
-    column = xp.swapaxes(T, -1, -2)
-    weights = T[..., None, :, :] * xp.swapaxes(beta, -1, -2)[..., :, None, :]
-    return CoupledParams(
-        B0=T * sites["beta0"][..., None, :],
-        B=weights,
-        b=(T @ sites["b"][..., None])[..., 0],
-        Delta_w=(T * sites["delta_w"][..., None, :] ** 2) @ column,
-        Delta_v=sites["delta_v"][..., None] ** 2 * xp.broadcast_to(eye, G.shape),
-        x0_mean=x0_mean,
-        x0_sd=x0_sd,
-    )
-
-
 def params_from(sites: Mapping[str, np.ndarray], about: Mapping[Any, Any]) -> Params:
     """Parameters from draws by name, leading axis (draw,), and the attributes of a posterior."""
     x0 = {name: about[name] for name in ("x0_mean", "x0_sd")}
@@ -236,8 +208,6 @@ def assemble_params(
 
     `memory`: what trust carries on, see `PooledTrust`.
     """
-    if "gamma" in sites:
-        return ordered_params(sites, **x0)
     if "B0" in sites:
         return CoupledParams(**{name: sites[name] for name in CoupledParams._fields[:5]}, **x0)
     values = {name: sites[name] for name in TrustParams._fields[:5]}

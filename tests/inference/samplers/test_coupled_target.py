@@ -7,12 +7,11 @@ import pytest
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
-from trustbo.inference import fit, params_of, sample_prior
+from trustbo.inference import fit, sample_prior
 from trustbo.inference.samplers.choice import resolve_sampler
 from trustbo.inference.samplers.coupled_target import CoupledTarget
 from trustbo.inference.samplers.importance import sample_scores
 from trustbo.models import CoupledParams, CoupledTrust, Priors
-from trustbo.models.params import ordered_params
 from trustbo.stacking import stack_missions
 
 
@@ -61,22 +60,19 @@ def rates_of(p, awareness):
 def dense_log_density(model, missions, weight, sites):
     """Log p(rates | all but the coefficients), each mission's density to its weight."""
     m, priors = missions[0].awareness.shape[2], model.priors
-    n, ordered = missions[0].awareness.shape[1], model.inter_robot == "ordered"
-    beta0 = sites["beta0"] if ordered else np.diag(sites["B0"])
+    n, beta0 = missions[0].awareness.shape[1], np.diag(sites["B0"])
 
     def params(c):
         own = c.reshape(n, -1)
-        if ordered:
-            return ordered_params(sites | {"beta": own[:, :-1], "b": own[:, -1]}, 0.5, 0.5)
         B = np.moveaxis(own[:, :-1].reshape(n, n, m), 2, 0)
         given = {name: sites[name] for name in ("B0", "Delta_w", "Delta_v")}
         return CoupledParams(B=B, b=own[:, -1], **given, x0_mean=0.5, x0_sd=0.5)
 
-    per_robot, rest = (m if ordered else n * m) + 1, 1.0 - beta0
+    per_robot, rest = n * m + 1, 1.0 - beta0
     rest = rest if priors.stationary else np.ones(n)
     loc, scale = np.zeros((n, per_robot)), np.full((n, per_robot), priors.coupling.scale)
     for i in range(n):
-        own = slice(0, m) if ordered else slice(i * m, (i + 1) * m)
+        own = slice(i * m, (i + 1) * m)
         loc[i, own], scale[i, own] = rest[i] * priors.beta.loc, rest[i] * priors.beta.scale
         loc[i, -1], scale[i, -1] = rest[i] * priors.b.loc, rest[i] * priors.b.scale
     X, off, blocks, constant = [], [], [], 0.0
@@ -101,8 +97,7 @@ def dense_log_density(model, missions, weight, sites):
 
 
 @pytest.mark.parametrize("stationary", [True, False])
-@pytest.mark.parametrize("inter_robot", ["full", "ordered"])
-def test_the_density_is_the_dense_joint_normal_s(inter_robot, stationary):
+def test_the_density_is_the_dense_joint_normal_s(stationary):
     """Missions of three lengths, two with the same gap and one with another; one weighs less."""
     gaps = (0, 1, 2), (1, 1, 2), (3, 4, 0)
     missions = small((5, 4, 3, 5), n_robots=3, n_features=2, gaps=gaps)
@@ -112,7 +107,7 @@ def test_the_density_is_the_dense_joint_normal_s(inter_robot, stationary):
         b=dist.Normal(0.1, 0.4),
         stationary=stationary,
     )
-    model = CoupledTrust(priors, inter_robot=inter_robot)
+    model = CoupledTrust(priors)
     target, rng = target_of(missions, model, weight), np.random.default_rng(1)
     z = 0.7 * rng.standard_normal((4, target.n_scores))
     found = target.log_density(z) - target.log_prior(z)
@@ -144,11 +139,10 @@ def test_scores_of_correlations_are_normal_under_the_lkj_prior():
     assert found == pytest.approx(-0.5 * (z**2).sum() - 1.5 * np.log(2.0 * np.pi), abs=1e-6)
 
 
-@pytest.mark.parametrize("inter_robot", ["full", "ordered"])
-def test_draws_and_evidence_are_those_of_weighted_prior_draws(inter_robot):
+def test_draws_and_evidence_are_those_of_weighted_prior_draws():
     """Importance sampling from the prior by the model's own likelihood: another way to both."""
     priors = Priors(beta=dist.Normal(0.1, 0.3), b=dist.Normal(0.2, 0.2))
-    model, missions = CoupledTrust(priors, inter_robot=inter_robot), small((2,))
+    model, missions = CoupledTrust(priors), small((2,))
     found = sample_scores(target_of(missions, model), 4000, 0).draws
     prior = sample_prior(model, 1, 40_000, seed=1, n_robots=2)
     log_weight = model.log_likelihood(prior, missions)[:, 0]
@@ -158,8 +152,6 @@ def test_draws_and_evidence_are_those_of_weighted_prior_draws(inter_robot):
     expected = np.log(weight.mean()) + log_weight.max()
     assert found.log_evidence == pytest.approx(expected, abs=5.0 / np.sqrt(n))
     together = found.params
-    if inter_robot == "ordered":
-        together = ordered_params(found.params, 0.5, 0.5)._asdict()
     for name in ("B0", "B", "b", "Delta_w", "Delta_v"):
         values = np.asarray(getattr(prior, name)).reshape(len(weight), -1)
         mean = weight @ values / weight.sum()
@@ -213,22 +205,11 @@ def test_where_coefficients_do_not_integrate_out_nuts_is_taken_and_says_why():
             resolve_sampler(censored, sampler)
 
 
-@pytest.mark.parametrize("inter_robot", ["full", "ordered"])
-def test_noises_that_underflow_have_no_density_and_raise_nothing(inter_robot):
-    model = CoupledTrust(inter_robot=inter_robot)
+def test_noises_that_underflow_have_no_density_and_raise_nothing():
+    model = CoupledTrust()
     target = target_of(small(), model)
     z = np.zeros((2, target.n_scores))
-    of_sizes = 2 + (2 if inter_robot == "full" else 1)  # behind beta0 and the coupling
+    of_sizes = 4  # behind beta0 and the coupling
     z[:, of_sizes : of_sizes + 2] = [[-800.0], [-380.0]]
     z[:, 0] = -40.0  # a beta0 of 0 leaves nothing of the start's variance
     assert (target.log_density(z) == -np.inf).all()
-
-
-def test_one_robot_in_order_follows_none():
-    missions = small((4, 3), n_robots=1)
-    ordered, apart = (
-        params_of(fit(missions, CoupledTrust(inter_robot=kind))) for kind in ("ordered", "none")
-    )
-    for found, expected in ((ordered.B0, apart.beta0), (ordered.b, apart.b)):
-        assert found.mean() == pytest.approx(expected.mean(), abs=0.03)
-        assert found.std() == pytest.approx(expected.std(), abs=0.03)

@@ -1,6 +1,6 @@
 """Rates of coupled robots with the linear coefficients integrated out, at many parameter values.
 
-Given B0, the noises and G, with x_k = B0 x_{k-1} + G (coefficients . inputs)_k + noise, the rates
+Given B0 and the noises, with x_k = B0 x_{k-1} + (coefficients . inputs)_k + noise, the rates
 are normal and linear in the coefficients c, which have normal priors. The Kalman filter of
 `vector` is linear in rates and drift, and its covariances depend on neither: the innovations of
 the rates, and of the response to each coefficient alone, are columns of one recursion. Whitened,
@@ -42,7 +42,6 @@ class Dynamics(NamedTuple):
     """Parameter values with a leading axis (point,)."""
 
     B0: np.ndarray  # (point, robot, robot')
-    G: np.ndarray  # (point, robot, robot')
     Q: np.ndarray  # (point, robot, robot')
     R: np.ndarray  # (point, robot, robot')
     mean: np.ndarray  # (point, coefficient), prior
@@ -107,7 +106,7 @@ def _integrate(data, dynamics, first, last, value, factor):
     for t in range(first, last):
         for c in range(p):
             for i in range(n):
-                spread[i, c] = dynamics.G[t, i, data.robot[c]]
+                spread[i, c] = 1.0 if i == data.robot[c] else 0.0
         total, n_rows = 0.0, np.int64(0)  # an int64 throughout
         for s in range(n_missions):
             if s == 0 or data.kind[s] != data.kind[s - 1]:

@@ -1,14 +1,13 @@
 """The posterior of coupled robots with Gaussian rates, their linear coefficients integrated out.
 
-Given B0, the noises and, of robots in order, gamma, all weights and intercepts integrate out
-(`coupled_marginal`), with the couplings among them. The remaining unknowns are scores of the
-priors: three robots have 9 numbers of B0 and 6 of each covariance, 21 in all (in order 3 + 2 + 6 =
-11), for any number of features. beta0 and the noises are scored as in `scores`, size and angle
-robot by robot; couplings are normal; correlations are the partial ones of the LKJ prior. With b =
-concentration + (n - 2 - k) / 2, the correlation of robots i and k < i given those before k is 2
-Beta(b, b) - 1, and row i of the factor of the correlations is p_0, p_1 (1 - p_0^2)^1/2, p_2 (1 -
-p_0^2)^1/2 (1 - p_1^2)^1/2, ..., and last the root of 1 less the squares before (Lewandowski,
-Kurowicka and Joe 2009).
+Given B0 and the noises, all weights and intercepts integrate out (`coupled_marginal`), with the
+couplings among them. The remaining unknowns are scores of the priors: three robots have 9 numbers
+of B0 and 6 of each covariance, 21 in all, for any number of features. beta0 and the noises are
+scored as in `scores`, size and angle robot by robot; couplings are normal; correlations are the
+partial ones of the LKJ prior. With b = concentration + (n - 2 - k) / 2, the correlation of robots i
+and k < i given those before k is 2 Beta(b, b) - 1, and row i of the factor of the correlations is
+p_0, p_1 (1 - p_0^2)^1/2, p_2 (1 - p_0^2)^1/2 (1 - p_1^2)^1/2, ..., and last the root of 1 less the
+squares before (Lewandowski, Kurowicka and Joe 2009).
 """
 
 import numpy as np
@@ -36,31 +35,26 @@ class CoupledTarget(ScoreTarget):
 
     def __init__(self, model: CoupledTrust, batch: MissionBatch, weight: np.ndarray) -> None:
         """Take missions and their weights."""
-        priors, ordered = model.priors, model.inter_robot == "ordered"
         _, _, n, n_features = batch.awareness.shape
-        self.priors, self.n, self.n_features, self.ordered = priors, n, n_features, ordered
+        self.priors, self.n, self.n_features = model.priors, n, n_features
         n_inputs = n * n_features + 1
         robot, source = np.divmod(np.arange(n * n_inputs), n_inputs)
         diagonal = source // n_features == robot
         free = source == n_inputs - 1
-        if ordered:
-            robot, source, diagonal, free = (
-                a[diagonal | free] for a in (robot, source, diagonal, free)
-            )
         self.data: Sequences = gather_sequences(
             batch.awareness, batch.contact_rate, weight, robot, source,
-            (float(priors.x0_mean), float(priors.x0_sd)),
+            (float(model.priors.x0_mean), float(model.priors.x0_sd)),
         )  # fmt: skip
         self._own, self._feature = diagonal | free, np.where(free, n_features, source % n_features)
         pairs = n * (n - 1) // 2
-        sizes = (n, n - 1, n, n) if ordered else (n, 2 * pairs, n, n, pairs, pairs)
+        sizes = n, 2 * pairs, n, n, pairs, pairs
         self._ends = np.cumsum(sizes)
         self.n_scores = sum(sizes)
 
     def log_density(self, z: np.ndarray) -> np.ndarray:
         """Log posterior density of scores (point, score), shape (point,)."""
         with np.errstate(all="ignore"):  # far out noises under- and overflow: no density there
-            value = integrate(self.data, self.constrain(z)[0])[0] + self.log_prior(z)
+            value = integrate(self.data, self.constrain(z))[0] + self.log_prior(z)
         return np.where(np.isfinite(value), value, -np.inf)
 
     def log_prior(self, z: np.ndarray) -> np.ndarray:
@@ -94,16 +88,12 @@ class CoupledTarget(ScoreTarget):
     ) -> tuple[dict[str, np.ndarray], None]:
         """Parameters at the points of sorted indices; these draws need no weights."""
         unique, where = np.unique(chosen, return_inverse=True)
-        dynamics, sites = self.constrain(z[unique])
+        dynamics = self.constrain(z[unique])
         factor = integrate(self.data, dynamics)[1]
         F, half = factor[where, :-1, :-1], factor[where, -1, :-1]
         right = (half + rng.standard_normal(half.shape))[..., None]
         c = np.linalg.solve(np.swapaxes(F, 1, 2), right)[..., 0]
-        sites = {name: values[where] for name, values in sites.items()}
         shape = (len(c), self.n, -1)
-        if self.ordered:
-            of_robots = c.reshape(shape)
-            return sites | {"beta": of_robots[..., :-1], "b": of_robots[..., -1]}, None
         B = c.reshape(shape)[..., :-1].reshape(len(c), self.n, self.n, -1)
         named = {
             "B0": dynamics.B0[where],
@@ -112,8 +102,8 @@ class CoupledTarget(ScoreTarget):
         }
         return named | {"Delta_w": dynamics.Q[where], "Delta_v": dynamics.R[where]}, None
 
-    def constrain(self, z: np.ndarray) -> tuple[Dynamics, dict[str, np.ndarray]]:
-        """Dynamics at scores (point, score); for robots in order, their parameters too."""
+    def constrain(self, z: np.ndarray) -> Dynamics:
+        """Dynamics at scores (point, score)."""
         n, eye = self.n, np.eye(self.n)
         beta0, coupling, size, angle, *partial = np.split(z, self._ends[:-1], axis=1)
         triples = np.stack([beta0, size, angle], axis=2).reshape(-1, 3)
@@ -121,20 +111,12 @@ class CoupledTarget(ScoreTarget):
         beta0, sd_w, sd_v = np.moveaxis(of_robots, 2, 0)
         coupling = scores.quantile(self.priors.coupling, coupling)
         prior = self._prior(beta0)
-        if self.ordered:
-            follows = np.zeros((len(z), n, n))
-            follows[:, np.arange(1, n), np.arange(n - 1)] = coupling
-            G = np.linalg.inv(eye - follows)
-            Q = (G * sd_w[:, None] ** 2) @ np.swapaxes(G, 1, 2)
-            R = np.where(eye, sd_v[:, :, None] ** 2, 0.0)
-            sites = {"beta0": beta0, "gamma": coupling, "delta_w": sd_w, "delta_v": sd_v}
-            return Dynamics(G * beta0[:, None], G, Q, R, *prior), sites
         B0 = np.where(eye, beta0[:, :, None], 0.0)
         B0[:, ~np.eye(n, dtype=bool)] = coupling
         w, v = (self._correlations(partials) for partials in partial)
         w, v = w * sd_w[:, :, None], v * sd_v[:, :, None]
         Q, R = w @ np.swapaxes(w, 1, 2), v @ np.swapaxes(v, 1, 2)
-        return Dynamics(B0, np.broadcast_to(eye, B0.shape), Q, R, *prior), {}
+        return Dynamics(B0, Q, R, *prior)
 
     def _prior(self, beta0: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Means and precisions of the coefficients (point, coefficient) given beta0."""
