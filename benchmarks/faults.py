@@ -110,7 +110,7 @@ FAULTS = (
           "math.sqrt(((r1 - r0) * pixel[0]) ** 2 + ((c1 - c0) * pixel[1]) ** 2 + dz**2)",
           "math.sqrt((r1 - r0) ** 2 + (c1 - c0) ** 2 + dz**2)"),
     Fault("the sign of an index is not the declared one", "terrain/composite.py",
-          "np.sign(vectors[0] @ signs) or 1.0", "np.sign(vectors[0].sum()) or 1.0"),
+          "np.sign(first @ signs) or 1.0", "np.sign(first.sum()) or 1.0"),
     Fault("the truth's best path is that of the robot seen most", "simulation/bound_table.py",
           'loss = 1.0 - self.data["contact"].values.mean(0)',
           'loss = 1.0 - self.data["contact"].values.max(0)'),
