@@ -13,7 +13,7 @@ import yaml
 from trustbo.cli import app, main
 from trustbo.export import FORMATS
 from trustbo.inference.samplers.choice import SAMPLERS
-from trustbo.models.families import AUTO, FAMILIES
+from trustbo.models.families import FAMILIES
 from trustbo.planning import OBJECTIVES, POLICIES
 from trustbo.study.methods import MODELS
 from trustbo.workspace.sight import SIGHT_MODES
@@ -200,7 +200,7 @@ def test_shells_complete_commands_flags_and_names():
     ("option", "names"),
     [
         ("policy", POLICIES), ("objective", OBJECTIVES), ("sampler", SAMPLERS),
-        ("model", MODELS), ("observation", [AUTO, *FAMILIES]),
+        ("model", MODELS), ("observation", [*FAMILIES]),
         ("sight", SIGHT_MODES),
     ],
 )  # fmt: skip
