@@ -1,0 +1,225 @@
+"""Adaptive importance sampling of normal scores, for any log density.
+
+Hyperparameters are sampled as *scores* z, coordinates whose prior is a standard normal. Everything
+else (coefficients, effects, trust) is integrated out of the density and drawn given the scores.
+
+1. `find_mode` climbs from each start and fits a Gaussian by finite differences.
+2. Each round draws points from the current proposal, from the modes if there are several, and from
+   a defensive proposal, by default the prior: it finds regions that the others miss. All proposals
+   so far form one mixture q, relative to which every point is weighted by p(z) / q(z).
+3. The moments of the weighted points give the next proposal, until k-hat and the effective number
+   of points are good.
+
+The weights are Pareto-smoothed (Vehtari, Simpson, Gelman, Yao and Gabry 2024). Their mean, before
+smoothing, estimates the evidence.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple, Self
+
+import numpy as np
+from arviz_stats.base.array import array_stats
+from scipy import optimize, special, stats
+from scipy.linalg import solve_triangular
+
+from trustbo.parallel import one_blas_thread
+
+GOOD_KHAT, MAX_KHAT = 0.5, 0.7
+"""Pareto shape of the weights: rounds end below the first, results beyond the second are bad."""
+_DEGREES = 8.0  # degrees of freedom of the proposals
+_WIDER = 1.15  # scale of a proposal relative to the points that it is fitted to
+_PER_AXIS = 4.0  # effective points for each score that moments need
+_SLOPE_STEP, _CURVATURE_STEP = 1e-3, 3e-2
+_LEAST_CURVATURE = 0.3  # of minus the log density; that of the prior is 1
+_FARTHEST = 7.0  # limit of the scores of a mode
+
+LogDensity = Callable[[np.ndarray], np.ndarray]
+"""Log density of scores (point, score), up to a constant; shape (point,), -inf where it is 0."""
+
+
+class Student(NamedTuple):
+    """Multivariate Student-t density."""
+
+    center: np.ndarray  # (score,)
+    scale: np.ndarray  # (score, score), lower triangular
+
+    @classmethod
+    def of(cls, z: np.ndarray, weight: np.ndarray, ridge: float = 1e-3) -> Self:
+        """Take the mean and covariance of weighted points, (point, score) and (point,)."""
+        mean = weight @ z
+        covariance = (z - mean).T * weight @ (z - mean)
+        return cls(mean, np.linalg.cholesky(covariance + ridge * np.eye(z.shape[1])))
+
+    def widened(self, factor: float) -> Self:
+        """The same density with its scale multiplied by `factor`."""
+        return self._replace(scale=factor * self.scale)
+
+    def draw(self, n: int, rng: np.random.Generator) -> np.ndarray:
+        """Draw points of a scrambled Sobol sequence, shape (n, score); n is a power of 2."""
+        d = len(self.center)
+        uniform = np.clip(stats.qmc.Sobol(d + 1, rng=rng).random(n), 1e-12, 1.0 - 1e-12)
+        chi2 = 2.0 * special.gammaincinv(0.5 * _DEGREES, uniform[:, d:]) / _DEGREES
+        return self.center + special.ndtri(uniform[:, :d]) / np.sqrt(chi2) @ self.scale.T
+
+    def log_density(self, z: np.ndarray) -> np.ndarray:
+        """Log density of points (point, score), shape (point,)."""
+        nu, d = _DEGREES, len(self.center)
+        white = solve_triangular(self.scale, (z - self.center).T, lower=True)
+        constant = special.gammaln(0.5 * (nu + d)) - special.gammaln(0.5 * nu)
+        constant -= 0.5 * d * np.log(nu * np.pi) + np.log(np.diag(self.scale)).sum()
+        return constant - 0.5 * (nu + d) * np.log1p((white**2).sum(0) / nu)
+
+
+class Points(NamedTuple):
+    """Weighted points of a posterior.
+
+    Attributes:
+        z: Scores, shape (point, score).
+        log_p: Their log density, shape (point,).
+        log_ratio: Log density relative to the mixture of all proposals, shape (point,).
+        weight: Pareto-smoothed weights with sum 1, shape (point,).
+        k_hat: Pareto shape of the weights, good below 0.5, bad beyond 0.7.
+        log_evidence: Log of the integral of the density.
+    """
+
+    z: np.ndarray
+    log_p: np.ndarray
+    log_ratio: np.ndarray
+    weight: np.ndarray
+    k_hat: float
+    log_evidence: float
+
+    @classmethod
+    def of(cls, z: np.ndarray, log_p: np.ndarray, log_ratio: np.ndarray) -> Self:
+        """Smooth the weights of points with these log ratios."""
+        return cls(z, log_p, log_ratio, *smoothed(log_ratio))
+
+    @property
+    def kish(self) -> float:
+        """Effective number of points, 1 / sum of squared weights."""
+        return 1.0 / float((self.weight**2).sum())
+
+    def fitted(self) -> Student:
+        """Student-t with the moments of the points; flattened weights where few points count."""
+        weight, least = self.weight, _PER_AXIS * self.z.shape[1]
+        for _ in range(6):
+            if (weight**2).sum() * least <= 1.0:
+                break
+            weight = np.sqrt(weight) / np.sqrt(weight).sum()
+        return Student.of(self.z, weight)
+
+    def resample(self, n: int, rng: np.random.Generator) -> np.ndarray:
+        """Draw indices of `n` equally weighted points, sorted."""
+        return systematic(self.weight, n, rng)
+
+
+def sample(
+    log_density: LogDensity,
+    starts: np.ndarray,
+    rng: np.random.Generator,
+    *,
+    size: int = 256,
+    enough: float = 200.0,
+    most: int = 8,
+    defensive: Callable[[Student], Student] | None = None,
+) -> Points:
+    """Sample a posterior of scores; the caller checks `k_hat`.
+
+    Args:
+        log_density: Log posterior density of scores.
+        starts: Starts of the search for modes, shape (start, score).
+        rng: Generator of random numbers.
+        size: Points of a round, a power of 2; half of them are drawn from `defensive`.
+        enough: Effective number of points that ends the rounds, if k-hat is good.
+        most: Maximum number of rounds.
+        defensive: Density for regions that the given proposal may miss; by default a Student-t
+            that is somewhat wider than the prior.
+    """
+    d = starts.shape[1]
+    prior = Student(np.zeros(d), 1.2 * np.eye(d))
+    z, log_p, mixture = np.empty((0, d)), np.empty(0), []
+
+    with one_blas_thread():
+        modes = find_modes(log_density, starts)
+        proposals = modes if len(modes) > 1 else []
+        current = modes[0]
+        while True:
+            own = [current.widened(_WIDER), *proposals]
+            share = 1 << int(np.log2(size / 2 / len(own)))
+            others = defensive(current) if defensive else prior
+            for density, n in [*((one, share) for one in own), (others, size // 2)]:
+                new = density.draw(n, rng)
+                z, log_p = np.vstack([z, new]), np.append(log_p, log_density(new))
+                mixture.append((density, n))
+
+            log_q = [density.log_density(z) + np.log(n) for density, n in mixture]
+            log_q = special.logsumexp(log_q, axis=0) - np.log(len(z))
+            points = Points.of(z, log_p, np.where(np.isfinite(log_p), log_p, -np.inf) - log_q)
+            current = points.fitted()
+            good = points.k_hat < GOOD_KHAT and points.kish > enough
+            if len(z) > size and (good or len(z) > (most - 1) * size):
+                return points
+
+
+def find_modes(log_density: LogDensity, starts: np.ndarray) -> list[Student]:
+    """Gaussian fits at the distinct modes that are reached from the starts, the highest first."""
+    found: list[tuple[float, Student]] = []
+    for start in starts:
+        mode = find_mode(log_density, start)
+        found.append((float(log_density(mode.center[None])[0]), mode))
+    found.sort(key=lambda pair: -pair[0])
+
+    modes = [found[0][1]]
+    for value, mode in found[1:]:
+        gaps = [np.linalg.solve(m.scale, mode.center - m.center) for m in modes]
+        if min(np.linalg.norm(gap) for gap in gaps) > 1.0 and value > found[0][0] - 8.0:
+            modes.append(mode)
+    return modes
+
+
+def find_mode(log_density: LogDensity, start: np.ndarray) -> Student:
+    """Gaussian fit at the mode: L-BFGS by forward differences, curvature by central ones."""
+    d = len(start)
+    axes = np.eye(d)
+
+    def cost(z: np.ndarray) -> tuple[float, np.ndarray]:
+        value = -log_density(np.vstack([z, z + _SLOPE_STEP * axes]))
+        value = np.minimum(np.nan_to_num(value, nan=np.inf), 1e10)
+        return value[0], (value[1:] - value[0]) / _SLOPE_STEP
+
+    options = {"maxiter": 40, "ftol": 1e-2 / max(1.0, abs(cost(start)[0]))}
+    bounds = [(-_FARTHEST, _FARTHEST)] * d
+    mode = optimize.minimize(
+        cost, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options
+    ).x
+
+    i, j = np.tril_indices(d, -1)
+    steps = np.vstack([np.zeros((1, d)), axes, -axes, axes[i] + axes[j]])
+    f = np.nan_to_num(log_density(mode + _CURVATURE_STEP * steps), nan=-1e10, neginf=-1e10)
+    up, down, both = f[1 : d + 1], f[d + 1 : 2 * d + 1], f[2 * d + 1 :]
+    hessian = np.diag(up - 2.0 * f[0] + down)
+    hessian[i, j] = hessian[j, i] = both - up[i] - up[j] + f[0]
+    curvature, vectors = np.linalg.eigh(-hessian / _CURVATURE_STEP**2)
+    covariance = vectors / np.maximum(curvature, _LEAST_CURVATURE) @ vectors.T
+    return Student(mode, np.linalg.cholesky(covariance))
+
+
+def smoothed(log_ratio: np.ndarray) -> tuple[np.ndarray, float, float]:
+    """Pareto-smooth log importance ratios (point,), some of them finite.
+
+    Returns:
+        Weights with sum 1, k-hat, and the log mean of the ratios.
+    """
+    finite = np.isfinite(log_ratio)
+    log_mean = float(special.logsumexp(log_ratio) - np.log(len(log_ratio)))
+    if finite.all() and np.ptp(log_ratio) < 1e-6:  # equal weights have no tail
+        return np.full(len(log_ratio), 1.0 / len(log_ratio)), -np.inf, log_mean
+    kept = np.where(finite, log_ratio, log_ratio[finite].min() - 100.0)
+    log_weight, k_hat = array_stats.psislw(-kept)
+    return special.softmax(log_weight), float(np.nan_to_num(k_hat, nan=np.inf)), log_mean
+
+
+def systematic(weight: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:
+    """Indices of `n` equally weighted draws, sorted, by systematic resampling."""
+    points = (rng.random() + np.arange(n)) / n
+    return np.searchsorted(np.cumsum(weight)[:-1] / weight.sum(), points)

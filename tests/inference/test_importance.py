@@ -1,0 +1,103 @@
+"""The importance sampler against closed forms."""
+
+import numpy as np
+import pytest
+from scipy import special, stats
+
+from trustbo.inference import importance
+
+
+def gaussian_posterior(d, rng):
+    """Log density of N(0, 1) scores seen as A z + noise, its mean, covariance and evidence."""
+    A, y = rng.normal(size=(d + 2, d)), rng.normal(size=d + 2)
+    covariance = np.linalg.inv(np.eye(d) + A.T @ A)
+    evidence = stats.multivariate_normal(cov=A @ A.T + np.eye(d + 2)).logpdf(y)
+
+    def log_density(z):
+        return stats.norm.logpdf(z).sum(1) + stats.norm.logpdf(y - z @ A.T).sum(1)
+
+    return log_density, covariance @ A.T @ y, covariance, evidence
+
+
+@pytest.mark.parametrize("d", [1, 4, 8])
+def test_a_gaussian_posterior_has_its_closed_form(d):
+    log_density, mean, covariance, evidence = gaussian_posterior(d, np.random.default_rng(d))
+
+    points = importance.sample(log_density, np.zeros((1, d)), np.random.default_rng(0))
+
+    assert points.k_hat < importance.MAX_KHAT
+    assert points.kish > 200.0
+    fit = importance.Student.of(points.z, points.weight, 0.0)
+    sd = np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose(fit.center / sd, mean / sd, atol=5.0 / np.sqrt(points.kish))
+    correlation = fit.scale @ fit.scale.T / np.outer(sd, sd)
+    np.testing.assert_allclose(
+        correlation, covariance / np.outer(sd, sd), atol=8.0 / np.sqrt(points.kish)
+    )
+    assert points.log_evidence == pytest.approx(evidence, abs=0.1)
+
+
+@pytest.mark.parametrize("starts", [[[0.0, 0.0]], [[0.0, 0.0], [-2.0, 0.0], [2.0, 0.0]]])
+def test_two_modes_share_their_mass(starts):
+    narrow = stats.multivariate_normal([2.0, 0.0], 0.02 * np.eye(2))
+    wide = stats.multivariate_normal([-2.0, 1.0], 0.1 * np.eye(2))
+
+    def log_density(z):
+        terms = [np.log(0.7) + narrow.logpdf(z), np.log(0.3) + wide.logpdf(z)]
+        return np.atleast_1d(special.logsumexp(terms, axis=0))
+
+    rng = np.random.default_rng(1)
+    points = importance.sample(log_density, np.array(starts), rng, size=1024, enough=500.0)
+
+    assert points.k_hat < importance.MAX_KHAT
+    assert points.log_evidence == pytest.approx(0.0, abs=0.1)
+    assert points.weight[points.z[:, 0] > 0.0].sum() == pytest.approx(0.7, abs=0.05)
+
+
+def test_a_density_may_vanish_in_places():
+    def log_density(z):
+        return np.where(z[:, 0] > 0.0, stats.norm.logpdf(z).sum(1), -np.inf)
+
+    points = importance.sample(log_density, np.ones((1, 3)), np.random.default_rng(2))
+
+    assert points.log_evidence == pytest.approx(np.log(0.5), abs=0.1)
+    assert points.weight @ points.z[:, 0] == pytest.approx(np.sqrt(2.0 / np.pi), abs=0.1)
+
+
+def test_the_same_generator_gives_the_same_points_and_draws():
+    log_density, *_ = gaussian_posterior(3, np.random.default_rng(3))
+    rngs = [np.random.default_rng(4) for _ in range(2)]
+
+    points = [importance.sample(log_density, np.zeros((1, 3)), rng) for rng in rngs]
+    draws = [one.z[one.resample(50, rng)] for one, rng in zip(points, rngs, strict=True)]
+
+    np.testing.assert_array_equal(points[0].weight, points[1].weight)
+    np.testing.assert_array_equal(draws[0], draws[1])
+
+
+def test_a_student_integrates_to_its_density():
+    rng = np.random.default_rng(5)
+    student = importance.Student(np.array([1.0, -1.0]), np.array([[2.0, 0.0], [0.5, 1.0]]))
+
+    z = rng.normal(size=(6, 2))
+    expected = stats.multivariate_t(student.center, student.scale @ student.scale.T, df=8.0)
+
+    np.testing.assert_allclose(student.log_density(z), expected.logpdf(z), rtol=1e-12)
+    within = (student.draw(4096, rng) @ [1.0, 0.0] < 1.0).mean()
+    assert within == pytest.approx(0.5, abs=0.02)
+
+
+def test_resampling_is_proportional_to_the_weights():
+    weight = np.array([0.1, 0.0, 0.4, 0.5])
+
+    count = np.bincount(importance.systematic(weight, 1000, np.random.default_rng(6)), minlength=4)
+
+    np.testing.assert_allclose(count, 1000 * weight, atol=1)
+
+
+def test_equal_weights_have_no_tail():
+    weight, k_hat, log_mean = importance.smoothed(np.full(8, -3.0))
+
+    np.testing.assert_array_equal(weight, 0.125)
+    assert k_hat == -np.inf
+    assert log_mean == pytest.approx(-3.0)
