@@ -1,7 +1,4 @@
-"""How Sphinx builds the site (`make docs`); neither it nor a reader needs the network.
-
-With a network, signatures also link to the pages of other projects.
-"""
+"""How Sphinx builds the site (`make docs`); neither it nor a reader needs the network."""
 
 import shutil
 import sys
@@ -22,25 +19,31 @@ version = release = installed_version("trustbo")
 extensions = [
     "mathml",
     "myst_nb",
-    "other_projects",
     "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
     "sphinx.ext.napoleon",
     "sphinx_copybutton",
 ]
 exclude_patterns = ["_build", "extensions"]
+templates_path = ["_templates"]
 
 # Pages are Markdown; notebooks are kept executed, and `make test` runs them again.
 myst_enable_extensions = ["attrs_inline", "colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 3
 nb_execution_mode = "off"
 nb_merge_streams = True
-suppress_warnings = ["mystnb.unknown_mime_type"]  # widgets, which have a plain form beside
+suppress_warnings = [
+    "mystnb.unknown_mime_type",  # widgets, which have a plain form beside
+    "ref.ref", "ref.term",  # in docstrings inherited from scikit-learn
+]  # fmt: skip
 
 # Docstrings are Google's. `Attributes:` as a list, lest a field be described twice.
 napoleon_numpy_docstring = False
 napoleon_custom_sections = [("Attributes", "params_style")]
 napoleon_use_rtype = False
 default_role = "code"  # docstrings quote names in single backticks
+autosummary_imported_members = True
+autosummary_ignore_module_all = False
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
 autodoc_preserve_defaults = True
@@ -48,19 +51,6 @@ autoclass_content = "both"  # what a class takes is often said by its `__init__`
 add_module_names = False
 python_maximum_signature_line_length = 120
 python_display_short_literal_types = True
-
-other_projects = {
-    "arviz": "https://python.arviz.org/en/stable/",
-    "geopandas": "https://geopandas.org/en/stable/",
-    "jax": "https://docs.jax.dev/en/latest/",
-    "matplotlib": "https://matplotlib.org/stable/",
-    "networkx": "https://networkx.org/documentation/stable/",
-    "numpy": "https://numpy.org/doc/stable/",
-    "numpyro": "https://num.pyro.ai/en/stable/",
-    "pandas": "https://pandas.pydata.org/docs/",
-    "python": "https://docs.python.org/3/",
-    "xarray": "https://docs.xarray.dev/en/stable/",
-}
 
 html_theme = "furo"
 html_title = f"trustbo {version}"

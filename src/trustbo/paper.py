@@ -1,7 +1,7 @@
 """The paper as printed: Zheng, Smereka, Mikulski and Wang 2021, arXiv 2201.01878.
 
-    workspace = tb.Workspace.from_terrain(terrain, **tb.paper.WORKSPACE)
-    result = tb.iterate(workspace, start, goal, **tb.paper.CAMPAIGN)
+    >>> workspace = tb.Workspace.from_terrain(terrain, **tb.paper.WORKSPACE)
+    >>> result = tb.iterate(workspace, start, goal, **tb.paper.CAMPAIGN)
 
 Of the paper are the model, the objective, the policy, the first path and the sampler. Not of it are
 the prior of trust before the first bound, which it does not give, and the integration of trust,

@@ -59,7 +59,7 @@ class ContactRate(dist.Distribution):
     def sample(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, key: Array, sample_shape: tuple[int, ...] = ()
     ) -> Array:
-        """Contact rates, shape (*sample_shape, mission, bound, robot)."""
+        """Contact rates, shape `(*sample_shape, mission, bound, robot)`."""
 
         def one(key: Array) -> Array:
             return jnp.swapaxes(self.ssm.simulate(key)[1], 0, 1)
