@@ -1,6 +1,6 @@
 """`python -m trustbo`, where the script `trustbo` is not on the path."""
 
-from trustbo.cli.program import main
+from trustbo.cli import main
 
 if __name__ == "__main__":
     main()

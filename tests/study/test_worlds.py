@@ -7,12 +7,9 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
-import pandas as pd
 import pytest
-from typer.testing import CliRunner
 
 import trustbo as tb
-from trustbo.cli import app
 from trustbo.errors import TrustboError
 from trustbo.models import PlaceEffect, PooledTrust
 from trustbo.planning.paths import AdmissiblePaths, PathClass
@@ -256,17 +253,6 @@ class Lucky:
         self.number = number
 
     def __call__(self, key, posterior, planner): ...
-
-
-def test_the_command_prints_the_table(tiny, tmp_path):
-    words = ["--out", tmp_path / "out", "--policy", "greedy", "--baseline", "shortest"]
-    words += ["--iterations", 1, "--executor", "serial", "--objective", "mean"]
-    done = CliRunner().invoke(app, ["worlds", *map(str, words)])
-    assert done.exit_code == 0, done.output
-    assert "| method | regret after 0 (%) | regret after 1 (%) |" in done.output
-    assert "| shortest path | " in done.output
-    table = pd.read_csv(tmp_path / "out" / "worlds.csv", header=[0, 1], index_col=0, skiprows=[2])
-    assert table.index.tolist() == ["greedy", "shortest path"]
 
 
 def test_absent_files_are_named_with_where_to_put_them(tmp_path):

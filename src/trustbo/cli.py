@@ -1,0 +1,258 @@
+"""The command line: `trustbo demo`, `info`, `run`, `resume` and `export`.
+
+Only the command that runs imports what it needs, so that `--help` takes a tenth of a second.
+"""
+
+import argparse
+import sys
+import warnings
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+from trustbo.errors import PosteriorError, TrustboError
+
+if TYPE_CHECKING:
+    from trustbo.campaign.result import Result
+    from trustbo.workspace import Workspace
+
+POLICIES = ("greedy", "optimistic", "thompson", "ucb", "random")
+OBJECTIVES = ("lost_contact", "terminal", "mean")
+FORMATS = ("geotiff", "geojson", "geopackage", "csv", "ros_map", "nav2")
+BAD_INPUT, REFUSED, INTERRUPTED = 2, 3, 130
+EPILOG = "exit codes: 0 done; 2 bad input; 3 the posterior was refused; 130 interrupted"
+PLACE = "ROW,COL, with row 0 in the north; or x=...,y=... in metres of the CRS; or lon=...,lat=..."
+_COLUMNS = ("status", "contact_rate", "objective", "k_hat", "r_hat", "path_changed")
+"""Columns of the table that a finished campaign prints."""
+
+
+def main(arguments: Sequence[str] | None = None) -> NoReturn:
+    """Run a command and exit; an error is one line on the standard error stream.
+
+    Args:
+        arguments: Words after `trustbo`; by default those of this process.
+    """
+    args = parser().parse_args(arguments)
+    folder = getattr(args, "folder", getattr(args, "out", None))
+    resume_later = f"continue with: trustbo resume {folder}"
+    warnings.showwarning = _show_warning
+    try:
+        args.run(args)
+    except KeyboardInterrupt:
+        _exit(f"interrupted; {resume_later}", INTERRUPTED)
+    except PosteriorError as error:
+        _exit(f"error: {error}\nThe missions so far are kept; {resume_later}", REFUSED)
+    except (TrustboError, OSError) as error:
+        _exit(f"error: {error}", BAD_INPUT)
+    sys.exit(0)
+
+
+def _exit(message: str, code: int) -> NoReturn:
+    print(message, file=sys.stderr)
+    sys.exit(code)
+
+
+def _show_version() -> None:
+    import trustbo as tb
+
+    print(f"trustbo {tb.__version__}")
+
+
+def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
+    print(f"warning: {message}", file=sys.stderr)
+
+
+def parser() -> argparse.ArgumentParser:
+    """Parser of all commands; its `run` is the function of the parsed arguments."""
+    top = argparse.ArgumentParser(
+        prog="trustbo",
+        description="Learn how trustworthy robots are on a terrain, and plan their best path.",
+        epilog=EPILOG,
+    )
+    top.add_argument("--version", action="store_true", help="print the version and exit")
+    top.set_defaults(run=lambda args: _show_version() if args.version else top.print_help())
+    commands = top.add_subparsers(metavar="COMMAND")
+
+    def command(run: Callable[..., None], text: str, example: str) -> Any:
+        name = run.__name__
+        example = f"example: trustbo {name} {example}"
+        made = commands.add_parser(name, help=text, description=text, epilog=example)
+        made.set_defaults(run=run)
+        return made.add_argument
+
+    add = command(demo, "Run a campaign on the example hillside.", "--missions 4")
+    _add_campaign(add, "out/demo")
+
+    add = command(info, "Describe and draw the planning grid of a terrain.", "dem.tif")
+    add("dem", type=Path, metavar="DEM", help="heights of the ground, such as a GeoTIFF")
+    add("dsm", type=Path, nargs="?", metavar="DSM", help="heights of the canopy")
+    _add_grid(add)
+    add("--out", type=Path, default=Path("grid.png"), metavar="FILE", help="picture of the grid")
+
+    example = "--dem dem.tif --dsm dsm.tif --start 9,0 --goal 0,9"
+    add = command(run, "Run a simulated campaign on your terrain.", example)
+    add("--dem", type=Path, required=True, metavar="FILE", help="heights of the ground")
+    add("--dsm", type=Path, metavar="FILE", help="heights of the canopy (default: no canopy)")
+    add("--start", type=_place, required=True, metavar="PLACE", help=PLACE)
+    add("--goal", type=_place, required=True, metavar="PLACE", help="likewise")
+    _add_grid(add)
+    add("--robots", type=_count, default=3, metavar="N", help="robots that overwatch (default 3)")
+    add("--max-slope", type=float, default=45.0, metavar="DEG", help="of robots (default 45)")
+    add("--policy", choices=POLICIES, help="how the next path is chosen (default greedy)")
+    add("--objective", choices=OBJECTIVES, help="what a path optimises (default lost_contact)")
+    add("--paper", action="store_true", help="model, awareness and policy of the paper as printed")
+    _add_stop(add)
+    _add_campaign(add, "out")
+
+    add = command(resume, "Continue a campaign, or add missions.", "out --missions 12")
+    add("folder", type=Path, metavar="DIR", help="folder of the campaign")
+    add("--missions", type=_count, metavar="N", help="number of missions in all")
+    _add_stop(add)
+    add("--quiet", "-q", action="store_true", help="show no progress bar and no table")
+
+    add = command(export, "Write a result for GIS, Nav2 or tables.", "out --format nav2")
+    add("folder", type=Path, metavar="DIR", help="folder of the campaign")
+    add("--format", dest="formats", choices=FORMATS, nargs="+", default=["geotiff", "geojson"])
+    add("--out", type=Path, metavar="DIR", help="folder of the files (default: the campaign's)")
+    return top
+
+
+def _add_campaign(add: Any, folder: str) -> None:
+    """Flags of a campaign that is begun."""
+    add("--missions", type=_count, default=8, metavar="N", help="missions in all (default 8)")
+    add("--seed", type=int, default=0, metavar="N", help="random seed (default 0)")
+    add("--out", type=Path, default=Path(folder), metavar="DIR", help=f"(default {folder})")
+    add("--overwrite", action="store_true", help="replace the campaign in that folder")
+    add("--quiet", "-q", action="store_true", help="show no progress bar and no table")
+
+
+def _add_grid(add: Any) -> None:
+    """Flags of a planning grid."""
+    add("--shape", type=_shape, default=(10, 10), metavar="ROWS,COLS", help="(default 10,10)")
+    add("--resolution", type=float, metavar="M", help="average the rasters to pixels of M m")
+
+
+def _add_stop(add: Any) -> None:
+    """Flag of the stopping rule."""
+    text = "stop when the path is within this share of the best with probability 0.9"
+    add("--stop-regret", type=float, metavar="SHARE", help=text)
+
+
+def _count(text: str) -> int:
+    """Whole number from 1 on."""
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"must be a whole number from 1 on; got {text!r}")
+    return int(text)
+
+
+def _shape(text: str) -> tuple[int, int]:
+    """Two whole numbers, such as "10,12"."""
+    rows, cols = map(int, text.split(","))
+    return rows, cols
+
+
+def _place(text: str) -> tuple[int, int] | dict[str, float]:
+    """Cell, such as "9,0"; or a position, such as "x=1748000,y=5427000"."""
+    if "=" not in text:
+        return _shape(text)
+    pairs = (part.split("=") for part in text.split(","))
+    return {name.strip(): float(value) for name, value in pairs}
+
+
+def demo(args: argparse.Namespace) -> None:
+    """Run a campaign on the example terrain."""
+    import trustbo as tb
+
+    workspace = tb.Workspace.from_terrain(tb.terrain.example(), (10, 10))
+    _run(args, workspace, start=(9, 0), goal=(0, 9))
+
+
+def info(args: argparse.Namespace) -> None:
+    """Print the workspace of a terrain and draw its cells."""
+    import matplotlib as mpl
+
+    import trustbo as tb
+
+    terrain = tb.terrain.read_terrain(args.dem, args.dsm, resolution=args.resolution)
+    workspace = tb.Workspace.from_terrain(terrain, args.shape)
+    print(workspace)
+    mpl.use("agg")
+    tb.plots.grid_map(workspace).figure.savefig(args.out, dpi=150)
+    print(f"the grid, with the names of its cells, is drawn in {args.out}")
+
+
+def run(args: argparse.Namespace) -> None:
+    """Run a simulated campaign on a terrain of the user."""
+    from math import radians
+
+    import trustbo as tb
+    from trustbo.workspace.grid import Grid
+
+    robot = tb.Robot(max_slope=radians(args.max_slope))
+    team = tb.Team(robots=(robot,) * args.robots, lead=robot)
+    terrain = tb.terrain.read_terrain(args.dem, args.dsm, resolution=args.resolution)
+    ends = {"start": args.start, "goal": args.goal}
+    for place in ends.values():  # before awareness is computed
+        Grid.over(terrain, args.shape).locate(place)
+    features, options = (tb.paper.WORKSPACE, dict(tb.paper.CAMPAIGN)) if args.paper else ({}, {})
+    for name in ("policy", "objective"):
+        if getattr(args, name) is not None:
+            options[name] = getattr(args, name)
+    workspace = tb.Workspace.from_terrain(terrain, args.shape, team, **features)
+    _run(args, workspace, **ends, **options, stop=_stop(args))
+
+
+def _run(args: argparse.Namespace, workspace: "Workspace", **options: Any) -> None:
+    """Run a campaign in a folder, and write its report."""
+    import trustbo as tb
+
+    result = tb.iterate(
+        workspace, n_iterations=args.missions, checkpoint=args.out, overwrite=args.overwrite,
+        seed=args.seed, progress=not args.quiet, **options,
+    )  # fmt: skip
+    _finish(result, args.out, args.quiet)
+
+
+def _stop(args: argparse.Namespace) -> Any:
+    """Stopping rule of the flag `--stop-regret`; None without it."""
+    from trustbo import RegretBound
+
+    return None if args.stop_regret is None else RegretBound(eps=args.stop_regret)
+
+
+def resume(args: argparse.Namespace) -> None:
+    """Continue the campaign of a folder, and write its report again."""
+    import trustbo as tb
+
+    result = tb.resume(
+        args.folder, n_iterations=args.missions, stop=_stop(args), progress=not args.quiet
+    )
+    _finish(result, args.folder, args.quiet)
+
+
+def _finish(result: "Result", folder: Path, quiet: bool) -> None:
+    """Write the report and, on a terrain, maps and path for GIS; print the missions."""
+    import matplotlib as mpl
+
+    from trustbo.export import export_result
+    from trustbo.report import write_report
+
+    mpl.use("agg")
+    write_report(folder / "report.html", result)
+    if result.workspace.terrain is not None:
+        export_result(result, folder, ("geotiff", "geojson"))
+    if not quiet:
+        table = result.table()
+        print(table[[name for name in _COLUMNS if name in table]].to_string(float_format="%.3f"))
+    print(f"stopped: {result.stop_reason}")
+    print(f"recommended: {' '.join(f'{row},{col}' for row, col in result.path)}")
+    print(f"results are in {folder}; open {folder / 'report.html'}")
+
+
+def export(args: argparse.Namespace) -> None:
+    """Write a result in other formats."""
+    import trustbo as tb
+
+    result = tb.load_result(args.folder)
+    for file in tb.export.export_result(result, args.out or args.folder, args.formats):
+        print(file)

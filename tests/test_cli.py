@@ -1,0 +1,126 @@
+"""Commands: what they write, how they fail, and that their help imports nothing heavy."""
+
+import subprocess
+import sys
+
+import pytest
+import rasterio
+from worlds import hillside
+
+import trustbo as tb
+from trustbo.cli import FORMATS, OBJECTIVES, POLICIES, main
+from trustbo.export import FORMATS as ALL_FORMATS
+
+
+def call(*words):
+    """Exit code of a command."""
+    with pytest.raises(SystemExit) as ended:
+        main([str(word) for word in words])
+    return ended.value.code
+
+
+@pytest.fixture(scope="module")
+def rasters(tmp_path_factory):
+    """A folder with dem.tif and dsm.tif."""
+    folder = tmp_path_factory.mktemp("rasters")
+    terrain = hillside()
+    for name in ("dem", "dsm"):
+        terrain[name].astype("float32").rio.to_raster(folder / f"{name}.tif")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def flags(rasters):
+    files = "--dem", rasters / "dem.tif", "--dsm", rasters / "dsm.tif"
+    return ("run", *files, "--start", "2,0", "--goal", "0,2", "--shape", "3,3")
+
+
+@pytest.fixture(scope="module")
+def campaign(flags, tmp_path_factory):
+    """Folder of a campaign of two missions."""
+    folder = tmp_path_factory.mktemp("campaign") / "mine"
+    assert call(*flags, "--missions", 2, "--seed", 1, "--out", folder) == 0
+    return folder
+
+
+def test_run_writes_a_campaign_with_its_report_and_maps(campaign):
+    assert {"report.html", "maps.tif", "path.geojson"} <= {f.name for f in campaign.iterdir()}
+    assert len(tb.load_result(campaign).missions) == 2
+
+
+def test_a_resumed_campaign_equals_one_that_was_not_interrupted(campaign, flags, tmp_path):
+    assert call(*flags, "--missions", 1, "--seed", 1, "--out", tmp_path / "two") == 0
+    assert call("resume", tmp_path / "two", "--missions", 2, "--quiet") == 0
+    one, two = tb.load_result(campaign), tb.load_result(tmp_path / "two")
+    assert one.path == two.path
+    assert one.value == two.value
+
+
+def test_an_existing_campaign_is_replaced_only_if_asked_to(campaign, flags, capsys):
+    before = sorted(campaign.iterdir())
+    assert call(*flags, "--missions", 1, "--out", campaign) == 2
+    assert capsys.readouterr().err.count("error: ") == 1
+    assert sorted(campaign.iterdir()) == before
+
+
+def test_a_position_is_the_cell_that_holds_it(flags, rasters, tmp_path):
+    with rasterio.open(rasters / "dem.tif") as raster:
+        left, bottom, _, _ = raster.bounds
+    words = [f"x={left + 15.0},y={bottom + 15.0}" if word == "2,0" else word for word in flags]
+    assert call(*words, "--missions", 1, "--quiet", "--out", tmp_path / "out") == 0
+    assert tb.load_result(tmp_path / "out").path[0] == (2, 0)
+
+
+def test_export_writes_the_formats_asked_for(campaign, tmp_path, capsys):
+    assert call("export", campaign, "--format", "csv", "geojson", "--out", tmp_path) == 0
+    written = capsys.readouterr().out.split()
+    assert written == [str(tmp_path / "missions.csv"), str(tmp_path / "path.geojson")]
+
+
+def test_info_describes_and_draws_the_grid(rasters, tmp_path, capsys):
+    picture = tmp_path / "grid.png"
+    files = rasters / "dem.tif", rasters / "dsm.tif"
+    assert call("info", *files, "--shape", "3,3", "--out", picture) == 0
+    assert "3 x 3" in capsys.readouterr().out
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("run", "--dem", "absent.tif", "--start", "0,0", "--goal", "1,1"),
+        ("resume", "absent"),
+        ("export", "absent"),
+        ("info", "absent.tif"),
+    ],
+)
+def test_a_missing_file_is_an_error_of_one_line(words, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert call(*words) == 2
+    assert capsys.readouterr().err.startswith("error: ")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        ("--start", "20,0"), ("--start", "x=1"), ("--shape", "3"), ("--missions", "0"),
+        ("--policy", "bold"), ("--robots", "two"), ("--max-slope", "0"), ("--stop-regret", "5"),
+    ],
+)  # fmt: skip
+def test_impossible_values_are_refused_before_anything_is_written(changed, flags, tmp_path, capsys):
+    assert call(*flags, *changed, "--out", tmp_path / "out") == 2
+    assert "error: " in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_choices_of_flags_are_names_that_the_package_knows():
+    assert set(POLICIES) <= set(tb.planning.POLICIES)
+    assert set(OBJECTIVES) <= set(tb.planning.OBJECTIVES)
+    assert set(FORMATS) == set(ALL_FORMATS)
+
+
+def test_help_imports_nothing_heavy():
+    code = "import sys; from trustbo.cli import parser; parser().format_help(); print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert not {"numpy", "jax", "matplotlib", "xarray"} & set(done.stdout.split())
