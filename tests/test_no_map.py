@@ -110,8 +110,6 @@ def test_a_path_is_given_or_not():
         Mission((), (bound,))
     with pytest.raises(ShapeError, match="at least one bound; got 0"):
         Mission((), ())
-    with pytest.raises(TrustboError, match="posts are of missions with a path"):
-        Mission.from_arrays(None, z, y, posts=np.zeros((2, 1, 2)))
     failed = Mission.from_arrays(None, z, y, failed_at=2, reason="stuck")
     assert failed.status == failed.bounds[-1].status == "stuck"
 

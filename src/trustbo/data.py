@@ -37,15 +37,12 @@ class Mission(Displayed):
         status: `"ok"` if the mission reached the goal, else the reason that it did not.
         features: Names of the features, in the order of the last axis of `awareness`.
         robots: Names of the overwatching robots.
-        posts: Planned places of the robots while the lead ran each bound of the path, shape
-            (bound, robot, 2), x and y in CRS metres; None where they are those of the workspace.
         scale: Scale of the reports of a person that `contact_rate` holds in place of contact, such
             as `"likert7"`, in missions of `logs.read_reports`; empty in all others.
 
     Raises:
-        ShapeError: Bounds that do not fit the path, or disagree on robots or features; or posts
-            of another shape.
-        TrustboError: An unknown status or scale, or posts that are not finite.
+        ShapeError: Bounds that do not fit the path, or disagree on robots or features.
+        TrustboError: An unknown status or scale.
     """
 
     path: tuple[Cell, ...]
@@ -53,7 +50,6 @@ class Mission(Displayed):
     status: str = "ok"
     features: tuple[str, ...] = ()
     robots: tuple[str, ...] = ()
-    posts: np.ndarray | None = None
     scale: str = ""
 
     def __post_init__(self) -> None:
@@ -73,9 +69,6 @@ class Mission(Displayed):
             if len(labels) != size:
                 raise ShapeError(f"{name} must be {size} names; got {labels}.")
             object.__setattr__(self, name, labels)
-        if self.posts is not None:
-            shape = len(self.path) - 1, n_robots, 2
-            object.__setattr__(self, "posts", require_posts(self.posts, shape))
 
     def _require_path(self) -> None:
         """Refuse bounds that do not fit the path."""
@@ -96,7 +89,7 @@ class Mission(Displayed):
                 )
 
     def _require_no_map(self) -> None:
-        """Refuse bounds that enter cells, or posts, in a mission without a path."""
+        """Refuse bounds that enter cells in a mission without a path."""
         if not self.bounds:
             raise ShapeError("a mission has at least one bound; got 0.")
         if entered := [bound.cell for bound in self.bounds if bound.cell != NOWHERE]:
@@ -104,8 +97,6 @@ class Mission(Displayed):
                 f"a bound enters {entered[0]}, but the mission has no path; give the path, or "
                 f"bounds of cell {NOWHERE}, trustbo.data.NOWHERE."
             )
-        if self.posts is not None:
-            raise TrustboError("posts are of missions with a path; this one has none.")
 
     @property
     def has_map(self) -> bool:
@@ -157,7 +148,6 @@ class Mission(Displayed):
         n_ticks: ArrayLike | None = None,
         features: Sequence[str] = (),
         robots: Sequence[str] = (),
-        posts: ArrayLike | None = None,
     ) -> Self:
         """Make a mission from the arrays of a log.
 
@@ -178,8 +168,6 @@ class Mission(Displayed):
             features: Names of the features; by default traversability, visibility, z3, ...; a
                 workspace with as many features gives z3, ... their names, see `Workspace.in_order`.
             robots: Names of the robots; by default r1, r2, ...
-            posts: Places of the robots while the lead ran each bound of the path, shape (bound,
-                robot, 2), such as `Plan.own_posts`; None where they are those of the workspace.
 
         Raises:
             ShapeError: Axes that do not fit together.
@@ -226,8 +214,7 @@ class Mission(Displayed):
         measured = zip(entered, z, y, seconds, statuses, map(float, starts), ticks, strict=False)
         bounds = tuple(Bound(*values, n_ticks=n) for *values, n in measured)
         named = as_names("features", features), as_names("robots", robots)
-        places = None if posts is None else as_array("posts", posts)
-        return cls(cells, bounds, status, *named, places)
+        return cls(cells, bounds, status, *named)
 
     def in_order(
         self, robots: Sequence[str], features: Sequence[str], unmeasured: Sequence[str] = ()
@@ -270,8 +257,7 @@ class Mission(Displayed):
             z = np.pad(b.awareness, ((0, 0), (0, len(lacks))), constant_values=np.nan)
             bounds.append(replace(b, awareness=z[np.ix_(i, m)], **rates, **optional))
         names = {"robots": tuple(robots), "features": tuple(features)}
-        posts = None if self.posts is None else self.posts[:, i]
-        return replace(self, bounds=tuple(bounds), posts=posts, **names)
+        return replace(self, bounds=tuple(bounds), **names)
 
     # Stacked once: every refit reads these of every mission.
 
@@ -314,20 +300,6 @@ def require_map(what: str, missions: Iterable[Mission]) -> None:
 def path_text(path: Iterable[Cell]) -> str:
     """Write cells as on the command line: "9,0 8,1"."""
     return " ".join(f"{row},{col}" for row, col in path)
-
-
-def require_posts(posts: ArrayLike, shape: tuple[int, int, int]) -> np.ndarray:
-    """Return posts as an array of that shape, (bound, robot, x and y), all finite."""
-    given = as_array("posts", posts)
-    if given.shape != shape:
-        raise ShapeError(f"posts must be {shape}, (bound, robot, x and y); got {given.shape}.")
-    if not np.isfinite(given).all():
-        k, i = np.argwhere(~np.isfinite(given))[0, :2].tolist()
-        raise TrustboError(
-            f"posts[{k}, {i}] = {given[k, i].tolist()} must be finite; leave out posts= where they "
-            "are those of the workspace."
-        )
-    return given
 
 
 def is_line_of_sight(feature: str) -> bool:

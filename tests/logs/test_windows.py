@@ -152,7 +152,7 @@ def test_missions_that_do_not_continue_each_other_are_not_joined():
         ([], "at least one mission"),
         ([two, two, one], r"mission 2 begins in \(0, 0\), and the one before ended in \(0, 2\)"),
         ([failed, two], "mission 0 ended 'stuck': no other continues it"),
-        ([one, Mission.from_arrays(None, z, y)], "mission 1 has a path, or posts"),
+        ([one, Mission.from_arrays(None, z, y)], "mission 1 has a path"),
         ([one, Mission.from_arrays([(0, 2)] * 3, z[..., :1], y)], "other robots or features"),
     ):
         with pytest.raises(TrustboError, match=message):

@@ -48,8 +48,7 @@ def test_a_watch_is_the_line_of_sight_of_every_pair_of_posts(wooded):
 
 
 def test_sight_along_a_path_is_its_line_of_sight_but_for_turns(wooded):
-    posts = np.stack([wooded.posts(*bound) for bound in pairwise(PATH)])
-    along = wooded.watch.seen_along(PATH, posts).line_of_sight()
+    along = wooded.watch.seen_along(PATH).line_of_sight()
     known = wooded.along(PATH)[..., -1]  # the mean over where a path may go on to
     assert np.abs(along - known).max() < 0.1
     assert abs((along - known).mean()) < 0.03
@@ -63,25 +62,12 @@ def test_a_bound_with_one_way_on_is_unseen_as_its_path_is():
     assert shares.dims == ("move", "row", "col")
     for move, path in (("e", range(4)), ("w", range(3, -1, -1))):
         path = tuple((0, col) for col in path)
-        seen = corridor.watch.seen_along(path, corridor.watch.rule(path))
+        seen = corridor.watch.seen_along(path)
         entered = [col for _, col in path[1:]]
         np.testing.assert_allclose(shares.sel(move=move, row=0)[entered], seen.unseen(), rtol=1e-12)
     assert 0.05 < float(shares.max()) <= 1.0
     assert int(shares.notnull().sum()) == 6
     assert Workspace.from_awareness(np.full((1, 2, 2, 1), 0.5)).unseen_bounds is None
-
-
-def test_posts_of_the_table_are_near_their_cells_of_a_broken_number_of_pixels():
-    """A campaign with a poor watcher once ended here: its plan's post was refused as too far."""
-    terrain = synthetic_terrain((78.0, 78.0), seed=3, relief=8.0)
-    small = Workspace.from_terrain(terrain, (4, 4), Team(n_robots=2))
-    farthest = 0.0
-    for a, c in pairwise([(3, 0), (2, 0), (1, 0), (0, 0), (0, 1), (0, 2), (1, 2), (2, 2), (2, 3)]):
-        posts = small.watch.posts(a, c)
-        farthest = max(farthest, np.abs(posts - small.grid.center(a)).max())
-        for post in posts:
-            assert np.isfinite(small.gain_of([a, c], np.tile(post, (1, 2, 1)))).all()
-    assert farthest > small.grid.cell_height
 
 
 def test_an_overwatch_map_has_what_is_seen_from_each_post(wooded):
@@ -91,8 +77,7 @@ def test_an_overwatch_map_has_what_is_seen_from_each_post(wooded):
     assert seen.rio.crs == wooded.terrain.rio.crs
     assert np.nanmin(seen) >= 0.0
     assert np.nanmax(seen) <= 1.0
-    posts = np.stack([wooded.posts(*bound) for bound in pairwise(PATH)])
-    watched = wooded.watch.seen_along(PATH, posts).watched.mean(-1)[0, 0]
+    watched = wooded.watch.seen_along(PATH).watched.mean(-1)[0, 0]
     x, y = wooded.posts(a, c)[0]
     here = seen.sel(x=x, y=y, method="nearest")
     assert abs(float(here["x"] - x)) <= 1.0  # points are 2 m apart

@@ -380,11 +380,7 @@ class Campaign(Displayed):
         It is the map's, which plans go by: weights fitted to what robots measured would be applied
         to other numbers, and plans be off by the difference.
         """
-        known = self.known_along(mission.path)
-        if mission.posts is not None:
-            gain = self.workspace.gain_of(mission.path, mission.posts)
-            known = np.clip(known + gain, 0.0, 1.0)
-        return replace_awareness(mission, known)
+        return replace_awareness(mission, self.known_along(mission.path))
 
     # --- results ---
 

@@ -4,8 +4,6 @@ import json
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from trustbo.campaign.planners import path_class
 from trustbo.campaign.progress import Progress
 from trustbo.campaign.stopping import Stop, reason_to_stop, require_stops
@@ -15,7 +13,6 @@ from trustbo.files import to_json
 from trustbo.planning import Plan
 from trustbo.simulation import KinematicSimulator, Truth
 from trustbo.simulation.protocol import Simulator, require_call, takes
-from trustbo.workspace import Workspace
 
 if TYPE_CHECKING:
     from trustbo.campaign.campaign import Campaign
@@ -58,7 +55,7 @@ def _run_missions(
     rules: list[Stop],
     progress: bool | str,
 ) -> Iterator[tuple[Plan, Mission]]:
-    numbered, to_posts = takes(runner.run, "mission"), takes(runner.run, "posts")
+    numbered = takes(runner.run, "mission")
     with Progress(campaign, n_iterations, progress) as shown:
         while True:
             n = len(campaign.missions)
@@ -72,8 +69,6 @@ def _run_missions(
             settings: dict[str, Any] = {"seed": campaign.seed_of("mission")}
             if numbered:  # its world changes
                 settings["mission"] = n
-            if to_posts and (posts := _posts_of(plan, runner)) is not None:
-                settings["posts"] = posts
             mission = runner.run(plan.path, **settings)
             extra = {}
             if truth is not None:
@@ -84,11 +79,3 @@ def _run_missions(
                 callback(campaign, mission)
             yield plan, mission
         campaign.stop("n_iterations")
-
-
-def _posts_of(plan: Plan, runner: Any) -> np.ndarray | None:
-    """Posts that a plan assigns, if the robots can get there where the simulator drives."""
-    posts, workspace = plan.own_posts, getattr(runner, "workspace", plan.workspace)
-    if posts is None or not isinstance(workspace, Workspace) or workspace.ground is None:
-        return posts
-    return posts if workspace.ground.posts.are_reached(plan.path, posts).all() else None

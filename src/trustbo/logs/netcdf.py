@@ -153,22 +153,17 @@ def _table(missions: Sequence[Mission]) -> xr.Dataset:
     awareness = np.full((*shape, len(robots), len(features)), np.nan)
     rates, duration, n_ticks = (np.full((*shape, len(robots)), np.nan) for _ in range(3))
     start, status = np.full(shape, np.nan), np.full(shape, "", dtype=object)
-    posts = np.full((*shape, len(robots), 2), np.nan)
     for j, mission in enumerate(missions):
         n = len(mission.bounds)
         path[j, : len(mission.path)] = np.reshape(mission.path, (-1, 2))
         awareness[j, :n], rates[j, :n] = mission.awareness, mission.contact_rate
         duration[j, :n], n_ticks[j, :n] = mission.duration, mission.n_ticks
-        if mission.posts is not None:
-            posts[j, : len(mission.posts)] = mission.posts
         start[j, :n] = [bound.t0 for bound in mission.bounds]
         status[j, :n] = [bound.status for bound in mission.bounds]
     dims = ("mission", "bound", "robot")
     own: dict[str, Any] = {}
     if any(mission.scale for mission in missions):
         own["scale"] = (dims[:1], [mission.scale for mission in missions])
-    if not np.isnan(posts).all():
-        own["posts"] = ((*dims, "xy"), posts, {"units": "m"})
     return xr.Dataset(
         {
             "path": (("mission", "step", "axis"), path),
@@ -199,10 +194,8 @@ def _mission(table: dict[str, np.ndarray], j: int, ticks: xr.Dataset | None) -> 
         poses, contact, states = _ticks_of(ticks, k)
         cell = path[k + 1] if path else NOWHERE
         bounds.append(Bound(cell, z, y, seconds, status, t0, poses, contact, n, states))
-    posts = table["posts"][j, : len(path) - 1] if "posts" in table and path else np.full(1, np.nan)
-    own = None if np.isnan(posts).any() else posts
     status, scale = str(table["status"][j]), str(table["scale"][j]) if "scale" in table else ""
-    return Mission(path, tuple(bounds), status, features, robots, own, scale)
+    return Mission(path, tuple(bounds), status, features, robots, scale)
 
 
 def _ticks_of(ticks: xr.Dataset | None, k: int) -> tuple[np.ndarray | None, ...]:

@@ -115,7 +115,7 @@ def join_missions(missions: Sequence[Mission]) -> Mission:
             goals; with a map, each begins in the cell in which the one before ended.
 
     Raises:
-        TrustboError: Missions that do not continue each other; or with posts.
+        TrustboError: Missions that do not continue each other.
     """
     first = missions[0] if missions else None
     if first is None:
@@ -124,8 +124,8 @@ def join_missions(missions: Sequence[Mission]) -> Mission:
     for j, mission in enumerate(missions):
         if (mission.robots, mission.features) != (first.robots, first.features):
             raise TrustboError(f"mission {j} has other robots or features than mission 0.")
-        if mission.has_map != first.has_map or mission.posts is not None:
-            raise TrustboError(f"mission {j} has a path, or posts, that mission 0 has not.")
+        if mission.has_map != first.has_map:
+            raise TrustboError(f"mission {j} has a path, or none, unlike mission 0.")
         if j and missions[j - 1].status != "ok":
             raise TrustboError(
                 f"mission {j - 1} ended {missions[j - 1].status!r}: no other continues it."

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from itertools import pairwise
 from typing import Any, Self
 
 import numpy as np
@@ -10,7 +9,6 @@ import numpy as np
 from trustbo.data import Cell, path_text
 from trustbo.display.card import Card, Displayed, arrival
 from trustbo.hazard.risk import PathRisk
-from trustbo.planning.assignment import robots_along
 from trustbo.workspace import Workspace
 
 QUANTILES = (0.05, 0.25, 0.75, 0.95)
@@ -21,9 +19,8 @@ QUANTILES = (0.05, 0.25, 0.75, 0.95)
 class Plan(Displayed):
     """A path with its expected trust, value and exactness.
 
-    What robots are to do, `stops`, `posts` and `ways`, in CRS metres, is the workspace's, but
-    for robots that differ (`robots`), computed on demand, and None without a terrain in memory.
-    Trust, value and bands are for the workspace's posts.
+    What robots are to do, `stops`, `posts` and `ways`, in CRS metres, is computed on demand from
+    the workspace, and None without a terrain in memory.
 
     Attributes:
         path: Cells, start first.
@@ -129,29 +126,8 @@ class Plan(Displayed):
     @cached_property
     def posts(self) -> np.ndarray | None:
         """Posts where T2 stands before each bound, shape (bound, robot, 2)."""
-        if (ground := self.workspace.ground) is None:
-            return None
-        return ground.posts.along(self.path) if self.own_posts is None else self.own_posts
-
-    @cached_property
-    def own_posts(self) -> np.ndarray | None:
-        """Posts by `robots`, shape (bound, robot, 2); None where they are the workspace's."""
-        if self.robots is None or (table := self.workspace.watch) is None:
-            return None
-        bounds = zip(pairwise(self.path), self.robots, strict=True)
-        return np.stack([table.posts(a, c)[chosen] for (a, c), chosen in bounds])
-
-    @cached_property
-    def robots(self) -> np.ndarray | None:
-        """Post of each robot in each bound, (bound, robot), where the robots differ.
-
-        An index into `workspace.watch.posts(a, c)`, the posts from which the bound from cell a to c
-        can be watched, by `planning.assignment`: the poorer watcher has the post that matters less.
-        Robots differ by their lidars, sizes and speeds, or where the contact expected of one, as a
-        share of what it should see, is below another's by more than `assignment.DIFFERENT`. None
-        where they are alike, in large teams, and without line of sight: posts are the workspace's.
-        """
-        return robots_along(self.workspace, self.path, self.trust)
+        ground = self.workspace.ground
+        return None if ground is None else ground.posts.along(self.path)
 
     @cached_property
     def ways(self) -> tuple[tuple[np.ndarray | None, ...], ...] | None:
@@ -161,7 +137,7 @@ class Plan(Displayed):
         that has no way.
         """
         ground = self.workspace.ground
-        return None if ground is None else tuple(ground.along(self.path, self.own_posts))
+        return None if ground is None else tuple(ground.along(self.path))
 
 
 def plan_to_record(plan: Plan) -> dict[str, Any]:

@@ -133,7 +133,7 @@ def _last_step(result: Result, bound_maps: _Moments) -> Step:
     path, planner = result.path, result.planner
     rolled = planner.dynamics(params_of(result.posterior, day=True).flat()).along(path)
     expected = path_trust(rolled, planner.problem.objective, 0.0, cap=False).trust
-    stops, posts = _planned(path, result.workspace, result.plan.own_posts)
+    stops, posts = _planned(path, result.workspace)
     z = along(result.workspace.bound_maps, path)
     return Step(
         "recommended",
@@ -186,7 +186,7 @@ def _latent_trust(result: Result, j: int, n_bounds: int) -> np.ndarray:
 
 def _recorded(mission: Mission, workspace: Workspace) -> tuple[np.ndarray, np.ndarray | None]:
     """Recorded stops and posts; those planned for bounds without a record."""
-    stops, posts = _planned(mission.path, workspace, mission.posts)
+    stops, posts = _planned(mission.path, workspace)
     n_robots = len(mission.robots)
     for k, bound in enumerate(mission.bounds):
         if bound.poses is None or not len(bound.poses):
@@ -198,18 +198,13 @@ def _recorded(mission: Mission, workspace: Workspace) -> tuple[np.ndarray, np.nd
     return stops, posts
 
 
-def _planned(
-    path: Sequence[Cell], workspace: Workspace, own: np.ndarray | None
-) -> tuple[np.ndarray, np.ndarray | None]:
-    """Stops and posts in m from the lower left corner: centres and None without a terrain.
-
-    Posts are the `own` of a plan, (bound, robot, 2), or else the workspace's.
-    """
+def _planned(path: Sequence[Cell], workspace: Workspace) -> tuple[np.ndarray, np.ndarray | None]:
+    """Stops and posts in m from the lower left corner: centres and None without a terrain."""
     corner = np.array(workspace.grid.corner)
     if (ground := workspace.ground) is None:
         return np.array([workspace.grid.center(cell) for cell in path]) - corner, None
     stops = np.stack([ground.posts.stop(cell) for cell in path])
-    return stops - corner, (ground.posts.along(path) if own is None else own) - corner
+    return stops - corner, ground.posts.along(path) - corner
 
 
 def _numbers(

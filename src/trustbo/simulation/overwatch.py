@@ -6,9 +6,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import xarray as xr
-from numpy.typing import ArrayLike
 
-from trustbo.data import Bound, Cell, Mission, require_posts
+from trustbo.data import Bound, Cell, Mission
 from trustbo.errors import TrustboError, require_positive, require_whole
 from trustbo.planning.plan import Plan
 from trustbo.simulation.events import Degradation, Event, Threat, require_events
@@ -134,22 +133,18 @@ class KinematicSimulator(DescribedSimulator):
         *,
         seed: int,
         mission: int = 0,
-        posts: ArrayLike | None = None,
     ) -> Mission:
-        """Run a path, or a plan with its posts, from start to goal or until it fails.
+        """Run a path, or that of a plan, from start to goal or until it fails.
 
         Args:
             path: Cells, each a neighbour of the last; or a plan.
             seed: Seed of slip and detections: same seed, same mission, on any machine.
             mission: Number of the mission, from 0, by which events go.
-            posts: Places of T2 before each bound, shape (bound, robot, 2), x and y in CRS metres;
-                by default the plan's, or the workspace's.
 
         Raises:
-            TrustboError: A cell that is off the grid or impassable, fewer than two cells, or posts
-                of another shape, or that cannot be reached near their cell.
+            TrustboError: A cell that is off the grid or impassable, or fewer than two cells.
         """
-        return self.run_batch(path, [seed], mission=mission, posts=posts)[0]
+        return self.run_batch(path, [seed], mission=mission)[0]
 
     def run_batch(
         self,
@@ -157,7 +152,6 @@ class KinematicSimulator(DescribedSimulator):
         seeds: Sequence[int],
         *,
         mission: int = 0,
-        posts: ArrayLike | None = None,
     ) -> list[Mission]:
         """Run a path many times, faster than one by one; each as `run` does with its seed.
 
@@ -165,20 +159,18 @@ class KinematicSimulator(DescribedSimulator):
             path: See `run`.
             seeds: Seeds of the missions.
             mission: See `run`.
-            posts: See `run`.
 
         Raises:
             TrustboError: See `run`.
         """
         if isinstance(path, Plan):
-            posts, path = path.own_posts if posts is None else posts, path.path
+            path = path.path
         cells = [self.workspace.require_cell(f"path[{k}]", cell) for k, cell in enumerate(path)]
         if len(cells) < 2:
             raise TrustboError(f"a path needs at least two cells; got {cells}.")
-        given = None if posts is None else self._require_posts(posts, cells)
         numbers = [require_whole("seed", seed, 0) for seed in seeds]
         self._enter(mission)
-        states = [self.standing(*cells[:2], seed=n, posts=given) for n in numbers]
+        states = [self.standing(*cells[:2], seed=n) for n in numbers]
         bounds: list[list[Bound]] = [[] for _ in states]
         under_way = list(range(len(states)))
         for k, cell in enumerate(cells[1:], start=1):
@@ -190,20 +182,7 @@ class KinematicSimulator(DescribedSimulator):
             if not under_way:
                 break
         names = self.workspace.features, self.workspace.team.names
-        return [Mission(tuple(cells), tuple(run), run[-1].status, *names, given) for run in bounds]
-
-    def _require_posts(self, posts: ArrayLike, path: Sequence[Cell]) -> np.ndarray:
-        """Posts of T2 for each bound, which it can reach."""
-        given = require_posts(posts, (len(path) - 1, len(self.team.robots), 2))
-        ground = self.workspace.ground
-        assert ground is not None  # noqa: S101  # `true_surface` has refused others
-        for k, i in np.argwhere(~ground.posts.are_reached(path, given)).tolist():
-            raise TrustboError(
-                f"posts[{k}, {i}] = {given[k, i].round(1).tolist()} cannot be reached from the "
-                f"lead's stop in cell {path[k]} over passable ground at most half a cell around "
-                "it; Workspace.posts has posts that can."
-            )
-        return given
+        return [Mission(tuple(cells), tuple(run), run[-1].status, *names) for run in bounds]
 
     def reset(
         self, start: Cell, seed: int, *, next_cell: Cell | None = None, mission: int = 0
@@ -324,18 +303,13 @@ class KinematicSimulator(DescribedSimulator):
 
     # --- one bound ---
 
-    def standing(
-        self, cell: Cell, next_cell: Cell | None, *, seed: int = 0, posts: np.ndarray | None = None
-    ) -> State:
-        """State of a mission with all in their places in a cell, to go to the next.
-
-        T2 at the first of posts (bound, robot, 2), by default at the workspace's.
-        """
+    def standing(self, cell: Cell, next_cell: Cell | None, *, seed: int = 0) -> State:
+        """State of a mission with all in their places in a cell, to go to the next."""
         rule = self._ways.posts
-        first = rule.watching(cell, next_cell) if posts is None else posts[0]
+        first = rule.watching(cell, next_cell)
         stops = np.concatenate([rule.stop(cell)[None], first])
         poses = np.concatenate([stops, np.zeros((len(stops), 1))], axis=1)
-        return State(cell, poses, stops, 0.0, seed, new_tracks(len(first)), posts)
+        return State(cell, poses, stops, 0.0, seed, new_tracks(len(first)))
 
     def _bounds(
         self, states: Sequence[State], k: int, cell: Cell, next_cell: Cell | None
@@ -382,8 +356,6 @@ class KinematicSimulator(DescribedSimulator):
         if lead.status != "ok":
             return lead
         goals = self._ways.posts.watching(cell, next_cell)
-        if state.posts is not None and k < len(state.posts):
-            goals = state.posts[k]
         left = self._max_ticks - len(lead.poses)
         return _joined([lead, self._close_up(_after(state, lead), cell, goals, left, rng)])
 

@@ -16,9 +16,7 @@ class Simulator(Protocol):
     `describe_mission(mission) -> dict` those of the world of a mission, equal in equal worlds; and
     `expected_contact()` the contact and failures of bounds, as a `BoundTable` of
     `simulation.bound_table`, which `Truth.of` takes instead of replicates. A simulator whose world
-    changes takes the number of the mission as a keyword `mission` of `run` (and of `reset`); one
-    whose robots can stand at given posts takes a keyword `posts` of `run`, shape (bound, robot,
-    2), given where a plan's posts are not the workspace's (`Plan.robots`).
+    changes takes the number of the mission as a keyword `mission` of `run` (and of `reset`).
     """
 
     def run(self, path: Sequence[Cell], *, seed: int) -> Mission:

@@ -18,7 +18,6 @@ class State:
     time: float
     seed: int
     tracks: np.ndarray  # (phase, robot, 2), see `sensing.new_tracks`
-    posts: np.ndarray | None = None  # of T2 by bound, (bound, robot, 2); None: the workspace's
 
 
 class Drive(NamedTuple):

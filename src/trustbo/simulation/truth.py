@@ -2,14 +2,14 @@
 
 import hashlib
 from collections.abc import Callable, Sequence
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 import xarray as xr
 
-from trustbo.data import Cell, Mission
+from trustbo.data import Cell
 from trustbo.display.card import Card, Displayed
 from trustbo.errors import (
     DamagedFileError,
@@ -32,7 +32,6 @@ from trustbo.terrain.dataset import digest_of
 from trustbo.workspace import Workspace
 from trustbo.workspace.location import Location
 
-_N_RUNS = 64
 OBJECTIVES = ("lost_contact", "mean")
 """Objectives for which a truth has a best path."""
 
@@ -65,14 +64,9 @@ class Truth(Displayed):
         workspace: Workspace,
         bounds: BoundTable | ModelContact,
         at_mission: "Callable[[int], Truth] | None" = None,
-        run: Callable[[Sequence[Cell], np.ndarray | None], list[Mission]] | None = None,
     ) -> None:
-        """Store the contact of bounds; `at(mission)` is the truth of another mission's world.
-
-        `run(path, posts)` runs missions, from posts if they are given.
-        """
+        """Store the contact of bounds; `at(mission)` is the truth of another mission's world."""
         self.workspace, self.bounds, self._other = workspace, bounds, at_mission
-        self._run = run
         self._best: dict[tuple[Any, ...], tuple[Cell, ...]] = {}
 
     def _card(self) -> Card:
@@ -132,8 +126,7 @@ class Truth(Displayed):
             world = _world(simulator, require_whole("mission", number, 0))
             if (key := to_json(world)) not in cached:
                 table = _table(simulator, number, world, *numbers, folder, progress)
-                run = partial(_runs, simulator, number) if takes(simulator.run, "posts") else None
-                cached[key] = cls(workspace, table, of_mission, run)
+                cached[key] = cls(workspace, table, of_mission)
             return cached[key]
 
         return of_mission(mission)
@@ -180,20 +173,10 @@ class Truth(Displayed):
     def value(self, path: Plan | Sequence[Cell]) -> PathContact:
         """Expected contact of a path, or of a plan, and its probability to arrive.
 
-        From the table of bounds; of a plan that assigns robots to posts (`Plan.robots`), the mean
-        of 64 missions of the simulator, NaN if none arrives.
-
         Raises:
             TrustboError: A cell is off the grid or impassable, or no neighbour of the last.
         """
         cells = self._cells(path)
-        posts = path.own_posts if isinstance(path, Plan) else None
-        if self._run is not None and posts is not None:
-            missions = self._run(cells, posts)
-            arrived = [m.contact_rate.mean(1) for m in missions if m.status == "ok"]
-            rates = np.mean(arrived, axis=0) if arrived else np.full(len(cells) - 1, np.nan)
-            share = len(arrived) / len(missions)
-            return PathContact(float((1.0 - rates).sum()), float(rates.mean()), share)
         rates = self.bounds.contact(cells).mean(1)
         arrives = float(np.prod(1.0 - self.bounds.failure(cells)))
         return PathContact(float((1.0 - rates).sum()), float(rates.mean()), arrives)
@@ -210,8 +193,7 @@ class Truth(Displayed):
 
         100 (contact lost on it - lost on the best) / contact kept on the best, both in bounds; for
         `"mean"` of mean rates. The best path is that of `best`, with the same ends; negative if
-        the path is better than all those admissible. Posts are the workspace's on every path: what
-        a plan gains by assigning robots is in `value`, not here.
+        the path is better than all those admissible.
 
         Raises:
             TrustboError: See `best` and `value`.
@@ -245,17 +227,6 @@ class Truth(Displayed):
 
 def _percent(lacking: float, whole: float) -> float:
     return 100.0 * lacking / whole if whole > 0.0 else np.nan
-
-
-def _runs(
-    simulator: Any, mission: int, path: Sequence[Cell], posts: np.ndarray | None
-) -> list[Mission]:
-    """Missions over a path, from posts if they are given, in the world of a mission."""
-    seeds = range(_N_RUNS)
-    if isinstance(simulator, KinematicSimulator):
-        return simulator.run_batch(path, seeds, mission=mission, posts=posts)
-    named = {"mission": mission} if takes(simulator.run, "mission") else {}
-    return [simulator.run(path, seed=seed, posts=posts, **named) for seed in seeds]
 
 
 def _world(simulator: Any, mission: int) -> tuple[object, int]:

@@ -64,9 +64,9 @@ def geometry(ways: Ways, bounds: Sequence[tuple[Cell, Cell]], passable: np.ndarr
     )
 
 
-def geometry_along(posts: Posts, path: Sequence[Cell], own: np.ndarray | None = None) -> Geometry:
-    """Collect the bounds of a path, T2 at its `own` posts (bound, robot, 2), or the rule's."""
-    lead, t2 = posts.places(path, own)
+def geometry_along(posts: Posts, path: Sequence[Cell]) -> Geometry:
+    """Collect the bounds of a path."""
+    lead, t2 = posts.places(path)
     lines = [posts.lead_line(a, c) for a, c in pairwise(path)]
     ends = np.repeat(t2[1:, None], N_SAMPLES, axis=1)
     return Geometry(lines, t2[:-1], ends, lead[1:])

@@ -21,11 +21,10 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike
 from scipy import ndimage
 
-from trustbo.data import Cell, require_posts
-from trustbo.errors import TerrainError, TrustboError
+from trustbo.data import Cell
+from trustbo.errors import TerrainError
 from trustbo.team import Robot, Team
 from trustbo.workspace.grid import Grid
 from trustbo.workspace.moves import MOVES
@@ -113,27 +112,6 @@ class Posts:
         start = self.surface.pixel_at(*self.stop(cell).tolist())
         return bool(linked_to(self.surface.passable, window, start)[row - top, col - left])
 
-    def are_reached(self, path: Sequence[Cell], posts: np.ndarray) -> np.ndarray:
-        """Whether robots can drive to posts (bound, robot, 2) from the stops, (bound, robot)."""
-        linked = np.empty(posts.shape[:2], bool)
-        for k, i in np.ndindex(linked.shape):
-            linked[k, i] = self.is_linked(path[k], posts[k, i])
-        return linked
-
-    def require_near(self, path: Sequence[Cell], posts: ArrayLike) -> np.ndarray:
-        """Refuse posts (bound, robot, 2) that are not near the cells that T2 stands in."""
-        given = require_posts(posts, (len(path) - 1, self.team.n_robots, 2))
-        centres = np.array([self.grid.center(cell) for cell in path[:-1]])[:, None]
-        # Half a cell from its edge, by whole pixels: the window that the rule's posts are in.
-        high, wide = self.surface.pixel
-        most = self.grid.cell_width + wide, self.grid.cell_height + high
-        for k, i in np.argwhere(~(np.abs(given - centres) <= most).all(-1)).tolist():
-            raise TrustboError(
-                f"posts[{k}, {i}] = {given[k, i].round(1).tolist()} is not near cell {path[k]}, "
-                f"whose centre is {centres[k, 0].round(1).tolist()}; give x and y in CRS metres."
-            )
-        return given
-
     def lead_way(self, a: Cell, c: Cell) -> np.ndarray | None:
         """Way of the lead from stop to stop, (point, 2); None if none."""
         return self.routes.find(self.team.lead, self.stop(a), self.stop(c), self.window(a, c))
@@ -196,17 +174,14 @@ class Posts:
         """Posts of T2 before each bound of a path, (bound, robot, 2)."""
         return self.places(path)[1][:-1]
 
-    def places(
-        self, path: Sequence[Cell], own: np.ndarray | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def places(self, path: Sequence[Cell]) -> tuple[np.ndarray, np.ndarray]:
         """Places of the lead, (bound + 1, 2), and of T2, (bound + 1, robot, 2).
 
-        Before each bound of a path, and at the goal; T2 at its `own` posts (bound, robot, 2), or by
-        the rule.
+        Before each bound of a path, and at the goal.
         """
         lead = [self.stop(cell) for cell in path]
         t2 = [self.watching(a, c) for a, c in zip(path, [*path[1:], None], strict=True)]
-        return np.stack(lead), np.stack(t2 if own is None else [*own, t2[-1]])
+        return np.stack(lead), np.stack(t2)
 
     def candidates(self, cell: Cell, next_cell: Cell | None, n: int) -> np.ndarray:
         """Up to `n` posts to choose from, (post, 2): those of `watching`, then the next best.

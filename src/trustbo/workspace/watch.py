@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import ArrayLike
 
 from trustbo.data import Cell
 from trustbo.team import Robot
@@ -72,28 +71,10 @@ class WatchTable:
         """Posts of the workspace's rule along a path, (bound, robot, 2)."""
         return self._ways.posts.along(path)
 
-    def seen_along(
-        self, path: tuple[Cell, ...], posts: np.ndarray, sight: Sight | None = None
-    ) -> Phases:
-        """Sight at times of both phases of a path's bounds, T2 at posts (bound, robot, 2).
-
-        Under the model of sight of the table, or another.
-        """
+    def seen_along(self, path: tuple[Cell, ...]) -> Phases:
+        """Sight at times of both phases of a path's bounds."""
         rule = self._ways.posts
-        given = geometry_along(rule, path, posts)
-        return phases(rule.surface, sight or self._sight, rule.team, given)
-
-    def gain(self, path: tuple[Cell, ...], posts: ArrayLike, sights: Sequence[Sight]) -> np.ndarray:
-        """Line of sight gained on a path by posts over those of the rule, (bound, robot, sight).
-
-        TrustboError: a post that is farther from its cell than half a cell.
-        """
-        both = self._ways.posts.require_near(path, posts), self.rule(path)
-        seen, usual = (
-            np.stack([self.seen_along(path, one, s).line_of_sight() for s in sights], axis=-1)
-            for one in both
-        )
-        return seen - usual
+        return phases(rule.surface, self._sight, rule.team, geometry_along(rule, path))
 
     def unseen(self, passable: np.ndarray) -> np.ndarray:
         """Share of the time of bounds in which nobody sees anybody, (move, row, col).

@@ -24,14 +24,9 @@ class Ways:
         posts = self.posts.watching(a, c), self.posts.watching(c, next_cell)
         return [self.posts.lead_way(a, c), *self.between((a, c), *posts)]
 
-    def along(
-        self, path: Sequence[Cell], own: np.ndarray | None = None
-    ) -> list[tuple[np.ndarray | None, ...]]:
-        """Ways in each bound of a path: the lead's, then that of each robot of T2.
-
-        T2 goes between its `own` posts (bound, robot, 2), or those of the rule.
-        """
-        t2 = self.posts.places(path, own)[1]
+    def along(self, path: Sequence[Cell]) -> list[tuple[np.ndarray | None, ...]]:
+        """Ways in each bound of a path: the lead's, then that of each robot of T2."""
+        t2 = self.posts.places(path)[1]
         return [
             (self.posts.lead_way(a, c), *self.between((a, c), t2[k], t2[k + 1]))
             for k, (a, c) in enumerate(pairwise(path))

@@ -346,37 +346,17 @@ class Workspace(Displayed):
         moves_along([a, c])
         return a, c
 
-    def along(self, path: Sequence[Cell], posts: ArrayLike | None = None) -> np.ndarray:
+    def along(self, path: Sequence[Cell]) -> np.ndarray:
         """Awareness of the bounds of a path, shape (bound, robot, feature), in [0, 1].
 
         Args:
             path: Cells, each a neighbour of the one before.
-            posts: Places of T2 before each bound, shape (bound, robot, 2), x and y in CRS metres;
-                by default the posts of the workspace.
 
         Raises:
-            ShapeError: Posts of another shape.
-            TrustboError: A cell is off the grid or impassable, or no neighbour of the one before;
-                or a post is not near its cell.
+            TrustboError: A cell is off the grid or impassable, or no neighbour of the one before.
         """
         cells = [self.require_cell(f"path[{k}]", cell) for k, cell in enumerate(path)]
-        known = np.swapaxes(along(self.bound_maps, cells), 0, 1)
-        return known if posts is None else np.clip(known + self.gain_of(cells, posts), 0.0, 1.0)
-
-    def gain_of(self, path: Sequence[Cell], posts: ArrayLike) -> np.ndarray:
-        """Line of sight gained on a path by posts, (bound, robot, feature), over the workspace's.
-
-        0 for other features, and where there is no terrain. Arguments are those of `along`.
-
-        Raises:
-            ShapeError: Posts of another shape.
-            TrustboError: A post that is farther from its cell than half a cell.
-        """
-        cells = tuple(self.require_cell(f"path[{k}]", cell) for k, cell in enumerate(path))
-        gain = np.zeros((len(cells) - 1, self.team.n_robots, len(self.features)))
-        if self.watch is not None and self.of_bounds is not None:
-            gain[..., -len(self.sights) :] = self.watch.gain(cells, posts, self.sights)
-        return gain
+        return np.swapaxes(along(self.bound_maps, cells), 0, 1)
 
     def in_order(self, mission: Mission) -> Mission:
         """Return a mission with its robots and features in the order of the workspace's.
@@ -402,8 +382,7 @@ class Workspace(Displayed):
     def fill(self, mission: Mission) -> Mission:
         """Fill awareness that a mission did not measure (NaN) with that of its bounds.
 
-        A simulator measures no line of sight; a campaign fills it in by itself. It is that of the
-        mission's posts, where these are not the workspace's.
+        A simulator measures no line of sight; a campaign fills it in by itself.
 
         Raises:
             TrustboError: The mission's path is no path of neighbouring cells on the grid.
@@ -411,7 +390,7 @@ class Workspace(Displayed):
         ordered = self.in_order(mission)
         if not np.isnan(ordered.awareness).any():
             return ordered
-        return fill_awareness(ordered, self.along(ordered.path, ordered.posts))
+        return fill_awareness(ordered, self.along(ordered.path))
 
     def with_bounds(self, values: np.ndarray) -> Self:
         """Return the workspace with awareness of bounds, (robot, move, row, col, feature)."""
