@@ -5,17 +5,18 @@ Run: python benchmarks/people.py [soh] [azevedo] [du] [--data FOLDER]
 The folder (`TRUSTBO_DATA` by default, or its `humans/`) holds tables that are not ours to ship,
 made of the public files of clear-nus/human-trust-transfer (soh_household.csv, soh_driving.csv),
 hazevedosa/bidirectional-trust (azevedo_sa.csv) and Du et al. 2025 (du_real.csv, du_vr.csv); the
-columns are those that `trustbo.logs.read_soh`, `read_azevedo_sa` and `read_du` name. Du's changes
-of trust are almost a function of level and event: a test of inputs, no evidence on people.
+columns are those that the readers below name. Du's changes of trust are almost a function of level
+and event: a test of inputs, no evidence on people.
 """
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 from common import Table, arguments, parsed, timed, verdict
 from scipy import special
-from scipy.special import expit
+from scipy.special import expit, logit
 
 import trustbo as tb
 from trustbo.inference import loo, predict_reports
@@ -45,7 +46,7 @@ def soh(folder, *, quick):
     """Their scale, expit(rating - 3.5), and protocol: 10 folds of people, of C, D and E alone."""
     table = Table("study", "method", "given", "MAE", "target", "met")
     for name, (means, transfer, own) in SOH.items():
-        people = tb.logs.read_soh(folder / f"soh_{name}.csv")
+        people = read_soh(folder / f"soh_{name}.csv")
         y = np.array([mission.contact_rate for mission in people]) * 6.0
         truth, n = expit(y - 2.5)[:, :, 2:], len(people)
         success = np.array([mission.awareness[1, 2, 12] for mission in people]) > 0.0
@@ -84,7 +85,7 @@ def soh(folder, *, quick):
 
 def azevedo(folder, *, quick):
     """A third rating given two, of half of the people; and each part of the model by LOO."""
-    people = tb.logs.read_azevedo_sa(folder / "azevedo_sa.csv")
+    people = read_azevedo_sa(folder / "azevedo_sa.csv")
     n = len(people)
     out = np.random.default_rng(0).permutation(n)[: n // 2]
     known = [without_last(m) if i in set(out.tolist()) else m for i, m in enumerate(people)]
@@ -124,10 +125,81 @@ def du(folder, *, quick):
     """One step ahead, people left out: a test of inputs."""
     for study in ("real", "vr"):
         for events in (False, True):
-            people = tb.logs.read_du(folder / f"du_{study}.csv", events=events)
+            people = read_du(folder / f"du_{study}.csv", events=events)
             found = compare_people(people, {"HumanTrust": HumanTrust()})
             print(f"\n{study}, {len(people)} people, {'events' if events else 'outcomes'}")
             print(found.round(4).to_string())
+
+
+def read_soh(file):
+    """Missions of a study of Soh et al. (2018): trust in tasks before and after two were seen.
+
+    Bound 1 is before, with reports of tasks A to E, A and B being those that are seen then; bound 2
+    is after, with reports of C, D and E. Features are the task, `task_1` to `task_12`, the outcome,
+    and it again for tasks of the category of the seen ones (1 to 6, 7 to 12).
+    """
+    table = pd.read_csv(file)
+    features = [f"task_{n}" for n in range(1, 13)]
+    features += ["success", "failure", "success_same", "failure_same"]
+    missions = []
+    for row in table.to_dict("records"):
+        z, y = np.zeros((2, 5, len(features))), np.full((2, 5), np.nan)
+        succeeded = np.array([row["B_SF"] == 1, row["B_SF"] == 0], dtype=float)
+        for r, t in enumerate("ABCDE"):
+            z[:, r, int(row[f"{t}_ID"]) - 1] = 1.0
+            y[0, r] = row[f"{t}_rating" if t in "AB" else f"{t}1_rating"]
+            if t in "CDE":
+                y[1, r] = row[f"{t}2_rating"]
+            z[1, r, 12:14] = succeeded
+            z[1, r, 14:] = succeeded * ((row[f"{t}_ID"] > 6) == (row["A_ID"] > 6))
+        made = tb.Mission.from_arrays(
+            None, z, (y - 1.0) / 6.0, n_ticks=6, features=features, robots=tuple("ABCDE")
+        )
+        missions.append(replace(made, scale="likert7"))
+    return missions
+
+
+def read_azevedo_sa(file):
+    """Missions of Azevedo-Sa et al. (2021): trust in a driving task after three others.
+
+    A seen task's demand is the share of its needs, sensing and processing, that are no less than
+    those of the asked task; the mean need of the asked task is the input `need`. The column trust
+    is the logistic function of the rating, 1 to 7, less 4.
+    """
+    table = pd.read_csv(file)
+    table["report"] = np.clip(np.round(logit(table["trust"].clip(0.01, 0.99)) + 4.0), 1, 7)
+    pairs = [(table[n], table[f"asked_{n}"]) for n in ("sensing", "processing")]
+    table["demand"] = np.mean([seen >= asked for seen, asked in pairs], axis=0)
+    table["need"] = np.mean([asked for _, asked in pairs], axis=0)
+    return tb.logs.read_reports(
+        table, outcome="success", demand="demand", inputs=("need",), scale="likert7"
+    )
+
+
+def read_du(file, *, events=False):
+    """Missions of Du et al. (2025): trust before and after each of ten steps.
+
+    With `events`, outcomes are apart by the level of trust before (from .5, or below) and the
+    state, in place of two inputs.
+    """
+    table = pd.read_csv(file)
+    kinds = [f"{o}_{h}_{s}" for o in ("success", "failure") for h in ("high", "low") for s in "01"]
+    rows = []
+    for person, steps in table.groupby("person", sort=False):
+        before = dict.fromkeys(kinds, 0.0)
+        rows.append(
+            {"person": person, "step": 0, "report": steps["trust_before"].iloc[0], **before}
+        )
+        for one in steps.to_dict("records"):
+            outcome = "success" if one["task_result"] > 0.0 else "failure"
+            level = "high" if one["trust_before"] >= 0.5 else "low"
+            happened = before | {f"{outcome}_{level}_{int(one['state'])}": 1.0}
+            rows.append({"person": person, "step": one["step"], "report": one["trust_after"],
+                         "outcome": outcome, **happened})  # fmt: skip
+    answers = pd.DataFrame(rows)
+    if events:
+        return tb.logs.read_reports(answers, inputs=kinds)
+    return tb.logs.read_reports(answers, outcome="outcome")
 
 
 def median_of(probability, values):

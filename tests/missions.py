@@ -2,8 +2,9 @@
 
 import jax
 import numpy as np
+from hypothesis import strategies as st
 
-from trustbo.data import Mission
+from trustbo.data import NOWHERE, Bound, Mission
 from trustbo.models import PooledTrust, TrustParams
 
 TRUTH = TrustParams(0.6, np.array([0.3, 0.2]), 0.05, 0.05, 0.05)
@@ -87,3 +88,57 @@ def random_covariance(rng, n, scale):
     """A covariance of n robots, about scale^2 on its diagonal."""
     A = rng.normal(size=(n, n))
     return scale**2 * (A @ A.T / n + 0.3 * np.eye(n))
+
+
+@st.composite
+def missions(draw, *, ticks=True):
+    """Missions of one team, as files must keep them: with or without a map, with what is missing.
+
+    With `ticks`, some bounds have poses, contacts and states of ticks.
+    """
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    mapped, n_features = draw(st.booleans()), draw(st.integers(1, 3))
+    robots = draw(st.permutations(["husky", "r 2", "ü-7", "12"]))[: draw(st.integers(1, 3))]
+    features = tuple(draw(st.permutations(["near", "line_of_sight", "z3"])))[:n_features]
+    made = []
+    for _ in range(draw(st.integers(1, 3))):
+        n_planned, n_run = sorted(draw(st.tuples(st.integers(1, 4), st.integers(1, 4))))[::-1]
+        n_run = n_run if mapped else n_planned
+        status = draw(st.sampled_from(["stuck", "aborted"])) if n_run < n_planned else "ok"
+        path = tuple(tuple(cell) for cell in rng.integers(0, 9, (n_planned + 1, 2)).tolist())
+        bounds, t0 = [], float(draw(st.sampled_from([0.0, 0.1, 7.0 / 3.0])))
+        for k in range(n_run):
+            z = rng.uniform(size=(len(robots), n_features)) * (1.0 if mapped else 9.0)
+            n_ticks = rng.integers(1, 30, len(robots)).astype(float)
+            rate = np.round(rng.uniform(size=len(robots)) * n_ticks) / n_ticks
+            duration = rng.uniform(0.1, 99.0, len(robots))
+            for values in (z, rate, duration, n_ticks):
+                values[rng.uniform(size=values.shape) < draw(st.sampled_from([0.0, 0.4]))] = np.nan
+            more = {}
+            if ticks and draw(st.booleans()):
+                n = draw(st.integers(1, 4))
+                more["poses"] = rng.normal(size=(n, 1 + len(robots), 3))
+                more["contact"] = rng.uniform(size=(n, len(robots))) < 0.5
+                if draw(st.booleans()):
+                    more["states"] = rng.normal(size=(n, len(robots), 5))
+            cell, ended = path[k + 1] if mapped else NOWHERE, status if k == n_run - 1 else "ok"
+            bounds.append(Bound(cell, z, rate, duration, ended, t0, n_ticks=n_ticks, **more))
+            t0 = bounds[-1].t1 + float(rng.choice([0.0, 0.3]))
+        made.append(Mission(path if mapped else (), tuple(bounds), status, features, tuple(robots)))
+    return made
+
+
+def assert_same_missions(found, expected, *, ticks=True):
+    """Every number and name of missions is as it was."""
+    assert len(found) == len(expected)
+    for one, other in zip(found, expected, strict=True):
+        for name in ("path", "status", "features", "robots", "scale"):
+            assert getattr(one, name) == getattr(other, name), name
+        assert len(one.bounds) == len(other.bounds)
+        for a, b in zip(one.bounds, other.bounds, strict=True):
+            assert (a.cell, a.status, a.t0) == (b.cell, b.status, b.t0)
+            kept = ("poses", "contact", "states") if ticks else ()
+            for name in ("awareness", "contact_rate", "duration", "n_ticks", *kept):
+                x, y = getattr(a, name), getattr(b, name)
+                assert (x is None) == (y is None), name
+                assert x is None or np.array_equal(x, y, equal_nan=x.dtype.kind == "f"), name

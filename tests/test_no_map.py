@@ -9,7 +9,7 @@ import trustbo as tb
 from trustbo.data import NOWHERE, Bound, Mission
 from trustbo.errors import ShapeError, TrustboError
 from trustbo.inference.posterior_tree import missions_of
-from trustbo.logs import read_missions, read_table, write_missions, write_table
+from trustbo.logs import read_missions, read_table, to_frame, write_missions
 from trustbo.models import PlaceEffect, PooledTrust, RobotEffect
 from trustbo.models.record import model_from_record
 
@@ -45,8 +45,7 @@ def equal(found, expected):
 def test_files_and_posteriors_give_them_back(missions, posterior, tmp_path):
     write_missions(tmp_path / "missions.nc", missions)
     equal(read_missions(tmp_path / "missions.nc"), missions)
-    write_table(missions, tmp_path / "missions.csv")
-    equal(read_table(tmp_path / "missions.csv"), missions)
+    equal(read_table(to_frame(missions)), missions)
     equal(missions_of(posterior), missions)
     assert "no map" in repr(missions[0])
 
@@ -112,14 +111,3 @@ def test_a_path_is_given_or_not():
         Mission((), ())
     failed = Mission.from_arrays(None, z, y, failed_at=2, reason="stuck")
     assert failed.status == failed.bounds[-1].status == "stuck"
-
-
-def test_tables_are_of_one_kind(tmp_path):
-    z, y = np.full((2, 1, 2), 0.5), np.zeros((2, 1))
-    mapped = Mission.from_arrays([(0, 0), (0, 1), (0, 2)], z, y)
-    with pytest.raises(TrustboError, match="mission 1 has no path, and others have"):
-        write_table([mapped, Mission.from_arrays(None, z, y)], tmp_path / "both.csv")
-    columns = {"mission": [1], "bound": [1], "robot": ["r1"], "contact_rate": [0.5], "z": [7.0]}
-    assert read_table(columns)[0].awareness == 7.0
-    with pytest.raises(TrustboError, match="lacks row, col"):
-        read_table(columns, start=(0, 0))

@@ -7,8 +7,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-import trustbo as tb
-from trustbo.logs import read_table, write_table
 from trustbo.spreadsheet import frame_as_csv, harmless, meant
 
 FORMULAS = ['=HYPERLINK("http://x")', "+1+cmd|' /C calc'!A0", "-2+3", "@SUM(A1)", "\t=1", "\r=1",
@@ -35,17 +33,3 @@ def test_a_frame_is_harmless_in_its_header_its_index_and_its_cells():
     assert list(csv.reader(io.StringIO(text))) == [
         ["", "'=a", "n"], ["'+i", "'@b", "-0.5"], ["j", 'say "x", y', ""],
     ]  # fmt: skip
-
-
-def test_a_table_of_missions_keeps_names_that_look_like_formulas(tmp_path):
-    names = {"robots": ("=r1", "'@r2"), "features": ("+z", "-t")}
-    rates = np.array([[0.25, 0.5]])
-    mission = tb.Mission.from_arrays([(0, 0), (0, 1)], np.full((1, 2, 2), 0.5), rates, **names)
-    write_table([mission], tmp_path / "missions.csv")
-    text = (tmp_path / "missions.csv").read_text()
-    cells = [c for row in csv.reader(io.StringIO(text)) for c in row]
-    assert {"'=r1", "''@r2", "'+z", "'-t"} <= set(cells)
-    assert not [cell for cell in cells if cell[:1] in tuple("=+-@")]
-    (back,) = read_table(tmp_path / "missions.csv", robots=names["robots"])
-    assert (back.robots, back.features) == (names["robots"], names["features"])
-    np.testing.assert_array_equal(back.contact_rate, rates)

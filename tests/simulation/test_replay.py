@@ -8,7 +8,7 @@ from worlds import ModelSimulator, hillside, random_cells
 import trustbo as tb
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
-from trustbo.logs.table import write_table
+from trustbo.logs.table import to_frame
 from trustbo.simulation.replay import ReplaySimulator
 
 ENDS = ((3, 0), (0, 3))
@@ -94,7 +94,7 @@ def test_a_replayed_table_gives_the_posterior_of_the_run_that_wrote_it(
     workspace, recorded, tmp_path
 ):
     """Exactly: text keeps every bit, and plans, hence paths, follow from the posteriors."""
-    write_table(recorded.missions, tmp_path / "missions.csv")
+    to_frame(recorded.missions).to_csv(tmp_path / "missions.csv", index=False)
     replay = ReplaySimulator.from_table(tmp_path / "missions.csv")
     assert_same_result(run(workspace, simulator=replay), recorded)
 

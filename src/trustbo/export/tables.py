@@ -17,7 +17,7 @@ def write_csv(path: FilePath, result: Result) -> None:
 
     Columns are `mission`, `bound`, `robot`, `row` and `col` of the cell entered, `contact_rate`,
     `duration` (s), `n_ticks`, `status` of the bound, `mission_status`, a column for each awareness
-    feature as in `logs.write_table`, and `trust_mean` and `trust_sd`, latent trust under the last
+    feature as in `logs.to_frame`, and `trust_mean` and `trust_sd`, latent trust under the last
     posterior. A blank stands for a value that was not measured, or for the trust of a mission that
     the last posterior does not cover.
 
@@ -50,5 +50,5 @@ def write_csv(path: FilePath, result: Result) -> None:
 
 
 def _column(feature: str) -> str:
-    """Return the column of `logs.write_table`, renamed if it is one of latent trust."""
+    """Return the column of a feature, renamed if it is one of latent trust."""
     return f"awareness_{feature}" if feature in _TRUST else column_of(feature)

@@ -8,15 +8,13 @@ from trustbo.logs.mrclam import read_mrclam
 from trustbo.logs.netcdf import read_missions, write_missions
 from trustbo.logs.reports import read_reports
 from trustbo.logs.sensor import Sensor, fit_sensor
-from trustbo.logs.studies import read_azevedo_sa, read_du, read_soh
 from trustbo.logs.synthetic import synthetic_log
-from trustbo.logs.table import read_table, write_table
+from trustbo.logs.table import read_table, to_frame
 from trustbo.logs.windows import join_missions, missions_of
 
 __all__ = [
     "Log", "Sensor", "Topics", "fit_sensor", "geometry", "join_missions", "missions_of",
-    "read_azevedo_sa", "read_bag", "read_du", "read_log", "read_missions", "read_mrclam",
-    "read_reports", "read_soh", "read_table", "synthetic_log",
-    "write_missions", "write_table",
+    "read_bag", "read_log", "read_missions", "read_mrclam", "read_reports", "read_table",
+    "synthetic_log", "to_frame", "write_missions",
 ]  # fmt: skip
 __dir__ = __all__.copy  # completion lists public names alone

@@ -1,0 +1,112 @@
+"""Columns of users' tables: what spreadsheets, surveys and other tools add, and clocks."""
+
+import gzip
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from trustbo.errors import TrustboError
+from trustbo.logs.columns import Columns, seconds_of
+
+EXPECTED = {"who": ["7", "8"], "t": [0.5, np.nan]}
+
+
+def assert_expected(columns):
+    assert columns.names("who") == EXPECTED["who"]
+    np.testing.assert_array_equal(columns.numbers("t"), EXPECTED["t"])
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "who,t\n7,0.5\n8,NA\n",
+        "\ufeffwho;t\r\n7;0,5\r\n8;#N/A\r\n",
+        '"sep=;"\nwho;t;;\n7;0,5;;\n8;;;\n;;;\n',
+        "who\tt\n7.0\t0,5\n8.0\t\n",
+        ",Who, T \n0,7,.5\n1,8,nan\n",
+        'who,t\n"a person","s"\n"{""ImportId"":1}","{""ImportId"":2}"\n7,5e-1\n8,\n',
+    ],
+)
+def test_files_of_spreadsheets_and_surveys_are_read(text, tmp_path):
+    (tmp_path / "größe.csv").write_text(text, encoding="utf-8", newline="")
+    assert_expected(Columns(tmp_path / "größe.csv"))
+    (tmp_path / "wide.csv").write_text(text.removeprefix("\ufeff"), encoding="utf-16", newline="")
+    assert_expected(Columns(tmp_path / "wide.csv"))
+    with gzip.open(tmp_path / "small.csv.gz", "wt", encoding="utf-8", newline="") as file:
+        file.write(text)
+    assert_expected(Columns(tmp_path / "small.csv.gz"))
+
+
+@pytest.mark.parametrize(
+    "table",
+    [
+        {"who": [7, 8], "t": [0.5, None]},
+        {"who": [7.0, "8"], "t": ["0.5", "none"]},
+        pd.DataFrame({"who": [7.0, 8.0], "t": [0.5, np.nan]}),
+        pd.DataFrame({"t": ["0.5", pd.NA]}, index=pd.Index([7, 8], name="who")),
+        pd.DataFrame({"Unnamed: 0": [0, 1], "who": ["7", "8"], "t": [0.5, np.nan]}),
+        np.array([(7, 0.5), (8, np.nan)], dtype=[("who", int), ("t", float)]),
+    ],
+)
+def test_frames_mappings_and_arrays_are_read(table):
+    assert_expected(Columns(table))
+
+
+@pytest.mark.parametrize("value", ["1_10", "1,5", "inf", "0x10", "one", "10:02", "1.234,5"])
+def test_text_that_is_no_number_is_refused_with_its_row(value):
+    with pytest.raises(TrustboError, match="row 2"):
+        Columns({"t": ["1.0", value]}).numbers("t")
+
+
+@pytest.mark.parametrize(
+    "content", [b"who,t\n7\n", b"who,t\n7,1,2\n", b"who,who\n7,1\n", b"who,t\n",
+                b"PK\x03\xff", b"a\xe9,t\n1,2\n"],
+)  # fmt: skip
+def test_files_that_are_no_table_are_refused(content, tmp_path):
+    (tmp_path / "bad.csv").write_bytes(content)
+    with pytest.raises(TrustboError):
+        Columns(tmp_path / "bad.csv")
+    for table in (tmp_path / "none.csv", 5, {"a": [1], "b": [1, 2]}):
+        with pytest.raises(TrustboError):
+            Columns(table)
+
+
+@pytest.mark.parametrize("names", [["a", "A"], ["1", "01"], ["r 1", "r_1"]])
+def test_one_name_in_two_spellings_is_refused(names):
+    with pytest.raises(TrustboError, match="column who"):
+        Columns({"who": names}).names("who")
+
+
+def of(*times):
+    return Columns({"t": list(times)}, "the table")
+
+
+def test_numbers_and_dates_of_any_zone_are_seconds_of_one_clock():
+    zone = pd.Timestamp("2026-11-24T12:00:00+02:00")
+    stamps = pd.Series([zone, zone + pd.Timedelta("1.5s")])
+    for first in (of("2026-11-24T10:00:00Z", "2026-11-24T10:00:03Z"), of(0.0, 3.0)):
+        seen = of(0.0, 1.5) if first.dates("t") is None else Columns({"t": stamps})
+        a, b = seconds_of(first, seen)
+        np.testing.assert_allclose(a, [0.0, 3.0])
+        np.testing.assert_allclose(b, [0.0, 1.5])
+    naive = of("2026-11-24 10:00", "2026-11-24 10:01")
+    np.testing.assert_allclose(seconds_of(naive, naive)[1], [0.0, 60.0])
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        (of(0.0, 3.0), of(1.7e9, 1.7e9 + 3.0)),
+        (of(0.0, 1e6, 2e6), of(0.0)),
+        (of(1.7e12, 1.7e12 + 1.0), of(1.7e12)),
+        (of(0.0, 5.0, 1.7e9), of(1.0)),
+        (of("2026-11-24T10:00", "2026-11-24T12:00"), of("2026-11-24T11:00Z")),
+        (of("2026-11-24T10:00Z", "2026-11-24T10:01Z"), of(3.0)),
+        (of("2026-11-24T10:00Z", "2026-11-24T10:01"), of("2026-11-24T10:00Z")),
+        (of("24.11.2026 10:00", "24.11.2026 10:01"), of("2026-11-24T10:00Z")),
+    ],
+)
+def test_clocks_that_cannot_be_one_are_refused(first, second):
+    with pytest.raises(TrustboError):
+        seconds_of(first, second)
