@@ -6,7 +6,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from trustbo.arrays import as_array, require_unit_interval
-from trustbo.display.card import Card, Displayed, number
+from trustbo.display import Rows, Summary, number
 from trustbo.errors import ShapeError, TrustboError, require_choice
 
 Cell = tuple[int, int]
@@ -17,7 +17,7 @@ NOWHERE: Cell = (-1, -1)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Bound(Displayed):
+class Bound(Summary):
     """Measurements of one bound, one row per overwatching robot.
 
     Attributes:
@@ -97,21 +97,14 @@ class Bound(Displayed):
         """End of the bound, s since the mission's start."""
         return self.t0 + float(np.nanmax(self.duration, initial=0.0))
 
-    def _card(self) -> Card:
-        return Card(
-            f"Bound into cell {self.cell}: {self.status}"
-            if self.cell != NOWHERE
-            else f"Bound of no map: {self.status}",
-            [
-                ("contact rate", np.array2string(self.contact_rate, precision=2)),
-                ("duration", f"{np.array2string(self.duration, precision=1)} s"),
-                ("begins", number(self.t0, "s", 4)),
-            ],
-            sections={
-                f"awareness of robot {i + 1}": [("features", np.array2string(z, precision=2))]
-                for i, z in enumerate(self.awareness)
-            },
-        )
+    def _rows(self) -> Rows:
+        return [
+            ("cell", str(self.cell) if self.cell != NOWHERE else "none: no map"),
+            ("status", self.status),
+            ("contact rate", np.array2string(self.contact_rate, precision=2)),
+            ("duration", f"{np.array2string(self.duration, precision=1)} s"),
+            ("begins", number(self.t0, "s", 4)),
+        ]
 
 
 def require_shares(rate: np.ndarray, ticks: np.ndarray) -> None:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from trustbo.answers import levels_of
 from trustbo.arrays import as_array, as_names
 from trustbo.bound import NOWHERE, STATUSES, Bound, Cell
-from trustbo.display.card import Card, Displayed, joined, number
+from trustbo.display import Rows, Summary, joined, number
 from trustbo.errors import (
     ShapeError,
     TrustboError,
@@ -27,7 +27,7 @@ LINE_OF_SIGHT = "line_of_sight"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Mission(Displayed):
+class Mission(Summary):
     """One traversal of a path: the bounds that were run, and the outcome.
 
     Attributes:
@@ -103,7 +103,7 @@ class Mission(Displayed):
         """Whether its bounds enter cells of a map."""
         return bool(self.path)
 
-    def _card(self) -> Card:
+    def _rows(self) -> Rows:
         rates = self.contact_rate
         measured = np.isfinite(rates)
         if self.scale:
@@ -113,7 +113,7 @@ class Mission(Displayed):
                 ("tasks", joined(self.robots)),
                 ("inputs", joined(self.features)),
             ]
-            return Card("Reports of a person", rows)
+            return rows
         mean = f"{np.nanmean(rates):.3f}" if measured.any() else "not measured"
         took = self.bounds[-1].t1
         ends = f"{path_text(self.path[:1])} to {path_text(self.path[-1:])}"
@@ -127,12 +127,7 @@ class Mission(Displayed):
             *((f"  {name}", f"{rate:.3f}") for name, rate in zip(self.robots, means, strict=True)),
             ("takes", number(took, "s", 4) if took > 0.0 else "not measured"),
         ]
-
-        sections = {
-            **({"cells": [("path", path_text(self.path))]} if self.path else {}),
-            "features": [("", ", ".join(self.features))],
-        }
-        return Card(f"Mission: {self.status}, contact {mean}", rows, sections)
+        return rows
 
     @classmethod
     def from_arrays(

@@ -6,12 +6,12 @@ from typing import Self
 
 import numpy as np
 
-from trustbo.display.card import Card, Displayed, number
+from trustbo.display import Rows, Summary, number
 from trustbo.errors import TrustboError, require_positive, require_whole
 
 
 @dataclass(frozen=True, repr=False)
-class Robot(Displayed):
+class Robot(Summary):
     """One ground robot with a lidar. The defaults describe a Husky-sized skid-steer vehicle.
 
     Attributes:
@@ -57,7 +57,7 @@ class Robot(Displayed):
                     "(degrees? use numpy.deg2rad)."
                 )
 
-    def _card(self) -> Card:
+    def _rows(self) -> Rows:
         field_of_view, max_slope = (
             number(float(np.rad2deg(angle)), "degrees")
             for angle in (2.0 * self.vertical_fov, self.max_slope)
@@ -72,11 +72,11 @@ class Robot(Displayed):
                 f"{self.detection:.0%} found; {self.acquire} to acquire, {self.drop} to drop",
             ),
         ]
-        return Card("Robot", rows)
+        return rows
 
 
 @dataclass(frozen=True, repr=False)
-class Team(Displayed):
+class Team(Summary):
     """The lead T1 and the overwatching subteam T2.
 
     Attributes:
@@ -121,10 +121,9 @@ class Team(Displayed):
             raise TrustboError(f"team must be a Team, e.g. Team(n_robots=3); got {team!r}.")
         return cls(n_robots=n_robots) if team is None else team
 
-    def _card(self) -> Card:
+    def _rows(self) -> Rows:
         members = {"lead": self.lead} | dict(zip(self.names, self.robots, strict=True))
         limit = number(float(np.rad2deg(self.max_slope)), "degrees")
         alike = "all alike" if len(set(members.values())) == 1 else "not all alike"
         rows = [("robots", f"{', '.join(self.names)} ({alike})"), ("slope limit", limit)]
-        sections = {name: robot._card().rows for name, robot in members.items()}
-        return Card(f"Team: a lead and {self.n_robots} overwatching robots", rows, sections)
+        return rows

@@ -290,11 +290,11 @@ def test_a_campaign_states_the_finding_in_its_report_and_once_asked_for_in_its_c
     simulator = tb.simulation.ModelSimulator(workspace, truth)
     options = {"simulator": simulator, "progress": False, "n_iterations": 2, "seed": 3}
     result = tb.iterate(workspace, (4, 0), (0, 4), **options)
-    assert "memory" not in dict(result._card().rows)
+    assert "memory" not in dict(result._rows())
     facts = {fact.name: fact.text for fact in facts_of(result)}
     finding = str(result.memory)
     assert facts["Memory"] == f"{finding[0].upper()}{finding[1:]}."
-    assert dict(result._card().rows)["memory"] == finding
+    assert dict(result._rows())["memory"] == finding
     alone = tb.inference.memory(result.posteriors[-1], result.missions, workspace)
     assert alone.log_bf == result.memory.log_bf
     with pytest.raises(TrustboError, match="parameters alone"):

@@ -12,12 +12,11 @@ import xarray as xr
 from worlds import hillside
 
 import trustbo as tb
-from trustbo.hazard.risk import PathRisk
 from trustbo.models import CoupledTrust, TrustParams
 from trustbo.models.params import CoupledParams
 from trustbo.report import write_report
 from trustbo.report.numbers import decimals_for, number
-from trustbo.report.summary import _arrival, facts_of
+from trustbo.report.summary import facts_of
 from trustbo.report.tables import parameter_table
 
 VOID = {"meta", "link", "img", "source", "br"}
@@ -96,30 +95,6 @@ def text(result, tmp_path_factory):
 @pytest.fixture(scope="module")
 def page(text):
     return Page(text)
-
-
-def test_the_chance_to_arrive_is_told_from_1_and_no_cause_on_a_tie():
-    share = np.array([8e-4, 0.0])
-    risk = PathRisk(
-        share,
-        np.zeros((2, 2)),
-        0.9992,
-        (0.99971, 1.0 - 1e-9),
-        {"a": share, "b": share},
-        1.0 - share,
-    )
-    assert _arrival(risk) == (
-        "It reaches the goal with probability 0.999 on average, over 0.999 in 90 % of the draws; "
-        "its bound 1 is the likeliest to fail, with 8.0e\N{MINUS SIGN}04."
-    )
-    usual = risk._replace(
-        p_arrive=0.9, p_arrive_band=(0.8, 0.95), by_cause={"a": 2 * share, "stuck_fast": 3 * share}
-    )
-    assert "0.900 on average, 0.800 to 0.950 in 90 % of the draws" in _arrival(usual)
-    assert _arrival(usual).endswith("The likeliest cause is stuck fast.")
-    alone = _arrival(usual._replace(p_arrive_band=(np.nan, np.nan), by_cause={}))
-    assert alone.startswith("It reaches the goal with probability 0.900; its bound 1")
-    assert "cause" not in alone
 
 
 def test_the_page_is_whole_and_needs_nothing_else(page, text):

@@ -23,9 +23,9 @@ from trustbo.campaign.running import run_missions
 from trustbo.campaign.state import SET_ASIDE, TOLD, CampaignState, Failure
 from trustbo.campaign.stopping import Stop
 from trustbo.campaign.storage import Storage
-from trustbo.campaign.summary import summary_of
+from trustbo.campaign.summary import evidence_of
 from trustbo.data import Cell, Mission
-from trustbo.display.card import Card, Displayed
+from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError, require_kind, require_whole
 from trustbo.files import FilePath, as_path, interpreting
 from trustbo.hazard.exposures import CAUSES
@@ -44,7 +44,7 @@ from trustbo.workspace.location import Location
 from trustbo.workspace.moves import along, moves_along, require_on_grid
 
 
-class Campaign(Displayed):
+class Campaign(Summary):
     """Learns from missions and proposes the next path.
 
     A mission is planned by `ask`, then recorded, then learned from. One that cannot be learned from
@@ -133,7 +133,7 @@ class Campaign(Displayed):
         if directory is not None:
             self._save_to(Storage(directory), keep=True)
 
-    def _card(self) -> Card:
+    def _rows(self) -> Rows:
         n, settings, state = len(self.missions), self.settings, self.state
         numbers = f"{n} told, {len(state.numbers(TOLD))} not learned from yet"
         others = {SET_ASIDE: len(state.numbers(SET_ASIDE)), "given up": len(state.failures)}
@@ -144,7 +144,7 @@ class Campaign(Displayed):
             ("model", self.model.in_short()),
             ("policy", f"{settings['policy']}, objective {settings['objective']}"),
         ]
-        return summary_of(f"Campaign: {n} mission{'s' * (n != 1)}", rows, settings, self.history)
+        return rows + evidence_of(self.history)
 
     # --- ask and tell ---
 
@@ -155,7 +155,7 @@ class Campaign(Displayed):
         *,
         truth: Truth | None = None,
         stop: Stop | Sequence[Stop] | None = None,
-        progress: bool | str = False,
+        progress: bool = False,
     ) -> Iterator[tuple[Plan, Mission]]:
         """Run missions in a simulator, one for each step of this iterator.
 

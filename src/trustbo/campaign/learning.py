@@ -11,7 +11,7 @@ from trustbo.campaign.options import CampaignOptions
 from trustbo.campaign.posteriors import Posterior
 from trustbo.campaign.state import LEARNED, SET_ASIDE, TOLD, CampaignState
 from trustbo.data import Mission
-from trustbo.display.bars import place_of, say
+from trustbo.display import say
 from trustbo.errors import PosteriorError, TrustboError
 from trustbo.files import interpreting
 from trustbo.hazard import fit_hazard
@@ -169,7 +169,8 @@ class Learner:
             if reason:
                 more = f'sampler "{sampler}" and {sampling["draws"]} draws a chain'
                 line = f"another try, with {more}, as the last failed: {reason}."
-                say(place_of(self.progress), line)
+                if self.progress:
+                    say(line)
             try:
                 return fit(
                     missions, self.model, sampler, workspace=self.workspace, earlier=last,

@@ -33,7 +33,7 @@ def iterate(
     checkpoint: FilePath | None = None,
     overwrite: bool = False,
     seed: int = 0,
-    progress: bool | str = True,
+    progress: bool = True,
     **options: Any,
 ) -> Result:
     """Run a campaign: plan a path, run it, learn from the contact rates, plan again.
@@ -94,7 +94,7 @@ def resume(
     model: TrustModel | None = None,
     policy: Policy | None = None,
     stop: Stop | Sequence[Stop] | None = None,
-    progress: bool | str = True,
+    progress: bool = True,
     **custom: Any,
 ) -> Result:
     """Go on with a campaign that `iterate(checkpoint=directory)` began, with identical results.

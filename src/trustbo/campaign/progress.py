@@ -1,13 +1,11 @@
-"""Progress of a campaign: a bar in a terminal, lines in a file, a bar and a map in a notebook."""
+"""Progress of a campaign."""
 
 import logging
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Self
 
 from trustbo.campaign.state import LEARNED
-from trustbo.display.bars import FILE, NOTEBOOK, bar_in, place_of, say
-from trustbo.display.compiling import compiling
-from trustbo.errors import require_choice
+from trustbo.display import compiling, progress_bar
 
 if TYPE_CHECKING:
     from trustbo.campaign.campaign import Campaign
@@ -16,29 +14,16 @@ _log = logging.getLogger(__name__)
 
 
 class Progress:
-    """Shows the missions of a campaign while they are run.
+    """Bar of the missions of a campaign while they are run."""
 
-    See `iterate` for `progress`. The campaign that a notebook shows is gone at the end.
-    """
-
-    def __init__(self, campaign: "Campaign", total: int, progress: bool | str) -> None:
-        """Show nothing yet, and nothing at all if `progress` is False."""
-        if isinstance(progress, str):
-            require_choice("progress", progress, ("bar",))
-        self._campaign, self._total = campaign, total
-        self._place = place_of(bool(progress))
-        self._map: Any = None
-        if self._place == NOTEBOOK and progress is True:
-            from IPython.display import display
-
-            self._map = display(campaign, display_id=True)
+    def __init__(self, campaign: "Campaign", total: int, show: bool) -> None:
+        self._campaign, self._total, self._show = campaign, total, show
 
     def __enter__(self) -> Self:
-        done = len(self._campaign.missions)
-        learner = self._campaign.learner
-        self._before, learner.progress = learner.progress, bool(self._place)
-        self._bar = bar_in(self._place, total=self._total, initial=done, desc="missions")
-        self._compiling = compiling(self._bar)
+        done, learner = len(self._campaign.missions), self._campaign.learner
+        self._before, learner.progress = learner.progress, self._show
+        self._bar = progress_bar(self._show, total=self._total, initial=done, desc="missions")
+        self._compiling = compiling()
         self._compiling.__enter__()
         return self
 
@@ -51,19 +36,13 @@ class Progress:
         self._compiling.__exit__(None, None, None)
         self._bar.close()
         self._campaign.learner.progress = self._before
-        if self._map is not None and kind is None:  # the result is what a cell shows afterwards
-            self._map.update({"text/plain": "", "text/html": ""}, raw=True)
 
     def step(self) -> None:
         """Show the last mission."""
-        number, report = len(self._campaign.missions), report_of(self._campaign)
+        report = report_of(self._campaign)
         self._bar.set_postfix_str(report, refresh=False)
         self._bar.update()
-        _log.info("mission %d: %s", number, report)
-        if self._place == FILE:
-            say(FILE, f"mission {number}/{self._total}: {report}")
-        if self._map is not None:
-            self._map.update(self._campaign)
+        _log.info("mission %d: %s", len(self._campaign.missions), report)
 
 
 def report_of(campaign: "Campaign") -> str:

@@ -16,9 +16,9 @@ from trustbo.campaign.options import PLANNING_OPTIONS, CampaignOptions
 from trustbo.campaign.planners import planner_of, under_risk
 from trustbo.campaign.posteriors import Posteriors, whole_posterior
 from trustbo.campaign.state import Failure
-from trustbo.campaign.summary import summary_of
+from trustbo.campaign.summary import evidence_of
 from trustbo.data import Cell, Mission
-from trustbo.display.card import Card, Displayed
+from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError, require_pair
 from trustbo.files import FilePath
 from trustbo.hazard.model import measures_of
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Result(Displayed):
+class Result(Summary):
     """Result of a campaign.
 
     Attributes:
@@ -73,7 +73,7 @@ class Result(Displayed):
     stop_reason: str
     failures: Sequence[Failure] = ()
 
-    def _card(self) -> Card:
+    def _rows(self) -> Rows:
         n = len(self.missions)
         rows = [
             ("missions", f"{n}; stopped: {self.stop_reason}"),
@@ -84,7 +84,7 @@ class Result(Displayed):
         ]
         if "memory" in self.__dict__:
             rows.append(("memory", str(self.memory)))
-        return summary_of(f"Result: {n} mission{'s' * (n != 1)}", rows, self.settings, self.history)
+        return rows + evidence_of(self.history)
 
     @property
     def has_posterior(self) -> bool:

@@ -24,7 +24,7 @@ def run_missions(
     n_iterations: int,
     truth: Truth | None,
     stop: Stop | Sequence[Stop] | None,
-    progress: bool | str,
+    progress: bool,
 ) -> Iterator[tuple[Plan, Mission]]:
     """Check everything, then run the missions of a campaign, see `Campaign.run`."""
     require_whole("n_iterations", n_iterations, 1)
@@ -53,7 +53,7 @@ def _run_missions(
     n_iterations: int,
     truth: Truth | None,
     rules: list[Stop],
-    progress: bool | str,
+    progress: bool,
 ) -> Iterator[tuple[Plan, Mission]]:
     numbered = takes(runner.run, "mission")
     with Progress(campaign, n_iterations, progress) as shown:

@@ -38,7 +38,7 @@ from trustbo.criticism.robots import (
 )
 from trustbo.criticism.score import Derivatives, Innovations, Outcome, derivatives, holm
 from trustbo.data import Mission
-from trustbo.display.card import Card, Displayed
+from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError, require_whole
 from trustbo.inference.posterior_tree import missions_of
 from trustbo.models.families import FAMILIES
@@ -56,7 +56,7 @@ _ATTRIBUTES = ("observation", "x0_mean", "x0_sd", "seed")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Criticism(Displayed):
+class Criticism(Summary):
     """Criticism of a fitted model.
 
     Attributes:
@@ -92,10 +92,9 @@ class Criticism(Displayed):
     robots: pd.DataFrame
     ablation: pd.DataFrame
 
-    def _card(self) -> Card:
+    def _rows(self) -> Rows:
         rows = [(str(name), str(row["finding"])) for name, row in self.table.iterrows()]
-        ablation = [(str(name), str(row["finding"])) for name, row in self.ablation.iterrows()]
-        return Card(f"Criticism: {self.verdict}", rows, {"without each component": ablation})
+        return [("verdict", self.verdict), *rows]
 
 
 @one_blas_thread()

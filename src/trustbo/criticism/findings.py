@@ -12,7 +12,7 @@ from trustbo.criticism.joint_normal import Data
 from trustbo.criticism.prior_moments import Coefficients, estimate
 from trustbo.criticism.score import Innovations, Outcome, judge
 from trustbo.data import Mission
-from trustbo.display.card import joined
+from trustbo.display import joined
 
 _MOST_CELLS = 3
 _LEVEL = 0.05

@@ -17,7 +17,7 @@ import xarray as xr
 from trustbo.criticism.departures import Departure
 from trustbo.criticism.joint_normal import Data
 from trustbo.data import Mission
-from trustbo.display.card import joined
+from trustbo.display import joined
 from trustbo.inference.fit import fit
 from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.effects.robot import RobotEffect

@@ -16,7 +16,7 @@ import numpy as np
 import shapely
 
 from trustbo.data import Cell
-from trustbo.display.card import Card, Displayed
+from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError, require_choice
 from trustbo.export.frame import PlacedFrame
 from trustbo.models.params import Params
@@ -35,7 +35,7 @@ Bound = tuple[Cell, Cell]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class RouteGraph(Displayed):
+class RouteGraph(Summary):
     """Directed graph of stops and bounds, with positions and costs.
 
     Edges of a bent way form a chain, among which the cost of the bound is divided by length.
@@ -67,7 +67,7 @@ class RouteGraph(Displayed):
     route: tuple[Cell, ...]
     gap: float
 
-    def _card(self) -> Card:
+    def _rows(self) -> Rows:
         low, high = self.costs.min(), self.costs.max()
         rows = [
             ("nodes", f"{len(self.nodes)}, positions in {self.frame!r}"),
@@ -75,7 +75,7 @@ class RouteGraph(Displayed):
             ("objective", self.objective),
             ("cheapest route", f"{len(self.route) - 1} bounds; {self.compared()}"),
         ]
-        return Card("RouteGraph", rows)
+        return rows
 
     def node_of(self, cell: Cell) -> int:
         """Id of the node of a cell; TrustboError: the cell has none."""

@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike
 
 from trustbo.arrays import as_array
 from trustbo.data import Mission
-from trustbo.display.bars import place_of
 from trustbo.errors import PosteriorError, ShapeError, TrustboError, require_kind, require_whole
 from trustbo.inference.place_maps import place_group
 from trustbo.inference.posterior_groups import add_weights, complete
@@ -138,7 +137,7 @@ def fit(
         warnings.warn(slow_places(reason), stacklevel=2)
     floored = model.at_resolution(ticks)
     # Of a campaign, only the first fit warns.
-    watch = Watch(place_of(progress), estimates=earlier is None)
+    watch = Watch(progress, estimates=earlier is None)
     watch.faster = "" if chosen == "exact" else faster_than_nuts(model)
     with watch:
         prior = draw_sites(floored, batch.awareness.shape[2:], _N_PRIOR, seed + 2)

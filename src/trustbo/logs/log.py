@@ -9,7 +9,7 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from trustbo.arrays import as_array, as_names
-from trustbo.display.card import Card, Displayed, joined, number
+from trustbo.display import Rows, Summary, joined, number
 from trustbo.errors import ShapeError, TrustboError, require_not_negative, require_positive
 from trustbo.files import FilePath
 from trustbo.logs.bagfile import opened
@@ -22,7 +22,7 @@ _FILES = ("poses", "detections", "landmarks")
 _ENDS = (".csv", ".csv.gz")
 
 
-class Log(Displayed):
+class Log(Summary):
     """Poses of robots and their detections of each other, with or without a map.
 
     Attributes:
@@ -119,7 +119,7 @@ class Log(Displayed):
                 one[known, column] = np.interp(t[known], track[:, 0], values)
         return poses
 
-    def _card(self) -> Card:
+    def _rows(self) -> Rows:
         start, end = self.span
         n, m = len(self.robots), len(self.detections)
         poses = sum(len(track) for track in self.tracks)
@@ -130,7 +130,7 @@ class Log(Displayed):
             ("detections", f"{m} between robots"),
             ("landmarks", str(len(self.landmarks))),
         ]
-        return Card(f"Log of {n} robots, {number((end - start) / 60.0, 'min')}", rows)
+        return rows
 
 
 def read_log(path: FilePath, *, topics: Topics | None = None, **options: Any) -> Log:

@@ -16,7 +16,7 @@ from sklearn.linear_model import LogisticRegression
 from sklearn.pipeline import Pipeline, make_pipeline
 from sklearn.preprocessing import SplineTransformer, StandardScaler
 
-from trustbo.display.card import Card, Displayed, number
+from trustbo.display import Rows, Summary, number
 from trustbo.errors import TrustboError, require_whole, unknown
 
 VARIABLES = ("range", "bearing", "hidden", "turning", "speed", "passes")
@@ -25,7 +25,7 @@ _KNOTS, _PENALTY = 8, 10.0  # chosen by ticks left out of one log
 _LEAST = 5  # ticks with contact, and without, of each fold
 
 
-class Sensor(Displayed):
+class Sensor(Summary):
     """Chance of detection by the geometry of a pair.
 
     Attributes:
@@ -68,7 +68,7 @@ class Sensor(Displayed):
         contact = self._geometry["contact"].values
         return float(np.nanmean(contact * np.log(p) + (1.0 - contact) * np.log1p(-p)))
 
-    def _card(self) -> Card:
+    def _rows(self) -> Rows:
         geometry = self._geometry
         contact = float(geometry["contact"].mean())
         alone = contact * np.log(contact) + (1.0 - contact) * np.log1p(-contact)
@@ -78,7 +78,7 @@ class Sensor(Displayed):
             ("log score", f"{number(self.log_score)} nats a tick of ticks left out"),
             ("", f"{number(alone)} of the share of contact alone"),
         ]
-        return Card("Sensor: chance of detection in a tick", rows)
+        return rows
 
 
 def fit_sensor(

@@ -14,7 +14,7 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from trustbo.data import Mission
-from trustbo.display.card import Card, Displayed
+from trustbo.display import Rows, Summary
 from trustbo.errors import ShapeError, TrustboError, require_choice
 from trustbo.models.backend import own_settings
 from trustbo.models.effects.effect import Effect, Slots, rest_of
@@ -35,7 +35,7 @@ _STREAM = 0x6D697373  # of `simulate`, among all that a seed gives
 
 
 @dataclass(frozen=True, repr=False)
-class TrustModel(Displayed, ABC):
+class TrustModel(Summary, ABC):
     """Trust model; callable as a numpyro model, so that `MCMC(NUTS(model))` works.
 
     Attributes:
@@ -319,7 +319,7 @@ class TrustModel(Displayed, ABC):
         """Reason why the exact sampler cannot treat the model; None if it can."""
         return why_not_exact(self)
 
-    def _card(self) -> Card:
+    def _rows(self) -> Rows:
         rows = [
             ("rates", self.observation),
             *((n, str(v)) for n, v in self.options().items() if n != "observation"),
@@ -327,8 +327,7 @@ class TrustModel(Displayed, ABC):
             *(("effects", effect.in_short()) for effect in self.effects),
             ("sampler", "exact" if self.why_not_exact is None else f"nuts: {self.why_not_exact}"),
         ]
-        priors = () if self.priors is None else self.priors._card().rows
-        return Card(type(self).__name__, rows, {"priors": priors})
+        return rows
 
     def in_short(self) -> str:
         """Name, effects of places, family, and the options that differ from their defaults."""

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 import numpy as np
 
 from trustbo.data import Cell
-from trustbo.display.card import Card, Displayed
+from trustbo.display import Rows, Summary
 from trustbo.workspace.moves import bounds_along
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ PLACES: Mapping[str, tuple[str, ...]] = {
 }
 
 
-class ParameterDraws(Displayed):
+class ParameterDraws(Summary):
     """Methods of parameters of every kind; mixed into their tuples."""
 
     __slots__ = ()
@@ -33,7 +33,7 @@ class ParameterDraws(Displayed):
     """Whether coefficients differ by robot; b then has the axis (robot,)."""
     _fields: ClassVar[tuple[str, ...]]
 
-    def _card(self) -> Card:
+    def _rows(self) -> Rows:
         n = int(np.prod(self.leading))
         many = f"{n} draws, mean +- sd" if self.leading else "one draw"
         rows: list[tuple[str, str]] = []
@@ -47,7 +47,7 @@ class ParameterDraws(Displayed):
         names = list(self.by_name)
 
         self.map(add)
-        return Card(f"{type(self).__name__}: {many}", rows)
+        return [("draws", many), *rows]
 
     @property
     def by_name(self) -> dict[str, Numbers]:

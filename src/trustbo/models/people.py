@@ -8,7 +8,7 @@ from typing import Any, ClassVar, NamedTuple, NoReturn, Self, cast
 import numpy as np
 import numpyro.distributions as dist
 
-from trustbo.display.card import Card
+from trustbo.display import Rows
 from trustbo.errors import TrustboError
 from trustbo.models.backend import own_settings
 from trustbo.models.effects.effect import Columns, Effect, Prior, Slots, Theta, dense_columns
@@ -158,10 +158,9 @@ class HumanTrust(PooledTrust):
         shared = (rows != 0.0) @ of_outcomes > 0
         return shared | every, np.array([True, every, True, True])
 
-    def _card(self) -> Card:
-        card = super()._card()
-        rows = [("reports", self.scale), *(row for row in card.rows if row[0] != "rates")]
-        return card._replace(rows=[row for row in rows if row[0] not in ("scale", "places")])
+    def _rows(self) -> Rows:
+        kept = [row for row in super()._rows() if row[0] not in ("rates", "scale", "places")]
+        return [("reports", self.scale), *kept]
 
     @property
     def why_not_exact(self) -> str | None:

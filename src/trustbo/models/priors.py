@@ -12,7 +12,7 @@ from jax import Array
 from numpyro.distributions import Distribution, constraints
 
 from trustbo.data import is_line_of_sight
-from trustbo.display.card import Card, Displayed
+from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError, require_positive
 from trustbo.models.backend import own_settings
 from trustbo.models.families import family_of
@@ -23,7 +23,7 @@ _SCALES = ("delta_w", "delta_v", "tau")
 
 
 @dataclass(frozen=True, repr=False)
-class Priors(Displayed):
+class Priors(Summary):
     """Prior of each parameter, any scalar numpyro distribution, and of trust before bound 1.
 
     `Priors()` has the defaults: beta0 ~ Beta(2, 2), beta_m ~ N(0, 1), b ~ N(0, 0.5), delta_w and
@@ -66,9 +66,8 @@ class Priors(Displayed):
     x0_sd: float = 0.5
     stationary: bool = False
 
-    def _card(self) -> Card:
-        rows = [(one.name, as_text(getattr(self, one.name))) for one in fields(self)]
-        return Card("Priors", rows)
+    def _rows(self) -> Rows:
+        return [(one.name, as_text(getattr(self, one.name))) for one in fields(self)]
 
     def __post_init__(self) -> None:
         with own_settings():

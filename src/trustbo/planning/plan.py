@@ -7,7 +7,7 @@ from typing import Any, Self
 import numpy as np
 
 from trustbo.data import Cell, path_text
-from trustbo.display.card import Card, Displayed, arrival
+from trustbo.display import Rows, Summary
 from trustbo.hazard.risk import PathRisk
 from trustbo.workspace import Workspace
 
@@ -16,7 +16,7 @@ QUANTILES = (0.05, 0.25, 0.75, 0.95)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Plan(Displayed):
+class Plan(Summary):
     """A path with its expected trust, value and exactness.
 
     What robots are to do, `stops`, `posts` and `ways`, in CRS metres, is computed on demand from
@@ -73,7 +73,7 @@ class Plan(Displayed):
         """Return the plan with the bands of another of its path, for many draws."""
         return replace(self, bands=given.bands, value_band=given.value_band)
 
-    def _card(self) -> Card:
+    def _rows(self) -> Rows:
         best = "no path is better" if self.exact else f"at most {self.bound:.3g} can be had"
         if np.isnan(self.bound):
             best = "given, or a policy's choice: value and trust are the means"
@@ -86,21 +86,18 @@ class Plan(Displayed):
         if self.unseen_toll:
             tolls = f", with a toll of {self.unseen_toll:.3g} on the time unseen"
         rows = [
-            ("path", f"{len(self.path) - 1} bounds, {self.length:.0f} m"),
+            ("path", f"{path_text(self.path)}: {len(self.path) - 1} bounds, {self.length:.0f} m"),
             ("value", f"{self.value:.3g} ({self.objective}{tolls})" + within),
             ("best", best),
             ("trust at the goal", f"{self.trust[-1].mean():.3f}, mean of the robots"),
         ]
         if self.p_arrive is not None:
             beyond = "; fails beyond max_failure" if self.infeasible else ""
-            rows.append(("chance to arrive", arrival(self.p_arrive, self.p_arrive_band) + beyond))
+            rows.append(("chance to arrive", f"{self.p_arrive:.3g}{beyond}"))
         if self.engine != "given":
             rows.append(("search", f"{self.engine}, {1e3 * self.seconds:.1f} ms"))
 
-        return Card(
-            f"Plan: {self.path[0]} to {self.path[-1]}", rows,
-            {"cells (row, col)": [("path", path_text(self.path))]},
-        )  # fmt: skip
+        return rows
 
     @property
     def p_fail(self) -> np.ndarray | None:

@@ -12,7 +12,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from trustbo.data import Cell
-from trustbo.display.card import Card, Displayed
+from trustbo.display import Rows, Summary
 from trustbo.errors import require_choice
 from trustbo.hazard.risk import Risk
 from trustbo.hazard.strata import Strata
@@ -32,7 +32,7 @@ from trustbo.workspace import Workspace
 from trustbo.workspace.location import Location
 
 
-class Planner(Displayed):
+class Planner(Summary):
     """Search for the most trustworthy path of a workspace.
 
     Attributes:
@@ -117,7 +117,7 @@ class Planner(Displayed):
         chosen = Objective(objective, length_weight, family, unseen_cost)
         self._hold(PlanningProblem(paths, chosen, team, rule=rule))
 
-    def _card(self) -> Card:
+    def _rows(self) -> Rows:
         rows = [
             ("from", f"{self.start} to {self.goal}, {self.connectivity} directions"),
             ("objective", f"{self.objective}, {self.team} of the robots"),
@@ -126,8 +126,7 @@ class Planner(Displayed):
             ("risk", "of each bound" if self.problem.risk is not None else "not known"),
             ("engine", self.engine),
         ]
-
-        return Card(f"Planner: {self.start} to {self.goal}", rows)
+        return rows
 
     def _hold(self, problem: PlanningProblem) -> None:
         paths = problem.paths

@@ -5,7 +5,7 @@ import numpy as np
 from trustbo import plots
 from trustbo.campaign.result import Result
 from trustbo.criticism.criticise import Criticism
-from trustbo.display.card import joined
+from trustbo.display import joined
 from trustbo.inference import params_of, place_maps
 from trustbo.inference.posterior_tree import labelled_draws
 from trustbo.report.blocks import Picture

@@ -4,7 +4,7 @@ import numpy as np
 
 from trustbo.campaign.result import Result
 from trustbo.data import path_text
-from trustbo.display.card import arrival, joined
+from trustbo.display import joined
 from trustbo.errors import TrustboError
 from trustbo.hazard.risk import PathRisk
 from trustbo.inference.samplers.convergence import GOOD_KHAT, MAX_KHAT, MAX_RHAT, MIN_ESS
@@ -94,7 +94,7 @@ def _exactness(plan: Plan) -> str:
 def _arrival(risk: PathRisk) -> str:
     worst = int(np.argmax(risk.p_fail))
     sentence = (
-        f"It reaches the goal with probability {arrival(risk.p_arrive, risk.p_arrive_band)}; its "
+        f"It reaches the goal with probability {risk.p_arrive:.3f}; its "
         f"bound {worst + 1} is the likeliest to fail, with {number(risk.p_fail[worst])}."
     )
     causes = {cause: float(p.sum()) for cause, p in risk.by_cause.items()}

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from trustbo.data import Bound, Cell, Mission
-from trustbo.display.card import Card, Displayed
+from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError
 
 
@@ -44,17 +44,17 @@ class BoundSimulator(Simulator, Protocol):
         ...
 
 
-class DescribedSimulator(Displayed):
+class DescribedSimulator(Summary):
     """Simulator of this package, displayed by the settings that it describes."""
 
     def describe(self) -> dict[str, object]:
         """Return the settings that decide what a mission measures."""
         raise NotImplementedError
 
-    def _card(self) -> Card:
+    def _rows(self) -> Rows:
         settings = {name: value for name, value in self.describe().items() if name != "simulator"}
         rows = [(name, str(value)) for name, value in settings.items() if value not in (None, [])]
-        return Card(type(self).__name__, [(name, text) for name, text in rows if len(text) < 200])
+        return [(name, text) for name, text in rows if len(text) < 200]
 
 
 def require_bounds(simulator: object, what: str) -> None:

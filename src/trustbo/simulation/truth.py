@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from trustbo.data import Cell
-from trustbo.display.card import Card, Displayed
+from trustbo.display import Rows, Summary
 from trustbo.errors import (
     DamagedFileError,
     TrustboError,
@@ -47,7 +47,7 @@ class PathContact(NamedTuple):
     """Probability that no bound fails."""
 
 
-class Truth(Displayed):
+class Truth(Summary):
     """Expected contact of every path of a simulator, in the world of a mission.
 
     Contact is expected given that no bound fails; `PathContact.p_arrive` is the probability of
@@ -69,7 +69,7 @@ class Truth(Displayed):
         self.workspace, self.bounds, self._other = workspace, bounds, at_mission
         self._best: dict[tuple[Any, ...], tuple[Cell, ...]] = {}
 
-    def _card(self) -> Card:
+    def _rows(self) -> Rows:
         grid = self.workspace.grid
         source = f"{type(self.bounds).__name__}, of {grid.shape[0]} x {grid.shape[1]} cells"
         error = f"{self.standard_error:.2g} of a bound's contact, mean over robots"
@@ -78,7 +78,7 @@ class Truth(Displayed):
             ("standard error", error),
             ("worlds", "one" if self._other is None else "of each mission, see at(mission)"),
         ]
-        return Card("Truth: expected contact of every bound", rows)
+        return rows
 
     @classmethod
     def of(

@@ -11,7 +11,7 @@ from rasterio.crs import CRS
 from rasterio.transform import from_origin
 
 from trustbo.data import Cell
-from trustbo.display.card import Card, Displayed
+from trustbo.display import Rows, Summary
 from trustbo.errors import TerrainError, TrustboError, require_pair
 from trustbo.workspace.location import Location, cell_of, crs_name, lonlat_of
 
@@ -20,7 +20,7 @@ Sums = tuple[np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True, repr=False)
-class Grid(Displayed):
+class Grid(Summary):
     """A regular grid of cells; row 0 at the top (north).
 
     Attributes:
@@ -67,17 +67,15 @@ class Grid(Displayed):
             None if crs is None else crs.to_wkt(),
         )
 
-    def _card(self) -> Card:
+    def _rows(self) -> Rows:
         left, bottom = self.corner
         rows = [
-            (
-                "cells",
-                f"{self.cell_height:.4g} m (north-south) x {self.cell_width:.4g} m (east-west)",
-            ),
+            ("cells", f"{self.shape[0]} rows x {self.shape[1]} columns"),
+            ("cell", f"{self.cell_height:.4g} m (north-south) x {self.cell_width:.4g} m"),
             ("corner", f"x {left:.10g}, y {bottom:.10g} m, lower left"),
             ("CRS", "none" if self.crs is None else crs_name(self)),
         ]
-        return Card(f"Grid: {self.shape[0]} x {self.shape[1]} cells", rows)
+        return rows
 
     def center(self, cell: Cell) -> tuple[float, float]:
         """X and y of a cell's centre, CRS metres."""

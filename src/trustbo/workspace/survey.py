@@ -7,7 +7,7 @@ import numpy as np
 import xarray as xr
 
 from trustbo.data import Cell
-from trustbo.display.card import Card, Displayed
+from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError
 from trustbo.team import Team
 from trustbo.terrain.dataset import is_lazy, pixel_size, require_terrain
@@ -25,7 +25,7 @@ _BANDS = 4
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Survey(Displayed):
+class Survey(Summary):
     """Grid of a terrain, and the cells that robots can stand in, from heights alone.
 
     Attributes:
@@ -81,7 +81,7 @@ class Survey(Displayed):
 
         return cell_of(what, location, self.grid, self.passable, why)
 
-    def _card(self) -> Card:
+    def _rows(self) -> Rows:
         grid, (low, high), free = self.grid, self.heights, self.passable
         (height, width), (rows, cols) = self.pixel, grid.shape
         x, y, longitude, latitude = spans(grid)
@@ -102,8 +102,7 @@ class Survey(Displayed):
                 (east, north), (lon, lat) = grid.center((row, col)), grid.lonlat((row, col))
                 text = f"{row},{col} or x={east:.1f},y={north:.1f} or lon={lon:.6f},lat={lat:.6f}"
                 rows_of.append((f"e.g. {name}", text))
-
-        return Card(f"Terrain: {rows} x {cols} cells", rows_of)
+        return rows_of
 
 
 def survey(

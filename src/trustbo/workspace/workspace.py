@@ -19,8 +19,7 @@ from trustbo.data import (
     is_line_of_sight,
     require_map,
 )
-from trustbo.display.card import Card, Displayed
-from trustbo.display.compiling import compiling
+from trustbo.display import Rows, Summary, compiling
 from trustbo.errors import ShapeError, require_choice, require_positive
 from trustbo.stacking import fill_awareness
 from trustbo.team import Team
@@ -50,7 +49,7 @@ from trustbo.workspace.ways import Ways
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Workspace(Displayed):
+class Workspace(Summary):
     """Planning grid with the situational awareness of each robot in each cell.
 
     Attributes:
@@ -188,7 +187,7 @@ class Workspace(Displayed):
         """Names of the awareness features."""
         return tuple(str(name) for name in self.awareness["feature"].values)
 
-    def _card(self) -> Card:
+    def _rows(self) -> Rows:
         grid, free, team = self.grid, self.passable.values, self.team
         n_pixels = [] if self.terrain is None else self.terrain["dem"].shape
         shown = self.awareness.mean("robot").where(self.passable)
@@ -197,19 +196,15 @@ class Workspace(Displayed):
             for name, one in ((n, shown.sel(feature=n)) for n in self.features)
         ]
         rows = [
-            (
-                "cells",
-                f"{grid.cell_height:.4g} m x {grid.cell_width:.4g} m, {free.mean():.0%} passable",
-            ),
+            ("cells", f"{grid.shape[0]} x {grid.shape[1]}, {free.mean():.0%} passable"),
+            ("cell", f"{grid.cell_height:.4g} m x {grid.cell_width:.4g} m"),
             ("team", f"a lead and {', '.join(team.names)}"),
             ("awareness", "of each bound" if self.of_bounds is not None else "of cells"),
             *((f"  {name}", f"{values} (middle 80 % of cells)") for name, values in spread),
             ("sight", ", ".join(sight.mode for sight in self.sights) or "none assumed"),
             ("terrain", " x ".join(map(str, n_pixels)) + " pixels" if n_pixels else "none"),
         ]
-        sections = {"grid": grid._card().rows, "team": team._card().rows}
-        title = f"Workspace: {grid.shape[0]} x {grid.shape[1]} cells"
-        return Card(title, rows, sections)
+        return rows
 
     def _with_line_of_sight(self) -> Self:
         ways, pixels = self.ground, self.pixels

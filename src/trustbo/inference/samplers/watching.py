@@ -13,7 +13,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from trustbo.display.bars import FILE, NOWHERE, Ticker, bar_in, say
+from trustbo.display import progress_bar, say
 from trustbo.inference.samplers.settings import NutsSettings
 
 LONG = 10.0
@@ -26,17 +26,17 @@ _QUICK = 1.0
 class Watch:
     """Shows the stages of a fit, and the runs of NUTS that it takes."""
 
-    def __init__(self, place: str = NOWHERE, faster: str = "", *, estimates: bool = True) -> None:
+    def __init__(self, show: bool = False, faster: str = "", *, estimates: bool = True) -> None:
         """Show nothing yet.
 
         Args:
-            place: Place of `display.bars`.
+            show: Whether anything is shown.
             faster: Advice on faster alternatives to NUTS, for the estimate.
             estimates: Whether to print an estimate of the time.
         """
-        self.faster, self._place, self._estimates = faster, place, estimates
+        self.faster, self._show, self._estimates = faster, show, estimates
         self._name, self._stage = "NUTS", None
-        self._started, self._said = time.perf_counter(), False
+        self._started = time.perf_counter()
 
     def __enter__(self) -> Self:
         return self
@@ -53,12 +53,9 @@ class Watch:
         """
         seconds = time.perf_counter() - self._started
         if self._stage is None and (slow or seconds > _QUICK):
-            self._stage: Any = bar_in(self._place, bar_format="{desc}", leave=False)
+            self._stage: Any = progress_bar(self._show, bar_format="{desc}", leave=False)
         if self._stage is not None:
             self._stage.set_description_str(f"fit, after {seconds:.0f} s: {doing}")
-        if self._place == FILE and seconds > LONG and not self._said:
-            self._said = True
-            say(self._place, f"fit, after {seconds:.0f} s: {doing}")
 
     def _end_stages(self) -> None:
         if self._stage is not None:
@@ -73,16 +70,12 @@ class Watch:
         self._seconds, self._n_steps = 0.0, np.zeros(0)
         self._of_chain, self._estimated = settings.warmup + settings.draws, not self._estimates
         total, label = settings.n_chains * self._of_chain, f"{self._name}, compiling, some 10 s"
-        with bar_in(self._place, total=total, desc=label, unit="draw", leave=False) as bar:
-            self._bar, self._ticker = bar, Ticker(bar)
-            try:
-                yield self
-            finally:
-                self._ticker.stop()
+        with progress_bar(self._show, total=total, desc=label, unit="draw", leave=False) as bar:
+            self._bar = bar
+            yield self
 
     def compiled(self) -> None:
         """Start the clock of the bar."""
-        self._ticker.stop()
         if not self._draws:
             self._bar.unpause()
 
@@ -114,20 +107,20 @@ class Watch:
     def retry(self, settings: NutsSettings, complaints: Sequence[str]) -> None:
         """Print that NUTS runs again, and why."""
         more = f" and {len(complaints) - 1} more" if len(complaints) > 1 else ""
-        say(
-            self._place,
-            f"{self._name} again, for longer ({settings}, target_accept "
-            f"{settings.target_accept:g}): {complaints[0]}{more}.",
-        )
+        if self._show:
+            say(
+                f"{self._name} again, for longer ({settings}, target_accept "
+                f"{settings.target_accept:g}): {complaints[0]}{more}."
+            )
         self._name, self.faster = "NUTS, second run", ""
 
     def _estimate(self) -> None:
         usual = float(np.median(self._n_steps[self._draws // 2 :]))
         self._estimated = True
         seconds = self._seconds / self._n_steps.sum() * usual * self._of_chain
-        if seconds > LONG:
+        if seconds > LONG and self._show:
             faster = f" Faster: {self.faster}." if self.faster else ""
-            say(self._place, f"{self._name}: {self._settings}, {about(seconds)}.{faster}")
+            say(f"{self._name}: {self._settings}, {about(seconds)}.{faster}")
 
 
 def about(seconds: float) -> str:

@@ -1,0 +1,84 @@
+"""Display of objects and of progress: text in a terminal, a table or a bar in a notebook."""
+
+import sys
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from html import escape
+from typing import Any
+
+from numba.core import event
+
+with warnings.catch_warnings():  # without ipywidgets, bars in a notebook are of text
+    warnings.simplefilter("ignore")
+    from tqdm.auto import tqdm
+
+Rows = list[tuple[str, str]]
+"""Names of the main properties of an object, and their values with units."""
+_WIDTH = 100
+
+
+class Summary:
+    """Object that is displayed by its main properties."""
+
+    __slots__ = ()
+
+    def _rows(self) -> Rows:
+        """Names and values to display."""
+        raise NotImplementedError
+
+    def __repr__(self) -> str:
+        rows = self._rows()
+        wide = max((len(name) for name, _ in rows), default=0)
+        lines = [type(self).__name__, *(f"  {name:<{wide}}  {value}" for name, value in rows)]
+        return "\n".join(line if len(line) <= _WIDTH else f"{line[:97]}..." for line in lines)
+
+    def _repr_html_(self) -> str:
+        cells = "".join(
+            f'<tr><th style="text-align:left">{escape(name)}</th>'
+            f'<td style="text-align:left">{escape(value)}</td></tr>'
+            for name, value in self._rows()
+        )
+        return f"<b>{escape(type(self).__name__)}</b><table>{cells}</table>"
+
+
+def number(value: float, unit: str = "", digits: int = 3) -> str:
+    """Write a number with its unit."""
+    return f"{value:.{digits}g}{' ' + unit if unit else ''}"
+
+
+def joined(names: Sequence[str]) -> str:
+    """Join names: "a, b and c"."""
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def progress_bar(show: bool, **options: Any) -> tqdm:
+    """Bar in a terminal or a notebook, hidden unless `show`; `options` are those of tqdm."""
+    return tqdm(disable=not show, **options)
+
+
+def say(line: str) -> None:
+    """Print a line above the bars."""
+    tqdm.write(line, file=sys.stderr)
+
+
+@contextmanager
+def compiling() -> Iterator[None]:
+    """Print a line when kernels are compiled, which happens once on a machine."""
+    with event.install_listener("numba:compile", _Announcement()):
+        yield
+
+
+class _Announcement(event.Listener):
+    """Listener that announces the first compilation."""
+
+    def __init__(self) -> None:
+        self._announced = False
+
+    def on_start(self, event: event.Event) -> None:
+        if not self._announced:
+            say("compiling kernels (once, about 30 s)")
+        self._announced = True
+
+    def on_end(self, event: event.Event) -> None:
+        pass

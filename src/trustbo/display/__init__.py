@@ -1,1 +1,0 @@
-"""Display of objects: text in a terminal, HTML in a notebook."""

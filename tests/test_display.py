@@ -1,0 +1,55 @@
+"""What a terminal and a notebook show of an object."""
+
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from numba import njit
+
+import trustbo as tb
+from trustbo.display import Summary, compiling, progress_bar
+from trustbo.models import PooledTrust, Priors, TrustParams
+
+
+class Odd(Summary):
+    def _rows(self):
+        return [("<script>", "</td>&"), ("long", "x" * 500)]
+
+
+def test_text_of_the_user_cannot_break_the_page():
+    html = Odd()._repr_html_()
+    ElementTree.fromstring(f"<div>{html}</div>")
+    assert "<script>" not in html
+
+
+def test_lines_are_cut_at_the_width_of_a_terminal():
+    assert max(map(len, repr(Odd()).splitlines())) == 100
+
+
+def test_every_object_is_displayed():
+    workspace = tb.Workspace.from_awareness(np.full((2, 3, 3, 1), 0.5))
+    params = TrustParams(0.5, np.ones(1), 0.0, 0.1, 0.1)
+    planner = tb.planning.Planner(workspace, (2, 0), (0, 2))
+    simulator = tb.simulation.ModelSimulator(workspace, params)
+    mission = simulator.run([(2, 0), (1, 1), (0, 2)], seed=0)
+    objects = [
+        workspace, workspace.grid, workspace.team, workspace.team.lead, mission, mission.bounds[0],
+        planner, planner.plan(params), params, Priors(), PooledTrust(), simulator,
+    ]  # fmt: skip
+    for one in objects:
+        assert 1 < len(repr(one).splitlines()) < 20
+        ElementTree.fromstring(f"<div>{one._repr_html_()}</div>")
+
+
+@pytest.mark.parametrize(("show", "shown"), [(True, True), (False, False)])
+def test_a_bar_is_shown_if_asked_for(show, shown, capsys):
+    with progress_bar(show, total=2, desc="missions") as bar:
+        bar.update(2)
+    assert ("missions: 100%" in capsys.readouterr().err) == shown
+
+
+def test_compiling_is_announced_once(capsys):
+    with compiling():
+        njit(lambda x: x + 1)(1)
+        njit(lambda x: x + 2)(1)
+    assert capsys.readouterr().err.count("compiling") == 1
