@@ -19,7 +19,6 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 from PIL import Image
 
-from trustbo import plots
 from trustbo.plots.plan import COLOURS
 from trustbo.plots.style import theme
 
@@ -40,7 +39,6 @@ def main(wanted: list[str]) -> None:
         elif code:
             draw(name, wanted, lambda code=code: exec(code, names))
             code = ""
-    draw("criticism", wanted, criticism)
     draw("architecture", wanted, architecture, "svg")
 
 
@@ -51,14 +49,6 @@ def draw(name: str, wanted: list[str], drawing: Callable[[], Any], suffix: str =
     drawing()
     save(plt.gcf(), FIGURES / f"{name}.{suffix}", "white")
     plt.close("all")
-
-
-def criticism() -> None:
-    """Draw the criticism of the first example of docs/howto/criticise.md."""
-    page = (FIGURES.parent / "howto" / "criticise.md").read_text()
-    namespace: dict[str, Any] = {}
-    exec(page.split("```python\n")[1].split("```")[0], namespace)
-    plots.criticism(namespace["found"])
 
 
 ROOMS = {

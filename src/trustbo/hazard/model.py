@@ -144,12 +144,18 @@ def sample(prior: BoundPrior, exposures: Exposures, rng: np.random.Generator) ->
 
     starts = np.zeros((3, len(prior.center)))
     starts[1:, -1] = -1.5, 1.5  # modes of the strength: certain outcomes, equal bounds
-    points = importance.sample(log_density, starts, rng, size=_ROUND, enough=_ENOUGH)
-    if not paths:
-        return HazardPoints(points, np.zeros((len(points.z), 0), int))
-    places, log_fail = impute(*lost_betas(points.z), paths, rng)
-    ratio = points.log_ratio + log_fail - log_any_fails(points.z)
-    return HazardPoints(importance.Points.of(points.z, points.log_p, ratio), places)
+    for more in (1, 8):  # a second time with more points, should the weights be uneven
+        size, enough = more * _ROUND, more * _ENOUGH
+        points = importance.sample(log_density, starts, rng, size=size, enough=enough)
+        places = np.zeros((len(points.z), len(paths)), int)
+        if paths:
+            places, log_fail = impute(*lost_betas(points.z), paths, rng)
+            ratio = points.log_ratio + log_fail - log_any_fails(points.z)
+            points = importance.Points.of(points.z, points.log_p, ratio)
+        posterior = HazardPoints(points, places)
+        if points.k_hat <= importance.MAX_KHAT:
+            break
+    return posterior
 
 
 def _log_rising(x: np.ndarray, k: np.ndarray) -> np.ndarray:
