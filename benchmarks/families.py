@@ -1,14 +1,14 @@
 """Plans, predictions and fits by family of observations, over the worlds.
 
-    python benchmarks/families.py campaigns --data DIR --out out/families
+    python benchmarks/families.py campaigns criticise --data DIR --out out/families
     python benchmarks/families.py loo --data DIR
 
 `campaigns`: the default campaign under each family, with the same seed; after each mission the
 regret of the path that it would recommend, and the contact that the path driven lost beyond the
 best one's, both by the truth of the world; coverage one mission ahead; processor seconds.
-`loo`: every family on the missions of one campaign of
+`criticise`: the verdicts on these campaigns. `loo`: every family on the missions of one campaign of
 each terrain, along random paths; the log density of a mission left out, in nats of counts of ticks,
-less that of the best family. Both go on where they stopped. Differences are paired by
+less that of the best family. The first two go on where they stopped. Differences are paired by
 world and course, their 95 % intervals by a bootstrap over these.
 """
 
@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from common import Table, arguments, parsed, records_of
+from common import Table, add_record, arguments, parsed, read_records, records_of
 
 import trustbo as tb
 from trustbo.inference import fit
@@ -33,12 +33,13 @@ TERRAINS = ("synthetic-0", "synthetic-1", "synthetic-2", "wellington", "tahoe", 
 DRIVEN = ("synthetic-0", "synthetic-1", "wellington", "synthetic-0-aged", "synthetic-0-wall",
           "synthetic-0-rain", "synthetic-cedar-dead-detector",
           "synthetic-alder-jammer-appears")  # fmt: skip
+HEALTHY = ("right", "aged", "wall")
 """Kinds of worlds in which no robot fails and nothing changes."""
 
 
 def main():
     parser = arguments(
-        __doc__, names=("campaigns", "loo"), data=True, out="out/families",
+        __doc__, names=("campaigns", "criticise", "loo"), data=True, out="out/families",
         quick="one synthetic world, 3 missions",
     )  # fmt: skip
     parser.add_argument("--worlds", nargs="*")
@@ -48,7 +49,7 @@ def main():
     if given.quick:
         given.worlds, given.courses, given.missions = ["synthetic-0"], ["sw-ne"], 3
     for name in given.names:
-        {"campaigns": campaigns, "loo": loo}[name](given)
+        {"campaigns": campaigns, "criticise": criticise, "loo": loo}[name](given)
 
 
 def campaigns(given):
@@ -117,6 +118,32 @@ def _interval(values: np.ndarray) -> str:
     means = values[rng.integers(len(values), size=(4000, len(values)))].mean(1)
     low, high = np.quantile(means, [0.025, 0.975])
     return f"{values.mean():.3f} [{low:.3f}, {high:.3f}]"
+
+
+def criticise(given):
+    """Verdicts on the campaigns that are kept."""
+    file, every = given.out / "verdicts.jsonl", worlds(given.data)
+    done = {record["campaign"] for record in read_records(file)}
+    for folder in sorted((given.out / "campaigns").iterdir()):
+        if folder.name not in done:
+            started, result = time.process_time(), tb.load_result(folder)
+            found = tb.criticise(result.posteriors[-1], result.missions, compare=False)
+            seconds = time.process_time() - started
+            add_record(file, {"campaign": folder.name, "fault": found.fault, "seconds": seconds})
+            print(f"{folder.name}: {found.verdict}", flush=True)
+    table = Table("family", "worlds", "campaigns", "a fault is found", "faults", "seconds")
+    records = read_records(file)
+    for family in FAMILIES:
+        for what, healthy in (("healthy", True), ("others", False)):
+            some = [
+                r for r in records
+                if r["campaign"].endswith(f" {family}")
+                and (every[r["campaign"].split()[0]].kind in HEALTHY) == healthy
+            ]  # fmt: skip
+            faults = [r["fault"] for r in some if r["fault"] != "none"]
+            names = ", ".join(f"{f} {faults.count(f)}" for f in dict.fromkeys(faults))
+            took = np.median([r["seconds"] for r in some]) if some else np.nan
+            table.row(family, what, len(some), len(faults), names, f"{took:.1f}")
 
 
 def loo(given):

@@ -83,7 +83,7 @@ FAULTS = (
           "smoothed_weights(without - whole)", "smoothed_weights(whole - without)"),
     Fault("a bound that failed is also counted as passed", "hazard/risk.py",
           "a, b = a + failed, b + n - failed", "a, b = a + failed, b + n"),
-    Fault("the margin raises the slope limit", "hazard/prior.py",
+    Fault("the margin raises the slope limit", "hazard/sampler.py",
           "beyond = (steepness + limit[:, :1])", "beyond = (steepness - limit[:, :1])"),
     Fault("the loss of a bound is clipped a second time", "planning/objectives.py",
           "noise_sd[..., None])[0]", "noise_sd[..., None])[0].clip(0.0, 1.0)"),

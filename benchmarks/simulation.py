@@ -37,7 +37,7 @@ def real_terrain(folder):
         xr.DataArray(np.pad(terrain[name].values, size, mode="symmetric"), coords, ("y", "x"))
         for name in ("dem", "dsm")
     )
-    return tb.terrain.dataset.assemble_terrain(*(a.rio.write_crs("EPSG:2193") for a in arrays))
+    return tb.terrain.read_terrain(*(a.rio.write_crs("EPSG:2193") for a in arrays))
 
 
 def synthetic(relief):

@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 from PIL import Image
 
+from trustbo import plots
 from trustbo.plots.plan import COLOURS
 from trustbo.plots.style import theme
 
@@ -39,6 +40,7 @@ def main(wanted: list[str]) -> None:
         elif code:
             draw(name, wanted, lambda code=code: exec(code, names))
             code = ""
+    draw("criticism", wanted, criticism)
     draw("architecture", wanted, architecture, "svg")
 
 
@@ -49,6 +51,14 @@ def draw(name: str, wanted: list[str], drawing: Callable[[], Any], suffix: str =
     drawing()
     save(plt.gcf(), FIGURES / f"{name}.{suffix}", "white")
     plt.close("all")
+
+
+def criticism() -> None:
+    """Draw the criticism of the first example of docs/howto/criticise.md."""
+    page = (FIGURES.parent / "howto" / "criticise.md").read_text()
+    namespace: dict[str, Any] = {}
+    exec(page.split("```python\n")[1].split("```")[0], namespace)
+    plots.criticism(namespace["found"])
 
 
 ROOMS = {

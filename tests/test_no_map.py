@@ -79,12 +79,10 @@ def test_a_robot_that_stands_out_is_found_without_places():
         y[:, 1] -= 0.5 * z[:, 1, 0] * (j >= 3)  # robot 2, index 1, from mission 3 on
         given = z, np.clip(y, 0.0, 1.0)
         missions.append(Mission.from_arrays(None, *given, features=["line_of_sight"]))
-    found = tb.check(tb.fit(missions, PooledTrust(effects=RobotEffect())), compare=False)
-    assert found.table.loc["robots", "stands_out"]
-    assert found.table.loc["robots", "label"] == "r2"
-    odd = found.robots[found.robots["stands_out"]]
-    assert set(odd["robot"]) == {"r2"}
-    assert set(odd["mission"]) == {3, 4, 5}
+    found = tb.criticise(tb.fit(missions, PooledTrust(effects=RobotEffect())))
+    assert found.fault == "robot in a mission"
+    assert "r2 has" in found.verdict
+    assert "from mission 3 on" in found.verdict
 
 
 def test_what_needs_a_map_refuses_them_in_a_sentence(missions, posterior):

@@ -14,7 +14,7 @@ import trustbo as tb
 from trustbo.data import Mission
 from trustbo.models import PooledTrust
 from trustbo.terrain import synthetic_terrain
-from trustbo.terrain.dataset import assemble_terrain
+from trustbo.terrain.read import read_terrain
 from trustbo.workspace import Workspace
 
 CORNER = np.array([100.0, 500.0])  # of `terrain_of`: x of the left edge, y of the top, m
@@ -40,7 +40,7 @@ def terrain_of(dem, height=0.0, resolution=1.0):
         "x": CORNER[0] + (np.arange(cols) + 0.5) * resolution,
     }
     dem = xr.DataArray(dem.astype(float), coords, ("y", "x")).rio.write_crs("EPSG:32633")
-    return assemble_terrain(dem, dem + height)
+    return read_terrain(dem, dem + height)
 
 
 def hillside(height=90.0, width=90.0):

@@ -25,7 +25,7 @@ from .campaign import (
     load_result,
     resume,
 )
-from .criticism import check
+from .criticism import criticise
 from .data import Bound, Mission
 from .errors import DamagedFileError, PosteriorError, ShapeError, TerrainError, TrustboError
 from .inference import compare, fit
@@ -51,8 +51,8 @@ __all__ = [
     "TimeLimit",
     "TrustboError",
     "Workspace",
-    "check",
     "compare",
+    "criticise",
     "criticism",
     "export",
     "fit",

@@ -9,7 +9,6 @@ from worlds import ModelSimulator
 import trustbo as tb
 from trustbo.data import Bound
 from trustbo.logs import read_missions, read_table, to_frame, write_missions
-from trustbo.terrain import CompositeIndex
 
 ENDS = ((1, 0), (0, 1))
 
@@ -149,13 +148,6 @@ def test_two_files_of_missions_in_a_folder_keep_their_own_ticks(tmp_path, terrai
         same_missions(missions, read_missions(tmp_path / f"log{j}.nc"))
 
 
-def test_a_composite(terrain, tmp_path):
-    features = tb.terrain.pixel_features(terrain, ("slope", "canopy_height"))
-    index = CompositeIndex({"slope": 1, "canopy_height": -1}).fit(features)
-    for again in rounds(CompositeIndex.save, CompositeIndex.load, index, tmp_path):
-        assert again.to_dataset().identical(index.to_dataset())
-
-
 def test_terrain_as_rasters(terrain, tmp_path):
     def write(terrain, folder):
         folder.mkdir()
@@ -163,7 +155,7 @@ def test_terrain_as_rasters(terrain, tmp_path):
             terrain[name].rio.to_raster(folder / f"{name}.tif")
 
     def read(folder):
-        return tb.terrain.read_terrain(folder / "dem.tif", folder / "dsm.tif", progress=False)
+        return tb.terrain.read_terrain(folder / "dem.tif", folder / "dsm.tif")
 
     once, twice = rounds(write, read, terrain, tmp_path)
     for name in ("dem", "dsm"):

@@ -214,6 +214,8 @@ def test_what_cannot_treat_deviations_refuses_them(deviations, of_deviations):
     censored = PooledTrust(memory="deviation", observation="censored")
     with pytest.raises(TrustboError, match="observations are not Gaussian"):
         tb.fit(deviations, censored, "nuts")
+    with pytest.raises(TrustboError, match='criticise takes memory="level"'):
+        tb.criticise(of_deviations)
 
 
 def test_deviations_are_found_in_counts_and_through_limits():

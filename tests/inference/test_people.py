@@ -309,8 +309,8 @@ def test_the_model_refuses_what_it_is_not_for(posterior, persons):
         fit(persons, HumanTrust(scale="likert5"), progress=False, whole=False)
     with pytest.raises(TrustboError, match=r"in \[0, 1\], but the missions' are on 7 levels"):
         fit(persons, HumanTrust(), progress=False, whole=False)
-    with pytest.raises(TrustboError, match="reports"):
-        tb.check(posterior, persons)
+    with pytest.raises(TrustboError, match="criticise is of robots' contact; of reports"):
+        tb.criticise(posterior, persons)
     with pytest.raises(TrustboError, match=r"for reports use trustbo\.inference\.predict_reports"):
         tb.inference.params_of(posterior)
     with pytest.raises(TrustboError, match="HumanTrust has no likelihoods of parameters"):

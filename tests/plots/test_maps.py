@@ -181,7 +181,7 @@ def test_contour_lines_are_where_the_ground_has_their_height():
     y, x = np.arange(60.0)[::-1] + 0.5, np.arange(90.0) + 0.5
     height = np.broadcast_to(0.5 * x, (60, 90))  # a plane: smoothing leaves it as it is
     dem = xr.DataArray(height, {"y": y, "x": x}, ("y", "x"))
-    terrain = tb.terrain.dataset.assemble_terrain(dem.rio.write_crs("EPSG:32633"), dem)
+    terrain = tb.terrain.read_terrain(*[dem.rio.write_crs("EPSG:32633")] * 2)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # such ground makes for odd indices
         workspace = tb.Workspace.from_terrain(terrain, (2, 3))

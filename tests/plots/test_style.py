@@ -24,6 +24,7 @@ def figures(result):
     cost = result.planner.cost_map(mean, per_robot=True)
     share = result.planner.path_posterior(posterior, n_draws=100)
     p_fail = result.planner.problem.risk.p_fail
+    found = tb.criticise(posterior, result.missions, compare=False)
     names = workspace.team.names
     rng = np.random.default_rng(0)
     study = xr.Dataset(
@@ -47,6 +48,7 @@ def figures(result):
         "mission_trust": (lambda **o: plots.mission_trust(posterior, **o), 3),
         "parameter_history": (lambda **o: plots.parameter_history(result.posteriors, **o), 12),
         "campaign_history": (lambda **o: plots.campaign_history(result.history, **o), 2),
+        "criticism": (lambda **o: plots.criticism(found, **o), 9),
         "regret_curves": (lambda **o: plots.regret_curves(study, panels="terrain", **o), 2),
     }
     return drawn
@@ -70,7 +72,7 @@ def drawn(figures):
 NAMES = (
     "trust_maps", "robot_maps", "path_posterior", "hazard_map", "terrain_maps", "loadings",
     "place_map", "plan_map", "plan_trust", "mission_trust", "parameter_history",
-    "campaign_history", "regret_curves",
+    "campaign_history", "criticism", "regret_curves",
 )  # fmt: skip
 MAPS = NAMES[:5]
 
@@ -240,6 +242,7 @@ def test_a_wrong_argument_is_said_in_a_line(result):
         "campaign_history": (result,),
         "terrain_maps": (result,),
         "loadings": (result.workspace,),
+        "criticism": (result,),
         "regret_curves": (result,),
     }
     for name, arguments in wrong.items():

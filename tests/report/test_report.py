@@ -141,7 +141,7 @@ def test_figures_have_text_as_outlines_and_need_no_other_file(page):
 
 
 def test_the_tables_numbers_are_the_result_s(page, result):
-    bounds, parameters, _, history, settings = page.tables
+    bounds, parameters, history, settings = page.tables
     plan = result.plan
     assert [row[1] for row in bounds[1:]] == [f"{r},{c}" for r, c in result.path[1:]]
     shown = re.fullmatch(r"(\S+) \((\S+) to (\S+)\)", bounds[1][2]).groups()

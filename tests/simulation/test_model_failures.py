@@ -5,8 +5,7 @@ import pytest
 
 import trustbo as tb
 from trustbo.errors import ShapeError, TrustboError
-from trustbo.hazard import Hazard, fit_hazard
-from trustbo.hazard.risk import BoundRisk
+from trustbo.hazard import Hazard
 from trustbo.models import TrustParams
 from trustbo.simulation import ModelSimulator, Truth
 
@@ -37,8 +36,7 @@ def test_missions_end_as_often_as_the_chances_say(workspace):
 
 
 def test_the_truth_knows_the_chance_to_arrive(workspace):
-    hazard = fit_hazard([], workspace, Hazard(intercept=(-1.0, 0.1)))
-    chances = BoundRisk.of(hazard, workspace).draw(1, seed=2)[0]
+    chances = Hazard(intercept=(-1.0, 0.1)).prior(workspace).draw(1, seed=2)[0]
     simulator = ModelSimulator(workspace, PARAMS, p_fail=chances)
     value = Truth.of(simulator).value(ROW)
     assert value.p_arrive == pytest.approx(np.prod(1.0 - chances[EAST, 0, 1:]), rel=1e-12)

@@ -10,6 +10,7 @@ import trustbo as tb
 from trustbo.errors import TrustboError
 from trustbo.logs.netcdf import STATES
 from trustbo.simulation import Degradation, KinematicSimulator, Threat
+from trustbo.simulation.measure import REALTIME
 from trustbo.simulation.sensing import contact_of, new_tracks
 from trustbo.team import Robot, Team
 from trustbo.terrain import CompositeIndex, synthetic_terrain
@@ -240,11 +241,11 @@ def test_states_see_as_far_as_the_simulator_s_sight(wooded, mode):
         np.testing.assert_allclose(shares, cast.reshape(-1, 12).mean(1), atol=1e-4)
 
 
-@pytest.mark.filterwarnings("ignore:the first component of", "ignore:.*enters its composite")
+@pytest.mark.filterwarnings("ignore:the first component of", "ignore:the loading of")
 def test_measured_awareness_can_be_fused_with_the_robots_states(wooded):
     plain = KinematicSimulator(wooded)
     samples = plain.calibration(n_bounds=80)
-    indices = {name: CompositeIndex.realtime(name).fit(samples[name]) for name in samples}
+    indices = {name: CompositeIndex(REALTIME[name]).fit(samples[name]) for name in samples}
     fused = KinematicSimulator(wooded, realtime=indices).run(PATH, seed=0)
     mapped = plain.run(PATH, seed=0)
     np.testing.assert_array_equal(fused.contact_rate, mapped.contact_rate)

@@ -1,11 +1,8 @@
 """The composite index: oriented by declared signs, in [0, 1], honest about what it lost."""
 
-import warnings
-
 import numpy as np
 import pytest
 import xarray as xr
-from sklearn.base import clone
 
 from trustbo.errors import TerrainError, TrustboError
 from trustbo.terrain import CompositeIndex
@@ -48,8 +45,8 @@ def test_more_slope_lowers_the_index_whatever_the_solver_s_sign():
 def test_two_percent_at_either_end_are_cut():
     features = correlated()
     index = CompositeIndex(SIGNS).fit(features).transform(features)
-    assert float((index == 0.0).mean()) == pytest.approx(0.02, abs=0.002)
-    assert float((index == 1.0).mean()) == pytest.approx(0.02, abs=0.002)
+    assert (index == 0.0).mean() == pytest.approx(0.02, abs=0.002)
+    assert (index == 1.0).mean() == pytest.approx(0.02, abs=0.002)
 
 
 def test_missing_pixels_stay_missing_and_do_not_count():
@@ -66,24 +63,23 @@ def test_a_constant_feature_has_no_say():
     features = correlated().assign(tri=("pixel", np.full(4000, 7.0)))
     index = CompositeIndex(SIGNS).fit(features)
     assert float(index.loadings_.sel(feature="tri")) == 0.0
-    assert index.transform(features).notnull().all()
+    assert np.isfinite(index.transform(features)).all()
     flat = xr.Dataset({name: ("pixel", np.ones(10)) for name in SIGNS})
     np.testing.assert_array_equal(CompositeIndex(SIGNS).fit(flat).transform(flat), 0.5)
 
 
 def test_a_feature_against_its_sign_is_named():
-    with pytest.warns(UserWarning, match="open enters its composite against the declared sign"):
+    with pytest.warns(UserWarning, match="'open' has the opposite sign"):
         CompositeIndex(SIGNS).fit(correlated(third=+1.0))
 
 
+@pytest.mark.filterwarnings("ignore:the loading of")
 def test_a_component_that_explains_little_is_reported():
     rng = np.random.default_rng(0)
     noise = xr.Dataset({name: ("pixel", rng.normal(size=2000)) for name in SIGNS})
     signs = {name: +1 for name in SIGNS}
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
+    with pytest.warns(UserWarning, match="explains only 3"):
         CompositeIndex(signs).fit(noise)
-    assert any("explains only 3" in str(w.message) for w in caught)
 
 
 def test_a_few_obstacles_on_flat_ground_are_the_low_end():
@@ -96,53 +92,20 @@ def test_a_few_obstacles_on_flat_ground_are_the_low_end():
 
 
 def test_bad_input():
-    with pytest.raises(TerrainError, match="the composite needs open"):
+    with pytest.raises(TerrainError, match="open"):
         CompositeIndex(SIGNS).fit(correlated().drop_vars("open"))
     empty = xr.Dataset({name: ("pixel", np.full(5, np.nan)) for name in SIGNS})
-    with pytest.raises(TerrainError, match="no pixel has all of the features"):
+    with pytest.raises(TerrainError, match="no pixel"):
         CompositeIndex(SIGNS).fit(empty)
 
 
 def test_a_fitted_index_is_read_back_as_it_was(tmp_path):
     features = correlated()
     index = CompositeIndex(SIGNS).fit(features)
-    index.save(tmp_path / "index.nc")
-    again = CompositeIndex.load(tmp_path / "index.nc")
-    assert again.get_params() == index.get_params()
+    index.to_dataset().to_netcdf(tmp_path / "index.nc")
+    again = CompositeIndex.from_dataset(xr.load_dataset(tmp_path / "index.nc"))
+    assert again.signs == index.signs
     xr.testing.assert_identical(again.loadings_, index.loadings_)
-    xr.testing.assert_identical(again.transform(features), index.transform(features))
-
-
-def test_it_keeps_scikit_learn_s_conventions():
-    index = CompositeIndex(SIGNS, min_samples=7)
-    copy = clone(index)
-    assert copy.get_params() == index.get_params()
-    features = correlated()
-    xr.testing.assert_identical(
-        index.fit_transform(features), copy.fit(features).transform(features)
-    )
-    with pytest.raises(TrustboError, match="this CompositeIndex is not fitted; call fit"):
+    np.testing.assert_array_equal(again.transform(features), index.transform(features))
+    with pytest.raises(TrustboError, match="not fitted"):
         CompositeIndex(SIGNS).transform(features)
-
-
-def bounds(n, seed=0):
-    """Ease of each bound drives the map's value, speed and attitude."""
-    rng = np.random.default_rng(seed)
-    ease = rng.normal(size=n)
-    names = {"offline": 1, "speed_ratio": 1, "pitch": -1, "roll": -1}
-    return xr.Dataset(
-        {name: ("bound", sign * ease + 0.4 * rng.normal(size=n)) for name, sign in names.items()}
-    )
-
-
-def test_a_real_time_index_is_fitted_once_on_enough_bounds():
-    index = CompositeIndex.realtime("traversability").fit(bounds(400))
-    np.testing.assert_array_equal(np.sign(index.loadings_), [1, 1, -1, -1])
-    window = bounds(10, seed=1)  # later, a short window is only transformed
-    fused = index.transform(window)
-    assert fused.dims == ("bound",)
-    assert np.corrcoef(fused, window["offline"])[0, 1] > 0.7
-    with pytest.raises(TerrainError, match=r"only 199 samples have all of .*; 200 are needed"):
-        CompositeIndex.realtime("traversability").fit(bounds(199))
-    with pytest.raises(TrustboError, match="unknown real-time feature 'trust'"):
-        CompositeIndex.realtime("trust")

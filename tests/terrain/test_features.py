@@ -9,24 +9,28 @@ import xarray as xr
 from worlds import terrain_of
 
 from trustbo.errors import TerrainError, TrustboError
-from trustbo.terrain import FEATURES, pixel_features, rays, register_feature
-from trustbo.terrain.dataset import assemble_terrain
+from trustbo.terrain import (
+    FEATURES,
+    feature,
+    gradient,
+    pixel_features,
+    pixel_size,
+    rays,
+    read_terrain,
+)
 from trustbo.terrain.features import (
-    aspect,
     canopy_cover,
     canopy_height,
-    curvature,
     openness,
     roughness,
     slope,
     step_height,
-    tpi,
     tri,
     vegetation_density,
 )
 
 GDAL = Path(__file__).parent.parent / "data" / "gdal"
-SHORT = {name: f for name, f in FEATURES.items() if name not in ("openness", "aspect")}
+SHORT = [name for name in FEATURES if name != "openness"]
 INSIDE = (slice(1, -1), slice(1, -1))
 
 
@@ -43,55 +47,32 @@ def rough_terrain(seed=0, n=24):
 @pytest.mark.parametrize("resolution", [0.5, 1.0, 3.0])
 def test_a_plane_has_its_own_slope_everywhere_inside(resolution):
     terrain = terrain_of(tilted(resolution=resolution), resolution=resolution)
-    # The polynomial arctangent is 1e-8 rad off at most.
-    np.testing.assert_allclose(
-        slope(terrain).values[INSIDE], np.arctan(np.hypot(0.3, 0.2)), atol=2e-8
-    )
+    np.testing.assert_allclose(slope(terrain)[INSIDE], np.arctan(np.hypot(0.3, 0.2)), atol=1e-12)
 
 
-@pytest.mark.parametrize("rise", [0.0, 0.1, 0.414, 0.415, 1.0, 2.41, 2.42, 10.0, 1e6])
+@pytest.mark.parametrize("rise", [0.0, 0.1, 1.0, 10.0])
 def test_slope_is_the_arctangent_of_the_rise(rise):
-    inside = slope(terrain_of(tilted(rise, 0.0))).values[INSIDE]
-    np.testing.assert_allclose(inside, np.arctan(rise), atol=2e-8)
+    inside = slope(terrain_of(tilted(rise, 0.0)))[INSIDE]
+    np.testing.assert_allclose(inside, np.arctan(rise), atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("a", "b", "north"),
-    [(0.0, 1.0, 180.0), (0.0, -1.0, 0.0), (-1.0, 0.0, 90.0), (1.0, 0.0, 270.0), (1.0, -1.0, 315.0)],
-)
-def test_aspect_is_the_compass_direction_of_descent(a, b, north):
-    """Ground rises by a per column to the east and b per row to the south."""
-    down = aspect(terrain_of(tilted(a, -b))).values[INSIDE]
-    np.testing.assert_allclose(np.rad2deg(down), north, atol=1e-9)
-    assert np.isnan(aspect(terrain_of(np.zeros((8, 8))))).all()
-
-
-def test_a_plane_s_roughness_tri_tpi_and_step_have_closed_forms():
+def test_a_plane_s_roughness_tri_and_step_have_closed_forms():
     terrain = terrain_of(tilted())
-    np.testing.assert_allclose(roughness(terrain).values[INSIDE], 2 * 0.5, rtol=1e-12)
-    np.testing.assert_allclose(step_height(terrain).values[INSIDE], 0.5, rtol=1e-12)
+    np.testing.assert_allclose(roughness(terrain)[INSIDE], 2 * 0.5, rtol=1e-12)
+    np.testing.assert_allclose(step_height(terrain)[INSIDE], 0.5, rtol=1e-12)
     squares = 6 * 0.3**2 + 6 * 0.2**2  # each of the 8 steps is +-0.3 i +- 0.2 j
-    np.testing.assert_allclose(tri(terrain).values[INSIDE], np.sqrt(squares), rtol=1e-12)
-    np.testing.assert_allclose(tpi(terrain).values[INSIDE], 0.0, atol=1e-12)
-    np.testing.assert_allclose(curvature(terrain).values[INSIDE], 0.0, atol=1e-12)
-
-
-def test_a_paraboloid_has_its_own_curvature():
-    row, col = np.mgrid[:12, :12] * 2.0
-    terrain = terrain_of(-0.05 * col**2 - 0.02 * row**2, resolution=2.0)
-    np.testing.assert_allclose(curvature(terrain).values[INSIDE], 2 * 0.05 + 2 * 0.02)
+    np.testing.assert_allclose(tri(terrain)[INSIDE], np.sqrt(squares), rtol=1e-12)
 
 
 @pytest.mark.parametrize(
-    ("name", "feature", "atol"),
+    ("name", "compute", "atol"),
     [
         ("slope", slope, 2e-3),
         ("roughness", roughness, 1e-4),
         ("tri", tri, 1e-4),
-        ("tpi", tpi, 1e-4),
     ],
 )
-def test_gdaldem_says_the_same(name, feature, atol):
+def test_gdaldem_says_the_same(name, compute, atol):
     """Its own numbers, stored with the commands that made them (tests/data/gdal/README.md).
 
     gdaldem computes in float32 and is itself 1.3e-3 degrees off float64 Horn.
@@ -100,7 +81,7 @@ def test_gdaldem_says_the_same(name, feature, atol):
         dem, resolution = source.read(1).astype(float), source.res[0]
     with rasterio.open(GDAL / f"{name}.tif") as source:
         gdal = source.read(1, masked=True).filled(np.nan)
-    ours = feature(terrain_of(dem, resolution=resolution)).values
+    ours = compute(terrain_of(dem, resolution=resolution))
     if name == "slope":
         ours = np.rad2deg(ours)
     assert np.isfinite(gdal[INSIDE]).all()
@@ -111,9 +92,9 @@ def test_float32_heights_give_what_float64_gives():
     terrain = terrain_of(500.0 + np.random.default_rng(0).normal(size=(20, 20)))
     single = terrain.astype(np.float32)
     double = single.astype(float)  # the same heights
-    for feature in (slope, roughness, tri, tpi, step_height, curvature):
-        assert feature(single).dtype == np.float32
-        np.testing.assert_allclose(feature(single), feature(double), rtol=3e-6, atol=3e-6)
+    for compute in (slope, roughness, tri, step_height):
+        assert compute(single).dtype == np.float32
+        np.testing.assert_allclose(compute(single), compute(double), rtol=3e-6, atol=3e-6)
 
 
 def test_canopy_height_and_cover():
@@ -121,7 +102,7 @@ def test_canopy_height_and_cover():
     height[:, 20:] = 8.0
     terrain = terrain_of(np.zeros((40, 40)), height)
     np.testing.assert_allclose(canopy_height(terrain), height)
-    cover = canopy_cover(terrain, radius=5.0).values
+    cover = canopy_cover(terrain)
     np.testing.assert_allclose(cover[:, :14], 0.0, atol=1e-12)
     np.testing.assert_allclose(cover[:, 26:], 1.0)
     np.testing.assert_allclose(cover[20, 20], 6 / 11)  # 6 of 11 columns are wooded
@@ -141,22 +122,20 @@ def test_openness_of_flat_ground_and_of_uniform_shrubs():
     np.testing.assert_allclose(openness(flat, reach=20.0), 1.0)
     shrubs = terrain_of(np.zeros((60, 60)), 2.0)
     # Rays at 1 m, inside the layer from 0.6 m to 2 m all the way; float32 inside.
-    through = openness(shrubs, reach=20.0, eye=1.0, target=1.0).values
+    through = openness(shrubs, reach=20.0, eye=1.0, target=1.0)
     np.testing.assert_allclose(through, np.exp(-0.1 * 20.0), rtol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("pixel", "reach", "n_rays"), [((1.0, 1.0), 9.0, 16), ((1.5, 0.7), 6.3, 7)]
-)
-def test_openness_is_the_mean_of_single_rays(pixel, reach, n_rays):
+@pytest.mark.parametrize(("pixel", "reach"), [((1.0, 1.0), 9.0), ((1.5, 0.7), 6.3)])
+def test_openness_is_the_mean_of_single_rays(pixel, reach):
     """Row-wise vector code against the scalar ray of `rays`, which has tests of its own."""
-    rng = np.random.default_rng(3)
+    n_rays, rng = 16, np.random.default_rng(3)
     dem = rng.normal(size=(30, 34)).cumsum(0) * 0.3
     height = np.maximum(rng.normal(1.0, 2.0, dem.shape), 0.0)
     dem[4:6, 7] = np.nan
     y, x = -np.arange(30) * pixel[0], np.arange(34) * pixel[1]
     ground = xr.DataArray(dem, {"y": y, "x": x}, ("y", "x")).rio.write_crs("EPSG:32633")
-    ours = openness(assemble_terrain(ground, ground + height), reach, n_rays=n_rays).values
+    ours = openness(read_terrain(ground, ground + height), reach)
     for i, j in rng.integers(0, 30, (60, 2)):
         passed = []
         for k in range(n_rays):
@@ -193,7 +172,7 @@ def test_features_keep_missing_pixels_missing():
     for name, values in pixel_features(terrain, SHORT).items():
         assert np.isnan(values.values[5, 6]), name
         assert np.isfinite(values.values[15, 15]), name
-    assert np.isnan(openness(terrain, 5.0).values[5, 6])
+    assert np.isnan(openness(terrain, 5.0)[5, 6])
 
 
 @pytest.mark.parametrize("turn", [np.rot90, np.fliplr, np.flipud])
@@ -205,7 +184,7 @@ def test_turning_the_terrain_turns_every_feature(turn):
         np.testing.assert_allclose(
             b[name], turn(a[name].values), rtol=1e-9, atol=1e-12, err_msg=name
         )
-    a, b = openness(before, 6.0).values, openness(after, 6.0).values
+    a, b = openness(before, 6.0), openness(after, 6.0)
     np.testing.assert_allclose(b, turn(a), atol=1e-5)
 
 
@@ -218,29 +197,31 @@ def test_a_constant_height_changes_nothing():
     np.testing.assert_allclose(openness(before, 6.0), openness(after, 6.0), atol=1e-6)
 
 
-def test_heights_and_pixels_scaled_together_keep_slope_and_aspect():
+def test_heights_and_pixels_scaled_together_keep_slope():
     before = rough_terrain(2)
     after = terrain_of(3.0 * before["dem"].values, resolution=3.0)
     np.testing.assert_allclose(slope(after), slope(before), rtol=1e-12)
-    np.testing.assert_allclose(aspect(after), aspect(before), rtol=1e-12)
-    np.testing.assert_allclose(tri(after), 3.0 * tri(before).values, rtol=1e-12)
+    np.testing.assert_allclose(tri(after), 3.0 * tri(before), rtol=1e-12)
 
 
 def test_a_feature_of_one_s_own():
-    @register_feature("northness", sign=1)
+    @feature("northness", sign=1)
     def northness(terrain):
-        return np.cos(aspect(terrain))
+        east, north = gradient(terrain["dem"].values, pixel_size(terrain))
+        return -north / np.hypot(east, north)
 
     try:
-        values = pixel_features(rough_terrain(), ["northness", "slope"])
+        falls_north = terrain_of(tilted(0.0, 0.3))
+        values = pixel_features(falls_north, ["northness", "slope"])
         assert list(values) == ["northness", "slope"]
-        with pytest.raises(TerrainError, match="there is a feature 'northness' already"):
-            register_feature("northness", sign=1)
+        np.testing.assert_allclose(values["northness"].values[INSIDE], 1.0)
+        with pytest.raises(TerrainError, match="northness"):
+            feature("northness", sign=1)
     finally:
         del FEATURES["northness"]
-    with pytest.raises(TerrainError, match="need sign 1 or -1 and halo >= 0; got 0"):
-        register_feature("other", sign=0)
-    with pytest.raises(TrustboError, match="unknown feature 'stepheight'; choose one of slope"):
+    with pytest.raises(TerrainError, match="sign"):
+        feature("other", sign=0)
+    with pytest.raises(TrustboError, match="stepheight"):
         pixel_features(rough_terrain(), ["stepheight"])
 
 

@@ -94,7 +94,7 @@ def test_line_of_sight_is_what_scalar_code_computes():
 def test_a_higher_sensor_sees_no_less_and_changes_its_robot_alone():
     low = Robot(vertical_fov=np.deg2rad(80.0))
     team = Team(robots=(low,) * 3, lead=low)
-    workspace = workspace_on(bumpy(2), team)
+    workspace = workspace_on(2.0 * bumpy(1), team)
     given = geometry(workspace.ground, bounds_of(workspace)[1], workspace.passable.values)
     higher = Team(robots=(low, replace(low, sensor_height=3.0), low), lead=low)
     level, raised = (

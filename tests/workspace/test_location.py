@@ -1,6 +1,5 @@
 """Cells of locations, against pyproj and rasterio, and the words for those that are none."""
 
-import importlib
 import json
 
 import numpy as np
@@ -180,17 +179,3 @@ def test_a_survey_knows_the_cells_that_are_impassable_before_awareness():
     with pytest.raises(TrustboError, match=r"\(0, 0\) is impassable: 100% of it has no data"):
         found.require_cell("location", (0, 0))
     assert "no data     9.4% of the area" in repr(found)
-
-
-def test_a_large_raster_is_surveyed_by_bands(tmp_path, monkeypatch):
-    terrain = tb.terrain.synthetic_terrain((160.0, 160.0), seed=2, relief=60.0)
-    for name in ("dem", "dsm"):
-        terrain[name].astype("float32").rio.to_raster(tmp_path / f"{name}.tif")
-    whole = survey(terrain, (4, 4))
-    module = importlib.import_module("trustbo.workspace.survey")  # not the function
-    monkeypatch.setattr(module, "_MOST_PIXELS", 160 * 16 * 2)
-    with tb.terrain.read_terrain(tmp_path / "dem.tif", tmp_path / "dsm.tif", lazy=True) as lazy:
-        found = survey(lazy, (4, 4))
-    np.testing.assert_allclose(found.cells["height"], whole.cells["height"], atol=3.0)
-    assert not np.array_equal(found.cells["height"], whole.cells["height"])
-    assert found.heights[0] >= whole.heights[0] - 1e-3

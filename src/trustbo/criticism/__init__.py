@@ -1,6 +1,6 @@
-"""Criticism: what may be wrong with a fitted trust model."""
+"""Criticism: tests of a fitted trust model against what may be wrong with it."""
 
-from trustbo.criticism.check import check
+from trustbo.criticism.criticise import criticise
 
-__all__ = ["check"]
+__all__ = ["criticise"]
 __dir__ = __all__.copy  # completion lists public names alone

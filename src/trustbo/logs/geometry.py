@@ -8,7 +8,7 @@ import xarray as xr
 
 from trustbo.errors import TrustboError, require_kind, require_positive
 from trustbo.logs.log import Log
-from trustbo.terrain.dataset import require_terrain
+from trustbo.terrain.read import require_terrain
 from trustbo.workspace.sight import Sight, detection_probability, sights_of
 from trustbo.workspace.surface import surface_of
 

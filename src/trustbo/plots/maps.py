@@ -22,7 +22,7 @@ from trustbo.plots.layout import (
     map_panels,
 )
 from trustbo.plots.style import COLOURS, SMALL, Style, StyleOptions, theme
-from trustbo.terrain.dataset import pixel_size
+from trustbo.terrain.read import pixel_size
 from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Grid, over_cells
 

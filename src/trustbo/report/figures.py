@@ -4,6 +4,7 @@ import numpy as np
 
 from trustbo import plots
 from trustbo.campaign.result import Result
+from trustbo.criticism.criticise import Criticism
 from trustbo.display import joined
 from trustbo.inference import params_of, place_maps
 from trustbo.inference.posterior_tree import labelled_draws
@@ -156,6 +157,22 @@ def parameters(result: Result) -> Picture | None:
         f"{counted(total, 'panel')}, one for each parameter: its posterior over "
         f"{counted(len(result.posteriors), 'mission')}. The table has the numbers.",
         caption,
+    )
+
+
+def criticism(outcome: Criticism) -> Picture:
+    """Draw the tests and residuals of the model's criticism."""
+    odd = outcome.groups.loc[outcome.groups["stands_out"].to_numpy(), :]
+    sentence = (
+        f"{counted(len(odd), 'mean')} outside a band" if len(odd) else "all within their bands"
+    )
+    return picture(
+        lambda: plots.criticism(outcome),
+        "Nine panels: adjusted p of each test, PIT, coverage, autocorrelation, and mean residuals "
+        f"by mission, bound, robot, expected contact and cell; {sentence}. "
+        "The table has the tests.",
+        "Tests (hollow: once the named fault is accounted for), predictions and mean residuals. "
+        "Grey bands hold a whole panel with 95 % where the model is right; red is outside.",
     )
 
 

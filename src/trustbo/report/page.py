@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from trustbo.campaign.result import Result
-from trustbo.criticism import check
+from trustbo.criticism import criticise
 from trustbo.errors import TrustboError
 from trustbo.files import FilePath, require_file, write_text
 from trustbo.models.backend import VERSIONS
@@ -105,7 +105,7 @@ def _sections(result: Result) -> Iterator[Section]:
     parameters = figures.parameters(result)
     learned = [*([] if parameters is None else [parameters]), tables.parameter_table(result)]
     yield Section("learned", "Parameters", _meaning_of_parameters(result), learned)
-    yield _check(result)
+    yield _criticism(result)
     last = [figures.last_mission(result)]
     yield Section("last", "Trust along the last mission", _last_outcome(result), last)
     history = [figures.history(result), tables.history_table(result)]
@@ -113,14 +113,15 @@ def _sections(result: Result) -> Iterator[Section]:
     yield Section("settings", "Settings", "", [tables.settings_table(result)])
 
 
-def _check(result: Result) -> Section:
-    """Section of the model's check, or of the reason why there is none."""
+def _criticism(result: Result) -> Section:
+    """Section of the model's criticism, or of the reason why there is none."""
     try:
-        outcome = check(result.posterior, result.missions, compare=False)
+        outcome = criticise(result.posterior, result.missions, compare=False)
     except TrustboError as error:
-        return Section("check", "Check of the model", f"Not made: {error}", [])
+        return Section("criticism", "Criticism of the model", f"Not made: {error}", [])
     sentence = outcome.verdict[0].upper() + outcome.verdict[1:]
-    return Section("check", "Check of the model", sentence, [tables.check_table(outcome)])
+    blocks = [figures.criticism(outcome), tables.criticism_table(outcome)]
+    return Section("criticism", "Criticism of the model", sentence, blocks)
 
 
 def _meaning_of_parameters(result: Result) -> str:

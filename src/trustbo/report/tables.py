@@ -8,7 +8,7 @@ from arviz_stats import sampling_diagnostics
 
 from trustbo.campaign.history import GIVEN_UP
 from trustbo.campaign.result import Result
-from trustbo.criticism.check import Check
+from trustbo.criticism.criticise import Criticism
 from trustbo.data import path_text
 from trustbo.files import to_json
 from trustbo.inference.posterior_tree import labelled_draws
@@ -120,22 +120,31 @@ def _outcome(row: dict[Hashable, Any]) -> str:
     return f"given up: {row['reason']}{where}" if row["state"] == GIVEN_UP else f"{status}{where}"
 
 
-def check_table(check: Check) -> Table:
-    """Tabulate a check of the model."""
-    sizes, probabilities = (
-        [NONE if np.isnan(value) else number(value, 2) for value in check.table[name].to_numpy()]
-        for name in ("size", "probability")
+def criticism_table(criticism: Criticism) -> Table:
+    """Tabulate the tests of a criticism."""
+    table = criticism.table
+    p, after = (map(_p, table[name].to_numpy(dtype=float)) for name in ("p_adjusted", "p_after"))
+    size, limit = (
+        [NONE if np.isnan(value) else number(value, 2) for value in table[name].to_numpy(float)]
+        for name in ("size", "limit")
     )
-    labels = [str(label) or NONE for label in check.table["label"]]
-    names, findings = map(str, check.table.index), map(str, check.table["finding"])
-    rows = list(zip(names, labels, sizes, probabilities, findings, strict=True))
+    words = (map(str, column) for column in (table.index, table["label"], table["finding"]))
+    names, labels, findings = words
+    rows = list(zip(names, labels, size, limit, p, after, findings, strict=True))
     return Table(
-        "What may be wrong with the model: the label that is most affected, its size, and the "
-        "probability of the finding.",
-        ("check", "label", "size", "probability", "finding"),
+        "Tests of what may be wrong with the model: the label with the strongest evidence, its "
+        "size in contact and that from which on it is a fault, p adjusted for the number of "
+        "tests, and p once the fault that is named is accounted for.",
+        ("check", "label", "size", "limit", "adjusted p", "p after", "finding"),
         rows,
-        text_columns=(1, 4),
+        text_columns=(1, 6),
     )
+
+
+def _p(value: float) -> str:
+    if np.isnan(value):
+        return NONE
+    return "< .001" if value < 0.001 else number(value, 3)
 
 
 def settings_table(result: Result) -> Table:

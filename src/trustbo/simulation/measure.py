@@ -15,6 +15,11 @@ from trustbo.workspace import Workspace
 from trustbo.workspace.sight import Sight
 from trustbo.workspace.surface import Surface
 
+REALTIME: Mapping[str, Mapping[str, int]] = {
+    "traversability": {"offline": +1, "speed_ratio": +1, "pitch": -1, "roll": -1},
+    "visibility": {"offline": +1, "return_range": +1, "visible_share": +1},
+}
+"""Inputs and signs of the real-time indices: the map's value, and motion or sensing state."""
 _SHARES, _N_RAYS = (0.25, 0.5, 0.75, 1.0), 12
 _OPAQUE = 1e6
 """Extinction of an opaque canopy, 1/m."""
@@ -65,7 +70,7 @@ class Measure:
                 recorded = np.concatenate(states)
                 columns = {n: recorded[..., i].ravel() for i, n in enumerate(STATES)}
                 columns["offline"] = values[..., m].ravel()
-                fused = index.of_columns({n: columns[n] for n in index.signs})
+                fused = index.transform({n: columns[n] for n in index.signs})
                 values[..., m] = fused.reshape(values.shape[:-1])
         # A robot that has arrived waits for the others: those ticks do not measure its track.
         moved = np.any(np.diff(poses[..., :2], axis=0, prepend=poses[:1, :, :2]) != 0.0, axis=-1)

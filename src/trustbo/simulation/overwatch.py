@@ -19,7 +19,7 @@ from trustbo.simulation.state import Drive, State
 from trustbo.simulation.world import Worlds, true_surface
 from trustbo.team import Robot, Team
 from trustbo.terrain import CompositeIndex
-from trustbo.terrain.dataset import digest_of
+from trustbo.terrain.read import digest_of
 from trustbo.workspace import Workspace
 from trustbo.workspace.sight import Sight, sights_of
 
@@ -68,8 +68,8 @@ class KinematicSimulator(DescribedSimulator):
             degradations: Lidars of T2 that are worse in some missions.
             events: Events of any kind, `Dust`, `Fouling`, `Vegetation` and `Season` too, which act
                 after threats and degradations, in this order.
-            realtime: Fitted `CompositeIndex.realtime` by feature: measured awareness is then the
-                map's value fused with the robot's state. Samples to fit them on: `calibration`.
+            realtime: Fitted `CompositeIndex` of `REALTIME` by feature: measured awareness is then
+                the map's value fused with the robot's state. Samples to fit them on: `calibration`.
             record_states: Keep each robot's state at each tick, `Bound.states`.
 
         Raises:
@@ -268,7 +268,7 @@ class KinematicSimulator(DescribedSimulator):
         return outcomes
 
     def calibration(self, n_bounds: int = 300, seed: int = 0) -> dict[str, xr.Dataset]:
-        """Simulate random bounds, without threats, to fit `CompositeIndex.realtime` on.
+        """Simulate random bounds, without threats, to fit real-time indices on.
 
         Args:
             n_bounds: Number of bounds, each from a passable cell to a neighbour.

@@ -17,7 +17,7 @@ from trustbo.data import Cell, Mission
 from trustbo.errors import TrustboError, require_whole
 from trustbo.simulation.bound_table import BoundTable, table_of
 from trustbo.simulation.protocol import DescribedSimulator
-from trustbo.terrain.dataset import digest_of
+from trustbo.terrain.read import digest_of
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import MOVES, moves_along
 

@@ -28,7 +28,7 @@ from trustbo.simulation.model_contact import ModelContact
 from trustbo.simulation.overwatch import KinematicSimulator
 from trustbo.simulation.protocol import takes
 from trustbo.simulation.replicates import KinematicReplicates, PlainReplicates
-from trustbo.terrain.dataset import digest_of
+from trustbo.terrain.read import digest_of
 from trustbo.workspace import Workspace
 from trustbo.workspace.location import Location
 

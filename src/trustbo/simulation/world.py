@@ -10,7 +10,7 @@ from trustbo.errors import TerrainError, TrustboError
 from trustbo.files import to_json
 from trustbo.simulation.events import Event, Fouling, Threat
 from trustbo.team import Team
-from trustbo.terrain.dataset import is_lazy, require_terrain
+from trustbo.terrain.read import require_terrain
 from trustbo.workspace import Workspace
 from trustbo.workspace.sight import Sight
 from trustbo.workspace.surface import Surface, surface_of
@@ -111,8 +111,6 @@ def true_surface(workspace: Workspace, terrain: xr.Dataset | None) -> Surface:
     if terrain is None:
         return planned
     terrain = require_terrain(terrain)
-    if is_lazy(terrain):
-        raise TerrainError("the true terrain must be in memory: read it without lazy=True.")
     if terrain.rio.crs != workspace.terrain.rio.crs:  # pyright: ignore[reportOptionalMemberAccess]
         raise TerrainError(
             f"the true terrain has CRS {terrain.rio.crs}, the workspace's another; reproject it."

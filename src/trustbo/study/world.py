@@ -21,8 +21,8 @@ from trustbo.simulation.protocol import Simulator
 from trustbo.study.calls import digest, identity_of, imported
 from trustbo.study.experiment import Scene
 from trustbo.team import Team
-from trustbo.terrain.dataset import assemble_terrain
 from trustbo.terrain.example import EXAMPLES, example_files
+from trustbo.terrain.read import read_terrain
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import MOVES
 from trustbo.workspace.sight import Sight
@@ -278,7 +278,7 @@ def aged(now: xr.Dataset, seed: int = 0) -> xr.Dataset:
     ground = dem + 0.3 * noise()
     canopy = np.where(clearings, 0.0, 0.7 * (dsm - dem))
     old = now["dem"].copy(data=ground), now["dsm"].copy(data=ground + canopy)
-    return assemble_terrain(*(heights.rio.write_crs(now.rio.crs) for heights in old))
+    return read_terrain(*(heights.rio.write_crs(now.rio.crs) for heights in old))
 
 
 @lru_cache(maxsize=4)

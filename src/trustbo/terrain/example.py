@@ -5,7 +5,7 @@ from pathlib import Path
 import xarray as xr
 
 from trustbo.errors import require_choice
-from trustbo.terrain.dataset import read_terrain
+from trustbo.terrain.read import read_terrain
 
 _FOLDER = Path(__file__).parent / "data"
 EXAMPLES = ("wellington",)

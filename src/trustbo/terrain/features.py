@@ -1,22 +1,24 @@
-"""Attributes of pixels that impede motion or sight."""
+"""Attributes of pixels that impede motion or sight.
 
-from collections.abc import Callable, Iterable, Mapping
-from typing import Any
+A feature is a function of a terrain (Dataset of `dem` and `dsm`, dims (y, x), metres) that returns
+an array (row, col), NaN where unknown. `feature` registers one for composites:
+
+    @tb.terrain.feature("northness", sign=+1)
+    def northness(terrain):
+        east, north = tb.terrain.gradient(terrain["dem"].values, tb.terrain.pixel_size(terrain))
+        return -north / np.hypot(east, north)
+"""
+
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
 from scipy import ndimage
 
-from trustbo.errors import require_whole
-from trustbo.terrain import fan, stencil
-from trustbo.terrain.dataset import pixel_size
-from trustbo.terrain.pixel_feature import (
-    FEATURES,
-    PixelFeature,
-    feature_named,
-    register_feature,
-    values_of_kernel,
-)
+from trustbo.errors import TerrainError, require_choice
+from trustbo.terrain import fan
+from trustbo.terrain.read import pixel_size
 
 CANOPY_THRESHOLD = 2.0
 """Vegetation at least this high (m) counts as canopy."""
@@ -24,161 +26,145 @@ COVER_RADIUS = 5.0
 """Half-width of the squares over which canopy is averaged, m."""
 REACH = 50.0
 """Length of the rays of openness, m."""
-
-
-def _of_window(kernel: Callable, sign: int, units: str) -> Callable[[xr.Dataset], xr.DataArray]:
-    """Register the attribute of the 3 x 3 window of a kernel, with its name and docstring."""
-    name = kernel.__name__
-
-    def feature(terrain: xr.Dataset) -> xr.DataArray:
-        values = values_of_kernel(terrain, kernel, slice(None), np.empty)
-        return _named(terrain["dem"].copy(deep=False, data=values), name, units)
-
-    feature.__name__ = feature.__qualname__ = name
-    feature.__doc__ = kernel.__doc__
-    return register_feature(name, sign=sign, kernel=kernel)(feature)
-
-
-# Beyond the raster's edge the ground is level.
-slope = _of_window(stencil.slope, -1, "rad")
-aspect = _of_window(stencil.aspect, 1, "rad")
-curvature = _of_window(stencil.curvature, 1, "1/m")
-roughness = _of_window(stencil.roughness, -1, "m")
-tri = _of_window(stencil.tri, -1, "m")
-tpi = _of_window(stencil.tpi, 1, "m")
-step_height = _of_window(stencil.step_height, -1, "m")
-
-
-@register_feature("canopy_height", sign=-1)
-def canopy_height(terrain: xr.Dataset) -> xr.DataArray:
-    """Surface minus ground, m."""
-    return _named(terrain["dsm"] - terrain["dem"], "canopy_height", "m")
-
-
-@register_feature("canopy_cover", sign=-1, halo=COVER_RADIUS)
-def canopy_cover(terrain: xr.Dataset, radius: float = COVER_RADIUS) -> xr.DataArray:
-    """Share of the square of half-width `radius` (m) that is under canopy over 2 m high."""
-    height = canopy_height(terrain)
-    tall = (height.values > CANOPY_THRESHOLD).astype(height.dtype)
-    return _named(_local_mean(terrain, tall, radius).clip(0.0, 1.0), "canopy_cover", "1")
-
-
-@register_feature("vegetation_density", sign=-1, halo=COVER_RADIUS)
-def vegetation_density(
-    terrain: xr.Dataset,
-    radius: float = COVER_RADIUS,
-    *,
-    layer: float = 3.0,
-    crown_base: float = 0.3,
-) -> xr.DataArray:
-    """Share of the lowest metres of air filled by canopy, around each pixel.
-
-    Args:
-        terrain: DEM and DSM.
-        radius: Half-width of the square around a pixel, m.
-        layer: Height of the layer of air that robots see through, m.
-        crown_base: Lower edge of the canopy layer as a share of its height.
-
-    Returns:
-        Dims (y, x), in [0, 1].
-    """
-    height = canopy_height(terrain).values
-    filled = np.minimum(height, layer) - np.minimum(crown_base * height, layer)
-    share = _local_mean(terrain, np.maximum(filled, 0.0) / layer, radius)
-    return _named(share.clip(0.0, 1.0), "vegetation_density", "1")
-
-
-def openness(
-    terrain: xr.Dataset,
-    reach: float = REACH,
-    *,
-    eye: float = 1.0,
-    target: float = 1.0,
-    n_rays: int = 16,
-    extinction: float = 0.1,
-    crown_base: float = 0.3,
-    rows: slice | None = None,
-) -> xr.DataArray:
-    """Expected share of clear rays from a pixel to targets `reach` metres away all around.
-
-    Args:
-        terrain: DEM and DSM.
-        reach: Length of the rays, m.
-        eye: Height of the sensor above ground, m.
-        target: Height of the targets above ground, m.
-        n_rays: Number of directions.
-        extinction: Extinction coefficient of the canopy, 1/m.
-        crown_base: Lower edge of the canopy layer as a share of its height.
-        rows: Rows of pixels to compute; the others are NaN.
-
-    Returns:
-        Dims (y, x), in [0, 1]; rays that end off the raster do not count, and a pixel without
-        other rays is NaN: keep `reach` below half the terrain's shorter side.
-
-    Raises:
-        TrustboError: `n_rays` is not positive.
-    """
-    values = fan.openness(
-        terrain["dem"].values,
-        terrain["dsm"].values,
-        pixel_size(terrain),
-        reach,
-        eye,
-        target,
-        require_whole("n_rays", n_rays, 1),
-        extinction,
-        crown_base,
-        rows or slice(None),
-    )
-    return _named(terrain["dem"].copy(deep=False, data=values), "openness", "1")
-
-
-FEATURES["openness"] = PixelFeature(openness, +1, REACH, by_rows=True)
-
-
 TRAVERSABILITY = ("slope", "roughness", "tri", "step_height")
 """Pixel features of traversability (z1); each lowers it."""
 VISIBILITY = ("vegetation_density", "openness")
 """Pixel features of visibility (z2): vegetation lowers it, openness raises it."""
 PAPER_VISIBILITY = ("canopy_height", "canopy_cover", "openness")
-"""Visibility of version 0.1, in the paper's setting; in forest it points the wrong way."""
+"""Visibility in the paper's setting; in forest it points the wrong way."""
 
 
-def pixel_features(
-    terrain: xr.Dataset, features: Iterable[str] | Mapping[str, PixelFeature]
-) -> xr.Dataset:
-    """Compute several features, as variables of dims (y, x).
+class Feature(NamedTuple):
+    """Attribute of pixels, and its sign in an index: +1 if it raises the index, -1 if not."""
 
-    Args:
-        terrain: DEM and DSM.
-        features: Names of registered features, or features by name.
+    compute: Callable[..., np.ndarray]
+    sign: int
+
+
+FEATURES: dict[str, Feature] = {}
+"""Registered features by name."""
+
+
+def feature[F: Callable[..., np.ndarray]](name: str, *, sign: int) -> Callable[[F], F]:
+    """Register a feature of pixels under a new name, by a decorator.
+
+    TerrainError: the name is taken, or the sign is neither 1 nor -1.
+    """
+    if name in FEATURES:
+        raise TerrainError(f"there is a feature {name!r} already; take another name.")
+    if sign not in (1, -1):
+        raise TerrainError(f"sign must be 1 or -1; got {sign!r}.")
+
+    def register(compute: F) -> F:
+        FEATURES[name] = Feature(compute, sign)
+        return compute
+
+    return register
+
+
+def pixel_features(terrain: xr.Dataset, names: Iterable[str]) -> xr.Dataset:
+    """Compute registered features, as variables of dims (y, x).
 
     Raises:
         TrustboError: An unknown name.
     """
-    if not isinstance(features, Mapping):
-        features = {name: feature_named(name) for name in features}
-    return xr.Dataset({name: feature.compute(terrain) for name, feature in features.items()})
+    like = terrain["dem"].drop_attrs(deep=False)
+    chosen = {name: FEATURES[require_choice("feature", name, FEATURES)] for name in names}
+    return xr.Dataset({name: like.copy(data=f.compute(terrain)) for name, f in chosen.items()})
+
+
+def _window(z: np.ndarray) -> dict[tuple[int, int], np.ndarray]:
+    """The nine heights of each pixel's 3 x 3 window, by steps (down, right).
+
+    Beyond the raster's edge the ground is level.
+    """
+    wide, (rows, cols) = np.pad(z, 1, mode="edge"), z.shape
+    steps = (-1, 0, 1)
+    return {(i, j): wide[1 + i :, 1 + j :][:rows, :cols] for i in steps for j in steps}
 
 
 def gradient(dem: np.ndarray, pixel: tuple[float, float]) -> np.ndarray:
-    """Horn's rise of the ground to the east and to the north, shape (2, row, col)."""
-    out = np.empty((2, *dem.shape), dem.dtype)
-    stencil.gradient(np.pad(dem, 1, mode="edge"), pixel, out)
-    return out
+    """Rise of the ground per metre to the east and to the north (Horn 1981), (2, row, col)."""
+    w = _window(dem)
+    east = (w[-1, 1] - w[-1, -1]) + 2.0 * (w[0, 1] - w[0, -1]) + (w[1, 1] - w[1, -1])
+    south = (w[1, -1] - w[-1, -1]) + 2.0 * (w[1, 0] - w[-1, 0]) + (w[1, 1] - w[-1, 1])
+    return np.stack([0.125 * east / pixel[1], -0.125 * south / pixel[0]])
 
 
-def _local_mean(terrain: xr.Dataset, values: np.ndarray, radius: float) -> xr.DataArray:
-    """Mean of the valid pixels in squares of half-width `radius` (m)."""
-    size: Any = [2 * max(1, round(radius / step)) + 1 for step in pixel_size(terrain)]
+@feature("slope", sign=-1)
+def slope(terrain: xr.Dataset) -> np.ndarray:
+    """Slope of the ground, rad (Horn 1981)."""
+    z = terrain["dem"].values
+    return np.arctan(np.hypot(*gradient(z, pixel_size(terrain)))) + (z - z)  # missing stays missing
+
+
+@feature("roughness", sign=-1)
+def roughness(terrain: xr.Dataset) -> np.ndarray:
+    """Highest minus lowest ground in the 3 x 3 window, m (Wilson et al. 2007)."""
+    window = np.stack(list(_window(terrain["dem"].values).values()))
+    return window.max(0) - window.min(0)
+
+
+@feature("tri", sign=-1)
+def tri(terrain: xr.Dataset) -> np.ndarray:
+    """Terrain ruggedness index, m: root sum of squared steps to the 8 neighbours (Riley 1999)."""
+    z = terrain["dem"].values
+    return np.sqrt(sum(((w - z) ** 2 for w in _window(z).values()), np.zeros_like(z)))
+
+
+@feature("step_height", sign=-1)
+def step_height(terrain: xr.Dataset) -> np.ndarray:
+    """Largest step up or down to one of the 8 neighbours, m; to a missing one there is none."""
+    z = terrain["dem"].values
+    return np.fmax.reduce([np.abs(w - z) for w in _window(z).values()])
+
+
+@feature("canopy_height", sign=-1)
+def canopy_height(terrain: xr.Dataset) -> np.ndarray:
+    """Surface minus ground, m."""
+    return terrain["dsm"].values - terrain["dem"].values
+
+
+@feature("canopy_cover", sign=-1)
+def canopy_cover(terrain: xr.Dataset) -> np.ndarray:
+    """Share of the square of half-width 5 m that is under canopy over 2 m high."""
+    return _local_mean(terrain, (canopy_height(terrain) > CANOPY_THRESHOLD).astype(float))
+
+
+@feature("vegetation_density", sign=-1)
+def vegetation_density(
+    terrain: xr.Dataset, *, layer: float = 3.0, crown_base: float = 0.3
+) -> np.ndarray:
+    """Share of the lowest `layer` metres of air filled by canopy, in squares of half-width 5 m.
+
+    Canopy is the layer of air from `crown_base` times its height to its top.
+    """
+    height = canopy_height(terrain)
+    filled = np.minimum(height, layer) - np.minimum(crown_base * height, layer)
+    return _local_mean(terrain, np.maximum(filled, 0.0) / layer)
+
+
+@feature("openness", sign=+1)
+def openness(
+    terrain: xr.Dataset, reach: float = REACH, *, eye: float = 1.0, target: float = 1.0
+) -> np.ndarray:
+    """Expected share of clear rays from a pixel to targets `reach` metres away all around.
+
+    Rays run from `eye` to `target` metres above ground. Those that end off the raster do not count;
+    a pixel without others is NaN: keep `reach` below half the terrain's shorter side.
+    """
+    heights = terrain["dem"].values, terrain["dsm"].values
+    pixel = pixel_size(terrain)
+    return fan.openness(*heights, pixel, reach, eye, target, 16, 0.1, 0.3, slice(None))
+
+
+def _local_mean(terrain: xr.Dataset, values: np.ndarray) -> np.ndarray:
+    """Mean of the valid pixels in squares of half-width 5 m, in [0, 1]; NaN without ground."""
+    size = [2 * max(1, round(COVER_RADIUS / step)) + 1 for step in pixel_size(terrain)]
     has_ground, valid = np.isfinite(terrain["dem"].values), np.isfinite(values)
-    total = ndimage.uniform_filter(np.where(valid, values, 0.0), size, mode="nearest")
-    weight = ndimage.uniform_filter(valid.astype(total.dtype), size, mode="nearest")
+    total, weight = (
+        np.asarray(ndimage.uniform_filter(a, size, mode="nearest"))
+        for a in (np.where(valid, values, 0.0), valid.astype(float))
+    )
     with np.errstate(invalid="ignore", divide="ignore"):
-        return terrain["dem"].copy(deep=False, data=np.where(has_ground, total / weight, np.nan))
-
-
-def _named(array: xr.DataArray, name: str, units: str) -> xr.DataArray:
-    array = array.rename(name)
-    array.attrs = {"units": units, "long_name": name.replace("_", " ")}
-    return array
+        return np.where(has_ground, (total / weight).clip(0.0, 1.0), np.nan)

@@ -7,7 +7,7 @@ import xarray as xr
 from scipy import ndimage
 
 from trustbo.errors import TerrainError, require_positive, require_whole
-from trustbo.terrain.dataset import assemble_terrain
+from trustbo.terrain.read import read_terrain
 
 _MOST_PIXELS = 1e8  # some 6 GB while it is made
 
@@ -71,7 +71,7 @@ def synthetic_terrain(
         "x": left + (np.arange(shape[1]) + 0.5) * resolution,
     }
     arrays = (xr.DataArray(a, coords, dims=("y", "x")).rio.write_crs(crs) for a in (dem, dsm))
-    return assemble_terrain(*arrays)
+    return read_terrain(*arrays)
 
 
 def _fractal(rng: np.random.Generator, shape: tuple[int, int], exponent: float) -> np.ndarray:

@@ -1,43 +1,83 @@
 """Awareness of cells, from the pixels of a terrain or from a user's arrays."""
 
-from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
 from trustbo.arrays import as_array
-from trustbo.errors import ShapeError, TrustboError
-from trustbo.parallel import in_order
+from trustbo.errors import ShapeError, TrustboError, require_choice, require_kind
 from trustbo.team import Team
-from trustbo.terrain.composite import CompositeIndex
-from trustbo.terrain.dataset import warn_if_clipped
-from trustbo.terrain.pixel_awareness import PixelAwareness
-from trustbo.terrain.strips import Strip
-from trustbo.workspace.grid import CellMeans, Grid, Sums
-from trustbo.workspace.moves import MOVES, existing_bounds
-from trustbo.workspace.survey import MAX_MISSING
+from trustbo.terrain import FEATURES, CompositeIndex, pixel_size
+from trustbo.terrain.features import slope
+from trustbo.workspace.grid import MAX_MISSING, Grid
+from trustbo.workspace.moves import MOVE_NAMES, MOVES, existing_bounds
 
+_DIMS = ("robot", "move", "row", "col", "feature")
 _AXES = "(robot, row, col, feature) or (robot, move, row, col, feature) with 8 moves"
 
 
-class CellMaps(NamedTuple):
-    """Maps of cells made from a terrain."""
+def cell_maps(
+    terrain: xr.Dataset, grid: Grid, features: Mapping[str, object], team: Team
+) -> tuple[np.ndarray, np.ndarray, xr.Dataset, dict[str, CompositeIndex]]:
+    """Compute awareness and passability of the cells of a terrain.
 
-    awareness: np.ndarray  # (row, col, feature), in [0, 1]; NaN where a cell has no data
-    passable_share: np.ndarray  # (row, col), share of pixels with data that are not too steep
-    composites: dict[str, CompositeIndex]  # by feature
-    features: tuple[str, ...]
-    pixels: xr.Dataset | None
-    """Awareness and passability of each pixel, dims (y, x), if kept."""
+    Openness is that of the team's heights, over the range of its lidars, at most the diagonal of a
+    cell and half the terrain.
 
-    def of_team(self, grid: Grid, team: Team) -> tuple[xr.DataArray, xr.DataArray]:
-        """Awareness, the same for each robot, and passability of the cells, see `labelled`."""
-        passable = np.nan_to_num(self.passable_share) >= 1.0 - MAX_MISSING
-        passable &= np.isfinite(self.awareness).all(-1)
-        z = np.repeat(self.awareness[None], len(team.robots), axis=0)
-        return labelled(z, passable, grid, team, self.features)
+    Returns:
+        Awareness (row, col, feature) in [0, 1], NaN where a cell has no data; passability (row,
+        col); maps of pixels, dims (y, x), of each feature and of passability; fitted composites.
+
+    Raises:
+        TrustboError: An unknown feature, or one that is used unchanged outside [0, 1].
+    """
+    remedy = "give names of pixel features by feature, e.g. {'ease': ('slope', 'tri')}"
+    require_kind("features", features, Mapping, remedy)
+    sides = [n * step for n, step in zip(terrain["dem"].shape, pixel_size(terrain), strict=True)]
+    diagonal = float(np.hypot(grid.cell_height, grid.cell_width))
+    ranges = [robot.lidar_range for robot in team.robots]
+    lidar = {
+        "reach": min(max(ranges), diagonal, 0.5 * min(sides)),
+        "eye": team.robots[0].sensor_height,
+        "target": team.lead.target_height,
+    }
+
+    def values_of(name: str) -> np.ndarray:
+        compute = FEATURES[require_choice("feature", name, FEATURES)].compute
+        return compute(terrain, **lidar) if name == "openness" else compute(terrain)
+
+    pixels, composites = {}, {}
+    for name, parts in features.items():
+        if isinstance(parts, str):
+            pixels[name] = _unit_values(name, values_of(parts))
+            continue
+        require_kind(f"feature {name!r}", parts, Iterable, remedy)
+        values = {part: values_of(part) for part in parts}
+        index = CompositeIndex({part: FEATURES[part].sign for part in values}).fit(values)
+        pixels[name], composites[name] = index.transform(values), index
+    even = slope(terrain) <= team.max_slope
+    dem = terrain["dem"]
+    maps = {
+        name: xr.DataArray(values, dem.coords, dem.dims, attrs={"units": "1"})
+        for name, values in pixels.items()
+    }
+    z = np.stack([grid.cell_means(one) for one in maps.values()], axis=-1)
+    maps["passable"] = xr.DataArray(even, dem.coords, dem.dims)
+    passable = grid.cell_means(maps["passable"].astype(float)) >= 1.0 - MAX_MISSING
+    return z, passable & np.isfinite(z).all(-1), xr.Dataset(maps), composites
+
+
+def _unit_values(name: str, values: np.ndarray) -> np.ndarray:
+    """Values of a feature that is used unchanged; TrustboError outside [0, 1]."""
+    low, high = np.nanmin(values, initial=0.0), np.nanmax(values, initial=1.0)
+    if low < 0.0 or high > 1.0:
+        raise TrustboError(
+            f"feature {name!r} is used unchanged and must lie in [0, 1]; it has {low:g} to "
+            f"{high:g}. Make it a composite of one: {{{name!r}: [...]}}."
+        )
+    return values
 
 
 def labelled(
@@ -65,51 +105,30 @@ def labelled(
     )
 
 
-def cell_maps(
-    terrain: xr.Dataset,
-    grid: Grid,
-    features: Mapping[str, object],
-    team: Team,
-    *,
-    keep_pixels: bool = True,
-) -> CellMaps:
-    """Compute awareness and passability of each cell; see `Workspace.from_terrain`.
+def unlabelled(
+    awareness: ArrayLike | xr.DataArray, names: Sequence[str], features: Sequence[str]
+) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...]]:
+    """Array of awareness in the order of axes that `of_cells` takes, names of robots and features.
 
-    Each pixel is added to its cell strip by strip. Pixels of a terrain read lazily are not kept.
+    A DataArray is put in order by the names of its dims, and of its moves; names that are not given
+    are its labels. ShapeError: other dims, or labels that contradict the names given.
     """
-    dem = terrain["dem"]
-    cells = CellMeans(grid.shape, *grid.cells_along(dem["y"].values, dem["x"].values))
-    diagonal = float(np.hypot(grid.cell_height, grid.cell_width))
-    pixels = PixelAwareness(terrain, features, team, reach=diagonal)
-    kept = (*pixels.names, "passable") if keep_pixels and not pixels.is_lazy else ()
-    maps: dict[str, list[np.ndarray]] = {name: [] for name in kept}
-
-    def work(strip: Strip) -> tuple[Strip, dict[str, np.ndarray], dict[str, Sums]]:
-        index = pixels.features_of(strip)
-        copied = {name: index[name].copy() for name in kept}
-        return strip, copied, cells.sums(index, strip.rows.start)
-
-    n_clipped = n_valid = 0.0
-    for strip, index, sums in in_order(work, pixels.strips):
-        cells.merge(sums)
-        for name, values in index.items():
-            maps[name].append(values)
-        share = (strip.rows.stop - strip.rows.start) / strip.window.sizes["y"]
-        n_clipped, n_valid = n_clipped + share * strip.n_clipped, n_valid + share * strip.n_valid
-    if pixels.is_lazy:
-        warn_if_clipped(round(n_clipped), round(n_valid), stacklevel=4)
-    units = {name: {} if name == "passable" else {"units": "1"} for name in maps}
-    whole = {
-        name: xr.DataArray(np.concatenate(strips), dem.coords, dem.dims, attrs=units[name])
-        for name, strips in maps.items()
-    }
-    return CellMaps(
-        np.stack([cells[name] for name in pixels.names], axis=-1),
-        cells["passable"],
-        pixels.composites,
-        pixels.names,
-        xr.Dataset(whole) if kept else None,
-    )
+    if not isinstance(awareness, xr.DataArray):
+        return as_array("awareness", awareness), tuple(names), tuple(features)
+    axes = [axis for axis in _DIMS if axis != "move" or "move" in awareness.dims]
+    if set(awareness.dims) != set(axes):
+        raise ShapeError(f"awareness must have dims {_AXES}; got {awareness.dims}.")
+    if "move" in awareness.coords:
+        awareness = awareness.sel(move=list(MOVE_NAMES))
+    chosen = []
+    for axis, given in (("robot", names), ("feature", features)):
+        labels = awareness[axis].values.astype(str).tolist() if axis in awareness.coords else []
+        if labels and given and set(labels) != set(given):
+            raise ShapeError(f"awareness has labels {labels} of {axis}; got {list(given)}.")
+        if labels and given:
+            awareness = awareness.sel({axis: list(given)})
+        chosen.append(tuple(given or labels))
+    return as_array("awareness", awareness.transpose(*axes).values), chosen[0], chosen[1]
 
 
 def of_cells(

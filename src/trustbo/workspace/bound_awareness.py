@@ -9,8 +9,6 @@ import xarray as xr
 
 from trustbo.data import LINE_OF_SIGHT, is_line_of_sight
 from trustbo.errors import TerrainError, TrustboError
-from trustbo.terrain.composite import MAX_PIXELS
-from trustbo.terrain.dataset import is_lazy
 from trustbo.workspace.line_of_sight import Geometry, bound_features, over_bounds
 from trustbo.workspace.moves import existing_bounds
 from trustbo.workspace.sight import Sight
@@ -39,7 +37,7 @@ def require_sight(
 ) -> None:
     """Refuse a terrain on which no line of sight can be computed.
 
-    TerrainError: it is read lazily, or has no canopy where a sight needs one. TrustboError: a
+    TerrainError: it has no canopy where a sight needs one. TrustboError: a
     feature has the name of a line of sight.
     """
     for name in features:
@@ -47,14 +45,6 @@ def require_sight(
             raise TrustboError(
                 f"{name!r} is the name of a feature of bounds; give yours another, or bounds=False."
             )
-    if is_lazy(terrain):
-        fewer = max(2.0, np.sqrt(terrain["dem"].size / MAX_PIXELS))  # a raster in memory
-        step = abs(terrain.rio.resolution()[1]) * fewer
-        raise TerrainError(
-            f"line of sight needs the terrain in memory, and it is read lazily: average it to "
-            f"pixels of {step:.3g} m, read_terrain(..., resolution={step:.3g}), or do without: "
-            "from_terrain(..., bounds=False)."
-        )
     if any(sight.mode == "wall" for sight in sights):
         if not (terrain["dsm"].values > terrain["dem"].values).any():
             raise TerrainError(

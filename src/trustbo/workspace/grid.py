@@ -1,11 +1,10 @@
 """Planning grid: cells of positions and of pixels, means over cells."""
 
-from collections.abc import Mapping
+import math
 from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
-from numba import njit
 from numpy.typing import ArrayLike
 from rasterio.crs import CRS
 from rasterio.transform import from_origin
@@ -15,8 +14,8 @@ from trustbo.display import Rows, Summary
 from trustbo.errors import TerrainError, TrustboError, require_pair
 from trustbo.workspace.location import Location, cell_of, crs_name, lonlat_of
 
-Sums = tuple[np.ndarray, np.ndarray]
-"""Sum over each cell's pixels with data, and their number, each of shape (row, col)."""
+MAX_MISSING = 0.5
+"""Largest share of missing or too steep pixels in a passable cell."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -161,9 +160,14 @@ class Grid(Summary):
         Returns:
             Shape (row, col); NaN where a cell has no data.
         """
-        means = CellMeans(self.shape, *self.cells_along(values["y"].values, values["x"].values))
-        means.merge(means.sums({"": values.transpose("y", "x").values}, 0))
-        return means[""]
+        row, col = self.cells_along(values["y"].values, values["x"].values)
+        cell, z = row[:, None] * self.shape[1] + col, values.transpose("y", "x").values
+        valid = np.isfinite(z)
+        total, count = (
+            np.bincount(cell[valid], weights, math.prod(self.shape)) for weights in (z[valid], None)
+        )
+        with np.errstate(invalid="ignore"):
+            return (total / count).reshape(self.shape)
 
     def cell_share(self, condition: xr.DataArray) -> np.ndarray:
         """Share of each cell's pixels where a condition holds, shape (row, col)."""
@@ -191,52 +195,3 @@ def over_cells[Map: (xr.Dataset, xr.DataArray)](maps: Map) -> Map:
     if not {"y", "x"} <= set(maps.dims):
         return maps
     return maps.drop_vars(["y", "x"], errors="ignore").rename(y="row", x="col")
-
-
-class CellMeans:
-    """Means of maps over each cell's pixels with data, from rows of pixels added strip by strip."""
-
-    def __init__(self, shape: tuple[int, int], row: np.ndarray, col: np.ndarray) -> None:
-        """Start without pixels; `row` and `col` are the cells of the rows and columns of pixels."""
-        self._shape, self._row = shape, row
-        self._edges = np.searchsorted(col, np.arange(shape[1] + 1))
-        self._sums: dict[str, Sums] = {}
-
-    def sums(self, maps: Mapping[str, np.ndarray], first: int) -> dict[str, Sums]:
-        """Sums for `merge` of maps of pixels, (row, col), from row `first` of the raster on.
-
-        Threads may compute them.
-        """
-        sums = {}
-        for name, values in maps.items():
-            values = values.view(np.uint8) if values.dtype == bool else values
-            sums[name] = total, count = np.zeros(self._shape), np.zeros(self._shape)
-            row = self._row[first : first + len(values)]
-            _add_rows(np.ascontiguousarray(values), row, self._edges, total, count)
-        return sums
-
-    def merge(self, sums: Mapping[str, Sums]) -> None:
-        """Add sums of pixels."""
-        for name, (total, count) in sums.items():
-            before = self._sums.get(name, (0.0, 0.0))
-            self._sums[name] = before[0] + total, before[1] + count
-
-    def __getitem__(self, name: str) -> np.ndarray:
-        """Means of a map, shape (row, col); NaN where a cell has no data."""
-        total, count = self._sums[name]
-        with np.errstate(invalid="ignore"):
-            return total / count
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz", "reassoc"})
-def _add_rows(values, row, edges, total, count):
-    for i in range(len(values)):
-        of_row = values[i]
-        for cell in range(len(edges) - 1):
-            s, n_missing = 0.0, 0
-            for j in range(edges[cell], edges[cell + 1]):
-                v = of_row[j]
-                s += v if v == v else 0.0
-                n_missing += v != v
-            total[row[i], cell] += s
-            count[row[i], cell] += edges[cell + 1] - edges[cell] - n_missing

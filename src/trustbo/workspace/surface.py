@@ -6,8 +6,8 @@ import numpy as np
 import xarray as xr
 from scipy import ndimage
 
-from trustbo.terrain.dataset import pixel_size
 from trustbo.terrain.features import gradient
+from trustbo.terrain.read import pixel_size
 
 
 class Surface(NamedTuple):

@@ -1,6 +1,5 @@
 """Survey of a terrain: the grid, and the cells without data or too steep, before awareness."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,18 +9,10 @@ from trustbo.data import Cell
 from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError
 from trustbo.team import Team
-from trustbo.terrain.dataset import is_lazy, pixel_size, require_terrain
-from trustbo.terrain.pixel_feature import FEATURES
-from trustbo.terrain.strips import Strip, strip_of, strips
-from trustbo.workspace.grid import CellMeans, Grid
-from trustbo.workspace.location import Location, cell_of, crs_name, name_of_crs, spans
-
-MAX_MISSING = 0.5
-"""Largest share of missing or too steep pixels in a passable cell."""
-_MOST_PIXELS = 1 << 22
-"""Pixels above which rows of a lazily read terrain are sampled."""
-_BANDS = 4
-"""Bands of rows that are read of each row of cells then."""
+from trustbo.terrain.features import slope
+from trustbo.terrain.read import pixel_size, require_terrain
+from trustbo.workspace.grid import MAX_MISSING, Grid
+from trustbo.workspace.location import Location, cell_of, crs_name, spans
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -36,8 +27,6 @@ class Survey(Summary):
         heights: Least and greatest height, m.
         pixel: Height and width of a pixel, m.
         shape: Rows and columns of pixels.
-        warped: CRSs that heights were warped from, "dem from EPSG:4326"; none where both rasters
-            are in that of the grid.
     """
 
     grid: Grid
@@ -46,7 +35,6 @@ class Survey(Summary):
     heights: tuple[float, float]
     pixel: tuple[float, float]
     shape: tuple[int, int]
-    warped: tuple[str, ...] = ()
 
     @property
     def passable(self) -> np.ndarray:
@@ -85,9 +73,8 @@ class Survey(Summary):
         grid, (low, high), free = self.grid, self.heights, self.passable
         (height, width), (rows, cols) = self.pixel, grid.shape
         x, y, longitude, latitude = spans(grid)
-        warped = f", to which are warped: {', '.join(self.warped)}" if self.warped else ""
         rows_of = [
-            ("CRS", crs_name(grid) + warped),
+            ("CRS", crs_name(grid)),
             ("extent", f"{x}, {y} m"),
             ("", f"{longitude}, {latitude}"),
             ("pixels", f"{self.shape[0]} x {self.shape[1]} of {height:.3g} m x {width:.3g} m"),
@@ -110,11 +97,8 @@ def survey(
 ) -> Survey:
     """Survey a terrain; fast, as no awareness is computed.
 
-    Of a lazily read terrain of over 4 million pixels, bands of rows are read, whose shares stand
-    for those of their cells.
-
     Args:
-        terrain: Dataset of `read_terrain` or `synthetic_terrain`, in memory or lazy.
+        terrain: Dataset of `read_terrain` or `synthetic_terrain`.
         shape: Rows and columns of the planning grid.
         team: Lead and robots; by default a lead and three robots.
 
@@ -123,15 +107,11 @@ def survey(
     """
     terrain, team = require_terrain(terrain), Team.of(team)
     grid = Grid.over(terrain, shape)
-    cells = CellMeans(grid.shape, *grid.cells_along(terrain["y"].values, terrain["x"].values))
-    low, high = np.inf, -np.inf
-    for strip in _strips(terrain, grid):
-        dem = strip.window.variables["dem"].values[strip.core]
-        slope = FEATURES["slope"].of_rows(strip.window, strip.core)
-        values = {"valid": np.isfinite(dem), "even": slope <= team.max_slope, "height": dem}
-        cells.merge(cells.sums(values, strip.rows.start))
-        low, high = np.nanmin(dem, initial=low), np.nanmax(dem, initial=high)
-    valid, even, height = (cells[name] for name in ("valid", "even", "height"))
+    dem = terrain["dem"]
+    low, high = float(dem.min()), float(dem.max())
+    even = dem.copy(data=(slope(terrain) <= team.max_slope).astype(float))
+    maps = dem.notnull().astype(float), even, dem
+    valid, even, height = (grid.cell_means(values) for values in maps)
     with np.errstate(invalid="ignore"):
         steep = 1.0 - even / valid
     dims = ("row", "col")
@@ -145,12 +125,7 @@ def survey(
         {"y": ("row", grid.y, {"units": "m"}), "x": ("col", grid.x, {"units": "m"})},
     )
     pixels = terrain.sizes["y"], terrain.sizes["x"]
-    heights = float(low), float(high)
-    sources = {
-        str(name): means.attrs.get("warped_from") for name, means in terrain.data_vars.items()
-    }
-    warped = tuple(f"{name} from {name_of_crs(crs)}" for name, crs in sources.items() if crs)
-    return Survey(grid, team, dataset, heights, pixel_size(terrain), pixels, warped)
+    return Survey(grid, team, dataset, (low, high), pixel_size(terrain), pixels)
 
 
 def reason_impassable(missing: float, team: Team) -> str:
@@ -159,16 +134,3 @@ def reason_impassable(missing: float, team: Team) -> str:
         return f": {missing:.0%} of it has no data"
     steep = np.rad2deg(team.max_slope)
     return f": over half of it is missing or steeper than the {steep:.0f} degrees the team stands"
-
-
-def _strips(terrain: xr.Dataset, grid: Grid) -> Iterator[Strip]:
-    """Strips of the whole terrain; of a large one read lazily, bands of each row of cells."""
-    n_rows, n_cols = terrain["dem"].shape
-    edges = np.linspace(0, n_rows, _BANDS * grid.shape[0] + 1).astype(int)
-    depth = max(1, _MOST_PIXELS // (n_cols * (len(edges) - 1)))
-    if not is_lazy(terrain) or n_rows * n_cols <= _MOST_PIXELS or (np.diff(edges) <= depth).any():
-        yield from strips(terrain, 1)
-        return
-    for top, bottom in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
-        first = (top + bottom - depth) // 2
-        yield strip_of(terrain, first, first + depth, 1)

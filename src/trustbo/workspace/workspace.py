@@ -24,13 +24,9 @@ from trustbo.errors import ShapeError, require_choice, require_positive
 from trustbo.stacking import fill_awareness
 from trustbo.team import Team
 from trustbo.terrain.composite import CompositeIndex
-from trustbo.terrain.dataset import require_terrain
-from trustbo.terrain.features import (
-    PAPER_VISIBILITY,
-    TRAVERSABILITY,
-    VISIBILITY,
-)
-from trustbo.workspace.awareness import cell_maps, labelled, of_cells
+from trustbo.terrain.features import PAPER_VISIBILITY, TRAVERSABILITY, VISIBILITY
+from trustbo.terrain.read import require_terrain
+from trustbo.workspace.awareness import cell_maps, labelled, of_cells, unlabelled
 from trustbo.workspace.bound_awareness import (
     TRAVERSABLE,
     of_bounds,
@@ -58,8 +54,7 @@ class Workspace(Summary):
         grid: Positions of the cells.
         team: Lead and robots.
         terrain: DEM and DSM; None without a terrain.
-        pixels: Dataset (y, x) of traversability, visibility and passable; None without a terrain in
-            memory.
+        pixels: Dataset (y, x) of traversability, visibility and passable; None without a terrain.
         composites: Fitted composites by feature.
         of_bounds: DataArray (robot, move, row, col, feature) of what the bound into a cell by a
             move meets, in [0, 1], NaN where there is no such bound; None where awareness is that of
@@ -102,14 +97,13 @@ class Workspace(Summary):
         line of sight of the bounds into each.
 
         Args:
-            terrain: Dataset of `read_terrain` or `synthetic_terrain`; of a lazily read one, only a
-                strip is in memory at a time, and maps of pixels are not kept.
+            terrain: Dataset of `read_terrain` or `synthetic_terrain`.
             shape: Rows and columns of the planning grid.
             team: Lead and robots; by default a lead and three robots.
-            features: Definitions of the awareness features by name: names of pixel features for a
-                composite (see `terrain.FEATURES`), a mapping of names to `PixelFeature`, or one
-                `PixelFeature` in [0, 1] that is used unchanged. By default traversability and
-                visibility, of `terrain.TRAVERSABILITY` and `terrain.VISIBILITY`.
+            features: Features of awareness by name: names of pixel features for a composite (see
+                `terrain.FEATURES`), or one name of a feature in [0, 1] that is used unchanged. By
+                default traversability and visibility, of `terrain.TRAVERSABILITY` and
+                `terrain.VISIBILITY`.
             bounds: False for awareness of cells alone, as in the paper: traversability, and the
                 visibility of `terrain.PAPER_VISIBILITY`.
             sight: Assumed model of sight, or its mode: `"bare"`, `"wall"` or `"transmittance"`; of
@@ -117,9 +111,7 @@ class Workspace(Summary):
 
         Raises:
             TerrainError: A grid too fine for the raster, a cell without standing room for the team,
-                a DSM without the canopy that a sight needs, a terrain that is read lazily, unless
-                `bounds` is False, or a dataset that is no terrain: without dem, dsm or a metric
-                CRS, or with irregular coordinates.
+                a DSM without the canopy that a sight needs, or a dataset that is no terrain.
             TrustboError: No cell is passable, or an unknown mode of sight.
         """
         terrain, sights = require_terrain(terrain), sights_of(sight)
@@ -132,16 +124,11 @@ class Workspace(Summary):
             "visibility": VISIBILITY if bounds else PAPER_VISIBILITY,
         }
         with compiling():
-            maps = cell_maps(terrain, grid, features or defaults, team)
-            workspace = cls(
-                *maps.of_team(grid, team),
-                grid,
-                team,
-                terrain,
-                maps.pixels,
-                maps.composites,
-                sights=sights,
-            )
+            z, free, pixels, composites = cell_maps(terrain, grid, features or defaults, team)
+            z = np.repeat(z[None], team.n_robots, axis=0)
+            names = [name for name in pixels.data_vars if name != "passable"]
+            cells = labelled(z, free, grid, team, names)
+            workspace = cls(*cells, grid, team, terrain, pixels, composites, sights=sights)
             return workspace._with_line_of_sight() if bounds else workspace
 
     @classmethod
@@ -170,13 +157,16 @@ class Workspace(Summary):
             ShapeError: Axes that do not fit together.
             TrustboError: A value outside [0, 1], NaN in a passable cell, or no passable cell.
         """
-        z, free, bounds = of_cells(awareness, passable)
-        team = Team.of(team, len(z))
+        known = () if team is None else Team.of(team).names
+        features = as_names("features", features)
+        z, robots, features = unlabelled(awareness, known, features)
+        z, free, bounds = of_cells(z, passable)
+        team = Team(len(z), names=robots) if team is None else Team.of(team)
         if len(team.robots) != len(z):
             raise ShapeError(f"awareness has {len(z)} robots, the team {len(team.robots)}.")
         side = require_positive("cell_size", cell_size)
         grid = Grid((z.shape[1], z.shape[2]), 0.0, z.shape[1] * side, side, side)
-        names = as_names("features", features) or default_features(z.shape[3])
+        names = features or default_features(z.shape[3])
         if len(names) != z.shape[3]:
             raise ShapeError(f"features must be {z.shape[3]} names; got {names}.")
         made = cls(*labelled(z, free, grid, team, names), grid, team)
@@ -222,12 +212,12 @@ class Workspace(Summary):
 
     @cached_property
     def ground(self) -> Ways | None:
-        """Posts and ways over the terrain; None without a terrain in memory."""
+        """Posts and ways over the terrain; None without a terrain."""
         return self.ways_over(self.surface) if self.surface is not None else None
 
     @cached_property
     def surface(self) -> Surface | None:
-        """Rasters for position, motion and sight; None without a terrain in memory."""
+        """Rasters for position, motion and sight; None without a terrain."""
         if self.terrain is None or self.pixels is None:
             return None
         return surface_of(self.terrain, self.pixels["passable"].values.astype(bool))
@@ -250,7 +240,7 @@ class Workspace(Summary):
     def watch(self) -> WatchTable | None:
         """Posts from which bounds can be watched, and what is seen from them by the first sight.
 
-        None without a terrain in memory or an assumed sight.
+        None without a terrain or an assumed sight.
         """
         if self.ground is None or not self.sights:
             return None
@@ -263,7 +253,7 @@ class Workspace(Summary):
         Expected by the map, with T2 at the workspace's posts, over the cells that a path may go on
         to; in [0, 1], NaN where there is no bound. The bound enters the cell (row, col) by the
         move, one of the eight of `MOVES`. It is that of the assumed sight, the first of several;
-        None without a terrain in memory or an assumed sight.
+        None without a terrain or an assumed sight.
         """
         if (table := self.watch) is None:
             return None

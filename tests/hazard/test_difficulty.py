@@ -4,7 +4,7 @@ import numpy as np
 from worlds import random_cells, terrain_of
 
 import trustbo as tb
-from trustbo.workspace.difficulty import MEASURES, difficulty_of
+from trustbo.hazard.difficulty import MEASURES, difficulty_of
 
 
 def behind_a_wall(gap):

@@ -1,0 +1,64 @@
+"""KIND: terrains in memory are not checked for fills as files are: -9999, even declared by rio.nodata, is a height
+RIGHT: missing where declared, else refused as by read_terrain
+SOURCE: xdem#417, geoutils#522 (-9999 after arrays pass between packages)"""
+import os
+import sys
+import tempfile
+import warnings
+
+os.chdir(tempfile.mkdtemp())
+import numpy as np
+
+import trustbo as tb
+
+
+def tried(f):
+    """Kind of end (value, refused, crash), its value or message, and text of warnings."""
+    with warnings.catch_warnings(record=True) as got:
+        warnings.simplefilter("always")
+        try:
+            end = "value", f()
+        except tb.errors.TrustboError as error:
+            end = "refused", str(error)
+        except Exception as error:
+            end = "crash", f"{type(error).__name__}: {error}"
+    told = [str(w.message) for w in got if w.category is UserWarning]
+    return *end, " ".join(t for t in told if "no surface (DSM)" not in t)
+
+
+def done(right, line):
+    print(("right: " if right else "WRONG: ") + " ".join(str(line).split())[:300])
+    sys.exit(0 if right else 1)
+
+
+import rasterio
+from rasterio import Affine
+
+yy, xx = np.mgrid[:80, :80]
+GROUND = 300.0 + 12 * np.sin(xx / 15) + 9 * np.cos(yy / 20)
+
+
+def tif(name, a, crs="EPSG:32633", at=Affine(1, 0, 500000, 0, -1, 5200000), unit=None, scale=None, **kw):
+    a = np.asarray(a)
+    a = a if a.ndim == 3 else a[None]
+    with rasterio.open(name, "w", driver="GTiff", height=a.shape[1], width=a.shape[2], count=len(a),
+                       dtype=kw.pop("dtype", a.dtype), crs=crs, transform=at, **kw) as d:
+        d.write(a)
+        if unit:
+            d.units = [unit] * len(a)
+        if scale:
+            d.scales = [scale] * len(a)
+    return name
+
+
+read = tb.terrain.read_terrain
+
+import rioxarray  # noqa: F401
+import xarray as xr
+made = xr.DataArray(GROUND.copy(), {"y": 5200000 - np.arange(80.0), "x": 500000 + np.arange(80.0)}, ("y", "x")).rio.write_crs(32633)
+
+made[:16, :16] = -9999.0
+made = made.rio.write_nodata(-9999.0)
+end, got, told = tried(lambda: read(made, made))
+low = float(got.dem.min()) if end == "value" else None
+done(end == "refused" or bool(told) or low > -430, f"{end}: lowest {low} m; warned: {told!r}" if end == "value" else f"{end}: {got}")

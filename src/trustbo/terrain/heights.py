@@ -1,0 +1,175 @@
+"""From the values that a raster stores to heights in metres, NaN where they are missing."""
+
+import re
+import warnings
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pyproj
+
+from trustbo.errors import TerrainError
+
+LOWEST, HIGHEST = -450.0, 9000.0
+"""Range of heights on land, m: the Dead Sea's shore is at -430 m, Everest's summit at 8849 m."""
+_FILLS = (-99999.0, -32768.0, -32767.0, -9999.0)  # suspicious before a scale is applied, too
+_METRE = {"m", "metre", "metres", "meter", "meters"}
+_FOOT = {"ft", "foot", "feet", "ftus", "usft"}
+_US = {"us", "survey", "ftus", "usft"}
+_PACKAGE = str(Path(__file__).parents[1])
+
+
+class Vertical(NamedTuple):
+    """Meaning of a raster's heights.
+
+    Attributes:
+        unit: Name of their unit.
+        metres: Length of the unit, negative where values are depths.
+        datum: Name of the vertical datum; None if nothing declares one.
+    """
+
+    unit: str = "m"
+    metres: float = 1.0
+    datum: str | None = None
+
+
+class Coding(NamedTuple):
+    """How a raster stores heights: metres = vertical.metres * (scale * stored + offset).
+
+    Attributes:
+        name: Name of the raster, for messages.
+        fills: Stored values that mean missing.
+        scale: Scale.
+        offset: Offset.
+        vertical: Unit and datum.
+    """
+
+    name: str
+    fills: tuple[float, ...] = ()
+    scale: float = 1.0
+    offset: float = 0.0
+    vertical: Vertical = Vertical()
+
+
+def warn(message: str) -> None:
+    """Issue a warning that points to the caller of the package."""
+    warnings.warn(message, skip_file_prefixes=(_PACKAGE,), stacklevel=2)
+
+
+def decoded(
+    stored: np.ndarray, coding: Coding, hidden: np.ndarray | None = None, row: int = 0
+) -> np.ndarray:
+    """Convert stored values (row, col) to heights in metres, NaN where missing.
+
+    Missing are values that are not finite, declared fills and pixels that a mask hides.
+
+    Args:
+        stored: Values of the raster, or of some of its rows.
+        coding: How they are stored.
+        hidden: Mask of hidden pixels, (row, col).
+        row: Position of the first row in the raster, for messages.
+
+    Raises:
+        TerrainError: Values that are no real numbers, or that no height on land has: undeclared
+            fill values, fill values blended with heights, or heights in another unit.
+    """
+    if stored.dtype.kind not in "iuf":
+        raise TerrainError(
+            f"{coding.name} holds {stored.dtype}, which are no heights; give real numbers."
+        )
+    values = stored.astype(float)
+    missing = ~np.isfinite(values) if hidden is None else hidden | ~np.isfinite(values)
+    for fill in coding.fills:
+        missing |= values == _as_stored(fill, stored.dtype)
+    suspicious = np.isin(values, _FILLS if coding.scale != 1.0 else (*_FILLS, -999.0))
+    heights = coding.vertical.metres * (coding.scale * values + coding.offset)
+    heights[missing] = np.nan
+    wrong = ~missing & (suspicious | (heights < LOWEST) | (heights > HIGHEST))
+    if wrong.any():
+        raise _no_heights(coding, stored, heights, wrong, row)
+    return heights
+
+
+def _no_heights(
+    coding: Coding, stored: np.ndarray, heights: np.ndarray, wrong: np.ndarray, row: int
+) -> TerrainError:
+    """Error about values that are no heights, with the first of them and the likely cause."""
+    r, c = np.unravel_index(np.argmax(wrong), wrong.shape)
+    value, height = float(stored[r, c]), heights[r, c]
+    scaled = "" if value == height else f" (scaled to {height:g} m)"
+    where = f"{coding.name} holds {value!r}{scaled} at row {row + r}, column {c}"
+    share = wrong.sum() / np.isfinite(heights).sum()
+    if share > 0.5:
+        return TerrainError(
+            f"{where}, and {share:.0%} of its heights lie outside {LOWEST:g} to {HIGHEST:g} m: "
+            "they may be in another unit, such as centimetres; convert them, or declare their "
+            "scale, e.g. with gdal_edit.py -scale 0.01."
+        )
+    return TerrainError(
+        f"{where}, no height on land: a fill value that no tag declares, or one that resampling "
+        f"has blended with heights. Pass nodata={value!r}, or resample the raster again with its "
+        "fill value declared."
+    )
+
+
+def _as_stored(value: float, dtype: np.dtype) -> float:
+    """Value rounded to the raster's type: float32 holds no -3.4e38."""
+    with np.errstate(over="ignore"):
+        return float(dtype.type(value)) if dtype.kind == "f" else value
+
+
+def warn_of_zeros(heights: np.ndarray, name: str) -> None:
+    """Warn of pixels at exactly 0 m apart from all other heights: a fill that nobody declared."""
+    zero, low = heights == 0.0, np.abs(heights) <= 10.0
+    others = np.isfinite(heights).sum() - zero.sum()
+    if zero.any() and low.sum() < 1.1 * zero.sum() < 1.1 * others:  # else the ground is level
+        warn(
+            f"{name} is exactly 0 m on {zero.mean():.1%} of its pixels, and nearly nowhere else "
+            "below 10 m: zeros may be missing heights; pass nodata=0 if they are."
+        )
+
+
+def vertical_of(name: str, declared: object, crs: pyproj.CRS | None) -> Vertical:
+    """Find the unit and datum of heights; metres if nothing declares a unit.
+
+    Args:
+        name: Name of the raster.
+        declared: Unit of the band, or of each band, of which the first counts; None if unknown.
+        crs: Coordinate reference system, which may have a vertical axis.
+
+    Raises:
+        TerrainError: An unknown unit, or a band and a CRS that disagree.
+    """
+    axis = _vertical_axis(crs)
+    text = str(np.ravel(np.array(declared, object))[0] or "").strip()
+    if not text:
+        return axis or Vertical()
+    words = set(re.findall(r"[a-z]+", text.lower()))
+    if words & _METRE and not words & _FOOT:
+        unit, length = "m", 1.0
+    elif words & _FOOT and not words & _METRE:
+        unit, length = text, 1200.0 / 3937.0 if words & _US else 0.3048
+    else:
+        raise TerrainError(
+            f"{name} has heights in {text!r}; metres and feet are known: convert them, or declare "
+            "the true unit, e.g. with gdal_edit.py -units m."
+        )
+    if axis and abs(length / abs(axis.metres) - 1.0) > 1e-5:
+        raise TerrainError(
+            f"{name} has heights in {text!r} by its band, but in {axis.unit!r} by its CRS; declare "
+            "the true unit, e.g. with gdal_edit.py -units m, or the true CRS, with -a_srs."
+        )
+    return axis._replace(unit=unit) if axis else Vertical(unit, length)
+
+
+def _vertical_axis(crs: pyproj.CRS | None) -> Vertical | None:
+    """Unit, direction and datum of a CRS's vertical axis, if it has one."""
+    for axis in crs.axis_info if crs else ():
+        if axis.direction in ("up", "down"):
+            part = crs.sub_crs_list[-1] if crs and crs.is_compound else None
+            datum = (
+                "the ellipsoid" if part is None else part.datum.name if part.datum else part.name
+            )
+            metres = axis.unit_conversion_factor * (1.0 if axis.direction == "up" else -1.0)
+            return Vertical("m" if abs(metres) == 1.0 else axis.unit_name, metres, datum)
+    return None
