@@ -75,8 +75,8 @@ def driven(world: World, course: str, n: int, family: str, out) -> dict[str, Any
         _, mission = next(run)
         seconds.append(time.process_time() - started)
         now, best = truth.at(j), truth.at(j).best(*ends)
-        regret.append(now.regret(campaign.recommend()))
-        lost.append(now.value(mission.path).lost - now.value(best).lost)
+        regret.append(now.regret(campaign.recommend().path))
+        lost.append(now.lost(mission.path) - now.lost(best))
     missions = [workspace.fill(mission) for mission in campaign.missions]
     scores = tb.inference.score(campaign.posteriors, missions, workspace=workspace)
     far = np.abs(scores["pit"].values - 0.5)

@@ -24,7 +24,8 @@ from scipy.stats import binomtest
 import trustbo as tb
 from trustbo.inference import params_of
 from trustbo.models import PlaceEffect, PooledTrust, RobotEffect, TrustParams
-from trustbo.simulation import ModelSimulator, Truth
+from trustbo.planning import Planner
+from trustbo.simulation import ModelSimulator
 from trustbo.study import worlds
 from trustbo.study.world import COURSES
 from trustbo.terrain import synthetic_terrain
@@ -141,16 +142,16 @@ def absent(given):
         beta = np.array([0.15, 0.15, 0.35]) * rng.uniform(0.5, 1.5, 3)
         params = TrustParams(0.4, beta, 0.55 - beta.sum() * 0.6, 0.05, 0.08, x0_sd=0.1)
         simulator = ModelSimulator(workspace, params)
-        truth = Truth.of(simulator)
         ends = ((9, 0), (0, 9)) if seed % 2 else ((9, 4), (0, 5))
-        best = truth.value(truth.best(*ends)).lost
+        planner = Planner(workspace, *ends)
+        best = -planner.plan(params).value
         for name, model in kinds.items():
             result = tb.iterate(
                 workspace, *ends, n_iterations=15, simulator=simulator, model=model, seed=seed,
-                sampler="exact", progress=False, truth=truth,
+                sampler="exact", progress=False,
             )  # fmt: skip
-            results[name]["lost"].append(truth.value(result.plan).lost)
-            driven_on = [truth.value(m.path).lost for m in result.missions]
+            results[name]["lost"].append(-planner.evaluate(result.plan.path, params).value)
+            driven_on = [-planner.evaluate(m.path, params).value for m in result.missions]
             results[name]["learning"].append(np.mean(driven_on) - best)
             if name == "places":
                 sites = result.posterior["posterior"]

@@ -159,7 +159,7 @@ def banded(world: World, course: str, n: int) -> dict[str, Any]:
     for m, (campaign, _) in enumerate(_driven(world, course, n), start=1):
         if m in AFTER and m < n:
             low, high, path = _band(campaign)
-            values.append([low, high, truth.at(m).value(path).lost])
+            values.append([low, high, truth.at(m).lost(path)])
     return {"world": world.name, "kind": world.kind, "course": course, "n": n, "values": values}
 
 

@@ -24,7 +24,7 @@ from trustbo.models import PlaceEffect, PooledTrust, Priors, TrustParams
 from trustbo.planning import Planner, roll_trust
 from trustbo.plots import regret_curves
 from trustbo.report import write_report
-from trustbo.simulation import KinematicSimulator, ModelSimulator, Truth
+from trustbo.simulation import KinematicSimulator, ModelSimulator
 from trustbo.workspace.grid import Grid
 
 ENDS = (5, 0), (0, 5)
@@ -177,10 +177,6 @@ MISTAKES = {
     "a simulator's class": (
         lambda c: c.iterate(simulator=KinematicSimulator), "make one of the class"
     ),
-    "a simulator without a seed": (
-        lambda c: c.iterate(simulator=Own(run=lambda path: c.mission)),
-        "needs run.path, .*, seed.; the call of Own.run fails: got an unexpected .* 'seed'",
-    ),
     "a report in another format": (
         lambda c: write_report("rep.pdf", None), "'rep.pdf' must end in .html or .htm"
     ),
@@ -188,10 +184,6 @@ MISTAKES = {
         lambda c: tb.iterate(c.workspace, *ENDS, progress=False), "make the workspace with Work"
     ),
     "a rule's name": (lambda c: c.iterate(stop="converged"), "stop"),
-    "the truth of another grid": (
-        lambda c: c.iterate(truth=Truth.of(ModelSimulator(made(3, 5, 5, 2), TRUTH))),
-        "its grid is 5 x 5 cells of 50 m x 50 m at 0, 250, the campaign's 6 x 6",
-    ),
     "an unknown policy, of numpy": (
         lambda c: c.iterate(policy=np.str_("greedyy")), "choose one of greedy, optimistic"
     ),

@@ -64,7 +64,7 @@ class ModelSimulator:
     def __init__(self, workspace, truth=TRUTH, fail_at=None, blind=False):
         self.workspace, self.truth, self.fail_at, self.blind = workspace, truth, fail_at, blind
 
-    def run(self, path, *, seed):
+    def run(self, path, *, seed, mission=0):
         z = np.swapaxes(self.workspace.awareness.values[:, *zip(*path[1:], strict=True)], 0, 1)
         status = "ok"
         if self.fail_at is not None:

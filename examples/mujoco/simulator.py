@@ -3,7 +3,7 @@
     pip install mujoco
     python examples/mujoco/simulator.py
 
-It inherits bounds, formations and contacts from `KinematicSimulator` and replaces the motion.
+It inherits bounds, posts and contacts from `KinematicSimulator` and replaces the motion.
 Import it with this folder on the path, for example
 
     result = tb.iterate(workspace, start, goal, simulator=MujocoSimulator(workspace))
@@ -19,8 +19,9 @@ from vehicle import Physics, crop, grip_of, wheel_speeds
 
 import trustbo as tb
 from trustbo.errors import require_positive
+from trustbo.simulation import KinematicSimulator
 from trustbo.simulation.motion import ARRIVED, LOOKAHEAD
-from trustbo.simulation.overwatch import KinematicSimulator
+from trustbo.simulation.world import World
 from trustbo.team import Robot
 from trustbo.workspace import Workspace
 from trustbo.workspace.routes import SLOWEST
@@ -49,7 +50,7 @@ GRIP_SD, SLIP_SD = 0.1, 0.05
 class MujocoSimulator(KinematicSimulator):
     """Simulator of skid-steer robots with weight, grip and torque on the DEM as a heightfield.
 
-    Bounds, formations, routes and contacts are those of `KinematicSimulator`; motion along the
+    Bounds, posts, routes and contacts are those of `KinematicSimulator`; motion along the
     routes is physics. All robots are of the size of a Husky (1.0 x 0.7 x 0.4 m, 50 kg); the
     `max_slope` of a `Robot` sets the height of its centre of mass and the grip of its wheels: it
     tips over and slides some degrees beyond it. Robots steer for a point ahead, slow down on slopes
@@ -102,8 +103,9 @@ class MujocoSimulator(KinematicSimulator):
             "mujoco": mujoco.__version__,
         }
 
-    def _move(
+    def drive(
         self,
+        world: World,
         poses: np.ndarray,
         robots: Sequence[Robot],
         routes: Sequence[np.ndarray | None],
@@ -111,7 +113,7 @@ class MujocoSimulator(KinematicSimulator):
         max_ticks: int,
         rng: np.random.Generator,
     ) -> tuple[np.ndarray, str]:
-        """Drive robots at the same time: poses (tick, robot, 3) until all arrive or one fails."""
+        """See `KinematicSimulator.drive`."""
         legs: list[_Leg] = []
         for robot, route in zip(robots, routes, strict=True):
             if route is None:
@@ -123,12 +125,12 @@ class MujocoSimulator(KinematicSimulator):
         grip *= np.exp(GRIP_SD * rng.standard_normal(len(robots)))
         slip = np.exp(SLIP_SD * rng.standard_normal((max(1, max_ticks), len(robots), 2)))
         physics = Physics(
-            crop(self._surface, self._true_window(window), MARGIN),
+            crop(world.surface, self._true_window(world.surface, window), MARGIN),
             robots,
             grip.tolist(),
             self.tick / n_commands / n_steps,
         )
-        convoy = _Convoy(physics, legs, self._surface, self.stuck_after)
+        convoy = _Convoy(physics, legs, world.surface, self.stuck_after)
         physics.place(poses)
         track, status = [poses], "underway"
         for slip_now in slip:
@@ -141,9 +143,11 @@ class MujocoSimulator(KinematicSimulator):
                 break
         return np.stack(track[1:]), "timeout" if status == "underway" else status
 
-    def _true_window(self, window: tuple[int, int, int, int]) -> tuple[int, int, int, int]:
+    def _true_window(
+        self, true: Surface, window: tuple[int, int, int, int]
+    ) -> tuple[int, int, int, int]:
         """The window's pixels on the true surface, whose raster may be another."""
-        planned, true = self._ways.posts.surface, self._surface
+        planned = self.workspace.surface
         if planned.pixel == true.pixel and planned.origin == true.origin:
             return window
         y, x = planned.axes

@@ -177,9 +177,9 @@ def test_a_baseline_is_that_of_line_of_sight_at_first_and_leaves_a_path_that_is_
 
 
 def test_the_oracle_is_without_regret_in_the_world_of_each_mission(workspace, tmp_path):
-    blind = [Degradation(robot, 0.0, 1, 1) for robot in ("r1", "r2")]
-    simulator = KinematicSimulator(workspace, degradations=blind)
-    truth = Truth.of(simulator, standard_error=0.05, folder=tmp_path)
+    blind = [Degradation(robot, 0.0, first=1, last=1) for robot in ("r1", "r2")]
+    simulator = KinematicSimulator(workspace, events=blind)
+    truth = Truth.of(simulator, n_replicates=1, folder=tmp_path)
     policy = oracle.Oracle(truth)
     now = Planner(workspace, START, GOAL, "lost_contact", max_bounds="shortest+2")
     campaign = SimpleNamespace(planner=now, planner_now=lambda: now)
@@ -190,7 +190,7 @@ def test_the_oracle_is_without_regret_in_the_world_of_each_mission(workspace, tm
         assert policy.choose(now, np.random.default_rng(0)) == chosen[-1]
         policy.learn(campaign, None)
     assert chosen[0] == chosen[2]
-    lost = [truth.at(mission).value(path).lost for mission, path in enumerate(chosen)]
+    lost = [truth.at(mission).lost(path) for mission, path in enumerate(chosen)]
     assert lost[1] > lost[0]  # another world
     with pytest.raises(TrustboError, match="the oracle needs the truth of the scene"):
         oracle.Oracle(None).recommend(campaign)

@@ -30,7 +30,7 @@ class Trap:
     def __init__(self, workspace, bound):
         self.inner, self.bound = ModelSimulator(workspace), bound
 
-    def run(self, path, *, seed):
+    def run(self, path, *, seed, mission=0):
         bounds = list(itertools.pairwise(path))
         fail_at = bounds.index(self.bound) + 1 if self.bound in bounds else None
         self.inner.fail_at = fail_at

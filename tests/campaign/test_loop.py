@@ -183,7 +183,7 @@ def test_saving_over_another_result_leaves_nothing_of_it(result, workspace, tmp_
 
 def test_a_run_that_dies_has_saved_its_missions(workspace, tmp_path):
     class Dies(ModelSimulator):
-        def run(self, path, *, seed):
+        def run(self, path, *, seed, mission=0):
             if len(list((tmp_path / "run" / "posteriors").glob("*.nc"))) == 2:
                 raise OSError("radio lost")
             return super().run(path, seed=seed)
@@ -238,7 +238,7 @@ def test_the_record_is_plain_json(result, tmp_path):
 
 def test_a_simulator_that_swaps_row_and_col_is_refused(workspace):
     class Swapped(ModelSimulator):
-        def run(self, path, *, seed):
+        def run(self, path, *, seed, mission=0):
             mission, swapped = super().run(path, seed=seed), [(col, row) for row, col in path]
             return tb.Mission.from_arrays(swapped, mission.awareness, mission.contact_rate)
 

@@ -91,7 +91,7 @@ def test_the_loop_goes_on_and_drives_no_mission_twice(workspace, tmp_path, monke
     driven = []
 
     class Counts(ModelSimulator):
-        def run(self, path, *, seed):
+        def run(self, path, *, seed, mission=0):
             driven.append(seed)
             return super().run(path, seed=seed)
 
@@ -251,14 +251,12 @@ def test_robots_and_features_are_put_in_order_by_their_names(workspace):
 def test_poses_and_states_follow_their_robots():
     terrain = hillside()
     workspace = tb.Workspace.from_terrain(terrain, (3, 3))
-    simulator = tb.simulation.KinematicSimulator(workspace, record_states=True)
-    mission = simulator.run([(2, 0), (1, 1)], seed=0)
+    mission = tb.simulation.KinematicSimulator(workspace).run([(2, 0), (1, 1)], seed=0)
     turned = mission.in_order(["r2", "r3", "r1"], mission.features)
     a, b = mission.bounds[0], turned.bounds[0]
     np.testing.assert_array_equal(b.poses[:, 0], a.poses[:, 0])  # the lead
     np.testing.assert_array_equal(b.poses[:, 1], a.poses[:, 2])
     np.testing.assert_array_equal(b.contact[:, 2], a.contact[:, 0])
-    np.testing.assert_array_equal(b.states[:, 0], a.states[:, 1])
     back = turned.in_order(mission.robots, mission.features).bounds[0]
     np.testing.assert_array_equal(back.poses, a.poses)
     with pytest.raises(tb.ShapeError, match="the mission has"):
@@ -490,18 +488,13 @@ def test_settings_of_a_simulator_survive_a_file(workspace, tmp_path):
         {"team": tb.Team(robots=(tb.Robot(speed=1.0),) * 3)},
         {"terrain": tb.terrain.synthetic_terrain((120.0, 120.0), seed=9)},
         {"bound_timeout": 99.0},
-        {"threats": [tb.simulation.Threat("jam", (380030.0, 5224950.0), 12.0, strength=0.4)]},
-        {"degradations": [tb.simulation.Degradation("r1", 0.4)]},
-        {"events": [tb.simulation.Dust(0.5)]},
+        {"events": [tb.simulation.Degradation("r1", 0.4)]},
     ],
 )
 def test_the_description_of_the_simulator_is_complete(changed):
     terrain = hillside()
     workspace = tb.Workspace.from_terrain(terrain, (3, 3))
-    before = {
-        "threats": [tb.simulation.Threat("jam", (380030.0, 5224950.0), 12.0, strength=0.5)],
-        "degradations": [tb.simulation.Degradation("r1", 0.5)],
-    }
+    before = {"events": [tb.simulation.Degradation("r1", 0.5)]}
     one = tb.simulation.KinematicSimulator(workspace, **before).describe()
     other = tb.simulation.KinematicSimulator(workspace, **before | changed).describe()
     told = [name.removeprefix("true_") for name in one if one[name] != other[name]]

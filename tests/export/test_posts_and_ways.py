@@ -157,7 +157,7 @@ def test_where_a_robot_has_no_way_it_has_no_line(plan, tmp_path):
 def test_what_is_exported_is_what_is_driven(plan, workspace, slip, tmp_path, monkeypatch):
     """Within a pixel of 1 m, and .5 m more with slip."""
     if not slip:
-        of_simulator = "trustbo.simulation.overwatch.np.random.default_rng"
+        of_simulator = "trustbo.simulation.kinematic.np.random.default_rng"
         monkeypatch.setattr(of_simulator, lambda *_: Steady())
     mission = tb.simulation.KinematicSimulator(workspace).run(plan.path, seed=0)
     assert mission.status == "ok"

@@ -21,10 +21,10 @@ def driven():
     """Two missions with ticks, the first with states too, and one of a log without."""
     terrain = hillside()
     workspace = tb.Workspace.from_terrain(terrain, (3, 3), tb.Team(n_robots=2))
-    simulators = [
-        tb.simulation.KinematicSimulator(workspace, record_states=keep) for keep in (True, False)
-    ]
-    missions = [s.run([(2, 0), (1, 1)], seed=0) for s in simulators]
+    plain = tb.simulation.KinematicSimulator(workspace).run([(2, 0), (1, 1)], seed=0)
+    shape = *plain.bounds[0].contact.shape, len(tb.logs.netcdf.STATES)
+    states = np.random.default_rng(0).uniform(size=shape)
+    missions = [replace(plain, bounds=(replace(plain.bounds[0], states=states),)), plain]
     z, names = np.full((1, 2, 3), 0.5), workspace.features
     log = Mission.from_arrays([(2, 0), (1, 1)], z, np.full((1, 2), 0.5), features=names)
     return [*missions, log]

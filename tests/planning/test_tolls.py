@@ -50,7 +50,7 @@ def test_the_time_unseen_is_that_of_missions_where_the_map_is_right(workspace):
         time = seen.lead_time + seen.times.max(1)
         shares = [
             1.0 - np.concatenate([bound.contact.any(1) for bound in mission.bounds]).mean()
-            for mission in simulator.run_batch(path, range(12))
+            for mission in (simulator.run(path, seed=seed) for seed in range(12))
         ]
         errors.append(seen.unseen() @ time / time.sum() - np.mean(shares))
     assert np.abs(errors).max() < 0.02  # 16 times in each phase, and robots slip

@@ -10,8 +10,7 @@ from trustbo.errors import TrustboError
 from trustbo.simulation import RadioSimulator, Truth
 from trustbo.simulation.radio import expected_rate
 from trustbo.team import Robot, Team
-from trustbo.workspace import Workspace
-from trustbo.workspace.moves import moves_along
+from trustbo.workspace import Sight, Workspace
 
 PATH = ((2, 0), (1, 1), (1, 2), (0, 1))
 
@@ -31,14 +30,13 @@ def test_the_expected_rate_is_that_of_quadrature(mean):
 
 def test_its_truth_is_the_mean_of_its_missions(radio):
     known, n = Truth.of(radio), 1500
-    rates = np.stack([radio.run(PATH, seed=seed).contact_rate for seed in range(n)])
+    rates = np.stack([radio.run(PATH, seed=seed).contact_rate.mean(1) for seed in range(n)])
     error = rates.std(0) / n**0.5
-    np.testing.assert_array_less(np.abs(known.bounds.contact(PATH) - rates.mean(0)), 4.5 * error)
+    np.testing.assert_array_less(np.abs(known._along(PATH)[0] - rates.mean(0)), 4.5 * error)
     assert known.at(7) is known
-    assert known.value(PATH).p_arrive == 1.0
-    assert known.standard_error == 0.0
+    assert known.p_arrive(PATH) == 1.0
     best = known.best((2, 0), (0, 2))
-    assert known.value(best).lost <= known.value(((2, 0), (1, 1), (0, 2))).lost
+    assert known.lost(best) <= known.lost(((2, 0), (1, 1), (0, 2)))
 
 
 def test_contact_is_the_formula_of_distance_canopy_and_field():
@@ -66,30 +64,19 @@ def test_contact_is_the_formula_of_distance_canopy_and_field():
 def test_it_shares_nothing_with_line_of_sight():
     terrain = hillside()
     short = Team(robots=(Robot(lidar_range=5.0, detection=0.1),) * 3)
-    one, other = (
-        RadioSimulator(Workspace.from_terrain(terrain, (3, 3), sight=sight), terrain=terrain)
-        for sight in ("wall", "bare")
-    )
-    np.testing.assert_array_equal(one.mean, other.mean)
+    one = RadioSimulator(Workspace.from_terrain(terrain, (3, 3), sight=Sight(extinction=1.0)))
     own = RadioSimulator(Workspace.from_terrain(terrain, (3, 3), short))
     np.testing.assert_array_equal(one.mean, own.mean)
-    contact = Truth.of(one).bounds.contact(PATH)
-    rates = expected_rate(one.mean)[:, moves_along(PATH), *np.array(PATH)[1:].T].T
-    np.testing.assert_array_equal(contact, rates)
 
 
 def test_missions_are_seeded_and_the_field_is_drawn_from_the_terrain(radio):
     a, b, c = (radio.run(PATH, seed=seed) for seed in (0, 0, 1))
     np.testing.assert_array_equal(a.contact_rate, b.contact_rate)
     assert not np.array_equal(a.contact_rate, c.contact_rate)
-    again = RadioSimulator(radio.workspace)
-    assert again.describe() == radio.describe()
-    other = RadioSimulator(radio.workspace, seed=1)
-    assert not np.allclose(other.mean, radio.mean)
+    assert RadioSimulator(radio.workspace).describe() == radio.describe()
+    assert not np.allclose(RadioSimulator(radio.workspace, seed=1).mean, radio.mean)
 
 
-def test_impossible_radio_simulators_are_refused(radio):
-    with pytest.raises(TrustboError, match="the radio simulator needs a terrain"):
+def test_a_workspace_without_terrain_is_refused():
+    with pytest.raises(TrustboError):
         RadioSimulator(random_cells())
-    with pytest.raises(TrustboError, match="a path needs at least two cells"):
-        radio.run([(0, 0)], seed=0)

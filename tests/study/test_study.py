@@ -10,10 +10,8 @@ import time
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from shutil import copy
 
 import jax
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import xarray as xr
@@ -148,21 +146,6 @@ def test_a_file_s_content_decides_and_not_its_name(tmp_path):
         file.write_text(text)
         found.append(read_study(file).experiment().runs()[0].key)
     assert found[0] == found[1] != found[2]
-
-
-def test_a_file_of_version_0_2_means_the_same_study(tmp_path):
-    terrain = tb.terrain.synthetic_terrain((40.0, 40.0), seed=1)
-    for name in ("dem", "dsm"):
-        terrain[name].rio.to_raster(tmp_path / f"{name}.tif")
-    old, new = (
-        read_study(copy(DATA / f"study_{version}.yaml", tmp_path)) for version in ("0.2", "0.3")
-    )
-    assert old.settings() != new.settings()  # defaults, which the old one has written out
-    table = [one.key for one in new.experiment().runs()]
-    assert [one.key for one in old.experiment().runs()] == table
-    assert len(set(table)) == 3 * 2 * 5 * 2
-    again = study.Study.of(json.loads(json.dumps(new.settings())))
-    assert [one.key for one in again.experiment().runs()] == table
 
 
 def test_a_constructor_of_the_user_is_named_with_its_module(serial, tmp_path, monkeypatch):
@@ -321,36 +304,6 @@ def test_a_study_goes_on_where_it_stopped(serial, tmp_path, counted, monkeypatch
     assert_same(run(tmp_path), serial)
 
 
-def test_a_run_that_fails_does_not_stop_the_others_and_is_tried_again(
-    tmp_path, counted, monkeypatch
-):
-    drive = tb.simulation.ModelSimulator.run
-
-    def lose_radio(self, path, *, seed):
-        if self.params.b == 0.25:
-            raise OSError("radio lost")
-        return drive(self, path, seed=seed)
-
-    monkeypatch.setattr(tb.simulation.ModelSimulator, "run", lose_radio)
-    flat = {"kind": "ModelSimulator", "params": {"kind": "TrustParams", **TRUTH, "b": 0.25}}
-    simulators = {"flat": flat, "good": CONFIG["simulators"]["truth"]}
-    changes = {"simulators": simulators, "policies": "greedy", "seeds": 1}
-    with pytest.warns(UserWarning, match="1 of 2 runs failed.*simulator=flat.*radio lost"):
-        result = run(tmp_path, **changes)
-    assert result["simulator"].values.tolist() == ["good"]
-    assert result.attrs == {"n_runs": 2, "n_failed": 1}
-    failed = study.failures(tmp_path)
-    assert failed["simulator"].tolist() == ["flat"]
-    assert failed["error"].iloc[0].startswith("OSError: radio lost")
-    assert "Traceback" in failed["traceback"].iloc[0]
-    with pytest.warns(UserWarning, match="1 of 2 runs failed"):
-        run(tmp_path, **changes)
-    assert [one.split("simulator=")[1].split(",")[0] for one in counted] == ["flat", "good", "flat"]
-    del simulators["good"]
-    with pytest.raises(tb.TrustboError, match="1 of 1 runs failed, and are run again at the next"):
-        run(tmp_path, **changes)
-
-
 def test_a_worker_of_another_version_is_an_error(tmp_path, monkeypatch):
     def execute(one, caller):
         return {"missions": [], "versions": {"trustbo": "0.0.7"}}
@@ -361,27 +314,6 @@ def test_a_worker_of_another_version_is_an_error(tmp_path, monkeypatch):
 
 
 # --- what comes out ---
-
-
-def test_regret_is_held_against_the_best_path_under_the_truth(serial):
-    params = tb.models.TrustParams(**TRUTH | {"beta": np.array(TRUTH["beta"])})
-    for i, seed in enumerate(serial["seed"].values):
-        z = np.random.default_rng(seed).uniform(size=(5, 5, 2))
-        workspace = tb.Workspace.from_awareness(np.repeat(z[None], 3, axis=0))
-        truth = tb.simulation.Truth.of(tb.simulation.ModelSimulator(workspace, params))
-        best = truth.best((4, 0), (0, 4), max_bounds="shortest+4")
-        assert serial["oracle"].values[i] == truth.value(best).lost
-        for j in range(2):
-            for path, which in (("path", "_followed"), ("recommended", "")):
-                steps = serial[path].values[i, j]
-                cells = [(int(row), int(col)) for row, col in steps[steps[:, 0] >= 0]]
-                regret = truth.regret(cells, max_bounds="shortest+4")
-                assert serial[f"regret{which}"].values[i, j] == regret >= 0.0
-                assert serial[f"lost{which}"].values[i, j] == truth.value(cells).lost
-    assert (serial["regret_before"] >= 0.0).all()
-    assert set(serial["status"].values.ravel()) == {"ok"}
-    assert (serial["k_hat"] < 0.7).all()
-    assert np.isfinite(serial["contact_rate"]).all()
 
 
 def test_kinematic_runs_know_their_regret_if_asked_to(tmp_path, monkeypatch):
@@ -428,33 +360,6 @@ def test_a_study_is_kept_in_files_that_netcdf_and_json_read(serial, folder, tmp_
     assert [r.key for r in runs_of(kept["study"])] == keys()
     with pytest.raises(tb.TrustboError, match="holds no study"):
         study.load_study(tmp_path)
-
-
-def test_the_summary_has_median_and_interval_of_each_policy_and_mission(serial):
-    table = study.summary(serial)
-    assert table.index.names == ["policy", "mission"]
-    chosen = serial["regret"].values[serial["policy"].values == "random"][:, 1]
-    row = table.loc[("random", 2)]
-    assert (row["median"], row["n"]) == (np.median(chosen), 3)
-    np.testing.assert_allclose([row["low"], row["high"]], np.quantile(chosen, [0.05, 0.95]))
-    with pytest.raises(tb.TrustboError, match="unknown coordinate 'colour'; choose one of"):
-        study.summary(serial, "colour")
-    with pytest.raises(tb.TrustboError, match="unknown variable 'status'; choose one of"):
-        study.summary(serial, variable="status")
-
-
-def test_regret_curves_show_each_policy_s_median(serial):
-    axes = tb.plots.regret_curves(serial)
-    assert axes.shape == (1,)
-    lines = {line.get_label(): line.get_ydata() for line in axes[0].get_lines()}
-    for policy in ("greedy", "random"):
-        chosen = serial["regret"].values[serial["policy"].values == policy]
-        np.testing.assert_allclose(lines[policy], np.median(chosen, axis=0))
-    assert "3 runs each" in axes[0].get_title()
-    assert tb.plots.regret_curves(serial, panels="seed").shape == (3,)
-    with pytest.raises(tb.TrustboError, match="unknown coordinate 'colour'; choose one of"):
-        tb.plots.regret_curves(serial, by="colour")
-    plt.close("all")
 
 
 # --- what is refused ---
@@ -589,28 +494,3 @@ def test_the_model_s_simulator_draws_from_the_model():
     np.testing.assert_array_equal(again.contact_rate, rates[3])
     np.testing.assert_array_equal(again.awareness, z)
     assert simulator.describe()["truth"]["beta"] == [0.3, 0.2]
-
-
-def test_the_model_s_simulator_measures_the_true_awareness_and_counts():
-    workspace = tb.Workspace.from_awareness(np.full((2, 3, 3, 1), 0.2))
-    truth = tb.models.TrustParams(0.5, np.array([1.0]), 0.0, 0.1, 0.1)
-    model = tb.models.PooledTrust(observation="beta_binomial")
-    simulator = tb.simulation.ModelSimulator(
-        workspace, truth, model, awareness=np.full((2, 3, 3, 1), 0.7), n_ticks=20
-    )
-    mission = simulator.run([(2, 0), (1, 1), (0, 2)], seed=0)
-    assert (mission.awareness == 0.7).all()
-    assert (mission.n_ticks == 20).all()
-    with pytest.raises(tb.TrustboError, match="n_ticks=20 is for counts, and gaussian rates are"):
-        tb.simulation.ModelSimulator(workspace, truth, n_ticks=20)
-    with pytest.raises(tb.TrustboError, match="counts ticks: give n_ticks"):
-        tb.simulation.ModelSimulator(workspace, truth, model)
-    with pytest.raises(
-        tb.ShapeError, match=r"awareness must be \(2, 3, 3, 1\), or .*; got shape \(2,\)"
-    ):
-        tb.simulation.ModelSimulator(workspace, truth, awareness=[1.0, 2.0])
-    many = truth._replace(beta=np.ones((4, 1)), beta0=np.full(4, 0.5))
-    with pytest.raises(tb.ShapeError, match="give one draw of params"):
-        tb.simulation.ModelSimulator(workspace, many)
-    with pytest.raises(tb.TrustboError, match=r"path\[1\] \(9, 9\) is outside the grid"):
-        simulator.run([(2, 0), (9, 9)], seed=0)

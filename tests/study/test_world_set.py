@@ -7,12 +7,10 @@ import itertools
 import numpy as np
 import pytest
 
-from trustbo.planning.paths import AdmissiblePaths, PathClass
-from trustbo.simulation import KinematicSimulator, RadioSimulator
+from trustbo.simulation import KinematicSimulator, RadioSimulator, Truth
 from trustbo.simulation.events import Event
-from trustbo.simulation.replicates import KinematicReplicates, edges_of
+from trustbo.simulation.replicates import table_of
 from trustbo.study import worlds
-from trustbo.study.kept import most_kept
 from trustbo.study.world import COURSES, REAL, SIMULATORS, drawn
 
 OLD = {"right": 7, "wall": 3, "bare": 3, "aged": 6, "canopy": 7, "slopes": 3}
@@ -46,13 +44,13 @@ def test_the_audit_s_cases_are_rows(listed):
     assert cases >= {"rain", "dead-detector", "jammer-lifted", "thin-canopy"}
     assert listed["synthetic-0"].case == "right"
     rain = listed["synthetic-0-rain"].events
-    assert [(e.robot, e.detection, e.first_mission, e.last_mission) for e in rain] == [
+    assert [(e.robot, e.detection, e.first, e.last) for e in rain] == [
         ("r2", 0.3, day, day) for day in (1, 3, 4, 7)
     ]
     (dead,) = listed["synthetic-0-dead-detector"].events
-    assert (dead.detection, dead.first_mission, dead.last_mission) == (0.0, 6, None)
+    assert (dead.detection, dead.first, dead.last) == (0.0, 6, None)
     (lifted,) = listed["synthetic-0-jammer-lifted"].events
-    assert (lifted.first_mission, lifted.last_mission) == (0, 5)
+    assert (lifted.first, lifted.last) == (0, 5)
 
 
 def test_no_two_worlds_are_the_same(listed):
@@ -95,18 +93,13 @@ def test_under_the_true_limit_a_path_leads_to_the_goal_on_both_courses(world, re
     if not world.is_packaged:
         world = dataclasses.replace(world, data=str(request.getfixturevalue("real_data")))
     workspace = world.workspace()
-    edges = edges_of(workspace)
-    passed = np.full((8, *world.shape, 9), np.nan)
-    runs = KinematicReplicates(world.simulator(workspace), 0, 0).run(edges, 0)
-    for edge, outcomes in zip(edges, runs, strict=True):
-        for after, (_, status) in zip(edge.next_moves, outcomes, strict=True):
-            passed[edge.move, *edge.cell, after] = status == "ok"
+    passed = Truth.of(world.simulator(workspace), n_replicates=1).bounds["passed"].values
     assert np.nanmin(passed) == 0.0
-    # Of contact on the last bound alone, a path keeps its chance to arrive.
-    last = np.where(np.arange(9) == 8, 1.0, 0.0) + 0.0 * passed
+    # Where every bound that passes keeps all contact, a path that arrives loses none.
+    truth = Truth(workspace, table_of(np.where(np.isfinite(passed), 1.0, np.nan), passed))
     for course in ("sw-ne", "nw-se"):
-        paths = AdmissiblePaths(workspace, *world.ends(course), PathClass(8, "shortest+4"))
-        assert most_kept(last, passed, paths).max() == 1.0
+        path = truth.best(*world.ends(course), failures=True)
+        assert truth.lost_or_failed(path) == 0.0
 
 
 def test_at_least_half_of_the_new_worlds_are_drawn_by_rule(listed):

@@ -12,7 +12,6 @@ from trustbo.errors import ShapeError, TerrainError, TrustboError
 from trustbo.inference import fit
 from trustbo.models import PooledTrust
 from trustbo.simulation import KinematicSimulator
-from trustbo.simulation.sensing import detections
 from trustbo.team import Robot, Team
 from trustbo.terrain import read_terrain, synthetic_terrain
 from trustbo.workspace import Sight, Workspace
@@ -116,7 +115,7 @@ def test_a_higher_sensor_sees_no_less_and_changes_its_robot_alone():
 @pytest.mark.parametrize("name", ["synthetic", "wellington", "tahoe", "topography"])
 @pytest.mark.filterwarnings("ignore:.*enters its composite", "ignore:the first component of")
 def test_line_of_sight_predicts_the_simulator_without_noise(name, real_terrain):
-    """All the difference is T2's own route, and slip; `benchmarks/line_of_sight.py` has more."""
+    """All the difference is T2's own route, and slip."""
     made = synthetic_terrain((500.0, 500.0), resolution=2.0, seed=1)
     terrain = made if name == "synthetic" else read_terrain(*real_terrain(name))
     workspace = Workspace.from_terrain(terrain, (10, 10))
@@ -126,16 +125,13 @@ def test_line_of_sight_predicts_the_simulator_without_noise(name, real_terrain):
     for b in rng.permutation(len(index))[:60]:
         (m, row, col), (a, c) = index[b], pairs[b]
         ahead = [n for p, n in pairs if p == c and n != a]
-        drives = []
-        for n in ahead:
-            state = simulator.standing(a, c)
-            drives.append(simulator._drive(state, 1, c, n, np.random.default_rng(0)))
-        if any(drive.status != "ok" for drive in drives):
+        world, state = simulator.world(), simulator.standing(a, c)
+        found = simulator.contact_ahead(world, state, c, ahead, np.random.default_rng(0))
+        if any(status != "ok" for _, status, _ in found):
             continue
-        rates = [f.mean(0) for f in detections(simulator._now, simulator.team, drives)]
-        simulated.append(np.mean(rates, axis=0))
-        expected.append(workspace.bound_awareness.values[:, m, row, col, 2])
-    expected, simulated = np.ravel(expected), np.ravel(simulated)
+        simulated.append(np.mean([contact for contact, _, _ in found]))
+        expected.append(workspace.bound_awareness.values[:, m, row, col, 2].mean())
+    expected, simulated = np.array(expected), np.array(simulated)
     assert np.corrcoef(expected, simulated)[0, 1] > 0.95
     assert abs((expected - simulated).mean()) < 0.02
 
@@ -193,7 +189,7 @@ def test_what_is_planned_is_what_is_driven(wooded, slip, tolerance, monkeypatch)
     """Within a pixel of 1 m, and .5 m more with slip."""
     simulator, path = KinematicSimulator(wooded), [A, C, NEXT, (0, 3)]
     if not slip:
-        of_simulator = "trustbo.simulation.overwatch.np.random.default_rng"
+        of_simulator = "trustbo.simulation.kinematic.np.random.default_rng"
         monkeypatch.setattr(of_simulator, lambda *_: Steady())
     mission = simulator.run(path, seed=0)
     for k, bound in enumerate(mission.bounds):
@@ -254,8 +250,9 @@ def test_without_a_terrain_there_are_no_posts():
 
 
 def test_missing_awareness_of_a_mission_is_filled(wooded):
-    mission = KinematicSimulator(wooded).run([A, C, NEXT], seed=0)
-    assert np.isnan(mission.awareness[..., 2]).all()
+    measured = np.stack([np.full((2, 2), 0.4), np.full((2, 2), 0.3), np.full((2, 2), np.nan)], -1)
+    names = wooded.features
+    mission = Mission.from_arrays([A, C, NEXT], measured, np.full((2, 2), 0.5), features=names)
     filled = wooded.fill(mission)
     expected = wooded.bound_awareness.sel(move="ne", feature="line_of_sight")
     np.testing.assert_array_equal(filled.awareness[0, :, 2], expected.sel(row=2, col=1))

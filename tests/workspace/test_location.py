@@ -10,7 +10,7 @@ from rasterio.transform import from_origin, rowcol
 import trustbo as tb
 from trustbo.errors import TrustboError
 from trustbo.planning import Planner
-from trustbo.simulation import ModelSimulator, Truth
+from trustbo.simulation import ModelSimulator
 from trustbo.workspace import Workspace, survey
 from trustbo.workspace.grid import Grid
 from trustbo.workspace.location import cell_of, named, position_near
@@ -59,8 +59,6 @@ def test_every_user_of_a_cell_takes_a_position(walled):
     campaign = tb.Campaign(walled, start, goal)
     assert campaign.settings["start"] == [3, 0]
     simulator = ModelSimulator(walled, tb.models.TrustParams(0.5, [0.2, 0.1], 0.2, 0.05, 0.05))
-    truth = Truth.of(simulator)
-    assert truth.best(start, goal) == truth.best((3, 0), (0, 3))
     options = {"simulator": simulator, "n_iterations": 1, "progress": False}
     model = tb.models.PooledTrust()
     result = tb.iterate(walled, start, goal, sampler="exact", model=model, **options)

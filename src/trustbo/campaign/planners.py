@@ -75,12 +75,5 @@ def to_avoid(risk: BoundRisk) -> np.ndarray:
 
 
 def path_class(planner: Planner) -> dict[str, Any]:
-    """Arguments of `Truth.best` and `Truth.regret` for the planner's admissible paths.
-
-    The objective is contact lost, or mean contact where that is the planner's.
-    """
-    return {
-        "objective": "mean" if planner.objective == "mean" else "lost_contact",
-        "max_bounds": planner.max_bounds,
-        "connectivity": planner.connectivity,
-    }
+    """Arguments of `Truth.best` and `Truth.regret` for the planner's admissible paths."""
+    return {"max_bounds": planner.max_bounds, "connectivity": planner.connectivity}

@@ -12,7 +12,7 @@ from trustbo.errors import TrustboError, require_whole
 from trustbo.files import to_json
 from trustbo.planning import Plan
 from trustbo.simulation import KinematicSimulator, Truth
-from trustbo.simulation.protocol import Simulator, require_call, takes
+from trustbo.simulation.protocol import Simulator
 
 if TYPE_CHECKING:
     from trustbo.campaign.campaign import Campaign
@@ -32,13 +32,11 @@ def run_missions(
     if isinstance(runner, type) or not callable(getattr(runner, "run", None)):
         made = "; make one of the class" if isinstance(runner, type) else ""
         raise TrustboError(
-            f"a simulator needs run(path, *, seed) -> Mission; got {runner!r}{made}."
+            f"a simulator needs run(path, *, seed, mission) -> Mission; got {runner!r}{made}."
         )
-    require_call(runner, "run", [], seed=0)
     if truth is not None:
         if not isinstance(truth, Truth):
             raise TrustboError(f"truth must be Truth.of(simulator); got {truth!r}.")
-        truth.require_workspace(campaign.workspace)
     rules = require_stops(stop)
     describe = getattr(runner, "describe", lambda: {"simulator": type(runner).__name__})
     # As a file gives them back: tuples are lists there, and arrays too.
@@ -55,7 +53,6 @@ def _run_missions(
     rules: list[Stop],
     progress: bool,
 ) -> Iterator[tuple[Plan, Mission]]:
-    numbered = takes(runner.run, "mission")
     with Progress(campaign, n_iterations, progress) as shown:
         while True:
             n = len(campaign.missions)
@@ -66,13 +63,10 @@ def _run_missions(
             if n >= n_iterations:
                 break
             plan = campaign.ask()
-            settings: dict[str, Any] = {"seed": campaign.seed_of("mission")}
-            if numbered:  # its world changes
-                settings["mission"] = n
-            mission = runner.run(plan.path, **settings)
+            mission = runner.run(plan.path, seed=campaign.seed_of("mission"), mission=n)
             extra = {}
             if truth is not None:
-                extra["regret"] = truth.at(n).regret(plan, **path_class(campaign.planner))
+                extra["regret"] = truth.at(n).regret(plan.path, **path_class(campaign.planner))
             campaign.tell(mission, **extra)
             shown.step()
             for callback in campaign.options.callbacks:

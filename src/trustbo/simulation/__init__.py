@@ -1,14 +1,15 @@
 """Simulators of bounding overwatch, and replay of recorded missions."""
 
-from trustbo.simulation.events import Degradation, Dust, Fouling, Season, Threat, Vegetation
+from trustbo.simulation.events import Degradation, Dust, Fouling, Jam, Season, Trees
+from trustbo.simulation.kinematic import KinematicSimulator
 from trustbo.simulation.model import ModelSimulator
-from trustbo.simulation.overwatch import KinematicSimulator
 from trustbo.simulation.radio import RadioSimulator
+from trustbo.simulation.realtime import RealtimeAwareness
 from trustbo.simulation.replay import ReplaySimulator
 from trustbo.simulation.truth import Truth
 
 __all__ = [
-    "Degradation", "Dust", "Fouling", "KinematicSimulator", "ModelSimulator",
-    "RadioSimulator", "ReplaySimulator", "Season", "Threat", "Truth", "Vegetation",
+    "Degradation", "Dust", "Fouling", "Jam", "KinematicSimulator", "ModelSimulator",
+    "RadioSimulator", "RealtimeAwareness", "ReplaySimulator", "Season", "Trees", "Truth",
 ]  # fmt: skip
 __dir__ = __all__.copy  # completion lists public names alone

@@ -1,46 +1,34 @@
-"""Protocols of simulators: whole missions, or one bound after the other."""
+"""Protocol of simulators, and what those of this package share."""
 
-import inspect
-from collections.abc import Callable, Sequence
+import hashlib
+from collections.abc import Sequence
 from typing import Protocol
 
-from trustbo.data import Bound, Cell, Mission
+import numpy as np
+from numpy.typing import ArrayLike
+
+from trustbo.data import Cell, Mission
 from trustbo.display import Rows, Summary
-from trustbo.errors import TrustboError
+from trustbo.errors import TrustboError, require_cells
+from trustbo.workspace import Workspace
 
 
 class Simulator(Protocol):
     """Simulator that runs a path: one of this package, a custom one, or real robots.
 
-    Three more methods are optional: `describe() -> dict` returns settings that a campaign records;
-    `describe_mission(mission) -> dict` those of the world of a mission, equal in equal worlds; and
-    `expected_contact()` the contact and failures of bounds, as a `BoundTable` of
-    `simulation.bound_table`, which `Truth.of` takes instead of replicates. A simulator whose world
-    changes takes the number of the mission as a keyword `mission` of `run` (and of `reset`).
+    Optional methods: `describe() -> dict` returns settings that a campaign records, and
+    `describe_world(mission) -> dict` those of the world of a mission, for `Truth`. A `Truth` also
+    needs the attribute `workspace`.
     """
 
-    def run(self, path: Sequence[Cell], *, seed: int) -> Mission:
-        """Run a path from its first cell to its last, or until it fails."""
-        ...
+    def run(self, path: Sequence[Cell], *, seed: int, mission: int = 0) -> Mission:
+        """Run a path from its first cell to its last, or until it fails.
 
-
-class BoundSimulator(Simulator, Protocol):
-    """Simulator that can also run bound by bound, for `Truth.of`.
-
-    If `reset` and `run_bound` take a keyword `next_cell`, they are given the cell after the bound,
-    so that the robots can take positions that see it.
-    """
-
-    def reset(self, start: Cell, seed: int) -> None:
-        """Begin a mission with the team in its start cell."""
-        ...
-
-    def run_bound(self, k: int, cell: Cell) -> Bound:
-        """Run bound k, 1 for the first, into a cell."""
-        ...
-
-    def close(self) -> None:
-        """End the mission."""
+        Args:
+            path: Cells, start first.
+            seed: Seed of all that is random.
+            mission: Number of the mission, from 0, where the world changes.
+        """
         ...
 
 
@@ -57,31 +45,18 @@ class DescribedSimulator(Summary):
         return [(name, text) for name, text in rows if len(text) < 200]
 
 
-def require_bounds(simulator: object, what: str) -> None:
-    """Refuse a simulator that cannot run bound by bound, as `what` needs: TrustboError."""
-    missing = [name for name in ("reset", "run_bound") if not hasattr(simulator, name)]
-    if missing:
-        raise TrustboError(
-            f"{what} needs a simulator with reset(start, seed) and run_bound(k, cell); "
-            f"{type(simulator).__name__} has no {' and no '.join(missing)}."
-        )
+def require_path(workspace: Workspace, path: Sequence[Cell]) -> list[Cell]:
+    """Return the cells of a path, at least two, all passable: TrustboError if not."""
+    path = require_cells("path", path)
+    cells = [workspace.require_cell(f"path[{k}]", cell) for k, cell in enumerate(path)]
+    if len(cells) < 2:
+        raise TrustboError(f"a path needs at least two cells; got {cells}.")
+    return cells
 
 
-def takes(function: Callable[..., object], name: str) -> bool:
-    """Whether a function has a parameter of that name."""
-    return name in inspect.signature(function).parameters
-
-
-def require_call(simulator: object, name: str, *arguments: object, **named: object) -> None:
-    """Check the signature of a simulator's method, without calling it: TrustboError."""
-    method = getattr(simulator, name)
-    if takes(method, "mission"):
-        named["mission"] = 0
-    try:
-        inspect.signature(method).bind(*arguments, **named)
-    except TypeError as error:
-        how = {"run": "run(path, *, seed)", "reset": "reset(start, seed)"}[name]
-        raise TrustboError(
-            f"a simulator needs {how}; the call of {type(simulator).__name__}.{name} fails: "
-            f"{error}."
-        ) from None
+def digest(*arrays: ArrayLike) -> str:
+    """Hash of the values of arrays."""
+    found = hashlib.sha256()
+    for array in arrays:
+        found.update(np.ascontiguousarray(array).tobytes())
+    return found.hexdigest()[:16]

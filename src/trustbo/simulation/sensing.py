@@ -4,26 +4,38 @@ At each tick, each standing robot scans each moving one once.
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
-from trustbo.simulation.state import Drive
 from trustbo.simulation.world import World
-from trustbo.team import Robot, Team
+from trustbo.team import Robot
 from trustbo.workspace.sight import detection_probability, optics
 
 
-def detections(
-    world: World, team: Team, drives: Sequence[Drive], fouling: float | np.ndarray = 1.0
-) -> list[np.ndarray]:
-    """Probability that a scan detects its target, shape (tick, robot) for each bound.
+class Drive(NamedTuple):
+    """Movements of one bound."""
 
-    `fouling`, shape (robot,), are factors on the detection by T2's lidars.
+    poses: np.ndarray
+    """Position and heading of each robot, the lead first, shape (tick, 1 + robot, 3)."""
+    lead_moves: np.ndarray
+    """Whether the lead moves in a tick, else T2 does, shape (tick,)."""
+    status: str
+    """Outcome of the bound."""
+    stops: np.ndarray
+    """Planned places of the robots afterwards, shape (1 + robot, 2)."""
+
+
+def detections(world: World, drives: Sequence[Drive], k: int) -> list[np.ndarray]:
+    """Probability that a scan detects its target, shape (tick, robot) for each drive.
+
+    The drives are alternatives for bound k of a mission, 1 for the first.
     """
+    team = world.team
     poses = np.concatenate([drive.poses[..., :2] for drive in drives])
     t2_scans = np.concatenate([drive.lead_moves for drive in drives])[:, None]  # else the lead does
-    lead, t2 = np.repeat(poses[:, :1], len(team.robots), axis=1), poses[:, 1:]
+    lead, t2 = np.repeat(poses[:, :1], team.n_robots, axis=1), poses[:, 1:]
     by_t2 = np.stack([optics(robot, team.lead) for robot in team.robots])
     by_lead = np.stack([optics(team.lead, robot) for robot in team.robots])
     sensor, target, scanners = (
@@ -35,8 +47,9 @@ def detections(
         inside = mask[world.surface.nearest(sensor[:, 0], sensor[:, 1])]
         inside |= mask[world.surface.nearest(target[:, 0], target[:, 1])]
         probability[inside] *= 1.0 - strength
-    probability = probability.reshape(-1, len(team.robots))
-    probability *= np.where(t2_scans, world.detection * fouling, world.lead_detection)
+    probability = probability.reshape(-1, team.n_robots)
+    detection = world.detection[min(k, len(world.detection)) - 1]
+    probability *= np.where(t2_scans, detection, world.lead_detection)
     return np.split(probability, np.cumsum([len(drive.poses) for drive in drives])[:-1])
 
 
@@ -48,9 +61,9 @@ def new_tracks(n_robots: int) -> np.ndarray:
 def contact_of(detected: np.ndarray, watchers: Sequence[Robot], tracks: np.ndarray) -> np.ndarray:
     """Contact from scans: a track begins after some detections in a row, and ends after misses.
 
-    `detected`, shape (tick, robot), has the outcome of each scan; the watchers' lidars, one per
-    robot, give the numbers of scans; the state of the tracks (robot, 2) is updated in place.
-    Returns shape (tick, robot), bool.
+    `detected`, shape (tick, robot), has the outcome of each scan. The lidars of the watchers, one
+    for each robot, give the numbers of scans. The state of the tracks, shape (robot, 2), is updated
+    in place. Returns shape (tick, robot), bool.
     """
     limits = np.array([[robot.acquire, robot.drop] for robot in watchers])
     contact = np.empty(detected.shape, bool)

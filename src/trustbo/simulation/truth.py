@@ -1,317 +1,272 @@
-"""Truth of a simulator: expected contact of paths, the best of them, and regret."""
+"""Truth of a simulator: the expected contact of every bound, the best path, and regret.
 
-import hashlib
+The expected contact of a bound is a function of three cells: the one left, the one entered and the
+next, as robots take posts that watch the next bound. The best path is then found by dynamic
+programming over bounds and the number of bounds that are left, which is exact.
+"""
+
+import re
 from collections.abc import Callable, Sequence
-from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
+import networkx as nx
 import numpy as np
 import xarray as xr
 
 from trustbo.data import Cell
 from trustbo.display import Rows, Summary
-from trustbo.errors import (
-    DamagedFileError,
-    TrustboError,
-    require_choice,
-    require_positive,
-    require_whole,
-)
-from trustbo.files import FilePath, cache_folder, require_folder, to_json
-from trustbo.logs.netcdf import read_tree, write_tree
-from trustbo.models.backend import VERSIONS
-from trustbo.planning import Plan
-from trustbo.planning.paths import AdmissiblePaths, PathClass
-from trustbo.simulation.bound_table import BoundTable, tabulate
-from trustbo.simulation.model_contact import ModelContact
-from trustbo.simulation.overwatch import KinematicSimulator
-from trustbo.simulation.protocol import takes
-from trustbo.simulation.replicates import KinematicReplicates, PlainReplicates
-from trustbo.terrain.read import digest_of
+from trustbo.errors import TrustboError, require_whole
+from trustbo.files import FilePath, to_json, write_file
+from trustbo.simulation.model import ModelSimulator
+from trustbo.simulation.protocol import digest, require_path
+from trustbo.simulation.replicates import END, replicated
 from trustbo.workspace import Workspace
 from trustbo.workspace.location import Location
+from trustbo.workspace.moves import MOVES, move_indices, moves_along
 
-OBJECTIVES = ("lost_contact", "mean")
-"""Objectives for which a truth has a best path."""
-
-
-class PathContact(NamedTuple):
-    """Expected contact lost and kept on a path, and the probability to arrive."""
-
-    lost: float
-    """Expected contact lost, in bounds: the sum over bounds of 1 - contact, mean over robots."""
-    mean: float
-    """Expected contact rate, mean over bounds and robots."""
-    p_arrive: float
-    """Probability that no bound fails."""
+_MAX_BOUNDS = re.compile(r"shortest(?:\+(\d+))?")
 
 
 class Truth(Summary):
-    """Expected contact of every path of a simulator, in the world of a mission.
-
-    Contact is expected given that no bound fails; `PathContact.p_arrive` is the probability of
-    that.
+    """Expected contact and failures of every bound of a simulator, in the world of a mission.
 
     Attributes:
         workspace: Workspace of the paths.
-        bounds: Expected contact of bounds: a `BoundTable`, whose `data` has it all, or a
-            `ModelContact`.
+        bounds: Dataset with dims move, row, col and next_move (the eight moves, and "end"):
+            `contact`, the expected contact rate, mean over robots, given that the bound does not
+            fail, 0 where it always did; and `passed`, the probability that it does not fail. NaN
+            where there is no such bound.
     """
 
     def __init__(
-        self,
-        workspace: Workspace,
-        bounds: BoundTable | ModelContact,
-        at_mission: "Callable[[int], Truth] | None" = None,
+        self, workspace: Workspace, bounds: xr.Dataset, of: "Callable[[int], Truth] | None" = None
     ) -> None:
-        """Store the contact of bounds; `at(mission)` is the truth of another mission's world."""
-        self.workspace, self.bounds, self._other = workspace, bounds, at_mission
-        self._best: dict[tuple[Any, ...], tuple[Cell, ...]] = {}
+        """Store the truth of bounds; `of(mission)` finds that of the world of another mission."""
+        self.workspace, self.bounds, self._of = workspace, bounds, of
 
     def _rows(self) -> Rows:
-        grid = self.workspace.grid
-        source = f"{type(self.bounds).__name__}, of {grid.shape[0]} x {grid.shape[1]} cells"
-        error = f"{self.standard_error:.2g} of a bound's contact, mean over robots"
-        rows = [
-            ("bounds", source),
-            ("standard error", error),
-            ("worlds", "one" if self._other is None else "of each mission, see at(mission)"),
-        ]
-        return rows
+        rows, cols = self.workspace.grid.shape
+        worlds = "one" if self._of is None else "those of missions, see at(mission)"
+        return [("bounds", f"of {rows} x {cols} cells"), ("worlds", worlds)]
 
     @classmethod
     def of(
         cls,
         simulator: Any,
         *,
-        seed: int = 0,
-        standard_error: float = 0.005,
         mission: int = 0,
+        n_replicates: int = 3,
+        seed: int = 0,
         folder: FilePath | None = None,
         progress: bool = False,
     ) -> Self:
-        """Find the truth of a simulator.
+        """Find the truth of a simulator by replicates of every bound with each that can follow.
 
-        A simulator with a method `expected_contact`, such as `ModelSimulator`, has it in closed
-        form. Of another, every bound, followed by each that can follow it, is replicated until the
-        standard error is reached; the result is cached on disk under a hash of the world's
-        settings (`describe_mission(mission)`, else `describe()`), the workspace and the code. Of
-        what varies within a mission (`Fouling`), contact is the expectation in the long run.
+        A simulator with a method `expected_contact`, which returns `bounds`, has it in closed form.
+        Of a `KinematicSimulator`, a replicate has no noise of detection, and begins where one of
+        the bounds before it ended in the replicate before. Of any other, it is a mission of the
+        bound and the next. Of `Fouling`, contact is the expectation in the long run.
 
         Args:
-            simulator: Simulator with a `workspace`, and with `reset` and `run_bound`.
-            seed: Seed of the replicates.
-            standard_error: Standard error of the contact of a bound, mean over robots.
+            simulator: Simulator with a `workspace`.
             mission: Number of the mission, where the world changes.
-            folder: Folder to keep it in; by default `truth` in trustbo's cache, which is
-                `$XDG_CACHE_HOME/trustbo`.
+            n_replicates: Replicates of every bound.
+            seed: Seed of the replicates.
+            folder: Folder where truths are kept; by default they are not.
             progress: Whether to show a progress bar.
 
         Raises:
-            TrustboError: A simulator without a workspace or bounds; a standard error that is not
-                positive.
+            TrustboError: A simulator without a workspace, or one whose contact has a memory.
         """
         workspace = getattr(simulator, "workspace", None)
         if not isinstance(workspace, Workspace):
             raise TrustboError(
                 f"truth needs a simulator with a workspace; {type(simulator).__name__} has none."
             )
-        if hasattr(simulator, "expected_contact"):
-            return cls(workspace, simulator.expected_contact())
-        numbers = require_whole("seed", seed, 0), require_positive("standard_error", standard_error)
-        cached: dict[str, Self] = {}
+        if isinstance(simulator, ModelSimulator):
+            raise TrustboError(
+                "in a ModelSimulator the contact of a bound depends on all bounds before it; use "
+                "Planner.evaluate(path, params) and Planner.plan(params)."
+            )
+        n_replicates = require_whole("n_replicates", n_replicates, 1)
+        found: dict[str, Self] = {}
 
         def of_mission(number: int) -> Self:
-            world = _world(simulator, require_whole("mission", number, 0))
-            if (key := to_json(world)) not in cached:
-                table = _table(simulator, number, world, *numbers, folder, progress)
-                cached[key] = cls(workspace, table, of_mission)
-            return cached[key]
+            world = to_json(_settings(simulator, require_whole("mission", number, 0)))
+            if world not in found:
+                replicates = number, n_replicates, seed, progress
+                table = _kept(folder, world, simulator, *replicates)
+                found[world] = cls(workspace, table, of_mission)
+            return found[world]
 
         return of_mission(mission)
 
-    @property
-    def standard_error(self) -> float:
-        """Standard error of the contact of a bound, mean over robots: root mean square over all."""
-        return self.bounds.standard_error
-
     def at(self, mission: int) -> "Truth":
         """Truth of the world of another mission, counted from 0."""
-        return self if self._other is None else self._other(mission)
+        return self if self._of is None else self._of(mission)
+
+    def lost(self, path: Sequence[Cell]) -> float:
+        """Expected contact lost on a path, in bounds, given that no bound fails.
+
+        Raises:
+            TrustboError: A cell is off the grid or impassable, or no neighbour of the last.
+        """
+        contact, _ = self._along(path)
+        return float((1.0 - contact).sum())
+
+    def lost_or_failed(self, path: Sequence[Cell]) -> float:
+        """Expected contact lost, where a bound that fails or is not reached keeps none.
+
+        It is sum_k (1 - S_k c_k) for the contact c_k of bound k, where S_k is the probability that
+        it and all bounds before it are completed. Raises as `lost` does.
+        """
+        contact, passed = self._along(path)
+        return float((1.0 - np.cumprod(passed) * contact).sum())
+
+    def p_arrive(self, path: Sequence[Cell]) -> float:
+        """Probability that no bound of a path fails; raises as `lost` does."""
+        return float(np.prod(self._along(path)[1]))
 
     def best(
         self,
         start: Location,
         goal: Location,
-        objective: str = "lost_contact",
         max_bounds: int | str = "shortest+4",
         *,
         connectivity: int = 8,
+        failures: bool = False,
     ) -> tuple[Cell, ...]:
-        """Find the best admissible path, exactly.
+        """Find the path of least `lost`, or with `failures` of least `lost_or_failed`, exactly.
 
         Args:
-            start: First cell, or a position in it; see `Workspace.locate`.
+            start: First cell, or a position in it, see `Workspace.locate`.
             goal: Last cell, or a position in it.
-            objective: `"lost_contact"`, the least contact lost, or `"mean"`, the largest mean rate.
-            max_bounds: Admissible paths, and
-            connectivity: moves, both as for `Planner`.
+            max_bounds: Longest path, as for `Planner`.
+            connectivity: Number of moves, 8 or 4.
+            failures: Whether bounds may fail.
 
         Raises:
-            TrustboError: An unknown name; a cell off the grid, or impassable.
-            NoPathError: The goal cannot be reached.
+            TrustboError: A cell off the grid, or impassable.
+            NetworkXNoPath: The goal cannot be reached.
         """
-        require_choice("objective of a truth", objective, OBJECTIVES)
         a, b = (self.workspace.require_cell(*e) for e in (("start", start), ("goal", goal)))
-        key = a, b, objective, max_bounds, connectivity
-        if key not in self._best:
-            paths = AdmissiblePaths(self.workspace, a, b, PathClass(connectivity, max_bounds))
-            self._best[key] = self.bounds.best(paths, objective)
-        return self._best[key]
-
-    def value(self, path: Plan | Sequence[Cell]) -> PathContact:
-        """Expected contact of a path, or of a plan, and its probability to arrive.
-
-        Raises:
-            TrustboError: A cell is off the grid or impassable, or no neighbour of the last.
-        """
-        cells = self._cells(path)
-        rates = self.bounds.contact(cells).mean(1)
-        arrives = float(np.prod(1.0 - self.bounds.failure(cells)))
-        return PathContact(float((1.0 - rates).sum()), float(rates.mean()), arrives)
+        contact, passed = (self.bounds[name].values for name in ("contact", "passed"))
+        passed = passed if failures else np.ones(passed.shape)
+        moves = move_indices(connectivity)
+        allowed = np.isin(np.arange(END), moves)[:, None, None]
+        contact = np.where(allowed[..., None], contact, np.nan)
+        longest = _longest(allowed & self.workspace.passable_bounds.values, a, b, max_bounds)
+        return _most_kept(contact, passed, a, b, longest, u_turns=isinstance(max_bounds, int))
 
     def regret(
         self,
-        path: Plan | Sequence[Cell],
-        objective: str = "lost_contact",
+        path: Sequence[Cell],
         max_bounds: int | str = "shortest+4",
         *,
         connectivity: int = 8,
     ) -> float:
-        """Regret of a path, or of a plan's, in % of the contact that the best path keeps.
+        """Regret of a path, in % of the contact that the best path between its ends keeps.
 
-        100 (contact lost on it - lost on the best) / contact kept on the best, both in bounds; for
-        `"mean"` of mean rates. The best path is that of `best`, with the same ends; negative if
-        the path is better than all those admissible.
-
-        Raises:
-            TrustboError: See `best` and `value`.
+        100 (lost on the path - lost on the best) / contact kept on the best, all in bounds.
+        Negative if the path is better than the best of at most `max_bounds`.
         """
-        cells = self._cells(path)
-        best_path = self.best(cells[0], cells[-1], objective, max_bounds, connectivity=connectivity)
-        best, value = self.value(best_path), self.value(cells)
-        if objective == "mean":
-            return _percent(best.mean - value.mean, best.mean)
-        return _percent(value.lost - best.lost, len(best_path) - 1 - best.lost)
+        best = self.best(path[0], path[-1], max_bounds, connectivity=connectivity)
+        least = self.lost(best)
+        kept = len(best) - 1 - least
+        return 100.0 * (self.lost(path) - least) / kept if kept > 0.0 else np.nan
 
-    def require_workspace(self, workspace: Workspace) -> None:
-        """Refuse another workspace than that of the truth; its features may differ.
-
-        Raises:
-            TrustboError: The grid, passable cells or terrain differ.
-        """
-        for name, mine, other in _differences(self.workspace, workspace):
-            raise TrustboError(
-                f"the truth is of another workspace: its {name} is {mine}, the campaign's {other}; "
-                "make it with Truth.of(simulator) of this workspace's simulator."
-            )
-
-    def _cells(self, path: Plan | Sequence[Cell]) -> tuple[Cell, ...]:
-        cells = path.path if isinstance(path, Plan) else path
-        cells = tuple(self.workspace.require_cell(f"path[{k}]", c) for k, c in enumerate(cells))
-        if len(cells) < 2:
-            raise TrustboError(f"a path needs at least two cells; got {cells}.")
-        return cells
+    def _along(self, path: Sequence[Cell]) -> tuple[np.ndarray, np.ndarray]:
+        """Contact and probability to pass of the bounds of a path, each shape (bound,)."""
+        cells = require_path(self.workspace, path)
+        moves, (rows, cols) = moves_along(cells), np.array(cells)[1:].T
+        where = moves, rows, cols, np.append(moves[1:], END)
+        return self.bounds["contact"].values[where], self.bounds["passed"].values[where]
 
 
-def _percent(lacking: float, whole: float) -> float:
-    return 100.0 * lacking / whole if whole > 0.0 else np.nan
+def _settings(simulator: Any, mission: int) -> object:
+    """Settings of the world of a mission."""
+    if hasattr(simulator, "describe_world"):
+        return simulator.describe_world(mission)
+    return getattr(simulator, "describe", lambda: type(simulator).__name__)()
 
 
-def _world(simulator: Any, mission: int) -> tuple[object, int]:
-    """Settings of the world of a mission, None if unknown, and its number if they lack it."""
-    if hasattr(simulator, "describe_mission"):
-        return simulator.describe_mission(mission), 0
-    describe, begin = (getattr(simulator, name, None) for name in ("describe", "reset"))
-    numbered = begin is not None and takes(begin, "mission")
-    return None if describe is None else describe(), mission if numbered else 0
-
-
-def _table(
+def _kept(
+    folder: FilePath | None,
+    world: str,
     simulator: Any,
     mission: int,
-    world: tuple[object, int],
+    n_replicates: int,
     seed: int,
-    standard_error: float,
-    folder: FilePath | None,
     progress: bool,
-) -> BoundTable:
-    """Table of a simulator, from the disk cache if present."""
-    file = None
-    if world[0] is not None:  # else its identity is unknown
-        about = [world, seed, standard_error, VERSIONS["trustbo"], _code()]
-        kept = cache_folder("truth") if folder is None else require_folder(folder)
-        digest = hashlib.sha256(to_json(about).encode())
-        for content in _content(simulator):
-            digest.update(content)
-        file = kept / f"{digest.hexdigest()[:20]}.nc"
-        if file.exists():
-            try:
-                return BoundTable(read_tree(file)["bounds"].to_dataset())
-            except (DamagedFileError, KeyError):
-                pass  # computed again
-    kind = type(simulator) is KinematicSimulator
-    source = (KinematicReplicates if kind else PlainReplicates)(simulator, mission, seed)
-    table = tabulate(simulator.workspace, source, standard_error=standard_error, progress=progress)
-    if file is not None:
-        write_tree(file, xr.DataTree.from_dict({"bounds": table.data}))
-    return table
+) -> xr.Dataset:
+    """Table of bounds from its file in a folder, which is written if it is not there."""
+    replicates = simulator, mission, n_replicates, seed, progress
+    if folder is None:
+        return replicated(*replicates)
+    workspace = simulator.workspace
+    known = digest(workspace.awareness.values, workspace.passable_bounds.values)
+    about = to_json([world, known, n_replicates, seed])
+    file = Path(folder) / f"truth-{digest(np.frombuffer(about.encode(), np.uint8))}.nc"
+    if not file.exists():
+        table = replicated(*replicates)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_file(file, table.to_netcdf)
+    return xr.load_dataset(file)
 
 
-def _content(simulator: Any) -> list[bytes]:
-    """Contents of the workspace on which contact depends."""
-    workspace: Workspace = simulator.workspace
-    settings = [workspace.grid, workspace.team, workspace.sights]
-    contents = [to_json(settings).encode(), _bytes(workspace.passable)]
-    if workspace.terrain is None or workspace.pixels is None:
-        return [*contents, _bytes(workspace.awareness)]
-    pixels = [_bytes(workspace.pixels[name]) for name in ("traversability", "passable")]
-    return [*contents, digest_of(workspace.terrain).encode(), *pixels]
+def _longest(exists: np.ndarray, start: Cell, goal: Cell, max_bounds: int | str) -> int:
+    """Largest number of bounds of a path, of bounds that exist, (move, row, col)."""
+    if isinstance(max_bounds, int):
+        return max_bounds
+    if (named := _MAX_BOUNDS.fullmatch(max_bounds)) is None:
+        raise TrustboError(f"max_bounds must be a number or shortest+n; got {max_bounds!r}.")
+    graph = nx.DiGraph()
+    for move, row, col in np.argwhere(exists).tolist():
+        down, right = MOVES[8][move]
+        graph.add_edge((row - down, col - right), (row, col))
+    return nx.shortest_path_length(graph, start, goal) + int(named[1] or 0)
 
 
-def _bytes(array: xr.DataArray) -> bytes:
-    return np.ascontiguousarray(array.values).tobytes()
+def _most_kept(
+    contact: np.ndarray, passed: np.ndarray, start: Cell, goal: Cell, longest: int, *, u_turns: bool
+) -> tuple[Cell, ...]:
+    """Path of at most `longest` bounds that loses least, of tables (move, row, col, next_move).
+
+    The most contact that is kept on a bound and what follows, V = max p (c + V'), is found backward
+    over the bound and the number of bounds after it, which is exact as the probability p to pass is
+    not negative. Without `u_turns` no bound leads back to the cell that the last one left.
+    """
+    follows = np.ones((END, END), bool)  # (move, next move)
+    if not u_turns:
+        follows &= ~np.eye(END, dtype=bool)[::-1]  # the reverse is the m-th from last
+    possible = np.isfinite(contact[..., :END]) & follows[:, None, None]
+    last = (passed * contact)[:, *goal, END]
+    value = np.full(contact.shape[:3], -np.inf)  # (move, row, col)
+    value[:, *goal] = np.where(np.isfinite(last), last, -np.inf)
+    most, first, choices = [], [], []
+    for _ in range(longest):
+        onward = np.stack([_by_cell_left(value[move], move) for move in range(END)])
+        first.append(int(onward[:, *start].argmax()))
+        most.append(onward[first[-1], *start])
+        after = np.moveaxis(onward, 0, -1)  # (row, col, next move)
+        ends = possible & np.isfinite(after)
+        kept = passed[..., :END] * (contact[..., :END] + np.where(np.isfinite(after), after, 0.0))
+        kept = np.where(ends, kept, -np.inf)
+        choices.append(kept.argmax(-1))
+        value = kept.max(-1)
+        value[:, *goal] = -np.inf  # a path ends on entering the goal
+    n = int(np.argmin(np.arange(1, longest + 1) - np.array(most)))
+    path, move = [start], first[n]
+    for choice in [*choices[:n][::-1], None]:
+        (row, col), (down, right) = path[-1], MOVES[8][move]
+        path.append((row + down, col + right))
+        move = move if choice is None else int(choice[move, *path[-1]])
+    return tuple(path)
 
 
-@cache
-def _code() -> str:
-    """Source hash of the simulator: invalidates cached truths during development."""
-    digest, root = hashlib.sha256(), Path(__file__).parents[1]
-    for room in ("simulation", "terrain", "workspace"):
-        for file in sorted((root / room).glob("*.py")):
-            digest.update(file.read_bytes())
-    return digest.hexdigest()
-
-
-def _differences(a: Workspace, b: Workspace) -> list[tuple[str, str, str]]:
-    """Names of settings that differ, with both values as text."""
-    if a.grid != b.grid:
-        mine, theirs = (
-            f"{g.shape[0]} x {g.shape[1]} cells of {g.cell_height:g} m x {g.cell_width:g} m at "
-            f"{g.left:g}, {g.top:g}"
-            for g in (a.grid, b.grid)
-        )
-        return [("grid", mine, theirs)]
-    if not np.array_equal(a.passable.values, b.passable.values):
-        n, other = (f"{int(w.passable.sum())} passable cells" for w in (a, b))
-        return [("passability", n, other)]
-    if a.terrain is None or b.terrain is None:
-        return []
-    differences = []
-    for name in ("dem", "dsm"):
-        mine, theirs = a.terrain[name].values, b.terrain[name].values
-        if mine.shape != theirs.shape or not np.array_equal(mine, theirs, equal_nan=True):
-            mean, other = (f"of mean height {np.nanmean(h):.2f} m" for h in (mine, theirs))
-            differences.append((name, mean, other))
-    return differences
+def _by_cell_left(values: np.ndarray, move: int) -> np.ndarray:
+    """Values of the cells that a move enters, (row, col), by the cell that it leaves."""
+    (down, right), (rows, cols) = MOVES[8][move], values.shape
+    framed = np.pad(values, 1, constant_values=-np.inf)
+    return framed[1 + down :, 1 + right :][:rows, :cols]

@@ -25,14 +25,12 @@ from trustbo.campaign.result import Result
 from trustbo.campaign.stopping import RegretBound
 from trustbo.data import Cell, Mission
 from trustbo.errors import TrustboError
-from trustbo.files import FilePath, interpreting
+from trustbo.files import FilePath, cache_folder, interpreting
 from trustbo.models.backend import VERSIONS
 from trustbo.planning import Planner
-from trustbo.planning.paths import AdmissiblePaths, PathClass
-from trustbo.simulation import Truth
+from trustbo.simulation import ModelSimulator, Truth
 from trustbo.simulation.protocol import Simulator
 from trustbo.study import executors
-from trustbo.study.kept import expected_loss, least_loss
 from trustbo.study.methods import Case
 from trustbo.study.store import Store
 from trustbo.study.table import to_dataset
@@ -70,7 +68,10 @@ class Scene:
         """Truth of the simulator, for any awareness in the workspace; None without."""
         if not self.has_truth:
             return None
-        return Truth.of(self.simulator(self.make_workspace(bounds=True)), progress=progress)
+        simulator = self.simulator(self.make_workspace(bounds=True))
+        if isinstance(simulator, ModelSimulator):
+            return None
+        return Truth.of(simulator, folder=cache_folder("truth"), progress=progress)
 
 
 def corners(
@@ -313,24 +314,22 @@ class _Referee:
         if self.truth is None:
             return unknown | {"best": math.nan}
         truth, (start, goal) = self.truth.at(mission), (planner.start, planner.goal)
-        best = truth.value(truth.best(start, goal, **self.class_of(planner))).lost
+        best = truth.lost(truth.best(start, goal, **self.class_of(planner)))
         if (path[0], path[-1]) != (start, goal):
             return unknown | {"best": best}
-        value, regret = truth.value(path), truth.regret(path, **self.class_of(planner))
-        loss = expected_loss(truth, path) - self.least_of(truth, planner)
+        regret = truth.regret(path, **self.class_of(planner))
+        loss = truth.lost_or_failed(path) - self.least_of(truth, planner)
         return {
-            "regret": regret, "lost": value.lost, "loss": loss, "p_arrive": value.p_arrive,
-            "best": best,
+            "regret": regret, "lost": truth.lost(path), "loss": loss,
+            "p_arrive": truth.p_arrive(path), "best": best,
         }  # fmt: skip
 
     def least_of(self, truth: Truth, planner: Planner) -> float:
         """Least expected loss of an admissible path."""
         if id(truth) not in self.least:
             judged = self.class_of(planner)
-            admitted = PathClass(judged["connectivity"], judged["max_bounds"])
-            ends = planner.start, planner.goal
-            paths = AdmissiblePaths(truth.workspace, *ends, admitted)
-            self.least[id(truth)] = least_loss(truth, paths)
+            best = truth.best(planner.start, planner.goal, **judged, failures=True)
+            self.least[id(truth)] = truth.lost_or_failed(best)
         return self.least[id(truth)]
 
     def class_of(self, planner: Planner) -> dict[str, Any]:

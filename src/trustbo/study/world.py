@@ -15,6 +15,7 @@ from scipy import ndimage
 from trustbo import terrain
 from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_choice
+from trustbo.files import cache_folder
 from trustbo.simulation import KinematicSimulator, RadioSimulator, Truth
 from trustbo.simulation.events import Event
 from trustbo.simulation.protocol import Simulator
@@ -110,7 +111,7 @@ class World:
 
     def identity(self) -> dict[str, Any]:
         """Everything that decides its numbers; real terrains by their contents."""
-        settings = asdict(self) | {"events": [event.settings for event in self.events]}
+        settings = asdict(self) | {"events": [repr(event) for event in self.events]}
         del settings["data"]
         return settings | ({} if self.is_made else {"files": [digest(f) for f in self.files()]})
 
@@ -190,7 +191,8 @@ class World:
 
     def truth(self, simulate: Simulate | None = None, *, progress: bool = False) -> Truth:
         """Truth of the simulator, from disk where it has been computed before."""
-        return Truth.of(self.simulator(self.workspace(), simulate), progress=progress)
+        simulator = self.simulator(self.workspace(), simulate)
+        return Truth.of(simulator, folder=cache_folder("truth"), progress=progress)
 
     def ends(self, course: str) -> tuple[Cell, Cell]:
         """Start and goal of a course: the nearest cells from which most others can be reached."""
@@ -226,7 +228,7 @@ def scene_of(
         judged: Objective and admissible paths that regret is held against, for all methods.
         simulate: Function of the user that makes the simulator, or `"module:name"` of one.
     """
-    objective, max_bounds = judged
+    _, max_bounds = judged
     return Scene(
         labels={"world": world.name, "kind": world.kind, "case": world.case, "course": course},
         identity={
@@ -238,10 +240,7 @@ def scene_of(
         make_workspace=world.workspace,
         ends=world.ends(course),
         simulator=partial(_simulator, world, simulate),
-        judged={
-            "objective": "mean" if objective == "mean" else "lost_contact",
-            "max_bounds": max_bounds,
-        },
+        judged={"max_bounds": max_bounds},
         options={"connectivity": world.connectivity},
     )
 

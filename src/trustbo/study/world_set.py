@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from trustbo.files import FilePath
-from trustbo.simulation import Degradation, Dust, Fouling, Season, Threat, Vegetation
+from trustbo.simulation import Degradation, Dust, Fouling, Jam, Season, Trees
 from trustbo.study.world import REAL, World, drawn
 from trustbo.team import Robot, Team
 from trustbo.workspace.sight import Sight
@@ -83,11 +83,11 @@ def _unlike(ground: str) -> dict[str, Any]:
 
 def _rain(ground: str) -> dict[str, Any]:
     robot = f"r{_one_robot(ground) + 1}"
-    return {"events": tuple(Degradation(robot, 0.3, day, day) for day in _days(ground))}
+    return {"events": tuple(Degradation(robot, 0.3, first=day, last=day) for day in _days(ground))}
 
 
 def _dust(ground: str) -> dict[str, Any]:
-    return {"events": tuple(Dust(0.5, day, day) for day in _days(ground))}
+    return {"events": tuple(Dust(0.5, first=day, last=day) for day in _days(ground))}
 
 
 def _foul(ground: str) -> dict[str, Any]:
@@ -97,24 +97,22 @@ def _foul(ground: str) -> dict[str, Any]:
 
 def _worn(detection: float) -> Callable[[str], dict[str, Any]]:
     return lambda ground: {
-        "events": (Degradation(f"r{_one_robot(ground) + 1}", detection, _AFTER),)
+        "events": (Degradation(f"r{_one_robot(ground) + 1}", detection, first=_AFTER),)
     }
 
 
 def _trees(height: float, radius: float) -> Callable[[str], dict[str, Any]]:
-    return lambda ground: {
-        "events": (Vegetation(height, _place(ground), radius, first_mission=_AFTER),)
-    }
+    return lambda ground: {"events": (Trees(height, _place(ground), radius, first=_AFTER),)}
 
 
 def _jam(first: int = 0, last: int | None = None) -> Callable[[str], dict[str, Any]]:
     return lambda ground: {
-        "events": (Threat("jam", _place(ground), _reach(ground), None, 0.8, first, last),)
+        "events": (Jam(_place(ground), _reach(ground), 0.8, first=first, last=last),)
     }
 
 
 def _season(factor: float) -> dict[str, Any]:
-    return {"events": (Season(factor, _AFTER),)}
+    return {"events": (Season(factor, first=_AFTER),)}
 
 
 # Slope limits that are assumed too high (kind "limit"). The true limit is chosen by rule: the

@@ -4,7 +4,6 @@ Whatever is wrong with a raster is refused or put right here, where it enters: t
 package relies on heights in metres, NaN where missing, on a grid of metres with north at the top.
 """
 
-import hashlib
 import math
 import os
 import re
@@ -141,14 +140,6 @@ def pixel_size(terrain: xr.Dataset) -> tuple[float, float]:
     """Pixel height and width in metres."""
     y, x = (terrain.variables[axis].values for axis in ("y", "x"))
     return abs(float(y[-1] - y[0])) / (len(y) - 1), abs(float(x[-1] - x[0])) / (len(x) - 1)
-
-
-def digest_of(terrain: xr.Dataset) -> str:
-    """Hash of a terrain's heights and positions, the same wherever it was read from."""
-    digest = hashlib.sha256()
-    for name in ("y", "x", "dem", "dsm"):
-        digest.update(np.ascontiguousarray(terrain[name].values, dtype=float).tobytes())
-    return digest.hexdigest()
 
 
 # --- one raster ---

@@ -1,0 +1,315 @@
+"""Kinematic simulator of bounding overwatch."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import xarray as xr
+
+from trustbo.data import Bound, Cell, Mission
+from trustbo.errors import TrustboError, require_positive, require_whole
+from trustbo.simulation.events import Event, changed
+from trustbo.simulation.motion import drive_together
+from trustbo.simulation.protocol import DescribedSimulator, digest, require_path
+from trustbo.simulation.sensing import Drive, contact_of, detections, new_tracks
+from trustbo.simulation.world import World, true_surface, world_of
+from trustbo.team import Robot, Team
+from trustbo.workspace import Workspace
+from trustbo.workspace.sight import Sight, sights_of
+
+
+class State(NamedTuple):
+    """Team between two bounds; positions in CRS metres, headings in rad."""
+
+    cell: Cell
+    """Cell of the lead."""
+    poses: np.ndarray
+    """Position and heading of each robot, the lead first, shape (1 + robot, 3)."""
+    stops: np.ndarray
+    """Planned places, from which the routes start, shape (1 + robot, 2)."""
+    tracks: np.ndarray
+    """State of the lidars' tracks, see `sensing.new_tracks`."""
+
+
+class KinematicSimulator(DescribedSimulator):
+    """Unicycle robots on a DEM and DSM, in contact while their lidar has a line of sight.
+
+    In the first phase of a bound the lead drives to its stop in the next cell while T2 watches from
+    its posts in the last; in the second, T2 closes up to its next posts while the lead watches. The
+    contact rate of a robot of T2 is the share of ticks, of both phases, in which it is in contact
+    with the lead. Awareness of a mission is that of the workspace's maps.
+
+    A simulator with other motion derives from this class and replaces `drive`.
+    """
+
+    def __init__(
+        self,
+        workspace: Workspace,
+        *,
+        terrain: xr.Dataset | None = None,
+        sight: Sight | str | None = None,
+        team: Team | None = None,
+        tick: float = 0.5,
+        bound_timeout: float = 600.0,
+        events: Sequence[Event] = (),
+    ) -> None:
+        """Prepare a terrain for simulation.
+
+        Robots stand and drive where the workspace planned. The true terrain, sight and team decide
+        contact, motion and failure only.
+
+        Args:
+            workspace: A workspace made from a terrain.
+            terrain: True DEM and DSM, where they differ from the workspace's, which they cover.
+            sight: True model of sight; by default the workspace's.
+            team: True robots, of the same names; by default the workspace's.
+            tick: Length of a tick, s.
+            bound_timeout: Longest duration of a bound, s; the mission then ends as "timeout".
+            events: Changes of the world in some missions, such as `Jam` or `Dust`.
+
+        Raises:
+            TrustboError: A workspace without terrain, a team of other robots, a value that is not
+                positive, an event that does not fit the terrain or the team.
+        """
+        assumed = (*workspace.sights, Sight())[0]
+        self.workspace, self.terrain = workspace, terrain
+        self.sight = assumed if sight is None else sights_of(sight)[0]
+        self.team = workspace.team if team is None else team
+        if self.team.names != workspace.team.names:
+            raise TrustboError(
+                f"the true team has robots {self.team.names}, the workspace's "
+                f"{workspace.team.names}; give as many, by the same names."
+            )
+        surface = true_surface(workspace, terrain)
+        self.tick = require_positive("tick", tick)
+        self.bound_timeout = require_positive("bound_timeout", bound_timeout)
+        self._max_ticks = round(self.bound_timeout / self.tick)
+        self._usual, self.events = world_of(surface, self.sight, self.team), tuple(events)
+        for event in self.events:
+            event.change(self._usual)  # refuses what does not fit
+        self._ways = workspace.ground
+
+    def describe(self) -> dict[str, object]:
+        """Return the settings that decide what a mission measures."""
+        same_team, terrain = self.team == self.workspace.team, self.terrain
+        rasters = () if terrain is None else (terrain[n].values for n in ("y", "x", "dem", "dsm"))
+        return {
+            "simulator": type(self).__name__,
+            "sight": dataclasses.asdict(self.sight),
+            "tick": self.tick,
+            "bound_timeout": self.bound_timeout,
+            "events": [repr(event) for event in self.events],
+            "true_team": None if same_team else dataclasses.asdict(self.team),
+            "true_terrain": None if terrain is None else digest(*rasters),
+        }
+
+    def describe_world(self, mission: int) -> dict[str, object]:
+        """Return the settings of the world of a mission, which are equal in equal worlds."""
+        acting = [event for event in self.events if event.acts_in(mission)]
+        always = [repr(dataclasses.replace(event, first=0, last=None)) for event in acting]
+        return {**self.describe(), "events": always}
+
+    def world(self, mission: int = 0, *, long_run: bool = False) -> World:
+        """World of a mission; with `long_run`, what varies from bound to bound has its mean."""
+        return changed(self._usual, self.events, require_whole("mission", mission, 0), long_run)
+
+    def run(self, path: Sequence[Cell], *, seed: int, mission: int = 0) -> Mission:
+        """Run a path from start to goal, or until a bound fails.
+
+        Args:
+            path: Cells, each a neighbour of the last.
+            seed: Seed of slip and detections: the same seed gives the same mission.
+            mission: Number of the mission, from 0, by which events go.
+
+        Raises:
+            TrustboError: A cell that is off the grid or impassable, or fewer than two cells.
+        """
+        cells, seed = require_path(self.workspace, path), require_whole("seed", seed, 0)
+        awareness, world = self.workspace.along(cells), self.world(mission)
+        state, time = self.standing(*cells[:2]), 0.0
+        bounds: list[Bound] = []
+        for k, (cell, after) in enumerate(zip(cells[1:], [*cells[2:], None], strict=True), start=1):
+            rng = np.random.default_rng([seed, k])
+            drive, contact, state = self._run_bound(world, state, k, cell, after, rng)
+            n_ticks = np.full(self.team.n_robots, len(contact))
+            measured = awareness[k - 1], contact.mean(0), n_ticks * self.tick
+            bounds.append(Bound(cell, *measured, drive.status, time, drive.poses, contact, n_ticks))
+            time = bounds[-1].t1
+            if drive.status != "ok":
+                break
+        names = self.workspace.features, self.workspace.team.names
+        return Mission(tuple(cells), tuple(bounds), bounds[-1].status, *names)
+
+    def standing(self, cell: Cell, next_cell: Cell | None) -> State:
+        """State of a team with all robots in their places in a cell, to go to the next."""
+        posts = self._ways.posts
+        stops = np.concatenate([posts.stop(cell)[None], posts.watching(cell, next_cell)])
+        poses = np.concatenate([stops, np.zeros((len(stops), 1))], axis=1)
+        return State(cell, poses, stops, new_tracks(len(stops) - 1))
+
+    def drive(
+        self,
+        world: World,
+        poses: np.ndarray,
+        robots: Sequence[Robot],
+        routes: Sequence[np.ndarray | None],
+        window: tuple[int, int, int, int],
+        max_ticks: int,
+        rng: np.random.Generator,
+    ) -> tuple[np.ndarray, str]:
+        """Drive robots along routes at the same time, until all arrive or one fails.
+
+        Args:
+            world: World of the mission.
+            poses: Initial positions and headings, shape (robot, 3).
+            robots: True robots.
+            routes: Points of the route of each robot, shape (point, 2); None for one without.
+            window: Pixels of the planned surface within which the routes keep: first and end row,
+                first and end column.
+            max_ticks: Ticks until the status is "timeout".
+            rng: Random numbers.
+
+        Returns:
+            Poses after each tick, shape (tick, robot, 3), and the status.
+        """
+        return drive_together(world.surface, robots, routes, poses, self.tick, max_ticks, rng)
+
+    def contact_ahead(
+        self,
+        world: World,
+        state: State,
+        cell: Cell,
+        ahead: Sequence[Cell | None],
+        rng: np.random.Generator,
+    ) -> list[tuple[float, str, State]]:
+        """Simulate the first bound of a mission for each cell that may follow it.
+
+        Moves that alternatives share are simulated once. Where a scan decides by itself about
+        contact, the rate is the mean probability of detection, else that of simulated tracks.
+
+        Returns:
+            For each next cell, the contact rate, mean over robots, the status, and the state
+            after the bound.
+        """
+        lead = self._advance(world, state, cell, rng)
+        drives, runs = [lead], []
+        moves: dict[bytes, int] = {}  # by their goals
+        for next_cell in ahead:
+            run = [0]
+            if lead.status == "ok":
+                goals = self._ways.posts.watching(cell, next_cell)
+                if (key := goals.tobytes()) not in moves:
+                    moves[key] = len(drives)
+                    drives.append(self._close_up(world, state, lead, cell, goals, rng))
+                run.append(moves[key])
+            runs.append(run)
+        lidars = world.team.lead, *world.team.robots
+        independent = all(robot.acquire == robot.drop == 1 for robot in lidars)
+        seen = detections(world, drives, 1)
+        outcomes = []
+        for run in runs:
+            whole = _joined([drives[i] for i in run])
+            probability = np.concatenate([seen[i] for i in run])
+            contact, tracks = probability, state.tracks
+            if not independent:
+                contact, tracks = self._contact(world, tracks, whole, probability, rng)
+            after = State(cell, whole.poses[-1], whole.stops, tracks)
+            outcomes.append((float(contact.mean()), whole.status, after))
+        return outcomes
+
+    # --- one bound ---
+
+    def _run_bound(
+        self,
+        world: World,
+        state: State,
+        k: int,
+        cell: Cell,
+        next_cell: Cell | None,
+        rng: np.random.Generator,
+    ) -> tuple[Drive, np.ndarray, State]:
+        """Run bound k: movements, contact at each tick (tick, robot), and the state after it."""
+        drive = self._advance(world, state, cell, rng)
+        if drive.status == "ok":
+            goals = self._ways.posts.watching(cell, next_cell)
+            drive = _joined([drive, self._close_up(world, state, drive, cell, goals, rng)])
+        probability = detections(world, [drive], k)[0]
+        contact, tracks = self._contact(world, state.tracks, drive, probability, rng)
+        return drive, contact, State(cell, drive.poses[-1], drive.stops, tracks)
+
+    def _advance(self, world: World, state: State, cell: Cell, rng: np.random.Generator) -> Drive:
+        """Drive the lead to its stop in a cell while T2 stands."""
+        robots = [world.team.lead], [self.workspace.team.lead]
+        goals = self._ways.posts.stop(cell)[None]
+        return self._move(world, state, cell, slice(0, 1), robots, goals, self._max_ticks, rng)
+
+    def _close_up(
+        self,
+        world: World,
+        state: State,
+        lead: Drive,
+        cell: Cell,
+        goals: np.ndarray,
+        rng: np.random.Generator,
+    ) -> Drive:
+        """Drive T2 to goals (robot, 2) in a cell while the lead stands."""
+        robots = world.team.robots, self.workspace.team.robots
+        now = state._replace(poses=lead.poses[-1], stops=lead.stops)
+        left = self._max_ticks - len(lead.poses)
+        return self._move(world, now, cell, slice(1, None), robots, goals, left, rng)
+
+    def _move(
+        self,
+        world: World,
+        state: State,
+        cell: Cell,
+        members: slice,
+        robots: tuple[Sequence[Robot], Sequence[Robot]],
+        goals: np.ndarray,
+        max_ticks: int,
+        rng: np.random.Generator,
+    ) -> Drive:
+        """Drive part of the team, the true `robots` as those that were planned for, to goals.
+
+        Routes start at the planned places, robots at their current poses.
+        """
+        true, planned = robots
+        now, window = state.poses, self._ways.posts.window(state.cell, cell)
+        routes: list[np.ndarray | None] = []
+        for robot, start, goal, pose in zip(
+            planned, state.stops[members], goals, now[members], strict=True
+        ):
+            route = self._ways.routes.find(robot, start, goal, window)
+            routes.append(None if route is None else np.concatenate([pose[None, :2], route[1:]]))
+        moved, status = self.drive(world, now[members], true, routes, window, max_ticks, rng)
+        poses = np.repeat(now[None], len(moved), axis=0)
+        poses[:, members] = moved
+        stops = state.stops.copy()
+        if status == "ok":
+            stops[members] = goals
+        return Drive(poses, np.full(len(poses), members.start == 0), status, stops)
+
+    def _contact(
+        self,
+        world: World,
+        tracks: np.ndarray,
+        drive: Drive,
+        probability: np.ndarray,
+        rng: np.random.Generator,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Contact at each tick, (tick, robot), and the tracks after it."""
+        detected = rng.random(probability.shape) < probability
+        contact, tracks = np.empty(detected.shape, bool), tracks.copy()
+        watchers = world.team.robots, (world.team.lead,) * world.team.n_robots
+        for phase, lidars in enumerate(watchers):
+            mask = drive.lead_moves == (phase == 0)
+            contact[mask] = contact_of(detected[mask], lidars, tracks[phase])
+        return contact, tracks
+
+
+def _joined(drives: Sequence[Drive]) -> Drive:
+    """Movements one after the other."""
+    poses = np.concatenate([drive.poses for drive in drives])
+    moves = np.concatenate([drive.lead_moves for drive in drives])
+    return drives[-1]._replace(poses=poses, lead_moves=moves)

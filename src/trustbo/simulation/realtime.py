@@ -1,0 +1,103 @@
+"""Real-time awareness of the paper: the map fused with the state of the robot that drives.
+
+Each feature is the first principal component of the map's value and of the robot's motion, for
+traversability, or of what its lidar sees, for visibility. The inputs are means over the ticks of a
+bound in which the robot moves.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from trustbo.data import Bound, Mission
+from trustbo.errors import TrustboError
+from trustbo.simulation.kinematic import KinematicSimulator
+from trustbo.terrain import CompositeIndex
+from trustbo.workspace.sight import detection_probability, optics
+
+SIGNS = {
+    "traversability": {"map": +1, "speed_ratio": +1, "pitch": -1, "roll": -1},
+    "visibility": {"map": +1, "return_range": +1, "visible_share": +1},
+}
+"""Inputs of each feature, and whether they raise it: angles in rad, the range in m."""
+MIN_SAMPLES = 200
+"""Least number of robots x bounds to fit on: with fewer, the loadings are unstable."""
+_SHARES, _ANGLES = np.array([0.25, 0.5, 0.75, 1.0]), np.linspace(0.0, 2.0 * np.pi, 13)[:-1]
+
+
+class RealtimeAwareness:
+    """Awareness as robots measure it in a bound.
+
+    Attributes:
+        indices: Fitted `CompositeIndex` by feature.
+    """
+
+    def __init__(self, simulator: KinematicSimulator, missions: Sequence[Mission]) -> None:
+        """Fit the indices to calibration missions of a simulator; TrustboError if they are few."""
+        self._workspace, self._world = simulator.workspace, simulator.world()
+        self._tick = simulator.tick
+        samples = [self.inputs(bound) for mission in missions for bound in mission.bounds]
+        n_samples = len(samples) * self._world.team.n_robots
+        if n_samples < MIN_SAMPLES:
+            raise TrustboError(
+                f"real-time awareness needs {MIN_SAMPLES} robots x bounds; got {n_samples}."
+            )
+        self.indices = {
+            feature: CompositeIndex(signs).fit(
+                {name: np.concatenate([one[feature][name] for one in samples]) for name in signs}
+            )
+            for feature, signs in SIGNS.items()
+        }
+
+    def inputs(self, bound: Bound) -> dict[str, dict[str, np.ndarray]]:
+        """Inputs of each feature, see `SIGNS`, arrays (robot,)."""
+        world, pixels, poses = self._world, self._workspace.pixels, bound.poses[:, 1:]
+        way = np.diff(poses[..., :2], axis=0, prepend=poses[:1, :, :2])
+        speed = np.hypot(way[..., 0], way[..., 1]) / self._tick
+        gx, gy = world.surface.gradient[:, *world.surface.nearest(poses[..., 0], poses[..., 1])]
+        ahead, left = np.cos(poses[..., 2]), np.sin(poses[..., 2])
+        return_range, visible_share = self._lidar(poses)
+        state = {
+            "speed_ratio": np.minimum(speed / [robot.speed for robot in world.team.robots], 1.0),
+            "pitch": np.abs(np.arctan(gx * ahead + gy * left)),
+            "roll": np.abs(np.arctan(gy * ahead - gx * left)),
+            "return_range": return_range,
+            "visible_share": visible_share,
+        }
+        place = self._workspace.surface.nearest(poses[..., 0], poses[..., 1])
+        moved = speed > 0.0
+        moved[0] |= ~moved.any(0)
+        found = {}
+        for feature, signs in SIGNS.items():
+            ticks = state | {"map": pixels[feature].values[place]}
+            found[feature] = {n: (ticks[n] * moved).sum(0) / moved.sum(0) for n in signs}
+        return found
+
+    def measured(self, mission: Mission) -> Mission:
+        """The mission with the features of `SIGNS` as the robots measured them."""
+        bounds = []
+        for bound in mission.bounds:
+            awareness = bound.awareness.copy()
+            for feature, inputs in self.inputs(bound).items():
+                column = mission.features.index(feature)
+                awareness[:, column] = self.indices[feature].transform(inputs)
+            bounds.append(replace(bound, awareness=awareness))
+        return replace(mission, bounds=tuple(bounds))
+
+    def _lidar(self, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Mean range of returns, m, and share of clear beams, both (tick, robot).
+
+        The mean range is the integral over range of the share of beams that reach it.
+        """
+        world = self._world
+        left, bottom, right, top = world.surface.extent
+        robot = world.team.robots[0]
+        reach = min(robot.lidar_range, 0.5 * (right - left), 0.5 * (top - bottom))
+        beams = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
+        eye = np.broadcast_to(poses[..., None, None, :2], (*poses.shape[:2], 4, 12, 2))
+        target = np.clip(eye + reach * _SHARES[:, None, None] * beams, (left, bottom), (right, top))
+        rays = eye.reshape(-1, 2), target.reshape(-1, 2), optics(robot, world.team.lead)
+        clear = detection_probability(world.surface, world.sight, *rays).reshape(eye.shape[:-1])
+        seen = np.insert(clear.mean(-1), 0, 1.0, axis=-1)  # (tick, robot, 1 + share)
+        return reach * np.trapezoid(seen, [0.0, *_SHARES], axis=-1), seen[..., -1]
