@@ -78,7 +78,7 @@ def judged_plans(world, simulator, course, seed, given):
                 }
             )
         if number < max(ASKED):
-            mission = simulator.run(plan.path, seed=campaign.seed_of("mission"))
+            mission = simulator.run(plan.path, seed=campaign.state.seed_of("mission"))
             campaign.tell(mission)
     return gathered
 

@@ -164,7 +164,7 @@ def loo(given):
 def along_random_paths(world, n=15):
     """Missions along random paths through a world."""
     workspace = world.workspace()
-    options = {"policy": "random", "max_bounds": "shortest+4", "sampler": "exact"}
+    options = {"policy": "random", "sampler": "exact", "planner": {"max_bounds": "shortest+4"}}
     campaign = tb.Campaign(workspace, *world.ends("sw-ne"), **options)
     run = campaign.run(world.simulator(workspace), n_iterations=n)
     return [workspace.fill(mission) for _, mission in run]

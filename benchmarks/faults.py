@@ -52,13 +52,14 @@ class Fault(NamedTuple):
 
 MEASURED = """\
         if self.storage is not None:
-            extras = [*(entry.extra for entry in self.state.entries), extra]
-            self.storage.write_measured([*self.state.measured, mission], extras)
+            self.storage.add_mission(len(state.entries), entry, extra)
 """
 LEARNED = """\
-        seconds = {"seconds_plan": self._asked[0], "seconds_run": started - self._asked[1]}
-        entry = self.state.add(mission, learned, plan, trust_map, extra, **seconds)
-        self.learner.take(self.state, seed)
+        if reason := why_never_learned(learned):
+            entry.become(EXCLUDED, reason)
+            warnings.warn(f"mission {len(state.entries)} is excluded: {reason}", stacklevel=4)
+        else:
+            self._learn(seed)
 """
 FAULTS = (
     Fault("the evidence has the wrong sign of beta0", "inference/evidence/gaussian.py",
@@ -114,10 +115,9 @@ FAULTS = (
     Fault("the truth's best path ends on the last bound but one", "simulation/truth.py",
           "last = (passed * contact)[:, *goal, END]", "last = (passed * contact)[:, *goal, 0]"),
     Fault("a fit takes the seeds of the policy", "campaign/campaign.py",
-          'self.trust_map(), self.seed_of("fit")', 'self.trust_map(), self.seed_of("policy")'),
+          'self.ask(), self.state.seed_of("fit")', 'self.ask(), self.state.seed_of("policy")'),
     Fault("a mission is learned from before it is on disk", "campaign/campaign.py",
-          MEASURED + LEARNED,
-          LEARNED + MEASURED.replace(", mission]", "]").replace(", extra]", "]")),
+          MEASURED + LEARNED, LEARNED + MEASURED),
     Fault("the y axis of a map for ROS is flipped", "export/ros.py",
           "raster.values[::-1].astype(np.uint8)", "raster.values.astype(np.uint8)"),
     Fault("frames are rotated the other way", "export/frame.py",

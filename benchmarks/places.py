@@ -82,16 +82,14 @@ def driven(side, n_missions, random_ends, missing=0.0):
 
 def campaign(world, workspace, course, n, seed, **options):
     """Result of a campaign on a world, and the regret of what is recommended after each mission."""
-    truth, results = world.truth(), []
-
-    def judge(campaign, mission):
-        results.append(truth.regret(campaign.recommend(), **TARGETS))
-
-    result = tb.iterate(
-        workspace, *world.ends(course), n_iterations=n, simulator=world.simulator(workspace),
-        seed=seed, progress=False, callbacks=[judge], **TARGETS, **options,
+    truth, planner = world.truth(), {"max_bounds": TARGETS["max_bounds"]}
+    campaign = tb.Campaign(
+        workspace, *world.ends(course), objective=TARGETS["objective"], planner=planner, seed=seed,
+        **options,
     )  # fmt: skip
-    return result, np.array(results)
+    steps = campaign.run(world.simulator(workspace), n)
+    results = [truth.regret(campaign.recommend(), **TARGETS) for _ in steps]
+    return campaign.result(), np.array(results)
 
 
 def times(given):

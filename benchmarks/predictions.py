@@ -30,6 +30,7 @@ from trustbo.inference import fit, score
 from trustbo.inference.score import AMONG
 from trustbo.models import PlaceEffect, PooledTrust, Priors, RobotEffect
 from trustbo.models.backend import own_settings
+from trustbo.planning import Planner
 from trustbo.study import worlds
 from trustbo.study.world import COURSES, World
 from trustbo.workspace.moves import bounds_along
@@ -291,7 +292,8 @@ def _models(features: Sequence[str]) -> dict[str, PooledTrust]:
 def _band(campaign: Campaign) -> tuple[float, float, Sequence[Cell]]:
     """Ends of the 90 % band of contact lost on the path that would be recommended, and the path."""
     path = campaign.recommend().path
-    planner = campaign.planner.with_observation(campaign.learner.observation)  # without the hazard
+    observation = campaign.model.observation
+    planner = Planner(campaign.workspace, path[0], path[-1], observation=observation)
     low, high = planner.evaluate(path, campaign.posterior).value_band
     return -high, -low, path
 

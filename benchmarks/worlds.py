@@ -20,7 +20,6 @@ from baselines import line_of_sight, oracle, residual_process, running_mean
 from common import arguments, parsed
 from groups import KINDS, OURS, report_groups, rows_of
 
-from trustbo.campaign.options import POLICY
 from trustbo.files import to_json
 from trustbo.study import run_worlds, worlds, worlds_table
 from trustbo.study.methods import BASELINE_ROWS
@@ -28,9 +27,9 @@ from trustbo.study.store import Store
 from trustbo.study.table import as_text, differences, to_dataset, worse_than
 
 METHODS: dict[str, Any] = {
-    OURS: {"model": "robots", "policy": POLICY},
+    OURS: {"model": "robots", "policy": "greedy"},
     "trustbo, optimistic": {"model": "robots", "policy": "optimistic"},
-    "trustbo, places": {"model": "places", "policy": POLICY},
+    "trustbo, places": {"model": "places", "policy": "greedy"},
     "trustbo, no places": {"model": "pooled", "policy": "greedy"},
     "running mean": running_mean.greedy,
     "running mean, optimistic": running_mean.optimistic,

@@ -26,8 +26,8 @@ def test_awareness_is_of_cells_and_of_the_paper_s_two_composites(workspace):
 
 def test_a_campaign_learns_equations_3_and_4_by_nuts_and_plans_by_equation_6(workspace):
     result = tb.iterate(
-        workspace, (2, 0), (0, 2), n_iterations=1, draws=300, warmup=150, progress=False,
-        **tb.paper.CAMPAIGN,
+        workspace, (2, 0), (0, 2), n_iterations=1, progress=False,
+        fit={"draws": 300, "warmup": 150}, **tb.paper.CAMPAIGN,
     )  # fmt: skip
     posterior = result.posterior
     assert posterior.attrs["sampler"] == "nuts"
@@ -39,6 +39,6 @@ def test_a_campaign_learns_equations_3_and_4_by_nuts_and_plans_by_equation_6(wor
 
 def test_the_first_path_is_of_one_draw_of_the_prior(workspace):
     first = [tb.Campaign(workspace, (2, 0), (0, 2), seed=s, **tb.paper.CAMPAIGN) for s in (0, 1)]
-    a, b = (campaign.learner.belief.beta for campaign in first)
+    a, b = (campaign.belief.beta for campaign in first)
     assert a.shape == (1, 2)
     assert (a != b).all()

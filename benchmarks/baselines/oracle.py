@@ -6,7 +6,7 @@ Less than 0.01 s a mission, once the truth is there.
 """
 
 from trustbo.campaign.campaign import Campaign
-from trustbo.campaign.planners import path_class
+from trustbo.campaign.running import path_class
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
 from trustbo.planning import Planner

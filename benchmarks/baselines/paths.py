@@ -34,7 +34,7 @@ class PathPolicy:
 
     def recommend(self, campaign: Campaign) -> Path:
         """Path that is recommended now."""
-        return self.best(campaign.planner_now())
+        return self.best(campaign.planner)
 
     def learn(self, campaign: Campaign, mission: Mission) -> None:
         """Learn from a mission."""

@@ -16,7 +16,6 @@ from . import (
 )
 from .campaign import (
     Campaign,
-    CampaignOptions,
     Follower,
     RegretBound,
     Result,
@@ -36,7 +35,6 @@ from .workspace import Workspace
 __all__ = [
     "Bound",
     "Campaign",
-    "CampaignOptions",
     "DamagedFileError",
     "Follower",
     "Mission",

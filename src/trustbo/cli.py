@@ -207,7 +207,7 @@ def _run(args: argparse.Namespace, workspace: "Workspace", **options: Any) -> No
     import trustbo as tb
 
     result = tb.iterate(
-        workspace, n_iterations=args.missions, checkpoint=args.out, overwrite=args.overwrite,
+        workspace, n_iterations=args.missions, directory=args.out, overwrite=args.overwrite,
         seed=args.seed, progress=not args.quiet, **options,
     )  # fmt: skip
     _finish(result, args.out, args.quiet)

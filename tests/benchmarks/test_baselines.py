@@ -159,7 +159,7 @@ def test_the_middle_of_a_bound_lies_between_its_cells_and_its_direction_has_leng
 @pytest.mark.parametrize("make", LEARNERS)
 def test_a_baseline_is_that_of_line_of_sight_at_first_and_leaves_a_path_that_is_bad(planner, make):
     policy = make()
-    campaign = SimpleNamespace(planner=planner, planner_now=lambda: planner)
+    campaign = SimpleNamespace(planner=planner)
     first = policy.recommend(campaign)
     walks = every_path(planner)
     best = max(paths.predicted(planner, walk) for walk in walks)
@@ -182,7 +182,7 @@ def test_the_oracle_is_without_regret_in_the_world_of_each_mission(workspace, tm
     truth = Truth.of(simulator, n_replicates=1, folder=tmp_path)
     policy = oracle.Oracle(truth)
     now = Planner(workspace, START, GOAL, "lost_contact", max_bounds="shortest+2")
-    campaign = SimpleNamespace(planner=now, planner_now=lambda: now)
+    campaign = SimpleNamespace(planner=now)
     chosen = []
     for mission in range(3):
         chosen.append(policy.recommend(campaign))

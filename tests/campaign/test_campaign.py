@@ -1,27 +1,20 @@
-"""Ask and tell: whatever runs the missions."""
+"""Ask and tell: what a campaign plans, learns, excludes and refuses."""
 
-import json
 from dataclasses import replace
 
+import jax
 import numpy as np
 import pytest
 from worlds import ModelSimulator, random_cells
 
-from trustbo import (
-    Campaign,
-    Mission,
-    NoPathError,
-    ShapeError,
-    TrustboError,
-    Workspace,
-)
-from trustbo.inference import fit, sample_prior
+import trustbo as tb
+from trustbo.data import Mission
+from trustbo.inference import fit
 from trustbo.models import CoupledTrust, HierarchicalTrust, PooledTrust
 from trustbo.models.record import model_to_record
-from trustbo.planning import policies
-from trustbo.study.methods import MODELS, model_of
 
 ENDS = ((3, 0), (0, 3))
+DIAGONAL = ((3, 0), (2, 1), (1, 2), (0, 3))
 
 
 @pytest.fixture(scope="module")
@@ -29,196 +22,275 @@ def workspace():
     return random_cells()
 
 
-def test_ask_is_the_same_until_told(workspace):
-    campaign = Campaign(workspace, *ENDS, sampler="exact", policy="thompson")
+def begin(workspace, **options):
+    usual = {"model": PooledTrust(), "sampler": "exact", "objective": "mean"}
+    return tb.Campaign(workspace, *ENDS, **usual | options)
+
+
+def rates(workspace, path, seed=0, **options):
+    return ModelSimulator(workspace, blind=True, **options).run(path, seed=seed)
+
+
+def states(campaign):
+    return campaign.table()["state"].tolist()
+
+
+def refuse(*args, **kwargs):
+    raise tb.PosteriorError("R-hat of beta0 is 1.5.")
+
+
+def test_ask_returns_the_same_plan_until_a_mission_is_told(workspace):
+    campaign = begin(workspace, policy="thompson")
     plan = campaign.ask()
     assert campaign.ask() is plan
     assert campaign.posterior is None
-    mission = ModelSimulator(workspace).run(plan.path, seed=0)
-    posterior = campaign.tell(mission)
-    assert campaign.posterior is campaign.posterior
+    posterior = campaign.tell(rates(workspace, plan.path))
     np.testing.assert_array_equal(campaign.posterior["posterior"]["b"], posterior["posterior"]["b"])
+    assert campaign.posterior is campaign.posterior
     assert campaign.missions[0].path == plan.path
-    assert [entry.plan for entry in campaign.state.entries] == [plan]
     assert campaign.ask() is not plan
 
 
-def test_the_first_plan_is_from_one_draw_of_the_prior_or_from_its_mean(workspace):
-    first = [Campaign(workspace, *ENDS, initial="prior_draw", seed=s).belief for s in range(2)]
+def test_first_plan_is_from_the_mean_of_the_prior_or_from_one_draw(workspace):
+    first = [begin(workspace, initial="prior_draw", seed=s).belief for s in range(2)]
     assert np.shape(first[0].beta) == (1, 2)
     assert first[0].beta0[0] != first[1].beta0[0]
-    mean = Campaign(workspace, *ENDS).belief
-    assert mean.beta0.tolist() == [0.5]
-    assert mean.beta.tolist() == [[0.0, 0.0]]
+    mean = begin(workspace).belief
+    assert (mean.beta0.tolist(), mean.beta.tolist()) == ([0.5], [[0.0, 0.0]])
 
 
-def test_fits_and_studies_have_the_default_model_of_campaigns(workspace):
-    campaign = Campaign(workspace, *ENDS)
-    path = [(3, 0), (2, 1), (1, 2), (0, 3)]
-    missions = [ModelSimulator(workspace).run(path, seed=0)]
-    posterior = fit(missions, draws=50, whole=False, check=False, progress=False)
-    record = model_to_record(campaign.model)
+def test_default_model_is_that_of_fit(workspace):
+    record = model_to_record(tb.Campaign(workspace, *ENDS).model)
+    assert record == model_to_record(tb.models.default_model())
     assert record["place"] is not None
-    assert json.loads(posterior.attrs["model_record"]) == record
-    assert model_to_record(model_of(MODELS["robots"])) == record
 
 
-def test_the_posterior_is_that_of_all_missions_so_far(workspace):
-    campaign = Campaign(workspace, *ENDS, model=PooledTrust(), sampler="exact")
-    simulator = ModelSimulator(workspace)
+def test_posterior_is_that_of_all_missions_with_the_awareness_of_the_map(workspace):
+    """What robots measure is half of what the map has; plans go by the map."""
+    lower = tb.Workspace.from_awareness(0.5 * workspace.awareness.values)
+    campaign = begin(workspace, fit={"draws": 300})
     for j in range(2):
-        seed = campaign.seed_of("fit")
-        campaign.tell(simulator.run(campaign.ask().path, seed=j))
-    again = fit(campaign.missions, PooledTrust(), sampler="exact", seed=seed)
-    np.testing.assert_array_equal(
-        again["posterior"]["beta"].values, campaign.posterior["posterior"]["beta"].values
-    )
+        seed = campaign.state.seed_of("fit")
+        campaign.tell(ModelSimulator(lower).run(campaign.ask().path, seed=j))
+    expected = [replace(m, bounds=tuple(
+        replace(b, awareness=z) for b, z in zip(m.bounds, workspace.along(m.path), strict=True)
+    )) for m in campaign.missions]  # fmt: skip
+    again = fit(expected, PooledTrust(), sampler="exact", seed=seed, draws=300)
+    for group in ("posterior", "log_likelihood"):
+        for name, values in again[group].data_vars.items():
+            np.testing.assert_array_equal(values, campaign.posterior[group][name])
+    measured = campaign.state.entries[0].measured.awareness[0]
+    np.testing.assert_array_equal(measured, 0.5 * campaign.missions[0].awareness[0])
 
 
-def test_unmeasured_awareness_comes_from_the_map(workspace):
-    campaign = Campaign(workspace, *ENDS, sampler="exact")
-    campaign.tell(ModelSimulator(workspace, blind=True).run(campaign.ask().path, seed=0))
-    cell = campaign.missions[0].bounds[0].cell
-    np.testing.assert_array_equal(
-        campaign.missions[0].awareness[0], workspace.awareness.values[:, *cell]
-    )
+def test_options_of_planner_and_fit_are_passed_on(workspace):
+    campaign = begin(workspace, fit={"draws": 60, "n_chains": 2}, planner={"max_bounds": 5})
+    assert campaign.planner.max_bounds == 5
+    sizes = campaign.tell(rates(workspace, campaign.ask().path))["posterior"].sizes
+    assert (sizes["chain"], sizes["draw"]) == (2, 60)
+    with pytest.raises(tb.TrustboError, match="drws"):
+        begin(workspace, fit={"drws": 3})
+    with pytest.raises(TypeError, match="max_bound"):
+        begin(workspace, planner={"max_bound": 3})
 
 
-def test_missions_are_learned_from_with_the_awareness_of_the_map(workspace):
-    # Awareness is measured lower than the map has it, everywhere: plans go by the map, and must
-    # predict what was measured on the path.
-    lower = Workspace.from_awareness(0.5 * workspace.awareness.values)
-    simulator = ModelSimulator(lower)
-    blind, told = (Campaign(workspace, *ENDS, sampler="exact", seed=1) for _ in range(2))
-    for j in range(4):
-        mission = simulator.run(told.ask().path, seed=j)
-        told.tell(mission)
-        unmeasured = [
-            replace(b, awareness=np.full_like(b.awareness, np.nan)) for b in mission.bounds
-        ]
-        blind.tell(replace(mission, bounds=tuple(unmeasured)))
-    np.testing.assert_array_equal(
-        told.missions[3].awareness, workspace.along(told.missions[3].path)
-    )
-    assert told.posterior["posterior"].equals(blind.posterior["posterior"])
-    assert told.recommend().value == blind.recommend().value
-    np.testing.assert_array_equal(told.state.measured[3].awareness, mission.awareness)
+@pytest.mark.parametrize("model", [HierarchicalTrust(), CoupledTrust()])
+def test_every_model_plans_with_bands(model):
+    campaign = tb.Campaign(random_cells(2), *ENDS, model=model, objective="terminal")
+    plan = campaign.ask()
+    assert plan.trust.shape[1] == 2
+    assert plan.bands.shape == (4, *plan.trust.shape)
 
 
-def test_another_team_s_mission_is_refused(workspace):
-    campaign = Campaign(workspace, *ENDS)
-    mission = Mission.from_arrays([(3, 0), (2, 1)], np.full((1, 2, 2), 0.5), np.full((1, 2), 0.5))
-    with pytest.raises(ShapeError, match=r"the mission has robots \('r1', 'r2'\), not"):
-        campaign.tell(mission)
+def test_recommendation_is_greedy_whatever_the_policy(workspace):
+    campaign = begin(workspace, policy="random")
+    campaign.tell(rates(workspace, campaign.ask().path))
+    assert campaign.recommend().path == campaign.planner.plan(campaign.belief.mean()).path
+
+
+def test_custom_policy_is_called_and_checked(workspace):
+    def leaps(key, draws, planner):
+        return replace(planner.plan(draws.mean()), path=((3, 0), (1, 1), (0, 3)))
+
+    def diagonal(key, draws, planner):
+        return planner.evaluate(DIAGONAL, draws.mean())
+
+    assert begin(workspace, policy=diagonal).ask().path == DIAGONAL
+    with pytest.raises(tb.TrustboError, match="leaps"):
+        begin(workspace, policy=leaps).ask()
+    with pytest.raises(tb.TrustboError, match="policy"):
+        begin(workspace, policy=lambda key, draws, planner: DIAGONAL).ask()
+
+
+@pytest.mark.parametrize("policy", ["thompson", "random"])
+def test_jax_flags_of_the_caller_do_not_change_a_campaign(workspace, policy):
+    def paths(*flags):
+        campaign = begin(workspace, policy=policy, seed=3, fit={"draws": 100})
+        for j, x64 in enumerate(flags):
+            with jax.enable_x64(x64), jax.threefry_partitionable(not x64):
+                campaign.tell(rates(workspace, campaign.ask().path, seed=j))
+        return [entry.plan.path for entry in campaign.state.entries]
+
+    assert paths(False, False, False) == paths(True, True, True)
+
+
+# --- missions that are refused, wait, or are excluded ---
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        [(0, 3), (1, 2), (2, 1), (3, 0)],  # from another start
+        [(3, 0), (1, 2), (0, 3)],  # with a jump
+        [(3, 0), (2, 1), (9, 9)],  # off the grid
+    ],
+)
+def test_mission_on_an_impossible_path_is_refused_and_not_recorded(workspace, tmp_path, path):
+    n = len(path) - 1
+    mission = Mission.from_arrays(path, np.full((n, 3, 2), 0.5), np.full((n, 3), 0.7))
+    with begin(workspace, directory=tmp_path) as campaign:
+        with pytest.raises(tb.TrustboError):
+            campaign.tell(mission)
+        assert campaign.missions == []
+        assert not (tmp_path / "missions").exists()
+
+
+def test_mission_of_another_team_or_with_a_reserved_number_is_refused(workspace):
+    campaign = begin(workspace)
+    other = Mission.from_arrays(DIAGONAL[:2], np.full((1, 2, 2), 0.5), np.full((1, 2), 0.5))
+    with pytest.raises(tb.ShapeError, match="robots"):
+        campaign.tell(other)
+    with pytest.raises(tb.TrustboError, match="status"):
+        campaign.tell(rates(workspace, DIAGONAL), objective=1.0, status=1.0)
+    with pytest.raises(tb.TrustboError, match="mission"):
+        campaign.tell([rates(workspace, DIAGONAL)])
     assert campaign.missions == []
 
 
-def test_a_mission_off_the_grid_is_refused(workspace):
-    campaign = Campaign(workspace, *ENDS, sampler="exact")
-    z = np.full((1, 3, 2), np.nan)
-    mission = Mission.from_arrays([(3, 0), (50, 50)], z, np.full((1, 3), 0.5))
-    with pytest.raises(TrustboError, match=r"path enters \(50, 50\), outside the grid of 4 rows"):
+def test_other_paths_and_cut_missions_are_learned_from(workspace):
+    campaign = begin(workspace, fit={"draws": 100})
+    campaign.suggest(DIAGONAL)
+    assert campaign.ask().path == DIAGONAL
+    other = ((3, 0), (2, 0), (1, 1), (0, 2), (0, 3))
+    assert campaign.tell(rates(workspace, other)) is not None
+    part = Mission.from_arrays(DIAGONAL[:3], np.full((2, 3, 2), 0.5), np.eye(3)[:2], status="stuck")
+    assert campaign.tell(part) is not None
+    assert campaign.missions[0].path == other
+
+
+def test_robots_and_features_are_put_in_the_order_of_the_workspace(workspace):
+    z, y = np.random.default_rng(0).uniform(size=(3, 3, 2)), np.eye(3) * 0.3 + 0.5
+    order, names = [2, 0, 1], ["traversability", "visibility"]
+    told = [
+        Mission.from_arrays(DIAGONAL, z, y),
+        Mission.from_arrays(
+            DIAGONAL, z[:, order][..., ::-1], y[:, order], features=names[::-1],
+            robots=["r3", "r1", "r2"],
+        ),
+    ]  # fmt: skip
+    found = []
+    for mission in told:
+        campaign = begin(workspace, fit={"draws": 100})
         campaign.tell(mission)
-    with pytest.raises(TrustboError, match="tell takes one Mission at a time; got int"):
-        campaign.tell(7)
+        found.append(campaign.missions[0])
+    for name in ("awareness", "contact_rate"):
+        np.testing.assert_array_equal(*(getattr(mission, name) for mission in found))
 
 
-def test_a_policy_of_one_s_own(workspace):
-    def along_the_diagonal(key, posterior, planner):
-        return planner.evaluate([(3, 0), (2, 1), (1, 2), (0, 3)], posterior.mean())
+def test_refused_posterior_leaves_a_mission_told_until_the_next_is_learned(workspace, monkeypatch):
+    campaign, tried = begin(workspace), []
 
-    campaign = Campaign(workspace, *ENDS, sampler="exact", policy=along_the_diagonal)
-    assert campaign.ask().path == ((3, 0), (2, 1), (1, 2), (0, 3))
-    assert campaign.settings["policy"] == "along_the_diagonal"
+    def refuse_all(*args, **kwargs):
+        tried.append((args[2], kwargs["seed"], kwargs["draws"]))
+        refuse()
+
+    with monkeypatch.context() as patch:
+        patch.setattr("trustbo.campaign.learning.fit", refuse_all)
+        with pytest.warns(UserWarning, match="mission 1"):
+            assert campaign.tell(rates(workspace, campaign.ask().path)) is None
+    # Another seed and more draws, then the other sampler.
+    samplers = [("exact", 1000), ("exact", 2000), ("nuts", 2000)]
+    assert [(sampler, n) for sampler, _, n in tried] == samplers
+    assert len({seed for _, seed, _ in tried}) == 3
+    assert states(campaign) == ["told"]
+    assert "R-hat" in campaign.table()["reason"][1]
+    assert campaign.belief is campaign._prior
+    with pytest.raises(tb.TrustboError, match="R-hat"):
+        _ = campaign.result().posterior
+    campaign.tell(rates(workspace, campaign.ask().path, seed=1))
+    assert states(campaign) == ["learned", "learned"]
+    assert campaign.posteriors[0] is None
+    assert campaign.posterior["constant_data"].sizes["mission"] == 2
 
 
-def test_a_policy_that_gives_no_plan_is_refused(workspace):
-    campaign = Campaign(workspace, *ENDS, policy=lambda key, posterior, planner: [(3, 0)])
-    with pytest.raises(TrustboError, match=r"'<lambda>' must return a Plan; got \[\(3, 0\)\]"):
-        campaign.ask()
+def test_defect_of_a_fit_costs_no_mission(workspace, monkeypatch):
+    def break_down(*args, **kwargs):
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    campaign = begin(workspace)
+    monkeypatch.setattr("trustbo.campaign.learning.fit", break_down)
+    with pytest.warns(UserWarning, match="LinAlgError"):
+        campaign.tell(rates(workspace, campaign.ask().path))
+    assert states(campaign) == ["told"]
 
 
-def test_a_policy_that_returns_a_broken_path_is_named_with_the_cell(workspace):
-    def leaps(key, posterior, planner):
-        plan = planner.plan(posterior.mean())
-        return replace(plan, path=((3, 0), (1, 1), (0, 3)))
+def test_mission_that_measured_nothing_or_left_the_map_is_excluded():
+    awareness = np.random.default_rng(0).uniform(size=(3, 4, 4, 2))
+    awareness[:, 2, 1] = np.nan
+    workspace = tb.Workspace.from_awareness(awareness)
+    campaign = begin(workspace, fit={"draws": 100})
+    detour = ((3, 0), (2, 0), (1, 1), (0, 2), (0, 3))
+    nothing = Mission.from_arrays(detour, np.full((4, 3, 2), np.nan), np.full((4, 3), np.nan))
+    unknown = Mission.from_arrays(DIAGONAL, np.full((3, 3, 2), np.nan), np.full((3, 3), 0.5))
+    for mission in (nothing, unknown):
+        with pytest.warns(UserWarning, match="excluded"):
+            assert campaign.tell(mission) is None
+    campaign.tell(rates(workspace, detour))
+    assert states(campaign) == ["excluded", "excluded", "learned"]
+    assert campaign.posterior["constant_data"]["mission"].values.tolist() == [2]
 
-    campaign = Campaign(workspace, *ENDS, policy=leaps)
-    with pytest.raises(
-        TrustboError, match=r"policy 'leaps': the path is broken: .* from \(3, 0\) to \(1, 1\)"
+
+def test_excluded_mission_is_forgotten_until_it_is_told_again(workspace):
+    campaign = begin(workspace, seed=1, fit={"draws": 300})
+    missions = [rates(workspace, DIAGONAL, seed=j, fail_at=2) for j in range(3)]
+    for mission in missions:
+        campaign.tell(mission)
+    assert campaign.hazard["failures"].values.sum() == 3
+    seed = campaign.state.seed_of("fit")
+    posterior = campaign.exclude(2, "the lidar was covered")
+    assert states(campaign) == ["learned", "excluded", "learned"]
+    assert campaign.table()["reason"][2] == "the lidar was covered"
+    assert campaign.hazard["failures"].values.sum() == 2
+    assert campaign.posterior["constant_data"]["mission"].values.tolist() == [0, 2]
+    rest = [campaign.missions[j] for j in (0, 2)]
+    again = fit(rest, PooledTrust(), sampler="exact", seed=seed, draws=300)
+    np.testing.assert_array_equal(again["posterior"]["beta"], posterior["posterior"]["beta"])
+    for n in (2, 4):  # excluded already; and none
+        with pytest.raises(tb.TrustboError, match=str(n)):
+            campaign.exclude(n, "again")
+    campaign.tell(missions[1])
+    assert campaign.posterior["constant_data"].sizes["mission"] == 3
+    for n in (1, 3, 4):
+        last = campaign.exclude(n, "wrong field")
+    assert last is None
+    assert campaign.posterior is None
+
+
+def test_bad_arguments_are_refused_at_once(workspace):
+    for options, said in (
+        ({"policy": "bold"}, "policy"),
+        ({"objective": "best"}, "objective"),
+        ({"sampler": "gibbs"}, "sampler"),
+        ({"initial": "zero"}, "initial"),
+        ({"model": "pooled"}, "model"),
+        ({"hazard": 0.1}, "hazard"),
+        ({"seed": -1}, "seed"),
     ):
-        campaign.ask()
-
-
-def test_recommending_is_greedy_whatever_the_policy(workspace):
-    campaign = Campaign(workspace, *ENDS, sampler="exact", policy="random")
-    campaign.tell(ModelSimulator(workspace).run(campaign.ask().path, seed=0))
-    best = policies.greedy(None, campaign.belief, campaign.planner)
-    assert campaign.recommend().path == best.path
-
-
-def test_bad_names_and_ends_are_refused_at_once(workspace):
-    for options, message in (
-        ({"policy": "bold"}, "unknown policy 'bold'; choose one of greedy, optimistic"),
-        ({"objective": "best"}, "unknown objective 'best'"),
-        ({"sampler": "gibbs"}, "unknown sampler 'gibbs'; choose one of auto, exact, nuts"),
-        ({"initial": "zero"}, "unknown initial 'zero'; choose one of prior_mean, prior_draw"),
-    ):
-        with pytest.raises(TrustboError, match=message):
-            Campaign(workspace, *ENDS, **options)
+        with pytest.raises(tb.TrustboError, match=said):
+            begin(workspace, **options)
     walls = np.ones((4, 4), bool)
     walls[2] = False
-    closed = Workspace.from_awareness(workspace.awareness.values, walls)
-    with pytest.raises(NoPathError, match="no path from"):
-        Campaign(closed, *ENDS)
-
-
-def test_what_cannot_be_planned_or_updated_with_is_refused_at_once(workspace):
-    with pytest.raises(TrustboError, match="model must be a trust model"):
-        Campaign(workspace, *ENDS, model="pooled")
-    with pytest.raises(TrustboError, match="unknown option 'update'"):
-        Campaign(workspace, *ENDS, update="refit")
-
-
-def test_a_campaign_with_censored_rates(workspace):
-    model = PooledTrust(observation="censored")
-    campaign = Campaign(workspace, *ENDS, model=model, policy="greedy")
-    campaign.tell(ModelSimulator(workspace).run(campaign.ask().path, seed=0))
-    assert campaign.posterior.attrs["sampler"] == "exact"
-    assert campaign.ask().exact
-
-
-@pytest.mark.parametrize("initial", ["prior_draw", "prior_mean"])
-@pytest.mark.parametrize("model", [HierarchicalTrust(), CoupledTrust()])
-def test_every_model_can_be_planned_with(model, initial):
-    workspace = random_cells(2)
-    campaign = Campaign(
-        workspace, *ENDS, model=model, objective="terminal", team="min", initial=initial
-    )
-    plan = campaign.ask()
-    assert plan.trust.shape[1] == 2
-    assert plan.value == pytest.approx(1.0 / (1.0 + np.exp(-plan.trust[-1].min())))
-
-
-def test_plans_carry_bands_over_the_draws_they_are_made_from(workspace):
-    campaign = Campaign(workspace, *ENDS, model=HierarchicalTrust())
-    campaign.learner.belief = sample_prior(campaign.model, 2, 50, seed=0, n_robots=3)
-    plan = campaign.ask()
-    assert plan.bands.shape == (4, *plan.trust.shape)
-    assert (plan.bands[-1] > plan.bands[0]).all()
-
-
-def test_settings_of_draws_are_options_and_go_to_every_fit(workspace):
-    sampling = {"draws": 60, "n_chains": 2}
-    campaign = Campaign(workspace, *ENDS, model=PooledTrust(), sampler="exact", **sampling)
-    campaign.tell(ModelSimulator(workspace).run(campaign.ask().path, seed=0))
-    sizes = campaign.posterior["posterior"].sizes
-    assert (sizes["chain"], sizes["draw"]) == (2, 60)
-    expected = 'target_accept, max_tree_depth are for NUTS, and the sampler is "exact"'
-    with pytest.raises(TrustboError, match=expected):
-        Campaign(workspace, *ENDS, target_accept=0.95, max_tree_depth=8)
-    Campaign(workspace, *ENDS, sampler="nuts", target_accept=0.95)
-    with pytest.raises(TrustboError, match="unknown option 'warm_up'; did you mean warmup"):
-        Campaign(workspace, *ENDS, warm_up=3)
-    with pytest.raises(TrustboError, match=r"warmup must be a .* from 0 on; got -1"):
-        Campaign(workspace, *ENDS, sampler="nuts", warmup=-1)
+    with pytest.raises(tb.NoPathError):
+        begin(tb.Workspace.from_awareness(workspace.awareness.values, walls))
+    with pytest.raises(tb.TrustboError, match="mission"):
+        begin(workspace).result()

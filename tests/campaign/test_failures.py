@@ -1,19 +1,16 @@
-"""Failures in the loop: learned beside trust, kept, resumed, and bounds that are avoided."""
+"""Failures in the loop: learned, priced from the first one on, and bounds that are avoided."""
 
 import itertools
 
 import numpy as np
-import pandas as pd
 import pytest
 from worlds import ModelSimulator, random_cells
 
 import trustbo as tb
-from trustbo.campaign.planners import to_avoid
-from trustbo.errors import PosteriorError
+from trustbo.campaign.learning import to_avoid
 from trustbo.hazard import Hazard, fit_hazard
 from trustbo.hazard.exposures import LostMission
 from trustbo.hazard.risk import BoundRisk
-from trustbo.planning.plan import plan_from_record, plan_to_record
 from trustbo.workspace.moves import moves_along
 
 ENDS = ((3, 0), (0, 3))
@@ -24,74 +21,110 @@ def workspace():
     return random_cells()
 
 
-class Trap:
-    """Missions that end in one bound, whenever they come to it."""
+@pytest.fixture(scope="module")
+def hills():
+    terrain = tb.terrain.synthetic_terrain(size=(150.0, 150.0), resolution=2.0, seed=3)
+    return tb.Workspace.from_terrain(terrain, (5, 5))
 
-    def __init__(self, workspace, bound):
-        self.inner, self.bound = ModelSimulator(workspace), bound
 
-    def run(self, path, *, seed, mission=0):
-        bounds = list(itertools.pairwise(path))
-        fail_at = bounds.index(self.bound) + 1 if self.bound in bounds else None
-        self.inner.fail_at = fail_at
-        return self.inner.run(path, seed=seed)
-
-    def describe(self):
-        return {"simulator": "Trap"}
+@pytest.fixture(scope="module")
+def steep():
+    """Ground of which many bounds are near the limit of 11 degrees."""
+    robot = tb.Robot(max_slope=np.deg2rad(11.0))
+    terrain = tb.terrain.synthetic_terrain((150.0, 150.0), resolution=2.0, seed=3, relief=8.0)
+    team = tb.Team(robots=(robot,), lead=robot)
+    return tb.Workspace.from_terrain(terrain, (5, 5), team, bounds=False)
 
 
 def begin(workspace, **options):
-    return tb.Campaign(workspace, *ENDS, sampler="exact", seed=1, **options)
-
-
-def recommended(workspace, limit):
-    return begin(workspace, max_failure=limit).recommend()
+    ends = ENDS if workspace.terrain is None else ((4, 0), (0, 4))
+    return tb.Campaign(workspace, *ends, sampler="exact", seed=1, **options)
 
 
 def at(bound):
     return int(moves_along(bound)[0]), *bound[1]
 
 
-def test_the_hazard_is_that_of_all_missions_and_in_the_posterior(workspace):
+def price(campaign):
+    return campaign.planner.problem.failure_cost
+
+
+def trapped(workspace, bound, path, seed):
+    """Mission on a path, which ends in a bound if it comes to it."""
+    bounds = list(itertools.pairwise(path))
+    fail_at = bounds.index(bound) + 1 if bound in bounds else None
+    return ModelSimulator(workspace, fail_at=fail_at).run(path, seed=seed)
+
+
+def test_hazard_is_that_of_all_missions_and_in_the_posterior(workspace):
     campaign = begin(workspace)
-    first = campaign.ask().path
-    bound = first[1:3]
-    simulator = Trap(workspace, bound)
-    before = campaign.risk.mean[at(bound)]
-    posterior = campaign.tell(simulator.run(first, seed=0))
-    assert posterior["hazard"]["failures"].values[at(bound)] == 1
-    assert campaign.risk.mean[at(bound)] > 2.0 * before
-    alone = fit_hazard(campaign.missions, workspace, seed=campaign.seed_of("hazard"))
+    path = campaign.ask().path
+    before = campaign.risk.mean[at(path[1:3])]
+    posterior = campaign.tell(trapped(workspace, path[1:3], path, 0))
+    assert posterior["hazard"]["failures"].values[at(path[1:3])] == 1
+    assert campaign.risk.mean[at(path[1:3])] > 2.0 * before
+    alone = fit_hazard(campaign.missions, workspace, seed=campaign.state.seed_of("hazard"))
     assert alone.drop_attrs().identical(campaign.hazard.drop_attrs())
     assert campaign.posterior["hazard"].to_dataset().identical(campaign.hazard)
-    assert "latent" in campaign.posterior.children
 
 
-def test_a_bound_that_stopped_robots_twice_is_not_entered_again(workspace):
+def test_mission_without_a_report_is_learned_from_if_a_bound_failed(workspace):
+    campaign = begin(workspace)
+    path = campaign.ask().path
+    campaign.fail("tipped")
+    lost, seed = [LostMission(path, "tipped")], campaign.state.seed_of("hazard")
+    expected = fit_hazard([], workspace, lost=lost, seed=seed)
+    assert campaign.hazard.drop_attrs().identical(expected.drop_attrs())
+    campaign.ask()
+    campaign.fail("rain")
+    assert campaign.hazard["failures_by_cause"].values.tolist() == [0, 1, 0, 0, 0]
+
+
+def test_prior_of_the_hazard_can_be_given(workspace):
+    prior = Hazard(intercept=(-3.0, 1.0), cause=0.5)
+    campaign = begin(workspace, hazard=prior)
+    expected = fit_hazard([], workspace, prior, seed=campaign.state.seed_of("hazard"))
+    assert campaign.hazard.drop_attrs().identical(expected.drop_attrs())
+
+
+def test_refused_hazard_leaves_the_previous_one(workspace, monkeypatch):
+    campaign = begin(workspace)
+    campaign.tell(ModelSimulator(workspace, fail_at=1).run(campaign.ask().path, seed=0))
+    before = campaign.hazard
+
+    def refuse(*args, **kwargs):
+        raise tb.PosteriorError("hazard refused: k-hat = 0.90 > 0.7.")
+
+    monkeypatch.setattr("trustbo.campaign.learning.fit_hazard", refuse)
+    with pytest.warns(UserWarning, match="hazard"):
+        campaign.tell(ModelSimulator(workspace).run(campaign.ask().path, seed=1))
+    assert campaign.hazard.identical(before)
+
+
+# --- bounds that are avoided ---
+
+
+def test_bound_that_stopped_robots_twice_is_not_entered_again(workspace):
     """Failures cost nothing here, so that no other reason keeps the plan away."""
-    campaign = begin(workspace, objective="mean", policy="greedy")
+    campaign = begin(workspace, objective="mean")
     bound = tuple(campaign.ask().path[1:3])
-    simulator = Trap(workspace, bound)
     paths = []
     for seed in range(5):
         paths.append(campaign.ask().path)
-        campaign.tell(simulator.run(paths[-1], seed=seed))
+        campaign.tell(trapped(workspace, bound, paths[-1], seed))
     assert sum(bound in itertools.pairwise(path) for path in paths) <= 2
     assert bound not in itertools.pairwise(campaign.recommend().path)
 
 
 def test_bounds_are_avoided_from_the_second_failure_until_they_recover(workspace):
     path = ((3, 0), (2, 1), (1, 2), (0, 3))
-    stuck, fine = (
-        ModelSimulator(workspace, fail_at=fail_at).run(path, seed=0) for fail_at in (2, None)
-    )
+    stuck, fine = (ModelSimulator(workspace, fail_at=n).run(path, seed=0) for n in (2, None))
     for told, avoided in (([stuck], 0), ([stuck] * 2, 1), ([stuck] * 2 + [fine] * 15, 0)):
         risk = BoundRisk.of(fit_hazard(told, workspace), workspace)
-        assert to_avoid(risk).sum() == avoided
-        assert to_avoid(risk)[at(path[1:3])] == avoided
+        assert to_avoid(risk).sum() == to_avoid(risk)[at(path[1:3])] == avoided
 
 
-def test_it_is_entered_where_there_is_no_other_way():
+def test_avoided_bound_is_entered_if_there_is_no_other_way():
     corridor = tb.Workspace.from_awareness(np.full((1, 1, 3, 1), 0.6))
     campaign = tb.Campaign(corridor, (0, 0), (0, 2), sampler="exact")
     for _ in range(3):
@@ -101,148 +134,111 @@ def test_it_is_entered_where_there_is_no_other_way():
     assert campaign.ask().path == ((0, 0), (0, 1), (0, 2))
 
 
-def test_a_mission_that_did_not_report_is_learned_from(workspace):
-    campaign = begin(workspace)
-    path = campaign.ask().path
-    campaign.fail("tipped")
-    expected = fit_hazard(
-        [], workspace, lost=[LostMission(path, "tipped")], seed=campaign.seed_of("hazard")
-    )
-    assert campaign.hazard.drop_attrs().identical(expected.drop_attrs())
-    mean = campaign.risk.mean[moves_along(path), *np.array(path)[1:].T]
-    assert (mean > BoundRisk.of(fit_hazard([], workspace), workspace).mean[at(path[:2])]).all()
+# --- the price of a failure ---
+
+
+def test_failure_is_priced_from_the_first_one_on(hills):
+    campaign = begin(hills)
+    assert price(campaign) == 0.0
     campaign.ask()
     campaign.fail("rain")
-    assert campaign.hazard["failures_by_cause"].values.tolist() == [0, 1, 0, 0, 0]
+    assert price(campaign) == 0.0
+    campaign.ask()
+    campaign.fail("tipped")
+    assert price(campaign) == campaign.planner.shortest
+    assert price(begin(hills, planner={"failure_cost": 3.0})) == 3.0
+    assert price(begin(hills, objective="mean")) == 0.0
 
 
-def test_a_plan_beyond_the_limit_says_so(workspace):
-    with pytest.warns(UserWarning, match=r"fails with a chance of .* beyond max_failure = 1e-06"):
-        plan = begin(workspace, max_failure=1e-6).ask()
+def test_result_prices_failures_as_its_campaign_does(hills):
+    simulator, campaign = tb.simulation.KinematicSimulator(hills), begin(hills)
+    campaign.tell(simulator.run(campaign.ask().path, seed=0))
+    before = campaign.result()
+    assert price(campaign) == before.planner.problem.failure_cost == 0.0
+    campaign.fail("stuck", where=campaign.ask().path[1])
+    after = campaign.result()
+    assert after.planner.problem.failure_cost == campaign.planner.shortest
+    assert after.plan.value == campaign.recommend().value < before.value
+    assert before.planner.problem.failure_cost == 0.0
+
+
+def test_unpriced_plan_that_may_well_fail_warns_once(steep):
+    campaign = begin(steep)
+    with pytest.warns(UserWarning, match="failure_cost"):
+        plan = campaign.ask()
+    assert plan.p_arrive < 0.9
+    campaign.suggest(plan.path)  # warnings are errors
+    assert begin(steep, planner={"failure_cost": 0.1}).ask().p_arrive < 0.9
+
+
+def test_price_after_a_failure_is_joint_over_strata(steep):
+    """F sum_m w_m (1 - prod (1 - p_m)), below that of the product of the means."""
+    campaign = begin(steep, planner={"failure_cost": 8.0})
+    campaign.fail("stuck", where=campaign.ask().path[1])
+    problem, path = campaign.planner.problem, campaign.ask().path
+    p, shares = campaign.risk.strata()
+    rows, cols = np.array(path[1:]).T
+    joint = 8.0 * shares @ (1.0 - np.prod(1.0 - p[:, moves_along(path), rows, cols], axis=1))
+    assert problem.cost_of_failure(path) == pytest.approx(joint, rel=1e-12)
+    assert joint < 8.0 * (1.0 - problem.risk.survival(path)) - 1e-3
+
+
+def test_limit_holds_without_a_price_and_warns_if_no_path_keeps_it(workspace, hills):
+    campaign = begin(hills, planner={"max_failure": 0.5})
+    plan = campaign.ask()
+    assert campaign.planner.problem.is_within_risk(plan.path)
+    assert plan.p_arrive == pytest.approx(campaign.planner.problem.risk.along(plan.path).p_arrive)
+    with pytest.warns(UserWarning, match="max_failure"):
+        plan = begin(workspace, planner={"max_failure": 1e-6}).ask()
     assert plan.infeasible
-    assert plan_from_record(plan_to_record(plan), workspace).infeasible
-    assert "none keeps within max_failure" in repr(recommended(workspace, 1e-6))
-    assert "fails beyond max_failure" in repr(plan)
-    within = begin(workspace, max_failure=0.9).ask()  # no warning, which would be an error
-    assert not within.infeasible
-    assert "max_failure" not in repr(within)
+    assert not begin(workspace, planner={"max_failure": 0.9}).ask().infeasible
 
 
-@pytest.mark.parametrize(
-    ("reason", "message"),
-    [
-        ("", "give a reason, such as one of stuck, tipped"),
-        (None, "got None"),
-    ],
-)
-def test_an_empty_reason_is_refused(workspace, reason, message):
-    campaign = begin(workspace)
-    with pytest.raises(tb.TrustboError, match=message):
-        campaign.fail(reason)
-    assert campaign.state.failures == []
+# --- what is given up ---
 
 
-def test_a_mission_that_arrived_did_not_fail(workspace):
-    campaign = begin(workspace)
-    mission = ModelSimulator(workspace).run(campaign.ask().path, seed=0)
-    with pytest.raises(tb.TrustboError, match="its status is 'ok', and 'stuck' is a failure"):
-        campaign.fail("stuck", mission)
+def test_next_try_may_take_another_path(workspace):
+    campaign, paths = begin(workspace, policy="random"), set()
+    for _ in range(7):
+        paths.add(campaign.ask().path)
+        assert campaign.fail("the lead lost its map") is None
     assert campaign.missions == []
+    assert len(paths) > 1
 
 
-def test_tables_have_a_row_for_each_mission_that_failed(workspace, tmp_path):
-    with begin(workspace, directory=tmp_path / "kept") as campaign:
-        path = campaign.ask().path
-        campaign.fail("stuck", where=path[2])
-        assert campaign.table()["where"].tolist() == [f"{path[2][0]},{path[2][1]}"]
-        simulator = ModelSimulator(workspace)
-        campaign.tell(simulator.run(campaign.ask().path, seed=0))
-        simulator.fail_at = 2
-        part = simulator.run(campaign.ask().path, seed=1)
-        campaign.fail("the wheel broke", part)
-        campaign.ask()
-        campaign.fail("rain")
-        table = campaign.table()
-        saved = tb.load_result(tmp_path / "kept").table()
+def test_table_has_a_row_for_each_mission_given_up(workspace):
+    campaign, simulator = begin(workspace), ModelSimulator(workspace)
+    path = campaign.ask().path
+    campaign.fail("stuck", where=path[2])
+    campaign.tell(simulator.run(campaign.ask().path, seed=0))
+    simulator.fail_at = 2
+    part = simulator.run(campaign.ask().path, seed=1)
+    campaign.fail("the wheel broke", part)
+    campaign.ask()
+    campaign.fail("rain")
+    table = campaign.table()
     assert table.index.isna().tolist() == [True, False, False, True]
-    assert table.loc[2, "where"] == ",".join(map(str, part.path[2]))
+    where = [f"{row},{col}" for row, col in (path[2], part.path[2])]
+    assert table["where"].tolist() == [where[0], "", where[1], ""]
     assert table["reason"].tolist() == ["stuck", "", "the wheel broke", "rain"]
     assert table["state"].tolist() == ["given up", "learned", "learned", "given up"]
     assert table["status"].tolist() == ["stuck", "ok", part.status, "aborted"]
-    n_bounds = [2, len(campaign.missions[0].bounds), 2]
-    assert table["n_bounds"].tolist()[:3] == n_bounds
-    pd.testing.assert_frame_equal(saved[table.columns], table)
-    written = pd.read_csv(tmp_path / "kept" / "history.csv", keep_default_na=False)
-    assert written["reason"].tolist() == table["reason"].tolist()
+    assert table["n_bounds"].tolist()[:3] == [2, len(campaign.missions[0].bounds), 2]
+    assert campaign.state.failures[1] == (2, "the wheel broke", (), None, True)
 
 
-def test_where_is_checked(workspace):
+def test_contradictory_reports_of_failures_are_refused(workspace):
     campaign = begin(workspace)
     path = campaign.ask().path
-    with pytest.raises(tb.TrustboError, match=r"where must be a cell that the plan enters"):
-        campaign.fail("stuck", where=path[0])
-    with pytest.raises(tb.TrustboError, match="is for the reasons stuck, tipped"):
-        campaign.fail("rain", where=path[1])
-    with pytest.raises(tb.TrustboError, match="the mission tells where it failed"):
-        campaign.fail("stuck", ModelSimulator(workspace).run(path, seed=0), where=path[1])
-    assert campaign.state.failures == []
-
-
-def test_a_campaign_resumes_with_the_same_hazard(workspace, tmp_path):
-    campaign = begin(workspace, directory=tmp_path)
-    bound = tuple(campaign.ask().path[1:3])
-    simulator = Trap(workspace, bound)
-    for seed in range(2):
-        campaign.tell(simulator.run(campaign.ask().path, seed=seed))
-    campaign.ask()
-    campaign.fail("stuck")
-    campaign.fail("lost_contact", where=campaign.ask().path[1])
-    with campaign:
-        pass
-    with tb.Campaign.load(tmp_path) as again:
-        assert again.state.failures == campaign.state.failures
-        assert again.hazard.drop_attrs().identical(campaign.hazard.drop_attrs())
-        np.testing.assert_array_equal(again.risk.draw(5), campaign.risk.draw(5))
-        assert again.ask().path == campaign.ask().path
-        kept = again.posteriors[1]["hazard"].to_dataset()
-        assert kept.identical(campaign.posteriors[1]["hazard"].to_dataset())
-
-
-def test_a_refused_hazard_leaves_the_one_before(workspace, monkeypatch):
-    campaign = begin(workspace)
-    campaign.tell(ModelSimulator(workspace, fail_at=1).run(campaign.ask().path, seed=0))
-    before = campaign.hazard
-
-    def refuse(*args, **kwargs):
-        raise PosteriorError("hazard refused: k-hat = 0.90 > 0.7.")
-
-    monkeypatch.setattr("trustbo.campaign.learning.fit_hazard", refuse)
-    with pytest.warns(UserWarning, match="goes on with the hazard before"):
-        campaign.tell(ModelSimulator(workspace).run(campaign.ask().path, seed=1))
-    assert campaign.hazard.identical(before)
-
-
-def test_a_mission_set_aside_by_hand_is_forgotten(workspace):
-    campaign = begin(workspace)
-    for seed in range(2):
-        campaign.tell(ModelSimulator(workspace, fail_at=1).run(campaign.ask().path, seed=seed))
-    campaign.set_aside("a person pushed the robot")
-    assert campaign.hazard["failures"].values.sum() == 1
-
-
-def test_priors_of_the_hazard_are_an_option_that_is_kept(workspace, tmp_path):
-    prior = Hazard(intercept=(-3.0, 1.0), cause=0.5)
-    campaign = begin(workspace, hazard=prior, directory=tmp_path)
-    expected = fit_hazard([], workspace, prior, seed=campaign.seed_of("hazard"))
-    assert campaign.hazard.drop_attrs().identical(expected.drop_attrs())
-    assert campaign.options == begin(workspace, hazard={"intercept": [-3, 1], "cause": 0.5}).options
-    campaign.ask()
-    with campaign:
-        pass
-    with tb.Campaign.load(tmp_path) as again:
-        assert again.options.hazard == prior
-        assert again.risk.mean[4, 0, 1] == campaign.risk.mean[4, 0, 1]
-    with pytest.raises(tb.TrustboError, match="unknown prior of the hazard 'intercpt'; did you"):
-        begin(workspace, hazard={"intercpt": (0.0, 1.0)})
-    with pytest.raises(tb.TrustboError, match=r"hazard must be a hazard\.Hazard"):
-        begin(workspace, hazard=0.1)
+    arrived = ModelSimulator(workspace).run(path, seed=0)
+    for arguments, named in (
+        ({"reason": ""}, "reason"),
+        ({"reason": None}, "reason"),
+        ({"reason": "stuck", "mission": arrived}, "mission"),
+        ({"reason": "rain", "mission": arrived, "where": path[1]}, "mission"),
+        ({"reason": "stuck", "where": path[0]}, "where"),
+        ({"reason": "rain", "where": path[1]}, "where"),
+    ):
+        with pytest.raises(tb.TrustboError, match=named):
+            campaign.fail(**arguments)
+    assert (campaign.state.failures, campaign.missions) == ([], [])

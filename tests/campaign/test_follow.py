@@ -9,6 +9,7 @@ import pytest
 from worlds import random_cells
 
 import trustbo as tb
+from trustbo.campaign.learning import as_learned
 from trustbo.inference import TrustFilter, sample_prior
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -58,7 +59,7 @@ def filter_of(campaign):
     if campaign.posterior is not None:
         return TrustFilter(campaign.posterior)
     model = campaign.model.for_features(campaign.workspace.features)
-    draws = sample_prior(model, 2, 1000, campaign.seed_of("prior"), n_robots=3)
+    draws = sample_prior(model, 2, 1000, campaign.state.seed_of("prior"), n_robots=3)
     return TrustFilter(draws, 3, observation=model.observation)
 
 
@@ -75,7 +76,7 @@ def test_trust_tick_by_tick_is_that_of_a_filter_of_whole_bounds(model, n_mission
     campaign = begun(model, n_missions)
     reference, follower = filter_of(campaign), tb.Follower(campaign)
     path = follower.path
-    mission = campaign.as_learned(whole(path, looks(len(path) - 1)))
+    mission = as_learned(whole(path, looks(len(path) - 1)), campaign.workspace)
     z, y, n = mission.awareness, mission.contact_rate, mission.n_ticks
     np.testing.assert_allclose(follower.trust, reference.state, rtol=1e-10)
     for k in follow(follower, looks(len(path) - 1)):

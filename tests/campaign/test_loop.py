@@ -1,17 +1,22 @@
-"""The loop: it learns, repeats itself, survives failures, and is saved as it goes."""
+"""The loop of a campaign: it learns, stops by rules, resumes, and collects a result."""
 
-import json
+import itertools
+import logging
+import time
 
 import numpy as np
 import pytest
 import xarray as xr
 from missions import TRUTH
+from scipy.special import expit
 from worlds import ModelSimulator, hillside, random_cells
 
 import trustbo as tb
+from trustbo.inference import params_of
 from trustbo.planning import Planner
 
 ENDS = ((3, 0), (0, 3))
+QUIET = {"sampler": "exact", "progress": False}
 
 
 @pytest.fixture(scope="module")
@@ -20,12 +25,8 @@ def workspace():
 
 
 def run(workspace, **options):
-    options = {
-        "n_iterations": 3,
-        "simulator": ModelSimulator(workspace),
-        "progress": False,
-    } | options
-    return tb.iterate(workspace, *ENDS, **options)
+    usual = {"n_iterations": 3, "simulator": ModelSimulator(workspace), **QUIET}
+    return tb.iterate(workspace, *ENDS, **usual | options)
 
 
 @pytest.fixture(scope="module")
@@ -33,58 +34,45 @@ def result(workspace):
     return run(workspace)
 
 
-@pytest.fixture(scope="module")
-def on_terrain():
-    terrain = hillside()
-    return from_corner_to_corner(tb.Workspace.from_terrain(terrain, (3, 3)))
-
-
-def from_corner_to_corner(workspace):
-    return tb.iterate(
-        workspace, (2, 0), (0, 2), n_iterations=2, sampler="exact", progress=False
-    )  # fmt: skip
-
-
-def test_the_history_has_one_row_per_mission(result):
-    history = result.history
-    assert list(history["iteration"].values) == [1, 2, 3]
-    assert len(result.missions) == len(result.posteriors) == 3
-    for i, mission in enumerate(result.missions):
-        steps = [tuple(step) for step in history["path"].values[i].tolist() if step[0] >= 0]
-        assert tuple(steps) == mission.path
-    changed = [bool(c) for c in history["path_changed"].values]
-    paths = [mission.path for mission in result.missions]
-    assert changed == [False, paths[1] != paths[0], paths[2] != paths[1]]
-    assert (history["k_hat"] <= 0.7).all()
+def test_history_has_a_row_for_each_mission(result):
+    history, paths = result.history, [mission.path for mission in result.missions]
+    assert history["iteration"].values.tolist() == [1, 2, 3]
+    for path, steps in zip(paths, history["path"].values.tolist(), strict=True):
+        assert path == tuple(tuple(step) for step in steps if step[0] >= 0)
+    changed = [False, paths[1] != paths[0], paths[2] != paths[1]]
+    assert history["path_changed"].values.tolist() == changed
     assert history["trust_map"].dims == ("iteration", "row", "col")
-    assert (history["seconds_fit"] > 0).all()
-    assert result.stop_reason == "n_iterations"
-    assert result.settings["simulator"] == "ModelSimulator"
+    assert (history["k_hat"] <= 0.7).all()
+    lost = [(1.0 - mission.contact_rate.mean(1)).sum() for mission in result.missions]
+    np.testing.assert_allclose(history["contact_lost"], lost)
+    assert (result.stop_reason, result.settings["simulator"]) == ("n_iterations", "ModelSimulator")
+    table = result.table()
+    assert table["path"][2].split() == [f"{row},{col}" for row, col in paths[1]]
+    assert table["n_bounds"].tolist() == [len(path) - 1 for path in paths]
 
 
-def test_the_result_recommends_the_best_path_under_the_last_posterior(result, workspace):
-    params = tb.inference.params_of(result.posterior).mean()
+def test_result_recommends_the_best_path_under_the_last_posterior(result, workspace):
+    params = params_of(result.posterior).mean()
     risk = tb.hazard.risk.BoundRisk.of(result.posterior["hazard"].to_dataset(), workspace)
     assert {mission.status for mission in result.missions} == {"ok"}  # so that no failure is priced
     plan = Planner(workspace, *ENDS, failure_cost=0.0).with_risk(risk.mean).plan(params)
-    assert result.path == list(plan.path)
-    assert result.value == plan.value
+    assert (result.path, result.value) == (list(plan.path), plan.value)
+    np.testing.assert_array_equal(result.trust, plan.trust)
+    assert (result.plan.bands[0] < result.plan.bands[-1]).all()
     np.testing.assert_allclose(result.trust_map, Planner(workspace, *ENDS).trust_map(params))
 
 
-def test_it_learns_the_truth_and_finds_the_oracle_s_path(workspace):
-    result = run(workspace, n_iterations=8, policy="random", sampler="exact")
-    posterior = result.posterior["posterior"]
-    for name, truth in zip(("beta0", "b"), (TRUTH.beta0, TRUTH.b), strict=True):
-        draws = posterior[name]
-        assert abs(float(draws.mean()) - truth) < 4 * float(draws.std())
+def test_campaign_learns_the_truth_and_finds_the_best_path(workspace):
+    result = run(workspace, n_iterations=8, policy="random")
+    for name in ("beta0", "b"):
+        draws = result.posterior["posterior"][name]
+        assert abs(float(draws.mean()) - getattr(TRUTH, name)) < 4 * float(draws.std())
     planner = Planner(workspace, *ENDS)
-    oracle = planner.plan(TRUTH)
-    found = planner.evaluate(result.path, TRUTH)
-    assert found.value >= oracle.value - 0.02 * (len(oracle.path) - 1 + oracle.value)  # kept
+    best, found = planner.plan(TRUTH), planner.evaluate(result.path, TRUTH)
+    assert found.value >= best.value - 0.02 * (len(best.path) - 1 + best.value)
 
 
-def test_the_same_seed_gives_the_same_result(result, workspace):
+def test_same_seed_gives_the_same_result(result, workspace):
     again = run(workspace)
     assert again.path == result.path
     for a, b in zip(again.posteriors, result.posteriors, strict=True):
@@ -93,154 +81,190 @@ def test_the_same_seed_gives_the_same_result(result, workspace):
     assert (other.missions[0].contact_rate[0] != result.missions[0].contact_rate[0]).any()
 
 
-def test_the_exact_sampler_runs_the_loop_too(workspace, capsys):
-    result = run(workspace, sampler="exact", n_iterations=2, progress=True)
-    assert (result.history["k_hat"] < 0.7).all()
-    assert "k-hat" in capsys.readouterr().err
-    assert result.settings["sampler"] == "exact"
+def test_later_missions_leave_a_result_unchanged(workspace):
+    campaign, simulator = tb.Campaign(workspace, *ENDS, sampler="exact"), ModelSimulator(workspace)
+    campaign.tell(simulator.run(campaign.ask().path, seed=0))
+    result = campaign.result()
+    path, table = result.path, result.table()
+    campaign.tell(simulator.run(campaign.ask().path, seed=1))
+    campaign.exclude(1, "a test")
+    assert (result.path, len(result.missions)) == (path, 1)
+    assert result.table().equals(table)
 
 
-@pytest.mark.parametrize("policy", ["thompson", "random"])
-def test_other_policies_run(workspace, policy):
-    result = run(workspace, policy=policy, sampler="exact", n_iterations=2)
-    assert result.settings["policy"] == policy
+def test_maps_are_over_the_posterior_and_lie_in_their_place(tmp_path):
+    terrain = hillside(90.0, 120.0)
+    workspace = tb.Workspace.from_terrain(terrain, (3, 4))
+    result = tb.iterate(workspace, (2, 0), (0, 3), n_iterations=1, **QUIET)
+    maps = result.maps(n_draws=50)
+    assert {"trust_mean", "trust_sd", "path_probability", "visibility", "place_sd"} <= {*maps}
+    assert maps["path_probability"][2, 0] == maps["path_probability"][0, 3] == 1.0
+    np.testing.assert_allclose(maps["cost"], 1.0 - expit(maps["trust_mean"]), atol=1e-2)
+    known = workspace.awareness.sel(feature="visibility").mean("robot")
+    np.testing.assert_allclose(maps["visibility"], known)
+    assert result.maps(n_draws=50).identical(maps)
+    assert maps.rio.crs == terrain.rio.crs
+    assert maps["cost"].rio.bounds() == terrain.rio.bounds()
+    x, y = workspace.grid.center((1, 2))
+    assert maps["cost"].sel(x=x, y=y) == maps["cost"].isel(y=1, x=2)
 
 
-def test_failed_missions_are_learned_from(workspace):
-    result = run(
-        workspace, simulator=ModelSimulator(workspace, fail_at=2), sampler="exact", n_iterations=2
-    )
-    assert list(result.history["status"].values) == ["stuck", "stuck"]
-    assert result.posterior["observed_data"].sizes["bound"] == 2
+def test_features_named_like_maps_are_renamed_in_maps():
+    awareness = np.random.default_rng(3).uniform(size=(2, 4, 4, 2))
+    workspace = tb.Workspace.from_awareness(awareness, features=("cost", "x"))
+    simulator = tb.simulation.ModelSimulator(workspace, TRUTH)
+    maps = run(workspace, n_iterations=1, simulator=simulator).maps(n_draws=20)
+    for m, name in enumerate(("awareness_cost", "awareness_x")):
+        np.testing.assert_allclose(maps[name], awareness[..., m].mean(0))
 
 
-def test_the_progress_bar_shows_objective_and_k_hat_and_can_be_silenced(workspace, capsys):
-    run(workspace, n_iterations=1, progress=True)
-    shown = capsys.readouterr().err
-    assert "1/1" in shown
-    assert "objective -" in shown
-    assert "k-hat " in shown
-    run(workspace, n_iterations=1)
-    assert capsys.readouterr() == ("", "")
+# --- stopping and resuming ---
 
 
-def test_callbacks_see_each_mission(workspace):
+def test_regret_bound_stops_when_the_path_is_nearly_the_best(workspace):
+    options = {"objective": "terminal"}
+    rule = tb.RegretBound(eps=0.2, delta=0.2)
+    result = run(workspace, n_iterations=12, stop=rule, **options)
+    assert 3 <= len(result.missions) < 12
+    assert result.stop_reason.startswith("regret_bound")
+    # By hand: the best of all paths under each draw against the recommended one.
+    planner, draws = Planner(workspace, *ENDS, **options), params_of(result.posterior)
+    shares = []
+    for d in planner.plan_draws(draws, n_draws=500).chosen:
+        best = planner.plan(draws.draw(int(d))).value
+        own = planner.evaluate(result.path, draws.draw(int(d))).value
+        shares.append((best - own) / best <= 0.2)
+    campaign = tb.Campaign(workspace, *ENDS, sampler="exact", **options)
+    for mission in result.missions:
+        campaign.tell(mission)
+    assert tb.RegretBound(eps=0.2).probability(campaign, len(result.missions)) == np.mean(shares)
+    strict = tb.RegretBound(eps=1e-6, delta=0.01)
+    assert run(workspace, stop=strict, **options).stop_reason == "n_iterations"
+
+
+@pytest.mark.parametrize("fails", [True, False])
+def test_regret_bound_waits_until_every_bound_was_completed(workspace, fails):
+    rule = tb.RegretBound(eps=0.9, delta=0.5, patience=2, min_missions=2)
+    campaign = tb.Campaign(workspace, *ENDS, sampler="exact")
+    for seed in range(2):
+        other = ((3, 0), (2, 1), (1, 2), (0, 2), (0, 3))
+        campaign.tell(ModelSimulator(workspace).run(other, seed=seed))
+    path = campaign.recommend().path
+    assert path == ((3, 0), (2, 1), (1, 2), (0, 3))
+    assert min(rule.probability(campaign, n) for n in (1, 2)) == 1.0
+    assert rule(campaign) is None
+    driven = ModelSimulator(workspace, fail_at=3 if fails else None)
+    campaign.tell(driven.run(path, seed=2))
+    assert rule(campaign).startswith("regret_bound")
+    assert (campaign.recommend().path == path) is not fails
+
+
+def test_rules_are_callables_that_are_asked_between_missions(workspace):
     seen = []
-    run(
-        workspace, n_iterations=2, callbacks=[lambda c, m: seen.append((len(c.missions), m.status))]
+
+    def enough(campaign):
+        seen.append(campaign.missions[-1].status)
+        return len(seen) == 2
+
+    result = run(workspace, stop=enough)
+    assert (len(result.missions), result.stop_reason, seen) == (2, "enough", ["ok", "ok"])
+    limit = tb.TimeLimit(0.001)
+    time.sleep(0.01)
+    result = run(workspace, stop=[lambda campaign: None, limit])
+    assert (len(result.missions), result.stop_reason) == (1, "seconds: 0.001")
+    for wrong in ({"eps": 0.0}, {"delta": 1.0}, {"patience": 0}):
+        with pytest.raises(tb.TrustboError, match=next(iter(wrong))):
+            tb.RegretBound(**wrong)
+    with pytest.raises(tb.TrustboError, match="stop"):
+        run(workspace, stop=[7])
+
+
+def test_generator_gives_each_mission_once_it_is_learned_from(workspace):
+    campaign = tb.Campaign(workspace, *ENDS, sampler="exact")
+    for plan, mission in itertools.islice(campaign.run(ModelSimulator(workspace), 5), 2):
+        assert mission.path == plan.path == campaign.missions[-1].path
+    assert len(campaign.missions) == 2
+    assert campaign.result().stop_reason == "interrupted"
+
+
+class Steady:
+    """Simulator in which a bound has contact as its mean awareness."""
+
+    def __init__(self, workspace):
+        self.workspace = workspace
+
+    def run(self, path, *, seed, mission=0):
+        z = self.workspace.along(path)
+        noise = 1e-3 * np.random.default_rng(seed).normal(size=z.shape[:2])
+        return tb.Mission.from_arrays(path, z, np.clip(z.mean(-1) + noise, 0.0, 1.0))
+
+
+def test_regret_against_the_truth_is_in_the_history(workspace):
+    truth = tb.simulation.Truth.of(Steady(workspace))
+    result = run(workspace, n_iterations=2, simulator=Steady(workspace), truth=truth)
+    best = truth.best(*ENDS, max_bounds="shortest+4")
+    kept = len(best) - 1 - truth.lost(best)
+    for mission, regret in zip(result.missions, result.history["regret"].values, strict=True):
+        lacking = truth.lost(mission.path) - truth.lost(best)
+        assert regret == pytest.approx(100.0 * lacking / kept, abs=1e-9)
+        assert regret >= -1e-9
+
+
+class Described(ModelSimulator):
+    """A simulator with settings that JSON does not have."""
+
+    def __init__(self, workspace, **settings):
+        super().__init__(workspace, blind=True)
+        self.settings = {"tuple": (1, 2.5), "array": np.arange(3.0), "nan": np.nan} | settings
+
+    def describe(self):
+        return self.settings
+
+
+def test_interrupted_campaign_resumes_with_the_same_simulator(workspace, tmp_path):
+    simulator = Described(workspace)
+    whole = run(workspace, simulator=simulator)
+    run(workspace, simulator=simulator, directory=tmp_path, n_iterations=2)
+    with pytest.raises(tb.TrustboError, match="simulator"):
+        tb.resume(tmp_path, simulator=Described(workspace, tuple=(1, 2.6)), progress=False)
+    again = tb.resume(tmp_path, simulator=simulator, n_iterations=3, progress=False)
+    assert again.path == whole.path
+    for a, b in zip(again.posteriors, whole.posteriors, strict=True):
+        xr.testing.assert_equal(a["posterior"].to_dataset(), b["posterior"].to_dataset())
+
+
+def test_campaign_that_a_rule_has_ended_resumes_only_on_request(workspace, tmp_path):
+    options = {"simulator": ModelSimulator(workspace, blind=True), "progress": False}
+    rule = tb.RegretBound(eps=0.9, delta=0.9, min_missions=2, patience=1)
+    ended = run(
+        workspace, objective="mean", n_iterations=5, stop=rule, directory=tmp_path, **options
     )
-    assert seen == [(1, "ok"), (2, "ok")]
+    n = len(ended.missions)
+    assert n < 5
+    for more, reason in (
+        ({}, ended.stop_reason),
+        ({"stop": rule, "n_iterations": 9}, ended.stop_reason),  # asked before it drives
+        ({"stop": lambda campaign: "seen enough"}, "seen enough"),
+    ):
+        again = tb.resume(tmp_path, **options, **more)
+        assert (len(again.missions), again.stop_reason) == (n, reason)
+        assert tb.load_result(tmp_path).stop_reason == reason
+    assert len(tb.resume(tmp_path, n_iterations=n + 1, **options).missions) == n + 1
 
 
-def test_a_result_is_saved_and_read_back(result, tmp_path):
-    result.save(tmp_path / "kept")
-    back = tb.load_result(tmp_path / "kept")
-    assert back.path == result.path
-    assert back.value == result.value
-    assert back.settings == result.settings
-    np.testing.assert_array_equal(back.trust, result.trust)
-    xr.testing.assert_equal(back.trust_map, result.trust_map)
-    xr.testing.assert_equal(back.history, result.history)
-    assert back.missions[1].path == result.missions[1].path
-    np.testing.assert_array_equal(back.missions[1].awareness, result.missions[1].awareness)
-    for a, b in zip(back.posteriors, result.posteriors, strict=True):
-        xr.testing.assert_equal(a, b)
-        assert a.attrs["sampler"] == b.attrs["sampler"]
-    lines = (tmp_path / "kept" / "history.csv").read_text().splitlines()
-    assert len(lines) == 4
-    assert lines[0].startswith("mission,status,state,reason,where,contact_rate,objective")
-    hidden = [f.name for f in (tmp_path / "kept").rglob(".*")]
-    assert hidden == [".trustbo.lock"]  # no temporary file is left
-
-
-def test_a_result_on_terrain_is_read_back_with_ticks_and_maps(on_terrain, tmp_path):
-    on_terrain.save(tmp_path)
-    back = tb.load_result(tmp_path)
-    for ours, kept in zip(on_terrain.missions, back.missions, strict=True):
-        for a, b in zip(ours.bounds, kept.bounds, strict=True):
-            np.testing.assert_array_equal(a.poses, b.poses)
-            np.testing.assert_array_equal(a.contact, b.contact)
-            assert (a.cell, a.status, a.t0) == (b.cell, b.status, b.t0)
-    assert back.workspace.grid == on_terrain.workspace.grid
-    assert back.workspace.team == on_terrain.workspace.team
-    assert back.workspace.terrain.rio.crs == on_terrain.workspace.terrain.rio.crs
-    np.testing.assert_array_equal(
-        back.workspace.pixels["visibility"], on_terrain.workspace.pixels["visibility"]
-    )
-    assert on_terrain.settings["sight"] == "transmittance"
-    # What was read back can be run again, to the same end.
-    assert from_corner_to_corner(back.workspace).path == on_terrain.path
-
-
-def test_saving_over_another_result_leaves_nothing_of_it(result, workspace, tmp_path):
-    result.save(tmp_path)
-    shorter = run(workspace, n_iterations=2, seed=5)
-    shorter.save(tmp_path)
-    back = tb.load_result(tmp_path)
-    assert len(back.missions) == len(list((tmp_path / "posteriors").glob("*.nc"))) == 2
-    xr.testing.assert_equal(back.posteriors[0], shorter.posteriors[0])
-
-
-def test_a_run_that_dies_has_saved_its_missions(workspace, tmp_path):
-    class Dies(ModelSimulator):
-        def run(self, path, *, seed, mission=0):
-            if len(list((tmp_path / "run" / "posteriors").glob("*.nc"))) == 2:
-                raise OSError("radio lost")
-            return super().run(path, seed=seed)
-
-    with pytest.raises(OSError, match="radio lost"):
-        run(workspace, simulator=Dies(workspace), checkpoint=tmp_path / "run")
-    kept = tb.load_result(tmp_path / "run")
-    assert len(kept.missions) == 2
-    assert kept.stop_reason == "interrupted"
-
-
-def test_settings_of_any_simulator_are_kept(workspace, tmp_path):
-    class Describes(ModelSimulator):
-        def describe(self):
-            return {"gains": np.array([1.0, 2.0]), "n": np.int64(3), "path": tmp_path}
-
-    result = run(workspace, simulator=Describes(workspace), n_iterations=1, max_bounds=np.int64(5))
-    result.save(tmp_path)
-    settings = tb.load_result(tmp_path).settings
-    assert (settings["gains"], settings["n"], settings["max_bounds"]) == ([1.0, 2.0], 3, 5)
-
-
-@pytest.mark.parametrize("n", [0, -3, 2.5, None, True])
-def test_a_number_of_iterations_must_be_whole_and_positive(workspace, n):
-    with pytest.raises(tb.TrustboError, match=f"whole number from 1 on; got {n}"):
-        run(workspace, n_iterations=n)
-
-
-def test_bad_input_is_refused_before_anything_is_written(workspace, tmp_path):
-    with pytest.raises(tb.TrustboError, match="goal"):
-        tb.iterate(workspace, (3, 0), (0, 9), checkpoint=tmp_path / "never")
-    with pytest.raises(tb.TrustboError, match=r"a simulator needs run\(path"):
-        run(workspace, simulator=object(), checkpoint=tmp_path / "never")
-    with pytest.raises(tb.TrustboError, match="seed must be a whole number from 0 on; got -1"):
-        run(workspace, seed=-1, checkpoint=tmp_path / "never")
-    with pytest.raises(tb.TrustboError, match="needs a terrain"):
-        tb.iterate(workspace, *ENDS, checkpoint=tmp_path / "never")
+@pytest.mark.parametrize(
+    "options", [{"n_iterations": 0}, {"n_iterations": 2.5}, {"simulator": object()}, {"seed": -1}]
+)
+def test_bad_input_is_refused_before_anything_is_written(workspace, tmp_path, options):
+    with pytest.raises(tb.TrustboError, match=next(iter(options))):
+        run(workspace, directory=tmp_path / "never", **options)
     assert not (tmp_path / "never").exists()
-    (tmp_path / "file").write_text("")
-    with pytest.raises(tb.TrustboError, match=r"cannot write to '.*': '.*file' is a file"):
-        run(workspace, checkpoint=tmp_path / "file" / "deep")
-    with pytest.raises(tb.TrustboError, match="holds no result"):
-        tb.load_result(tmp_path)
 
 
-def test_the_record_is_plain_json(result, tmp_path):
-    result.save(tmp_path)
-    record = json.loads((tmp_path / "result.json").read_text())
-    assert record["settings"]["policy"] == "greedy"
-    assert record["settings"]["start"] == [3, 0]
-
-
-def test_a_simulator_that_swaps_row_and_col_is_refused(workspace):
-    class Swapped(ModelSimulator):
-        def run(self, path, *, seed, mission=0):
-            mission, swapped = super().run(path, seed=seed), [(col, row) for row, col in path]
-            return tb.Mission.from_arrays(swapped, mission.awareness, mission.contact_rate)
-
-    with pytest.raises(tb.TrustboError, match=r"starts at \(0, 3\), not at \(3, 0\)"):
-        run(workspace, simulator=Swapped(workspace))
+def test_progress_is_a_line_and_the_log_has_it_too(workspace, capsys, caplog):
+    with caplog.at_level(logging.INFO, logger="trustbo"):
+        run(workspace, n_iterations=1)
+    assert capsys.readouterr() == ("", "")
+    assert "mission 1" in caplog.text
+    run(workspace, n_iterations=1, progress=True)
+    assert "k-hat" in capsys.readouterr().err

@@ -40,7 +40,7 @@ def test_trust_is_blank_in_missions_that_the_last_posterior_is_not_of(result, tm
     campaign = tb.Campaign(result.workspace, (2, 0), (0, 3), sampler="exact", seed=3)
     for _ in campaign.run(n_iterations=2):
         pass
-    campaign.set_aside("its log was of another hill", mission=1)
+    campaign.exclude(1, "its log was of another hill")
     without = campaign.result()
     write_csv(tmp_path / "bounds.csv", without)
     with (tmp_path / "bounds.csv").open(newline="", encoding="utf-8") as stream:

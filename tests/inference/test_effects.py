@@ -136,9 +136,9 @@ def test_a_campaign_learns_it_plans_with_it_and_goes_on(tmp_path):
     workspace = tb.Workspace.from_awareness(z, features=FEATURES)
     truth = TrustParams(0.2, np.array([0.7, 0.0]), 0.05, 0.03, 0.03)
     simulator = tb.simulation.ModelSimulator(workspace, truth)
-    options = {"simulator": simulator, "progress": False, "seed": 3, "checkpoint": tmp_path}
+    options = {"simulator": simulator, "progress": False, "seed": 3, "directory": tmp_path}
     tb.iterate(workspace, (4, 0), (0, 4), n_iterations=2, model=MODEL, **options)
-    del options["checkpoint"], options["seed"]
+    del options["directory"], options["seed"]
     result = tb.resume(tmp_path, n_iterations=3, **options)
     assert all("daylight" in tree.children for tree in result.posteriors)
     assert result.posteriors[-1].attrs["n_missions"] == 3

@@ -255,7 +255,7 @@ def test_a_campaign_learns_and_plans_with_robots(tmp_path):
     simulator = tb.simulation.ModelSimulator(workspace, truth)
     model = PooledTrust(effects=[PlaceEffect(), RobotEffect()])
     options = {"simulator": simulator, "progress": False, "model": model}
-    tb.iterate(workspace, (4, 0), (0, 4), n_iterations=2, seed=3, checkpoint=tmp_path, **options)
+    tb.iterate(workspace, (4, 0), (0, 4), n_iterations=2, seed=3, directory=tmp_path, **options)
     del options["model"]  # it is in the record
     result = tb.resume(tmp_path, n_iterations=3, **options)
     assert [tree["robots"].sizes["mission"] for tree in result.posteriors] == [1, 2, 3]

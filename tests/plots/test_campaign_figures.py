@@ -75,4 +75,4 @@ def test_dots_are_missions_and_crosses_those_that_failed(result):
 def test_a_campaign_without_missions_has_no_history(result):
     campaign = tb.Campaign(result.workspace, (2, 0), (0, 3))
     with pytest.raises(tb.TrustboError, match="the history has no mission yet"):
-        tb.plots.campaign_history(campaign.history)
+        tb.plots.campaign_history(campaign.state.history())

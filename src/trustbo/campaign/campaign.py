@@ -1,8 +1,11 @@
 """A campaign: `ask` for a path, run it by any means, `tell` the mission."""
 
+import inspect
+import json
 import time
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
 from typing import Any, Self
 
 import jax
@@ -11,56 +14,70 @@ import pandas as pd
 import xarray as xr
 from jax import random
 
-from trustbo.campaign.checks import require_extra, require_mission, require_reason, require_where
-from trustbo.campaign.folder import STATE
-from trustbo.campaign.history import history_of, table_of
-from trustbo.campaign.learning import Learner
-from trustbo.campaign.options import OBJECTIVE, POLICY, SAMPLER, CampaignOptions, arguments_of
-from trustbo.campaign.planners import planner_given, planner_of, unpriced_risk
-from trustbo.campaign.posteriors import Posterior, Posteriors, whole_posterior
-from trustbo.campaign.result import Result
+from trustbo.campaign.learning import (
+    as_learned,
+    base_planner,
+    informed_planner,
+    known_along,
+    learn,
+    learn_hazard,
+    prior_belief,
+    why_never_learned,
+)
+from trustbo.campaign.result import Result, evidence_of, whole_posterior
 from trustbo.campaign.running import run_missions
-from trustbo.campaign.state import SET_ASIDE, TOLD, CampaignState, Failure
+from trustbo.campaign.state import EXCLUDED, LEARNED, TOLD, Entry, Failure, Posterior, State
 from trustbo.campaign.stopping import Stop
-from trustbo.campaign.storage import Storage
-from trustbo.campaign.summary import evidence_of
+from trustbo.campaign.storage import Storage, read_campaign
 from trustbo.data import Cell, Mission
 from trustbo.display import Rows, Summary
-from trustbo.errors import TrustboError, require_kind, require_whole
-from trustbo.files import FilePath, as_path, interpreting
+from trustbo.errors import (
+    TrustboError,
+    require_choice,
+    require_kind,
+    require_known,
+    require_pair,
+    require_whole,
+)
+from trustbo.files import FilePath, to_json
+from trustbo.hazard import Hazard
 from trustbo.hazard.exposures import CAUSES
 from trustbo.hazard.risk import BoundRisk
-from trustbo.models.backend import VERSIONS
-from trustbo.models.model import TrustModel
+from trustbo.inference import diagnostics, fit, params_of
+from trustbo.inference.samplers.choice import resolve_sampler
+from trustbo.models import HumanTrust, default_model
+from trustbo.models.model import TrustModel, require_model
 from trustbo.models.params import Params
 from trustbo.models.record import model_from_record, model_to_record
 from trustbo.planning import Plan, Planner, Policy
 from trustbo.planning.policies import resolve_policy
 from trustbo.simulation import Truth
 from trustbo.simulation.protocol import Simulator
-from trustbo.stacking import replace_awareness
 from trustbo.workspace import Workspace
 from trustbo.workspace.location import Location
-from trustbo.workspace.moves import along, moves_along, require_on_grid
+
+_ARRIVES = 0.9
+"""Chance to arrive of a plan below which a campaign without a price of failures warns."""
+_FIT = (
+    "missions", "model", "sampler", "workspace", "earlier", "seed", "progress", "whole", "check",
+)  # fmt: skip
+"""Arguments of `fit` that a campaign gives itself."""
 
 
 class Campaign(Summary):
     """Learns from missions and proposes the next path.
 
-    A mission is planned by `ask`, then recorded, then learned from. One that cannot be learned from
-    yet waits, and is tried with every later one; one that never can be is excluded. With a
-    `directory`, every mission is on disk before anything is learned from it, and everything before
-    the next is asked for: `Campaign.load` goes on where the process ended, with identical results.
+    `ask` plans a path, `tell` records the mission that was run and learns from it. With a
+    `directory`, a mission is on disk before anything is learned from it, and `Campaign.load`
+    continues where the process ended, with identical results.
 
     Attributes:
         workspace: Workspace of the paths.
-        options: Options of the campaign.
-        state: Missions as measured, their states, plans and posteriors, failures and notes.
-        learner: Model, fit and hazard, and the current belief.
-        planner: Planner on the workspace's awareness map; see `planner_now`.
+        model: Trust model.
         policy: Policy that chooses the paths.
-        storage: Files of the campaign; None where it is in memory only.
-        settings: Options and model, for `Result.settings`.
+        state: Missions with their plans and posteriors, failures, and settings.
+        storage: Folder of the campaign; None if it is in memory only.
+        progress: Whether fits show their progress.
     """
 
     def __init__(
@@ -70,12 +87,16 @@ class Campaign(Summary):
         goal: Location,
         *,
         model: TrustModel | None = None,
-        policy: str | Policy = POLICY,
-        objective: str = OBJECTIVE,
-        sampler: str = SAMPLER,
+        policy: str | Policy = "greedy",
+        objective: str = "lost_contact",
+        sampler: str = "auto",
         seed: int = 0,
         directory: FilePath | None = None,
-        **options: Any,
+        overwrite: bool = False,
+        initial: str = "prior_mean",
+        hazard: Hazard | None = None,
+        planner: Mapping[str, Any] | None = None,
+        fit: Mapping[str, Any] | None = None,
     ) -> None:
         """Prepare a campaign; nothing is computed yet.
 
@@ -83,70 +104,292 @@ class Campaign(Summary):
             workspace: Workspace of the paths.
             start: First cell of every path, or a position in it; see `Workspace.locate`.
             goal: Last cell of every path, or a position in it.
-            model: Trust model; by default `PooledTrust` with effects of places and robots.
-            policy: Name of a policy, or a callable `policy(key, draws, planner) -> Plan`.
-            objective: Objective of the paths; see `Planner`.
-            sampler: Sampler of the posterior; see `trustbo.fit`.
+            model: Trust model; by default `models.default_model()`, with effects of places and
+                robots.
+            policy: Name in `planning.POLICIES`, or a callable `policy(key, draws, planner)` that
+                returns a Plan.
+            objective: Objective of the paths, see `planning.Planner`.
+            sampler: Sampler of the posterior, see `trustbo.fit`.
             seed: Seed of everything random.
             directory: Folder that is updated after each mission. It is locked until the end of
                 `with campaign:`, or of the process.
-            **options: Fields of `CampaignOptions`, or a whole one as `options`.
+            overwrite: Whether to remove another campaign from that folder first.
+            initial: Belief of the first plan: `"prior_mean"`, or `"prior_draw"`, one random draw of
+                the prior, as in the paper.
+            hazard: Priors of the chance that a bound fails, by default `Hazard()`.
+            planner: Further options of `planning.Planner`, such as `{"max_failure": 0.1}`. A
+                failure costs nothing until one was recorded, unless `failure_cost` is given.
+            fit: Further options of `trustbo.fit`, such as `{"draws": 500}`.
 
         Raises:
             TrustboError: Start, goal or a name that does not exist; a sampler that does not suit
-                the model; or a model that cannot be updated so.
+                the model; or a folder that holds a campaign, without `overwrite`.
             NoPathError: The goal cannot be reached.
         """
-        self.options = CampaignOptions.from_keywords(options, Campaign.__init__)
-        self.policy = resolve_policy(policy)
         require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
-        self.workspace = workspace
-        self.state = CampaignState(require_whole("seed", seed, 0))
-        self.learner = Learner(workspace, self.options, model, sampler, self.seed_of("prior"))
-        model = self.model
-        self.planner = planner_of(
-            self.options, workspace, start, goal, objective, model.family.name
-        )
-        self.storage: Storage | None = None
-        self._planner_now: Planner | None = None
-        self._whole: tuple[Posterior, xr.DataTree] | None = None
-        self._warned_of_risk = False
-        self._asked = (0.0, 0.0)  # seconds that planning took, and the time when it was done
-        name = getattr(policy, "__name__", type(policy).__name__)
-        record = {
-            "start": list(self.planner.start),
-            "goal": list(self.planner.goal),
-            "policy": policy if isinstance(policy, str) else name,
+        require_choice("initial", initial, ("prior_mean", "prior_draw"))
+        model = default_model() if model is None else model
+        _require_learnable(model, sampler)
+        self._fit = dict(fit or {})
+        _require_options_of_fit(self._fit)
+        self._hazard_prior = Hazard() if hazard is None else hazard
+        require_kind("hazard", self._hazard_prior, Hazard, "give a trustbo.hazard.Hazard")
+        self.workspace, self.model, self.policy = workspace, model, resolve_policy(policy)
+        settings = {
+            "policy": policy if isinstance(policy, str) else _name_of(policy),
+            "own_policy": not isinstance(policy, str),
             "objective": objective,
             "sampler": sampler,
-            "seed": self.state.seed,
-        } | self.options.to_record()
-        self.settings = record | {
-            "model": model.named_with_effects,
+            "seed": require_whole("seed", seed, 0),
+            "initial": initial,
             "observation": model.observation,
-            "max_bounds": self.planner.max_bounds,
+            "planner": dict(planner or {}),
         }
-        self.state.options = record | {
-            "model": model_to_record(model),
-            "own_policy": not isinstance(policy, str),
+        self._base = base_planner(workspace, {"start": start, "goal": goal, **settings})
+        settings |= {
+            "start": self._base.start,
+            "goal": self._base.goal,
+            "max_bounds": self._base.max_bounds,
+            "fit": self._fit,
+            "hazard": asdict(self._hazard_prior),
+            "model": model.named_with_effects,
+            "model_record": model_to_record(model),
         }
+        self.state = State(json.loads(to_json(settings)))  # as a file returns them
+        self._prior = prior_belief(model, initial, workspace, self.state.seed_of("prior"))
+        self._hazard: tuple[object, xr.Dataset] | None = None  # with what it was learned from
+        self._cached: dict[str, Any] = {}  # until the next mission or failure
+        self._asked_at = (0.0, 0.0)  # seconds that planning took, and the time when it was done
+        self._warned_of_risk = False
+        self.progress = True
+        self.storage: Storage | None = None
         if directory is not None:
-            self._save_to(Storage(directory), keep=True)
+            self.keep_in(directory, overwrite=overwrite)
 
     def _rows(self) -> Rows:
-        n, settings, state = len(self.missions), self.settings, self.state
-        numbers = f"{n} told, {len(state.numbers(TOLD))} not learned from yet"
-        others = {SET_ASIDE: len(state.numbers(SET_ASIDE)), "given up": len(state.failures)}
-        numbers += "".join(f", {number} {name}" for name, number in others.items() if number)
+        settings, state = self.state.settings, self.state
+        counts = {name: len(state.numbers(name)) for name in (LEARNED, TOLD, EXCLUDED)}
+        counts["given up"] = len(state.failures)
+        shown = [f"{number} {name}" for name, number in counts.items() if number]
         rows = [
             ("course", f"{tuple(settings['start'])} to {tuple(settings['goal'])}"),
-            ("missions", numbers),
+            ("missions", ", ".join(shown) or "none yet"),
             ("model", self.model.in_short()),
             ("policy", f"{settings['policy']}, objective {settings['objective']}"),
         ]
-        return rows + evidence_of(self.history)
+        return rows + evidence_of(state)
 
     # --- ask and tell ---
+
+    def ask(self) -> Plan:
+        """Plan the next path; the same one until `tell`, `fail` or `suggest`.
+
+        Raises:
+            TrustboError: The policy returned a path that is broken, or no plan.
+        """
+        if self.state.asked is None:
+            started = time.perf_counter()
+            with jax.threefry_partitionable(True):  # else the caller's flag decides what is drawn
+                key = random.key(self.state.seed_of("policy"), impl="threefry2x32")
+                plan = self.policy(key, self.belief, self.planner)
+            name = f"policy {self.state.settings['policy']!r}"
+            require_kind(name, plan, Plan, "a policy returns a trustbo.planning.Plan")
+            try:
+                self.planner.require_path(plan.path)
+            except TrustboError as error:
+                raise TrustboError(f"{name}: {error}") from None
+            return self._accept(plan, started)
+        return self.state.asked
+
+    def suggest(self, path: Sequence[Cell]) -> Plan:
+        """Choose the next path by hand; `ask` then returns it.
+
+        Args:
+            path: Cells from start to goal.
+
+        Raises:
+            TrustboError: The path is broken, or does not lead from start to goal.
+        """
+        started = time.perf_counter()
+        return self._accept(self.planner.evaluate(path, self.belief.mean()), started)
+
+    def _accept(self, plan: Plan, started: float) -> Plan:
+        """Store a plan, with bands over the posterior, as the next one to run."""
+        given = self.planner.evaluate(plan.path, self.belief)
+        now = time.perf_counter()
+        self._asked_at = now - started, now
+        self._warn_of_risk(plan, given)
+        self.state.asked = accepted = plan.with_draws(given)
+        self._write()
+        return accepted
+
+    def _warn_of_risk(self, plan: Plan, given: Plan) -> None:
+        """Warn of a plan beyond `max_failure`; or, once, of one that may well fail at no cost."""
+        options = self.state.settings["planner"]
+        if plan.infeasible and plan.p_fail is not None:
+            p_fail = 1.0 - np.prod(1.0 - plan.p_fail)  # by which max_failure goes
+            warnings.warn(
+                f"the plan fails with probability {p_fail:.3g} if bounds fail independently, more "
+                f"than max_failure = {options['max_failure']:g}: no safer path was found.",
+                stacklevel=4,
+            )
+        limited = any(options.get(name) is not None for name in ("max_failure", "failure_cost"))
+        p_arrive = 1.0 if given.p_arrive is None else given.p_arrive
+        if limited or self._warned_of_risk or self.risk.has_failures or p_arrive >= _ARRIVES:
+            return
+        self._warned_of_risk = True
+        warnings.warn(
+            f"the plan arrives with a chance of {p_arrive:.2f} only, and a failure has no price "
+            'until one was recorded; give planner={"max_failure": ...} or {"failure_cost": ...}, '
+            "or lower max_slope of the team's robots.",
+            stacklevel=4,
+        )
+
+    def tell(self, mission: Mission, **extra: float) -> xr.DataTree | None:
+        """Record a mission and learn from it.
+
+        It is learned from with the awareness of the map. Robots and features may be in any order of
+        their names, and the path may differ from the one asked for.
+
+        Args:
+            mission: Mission as measured, whether or not it reached the goal.
+            **extra: More numbers for its row of the history, such as its regret.
+
+        Returns:
+            Posterior of the parameters given all missions that can be learned from; with a warning
+            the previous one, or None, if this mission cannot be learned from yet, or never.
+
+        Raises:
+            ShapeError: Robots or features differ from the workspace's.
+            TrustboError: The path leaves the grid, jumps, or begins in another cell than the one
+                asked for; or an extra has the name of a column. Nothing is stored then.
+        """
+        require_kind("mission", mission, Mission, "tell one trustbo.Mission at a time")
+        mission = self.workspace.in_order(mission)
+        if mission.path[0] != (first := self.ask().path[0]):
+            raise TrustboError(
+                f"the mission starts at {mission.path[0]}, not at {first}; cells are (row, col)."
+            )
+        self._take(mission, extra)
+        return None if self.state.last is None else self.state.last()
+
+    def _take(self, mission: Mission, extra: dict[str, float]) -> None:
+        """Write a mission to disk, then learn from it."""
+        state, plan, seed = self.state, self.ask(), self.state.seed_of("fit")
+        learned, row = as_learned(mission, self.workspace), state.row_of(plan, mission, extra)
+        started = time.perf_counter()
+        row |= {"seconds_plan": self._asked_at[0], "seconds_run": started - self._asked_at[1]}
+        entry = Entry(plan, mission, learned, self.trust_map(), row, state.last)
+        state.entries.append(entry)
+        if self.storage is not None:
+            self.storage.add_mission(len(state.entries), entry, extra)
+        if reason := why_never_learned(learned):
+            entry.become(EXCLUDED, reason)
+            warnings.warn(f"mission {len(state.entries)} is excluded: {reason}", stacklevel=4)
+        else:
+            self._learn(seed)
+        row["seconds_fit"] = time.perf_counter() - started
+        self._continue()
+
+    def _learn(self, seed: int) -> None:
+        """Fit the posterior after the last mission."""
+        state, entry = self.state, self.state.entries[-1]
+        if not (n_learned := len(state.numbers(TOLD, LEARNED))):
+            entry.posterior = None
+            return
+        tree = learn(
+            state, self.model, self.state.settings["sampler"], self._fit, self.workspace, seed,
+            self.progress,
+        )  # fmt: skip
+        if tree is None:
+            return
+        tree["hazard"] = xr.DataTree(self.hazard)
+        entry.row |= diagnostics(tree)
+        if state.last is not None:
+            state.last.release()
+        n_excluded = len(state.entries) - n_learned
+        name = f"{len(state.entries):04d}" + (f"-{n_excluded}" if n_excluded else "")
+        entry.posterior = Posterior(name, tree)
+        if self.storage is not None:
+            self.storage.add_posterior(entry.posterior)
+
+    def _continue(self) -> None:
+        """Drop the plan that was run or given up and what was computed for it; write the state."""
+        self.state.asked, self._cached = None, {}
+        self._write()
+
+    def _write(self) -> None:
+        if self.storage is not None:
+            self.storage.write_record(self.state)
+
+    def stop(self, reason: str) -> None:
+        """Record why the campaign ends; it may continue later."""
+        self.state.stop_reason = reason
+        self._write()
+
+    def exclude(self, n: int, reason: str) -> xr.DataTree | None:
+        """Exclude a mission from learning for good; `tell` with the same mission adds it again.
+
+        Args:
+            n: Number of the mission, from 1.
+            reason: Reason, for the record.
+
+        Returns:
+            Posterior of the parameters given the others; None if there is nothing to learn from.
+
+        Raises:
+            TrustboError: There is no such mission, or it is excluded already.
+        """
+        if not 1 <= require_whole("n", n, 1) <= (n_told := len(self.state.entries)):
+            raise TrustboError(f"there is no mission {n} to exclude; {n_told} were told.")
+        if (entry := self.state.entries[n - 1]).state == EXCLUDED:
+            raise TrustboError(f"mission {n} is excluded already: {entry.row['reason']}")
+        entry.become(EXCLUDED, str(reason))
+        self._learn(self.state.seed_of("fit"))
+        self._continue()
+        return None if self.state.last is None else self.state.last()
+
+    def fail(
+        self, reason: str, mission: Mission | None = None, *, where: Cell | None = None
+    ) -> xr.DataTree | None:
+        """Give up the mission that was asked for; the next plan takes it into account.
+
+        Args:
+            reason: Reason, for the record. One of `hazard.CAUSES`, such as "stuck", means that a
+                bound of the plan failed, and is learned from as a hazard.
+            mission: Bounds that were run, to learn from; None if there are none.
+            where: Cell that the team failed to enter, if that is known without a report.
+
+        Returns:
+            Posterior of the parameters, if there was something to learn.
+
+        Raises:
+            TrustboError: The mission is one that `tell` refuses, or reached the goal in spite of
+                a cause; a reason that is empty; or a `where` that the plan does not enter, together
+                with a mission, or for another reason.
+        """
+        if not isinstance(reason, str) or not reason.strip():
+            raise TrustboError(f"reason must be text, such as {CAUSES[0]!r}; got {reason!r}.")
+        posterior, path = None, ()
+        if mission is not None:
+            if where is not None or (reason in CAUSES and mission.status == "ok"):
+                raise TrustboError(
+                    f"mission ends with status {mission.status!r}, which contradicts reason = "
+                    f"{reason!r}, where = {where}; give its bounds with the status of the last."
+                )
+            posterior = self.tell(mission)
+        elif where is not None or reason in CAUSES:
+            path = self.ask().path
+            where = None if where is None else require_pair("where", where)
+            if where is not None and (reason not in CAUSES or where not in path[1:]):
+                raise TrustboError(
+                    f"where = {where} must be a cell that the plan enters, {path[1:]}, and reason "
+                    f"one of {', '.join(CAUSES)}; got {reason!r}."
+                )
+        n = len(self.state.entries)
+        self.state.failures.append(Failure(n, reason, tuple(path), where, mission is not None))
+        self._continue()
+        return posterior
 
     def run(
         self,
@@ -160,13 +403,7 @@ class Campaign(Summary):
         """Run missions in a simulator, one for each step of this iterator.
 
         Nothing is run until it is iterated over: `for plan, mission in campaign.run(simulator, 8)`.
-
-        Args:
-            simulator: Simulator, as in `iterate`.
-            n_iterations: Largest number of missions in all.
-            truth: Truth of the simulator, as in `iterate`.
-            stop: Rules to end before `n_iterations`, as in `iterate`.
-            progress: Progress to show, as in `iterate`.
+        The arguments are those of `iterate`; `n_iterations` counts earlier missions too.
 
         Yields:
             Plan of each mission, and the mission, learned from already.
@@ -176,193 +413,57 @@ class Campaign(Summary):
         """
         return run_missions(self, simulator, n_iterations, truth, stop, progress)
 
-    def ask(self) -> Plan:
-        """Plan the next path to run; the same one until `tell`, `fail` or `suggest`.
-
-        Raises:
-            TrustboError: The policy returned a path that is broken, or no plan.
-        """
-        if self.state.suggested is not None:
-            return self.state.suggested
-        started = time.perf_counter()
-        planner = self.planner_now()
-        with jax.threefry_partitionable(True):  # else the caller's flag decides what is drawn
-            key = random.key(self.seed_of("policy"), impl="threefry2x32")
-            plan = self.policy(key, self.belief, planner)
-        name = f"the policy {self.settings['policy']!r}"
-        if not isinstance(plan, Plan):
-            raise TrustboError(f"{name} must return a Plan; got {plan!r}.")
-        try:
-            planner.require_path(plan.path)
-        except TrustboError as error:
-            raise TrustboError(f"{name}: {error}") from None
-        return self._accept(plan, started)
-
-    def suggest(self, path: Sequence[Cell]) -> Plan:
-        """Let the operator choose the next path; `ask` then returns it.
-
-        Args:
-            path: Cells from start to goal.
-
-        Raises:
-            TrustboError: The path is broken, or does not lead from start to goal.
-        """
-        started = time.perf_counter()
-        plan = self.planner_now().evaluate(path, self.belief.mean())
-        return self._accept(plan, started)
-
-    def _accept(self, plan: Plan, started: float) -> Plan:
-        """Store a plan as the next one to run."""
-        given = self.planner_now().evaluate(plan.path, self.belief)
-        now = time.perf_counter()
-        self._asked = now - started, now
-        if plan.infeasible and plan.p_fail is not None:
-            p_fail = 1.0 - np.prod(1.0 - plan.p_fail)  # by which max_failure goes
-            warnings.warn(
-                f"the plan fails with a chance of {p_fail:.3g}, bounds taken for independent, "
-                f"beyond max_failure = {self.options.max_failure:g}; no safer path keeps within "
-                "it, or none was found.",
-                stacklevel=4,
-            )
-        if not self._warned_of_risk and (warning := unpriced_risk(self.options, self.risk, given)):
-            self._warned_of_risk = True
-            warnings.warn(warning, stacklevel=4)
-        self.state.suggested = accepted = plan.with_draws(given)
-        if self.storage is not None:
-            self.storage.write(self.state, None)
-        return accepted
-
-    def tell(self, mission: Mission, **extra: float) -> xr.DataTree | None:
-        """Record a mission and learn from it.
-
-        It is learned from with the awareness of the map; with a belief about the awareness, with
-        what robots measured, filled in from the belief.
-        Robots and features may be in any order of their names. The path may differ from the one
-        asked for.
-
-        Args:
-            mission: Mission as measured, whether or not the goal was reached.
-            **extra: More numbers for its row of the history, such as its regret.
-
-        Returns:
-            Posterior of the parameters given all missions that can be learned from; with a warning
-            the last one, or None, where this mission cannot be learned from yet, or never.
-
-        Raises:
-            ShapeError: Robots or features differ from the workspace's.
-            TrustboError: The path leaves the grid, jumps or begins in another cell than the one
-                asked for; or an extra is no number. Nothing is stored then.
-        """
-        mission = require_mission(mission, self.workspace, self.ask().path)
-        self._take(mission, require_extra(extra))
-        return self.state.last_tree
-
-    def _take(self, mission: Mission, extra: dict[str, float]) -> None:
-        """Write a mission to disk, then learn from it."""
-        plan, trust_map, seed = self.ask(), self.trust_map(), self.seed_of("fit")
-        learned = self.as_learned(mission)
-        started = time.perf_counter()
-        if self.storage is not None:
-            extras = [*(entry.extra for entry in self.state.entries), extra]
-            self.storage.write_measured([*self.state.measured, mission], extras)
-        seconds = {"seconds_plan": self._asked[0], "seconds_run": started - self._asked[1]}
-        entry = self.state.add(mission, learned, plan, trust_map, extra, **seconds)
-        self.learner.take(self.state, seed)
-        entry.row["seconds_fit"] = time.perf_counter() - started
-        self._go_on()
-
-    def _go_on(self) -> None:
-        """Drop the plan that was run or given up, and write the new state."""
-        self.state.suggested = self._planner_now = None
-        if self.storage is not None:
-            self.storage.write(self.state, self._result_so_far())
-
-    def set_aside(self, reason: str, mission: int | None = None) -> xr.DataTree | None:
-        """Exclude a mission from learning, for good; `tell` with the same mission adds it again.
-
-        Args:
-            reason: Reason, for the record.
-            mission: Number of the mission, from 1; by default the last.
-
-        Returns:
-            Posterior of the parameters given the others; None if there is nothing to learn from.
-
-        Raises:
-            TrustboError: There is no such mission, or it is excluded already.
-        """
-        n = len(self.state.entries)
-        number = n if mission is None else require_whole("mission", mission, 1)
-        if not 1 <= number <= n:
-            raise TrustboError(f"there is no mission {number} to set aside; {n} were told.")
-        if (entry := self.state.entries[number - 1]).state == SET_ASIDE:
-            raise TrustboError(f"mission {number} is set aside already: {entry.row['reason']}")
-        entry.become(SET_ASIDE, str(reason))
-        self.learner.learn(self.state, self.seed_of("fit"))
-        self.state.suggested = self._planner_now = None
-        if self.storage is not None:
-            self.storage.write(self.state, self.result())
-        return self.state.last_tree
-
-    def fail(
-        self,
-        reason: str,
-        mission: Mission | None = None,
-        *,
-        where: Cell | None = None,
-    ) -> xr.DataTree | None:
-        """Give up the mission that was asked for; the next plan takes it into account.
-
-        Args:
-            reason: Reason, for the record. One of `hazard.CAUSES`, such as "stuck", means that a
-                bound of the plan failed, and is learned from as a hazard.
-            mission: Bounds that were run, to learn from; None if there are none.
-            where: Cell that it failed to enter, if that is certain though it did not report.
-
-        Returns:
-            Posterior of the parameters, if there was something to learn.
-
-        Raises:
-            TrustboError: The mission is one that `tell` refuses, or reached the goal in spite of
-                a cause; a reason that is empty; or a `where` that the plan does not enter, together
-                with a mission, or for another reason.
-        """
-        if mission is not None and where is not None:
-            raise TrustboError(f"the mission tells where it failed; leave where = {where}.")
-        require_reason(reason, mission)
-        state, posterior, path = self.state, None, ()
-        if mission is not None:
-            posterior = self.tell(mission)
-        elif where is not None or reason in CAUSES:
-            path = self.ask().path
-            where = None if where is None else require_where(where, reason, path)
-        failure = Failure(len(state.entries), reason, tuple(path), where, mission is not None)
-        state.failures.append(failure)
-        self._go_on()
-        return posterior
+    # --- what is believed ---
 
     def recommend(self) -> Plan:
         """Plan the best path under the mean of the belief, regardless of the policy."""
-        return self.planner_now().plan(self.belief.mean())
+        return self.planner.plan(self.belief.mean())
 
     def trust_map(self) -> xr.DataArray:
         """Compute the team's trust map under the mean of the belief, dims (row, col)."""
-        return self.planner_now().trust_map(self.belief.mean())
+        return self.planner.trust_map(self.belief.mean())
 
-    def planner_now(self) -> Planner:
-        """Planner with the current belief about the awareness, away from bounds that failed.
+    @property
+    def belief(self) -> Params:
+        """Parameter draws of the next plan: the posterior's, or, at first, those of `initial`."""
+        if self.state.last is None:
+            return self._prior
+        if "belief" not in self._cached:
+            self._cached["belief"] = params_of(self.state.last())
+        return self._cached["belief"]
+
+    @property
+    def hazard(self) -> xr.Dataset:
+        """Group `hazard` of the posterior, see `hazard.fit_hazard`; of the prior at first."""
+        state = self.state
+        key = len(state.entries), len(state.failures), tuple(state.numbers(EXCLUDED))
+        if self._hazard is None or self._hazard[0] != key:
+            self._hazard = key, learn_hazard(state, self.workspace, self._hazard_prior)
+        return self._hazard[1]
+
+    @property
+    def risk(self) -> BoundRisk:
+        """Chances of the bounds to fail, given all missions so far."""
+        if "risk" not in self._cached:
+            self._cached["risk"] = BoundRisk.of(self.hazard, self.workspace)
+        return self._cached["risk"]
+
+    @property
+    def planner(self) -> Planner:
+        """Planner that takes the failures so far into account.
 
         A bound that failed twice is not entered again unless there is no other way, or its chance
         to fail fell below 0.2.
         """
-        if self._planner_now is None:
-            self._planner_now = planner_given(self.planner, self.learner, self.state)
-        return self._planner_now
+        if "planner" not in self._cached:
+            any_run = bool(self.state.entries or self.state.failures)
+            self._cached["planner"] = informed_planner(self._base, self.risk, avoid=any_run)
+        return self._cached["planner"]
 
     def known_along(self, path: Sequence[Cell]) -> np.ndarray:
-        """Awareness expected in the bounds of a path, shape (bound, robot, feature).
+        """Awareness of the map in the bounds of a path, shape (bound, robot, feature).
 
-        It is that of the map, or of the belief after the missions so far; `TrustFilter` and
-        missions use it where robots do not measure awareness.
+        `TrustFilter` needs it, as robots do not measure awareness.
 
         Args:
             path: Current cell of the team and the cells to be entered; need not begin at the start.
@@ -370,136 +471,54 @@ class Campaign(Summary):
         Raises:
             TrustboError: A cell is off the grid, or no neighbour of the one before.
         """
-        cells = require_on_grid(path, self.workspace.grid.shape)
-        moves_along(cells)
-        return np.swapaxes(along(self.workspace.bound_maps, cells), 0, 1)
+        return known_along(path, self.workspace)
 
-    def as_learned(self, mission: Mission) -> Mission:
-        """Return a mission with the awareness that it is learned from.
+    @property
+    def missions(self) -> list[Mission]:
+        """Missions recorded so far, with the awareness that they are learned from."""
+        return [entry.mission for entry in self.state.entries]
 
-        It is the map's, which plans go by: weights fitted to what robots measured would be applied
-        to other numbers, and plans be off by the difference.
-        """
-        return replace_awareness(mission, self.known_along(mission.path))
+    @property
+    def posteriors(self) -> list[xr.DataTree | None]:
+        """Posterior of the parameters after each mission; None where nothing was learned yet."""
+        return [entry.posterior and entry.posterior() for entry in self.state.entries]
 
-    # --- results ---
+    @property
+    def posterior(self) -> xr.DataTree | None:
+        """Posterior after the last mission, with all groups; None before anything is learned."""
+        if self.state.last is not None and "posterior" not in self._cached:
+            whole = whole_posterior(self.state.last(), self.missions, self.hazard, self.model)
+            self._cached["posterior"] = whole
+        return self._cached.get("posterior")
+
+    def table(self) -> pd.DataFrame:
+        """Table with a row for each mission, as `Result.table`."""
+        return self.state.table()
 
     def result(self) -> Result:
         """Collect everything learned so far, as `iterate` returns it.
 
         Raises:
-            TrustboError: Nothing was learned yet.
+            TrustboError: There is no mission yet.
         """
         if not self.state.entries:
             raise TrustboError("the campaign has no mission yet; tell it one first.")
-        best = self.recommend()
-        return Result(
-            self.workspace, self.missions, self.posteriors, list(best.path), best.trust, best.value,
-            self.trust_map(), self.history,
-            {**self.settings, **self.state.notes, "trustbo_version": VERSIONS["trustbo"]},
-            self.state.stop_reason, tuple(self.state.failures),
-        )  # fmt: skip
-
-    def _result_so_far(self) -> Result | None:
-        return self.result() if self.state.entries else None
-
-    def stop(self, reason: str) -> Result:
-        """End the campaign, which may still go on later, and return its result.
-
-        Args:
-            reason: Reason, for `Result.stop_reason`.
-        """
-        self.state.stop_reason = reason
-        result = self.result()
-        if self.storage is not None:
-            self.storage.write(self.state, result, ended=True)
-        return result
-
-    @property
-    def missions(self) -> list[Mission]:
-        """Missions recorded so far, their awareness filled in."""
-        return self.state.missions
-
-    @property
-    def posteriors(self) -> Posteriors:
-        """Posterior of the parameters after each mission; None where nothing was learned yet."""
-        return self.state.posteriors
-
-    @property
-    def posterior(self) -> xr.DataTree | None:
-        """Posterior after the last mission, with all groups; None before anything is learned."""
-        last = self.state.last
-        if last is None:
-            return None
-        if self._whole is None or self._whole[0] is not last:
-            self._whole = last, whole_posterior(last(), self.missions, self.model)
-        whole = self._whole[1]
-        whole["hazard"] = xr.DataTree(self.hazard)
-        return whole
-
-    @property
-    def history(self) -> xr.Dataset:
-        """Dataset as `Result.history`; empty before the first mission."""
-        return history_of(self.state.entries)
-
-    def table(self) -> pd.DataFrame:
-        """Table with a row for each mission, as `Result.table`."""
-        return table_of(self.history, self.missions, self.state.failures)
-
-    @property
-    def model(self) -> TrustModel:
-        """Trust model."""
-        return self.learner.model
-
-    @property
-    def belief(self) -> Params:
-        """Parameter draws of the next plan: the posterior's, or, at first, one from the prior."""
-        return self.learner.belief
-
-    @property
-    def hazard(self) -> xr.Dataset:
-        """Group `hazard` of the posterior, see `hazard.fit_hazard`; of the prior at first."""
-        return self.learner.hazard(self.state)[0]
-
-    @property
-    def risk(self) -> BoundRisk:
-        """Chances of the bounds to fail, of all missions so far."""
-        return self.learner.hazard(self.state)[1]
-
-    def seed_of(self, stream: str) -> int:
-        """Seed of one stream of randomness ("policy", "fit", "mission") at this iteration."""
-        return self.state.seed_of(stream)
+        parts = self.workspace, self.state.copy(), self.planner, self.belief
+        return Result(*parts, self.hazard, self.model)
 
     # --- the folder ---
 
-    def save(self, directory: FilePath, *, keep: bool = False, overwrite: bool = False) -> None:
-        """Write everything to a folder that `Campaign.load` reads.
+    def keep_in(self, directory: FilePath, *, overwrite: bool = False) -> None:
+        """Write everything to a folder, and update it after each mission from now on.
 
         Args:
-            directory: Folder to write to.
-            keep: Whether to go on writing there after each mission, as with a `directory`, until
-                the end of `with campaign:`.
-            overwrite: Whether to remove another campaign or result in the folder first.
-
-        Raises:
-            TrustboError: The folder holds another campaign or result, without `overwrite`; another
-                campaign has locked it; or its name belongs to a file.
+            directory: Folder, see `Campaign`.
+            overwrite: Whether to remove another campaign from it first.
         """
-        storage, path = self.storage, as_path(directory).resolve()
-        if storage is None or storage.path.resolve() != path:
-            storage = Storage(directory, overwrite=overwrite)
-        self._save_to(storage, keep)
-
-    def _save_to(self, storage: Storage, keep: bool) -> None:
-        before = self.storage
-        try:
-            storage.write_whole(self.workspace, self.state, self._result_so_far())
-            if keep:
-                self.storage = storage
-        finally:
-            for other in (before, storage):
-                if other is not None and other is not self.storage:
-                    other.release()
+        storage = Storage(directory, overwrite=overwrite)
+        storage.begin(self.workspace, self.state)
+        self.__exit__()
+        self.storage = storage
 
     @classmethod
     def load(
@@ -508,34 +527,38 @@ class Campaign(Summary):
         *,
         model: TrustModel | None = None,
         policy: Policy | None = None,
-        **custom: Any,
     ) -> Self:
-        """Go on with a campaign where it stopped, in the same folder.
+        """Continue a campaign where it stopped, in the same folder.
 
         A mission that was recorded and not yet learned from is learned from now.
 
         Args:
-            directory: Folder that was passed as `directory`, or to `save`.
+            directory: Folder that was passed as `directory`, or to `Result.save`.
             model: The same model, if it or its priors are custom.
             policy: The same policy, if it is custom.
-            **custom: The same `callbacks`.
 
         Raises:
             TrustboError: There is no campaign; another process has locked it; or a custom object
                 is missing.
+            DamagedFileError: A file of the folder is missing or damaged.
         """
         storage = Storage(directory, begun=True)
         try:
-            state, workspace, pending = storage.read()
-            with interpreting(storage.path / STATE):
-                given, kind = arguments_of(state.options, policy, **custom)
-                restored = model_from_record(kind) if model is None else None
-            # Not within: an error of the user's model is none of the file.
-            restored = model_from_record(kind, model) if restored is None else restored
-            campaign = cls(workspace, model=restored, **given)
-            state.options = campaign.state.options  # as this version writes them
+            state, workspace, pending = read_campaign(storage.path)
+            given = state.settings
+            if given["own_policy"] and policy is None:
+                raise TrustboError(
+                    f"the campaign's policy {given['policy']!r} was your own: give policy=."
+                )
+            campaign = cls(
+                workspace, given["start"], given["goal"],
+                model=model_from_record(given["model_record"], model),
+                policy=given["policy"] if policy is None else policy,
+                objective=given["objective"], sampler=given["sampler"], seed=given["seed"],
+                initial=given["initial"], hazard=Hazard(**given["hazard"]),
+                planner=given["planner"], fit=given["fit"],
+            )  # fmt: skip
             campaign.state, campaign.storage = state, storage
-            campaign.learner.restore(state)
             for mission, extra in pending:
                 campaign._take(mission, extra)
         except BaseException:
@@ -550,3 +573,21 @@ class Campaign(Summary):
         if self.storage is not None:
             self.storage.release()
             self.storage = None
+
+
+def _name_of(policy: Policy) -> str:
+    return getattr(policy, "__name__", type(policy).__name__)
+
+
+def _require_learnable(model: TrustModel, sampler: str) -> None:
+    """Refuse a model that plans no paths, or has no such sampler: TrustboError."""
+    require_model(model)
+    if isinstance(model, HumanTrust):
+        raise TrustboError("model: HumanTrust is for reports of people, and plans no paths.")
+    resolve_sampler(model, sampler)
+
+
+def _require_options_of_fit(options: Mapping[str, Any]) -> None:
+    """Refuse an option that `fit` does not have before a mission is run: TrustboError."""
+    names = [name for name in inspect.signature(fit).parameters if name not in _FIT]
+    require_known("option of fit", options, names)

@@ -164,9 +164,11 @@ class Follower:
 
 def _filter_of(campaign: Campaign) -> TrustFilter:
     """Filter of the last posterior of a campaign, or of the prior if nothing was learned yet."""
-    if (posterior := campaign.state.last_tree) is not None:
-        return TrustFilter(posterior)
+    if campaign.state.last is not None:
+        return TrustFilter(campaign.state.last())
     names, n_robots = campaign.workspace.features, campaign.workspace.team.n_robots
     model = campaign.model.for_features(names)
-    draws = sample_prior(model, len(names), 1000, campaign.seed_of("prior"), n_robots=n_robots)
+    draws = sample_prior(
+        model, len(names), 1000, campaign.state.seed_of("prior"), n_robots=n_robots
+    )
     return TrustFilter(draws, n_robots, observation=model.observation)

@@ -1,4 +1,4 @@
-"""Result of a campaign, in memory and on disk."""
+"""Result of a campaign: what was learned, and the path to take."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,24 +11,21 @@ import pandas as pd
 import rioxarray  # noqa: F401  (registers the .rio accessor)
 import xarray as xr
 
-from trustbo.campaign.history import table_of
-from trustbo.campaign.options import PLANNING_OPTIONS, CampaignOptions
-from trustbo.campaign.planners import planner_of, under_risk
-from trustbo.campaign.posteriors import Posteriors, whole_posterior
-from trustbo.campaign.state import Failure
-from trustbo.campaign.summary import evidence_of
+from trustbo.campaign.learning import base_planner, informed_planner, learn_hazard, prior_belief
+from trustbo.campaign.state import Failure, State
+from trustbo.campaign.storage import Storage, read_campaign
 from trustbo.data import Cell, Mission
 from trustbo.display import Rows, Summary
-from trustbo.errors import TrustboError, require_pair
+from trustbo.errors import TrustboError
 from trustbo.files import FilePath
-from trustbo.hazard.model import measures_of
+from trustbo.hazard import Hazard
 from trustbo.hazard.risk import BoundRisk
-from trustbo.inference import (
-    memory,
-    params_of,
-    place_maps,
-)
-from trustbo.inference.memory import Memory
+from trustbo.inference import complete, params_of, place_maps
+from trustbo.inference.samplers.convergence import GOOD_KHAT, MAX_RHAT
+from trustbo.models.backend import VERSIONS
+from trustbo.models.model import TrustModel
+from trustbo.models.params import Params
+from trustbo.models.record import model_from_record
 from trustbo.planning import Plan, Planner
 from trustbo.workspace import Workspace
 
@@ -42,137 +39,133 @@ class Result(Summary):
 
     Attributes:
         workspace: Workspace of the campaign.
-        missions: All missions, in order.
-        posteriors: Posterior of the parameters after each of them (ArviZ DataTrees, read from the
-            folder when asked for); None where nothing could be learned yet.
-        path: Path recommended after the last mission: the best under the posterior mean.
-        trust: Expected trust along it, shape (bound, robot).
-        value: Its objective.
-        trust_map: Trust map of the team after the last mission, dims (row, col).
-        history: Dataset over `iteration` (1, 2, ...): the path that was planned (`path`, row and
-            col of each step, -1 after the goal), its `objective` when it was planned, whether it
-            differs from the plan before (`path_changed`), the `trust_map` it was planned on, the
-            mission's mean `contact_rate`, its `status`, its `state` with the `reason` (`"told"`: to
-            be learned from later; `"learned"`; `"set aside"`: never), the diagnostics
-            of the posterior (see `inference.diagnostics`), and the seconds of planning, running and
-            fitting.
-        settings: Options of the campaign, and the settings of its model and simulator.
-        stop_reason: Reason of the end.
-        failures: Missions that were given up, see `Campaign.fail`.
+        state: Missions with their plans and posteriors, failures, and settings.
+        planner: Planner of the campaign after the last mission.
+        belief: Parameter draws after the last mission.
+        hazard: Posterior of the chance that a bound fails, see `hazard.fit_hazard`.
+        model: Trust model; None if it is custom and the result was read from files.
     """
 
     workspace: Workspace
-    missions: list[Mission]
-    posteriors: Sequence[xr.DataTree]
-    path: list[Cell]
-    trust: np.ndarray
-    value: float
-    trust_map: xr.DataArray
-    history: xr.Dataset
-    settings: dict[str, Any]
-    stop_reason: str
-    failures: Sequence[Failure] = ()
+    state: State
+    planner: Planner
+    belief: Params
+    hazard: xr.Dataset
+    model: TrustModel | None = None
 
     def _rows(self) -> Rows:
-        n = len(self.missions)
+        n, history = len(self.missions), self.history
         rows = [
             ("missions", f"{n}; stopped: {self.stop_reason}"),
             ("recommended", f"{self.path[0]} to {self.path[-1]}, {len(self.path) - 1} bounds"),
-            ("value", f"{self.value:.3g} ({self.settings.get('objective', 'objective unknown')})"),
-            ("contact rate", f"{self.history['contact_rate'].values[-1]:.3f} on the last mission"),
-            ("outcomes", ", ".join(map(str, self.history["status"].values))),
+            ("value", f"{self.value:.3g} ({self.settings['objective']})"),
+            ("contact rate", f"{history['contact_rate'].values[-1]:.3f} on the last mission"),
+            ("outcomes", ", ".join(map(str, history["status"].values))),
         ]
-        if "memory" in self.__dict__:
-            rows.append(("memory", str(self.memory)))
-        return rows + evidence_of(self.history)
+        return rows + evidence_of(self.state)
 
     @property
-    def has_posterior(self) -> bool:
-        """Whether anything could be learned yet."""
-        return (
-            len(self.posteriors) > 0
-            and Posteriors.from_trees(self.posteriors).stored[-1] is not None
-        )
+    def missions(self) -> list[Mission]:
+        """All missions in order, with the awareness that they are learned from."""
+        return [entry.mission for entry in self.state.entries]
+
+    @property
+    def posteriors(self) -> list[xr.DataTree | None]:
+        """Posterior of the parameters after each mission; None where nothing was learned yet."""
+        return [entry.posterior and entry.posterior() for entry in self.state.entries]
 
     @cached_property
     def posterior(self) -> xr.DataTree:
         """Posterior after the last mission, with all groups, for ArviZ.
 
-        Its missions are labelled by their index in `missions`; see `inference.complete` for those
-        before.
+        Its missions are labelled by their index in `missions`; see `inference.complete` for the
+        groups of earlier posteriors.
 
         Raises:
             TrustboError: Nothing could be learned yet.
         """
-        if not self.has_posterior:
-            reasons = [str(r) for r in self.history.get("reason", xr.DataArray([""])).values]
+        if self.state.last is None:
             raise TrustboError(
                 f"there is no posterior: none of {len(self.missions)} missions could be learned "
-                f"from yet ({reasons[-1]}). They are kept; go on with more missions."
+                f"from yet ({self.state.entries[-1].row['reason']}). They are recorded; continue "
+                "with more missions."
             )
-        return whole_posterior(self.posteriors[-1], self.missions)
+        return whole_posterior(self.state.last(), self.missions, self.hazard, self.model)
 
     @cached_property
-    def memory(self) -> Memory:
-        """Whether trust carries over from one bound to the next, see `inference.memory`.
+    def plan(self) -> Plan:
+        """Recommended path, the best under the posterior mean, with bands over the posterior."""
+        best = self.planner.plan(self.belief.mean())
+        draws = self.belief if self.state.last is None else self.state.last()
+        return best.with_draws(self.planner.evaluate(best.path, draws))
 
-        Computed when first asked for, in a second; the summary shows it from then on.
+    @property
+    def path(self) -> list[Cell]:
+        """Recommended path."""
+        return list(self.plan.path)
 
-        Raises:
-            TrustboError: Nothing could be learned yet; or memory cannot be weighed under the model.
+    @property
+    def trust(self) -> np.ndarray:
+        """Expected trust along the recommended path, shape (bound, robot)."""
+        return self.plan.trust
+
+    @property
+    def value(self) -> float:
+        """Objective of the recommended path."""
+        return self.plan.value
+
+    @cached_property
+    def trust_map(self) -> xr.DataArray:
+        """Trust map of the team after the last mission, dims (row, col)."""
+        return self.planner.trust_map(self.belief.mean())
+
+    @cached_property
+    def history(self) -> xr.Dataset:
+        """Numbers of each mission over `iteration` (1, 2, ...).
+
+        The path that was planned (`path`, row and col of each step, -1 after the goal), its
+        `objective` when it was planned, whether it differs from the plan before (`path_changed`)
+        and the `trust_map` it was planned on; the mean `contact_rate` of the mission, the
+        `contact_lost` in bounds (those not run lose all), its `status`, its `state` with the
+        `reason` (`"told"`: to be learned from later; `"learned"`; `"excluded"`), diagnostics of the
+        posterior (see `inference.diagnostics`), and the seconds of planning, running and fitting.
         """
-        return memory(self.posterior, self.missions, self.workspace)
+        return self.state.history()
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Settings of the campaign, its model and its simulator."""
+        return {
+            **self.state.settings, **self.state.simulation, "trustbo_version": VERSIONS["trustbo"]
+        }  # fmt: skip
+
+    @property
+    def stop_reason(self) -> str:
+        """Why the campaign ended."""
+        return self.state.stop_reason
+
+    @property
+    def failures(self) -> Sequence[Failure]:
+        """Missions that were given up, see `Campaign.fail`."""
+        return self.state.failures
 
     def table(self) -> pd.DataFrame:
-        """Table with a row for each mission, labelled by its number, from 1; also `history.csv`.
+        """Table with a row for each mission, labelled by its number, from 1.
 
         Columns are the `status`, the `state` with its `reason`, or the reason of a failure, the
         cell `where` the mission failed, the mean `contact_rate`, the plan's `objective`, the number
         `n_bounds` of bounds run, including a failed one, `path_changed` and the `path` as text,
-        "9,0 8,1"; then diagnostics of the posterior and seconds, as in `history`. A mission given
-        up without a report, see `Campaign.fail`, has no number and the state "given up".
+        "9,0 8,1"; then the other numbers of `history`. A mission given up without a report, see
+        `Campaign.fail`, has no number and the state "given up".
         """
-        return table_of(self.history, self.missions, self.failures)
-
-    @cached_property
-    def planner(self) -> Planner:
-        """Planner as the campaign's at the end."""
-        needed = ("start", "goal", "objective", *PLANNING_OPTIONS)
-        missing = [name for name in needed if name not in self.settings]
-        if missing:
-            raise TrustboError(
-                f"the result's settings lack {', '.join(missing)}: it was made by another version "
-                "or by hand; plan with a Planner of your own."
-            )
-        options = CampaignOptions(**{name: self.settings[name] for name in PLANNING_OPTIONS})
-        start, goal = (require_pair(name, self.settings[name]) for name in ("start", "goal"))
-        observation = self.posterior.attrs.get("observation", "gaussian")
-        planner = planner_of(
-            options, self.workspace, start, goal, self.settings["objective"], observation,
-        )  # fmt: skip
-        if "hazard" in self.posterior.children:
-            hazard = self.posterior["hazard"].to_dataset()
-            # The workspace has no measures where the terrain was taken away.
-            if {*hazard["measure"].values.tolist()} <= {*measures_of(self.workspace)}:
-                planner = under_risk(planner, BoundRisk.of(hazard, self.workspace))
-        return planner
-
-    @cached_property
-    def plan(self) -> Plan:
-        """Recommended path as a `Plan`, with bands over the posterior."""
-        mean = params_of(self.posterior).mean()
-        best = self.planner.plan(mean)
-        if list(best.path) != self.path:  # another version may find one of equal value
-            best = self.planner.evaluate(self.path, mean)
-        given = self.planner.evaluate(best.path, self.posterior)
-        return best.with_draws(given)
+        return self.state.table()
 
     def maps(self, *, n_draws: int | None = None, seed: int = 0) -> xr.Dataset:
         """Compute every map of the planning cells after the last mission, for GIS and figures.
 
         Args:
-            n_draws: Number of draws of the posterior; by default 1000, or 100 where each cell needs
-                a separate search: `team="min"`, or robots that influence each other.
+            n_draws: Number of draws of the posterior; by default 1000, or 100 for robots that
+                influence each other, of which each cell needs a separate search.
             seed: Seed of the choice of draws.
 
         Returns:
@@ -185,25 +178,24 @@ class Result(Summary):
             `place_sd` of the cell's, and `place_bounds_mean`, the mean of those of the bounds into
             it (see `inference.place_maps`); of robots' own effects, the mean over robots.
         """
-        if n_draws is None and seed == 0:
-            return self._maps.copy(deep=True)  # the caller may write into it
-        return self._compute_maps(n_draws, seed)
+        if n_draws is None:
+            n_draws = 1000 if self.planner.dynamics(self.belief.mean()).is_scalar else 100
+        if (n_draws, seed) not in self._maps:
+            self._maps[n_draws, seed] = self._compute_maps(n_draws, seed)
+        return self._maps[n_draws, seed].copy(deep=True)  # the caller may write into it
 
     @cached_property
-    def _maps(self) -> xr.Dataset:
-        return self._compute_maps(None, 0)
+    def _maps(self) -> dict[tuple[int, int], xr.Dataset]:
+        """Maps that were computed, by number of draws and seed."""
+        return {}
 
-    def _compute_maps(self, n_draws: int | None, seed: int) -> xr.Dataset:
-        if n_draws is None:
-            mean = params_of(self.posterior).mean()
-            n_draws = 1000 if self.planner.dynamics(mean).is_scalar else 100
+    def _compute_maps(self, n_draws: int, seed: int) -> xr.Dataset:
         summary = self.planner.trust_summary(self.posterior, n_draws=n_draws, seed=seed)
         maps = summary.rename(mean="trust_mean", sd="trust_sd")
         share = self.planner.path_posterior(self.posterior, n_draws=n_draws, seed=seed)
-        awareness = self.workspace.awareness
-        places = self._places()
+        awareness, places = self.workspace.awareness, self._places()
         taken = {*maps.variables, *maps.dims, "path_probability", "x", "y", "spatial_ref", *places}
-        for name in [str(feature) for feature in awareness["feature"].values]:
+        for name in self.workspace.features:
             values = awareness.sel(feature=name, drop=True).mean("robot")
             free = f"awareness_{name}" if name in taken else name
             maps[free] = values.assign_attrs(long_name=f"{name}, 0 worst, 1 best")
@@ -212,7 +204,7 @@ class Result(Summary):
         return self.workspace.grid.place(maps.where(self.workspace.passable))
 
     def _places(self) -> xr.Dataset:
-        """Maps of the effects of places, (row, col), where there are some."""
+        """Maps of the effects of places, (row, col), if the model has them."""
         if "places" not in self.posterior.children:
             return xr.Dataset()
         effects = place_maps(self.posterior)
@@ -230,6 +222,12 @@ class Result(Summary):
 
         return plots.trust_maps(self.history, self.trust_map, self.path, self.workspace, **options)
 
+    def plot_history(self, **options: Any) -> np.ndarray:
+        """Draw each mission's numbers; options and Axes as of `plots.campaign_history`."""
+        from trustbo import plots  # imports matplotlib
+
+        return plots.campaign_history(self.history, **options)
+
     def explore(self) -> "Explorer":
         """Draw an interactive page with layers of the map and the missions on a slider.
 
@@ -246,20 +244,81 @@ class Result(Summary):
         return draw_explorer(exploring.scene_of(self, self.maps()))
 
     def save(self, directory: FilePath, *, overwrite: bool = False) -> None:
-        """Write everything to a folder that `load_result` reads.
-
-        Each file is written whole or not at all: `posteriors/` (one per mission), `posterior.nc`
-        (the last of them), `missions.nc`, `workspace.nc`, `history.nc`, `history.csv` and
-        `result.json`.
+        """Write everything to a folder that `load_result` and `Campaign.load` read.
 
         Args:
             directory: Folder to write to.
-            overwrite: Whether to remove another campaign or result in it first.
+            overwrite: Whether to remove another campaign from it first.
 
         Raises:
-            TrustboError: The folder holds a campaign or a result, without `overwrite`; or its name
-                belongs to a file.
+            TrustboError: The folder holds a campaign, without `overwrite`; another process has
+                locked it; or its name belongs to a file.
         """
-        from trustbo.campaign.storage import save_result  # it reads results too
+        storage = Storage(directory, overwrite=overwrite)
+        try:
+            storage.begin(self.workspace, self.state)
+        finally:
+            storage.release()
 
-        save_result(self, directory, overwrite=overwrite)
+
+def load_result(directory: FilePath) -> Result:
+    """Read the result of a campaign from its folder.
+
+    Args:
+        directory: Folder of a campaign, or one that `Result.save` wrote.
+
+    Raises:
+        TrustboError: The folder holds no campaign, or one without missions.
+        DamagedFileError: A file is missing or damaged.
+    """
+    state, workspace, _ = read_campaign(directory)
+    if not state.entries:
+        raise TrustboError(f"the campaign in {str(directory)!r} has no mission yet.")
+    settings = state.settings
+    model = None
+    try:
+        model = model_from_record(settings["model_record"])
+    except TrustboError:  # a custom model, which is needed only while nothing was learned
+        if state.last is None:
+            raise
+    hazard = learn_hazard(state, workspace, Hazard(**settings["hazard"]))
+    risk = BoundRisk.of(hazard, workspace)
+    planner = informed_planner(base_planner(workspace, settings), risk, avoid=True)
+    if state.last is not None:
+        belief = params_of(state.last())
+    else:
+        seed = State(settings).seed_of("prior")
+        belief = prior_belief(model, settings["initial"], workspace, seed)  # pyright: ignore
+    return Result(workspace, state, planner, belief, hazard, model)
+
+
+def whole_posterior(
+    stored: xr.DataTree, missions: Sequence[Mission], hazard: xr.Dataset, model: TrustModel | None
+) -> xr.DataTree:
+    """Posterior with all groups, its missions labelled by their numbers in the campaign, from 0.
+
+    `missions` are all that were recorded. The model is needed for `log_prior` if its priors are not
+    the default.
+    """
+    numbers = np.atleast_1d(stored.attrs["missions"]).astype(int).tolist()
+    whole = complete(stored, [missions[j] for j in numbers], model=model)
+    groups = {name: group.to_dataset() for name, group in whole.children.items()}
+    for name, group in groups.items():
+        if "mission" in group.dims:
+            groups[name] = group.assign_coords(mission=numbers)
+    labelled = xr.DataTree.from_dict({**groups, "hazard": hazard})
+    labelled.attrs = whole.attrs
+    return labelled
+
+
+def evidence_of(state: State) -> Rows:
+    """Row of the diagnostics of the last posterior, if there is one."""
+    last = state.entries[-1].row if state.entries else {}
+    if np.isfinite(last.get("k_hat", np.nan)):
+        khat = f"k-hat {last['k_hat']:.2f} (good below {GOOD_KHAT:g})"
+        return [("posterior", f"{khat}, Kish size {last['kish']:.0f}")]
+    if np.isfinite(last.get("r_hat", np.nan)):
+        rhat = f"R-hat {last['r_hat']:.3f} (good up to {MAX_RHAT:g})"
+        ess = f"bulk ESS {last['ess_bulk']:.0f}, divergences {last['divergences']:.0f}"
+        return [("posterior", f"{rhat}, {ess}")]
+    return []

@@ -1,21 +1,24 @@
 """Missions of a campaign, run by a simulator."""
 
 import json
+import logging
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
-from trustbo.campaign.planners import path_class
-from trustbo.campaign.progress import Progress
+from trustbo.campaign.state import LEARNED
 from trustbo.campaign.stopping import Stop, reason_to_stop, require_stops
 from trustbo.data import Mission
-from trustbo.errors import TrustboError, require_whole
+from trustbo.display import compiling, progress_bar
+from trustbo.errors import TrustboError, require_kind, require_whole
 from trustbo.files import to_json
-from trustbo.planning import Plan
+from trustbo.planning import Plan, Planner
 from trustbo.simulation import KinematicSimulator, Truth
 from trustbo.simulation.protocol import Simulator
 
 if TYPE_CHECKING:
     from trustbo.campaign.campaign import Campaign
+
+_log = logging.getLogger(__name__)
 
 
 def run_missions(
@@ -30,18 +33,15 @@ def run_missions(
     require_whole("n_iterations", n_iterations, 1)
     runner: Any = KinematicSimulator(campaign.workspace) if simulator is None else simulator
     if isinstance(runner, type) or not callable(getattr(runner, "run", None)):
-        made = "; make one of the class" if isinstance(runner, type) else ""
         raise TrustboError(
-            f"a simulator needs run(path, *, seed, mission) -> Mission; got {runner!r}{made}."
+            f"simulator must have run(path, *, seed, mission) -> Mission; got {runner!r}."
         )
     if truth is not None:
-        if not isinstance(truth, Truth):
-            raise TrustboError(f"truth must be Truth.of(simulator); got {truth!r}.")
+        require_kind("truth", truth, Truth, "give Truth.of(simulator)")
     rules = require_stops(stop)
     describe = getattr(runner, "describe", lambda: {"simulator": type(runner).__name__})
-    # As a file gives them back: tuples are lists there, and arrays too.
-    simulated = json.loads(to_json(describe()))
-    campaign.state.notes = {**simulated, "n_iterations": n_iterations}
+    described = json.loads(to_json(describe()))  # as a file returns it
+    campaign.state.simulation = described | {"n_iterations": n_iterations}
     return _run_missions(campaign, runner, n_iterations, truth, rules, progress)
 
 
@@ -53,23 +53,47 @@ def _run_missions(
     rules: list[Stop],
     progress: bool,
 ) -> Iterator[tuple[Plan, Mission]]:
-    with Progress(campaign, n_iterations, progress) as shown:
-        while True:
-            n = len(campaign.missions)
-            # Before each mission: of a campaign that goes on, the rules may be satisfied already.
-            if n and (reason := reason_to_stop(rules, campaign)):
-                campaign.stop(reason)
-                return
-            if n >= n_iterations:
-                break
-            plan = campaign.ask()
-            mission = runner.run(plan.path, seed=campaign.seed_of("mission"), mission=n)
-            extra = {}
-            if truth is not None:
-                extra["regret"] = truth.at(n).regret(plan.path, **path_class(campaign.planner))
-            campaign.tell(mission, **extra)
-            shown.step()
-            for callback in campaign.options.callbacks:
-                callback(campaign, mission)
-            yield plan, mission
-        campaign.stop("n_iterations")
+    state, shown = campaign.state, campaign.progress
+    state.stop_reason, campaign.progress = "interrupted", progress
+    bar = progress_bar(progress, total=n_iterations, initial=len(state.entries), desc="missions")
+    try:
+        with bar, compiling():
+            # The rules are asked before each mission: they may hold already when one continues.
+            while not (reason := _reason_to_end(campaign, n_iterations, rules)):
+                n, plan = len(state.entries), campaign.ask()
+                mission = runner.run(plan.path, seed=state.seed_of("mission"), mission=n)
+                extra = {}
+                if truth is not None:
+                    admitted = path_class(campaign.planner)
+                    extra["regret"] = truth.at(n).regret(plan.path, **admitted)
+                campaign.tell(mission, **extra)
+                line = report_of(campaign)
+                bar.set_postfix_str(line, refresh=False)
+                bar.update()
+                _log.info("mission %d: %s", n + 1, line)
+                yield plan, mission
+    finally:
+        campaign.progress = shown
+    campaign.stop(reason)
+
+
+def _reason_to_end(campaign: "Campaign", n_iterations: int, rules: Sequence[Stop]) -> str | None:
+    """Why no further mission is run; None if one is."""
+    n = len(campaign.state.entries)
+    if n and (reason := reason_to_stop(rules, campaign)):
+        return reason
+    return "n_iterations" if n >= n_iterations else None
+
+
+def path_class(planner: Planner) -> dict[str, Any]:
+    """Arguments of `Truth.best` and `Truth.regret` for the planner's admissible paths."""
+    return {"max_bounds": planner.max_bounds, "connectivity": planner.connectivity}
+
+
+def report_of(campaign: "Campaign") -> str:
+    """Describe the last mission in a line."""
+    row = campaign.state.entries[-1].row
+    regret = f", regret {row['regret']:.1f} %" if "regret" in row else ""
+    name, label = ("r_hat", "R-hat") if "r_hat" in row else ("k_hat", "k-hat")
+    learned = f"{label} {row[name]:.3f}" if row["state"] == LEARNED else row["state"]
+    return f"objective {row['objective']:.3f}{regret}, {learned}, {row['status']}"

@@ -1,74 +1,108 @@
-"""State of a campaign: missions, failures and notes, as data and as a record."""
+"""State of a campaign: its missions with their plans and posteriors, and missions given up."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 
-from trustbo.campaign.posteriors import Posterior, Posteriors
-from trustbo.data import Cell, Mission
-from trustbo.models.backend import VERSIONS
+from trustbo.data import Cell, Mission, path_text
+from trustbo.errors import TrustboError
+from trustbo.logs.netcdf import read_tree
 from trustbo.planning import Plan
-from trustbo.planning.plan import plan_from_record, plan_to_record
-from trustbo.workspace import Workspace
 
-TOLD, LEARNED, SET_ASIDE = "told", "learned", "set aside"
-"""States of a mission: on disk, in the posterior, or excluded from it."""
+TOLD, LEARNED, EXCLUDED, GIVEN_UP = "told", "learned", "excluded", "given up"
+"""States of a mission: recorded, in the posterior, left out of it, or ended without a report."""
 _STREAMS = ("policy", "fit", "mission", "prior", "awareness", "hazard")
-"""Streams of randomness; a seed depends on the place, so that names are added at the end."""
+"""Streams of randomness; a seed depends on the position, so new names are added at the end."""
+_COLUMNS = (
+    "status", "state", "reason", "where", "contact_rate", "objective", "n_bounds", "path_changed",
+    "path",
+)  # fmt: skip
+"""First columns of a table of missions."""
 
 
 class Failure(NamedTuple):
-    """A mission that was given up."""
+    """A mission that was given up.
+
+    Attributes:
+        after: Number of missions recorded before it.
+        reason: Reason, one of `hazard.CAUSES` if a bound failed.
+        path: Path that was asked for, start first; empty if no bound is to blame.
+        where: Cell that the team failed to enter, if known.
+        reported: Whether the bounds that were run are recorded as a mission.
+    """
 
     after: int
-    """Number of missions recorded before."""
     reason: str
     path: tuple[Cell, ...] = ()
-    """Path that was asked for, start first; empty where the failure is of no bound."""
     where: Cell | None = None
-    """Cell that it failed to enter, where that is recorded."""
     reported: bool = False
-    """Whether the bounds that were run are a mission with a row in the history."""
 
-    @classmethod
-    def restore(cls, record: Sequence[Any]) -> Self:
-        """Failure of a record."""
-        after, reason, path, where, reported = record
-        cells = tuple((row, col) for row, col in path)
-        cell = None if where is None else (where[0], where[1])
-        if cell is not None and cell not in cells[1:]:
-            raise ValueError(f"no path enters {cell}")
-        return cls(after, reason, cells, cell, reported)
+    def row(self) -> dict[str, Any]:
+        """Row of the table of missions, for a mission without a report."""
+        return {
+            "status": self.reason if self.path else "aborted",
+            "state": GIVEN_UP,
+            "reason": self.reason,
+            "where": "" if self.where is None else path_text([self.where]),
+            "n_bounds": np.nan if self.where is None else self.path.index(self.where, 1),
+            "path_changed": False,
+            "path": path_text(self.path),
+        }
+
+
+class Posterior:
+    """Posterior of the parameters after a mission, in memory or in its file.
+
+    Attributes:
+        name: Name of its file: the number of missions recorded when it was fitted, and the number
+            excluded from it if there are any, such as `"0003-1"`.
+        file: File that holds it; None if it is in memory only.
+    """
+
+    def __init__(
+        self, name: str, tree: xr.DataTree | None = None, file: Path | None = None
+    ) -> None:
+        self.name, self.file, self._tree = name, file, tree
+
+    def __call__(self) -> xr.DataTree:
+        """Posterior, read from its file if need be; DamagedFileError if that is not possible."""
+        if self._tree is None:
+            self._tree = read_tree(self.file or "")
+        return self._tree
+
+    def release(self) -> None:
+        """Free the memory of a posterior that is in a file."""
+        if self.file is not None:
+            self._tree = None
 
 
 @dataclass(eq=False)
 class Entry:
-    """One recorded mission.
+    """A recorded mission.
 
     Attributes:
-        mission: Mission with the awareness that it is learned from, see `Campaign.as_learned`.
-        measured: The same mission as measured.
-        plan: Plan that it was asked for with.
+        plan: Plan that was asked for.
+        measured: Mission as measured.
+        mission: Mission with the awareness that it is learned from, see `learning.as_learned`.
         trust_map: Trust map that it was planned on, dims (row, col).
-        row: Numbers of the mission, by name; its `state` and the `reason` of that among them.
-        posterior: Posterior after it; None where nothing could be learned yet.
-        extra: Numbers that were passed with it.
+        row: Numbers of the mission by name, among them its `state` and the `reason` for that.
+        posterior: Posterior after it; None if nothing could be learned yet.
     """
 
-    mission: Mission
-    measured: Mission
     plan: Plan
+    measured: Mission
+    mission: Mission
     trust_map: xr.DataArray
     row: dict[str, Any]
-    posterior: Posterior | None
-    extra: dict[str, float] = field(default_factory=dict)
+    posterior: Posterior | None = None
 
     @property
     def state(self) -> str:
-        """State of the mission: `TOLD`, `LEARNED` or `SET_ASIDE`."""
+        """State of the mission: `TOLD`, `LEARNED` or `EXCLUDED`."""
         return self.row["state"]
 
     def become(self, state: str, reason: str = "") -> None:
@@ -77,51 +111,34 @@ class Entry:
 
 
 @dataclass(eq=False)
-class CampaignState:
-    """Data of a campaign: all that a folder holds, except for the workspace.
+class State:
+    """Data of a campaign: all that its folder holds, except for the workspace.
 
     Attributes:
-        seed: Seed of everything random.
-        options: Record of the arguments that the campaign was made with.
-        suggested: Plan that was asked for and not run yet.
-        entries: One for each recorded mission.
+        settings: Arguments of the campaign, JSON-serialisable.
+        entries: Recorded missions, in order.
         failures: Missions given up.
-        notes: More for `Result.settings`, by the loop.
-        stop_reason: Reason of the end.
+        asked: Plan that was asked for and not run yet.
+        simulation: Settings that the simulator describes, and `n_iterations`.
+        stop_reason: Why the last run ended.
     """
 
-    seed: int
-    options: dict[str, Any] = field(default_factory=dict)
-    suggested: Plan | None = None
+    settings: dict[str, Any]
     entries: list[Entry] = field(default_factory=list)
     failures: list[Failure] = field(default_factory=list)
-    notes: dict[str, Any] = field(default_factory=dict)
+    asked: Plan | None = None
+    simulation: dict[str, Any] = field(default_factory=dict)
     stop_reason: str = "interrupted"
 
-    @property
-    def missions(self) -> list[Mission]:
-        """Recorded missions, their awareness filled in."""
-        return [entry.mission for entry in self.entries]
-
-    @property
-    def measured(self) -> list[Mission]:
-        """Recorded missions as measured."""
-        return [entry.measured for entry in self.entries]
-
-    @property
-    def posteriors(self) -> Posteriors:
-        """Posterior after each mission."""
-        return Posteriors(entry.posterior for entry in self.entries)
+    def copy(self) -> Self:
+        """State that later missions leave unchanged."""
+        entries = [replace(entry, row=dict(entry.row)) for entry in self.entries]
+        return replace(self, entries=entries, failures=list(self.failures))
 
     @property
     def last(self) -> Posterior | None:
         """Posterior after the last mission."""
         return self.entries[-1].posterior if self.entries else None
-
-    @property
-    def last_tree(self) -> xr.DataTree | None:
-        """Tree of `last`; None where nothing could be learned yet."""
-        return None if self.last is None else self.last()
 
     def numbers(self, *states: str) -> list[int]:
         """Numbers, from 0, of the missions in one of these states."""
@@ -130,64 +147,69 @@ class CampaignState:
     def seed_of(self, stream: str) -> int:
         """Seed of one stream of randomness for the next mission."""
         n = len(self.entries)
-        entropy = [self.seed, _STREAMS.index(stream), n]
+        entropy = [self.settings["seed"], _STREAMS.index(stream), n]
         if n_failures := sum(failure.after == n for failure in self.failures):
-            entropy.append(n_failures)  # another try may choose another path
+            entropy.append(n_failures)  # another attempt may choose another path
         return int(np.random.SeedSequence(entropy).generate_state(1)[0])
 
-    def add(
-        self,
-        measured: Mission,
-        filled: Mission,
-        plan: Plan,
-        trust_map: xr.DataArray,
-        extra: dict[str, float],
-        **seconds: float,
-    ) -> Entry:
-        """Add a mission, with its row of the history; see `Entry` for the arguments."""
+    def row_of(self, plan: Plan, mission: Mission, extra: dict[str, float]) -> dict[str, Any]:
+        """Row of a new mission; TrustboError if an extra has the name of a column."""
         before = self.entries[-1].plan if self.entries else plan
-        rates = measured.contact_rate
+        rates = mission.contact_rate
+        contact = float(np.nanmean(rates)) if np.isfinite(rates).any() else np.nan
+        n_run = len(mission.bounds)
         row: dict[str, Any] = {
             "objective": plan.value,
             "path_changed": plan.path != before.path,
-            "contact_rate": float(np.nanmean(rates)) if np.isfinite(rates).any() else np.nan,
-            "status": measured.status,
+            "contact_rate": contact,
+            "contact_lost": len(mission.path) - 1 - n_run * contact,
+            "status": mission.status,
             "state": TOLD,
             "reason": "",
-            **extra,
-            **seconds,
         }
-        entry = Entry(filled, measured, plan, trust_map, row, self.last, extra)
-        self.entries.append(entry)
-        return entry
+        for name in extra.keys() & {*row, *_COLUMNS, "mission", "iteration", "trust_map"}:
+            raise TrustboError(f"{name!r} is a column of the history; give it another name.")
+        return row | {name: float(value) for name, value in extra.items()}
 
-    def to_record(self) -> dict[str, Any]:
-        """JSON-serialisable record of everything that no file of a `Result` holds."""
-        return {
-            "options": self.options,
-            "suggested": None if self.suggested is None else plan_to_record(self.suggested),
-            "n_missions": len(self.entries),
-            "plans": [plan_to_record(entry.plan) for entry in self.entries],
-            "rows": [entry.row for entry in self.entries],
-            "posteriors": self.posteriors.names,
-            "failures": self.failures,
-            "notes": self.notes,
-            "stop_reason": self.stop_reason,
-            "versions": VERSIONS | {"numpy": np.__version__},
+    def history(self) -> xr.Dataset:
+        """Dataset as `Result.history`; empty before the first mission."""
+        if not self.entries:
+            return xr.Dataset()
+        plans, first = [entry.plan for entry in self.entries], self.entries[0].trust_map
+        steps = np.full((len(plans), max(len(plan.path) for plan in plans), 2), -1)
+        for i, plan in enumerate(plans):
+            steps[i, : len(plan.path)] = plan.path
+        rows = pd.DataFrame([entry.row for entry in self.entries])
+        maps = np.stack([entry.trust_map.values for entry in self.entries])
+        variables: dict[str, Any] = {
+            name: ("iteration", rows[name].tolist(), {"units": "%"} if name == "regret" else {})
+            for name in rows
         }
+        variables["path"] = ("iteration", "step", "axis"), steps
+        variables["trust_map"] = ("iteration", "row", "col"), maps, first.attrs
+        coords = {"iteration": np.arange(1, len(rows) + 1), "axis": ["row", "col"]}
+        return xr.Dataset(variables, coords | dict(first.coords))
 
-    @classmethod
-    def from_record(
-        cls, record: dict[str, Any], entries: list[Entry], workspace: Workspace
-    ) -> Self:
-        """State of a record and of its missions."""
-        suggested = record.get("suggested")
-        return cls(
-            record["options"]["seed"],
-            record["options"],
-            None if suggested is None else plan_from_record(suggested, workspace),
-            entries,
-            [Failure.restore(failure) for failure in record["failures"]],
-            dict(record["notes"]),
-            str(record["stop_reason"]),
-        )
+    def table(self) -> pd.DataFrame:
+        """Table as `Result.table`; a mission given up follows the missions recorded before it."""
+        reasons = {f.after: f.reason for f in self.failures if f.reported}
+        numbers: list[int | None] = []
+        rows: list[dict[str, Any]] = []
+        for n in range(len(self.entries) + 1):
+            if n:
+                entry = self.entries[n - 1]
+                failed = entry.measured.status != "ok"
+                numbers.append(n)
+                rows.append({
+                    **entry.row,
+                    "reason": entry.row["reason"] or reasons.get(n, ""),
+                    "where": path_text([entry.measured.bounds[-1].cell]) if failed else "",
+                    "n_bounds": len(entry.measured.bounds),
+                    "path": path_text(entry.plan.path),
+                })  # fmt: skip
+            for failure in self.failures:
+                if failure.after == n and not failure.reported:
+                    numbers.append(None)
+                    rows.append(failure.row())
+        names = dict.fromkeys([*_COLUMNS, *(name for row in rows for name in row)])
+        return pd.DataFrame(rows, pd.Index(numbers, dtype="Int64", name="mission"), list(names))

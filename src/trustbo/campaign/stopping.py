@@ -22,13 +22,11 @@ Stop = Callable[["Campaign"], str | bool | None]
 class RegretBound:
     """Stop when the recommended path is nearly the best, with high probability, twice in a row.
 
-    Under each of `n_draws` posterior draws the best path is planned exactly; the regret of the
-    recommended path is the value it lacks under that draw, relative to the best path's: the contact
-    it loses more, as a share of what the best path keeps, for lost_contact, and a share of the best
-    path's value for other objectives. Stop when P(regret <= eps) >= 1 - delta after each of the
-    last `patience` missions, and robots have completed every bound of the path at least once: that
-    untried ground lets them pass is an assumption of the map. ("The path did not change" would be
-    the wrong test: near-ties change for ever.)
+    Under each of `n_draws` posterior draws the best path is planned exactly. The regret of the
+    recommended path under a draw is, for lost_contact, the additional contact that it loses, as a
+    share of what the best path keeps; for other objectives, a share of the best path's value. Stop
+    when P(regret <= eps) >= 1 - delta after each of the last `patience` missions, and robots have
+    completed every bound of the path at least once, since the map may be wrong about others.
 
     Attributes:
         eps: Regret that is good enough, as a share; .05 is 5 %.
@@ -58,7 +56,7 @@ class RegretBound:
 
     def __call__(self, campaign: "Campaign") -> str | None:
         """Reason to stop, or None."""
-        n = len(campaign.missions)
+        n = len(campaign.state.entries)
         if n < max(self.min_missions, self.patience):
             return None
         sure = [self.probability(campaign, n - i) for i in range(self.patience)]
@@ -71,10 +69,10 @@ class RegretBound:
 
     def probability(self, campaign: "Campaign", n_missions: int) -> float:
         """P(regret of the recommended path <= eps) after the first `n_missions`."""
-        posterior = campaign.posteriors[n_missions - 1]
+        posterior = campaign.state.entries[n_missions - 1].posterior
         if posterior is None:
             return 0.0
-        planner, draws = campaign.planner_now(), params_of(posterior)
+        planner, draws = campaign.planner, params_of(posterior())
         path = planner.plan(draws.mean()).path
         drawn = planner.plan_draws(draws, n_draws=self.n_draws)
         return float(np.mean(drawn.relative_regret(path) <= self.eps))
@@ -107,19 +105,14 @@ def require_stops(stop: Stop | Sequence[Stop] | None) -> list[Stop]:
     rules: list[Stop] = [] if stop is None else [stop] if callable(stop) else list(stop)
     for rule in rules:
         if not callable(rule):
-            raise TrustboError(
-                f"stop must be callables stop(campaign) -> reason or None; got {rule!r}."
-            )
+            raise TrustboError(f"stop must be stop(campaign) -> reason or None; got {rule!r}.")
     return rules
 
 
 def reason_to_stop(rules: Sequence[Stop], campaign: "Campaign") -> str | None:
-    """Reason of the first rule that ends the campaign, or None."""
+    """Reason of the first rule that ends the campaign, by default its name; or None."""
     for rule in rules:
         if verdict := rule(campaign):
-            return verdict if isinstance(verdict, str) else _name(rule)
+            name = getattr(rule, "__name__", type(rule).__name__)
+            return verdict if isinstance(verdict, str) else name
     return None
-
-
-def _name(rule: Stop) -> str:
-    return getattr(rule, "__name__", type(rule).__name__)

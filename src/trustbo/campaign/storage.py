@@ -1,67 +1,45 @@
-"""Files of campaigns and results, written atomically and read back."""
+"""Folder of a campaign: a file for each mission and each posterior, and one record, written last.
+
+    workspace.nc          written once
+    missions/0001.nc      mission as measured, with its plan, before anything is learned from it
+    posteriors/0001.nc    draws of the parameters after the first mission
+    campaign.json         settings, numbers and states; counts the missions that are complete
+
+Every file is written to a temporary name, flushed to disk and renamed. A process that dies at any
+write loses nothing: missions beyond the record's count are learned from when the folder is opened.
+"""
 
 import json
-import shutil
-from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import xarray as xr
 from filelock import FileLock, Timeout
 
-from trustbo.campaign.folder import (
-    FILES,
-    HISTORY,
-    MEASURED,
-    MISSIONS,
-    POSTERIOR,
-    POSTERIORS,
-    RESULT,
-    STATE,
-    TABLE,
-    TICKS,
-    WORKSPACE,
-    require_free,
-)
-from trustbo.campaign.posteriors import Posterior, Posteriors
-from trustbo.campaign.result import Result
-from trustbo.campaign.state import CampaignState, Entry, Failure
+from trustbo.campaign.learning import as_learned
+from trustbo.campaign.state import Entry, Failure, Posterior, State
 from trustbo.data import Mission
 from trustbo.errors import DamagedFileError, TrustboError
 from trustbo.files import (
     FilePath,
     as_path,
     interpreting,
-    naming_refusal,
     read_record,
-    remove_leftovers,
     require_folder,
     to_json,
     write_text,
 )  # fmt: skip
-from trustbo.logs.netcdf import (
-    missions_of_tree,
-    read_missions,
-    read_tree,
-    write_missions,
-    write_tree,
-)  # fmt: skip
-from trustbo.planning.plan import plan_from_record
-from trustbo.spreadsheet import frame_as_csv
+from trustbo.logs.netcdf import mission_from_tree, mission_to_tree, read_tree, write_tree
+from trustbo.models.backend import VERSIONS
+from trustbo.planning.plan import plan_from_record, plan_to_record
 from trustbo.workspace import Workspace
 from trustbo.workspace import netcdf as archive
-from trustbo.workspace.moves import require_on_grid
 
-_Extras = Sequence[Mapping[str, float]]
+RECORD, WORKSPACE, MISSIONS, POSTERIORS = "campaign.json", "workspace.nc", "missions", "posteriors"
 
 
 class Storage:
-    """Files of a campaign, written as it goes and read back.
-
-    `measured.nc` holds the missions as measured, before anything is learned from them. The rest is
-    what `Result.save` writes, and last comes `campaign.json`, which holds the number of missions
-    that are complete: a process that dies in between loses nothing.
+    """Folder of a campaign, locked until `release` or the end of the process.
 
     Attributes:
         path: Path of the folder.
@@ -70,253 +48,152 @@ class Storage:
     def __init__(
         self, directory: FilePath, *, begun: bool = False, overwrite: bool = False
     ) -> None:
-        """Lock the folder, until `release` or the end of the process.
+        """Lock the folder.
 
         Args:
-            directory: Path of the folder.
+            directory: Path of the folder, which is made if need be.
             begun: Whether it holds the campaign already.
-            overwrite: Whether `write_whole` may replace another campaign or result in it.
+            overwrite: Whether it may hold another campaign, which `begin` removes.
 
         Raises:
-            TrustboError: The folder holds no campaign and must, or one and must not; it is locked
-                by another process or not writable; or its name belongs to a file.
+            TrustboError: The folder holds no campaign and must, or one and must not; another
+                process has locked it; or its name belongs to a file.
         """
-        self.path = as_path(directory)
-        if begun and not (self.path / STATE).exists():
+        self.path = require_folder(directory)
+        if begun:
+            _require_campaign(self.path)
+        elif not overwrite and any((self.path / n).exists() for n in (RECORD, MISSIONS)):
             raise TrustboError(
-                f"{str(directory)!r} holds no campaign; give a folder that one was saved to."
+                f"{str(directory)!r} holds a campaign: continue it by Campaign.load or resume, "
+                "give another folder, or replace it with overwrite=True."
             )
-        if not (begun or overwrite):
-            require_free(self.path)
-        self._lock = _locked(self.path)
-        self._overwrite = overwrite
-        self._n_ticks = 0  # missions whose ticks are in separate files
+        self.path.mkdir(parents=True, exist_ok=True)
+        self._lock = FileLock(self.path / ".lock", timeout=0)
+        try:
+            self._lock.acquire()
+        except Timeout:
+            raise TrustboError(
+                f"another campaign is using {str(directory)!r}; close it first, or give another "
+                "folder."
+            ) from None
 
     def release(self) -> None:
         """Release the lock of the folder."""
         self._lock.release()
 
-    def write_whole(
-        self, workspace: Workspace, state: CampaignState, result: Result | None
-    ) -> None:
-        """Write a whole campaign; with `overwrite`, another one is removed first."""
-        if self._overwrite:
-            _clear(self.path, state.posteriors.stored)
-        self._overwrite, self._n_ticks = False, 0
+    def begin(self, workspace: Workspace, state: State) -> None:
+        """Write a whole campaign; the files of another one are removed, its record first."""
+        stored = {e.posterior.name: e.posterior for e in state.entries if e.posterior is not None}
+        trees = [posterior() for posterior in stored.values()]  # may be in files that go
+        (self.path / RECORD).unlink(missing_ok=True)
+        for room in (MISSIONS, POSTERIORS):
+            for file in (self.path / room).glob("*.nc"):
+                file.unlink()
         write_tree(self.path / WORKSPACE, archive.workspace_to_tree(workspace))
-        if state.entries:
-            self.write_measured(state.measured, [entry.extra for entry in state.entries])
-        self.write(state, result, whole=True)
+        for n, entry in enumerate(state.entries, start=1):
+            self.add_mission(n, entry, {})
+        for posterior, tree in zip(stored.values(), trees, strict=True):
+            write_tree(self._posterior(posterior.name), tree)
+        self.write_record(state)
 
-    def write_measured(self, missions: Sequence[Mission], extras: _Extras) -> None:
-        """Write missions as measured, the new one included, and their extra numbers."""
-        since, self._n_ticks = min(self._n_ticks, len(missions) - 1), len(missions)
-        notes = {"extra": json.dumps(list(extras))}
-        write_missions(self.path / MEASURED, missions, since=since, notes=notes)
+    def add_mission(self, n: int, entry: Entry, extra: dict[str, float]) -> None:
+        """Write mission n, from 1, as measured, with its plan and the numbers told with it."""
+        planned = xr.Dataset({"trust_map": entry.trust_map})
+        planned.attrs = {"plan": to_json(plan_to_record(entry.plan)), "extra": to_json(extra)}
+        tree = mission_to_tree(entry.measured)
+        tree["planned"] = xr.DataTree(planned)
+        write_tree(self.path / MISSIONS / f"{n:04d}.nc", tree)
 
-    def write(
-        self,
-        state: CampaignState,
-        result: Result | None,
-        *,
-        whole: bool = False,
-        ended: bool = False,
-    ) -> None:
-        """Write the result and then the state.
+    def add_posterior(self, posterior: Posterior) -> None:
+        """Write a posterior of parameters."""
+        file = self._posterior(posterior.name)
+        write_tree(file, posterior())
+        posterior.file = file
 
-        By default only what the last mission added to the result is written. Without a `result`,
-        that in the folder stays. With `ended`, `posterior.nc` with all groups is written too.
-        """
-        if result is not None:
-            _write_result(result, self.path, whole=whole)
-            if ended and result.has_posterior:
-                write_tree(self.path / POSTERIOR, result.posterior)
-            else:
-                (self.path / POSTERIOR).unlink(missing_ok=True)  # of the missions before
-        write_text(self.path / STATE, to_json(state.to_record()))
+    def write_record(self, state: State) -> None:
+        """Write all but arrays; last, as it counts the missions that are complete."""
+        record = {
+            "settings": state.settings,
+            "simulation": state.simulation,
+            "asked": None if state.asked is None else plan_to_record(state.asked),
+            "rows": [entry.row for entry in state.entries],
+            "posteriors": [entry.posterior and entry.posterior.name for entry in state.entries],
+            "failures": state.failures,
+            "stop_reason": state.stop_reason,
+            "versions": VERSIONS | {"numpy": np.__version__},
+        }
+        write_text(self.path / RECORD, to_json(record))
 
-    def read(self) -> tuple[CampaignState, Workspace, list[tuple[Mission, dict[str, float]]]]:
-        """Read the state, the workspace, and missions that the state does not count yet.
-
-        Those have their extra numbers with them. DamagedFileError: a file is missing or damaged.
-        """
-        record, file = read_record(self.path / STATE), self.path / MEASURED
-        measured: list[Mission] = []
-        extras: list[dict[str, float]] = []
-        with interpreting(self.path / STATE):
-            n = int(record["n_missions"])
-        if n or file.exists():
-            tree = read_tree(file)
-            measured = missions_of_tree(tree, file)
-            with interpreting(file):
-                extras = json.loads(tree["missions"].attrs["extra"])
-        if len(measured) < n:
-            raise DamagedFileError(f"{str(file)!r} holds {len(measured)} missions of {n}.")
-        stored = _read_missions(self.path / STATE, record) if n else None
-        workspace = read_workspace(self.path)
-        self._n_ticks = len(measured) if (self.path / TICKS).exists() else 0
-        entries: list[Entry] = []
-        with interpreting(self.path / STATE):
-            if stored is not None:
-                filled, posteriors, history = stored
-                plans = [plan_from_record(plan, workspace) for plan in record["plans"]]
-                maps = [history["trust_map"].isel(iteration=i, drop=True) for i in range(n)]
-                columns = filled, measured[:n], plans, maps, record["rows"], posteriors.stored
-                entries = [Entry(*fields) for fields in zip(*columns, extras[:n], strict=True)]
-            state = CampaignState.from_record(record, entries, workspace)
-        return state, workspace, list(zip(measured[n:], extras[n:], strict=True))
+    def _posterior(self, name: str) -> Path:
+        return self.path / POSTERIORS / f"{name}.nc"
 
 
-def _locked(directory: FilePath) -> FileLock:
-    """Lock a folder, made if need be; TrustboError if another process has locked it."""
-    folder = require_folder(directory)
-    lock = FileLock(folder / ".trustbo.lock", timeout=0)
-    with naming_refusal(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-        try:
-            lock.acquire()
-        except Timeout:
-            raise TrustboError(
-                f"another campaign is at work in {str(folder)!r}; close it first, or choose "
-                "another folder."
-            ) from None
-        for room in (folder, folder / POSTERIORS, folder / TICKS):
-            remove_leftovers(room)
-    return lock
+def read_campaign(
+    directory: FilePath,
+) -> tuple[State, Workspace, list[tuple[Mission, dict[str, float]]]]:
+    """Read a campaign from its folder.
 
-
-def _clear(folder: Path, posteriors: Iterable[Posterior | None]) -> None:
-    """Remove a campaign from a folder; `posteriors` to be written may be among its files."""
-    for posterior in posteriors:
-        if posterior is not None:
-            posterior()  # into memory
-    with naming_refusal(folder):
-        for name in FILES:
-            (folder / name).unlink(missing_ok=True)
-        for room in (POSTERIORS, TICKS):
-            if (folder / room).is_dir():
-                shutil.rmtree(folder / room)
-
-
-def save_result(result: Result, directory: FilePath, *, overwrite: bool = False) -> None:
-    """Write a result to a folder, see `Result.save`."""
-    folder = require_folder(directory)
-    if not overwrite:
-        require_free(folder)
-    lock = _locked(folder)
-    try:
-        if overwrite:
-            _clear(folder, Posteriors.from_trees(result.posteriors).stored)
-        write_tree(folder / WORKSPACE, archive.workspace_to_tree(result.workspace))
-        if result.has_posterior:
-            write_tree(folder / POSTERIOR, result.posterior)
-        _write_result(result, folder, whole=True)
-    finally:
-        lock.release()
-
-
-def load_result(directory: FilePath) -> Result:
-    """Read a result that `Result.save` wrote.
-
-    Args:
-        directory: Folder that it was written to.
+    Returns:
+        State; workspace; and missions that the record does not count yet, with the numbers that
+        were told with them.
 
     Raises:
-        TrustboError: The folder holds no result.
+        TrustboError: The folder holds no campaign.
         DamagedFileError: A file is missing or damaged.
     """
     folder = as_path(directory)
-    if not (folder / RESULT).exists():
-        raise TrustboError(f"{str(directory)!r} holds no result; give a folder written by save().")
-    record = read_record(folder / RESULT)
-    # A run killed while it saved may have left one mission more than the record counts.
-    with interpreting(folder / RESULT):
-        settings = dict(record["settings"])
-    missions, posteriors, history = _read_missions(folder / RESULT, record)
-    workspace = read_workspace(folder)
-    with interpreting(folder / HISTORY):
-        trust_map = history["final_trust_map"].rename("trust")
-        history = history.drop_vars("final_trust_map")
-    with interpreting(folder / RESULT):
-        trust = np.array(record["trust"], dtype=float)
-        path = require_on_grid(record["path"], workspace.grid.shape)
-        if trust.shape != (len(path) - 1, workspace.awareness.sizes["robot"]):
-            raise ValueError(f"trust of shape {trust.shape} along {len(path)} cells")
-        failures = tuple(Failure.restore(failure) for failure in record["failures"])
-        value, reason = float(record["value"]), str(record["stop_reason"])
-    return Result(
-        workspace, missions, posteriors, list(path), trust, value, trust_map, history, settings,
-        reason, failures,
-    )  # fmt: skip
+    _require_campaign(folder)
+    record, workspace = read_record(folder / RECORD), read_workspace(folder)
+    with interpreting(folder / RECORD):
+        asked = record["asked"] and plan_from_record(record["asked"], workspace)
+        failures = [_failure(*failure) for failure in record["failures"]]
+        state = State(record["settings"], [], failures, asked, record["simulation"])
+        state.stop_reason = str(record["stop_reason"])
+        rows, names = list(record["rows"]), list(record["posteriors"])
+    posteriors: dict[str, Posterior] = {}
+    for n, (row, name) in enumerate(zip(rows, names, strict=True), start=1):
+        file = folder / MISSIONS / f"{n:04d}.nc"
+        measured, planned = _read_mission(file)
+        if name is not None and name not in posteriors:
+            stored = folder / POSTERIORS / f"{name}.nc"
+            if not stored.exists():
+                raise DamagedFileError(f"{str(stored)!r} is missing.")
+            posteriors[name] = Posterior(name, file=stored)
+        with interpreting(file):
+            plan = plan_from_record(json.loads(planned.attrs["plan"]), workspace)
+            learned, trust_map = as_learned(measured, workspace), planned["trust_map"]
+            posterior = None if name is None else posteriors[name]
+            state.entries.append(Entry(plan, measured, learned, trust_map, row, posterior))
+    pending = []
+    while (file := folder / MISSIONS / f"{len(rows) + len(pending) + 1:04d}.nc").exists():
+        measured, planned = _read_mission(file)
+        with interpreting(file):
+            pending.append((measured, json.loads(planned.attrs["extra"])))
+    return state, workspace, pending
 
 
 def read_workspace(folder: Path) -> Workspace:
-    """Read the workspace of a campaign or result; DamagedFileError if it is missing or damaged."""
+    """Read the workspace of a campaign; DamagedFileError if it is missing or damaged."""
     tree = read_tree(folder / WORKSPACE)
     with interpreting(folder / WORKSPACE):
         return archive.workspace_from_tree(tree)
 
 
-def _write_result(result: Result, folder: Path, *, whole: bool) -> None:
-    """Write all but the workspace of a result.
-
-    Not `whole`, only the last mission is written, to a folder that has all before it: earlier
-    posteriors never change.
-    """
-    stored = Posteriors.from_trees(result.posteriors).stored
-    files = list({posterior.name: posterior for posterior in stored if posterior}.values())
-    for posterior in files if whole else files[-2:]:  # the last but one may have shrunk
-        file = _posterior_file(folder, posterior.name)
-        if whole or posterior.file != file:
-            write_tree(file, posterior())
-            posterior.file = file
-    since = 0 if whole else len(result.missions)  # whose ticks are there
-    write_missions(folder / MISSIONS, result.missions, since=since)
-    history = result.history.assign(final_trust_map=result.trust_map)
-    write_tree(folder / HISTORY, xr.DataTree(history))
-    write_text(folder / TABLE, frame_as_csv(result.table()))
-    # Written last: its presence means that the rest is complete.
-    write_text(folder / RESULT, to_json(_record_of(result)))
-
-
-def _posterior_file(folder: Path, name: str) -> Path:
-    return folder / POSTERIORS / f"{name}.nc"
-
-
-def _record_of(result: Result) -> dict[str, Any]:
-    """Record of everything that no other file holds."""
-    return {
-        "n_missions": len(result.missions),
-        "path": result.path,
-        "trust": result.trust.tolist(),
-        "value": result.value,
-        "settings": result.settings,
-        "stop_reason": result.stop_reason,
-        "posteriors": Posteriors.from_trees(result.posteriors).names,
-        "failures": result.failures,
-    }
-
-
-def _read_missions(
-    file: Path, record: dict[str, Any]
-) -> tuple[list[Mission], Posteriors, xr.Dataset]:
-    """Read the missions that the record of a file counts, their posteriors and the history."""
-    folder = file.parent
+def _read_mission(file: Path) -> tuple[Mission, xr.Dataset]:
+    """Mission as measured, and what was planned."""
+    tree = read_tree(file)
     with interpreting(file):
-        n = int(record["n_missions"])
-        order = [None if name is None else str(name) for name in record["posteriors"]]
-    posteriors: dict[str | None, Posterior] = {}
-    for name in filter(None, order):
-        stored = _posterior_file(folder, name)
-        if not stored.exists():
-            raise DamagedFileError(f"{str(stored)!r} is missing.")
-        posteriors[name] = posteriors.get(name) or Posterior(name, file=stored)
-    history, missions = read_tree(folder / HISTORY).to_dataset(), folder / MISSIONS
-    with interpreting(folder / HISTORY):
-        history = history.isel(iteration=slice(n))
-        if (rows := history.sizes["iteration"]) != n:
-            raise ValueError(f"{rows} missions of {n}")
-    filled = read_missions(missions)[:n]
-    if len(filled) != n:
-        raise DamagedFileError(f"{str(missions)!r} holds {len(filled)} missions of {n}.")
-    return filled, Posteriors(posteriors.get(name) for name in order), history
+        return mission_from_tree(tree), tree["planned"].to_dataset()
+
+
+def _failure(
+    after: int, reason: str, path: list[list[int]], where: list[int] | None, reported: bool
+) -> Failure:
+    """Failure of its record."""
+    cells = tuple((row, col) for row, col in path)
+    return Failure(after, reason, cells, None if where is None else (where[0], where[1]), reported)
+
+
+def _require_campaign(folder: Path) -> None:
+    if not (folder / RECORD).exists():
+        raise TrustboError(f"{str(folder)!r} holds no campaign; give the folder of one.")

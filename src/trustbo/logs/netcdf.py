@@ -83,7 +83,7 @@ def write_missions(
 ) -> None:
     """Write missions to a netCDF file, and the ticks of each to a file in a folder next to it.
 
-    The folder is `ticks/` for the files of a campaign, else named after the file.
+    The folder is named after the file.
 
     Args:
         path: File of all missions.
@@ -103,26 +103,47 @@ def write_missions(
     write_tree(path, xr.DataTree.from_dict({"missions": table}))
 
 
+def mission_to_tree(mission: Mission) -> xr.DataTree:
+    """Tree of one mission, with its ticks if they were recorded."""
+    groups = {"mission": _table([mission])}
+    if (recorded := _ticks(mission)) is not None:
+        groups[_TICKS] = recorded
+    return xr.DataTree.from_dict(groups)
+
+
+def mission_from_tree(tree: xr.DataTree) -> Mission:
+    """Mission of a tree of `mission_to_tree`; LookupError or ValueError if it is none."""
+    table = {str(n): a.values for n, a in tree["mission"].to_dataset().variables.items()}
+    return _mission(table, 0, tree[_TICKS].to_dataset() if _TICKS in tree.children else None)
+
+
 def ticks_file(path: FilePath, folder: str, j: int) -> Path:
     """Name of the file with the ticks of mission j, from 0, in a folder next to the missions'."""
     return Path(path).parent / Path(folder).name / f"{j + 1:04d}.nc"
 
 
 def _ticks_name(path: FilePath) -> str:
-    """Name of the folder of ticks: two files of missions share one only in a campaign."""
-    name = Path(path)
-    return _TICKS if name.name in ("measured.nc", "missions.nc") else f"{name.stem}.{_TICKS}"
+    """Name of the folder of ticks."""
+    return f"{Path(path).stem}.{_TICKS}"
 
 
 def read_missions(path: FilePath) -> list[Mission]:
-    """Read missions from a netCDF file, such as `measured.nc` of a campaign, and their ticks.
+    """Read missions, and their ticks, from a netCDF file or from the folder of a campaign.
 
     Args:
-        path: File of missions; ticks are read from the folder next to it, if any.
+        path: File of missions, with the folder of their ticks next to it if they have some; or
+            folder of a campaign, whose missions are as measured.
 
     Raises:
         DamagedFileError: There is no such file, it is damaged, or it holds no missions.
     """
+    if files := sorted(Path(path).glob("missions/*.nc")):
+        missions = []
+        for file in files:
+            tree = read_tree(file)
+            with interpreting(file):
+                missions.append(mission_from_tree(tree))
+        return missions
     return missions_of_tree(read_tree(path), path)
 
 

@@ -178,7 +178,9 @@ def _latent_trust(result: Result, j: int, n_bounds: int) -> np.ndarray:
     if j not in latent.indexes["mission"]:  # never learned from
         return along
     by_robot = latent.sel(mission=j).transpose("chain", "draw", "bound", "robot").values
-    team = by_robot.min(-1) if result.settings.get("team") == "min" else by_robot.mean(-1)
+    team = (
+        by_robot.min(-1) if result.settings["planner"].get("team") == "min" else by_robot.mean(-1)
+    )
     draws = team.reshape(-1, team.shape[-1])[:, :n_bounds]
     along[:, : draws.shape[1]] = np.quantile(draws, _FIVE, axis=0)
     return along

@@ -7,6 +7,7 @@ from trustbo.data import path_text
 from trustbo.display import joined
 from trustbo.errors import TrustboError
 from trustbo.hazard.risk import PathRisk
+from trustbo.inference import memory
 from trustbo.inference.samplers.convergence import GOOD_KHAT, MAX_KHAT, MAX_RHAT, MIN_ESS
 from trustbo.planning import Plan
 from trustbo.report.blocks import Fact
@@ -73,7 +74,7 @@ def _path(result: Result, plan: Plan) -> str:
 def _value(result: Result) -> str:
     name = str(result.settings["objective"])
     meaning = _MEANS[name]
-    if paid := [toll for name, toll in _TOLLS.items() if result.settings.get(name)]:
+    if paid := [toll for name, toll in _TOLLS.items() if result.settings["planner"].get(name)]:
         meaning += f", less the toll on {joined(paid)}"
     within = ""
     if (band := result.plan.value_band) is not None:
@@ -134,7 +135,7 @@ def _soundness(result: Result) -> Fact:
 def _memory(result: Result) -> Fact:
     """State whether trust carries over between bounds, or why this was not weighed."""
     try:
-        finding = str(result.memory)
+        finding = str(memory(result.posterior, result.missions, result.workspace))
     except TrustboError as error:
         return Fact("Memory", f"Not weighed: {error}")
     return Fact("Memory", f"{finding[0].upper()}{finding[1:]}.")

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from arviz_stats import sampling_diagnostics
 
-from trustbo.campaign.history import GIVEN_UP
 from trustbo.campaign.result import Result
+from trustbo.campaign.state import GIVEN_UP
 from trustbo.criticism.criticise import Criticism
 from trustbo.data import path_text
 from trustbo.files import to_json

@@ -6,7 +6,6 @@ from typing import Any
 
 import xarray as xr
 
-from trustbo.campaign.options import OBJECTIVE, POLICY
 from trustbo.errors import TrustboError, require_choice, require_whole
 from trustbo.files import FilePath
 from trustbo.study.experiment import Experiment, Scene
@@ -22,12 +21,12 @@ def run_worlds(
     only: Sequence[str] | None = None,
     kinds: Sequence[str] | None = None,
     courses: Sequence[str] = COURSES,
-    policies: Any = (POLICY,),
+    policies: Any = ("greedy",),
     models: Any = ("robots",),
     simulator: Simulate | str | None = None,
     baselines: Sequence[str] = tuple(BASELINES),
     methods: Mapping[str, Callable[[], Any]] | None = None,
-    objective: str = OBJECTIVE,
+    objective: str = "lost_contact",
     max_bounds: int | str = "shortest+4",
     sampler: str = "exact",
     n_iterations: int = 15,

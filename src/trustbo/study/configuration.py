@@ -12,7 +12,6 @@ from typing import Any, Self
 
 import xarray as xr
 
-from trustbo.campaign.options import OBJECTIVE, POLICY, SAMPLER, CampaignOptions
 from trustbo.errors import (
     TrustboError,
     require_choice,
@@ -28,13 +27,16 @@ from trustbo.simulation import ModelSimulator
 from trustbo.simulation.protocol import Simulator
 from trustbo.study.calls import FILES, call_of, identity, made, parameters_of, seeded
 from trustbo.study.experiment import Experiment, Scene, corners
-from trustbo.study.methods import Case, Model, model_from, model_of
+from trustbo.study.methods import FIT_OPTIONS, PLANNER_OPTIONS, Case, Model, model_from, model_of
 from trustbo.team import Team
 from trustbo.workspace import Workspace, survey
 from trustbo.workspace.location import CELL, named
 
 OPTIONS = (
-    *(option.name for option in fields(CampaignOptions) if option.name != "callbacks"),
+    *PLANNER_OPTIONS,
+    *FIT_OPTIONS,
+    "initial",
+    "hazard",
     "stop",
 )
 """Names in `Study.options`."""
@@ -110,18 +112,18 @@ class Study:
         simulators: Simulators, with `known_truth` where regret is asked for.
         seeds: Seeds, or their number: 0, 1, ...
         n_iterations: Missions of a run.
-        options: Fields of `CampaignOptions` but callbacks, and `stop`, the settings of a
-            `RegretBound`; a list of values means each of them.
+        options: Options of `Planner` and of `fit`, `initial`, `hazard`, and `stop`, the settings of
+            a `RegretBound`; a list of values means each of them.
 
     Raises:
         TrustboError: An unknown name or setting, or an impossible value.
     """
 
     terrains: Any
-    policies: Any = (POLICY,)
-    objectives: Any = (OBJECTIVE,)
+    policies: Any = ("greedy",)
+    objectives: Any = ("lost_contact",)
     models: Any = ("pooled",)
-    samplers: Any = (SAMPLER,)
+    samplers: Any = ("auto",)
     simulators: Any = ("KinematicSimulator",)
     seeds: Any = 1
     n_iterations: int = 8

@@ -20,8 +20,8 @@ from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from trustbo.campaign.campaign import Campaign
-from trustbo.campaign.planners import path_class
 from trustbo.campaign.result import Result
+from trustbo.campaign.running import path_class
 from trustbo.campaign.stopping import RegretBound
 from trustbo.data import Cell, Mission
 from trustbo.errors import TrustboError
@@ -124,10 +124,27 @@ class Run:
         stop = self.case.options.get("stop")
         rule = RegretBound(**stop) if isinstance(stop, Mapping) else stop
         simulator = self.scene.simulator(workspace)
-        return campaign, campaign.run(simulator, self.n_iterations, stop=rule)
+        learn = getattr(campaign.policy, "learn", None)  # of one that learns by itself
+        called = callbacks if learn is None else (learn, *callbacks)
+        return campaign, _calling(campaign, simulator, self.n_iterations, rule, called)
 
     def __str__(self) -> str:
         return ", ".join(f"{name}={value}" for name, value in self.labels.items())
+
+
+def _calling(
+    campaign: Campaign, simulator: Simulator, n: int, stop: Any, callbacks: Sequence[Any]
+) -> Iterator[object]:
+    """Missions of a campaign, each followed by calls of `callback(campaign, mission)`."""
+    steps = campaign.run(simulator, n, stop=stop)
+
+    def run() -> Iterator[object]:
+        for plan, mission in steps:
+            for callback in callbacks:
+                callback(campaign, mission)
+            yield plan, mission
+
+    return run()
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,9 @@ import numpy as np
 from jax import Array
 
 from trustbo.campaign.campaign import Campaign
-from trustbo.campaign.options import SAMPLER
 from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_choice
+from trustbo.hazard import Hazard
 from trustbo.inference.samplers.choice import resolve_sampler
 from trustbo.models.model import TrustModel, require_model
 from trustbo.models.params import Params
@@ -34,6 +34,11 @@ MODELS: dict[str, dict[str, Any]] = {
     "coupled": {"kind": "CoupledTrust"},
 }
 """Settings of models by short names."""
+
+PLANNER_OPTIONS = ("connectivity", "max_bounds", "team", "length_weight", "unseen_cost",
+                   "max_failure", "failure_cost")  # fmt: skip
+FIT_OPTIONS = ("n_chains", "warmup", "draws", "target_accept", "max_tree_depth")
+"""Options of a case that are those of the planner and of fits."""
 
 type Model = Mapping[str, Any] | TrustModel
 """Trust model, or the settings that make it."""
@@ -59,7 +64,7 @@ class Case:
     model: Model
     policy: Any
     objective: str
-    sampler: str = SAMPLER
+    sampler: str = "auto"
     options: Mapping[str, Any] = field(default_factory=dict)
     bounds: bool = True
     factory: bool = False
@@ -78,8 +83,12 @@ class Case:
         """
         policy = resolved("policy", self.policy, POLICIES)
         policy = _made(policy, callbacks) if self.factory else policy
-        learn = getattr(policy, "learn", None)  # of one that learns by itself
-        options = {name: value for name, value in self.options.items() if name != "stop"}
+        given = {name: value for name, value in self.options.items() if name != "stop"}
+        options: dict[str, Any] = {}
+        for keyword, names in (("planner", PLANNER_OPTIONS), ("fit", FIT_OPTIONS)):
+            options[keyword] = {name: given.pop(name) for name in names if name in given}
+        if isinstance(given.get("hazard"), Mapping):
+            given["hazard"] = Hazard(**given["hazard"])
         return Campaign(
             workspace,
             *ends,
@@ -88,8 +97,8 @@ class Case:
             objective=self.objective,
             sampler=self.sampler,
             seed=seed,
-            callbacks=callbacks if learn is None else (learn, *callbacks),
             **options,
+            **given,
         )
 
     def identity(self) -> dict[str, Any]:
@@ -252,7 +261,7 @@ def _able(model: Model, sampler: str) -> str:
     try:
         resolve_sampler(model_of(model), sampler)
     except TrustboError:
-        return SAMPLER
+        return "auto"
     return sampler
 
 
