@@ -1,123 +1,111 @@
-"""Logs of real robots: models and baselines, fitted to one half, scored by bound on the other.
+"""A log of real robots: models fitted to one half, scored one bound ahead on the other.
 
-Run: python benchmarks/logs.py [replicate] [memory] [--data FOLDER] [--window 20 10 5] [--quick]
+Run: python benchmarks/logs.py [score] [memory] [--data FOLDER] [--window 20 10] [--quick]
 
-FOLDER, by default TRUSTBO_DATA, has `mrclam/`, a run of the UTIAS data set as `tb.logs.read_mrclam`
-reads it; `--to` names the folder of another run of the same robots, which then takes the place of
-the second half. --quick takes a log that is made up.
+FOLDER, by default TRUSTBO_DATA, has `mrclam/`, a run of the UTIAS data set as published: Leung,
+Halpern, Barfoot and Liu, International Journal of Robotics Research 30 (8), 2011. The files are
+the user's: their terms are the producer's.
 """
 
-import time
-from pathlib import Path
-
+import numpy as np
 import pandas as pd
 from common import Table, arguments, parsed
 
 import trustbo as tb
-from trustbo.models import HierarchicalTrust, PooledTrust, RobotEffect
+from trustbo.models import PooledTrust, RobotEffect
 
-COUNTS = {"observation": "beta_binomial"}
 MODELS = {
-    "Pooled, Gaussian": PooledTrust(),
-    "Pooled, censored": PooledTrust(observation="censored"),
-    "Hierarchical, censored": HierarchicalTrust(observation="censored"),
-    "Pooled, counts": PooledTrust(**COUNTS),
-    "Hierarchical, counts": HierarchicalTrust(**COUNTS),
-    "robots, counts": PooledTrust(effects=RobotEffect(), **COUNTS),
-    "robots, counts, deviation": PooledTrust(effects=RobotEffect(), memory="deviation", **COUNTS),
+    "Gaussian": PooledTrust(),
+    "censored": PooledTrust(observation="censored"),
+    "counts": PooledTrust(observation="beta_binomial"),
+    "counts, robots": PooledTrust(effects=RobotEffect(), observation="beta_binomial"),
 }
-SIMPLE = ("Pooled, censored", "Hierarchical, censored", "robots, counts, deviation")
-"""Models that are tried without a sensor too."""
 
 
-class Logs:
-    """Two logs, their geometry and sensors, and missions of both."""
+def read_mrclam(run):
+    """Tables of poses and detections, and landmarks, of a run of the five robots.
 
-    def __init__(self, logs: dict[str, tb.logs.Log]) -> None:
-        self.logs = logs
-        self.geometry = {name: tb.logs.geometry(log) for name, log in logs.items()}
-        self.sensors = {name: tb.logs.fit_sensor(g) for name, g in self.geometry.items()}
-
-    def missions(self, window: float, *, sensor: bool) -> dict:
-        """Missions of each log, of features learned from the log fitted to."""
-
-        def of(name: str):
-            def missions(learned: str) -> list[tb.Mission]:
-                return tb.logs.missions_of(
-                    self.logs[name], window, geometry=self.geometry[name],
-                    sensor=self.sensors[learned] if sensor else None,
-                )  # fmt: skip
-
-            return missions
-
-        return {name: of(name) for name in self.logs}
-
-
-def replicate(logs: Logs, windows: list[float]) -> None:
-    """Scores of all models and baselines, both ways."""
-    first = next(iter(logs.logs))
-    for window in windows:
-        began = time.process_time()
-        expected = tb.study.replicate(logs.missions(window, sensor=True), MODELS)
-        models = {name: MODELS[name] for name in SIMPLE}
-        simple = tb.study.replicate(logs.missions(window, sensor=False), models)
-        simple = simple.rename(index=lambda name: f"{name}, no sensor", level="model")
-        both = pd.concat([expected, simple]).reset_index()
-        for learned, rows in both.groupby("fitted to", sort=False):
-            rows = rows.sort_values("mean_log_score", ascending=False)
-            other = rows["scored on"].iloc[0]
-            print(f"\nwindows of {window:g} s, {learned} -> {other}")
-            table = Table("model", "R2", "log score", "95 %", "behind", "95 %", "50 %", "90 %", "n")
-            for row in rows.itertuples():
-                apart = row.model.endswith("no sensor")  # behind the best of these
-                behind = f"{row.behind_low:.2f} to {row.behind_high:.2f}"
-                table.row(row.model, f"{row.r2:.3f}", f"{row.mean_log_score:.3f}",
-                          f"{row.low:.2f} to {row.high:.2f}", "" if apart else f"{row.behind:.3f}",
-                          "" if apart else behind, f"{row.coverage_50:.2f}",
-                          f"{row.coverage_90:.2f}", row.n)  # fmt: skip
-        print(f"{time.process_time() - began:.0f} s of one core, {first} first")
+    `run` has Robot1_Groundtruth.dat, Robot1_Measurement.dat, ..., Landmark_Groundtruth.dat and
+    Barcodes.dat; or poses.csv and detections.csv.
+    """
+    if not (run / "Barcodes.dat").exists():
+        tables = [next(run.glob(f"{name}.csv*")) for name in ("poses", "detections", "landmarks")]
+        poses, detections, landmarks = map(pd.read_csv, tables)
+        return poses, detections, landmarks[["x", "y"]].assign(radius=0.06).to_numpy()
+    subject = {int(code): int(n) for n, code in np.loadtxt(run / "Barcodes.dat")[:, :2]}
+    poses, detections = [], []
+    for i in range(1, 6):
+        track = np.loadtxt(run / f"Robot{i}_Groundtruth.dat")
+        times = np.arange(track[0, 0], track[-1, 0], 0.5)  # of a hundred poses a second
+        kept = track[np.unique(np.searchsorted(track[:, 0], times))]
+        poses.append(pd.DataFrame(kept, columns=["t", "x", "y", "heading"]).assign(robot=i))
+        for t, code, *_ in np.loadtxt(run / f"Robot{i}_Measurement.dat"):
+            if 1 <= subject.get(int(code), 0) <= 5:
+                detections.append((t, i, subject[int(code)]))
+    table, start = pd.concat(poses), min(one["t"].iloc[0] for one in poses)
+    seen = pd.DataFrame(detections, columns=["t", "watcher", "seen"])
+    tubes = np.loadtxt(run / "Landmark_Groundtruth.dat")[:, 1:3]
+    landmarks = np.column_stack([tubes, np.full(len(tubes), 0.06)])
+    return table.assign(t=table["t"] - start), seen.assign(t=seen["t"] - start), landmarks
 
 
-def memory(logs: Logs, windows: list[float]) -> None:
-    """Does trust, or its deviation from expectation, last; do robots differ: log Bayes factors."""
-    table = Table("window", "log", "memory", "beta0", "for beta0 > 0", "for robots", "fit, s")
-    for window in windows:
-        for name in logs.logs:
-            missions = logs.missions(window, sensor=True)[name](name)
-            for kept in ("level", "deviation"):
-                model = PooledTrust(effects=RobotEffect(), memory=kept, **COUNTS)
-                began = time.process_time()
-                posterior = tb.fit(missions, model, progress=False)
-                seconds = time.process_time() - began
-                found = tb.inference.memory(posterior)
-                alone = PooledTrust(memory=kept, **COUNTS)
-                without = tb.fit(missions, alone, progress=False, whole=False, check=False)
-                gain = posterior.attrs["log_evidence"] - without.attrs["log_evidence"]
-                beta0 = posterior["posterior"]["beta0"]
-                table.row(f"{window:g}", name, kept, f"{float(beta0.mean()):.2f}",
-                          f"{found.log_bf:.1f}", f"{gain:.1f}", f"{seconds:.1f}")  # fmt: skip
+def halves(poses, detections, landmarks):
+    """Tracks of both halves of a log."""
+    middle = poses["t"].max() // 40.0 * 20.0
+    return {
+        name: tb.logs.Tracks(*(table[(table["t"] >= a) & (table["t"] <= b)]
+                               for table in (poses, detections)),
+                             landmarks=landmarks, robot_radius=0.17)
+        for name, a, b in (("first", 0.0, middle), ("second", middle, np.inf))
+    }  # fmt: skip
 
 
-def main() -> None:
-    parser = arguments(__doc__, names=("replicate", "memory"), data=True, quick="a made-up log")
-    parser.add_argument("--to", type=Path, help="folder of another run")
-    parser.add_argument("--window", type=float, nargs="+", default=[20.0, 10.0, 5.0])
+def made_up():
+    """Robots on circles that see each other the less, the further they are apart."""
+    rng, t, rows, seen = np.random.default_rng(0), np.arange(0.0, 600.0, 0.5), [], []
+    for i in range(4):
+        a = t / (20.0 + 5.0 * i) + i
+        place = {"x": (3.0 + i) * np.cos(a), "y": (3.0 + i) * np.sin(a)}
+        rows.append(pd.DataFrame({"t": t, "robot": i, **place, "heading": a + np.pi / 2}))
+    for k in range(0, len(t), 2):
+        xy = np.array([one[["x", "y"]].iloc[k] for one in rows])
+        away = np.linalg.norm(xy[:, None] - xy[None], axis=-1)
+        chance = rng.random((4, 4)) < 0.8 - 0.05 * away
+        seen += [(t[k], i, j) for i, j in np.argwhere(chance) if i != j]
+    return pd.concat(rows), pd.DataFrame(seen, columns=["t", "watcher", "seen"]), np.empty((0, 3))
+
+
+def score(logs, window):
+    """Log score of each model on the half that it was not fitted to."""
+    table = Table("window", "fitted to", "model", "log score", "n")
+    for learned, other in (("first", "second"), ("second", "first")):
+        train, test = (tb.logs.missions_of(logs[name], window) for name in (learned, other))
+        for name, model in MODELS.items():
+            posterior = tb.fit(train, model, progress=False)
+            found = tb.inference.score(posterior, test).sel(among="all")
+            table.row(f"{window:g} s", learned, name, f"{float(found['mean_log_score']):.3f}",
+                      int(found["n"]))  # fmt: skip
+
+
+def memory(logs, window):
+    """Log Bayes factor for trust that carries over from one bound to the next."""
+    table = Table("window", "half", "for beta0 > 0", "beta0")
+    for name, tracks in logs.items():
+        posterior = tb.fit(tb.logs.missions_of(tracks, window), MODELS["counts"], progress=False)
+        beta0 = float(posterior["posterior"]["beta0"].mean())
+        found = tb.inference.memory(posterior)
+        table.row(f"{window:g} s", name, f"{found.log_bf:.1f}", f"{beta0:.2f}")
+
+
+def main():
+    parser = arguments(__doc__, names=("score", "memory"), data=True, quick="a made-up log")
+    parser.add_argument("--window", type=float, nargs="+", default=[20.0, 10.0])
     given = parsed(parser)
-    if given.quick:
-        whole = tb.logs.synthetic_log(minutes=10.0)
-        given.window = [20.0]
-    else:
-        whole = tb.logs.read_mrclam(given.data / "mrclam")
-    if given.to:
-        logs = {"this run": whole, "other run": tb.logs.read_mrclam(given.to)}
-    else:
-        middle = whole.span[1] // 40.0 * 20.0
-        parts = (0.0, middle), (middle, whole.span[1])
-        logs = {n: whole.between(*p) for n, p in zip(("first", "second"), parts, strict=True)}
-    both = Logs(logs)
-    for name, part in (("replicate", replicate), ("memory", memory)):
+    logs = halves(*(made_up() if given.quick else read_mrclam(given.data / "mrclam")))
+    for name, part in (("score", score), ("memory", memory)):
         if name in given.names:
-            part(both, given.window)
+            for window in given.window:
+                part(logs, window)
 
 
 if __name__ == "__main__":

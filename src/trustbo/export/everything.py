@@ -33,7 +33,6 @@ from trustbo.export.route_graph import OBJECTIVES, graph_of, summed
 from trustbo.export.route_graph_file import write_route_graph
 from trustbo.export.tables import write_csv
 from trustbo.files import FilePath, require_file, require_folder
-from trustbo.logs.messages import require_topic_names
 from trustbo.planning.problem import mean_of
 
 
@@ -217,7 +216,6 @@ def _require_nav2(result: Result, place: PlacedFrame) -> None:
     require_fine(place, result.workspace, "a route graph")
     graph_of(summed(result.planner, _summable(result)), mean_of(result.posterior), place)
     if result.workspace.ground is not None:
-        require_topic_names(LEAD, result.workspace.team.names)
         for robot in (LEAD, *result.workspace.team.names):
             stops_of(result.plan, robot, place)
 

@@ -1,25 +1,19 @@
 """Table of measurements and of learned trust, for pandas or R."""
 
 import numpy as np
-import pandas as pd
 
 from trustbo.campaign.result import Result
 from trustbo.errors import require_kind
 from trustbo.files import FilePath, require_file, write_text
-from trustbo.logs.rows import KEYS, column_of
-from trustbo.spreadsheet import frame_as_csv
-
-_TRUST = ("trust_mean", "trust_sd")
+from trustbo.logs.table import to_frame
 
 
 def write_csv(path: FilePath, result: Result) -> None:
-    """Write a table with a row for each mission, bound run (both from 1) and robot.
+    """Write a table with a row for each mission, bound and robot, numbered from 1.
 
-    Columns are `mission`, `bound`, `robot`, `row` and `col` of the cell entered, `contact_rate`,
-    `duration` (s), `n_ticks`, `status` of the bound, `mission_status`, a column for each awareness
-    feature as in `logs.to_frame`, and `trust_mean` and `trust_sd`, latent trust under the last
-    posterior. A blank stands for a value that was not measured, or for the trust of a mission that
-    the last posterior does not cover.
+    Columns are those of `logs.to_frame`, and `trust_mean` and `trust_sd`, latent trust under the
+    last posterior; blank for a value that was not measured, for the start cell, and for the trust
+    of a mission that the last posterior does not cover.
 
     Args:
         path: File to write, or to replace.
@@ -30,25 +24,15 @@ def write_csv(path: FilePath, result: Result) -> None:
     """
     target = require_file(path)
     require_kind("result", result, Result, "give a Result, as iterate returns it")
-    latent = result.posterior["latent"].to_dataset()
+    table, latent = to_frame(result.missions), result.posterior["latent"].to_dataset()
     # A posterior need not cover all missions: some are excluded, or wait to be learned from.
-    numbers = [int(j) for j in latent["mission"].values]
-    trust = {name: dict(zip(numbers, latent[name].values, strict=True)) for name in _TRUST}
-    rows = []
-    for j, mission in enumerate(result.missions):
-        for k, bound in enumerate(mission.bounds):
-            for i, robot in enumerate(mission.robots):
-                rates = {n: getattr(bound, n)[i] for n in ("contact_rate", "duration", "n_ticks")}
-                rows.append(
-                    dict(zip(KEYS, (j + 1, k + 1, robot, *bound.cell), strict=True))
-                    | rates
-                    | {"status": bound.status, "mission_status": mission.status}
-                    | dict(zip(map(_column, mission.features), bound.awareness[i], strict=True))
-                    | {n: a[j][k, i] if j in a else np.nan for n, a in trust.items()}
-                )
-    write_text(target, frame_as_csv(pd.DataFrame(rows), index=False))
-
-
-def _column(feature: str) -> str:
-    """Return the column of a feature, renamed if it is one of latent trust."""
-    return f"awareness_{feature}" if feature in _TRUST else column_of(feature)
+    of_mission = {int(j) + 1: i for i, j in enumerate(latent["mission"].values)}
+    keys = table[["mission", "bound", "robot"]].itertuples(index=False, name=None)
+    robots = result.workspace.team.names
+    at = [(of_mission.get(j, -1), k - 1, robots.index(robot)) for j, k, robot in keys]
+    for name in ("trust_mean", "trust_sd"):
+        values, n_bounds = latent[name].values, latent.sizes["bound"]
+        table[name] = [
+            values[i, k, r] if i >= 0 and 0 <= k < n_bounds else np.nan for i, k, r in at
+        ]
+    write_text(target, table.to_csv(index=False, lineterminator="\n"))

@@ -1,101 +1,272 @@
-"""Missions in ROS bags: `.bag` files of ROS 1, folders of ROS 2 (sqlite3 or mcap).
+"""Missions in ROS bags: `.bag` files of ROS 1, folders of ROS 2, read by rosbags (extra `ros`).
 
-Needs `pip install rosbags`, not ROS itself. All types are standard; topics, their types and
-times of publication are tabulated in docs/howto/your-own-robots.md, and can be renamed (`Topics`).
+    /mission/bound    std_msgs/String, JSON {"bound": k, "cell": [row, col]}, at the start of bound
+                      k; or Int32MultiArray [k, row, col]. Bound 0 is the start of a mission, in its
+                      start cell, and may have "path", the planned cells.
+    /mission/status   std_msgs/String, "ok", "stuck", ..., at the end of a bound, optional; a second
+                      one after the last bound is the mission's.
+    /{robot}/contact  std_msgs/Bool, or Float32 and Float64 in [0, 1], at each tick
+    /{robot}/odom     Odometry, PoseStamped or PoseWithCovarianceStamped, optional; also of /lead
 
-All times are those of recording, whole nanoseconds; bounds are cut as in `Recording`. The contact
-rate is the share of a robot's ticks with contact, n_ticks their number; a contact of NaN was not
-measured, and is no tick. If robots have unequal numbers, `Bound.contact` has the ticks of the one
-with most. Poses and states are the last ones at each tick, x and y as recorded: in CRS metres if
-their frame is; headings have no jumps. Awareness that was not published is NaN, which
-`Campaign.tell` takes from the map.
+A bound lasts from its marker to its status, else to the last contact before the next marker. Its
+contact rate is the share of a robot's ticks with contact; NaN was not measured, and is no tick.
 """
 
+import json
+import math
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from trustbo.data import FEATURES, Mission, default_features
-from trustbo.errors import TrustboError
+from trustbo.data import Bound, Cell, Mission
+from trustbo.errors import TrustboError, require_package, require_pair, require_whole
 from trustbo.files import FilePath
-from trustbo.logs.bagfile import opened
-from trustbo.logs.messages import (
-    AWARENESS_TYPES,
-    CONTACT_TYPES,
-    MARKER_TYPES,
-    POSE_TYPES,
-    STATUS_TYPES,
-    Topics,
-)
-from trustbo.logs.netcdf import STATES
-from trustbo.logs.recording import Marker, Recording, Series
 from trustbo.workspace import Workspace
 
+_NEVER = np.iinfo(np.int64).max
+_NS = 1e9  # in a second
 
-def read_bag(
-    path: FilePath, workspace: Workspace | None = None, *, topics: Topics | None = None
-) -> list[Mission]:
-    """Read the missions of a ROS bag; see docs/howto/your-own-robots.md for its topics.
+
+@dataclass(frozen=True)
+class Topics:
+    """Names of topics; `{robot}` stands for the name of a robot, or of the lead.
+
+    Attributes:
+        bound: Markers of the starts of bounds.
+        status: Statuses of bounds and missions.
+        contact: Contact of each robot.
+        pose: Pose of each robot and the lead.
+        lead: Name of the lead.
+    """
+
+    bound: str = "/mission/bound"
+    status: str = "/mission/status"
+    contact: str = "/{robot}/contact"
+    pose: str = "/{robot}/odom"
+    lead: str = "lead"
+
+
+class _Series(NamedTuple):
+    """Values and their times, ascending."""
+
+    time: np.ndarray  # (record,), ns
+    value: np.ndarray  # (record, ...)
+
+    def between(self, after: int, until: int) -> "_Series":
+        """Records later than `after`, up to and including `until`."""
+        first, last = np.searchsorted(self.time, (after, until), side="right")
+        return _Series(self.time[first:last], self.value[first:last])
+
+    def held(self, ticks: np.ndarray) -> np.ndarray:
+        """Latest value at each tick, (tick, ...); NaN before the first."""
+        last = np.searchsorted(self.time, ticks, side="right") - 1
+        padded = np.concatenate([np.full((1, *self.value.shape[1:]), np.nan), self.value])
+        return padded[last + 1]
+
+
+class _Marker(NamedTuple):
+    """Start of a bound."""
+
+    time: int
+    bound: int
+    cell: Cell
+    path: tuple[Cell, ...]
+
+
+class _Recording(NamedTuple):
+    """Records of a bag, in the order of the robots; poses begin with the lead's, or are empty."""
+
+    markers: list[_Marker]
+    status: _Series
+    contact: list[_Series]
+    poses: list[_Series]
+
+
+def read_bag(path: FilePath, workspace: Workspace, *, topics: Topics = Topics()) -> list[Mission]:
+    """Read the missions of a ROS bag.
 
     Args:
         path: A `.bag` file of ROS 1, or the folder of a bag of ROS 2.
-        workspace: Workspace with the robots and features to read, in its order. By default those
-            that the first marker names, else those found: robots by name, features by label.
+        workspace: Workspace with the robots to read, in its order.
         topics: Names of topics, if not the default ones.
 
+    Returns:
+        Missions with the ticks of robots. Awareness is NaN, which a campaign takes from its map.
+
     Raises:
-        TrustboError: No rosbags; not a bag, or a damaged one; a missing topic, or one of another
-            type; a clock that goes backwards; markers out of order; or what `Mission` refuses.
+        TrustboError: No rosbags; not a bag, or a damaged one; a missing topic; a clock that goes
+            backwards; markers out of order; or what `Mission` refuses.
     """
-    names = Topics() if topics is None else topics
-    with opened(Path(path)) as bag:
-        bag.require([names.bound])
-        marked = bag.collect({names.bound: MARKER_TYPES})[names.bound]
-        if not len(marked.time):
-            raise TrustboError(f"no message on {names.bound}, which marks the starts of bounds.")
-        first = marked.value[0]
-        if workspace is None:
-            robots, features = first["robots"] or bag.robots(names.contact), first["features"]
-        else:
-            robots, features = workspace.team.names, workspace.features
-        contact, awareness = names.of("contact", robots), names.of("awareness", robots)
-        bag.require(contact or [names.contact])
-        poses = names.of("pose", (names.lead, *robots))
-        if any(topic in bag.types for topic in poses):
-            bag.require(poses)
-        else:
-            poses = []
-        states = [topic for topic in names.of("state", robots) if topic in bag.types]
-        read: dict[str, tuple[str, ...]] = {names.status: STATUS_TYPES}
-        read |= dict.fromkeys(states, AWARENESS_TYPES)
-        read |= dict.fromkeys(contact, CONTACT_TYPES)
-        read |= dict.fromkeys(awareness, AWARENESS_TYPES) | dict.fromkeys(poses, POSE_TYPES)
-        series = bag.collect(read)
-    named = (n or default_features(len(v)) for t in awareness for n, v in series[t].value)
-    features = features or next(named, FEATURES)
-    markers = zip(marked.time.tolist(), marked.value, strict=True)
-    recording = Recording(
-        [Marker(time, m["bound"], m["cell"], m["path"]) for time, m in markers],
-        series[names.status],
-        [series[topic] for topic in contact],
-        [_by_feature(topic, series[topic], features) for topic in awareness],
-        [series[topic] for topic in poses],
-        [_by_feature(topic, series[topic], STATES) for topic in states],
+    robots = workspace.team.names
+    found = _recording(Path(path), topics, robots)
+    starts = [i for i, marker in enumerate(found.markers) if marker.bound == 0]
+    if not starts or starts[0] > 0:
+        raise TrustboError(f"{str(path)!r} must begin with the marker of bound 0, the start cell.")
+    missions = []
+    for first, end in zip(starts, [*starts[1:], len(found.markers)], strict=True):
+        until = found.markers[end].time if end < len(found.markers) else _NEVER
+        if end - first > 1:
+            try:
+                missions.append(_mission(found, found.markers[first:end], until, workspace))
+            except TrustboError as error:
+                raise TrustboError(f"{str(path)!r}, mission {len(missions) + 1}: {error}") from None
+    return missions
+
+
+def _recording(path: Path, topics: Topics, robots: tuple[str, ...]) -> _Recording:
+    """Records of a bag."""
+    contact = [topics.contact.replace("{robot}", robot) for robot in robots]
+    poses = [topics.pose.replace("{robot}", robot) for robot in (topics.lead, *robots)]
+    messages = _messages(path, [topics.bound, *contact], [topics.status, *poses])
+    markers = [_marker(time, message) for time, message in messages[topics.bound]]
+    status = _series(topics.status, [(t, str(m.data)) for t, m in messages[topics.status]])
+    moved = [[(t, _pose(m)) for t, m in messages[topic]] for topic in poses]
+    return _Recording(
+        sorted(markers, key=lambda marker: (marker.time, marker.bound)),
+        status._replace(value=status.value.astype(object)),
+        [
+            _series(topic, [(t, _contact(topic, m)) for t, m in messages[topic]])
+            for topic in contact
+        ],
+        [_series(*pair) for pair in zip(poses, moved, strict=True)] if all(moved) else [],
     )
+
+
+def _messages(
+    path: Path, needed: list[str], optional: list[str]
+) -> dict[str, list[tuple[int, Any]]]:
+    """Time of recording (ns) and content of each message, by topic."""
+    require_package("ROS bags need", "rosbags", "rosbags")
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
+
+    messages: dict[str, list[tuple[int, Any]]] = {topic: [] for topic in (*needed, *optional)}
+    there = {}
     try:
-        return recording.missions(features, robots)
-    except TrustboError as error:
-        raise TrustboError(f"{str(path)!r}: {error}") from None
+        # Bags of ROS 2 before Iron do not define their types.
+        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+            there = {c.topic: c.msgtype for c in reader.connections}
+            chosen = [c for c in reader.connections if c.topic in messages]
+            for c, time, raw in reader.messages(connections=chosen) if chosen else ():
+                messages[c.topic].append((time, reader.deserialize(raw, c.msgtype)))
+    except Exception as error:  # rosbags raises many kinds for a file that is damaged or no bag
+        raise TrustboError(
+            f"{str(path)!r} cannot be read as a ROS bag ({error or type(error).__name__}); give a "
+            "whole .bag file of ROS 1, or the folder of a bag of ROS 2 with its metadata.yaml."
+        ) from None
+    if missing := [topic for topic in needed if topic not in there]:
+        found = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(there.items()))
+        raise TrustboError(
+            f"{str(path)!r} lacks {', '.join(missing)}; it has {found or 'no topics'}. "
+            "Topics with other names: topics=Topics(...)."
+        )
+    return messages
 
 
-def _by_feature(topic: str, named: Series, features: tuple[str, ...]) -> Series:
-    """Vectors in the order of the features, NaN for those that they lack."""
-    values = np.full((len(named.time), len(features)), np.nan)
-    for row, (names, entries) in zip(values, named.value, strict=True):
-        labels = names or features
-        unknown = [name for name in labels if name not in features]
-        if unknown or len(labels) != len(entries):
-            what = ", ".join(unknown) or f"{len(entries)} unnamed values"
-            raise TrustboError(f"{topic} has {what}; the features are {', '.join(features)}.")
-        row[[features.index(name) for name in labels]] = entries
-    return Series(named.time, values)
+def _series(topic: str, records: list[tuple[int, Any]]) -> _Series:
+    time = np.array([t for t, _ in records], dtype=np.int64)
+    if (np.diff(time) < 0).any():
+        raise TrustboError(f"the clock of {topic} goes backwards.")
+    return _Series(time, np.array([value for _, value in records]))
+
+
+def _marker(time: int, message: Any) -> _Marker:
+    """Start of a bound in a message."""
+    try:
+        if isinstance(message.data, str):
+            content = json.loads(message.data)
+        else:
+            bound, *cell = message.data.tolist()
+            content = {"bound": bound, "cell": cell}
+        path = tuple(require_pair("path", cell) for cell in content.get("path", ()))
+        k = require_whole("bound", content["bound"], 0)
+        return _Marker(time, k, require_pair("cell", content["cell"]), path)
+    except (AttributeError, KeyError, TypeError, ValueError):
+        raise TrustboError(
+            "a marker must be JSON with a bound and a cell, or [bound, row, col]; got "
+            f"{getattr(message, 'data', message)!r:.60}."
+        ) from None
+
+
+def _contact(topic: str, message: Any) -> float:
+    value = float(message.data)
+    if value < 0.0 or value > 1.0:
+        raise TrustboError(f"{topic} has {value:g}, outside [0, 1]; divide percentages by 100.")
+    return value
+
+
+def _pose(message: Any) -> list[float]:
+    """Position x and y, and heading in rad from the x axis, in [-pi, pi]."""
+    pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
+    p, q = pose.position, pose.orientation
+    yaw = math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y**2 + q.z**2))
+    return [p.x, p.y, yaw]
+
+
+def _mission(
+    found: _Recording, markers: list[_Marker], until: int, workspace: Workspace
+) -> Mission:
+    """Mission of its markers, the last bound of which ends at `until` at the latest."""
+    start, cells = markers[0], tuple(marker.cell for marker in markers)
+    if [marker.bound for marker in markers] != list(range(len(markers))):
+        raise TrustboError(f"bounds are in the order {[marker.bound for marker in markers]}.")
+    path = start.path or cells
+    if path[0] != cells[0]:
+        raise TrustboError(f"it starts in {cells[0]}, but its path in {path[0]}.")
+    poses = [_continuous(series, start.time, until) for series in found.poses]
+    ends = [*(marker.time for marker in markers[2:]), until]
+    bounds = tuple(
+        _bound(found, poses, marker, end, start.time, len(workspace.features))
+        for marker, end in zip(markers[1:], ends, strict=True)
+    )
+    statuses = found.status.between(markers[-1].time, until).value
+    status = str(statuses[-1]) if len(statuses) else "ok"
+    if status == "ok" and len(bounds) < len(path) - 1:
+        status = "aborted"  # no record of the reason
+    return Mission(path, bounds, status, workspace.features, workspace.team.names)
+
+
+def _bound(
+    found: _Recording,
+    poses: list[_Series],
+    marker: _Marker,
+    until: int,
+    start: int,
+    n_features: int,
+) -> Bound:
+    """Bound from its marker to the next, at `until`, of a mission from `start`."""
+    statuses = found.status.between(marker.time, until)
+    end = int(statuses.time[0]) if len(statuses.time) else until
+    contacts = [series.between(marker.time, end) for series in found.contact]
+    if not len(statuses.time):
+        end = max((int(c.time[-1]) for c in contacts if len(c.time)), default=marker.time)
+    looked = [~np.isnan(c.value) for c in contacts]
+    contacts = [_Series(c.time[m], c.value[m] > 0.5) for c, m in zip(contacts, looked, strict=True)]
+    n_ticks = np.array([len(c.time) for c in contacts], dtype=float)
+    ticks = contacts[int(np.argmax(n_ticks))].time
+    of_ticks = [c.value if len(c.time) == len(ticks) else
+                c.value[np.maximum(np.searchsorted(c.time, ticks, side="right") - 1, 0)]
+                for c in contacts if n_ticks.all()]  # fmt: skip
+    seconds = (end - marker.time) / _NS if end > marker.time else np.nan
+    return Bound(
+        marker.cell,
+        np.full((len(contacts), n_features), np.nan),
+        np.array([c.value.mean() if len(c.value) else np.nan for c in contacts]),
+        np.full(len(contacts), seconds),
+        str(statuses.value[0]) if len(statuses.time) else "ok",
+        (marker.time - start) / _NS,
+        np.stack([series.held(ticks) for series in poses], axis=1) if poses else None,
+        np.stack(of_ticks, axis=1) if of_ticks else None,
+        np.where(n_ticks > 0, n_ticks, np.nan),
+    )
+
+
+def _continuous(poses: _Series, start: int, until: int) -> _Series:
+    """Poses of a mission, and the last before it; headings without jumps from its start on."""
+    first, last = np.searchsorted(poses.time, (start, until), side="right")
+    values = poses.value[max(first - 1, 0) : last].copy()
+    kept = slice(min(int(first), 1), None)
+    values[kept, 2] = np.unwrap(values[kept, 2])
+    return _Series(poses.time[max(first - 1, 0) : last], values)
