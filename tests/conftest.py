@@ -1,13 +1,11 @@
 """Settings of every test, and fixtures that several rooms share."""
 
 import os
-import shutil
 from pathlib import Path
 
 import jax
 import matplotlib as mpl
 import pytest
-from matplotlib.figure import Figure
 
 from trustbo.terrain.example import EXAMPLES, example_files
 
@@ -24,46 +22,6 @@ def pytest_collection_modifyitems(items):
     others = [item for item in items if "tests/models/" not in item.nodeid]
     half = min(len(items) // 2, len(others))
     items[:] = [*others[:half], *models, *others[half:]]
-
-
-@pytest.fixture(scope="session")
-def leave_figures_blank():
-    """Save figures without what they show, and draw none in a report, which takes seconds."""
-    from trustbo.report.blocks import Picture  # 3 s, of no use where workers run tests
-
-    def picture(_, alt, caption):
-        return Picture(alt, caption, "data:image/svg+xml;base64,PHN2Zy8+", 800, 400)
-
-    def leave(monkeypatch):
-        monkeypatch.setattr(Figure, "draw", lambda *_: None)
-        monkeypatch.setattr("trustbo.report.figures.picture", picture)
-
-    return leave
-
-
-@pytest.fixture
-def blank_figures(monkeypatch, leave_figures_blank):
-    """The same for one test."""
-    leave_figures_blank(monkeypatch)
-
-
-@pytest.fixture(scope="session")
-def chromium():
-    """A headless browser that selenium drives; skips where there is none."""
-    program, driver = shutil.which("chromium"), shutil.which("chromedriver")
-    if program is None or driver is None:
-        pytest.skip("no chromium and chromedriver on the path")
-    from selenium import webdriver
-    from selenium.webdriver.chrome.service import Service
-
-    options = webdriver.ChromeOptions()
-    options.binary_location = program
-    for flag in ("--headless=new", "--no-sandbox", "--disable-gpu", "--hide-scrollbars"):
-        options.add_argument(flag)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    browser = webdriver.Chrome(options=options, service=Service(driver))
-    yield browser
-    browser.quit()
 
 
 @pytest.fixture(scope="session")

@@ -22,8 +22,6 @@ from trustbo.inference import (
 )
 from trustbo.models import PlaceEffect, PooledTrust, Priors, TrustParams
 from trustbo.planning import Planner, roll_trust
-from trustbo.plots import regret_curves
-from trustbo.report import write_report
 from trustbo.simulation import KinematicSimulator, ModelSimulator
 from trustbo.workspace.grid import Grid
 
@@ -177,9 +175,6 @@ MISTAKES = {
     "a simulator's class": (
         lambda c: c.iterate(simulator=KinematicSimulator), "make one of the class"
     ),
-    "a report in another format": (
-        lambda c: write_report("rep.pdf", None), "'rep.pdf' must end in .html or .htm"
-    ),
     "no terrain to drive on": (
         lambda c: tb.iterate(c.workspace, *ENDS, progress=False), "make the workspace with Work"
     ),
@@ -224,9 +219,6 @@ MISTAKES = {
         lambda c: loo(xr.DataTree()), "loo takes a posterior from fit; this DataTree has no 'post"
     ),
     "LOO of a result": (lambda c: loo(c.result), "a posterior from fit; .* Give its .posterior"),
-    "curves of a result": (
-        lambda c: regret_curves(c.result), "got Result .* give a study.s dataset, from study.load"
-    ),
     "a number for a truth": (lambda c: c.iterate(truth=3), "must be Truth.of.simulator.; got 3"),
     "a policy of two": (
         lambda c: c.iterate(policy=lambda key, draws: None), "is called policy.key, draws, planner."

@@ -239,6 +239,7 @@ def _finish(result: "Result", folder: Path, quiet: bool) -> None:
 
     mpl.use("agg")
     write_report(folder / "report.html", result)
+    result.explore().save(folder / "explore.html")
     if result.workspace.terrain is not None:
         export_result(result, folder, ("geotiff", "geojson"))
     if not quiet:

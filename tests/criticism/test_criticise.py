@@ -386,7 +386,6 @@ def few(n, n_bounds):
 def test_one_mission_and_missions_of_one_bound_have_figures_too(missions):
     found = tb.criticise(tb.fit(missions), compare=False, n_replicates=200)
     assert found.fault == "none"
-    tb.plots.criticism(found)
     plt.close("all")
 
 

@@ -25,7 +25,6 @@ from trustbo.models.effects.effect import Slots
 from trustbo.models.effects.weights import Weights
 from trustbo.models.params import DeviationParams, DeviationRobotParams
 from trustbo.models.record import model_from_record, model_to_record
-from trustbo.report.summary import facts_of
 from trustbo.stacking import stack_missions
 
 FEATURES = ("line_of_sight", "slope")
@@ -279,20 +278,3 @@ def test_what_has_no_such_evidence_is_refused():
         tb.inference.memory(tb.fit(missions, HierarchicalTrust(), whole=False, check=False))
     with pytest.raises(TrustboError, match="takes a posterior from fit"):
         tb.inference.memory(missions)
-
-
-def test_a_report_of_a_campaign_states_the_finding():
-    z = np.random.default_rng(2).uniform(size=(3, 5, 5, 2))
-    workspace = tb.Workspace.from_awareness(z, features=FEATURES)
-    truth = TrustParams(0.5, np.array([0.3, 0.05]), 0.05, 0.03, 0.03)
-    simulator = tb.simulation.ModelSimulator(workspace, truth)
-    options = {"simulator": simulator, "progress": False, "n_iterations": 2, "seed": 3}
-    result = tb.iterate(workspace, (4, 0), (0, 4), **options)
-    facts = {fact.name: fact.text for fact in facts_of(result)}
-    found = tb.inference.memory(result.posterior, result.missions, workspace)
-    finding = str(found)
-    assert facts["Memory"] == f"{finding[0].upper()}{finding[1:]}."
-    alone = tb.inference.memory(result.posteriors[-1], result.missions, workspace)
-    assert alone.log_bf == found.log_bf
-    with pytest.raises(TrustboError, match="parameters alone"):
-        tb.inference.memory(result.posteriors[-1])

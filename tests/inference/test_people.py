@@ -268,12 +268,6 @@ def test_a_model_comes_back_from_its_record(memory):
     assert model_from_record(model_to_record(model)) == model
 
 
-def test_a_figure_of_a_person_speaks_of_reports_and_steps(persons, posterior):
-    (ax,) = tb.plots.mission_trust(posterior, 3)
-    assert (ax.get_xlabel(), ax.get_ylabel()) == ("step", "trust, report")
-    np.testing.assert_array_equal(ax.lines[1].get_ydata(), persons[3].contact_rate[:, 0])
-
-
 def test_numbers_at_the_ends_are_limits():
     people = simulated(n=20, scale="unit", seed=4)
     tree = fit(people, HumanTrust(), progress=False)

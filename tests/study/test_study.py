@@ -329,8 +329,6 @@ def test_kinematic_runs_know_their_regret_if_asked_to(tmp_path, monkeypatch):
     )
     assert result["regret"].isnull().all()
     assert result["simulator"].item() == "KinematicSimulator"
-    with pytest.raises(tb.TrustboError, match="no regret is known"):
-        tb.plots.regret_curves(result)
     known = {"kind": "KinematicSimulator", "known_truth": True}
     changes = {"terrains": {"hill": hill}, "simulators": {"known": known}, "seeds": 1}
     result = run(tmp_path / "known", policies="greedy", **changes)

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -30,7 +29,7 @@ from trustbo.planning import Plan, Planner
 from trustbo.workspace import Workspace
 
 if TYPE_CHECKING:
-    from trustbo.plots.explorer import Explorer
+    from trustbo.plots.explore import Explorer
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -223,25 +222,22 @@ class Result(Summary):
         return plots.trust_maps(self.history, self.trust_map, self.path, self.workspace, **options)
 
     def plot_history(self, **options: Any) -> np.ndarray:
-        """Draw each mission's numbers; options and Axes as of `plots.campaign_history`."""
-        from trustbo import plots  # imports matplotlib
+        """Draw contact and objective by mission, see `plots.campaign_history`."""
+        from trustbo import plots
 
         return plots.campaign_history(self.history, **options)
 
     def explore(self) -> "Explorer":
-        """Draw an interactive page with layers of the map and the missions on a slider.
+        """Draw an interactive map: layers, the numbers of each cell, and missions by a slider.
 
-        Layers are those of `maps`, the awareness of each robot, the failure chance, and the trust
-        map that each mission was planned on. A notebook shows the page; `.save(path)` writes it to
-        one HTML file that needs no network.
+        A notebook displays it; `.save(path)` writes it to one HTML file that needs no network.
 
         Raises:
             TrustboError: Nothing could be learned yet.
         """
-        from trustbo.plots.explorer import draw_explorer
+        from trustbo import plots
 
-        exploring = import_module("trustbo.report.exploring")  # by name: it lies above
-        return draw_explorer(exploring.scene_of(self, self.maps()))
+        return plots.explore(self.plan, self.maps(), self.history)
 
     def save(self, directory: FilePath, *, overwrite: bool = False) -> None:
         """Write everything to a folder that `load_result` and `Campaign.load` read.

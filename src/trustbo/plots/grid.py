@@ -1,20 +1,20 @@
 """Planning grid of a workspace, with the names of its cells."""
 
-import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 
-from trustbo.plots.style import SMALL
+from trustbo.plots.style import panels, styled
 from trustbo.workspace import Workspace
 from trustbo.workspace.location import crs_name
 
 _WIDTH = 7.0
-"""Width of a new figure, inches."""
 _MOST_NAMED = 24
 """Rows and columns above which cells are named at the edges alone."""
 
 
+@styled
 def grid_map(workspace: Workspace, *, ax: Axes | None = None) -> Axes:
     """Draw the mean heights of the cells, with the cells' names, row,col.
 
@@ -27,27 +27,25 @@ def grid_map(workspace: Workspace, *, ax: Axes | None = None) -> Axes:
     Returns:
         Axes of the grid.
     """
-    grid, free = workspace.grid, workspace.passable.values
-    rows, cols = grid.shape
-    aspect = grid.cell_height / grid.cell_width
-    if ax is None:
-        height = np.clip(_WIDTH * rows * aspect / cols, 2.0, 11.0)
-        _, ax = plt.subplots(figsize=(_WIDTH, height), layout="constrained")
+    grid, (rows, cols) = workspace.grid, workspace.grid.shape
+    tall = grid.cell_height / grid.cell_width
+    height = float(np.clip(_WIDTH * rows * tall / cols, 2.0, 11.0))
+    (ax,) = panels(1, ax, (_WIDTH, height))
     edges = np.arange(cols + 1) - 0.5, np.arange(rows + 1) - 0.5
     if workspace.terrain is not None:
-        light = ListedColormap(plt.get_cmap("YlOrBr")(np.linspace(0.0, 0.55, 256)))
+        light = ListedColormap(colormaps["YlOrBr"](np.linspace(0.0, 0.55, 256)))
         image = ax.pcolormesh(*edges, grid.cell_means(workspace.terrain["dem"]), cmap=light)
-        ax.figure.colorbar(image, ax=ax, label="mean height (m)", shrink=0.8)
-    closed = np.ma.masked_array(np.ones(grid.shape), free)
+        ax.figure.colorbar(image, ax=ax, label="mean height (m)")
+    closed = np.ma.masked_array(np.ones(grid.shape), workspace.passable.values)
     ax.pcolor(*edges, closed, cmap=ListedColormap(["0.8"]), hatch="///", edgecolor="0.6", lw=0.0)
     ax.vlines(edges[0], -0.5, rows - 0.5, color="black", lw=0.4, alpha=0.5)
     ax.hlines(edges[1], -0.5, cols - 0.5, color="black", lw=0.4, alpha=0.5)
     if max(rows, cols) <= _MOST_NAMED:
-        size = min(SMALL, 72.0 * _WIDTH / (4.5 * cols))
+        room = ax.figure.get_figwidth() * ax.get_position().width / cols  # inches
+        size = min(8.0, 72.0 * room / 3.2)
         for row, col in np.ndindex(*grid.shape):
-            name = f"{row},{col}"
-            ax.text(col, row, name, ha="center", va="center", fontsize=size, color="black")
+            ax.text(col, row, f"{row},{col}", ha="center", va="center", size=size, color="black")
     ax.set(xlabel="column", ylabel="row", xlim=(-0.5, cols - 0.5), ylim=(rows - 0.5, -0.5))
-    ax.set_aspect(aspect)
-    ax.set_title(f"{crs_name(grid)}; hatched: without data or too steep", fontsize=9)
+    ax.set_aspect(tall)
+    ax.set_title(f"{crs_name(grid)}; hatched: without data or too steep")
     return ax

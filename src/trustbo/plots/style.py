@@ -1,140 +1,119 @@
-"""Appearance that all figures share: colours, and the options of a user."""
+"""Style of all figures, and the axes that they are drawn on."""
 
-from dataclasses import dataclass, fields
-from typing import Any, NamedTuple, Self, TypedDict
+from collections.abc import Sequence
+from typing import Any
 
 import matplotlib as mpl
+import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib import colormaps
+from matplotlib import patheffects
 from matplotlib.axes import Axes
-from matplotlib.colors import Colormap, to_hex, to_rgb
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-from trustbo.errors import TrustboError, require_known, require_positive, require_whole
+from trustbo.errors import TrustboError
 
-COLOURS = "viridis"
-"""Perceptually uniform, safe for the colour-blind, and monotone in greyscale."""
-SMALL, MEDIUM = 8.0, 9.0
-"""Sizes of text, points: of numbers and keys, and of labels and titles."""
-
-
-class Theme(NamedTuple):
-    """Colours of all but data values, hexadecimal."""
-
-    ink: str
-    """Colour of text, frames and measurements."""
-    paper: str
-    """Background."""
-    quiet: str
-    """References, such as a prior or a line at 0."""
-    band: str
-    """Area where a sound model stays."""
-    line: str
-    """Middle of a posterior."""
-    inner: str
-    """Half of a posterior."""
-    outer: str
-    """Nine tenths of a posterior."""
-    odd: str
-    """Points outside their band."""
-    ground: str
-    """Bare ground under robots."""
-    contour: str
-    """Lines of equal height on it."""
-    closed: str
-    """Cells and pixels that cannot be entered."""
+RC: dict[str, Any] = {
+    "font.size": 8.0,
+    "axes.titlesize": 9.0,
+    "axes.labelsize": 8.0,
+    "xtick.labelsize": 8.0,
+    "ytick.labelsize": 8.0,
+    "legend.fontsize": 8.0,
+    "legend.frameon": False,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "image.cmap": "viridis",
+    "image.interpolation": "nearest",
+}
+"""Settings of matplotlib under which every figure is drawn; colours of text and background, fonts
+and resolution stay those of the user."""
+styled = mpl.rc_context(RC)
+"""Decorator of a function that draws a figure."""
+ROBOTS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
+"""Colours of Okabe and Ito (2008), by robot; markers distinguish robots without colour."""
+MARKERS = "osD^vPX*<>"
+GREY = "0.55"
+"""References and impassable cells, visible on light and on dark ground."""
+PAGE = 7.6
+"""Width of a page, inches: no new figure is wider."""
 
 
-LIGHT = Theme(
-    "#1c1f22", "#fcfcfa", "#8c9196", "#dfe2e4", "#00416b", "#7fb2d6", "#c6dcec", "#c1272d",
-    "#f1f0ec", "#a9aaa4", "#bcbfc2",
-)  # fmt: skip
+def panels(
+    n: int, ax: Any, size: tuple[float, float], *, columns: int = 4, **shared: Any
+) -> np.ndarray:
+    """Axes of n panels, row by row: those of the user, or those of a new figure.
 
-
-def theme() -> Theme:
-    """Colours of the figure to be drawn: ink and paper are those of matplotlib's settings."""
-    ink, paper = (to_hex(mpl.rcParams[name]) for name in ("text.color", "axes.facecolor"))
-    return LIGHT._replace(ink=ink, paper=paper)
-
-
-def luminance(colour: Any) -> float:
-    """Luma of a colour, 0 black to 1 white (ITU-R BT.601)."""
-    return float(np.dot(to_rgb(colour), (0.299, 0.587, 0.114)))
-
-
-class StyleOptions(TypedDict, total=False):
-    """Keyword arguments of every figure; see `Style`."""
-
-    ax: Any
-    n_columns: int | None
-    width: float | None
-    cmap: str | Colormap | None
-    title: str | None
-    legend: bool
-
-
-@dataclass(frozen=True)
-class Style:
-    """Options that every figure takes as keyword arguments.
-
-    Attributes:
-        ax: Axes to draw on, one for each panel, in an array or a list; by default a new figure.
-        n_columns: Panels per row of a new figure.
-        width: Width of a new figure, inches: 3.5 is a column of a journal's page. Text stays of 8
-            points or more, and there are fewer panels per row.
-        cmap: Colours of values or curves, a name or a `Colormap` of matplotlib.
-        title: Title of a figure of one panel, or above all panels of a new figure; `""` for none.
-        legend: Whether to draw the legend or the colour bar.
+    Args:
+        n: Number of panels.
+        ax: Axes of the user, one or an array; None for a new figure.
+        size: Width and height of a panel of a new figure, inches.
+        columns: Most panels in a row.
+        **shared: `sharex` and `sharey` of `plt.subplots`.
 
     Raises:
-        TrustboError: An option is unknown, or its value invalid.
+        TrustboError: `ax` has fewer axes than there are panels, or is something else.
     """
-
-    ax: Any = None
-    n_columns: int | None = None
-    width: float | None = None
-    cmap: str | Colormap | None = None
-    title: str | None = None
-    legend: bool = True
-
-    def __post_init__(self) -> None:
-        if self.n_columns is not None:
-            require_whole("n_columns", self.n_columns, 1)
-        if self.width is not None:
-            require_positive("width", self.width)
-        if not isinstance(self.legend, bool | np.bool_):
-            raise TrustboError(f"legend must be True or False; got {self.legend!r}.")
-        if self.title is not None and not isinstance(self.title, str):
-            raise TrustboError(f"title must be text; got {self.title!r}.")
-        self.colours()
-
-    @classmethod
-    def from_options(cls, options: StyleOptions) -> Self:
-        """Check the keyword arguments of a figure."""
-        require_known("option", options, [f.name for f in fields(cls)])
-        return cls(**options)
-
-    def colours(self, default: str = COLOURS) -> Colormap:
-        """Colour map of the user, or a default one."""
-        chosen = default if self.cmap is None else self.cmap
-        try:
-            return colormaps.get_cmap(chosen)
-        except (ValueError, TypeError):
-            raise TrustboError(
-                f"unknown cmap {chosen!r}; give a name of matplotlib.colormaps, such as 'viridis', "
-                "or a Colormap."
-            ) from None
-
-    def axes(self, n: int) -> np.ndarray:
-        """Axes of the user, shape (n,)."""
-        given = np.atleast_1d(np.asarray(self.ax, dtype=object)).ravel()
-        if not all(isinstance(ax, Axes) for ax in given):
-            raise TrustboError(f"ax must be matplotlib Axes; got a {type(self.ax).__name__}.")
-        if len(given) < n:
-            raise TrustboError(f"this figure has {n} panels, and ax {len(given)}; give {n} Axes.")
+    if ax is not None:
+        given = np.asarray(ax, dtype=object).ravel()
+        if len(given) < n or not all(isinstance(one, Axes) for one in given):
+            raise TrustboError(f"ax must be at least {n} Axes, one for each panel; got {ax!r:.80}.")
+        for one in given[:n]:  # their texts were made under the settings of the user
+            one.tick_params(labelsize=RC["xtick.labelsize"])
+            for text in (one.xaxis.label, one.yaxis.label):
+                text.set_size(RC["axes.labelsize"])
         return given[:n]
+    cols = min(n, columns)
+    rows = -(-n // cols)
+    width = min(cols * size[0], PAGE)
+    _, axes = plt.subplots(
+        rows, cols, figsize=(width, rows * size[1] * width / (cols * size[0])), squeeze=False,
+        layout="compressed", **shared,
+    )  # fmt: skip
+    for unused in axes.ravel()[n:]:
+        unused.remove()
+    return axes.ravel()[:n]
 
 
-def curve_colours(n: int, style: Style) -> np.ndarray:
-    """Colours of n curves that stand out from the paper, also in grey; shape (n, 4)."""
-    ends = (0.35, 1.0) if luminance(theme().paper) < 0.5 else (0.0, 0.8)
-    return style.colours()(np.linspace(*ends, max(n, 1)))
+def figure_of(axes: Sequence[Axes] | np.ndarray) -> Figure:
+    """Top-level figure of some axes."""
+    figure = axes[0].get_figure(root=True)
+    assert isinstance(figure, Figure)  # noqa: S101
+    return figure
+
+
+def add_legend(axes: np.ndarray, handles: Sequence[Any]) -> None:
+    """Add a legend below the axes, or inside the first where the figure has no layout engine."""
+    figure = figure_of(axes)
+    if isinstance(figure.get_layout_engine(), ConstrainedLayoutEngine):
+        columns = min(len(handles), 4 if figure.get_figwidth() > 5.0 else 2)
+        figure.legend(handles=list(handles), loc="outside lower center", ncols=columns)
+    else:
+        axes[0].legend(handles=list(handles))
+
+
+def accent() -> str:
+    """Colour of a single curve: blue that is visible on the background."""
+    red, green, blue = to_rgb(paper())
+    return ROBOTS[4] if 0.3 * red + 0.6 * green + 0.1 * blue < 0.5 else ROBOTS[0]
+
+
+def ink() -> str:
+    """Colour of text."""
+    return mpl.rcParams["text.color"]
+
+
+def paper() -> str:
+    """Colour of the background."""
+    return mpl.rcParams["axes.facecolor"]
+
+
+def outlined(width: float, colour: str) -> list[patheffects.AbstractPathEffect]:
+    """Effect of an outline, `width` points with the line."""
+    return [patheffects.withStroke(linewidth=width, foreground=colour)]
+
+
+def as_text(name: object) -> str:
+    """Text of a name, whose dollar signs matplotlib would take for formulas."""
+    return str(name).replace("$", r"\$").replace("_", " ")

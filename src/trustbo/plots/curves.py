@@ -1,0 +1,160 @@
+"""Curves: trust along a mission, a campaign by mission, regret of studies, effects of robots."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.ticker import MaxNLocator
+
+from trustbo.errors import TrustboError, require_choice
+from trustbo.planning.plan import QUANTILES, Plan
+from trustbo.plots.style import MARKERS, ROBOTS, accent, add_legend, as_text, ink, panels, styled
+
+_LABELS = {
+    "contact_lost": "contact lost\n(bounds)",
+    "contact_rate": "contact rate",
+    "objective": "objective\nwhen planned",
+    "regret": "regret (%)",
+}
+"""Variables of a history that `campaign_history` draws, and the labels of their axes."""
+
+
+@styled
+def trust_curves(given: xr.DataTree | Plan, mission: int = -1, *, ax: Any = None) -> np.ndarray:
+    """Draw the trust of each robot along a mission or a plan, with 50 % and 90 % bands.
+
+    Args:
+        given: Posterior of `tb.fit`, whose dots are the measured contact rates; or a plan over a
+            posterior, such as `Result.plan`.
+        mission: Index of the mission in a posterior; negative indices count from the last.
+        ax: Axes to draw on, one for each robot; by default a new figure.
+
+    Returns:
+        Axes, shape (robot,).
+
+    Raises:
+        TrustboError: There is no such mission, or the posterior has no latent trust.
+    """
+    if isinstance(given, Plan):
+        x, middle, bands = np.arange(1, len(given.trust) + 1), given.trust, given.bands
+        rates, robots = np.full(given.trust.shape, np.nan), given.workspace.team.names
+    else:
+        x, middle, bands, rates, robots = _latent_trust(given, mission)
+    axes = panels(len(robots), ax, (2.4, 1.9), sharex=True, sharey=True)
+    for i, (one, name) in enumerate(zip(axes, robots, strict=True)):
+        colour, (low, lower, upper, high) = accent(), bands[..., i]
+        style: dict[str, Any] = {"color": colour, "linewidth": 0.0}
+        one.fill_between(x, low, high, alpha=0.25, label="90 %", **style)
+        one.fill_between(x, lower, upper, alpha=0.5, label="50 %", **style)
+        one.plot(x, middle[:, i], color=colour, marker="." if len(x) == 1 else "", label="trust")
+        if np.isfinite(rates[:, i]).any():
+            one.plot(x, rates[:, i], "o", color=ink(), markersize=3.5, label="contact rate")
+        one.set_title(as_text(name))
+        one.set_xlabel("bound")
+        one.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes[0].set_ylabel("trust, contact rate")
+    add_legend(axes, axes[0].get_legend_handles_labels()[0])
+    return axes
+
+
+def _latent_trust(
+    posterior: xr.DataTree, mission: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Sequence[str]]:
+    """Bounds, medians and quantiles of trust, measured rates and robots of a mission."""
+    if "latent" not in posterior.children:
+        raise TrustboError(
+            "this posterior has no latent trust; give inference.complete(posterior, missions)."
+        )
+    latent = posterior["latent"].to_dataset()
+    n = latent.sizes["mission"]
+    if not -n <= mission < n:
+        raise TrustboError(f"mission must be from {-n} to {n - 1}; got {mission!r}.")
+    trust = latent["trust"].isel(mission=mission).stack(all_draws=("chain", "draw"))
+    trust = trust.dropna("bound", how="all").transpose("all_draws", "bound", "robot")
+    rates = posterior["observed_data"]["contact_rate"].isel(mission=mission)
+    rates = rates.sel(bound=trust["bound"]).transpose("bound", "robot").values
+    middle, bands = np.median(trust.values, 0), np.quantile(trust.values, QUANTILES, axis=0)
+    return trust["bound"].values, middle, bands, rates, trust["robot"].values.tolist()
+
+
+@styled
+def campaign_history(history: xr.Dataset, *, ax: Any = None) -> np.ndarray:
+    """Draw the contact and the objective of each mission and, if it is known, the regret.
+
+    A filled dot marks a path that differs from the one before, a cross a mission that did not reach
+    the goal.
+
+    Args:
+        history: `Result.history` or `Campaign.history`.
+        ax: Axes to draw on, one for each variable; by default a new figure.
+
+    Returns:
+        Axes, shape (variable,): contact lost (or the contact rate), objective, and regret.
+
+    Raises:
+        TrustboError: The history is empty.
+    """
+    if not history.sizes.get("iteration"):
+        raise TrustboError("the history has no mission yet.")
+    names = [name for name in _LABELS if name in history]
+    if "contact_lost" in names:
+        names.remove("contact_rate")
+    mission = history["iteration"].values
+    changed = history["path_changed"].values.astype(bool) | (mission == 1)
+    failed = history["status"].values.astype(str) != "ok"
+    axes = panels(len(names), ax, (4.6, 1.5), columns=1, sharex=True)
+    for one, name in zip(axes, names, strict=True):
+        values = history[name].values
+        one.plot(mission, values, color=accent(), linewidth=1.0)
+        for which, fill, label in ((changed, accent(), "new path"), (~changed, "none", "same")):
+            dots = {"markerfacecolor": fill, "markeredgecolor": accent(), "label": label}
+            one.plot(mission[which], values[which], "o", markersize=5.5, **dots)
+        if failed.any():
+            cross = {"color": ROBOTS[1], "markersize": 9.0, "label": "not at the goal"}
+            one.plot(mission[failed], values[failed], "x", **cross)
+        one.set_ylabel(_LABELS[name])
+    axes[-1].set_xlabel("mission")
+    axes[-1].xaxis.set_major_locator(MaxNLocator(integer=True))
+    add_legend(axes, axes[0].get_legend_handles_labels()[0])
+    return axes
+
+
+@styled
+def regret_curves(table: pd.DataFrame, *, by: str = "policy", ax: Axes | None = None) -> Axes:
+    """Draw the regret of many campaigns by mission: its median, with bars of 50 % and 90 %.
+
+    Args:
+        table: A row for each campaign and mission, with the columns `mission`, `regret` and `by`.
+        by: Column with a value for each curve.
+        ax: Axes to draw on; by default a new figure.
+
+    Returns:
+        Axes of the curves.
+
+    Raises:
+        TrustboError: A column is missing, or no regret is known.
+    """
+    for name in ("mission", "regret", by):
+        require_choice("column", name, [str(column) for column in table.columns])
+    known = table.dropna(subset=["regret"])
+    if known.empty:
+        raise TrustboError("no regret is known: regret needs the truth of the simulator.")
+    (ax,) = panels(1, ax, (5.0, 3.0))
+    groups = list(known.groupby(by, sort=False))
+    shades = plt.get_cmap()(np.linspace(0.25, 0.85, len(groups)))
+    shifts = np.linspace(-0.25, 0.25, len(groups)) if len(groups) > 1 else [0.0]
+    for i, (name, rows) in enumerate(groups):
+        ends = rows.groupby("mission")["regret"].quantile([*QUANTILES, 0.5]).unstack()
+        x, style = ends.index.to_numpy() + shifts[i], {"color": shades[i]}
+        low, lower, upper, high, middle = ends.to_numpy().T
+        ax.vlines(x, low, high, linewidth=0.9, **style)
+        ax.vlines(x, lower, upper, linewidth=3.2, **style)
+        ax.plot(x, middle, marker=MARKERS[i % len(MARKERS)], linewidth=1.1, label=name, **style)
+    ax.set(xlabel="mission", ylabel="regret of the recommended path (%)")
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.legend(title=f"{as_text(by)}: median, 50 % and 90 % of campaigns")
+    return ax

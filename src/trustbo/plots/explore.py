@@ -1,0 +1,196 @@
+"""Interactive map of a result as one self-contained HTML page."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from trustbo.data import Cell
+from trustbo.errors import TrustboError
+from trustbo.files import FilePath, write_text
+from trustbo.planning import Plan
+from trustbo.plots.maps import contours, extent_of, robust_limits
+from trustbo.plots.style import ROBOTS
+from trustbo.workspace.grid import Grid, over_cells
+
+_PLANNED_ON = "trust map that the mission was planned on"
+_MARKERS = ("circle", "square", "diamond", "triangle", "inverted_triangle", "plus")
+_HEIGHT = 640
+"""Height of the page in a notebook, pixels."""
+_UPDATE = """
+const n = mission.value
+const column = layer.value == planned_on ? `mission ${n}` : layer.value
+cells.data = {...cells.data, value: cells.data[column]}
+colours.low = limits[column][0]
+colours.high = limits[column][1]
+driven.data = paths[n - 1]
+text.text = texts[n - 1]
+"""
+"""Code that the browser runs when another layer or mission is chosen."""
+
+
+@dataclass(frozen=True)
+class Explorer:
+    """Interactive page; a notebook displays it.
+
+    Attributes:
+        html: The page, which needs no other file and no network.
+    """
+
+    html: str
+
+    def save(self, path: FilePath) -> None:
+        """Write the page to an HTML file."""
+        write_text(path, self.html)
+
+    def _repr_html_(self) -> str:
+        page = escape(self.html, quote=True)
+        return f'<iframe srcdoc="{page}" width="100%" height="{_HEIGHT}" frameborder="0"></iframe>'
+
+
+def explore(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> Explorer:
+    """Draw a map with layers, the numbers of each cell under the pointer, and missions by a slider.
+
+    Args:
+        plan: Recommended plan, such as `Result.plan`.
+        maps: Maps of the cells, dims (y, x) or (row, col), such as `Result.maps()`.
+        history: Path, trust map and outcome of each mission, such as `Result.history`.
+
+    Returns:
+        Page to display or save.
+
+    Raises:
+        TrustboError: The history has no mission.
+    """
+    if not history.sizes.get("iteration"):
+        raise TrustboError("there is nothing to explore: the history has no mission.")
+    from bokeh.embed import file_html  # half a second, for this alone
+    from bokeh.resources import INLINE
+
+    html = file_html(_layout(plan, maps, history), INLINE, title="trustbo")
+    viewport = '<meta name="viewport" content="width=device-width, initial-scale=1">'
+    return Explorer(html.replace("<head>", f"<head>{viewport}", 1))
+
+
+def _layout(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> Any:
+    """Column of the controls, the map, and the text of the mission."""
+    from bokeh import models
+    from bokeh.layouts import column
+    from bokeh.plotting import figure
+
+    grid = plan.workspace.grid
+    layers = _layers(plan, maps, history)
+    names = [name for name in layers if not name.startswith("mission ")]
+    limits = {name: robust_limits(values) for name, values in layers.items()}
+    x, y = np.meshgrid(grid.x - grid.corner[0], grid.y - grid.corner[1])
+    row, col = np.indices(grid.shape)
+    columns = {name: values.ravel() for name, values in layers.items()}
+    position = {"x": x.ravel(), "y": y.ravel(), "cell_row": row.ravel(), "cell_col": col.ravel()}
+    cells = models.ColumnDataSource({**position, **columns, "value": columns[names[0]]})
+    low, high = limits[names[0]]
+    colours = models.LinearColorMapper("Viridis256", low=low, high=high, nan_color="#9a9a9a")
+
+    left, right, bottom, top = extent_of(grid)
+    height = int(np.clip(760 * (top - bottom) / (right - left), 250, 900))
+    plot = figure(
+        width=800, height=height, sizing_mode="scale_width", match_aspect=True,
+        tools="pan,wheel_zoom,reset,save", active_drag=None,
+        x_axis_label="east (m)", y_axis_label="north (m)",
+    )  # fmt: skip
+    plot.grid.visible = False
+    size: dict[str, Any] = {"width": grid.cell_width, "height": grid.cell_height}
+    fill: dict[str, Any] = {"field": "value", "transform": colours}
+    drawn = plot.rect("x", "y", source=cells, fill_color=fill, line_color=None, **size)
+    plot.add_layout(models.ColorBar(color_mapper=colours), "right")
+    tips = [("cell", "@cell_row,@cell_col"), *((n, f"@{{{n}}}{{0.000}}") for n in names)]
+    plot.add_tools(models.HoverTool(renderers=[drawn], tooltips=tips))
+    lines = contours(plan.workspace)
+    if lines:
+        xs, ys = [line[:, 0] for line in lines], [line[:, 1] for line in lines]
+        plot.multi_line(xs, ys, color="black", alpha=0.25, line_width=0.7)
+
+    paths = [_places(_cells(one), grid) for one in history["path"].values]
+    texts = [_text(history.isel(iteration=i)) for i in range(len(paths))]
+    n_missions = len(paths)
+    driven = models.ColumnDataSource(paths[-1])
+    plot.line(
+        "x", "y", source=driven, color="#d55e00", line_width=4, line_dash="dashed",
+        legend_label="path of the mission",
+    )  # fmt: skip
+    _draw_plan(plot, plan)
+    plot.legend.click_policy = "hide"
+    plot.legend.update(orientation="horizontal", ncols=2)
+    plot.add_layout(plot.legend[0], "below")
+
+    layer = models.Select(title="Layer", value=names[0], options=[*names, _PLANNED_ON])
+    mission = models.Slider(
+        title="Mission", start=1, end=max(n_missions, 2), value=n_missions, step=1,
+        visible=n_missions > 1, sizing_mode="stretch_width",
+    )  # fmt: skip
+    text = models.Div(text=texts[-1], sizing_mode="stretch_width")
+    shared = {
+        "cells": cells, "colours": colours, "driven": driven, "layer": layer, "mission": mission,
+        "text": text, "limits": limits, "paths": paths, "texts": texts, "planned_on": _PLANNED_ON,
+    }  # fmt: skip
+    update = models.CustomJS(args=shared, code=_UPDATE)
+    layer.js_on_change("value", update)
+    mission.js_on_change("value", update)
+    styles = {"max-width": "900px", "margin": "0 auto"}
+    return column(layer, mission, text, plot, sizing_mode="stretch_width", styles=styles)
+
+
+def _layers(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> dict[str, np.ndarray]:
+    """Values of each layer (row, col), by name; those of missions by "mission 1" and so on."""
+    free = plan.workspace.passable.values
+    layers = {
+        str(name).replace("_", " "): over_cells(values).transpose("row", "col").values
+        for name, values in maps.data_vars.items()
+        if values.ndim == 2
+    }
+    trust = history["trust_map"].transpose("iteration", "row", "col").values
+    layers |= {f"mission {i + 1}": values for i, values in enumerate(trust)}
+    return {name: np.where(free, values, np.nan) for name, values in layers.items()}
+
+
+def _draw_plan(plot: Any, plan: Plan) -> None:
+    """Draw the recommended path and, on a terrain, the posts and routes of the robots."""
+    grid = plan.workspace.grid
+    corner, path = np.array(grid.corner), _places(plan.path, grid)
+    plot.line(path["x"], path["y"], color="black", line_width=5, legend_label="recommended path")
+    plot.line(path["x"], path["y"], color="white", line_width=3, legend_label="recommended path")
+    for k, marker in ((0, "circle"), (-1, "star")):
+        end = [path["x"][k]], [path["y"][k]]
+        plot.scatter(*end, marker=marker, size=14, color="white", line_color="black")
+    if plan.posts is None or plan.ways is None:
+        return
+    for i, name in enumerate(plan.workspace.team.names):
+        x, y = (plan.posts[:, i] - corner).T
+        look = {"color": ROBOTS[i % len(ROBOTS)], "legend_label": f"{name}: posts, routes"}
+        marker = _MARKERS[i % len(_MARKERS)]
+        plot.scatter(x, y, marker=marker, size=8, line_color="white", **look)
+        routes = [ways[i + 1] - corner for ways in plan.ways if ways[i + 1] is not None]
+        plot.multi_line([r[:, 0] for r in routes], [r[:, 1] for r in routes], **look)
+
+
+def _cells(steps: np.ndarray) -> list[Cell]:
+    """Cells of a path of a history, which is padded with -1."""
+    return [(int(row), int(col)) for row, col in steps if row >= 0]
+
+
+def _places(path: Sequence[Cell], grid: Grid) -> dict[str, list[float]]:
+    """Positions of a path, metres from the lower left corner of the grid."""
+    x, y = (np.array([grid.center(cell) for cell in path]) - grid.corner).T
+    return {"x": x.tolist(), "y": y.tolist()}
+
+
+def _text(mission: xr.Dataset) -> str:
+    """Describe a mission in a line."""
+    return (
+        f"<b>Mission {int(mission['iteration'])}</b>: {escape(str(mission['status'].item()))}, "
+        f"contact rate {float(mission['contact_rate']):.3f}, "
+        f"{len(_cells(mission['path'].values)) - 1} bounds, "
+        f"objective {float(mission['objective']):.3f} when planned"
+    )

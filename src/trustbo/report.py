@@ -1,0 +1,228 @@
+"""Report of a result: one HTML page with its figures, tables and diagnostics."""
+
+import base64
+import io
+from collections.abc import Callable
+from html import escape
+from typing import Any
+
+import arviz_stats as azs
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+
+from trustbo import plots
+from trustbo.campaign.result import Result
+from trustbo.files import FilePath, write_text
+from trustbo.planning import Plan
+
+__all__ = ["write_report"]
+__dir__ = __all__.copy  # completion lists public names alone
+
+_DRAWS = 50
+"""Draws of the posterior behind the map of uncertainty."""
+_SHOWN = 3
+"""Bounds of the path that are drawn in detail: those with the least trust."""
+_ENDS = {"n_iterations": "all missions were run", "interrupted": "it was interrupted"}
+_PAGE = """<!DOCTYPE html>
+<html lang="en"><head><meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{title}</title>
+<style>
+body {{ font: 16px/1.5 system-ui, sans-serif; max-width: 52em; margin: 1.5em auto; padding: 0 1em;
+  color: #1c1f22; background: #fff }}
+h1 {{ font-size: 1.6em }} h2 {{ font-size: 1.2em; margin-top: 2em }}
+img {{ max-width: 100%; height: auto }}
+.wide {{ overflow-x: auto }}
+table {{ border-collapse: collapse; font-size: .85em; border: 0 }}
+td, th {{ padding: .2em .7em; text-align: right; border: 0; border-bottom: 1px solid #ddd }}
+.facts td, .facts th {{ text-align: left; vertical-align: top; font-size: 1.1em }}
+.note {{ color: #555; font-size: .9em }}
+</style></head><body>
+<h1>{title}</h1>
+{body}
+</body></html>
+"""
+
+
+def write_report(path: FilePath, result: Result) -> None:
+    """Write a result as one HTML page that needs no other file.
+
+    The page begins with the recommended path and what to expect on it; then come the trust map,
+    the missions, what is uncertain, and the diagnostics and settings.
+
+    Args:
+        path: File to write.
+        result: Result of a campaign with a posterior.
+
+    Raises:
+        TrustboError: Nothing could be learned yet, or the file cannot be written.
+    """
+    plan, body = result.plan, []
+    body += [_facts(result), *_path(plan), *_trust(result), *_missions(result)]
+    body += [*_uncertainty(result), *_diagnostics(result), *_settings(result)]
+    n = len(result.missions)
+    title = f"Recommended path after {n} mission{'s' * (n != 1)}"
+    write_text(path, _PAGE.format(title=title, body="\n".join(body)))
+
+
+def _facts(result: Result) -> str:
+    """Table of what decides whether to take the path."""
+    plan, trust = result.plan, np.minimum(result.plan.trust, 1.0).mean(1)
+    worst = int(np.argmin(trust))
+    cells = " → ".join(f"{row},{col}" for row, col in plan.path)
+    facts = {
+        "Path": f"{cells} (row,column; row 0 is north)",
+        "Length": f"{len(plan.path) - 1} bounds, {plan.length:.0f} m",
+        "Expected contact": f"{trust.mean():.1%} of the time, mean over robots and bounds",
+        "Weakest bound": f"bound {worst + 1} into cell {_name(plan.path[worst + 1])}, "
+        f"expected contact {trust[worst]:.1%}",
+        "Last mission": f"{result.missions[-1].status}, contact "
+        f"{np.nanmean(result.missions[-1].contact_rate):.1%} of the time",
+        "Campaign ended": _ENDS.get(result.stop_reason, result.stop_reason),
+    }
+    if plan.p_arrive is not None:
+        facts["Chance to arrive"] = f"{plan.p_arrive:.1%}, given the slope limit of the robots"
+    rows = "".join(
+        f"<tr><th>{escape(name)}</th><td>{escape(text)}</td></tr>" for name, text in facts.items()
+    )
+    return f'<table class="facts">{rows}</table>'
+
+
+def _path(plan: Plan) -> list[str]:
+    """Recommended path on the terrain with posts, and its bounds."""
+    content = [_heading("Recommended path")]
+    if plan.stops is not None:
+        weakest = sorted((np.argsort(plan.trust.mean(1))[:_SHOWN] + 1).tolist())
+        content += [
+            _image(lambda: plots.plan_map(plan, bounds=weakest), "path, posts and routes"),
+            _note(
+                "The path from its start (circle) to its goal (star), and the bounds with the "
+                "least trust. The robots watch from their posts while the lead drives, and then "
+                "follow to their next posts."
+            ),
+        ]
+    low, high = plan.bands[0], plan.bands[-1]
+    table = pd.DataFrame({
+        "cell": [_name(cell) for cell in plan.path[1:]],
+        "expected trust": plan.trust.mean(1),
+        "5 %": low.mean(1),
+        "95 %": high.mean(1),
+    }, index=pd.RangeIndex(1, len(plan.path), name="bound"))  # fmt: skip
+    return [*content, _table(table)]
+
+
+def _trust(result: Result) -> list[str]:
+    return [
+        _heading("Trust map"),
+        _image(result.plot_maps, "trust maps after some of the missions"),
+        _note(
+            "Expected trust in each cell with the path planned on it. A trust of 1 means unbroken "
+            "contact between the lead and the robots that watch it; grey cells are impassable."
+        ),
+    ]
+
+
+def _missions(result: Result) -> list[str]:
+    table = result.table()
+    columns = ("status", "contact_rate", "contact_lost", "objective", "regret", "n_bounds")
+    shown = table[[name for name in columns if name in table]].rename_axis("mission")
+    return [
+        _heading("Contact by mission"),
+        _image(lambda: plots.campaign_history(result.history), "contact and objective by mission"),
+        _table(shown.rename(columns=lambda name: name.replace("_", " "))),
+        _note(
+            "The objective is that of the plan before the mission, under the posterior of the "
+            f"missions before it: {result.settings['objective'].replace('_', ' ')}."
+        ),
+    ]
+
+
+def _uncertainty(result: Result) -> list[str]:
+    plan = result.plan
+    maps = result.planner.trust_summary(result.posterior, n_draws=_DRAWS)
+    driven = {bound.cell for mission in result.missions for bound in mission.bounds}
+    new = [_name(cell) for cell in plan.path[1:] if cell not in driven]
+    known = "Every cell of the path was entered before."
+    if new:
+        known = f"Cells of the path that were never entered: {', '.join(new)}."
+    band = ""
+    if plan.value_band is not None:
+        low, high = plan.value_band
+        band = (
+            f"The objective is {plan.value:.3g}, with a 90 % interval of {low:.3g} to {high:.3g}."
+        )
+    return [
+        _heading("What is uncertain"),
+        _image(
+            lambda: plots.cell_map(
+                maps["sd"], result.workspace, path=plan.path, label="sd of expected trust"
+            ),
+            "standard deviation of trust",
+        ),
+        _note(
+            f"{known} {band} The intervals hold if the model is right; `trustbo.criticism` checks "
+            "it. Trust where nobody drove follows from the terrain map, which may be out of date."
+        ),
+    ]
+
+
+def _diagnostics(result: Result) -> list[str]:
+    attrs = result.posterior.attrs
+    names = {
+        "k_hat": "Pareto k-hat (good below 0.7)",
+        "kish": "effective draws (Kish)",
+        "r_hat": "R-hat (good up to 1.01)",
+        "ess_bulk": "bulk ESS",
+        "divergences": "divergences",
+    }
+    last = result.history.isel(iteration=-1)
+    rows = {text: float(last[name]) for name, text in names.items() if name in last}
+    rows = {text: value for text, value in rows.items() if np.isfinite(value)}
+    summary = azs.summary(result.posterior, round_to="none")
+    kept = [name for name in ("mean", "sd", "eti89_lb", "eti89_ub") if name in summary]
+    return [
+        _heading("Diagnostics"),
+        _note(f"Sampler of the last posterior: {escape(str(attrs.get('sampler', 'unknown')))}."),
+        _table(pd.Series(rows, name="value").rename_axis("diagnostic").to_frame()),
+        _table(summary[kept or list(summary.columns)].rename_axis("parameter")),
+    ]
+
+
+def _settings(result: Result) -> list[str]:
+    texts = {name: str(value) for name, value in result.settings.items()}
+    short = {name: text for name, text in texts.items() if len(text) < 120}
+    return [
+        _heading("Settings"),
+        _table(pd.Series(short, name="value").rename_axis("setting").to_frame()),
+    ]
+
+
+def _name(cell: tuple[int, int]) -> str:
+    return f"{cell[0]},{cell[1]}"
+
+
+def _heading(text: str) -> str:
+    return f"<h2>{escape(text)}</h2>"
+
+
+def _note(text: str) -> str:
+    return f'<p class="note">{escape(text)}</p>'
+
+
+def _table(frame: pd.DataFrame) -> str:
+    html = frame.reset_index().to_html(
+        index=False, border=0, float_format=lambda x: f"{x:.3g}", na_rep="-"
+    )
+    return f'<div class="wide">{html}</div>'
+
+
+def _image(draw: Callable[[], Any], alt: str) -> str:
+    """Draw a figure and return it as an image of the page."""
+    with plt.style.context("default"):
+        figure = np.ravel(draw())[0].get_figure(root=True)
+        file = io.BytesIO()
+        figure.savefig(file, format="png", dpi=130, bbox_inches="tight")
+        plt.close(figure)
+    data = base64.b64encode(file.getvalue()).decode()
+    return f'<img alt="{escape(alt)}" src="data:image/png;base64,{data}">'

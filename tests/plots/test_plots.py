@@ -1,0 +1,116 @@
+"""Figures: they draw on new axes and on those of the user, and show the numbers given."""
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+import pytest
+
+import trustbo as tb
+from trustbo import plots
+from trustbo.plots.maps import contour_interval, contours, extent_of
+from trustbo.report import write_report
+
+RUNS = pd.DataFrame(
+    [
+        {"policy": policy, "mission": mission, "regret": run + 10.0 / mission}
+        for policy in ("greedy", "random") for run in range(5) for mission in (1, 2, 3)
+    ]
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def result():
+    terrain = tb.terrain.synthetic_terrain((80.0, 60.0), 2.0, seed=0, relief=4.0)
+    workspace = tb.Workspace.from_terrain(terrain, (4, 3))
+    return tb.iterate(workspace, (3, 0), (0, 2), n_iterations=2, seed=1, progress=False)
+
+
+FIGURES = {
+    "trust_maps": (lambda r, ax: r.plot_maps(ax=ax), 3),
+    "terrain_maps": (lambda r, ax: plots.terrain_maps(r.workspace, ax=ax), 4),
+    "cell_map": (lambda r, ax: plots.cell_map(r.trust_map, r.workspace, path=r.path, ax=ax), 1),
+    "plan_map": (lambda r, ax: plots.plan_map(r.plan, bounds=[1], ax=ax), 2),
+    "trust_curves": (lambda r, ax: plots.trust_curves(r.posterior, ax=ax), 3),
+    "trust_curves of a plan": (lambda r, ax: plots.trust_curves(r.plan, ax=ax), 3),
+    "campaign_history": (lambda r, ax: r.plot_history(ax=ax), 2),
+    "regret_curves": (lambda r, ax: plots.regret_curves(RUNS, ax=ax), 1),
+    "grid_map": (lambda r, ax: plots.grid_map(r.workspace, ax=ax), 1),
+}
+
+
+@pytest.fixture(autouse=True)
+def close_figures():
+    yield
+    plt.close("all")
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_a_figure_draws_on_new_axes_and_on_those_of_the_user(name, result):
+    draw, n = FIGURES[name]
+    made = np.ravel(draw(result, None))
+    made[0].figure.canvas.draw()
+    assert len(made) == n
+    _, axes = plt.subplots(2, 2, layout="constrained", figsize=(3.5, 4.0))
+    drawn = np.ravel(draw(result, axes.ravel()[:n]))
+    assert list(drawn) == list(axes.ravel()[:n])
+    drawn[0].figure.canvas.draw()
+
+
+def test_settings_of_matplotlib_stay_as_they_were(result):
+    before = dict(plt.rcParams)
+    result.plot_maps()
+    assert dict(plt.rcParams) == before
+
+
+def test_too_few_axes_are_refused(result):
+    with pytest.raises(tb.TrustboError, match="ax"):
+        result.plot_maps(ax=plt.gca())
+
+
+def test_a_map_shows_the_values_of_passable_cells_in_metres(result):
+    ax = plots.cell_map(result.trust_map, result.workspace, limits=(0.0, 1.0))
+    free = result.workspace.passable.values
+    shown = np.ma.filled(ax.images[0].get_array(), np.nan)
+    np.testing.assert_array_equal(shown, np.where(free, result.trust_map.values, np.nan))
+    assert tuple(ax.images[0].get_extent()) == extent_of(result.workspace.grid) == (0, 60, 0, 80)
+
+
+def test_a_path_goes_through_the_centres_of_its_cells(result):
+    _, ax = plt.subplots()
+    plots.draw_path(ax, [(3, 0), (2, 1)], result.workspace.grid)
+    np.testing.assert_allclose(ax.lines[0].get_xydata(), [(10.0, 10.0), (30.0, 30.0)])
+
+
+def test_contour_lines_of_a_plane_are_level():
+    terrain = tb.terrain.synthetic_terrain((80.0, 60.0), 2.0, seed=0, relief=4.0)
+    terrain["dem"] = terrain["dem"] * 0.0 + np.arange(terrain.sizes["y"])[:, None]
+    terrain["dsm"] = terrain["dem"]
+    lines = contours(tb.Workspace.from_terrain(terrain, (4, 3)))
+    assert len(lines) > 3
+    assert all(np.ptp(line[:, 1]) < 1e-6 for line in lines)
+    assert [contour_interval(relief) for relief in (0.0, 12.0, 60.0, 240.0)] == [None, 1, 5, 20]
+
+
+def test_regret_curves_show_medians(result):
+    ax = plots.regret_curves(RUNS)
+    np.testing.assert_allclose(ax.lines[0].get_ydata(), [12.0, 7.0, 2.0 + 10.0 / 3.0])
+    with pytest.raises(tb.TrustboError, match="column"):
+        plots.regret_curves(RUNS, by="model")
+
+
+def test_the_explorer_is_one_page_without_addresses(result, tmp_path):
+    page = result.explore()
+    page.save(tmp_path / "map.html")
+    html = (tmp_path / "map.html").read_text(encoding="utf-8")
+    assert '<script src="http' not in html
+    assert '<link rel="stylesheet" href="http' not in html
+    assert "trust mean" in html
+    assert page._repr_html_().startswith("<iframe")
+
+
+def test_the_report_is_one_page_with_the_path_and_every_figure(result, tmp_path):
+    write_report(tmp_path / "report.html", result)
+    html = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "→".join(f" {row},{col} " for row, col in result.path).strip() in html
+    assert html.count('src="data:image/png;base64,') == 4
+    assert "http" not in html
