@@ -9,7 +9,7 @@ from worlds import hillside
 
 import trustbo as tb
 from trustbo.cli import FORMATS, OBJECTIVES, POLICIES, main
-from trustbo.export import FORMATS as ALL_FORMATS
+from trustbo.export import WRITERS as ALL_FORMATS
 
 
 def call(*words):

@@ -8,7 +8,7 @@ import pytest
 import xarray as xr
 
 import trustbo as tb
-from trustbo.export import write_csv, write_path
+from trustbo.export import write_geojson
 from trustbo.inference import (
     TrustFilter,
     by_rate,
@@ -284,10 +284,9 @@ MISTAKES = {
     "a simulator on text": (lambda c: ModelSimulator("x", TRUTH), "workspace: got str 'x'"),
     "a simulator of a number": (lambda c: ModelSimulator(c.workspace, 3), "params: got int 3"),
     "a path exported to nowhere": (
-        lambda c: write_path(None, c.result), "path of a file or folder; got a NoneType"
+        lambda c: write_geojson(None, c.result), "path of a file or folder; got a NoneType"
     ),
-    "a number exported": (lambda c: write_path("p.csv", 3), "plan: got int 3; give a Plan"),
-    "a table of a number": (lambda c: write_csv("p.csv", 3), "result: got int 3; give a Result"),
+    "a number exported": (lambda c: write_geojson("p.csv", 3), "plan: got int 3; give a Plan"),
     "latitude first": (
         lambda c: GRID.cell_at_lonlat(46.5, 200.0),
         r"'lon=46.5,lat=200' .*no place of the CRS.*outside the grid",

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 POLICIES = ("greedy", "optimistic", "thompson", "ucb", "random")
 OBJECTIVES = ("lost_contact", "terminal", "mean")
-FORMATS = ("geotiff", "geojson", "geopackage", "csv", "ros_map", "nav2")
+FORMATS = ("geotiff", "geojson", "csv", "nav2")
 BAD_INPUT, REFUSED, INTERRUPTED = 2, 3, 130
 EPILOG = "exit codes: 0 done; 2 bad input; 3 the posterior was refused; 130 interrupted"
 PLACE = "ROW,COL, with row 0 in the north; or x=...,y=... in metres of the CRS; or lon=...,lat=..."

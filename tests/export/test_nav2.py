@@ -1,64 +1,73 @@
-"""Waypoints for Nav2."""
+"""Files for Nav2, read as its loaders read them."""
 
-import math
+import json
 
+import networkx as nx
 import numpy as np
 import pytest
-import yaml
 
 from trustbo.errors import TrustboError
-from trustbo.export import Frame, write_waypoints
-from trustbo.export.frame import OF_CRS
-from trustbo.export.poses import onward
+from trustbo.export import Frame, write_nav2, write_ros_map
 
 
-def poses_of(file):
-    """Poses (x, y, heading) of a goal of FollowWaypoints: `poses`, geometry_msgs/PoseStamped[]."""
-    (name, stamped), *others = yaml.safe_load(file.read_text()).items()
-    assert (name, others) == ("poses", [])
-    poses = []
-    for one in stamped:
-        assert one.keys() == {"header", "pose"}
-        assert one["header"] == {"frame_id": "odom"}
-        place, turn = one["pose"]["position"], one["pose"]["orientation"]
-        assert place["z"] == turn["x"] == turn["y"] == 0.0
-        assert math.hypot(turn["z"], turn["w"]) == pytest.approx(1.0)
-        poses.append((place["x"], place["y"], 2.0 * math.atan2(turn["z"], turn["w"])))
-    return np.array(poses)
+def picture(file):
+    """Pixels of a PGM file, the northern row first."""
+    kind, size, most, pixels = file.read_bytes().split(b"\n", 3)
+    assert (kind, most) == (b"P5", b"255")
+    width, height = map(int, size.split())
+    return np.frombuffer(pixels, dtype=np.uint8).reshape(height, width)
 
 
-@pytest.mark.parametrize("robot", ["lead", "r2"])
-def test_waypoints_are_the_stops_of_a_robot_in_the_frame(result, tmp_path, robot):
-    plan, angle = result.plan, 0.3
-    origin = np.array([380010.0, 5224920.0])
-    write_waypoints(
-        tmp_path / "w.yaml", result, robot=robot, frame=Frame(tuple(origin), angle, "odom"),
-    )  # fmt: skip
-    assert yaml.safe_load((tmp_path / "w_frame.yaml").read_text())["rotation"] == angle
-    poses = poses_of(tmp_path / "w.yaml")
-    c, s = math.cos(angle), math.sin(angle)
-    places = poses[:, :2] @ [[c, s], [-s, c]] + origin
-    headings = np.column_stack([np.cos(poses[:, 2] + angle), np.sin(poses[:, 2] + angle)])
-    if robot == "lead":
-        np.testing.assert_allclose(places, plan.stops, rtol=0.0, atol=1e-6)
-        ahead = np.diff(plan.stops, axis=0)
-        ahead = np.vstack([ahead, ahead[-1:]])
-    else:
-        at_goal = plan.ways[-1][2][-1]  # ways begin with the lead's
-        expected = np.vstack([plan.posts[:, 1], at_goal])
-        np.testing.assert_allclose(places, expected, rtol=0.0, atol=1e-6)
-        ahead = np.vstack([plan.stops[1:], plan.stops[-1:]]) - expected
-    np.testing.assert_allclose(headings, ahead / np.linalg.norm(ahead, axis=1)[:, None], atol=1e-9)
+@pytest.mark.parametrize("rotation", [0.0, 0.7])
+def test_pixels_are_the_costs_of_the_cells_at_their_centres(rotation, result, tmp_path):
+    workspace, cost = result.workspace, result.maps()["cost"]
+    grid, frame = workspace.grid, Frame(workspace.grid.center((1, 1)), rotation)
+    write_ros_map(tmp_path / "map.yaml", cost, workspace, frame=frame, pixel=3.0)
+    about = json.loads((tmp_path / "map.yaml").read_text())
+    values = picture(tmp_path / about["image"])[::-1]
+    for row, col in [(0, 0), (0, 1), (1, 2), (2, 3)]:
+        x, y = (frame.of_crs(grid.center((row, col))) - about["origin"][:2]) / about["resolution"]
+        expected = 100 if not workspace.passable[row, col] else round(100 * float(cost[row, col]))
+        assert values[int(y), int(x)] == min(expected, 98 if workspace.passable[row, col] else 100)
+    assert (values[0, 0] == 255) == (rotation > 0.0)
+    for bad in ({"cost": cost + 1.0}, {"pixel": 1e-4}):
+        with pytest.raises(TrustboError, match=next(iter(bad))):
+            write_ros_map(tmp_path / "no.yaml", **{"cost": cost, "workspace": workspace,
+                          "frame": frame, "pixel": 3.0} | bad)  # fmt: skip
 
 
-def test_what_cannot_be_followed_is_refused(result, nowhere, tmp_path):
-    with pytest.raises(TrustboError, match="unknown robot 'r9'; choose one of lead, r1, r2, r3"):
-        write_waypoints(tmp_path / "w.yaml", result, robot="r9")
-    with pytest.raises(TrustboError, match="a plan has posts and ways where its workspace was"):
-        write_waypoints(tmp_path / "w.yaml", nowhere, frame=OF_CRS)
-    assert list(tmp_path.iterdir()) == []
+def test_waypoints_are_stops_and_posts_that_look_at_the_lead(result, tmp_path):
+    plan, frame = result.plan, Frame(result.workspace.grid.center(result.path[0]), 0.3, "odom")
+    write_nav2(tmp_path / "größe", result, frame=frame)
+    for robot, expected in (("lead", plan.stops), ("r2", plan.posts[:, 1])):
+        poses = json.loads((tmp_path / "größe" / f"waypoints_{robot}.yaml").read_text())["poses"]
+        assert {pose["header"]["frame_id"] for pose in poses} == {"odom"}
+        places = [[p["pose"]["position"][axis] for axis in "xy"] for p in poses]
+        found = frame.to_crs(places)[: len(expected)]
+        np.testing.assert_allclose(found, expected, atol=1e-6)
+        turns = [p["pose"]["orientation"] for p in poses]
+        heading = frame.rotation + np.array([2.0 * np.arctan2(q["z"], q["w"]) for q in turns])
+        to = plan.stops[1:] - expected[: len(plan.stops) - 1]
+        ahead = np.column_stack([np.cos(heading), np.sin(heading)])[: len(to)]
+        np.testing.assert_allclose(ahead, to / np.linalg.norm(to, axis=1)[:, None], atol=1e-9)
+    about = json.loads((tmp_path / "größe" / "frame.yaml").read_text())
+    assert (about["origin"], about["rotation"]) == ([*frame.origin], 0.3)
 
 
-def test_a_robot_that_stands_faces_its_next_place():
-    places = np.array([[0.0, 0.0], [0.0, 0.0], [0.0, 2.0], [3.0, 2.0]])
-    np.testing.assert_allclose(onward(places)[:, 2], [np.pi / 2, np.pi / 2, 0.0, 0.0])
+def test_the_route_graph_has_the_costs_of_all_bounds(result, tmp_path):
+    write_nav2(tmp_path, result)
+    features = json.loads((tmp_path / "route_graph.geojson").read_text())["features"]
+    about = [feature["properties"] for feature in features]
+    nodes = {one["id"]: (one["metadata"]["row"], one["metadata"]["col"])
+             for one in about if "startid" not in one}  # fmt: skip
+    edges = [one for one in about if "startid" in one]
+    assert len({one["id"] for one in about}) == len(about)
+    found = nx.DiGraph()
+    for one in edges:
+        found.add_edge(nodes[one["startid"]], nodes[one["endid"]], cost=one["cost"])
+        assert one["cost"] == one["metadata"]["penalty"] > 0.0
+    planner = result.planner.with_objective("lost_contact")
+    graph = planner.graph_of(result.posterior)
+    assert {*found.edges} == {*graph.edges}
+    for a, c, lost in graph.edges(data="lost"):
+        assert found.edges[a, c]["cost"] == pytest.approx(max(lost, 1e-9))

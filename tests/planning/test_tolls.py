@@ -1,13 +1,11 @@
 """Tolls on the time in which nobody sees anybody, in closed form and beside missions."""
 
-import json
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
 from trustbo import Workspace, iterate
-from trustbo.export import write_path
 from trustbo.inference import sample_prior
 from trustbo.models import PooledTrust, TrustParams
 from trustbo.planning import Planner
@@ -112,6 +110,3 @@ def test_campaigns_pay_for_the_time_unseen_and_say_so(workspace, tmp_path):
     assert plan.unseen_toll == pytest.approx(2.5 * unseen)
     kept = plan_from_record(plan_to_record(plan), workspace)
     assert kept.unseen_toll == plan.unseen_toll
-    write_path(tmp_path / "path.geojson", plan)
-    line = json.loads((tmp_path / "path.geojson").read_text())["features"][0]["properties"]
-    assert line["unseen_toll"] == plan.unseen_toll

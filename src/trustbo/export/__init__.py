@@ -1,28 +1,38 @@
 """Results as files for other programs: GIS, robots, tables."""
 
-from trustbo.export.everything import FORMATS, export_result
-from trustbo.export.frame import Frame, write_frame
-from trustbo.export.nav2 import write_waypoints
-from trustbo.export.paths import path_frame, write_path
-from trustbo.export.rasters import write_geotiff
-from trustbo.export.ros import write_ros_map
-from trustbo.export.route_graph import RouteGraph
-from trustbo.export.route_graph_file import edge_updates, write_route_graph
-from trustbo.export.tables import write_csv
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from trustbo.campaign.result import Result
+from trustbo.errors import require_choice
+from trustbo.export.gis import write_csv, write_geojson, write_geotiff
+from trustbo.export.nav2 import Frame, write_nav2, write_ros_map
+from trustbo.files import FilePath, require_folder
+
+WRITERS: dict[str, Callable[[Path, Result], None]] = {
+    "geotiff": write_geotiff,
+    "geojson": write_geojson,
+    "csv": write_csv,
+    "nav2": write_nav2,
+}
+"""Writers of a result to a path, by format."""
+FILES = {"geotiff": "maps.tif", "geojson": "path.geojson", "csv": "missions.csv", "nav2": "nav2"}
+"""Names of what `export_result` writes to a folder, by format."""
+
+
+def export_result(
+    result: Result, folder: FilePath, formats: Sequence[str] = ("geotiff", "geojson")
+) -> list[Path]:
+    """Write a result to a folder in several formats, keys of `WRITERS`; return what was written."""
+    target = require_folder(folder)
+    chosen = [require_choice("format", name, WRITERS) for name in formats]
+    for name in chosen:
+        WRITERS[name](target / FILES[name], result)
+    return [target / FILES[name] for name in chosen]
+
 
 __all__ = [
-    "FORMATS",
-    "Frame",
-    "RouteGraph",
-    "edge_updates",
-    "export_result",
-    "path_frame",
-    "write_csv",
-    "write_frame",
-    "write_geotiff",
-    "write_path",
-    "write_ros_map",
-    "write_route_graph",
-    "write_waypoints",
+    "FILES", "WRITERS", "Frame", "export_result", "write_csv", "write_geojson", "write_geotiff",
+    "write_nav2", "write_ros_map",
 ]  # fmt: skip
 __dir__ = __all__.copy  # completion lists public names alone

@@ -1,79 +1,229 @@
-"""Waypoints of robots for Nav2."""
+"""Files for Nav2: cost map for map_server, stops for FollowWaypoints, graph for its route server.
 
+Positions are in a frame with its origin near the robots: RViz and Nav2 hold them in float32, which
+is coarse at the coordinates of a CRS. `frame.yaml` has the frame's pose in the CRS. The files are
+JSON, which is YAML.
+"""
+
+import json
 import math
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
-import yaml
+import xarray as xr
 
 from trustbo.campaign.result import Result
-from trustbo.errors import require_choice
-from trustbo.export.checks import LEAD
-from trustbo.export.frame import AT_START, Frame, PlacedFrame, frame_file, placed, save_beside
-from trustbo.export.layers import complete_routes, plan_of
-from trustbo.export.poses import onward, towards
-from trustbo.files import FilePath, require_file, write_text
+from trustbo.errors import TrustboError, require_choice, require_positive
+from trustbo.export.gis import LEAD
+from trustbo.files import FilePath, require_file, write_file, write_text
 from trustbo.planning import Plan
+from trustbo.planning.problem import mean_of
+from trustbo.workspace import Workspace
+from trustbo.workspace.location import crs_name
+from trustbo.workspace.moves import MOVES
+
+IMPASSABLE, UNKNOWN, WORST = 100, 255, 98
+"""Pixels of a cost map; costmaps publish 99 and 100 where no robot may go."""
+_MOST_PIXELS = 1e8
+_MOST_IDS = 65_535
+"""Largest id in messages of Nav2 (uint16)."""
+_LEAST_COST = 1e-9
+"""Least cost of an edge: the route server refuses 0."""
 
 
-def write_waypoints(
-    path: FilePath,
-    plan: Plan | Result,
-    *,
-    robot: str = LEAD,
-    frame: Frame | PlacedFrame = AT_START,
+class Frame(NamedTuple):
+    """Frame of robots: a pose in the CRS.
+
+    Attributes:
+        origin: Position of (0, 0) of the frame, x and y in CRS metres.
+        rotation: Angle from east, the CRS's x axis, to that of the frame, rad, anticlockwise.
+        name: Name, the `frame_id` of messages.
+    """
+
+    origin: tuple[float, float]
+    rotation: float = 0.0
+    name: str = "map"
+
+    def of_crs(self, xy: Any) -> np.ndarray:
+        """Positions in the frame of positions in the CRS, (..., 2), m."""
+        c, s = math.cos(self.rotation), math.sin(self.rotation)
+        return (np.asarray(xy, dtype=float) - self.origin) @ np.array([[c, -s], [s, c]])
+
+    def to_crs(self, xy: Any) -> np.ndarray:
+        """Positions in the CRS of positions in the frame, (..., 2), m."""
+        c, s = math.cos(self.rotation), math.sin(self.rotation)
+        return np.asarray(xy, dtype=float) @ np.array([[c, s], [-s, c]]) + self.origin
+
+
+def write_nav2(
+    folder: FilePath, result: Result, *, frame: Frame | None = None, pixel: float | None = None
 ) -> None:
-    """Write the stops of a robot in order as a goal of the action FollowWaypoints of Nav2.
-
-    They are the lead's stops, each towards the next; of another robot its posts, each towards the
-    lead's next stop, then its place at the goal. No robot waits for the others by the file: send T2
-    on when the lead has stopped, and the lead when T2 has. A file of the frame is written as by
-    `write_ros_map`.
+    """Write the cost map, each robot's waypoints, the route graph and the frame to a folder.
 
     Args:
-        path: .yaml or .yml file to write, or to replace.
-        plan: Plan, or result whose recommended path is meant, on a terrain in memory.
-        robot: Name of a robot of T2, or `"lead"`.
-        frame: Frame, by default at the start of the path.
+        folder: Folder of `cost_map.yaml` and `.pgm`, `waypoints_<robot>.yaml` (on a terrain),
+            `route_graph.geojson` and `frame.yaml`.
+        result: Result of a campaign.
+        frame: Frame of all files, by default with its origin at the start of the path.
+        pixel: Side of a pixel of the map, m; by default a tenth of a cell's shorter side.
 
     Raises:
-        TrustboError: An unknown robot; one that has no way in a bound; no terrain in memory; or an
-            argument is refused by `write_ros_map`.
+        TrustboError: A robot has no way in a bound; more cells than ids of Nav2; a map of too many
+            pixels; or a file cannot be written.
+    """
+    folder, workspace = Path(folder), result.workspace
+    place = frame or Frame(workspace.grid.center(result.path[0]))
+    names = () if result.plan.stops is None else (LEAD, *workspace.team.names)
+    stops = {robot: stops_of(result.plan, robot, place) for robot in names}
+    graph = _graph(result, place)
+    write_ros_map(folder / "cost_map.yaml", result.maps()["cost"], workspace, frame=place,
+                  pixel=pixel)  # fmt: skip
+    for robot, poses in stops.items():
+        listed = [_pose(place.name, *pose) for pose in poses.tolist()]
+        write_text(folder / f"waypoints_{robot}.yaml", json.dumps({"poses": listed}, indent=1))
+    write_text(folder / "route_graph.geojson", graph)
+    parent = "grid" if workspace.grid.crs is None else crs_name(workspace.grid)
+    about = {"frame": place.name, "parent": parent, "origin": [*place.origin]}
+    write_text(folder / "frame.yaml", json.dumps(about | {"rotation": place.rotation}))
+
+
+def write_ros_map(
+    path: FilePath,
+    cost: xr.DataArray,
+    workspace: Workspace,
+    *,
+    frame: Frame,
+    pixel: float | None = None,
+) -> None:
+    """Write a cost map for map_server of ROS 1 and of Nav2: a .yaml and a .pgm file.
+
+    Args:
+        path: .yaml file to write, or to replace.
+        cost: Cost map of the cells, in [0, 1], NaN where unknown, e.g. `Result.maps()["cost"]`. It
+            is written as 100 times the cost, at most 98; 100 is impassable, 255 unknown.
+        workspace: Workspace of the cells.
+        frame: Frame; pixels lie along its axes, and have the cost of the cell at their centre.
+        pixel: Side of a pixel, m; by default a tenth of a cell's shorter side.
+
+    Raises:
+        TrustboError: A cost outside [0, 1], or a map of too many pixels.
     """
     target = require_file(path, ".yaml", ".yml")
-    frame_file(target)
-    plan = plan_of(plan)
+    values, corner, side = occupancy(cost.values, workspace, frame, pixel)
+    picture = target.with_suffix(".pgm")
+    # Pictures begin in the north. In raw mode, map_server takes the byte of a pixel as its value.
+    pixels = f"P5\n{values.shape[1]} {values.shape[0]}\n255\n".encode() + values[::-1].tobytes()
+    write_file(picture, lambda file: file.write_bytes(pixels))
+    about = {"image": picture.name, "mode": "raw", "resolution": side, "origin": [*corner, 0.0],
+             "negate": 0, "occupied_thresh": 0.65, "free_thresh": 0.196}  # fmt: skip
+    write_text(target, json.dumps(about))
+
+
+def occupancy(
+    cost: np.ndarray, workspace: Workspace, frame: Frame, pixel: float | None = None
+) -> tuple[np.ndarray, list[float], float]:
+    """Pixels (row, col), uint8, the southern row first; their lower left corner; their side, m."""
+    if ((cost < 0.0) | (cost > 1.0)).any():
+        raise TrustboError(
+            f"cost must be in [0, 1]; got {np.nanmin(cost):g} to {np.nanmax(cost):g}."
+        )
+    grid, (rows, cols) = workspace.grid, workspace.grid.shape
+    shorter = min(grid.cell_height, grid.cell_width)
+    side = float(f"{shorter / 10.0:.2g}") if pixel is None else require_positive("pixel", pixel)
+    left, bottom, right, top = grid.bounds
+    corners = frame.of_crs([[x, y] for x in (left, right) for y in (bottom, top)])
+    corner = corners.min(0)
+    # The quotient may be whole up to rounding.
+    n_x, n_y = np.ceil(np.ptp(corners, axis=0) / side - 1e-6).astype(int)
+    if float(n_x) * float(n_y) > _MOST_PIXELS:
+        raise TrustboError(f"pixel={side:g} m gives {n_x} x {n_y} pixels; take a larger one.")
+    percent = np.where(np.isnan(cost), UNKNOWN, np.fmin(np.rint(100.0 * cost), WORST))
+    percent = np.where(workspace.passable.values, percent, IMPASSABLE)
+    values = np.full((n_y, n_x), UNKNOWN, dtype=np.uint8)
+    for i in range(n_y):  # row by row, as maps may be large
+        x = (np.arange(n_x) + 0.5) * side
+        places = frame.to_crs(np.column_stack([x, np.full(n_x, (i + 0.5) * side)]) + corner)
+        col = np.floor((places[:, 0] - left) / grid.cell_width).astype(int)
+        row = rows - 1 - np.floor((places[:, 1] - bottom) / grid.cell_height).astype(int)
+        inside = (row >= 0) & (row < rows) & (col >= 0) & (col < cols)
+        values[i, inside] = percent[row[inside], col[inside]]
+    return values, corner.tolist(), side
+
+
+def stops_of(plan: Plan, robot: str, frame: Frame) -> np.ndarray:
+    """Poses of a robot's stops in a frame, (stop, 3): x, y and heading.
+
+    The lead's stops look at the next; a robot's posts, and its place at the goal, at the lead's
+    next stop. No robot waits for the others by the file. TrustboError: no terrain or way.
+    """
     require_choice("robot", robot, (LEAD, *plan.workspace.team.names))
-    place = placed(frame, plan.workspace, plan.path[0])
-    poses = [
-        {
-            "header": {"frame_id": place.name},
-            "pose": {
-                "position": {"x": x, "y": y, "z": 0.0},
-                "orientation": {
-                    "x": 0.0, "y": 0.0, "z": math.sin(0.5 * turn), "w": math.cos(0.5 * turn)
-                },
-            },
-        }
-        for x, y, turn in stops_of(plan, robot, place).tolist()
-    ]  # fmt: skip
-    about = (
-        "# Goal of the action FollowWaypoints of Nav2:\n"
-        "#   ros2 action send_goal /follow_waypoints nav2_msgs/action/FollowWaypoints "
-        f'"$(cat {target.name})"\n'
-        "# It does not have the robot wait for the others.\n"
-    )
-    write_text(target, about + yaml.safe_dump({"poses": poses}, sort_keys=False))
-    save_beside(target, frame, place, plan.workspace)
-
-
-def stops_of(plan: Plan, robot: str, place: PlacedFrame) -> np.ndarray:
-    """Poses of a robot's stops in a frame, (stop, 3); TrustboError: it has no way in a bound."""
-    ways = complete_routes(plan)[robot]
-    assert plan.stops is not None and plan.posts is not None  # noqa: S101, PT018  # it has ways
-    of_lead = place.of_crs(plan.stops)
+    if plan.stops is None or plan.posts is None or plan.ways is None:
+        raise TrustboError("waypoints need a terrain; use Workspace.from_terrain.")
+    lead = frame.of_crs(plan.stops)
     if robot == LEAD:
-        return onward(of_lead)
-    posts = place.of_crs(plan.posts[:, plan.workspace.team.names.index(robot)])
-    stops = np.vstack([posts, place.of_crs(ways[-1][-1:])])
-    watched = np.vstack([of_lead[1:], of_lead[-1:]])
-    return towards(stops, watched - stops)
+        steps = np.diff(lead, axis=0)
+        return _towards(lead, np.vstack([steps, steps[-1:]]))
+    i = plan.workspace.team.names.index(robot)
+    ways = [of_bound[i + 1] for of_bound in plan.ways]
+    if any(way is None for way in ways) or ways[-1] is None:
+        raise TrustboError(f"{robot} has no way in a bound; plan another path.")
+    places = frame.of_crs(np.vstack([plan.posts[:, i], ways[-1][-1:]]))
+    return _towards(places, np.vstack([lead[1:], lead[-1:]]) - places)
+
+
+def _towards(places: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    return np.column_stack([places, np.arctan2(steps[:, 1], steps[:, 0])])
+
+
+def _pose(frame: str, x: float, y: float, turn: float) -> dict[str, Any]:
+    turned = {"x": 0.0, "y": 0.0, "z": math.sin(turn / 2.0), "w": math.cos(turn / 2.0)}
+    pose = {"position": {"x": x, "y": y, "z": 0.0}, "orientation": turned}
+    return {"header": {"frame_id": frame}, "pose": pose}
+
+
+def _graph(result: Result, frame: Frame) -> str:
+    """All bounds with the contact each loses, as GeoJSON of Nav2's route server.
+
+    Nodes are the stops of cells, row * columns + column, and edges straight, (1 + move) * cells +
+    the cell entered. Costs are in `metadata`, for its scorer PenaltyScorer.
+    """
+    workspace = result.workspace
+    cols, n_cells = workspace.grid.shape[1], math.prod(workspace.grid.shape)
+    if (1 + len(MOVES[8])) * n_cells - 1 > _MOST_IDS:
+        raise TrustboError(
+            f"a route graph of {n_cells} cells has ids beyond {_MOST_IDS}, which messages of Nav2 "
+            "hold; take larger cells."
+        )
+    planner, ground = result.planner.with_objective("lost_contact"), workspace.ground
+    graph = planner.graph_of(mean_of(result.posterior))
+    place = workspace.grid.center if ground is None else ground.posts.stop
+    where = {cell: frame.of_crs(place(cell)).tolist() for cell in graph.nodes}
+    features = []
+    for (row, col), xy in where.items():
+        about = {"id": row * cols + col, "frame": frame.name, "metadata": {"row": row, "col": col}}
+        features.append(_feature("Point", xy, about))
+    for a, c, lost in graph.edges(data="lost"):
+        move = list(MOVES[8]).index((c[0] - a[0], c[1] - a[1]))
+        first, last = (row * cols + col for row, col in (a, c))
+        cost = max(float(lost), _LEAST_COST)
+        about = {"id": (1 + move) * n_cells + last, "startid": first, "endid": last, "cost": cost}
+        about |= {"overridable": True, "metadata": {"penalty": cost}}
+        features.append(_feature("MultiLineString", [[where[a], where[c]]], about))
+    return '{"type": "FeatureCollection", "features": [\n' + ",\n".join(features) + "\n]}\n"
+
+
+def _feature(kind: str, coordinates: list[Any], properties: dict[str, Any]) -> str:
+    geometry = {"type": kind, "coordinates": coordinates}
+    return _json({"type": "Feature", "properties": properties, "geometry": geometry})
+
+
+def _json(value: Any) -> str:
+    """JSON of plain values, floats with a decimal point: the loader takes others as integers."""
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{json.dumps(k)}: {_json(v)}" for k, v in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(_json, value)) + "]"
+    if isinstance(value, float):
+        return np.format_float_positional(value, trim="0")
+    return json.dumps(value)

@@ -1,0 +1,176 @@
+"""Files for GIS: maps as GeoTIFF; the path, posts and ways of a plan as GeoJSON; CSV."""
+
+import json
+from typing import Any
+
+import numpy as np
+import rasterio
+import rioxarray  # noqa: F401  (registers the .rio accessor)
+import shapely
+import xarray as xr
+from rasterio.warp import transform
+from shapely import affinity
+
+from trustbo.campaign.result import Result
+from trustbo.errors import TrustboError, require_kind
+from trustbo.files import FilePath, require_file, write_file, write_text
+from trustbo.logs.table import to_frame
+from trustbo.planning import Plan
+from trustbo.planning.plan import QUANTILES
+
+LEAD = "lead"
+"""Name of the lead among the robots."""
+_BAND = {"low": QUANTILES.index(0.05), "high": QUANTILES.index(0.95)}
+
+
+def write_geotiff(path: FilePath, maps: Result | xr.Dataset) -> None:
+    """Write maps of the planning cells as the bands of a GeoTIFF in the terrain's CRS.
+
+    Bands are float32, named after their variables, with the long name as metadata; NaN is nodata.
+
+    Args:
+        path: .tif or .tiff file to write, or to replace.
+        maps: Result, or maps of one: `Result.maps()`.
+
+    Raises:
+        TrustboError: The maps have no CRS, or the file cannot be written.
+    """
+    maps = maps.maps() if isinstance(maps, Result) else maps
+    target = require_file(path, ".tif", ".tiff")
+    if maps.rio.crs is None:
+        raise TrustboError(_NO_CRS)
+    profile = {
+        "driver": "GTiff", "interleave": "band", "height": maps.sizes["y"],
+        "width": maps.sizes["x"], "count": len(maps.data_vars), "dtype": "float32",
+        "nodata": np.nan, "crs": maps.rio.crs, "transform": maps.rio.transform(),
+        "compress": "deflate",
+    }  # fmt: skip
+
+    def write(file: Any) -> None:
+        with rasterio.open(file, "w", **profile) as raster:
+            for i, (name, values) in enumerate(maps.data_vars.items(), start=1):
+                raster.write(values.transpose("y", "x").values.astype(np.float32), i)
+                raster.set_band_description(i, str(name))
+                if "long_name" in values.attrs:
+                    raster.update_tags(i, long_name=str(values.attrs["long_name"]))
+
+    write_file(target, write)
+
+
+def write_geojson(path: FilePath, plan: Plan | Result) -> None:
+    """Write a path as GeoJSON (RFC 7946), longitude and latitude on WGS 84.
+
+    It has a LineString from start to goal, a Point for each cell with its `bound`, `cell`, expected
+    trust of each robot and its 90 % band, and chance to fail; and on a terrain a Point for each
+    post and a LineString for each way. The property `layer` is "path", "bounds", "posts" or "ways".
+    Lines across 180 degrees are cut in two there.
+
+    Args:
+        path: File to write, or to replace.
+        plan: Plan, or result whose recommended path is meant.
+
+    Raises:
+        TrustboError: The workspace has no CRS, or the file cannot be written.
+    """
+    plan = plan.plan if isinstance(plan, Result) else plan
+    require_kind("plan", plan, Plan, "give a Plan, as Campaign.ask returns it, or a Result")
+    target = require_file(path)
+    centres = np.array([plan.workspace.grid.center(cell) for cell in plan.path])
+    facts = {"name": "most trustworthy path", "n_bounds": len(plan.path) - 1}
+    facts |= {"value": float(plan.value), "objective": plan.objective}
+    features = [_feature(plan, "path", centres, facts | {"length_m": float(plan.length)})]
+    for about, place in zip(_cells(plan), centres, strict=True):
+        features.append(_feature(plan, "bounds", place, about))
+    names = plan.workspace.team.names
+    for k, (cell, places) in enumerate(zip(plan.path, _of(plan.posts), strict=False), start=1):
+        for robot, place in zip(names, places, strict=True):
+            features.append(
+                _feature(plan, "posts", place, {"bound": k, "robot": robot, "cell": [*cell]})
+            )
+    for k, ways in enumerate(_of(plan.ways), start=1):
+        for robot, way in zip((LEAD, *names), ways, strict=True):
+            if way is not None:
+                about = {"bound": k, "robot": robot, "length_m": shapely.LineString(way).length}
+                features.append(_feature(plan, "ways", way, about))
+    write_text(target, json.dumps({"type": "FeatureCollection", "features": features}))
+
+
+def write_csv(path: FilePath, result: Result) -> None:
+    """Write a table with a row for each mission, bound and robot, numbered from 1.
+
+    Columns are those of `logs.to_frame`, and `trust_mean` and `trust_sd`, latent trust under the
+    last posterior; blank for a value that was not measured, for the start cell, and for the trust
+    of a mission that the last posterior does not cover.
+
+    Args:
+        path: File to write, or to replace.
+        result: Result of a campaign.
+
+    Raises:
+        TrustboError: The file cannot be written.
+    """
+    target = require_file(path)
+    table, latent = to_frame(result.missions), result.posterior["latent"].to_dataset()
+    # A posterior need not cover all missions: some are excluded, or wait to be learned from.
+    of_mission = {int(j) + 1: i for i, j in enumerate(latent["mission"].values)}
+    keys = table[["mission", "bound", "robot"]].itertuples(index=False, name=None)
+    robots = result.workspace.team.names
+    at = [(of_mission.get(j, -1), k - 1, robots.index(robot)) for j, k, robot in keys]
+    for name in ("trust_mean", "trust_sd"):
+        values, n_bounds = latent[name].values, latent.sizes["bound"]
+        table[name] = [
+            values[i, k, r] if i >= 0 and 0 <= k < n_bounds else np.nan for i, k, r in at
+        ]
+    write_text(target, table.to_csv(index=False, lineterminator="\n"))
+
+
+def _of(values: Any) -> Any:
+    """Values of a plan on a terrain; none without."""
+    return () if values is None else values
+
+
+def _cells(plan: Plan) -> list[dict[str, Any]]:
+    """Properties of the cells of a path; what is not known is left out."""
+    columns: dict[str, np.ndarray] = {}
+    for i, robot in enumerate(plan.workspace.team.names):
+        columns[f"trust_{robot}"] = plan.trust[:, i]
+        columns |= {f"trust_{robot}_{end}": plan.bands[q, :, i] for end, q in _BAND.items()}
+    if plan.risk is not None:
+        columns["p_fail"] = plan.risk.p_fail
+    rows: list[dict[str, Any]] = []
+    for k, cell in enumerate(plan.path):
+        values = {name: float(v[k - 1]) for name, v in columns.items() if k}
+        known = {name: value for name, value in values.items() if value == value}
+        rows.append({"bound": k, **known, "cell": [*cell]})
+    return rows
+
+
+def _feature(plan: Plan, layer: str, places: np.ndarray, about: dict[str, Any]) -> dict[str, Any]:
+    """Feature at a place (2,) or along places (point, 2), CRS metres."""
+    if plan.workspace.grid.crs is None:
+        raise TrustboError(_NO_CRS)
+    crs, xy = plan.workspace.grid.crs, np.atleast_2d(places)
+    lon, lat = (np.array(values) for values in transform(crs, "EPSG:4326", *xy.T.tolist()))
+    shape = shapely.Point(lon[0], lat[0])
+    if np.ndim(places) == 2:
+        shape = _cut(shapely.LineString(np.column_stack([np.unwrap(lon, period=360.0), lat])))
+    # RFC 7946, 11.2: no more digits than the precision; the eighth is a millimetre.
+    rounded = shapely.transform(shape, lambda values: np.round(values, 8))
+    geometry = json.loads(shapely.to_geojson(rounded))
+    return {"type": "Feature", "geometry": geometry, "properties": {"layer": layer, **about}}
+
+
+def _cut(line: shapely.LineString) -> shapely.Geometry:
+    """Line of longitudes without jumps, cut at 180 degrees (RFC 7946, 3.1.9)."""
+    west, _, east, _ = line.bounds
+    if -180.0 <= west and east <= 180.0:
+        return line
+    parts = []
+    for turn in (-360.0, 0.0, 360.0):
+        part = line.intersection(shapely.box(turn - 180.0, -90.0, turn + 180.0, 90.0))
+        parts += [affinity.translate(one, -turn) for one in shapely.get_parts(part)
+                  if one.geom_type == "LineString" and not one.is_empty]  # fmt: skip
+    return shapely.MultiLineString(parts)
+
+
+_NO_CRS = "only a workspace made from a terrain has a place on Earth; use Workspace.from_terrain."

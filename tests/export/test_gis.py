@@ -1,0 +1,84 @@
+"""Files for GIS and tables, read back by other programs."""
+
+import csv
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import rasterio
+import shapely
+from rasterio.warp import transform
+
+from trustbo.errors import TrustboError
+from trustbo.export import FILES, WRITERS, export_result, write_csv, write_geojson, write_geotiff
+from trustbo.export.gis import _cut
+
+
+def test_bands_of_a_geotiff_are_the_maps_in_their_place(result, maps, tmp_path):
+    write_geotiff(tmp_path / "größe.tif", maps)
+    with rasterio.open(tmp_path / "größe.tif") as raster:
+        assert raster.descriptions == tuple(maps)
+        assert raster.crs == result.workspace.grid.require_crs()
+        np.testing.assert_allclose(raster.read(1), maps["trust_mean"], rtol=1e-6)
+        for cell in ((0, 1), (2, 3)):
+            assert raster.index(*result.workspace.grid.center(cell)) == cell
+
+
+def test_places_in_geojson_are_those_of_the_plan(result, tmp_path):
+    write_geojson(tmp_path / "高度.geojson", result)
+    features = json.loads((tmp_path / "高度.geojson").read_text("utf-8"))["features"]
+    plan, crs = result.plan, result.workspace.grid.crs
+    layers = {layer: [f for f in features if f["properties"]["layer"] == layer]
+              for layer in ("path", "bounds", "posts", "ways")}  # fmt: skip
+    assert len(layers["bounds"]) == len(plan.path)
+    line = np.array(layers["path"][0]["geometry"]["coordinates"])
+    x, y = transform("EPSG:4326", crs, *line.T.tolist())
+    centres = [result.workspace.grid.center(cell) for cell in plan.path]
+    np.testing.assert_allclose(np.transpose([x, y]), centres, atol=0.01)
+    last = layers["bounds"][-1]["properties"]
+    assert last["cell"] == [*plan.path[-1]]
+    assert last["trust_r1"] == plan.trust[-1, 0]
+    posts = [f["geometry"]["coordinates"] for f in layers["posts"]]
+    x, y = transform("EPSG:4326", crs, *np.transpose(posts).tolist())
+    np.testing.assert_allclose(np.transpose([x, y]), plan.posts.reshape(-1, 2), atol=0.01)
+    assert len(layers["ways"]) == sum(way is not None for ways in plan.ways for way in ways)
+
+
+@pytest.mark.parametrize("west", [-180.5, 179.5])
+def test_a_line_across_180_degrees_is_cut_there(west):
+    cut = _cut(shapely.LineString([(west, -17.0), (west + 1.0, -16.0)]))
+    parts = [np.array(part.coords) for part in cut.geoms]
+    assert len(parts) == 2
+    assert max(np.ptp(part[:, 0]) for part in parts) <= 0.5
+    ends = sorted(tuple(end) for part in parts for end in part)
+    assert ends == [(-180.0, -16.5), (-179.5, -16.0), (179.5, -17.0), (180.0, -16.5)]
+
+
+def test_a_table_has_measurements_and_trust(result, tmp_path):
+    write_csv(tmp_path / "missions.csv", result)
+    with (tmp_path / "missions.csv").open(newline="", encoding="utf-8") as stream:
+        rows = [row for row in csv.DictReader(stream) if row["trust_mean"]]
+    assert len(rows) == 3 * sum(len(mission.bounds) for mission in result.missions)
+    latent = result.posterior["latent"]
+    for row in rows:
+        mission, k = result.missions[int(row["mission"]) - 1], int(row["bound"])
+        rate = mission.bounds[k - 1].contact_rate[mission.robots.index(row["robot"])]
+        assert float(row["contact_rate"]) == rate
+        at = {"mission": int(row["mission"]) - 1, "bound": k, "robot": row["robot"]}
+        assert float(row["trust_sd"]) == float(latent["trust_sd"].sel(at))
+
+
+def test_all_formats_are_written_to_a_folder(result, tmp_path):
+    assert export_result(result, tmp_path, list(WRITERS)) == [tmp_path / f for f in FILES.values()]
+    assert all((tmp_path / name).exists() for name in FILES.values())
+    with pytest.raises(TrustboError, match="format"):
+        export_result(result, tmp_path, ["kmz"])
+
+
+def test_without_a_terrain_there_is_no_place_on_earth(result, maps, nowhere, tmp_path):
+    bare = dataclasses.replace(result.plan, workspace=nowhere.workspace)
+    for write, what in ((write_geojson, bare), (write_geotiff, maps.drop_vars("spatial_ref"))):
+        with pytest.raises(TrustboError):
+            write(tmp_path / "a.tif", what)
+    assert not list(tmp_path.iterdir())
