@@ -177,7 +177,9 @@ def info(args: argparse.Namespace) -> None:
     workspace = tb.Workspace.from_terrain(terrain, args.shape)
     print(workspace)
     mpl.use("agg")
-    tb.plots.grid_map(workspace).figure.savefig(args.out, dpi=150)
+    figure = tb.plots.grid_map(workspace).get_figure(root=True)
+    assert figure is not None  # noqa: S101
+    figure.savefig(args.out, dpi=150)
     print(f"the grid, with the names of its cells, is drawn in {args.out}")
 
 

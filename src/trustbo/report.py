@@ -6,10 +6,10 @@ from collections.abc import Callable
 from html import escape
 from typing import Any
 
-import arviz_stats as azs
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
+from arviz_stats.summary import summary
 
 from trustbo import plots
 from trustbo.campaign.result import Result
@@ -126,11 +126,12 @@ def _trust(result: Result) -> list[str]:
 def _missions(result: Result) -> list[str]:
     table = result.table()
     columns = ("status", "contact_rate", "contact_lost", "objective", "regret", "n_bounds")
-    shown = table[[name for name in columns if name in table]].rename_axis("mission")
+    shown = table.loc[:, [name for name in columns if name in table]].rename_axis("mission")
+    shown.columns = [str(name).replace("_", " ") for name in shown.columns]
     return [
         _heading("Contact by mission"),
         _image(lambda: plots.campaign_history(result.history), "contact and objective by mission"),
-        _table(shown.rename(columns=lambda name: name.replace("_", " "))),
+        _table(shown),
         _note(
             "The objective is that of the plan before the mission, under the posterior of the "
             f"missions before it: {result.settings['objective'].replace('_', ' ')}."
@@ -179,13 +180,13 @@ def _diagnostics(result: Result) -> list[str]:
     last = result.history.isel(iteration=-1)
     rows = {text: float(last[name]) for name, text in names.items() if name in last}
     rows = {text: value for text, value in rows.items() if np.isfinite(value)}
-    summary = azs.summary(result.posterior, round_to="none")
-    kept = [name for name in ("mean", "sd", "eti89_lb", "eti89_ub") if name in summary]
+    table: Any = summary(result.posterior, round_to="none")
+    kept = [name for name in ("mean", "sd", "eti89_lb", "eti89_ub") if name in table]
     return [
         _heading("Diagnostics"),
         _note(f"Sampler of the last posterior: {escape(str(attrs.get('sampler', 'unknown')))}."),
         _table(pd.Series(rows, name="value").rename_axis("diagnostic").to_frame()),
-        _table(summary[kept or list(summary.columns)].rename_axis("parameter")),
+        _table(table[kept or list(table.columns)].rename_axis("parameter")),
     ]
 
 

@@ -17,6 +17,13 @@ RUNS = pd.DataFrame(
     ]
 )  # fmt: skip
 
+EFFECTS = pd.DataFrame(
+    [
+        {"mission": m, "robot": r, "effect": 0.3 * (r == "r2"), "sd": 0.05, "stands_out": r == "r2"}
+        for m in (1, 2) for r in ("r1", "r2")
+    ]
+)  # fmt: skip
+
 
 @pytest.fixture(scope="module")
 def result():
@@ -34,6 +41,7 @@ FIGURES = {
     "trust_curves of a plan": (lambda r, ax: plots.trust_curves(r.plan, ax=ax), 3),
     "campaign_history": (lambda r, ax: r.plot_history(ax=ax), 2),
     "regret_curves": (lambda r, ax: plots.regret_curves(RUNS, ax=ax), 1),
+    "robot_effects": (lambda r, ax: plots.robot_effects(EFFECTS, ax=ax), 1),
     "grid_map": (lambda r, ax: plots.grid_map(r.workspace, ax=ax), 1),
 }
 

@@ -12,7 +12,18 @@ from matplotlib.ticker import MaxNLocator
 
 from trustbo.errors import TrustboError, require_choice
 from trustbo.planning.plan import QUANTILES, Plan
-from trustbo.plots.style import MARKERS, ROBOTS, accent, add_legend, as_text, ink, panels, styled
+from trustbo.plots.style import (
+    GREY,
+    MARKERS,
+    ROBOTS,
+    accent,
+    add_legend,
+    as_text,
+    ink,
+    panels,
+    paper,
+    styled,
+)
 
 _LABELS = {
     "contact_lost": "contact lost\n(bounds)",
@@ -21,6 +32,8 @@ _LABELS = {
     "regret": "regret (%)",
 }
 """Variables of a history that `campaign_history` draws, and the labels of their axes."""
+SMALL_EFFECT = 0.1
+"""Share of contact below which an effect of a robot changes no plan."""
 
 
 @styled
@@ -143,18 +156,54 @@ def regret_curves(table: pd.DataFrame, *, by: str = "policy", ax: Axes | None = 
     known = table.dropna(subset=["regret"])
     if known.empty:
         raise TrustboError("no regret is known: regret needs the truth of the simulator.")
-    (ax,) = panels(1, ax, (5.0, 3.0))
+    (one,) = panels(1, ax, (5.0, 3.0))
     groups = list(known.groupby(by, sort=False))
     shades = plt.get_cmap()(np.linspace(0.25, 0.85, len(groups)))
     shifts = np.linspace(-0.25, 0.25, len(groups)) if len(groups) > 1 else [0.0]
     for i, (name, rows) in enumerate(groups):
-        ends = rows.groupby("mission")["regret"].quantile([*QUANTILES, 0.5]).unstack()
+        ends = rows.groupby("mission")["regret"].quantile(np.array([*QUANTILES, 0.5])).unstack()
         x, style = ends.index.to_numpy() + shifts[i], {"color": shades[i]}
         low, lower, upper, high, middle = ends.to_numpy().T
-        ax.vlines(x, low, high, linewidth=0.9, **style)
-        ax.vlines(x, lower, upper, linewidth=3.2, **style)
-        ax.plot(x, middle, marker=MARKERS[i % len(MARKERS)], linewidth=1.1, label=name, **style)
-    ax.set(xlabel="mission", ylabel="regret of the recommended path (%)")
-    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    ax.legend(title=f"{as_text(by)}: median, 50 % and 90 % of campaigns")
-    return ax
+        one.vlines(x, low, high, linewidth=0.9, **style)
+        one.vlines(x, lower, upper, linewidth=3.2, **style)
+        one.plot(x, middle, marker=MARKERS[i % len(MARKERS)], linewidth=1.1, label=name, **style)
+    one.set(xlabel="mission", ylabel="regret of the recommended path (%)")
+    one.xaxis.set_major_locator(MaxNLocator(integer=True))
+    one.legend(title=f"{as_text(by)}: median, 50 % and 90 % of campaigns")
+    return one
+
+
+@styled
+def robot_effects(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
+    """Draw the effect of each robot by mission with two standard deviations, from a check.
+
+    The band holds effects too small to change a plan; filled markers stand out.
+
+    Args:
+        table: A row for each mission and robot, with the columns `mission`, `robot`, `effect`, `sd`
+            and `stands_out`, such as the `robots` of a check.
+        ax: Axes to draw on; by default a new figure.
+
+    Returns:
+        Axes of the effects.
+
+    Raises:
+        TrustboError: A column is missing.
+    """
+    for name in ("mission", "robot", "effect", "sd", "stands_out"):
+        require_choice("column", name, [str(column) for column in table.columns])
+    (one,) = panels(1, ax, (5.0, 2.6))
+    one.axhspan(-SMALL_EFFECT, SMALL_EFFECT, color=GREY, alpha=0.25, linewidth=0.0)
+    groups = list(table.groupby("robot", sort=False))
+    shifts = np.linspace(-0.2, 0.2, len(groups)) if len(groups) > 1 else [0.0]
+    for i, (name, rows) in enumerate(groups):
+        colour, marker = ROBOTS[i % len(ROBOTS)], MARKERS[i % len(MARKERS)]
+        x, y = rows["mission"].to_numpy() + shifts[i], rows["effect"].to_numpy()
+        odd = rows["stands_out"].to_numpy(dtype=bool)
+        one.errorbar(x, y, 2.0 * rows["sd"].to_numpy(), color=colour, fmt="none", elinewidth=1.0)
+        one.plot(x, y, marker, color=colour, markerfacecolor=paper(), label=str(name))
+        one.plot(x[odd], y[odd], marker, color=colour)
+    one.set(xlabel="mission", ylabel="effect on contact in full sight")
+    one.xaxis.set_major_locator(MaxNLocator(integer=True))
+    one.legend(ncols=len(groups))
+    return one

@@ -91,7 +91,9 @@ def _layout(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> Any:
     position = {"x": x.ravel(), "y": y.ravel(), "cell_row": row.ravel(), "cell_col": col.ravel()}
     cells = models.ColumnDataSource({**position, **columns, "value": columns[names[0]]})
     low, high = limits[names[0]]
-    colours = models.LinearColorMapper("Viridis256", low=low, high=high, nan_color="#9a9a9a")
+    colours = models.LinearColorMapper(
+        palette="Viridis256", low=low, high=high, nan_color="#9a9a9a"
+    )
 
     left, right, bottom, top = extent_of(grid)
     height = int(np.clip(760 * (top - bottom) / (right - left), 250, 900))
@@ -102,14 +104,15 @@ def _layout(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> Any:
     )  # fmt: skip
     plot.grid.visible = False
     size: dict[str, Any] = {"width": grid.cell_width, "height": grid.cell_height}
-    fill: dict[str, Any] = {"field": "value", "transform": colours}
+    fill: Any = {"field": "value", "transform": colours}
     drawn = plot.rect("x", "y", source=cells, fill_color=fill, line_color=None, **size)
     plot.add_layout(models.ColorBar(color_mapper=colours), "right")
     tips = [("cell", "@cell_row,@cell_col"), *((n, f"@{{{n}}}{{0.000}}") for n in names)]
     plot.add_tools(models.HoverTool(renderers=[drawn], tooltips=tips))
     lines = contours(plan.workspace)
     if lines:
-        xs, ys = [line[:, 0] for line in lines], [line[:, 1] for line in lines]
+        xs: Any = [line[:, 0] for line in lines]
+        ys: Any = [line[:, 1] for line in lines]
         plot.multi_line(xs, ys, color="black", alpha=0.25, line_width=0.7)
 
     paths = [_places(_cells(one), grid) for one in history["path"].values]
@@ -180,7 +183,7 @@ def _cells(steps: np.ndarray) -> list[Cell]:
     return [(int(row), int(col)) for row, col in steps if row >= 0]
 
 
-def _places(path: Sequence[Cell], grid: Grid) -> dict[str, list[float]]:
+def _places(path: Sequence[Cell], grid: Grid) -> dict[str, Any]:
     """Positions of a path, metres from the lower left corner of the grid."""
     x, y = (np.array([grid.center(cell) for cell in path]) - grid.corner).T
     return {"x": x.tolist(), "y": y.tolist()}

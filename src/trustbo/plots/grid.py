@@ -5,7 +5,7 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 
-from trustbo.plots.style import panels, styled
+from trustbo.plots.style import figure_of, panels, styled
 from trustbo.workspace import Workspace
 from trustbo.workspace.location import crs_name
 
@@ -30,22 +30,22 @@ def grid_map(workspace: Workspace, *, ax: Axes | None = None) -> Axes:
     grid, (rows, cols) = workspace.grid, workspace.grid.shape
     tall = grid.cell_height / grid.cell_width
     height = float(np.clip(_WIDTH * rows * tall / cols, 2.0, 11.0))
-    (ax,) = panels(1, ax, (_WIDTH, height))
+    (one,) = panels(1, ax, (_WIDTH, height))
     edges = np.arange(cols + 1) - 0.5, np.arange(rows + 1) - 0.5
     if workspace.terrain is not None:
         light = ListedColormap(colormaps["YlOrBr"](np.linspace(0.0, 0.55, 256)))
-        image = ax.pcolormesh(*edges, grid.cell_means(workspace.terrain["dem"]), cmap=light)
-        ax.figure.colorbar(image, ax=ax, label="mean height (m)")
+        image = one.pcolormesh(*edges, grid.cell_means(workspace.terrain["dem"]), cmap=light)
+        one.figure.colorbar(image, ax=one, label="mean height (m)")
     closed = np.ma.masked_array(np.ones(grid.shape), workspace.passable.values)
-    ax.pcolor(*edges, closed, cmap=ListedColormap(["0.8"]), hatch="///", edgecolor="0.6", lw=0.0)
-    ax.vlines(edges[0], -0.5, rows - 0.5, color="black", lw=0.4, alpha=0.5)
-    ax.hlines(edges[1], -0.5, cols - 0.5, color="black", lw=0.4, alpha=0.5)
+    one.pcolor(*edges, closed, cmap=ListedColormap(["0.8"]), hatch="///", edgecolor="0.6", lw=0.0)
+    one.vlines(edges[0], -0.5, rows - 0.5, color="black", lw=0.4, alpha=0.5)
+    one.hlines(edges[1], -0.5, cols - 0.5, color="black", lw=0.4, alpha=0.5)
     if max(rows, cols) <= _MOST_NAMED:
-        room = ax.figure.get_figwidth() * ax.get_position().width / cols  # inches
+        room = figure_of([one]).get_figwidth() * one.get_position().width / cols  # inches
         size = min(8.0, 72.0 * room / 3.2)
         for row, col in np.ndindex(*grid.shape):
-            ax.text(col, row, f"{row},{col}", ha="center", va="center", size=size, color="black")
-    ax.set(xlabel="column", ylabel="row", xlim=(-0.5, cols - 0.5), ylim=(rows - 0.5, -0.5))
-    ax.set_aspect(tall)
-    ax.set_title(f"{crs_name(grid)}; hatched: without data or too steep")
-    return ax
+            one.text(col, row, f"{row},{col}", ha="center", va="center", size=size, color="black")
+    one.set(xlabel="column", ylabel="row", xlim=(-0.5, cols - 0.5), ylim=(rows - 0.5, -0.5))
+    one.set_aspect(tall)
+    one.set_title(f"{crs_name(grid)}\nhatched: without data or too steep")
+    return one

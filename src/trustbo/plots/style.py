@@ -29,7 +29,7 @@ RC: dict[str, Any] = {
 }
 """Settings of matplotlib under which every figure is drawn; colours of text and background, fonts
 and resolution stay those of the user."""
-styled = mpl.rc_context(RC)
+styled = mpl.rc_context(RC)  # pyright: ignore[reportArgumentType]
 """Decorator of a function that draws a figure."""
 ROBOTS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
 """Colours of Okabe and Ito (2008), by robot; markers distinguish robots without colour."""
