@@ -35,7 +35,7 @@ from trustbo.criticism import criticise
 from trustbo.inference import fit
 from trustbo.models import PlaceEffect, PooledTrust, RobotEffect
 from trustbo.models.place import matern
-from trustbo.planning.path_sampling import path_sampler
+from trustbo.planning.policies import random_path
 from trustbo.simulation import Degradation, Dust, KinematicSimulator
 from trustbo.study.world import COURSES, World
 
@@ -143,8 +143,8 @@ def simulated(case, seed):
         np.random.default_rng([seed, 1]),
     )
     robot = f"r{1 + rng.integers(3)}"
-    sampler = path_sampler(tb.planning.Planner(ws, *ends).paths)
-    paths = [sampler.draw(rng) for _ in range(N_SIMULATED)]
+    planner = tb.planning.Planner(ws, *ends)
+    paths = [random_path(rng, planner) for _ in range(N_SIMULATED)]
     sim = KinematicSimulator(
         ws, terrain=world.true_terrain(), sight=world.sight, team=world.team,
         events=CASES[case](robot),

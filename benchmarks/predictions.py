@@ -293,7 +293,7 @@ def _band(campaign: Campaign) -> tuple[float, float, Sequence[Cell]]:
     """Ends of the 90 % band of contact lost on the path that would be recommended, and the path."""
     path = campaign.recommend().path
     observation = campaign.model.observation
-    planner = Planner(campaign.workspace, path[0], path[-1], observation=observation)
+    planner = Planner(campaign.workspace, path[0], path[-1], family=observation)
     low, high = planner.evaluate(path, campaign.posterior).value_band
     return -high, -low, path
 

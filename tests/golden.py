@@ -35,8 +35,6 @@ EXACT = {
         "bounds": True,
         "planner": {"failure_cost": 0.0},
     },
-    "team min": {"planner": {"team": "min"}},
-    "length": {"planner": {"length_weight": 1e-4, "connectivity": 4}},
     "prior mean": {"initial": "prior_mean"},
     "bounds": {"initial": "prior_mean", "bounds": True},
 }

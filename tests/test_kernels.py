@@ -12,9 +12,8 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 REACH_EVERY_KERNEL = (
     "hazard/test_difficulty.py",
-    "planning/search",
-    "planning/test_closed_bounds.py",
-    "planning/test_risk.py",
+    "planning/test_search.py",
+    "planning/test_planner.py",
     "inference/evidence/test_ep.py",
     "inference/evidence/test_gaussian.py",
     "inference/samplers/test_coupled_target.py",

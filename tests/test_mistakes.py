@@ -220,9 +220,6 @@ MISTAKES = {
     ),
     "LOO of a result": (lambda c: loo(c.result), "a posterior from fit; .* Give its .posterior"),
     "a number for a truth": (lambda c: c.iterate(truth=3), "must be Truth.of.simulator.; got 3"),
-    "a policy of two": (
-        lambda c: c.iterate(policy=lambda key, draws: None), "is called policy.key, draws, planner."
-    ),
     # odd values
     "weights as text": (lambda c: fit([c.mission], weights="a"), "weights must be an array of num"),
     "a fit's workspace as text": (

@@ -25,13 +25,6 @@ def random_cells(n_robots=3, n=4):
     return Workspace.from_awareness(np.random.default_rng(0).uniform(size=(n_robots, n, n, 2)))
 
 
-def with_unseen(workspace, shares):
-    """The workspace with given shares of the time of bounds unseen, (move, row, col)."""
-    made = dataclasses.replace(workspace)
-    vars(made)["unseen_bounds"] = xr.DataArray(shares, dims=("move", "row", "col"))  # as if cached
-    return made
-
-
 def terrain_of(dem, height=0.0, resolution=1.0):
     """A terrain of ground heights (row, col) and canopy heights above them, m."""
     rows, cols = dem.shape

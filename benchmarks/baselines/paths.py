@@ -7,15 +7,14 @@ the bound that enters a cell by a move, mean over robots; NaN where there is no 
 from collections.abc import Sequence
 
 import numpy as np
-from jax import Array
 
 from trustbo.campaign.campaign import Campaign
 from trustbo.data import LINE_OF_SIGHT, Cell, Mission
 from trustbo.models.params import Params
 from trustbo.planning import Plan, Planner
-from trustbo.planning.policies import seed_of
-from trustbo.planning.search.layers import Weights, best_additive
-from trustbo.workspace.moves import bounds_along, move_indices
+from trustbo.planning.objectives import Weights
+from trustbo.planning.sums import best_sums
+from trustbo.workspace.moves import bounds_along
 
 Path = tuple[Cell, ...]
 
@@ -27,10 +26,9 @@ class PathPolicy:
     `best(planner)`, the path that it recommends; and `learn`, which does nothing here.
     """
 
-    def __call__(self, key: Array, posterior: Params, planner: Planner) -> Plan:
+    def __call__(self, rng: np.random.Generator, params: Params, planner: Planner) -> Plan:
         """Plan the next mission."""
-        path = self.choose(planner, np.random.default_rng(seed_of(key)))
-        return planner.evaluate(path, posterior.mean())
+        return planner.evaluate(self.choose(planner, rng), params.mean())
 
     def recommend(self, campaign: Campaign) -> Path:
         """Path that is recommended now."""
@@ -61,8 +59,7 @@ def best_paths(planner: Planner, rates: np.ndarray) -> list[Path]:
 
     Most contact less the number of bounds; or for the objective `mean`, the largest mean.
     """
-    paths, n_draws = planner.paths, len(rates)
-    lengths = np.arange(paths.shortest, paths.longest + 1)
+    paths, n_draws = planner.problem.paths, len(rates)
     n_bounds = np.arange(paths.longest + 1.0)
     is_mean = planner.objective == "mean"
     weights = Weights(
@@ -70,10 +67,8 @@ def best_paths(planner: Planner, rates: np.ndarray) -> list[Path]:
         np.tile(0.0 * n_bounds if is_mean else -n_bounds, (n_draws, 1)),
         np.maximum(1.0, n_bounds) if is_mean else np.ones(len(n_bounds)),
     )
-    gains = np.nan_to_num(rates[:, move_indices(paths.connectivity)])
-    gains = gains.reshape(n_draws, 1, gains.shape[1], -1)
-    no_tolls = np.zeros((len(paths.steps), 1))
-    _, found = best_additive(paths.layers, gains, weights, no_tolls, lengths)
+    gains = np.nan_to_num(rates).reshape(n_draws, 1, -1)
+    _, found = best_sums(paths.graph, gains, weights, np.zeros(gains.shape[2]))
     return [paths.cells(flat) for flat in found]
 
 

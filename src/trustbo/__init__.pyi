@@ -28,7 +28,7 @@ from .criticism import criticise
 from .data import Bound, Mission
 from .errors import DamagedFileError, PosteriorError, ShapeError, TerrainError, TrustboError
 from .inference import compare, fit
-from .planning.graph import NoPathError
+from .planning.paths import NoPathError
 from .team import Robot, Team
 from .workspace import Workspace
 

@@ -29,22 +29,20 @@ def workspace():
     return tb.Workspace.from_terrain(terrain, (4, 4))
 
 
-@pytest.fixture(scope="module", params=[8, 4])
-def planner(workspace, request):
-    return Planner(
-        workspace, START, GOAL, "lost_contact", connectivity=request.param, max_bounds="shortest+2"
-    )
+@pytest.fixture(scope="module")
+def planner(workspace):
+    return Planner(workspace, START, GOAL, max_bounds="shortest+2")
 
 
 def every_path(planner):
     """All walks without U-turns from start to goal, by depth first."""
-    steps, walks = MOVES[planner.connectivity], []
+    steps, walks = MOVES[8], []
     free = planner.workspace.passable_bounds.values
 
     def extend(walk):
         if walk[-1] == planner.goal:
             walks.append(tuple(walk))
-        elif len(walk) <= planner.longest:
+        elif len(walk) <= planner.problem.paths.longest:
             for step in steps:
                 cell = (walk[-1][0] + step[0], walk[-1][1] + step[1])
                 inside = all(0 <= i < n for i, n in zip(cell, free.shape[1:], strict=True))
@@ -76,10 +74,7 @@ def rates_along(table, path):
 
 @pytest.mark.parametrize("objective", ["lost_contact", "mean"])
 def test_best_paths_are_admissible_and_the_best_under_their_rates(planner, objective):
-    planner = Planner(
-        planner.workspace, START, GOAL, objective, connectivity=planner.connectivity,
-        max_bounds="shortest+2",
-    )  # fmt: skip
+    planner = Planner(planner.workspace, START, GOAL, objective, max_bounds="shortest+2")
     walks, rng = every_path(planner), np.random.default_rng(0)
     sight = paths.line_of_sight(planner)
     tables = np.clip(sight + rng.normal(0.0, 0.2, (40, *sight.shape)), 0.0, 1.0)

@@ -109,17 +109,17 @@ def test_recommendation_is_greedy_whatever_the_policy(workspace):
 
 
 def test_custom_policy_is_called_and_checked(workspace):
-    def leaps(key, draws, planner):
+    def leaps(rng, draws, planner):
         return replace(planner.plan(draws.mean()), path=((3, 0), (1, 1), (0, 3)))
 
-    def diagonal(key, draws, planner):
+    def diagonal(rng, draws, planner):
         return planner.evaluate(DIAGONAL, draws.mean())
 
     assert begin(workspace, policy=diagonal).ask().path == DIAGONAL
     with pytest.raises(tb.TrustboError, match="leaps"):
         begin(workspace, policy=leaps).ask()
     with pytest.raises(tb.TrustboError, match="policy"):
-        begin(workspace, policy=lambda key, draws, planner: DIAGONAL).ask()
+        begin(workspace, policy=lambda rng, draws, planner: DIAGONAL).ask()
 
 
 @pytest.mark.parametrize("policy", ["thompson", "random"])

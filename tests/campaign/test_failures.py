@@ -46,7 +46,7 @@ def at(bound):
 
 
 def price(campaign):
-    return campaign.planner.problem.failure_cost
+    return campaign.planner.problem.price
 
 
 def trapped(workspace, bound, path, seed):
@@ -145,7 +145,7 @@ def test_failure_is_priced_from_the_first_one_on(hills):
     assert price(campaign) == 0.0
     campaign.ask()
     campaign.fail("tipped")
-    assert price(campaign) == campaign.planner.shortest
+    assert price(campaign) == campaign.planner.problem.paths.shortest
     assert price(begin(hills, planner={"failure_cost": 3.0})) == 3.0
     assert price(begin(hills, objective="mean")) == 0.0
 
@@ -154,12 +154,12 @@ def test_result_prices_failures_as_its_campaign_does(hills):
     simulator, campaign = tb.simulation.KinematicSimulator(hills), begin(hills)
     campaign.tell(simulator.run(campaign.ask().path, seed=0))
     before = campaign.result()
-    assert price(campaign) == before.planner.problem.failure_cost == 0.0
+    assert price(campaign) == before.planner.problem.price == 0.0
     campaign.fail("stuck", where=campaign.ask().path[1])
     after = campaign.result()
-    assert after.planner.problem.failure_cost == campaign.planner.shortest
+    assert after.planner.problem.price == campaign.planner.problem.paths.shortest
     assert after.plan.value == campaign.recommend().value < before.value
-    assert before.planner.problem.failure_cost == 0.0
+    assert before.planner.problem.price == 0.0
 
 
 def test_unpriced_plan_that_may_well_fail_warns_once(steep):
@@ -179,14 +179,14 @@ def test_price_after_a_failure_is_joint_over_strata(steep):
     p, shares = campaign.risk.strata()
     rows, cols = np.array(path[1:]).T
     joint = 8.0 * shares @ (1.0 - np.prod(1.0 - p[:, moves_along(path), rows, cols], axis=1))
-    assert problem.cost_of_failure(path) == pytest.approx(joint, rel=1e-12)
+    assert problem.failure_along(path) == pytest.approx(joint, rel=1e-12)
     assert joint < 8.0 * (1.0 - problem.risk.survival(path)) - 1e-3
 
 
 def test_limit_holds_without_a_price_and_warns_if_no_path_keeps_it(workspace, hills):
     campaign = begin(hills, planner={"max_failure": 0.5})
     plan = campaign.ask()
-    assert campaign.planner.problem.is_within_risk(plan.path)
+    assert campaign.planner.problem.is_within_limit(plan.path)
     assert plan.p_arrive == pytest.approx(campaign.planner.problem.risk.along(plan.path).p_arrive)
     with pytest.warns(UserWarning, match="max_failure"):
         plan = begin(workspace, planner={"max_failure": 1e-6}).ask()

@@ -200,7 +200,7 @@ def test_folder_is_locked_for_one_campaign_at_a_time(workspace, tmp_path):
 
 
 def test_custom_objects_are_required_again(workspace, tmp_path):
-    def straight(key, draws, planner):
+    def straight(rng, draws, planner):
         return planner.evaluate([(2, 0), (1, 1), (0, 2)], draws.mean())
 
     model = PooledTrust(priors=Priors(x0_mean=0.4))

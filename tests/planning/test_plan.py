@@ -49,14 +49,14 @@ def test_a_record_has_no_ways_and_the_plan_read_from_it_does(plan, workspace):
 
 
 def test_plans_of_a_campaign_from_disk_have_them(workspace, tmp_path):
-    campaign = tb.Campaign(workspace, (2, 0), (0, 3), sampler="exact", seed=0)
-    asked = campaign.ask()
-    campaign.save(tmp_path / "campaign")
-    again = tb.Campaign.load(tmp_path / "campaign")
-    assert again.ask().path == asked.path
-    assert_is_of_its_path(again.ask(), workspace)
-    with again:
-        pass
+    ends = (2, 0), (0, 3)
+    with tb.Campaign(
+        workspace, *ends, sampler="exact", directory=tmp_path / "campaign"
+    ) as campaign:
+        asked = campaign.ask()
+    with tb.Campaign.load(tmp_path / "campaign") as again:
+        assert again.ask().path == asked.path
+        assert_is_of_its_path(again.ask(), workspace)
 
 
 def test_without_a_terrain_there_are_none():

@@ -44,7 +44,7 @@ def made_up(workspace, rng, some_fail=True):
     return Truth(workspace, table_of(contact, passed))
 
 
-def walks(workspace, start, goal, longest, *, u_turns, connectivity):
+def walks(workspace, start, goal, longest, *, u_turns):
     """All admissible paths, by enumeration."""
     found, passable = [], workspace.passable.values
 
@@ -52,7 +52,7 @@ def walks(workspace, start, goal, longest, *, u_turns, connectivity):
         if path[-1] == goal:
             found.append(tuple(path))
         elif len(path) <= longest:
-            for down, right in MOVES[connectivity]:
+            for down, right in MOVES[8]:
                 r, c = path[-1][0] + down, path[-1][1] + right
                 inside = 0 <= r < passable.shape[0] and 0 <= c < passable.shape[1]
                 back = not u_turns and len(path) > 1 and (r, c) == path[-2]
@@ -132,23 +132,19 @@ def test_a_truth_is_found_once_and_read_from_its_file_again(tmp_path, monkeypatc
 
 
 @pytest.mark.parametrize("failures", [False, True])
-@pytest.mark.parametrize("connectivity", [4, 8])
 @pytest.mark.parametrize("max_bounds", ["shortest", "shortest+2", 6])
-def test_the_best_path_is_that_of_enumeration(max_bounds, connectivity, failures):
+def test_the_best_path_is_that_of_enumeration(max_bounds, failures):
     rng = np.random.default_rng(3)
     for seed in range(3):
         workspace, ends = grid(walls=[(1, seed)]), ((2, 0), (0, 3))
         truth = made_up(workspace, rng)
         measure = truth.lost_or_failed if failures else truth.lost
-        options = {"max_bounds": max_bounds, "connectivity": connectivity}
+        options = {"max_bounds": max_bounds}
         best = truth.best(*ends, **options, failures=failures)
         u_turns = isinstance(max_bounds, int)
-        shortest = min(
-            len(path) - 1
-            for path in walks(workspace, *ends, 6, u_turns=False, connectivity=connectivity)
-        )
+        shortest = min(len(path) - 1 for path in walks(workspace, *ends, 6, u_turns=False))
         longest = 6 if u_turns else shortest + int(max_bounds.partition("+")[2] or 0)
-        admissible = walks(workspace, *ends, longest, u_turns=u_turns, connectivity=connectivity)
+        admissible = walks(workspace, *ends, longest, u_turns=u_turns)
         assert best in admissible
         assert measure(best) == pytest.approx(min(map(measure, admissible)), rel=1e-12)
         if not failures:

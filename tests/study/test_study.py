@@ -109,7 +109,7 @@ def test_a_key_depends_on_what_decides_the_numbers_and_on_nothing_else():
         {"simulators": {"truth": truth | {"params": truth["params"] | {"b": 0.06}}}},
         {"models": {"PooledTrust": {"observation": "censored"}}},
         {"objectives": ["mean"]},
-        {"options": {"connectivity": 4}},
+        {"options": {"max_bounds": "shortest+1"}},
         {"n_iterations": 3},
     ):
         assert not set(keys(**change)) & set(keys())
@@ -122,12 +122,12 @@ def test_every_option_is_crossed_with_every_other():
             "objectives": ["terminal", "mean"],
             "models": ["pooled", "hierarchical"],
             "samplers": "nuts",
-            "options": {"length_weight": [0.0, 0.1], "connectivity": 4},
+            "options": {"failure_cost": [0.0, 0.1], "max_bounds": "shortest+1"},
         }
     )
     assert len(table) == 3 * 2 * 2 * 2 * 2
     assert len({one.key for one in table}) == len(table)
-    assert {one.labels["length_weight"] for one in table[:16]} == {0.0, 0.1}
+    assert {one.labels["failure_cost"] for one in table[:16]} == {0.0, 0.1}
 
 
 def test_a_file_s_content_decides_and_not_its_name(tmp_path):

@@ -31,7 +31,7 @@ def test_there_are_enough_worlds_of_every_kind(listed):
     assert len(listed) - sum(OLD.values()) >= 24
     assert all(len(by_kind[kind]) >= n for kind, n in OLD.items())
     assert by_kind.keys() == OLD.keys() | {
-        "robots", "days", "foul", "change", "jammer", "physics", "shapes", "teams", "four-ways",
+        "robots", "days", "foul", "change", "jammer", "physics", "shapes", "teams",
         "limit",
     }  # fmt: skip
     assert len(COURSES) == 4

@@ -8,15 +8,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any, Self
 
-import jax
 import numpy as np
 import pandas as pd
 import xarray as xr
-from jax import random
 
 from trustbo.campaign.learning import (
     as_learned,
     base_planner,
+    best_plan,
     informed_planner,
     known_along,
     learn,
@@ -49,7 +48,7 @@ from trustbo.models import HumanTrust, default_model
 from trustbo.models.model import TrustModel, require_model
 from trustbo.models.params import Params
 from trustbo.models.record import model_from_record, model_to_record
-from trustbo.planning import Plan, Planner, Policy
+from trustbo.planning import InfeasibleError, Plan, Planner, Policy
 from trustbo.planning.policies import resolve_policy
 from trustbo.simulation import Truth
 from trustbo.simulation.protocol import Simulator
@@ -106,7 +105,7 @@ class Campaign(Summary):
             goal: Last cell of every path, or a position in it.
             model: Trust model; by default `models.default_model()`, with effects of places and
                 robots.
-            policy: Name in `planning.POLICIES`, or a callable `policy(key, draws, planner)` that
+            policy: Name in `planning.POLICIES`, or a callable `policy(rng, draws, planner)` that
                 returns a Plan.
             objective: Objective of the paths, see `planning.Planner`.
             sampler: Sampler of the posterior, see `trustbo.fit`.
@@ -189,9 +188,11 @@ class Campaign(Summary):
         """
         if self.state.asked is None:
             started = time.perf_counter()
-            with jax.threefry_partitionable(True):  # else the caller's flag decides what is drawn
-                key = random.key(self.state.seed_of("policy"), impl="threefry2x32")
-                plan = self.policy(key, self.belief, self.planner)
+            rng = np.random.default_rng(self.state.seed_of("policy"))
+            try:
+                plan = self.policy(rng, self.belief, self.planner)
+            except InfeasibleError as error:  # `_accept` warns
+                plan = self.planner.evaluate(error.path, self.belief.mean())
             name = f"policy {self.state.settings['policy']!r}"
             require_kind(name, plan, Plan, "a policy returns a trustbo.planning.Plan")
             try:
@@ -417,7 +418,7 @@ class Campaign(Summary):
 
     def recommend(self) -> Plan:
         """Plan the best path under the mean of the belief, regardless of the policy."""
-        return self.planner.plan(self.belief.mean())
+        return best_plan(self.planner, self.belief.mean())
 
     def trust_map(self) -> xr.DataArray:
         """Compute the team's trust map under the mean of the belief, dims (row, col)."""

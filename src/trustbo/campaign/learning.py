@@ -19,7 +19,7 @@ from trustbo.inference.posterior_groups import parameters_alone
 from trustbo.inference.samplers.choice import resolve_sampler
 from trustbo.models.model import TrustModel
 from trustbo.models.params import Params
-from trustbo.planning import Planner
+from trustbo.planning import InfeasibleError, Plan, Planner
 from trustbo.stacking import replace_awareness
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import along, moves_along, require_on_grid
@@ -184,8 +184,16 @@ def base_planner(workspace: Workspace, settings: Mapping[str, Any]) -> Planner:
     """Planner of the settings of a campaign, before anything is known about failures."""
     return Planner(
         workspace, settings["start"], settings["goal"], settings["objective"],
-        observation=settings["observation"], infeasible="safest", **settings["planner"],
+        family=settings["observation"], **settings["planner"],
     )  # fmt: skip
+
+
+def best_plan(planner: Planner, params: Params) -> Plan:
+    """Best plan, or where no path respects `max_failure`, that of the safest path."""
+    try:
+        return planner.plan(params)
+    except InfeasibleError as error:
+        return planner.evaluate(error.path, params)
 
 
 def informed_planner(planner: Planner, risk: BoundRisk, *, avoid: bool) -> Planner:
@@ -198,9 +206,10 @@ def informed_planner(planner: Planner, risk: BoundRisk, *, avoid: bool) -> Plann
     """
     if avoid and (stopped := to_avoid(risk)).any():
         planner = planner.avoiding(stopped, risk.mean)
-    if planner.problem.rule.failure_cost is None and not risk.has_failures:
+    if planner.problem.failure_cost is None and not risk.has_failures:
         planner = planner.with_failure_cost(0.0)
-    strata = risk.strata() if planner.problem.failure_cost > 0.0 else None
+    priced = planner.problem.objective.of_contact and planner.problem.failure_cost != 0.0
+    strata = risk.strata() if priced else None
     return planner.with_risk(risk.mean, risk.draw(_N_RISKS), risk.causes, strata)
 
 

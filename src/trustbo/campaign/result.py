@@ -10,7 +10,13 @@ import pandas as pd
 import rioxarray  # noqa: F401  (registers the .rio accessor)
 import xarray as xr
 
-from trustbo.campaign.learning import base_planner, informed_planner, learn_hazard, prior_belief
+from trustbo.campaign.learning import (
+    base_planner,
+    best_plan,
+    informed_planner,
+    learn_hazard,
+    prior_belief,
+)
 from trustbo.campaign.state import Failure, State
 from trustbo.campaign.storage import Storage, read_campaign
 from trustbo.data import Cell, Mission
@@ -94,7 +100,7 @@ class Result(Summary):
     @cached_property
     def plan(self) -> Plan:
         """Recommended path, the best under the posterior mean, with bands over the posterior."""
-        best = self.planner.plan(self.belief.mean())
+        best = best_plan(self.planner, self.belief.mean())
         draws = self.belief if self.state.last is None else self.state.last()
         return best.with_draws(self.planner.evaluate(best.path, draws))
 

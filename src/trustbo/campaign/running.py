@@ -87,7 +87,7 @@ def _reason_to_end(campaign: "Campaign", n_iterations: int, rules: Sequence[Stop
 
 def path_class(planner: Planner) -> dict[str, Any]:
     """Arguments of `Truth.best` and `Truth.regret` for the planner's admissible paths."""
-    return {"max_bounds": planner.max_bounds, "connectivity": planner.connectivity}
+    return {"max_bounds": planner.max_bounds}
 
 
 def report_of(campaign: "Campaign") -> str:

@@ -9,6 +9,7 @@ import numpy as np
 
 from trustbo.errors import TrustboError, require_positive, require_whole
 from trustbo.inference import params_of
+from trustbo.planning import InfeasibleError
 from trustbo.workspace.moves import bounds_along
 
 if TYPE_CHECKING:
@@ -73,8 +74,11 @@ class RegretBound:
         if posterior is None:
             return 0.0
         planner, draws = campaign.planner, params_of(posterior())
-        path = planner.plan(draws.mean()).path
-        drawn = planner.plan_draws(draws, n_draws=self.n_draws)
+        try:
+            path = planner.plan(draws.mean()).path
+            drawn = planner.plan_draws(draws, n_draws=self.n_draws)
+        except InfeasibleError:  # no path respects the limit
+            return 0.0
         return float(np.mean(drawn.relative_regret(path) <= self.eps))
 
 

@@ -1,15 +1,16 @@
 """Planning: from a posterior to the most trustworthy path."""
 
-from trustbo.planning import policies
+from trustbo.planning import policies, reference
 from trustbo.planning.dynamics import roll_trust
 from trustbo.planning.objectives import OBJECTIVES
+from trustbo.planning.paths import NoPathError
 from trustbo.planning.plan import Plan
 from trustbo.planning.planner import Planner
 from trustbo.planning.policies import POLICIES, Policy
-from trustbo.planning.risk import InfeasibleError
+from trustbo.planning.problem import InfeasibleError
 
 __all__ = [
-    "OBJECTIVES", "POLICIES", "InfeasibleError", "Plan", "Planner", "Policy", "policies",
-    "roll_trust",
+    "OBJECTIVES", "POLICIES", "InfeasibleError", "NoPathError", "Plan", "Planner", "Policy",
+    "policies", "reference", "roll_trust",
 ]  # fmt: skip
 __dir__ = __all__.copy  # completion lists public names alone

@@ -1,115 +1,146 @@
-"""The six objectives: value of a path from the team's expected trust along it."""
+"""Objectives: the value of a path from the team's expected trust along it, one row each."""
 
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.special import expit
 
-from trustbo.models.families import FAMILIES, Family
+from trustbo.models.families import Family
 from trustbo.planning.dynamics import Dynamics
+
+Array = np.ndarray
+
+
+def _ones(n: Array) -> Array:
+    return np.ones(len(n))
+
+
+def _same(score: Array) -> Array:
+    return score
 
 
 class Objective(NamedTuple):
-    """Name of an objective, weight of the path's length in it, and the family of the rates."""
+    """A row of `OBJECTIVES`: how trust along a path and its tolls become its value.
+
+    The score of a path of K bounds, with trust x_k after bound k, is
+
+        (sum_k credit(K - k) x_k - tolls) / scale(K),
+
+    or, for objectives `of_contact`, minus the contact expected to be lost and the tolls. A new
+    objective is a new row: searches and tests need nothing else.
+    """
 
     name: str
-    length_weight: float = 0.0
-    """Cost of a metre of the path, in units of trust, of lost bounds or of log probability."""
-    family: Family = FAMILIES["gaussian"]
-    """Family of the contact rates."""
-    unseen_cost: float = 0.0
-    """Cost of a bound in which nobody sees anybody, in the same units as that of a metre."""
-
-    @property
-    def has_toll(self) -> bool:
-        """Whether bounds cost something apart from trust, see `tolls`."""
-        return self.length_weight > 0.0 or self.unseen_cost > 0.0
-
-    @property
-    def has_labels(self) -> bool:
-        """Whether it depends on a path's whole history, and needs beta0 >= 0."""
-        return self.name in LABELLED or (
-            self.name == "lost_contact" and self.family.expected_rate != "identity"
-        )
-
-    def capped(self, dynamics: Dynamics) -> Dynamics:
-        """Cap drift and start for `lost_contact` where rates are linear in trust.
-
-        u <= 1 - B0 1 and x0 <= 1 for each state (the mean of robots alike in all, else each robot),
-        so that trust is at most 1 if B0 >= 0: no bound gains contact, and a loop never pays. Other
-        dynamics are returned unchanged.
-        """
-        if self.name != "lost_contact" or self.has_labels:
-            return dynamics
-        most = 1.0 - dynamics.transition.sum(-1)[..., None, None, None]
-        drift, start = np.minimum(dynamics.drift, most), np.minimum(dynamics.start, 1.0)
-        return dynamics._replace(drift=drift, start=start)
-
-    def contact_lost(self, trust: np.ndarray, noise_sd: np.ndarray) -> np.ndarray:
-        """Expected contact lost in each bound, 1 - E[rate], shape (..., bound).
-
-        From the team's trust after each bound and the sd of a rate (...,). It is not negative, but
-        where a linear rate of uncapped trust exceeds 1.
-        """
-        return 1.0 - self.family.rate_moments(trust, noise_sd[..., None])[0]
+    credit: Callable[[Array], Array] = _ones
+    """Weight of trust after a bound by the number of bounds that are left, both (left,)."""
+    scale: Callable[[Array], Array] = _ones
+    """Divisor of the sum by the number of bounds of the path, both (length,)."""
+    value: Callable[[Array], Array] = _same
+    """Value to report for a score: an increasing function."""
+    inverse: Callable[[Array], Array] = _same
+    """Its inverse."""
+    of_contact: bool = False
+    """Whether contact is expected of trust by the family of the rates; a failure then loses it."""
+    max_bounds: str = "shortest+2"
+    """Default limit on the number of bounds."""
 
 
-class PathTrust(NamedTuple):
-    """Trust along a path and the path's toll; leading axes (...,) such as (draw,)."""
-
-    trust: np.ndarray
-    """Expected trust of the team after each bound, shape (..., bound)."""
-    steady_state: np.ndarray
-    """Limit of the team's trust if each bound were repeated, u / (1 - beta0), (..., bound)."""
-    toll: np.ndarray | float = 0.0
-    """Cost of its metres and of the time unseen, see `tolls`."""
-    contact_lost: np.ndarray | float = np.nan
-    """Expected contact lost in each bound, 1 - E[rate given trust], (..., bound)."""
-
-
-def softplus(x: ArrayLike) -> np.ndarray:
-    """log(1 + exp(x)) without overflow: -log sigma(-x)."""
-    return np.logaddexp(0.0, x)
-
-
-SCORES: dict[str, Callable[[PathTrust], np.ndarray]] = {
-    "lost_contact": lambda path: -np.sum(path.contact_lost, axis=-1) - path.toll,
-    "terminal": lambda path: path.trust[..., -1] - path.toll,
-    "mean": lambda path: path.trust.mean(-1) - path.toll,
-    "success": lambda path: -softplus(-path.trust).sum(-1) - path.toll,
-    "bottleneck": lambda path: path.trust.min(-1),
-    "stationary": lambda path: -softplus(-path.steady_state).sum(-1) - path.toll,
+OBJECTIVES: Mapping[str, Objective] = {
+    row.name: row
+    for row in (
+        Objective("lost_contact", of_contact=True, max_bounds="shortest+4"),
+        Objective(
+            "terminal",
+            credit=lambda left: np.where(left == 0, 1.0, 0.0),
+            value=expit,
+            inverse=lambda value: np.log(value) - np.log1p(-value),
+        ),
+        Objective("mean", scale=lambda n_bounds: np.maximum(n_bounds, 1.0)),
+    )
 }
-"""Score of a path, to compare it by: the larger, the better.
-
-The value is this, its sigma (terminal) or its exp (success, stationary): these round to 1 beyond
-40, and to 0 below -745, where paths still differ.
-"""
-OBJECTIVES: Mapping[str, Callable[[PathTrust], np.ndarray]] = SCORES | {
-    "terminal": lambda path: expit(SCORES["terminal"](path)),
-    "success": lambda path: np.exp(SCORES["success"](path)),
-    "stationary": lambda path: np.exp(SCORES["stationary"](path)),
-}
-"""Value of a path, to be maximised; its toll is `length_weight` times its metres, and `unseen_cost`
-times the expected time in which nobody sees anybody, in bounds.
+"""Objectives by name; values are to be maximised.
 
 lost_contact: minus the contact that is expected to be lost on the way, in bounds (9 bounds with an
-expected rate of .9 lose .9), less the toll; where the planner has a risk, less `failure_cost` times
-the chance to fail. terminal: sigma(x^K - toll), one minus the paper's cost (6) without a toll.
-mean: mean trust over the bounds, less the toll. success: product of sigma(x^k), an index that
-compares paths: every bound counts, and a worse one more; the probability to arrive is another,
-`Plan.p_arrive`; times exp(-toll). bottleneck: least trust on the path, without a toll. stationary:
-the product of sigma of each bound's steady-state trust, independent of history, times exp(-toll).
+expected rate of .9 lose .9), less the tolls and, where the planner has a risk, `failure_cost` times
+the chance to fail. terminal: sigma(trust at the goal - tolls), one minus the paper's cost (6)
+without tolls. mean: mean over the bounds of trust less the toll.
 """
-ADDITIVE = ("lost_contact", "terminal", "mean", "stationary")
-"""Objectives that are sums over bounds, but for `lost_contact` of other than linear rates."""
-TOLLED = (*ADDITIVE, "success")
-"""Objectives from which a toll is taken; a least trust is no sum that it could be added to."""
-LABELLED = ("success", "bottleneck")
-"""Objectives that depend on the whole history of a path, for every family of rates."""
-DEFAULT_MAX_BOUNDS: Mapping[str, str | None] = {"lost_contact": "shortest+4"} | {
-    name: None for name in LABELLED
-}
-"""Limits of objectives on the number of bounds; that of others is "shortest+2"."""
+
+
+class Weights(NamedTuple):
+    """Weights of the drift in a score that is a sum; leading axis (draw,)."""
+
+    per_bound: Array
+    """w_j by the bounds left after a bound, (draw, left, state)."""
+    constant: Array
+    """Part that depends on the number of bounds alone, (draw, length)."""
+    scale: Array
+    """Divisor of a path's sum, (length,)."""
+
+
+def weights_of(objective: Objective, dynamics: Dynamics, view: Array, longest: int) -> Weights:
+    """Compute the weights of the drift for paths of up to `longest` bounds.
+
+    Unrolled, x_k = B0^k x_0 + sum_{i <= k} B0^(k - i) u_i. The team's trust is view . x, so that a
+    bound with j bounds left after it has w_j = sum_{i <= j} credit(i) view . B0^(j - i), and x_0
+    adds sum_k credit(K - k) view . B0^k x_0 to the sum of a path of K bounds.
+
+    Args:
+        objective: Row of `OBJECTIVES`; contact is taken to be trust.
+        dynamics: Recursion of trust with leading axis (draw,).
+        view: Weights of the states in the team's trust, (state,).
+        longest: Largest number of bounds.
+    """
+    n = np.arange(longest + 1)
+    credit = objective.credit(n)
+    powers = np.empty((len(dynamics.start), longest + 1, len(view)))  # view . B0^k
+    powers[:, 0] = view
+    for k in range(longest):
+        powers[:, k + 1] = np.einsum("ds,dst->dt", powers[:, k], dynamics.transition)
+    of_start = np.einsum("dks,ds->dk", powers, dynamics.start)
+    of_start[:, 0] = 0.0  # trust counts after bounds
+    lags = np.tril(credit[n[:, None] - n])  # (left, lag): credit(left - lag)
+    constant = of_start @ lags.T - (n if objective.of_contact else 0.0)
+    return Weights(lags @ powers, constant, objective.scale(n.astype(float)))
+
+
+def has_history(objective: Objective, family: Family) -> bool:
+    """Whether the loss of a bound depends on the trust with which it is entered.
+
+    Otherwise the score is a sum of weights of drifts. Needs B0 >= 0.
+    """
+    return objective.of_contact and family.expected_rate != "identity"
+
+
+def capped(objective: Objective, family: Family, dynamics: Dynamics) -> Dynamics:
+    """Cap drift and start where rates are linear in trust, so that no bound gains contact.
+
+    u <= 1 - B0 1 and x_0 <= 1 for each state, so that trust is at most 1 if B0 >= 0, and a loop
+    never pays. Other dynamics are returned unchanged.
+    """
+    if not objective.of_contact or has_history(objective, family):
+        return dynamics
+    most = 1.0 - dynamics.transition.sum(-1)[..., None, None, None]
+    drift, start = np.minimum(dynamics.drift, most), np.minimum(dynamics.start, 1.0)
+    return dynamics._replace(drift=drift, start=start)
+
+
+def score_of(
+    objective: Objective, family: Family, trust: Array, noise_sd: Array, toll: float
+) -> Array:
+    """Score of paths from the team's trust after each bound, (..., bound); shape (...,).
+
+    Args:
+        objective: Row of `OBJECTIVES`.
+        family: Family of the contact rates.
+        trust: Trust of the team, (..., bound).
+        noise_sd: Standard deviation of a rate, (...,).
+        toll: Sum of the tolls of the path.
+    """
+    if objective.of_contact:
+        lost = 1.0 - family.rate_moments(trust, noise_sd[..., None])[0]
+        return -lost.sum(-1) - toll
+    n_bounds = trust.shape[-1]
+    credit = objective.credit(np.arange(n_bounds))[::-1]
+    return (trust @ credit - toll) / objective.scale(np.array([float(n_bounds)]))[0]

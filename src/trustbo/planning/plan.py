@@ -31,23 +31,17 @@ class Plan(Summary):
             robot), see `QUANTILES`; equal to `trust` where the plan is for one draw.
         value: Value of the objective, to be maximised (see `OBJECTIVES`): for lost_contact, minus
             the contact expected to be lost, in bounds, with trust capped at 1.
-        success_index: Product over the bounds of sigma(team's trust), to compare paths by. It is
-            no probability; see `p_arrive`.
         objective: Name of the objective.
         exact: True if no admissible path is better.
-        bound: Upper limit on the value of any admissible path; `value` where exact, NaN for a given
+        limit: Upper limit on the value of any admissible path; `value` where exact, NaN for a given
             path.
         revisits: Number of bounds that enter a cell again.
-        engine: Engine that found the path, "networkx" or "numba"; or "given".
         seconds: Time of the search, s.
         workspace: Workspace of the path.
         risk: Chance of each bound to end the mission, None without a hazard.
-        infeasible: Whether its chance to fail exceeds `max_failure`: the path was given, or is the
-            safest where no admissible path respects the limit.
+        infeasible: Whether its chance to fail exceeds `max_failure`, as that of a given path may.
         value_band: Ends of the 90 % band of the value over draws of the parameters, at the chance
             to fail expected; None where the plan is for one draw. Noise of rates is not in it.
-        unseen_toll: Part of the value that is paid for the time in which nobody sees anybody:
-            `unseen_cost` times that expected by the map, in bounds.
     """
 
     path: tuple[Cell, ...]
@@ -56,46 +50,38 @@ class Plan(Summary):
     trust: np.ndarray
     bands: np.ndarray
     value: float
-    success_index: float
     objective: str
     exact: bool
-    bound: float
+    limit: float
     revisits: int
-    engine: str
     seconds: float
     workspace: Workspace
     risk: PathRisk | None = None
     infeasible: bool = False
     value_band: tuple[float, float] | None = None
-    unseen_toll: float = 0.0
 
     def with_draws(self, given: Self) -> Self:
         """Return the plan with the bands of another of its path, for many draws."""
         return replace(self, bands=given.bands, value_band=given.value_band)
 
     def _rows(self) -> Rows:
-        best = "no path is better" if self.exact else f"at most {self.bound:.3g} can be had"
-        if np.isnan(self.bound):
+        best = "no path is better" if self.exact else f"at most {self.limit:.3g} can be had"
+        if np.isnan(self.limit):
             best = "given, or a policy's choice: value and trust are the means"
-        elif self.infeasible:
-            best = "none of the safest paths is better; none keeps within max_failure"
         within = ""
         if self.value_band is not None:
             within = ", {:.3g} to {:.3g} in 90 % of the draws".format(*self.value_band)
-        tolls = ""
-        if self.unseen_toll:
-            tolls = f", with a toll of {self.unseen_toll:.3g} on the time unseen"
         rows = [
             ("path", f"{path_text(self.path)}: {len(self.path) - 1} bounds, {self.length:.0f} m"),
-            ("value", f"{self.value:.3g} ({self.objective}{tolls})" + within),
+            ("value", f"{self.value:.3g} ({self.objective})" + within),
             ("best", best),
             ("trust at the goal", f"{self.trust[-1].mean():.3f}, mean of the robots"),
         ]
         if self.p_arrive is not None:
             beyond = "; fails beyond max_failure" if self.infeasible else ""
             rows.append(("chance to arrive", f"{self.p_arrive:.3g}{beyond}"))
-        if self.engine != "given":
-            rows.append(("search", f"{self.engine}, {1e3 * self.seconds:.1f} ms"))
+        if not np.isnan(self.limit):
+            rows.append(("search", f"{1e3 * self.seconds:.1f} ms"))
 
         return rows
 

@@ -4,7 +4,7 @@ import time
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import replace
-from typing import Self
+from typing import Any, Self
 
 import networkx as nx
 import numpy as np
@@ -13,41 +13,28 @@ from numpy.typing import ArrayLike
 
 from trustbo.data import Cell
 from trustbo.display import Rows, Summary
-from trustbo.errors import require_choice
+from trustbo.errors import ShapeError, TrustboError, require_choice
 from trustbo.hazard.risk import Risk
 from trustbo.hazard.strata import Strata
 from trustbo.models.families import FAMILIES
 from trustbo.models.params import Params
-from trustbo.planning.dynamics import Dynamics
-from trustbo.planning.objectives import DEFAULT_MAX_BOUNDS, Objective
-from trustbo.planning.paths import AdmissiblePaths, PathClass
-from trustbo.planning.plan import Plan
-from trustbo.planning.posterior import DrawnPaths, choose_draws
-from trustbo.planning.problem import PlanningProblem, draws_of, mean_of
-from trustbo.planning.risk import RiskRule
-from trustbo.planning.search import solve
+from trustbo.planning.draws import DrawnPaths, choose_draws
+from trustbo.planning.dynamics import Dynamics, as_map, roll, trust_dynamics
+from trustbo.planning.objectives import OBJECTIVES, capped, score_of
+from trustbo.planning.paths import AdmissiblePaths
+from trustbo.planning.plan import QUANTILES, Plan
+from trustbo.planning.problem import EXACT, InfeasibleError, Problem, draws_of, mean_of, risk_of
 from trustbo.planning.trust_map import cost_of, summary_of, trust_map
-from trustbo.planning.values import evaluate
 from trustbo.workspace import Workspace
 from trustbo.workspace.location import Location
+from trustbo.workspace.moves import MOVES
 
 
 class Planner(Summary):
     """Search for the most trustworthy path of a workspace.
 
     Attributes:
-        problem: Planning problem, from which all that follows is taken but the engine.
-        workspace: Planning grid with awareness and passability.
-        paths: Admissible paths, with tables of the grid.
-        start: First cell.
-        goal: Last cell.
-        shortest: Fewest bounds from start to goal.
-        longest: Largest number of bounds of an admissible path.
-        max_bounds: Limit on the number of bounds, as given.
-        connectivity: 4 or 8.
-        objective: Name of the objective.
-        team: `"mean"` or `"min"`.
-        engine: `"auto"`, `"networkx"` or `"numba"`.
+        problem: Admissible paths, objective and costs.
     """
 
     def __init__(
@@ -57,16 +44,11 @@ class Planner(Summary):
         goal: Location,
         objective: str = "lost_contact",
         *,
-        connectivity: int = 8,
         max_bounds: int | str | None = None,
-        team: str = "mean",
-        length_weight: float = 0.0,
-        unseen_cost: float = 0.0,
-        engine: str = "auto",
-        observation: str = "gaussian",
+        toll: ArrayLike = 0.0,
         max_failure: float | None = None,
         failure_cost: float | None = None,
-        infeasible: str = "refuse",
+        family: str = "gaussian",
     ) -> None:
         """Prepare to plan.
 
@@ -74,124 +56,93 @@ class Planner(Summary):
             workspace: Planning grid with awareness and passability.
             start: First cell, or a position in it; see `Workspace.locate`.
             goal: Last cell, or a position in it.
-            objective: `"lost_contact"`, `"terminal"`, `"mean"`, `"success"`, `"bottleneck"` or
-                `"stationary"`; see `OBJECTIVES`.
-            connectivity: 4, or 8 to allow diagonal bounds too.
+            objective: `"lost_contact"`, `"terminal"` or `"mean"`; see `OBJECTIVES`.
             max_bounds: Limit on the number of bounds. `"shortest"`: the fewest possible;
                 `"shortest+n"`: up to n more, without U-turns (default: n = 2 for terminal and mean,
                 4 for lost_contact); paths are simple for n up to 2, and `Plan.revisits` counts
-                cells entered again for larger n. An int: walks of at most that many bounds
-                (default for success and bottleneck: shortest + 8). Without effect on stationary,
-                whose admissible paths are all simple paths.
-            team: Trust of the team: `"mean"` or `"min"` (least) of that of its robots.
-            length_weight: Cost of a metre of the path, for lost_contact (in bounds), terminal and
-                mean (in units of trust), success and stationary (in units of log probability).
-            unseen_cost: Cost of a bound in which nobody sees anybody, in the same units: a path
-                pays this times the sum over its bounds of the share of their time that
-                `Workspace.unseen_bounds` expects so.
-            engine: `"numba"`, compiled, which `"auto"` takes; or `"networkx"`, the reference. Both
-                find paths of the same value.
-            observation: Family of the contact rates, that of the trust model; for
-                lost_contact.
+                cells entered again for larger n. An int: walks of at most that many bounds.
+            toll: Cost of each bound apart from trust, such as its length or the time that it takes,
+                (move, row, col) with the moves of `workspace.moves.MOVES[8]`, or an array that
+                broadcasts to it; in bounds for lost_contact, else in units of trust.
             max_failure: Largest chance that a path fails, in [0, 1), under the risk of `with_risk`;
                 by default no limit.
             failure_cost: Cost of a failure for lost_contact, in bounds: its value is less by this
                 times the chance to fail. By default the fewest bounds from start to goal, so that
                 a mission that fails counts as one that lost all contact.
-            infeasible: Response to a `max_failure` that no path respects, `"refuse"` or
-                `"safest"`: plan the best of the safest paths.
+            family: Family of the contact rates, that of the trust model; for lost_contact.
 
         Raises:
+            ShapeError: A toll of another shape.
             TrustboError: Start or goal off the grid, impassable, or equal; an unknown name;
-                `max_bounds` below the fewest possible; a length weight or an unseen cost that is
-                negative, or for bottleneck; an unseen cost without a terrain in memory.
+                `max_bounds` below the fewest possible; a number out of its range.
             NoPathError: The goal cannot be reached.
         """
-        self.engine = require_choice("engine", engine, solve.ENGINES)
-        family = FAMILIES[require_choice("observation", observation, FAMILIES)]
-        if max_bounds is None:
-            max_bounds = DEFAULT_MAX_BOUNDS.get(objective, "shortest+2")
-        admitted = PathClass(connectivity, max_bounds)
-        paths = AdmissiblePaths(workspace, start, goal, admitted)
-        rule = RiskRule(max_failure, failure_cost, infeasible)
-        chosen = Objective(objective, length_weight, family, unseen_cost)
-        self._hold(PlanningProblem(paths, chosen, team, rule=rule))
+        row = OBJECTIVES[require_choice("objective", objective, OBJECTIVES)]
+        chosen = FAMILIES[require_choice("family", family, FAMILIES)]
+        paths = AdmissiblePaths(workspace, start, goal, max_bounds or row.max_bounds)
+        tolls = _toll_of(toll, paths.bounds)
+        self.problem = Problem(paths, row, chosen, tolls, max_failure, failure_cost)
 
     def _rows(self) -> Rows:
-        rows = [
-            ("from", f"{self.start} to {self.goal}, {self.connectivity} directions"),
-            ("objective", f"{self.objective}, {self.team} of the robots"),
-            ("paths", f"{self.shortest} to {self.longest} bounds ({self.max_bounds})"),
-            ("rates", self.family.name),
-            ("risk", "of each bound" if self.problem.risk is not None else "not known"),
-            ("engine", self.engine),
+        problem, paths = self.problem, self.problem.paths
+        return [
+            ("from", f"{self.start} to {self.goal}"),
+            ("objective", problem.objective.name),
+            ("paths", f"{paths.shortest} to {paths.longest} bounds ({paths.max_bounds})"),
+            ("rates", problem.family.name),
+            ("risk", "of each bound" if problem.risk is not None else "not known"),
         ]
-        return rows
-
-    def _hold(self, problem: PlanningProblem) -> None:
-        paths = problem.paths
-        self.problem, self.workspace, self.paths = problem, problem.workspace, paths
-        self.start, self.goal = paths.start, paths.goal
-        self.shortest, self.longest = paths.shortest, paths.longest
-        self.max_bounds, self.connectivity = paths.max_bounds, paths.connectivity
-        self.objective, _, self.family, _ = problem.objective
-        self.team = problem.team
-
-    def _with(self, problem: PlanningProblem) -> Self:
-        other = copy(self)
-        other._hold(problem)
-        return other
 
     @property
-    def graph(self) -> nx.DiGraph:
-        """Graph of passable cells; nodes with `x`, `y` (CRS metres), edges with `length` (m)."""
-        return self.paths.graph
+    def workspace(self) -> Workspace:
+        """Workspace of the paths."""
+        return self.problem.paths.workspace
 
-    def graph_of(self, params: Params | xr.DataTree) -> nx.DiGraph:
-        """Build `graph` with the costs of its bounds, for any algorithm of networkx.
+    @property
+    def start(self) -> Cell:
+        """First cell."""
+        return self.problem.paths.start
 
-        Attributes of the edges: `length` (m); `drift` of the team's mean trust; `cost`, that of
-        `stationary`: -log sigma of the trust that the bound would lead to if all were like it, and
-        the toll; for lost_contact of rates that measure trust `lost`, the contact that the bound
-        would lose then, in bounds, and the toll; and with a risk `risk`, -log(1 - p_fail).
+    @property
+    def goal(self) -> Cell:
+        """Last cell."""
+        return self.problem.paths.goal
 
-        Args:
-            params: Posterior or parameters, whose mean is taken.
+    @property
+    def objective(self) -> str:
+        """Name of the objective."""
+        return self.problem.objective.name
 
-        Raises:
-            TrustboError: abs(beta0) >= 1, for which trust settles nowhere.
-        """
-        return solve.graph_of(self.problem, self.problem.dynamics(mean_of(params)))
+    @property
+    def max_bounds(self) -> int | str:
+        """Limit on the number of bounds."""
+        return self.problem.paths.max_bounds
+
+    def _with(self, **changes: Any) -> Self:
+        other = copy(self)
+        other.problem = replace(self.problem, **changes)
+        return other
 
     def require_path(self, path: Sequence[Cell]) -> tuple[Cell, ...]:
         """Return a path as a tuple of cells; refuse a broken one, or one between other ends."""
-        return self.paths.require_path(path)
+        return self.problem.paths.require_path(path)
 
     def avoiding(self, bounds: np.ndarray, risk: np.ndarray) -> Self:
         """Return the planner of paths without some bounds; see `AdmissiblePaths.avoiding`."""
-        return self._with(replace(self.problem, paths=self.paths.avoiding(bounds, risk)))
+        return self._with(paths=self.problem.paths.avoiding(bounds, risk))
 
-    def with_observation(self, observation: str) -> Self:
+    def with_family(self, family: str) -> Self:
         """Return the planner for contact rates of another family, see `Planner`."""
-        family = FAMILIES[require_choice("observation", observation, FAMILIES)]
-        if family is self.family:  # what the problem has computed stays
-            return self
-        objective = self.problem.objective._replace(family=family)
-        return self._with(replace(self.problem, objective=objective))
+        return self._with(family=FAMILIES[require_choice("family", family, FAMILIES)])
 
     def with_objective(self, objective: str) -> Self:
-        """Return the planner of another objective, with the same admissible paths.
+        """Return the planner of another objective, with the same paths and tolls.
 
         A cost of failure is dropped unless the objective is lost_contact.
-
-        Raises:
-            TrustboError: An unknown objective, or one that admits no length weight where there is
-                one.
         """
-        chosen, rule = self.problem.objective._replace(name=objective), self.problem.rule
-        if objective != "lost_contact":
-            rule = rule._replace(failure_cost=None)
-        return self._with(replace(self.problem, objective=chosen, rule=rule))
+        row = OBJECTIVES[require_choice("objective", objective, OBJECTIVES)]
+        failure_cost = self.problem.failure_cost if row.of_contact else None
+        return self._with(objective=row, failure_cost=failure_cost)
 
     def with_risk(
         self,
@@ -205,8 +156,8 @@ class Planner(Summary):
         Plans then have `p_arrive`, respect `max_failure`, and pay `failure_cost` in lost_contact.
 
         Args:
-            p_fail: Posterior mean, shape (move, row, col) with the moves of `workspace.moves.MOVES`
-                for connectivity 8; NaN where there is no bound. None: no risk.
+            p_fail: Posterior mean, shape (move, row, col); NaN where there is no bound. None: no
+                risk.
             draws: Draws from its posterior, shape (draw, move, row, col), for bands of `p_arrive`.
             causes: Share of each cause of failure, numbers or arrays (move, row, col).
             strata: Chances under groups of draws, such as `BoundRisk.strata()`, by which a failure
@@ -217,10 +168,10 @@ class Planner(Summary):
             TrustboError: A chance outside [0, 1].
         """
         if p_fail is None:
-            return self._with(self.problem.with_risk(None))
+            return self._with(risk=None)
         drawn = None if draws is None else np.asarray(draws, dtype=float)
         risk = Risk(np.asarray(p_fail, dtype=float), drawn, dict(causes or {}), strata)
-        return self._with(self.problem.with_risk(risk))
+        return self._with(risk=risk)
 
     def with_failure_cost(self, failure_cost: float) -> Self:
         """Return the planner with another cost of a failure, in bounds.
@@ -230,17 +181,10 @@ class Planner(Summary):
         Raises:
             TrustboError: It is negative, or not finite.
         """
-        if self.objective != "lost_contact":
-            return self
-        rule = self.problem.rule._replace(failure_cost=failure_cost)
-        return self._with(replace(self.problem, rule=rule))
-
-    def onward(self, done: Sequence[Cell]) -> Self:
-        """Return a planner for the rest of a mission; see `PlanningProblem.onward`."""
-        return self._with(self.problem.onward(done))
+        return self._with(failure_cost=failure_cost) if self.problem.objective.of_contact else self
 
     def dynamics(self, params: Params, x0: ArrayLike | None = None) -> Dynamics:
-        """Build the recursion of expected trust; see `PlanningProblem.dynamics`."""
+        """Build the recursion of expected trust; see `trust_dynamics`."""
         return self.problem.dynamics(params, x0)
 
     def plan(self, params: Params | xr.DataTree, *, x0: ArrayLike | None = None) -> Plan:
@@ -258,18 +202,14 @@ class Planner(Summary):
         """
         started = time.perf_counter()
         mean = mean_of(params)
-        best = solve.find_paths(self.problem, self.problem.dynamics(mean, x0), self.engine)
-        plan = evaluate(self.problem, self.paths.cells(best.paths[0]), mean, x0)
+        best = self.problem.best(self.dynamics(mean, x0))
+        path = self.problem.paths.cells(best.paths[0])
+        plan = self.evaluate(path, mean, x0=x0)
         if mean is not params:
-            plan = plan.with_draws(self.evaluate(plan.path, params, x0=x0))
-        gap = float(best.gap[0])
-        return replace(
-            plan,
-            exact=gap <= solve.EXACT,
-            bound=solve.value_limit(self.objective, plan.value, gap),
-            engine="networkx" if self.engine == "networkx" else "numba",
-            seconds=time.perf_counter() - started,
-        )
+            plan = plan.with_draws(self.evaluate(path, params, x0=x0))
+        exact = bool(best.limit[0] - best.score[0] <= EXACT)
+        limit = plan.value if exact else float(self.problem.objective.value(best.limit[0]))
+        return replace(plan, exact=exact, limit=limit, seconds=time.perf_counter() - started)
 
     def best_path(self, dynamics: Dynamics) -> tuple[Cell, ...]:
         """Find the best admissible path under other dynamics, such as an optimistic drift.
@@ -279,9 +219,9 @@ class Planner(Summary):
 
         Raises:
             TrustboError: beta0 is outside the range the objective is exact for.
+            InfeasibleError: No path respects `max_failure`.
         """
-        best = solve.find_paths(self.problem, dynamics, self.engine)
-        return self.paths.cells(best.paths[0])
+        return self.problem.paths.cells(self.problem.best(dynamics).paths[0])
 
     def plan_draws(
         self, posterior: Params | xr.DataTree, *, n_draws: int | None = None, seed: int = 0
@@ -295,30 +235,99 @@ class Planner(Summary):
 
         Raises:
             TrustboError: beta0 of a draw is outside the range the objective is exact for.
+            InfeasibleError: No path respects `max_failure`.
         """
         params, chosen = choose_draws(draws_of(posterior), n_draws, seed)
         dynamics = self.problem.dynamics(params)
-        best = solve.find_paths(self.problem, dynamics, self.engine)
-        return DrawnPaths(self.problem, dynamics, best.paths, best.gap, chosen)
+        best = self.problem.best(dynamics)
+        return DrawnPaths(self.problem, dynamics, best.paths, best.limit - best.score, chosen)
 
     def evaluate(
         self, path: Sequence[Cell], params: Params | xr.DataTree, *, x0: ArrayLike | None = None
     ) -> Plan:
-        """Evaluate a given path; `exact` is False and `bound` NaN.
+        """Evaluate a given path; `exact` is False and `limit` NaN.
 
         Args:
             path: Cells from start to goal, each a neighbour of the last.
             params: Draws of parameters, one or many, or a posterior; of many, `trust` and `value`
-                are those of mean trust, and `bands` its quantiles. For lost_contact and stationary,
-                `value` is the mean over draws. Draws of a posterior have the next mission's day of
-                each robot, see `params_of`.
+                are those of mean trust, and `bands` its quantiles. For lost_contact, `value` is the
+                mean over draws. Draws of a posterior have the next mission's day of each robot, see
+                `params_of`.
             x0: Expected trust at the start; by default `params.x0_mean`.
 
         Raises:
             ShapeError: Parameters of other robots or features.
             TrustboError: A path that is broken, or does not lead from start to goal.
         """
-        return evaluate(self.problem, self.require_path(path), draws_of(params, day=True), x0)
+        path, problem = self.require_path(path), self.problem
+        draws, cells = draws_of(params, day=True), np.array(path)
+        trust, value, values = _value_along(problem, cells, draws, x0)
+        cost, (rows, cols) = problem.failure_along(cells), cells.T
+        bands = np.repeat(trust, len(QUANTILES), axis=0), None
+        if len(trust) > 1:
+            low, high = np.quantile(values - cost, (QUANTILES[0], QUANTILES[-1])).tolist()
+            bands = np.quantile(trust, QUANTILES, axis=0), (low, high)
+        grid = self.workspace.grid
+        positions = np.stack([grid.x[cols], grid.y[rows]], axis=1)
+        return Plan(
+            path=path,
+            positions=positions,
+            length=float(np.hypot(*np.diff(positions, axis=0).T).sum()),
+            trust=trust.mean(0),
+            bands=bands[0],
+            value=value - cost,
+            objective=self.objective,
+            exact=False,
+            limit=np.nan,
+            revisits=len(path) - len(set(path)),
+            seconds=0.0,
+            workspace=self.workspace,
+            risk=None if problem.risk is None else problem.risk.along(cells),
+            infeasible=not problem.is_within_limit(cells),
+            value_band=bands[1],
+        )
+
+    def graph(self, params: Params | xr.DataTree) -> nx.DiGraph:
+        """Return the bounds as a graph of cells, on which any algorithm of networkx runs.
+
+        Nodes are the passable cells `(row, col)` with `x` and `y` of their centres, CRS metres.
+        Attributes of an edge, a bound: `length`, m; `drift` of the team's mean trust; `cost`, -log
+        sigma of the trust that the bound would lead to if all were like it, and its toll; `lost`,
+        the contact that it would lose then, in bounds, and its toll; and with a risk `risk`,
+        -log(1 - p_fail). Apart from the memory of trust, sums of `lost` are those of lost_contact.
+
+        Args:
+            params: Posterior or parameters, whose mean is taken.
+
+        Raises:
+            TrustboError: abs(beta0) >= 1, for which trust settles nowhere.
+        """
+        problem, dynamics = self.problem, self.dynamics(mean_of(params))
+        if (radius := np.abs(np.linalg.eigvals(dynamics.transition)).max()) >= 1.0:
+            raise TrustboError(f"a graph of settled trust needs abs(beta0) < 1; got {radius:g}.")
+        contact = capped(OBJECTIVES["lost_contact"], problem.family, dynamics)
+        grid, bounds = self.workspace.grid, problem.paths.bounds
+
+        def of_bounds(values: np.ndarray) -> np.ndarray:
+            return np.broadcast_to(values, bounds.shape)[bounds]
+
+        toll, settled = of_bounds(problem.toll), of_bounds(dynamics.settled())
+        rate = problem.family.rate_moments(of_bounds(contact.settled()), dynamics.noise_sd)[0]
+        values = {
+            "length": of_bounds(problem.paths.lengths[:, None, None]),
+            "drift": of_bounds(dynamics.drift.mean(0)),
+            "cost": toll + np.logaddexp(0.0, -settled),
+            "lost": toll + 1.0 - rate,
+        }
+        if problem.risk is not None:
+            values["risk"] = of_bounds(risk_of(problem.risk.p_fail))
+        graph = nx.DiGraph()
+        for row, col in np.argwhere(problem.paths.passable).tolist():
+            graph.add_node((row, col), x=float(grid.x[col]), y=float(grid.y[row]))
+        for k, (move, row, col) in enumerate(np.argwhere(bounds).tolist()):
+            left = row - MOVES[8][move][0], col - MOVES[8][move][1]
+            graph.add_edge(left, (row, col), **{name: float(v[k]) for name, v in values.items()})
+        return graph
 
     def trust_map(
         self, params: Params | xr.DataTree, *, per_robot: bool = False, x0: ArrayLike | None = None
@@ -345,11 +354,7 @@ class Planner(Summary):
         return cost_of(self.trust_map(params, per_robot=per_robot, x0=x0))
 
     def trust_summary(
-        self,
-        posterior: Params | xr.DataTree,
-        *,
-        n_draws: int = 200,
-        seed: int = 0,
+        self, posterior: Params | xr.DataTree, *, n_draws: int = 200, seed: int = 0
     ) -> xr.Dataset:
         """Compute `mean` and `sd` of the trust map over draws, (row, col), and the mean `cost`.
 
@@ -366,11 +371,58 @@ class Planner(Summary):
     ) -> xr.DataArray:
         """Compute P(cell on the best path), (row, col), from the best path under some draws.
 
+        Where no path respects `max_failure`, that of the safest one.
+
         Args:
             posterior: Posterior of `fit`, or draws with leading axis (draw,).
             n_draws: Number of draws, taken at random without replacement.
             seed: Seed of the choice of draws.
         """
-        drawn = self.plan_draws(posterior, n_draws=n_draws, seed=seed)
-        share = self.workspace.passable.copy(data=drawn.share()).rename("path_probability")
+        try:
+            share = self.plan_draws(posterior, n_draws=n_draws, seed=seed).share()
+        except InfeasibleError as error:
+            share = np.zeros(self.workspace.passable.shape)
+            share[tuple(np.array(error.path).T)] = 1.0
+        share = self.workspace.passable.copy(data=share).rename("path_probability")
         return share.assign_attrs(long_name="P(cell on the best path)")
+
+
+def _toll_of(toll: ArrayLike, bounds: np.ndarray) -> np.ndarray:
+    """Tolls (move, row, col), 0 where there is no bound.
+
+    ShapeError: they do not broadcast. TrustboError: that of a bound is not finite.
+    """
+    given = np.asarray(toll, dtype=float)
+    try:
+        tolls = np.where(bounds, np.broadcast_to(given, bounds.shape), 0.0)
+    except ValueError:
+        raise ShapeError(
+            f"toll must be (move, row, col), {bounds.shape}; got {given.shape}."
+        ) from None
+    if not np.isfinite(tolls).all():
+        move, row, col = np.argwhere(~np.isfinite(tolls))[0].tolist()
+        raise TrustboError(f"toll[{move}, {row}, {col}] = {tolls[move, row, col]} must be finite.")
+    return tolls
+
+
+def _value_along(
+    problem: Problem, cells: np.ndarray, params: Params, x0: ArrayLike | None
+) -> tuple[np.ndarray, float, np.ndarray]:
+    """Trust along a path (draw, bound, robot), its value without failures, and that of draws."""
+    z, of_path = as_map(problem.awareness_along(cells)), params.along(cells)
+    by_robot = trust_dynamics(of_path, z, x0, by_robot=True)
+    trust = roll(by_robot)
+    trust = trust.reshape(-1, *trust.shape[-2:])
+    toll, objective, family = problem.toll_along(cells), problem.objective, problem.family
+
+    def value(of_team: np.ndarray, sd: np.ndarray) -> np.ndarray:
+        return objective.value(score_of(objective, family, of_team, sd, toll))
+
+    values = np.atleast_1d(value(trust.mean(-1), by_robot.noise_sd))
+    if not objective.of_contact:
+        return trust, float(value(trust.mean((0, -1)), by_robot.noise_sd)), values
+    # Trust capped draw by draw is biased, so that the band is of trust as it is; but no path loses
+    # less than nothing.
+    team = capped(objective, family, trust_dynamics(of_path, z, x0))
+    mean = value(roll(team).mean(-1), team.noise_sd).mean()
+    return trust, float(mean), np.minimum(values, -toll)

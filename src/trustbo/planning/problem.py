@@ -1,141 +1,237 @@
-"""The planning problem: workspace, admissible paths, objective and team."""
+"""The planning problem: admissible paths, objective and costs, and its best paths."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Self
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
 from trustbo.data import Cell
-from trustbo.errors import (
-    ShapeError,
-    TrustboError,
-    require_choice,
-    require_kind,
-    require_not_negative,
-)
-from trustbo.hazard.risk import Risk
+from trustbo.errors import ShapeError, TrustboError, require_kind, require_not_negative
+from trustbo.hazard.risk import ROUNDING, Risk
 from trustbo.inference.draws import params_of
+from trustbo.models.families import Family
 from trustbo.models.params import Params
-from trustbo.planning.dynamics import TEAMS, Dynamics, trust_dynamics
-from trustbo.planning.objectives import OBJECTIVES, TOLLED, Objective
+from trustbo.planning.dynamics import Dynamics, trust_dynamics
+from trustbo.planning.labels import LOSSES, SUM, TINY_SD, Costs, best_labels
+from trustbo.planning.objectives import Objective, Weights, capped, has_history, weights_of
 from trustbo.planning.paths import AdmissiblePaths
-from trustbo.planning.risk import NO_RULE, RiskRule, RiskTable, risk_table
-from trustbo.workspace import Workspace
-from trustbo.workspace.moves import MOVES, along, move_indices
+from trustbo.planning.sums import best_sums
+from trustbo.workspace.moves import MOVE_NAMES, along, bounds_along
+
+EXACT = 1e-12
+"""Largest optimality gap, in the unit of the score, of a path that counts as exact."""
+_CERTAIN = 700.0  # -log(1 - p) of a bound that always fails
+
+
+class InfeasibleError(TrustboError):
+    """No admissible path respects `max_failure`.
+
+    Attributes:
+        path: Safest admissible path.
+        p_fail: Chance that it fails, the least of all admissible paths.
+    """
+
+    def __init__(self, message: str, path: tuple[Cell, ...], p_fail: float) -> None:
+        super().__init__(message)
+        self.path, self.p_fail = path, p_fail
+
+
+class Best(NamedTuple):
+    """Best path of each draw as flat cells (draw, cell), filled with -1; score and its limit."""
+
+    paths: np.ndarray
+    score: np.ndarray
+    limit: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
-class PlanningProblem:
-    """Workspace, admissible paths and objective: the data of a `Planner`.
+class Problem:
+    """Admissible paths, objective and costs: the data of a `Planner`, which explains them.
 
-    Trust of the `team` is the `"mean"` or the least (`"min"`) of its robots'. `rule` limits the
-    chance that a plan fails, and `risk` has the chances that its bounds do.
-
-    TrustboError: unknown team or objective; a length weight that is negative, or for success or
-    bottleneck.
+    Attributes:
+        paths: Admissible paths.
+        objective: Row of `OBJECTIVES`.
+        family: Family of the contact rates.
+        toll: Cost of each bound apart from trust, (move, row, col).
+        max_failure: Largest chance that a path fails, or None.
+        failure_cost: Cost of a failure in bounds; None: the fewest bounds of a path.
+        risk: Chance of each bound to end the mission, or None.
     """
 
     paths: AdmissiblePaths
     objective: Objective
-    team: str
-    rule: RiskRule = NO_RULE
+    family: Family
+    toll: np.ndarray
+    max_failure: float | None = None
+    failure_cost: float | None = None
     risk: Risk | None = None
 
     def __post_init__(self) -> None:
-        self.rule.checked(self.objective.name)
-        require_objective(self.objective, self.team)
-        if self.objective.unseen_cost:
-            _ = self.paths.unseen  # which refuses a workspace without line of sight
+        if self.max_failure is not None:
+            require_not_negative("max_failure", self.max_failure)
+            if self.max_failure >= 1.0:
+                raise TrustboError(f"max_failure must be below 1; got {self.max_failure!r}.")
+        if self.failure_cost is not None:
+            require_not_negative("failure_cost", self.failure_cost)
+            if not self.objective.of_contact:
+                raise TrustboError(
+                    f"failure_cost is a loss of contact, which {self.objective.name!r} does not "
+                    "count; use max_failure."
+                )
+        shape = self.paths.bounds.shape
+        if self.risk is not None and self.risk.p_fail.shape != shape:
+            raise ShapeError(f"p_fail must have shape {shape}; got {self.risk.p_fail.shape}.")
 
     @property
-    def workspace(self) -> Workspace:
-        """Workspace of the admissible paths."""
-        return self.paths.workspace
+    def price(self) -> float:
+        """Cost of a failure, in bounds: 0 without a risk, or for objectives not of contact."""
+        if self.risk is None or not self.objective.of_contact:
+            return 0.0
+        return float(self.paths.shortest) if self.failure_cost is None else self.failure_cost
 
     def awareness_along(self, path: Sequence[Cell] | np.ndarray) -> np.ndarray:
         """Awareness of a path's bounds, shape (bound, robot, feature)."""
-        return np.swapaxes(along(self.workspace.bound_maps, path), 0, 1)
+        return np.swapaxes(along(self.paths.workspace.bound_maps, path), 0, 1)
 
-    def with_risk(self, risk: Risk | None) -> Self:
-        """Return the problem with a risk; ShapeError if it is not of the workspace's cells."""
-        expected = (len(MOVES[8]), *self.paths.passable.shape)
-        if risk is not None and risk.p_fail.shape != expected:
-            raise ShapeError(f"p_fail must have shape {expected}; got {risk.p_fail.shape}.")
-        return replace(self, risk=risk)
+    def toll_along(self, path: Sequence[Cell] | np.ndarray) -> float:
+        """Toll of a path."""
+        return float(self.toll[*bounds_along(path).T].sum())
 
-    @cached_property
-    def risk_table(self) -> RiskTable | None:
-        """Risks of the bounds and their limits, None where plans do not depend on them.
+    def failure_along(self, path: Sequence[Cell] | np.ndarray) -> float:
+        """Cost of a failure times the chance that a path fails."""
+        return self.price * self.risk.priced(path) if self.risk and self.price else 0.0
 
-        TrustboError: there is a limit and no risk, or what `risk_table` raises.
-        """
-        if self.risk is None:
-            if self.rule.max_failure is not None:
-                raise TrustboError(
-                    f"max_failure = {self.rule.max_failure:g} needs the chance of each bound to "
-                    "fail; use planner.with_risk(p_fail)."
-                )
-            return None
-        return risk_table(self.risk, self.rule, self.failure_cost, self.paths)
-
-    def is_within_risk(self, path: Sequence[Cell] | np.ndarray) -> bool:
-        """Whether a path keeps within `max_failure`; True without one."""
-        if self.rule.max_failure is None or (table := self.risk_table) is None:
+    def is_within_limit(self, path: Sequence[Cell] | np.ndarray) -> bool:
+        """Whether a path keeps within `max_failure`."""
+        if self.max_failure is None or self.risk is None:
             return True
-        return table.is_feasible(table.along(path, self.paths.passable.shape))
-
-    @property
-    def failure_cost(self) -> float:
-        """Cost of a failure, in bounds; 0 for other objectives than lost_contact."""
-        if self.objective.name != "lost_contact":
-            return 0.0
-        cost = self.rule.failure_cost
-        return float(self.paths.shortest) if cost is None else cost
-
-    def cost_of_failure(self, path: Sequence[Cell] | np.ndarray) -> float:
-        """`failure_cost` times the chance that a path fails, 0 without a risk."""
-        if self.risk is None or self.failure_cost == 0.0:
-            return 0.0
-        return self.failure_cost * self.risk.priced(path)
-
-    def onward(self, done: Sequence[Cell]) -> Self:
-        """Return the problem of the rest of a mission that entered the cells `done`, start first.
-
-        Bounds already made count towards the limit on their number, and their risk towards
-        `max_failure`. The value of a plan is that of the rest alone: for `mean`, the mean over the
-        bounds still to come. Raises what `AdmissiblePaths.onward` raises.
-        """
-        paths, rule, most = self.paths.onward(done), self.rule, self.rule.max_failure
-        if self.risk is not None and most is not None and len(done) > 1:
-            survived = self.risk.survival(done)
-            rule = rule._replace(max_failure=max(0.0, 1.0 - (1.0 - most) / max(survived, 1e-300)))
-        return replace(self, paths=paths, rule=rule)
+        return 1.0 - self.risk.survival(path) <= self.max_failure + ROUNDING
 
     def dynamics(
-        self, params: Params, x0: ArrayLike | None = None, *, team: str | None = None
+        self, params: Params, x0: ArrayLike | None = None, *, by_robot: bool = False
     ) -> Dynamics:
-        """Build the recursion of expected trust.
+        """Build the recursion of expected trust; see `trust_dynamics`."""
+        return trust_dynamics(params, self.paths.workspace.bound_maps, x0, by_robot=by_robot)
 
-        `x0` is by default `params.x0_mean`, and `team` the problem's.
+    @cached_property
+    def risks(self) -> "Risks | None":
+        """Risks that searches add up, None where plans do not depend on them.
+
+        Raises:
+            TrustboError: There is a limit and no risk, or the chance of a possible bound is NaN.
         """
-        maps, moves = self.workspace.bound_maps, move_indices(self.paths.connectivity)
-        z = maps if maps.shape[1] == 1 else maps[:, moves]
-        return trust_dynamics(params, z, team or self.team, x0, moves)
+        if self.risk is None and self.max_failure is not None:
+            raise TrustboError(
+                f"max_failure = {self.max_failure:g} needs the chance of each bound to fail; use "
+                "planner.with_risk(p_fail)."
+            )
+        if self.risk is None or (self.max_failure is None and self.price == 0.0):
+            return None
+        p_fail, shares = self.risk.p_fail[None], np.ones(1)
+        if self.risk.strata is not None and self.price > 0.0:
+            p_fail, shares = self.risk.strata
+        limit = np.inf
+        if self.max_failure is not None:
+            limit = -np.log1p(-self.max_failure) + ROUNDING
+            if len(shares) > 1:  # the mean of the strata has the last sum
+                p_fail = np.concatenate([p_fail, self.risk.p_fail[None]])
+                shares = np.append(shares, 0.0)
+        if (missing := np.isnan(p_fail).any(0) & self.paths.bounds).any():
+            move, row, col = np.argwhere(missing)[0].tolist()
+            raise TrustboError(
+                f"p_fail of the bound into {(row, col)} by move {MOVE_NAMES[move]!r} is NaN; give "
+                "a chance to every possible bound."
+            )
+        of_bounds = risk_of(p_fail).reshape(len(p_fail), -1).T
+        return Risks(np.ascontiguousarray(of_bounds), self.price * shares, limit)
+
+    def best(self, dynamics: Dynamics) -> Best:
+        """Find the best admissible path under every draw of `dynamics`, or the only one.
+
+        Raises:
+            TrustboError: beta0 outside the range for which the search is exact.
+            InfeasibleError: No path respects `max_failure`.
+        """
+        history = has_history(self.objective, self.family)
+        self._require_valid(dynamics, history)
+        dynamics = capped(self.objective, self.family, dynamics).flat()
+        n_draws, n_states = dynamics.start.shape
+        drift, toll = dynamics.drift.reshape(n_draws, n_states, -1), self.toll.ravel()
+        view, graph = np.full(n_states, 1.0 / n_states), self.paths.graph
+        weights = weights_of(self.objective, dynamics, view, graph.longest)
+        if self.risks is None and not history:
+            score, paths = best_sums(graph, drift, weights, toll)
+            return Best(paths, score, score)
+        start = np.zeros_like(weights.constant) if history else -weights.constant
+        loss = LOSSES[self.family.expected_rate] if history else SUM
+        risks = self.risks or Risks(np.zeros((len(toll), 1)), np.zeros(1), np.inf)
+        trust = np.array(dynamics.transition), np.array(dynamics.start)
+        sd = np.maximum(dynamics.noise_sd, TINY_SD)
+        costs = Costs(loss, drift, weights.per_bound, start, *trust, sd, toll, *risks)
+        cost, lower, paths = best_labels(graph, costs, weights.scale)
+        if np.isinf(cost).any():
+            raise self._infeasible()
+        return Best(paths, -cost, -lower)
+
+    def _require_valid(self, dynamics: Dynamics, history: bool) -> None:
+        if not self.objective.of_contact:
+            return
+        beta0 = np.diagonal(dynamics.transition, axis1=-2, axis2=-1)
+        if beta0.min() < 0.0 or (history and dynamics.transition.min() < 0.0):
+            raise TrustboError(
+                f"objective {self.objective.name!r} needs beta0 >= 0, and B0 >= 0 where rates are "
+                f"not linear in trust; got {dynamics.transition.min():g}. Use 'terminal' or 'mean'."
+            )
+
+    def safest(self) -> tuple[tuple[Cell, ...], float]:
+        """Find the admissible path with the least chance to fail, and this chance.
+
+        Raises:
+            TrustboError: The problem has no risk.
+        """
+        if self.risk is None:
+            raise TrustboError("the safest path needs chances to fail; use planner.with_risk.")
+        graph, n = self.paths.graph, self.paths.graph.longest + 1
+        nothing = Weights(np.zeros((1, n, 1)), np.zeros((1, n)), np.ones(n))
+        of_bounds = risk_of(self.risk.p_fail).ravel()
+        _, paths = best_sums(graph, np.zeros((1, 1, len(of_bounds))), nothing, of_bounds)
+        path = self.paths.cells(paths[0])
+        return path, 1.0 - self.risk.survival(path)
+
+    def _infeasible(self) -> InfeasibleError:
+        """Error of a problem in which no path respects the limit."""
+        path, p_fail = self.safest()
+        return InfeasibleError(
+            f"no admissible path from {path[0]} to {path[-1]} fails with a chance of at most "
+            f"max_failure = {self.max_failure:g}; the least is {p_fail:.4g}, on the path {path}. "
+            "Raise max_failure, admit more paths by max_bounds, or take the safest, the "
+            "attribute path of this error.",
+            path,
+            p_fail,
+        )
 
 
-def require_objective(objective: Objective, team: str) -> None:
-    """Refuse an objective or a team that is unknown, or that cannot be together: TrustboError."""
-    name = objective.name
-    require_choice("objective", name, OBJECTIVES)
-    require_choice("team", team, TEAMS)
-    for weight in ("length_weight", "unseen_cost"):
-        per_unit = require_not_negative(weight, getattr(objective, weight))
-        if per_unit and name not in TOLLED:
-            raise TrustboError(f"{weight} is for {', '.join(TOLLED)}; the objective is {name!r}.")
+class Risks(NamedTuple):
+    """Risks -log(1 - p_fail) of bounds, which a path adds up.
+
+    Fields: of_bounds (bound, sum), for the strata of the risk and, with a limit, for their mean;
+    failure (sum,), the cost F_m of a path with sum r_m, F_m (1 - exp(-r_m)); and the limit of the
+    last sum.
+    """
+
+    of_bounds: np.ndarray
+    failure: np.ndarray
+    limit: float
+
+
+def risk_of(p_fail: np.ndarray) -> np.ndarray:
+    """Risk of chances to fail, of which 1 has a large one; 0 where there is no bound."""
+    with np.errstate(divide="ignore"):
+        return np.minimum(-np.log1p(-np.nan_to_num(p_fail)), _CERTAIN)
 
 
 def draws_of(posterior: Params | xr.DataTree, *, day: bool = False) -> Params:

@@ -5,34 +5,31 @@ import xarray as xr
 from numpy.typing import ArrayLike
 from scipy.special import expit
 
-from trustbo.data import Cell
 from trustbo.models.params import Params
 from trustbo.planning.dynamics import Dynamics
-from trustbo.planning.objectives import Objective
-from trustbo.planning.paths import SIMPLE_EXTRA, AdmissiblePaths
-from trustbo.planning.problem import PlanningProblem
-from trustbo.planning.search.case import Case
-from trustbo.planning.search.compiled import plan_compiled
-from trustbo.planning.search.reachable_trust import best_trust
-from trustbo.planning.values import path_trust
+from trustbo.planning.objectives import OBJECTIVES, weights_of
+from trustbo.planning.paths import SIMPLE_EXTRA, STEPS, AdmissiblePaths
+from trustbo.planning.problem import Problem
+from trustbo.planning.sums import best_sums
 
 
 def trust_map(
-    problem: PlanningProblem,
+    problem: Problem,
     params: Params,
     *,
     per_robot: bool = False,
     x0: ArrayLike | None = None,
 ) -> xr.DataArray:
     """Compute the map of `Planner.trust_map`."""
-    team = "min" if per_robot else None
-    dynamics = problem.dynamics(params, x0, team=team).flat()
-    like = problem.workspace.awareness.isel(feature=0, drop=True)
+    dynamics = problem.dynamics(params, x0, by_robot=per_robot).flat()
+    like = problem.paths.workspace.awareness.isel(feature=0, drop=True)
+    n_states = dynamics.start.shape[-1]
     if per_robot:
-        robots = [_of_robot(dynamics, i) for i in range(dynamics.start.shape[-1])]
-        values = np.stack([_largest_trust(problem.paths, robot) for robot in robots], axis=1)
+        robots = [_largest(problem.paths, dynamics, view) for view in np.eye(n_states)]
+        values = np.stack(robots, axis=1)
     else:
-        values, like = _largest_trust(problem.paths, dynamics), like.isel(robot=0, drop=True)
+        values = _largest(problem.paths, dynamics, np.full(n_states, 1.0 / n_states))
+        like = like.isel(robot=0, drop=True)
     like = like.expand_dims(draw=len(values)) if params.leading else like
     trust = like.copy(data=values if params.leading else values[0])
     return trust.rename("trust").assign_attrs(long_name="expected trust")
@@ -54,38 +51,66 @@ def summary_of(trust: xr.DataArray) -> xr.Dataset:
     return xr.Dataset(summary)
 
 
-def _of_robot(dynamics: Dynamics, robot: int) -> Dynamics:
-    """Dynamics whose view is one robot; its state suffices where robots do not interact."""
-    n_robots, one = dynamics.start.shape[-1], slice(robot, robot + 1)
-    transition, drift, start, _, sd = dynamics
-    if (transition == transition * np.eye(n_robots)).all():
-        return Dynamics(transition[:, one, one], drift[:, one], start[:, one], np.eye(1), sd)
-    return dynamics._replace(views=np.eye(n_robots)[one])
-
-
-def _largest_trust(admissible: AdmissiblePaths, dynamics: Dynamics) -> np.ndarray:
-    """Largest trust of every draw and cell, shape (draw, row, col); NaN if out of reach."""
-    extra = min(SIMPLE_EXTRA, admissible.longest - admissible.shortest)
-    fewest = admissible.bounds_from_start
-    if dynamics.is_scalar:
-        beta0, x0 = dynamics.transition[:, 0, 0], dynamics.start[:, 0]
-        drift = admissible.masked(dynamics.drift[:, 0])
-        return best_trust(drift, beta0, x0, fewest, admissible.steps, extra)
-    values = np.full((len(dynamics.start), *fewest.shape), np.nan)
-    for row, col in np.argwhere(fewest >= 0).tolist():
-        values[:, row, col] = _trust_at(admissible, dynamics, (row, col), extra)
+def _largest(paths: AdmissiblePaths, dynamics: Dynamics, view: np.ndarray) -> np.ndarray:
+    """Largest trust view . x of every draw and cell, (draw, row, col); NaN if out of reach."""
+    extra = min(SIMPLE_EXTRA, paths.longest - paths.shortest)
+    weights = view @ dynamics.transition  # (draw, state)
+    beta0 = np.divide(weights, view, out=np.zeros_like(weights), where=view > 0.0)
+    if (weights == beta0.max(-1, keepdims=True) * view).all():  # view . x depends on itself alone
+        drift = np.einsum("s,dsmrc->dmrc", view, dynamics.drift)
+        drift = np.where(paths.bounds, drift, np.nan)
+        fewest = paths.bounds_from_start, paths.start, extra
+        return best_trust(drift, beta0.max(-1), dynamics.start @ view, *fewest)
+    drift = dynamics.drift.reshape(*dynamics.start.shape, -1)
+    values = np.full((len(drift), *paths.passable.shape), np.nan)
+    for row, col in np.argwhere(paths.bounds_from_start > 0).tolist():
+        graph = paths.to((row, col), extra).graph
+        weights = weights_of(OBJECTIVES["terminal"], dynamics, view, graph.longest)
+        no_toll = np.zeros(paths.bounds.size)
+        values[:, row, col], _ = best_sums(graph, drift, weights, no_toll)
+    values[:, *paths.start] = dynamics.start @ view
     return values
 
 
-def _trust_at(
-    admissible: AdmissiblePaths, dynamics: Dynamics, cell: Cell, extra: int
+def best_trust(
+    drift: np.ndarray,
+    beta0: np.ndarray,
+    x0: np.ndarray,
+    fewest: np.ndarray,
+    start: tuple[int, int],
+    extra: int,
 ) -> np.ndarray:
-    """Largest trust at one cell, by planning a path to it: vector trust has no scalar recursion."""
-    if cell == admissible.start:
-        return (dynamics.start @ dynamics.views.T).min(-1)
-    objective = Objective("terminal")
-    best = plan_compiled(Case(admissible.to(cell, extra), dynamics, objective))
-    assert best is not None  # as there is no risk  # noqa: S101
-    paths = [admissible.cells(flat) for flat in best.paths]
-    along = [dynamics.take(d).along(path) for d, path in enumerate(paths)]
-    return np.array([path_trust(one, objective, 0.0).trust[-1] for one in along])
+    """Largest trust with which each cell can be entered, (draw, row, col); NaN if out of reach.
+
+    One pass over the numbers of bounds. A bound may not lead back to the cell before: each cell
+    keeps the largest trust by any move and by another. Exact for beta0 >= 0.
+
+    Args:
+        drift: Drift of bounds, (draw, move, row, col), NaN where there is none.
+        beta0: Autoregression, (draw,).
+        x0: Trust at the start, (draw,).
+        fewest: Fewest bounds from the start, (row, col), -1 where there is no path.
+        start: First cell.
+        extra: Bounds beyond the fewest that a path to a cell may have.
+    """
+    margin = ((0, 0), (0, 0), (1, 1), (1, 1))
+    u = np.pad(np.where(np.isnan(drift), -np.inf, drift), margin, constant_values=-np.inf)
+    n_draws, n_moves, rows, cols = u.shape
+    reach = np.pad(np.where(fewest < 0, -1, fewest + extra), 1, constant_values=-1)
+    top, second = np.full((2, n_draws, rows, cols), -np.inf)
+    by = np.full((n_draws, rows, cols), -1)
+    top[:, start[0] + 1, start[1] + 1] = second[:, start[0] + 1, start[1] + 1] = x0
+    best, entered = top.copy(), np.empty((n_moves, n_draws, rows, cols))
+    for k in range(1, int(fewest.max()) + extra + 1):
+        for m, step in enumerate(STEPS):
+            before = np.where(by == n_moves - 1 - m, second, top)  # the reverse move is forbidden
+            before = np.roll(before, step, axis=(1, 2))  # the margin is closed
+            carried = np.where(np.isneginf(before), before, beta0[:, None, None] * before)
+            entered[m] = carried + u[:, m]
+        entered[:, :, k > reach] = -np.inf
+        by = entered.argmax(0)
+        top = np.take_along_axis(entered, by[None], 0)[0]
+        np.put_along_axis(entered, by[None], -np.inf, 0)
+        second = entered.max(0)
+        best = np.maximum(best, top)
+    return np.where(np.isfinite(best), best, np.nan)[:, 1:-1, 1:-1]

@@ -23,7 +23,7 @@ from trustbo.simulation.protocol import digest, require_path
 from trustbo.simulation.replicates import END, replicated
 from trustbo.workspace import Workspace
 from trustbo.workspace.location import Location
-from trustbo.workspace.moves import MOVES, move_indices, moves_along
+from trustbo.workspace.moves import MOVES, moves_along
 
 _MAX_BOUNDS = re.compile(r"shortest(?:\+(\d+))?")
 
@@ -134,7 +134,6 @@ class Truth(Summary):
         goal: Location,
         max_bounds: int | str = "shortest+4",
         *,
-        connectivity: int = 8,
         failures: bool = False,
     ) -> tuple[Cell, ...]:
         """Find the path of least `lost`, or with `failures` of least `lost_or_failed`, exactly.
@@ -143,7 +142,6 @@ class Truth(Summary):
             start: First cell, or a position in it, see `Workspace.locate`.
             goal: Last cell, or a position in it.
             max_bounds: Longest path, as for `Planner`.
-            connectivity: Number of moves, 8 or 4.
             failures: Whether bounds may fail.
 
         Raises:
@@ -153,25 +151,16 @@ class Truth(Summary):
         a, b = (self.workspace.require_cell(*e) for e in (("start", start), ("goal", goal)))
         contact, passed = (self.bounds[name].values for name in ("contact", "passed"))
         passed = passed if failures else np.ones(passed.shape)
-        moves = move_indices(connectivity)
-        allowed = np.isin(np.arange(END), moves)[:, None, None]
-        contact = np.where(allowed[..., None], contact, np.nan)
-        longest = _longest(allowed & self.workspace.passable_bounds.values, a, b, max_bounds)
+        longest = _longest(self.workspace.passable_bounds.values, a, b, max_bounds)
         return _most_kept(contact, passed, a, b, longest, u_turns=isinstance(max_bounds, int))
 
-    def regret(
-        self,
-        path: Sequence[Cell],
-        max_bounds: int | str = "shortest+4",
-        *,
-        connectivity: int = 8,
-    ) -> float:
+    def regret(self, path: Sequence[Cell], max_bounds: int | str = "shortest+4") -> float:
         """Regret of a path, in % of the contact that the best path between its ends keeps.
 
         100 (lost on the path - lost on the best) / contact kept on the best, all in bounds.
         Negative if the path is better than the best of at most `max_bounds`.
         """
-        best = self.best(path[0], path[-1], max_bounds, connectivity=connectivity)
+        best = self.best(path[0], path[-1], max_bounds)
         least = self.lost(best)
         kept = len(best) - 1 - least
         return 100.0 * (self.lost(path) - least) / kept if kept > 0.0 else np.nan

@@ -52,7 +52,7 @@ class Scene:
         has_truth: Whether regret is held against the truth of the simulator.
         judged: Objective and admissible paths of the best path, see `path_class`; by default those
             of the campaign.
-        options: Options of the campaigns on it, such as the connectivity of paths.
+        options: Options of the campaigns on it.
     """
 
     labels: Mapping[str, Any]

@@ -7,7 +7,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from jax import Array
 
 from trustbo.campaign.campaign import Campaign
 from trustbo.data import Cell
@@ -18,10 +17,9 @@ from trustbo.models.model import TrustModel, require_model
 from trustbo.models.params import Params
 from trustbo.models.record import model_to_record
 from trustbo.paper import CAMPAIGN, WORKSPACE
-from trustbo.planning import POLICIES, Plan, Planner
-from trustbo.planning.path_sampling import path_sampler
-from trustbo.planning.paths import AdmissiblePaths, PathClass
-from trustbo.planning.policies import random, seed_of
+from trustbo.planning import POLICIES, Plan, Planner, Policy
+from trustbo.planning.policies import random
+from trustbo.planning.policies import random_path as along_random_drifts
 from trustbo.study.calls import IMPORTED, identity_of, imported, made
 from trustbo.workspace import Workspace
 from trustbo.workspace.location import Location
@@ -35,8 +33,7 @@ MODELS: dict[str, dict[str, Any]] = {
 }
 """Settings of models by short names."""
 
-PLANNER_OPTIONS = ("connectivity", "max_bounds", "team", "length_weight", "unseen_cost",
-                   "max_failure", "failure_cost")  # fmt: skip
+PLANNER_OPTIONS = ("max_bounds", "max_failure", "failure_cost")
 FIT_OPTIONS = ("n_chains", "warmup", "draws", "target_accept", "max_tree_depth")
 """Options of a case that are those of the planner and of fits."""
 
@@ -124,13 +121,13 @@ def _made(factory: Callable[..., Any], callbacks: Sequence[Any]) -> Any:
 class Unlearned:
     """Policy that recommends what it would do next, and ignores what a model has learned."""
 
-    def __init__(self, name: str, choose: Callable[[Array, Params, Planner], Plan]) -> None:
+    def __init__(self, name: str, choose: Policy) -> None:
         """Wrap a policy."""
         self.__name__, self._choose = name, choose
 
-    def __call__(self, key: Array, posterior: Params, planner: Planner) -> Plan:
+    def __call__(self, rng: np.random.Generator, params: Params, planner: Planner) -> Plan:
         """Choose a path."""
-        return self._choose(key, posterior, planner)
+        return self._choose(rng, params, planner)
 
     def recommend(self, campaign: Campaign) -> tuple[Cell, ...]:
         """Path of the next mission."""
@@ -138,20 +135,18 @@ class Unlearned:
 
 
 def random_path() -> Unlearned:
-    """Policy that draws any admissible path."""
+    """Policy that takes the best path under random drifts."""
     return Unlearned("random", random)
 
 
 def shortest_path() -> Unlearned:
-    """Policy that draws any of the paths with the fewest bounds."""
+    """Policy that takes the best path under random drifts of those with the fewest bounds."""
     return Unlearned("shortest", _random_shortest)
 
 
-def _random_shortest(key: Array, posterior: Params, planner: Planner) -> Plan:
-    admitted = PathClass(planner.connectivity, "shortest")
-    paths = AdmissiblePaths(planner.workspace, planner.start, planner.goal, admitted)
-    path = path_sampler(paths).draw(np.random.default_rng(seed_of(key)))
-    return planner.evaluate(path, posterior.mean())
+def _random_shortest(rng: np.random.Generator, params: Params, planner: Planner) -> Plan:
+    shortest = Planner(planner.workspace, planner.start, planner.goal, max_bounds="shortest")
+    return planner.evaluate(along_random_drifts(rng, shortest), params.mean())
 
 
 BASELINE_ROWS: Mapping[str, tuple[str, Mapping[str, Any]]] = {

@@ -25,7 +25,6 @@ from trustbo.team import Team
 from trustbo.terrain.example import EXAMPLES, example_files
 from trustbo.terrain.read import read_terrain
 from trustbo.workspace import Workspace
-from trustbo.workspace.moves import MOVES
 from trustbo.workspace.sight import Sight
 
 REAL = ("wellington", "tahoe", "bcts", "topography")
@@ -74,7 +73,6 @@ class World:
             height from its lower left corner, in place of CRS metres.
         shape: Planning grid.
         cell: Side of a cell of a synthetic terrain, m.
-        connectivity: Number of directions that a path may take, 8 or 4.
         simulate: Name of the simulator, in `SIMULATORS`.
         data: Folder of the real terrains.
     """
@@ -90,7 +88,6 @@ class World:
     events: tuple[Event, ...] = ()
     shape: tuple[int, int] = (10, 10)
     cell: float = 50.0
-    connectivity: int = 8
     simulate: str = "kinematic"
     data: str | None = None
 
@@ -151,7 +148,7 @@ class World:
         assumed = replace(
             self, name="", kind="", sight=self.assumed or self.sight, assumed=None,
             team=self.assumed_team or self.team, assumed_team=None, events=(),
-            connectivity=8, simulate="kinematic",
+            simulate="kinematic",
         )  # fmt: skip
         return _workspace(assumed, tuple(sorted(options.items())))
 
@@ -203,9 +200,7 @@ class World:
             "n-s": ((0, cols // 2), (rows, cols - cols // 2)),
             "w-e": ((rows - rows // 2, 0), (rows // 2, cols)),
         }[require_choice("course", course, COURSES)]
-        steps = np.zeros((3, 3))
-        steps[*(np.array(MOVES[self.connectivity]).T + 1)] = 1
-        regions: Any = ndimage.label(self.workspace().passable.values, steps)
+        regions: Any = ndimage.label(self.workspace().passable.values, np.ones((3, 3)))
         labels = regions[0]
         largest = np.argmax(np.bincount(labels.ravel())[1:]) + 1
         free = np.argwhere(labels == largest)
@@ -241,7 +236,6 @@ def scene_of(
         ends=world.ends(course),
         simulator=partial(_simulator, world, simulate),
         judged={"max_bounds": max_bounds},
-        options={"connectivity": world.connectivity},
     )
 
 

@@ -155,7 +155,6 @@ _CASES: tuple[_Case, ...] = (
     ("shapes", "20x20", (_CEDAR,), {"shape": (20, 20), "cell": 25.0}),
     ("teams", "team-of-2", ("synthetic-2", "bcts"), {"team": Team(2)}),
     ("teams", "team-of-5", (_CEDAR,), {"team": Team(5)}),
-    ("four-ways", "four-ways", ("synthetic-1", _ALDER, "topography"), {"connectivity": 4}),
     ("limit", "limit-4", ("synthetic-0", "synthetic-1", _BIRCH, _CEDAR), _limit(14.0, 18.0)),
     ("limit", "limit-4", (_ALDER,), _limit(18.0, 22.0)),
     ("limit", "limit-4", ("tahoe", "topography"), _limit(22.0, 26.0)),

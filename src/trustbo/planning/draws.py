@@ -9,11 +9,9 @@ import numpy as np
 from trustbo.data import Cell
 from trustbo.errors import require_whole
 from trustbo.models.params import Params
-from trustbo.planning.dynamics import Dynamics
-from trustbo.planning.objectives import OBJECTIVES
-from trustbo.planning.problem import PlanningProblem
-from trustbo.planning.tolls import toll_along
-from trustbo.planning.values import path_trust
+from trustbo.planning.dynamics import Dynamics, roll
+from trustbo.planning.objectives import capped, score_of
+from trustbo.planning.problem import Problem
 
 _ROUNDING = 1e-12
 """Difference of the values of two paths that may be the same."""
@@ -24,13 +22,14 @@ class DrawnPaths:
     """Best path under each of some draws of a planning problem.
 
     Attributes:
+        problem: Planning problem.
         dynamics: Recursion of expected trust with leading axis (draw,).
         paths: Flat indices of cells, shape (draw, length), filled with -1.
         gap: Optimality gap of each path, shape (draw,); 0 where exact.
         chosen: Indices of the draws in the posterior, shape (draw,).
     """
 
-    problem: PlanningProblem
+    problem: Problem
     dynamics: Dynamics
     paths: np.ndarray
     gap: np.ndarray
@@ -70,8 +69,10 @@ class DrawnPaths:
         other objectives, of the best path's value. Infinite where that is 0.
         """
         scale = np.abs(self.values)
-        if self.problem.objective.name == "lost_contact":
-            scale = np.maximum(0.0, (self.paths >= 0).sum(1) - 1 + self.values + self._tolls)
+        if self.problem.objective.of_contact:
+            tolls = [self.problem.toll_along(path) for path in map(self._cells, self._unique[0])]
+            n_bounds = (self.paths >= 0).sum(1) - 1
+            scale = np.maximum(0.0, n_bounds + self.values + np.array(tolls)[self._unique[1]])
         regret = self.regret(path)
         nothing = np.where(regret > _ROUNDING, np.inf, 0.0)
         return np.divide(regret, scale, out=nothing, where=scale > 0.0)
@@ -92,19 +93,15 @@ class DrawnPaths:
             count[np.unique(path[path >= 0])] += n
         return (count / len(self.paths)).reshape(passable.shape)
 
-    def _value(self, dynamics: Dynamics, path: Sequence[Cell]) -> np.ndarray:
-        objective = self.problem.objective
-        toll = toll_along(self.problem.paths, objective, path)
-        trust = path_trust(dynamics.along(path), objective, toll)
-        return OBJECTIVES[objective.name](trust) - self.problem.cost_of_failure(path)
+    def _cells(self, flat: np.ndarray) -> tuple[Cell, ...]:
+        return self.problem.paths.cells(flat)
 
-    @cached_property
-    def _tolls(self) -> np.ndarray:
-        """Toll of the best path of each draw, (draw,)."""
-        paths, objective = self.problem.paths, self.problem.objective
-        unique, inverse, _ = self._unique
-        tolls = [toll_along(paths, objective, paths.cells(path)) for path in unique]
-        return np.array(tolls)[inverse]
+    def _value(self, dynamics: Dynamics, path: Sequence[Cell]) -> np.ndarray:
+        problem, objective, family = self.problem, self.problem.objective, self.problem.family
+        along = capped(objective, family, dynamics.along(path))
+        toll = problem.toll_along(path)
+        score = score_of(objective, family, roll(along).mean(-1), along.noise_sd, toll)
+        return objective.value(score) - problem.failure_along(path)
 
     @cached_property
     def _unique(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

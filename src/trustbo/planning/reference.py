@@ -1,0 +1,93 @@
+"""The planner by networkx and by enumeration: slow, readable, and judge of the compiled searches.
+
+Where the value of a path is a sum over its bounds, it is the shortest path by Bellman and Ford in
+the unrolled graph; where history or risk counts, all admissible paths are written out. Neither uses
+a kernel of the package.
+"""
+
+from collections.abc import Iterator
+
+import networkx as nx
+import numpy as np
+import xarray as xr
+
+from trustbo.data import Cell
+from trustbo.models.params import Params
+from trustbo.planning.dynamics import Dynamics
+from trustbo.planning.objectives import capped, has_history
+from trustbo.planning.paths import AdmissiblePaths
+from trustbo.planning.plan import Plan
+from trustbo.planning.planner import Planner
+from trustbo.planning.problem import mean_of
+from trustbo.workspace.moves import MOVES
+
+
+def plan(planner: Planner, params: Params | xr.DataTree) -> Plan:
+    """Find the best admissible path for given parameters, or for the mean of a posterior.
+
+    Its value is that of `planner.plan(params)`; of several best paths it may be another one.
+
+    Args:
+        planner: Planner of a small grid.
+        params: Posterior or parameters, whose mean is taken.
+
+    Raises:
+        InfeasibleError: No path respects `max_failure`.
+    """
+    problem, mean = planner.problem, mean_of(params)
+    if problem.risks is not None or has_history(problem.objective, problem.family):
+        plans = [planner.evaluate(path, mean) for path in every_path(problem.paths)]
+        within = [one for one in plans if not one.infeasible]
+        return max(within, key=lambda one: one.value) if within else planner.plan(mean)
+    dynamics = capped(problem.objective, problem.family, planner.dynamics(mean))
+    plans = [planner.evaluate(path, mean) for path in shortest_paths(planner, dynamics)]
+    return max(plans, key=lambda one: one.value)
+
+
+def shortest_paths(planner: Planner, dynamics: Dynamics) -> Iterator[tuple[Cell, ...]]:
+    """Best path of each number of bounds, by `networkx.bellman_ford_path`.
+
+    In a path, a bound with j bounds left after it adds w_j . u to the sum, with the weights w_j =
+    sum_{i <= j} credit(i) view . B0^(j - i) of its drift u, and takes its toll away.
+    """
+    problem = planner.problem
+    graph, n_states = problem.paths.graph, len(dynamics.start)
+    credit = problem.objective.credit(np.arange(graph.longest + 1))
+    view, weights = np.full(n_states, 1.0 / n_states), []
+    carried = np.zeros(n_states)
+    for j in range(graph.longest):
+        carried = carried @ dynamics.transition + credit[j] * view
+        weights.append(carried)
+    drift = np.broadcast_to(dynamics.drift, (n_states, *problem.paths.bounds.shape))
+    drift, toll = drift.reshape(n_states, -1), problem.toll.ravel()
+    left = graph.left[graph.head]  # after each edge
+    cost = [toll[b] - weights[j] @ drift[:, b] for b, j in zip(graph.bound, left, strict=True)]
+    network = graph.to_networkx(cost)
+    for s in graph.starts:
+        start = None, int(graph.cell[s]), int(graph.left[s])
+        try:
+            nodes = nx.bellman_ford_path(network, start, "goal", weight="cost")
+        except (nx.NetworkXNoPath, nx.NodeNotFound):  # none without a U-turn
+            continue
+        cells = np.array([node[1] for node in nodes[:-1]])
+        yield (*problem.paths.cells(cells), planner.goal)
+
+
+def every_path(paths: AdmissiblePaths) -> Iterator[tuple[Cell, ...]]:
+    """All admissible paths, written out: for small grids."""
+    onward: dict[Cell, list[Cell]] = {}
+    for move, row, col in np.argwhere(paths.bounds).tolist():
+        down, right = MOVES[8][move]
+        onward.setdefault((row - down, col - right), []).append((row, col))
+    stack: list[tuple[Cell, ...]] = [(paths.start,)]
+    while stack:
+        path = stack.pop()
+        for cell in onward.get(path[-1], []):
+            if not 0 <= paths.bounds_to_goal[cell] <= paths.longest - len(path):
+                continue
+            if not paths.turns and path[-2:-1] == (cell,):
+                continue
+            if cell == paths.goal:
+                yield (*path, cell)
+            else:
+                stack.append((*path, cell))

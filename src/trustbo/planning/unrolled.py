@@ -1,0 +1,182 @@
+"""The unrolled graph: the bounds of a path problem, copied for each number of bounds left.
+
+A state (cell, left) is a path in a cell with so many bounds to go. An edge is a bound; it leads to
+a state with one bound less. Every path through the graph is admissible, and every admissible path
+is in it. Kernels go through its arrays once, in the order of `left`; networkx gets the same edges
+by `to_networkx`.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple, Self
+
+import networkx as nx
+import numpy as np
+from numba import njit
+
+kernel = njit(cache=True, nogil=True, error_model="numpy")
+"""Compiler of the kernels: cached on disk, without the interpreter's lock, 1 / 0 is inf."""
+
+
+class Unrolled(NamedTuple):
+    """States in the order of the bounds left, the goal first; edges in the order of their tails.
+
+    Fields:
+        cell: Flat index of the cell of each state, (state,).
+        left: Bounds left in each state, (state,).
+        first: Edges first[s] to first[s + 1] - 1 leave state s, (state + 1,).
+        head: State that each edge leads to, (edge,).
+        bound: Bound of each edge, move * cells + cell entered, (edge,).
+        starts: State of the start for each number of bounds, from fewest to most, (length,).
+        turns: Whether a bound may lead back to the cell before.
+    """
+
+    cell: np.ndarray
+    left: np.ndarray
+    first: np.ndarray
+    head: np.ndarray
+    bound: np.ndarray
+    starts: np.ndarray
+    turns: bool
+
+    @classmethod
+    def of_grid(
+        cls,
+        bounds: np.ndarray,
+        steps: np.ndarray,
+        to_goal: np.ndarray,
+        from_start: np.ndarray,
+        longest: int,
+        *,
+        turns: bool,
+    ) -> Self:
+        """Unroll the bounds of a grid.
+
+        Args:
+            bounds: Bounds that a path may take, (move, row, col), by the cell that they enter.
+            steps: Rows and columns of each move, (move, 2).
+            to_goal: Fewest bounds from each cell to the goal, (row, col), -1 without a path.
+            from_start: Fewest bounds from the start, likewise.
+            longest: Largest number of bounds of a path.
+            turns: Whether a bound may lead back to the cell before.
+        """
+        n_moves, rows, cols = bounds.shape
+        far, bounds = to_goal.ravel(), bounds.reshape(n_moves, -1)
+        n_left = numbers_left(to_goal, from_start, longest).ravel()
+        cell = np.repeat(np.arange(rows * cols, dtype=np.int32), n_left)
+        base = np.concatenate([[0], np.cumsum(n_left)])
+        left = (np.arange(len(cell)) - base[cell] + far[cell]).astype(np.int32)
+        order = np.argsort(left, kind="stable")
+        rank = np.empty(len(cell), np.int32)
+        rank[order] = np.arange(len(cell))
+        cell, left = cell[order], left[order]
+        row, col = np.divmod(cell, cols)
+        head = np.full((len(cell), n_moves), -1, np.int32)
+        for m, (down, right) in enumerate(steps.tolist()):
+            inside = (row + down >= 0) & (row + down < rows)
+            inside &= (col + right >= 0) & (col + right < cols) & (left > 0)
+            tail = np.flatnonzero(inside)
+            other = cell[tail] + down * cols + right
+            more = left[tail] - 1 - far[other]  # of the bounds left there, beyond the fewest
+            fits = bounds[m, other] & (more >= 0) & (more < n_left[other])
+            head[tail[fits], m] = rank[base[other[fits]] + more[fits]]
+        tail, move = np.nonzero(head >= 0)
+        head = head[tail, move]
+        first = np.searchsorted(tail, np.arange(len(cell) + 1))
+        start = np.flatnonzero(from_start.ravel() == 0)[0]
+        starts = rank[base[start] : base[start + 1]]
+        bound = (move * rows * cols + cell[head]).astype(np.int32)
+        return cls(cell, left, first, head, bound, starts, turns)
+
+    @property
+    def longest(self) -> int:
+        """Largest number of bounds of a path."""
+        return int(self.left[-1])
+
+    def to_networkx(self, cost: Sequence[float] | np.ndarray) -> nx.DiGraph:
+        """Return the graph with the `cost` and the `bound` of each edge, for any algorithm.
+
+        Every path of the graph from a node `(None, start, left)` to the node `"goal"` is
+        admissible. A node is (cell before, cell, bounds left); the cell before is None where a
+        path may turn back, as it does not matter there.
+
+        Args:
+            cost: Cost of each edge, (edge,).
+        """
+        graph = nx.DiGraph()
+        nodes: list[tuple[int | None, int]] = [(None, s) for s in self.starts.tolist()]
+        met = set(nodes)
+        while nodes:
+            before, s = nodes.pop()
+            tail = (before, int(self.cell[s]), int(self.left[s]))
+            for e in range(self.first[s], self.first[s + 1]):
+                h = int(self.head[e])
+                if not self.turns and self.cell[h] == before:
+                    continue
+                onward = (None if self.turns else tail[1], h)
+                head = "goal" if h == 0 else (onward[0], int(self.cell[h]), int(self.left[h]))
+                graph.add_edge(tail, head, cost=float(cost[e]), bound=int(self.bound[e]))
+                if h > 0 and onward not in met:
+                    met.add(onward)
+                    nodes.append(onward)
+        return graph
+
+
+def numbers_left(to_goal: np.ndarray, from_start: np.ndarray, longest: int) -> np.ndarray:
+    """How many numbers of bounds can be left in each cell on a path, (row, col).
+
+    They begin with the fewest bounds `to_goal`; in the goal, where a path ends, there is one.
+    """
+    number = np.maximum(longest - from_start - to_goal + 1, 0)
+    number = np.where((to_goal >= 0) & (from_start >= 0), number, 0)
+    return np.where(to_goal == 0, np.minimum(number, 1), number)
+
+
+class ToGo(NamedTuple):
+    """Least cost from each state to the goal, (state,), its first edge, and the second best.
+
+    The second best begins with another edge: where a path may not turn back, at most one first
+    edge is forbidden, so that these two suffice.
+    """
+
+    least: np.ndarray
+    edge: np.ndarray
+    second: np.ndarray
+    other: np.ndarray
+
+
+@kernel
+def new_to_go(n_states: int) -> ToGo:
+    """Room for the costs to go of so many states."""
+    edge, other = np.full(n_states, -1), np.full(n_states, -1)
+    return ToGo(np.zeros(n_states), edge, np.full(n_states, np.inf), other)
+
+
+@kernel
+def fill_to_go(graph, cost, to_go) -> None:
+    """Dynamic programming from the goal: write the least sums of the cost of edges, (edge,)."""
+    least, edge, second, other = to_go
+    cell, first, head = graph.cell, graph.first, graph.head
+    for s in range(1, len(cell)):
+        low, next_low, at, at_next = np.inf, np.inf, -1, -1
+        for e in range(first[s], first[s + 1]):
+            h = head[e]
+            value = cost[e] + least[h]
+            if not graph.turns and edge[h] >= 0 and cell[head[edge[h]]] == cell[s]:
+                value = cost[e] + second[h]
+            if value < low:
+                next_low, at_next, low, at = low, at, value, e
+            elif value < next_low:
+                next_low, at_next = value, e
+        least[s], edge[s], second[s], other[s] = low, at, next_low, at_next
+
+
+@kernel
+def edges_from(graph, to_go, start, edges) -> int:
+    """Write the edges of the cheapest path from a state; their number."""
+    s, before, n = start, -1, 0
+    while s > 0:
+        e = to_go.edge[s]
+        if not graph.turns and graph.cell[graph.head[e]] == before:
+            e = to_go.other[s]
+        edges[n], before, s, n = e, graph.cell[s], graph.head[e], n + 1
+    return n

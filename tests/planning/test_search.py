@@ -1,0 +1,156 @@
+"""Plans against all admissible paths written out, against networkx, and by closed forms."""
+
+import networkx as nx
+import numpy as np
+import pytest
+from fuzz_plans import draw_problem, faults
+from peers.every_path import TooManyError, best_walk
+
+from trustbo.errors import TrustboError
+from trustbo.hazard.strata import Strata
+from trustbo.models import TrustParams
+from trustbo.planning import OBJECTIVES, InfeasibleError, Planner, reference
+from trustbo.planning.objectives import Objective
+from trustbo.workspace import Workspace
+
+PARAMS = TrustParams(0.6, np.array([0.8, 0.4]), -0.3, 0.1, 0.1)
+ENDS = (3, 0), (0, 3)
+
+
+@pytest.fixture
+def workspace():
+    passable = np.ones((4, 4), bool)
+    passable[1, 1] = False
+    z = np.random.default_rng(3).uniform(size=(2, 8, 4, 4, 2))
+    return Workspace.from_awareness(z, passable, cell_size=20.0)
+
+
+def random_problems(seed, n, most):
+    """Random problems with their best score, by all paths written out."""
+    found = []
+    while len(found) < n:
+        drawn = draw_problem(rng := np.random.default_rng([seed, len(found)]))
+        while True:
+            try:
+                best, _ = best_walk(drawn[2], most)
+            except TooManyError:
+                best = np.nan
+            if not np.isnan(best):
+                break
+            drawn = draw_problem(rng)
+        found.append((*drawn, best))
+    return found
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.filterwarnings("ignore:Mean of empty slice")
+def test_plans_are_the_best_of_all_paths_written_out(seed):
+    for planner, params, world, best in random_problems(seed, 40, 30_000):
+        assert faults(planner, params, world, best) == ([], True)
+
+
+@pytest.mark.filterwarnings("ignore:Mean of empty slice")
+def test_networkx_finds_plans_of_the_same_value():
+    for planner, params, _, best in random_problems(9, 40, 500):
+        if best > -np.inf:
+            expected = reference.plan(planner, params).value
+            assert planner.plan(params).value == pytest.approx(expected, rel=1e-9, abs=1e-9)
+
+
+@pytest.mark.parametrize("max_bounds", ["shortest", "shortest+2", 5])
+def test_the_unrolled_graph_has_every_admissible_path(workspace, max_bounds):
+    paths = Planner(workspace, *ENDS, max_bounds=max_bounds).problem.paths
+    graph = paths.graph.to_networkx(np.zeros(len(paths.graph.head)))
+    assert nx.is_directed_acyclic_graph(graph)
+    found = set()
+    for s in paths.graph.starts.tolist():
+        start = (None, int(paths.graph.cell[s]), int(paths.graph.left[s]))
+        for nodes in nx.all_simple_paths(graph, start, "goal"):
+            cells = np.array([node[1] for node in nodes[:-1]])
+            found.add((*paths.cells(cells), paths.goal))
+    assert found == set(reference.every_path(paths))
+    assert max_bounds == "shortest" or len(found) > 3
+
+
+def test_a_new_objective_is_a_row(workspace, monkeypatch):
+    """Trust discounted by the bounds that are left, by its definition on every path."""
+    row = Objective("late", credit=lambda left: 0.7**left, scale=lambda n_bounds: n_bounds + 1.0)
+    monkeypatch.setitem(OBJECTIVES, "late", row)
+    toll = np.random.default_rng(1).uniform(0.0, 0.2, (8, 4, 4))
+    planner = Planner(workspace, *ENDS, "late", toll=toll)
+    values = []
+    for path in reference.every_path(planner.problem.paths):
+        plan = planner.evaluate(path, PARAMS)
+        trust = plan.trust.mean(1)
+        n = len(trust)
+        paid = planner.problem.toll_along(path)
+        values.append(
+            (sum(0.7 ** (n - k) * trust[k - 1] for k in range(1, n + 1)) - paid) / (n + 1)
+        )
+        assert plan.value == pytest.approx(values[-1], rel=1e-12)
+    assert planner.plan(PARAMS).value == pytest.approx(max(values), rel=1e-12)
+    limited = Planner(workspace, *ENDS, "late", toll=toll, max_failure=0.99)
+    limited = limited.with_risk(np.full((8, 4, 4), 0.01))
+    assert limited.plan(PARAMS).value == pytest.approx(max(values), rel=1e-12)
+
+
+def test_bounds_that_fail_together_are_priced_as_one_failure(workspace):
+    """Half of the draws fail every bound: a price of F / 2, whatever the number of bounds."""
+    p = np.array([0.0, 1.0])[:, None, None, None] * np.ones((8, 4, 4))
+    planner = Planner(workspace, *ENDS, failure_cost=8.0)
+    plan = planner.with_risk(p.mean(0), None, {}, Strata(p, np.array([0.5, 0.5]))).plan(PARAMS)
+    assert plan.value == pytest.approx(planner.plan(PARAMS).value - 4.0, rel=1e-12)
+    assert planner.with_failure_cost(0.0).with_risk(p.mean(0)).plan(PARAMS).path == plan.path
+
+
+def test_an_infeasible_limit_is_an_error_with_the_safest_path(workspace):
+    p = np.random.default_rng(2).uniform(0.05, 0.3, (8, 4, 4))
+    planner = Planner(workspace, *ENDS, max_failure=0.1).with_risk(p)
+    risk = planner.problem.risk
+    survival = {path: risk.survival(path) for path in reference.every_path(planner.problem.paths)}
+    with pytest.raises(InfeasibleError, match="max_failure") as error:
+        planner.plan(PARAMS)
+    assert error.value.path == max(survival, key=survival.get)
+    assert error.value.p_fail == pytest.approx(1.0 - max(survival.values()), rel=1e-9)
+    assert planner.evaluate(error.value.path, PARAMS).infeasible
+    assert planner.path_posterior(PARAMS.flat()).sum() == len(error.value.path)
+    with pytest.raises(TrustboError, match="max_failure"):
+        Planner(workspace, *ENDS, max_failure=0.1).plan(PARAMS)  # without a risk
+
+
+def test_a_search_that_is_cut_short_keeps_the_limit_and_says_what_could_be_better(monkeypatch):
+    rng, cut = np.random.default_rng(3), 0
+    for _ in range(4):
+        workspace = Workspace.from_awareness(rng.uniform(size=(1, 8, 12, 12, 2)))
+        planner = Planner(workspace, (11, 0), (0, 11), max_failure=0.3)
+        planner = planner.with_risk(rng.uniform(0.0, 0.05, (8, 12, 12)))
+        whole = planner.plan(PARAMS)
+        monkeypatch.setattr("trustbo.planning.labels.MAX_LABELS", 9)
+        plan = planner.plan(PARAMS)
+        monkeypatch.undo()
+        assert whole.exact
+        assert not plan.infeasible
+        assert plan.value <= whole.value + 1e-9 <= plan.limit + 2e-9
+        cut += not plan.exact
+    assert cut > 0
+
+
+def test_draws_are_planned_as_one_by_one(workspace):
+    rng = np.random.default_rng(0)
+    draws = TrustParams(
+        rng.uniform(0.2, 0.8, 70), rng.normal(size=(70, 2)), rng.normal(size=70), np.full(70, 0.1),
+        np.full(70, 0.1),
+    )  # fmt: skip
+    p = rng.uniform(0.0, 0.1, (8, 4, 4))
+    for options in ({}, {"family": "censored"}, {"objective": "mean", "max_failure": 0.5}):
+        planner = Planner(workspace, *ENDS, **options).with_risk(p)
+        alone = [planner.plan(draws.draw(d)).value for d in range(70)]
+        np.testing.assert_allclose(planner.plan_draws(draws).values, alone, rtol=1e-9)
+
+
+def test_objectives_of_contact_need_memory_that_is_not_negative(workspace):
+    forgetful = PARAMS._replace(beta0=-0.2)
+    for family in ("gaussian", "censored"):
+        with pytest.raises(TrustboError, match="beta0"):
+            Planner(workspace, *ENDS, family=family).plan(forgetful)
+    assert Planner(workspace, *ENDS, "mean").plan(forgetful).exact

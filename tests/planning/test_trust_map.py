@@ -1,0 +1,59 @@
+"""Trust maps against all paths to each cell, and the cost map of the paper."""
+
+import numpy as np
+import pytest
+
+from trustbo.inference import sample_prior
+from trustbo.models import HierarchicalTrust, PooledTrust
+from trustbo.planning import Planner, reference, roll_trust
+from trustbo.workspace import Workspace
+
+ENDS = (3, 0), (0, 3)
+
+
+@pytest.fixture
+def workspace():
+    passable = np.ones((4, 4), bool)
+    passable[1, 1] = False
+    z = np.random.default_rng(3).uniform(size=(2, 8, 4, 4, 2))
+    return Workspace.from_awareness(z, passable)
+
+
+@pytest.mark.parametrize("model", [PooledTrust(), HierarchicalTrust()])
+def test_a_trust_map_is_the_best_of_all_paths_to_each_cell(workspace, model):
+    draws = sample_prior(model, 2, 3, seed=4, n_robots=2)
+    planner = Planner(workspace, *ENDS)
+    maps, by_robot = planner.trust_map(draws), planner.trust_map(draws, per_robot=True)
+    assert maps.dims == ("draw", "row", "col")
+    assert by_robot.dims == ("draw", "robot", "row", "col")
+    for row, col in np.argwhere(workspace.passable.values).tolist():
+        if (row, col) == planner.start:
+            continue
+        last = []
+        for path in reference.every_path(planner.problem.paths.to((row, col), 2)):
+            z = planner.problem.awareness_along(path)
+            last.append(roll_trust(draws, z)[:, -1])
+        last = np.stack(last)  # (path, draw, robot)
+        np.testing.assert_allclose(maps[:, row, col], last.mean(-1).max(0), rtol=1e-12)
+        np.testing.assert_allclose(by_robot[:, :, row, col], last.max(0), rtol=1e-12)
+    assert np.isnan(maps[:, 1, 1]).all()
+
+
+def test_the_trust_of_the_goal_is_that_of_the_terminal_plan(workspace):
+    params = sample_prior(PooledTrust(), 2, 1, seed=1).draw(0)
+    planner = Planner(workspace, *ENDS, "terminal")
+    closed = np.random.default_rng(5).uniform(size=(8, 4, 4)) < 0.2
+    planner = planner.avoiding(closed, np.zeros((8, 4, 4)))
+    last = planner.plan(params).trust[-1].mean()
+    assert float(planner.trust_map(params)[ENDS[1]]) == pytest.approx(last, rel=1e-12)
+
+
+def test_the_summary_and_the_cost_are_over_the_maps_of_draws(workspace):
+    draws = sample_prior(PooledTrust(), 2, 50, seed=1)
+    planner = Planner(workspace, *ENDS)
+    maps, summary = planner.trust_map(draws).values, planner.trust_summary(draws, n_draws=50)
+    np.testing.assert_allclose(summary["mean"], maps.mean(0))
+    np.testing.assert_allclose(summary["sd"], maps.std(0))
+    np.testing.assert_allclose(summary["cost"], (1.0 / (1.0 + np.exp(maps))).mean(0))
+    cost = planner.cost_map(draws.draw(0))
+    np.testing.assert_allclose(cost, 1.0 / (1.0 + np.exp(planner.trust_map(draws.draw(0)))))
