@@ -1,11 +1,10 @@
 """Effects of places: what they cost, and what they cost where there are none.
 
-Run: python benchmarks/places.py [times|nuts|absent|sights|stopping ...] [--data DIR]
+Run: python benchmarks/places.py [times|nuts|absent|stopping ...] [--data DIR]
 
 - times: refits and draws by effects and family, medians of three, one core; NUTS (the peer).
 - nuts: means and sds of twelve seeds together, beside long NUTS (the peer); fifteen minutes.
 - absent: truths without effects of places; regret with them in the model and without.
-- sights: line of sight under one wrong assumption, and under three that bracket the truth.
 - stopping: campaigns that `RegretBound(eps=.05)` stopped, and how many of them were wrong.
 """
 
@@ -29,7 +28,6 @@ from trustbo.simulation import ModelSimulator
 from trustbo.study import worlds
 from trustbo.study.world import COURSES
 from trustbo.terrain import synthetic_terrain
-from trustbo.workspace.sight import Sight
 
 PLACES = PooledTrust(place=PlaceEffect())
 BOTH = {"place": PlaceEffect(), "effects": [RobotEffect()]}
@@ -166,27 +164,6 @@ def absent(given):
           f"(prior {PlaceEffect().tau_s * 0.674:.3f})")  # fmt: skip
 
 
-def sights(given):
-    """Wrong canopy: one assumption of sight, and three that bracket the truth."""
-    three = [Sight(extinction=0.3), Sight(extinction=0.1 / 3.0), Sight(crown_base=0.0)]
-    results = {}
-    for world in of_synthetic_or_given(given.data):
-        if world.kind != "canopy":
-            continue
-        for name, sight in (("one, wrong", world.assumed), ("three", three)):
-            workspace = tb.Workspace.from_terrain(
-                world.true_terrain(), world.shape, world.team, sight=sight
-            )
-            for course in COURSES:
-                _, regret = campaign(world, workspace, course, 15, seed=0)
-                results.setdefault(name, []).append(regret[[0, 2, 7, 14]])
-        print(world.name, {n: np.median(v[-4:], axis=0).round(2) for n, v in results.items()},
-              flush=True)  # fmt: skip
-    for name, values in results.items():
-        middle, n = np.median(values, axis=0).round(2), len(values)
-        print(f"{name}: regret after 1, 3, 8, 15 missions, medians of {n}: {middle}")
-
-
 def of_synthetic_or_given(data):
     """Worlds of version 0.2 that have their files: synthetic ones, all where there is a folder."""
     kinds = "right", "wall", "bare", "aged", "canopy", "slopes"
@@ -246,7 +223,7 @@ def moments(posterior):
 
 
 def main():
-    parts = {f.__name__: f for f in (times, nuts, absent, sights, stopping)}
+    parts = {f.__name__: f for f in (times, nuts, absent, stopping)}
     parser = arguments(__doc__, names=parts, data=True, quick="one row, two campaigns")
     parser.set_defaults(names=["times", "absent"])
     given = parsed(parser)

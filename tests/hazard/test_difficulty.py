@@ -12,7 +12,7 @@ def behind_a_wall(gap):
     dem = np.zeros((60, 60))
     dem[:, 30] = 30.0
     dem[gap, 30] = 0.0
-    return tb.Workspace.from_terrain(terrain_of(dem), (3, 3), sight="bare")
+    return tb.Workspace.from_terrain(terrain_of(dem), (3, 3), sight=tb.workspace.Sight(0.0))
 
 
 def test_difficulty_is_that_of_the_largest_tilt_and_the_least_room():
@@ -21,7 +21,7 @@ def test_difficulty_is_that_of_the_largest_tilt_and_the_least_room():
     for limit in (1.0, 0.4):
         robot = tb.Robot(max_slope=float(np.arctan(limit)))
         team = tb.Team(robots=(robot,) * 2, lead=robot)
-        workspace = tb.Workspace.from_terrain(plane, (3, 3), team, sight="bare")
+        workspace = tb.Workspace.from_terrain(plane, (3, 3), team, sight=tb.workspace.Sight(0.0))
         measured.append(difficulty_of(workspace).sel(move="e").values[1, 1])
     for (_, tilt, narrow, tight), limit in zip(measured, (1.0, 0.4), strict=True):
         # Roll along the contour; no robot's way is but straight down, with the whole as pitch.

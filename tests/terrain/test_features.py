@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
-import xarray as xr
+from scipy.interpolate import interpn
 from worlds import terrain_of
 
 from trustbo.errors import TerrainError, TrustboError
@@ -16,7 +16,6 @@ from trustbo.terrain import (
     pixel_features,
     pixel_size,
     rays,
-    read_terrain,
 )
 from trustbo.terrain.features import (
     canopy_cover,
@@ -127,42 +126,21 @@ def test_openness_of_flat_ground_and_of_uniform_shrubs():
 
 
 @pytest.mark.parametrize(("pixel", "reach"), [((1.0, 1.0), 9.0), ((1.5, 0.7), 6.3)])
-def test_openness_is_the_mean_of_single_rays(pixel, reach):
-    """Row-wise vector code against the scalar ray of `rays`, which has tests of its own."""
-    n_rays, rng = 16, np.random.default_rng(3)
-    dem = rng.normal(size=(30, 34)).cumsum(0) * 0.3
+def test_openness_is_the_mean_of_rays_from_the_middle_of_squares(pixel, reach):
+    rng = np.random.default_rng(3)
+    dem = rng.normal(size=(32, 36)).cumsum(0) * 0.3
     height = np.maximum(rng.normal(1.0, 2.0, dem.shape), 0.0)
-    dem[4:6, 7] = np.nan
-    y, x = -np.arange(30) * pixel[0], np.arange(34) * pixel[1]
-    ground = xr.DataArray(dem, {"y": y, "x": x}, ("y", "x")).rio.write_crs("EPSG:32633")
-    ours = openness(read_terrain(ground, ground + height), reach)
-    for i, j in rng.integers(0, 30, (60, 2)):
-        passed = []
-        for k in range(n_rays):
-            angle = 2.0 * np.pi * k / n_rays
-            r, c = i + reach * np.sin(angle) / pixel[0], j + reach * np.cos(angle) / pixel[1]
-            end = rays.ground_height(dem, round(r, 9), round(c, 9))
-            if not np.isnan(end) and not np.isnan(dem[i, j]):
-                start, stop = (
-                    (float(i), float(j), dem[i, j] + 1.0),
-                    (round(r, 9), round(c, 9), end + 1.0),
-                )
-                passed.append(
-                    rays.ray_transmittance(
-                        dem,
-                        dem + height,
-                        pixel,
-                        start,
-                        stop,
-                        rays.TRANSMITTANCE,
-                        0.1,
-                        0.3,
-                        rays.work_space(),
-                    )
-                )
-        expected = np.mean(passed) if passed else np.nan
-        # float32 heights: a ray that grazes the ground to 1e-6 m may fall on either side.
-        np.testing.assert_allclose(ours[i, j], expected, atol=2e-5)
+    ours = rays.openness(dem, dem + height, pixel, reach, (1.0, 1.0))
+    index = np.arange(32), np.arange(36)
+    for r, c in ((1.5, 1.5), (13.5, 17.5), (29.5, 33.5)):
+        angle = 2.0 * np.pi * np.arange(16) / 16
+        end = np.stack([r - reach * np.sin(angle) / pixel[0], c + reach * np.cos(angle) / pixel[1]])
+        end = end[:, (end >= 0.0).all(0) & (end[0] <= 31.0) & (end[1] <= 35.0)].T
+        z = interpn(index, dem, np.concatenate([[[r, c]], end])) + 1.0
+        ends = np.column_stack([np.tile([r, c, z[0]], (len(end), 1)), end, z[1:]])
+        expected = rays.transmittances(dem, dem + height, pixel, ends, 0.1, 0.3).mean()
+        square = ours[int(r - 1.5) : int(r + 2.5), int(c - 1.5) : int(c + 2.5)]
+        np.testing.assert_allclose(square, expected, atol=1e-12)
 
 
 def test_features_keep_missing_pixels_missing():

@@ -62,7 +62,7 @@ def workspace_on(ground, team, **rules):
     terrain = synthetic_terrain((60.0, 60.0), seed=0)
     terrain["dem"].values[:] = ground
     terrain["dsm"].values[:] = ground
-    return Workspace.from_terrain(terrain, (3, 3), team, sight="bare", **rules)
+    return Workspace.from_terrain(terrain, (3, 3), team, sight=Sight(0.0), **rules)
 
 
 def test_line_of_sight_is_what_scalar_code_computes():
@@ -71,7 +71,7 @@ def test_line_of_sight_is_what_scalar_code_computes():
     workspace = workspace_on(bumpy(1), team)
     surface, (_, pairs) = workspace.surface, bounds_of(workspace)
     given = geometry(workspace.ground, pairs, workspace.passable.values)
-    found, _ = bound_features(surface, Sight("bare"), team, given, surface.ground)
+    found, _ = bound_features(surface, Sight(0.0), team, given, surface.ground)
 
     def pixel(xy):
         return np.array([xy[0] - surface.origin[0], surface.origin[1] - xy[1]])
@@ -97,7 +97,7 @@ def test_a_higher_sensor_sees_no_less_and_changes_its_robot_alone():
     given = geometry(workspace.ground, bounds_of(workspace)[1], workspace.passable.values)
     higher = Team(robots=(low, replace(low, sensor_height=3.0), low), lead=low)
     level, raised = (
-        bound_features(workspace.surface, Sight("bare"), t, given, workspace.surface.ground)[0]
+        bound_features(workspace.surface, Sight(0.0), t, given, workspace.surface.ground)[0]
         for t in (team, higher)
     )
     np.testing.assert_array_equal(level[:, [0, 2]], raised[:, [0, 2]])
@@ -211,23 +211,10 @@ def test_robots_differ():
     assert seen.values[1][known].mean() < seen.values[0][known].mean() - 0.1
 
 
-def test_several_sights_are_several_features(wooded):
-    sights = [Sight(), "wall", Sight(extinction=0.0)]
-    workspace = Workspace.from_terrain(wooded.terrain, (4, 4), wooded.team, sight=sights)
-    names = ["line_of_sight_1", "line_of_sight_2", "line_of_sight_3"]
-    assert workspace.features == ("traversability", "visibility", *names)
-    first, wall, clear_air = (workspace.bound_awareness.sel(feature=name) for name in names)
-    np.testing.assert_array_equal(first, wooded.bound_awareness.sel(feature="line_of_sight"))
-    known = np.isfinite(first.values)
-    # Crowns thinner than a step of a ray weaken what passes, and are no wall.
-    assert (wall.values[known] <= first.values[known] + 0.01).all()
-    assert (first.values[known] <= clear_air.values[known]).all()
-
-
 def test_a_workspace_of_bounds_survives_a_file(wooded):
     again = workspace_from_tree(workspace_to_tree(wooded))
     np.testing.assert_array_equal(again.bound_awareness, wooded.bound_awareness)
-    assert again.sights == wooded.sights
+    assert again.sight == wooded.sight
     np.testing.assert_array_equal(again.posts(A, C), wooded.posts(A, C))
 
 
@@ -288,17 +275,10 @@ def test_a_fit_on_a_workspace_fills_the_line_of_sight(wooded):
     )
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"sight": "fog"}, "unknown sight mode 'fog'"),
-        ({"sight": []}, r"or several; got \[\]"),
-        ({"features": {"line_of_sight": ["slope"]}}, "'line_of_sight' is the name of a feature of"),
-    ],
-)
-def test_impossible_settings_are_refused(wooded, options, message):
-    with pytest.raises(TrustboError, match=message):
-        Workspace.from_terrain(wooded.terrain, (4, 4), **options)
+def test_a_feature_of_cells_has_another_name(wooded):
+    features = {"line_of_sight": ["slope"]}
+    with pytest.raises(TrustboError, match="line_of_sight"):
+        Workspace.from_terrain(wooded.terrain, (4, 4), features=features)
 
 
 def test_no_room_to_stand_is_named():
@@ -307,12 +287,6 @@ def test_no_room_to_stand_is_named():
         TerrainError, match=r"cell \(0, 0\) has 2 passable pixels, on which robot 'r2'"
     ):
         Workspace.from_terrain(terrain, (3, 3), Team(n_robots=6))
-
-
-def test_a_terrain_without_canopy_has_no_wall():
-    terrain = synthetic_terrain((60.0, 60.0), seed=0, canopy_cover=0.0)
-    with pytest.raises(TerrainError, match="'wall' needs canopy, and the DSM is nowhere above"):
-        Workspace.from_terrain(terrain, (3, 3), sight="wall")
 
 
 def test_a_bound_is_between_neighbours(wooded):

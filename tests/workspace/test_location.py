@@ -57,7 +57,7 @@ def test_every_user_of_a_cell_takes_a_position(walled):
     planner = Planner(walled, start, goal)
     assert (planner.start, planner.goal) == ((3, 0), (0, 3))
     campaign = tb.Campaign(walled, start, goal)
-    assert campaign.settings["start"] == [3, 0]
+    assert campaign.ask().path[0] == (3, 0)
     simulator = ModelSimulator(walled, tb.models.TrustParams(0.5, [0.2, 0.1], 0.2, 0.05, 0.05))
     options = {"simulator": simulator, "n_iterations": 1, "progress": False}
     model = tb.models.PooledTrust()

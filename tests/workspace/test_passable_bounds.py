@@ -18,7 +18,7 @@ def walled(gap=None, side=60, shape=(3, 3)):
     terrain = tb.terrain.synthetic_terrain((side, side), resolution=1.0, seed=0)
     terrain["dem"].values[:] = dem
     terrain["dsm"].values[:] = dem
-    return tb.Workspace.from_terrain(terrain, shape, sight="bare")
+    return tb.Workspace.from_terrain(terrain, shape, sight=tb.workspace.Sight(0.0))
 
 
 def test_linked_pixels_are_those_of_networkx():

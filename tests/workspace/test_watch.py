@@ -8,6 +8,7 @@ import pytest
 from trustbo import Team, Workspace
 from trustbo.errors import TrustboError
 from trustbo.terrain import synthetic_terrain
+from trustbo.workspace import Sight
 from trustbo.workspace.line_of_sight import Geometry, phases
 from trustbo.workspace.watch import N_POSTS
 
@@ -40,7 +41,7 @@ def test_a_watch_is_the_line_of_sight_of_every_pair_of_posts(wooded):
         ends = np.broadcast_to(after[k], (1, 16, 2, 2))
         line, stops = [ground.lead_way(a, c)], ground.stop(c)[None]
         given = Geometry(line, starts, ends, stops)
-        seen = phases(ground.surface, wooded.sights[0], wooded.team, given, doubt=True)
+        seen = phases(ground.surface, wooded.sight, wooded.team, given, doubt=True)
         np.testing.assert_allclose(watch.watched[:, j], seen.watched.mean(-1)[0])
         np.testing.assert_allclose(watch.closing[:, j, k], seen.closing.mean(-1)[0])
         np.testing.assert_allclose(watch.waiting[:, k], seen.waiting.mean(-1)[0])
@@ -57,7 +58,7 @@ def test_sight_along_a_path_is_its_line_of_sight_but_for_turns(wooded):
 def test_a_bound_with_one_way_on_is_unseen_as_its_path_is():
     """A corridor of cells: the next bound, and with it T2's way, is known."""
     terrain = synthetic_terrain((50.0, 200.0), seed=3, relief=12.0)
-    corridor = Workspace.from_terrain(terrain, (1, 4), Team(n_robots=2), sight="wall")
+    corridor = Workspace.from_terrain(terrain, (1, 4), Team(n_robots=2), sight=Sight(np.inf, 0.0))
     shares = corridor.unseen_bounds
     assert shares.dims == ("move", "row", "col")
     for move, path in (("e", range(4)), ("w", range(3, -1, -1))):

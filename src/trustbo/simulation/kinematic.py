@@ -16,7 +16,7 @@ from trustbo.simulation.sensing import Drive, contact_of, detections, new_tracks
 from trustbo.simulation.world import World, true_surface, world_of
 from trustbo.team import Robot, Team
 from trustbo.workspace import Workspace
-from trustbo.workspace.sight import Sight, sights_of
+from trustbo.workspace.sight import Sight
 
 
 class State(NamedTuple):
@@ -72,9 +72,8 @@ class KinematicSimulator(DescribedSimulator):
             TrustboError: A workspace without terrain, a team of other robots, a value that is not
                 positive, an event that does not fit the terrain or the team.
         """
-        assumed = (*workspace.sights, Sight())[0]
         self.workspace, self.terrain = workspace, terrain
-        self.sight = assumed if sight is None else sights_of(sight)[0]
+        self.sight = sight or workspace.sight or Sight()
         self.team = workspace.team if team is None else team
         if self.team.names != workspace.team.names:
             raise TrustboError(

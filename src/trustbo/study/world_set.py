@@ -1,5 +1,6 @@
 """The set of worlds of the benchmark, by kind."""
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
@@ -125,8 +126,8 @@ def _season(factor: float) -> dict[str, Any]:
 # wellington, the steepest, 44 of the 45 of usual robots; the same rule admits all three.
 _CASES: tuple[_Case, ...] = (
     ("right", "", (*_SYNTHETIC, *REAL), {}),
-    ("wall", "wall", ("synthetic-0", "synthetic-1", "tahoe"), {"sight": Sight("wall")}),
-    ("bare", "bare", ("synthetic-2", "wellington", "bcts"), {"sight": Sight("bare")}),
+    ("wall", "wall", ("synthetic-0", "synthetic-1", "tahoe"), {"sight": Sight(math.inf, 0.0)}),
+    ("bare", "bare", ("synthetic-2", "wellington", "bcts"), {"sight": Sight(0.0)}),
     ("aged", "aged", ("synthetic-0", "synthetic-1", *REAL), {"aged": True}),
     ("canopy", "dense", ("synthetic-1", "wellington"), {"assumed": Sight(extinction=0.3)}),
     ("canopy", "thin", ("synthetic-2", "tahoe"), {"assumed": Sight(extinction=0.1 / 3.0)}),

@@ -17,7 +17,7 @@ import xarray as xr
 from scipy import ndimage
 
 from trustbo.errors import TerrainError, require_choice
-from trustbo.terrain import fan
+from trustbo.terrain import rays
 from trustbo.terrain.read import pixel_size
 
 CANOPY_THRESHOLD = 2.0
@@ -153,9 +153,8 @@ def openness(
     Rays run from `eye` to `target` metres above ground. Those that end off the raster do not count;
     a pixel without others is NaN: keep `reach` below half the terrain's shorter side.
     """
-    heights = terrain["dem"].values, terrain["dsm"].values
-    pixel = pixel_size(terrain)
-    return fan.openness(*heights, pixel, reach, eye, target, 16, 0.1, 0.3, slice(None))
+    maps = terrain["dem"].values, terrain["dsm"].values
+    return rays.openness(*maps, pixel_size(terrain), reach, (eye, target))
 
 
 def _local_mean(terrain: xr.Dataset, values: np.ndarray) -> np.ndarray:

@@ -27,7 +27,7 @@ def workspace_to_tree(workspace: Workspace) -> xr.DataTree:
     result.attrs = {
         "grid": to_json(asdict(workspace.grid)),
         "team": to_json(asdict(workspace.team)),
-        "sights": to_json([asdict(sight) for sight in workspace.sights]),
+        "sight": to_json(workspace.sight and asdict(workspace.sight)),
     }
     return result
 
@@ -36,6 +36,7 @@ def workspace_from_tree(tree: xr.DataTree) -> Workspace:
     """Convert a tree of `workspace_to_tree` back."""
     cells = tree["cells"].to_dataset()
     grid, team = json.loads(tree.attrs["grid"]), json.loads(tree.attrs["team"])
+    sight = json.loads(tree.attrs["sight"])
     terrain = pixels = None
     if "terrain" in tree:
         terrain = tree["terrain"].to_dataset().set_coords("spatial_ref")
@@ -59,5 +60,5 @@ def workspace_from_tree(tree: xr.DataTree) -> Workspace:
             for name, node in (tree["composites"].children if "composites" in tree else {}).items()
         },
         cells.get("bound_awareness"),
-        tuple(Sight(**sight) for sight in json.loads(tree.attrs.get("sights", "[]"))),
+        Sight(**sight) if sight else None,
     )

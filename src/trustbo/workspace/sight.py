@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 from numba import njit
 
-from trustbo.errors import TrustboError, require_choice
+from trustbo.errors import TrustboError
 from trustbo.parallel import PART, plain
 from trustbo.team import Robot
 from trustbo.terrain import rays
@@ -17,51 +17,33 @@ _compiled = njit(cache=True, nogil=True, error_model="numpy")
 _part = njit(nogil=True, error_model="numpy", **PART)
 
 _JITTER = 0.7  # m
-SIGHT_MODES = {"bare": rays.BARE, "wall": rays.WALL, "transmittance": rays.TRANSMITTANCE}
 
 
 @dataclass(frozen=True)
 class Sight:
     """Model of sight through terrain and canopy.
 
-    On real forest the contact rates of the three modes differ by an order of magnitude.
+    The ground blocks; the canopy, a layer from `crown_base` times its height to its top, transmits
+    exp(-extinction x metres inside). With extinction 0 only the ground blocks; with `math.inf` and
+    crown base 0, the whole surface does. On real forest the three differ by an order of magnitude.
 
     Attributes:
-        mode: `"bare"`: only the ground blocks. `"wall"`: the surface blocks, canopy included.
-            `"transmittance"`: the ground blocks; the canopy, a layer from `crown_base` times its
-            height to its top, transmits exp(-extinction x metres inside).
         extinction: Extinction coefficient of the canopy, 1/m.
         crown_base: Lower edge of the canopy as a share of its height.
 
     Raises:
-        TrustboError: An unknown mode, a negative extinction, a crown base outside [0, 1].
+        TrustboError: A negative extinction, or a crown base outside [0, 1].
     """
 
-    mode: str = "transmittance"
     extinction: float = 0.1
     crown_base: float = 0.3
 
     def __post_init__(self) -> None:
-        require_choice("sight mode", self.mode, SIGHT_MODES)
         if not self.extinction >= 0.0 or not 0.0 <= self.crown_base <= 1.0:
             raise TrustboError(
                 "need extinction >= 0 and crown_base in [0, 1]; got "
                 f"{self.extinction} and {self.crown_base}."
             )
-
-
-def sights_of(sight: object) -> tuple[Sight, ...]:
-    """Assumed models of sight from a model, a mode, or a list of both.
-
-    TrustboError: an unknown mode, no sight, or something else.
-    """
-    sights = [sight] if isinstance(sight, str | Sight) else sight
-    if not isinstance(sights, list | tuple) or not sights:
-        raise TrustboError(f"sight must be a mode's name or a Sight, or several; got {sight!r}.")
-    for one in sights:
-        if not isinstance(one, str | Sight):
-            raise TrustboError(f"sight must be a mode's name or a Sight; got {one!r}.")
-    return tuple(Sight(one) if isinstance(one, str) else one for one in sights)
 
 
 def optics(watcher: Robot, watched: Robot) -> np.ndarray:
@@ -104,15 +86,8 @@ def detection_probability(
         plain(target),
         plain(np.broadcast_to(optics, (len(sensor), 4))),
     )
-    return _transmittances(
-        surface.ground,
-        surface.canopy,
-        surface.pixel,
-        ends,
-        SIGHT_MODES[sight.mode],
-        sight.extinction,
-        sight.crown_base,
-    )
+    rasters = surface.ground, surface.canopy, surface.pixel
+    return rays.transmittances(*rasters, ends, sight.extinction, sight.crown_base)
 
 
 def detection_between(
@@ -138,8 +113,8 @@ def _ends(ground, gradient, pixel, origin, sensor, target, optics):
         c0 = _inward((sensor[i, 0] - origin[0]) / pixel[1], n_cols)
         r1 = _inward((origin[1] - target[i, 1]) / pixel[0], n_rows)
         c1 = _inward((target[i, 0] - origin[0]) / pixel[1], n_cols)
-        z0 = rays.ground_height(ground, r0, c0) + optics[i, 0]
-        z1 = rays.ground_height(ground, r1, c1) + optics[i, 1]
+        z0 = rays.bilinear(ground, r0, c0) + optics[i, 0]
+        z1 = rays.bilinear(ground, r1, c1) + optics[i, 1]
         east, north, up = (c1 - c0) * pixel[1], (r0 - r1) * pixel[0], z1 - z0
         distance = math.sqrt(east**2 + north**2 + up**2)
         row = min(max(int(r0 + 0.5), 0), n_rows - 1)
@@ -151,21 +126,6 @@ def _ends(ground, gradient, pixel, origin, sensor, target, optics):
         ends[i, 0], ends[i, 1], ends[i, 2] = r0, c0, z0 if seen else math.nan
         ends[i, 3], ends[i, 4], ends[i, 5] = r1, c1, z1
     return ends
-
-
-@_compiled
-def _transmittances(ground, canopy, pixel, ends, mode, extinction, crown_base):
-    result, work = np.empty(len(ends)), rays.work_space()
-    for i in range(len(ends)):
-        start = (ends[i, 0], ends[i, 1], ends[i, 2])
-        end = (ends[i, 3], ends[i, 4], ends[i, 5])
-        if math.isnan(start[2]):
-            result[i] = 0.0
-            continue
-        result[i] = rays.ray_transmittance(
-            ground, canopy, pixel, start, end, mode, extinction, crown_base, work
-        )
-    return result
 
 
 @_part

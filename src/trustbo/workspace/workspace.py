@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from trustbo.data import (
     FEATURES,
+    LINE_OF_SIGHT,
     Cell,
     Mission,
     as_names,
@@ -30,14 +31,13 @@ from trustbo.workspace.awareness import cell_maps, labelled, of_cells, unlabelle
 from trustbo.workspace.bound_awareness import (
     TRAVERSABLE,
     of_bounds,
-    require_sight,
-    sight_features,
+    require_names,
 )
 from trustbo.workspace.grid import Grid
 from trustbo.workspace.location import Location, cell_of
 from trustbo.workspace.moves import MOVE_NAMES, along, existing_bounds, moves_along
 from trustbo.workspace.posts import Posts
-from trustbo.workspace.sight import Sight, sights_of
+from trustbo.workspace.sight import Sight
 from trustbo.workspace.surface import Surface, surface_of
 from trustbo.workspace.survey import reason_impassable
 from trustbo.workspace.watch import WatchTable
@@ -59,7 +59,7 @@ class Workspace(Summary):
         of_bounds: DataArray (robot, move, row, col, feature) of what the bound into a cell by a
             move meets, in [0, 1], NaN where there is no such bound; None where awareness is that of
             the cell entered, for any move.
-        sights: Assumed models of sight; posts go by the first. Empty without a terrain.
+        sight: Assumed model of sight, by which posts are chosen; None without a terrain.
     """
 
     awareness: xr.DataArray
@@ -70,7 +70,7 @@ class Workspace(Summary):
     pixels: xr.Dataset | None = None
     composites: dict[str, CompositeIndex] = field(default_factory=dict)
     of_bounds: xr.DataArray | None = None
-    sights: tuple[Sight, ...] = ()
+    sight: Sight | None = None
 
     @classmethod
     def from_terrain(
@@ -81,7 +81,7 @@ class Workspace(Summary):
         *,
         features: Mapping[str, object] | None = None,
         bounds: bool = True,
-        sight: Sight | str | Sequence[Sight | str] = "transmittance",
+        sight: Sight | None = None,
     ) -> Self:
         """Derive traversability, visibility and line of sight from a DEM and a DSM.
 
@@ -106,19 +106,18 @@ class Workspace(Summary):
                 `terrain.VISIBILITY`.
             bounds: False for awareness of cells alone, as in the paper: traversability, and the
                 visibility of `terrain.PAPER_VISIBILITY`.
-            sight: Assumed model of sight, or its mode: `"bare"`, `"wall"` or `"transmittance"`; of
-                several, features `line_of_sight_1`, `line_of_sight_2`, ...
+            sight: Assumed model of sight; by default `Sight()`.
 
         Raises:
             TerrainError: A grid too fine for the raster, a cell without standing room for the team,
-                a DSM without the canopy that a sight needs, or a dataset that is no terrain.
-            TrustboError: No cell is passable, or an unknown mode of sight.
+                or a dataset that is no terrain.
+            TrustboError: No cell is passable, or a feature has the name of the line of sight.
         """
-        terrain, sights = require_terrain(terrain), sights_of(sight)
+        terrain, sight = require_terrain(terrain), sight or Sight()
         team = Team.of(team)
         grid = Grid.over(terrain, shape)
         if bounds:
-            require_sight(terrain, sights, features or {})
+            require_names(features or {})
         defaults = {
             "traversability": TRAVERSABILITY,
             "visibility": VISIBILITY if bounds else PAPER_VISIBILITY,
@@ -128,7 +127,7 @@ class Workspace(Summary):
             z = np.repeat(z[None], team.n_robots, axis=0)
             names = [name for name in pixels.data_vars if name != "passable"]
             cells = labelled(z, free, grid, team, names)
-            workspace = cls(*cells, grid, team, terrain, pixels, composites, sights=sights)
+            workspace = cls(*cells, grid, team, terrain, pixels, composites, sight=sight)
             return workspace._with_line_of_sight() if bounds else workspace
 
     @classmethod
@@ -191,7 +190,7 @@ class Workspace(Summary):
             ("team", f"a lead and {', '.join(team.names)}"),
             ("awareness", "of each bound" if self.of_bounds is not None else "of cells"),
             *((f"  {name}", f"{values} (middle 80 % of cells)") for name, values in spread),
-            ("sight", ", ".join(sight.mode for sight in self.sights) or "none assumed"),
+            ("sight", "none assumed" if self.sight is None else str(self.sight)),
             ("terrain", " x ".join(map(str, n_pixels)) + " pixels" if n_pixels else "none"),
         ]
         return rows
@@ -201,9 +200,14 @@ class Workspace(Summary):
         assert ways is not None and pixels is not None  # noqa: S101, PT018  # `require_sight`
         easy = pixels[TRAVERSABLE].values if TRAVERSABLE in pixels else None
         maps = of_bounds(
-            ways, self.sights, self.awareness.values, self.passable.values, self.features, easy
+            ways,
+            self.sight or Sight(),
+            self.awareness.values,
+            self.passable.values,
+            self.features,
+            easy,
         )
-        names = [*self.features, *sight_features(len(self.sights))]
+        names = [*self.features, LINE_OF_SIGHT]
         like = self.awareness.isel(feature=[0] * len(names)).assign_coords(feature=names)
         made = dataclasses.replace(self, awareness=like.copy(data=maps.cells))
         made = made.with_bounds(maps.bounds)
@@ -242,9 +246,9 @@ class Workspace(Summary):
 
         None without a terrain or an assumed sight.
         """
-        if self.ground is None or not self.sights:
+        if self.ground is None or self.sight is None:
             return None
-        return WatchTable(self.ground, self.sights[0])
+        return WatchTable(self.ground, self.sight)
 
     @cached_property
     def unseen_bounds(self) -> xr.DataArray | None:
@@ -265,7 +269,7 @@ class Workspace(Summary):
 
         Posts are chosen by the workspace's sight, or by `sight` where it has none.
         """
-        assumed = (*self.sights, sight or Sight())[0]
+        assumed = self.sight or sight or Sight()
         assert self.pixels is not None  # noqa: S101  # there is a surface
         easy = self.pixels[TRAVERSABLE].values if TRAVERSABLE in self.pixels else surface.passable
         return Ways(Posts(self.grid, self.team, surface, assumed, easy))
