@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 import trustbo
-from trustbo.errors import pip_install
 
 ROOT = Path(__file__).resolve().parents[1]
 PARTS = ("export", "logs", "models", "planning", "plots", "report", "simulation", "study",
@@ -119,19 +118,6 @@ def test_a_missing_package_is_named_itself_and_is_one_of_an_extra():
     }
     assert named >= {"rosbags", "laspy"}
     assert named <= offered
-
-
-def test_the_command_that_installs_a_package_names_the_python_that_runs(tmp_path, monkeypatch):
-    python = tmp_path / "clone" / ".venv" / "bin" / "python"
-    python.parent.mkdir(parents=True)
-    python.touch(mode=0o755)
-    monkeypatch.setattr(sys, "executable", str(python))
-    monkeypatch.setenv("PATH", str(tmp_path))
-    assert pip_install("rosbags") == f"{python} -m pip install rosbags"
-    monkeypatch.chdir(tmp_path / "clone")
-    assert pip_install("laspy[lazrs]") == ".venv/bin/python -m pip install 'laspy[lazrs]'"
-    monkeypatch.setenv("PATH", str(python.parent))  # as an activated environment does
-    assert pip_install("rosbags") == "python -m pip install rosbags"
 
 
 def test_helpers_of_tests_are_not_in_test_files():

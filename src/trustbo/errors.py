@@ -4,12 +4,8 @@ import difflib
 import importlib.util
 import math
 import operator
-import os
 import shlex
-import shutil
-import sys
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Any
 
 
@@ -43,17 +39,8 @@ class PosteriorError(TrustboError):
 
 
 def pip_install(*packages: str) -> str:
-    """Command that installs packages of the registry for the running Python.
-
-    Packages are named themselves, as `trustbo[ros]` is unknown to pip where trustbo was installed
-    from a clone; and Python by its path, if the shell's `python` is another.
-    """
-    python, of_shell = Path(sys.executable), shutil.which("python")
-    if of_shell is not None and Path(of_shell).parent == python.parent:
-        python = "python"
-    elif python.is_relative_to(Path.cwd()):
-        python = python.relative_to(Path.cwd())
-    return shlex.join([os.fspath(python), "-m", "pip", "install", *packages])
+    """Command that installs packages of the registry."""
+    return shlex.join(["python", "-m", "pip", "install", *packages])
 
 
 def require_package(what: str, package: str, module: str) -> None:

@@ -1,14 +1,9 @@
-"""Atomic writes, and errors for files that cannot be written or read."""
+"""Files that are written whole or not at all, and errors for files that cannot be read."""
 
-import errno
 import json
 import os
-import re
-import shutil
-import signal
-import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import asdict, is_dataclass
 from os import PathLike
 from pathlib import Path
@@ -18,123 +13,29 @@ import numpy as np
 
 from trustbo.errors import DamagedFileError, TrustboError
 
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-_REFUSED = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT, errno.ENOTDIR, errno.ELOOP)
-_LEAST_FREE = 1 << 20
-"""Free bytes below which a failed write is blamed on the disk: libraries give no reason."""
-
 FilePath = str | PathLike[str]
 
 
 def write_file(path: FilePath, write: Callable[[Path], object]) -> None:
-    """Write a file atomically: `write` gets a temporary name of the same suffix, then renamed.
-
-    Ctrl-C and SIGTERM take effect after the write, a second one at once. A link of that name is
-    replaced by the file, its target is unchanged.
+    """Write a file to a temporary name of the same suffix, flush it to disk, and rename it.
 
     Args:
         path: File to write; its folder is made if it does not exist.
-        write: Function that writes to a given path of the same suffix.
+        write: Function that writes to a given path.
 
     Raises:
-        TrustboError: The disk is full, or the folder may not be written to; a file of that name is
-            unchanged.
+        TrustboError: The system refuses to write; a file of that name is unchanged.
     """
     path = Path(path)
-    with naming_refusal(path.parent):
+    temporary = path.with_name(f".{path.stem}.tmp{path.suffix}")
+    try:
         path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = temporary_name(path)
-    try:
-        with defer_interrupt():
-            temporary.unlink(missing_ok=True)  # not to write through a link of that name
-            write(temporary)
-            _to_disk(temporary)
-            os.replace(temporary, path)
-            _folder_to_disk(path.parent)
-    except Exception as error:
-        full = isinstance(error, OSError) and error.errno in _FULL
-        disk = shutil.disk_usage(path.parent)
-        if full or (disk.free < _LEAST_FREE and disk.total > 0):  # /proc reports no free bytes
-            raise TrustboError(
-                f"the disk is full: {str(path)!r} was not written. What was there before is as it "
-                "was; make room and go on, or run the same again."
-            ) from error
-        with naming_refusal(path.parent, temporary):
-            raise
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def temporary_name(path: Path) -> Path:
-    """Temporary name in the folder of a file, with a mark that no other program uses.
-
-    The suffix is the file's: libraries choose a format by it.
-    """
-    return path.with_name(f".{path.stem}.trustbo-{os.getpid()}{path.suffix}")
-
-
-def _to_disk(file: Path) -> None:
-    """Flush a file's bytes to disk before it is renamed."""
-    with file.open("rb+") as stream:
-        os.fsync(stream.fileno())
-
-
-def _folder_to_disk(folder: Path) -> None:
-    """Flush a folder's entries to disk, where the system supports it."""
-    with suppress(OSError):  # folders cannot be opened everywhere
-        opened = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(opened)
-        finally:
-            os.close(opened)
-
-
-@contextmanager
-def naming_refusal(folder: Path, file: Path | None = None) -> Iterator[None]:
-    """Convert the system's refusal to write to a folder to a TrustboError with the remedy.
-
-    With `file`, only refusals of that file: others may be read meanwhile.
-    """
-    try:
-        yield
+        write(temporary)
+        with temporary.open("rb+") as stream:
+            os.fsync(stream.fileno())
+        os.replace(temporary, path)
     except OSError as error:
-        if error.errno in _FULL:
-            raise TrustboError(
-                f"the disk is full: nothing was written to {str(folder)!r}; make room and go on."
-            ) from error
-        of_others = file is not None and error.filename not in (str(file), file)
-        if error.errno not in _REFUSED or of_others:
-            raise
-        raise TrustboError(
-            f"cannot write to {str(folder)!r}: {error.strerror}; give a folder that may be "
-            "written to."
-        ) from error
-
-
-@contextmanager
-def defer_interrupt() -> Iterator[None]:
-    """Defer the first Ctrl-C or SIGTERM: it can leave the netCDF library locked for ever."""
-    handlers = {int(n): signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)}
-    before = {n: then for n, then in handlers.items() if callable(then)}  # others raise nothing
-    if threading.current_thread() is not threading.main_thread():
-        yield  # Python delivers signals to the main thread
-        return
-    seen: list[int] = []
-
-    def count(number, frame) -> None:
-        seen.append(number)
-        if len(seen) > 1:
-            before[number](number, frame)
-
-    for number in before:
-        signal.signal(number, count)
-    try:
-        yield
-    finally:
-        for number, then in before.items():
-            signal.signal(number, then)
-        if len(seen) == 1:
-            before[seen[0]](seen[0], None)
+        raise TrustboError(f"cannot write {str(path)!r}: {error.strerror or error}.") from error
 
 
 def read_file(path: FilePath) -> bytes:
@@ -182,19 +83,6 @@ def interpreting(path: FilePath) -> Iterator[None]:
         raise DamagedFileError(
             f"{str(path)!r} is damaged: it does not hold what it should ({message})."
         ) from error
-
-
-def remove_leftovers(folder: Path) -> None:
-    """Remove temporary files of a dead process; no other process may write there.
-
-    Those in the folder itself, by the mark of `temporary_name`; never through a link.
-    """
-    if folder.is_symlink() or not folder.is_dir():
-        return
-    for file in folder.iterdir():
-        ours = re.fullmatch(r"\..+\.trustbo-\d+(\.[^.]*)?", file.name)
-        if ours and file.is_file() and not file.is_symlink():
-            file.unlink(missing_ok=True)
 
 
 def write_text(path: FilePath, text: str) -> None:

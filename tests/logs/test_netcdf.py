@@ -32,8 +32,11 @@ def driven():
 
 def test_ticks_and_states_come_back_as_they_were(driven, tmp_path):
     write_missions(tmp_path / "missions.nc", driven)
-    assert sorted(f.name for f in (tmp_path / "ticks").glob("*.nc")) == ["0001.nc", "0002.nc"]
-    with xr.open_dataset(tmp_path / "ticks" / "0001.nc") as ticks:
+    assert sorted(f.name for f in (tmp_path / "missions.ticks").glob("*.nc")) == [
+        "0001.nc",
+        "0002.nc",
+    ]
+    with xr.open_dataset(tmp_path / "missions.ticks" / "0001.nc") as ticks:
         assert list(ticks["state"].values) == list(tb.logs.netcdf.STATES)
     again = read_missions(tmp_path / "missions.nc")
     for one, other in zip(again, driven, strict=True):
@@ -46,10 +49,9 @@ def test_ticks_and_states_come_back_as_they_were(driven, tmp_path):
         np.testing.assert_array_equal(
             getattr(again[0].bounds[0], name), getattr(driven[0].bounds[0], name)
         )
-    # The ticks of those before are not written again; a mission without ticks leaves none.
-    write_missions(tmp_path / "missions.nc", [driven[0], driven[2]], since=1)
-    assert [f.name for f in (tmp_path / "ticks").glob("*.nc")] == ["0001.nc"]
-    (tmp_path / "ticks" / "0001.nc").unlink()  # the rates are known without
+    write_missions(tmp_path / "missions.nc", [driven[0], driven[2]])  # the second without ticks
+    assert [f.name for f in (tmp_path / "missions.ticks").glob("*.nc")] == ["0001.nc"]
+    (tmp_path / "missions.ticks" / "0001.nc").unlink()  # the rates are known without
     assert read_missions(tmp_path / "missions.nc")[0].bounds[0].poses is None
 
 
@@ -102,17 +104,6 @@ class Pressed(xr.DataTree):
         for node in super().subtree:
             yield node
             signal.raise_signal(signal.SIGINT)
-
-
-def test_ctrl_c_waits_for_the_netcdf_library(tmp_path):
-    """Else it may stay locked, and the next write waits for ever."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            write_tree(tmp_path / "a.nc", Pressed(xr.Dataset({"number": 1})))
-    finally:
-        signal.signal(signal.SIGINT, before)
-    assert read_tree(tmp_path / "a.nc")["number"] == 1
 
 
 def test_damage_is_named_with_its_file(driven, tmp_path):

@@ -1,6 +1,6 @@
 """Missions as trees of arrays, for netCDF files."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,6 @@ from trustbo.data import NOWHERE, Bound, Mission
 from trustbo.errors import DamagedFileError, TrustboError
 from trustbo.files import (
     FilePath,
-    defer_interrupt,
     interpreting,
     read_file,
     write_file,
@@ -33,18 +32,16 @@ def read_tree(path: FilePath) -> xr.DataTree:
     """
     content = read_file(path)
     try:
-        with defer_interrupt():
-            with xr.open_datatree(content, engine="netcdf4") as tree:
-                return tree.load()
+        with xr.open_datatree(content, engine="netcdf4") as tree:
+            return tree.load()
     except Exception:  # the library raises many kinds for bytes that are no netCDF
         raise DamagedFileError(f"{str(path)!r} is damaged, or no netCDF file.") from None
 
 
 def write_tree(path: FilePath, tree: xr.DataTree) -> None:
     """Write a netCDF file of groups."""
-    with defer_interrupt():  # which could leave the netCDF library locked, in memory too
-        content = _encode(tree)
-        write_file(path, lambda file: file.write_bytes(content))
+    content = _encode(tree)
+    write_file(path, lambda file: file.write_bytes(content))
 
 
 def _encode(tree: xr.DataTree) -> bytes:
@@ -77,9 +74,6 @@ class _Arrays(list[tuple[Any, Any]]):
 def write_missions(
     path: FilePath,
     missions: Sequence[Mission],
-    *,
-    since: int = 0,
-    notes: Mapping[str, str] | None = None,
 ) -> None:
     """Write missions to a netCDF file, and the ticks of each to a file in a folder next to it.
 
@@ -88,18 +82,16 @@ def write_missions(
     Args:
         path: File of all missions.
         missions: Missions, at least one.
-        since: Number of leading missions whose ticks are written already.
-        notes: Attributes of the table of missions.
 
     TrustboError: states with another shape than (tick, robot, state).
     """
-    for j in range(since, len(missions)):
+    for j in range(len(missions)):
         file, recorded = ticks_file(path, _ticks_name(path), j), _ticks(missions[j])
         if recorded is None:
             file.unlink(missing_ok=True)
         else:
             write_tree(file, xr.DataTree(recorded))
-    table = _table(missions).assign_attrs({_TICKS: _ticks_name(path), **(notes or {})})
+    table = _table(missions).assign_attrs({_TICKS: _ticks_name(path)})
     write_tree(path, xr.DataTree.from_dict({"missions": table}))
 
 
@@ -137,7 +129,7 @@ def read_missions(path: FilePath) -> list[Mission]:
     Raises:
         DamagedFileError: There is no such file, it is damaged, or it holds no missions.
     """
-    if files := sorted(Path(path).glob("missions/*.nc")):
+    if files := sorted(Path(path).glob("missions/[0-9]*.nc")):
         missions = []
         for file in files:
             tree = read_tree(file)

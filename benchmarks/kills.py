@@ -1,0 +1,78 @@
+"""Campaigns whose process is killed: each resumes with results identical to the undisturbed one.
+
+Run: python benchmarks/kills.py [--kills 20]
+"""
+
+import argparse
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+import trustbo as tb
+from trustbo.models import TrustParams
+
+ENDS = (3, 0), (0, 3)
+N_MISSIONS = 8
+
+
+def simulator():
+    """Simulator of a workspace of 4 x 4 cells."""
+    workspace = tb.Workspace.from_awareness(np.random.default_rng(0).uniform(size=(3, 4, 4, 2)))
+    truth = TrustParams(0.6, np.array([0.3, 0.2]), 0.05, 0.05, 0.05)
+    return tb.simulation.ModelSimulator(workspace, truth)
+
+
+def go_on(folder):
+    """Run the campaign of a folder to its end."""
+    robots = simulator()
+    options = {"simulator": robots, "n_iterations": N_MISSIONS, "progress": False}
+    if (Path(folder) / "campaign.json").exists():
+        return tb.resume(folder, **options)
+    return tb.iterate(robots.workspace, *ENDS, policy="thompson", directory=folder, **options)
+
+
+def numbers(folder):
+    """Paths and draws of a campaign, as bytes."""
+    result = tb.load_result(folder)
+    draws = [v.values.tobytes() for t in result.posteriors for v in t["posterior"].values()]
+    return [m.path for m in result.missions], result.path, draws
+
+
+def main():
+    """Kill processes at random moments, and compare."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--kills", type=int, default=20)
+    parser.add_argument("--folder", help="campaign that a process of this program runs")
+    given = parser.parse_args()
+    if given.folder:
+        go_on(given.folder)
+        return
+    rng, n_kills, n_campaigns, n_same = np.random.default_rng(0), 0, 0, 0
+    with tempfile.TemporaryDirectory() as root:
+        go_on(f"{root}/whole")
+        expected = numbers(f"{root}/whole")
+        while n_kills < given.kills:
+            folder = Path(root) / str(n_campaigns)
+            for _ in range(4):
+                process = subprocess.Popen([sys.executable, __file__, "--folder", str(folder)])
+                record, before = folder / "campaign.json", time.time()
+                while process.poll() is None:  # a process that still imports has nothing to lose
+                    if record.exists() and record.stat().st_mtime > before:
+                        time.sleep(rng.uniform(0.0, 0.5))
+                        process.send_signal(signal.SIGKILL)
+                        break
+                    time.sleep(0.005)
+                n_kills += process.wait() == -signal.SIGKILL
+            go_on(folder)
+            n_campaigns += 1
+            n_same += numbers(folder) == expected
+    print(f"{n_kills} kills; {n_same} of {n_campaigns} campaigns identical")
+
+
+if __name__ == "__main__":
+    main()
