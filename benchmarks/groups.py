@@ -9,19 +9,18 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-import xarray as xr
 from common import Table
 from scipy import stats
 
 from trustbo.study import worlds
-from trustbo.study.table import bootstrap, numbers_of
+from trustbo.study.summary import bootstrap
 
 OURS, BASELINES = "trustbo", ("running mean", "residual process", "line of sight")
-KINDS = ("right", "wall", "bare", "slopes", "aged", "canopy", "shapes", "teams", "four-ways",
+KINDS = ("right", "wall", "bare", "slopes", "aged", "canopy", "shapes", "teams",
          "robots", "days", "foul", "change", "jammer", "physics", "limit")  # fmt: skip
-CALM = KINDS[:9]
+CALM = KINDS[:8]
 """Kinds in which nothing goes wrong: the survey may be wrong, robots and missions are alike."""
-WRONG = KINDS[9:]
+WRONG = KINDS[8:]
 GROUPS = {
     "all": KINDS,
     "calm": CALM,
@@ -39,18 +38,19 @@ DEAD = "dead-detector"
 """Case of kind `change` that is compared with version 0.3 by name."""
 
 
-def rows_of(results: xr.Dataset) -> pd.DataFrame:
-    """Rows of the results of `run_worlds`: a method on a world and course, means over seeds."""
-    numbers, home = numbers_of(results), results["status"].values == "ok"
-    ran = results["status"].values != ""
-    labels = ("world", "kind", "course", "method")
-    rows = pd.DataFrame({name: results[name].values for name in labels})
-    for name in COLUMNS[:4]:
-        rows[name] = numbers.get(name.replace("_", " "), np.nan)
-    for name, some in (("arrive_first_3", slice(3)), ("arrive_later", slice(3, None))):
-        n = ran[:, some].sum(1)
-        rows[name] = np.where(n > 0, home[:, some].sum(1) / np.maximum(n, 1), np.nan)
-    return rows.groupby(list(labels), as_index=False)[COLUMNS].mean()
+NAMES = {
+    "case": "method", "lost while learning": "lost_while_learning", "regret now": "regret_now",
+    "lost with failures": LOST, "arrive of the first 3": "arrive_first_3",
+    "arrive later": "arrive_later",
+}  # fmt: skip
+"""Columns of `study.numbers_of` by their names in a row."""
+
+
+def rows_of(numbers: pd.DataFrame) -> pd.DataFrame:
+    """Rows of `study.numbers_of`: a method on a world and course, means over seeds."""
+    rows = numbers.rename(columns=NAMES)
+    labels = ["world", "kind", "course", "method"]
+    return rows.groupby(labels, as_index=False)[COLUMNS].mean()
 
 
 def references() -> pd.DataFrame:

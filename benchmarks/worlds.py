@@ -3,42 +3,63 @@
     python benchmarks/worlds.py --data DIR --out out/worlds
     python benchmarks/worlds.py --kind aged --kind wall --method trustbo --method "running mean"
 
+The 17 worlds x 2 courses that changes of the default are judged by:
+
+    python benchmarks/worlds.py --set --out out/set --csv set.csv
+
 All worlds x 4 courses x methods, 15 missions each; called again, it goes on where it stopped, with
-other parts too: the tables are those of the chosen parts.
-`--targets` runs the objective and path class of the targets instead, mean contact on shortest+2.
-`--report` runs nothing, and prints the tables of what is in `--out`, for the worlds and courses
-that the default campaign has run. `--csv` writes a row for each world, course and method.
+other parts too: the tables are those of the chosen parts. `--csv` writes a row for each world,
+course and method.
 """
 
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-import xarray as xr
-from baselines import line_of_sight, oracle, residual_process, running_mean
+from baselines import line_of_sight, oracle, residual_process, running_mean, unlearned
 from common import arguments, parsed
 from groups import KINDS, OURS, report_groups, rows_of
+from joblib import Parallel, delayed
 
-from trustbo.files import to_json
-from trustbo.study import run_worlds, worlds, worlds_table
-from trustbo.study.methods import BASELINE_ROWS
-from trustbo.study.store import Store
-from trustbo.study.table import as_text, differences, to_dataset, worse_than
+import trustbo as tb
+from trustbo.study import World, differences, numbers_of, run_grid, summary, worlds
+from trustbo.study.world import COURSES
+
+SET = (
+    "synthetic-0", "synthetic-1", "synthetic-2", "wellington", "synthetic-0-aged",
+    "synthetic-1-aged", "synthetic-0-slopes", "synthetic-0-low", "synthetic-alder-thin-canopy",
+    "synthetic-1-dense", "synthetic-1-one-poor", "synthetic-alder-one-poor", "synthetic-2-dust",
+    "synthetic-0-rain", "synthetic-2-jammer", "synthetic-birch-jammer", "synthetic-1-radio",
+)  # fmt: skip
+SET_COURSES = ("sw-ne", "nw-se")
+
+
+def beside_pooled(make: Any, scene: tb.study.Scene) -> dict[str, Any]:
+    """Options of a method whose campaign fits the pooled model, which it does not use."""
+    return {"model": tb.models.PooledTrust(), **make(scene)}
+
 
 METHODS: dict[str, Any] = {
-    OURS: {"model": "robots", "policy": "greedy"},
-    "trustbo, optimistic": {"model": "robots", "policy": "optimistic"},
-    "trustbo, places": {"model": "places", "policy": "greedy"},
-    "trustbo, no places": {"model": "pooled", "policy": "greedy"},
-    "running mean": running_mean.greedy,
-    "running mean, optimistic": running_mean.optimistic,
-    "residual process": residual_process.ResidualProcess,
-    "line of sight": line_of_sight.LineOfSight,
-    "oracle": oracle.Oracle,
-    **dict(BASELINE_ROWS.values()),
+    OURS: {},
+    "trustbo, optimistic": {"policy": "optimistic"},
+    "trustbo, places": {"model": tb.models.PooledTrust(place=tb.models.PlaceEffect())},
+    "trustbo, no places": {"model": tb.models.PooledTrust(), "policy": "greedy"},
+    "running mean": lambda scene: {"policy": running_mean.greedy()},
+    "running mean, optimistic": lambda scene: {"policy": running_mean.optimistic()},
+    "residual process": lambda scene: {"policy": residual_process.ResidualProcess()},
+    "line of sight": lambda scene: {"policy": line_of_sight.LineOfSight()},
+    "oracle": lambda scene: {"policy": oracle.Oracle(scene.truth)},
+    "random path": lambda scene: {"policy": unlearned.RandomPath()},
+    "shortest path": lambda scene: {"policy": unlearned.shortest()},
+    "paper": {**tb.paper.CAMPAIGN, "sampler": "auto"},
 }
-"""Methods by the names of their rows."""
+"""Methods by the names of their rows; that of the paper has awareness of cells."""
+for _name, _make in METHODS.items():
+    if callable(_make):
+        METHODS[_name] = partial(beside_pooled, _make)
 CASES = ("canopy", "robots", "days", "change", "jammer", "limit")
 """Kinds of which each case has a table."""
 COLUMNS = ["regret after 0", "regret after 3", "regret after 8", "regret after 15", "regret now",
@@ -57,82 +78,125 @@ def main():
     parser.add_argument("--kind", action="append", help="a kind of worlds; by default all")
     parser.add_argument("--world", action="append", help="a world; by default all of the kinds")
     parser.add_argument("--course", action="append", help="a course; by default all")
+    parser.add_argument("--set", action="store_true", help="17 worlds x 2 courses")
     parser.add_argument("--method", action="append", choices=METHODS, help="by default all")
     parser.add_argument("--missions", type=int, default=15, help="of a campaign; default 15")
-    parser.add_argument("--objective", default="lost_contact")
     parser.add_argument("--max-bounds", default="shortest+4")
-    parser.add_argument("--targets", action="store_true")
-    parser.add_argument("--serial", action="store_true", help="one campaign after the other")
-    parser.add_argument("--report", action="store_true", help="tables alone, of --out")
+    parser.add_argument("--jobs", type=int, default=-1, help="processes; default one a core")
     parser.add_argument("--csv", type=Path, help="file of the rows of all campaigns")
     given = parsed(parser)
-    if given.report:
-        report(kept(given.out), given.csv)
-        return
-    objective, max_bounds = given.objective, given.max_bounds
-    if given.targets:
-        objective, max_bounds = "mean", "shortest+2"
-    names = [
-        world.name
+    names = SET if given.set else given.world
+    courses = given.course or (SET_COURSES if given.set else COURSES)
+    chosen = [
+        world
         for world in worlds(given.data).values()
         if (given.data or world.is_packaged)
         and (given.kind is None or world.kind in given.kind)
-        and (given.world is None or world.name in given.world)
+        and (names is None or world.name in names)
     ]
+    if given.quick:
+        chosen, courses, given.missions = small(chosen), courses[:1], 3
+    kept = given.out / "truths"
+    Parallel(given.jobs)(delayed(find_truths)(world, kept, given.missions) for world in chosen)
+    scenes = {
+        f"{world.name}, {course}": partial(world.scene, course, kept, given.max_bounds)
+        for world in chosen
+        for course in courses
+    }
     methods = {name: METHODS[name] for name in given.method or METHODS}
-    courses = {} if given.course is None else {"courses": given.course}
-    results = run_worlds(
-        given.out, data=given.data, only=names, methods=methods, baselines=(), policies=(),
-        seeds=given.seeds, n_iterations=given.missions, objective=objective,
-        max_bounds=max_bounds, quick=given.quick, executor="serial" if given.serial else "loky",
-        **courses,
-    )  # fmt: skip
-    report(results, given.csv)
+    settings = {"seeds": range(given.seeds), "n_missions": given.missions, "n_jobs": given.jobs}
+    tables = []
+    if printed := {"paper": methods.pop("paper")} if "paper" in methods else {}:
+        cells = {name: partial(scene, bounds=tb.paper.WORKSPACE["bounds"])
+                 for name, scene in scenes.items()}  # fmt: skip
+        tables.append(run_grid(printed, cells, given.out, **settings))
+    if methods:
+        tables.append(run_grid(methods, scenes, given.out, **settings))
+    report(numbers_of(pd.concat(tables)), given.csv)
 
 
-def kept(folder: Path) -> xr.Dataset:
-    """Results of all runs that a folder holds, of whatever parts; of equal labels the newest."""
-    store = Store(folder)
-    files = sorted((folder / "runs").glob("*.json"), key=lambda file: file.stat().st_mtime)
-    newest = {to_json(store.read(file.stem)["labels"]): file.stem for file in files}
-    records = {key: store.read(key) for key in newest.values()}
-    return to_dataset(records, {key: record["labels"] for key, record in records.items()})
+def small(chosen: list[World]) -> list[World]:
+    """A small synthetic world of each of three kinds."""
+    made = {world.kind: world for world in reversed(chosen) if world.is_made}
+    return [
+        replace(made[kind], name=f"{made[kind].name}-small", shape=(5, 5), cell=40.0)
+        for kind in ("right", "days", "physics")
+        if kind in made
+    ]
 
 
-def report(results: xr.Dataset, csv: Path | None = None):
+def find_truths(world: World, folder: Path, n_missions: int) -> None:
+    """Find the truths of all missions, each world once, before campaigns need them."""
+    truth = world.truth(folder)
+    for mission in range(n_missions + 1):
+        truth.at(mission)
+
+
+def report(numbers: pd.DataFrame, csv: Path | None = None):
     """Print tables of all worlds, kinds and cases, of the differences, and of the groups."""
-    rows = results[["world", "course", "method", "seed"]].to_dataframe()
-    if OURS in set(rows["method"]):
-        ours = rows[rows["method"] == OURS].set_index(["world", "course", "seed"]).index
-        rows = rows[rows.set_index(["world", "course", "seed"]).index.isin(ours)]
-    order = [name for name in METHODS if name in set(rows["method"])]
-    rows = rows.assign(rank=rows["method"].map(order.index)).sort_values("rank", kind="stable")
-    results = results.isel(run=rows.index.to_numpy())
+    order = [name for name in METHODS if name in set(numbers["case"])]
+    rank = numbers["case"].map(order.index)
+    numbers = numbers.iloc[np.argsort(rank, kind="stable")]
     if csv is not None:
-        rows_of(results).round(4).to_csv(csv, index=False)
-    kinds = results["kind"].values
+        rows_of(numbers).round(4).to_csv(csv, index=False)
     for kind in ("all worlds", *KINDS):
-        runs = results if kind == "all worlds" else results.isel(run=kinds == kind)
-        if runs.sizes["run"]:
-            n = len(np.unique(runs["world"].values))
-            print(f"\n**{kind}** ({n} worlds)\n\n{text(worlds_table(runs), COLUMNS)}")
-    runs = results.isel(run=np.isin(kinds, CASES))
-    for case in np.unique(runs["case"].values):
-        one = runs.isel(run=runs["case"].values == case)
-        print(f"\n**{case}**: {', '.join(np.unique(one['world'].values))}\n")
-        print(text(worlds_table(one), OF_CASES))
+        some = numbers if kind == "all worlds" else numbers[numbers["kind"] == kind]
+        if len(some):
+            n = some["world"].nunique()
+            print(f"\n**{kind}** ({n} worlds)\n\n{as_text(summary(some), COLUMNS)}")
+    of_cases = numbers[numbers["kind"].isin(CASES)]
+    for case, some in of_cases.groupby("of"):
+        print(f"\n**{case}**: {', '.join(some['world'].unique())}\n")
+        print(as_text(summary(some), OF_CASES))
     if len(order) < 2 or order[0] != OURS:
         return
     for by in ((), ("kind",)):
-        table = differences(results, OURS, by)
+        table = differences(numbers, OURS, by)
         print(f"\n{OURS} less each other method, same world, course and seed\n")
-        print(f"{text(table, OF_DIFFERENCES)}\n\n" + "\n".join(worse_than(table)))
-    report_groups(rows_of(results))
+        print(f"{as_text(table, OF_DIFFERENCES)}\n\n" + "\n".join(worse_than(table)))
+    report_groups(rows_of(numbers))
 
 
-def text(table: pd.DataFrame, columns: list[str]) -> str:
-    """Some columns of a table in Markdown; campaigns may be too short for all."""
-    return as_text(table[[name for name in columns if name in table.columns.levels[0]]])
+def worse_than(table: pd.DataFrame) -> list[str]:
+    """Rows and quantities of `differences` in which ours is significantly worse, as text.
+
+    Those whose interval is above 0, or below it for `arrive`.
+    """
+    lines = []
+    for name in dict.fromkeys(str(name) for name, _ in table.columns):
+        if name == "pairs":
+            continue
+        good = name.startswith("arrive")
+        worse = table[name, "high"] < 0.0 if good else table[name, "low"] > 0.0
+        rows = [label(key) for key in table.index[worse.to_numpy()]]
+        if rows:
+            lines.append(f"worse in {name} than: {'; '.join(rows)}")
+    return lines or ["worse than: none"]
+
+
+def as_text(table: pd.DataFrame, columns: list[str]) -> str:
+    """Some columns of `summary` or `differences` in Markdown, each value with its interval."""
+    names = [name for name in columns if name in table.columns.levels[0]]
+    head = [" and ".join(table.index.names)]
+    head += [f"{name} (%)" if "regret" in name else name for name in names]
+    lines = [" | ".join(head), " | ".join("---" for _ in head)]
+    for key, row in table.iterrows():
+        cells = []
+        for name in names:
+            if name == "pairs":
+                cells.append(f"{row[name, 'value']:.0f}")
+                continue
+            places = 1 if "regret" in name or "missions" in name else 2
+            value, low, high = (
+                f"{row[name, what]:z.{places}f}" for what in ("value", "low", "high")
+            )
+            cells.append(f"{value} [{low}, {high}]")
+        lines.append(" | ".join([label(key), *cells]))
+    return "\n".join(f"| {line} |" for line in lines)
+
+
+def label(key: Any) -> str:
+    return ", ".join(map(str, key)) if isinstance(key, tuple) else str(key)
 
 
 if __name__ == "__main__":

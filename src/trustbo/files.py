@@ -105,12 +105,6 @@ def to_json(record: object) -> str:
     return json.dumps(record, default=plain)
 
 
-def cache_folder(name: str) -> Path:
-    """Folder of that name in the user's cache, `$XDG_CACHE_HOME/trustbo`; it need not exist."""
-    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(home) / "trustbo" / name
-
-
 def require_folder(directory: FilePath) -> Path:
     """Return a folder, which need not exist; TrustboError if it or a parent is a file."""
     folder = as_path(directory)

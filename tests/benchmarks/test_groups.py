@@ -3,7 +3,6 @@
 import numpy as np
 import pandas as pd
 import pytest
-import xarray as xr
 from groups import (
     GROUPS,
     KINDS,
@@ -146,19 +145,13 @@ def test_holm_corrects_as_by_hand_and_as_statsmodels_does():
 
 
 def test_rows_count_arrivals_of_the_first_three_missions_apart():
-    status = np.array([["ok", "stuck", "stuck", "ok", "ok"], ["ok", "ok", "stuck", "ok", ""]])
-    one = np.ones(status.shape)
     labels = {"world": "tahoe", "kind": "right", "course": "sw-ne", "method": OURS}
-    results = xr.Dataset(
-        {
-            "regret": (("run", "mission"), one), "lost": (("run", "mission"), one),
-            "lost_followed": (("run", "mission"), 3.0 * one), "regret_before": ("run", [1.0, 1.0]),
-            "lost_before": ("run", [1.0, 1.0]), "oracle": ("run", [1.0, 1.0]),
-            "loss_followed": (("run", "mission"), one * [[4.0], [6.0]]),
-            "status": (("run", "mission"), status), "seconds_cpu": ("run", [1.0, 1.0]),
-        },
-        {name: ("run", [label] * 2) for name, label in labels.items()} | {"seed": ("run", [0, 1])},
-    ).assign_coords(mission=np.arange(1, 6))  # fmt: skip
+    results = pd.DataFrame({
+        "case": OURS, "scene": "tahoe, sw-ne", "seed": [0, 1],
+        **{name: labels[name] for name in ("world", "kind", "course")},
+        "regret now": 1.0, "lost while learning": 2.0, "lost with failures": [4.0, 6.0],
+        "arrive": [3 / 5, 3 / 4], "arrive of the first 3": [1 / 3, 2 / 3], "arrive later": 1.0,
+    })  # fmt: skip
     row = of_row(rows_of(results), **labels)
     assert row[LOST] == 5.0
     assert row["lost_while_learning"] == 2.0

@@ -172,12 +172,7 @@ def test_what_cannot_treat_it_refuses_it_by_its_noun(missions):
         tb.fit(missions, PooledTrust(effects=Daylight((12.0,))))
 
 
-def test_a_study_takes_it_by_its_module():
-    effect = {"kind": f"{__name__}:Daylight", "hours": [12.0, 0.0]}
-    settings = {"terrains": ["random_workspace"], "seeds": [0]}
-    models = {"lit": {"kind": "PooledTrust", "effects": [effect]}}
-    study = tb.study.Study(**settings, models=models)
-    assert study.models["lit"]["effects"][0] == effect
+def test_an_effect_can_be_compared():
     assert hash(Daylight([12.0, 0.0])) == hash(Daylight((12.0, 0.0)))
 
 

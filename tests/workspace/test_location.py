@@ -1,7 +1,5 @@
 """Cells of locations, against pyproj and rasterio, and the words for those that are none."""
 
-import json
-
 import numpy as np
 import pytest
 from pyproj import Transformer
@@ -13,7 +11,7 @@ from trustbo.planning import Planner
 from trustbo.simulation import ModelSimulator
 from trustbo.workspace import Workspace, survey
 from trustbo.workspace.grid import Grid
-from trustbo.workspace.location import cell_of, named, position_near
+from trustbo.workspace.location import cell_of, position_near
 
 
 @pytest.fixture(scope="module")
@@ -146,20 +144,6 @@ def test_an_impassable_cell_names_the_nearest_and_degrees_need_a_crs(walled):
         Planner(walled, (2, 2), (0, 0))
     with pytest.raises(TrustboError, match="no coordinate reference system"):
         walled.locate("lon=1,lat=2")
-
-
-def test_a_position_survives_the_settings_of_a_study():
-    found = named("start", {"lon": 175.40197207732, "lat": -40.91931111})
-    assert found.text == "lon=175.401972077,lat=-40.91931111"
-    part = tb.study.Study(
-        terrains={
-            "cells": {"kind": "random", "shape": [4, 4], "start": {"x": 25, "y": 30}, "goal": "0,3"}
-        }
-    )
-    again = tb.study.Study.of(json.loads(json.dumps(part.settings())))
-    scene = again.experiment().runs()[0].scene
-    assert scene.ends == ("x=25,y=30", (0, 3))
-    assert Planner(scene.make_workspace(bounds=True), *scene.ends).start == (3, 0)
 
 
 def test_a_survey_knows_the_cells_that_are_impassable_before_awareness():

@@ -1,10 +1,8 @@
 """A world: a true terrain, sight and team, what is assumed of them, and courses through it."""
 
 import hashlib
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
-from functools import lru_cache, partial
-from inspect import signature
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, cast
 
@@ -15,15 +13,12 @@ from scipy import ndimage
 from trustbo import terrain
 from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_choice
-from trustbo.files import cache_folder
+from trustbo.files import FilePath
 from trustbo.simulation import KinematicSimulator, RadioSimulator, Truth
 from trustbo.simulation.events import Event
-from trustbo.simulation.protocol import Simulator
-from trustbo.study.calls import digest, identity_of, imported
-from trustbo.study.experiment import Scene
+from trustbo.study.grid import Scene
 from trustbo.team import Team
 from trustbo.terrain.example import EXAMPLES, example_files
-from trustbo.terrain.read import read_terrain
 from trustbo.workspace import Workspace
 from trustbo.workspace.sight import Sight
 
@@ -35,19 +30,6 @@ _STRIP = 250
 """Rows of a real terrain that are used, those with most data: all but bcts have not many more."""
 _RELIEF = 0.06
 """Relief of a synthetic terrain as a share of its longer side."""
-
-Simulate = Callable[..., Simulator]
-"""Function `simulator(workspace, *, terrain, sight, team)` of a true world, and with `events` of
-one where something happens."""
-
-
-def _radio(workspace: Workspace, *, terrain: xr.Dataset, sight: Sight, team: Team) -> Simulator:
-    """Simulator by radio, to which sight and the robots' lidars are nothing."""
-    return RadioSimulator(workspace, terrain=terrain)
-
-
-SIMULATORS: dict[str, Simulate] = {"kinematic": KinematicSimulator, "radio": _radio}
-"""Simulators of worlds by name."""
 
 
 def drawn(ground: str, what: str) -> np.random.Generator:
@@ -73,7 +55,7 @@ class World:
             height from its lower left corner, in place of CRS metres.
         shape: Planning grid.
         cell: Side of a cell of a synthetic terrain, m.
-        simulate: Name of the simulator, in `SIMULATORS`.
+        radio: Whether contact is that of `RadioSimulator`.
         data: Folder of the real terrains.
     """
 
@@ -88,7 +70,7 @@ class World:
     events: tuple[Event, ...] = ()
     shape: tuple[int, int] = (10, 10)
     cell: float = 50.0
-    simulate: str = "kinematic"
+    radio: bool = False
     data: str | None = None
 
     @property
@@ -105,12 +87,6 @@ class World:
     def is_packaged(self) -> bool:
         """Whether the terrain comes with the package."""
         return self.is_made or self.ground in EXAMPLES
-
-    def identity(self) -> dict[str, Any]:
-        """Everything that decides its numbers; real terrains by their contents."""
-        settings = asdict(self) | {"events": [repr(event) for event in self.events]}
-        del settings["data"]
-        return settings | ({} if self.is_made else {"files": [digest(f) for f in self.files()]})
 
     def files(self) -> list[str]:
         """Files of a real terrain.
@@ -148,48 +124,56 @@ class World:
         assumed = replace(
             self, name="", kind="", sight=self.assumed or self.sight, assumed=None,
             team=self.assumed_team or self.team, assumed_team=None, events=(),
-            simulate="kinematic",
+            radio=False,
         )  # fmt: skip
         return _workspace(assumed, tuple(sorted(options.items())))
 
-    def true_events(self) -> tuple[Event, ...]:
-        """Events with their centres in CRS metres."""
-        left, bottom, right, top = self.true_terrain().rio.bounds(recalc=True)
-        corner, size = np.array([left, bottom]), np.array([right - left, top - bottom])
+    def simulator(self, workspace: Workspace) -> KinematicSimulator | RadioSimulator:
+        """Simulator of the true world, with posts and ways of a workspace on the assumed one."""
+        terrain = self.true_terrain()
+        if self.radio:
+            return RadioSimulator(workspace, terrain=terrain)
+        return KinematicSimulator(
+            workspace,
+            terrain=terrain,
+            sight=self.sight,
+            team=self.team,
+            events=self._events(terrain),
+        )
 
-        def placed(event: Event) -> Event:
-            share = getattr(event, "center", None)
-            if share is None:
-                return event
-            x, y = corner + share * size
-            return replace(cast(Any, event), center=(float(x), float(y)))
+    def truth(self, folder: FilePath | None = None) -> Truth:
+        """Truth of the simulator, from its file in a folder where it has been found before."""
+        return Truth.of(self.simulator(self.workspace()), folder=folder)
 
-        return tuple(placed(event) for event in self.events)
+    def scene(
+        self,
+        course: str,
+        folder: FilePath | None = None,
+        max_bounds: int | str = "shortest+4",
+        **options: Any,
+    ) -> Scene:
+        """Course through the world for `run_grid`, with the truth kept in a folder.
 
-    def simulator(self, workspace: Workspace, simulate: Simulate | None = None) -> Simulator:
-        """Simulator of the true world, with posts and ways of a workspace on the assumed one.
-
-        TrustboError: the function does not take what is true of the world.
+        Options are those of `workspace`. TrustboError: an unknown course, or absent files.
         """
-        true: dict[str, Any] = {
-            "terrain": self.true_terrain(), "sight": self.sight, "team": self.team,
-        }  # fmt: skip
-        if self.events:
-            true["events"] = self.true_events()
-        make = SIMULATORS[self.simulate] if simulate is None else simulate
-        try:
-            signature(make).bind(workspace, **true)
-        except TypeError as error:
-            raise TrustboError(
-                f"world {self.name!r} has {', '.join(true)}, and the simulator {make!r} does not "
-                f"take them: {error}; leave the world out."
-            ) from None
-        return make(workspace, **true)
+        workspace = self.workspace(**options)
+        paths = {"max_bounds": max_bounds}
+        labels = {"world": self.name, "kind": self.kind, "of": self.case, "course": course}
+        simulator, truth = self.simulator(workspace), self.truth(folder)
+        ends, options = self.ends(course), {"planner": paths}
+        return Scene(workspace, simulator, *ends, truth, options, labels, paths)
 
-    def truth(self, simulate: Simulate | None = None, *, progress: bool = False) -> Truth:
-        """Truth of the simulator, from disk where it has been computed before."""
-        simulator = self.simulator(self.workspace(), simulate)
-        return Truth.of(simulator, folder=cache_folder("truth"), progress=progress)
+    def _events(self, terrain: xr.Dataset) -> list[Event]:
+        """Events with their centres in CRS metres."""
+        left, bottom, right, top = terrain.rio.bounds(recalc=True)
+        corner, size = np.array([left, bottom]), np.array([right - left, top - bottom])
+        placed = []
+        for event in self.events:
+            if (share := getattr(event, "center", None)) is not None:
+                x, y = corner + share * size
+                event = replace(cast(Any, event), center=(float(x), float(y)))
+            placed.append(event)
+        return placed
 
     def ends(self, course: str) -> tuple[Cell, Cell]:
         """Start and goal of a course: the nearest cells from which most others can be reached."""
@@ -207,50 +191,6 @@ class World:
         near = [free[np.argmin(((free - cell) ** 2).sum(1))] for cell in (start, goal)]
         (a, b), (c, d) = near
         return (int(a), int(b)), (int(c), int(d))
-
-
-def scene_of(
-    world: World,
-    course: str,
-    judged: tuple[str, int | str] = ("lost_contact", "shortest+4"),
-    simulate: Simulate | str | None = None,
-) -> Scene:
-    """Course through a world as a scene of an experiment.
-
-    Args:
-        world: World.
-        course: Name in `COURSES`.
-        judged: Objective and admissible paths that regret is held against, for all methods.
-        simulate: Function of the user that makes the simulator, or `"module:name"` of one.
-    """
-    _, max_bounds = judged
-    return Scene(
-        labels={"world": world.name, "kind": world.kind, "case": world.case, "course": course},
-        identity={
-            "world": world.identity(),
-            "course": course,
-            "judged": judged,
-            "simulator": identity_of(simulate),
-        },
-        make_workspace=world.workspace,
-        ends=world.ends(course),
-        simulator=partial(_simulator, world, simulate),
-        judged={"max_bounds": max_bounds},
-    )
-
-
-def _simulator(world: World, simulate: Simulate | str | None, workspace: Workspace) -> Simulator:
-    """Make the simulator of a world; TrustboError: the user's function makes none."""
-    make: Any = imported("simulator", simulate) if isinstance(simulate, str) else simulate
-    simulator: Any = None
-    if make is None or callable(make):
-        simulator = world.simulator(workspace, cast(Any, make))
-    if not callable(getattr(simulator, "run", None)):
-        raise TrustboError(
-            f"simulator {simulate!r} must be a function that makes a simulator from a "
-            "workspace and the true terrain, sight and team."
-        )
-    return simulator
 
 
 def aged(now: xr.Dataset, seed: int = 0) -> xr.Dataset:
@@ -271,7 +211,7 @@ def aged(now: xr.Dataset, seed: int = 0) -> xr.Dataset:
     ground = dem + 0.3 * noise()
     canopy = np.where(clearings, 0.0, 0.7 * (dsm - dem))
     old = now["dem"].copy(data=ground), now["dsm"].copy(data=ground + canopy)
-    return read_terrain(*(heights.rio.write_crs(now.rio.crs) for heights in old))
+    return terrain.read_terrain(*(heights.rio.write_crs(now.rio.crs) for heights in old))
 
 
 @lru_cache(maxsize=4)

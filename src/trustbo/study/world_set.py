@@ -116,14 +116,11 @@ def _season(factor: float) -> dict[str, Any]:
     return {"events": (Season(factor, first=_AFTER),)}
 
 
-# Slope limits that are assumed too high (kind "limit"). The true limit is chosen by rule: the
-# lowest of 14, 18, 22 and 26 degrees under which, with 4 degrees more assumed, an admissible path
-# arrives on both diagonal courses while at least 5 % of bounds fail. One simulated replicate of
-# each bound decides, as bounds always fail by the limit or never do. Tried, and without a path on
-# one of the courses: alder 14; tahoe and topography 14 and 18; bcts 18 and 22; wellington 38 and
-# 41. Wellington is too steep for the rule, and on synthetic-2 with 14 only 4 % of bounds fail:
-# both are out. With 1 degree more assumed, the limits are 17 of the 18 of kind "slopes", and on
-# wellington, the steepest, 44 of the 45 of usual robots; the same rule admits all three.
+# Slope limits assumed too high (kind "limit"): the true limit is the lowest of 14, 18, 22 and 26
+# degrees under which, with 4 degrees more assumed, an admissible path arrives on both diagonal
+# courses while at least 5 % of bounds fail. No such limit is found for wellington, and on
+# synthetic-2 only 4 % of bounds fail: both are out. With 1 degree more assumed, the limits are 17
+# of the 18 of kind "slopes", and on wellington 44 of the 45 of usual robots.
 _CASES: tuple[_Case, ...] = (
     ("right", "", (*_SYNTHETIC, *REAL), {}),
     ("wall", "wall", ("synthetic-0", "synthetic-1", "tahoe"), {"sight": Sight(math.inf, 0.0)}),
@@ -151,7 +148,7 @@ _CASES: tuple[_Case, ...] = (
     ("jammer", "jammer", ("synthetic-2", _BIRCH), _jam()),
     ("jammer", "jammer-appears", (_ALDER, "wellington"), _jam(_AFTER)),
     ("jammer", "jammer-lifted", ("synthetic-0", _CEDAR, "tahoe"), _jam(last=_AFTER - 1)),
-    ("physics", "radio", ("synthetic-1", _BIRCH, "topography"), {"simulate": "radio"}),
+    ("physics", "radio", ("synthetic-1", _BIRCH, "topography"), {"radio": True}),
     ("shapes", "12x7", (_BIRCH, "tahoe"), {"shape": (12, 7)}),
     ("shapes", "20x20", (_CEDAR,), {"shape": (20, 20), "cell": 25.0}),
     ("teams", "team-of-2", ("synthetic-2", "bcts"), {"team": Team(2)}),

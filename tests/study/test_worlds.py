@@ -11,7 +11,7 @@ from trustbo.simulation import KinematicSimulator, RadioSimulator, Truth
 from trustbo.simulation.events import Event
 from trustbo.simulation.replicates import table_of
 from trustbo.study import worlds
-from trustbo.study.world import COURSES, REAL, SIMULATORS, drawn
+from trustbo.study.world import COURSES, REAL, drawn
 
 OLD = {"right": 7, "wall": 3, "bare": 3, "aged": 6, "canopy": 7, "slopes": 3}
 """Worlds of version 0.2 by kind."""
@@ -126,10 +126,8 @@ def test_worlds_of_synthetic_terrain_can_be_made(listed):
     for world in one_of_each.values():
         small = dataclasses.replace(world, shape=(3, 3), cell=20.0)
         simulator = small.simulator(small.workspace(bounds=False))
-        radio = world.simulate == "radio"
-        assert isinstance(simulator, RadioSimulator if radio else KinematicSimulator)
+        assert isinstance(simulator, RadioSimulator if world.radio else KinematicSimulator)
         assert len(getattr(simulator, "events", ())) == len(world.events)
         assert all(isinstance(event, Event) for event in world.events)
         seeds.add(float(small.true_terrain()["dem"].mean()))
-    assert {world.simulate for world in listed.values()} == SIMULATORS.keys()
     assert len(seeds) == 6  # terrains

@@ -1,0 +1,179 @@
+"""Campaigns as one table: cases x scenes x seeds, in processes, going on where they stopped."""
+
+import copy
+import re
+import time
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import product
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pandas as pd
+from joblib import Parallel, delayed
+from threadpoolctl import threadpool_limits
+
+from trustbo.campaign.campaign import Campaign
+from trustbo.data import Cell
+from trustbo.errors import TrustboError, require_whole
+from trustbo.files import FilePath, write_file
+from trustbo.simulation import Truth
+from trustbo.simulation.protocol import Simulator
+from trustbo.workspace import Workspace
+
+
+class Scene(NamedTuple):
+    """Where campaigns are run: what is assumed, the true world, and a course through it."""
+
+    workspace: Workspace
+    simulator: Simulator
+    start: Cell
+    goal: Cell
+    truth: Truth | None = None
+    """Truth of the simulator, by which paths are judged."""
+    options: Mapping[str, Any] = {}
+    """Options of `Campaign` on this scene, which those of a case replace."""
+    labels: Mapping[str, Any] = {}
+    """Further columns of the table."""
+    judged: Mapping[str, Any] = {}
+    """Options of `Truth.best`, such as `max_bounds`, for the path that others are compared with."""
+
+
+type Case = Mapping[str, Any] | Callable[[Scene], Mapping[str, Any]]
+"""Options of `Campaign`, or a function that makes them for a scene."""
+
+
+def run_grid(
+    cases: Mapping[str, Case],
+    scenes: Mapping[str, Callable[[], Scene]],
+    folder: FilePath,
+    *,
+    seeds: Sequence[int] = (0,),
+    n_missions: int = 15,
+    n_jobs: int = -1,
+) -> pd.DataFrame:
+    """Run each case on each scene with each seed, and judge the paths of each mission.
+
+    A run is a file in the folder, named by its case, scene, seed and number of missions; runs whose
+    files are there are not run again. Processes are those of joblib: `joblib.parallel_config`
+    chooses others, such as `backend="dask"` for a cluster. A policy with a method
+    `learn(campaign, mission)` is told of each mission, and one with `recommend(campaign)`
+    recommends a path in place of the campaign.
+
+    Args:
+        cases: Cases by name.
+        scenes: Functions that make the scenes, by name; they are called in the processes.
+        folder: Folder of the runs.
+        seeds: Seeds of the campaigns.
+        n_missions: Missions of a campaign.
+        n_jobs: Processes; -1 for one a core, 1 for none but this.
+
+    Returns:
+        A row for each run and mission: `case`, `scene`, `seed`, labels of the scene, and `mission`;
+        0 is before the first. `regret` in % and `lost` in bounds are those of the path recommended
+        after the mission in the world of the next, see `Truth`, and `best` what the best path
+        loses there. Of the mission itself are `status`, `contact_rate` (mean), `driven` and
+        `best_driven`, which are expected to be lost on its path and on the best,
+        `failed_driven`, what is lost more than on the best path if bounds that fail or are not
+        reached keep no contact, and `seconds` of processor time.
+
+    Raises:
+        TrustboError: Some runs failed; they are run again at the next call.
+    """
+    require_whole("n_missions", n_missions, 1)
+    kept, runs = Path(folder), list(product(seeds, scenes, cases))
+    files = {
+        (seed, scene, case): kept / f"{_plain(case)}~{_plain(scene)}~{seed}~{n_missions}.csv"
+        for seed, scene, case in runs
+    }
+    if len(set(files.values())) < len(runs):
+        raise TrustboError("names of cases and scenes must differ in their letters and digits.")
+    errors = Parallel(n_jobs=n_jobs)(
+        delayed(_run)(cases[case], scenes[scene], (case, scene, seed), n_missions, file)
+        for (seed, scene, case), file in files.items()
+        if not file.exists()
+    )
+    if failed := [error for error in errors if error]:
+        raise TrustboError(
+            f"{len(failed)} of {len(runs)} runs failed, and are run again at the next call: "
+            f"{'; '.join(failed[:3])}"
+        )
+    return pd.concat([pd.read_csv(file) for file in files.values()], ignore_index=True)
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"\W+", "-", name)
+
+
+def _run(
+    case: Case,
+    scene: Callable[[], Scene],
+    names: tuple[str, str, int],
+    n_missions: int,
+    file: Path,
+) -> str:
+    """Run a campaign and write its rows to a file; return the error, if any."""
+    labels = dict(zip(("case", "scene", "seed"), names, strict=True))
+    try:
+        with warnings.catch_warnings(), threadpool_limits(1):
+            warnings.simplefilter("ignore")
+            where = scene()
+            rows = [
+                labels | dict(where.labels) | row
+                for row in _rows(case, where, labels["seed"], n_missions)
+            ]
+        write_file(file, lambda path: pd.DataFrame(rows).to_csv(path, index=False))
+    except Exception as error:  # of one run, which does not stop the others
+        return f"{', '.join(map(str, names))}: {type(error).__name__}: {error}"
+    return ""
+
+
+def _rows(case: Case, scene: Scene, seed: int, n_missions: int) -> Iterator[dict[str, Any]]:
+    """Run a campaign: its rows, the first before any mission."""
+    options = case(scene) if callable(case) else case
+    given = {
+        "workspace": scene.workspace, "start": scene.start, "goal": scene.goal, "seed": seed,
+        **scene.options, **copy.deepcopy(dict(options)),
+    }  # fmt: skip
+    with Campaign(**given) as campaign:
+        policy = campaign.policy
+        yield {"mission": 0, **_recommended(campaign, scene, 0)}
+        began = time.process_time()
+        driven = campaign.run(scene.simulator, n_missions)
+        for number, (_, mission) in enumerate(driven, start=1):
+            if hasattr(policy, "learn"):
+                policy.learn(campaign, mission)
+            row = {"mission": number, **_recommended(campaign, scene, number)}
+            row |= {"status": mission.status, "contact_rate": mission.contact_rate.mean()}
+            yield (
+                row
+                | _driven(mission.path, scene, number - 1)
+                | {"seconds": time.process_time() - began}
+            )
+            began = time.process_time()
+
+
+def _recommended(campaign: Campaign, scene: Scene, mission: int) -> dict[str, float]:
+    """Regret and loss of the path that is recommended for a mission."""
+    if scene.truth is None:
+        return {}
+    choose = getattr(campaign.policy, "recommend", None)
+    path = campaign.recommend().path if choose is None else choose(campaign)
+    truth = scene.truth.at(mission)
+    best = truth.best(scene.start, scene.goal, **scene.judged)
+    regret = truth.regret(path, **scene.judged)
+    return {"regret": regret, "lost": truth.lost(path), "best": truth.lost(best)}
+
+
+def _driven(path: Sequence[Cell], scene: Scene, mission: int) -> dict[str, float]:
+    """Loss that was expected on the path of a mission, and on the best."""
+    if scene.truth is None:
+        return {}
+    truth, ends = scene.truth.at(mission), (scene.start, scene.goal)
+    best = truth.best(*ends, **scene.judged)
+    safest = truth.best(*ends, **scene.judged, failures=True)
+    return {
+        "driven": truth.lost(path),
+        "best_driven": truth.lost(best),
+        "failed_driven": truth.lost_or_failed(path) - truth.lost_or_failed(safest),
+    }

@@ -1,0 +1,155 @@
+"""Numbers of campaigns, and paired differences of cases, with bootstrap intervals."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from trustbo.errors import require_choice
+
+SHOWN = (0, 1, 3, 8, 15)
+"""Numbers of missions after which regret is shown."""
+NEAR = 1.0
+"""Regret in % within which a campaign is near the best path."""
+_RUN = ["case", "scene", "seed"]
+
+
+def numbers_of(table: pd.DataFrame) -> pd.DataFrame:
+    """Numbers of each run of a table of `run_grid` whose scenes have a truth.
+
+    Columns: labels of the run; `regret after n` missions in %, and `lost after n`, contact lost
+    more than on the best path, in bounds, both in the world of the next mission; `regret now`, mean
+    over all missions; `lost while learning`, the same as `lost` for paths driven, in the world they
+    were driven in; `lost with failures`, the same where bounds that fail or are not reached keep
+    no contact; `missions to 1 %`, after which the recommended path stays within 1 %, one more
+    than were driven if it does not; shares of missions that `arrive`, of the first three and of
+    the later ones; and processor `seconds` of a mission.
+    """
+    judged = {"mission", "regret", "lost", "best", "status", "contact_rate", "driven",
+              "best_driven", "failed_driven", "seconds"}  # fmt: skip
+    labels = [name for name in table.columns if name not in judged]
+    rows = [_numbers(run) for _, run in table.groupby(_RUN, sort=False)]
+    of_runs = table.groupby(_RUN, sort=False)[labels].first()
+    return pd.concat([of_runs.reset_index(drop=True), pd.DataFrame(rows)], axis=1)
+
+
+def _numbers(run: pd.DataFrame) -> dict[str, float]:
+    """Numbers of one run, rows of missions 0, 1, ..."""
+    run = run.sort_values("mission")
+    driven, regret = run.iloc[1:], run["regret"].to_numpy()
+    after = [n for n in SHOWN if n < len(run)]
+    lost, home = (run["lost"] - run["best"]).to_numpy(), driven["status"] == "ok"
+    away = np.flatnonzero(~(regret <= NEAR))
+    return {
+        **{f"regret after {n}": regret[n] for n in after},
+        **{f"lost after {n}": lost[n] for n in after},
+        "regret now": np.nanmean(regret),
+        "lost while learning": (driven["driven"] - driven["best_driven"]).mean(),
+        "lost with failures": driven["failed_driven"].mean(),
+        f"missions to {NEAR:g} %": float(away[-1] + 1 if len(away) else 0),
+        "arrive": home.mean(),
+        "arrive of the first 3": home[:3].mean(),
+        "arrive later": home[3:].mean(),
+        "seconds": driven["seconds"].mean(),
+    }
+
+
+def summary(
+    numbers: pd.DataFrame, by: str | Sequence[str] = "case", *, clusters: str = "scene"
+) -> pd.DataFrame:
+    """Mean of each number, of regret and loss after n missions the median, with 95 % intervals.
+
+    Args:
+        numbers: Rows of `numbers_of`.
+        by: Columns of a row of the result.
+        clusters: Column whose equal runs enter the bootstrap together.
+
+    Returns:
+        Columns of two levels: the number, and `value`, `low` and `high`.
+
+    Raises:
+        TrustboError: An unknown column.
+    """
+    by = [
+        require_choice("column", n, numbers.columns) for n in ([by] if isinstance(by, str) else by)
+    ]
+    rows = {
+        key if len(by) > 1 else key[0]: bootstrap(_values(rows), rows[clusters].to_numpy())
+        for key, rows in numbers.groupby(by, sort=False)
+    }
+    return _table(rows, by)
+
+
+def differences(
+    numbers: pd.DataFrame, ours: str, by: Sequence[str] = (), *, clusters: str = "scene"
+) -> pd.DataFrame:
+    """Compare a case with each other one on the same scenes and seeds.
+
+    Args:
+        numbers: Rows of `numbers_of`.
+        ours: Case that others are subtracted from.
+        by: Columns of a row of the result beside the other case.
+        clusters: Column whose equal pairs enter the bootstrap together.
+
+    Returns:
+        Columns as of `summary`, means of `ours` less those of the other, and the number of `pairs`;
+        intervals are NaN for one cluster.
+
+    Raises:
+        TrustboError: An unknown case or column.
+    """
+    require_choice("case", ours, list(numbers["case"]))
+    for name in by:
+        require_choice("column", name, numbers.columns)
+    mine = numbers[numbers["case"] == ours]
+    pairs = mine.merge(numbers[numbers["case"] != ours], on=["scene", "seed"], suffixes=("", " 2"))
+    rows: dict[Any, dict[tuple[str, str], float]] = {}
+    names = [name for name in _values(numbers) if not name.startswith("lost after")]
+    for key, some in pairs.groupby([*by, "case 2"], sort=False):
+        less = {name: (some[name] - some[f"{name} 2"]).to_numpy() for name in names}
+        apart = some[clusters].to_numpy()
+        row = bootstrap(less, apart, np.nanmean)
+        if len(set(apart)) == 1:
+            row |= {(name, end): np.nan for name in names for end in ("low", "high")}
+        rows[key if by else key[0]] = {("pairs", "value"): float(len(some))} | row
+    return _table(rows, [*by, f"{ours} less"])
+
+
+def bootstrap(
+    numbers: Mapping[str, np.ndarray],
+    clusters: np.ndarray,
+    middle: Callable[[np.ndarray], Any] | None = None,
+) -> dict[tuple[str, str], float]:
+    """Value and 95 % interval of each quantity, by default a median of those after n missions.
+
+    Runs of one cluster enter the bootstrap together, and all quantities have the same draws.
+    """
+    rng, (names, index) = np.random.default_rng(0), np.unique(clusters, return_inverse=True)
+    members = [np.flatnonzero(index == i) for i in range(len(names))]
+    drawn = [
+        np.concatenate([members[i] for i in rng.integers(len(names), size=len(names))])
+        for _ in range(1000)
+    ]
+    row = {}
+    for name, values in numbers.items():
+        if np.isnan(values).all():  # such as arrivals of later missions where there are none
+            row |= {(name, what): np.nan for what in ("value", "low", "high")}
+            continue
+        usual = middle or (np.nanmedian if " after " in name else np.nanmean)
+        low, high = np.quantile([usual(values[chosen]) for chosen in drawn], [0.025, 0.975])
+        row |= {(name, "value"): float(usual(values)), (name, "low"): low, (name, "high"): high}
+    return row
+
+
+def _values(numbers: pd.DataFrame) -> dict[str, np.ndarray]:
+    """Columns of numbers, by name."""
+    first = numbers.columns.get_loc("regret after 0")
+    return {name: numbers[name].to_numpy(float) for name in numbers.columns[first:]}
+
+
+def _table(rows: Mapping[Any, Mapping[Any, float]], levels: Sequence[str]) -> pd.DataFrame:
+    table = pd.DataFrame.from_dict(dict(rows), orient="index")
+    table.columns = pd.MultiIndex.from_tuples(table.columns)
+    table.index.names = list(levels)
+    return table

@@ -1,0 +1,148 @@
+"""Grids of campaigns: what a row says, processes, and going on after a failure or a kill."""
+
+import os
+from functools import partial
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import trustbo as tb
+from trustbo.errors import TrustboError
+from trustbo.simulation import Truth
+from trustbo.study import Scene, run_grid
+
+POOLED = tb.models.PooledTrust()
+CASES = {"greedy": {"model": POOLED}, "random": {"model": POOLED, "policy": "random"}}
+
+
+class Steady:
+    """Simulator in which a bound has contact as its mean awareness, and no mission starts twice."""
+
+    def __init__(self, workspace, breaks=None):
+        self.workspace, self.breaks = workspace, breaks
+
+    def run(self, path, *, seed, mission=0):
+        if self.breaks is not None and self.breaks.exists():
+            raise RuntimeError("broken")
+        z = self.workspace.along(path)
+        noise = 0.02 * np.random.default_rng(seed).normal(size=z.shape[:2])
+        return tb.Mission.from_arrays(path, z, np.clip(z.mean(-1) + noise, 0.0, 1.0))
+
+
+def scene(seed, breaks=None):
+    z = np.random.default_rng(seed).uniform(size=(2, 3, 3, 2))
+    workspace = tb.Workspace.from_awareness(z)
+    truth = Truth.of(Steady(workspace), n_replicates=1)
+    simulator, labels = Steady(workspace, breaks), {"ground": f"made {seed}"}
+    return Scene(workspace, simulator, (2, 0), (0, 2), truth, labels=labels)
+
+
+SCENES = {f"made {seed}": partial(scene, seed) for seed in (0, 1)}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("grid")
+
+
+@pytest.fixture(scope="module")
+def table(folder):
+    return run_grid(CASES, SCENES, folder, seeds=(0, 1), n_missions=2, n_jobs=1)
+
+
+def test_a_row_is_of_a_run_and_mission(table):
+    assert len(table) == 2 * 2 * 2 * 3
+    assert set(table["ground"]) == set(SCENES)
+    before = table["mission"] == 0
+    assert table.loc[before, "status"].isna().all()
+    assert (table.loc[~before, "status"] == "ok").all()
+    assert (table["regret"] >= -1e-9).all()
+    np.testing.assert_allclose(table.loc[~before, "failed_driven"],
+                               (table["driven"] - table["best_driven"])[~before])  # fmt: skip
+
+
+def test_regret_is_that_of_the_campaign_itself(table):
+    where = scene(1)
+    with tb.Campaign(where.workspace, (2, 0), (0, 2), model=POOLED, seed=1) as campaign:
+        expected = [where.truth.regret(campaign.recommend().path)]
+        for _ in campaign.run(where.simulator, 2):
+            expected.append(where.truth.regret(campaign.recommend().path))
+    run = table[(table["case"] == "greedy") & (table["scene"] == "made 1") & (table["seed"] == 1)]
+    np.testing.assert_allclose(run["regret"], expected, atol=1e-9)
+
+
+def test_called_again_it_reads_what_is_there(table, folder):
+    def broken():
+        raise RuntimeError
+
+    again = run_grid(CASES, dict.fromkeys(SCENES, broken), folder, seeds=(0, 1), n_missions=2)
+    pd.testing.assert_frame_equal(again, table)
+
+
+def test_a_run_that_fails_does_not_stop_the_others_and_is_run_again(tmp_path, table):
+    switch = tmp_path / "switch"
+    switch.touch()
+    scenes = SCENES | {"made 1": partial(scene, 1, switch)}
+    options = {"seeds": (0, 1), "n_missions": 2, "n_jobs": 1}
+    with pytest.raises(TrustboError, match="4 of 8 runs"):
+        run_grid(CASES, scenes, tmp_path / "out", **options)
+    assert len(list((tmp_path / "out").iterdir())) == 4
+    switch.unlink()
+    pd.testing.assert_frame_equal(run_grid(CASES, scenes, tmp_path / "out", **options), _timeless(
+        table, run_grid(CASES, scenes, tmp_path / "out", **options)))  # fmt: skip
+
+
+def _timeless(table, other):
+    """The table with the processor times of another."""
+    return table.assign(seconds=other["seconds"])
+
+
+class Counting:
+    """Policy that learns by itself, and recommends the path of its last mission."""
+
+    def __init__(self):
+        self.paths = []
+
+    def __call__(self, key, posterior, planner):
+        return planner.plan(posterior.mean())
+
+    def learn(self, campaign, mission):
+        self.paths.append(mission.path)
+
+    def recommend(self, campaign):
+        return self.paths[-1] if self.paths else campaign.recommend().path
+
+
+def test_a_policy_that_learns_by_itself_is_told_and_is_new_in_each_run(tmp_path):
+    case = {"own": {"policy": Counting(), "model": POOLED}, "made": lambda scene: CASES["greedy"]}
+    table = run_grid(case, SCENES, tmp_path, n_missions=2, n_jobs=1)
+    own = table[(table["case"] == "own") & (table["mission"] > 0)]
+    np.testing.assert_allclose(own["lost"], own["driven"])
+    assert not case["own"]["policy"].paths
+
+
+def test_names_that_are_one_file_are_refused(tmp_path):
+    with pytest.raises(TrustboError):
+        run_grid({"a b": {}, "a-b": {}}, SCENES, tmp_path)
+
+
+@pytest.mark.slow  # processes that import JAX
+def test_processes_give_the_same_table(table, tmp_path):
+    found = run_grid(CASES, SCENES, tmp_path, seeds=(0, 1), n_missions=2, n_jobs=2)
+    pd.testing.assert_frame_equal(found, _timeless(table, found))
+
+
+@pytest.mark.slow  # processes that import JAX
+def test_dask_gives_the_same_table(table, tmp_path, monkeypatch):
+    joblib = pytest.importorskip("joblib")
+    distributed = pytest.importorskip("distributed")
+    here = os.path.dirname(__file__)
+    monkeypatch.setenv("PYTHONPATH", here)  # the workers import this module
+    with (
+        distributed.LocalCluster(2, threads_per_worker=1, dashboard_address=None) as cluster,
+        distributed.Client(cluster),
+        joblib.parallel_config(backend="dask"),
+    ):
+        found = run_grid(CASES, SCENES, tmp_path, seeds=(0, 1), n_missions=2)
+    pd.testing.assert_frame_equal(found, _timeless(table, found))
