@@ -381,10 +381,9 @@ def _number(what: str, value: Any) -> float:
 # --- place on Earth ---
 
 
-def _known_crs(crs: object) -> pyproj.CRS:
+def _known_crs(crs: Any) -> pyproj.CRS:
     try:
-        wkt = crs.to_wkt() if isinstance(crs, rasterio.crs.CRS) else crs
-        return pyproj.CRS.from_user_input(wkt)
+        return pyproj.CRS.from_user_input(crs)
     except CRSError:
         raise TerrainError(f"crs {crs!r} is not one PROJ knows; give e.g. 'EPSG:32633'.") from None
 

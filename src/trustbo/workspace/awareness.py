@@ -53,8 +53,8 @@ def cell_maps(
         if isinstance(parts, str):
             pixels[name] = _unit_values(name, values_of(parts))
             continue
-        require_kind(f"feature {name!r}", parts, Iterable, remedy)
-        values = {part: values_of(part) for part in parts}
+        names = require_kind(f"feature {name!r}", parts, Iterable, remedy)
+        values = {part: values_of(part) for part in names}
         index = CompositeIndex({part: FEATURES[part].sign for part in values}).fit(values)
         pixels[name], composites[name] = index.transform(values), index
     even = slope(terrain) <= team.max_slope

@@ -125,7 +125,7 @@ class Workspace(Summary):
         with compiling():
             z, free, pixels, composites = cell_maps(terrain, grid, features or defaults, team)
             z = np.repeat(z[None], team.n_robots, axis=0)
-            names = [name for name in pixels.data_vars if name != "passable"]
+            names = [str(name) for name in pixels.data_vars if name != "passable"]
             cells = labelled(z, free, grid, team, names)
             workspace = cls(*cells, grid, team, terrain, pixels, composites, sight=sight)
             return workspace._with_line_of_sight() if bounds else workspace
