@@ -1,17 +1,18 @@
-"""Simulation-based calibration of every model, family and sampler; prints the table of the docs.
+"""Simulation-based calibration of models, families and effects; prints the table of the docs.
 
-Run: python benchmarks/calibration.py [exact] [nuts] [--share 1] [--out out/calibration]
+    python benchmarks/calibration.py [row ...] --sets 200
 
-Ranks are kept in the folder after each data set: a run that was stopped goes on where it was.
+A row is a model; its data sets are simulated from the prior on the same missions: random walks over
+a small grid, with gaps. `--sampler nuts` ranks draws of NUTS.
 """
 
-import sys
+import argparse
+import time
 
-from common import Table, arguments, parsed, timed
-from sbc_places import Walks
+import numpy as np
 
+import trustbo as tb
 from trustbo.inference import sbc
-from trustbo.inference.samplers.choice import why_not_scores
 from trustbo.models import (
     CoupledTrust,
     HierarchicalTrust,
@@ -21,91 +22,78 @@ from trustbo.models import (
     RobotEffect,
 )
 
-SMALL = (3, 6, 2, 2)  # missions, bounds, robots, features
-LOG = (2, 40, 3, 1)  # missions of a log, trust carried over all of it
-PEOPLE = (12, 5, 1, 2)  # persons, steps, tasks, success and failure
+EFFECTS = (PlaceEffect(), RobotEffect())
+ROWS = {
+    "pooled": PooledTrust(),
+    "pooled, deviations": PooledTrust(memory="deviation"),
+    "pooled, shared noise": PooledTrust(shared_noise=True),
+    "pooled, places and robots": PooledTrust(effects=EFFECTS),
+    "pooled, all": PooledTrust(shared_noise=True, effects=EFFECTS),
+    "hierarchical, robots": HierarchicalTrust(effects=(RobotEffect(),)),
+    "coupled": CoupledTrust(),
+    "coupled, robots": CoupledTrust(effects=(RobotEffect(),)),
+    "censored, robots": PooledTrust(observation="censored", effects=(RobotEffect(),)),
+    "censored, places": PooledTrust(observation="censored", effects=(PlaceEffect(),)),
+    "counts": PooledTrust(observation="beta_binomial"),
+    "likert7": HumanTrust(scale="likert7"),
+}
 
 
-def cases():
-    """Model, sampler, data sets, shape."""
-    yield PooledTrust(), "exact", 1000, (4, 8, 3, 2)
-    yield CoupledTrust(inter_robot="none"), "exact", 200, SMALL
-    for observation in ("censored", "beta_binomial"):
-        yield PooledTrust(observation=observation), "exact", 300, SMALL
-        yield CoupledTrust(observation=observation, inter_robot="none"), "exact", 200, SMALL
-        yield PooledTrust(observation=observation, place=PlaceEffect()), "exact", 200, SMALL
-        yield HierarchicalTrust(observation=observation), "exact", 200, SMALL
-    for observation in ("gaussian", "censored", "beta_binomial"):
-        for places in ([], [PlaceEffect()]):
-            effects = [*places, RobotEffect()]
-            yield PooledTrust(effects=effects, observation=observation), "exact", 200, SMALL
-        robots = {"effects": [RobotEffect()], "observation": observation}
-        yield PooledTrust(memory="deviation", **robots), "exact", 200, LOG
-    yield HierarchicalTrust(observation="beta_binomial"), "exact", 200, LOG
-    yield HierarchicalTrust(), "exact", 300, SMALL
-    yield CoupledTrust(), "exact", 200, SMALL
-    yield PooledTrust(place=PlaceEffect()), "exact", 300, SMALL
-    for scale in ("unit", "likert7", "ordinal7"):
-        people = HumanTrust(scale=scale).for_features(("success", "failure"))
-        yield people, "exact", 200, PEOPLE
-    for model in (PooledTrust, HierarchicalTrust, CoupledTrust):
-        yield model(), "nuts", 200, SMALL
-    yield PooledTrust(place=PlaceEffect()), "nuts", 200, SMALL
-    yield PooledTrust(effects=[RobotEffect()]), "nuts", 200, SMALL
-    yield PooledTrust(effects=[PlaceEffect(), RobotEffect()]), "nuts", 200, SMALL
+def walks(n_missions=4, n_bounds=6, n_robots=2, size=4):
+    """Missions over random walks, whose rates are replaced."""
+    rng, missions = np.random.default_rng(0), []
+    for _ in range(n_missions):
+        path = [tuple(rng.integers(size, size=2).tolist())]
+        while len(path) <= n_bounds:
+            step = np.array(path[-1]) + rng.integers(-1, 2, size=2)
+            if (step >= 0).all() and (step < size).all() and tuple(step.tolist()) != path[-1]:
+                path.append(tuple(step.tolist()))
+        z, y = rng.uniform(size=(n_bounds, n_robots, 2)), np.full((n_bounds, n_robots), 0.5)
+        y[rng.integers(n_bounds), rng.integers(n_robots)] = np.nan
+        ticks, features = np.full(y.shape, 40.0), ["line_of_sight", "slope"]
+        missions.append(tb.Mission.from_arrays(path, z, y, n_ticks=ticks, features=features))
+    return missions
+
+
+def people(n_persons=10, n_steps=5):
+    """Persons who meet successes and failures."""
+    rng, persons = np.random.default_rng(0), []
+    for _ in range(n_persons):
+        z = rng.uniform(size=(n_steps, 1, 2))
+        y, ticks = np.full((n_steps, 1), 0.5), np.full((n_steps, 1), 6.0)
+        features = ["success", "failure"]
+        persons.append(tb.Mission.from_arrays(None, z, y, n_ticks=ticks, features=features))
+    return persons
 
 
 def main():
-    parser = arguments(
-        __doc__, names=("exact", "nuts"), out="out/calibration", quick="2 data sets each"
+    """Print one row for each model."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("rows", nargs="*", choices=[*ROWS, []])
+    parser.add_argument("--sets", type=int, default=200)
+    parser.add_argument("--sampler", default="importance")
+    given = parser.parse_args()
+    print(
+        "| model | data sets | refused | parameters | smallest p | limit | 50 % | 90 % | s a set |"
     )
-    parser.add_argument("--only", default="", help="rows whose label has this text")
-    parser.add_argument("--share", type=float, default=1.0, help="share of the data sets")
-    given = parsed(parser)
-    table = Table(
-        "model", "observation", "sampler", "data sets", "refused", "parameters", "smallest p",
-        "limit", "50 % interval", "90 % interval", "uniform",
-    )  # fmt: skip
-    for model, sampler, n, shape in cases():
-        if sampler not in given.names:
-            continue
-        n = 2 if given.quick else max(2, round(n * given.share))
-        name = type(model).__name__
-        detail = getattr(model, "inter_robot", "full")
-        effects = ["places"] * (model.place is not None) + ["robots"] * bool(model.effects)
-        detail = " and ".join(effects) or detail
-        detail = getattr(model, "scale", detail)
-        label = name if detail == "full" else f"{name}, {detail}"
-        if shape is LOG:
-            detail, label = f"{detail}-log", f"{label}, of a log"
-        if model.memory != "level" and not isinstance(model, HumanTrust):
-            detail, label = f"{detail}-{model.memory}", f"{label}, memory of the {model.memory}"
-        if given.only not in label:
-            continue
-        file = given.out / f"{name}-{detail}-{model.observation}-{sampler}.json"
-        design = None if model.place is None else Walks.random(shape[:2], seed=0)
-        options = {
-            "design": design,
-            "n_datasets": n,
-            "shape": shape,
-            "checkpoint": file,
-            "max_refused": 0.05,
-            "n_draws": 400 if why_not_scores(model) is None else 1000,
-            "progress": False,
-        }
-        seconds, result = timed(
-            lambda model=model, sampler=sampler, given=options: sbc(model, sampler, **given)
+    print("|---|---:|---:|---:|---:|---:|---:|---:|---:|")
+    for name in given.rows or ROWS:
+        model, started = ROWS[name], time.process_time()
+        missions = people() if isinstance(model, HumanTrust) else walks()
+        ranks = sbc(
+            model,
+            missions,
+            sampler=given.sampler,
+            n_datasets=given.sets,
+            max_refused=0.2,
+            progress=False,
         )
-        p, limit = float(result["p_value"].min()), 0.01 / result.sizes["parameter"]
-        half, most = result["coverage"].mean("parameter").values
-        levels = getattr(model, "scale", "unit") != "unit"
-        family = "intervals" if levels else model.observation
-        table.row(
-            label, family, f"`{sampler}`", n, result.attrs["n_refused"],
-            result.sizes["parameter"], f"{p:.4f}", f"{limit:.5f}", f"{half:.1%}", f"{most:.1%}",
-            "not rejected" if p > limit else "REJECTED",
-        )  # fmt: skip
-        print(f"{label}: {seconds:.0f} s", file=sys.stderr, flush=True)
+        seconds = (time.process_time() - started) / given.sets
+        p, limit = float(ranks["p_value"].min()), 0.01 / ranks.sizes["parameter"]
+        half, most = ranks["coverage"].mean("parameter").values
+        refused, n = ranks.attrs["n_refused"], ranks.sizes["parameter"]
+        row = f"| {name} | {given.sets} | {refused} | {n} | {p:.4f} | {limit:.5f} | {half:.1%} "
+        print(f"{row}| {most:.1%} | {seconds:.2f} |", flush=True)
 
 
 if __name__ == "__main__":

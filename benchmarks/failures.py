@@ -61,7 +61,7 @@ def climbing(degrees):
 def judged_plans(world, simulator, course, seed, given):
     """Chance to arrive of a campaign's plans, and the share of runs of each that arrive."""
     campaign, gathered = tb.Campaign(
-        simulator.workspace, *world.ends(course), sampler="exact", seed=seed
+        simulator.workspace, *world.ends(course), sampler="importance", seed=seed
     ), []  # fmt: skip
     for number in range(1, max(ASKED) + 1):
         plan = campaign.ask()

@@ -1,14 +1,14 @@
 """Plans, predictions and fits by family of observations, over the worlds.
 
-    python benchmarks/families.py campaigns criticise --data DIR --out out/families
+    python benchmarks/families.py campaigns --data DIR --out out/families
     python benchmarks/families.py loo --data DIR
 
 `campaigns`: the default campaign under each family, with the same seed; after each mission the
 regret of the path that it would recommend, and the contact that the path driven lost beyond the
 best one's, both by the truth of the world; coverage one mission ahead; processor seconds.
-`criticise`: the verdicts on these campaigns. `loo`: every family on the missions of one campaign of
+`loo`: every family on the missions of one campaign of
 each terrain, along random paths; the log density of a mission left out, in nats of counts of ticks,
-less that of the best family. The first two go on where they stopped. Differences are paired by
+less that of the best family. Both go on where they stopped. Differences are paired by
 world and course, their 95 % intervals by a bootstrap over these.
 """
 
@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from common import Table, add_record, arguments, parsed, read_records, records_of
+from common import Table, arguments, parsed, records_of
 
 import trustbo as tb
 from trustbo.inference import fit
@@ -33,13 +33,12 @@ TERRAINS = ("synthetic-0", "synthetic-1", "synthetic-2", "wellington", "tahoe", 
 DRIVEN = ("synthetic-0", "synthetic-1", "wellington", "synthetic-0-aged", "synthetic-0-wall",
           "synthetic-0-rain", "synthetic-cedar-dead-detector",
           "synthetic-alder-jammer-appears")  # fmt: skip
-HEALTHY = ("right", "aged", "wall")
 """Kinds of worlds in which no robot fails and nothing changes."""
 
 
 def main():
     parser = arguments(
-        __doc__, names=("campaigns", "criticise", "loo"), data=True, out="out/families",
+        __doc__, names=("campaigns", "loo"), data=True, out="out/families",
         quick="one synthetic world, 3 missions",
     )  # fmt: skip
     parser.add_argument("--worlds", nargs="*")
@@ -49,7 +48,7 @@ def main():
     if given.quick:
         given.worlds, given.courses, given.missions = ["synthetic-0"], ["sw-ne"], 3
     for name in given.names:
-        {"campaigns": campaigns, "criticise": criticise, "loo": loo}[name](given)
+        {"campaigns": campaigns, "loo": loo}[name](given)
 
 
 def campaigns(given):
@@ -66,7 +65,7 @@ def campaigns(given):
 def driven(world: World, course: str, n: int, family: str, out) -> dict[str, Any]:
     """Regret, contact lost, coverage and seconds of one campaign, which is saved to a folder."""
     workspace, truth, ends = world.workspace(), world.truth(), world.ends(course)
-    model = PooledTrust(place=PlaceEffect(), effects=(RobotEffect(),), observation=family)
+    model = PooledTrust(effects=(PlaceEffect(), RobotEffect()), observation=family)
     campaign = tb.Campaign(workspace, *ends, model=model, seed=0)
     regret, lost, seconds = [], [], []
     run = campaign.run(world.simulator(workspace), n)
@@ -120,32 +119,6 @@ def _interval(values: np.ndarray) -> str:
     return f"{values.mean():.3f} [{low:.3f}, {high:.3f}]"
 
 
-def criticise(given):
-    """Verdicts on the campaigns that are kept."""
-    file, every = given.out / "verdicts.jsonl", worlds(given.data)
-    done = {record["campaign"] for record in read_records(file)}
-    for folder in sorted((given.out / "campaigns").iterdir()):
-        if folder.name not in done:
-            started, result = time.process_time(), tb.load_result(folder)
-            found = tb.criticise(result.posteriors[-1], result.missions, compare=False)
-            seconds = time.process_time() - started
-            add_record(file, {"campaign": folder.name, "fault": found.fault, "seconds": seconds})
-            print(f"{folder.name}: {found.verdict}", flush=True)
-    table = Table("family", "worlds", "campaigns", "a fault is found", "faults", "seconds")
-    records = read_records(file)
-    for family in FAMILIES:
-        for what, healthy in (("healthy", True), ("others", False)):
-            some = [
-                r for r in records
-                if r["campaign"].endswith(f" {family}")
-                and (every[r["campaign"].split()[0]].kind in HEALTHY) == healthy
-            ]  # fmt: skip
-            faults = [r["fault"] for r in some if r["fault"] != "none"]
-            names = ", ".join(f"{f} {faults.count(f)}" for f in dict.fromkeys(faults))
-            took = np.median([r["seconds"] for r in some]) if some else np.nan
-            table.row(family, what, len(some), len(faults), names, f"{took:.1f}")
-
-
 def loo(given):
     """Leave-one-out densities."""
     total = dict.fromkeys(LOO, 0.0)
@@ -164,7 +137,7 @@ def loo(given):
 def along_random_paths(world, n=15):
     """Missions along random paths through a world."""
     workspace = world.workspace()
-    options = {"policy": "random", "sampler": "exact", "planner": {"max_bounds": "shortest+4"}}
+    options = {"policy": "random", "sampler": "importance", "planner": {"max_bounds": "shortest+4"}}
     campaign = tb.Campaign(workspace, *world.ends("sw-ne"), **options)
     run = campaign.run(world.simulator(workspace), n_iterations=n)
     return [workspace.fill(mission) for _, mission in run]

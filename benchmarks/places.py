@@ -29,7 +29,7 @@ from trustbo.study import worlds
 from trustbo.study.world import COURSES
 from trustbo.terrain import synthetic_terrain
 
-PLACES = PooledTrust(place=PlaceEffect())
+PLACES = PooledTrust(effects=PlaceEffect())
 BOTH = {"place": PlaceEffect(), "effects": [RobotEffect()]}
 MODELS = {
     "places": PLACES,
@@ -104,7 +104,7 @@ def times(given):
         ("30 x 30, 40, corner to corner", 30, 40, False, 0.0, ["places"]),
     )[: 1 if given.quick else None]:
         workspace, missions = driven(side, n, random_ends, missing)
-        fitted = {"workspace": workspace, "sampler": "exact", "whole": False}
+        fitted = {"workspace": workspace, "sampler": "importance", "whole": False}
         for kind in models:
             fit = partial(tb.fit, model=MODELS[kind], **fitted)
             earlier = fit(missions[:-1])
@@ -144,7 +144,7 @@ def absent(given):
         for name, model in kinds.items():
             result = tb.iterate(
                 workspace, *ends, n_iterations=15, simulator=simulator, model=model, seed=seed,
-                sampler="exact", progress=False,
+                sampler="importance", progress=False,
             )  # fmt: skip
             results[name]["lost"].append(-planner.evaluate(result.plan.path, params).value)
             driven_on = [-planner.evaluate(m.path, params).value for m in result.missions]
@@ -193,7 +193,7 @@ def stopping(given):
 def nuts(given):
     workspace, missions = driven(6, 8, random_ends=False)
     seeds = [
-        moments(tb.fit(missions, PLACES, "exact", workspace=workspace, seed=seed))
+        moments(tb.fit(missions, PLACES, sampler="importance", workspace=workspace, seed=seed))
         for seed in range(12)
     ]
     longer = {"warmup": 600, "draws": 6000, "check": False}

@@ -140,7 +140,7 @@ def scored(world: World, course: str, n: int) -> dict[str, Any]:
             break
         learned, ahead = missions[:m], missions[m]
         scores = {
-            name: score(fit(learned, model, "exact", workspace=workspace, check=False,
+            name: score(fit(learned, model, sampler="importance", workspace=workspace, check=False,
                             progress=False), [ahead])
             for name, model in _models(ahead.features).items()
         }  # fmt: skip

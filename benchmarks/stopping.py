@@ -62,7 +62,7 @@ def main():
             workspace, truth = world(seed, noise)
             result = tb.iterate(
                 workspace, *ENDS, n_iterations=MOST, simulator=ModelSimulator(workspace, truth),
-                sampler="exact", stop=tb.RegretBound(eps, delta), seed=seed, progress=False,
+                sampler="importance", stop=tb.RegretBound(eps, delta), seed=seed, progress=False,
                 objective="terminal",
             )  # fmt: skip
             if result.stop_reason != "n_iterations":

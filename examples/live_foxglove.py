@@ -58,7 +58,7 @@ def main(faster=10.0):
 
     foxglove.start_server()
     workspace = tb.Workspace.from_terrain(tb.terrain.example(), (10, 10))
-    campaign = tb.Campaign(workspace, (9, 0), (0, 9), sampler="exact")
+    campaign = tb.Campaign(workspace, (9, 0), (0, 9), sampler="importance")
     follower, robots = tb.Follower(campaign), workspace.team.names
     driven = tb.simulation.KinematicSimulator(workspace).run(follower.path, seed=0)
     trust_map = campaign.trust_map().values

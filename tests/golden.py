@@ -101,7 +101,7 @@ def record(name: str) -> dict:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         if name in EXACT:
-            return campaign(EXACT[name], sampler="exact", n_iterations=3)
+            return campaign(EXACT[name], sampler="importance", n_iterations=3)
         try:
             return campaign(NUTS[name], sampler="nuts", n_iterations=2)
         except tb.PosteriorError as error:

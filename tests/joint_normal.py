@@ -2,90 +2,72 @@
 
 Trust is a linear function of x_0, process noise and coefficients, solved bound by bound from its
 recursion; the covariance of the rates is formed and factored. It needs the cube of their number,
-takes any columns, and shares no step with `gaussian`.
+takes any model and any columns, and shares no step with `inference.engine`.
 """
 
-from collections.abc import Sequence
-
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
-
-from trustbo.models.effects.effect import Group, Slots, Theta, dense_root
+from scipy.linalg import block_diag
+from scipy.stats import multivariate_normal
 
 
 class Dense:
-    """Joint normal of all rates, for one theta."""
+    """Joint normal of all rates and coefficients, for one theta of arrays (1, ...)."""
 
-    def __init__(
-        self,
-        slots: Slots,
-        groups: Sequence[Group],
-        theta: Theta,
-        x0: tuple[float, float] = (0.5, 0.5),
-        memory: str = "level",
-    ) -> None:
-        """Form the joint normal; `theta` has one point, of beta0 maybe (point, robot)."""
-        (delta_w,), (delta_v,) = (theta[name] for name in ("delta_w", "delta_v"))
-        of_robot = np.resize(theta["beta0"][0], slots.n_robots)
-        n_chains, K = slots.y.shape
-        U = np.concatenate([group.columns.toarray() for group in groups], axis=1)
-        m = U.shape[1]
-        # Each row of x: its mean, and its weights of coefficients, x_0 - E x_0, and process noise.
-        mean, of_c = np.zeros((n_chains, K)), np.zeros((n_chains, K, m))
-        of_noise = np.zeros((n_chains, K, n_chains, K + 1))
-        for c, u in enumerate(U.reshape(n_chains, K, m)):
-            last_mean, last_c, last_noise = x0[0], np.zeros(m), np.zeros((n_chains, K + 1))
-            last_noise[c, 0], beta0 = x0[1], of_robot[slots.robot[c]]
+    def __init__(self, model, slots, theta):
+        """Form the joint normal."""
+        n_missions, K, R = slots.y.shape
+        U = np.concatenate([e.columns(slots).toarray() for e in model.columns], axis=1)
+        U = U.reshape(n_missions, K, R, -1)
+        means, precisions = [], []
+        for effect in model.columns:
+            mean, parts = effect.prior(theta, slots)
+            precisions += [part[0] if part.ndim == 3 else np.diag(part[0]) for part in parts]
+            means.append(np.zeros(sum(p.shape[1] for p in parts)) if mean is None else mean[0])
+        self.prior_mean = np.concatenate(means)
+        self.prior_cov = block_diag(*(np.linalg.inv(Q) for Q in precisions))
+        B0, Q, noise = _matrices(theta, R)
+        x0 = np.full(R, model.x0["x0_mean"])
+        mean, cov, of_c = [], [], []
+        for u in U:
+            # Trust is mean + of_c c + of_noise e: x_0, then process noise, then rates' noise.
+            m, A, E = x0, np.zeros((R, U.shape[3])), np.zeros((R, R + 2 * K * R))
+            E[:, :R] = model.x0["x0_sd"] * np.eye(R)
+            rates = []
             for k in range(K):
-                last_mean, last_c, last_noise = (
-                    beta0 * last_mean,
-                    beta0 * last_c,
-                    beta0 * last_noise,
-                )
-                last_c = last_c + u[k]
-                if memory == "deviation":
-                    last_c = last_c - (beta0 * u[k - 1] if k else 0.0)
-                    last_mean -= 0.0 if k else beta0 * x0[0]
-                last_noise = last_noise.copy()
-                last_noise[c, k + 1] = delta_w
-                mean[c, k], of_c[c, k], of_noise[c, k] = last_mean, last_c, last_noise
-        priors = [group.prior(theta) for group in groups]
-        self.prior_mean = np.concatenate([np.broadcast_to(p.mean, p.sd.shape)[0] for p in priors])
-        self.prior_cov = np.zeros((m, m))
-        start = 0
-        for group, prior in zip(groups, priors, strict=True):
-            n = prior.sd.shape[1]
-            root = np.eye(n)
-            for columns, one in zip(group.joined, prior.roots, strict=True):
-                root[columns, columns] = dense_root(one)[0]
-            root = prior.sd[0][:, None] * root
-            self.prior_cov[start : start + n, start : start + n] = root @ root.T
-            start += n
-        seen = ~np.isnan(slots.y)
-        self._of_c, noise = of_c[seen], of_noise[seen].reshape(seen.sum(), -1)
-        self._off = slots.y[seen] - mean[seen] - self._of_c @ self.prior_mean
-        # A chain counts by its density to the power of its weight w: N(V / w) and a constant.
-        V = noise @ noise.T + delta_v**2 * np.eye(len(noise))
-        w = np.broadcast_to(slots.weight[:, None], seen.shape)[seen]
-        cov = self._of_c @ self.prior_cov @ self._of_c.T + V / np.sqrt(w[:, None] * w)
-        self._factor = cho_factor(cov, lower=True)
-        self._constant = -0.5 * (np.log(w) + w * np.log(2.0 * np.pi)).sum()
-        for weight, mine in zip(slots.weight, _chains(seen), strict=True):
-            self._constant += 0.5 * (1.0 - weight) * np.linalg.slogdet(V[np.ix_(mine, mine)])[1]
+                m, A, E = B0 @ m, B0 @ A + u[k], B0 @ E
+                if model.memory == "deviation":
+                    m = m - (B0 @ x0 if k == 0 else 0.0)
+                    A = A - (B0 @ u[k - 1] if k else 0.0)
+                E[:, R + k * R : R + (k + 1) * R] += np.linalg.cholesky(Q)
+                measured = E.copy()
+                measured[:, R + (K + k) * R : R + (K + k + 1) * R] += np.linalg.cholesky(noise)
+                mean.append(m)
+                of_c.append(A)
+                rates.append(measured)
+            rates = np.concatenate(rates)
+            cov.append(rates @ rates.T)
+        self.seen = ~np.isnan(slots.y.ravel())
+        self.y = slots.y.ravel()[self.seen]
+        self.of_c = np.concatenate(of_c)[self.seen]
+        self.mean = np.concatenate(mean)[self.seen] + self.of_c @ self.prior_mean
+        cov = block_diag(*cov)[np.ix_(self.seen, self.seen)]
+        self.cov = cov + self.of_c @ self.prior_cov @ self.of_c.T
 
-    def log_density(self) -> float:
+    def log_density(self):
         """Log density of the rates, in nats."""
-        misfit = self._off @ cho_solve(self._factor, self._off)
-        log_det = 2.0 * np.log(np.diag(self._factor[0])).sum()
-        return float(self._constant - 0.5 * (misfit + log_det))
+        return multivariate_normal(self.mean, self.cov).logpdf(self.y)
 
-    def coefficients(self) -> tuple[np.ndarray, np.ndarray]:
+    def coefficients(self):
         """Mean and covariance of the coefficients given the rates."""
-        cross = self.prior_cov @ self._of_c.T
-        gain = cho_solve(self._factor, cross.T).T
-        return self.prior_mean + gain @ self._off, self.prior_cov - gain @ cross.T
+        cross = self.prior_cov @ self.of_c.T
+        gain = np.linalg.solve(self.cov, cross.T).T
+        return self.prior_mean + gain @ (self.y - self.mean), self.prior_cov - gain @ cross.T
 
 
-def _chains(seen: np.ndarray) -> list[np.ndarray]:
-    """Indices of the rates of each chain among all measured ones."""
-    return np.split(np.arange(seen.sum()), np.cumsum(seen.sum(1))[:-1])
+def _matrices(theta, R):
+    """B0, and covariances of process noise and of rates' noise."""
+    if "B0" in theta:
+        return tuple(theta[name][0] for name in ("B0", "Delta_w", "Delta_v"))
+    shared = theta["delta_s"][0] ** 2 if "delta_s" in theta else 0.0
+    noise = theta["delta_v"][0] ** 2 * np.eye(R) + shared
+    return theta["beta0"][0] * np.eye(R), theta["delta_w"][0] ** 2 * np.eye(R), noise

@@ -33,7 +33,7 @@ def name_of(page):
 
 # Pages that compile models, or draw all figures.
 _SLOW = ("gallery", "howto/use-arviz", "howto/your-own-model", "howto/compare-models",
-         "howto/criticise", "index")  # fmt: skip
+         "index")  # fmt: skip
 SLOW = {f"docs/{page}.md" for page in _SLOW}
 EXAMPLES = [
     pytest.param(page, marks=pytest.mark.slow if name_of(page) in SLOW else (), id=name_of(page))

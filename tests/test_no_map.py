@@ -8,7 +8,7 @@ import pytest
 import trustbo as tb
 from trustbo.data import NOWHERE, Bound, Mission
 from trustbo.errors import ShapeError, TrustboError
-from trustbo.inference.posterior_tree import missions_of
+from trustbo.inference.draws import missions_of
 from trustbo.logs import read_missions, read_table, to_frame, write_missions
 from trustbo.models import PlaceEffect, PooledTrust, RobotEffect
 from trustbo.models.record import model_from_record
@@ -79,17 +79,19 @@ def test_a_robot_that_stands_out_is_found_without_places():
         y[:, 1] -= 0.5 * z[:, 1, 0] * (j >= 3)  # robot 2, index 1, from mission 3 on
         given = z, np.clip(y, 0.0, 1.0)
         missions.append(Mission.from_arrays(None, *given, features=["line_of_sight"]))
-    found = tb.criticise(tb.fit(missions, PooledTrust(effects=RobotEffect())))
-    assert found.fault == "robot in a mission"
-    assert "r2 has" in found.verdict
-    assert "from mission 3 on" in found.verdict
+    found = tb.check(tb.fit(missions, PooledTrust(effects=RobotEffect())), compare=False)
+    assert found.table.loc["robots", "stands_out"]
+    assert found.table.loc["robots", "label"] == "r2"
+    odd = found.robots[found.robots["stands_out"]]
+    assert set(odd["robot"]) == {"r2"}
+    assert set(odd["mission"]) == {3, 4, 5}
 
 
 def test_what_needs_a_map_refuses_them_in_a_sentence(missions, posterior):
     z = np.full((2, 3, 3, 2), 0.5)
     workspace = tb.Workspace.from_awareness(z, features=missions[0].features)
     for call in (
-        lambda: tb.fit(missions, PooledTrust(place=PlaceEffect())),
+        lambda: tb.fit(missions, PooledTrust(effects=PlaceEffect())),
         lambda: tb.fit(missions, PooledTrust(), workspace=workspace),
         lambda: tb.simulation.ReplaySimulator(missions),
         lambda: tb.Campaign(workspace, (0, 0), (2, 2)).tell(missions[0]),

@@ -74,7 +74,7 @@ class ModelSimulator:
 def begin(workspace, folder, n):
     """A campaign of n missions in a folder; its robots measure no awareness."""
     return tb.iterate(
-        workspace, (3, 0), (0, 3), n_iterations=n, directory=folder, sampler="exact",
+        workspace, (3, 0), (0, 3), n_iterations=n, directory=folder, sampler="importance",
         policy="thompson", simulator=ModelSimulator(workspace, blind=True),
         progress=False,
     )  # fmt: skip

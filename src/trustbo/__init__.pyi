@@ -24,7 +24,7 @@ from .campaign import (
     load_result,
     resume,
 )
-from .criticism import criticise
+from .criticism import check
 from .data import Bound, Mission
 from .errors import DamagedFileError, PosteriorError, ShapeError, TerrainError, TrustboError
 from .inference import compare, fit
@@ -49,8 +49,8 @@ __all__ = [
     "TimeLimit",
     "TrustboError",
     "Workspace",
+    "check",
     "compare",
-    "criticise",
     "criticism",
     "export",
     "fit",

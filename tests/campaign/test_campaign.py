@@ -23,7 +23,7 @@ def workspace():
 
 
 def begin(workspace, **options):
-    usual = {"model": PooledTrust(), "sampler": "exact", "objective": "mean"}
+    usual = {"model": PooledTrust(), "sampler": "importance", "objective": "mean"}
     return tb.Campaign(workspace, *ENDS, **usual | options)
 
 
@@ -75,7 +75,7 @@ def test_posterior_is_that_of_all_missions_with_the_awareness_of_the_map(workspa
     expected = [replace(m, bounds=tuple(
         replace(b, awareness=z) for b, z in zip(m.bounds, workspace.along(m.path), strict=True)
     )) for m in campaign.missions]  # fmt: skip
-    again = fit(expected, PooledTrust(), sampler="exact", seed=seed, draws=300)
+    again = fit(expected, PooledTrust(), sampler="importance", seed=seed, draws=300)
     for group in ("posterior", "log_likelihood"):
         for name, values in again[group].data_vars.items():
             np.testing.assert_array_equal(values, campaign.posterior[group][name])
@@ -84,7 +84,7 @@ def test_posterior_is_that_of_all_missions_with_the_awareness_of_the_map(workspa
 
 
 def test_options_of_planner_and_fit_are_passed_on(workspace):
-    campaign = begin(workspace, fit={"draws": 60, "n_chains": 2}, planner={"max_bounds": 5})
+    campaign = begin(workspace, fit={"draws": 60, "chains": 2}, planner={"max_bounds": 5})
     assert campaign.planner.max_bounds == 5
     sizes = campaign.tell(rates(workspace, campaign.ask().path))["posterior"].sizes
     assert (sizes["chain"], sizes["draw"]) == (2, 60)
@@ -209,7 +209,7 @@ def test_refused_posterior_leaves_a_mission_told_until_the_next_is_learned(works
         with pytest.warns(UserWarning, match="mission 1"):
             assert campaign.tell(rates(workspace, campaign.ask().path)) is None
     # Another seed and more draws, then the other sampler.
-    samplers = [("exact", 1000), ("exact", 2000), ("nuts", 2000)]
+    samplers = [("importance", 1000), ("importance", 2000), ("nuts", 2000)]
     assert [(sampler, n) for sampler, _, n in tried] == samplers
     assert len({seed for _, seed, _ in tried}) == 3
     assert states(campaign) == ["told"]
@@ -263,7 +263,7 @@ def test_excluded_mission_is_forgotten_until_it_is_told_again(workspace):
     assert campaign.hazard["failures"].values.sum() == 2
     assert campaign.posterior["constant_data"]["mission"].values.tolist() == [0, 2]
     rest = [campaign.missions[j] for j in (0, 2)]
-    again = fit(rest, PooledTrust(), sampler="exact", seed=seed, draws=300)
+    again = fit(rest, PooledTrust(), sampler="importance", seed=seed, draws=300)
     np.testing.assert_array_equal(again["posterior"]["beta"], posterior["posterior"]["beta"])
     for n in (2, 4):  # excluded already; and none
         with pytest.raises(tb.TrustboError, match=str(n)):

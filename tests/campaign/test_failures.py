@@ -38,7 +38,7 @@ def steep():
 
 def begin(workspace, **options):
     ends = ENDS if workspace.terrain is None else ((4, 0), (0, 4))
-    return tb.Campaign(workspace, *ends, sampler="exact", seed=1, **options)
+    return tb.Campaign(workspace, *ends, sampler="importance", seed=1, **options)
 
 
 def at(bound):
@@ -126,7 +126,7 @@ def test_bounds_are_avoided_from_the_second_failure_until_they_recover(workspace
 
 def test_avoided_bound_is_entered_if_there_is_no_other_way():
     corridor = tb.Workspace.from_awareness(np.full((1, 1, 3, 1), 0.6))
-    campaign = tb.Campaign(corridor, (0, 0), (0, 2), sampler="exact")
+    campaign = tb.Campaign(corridor, (0, 0), (0, 2), sampler="importance")
     for _ in range(3):
         campaign.ask()
         campaign.fail("stuck", where=(0, 2))

@@ -47,7 +47,7 @@ def follow(follower, seen, start=1000.0):
 
 
 def begun(model=None, n_missions=1, **options):
-    campaign = tb.Campaign(random_cells(), *ENDS, model=model, sampler="exact", **options)
+    campaign = tb.Campaign(random_cells(), *ENDS, model=model, sampler="importance", **options)
     for seed in range(n_missions):
         path = campaign.ask().path
         campaign.tell(whole(path, looks(len(path) - 1, seed + 10)))

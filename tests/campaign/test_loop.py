@@ -16,7 +16,7 @@ from trustbo.inference import params_of
 from trustbo.planning import Planner
 
 ENDS = ((3, 0), (0, 3))
-QUIET = {"sampler": "exact", "progress": False}
+QUIET = {"sampler": "importance", "progress": False}
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +82,10 @@ def test_same_seed_gives_the_same_result(result, workspace):
 
 
 def test_later_missions_leave_a_result_unchanged(workspace):
-    campaign, simulator = tb.Campaign(workspace, *ENDS, sampler="exact"), ModelSimulator(workspace)
+    campaign, simulator = (
+        tb.Campaign(workspace, *ENDS, sampler="importance"),
+        ModelSimulator(workspace),
+    )
     campaign.tell(simulator.run(campaign.ask().path, seed=0))
     result = campaign.result()
     path, table = result.path, result.table()
@@ -134,7 +137,7 @@ def test_regret_bound_stops_when_the_path_is_nearly_the_best(workspace):
         best = planner.plan(draws.draw(int(d))).value
         own = planner.evaluate(result.path, draws.draw(int(d))).value
         shares.append((best - own) / best <= 0.2)
-    campaign = tb.Campaign(workspace, *ENDS, sampler="exact", **options)
+    campaign = tb.Campaign(workspace, *ENDS, sampler="importance", **options)
     for mission in result.missions:
         campaign.tell(mission)
     assert tb.RegretBound(eps=0.2).probability(campaign, len(result.missions)) == np.mean(shares)
@@ -145,7 +148,7 @@ def test_regret_bound_stops_when_the_path_is_nearly_the_best(workspace):
 @pytest.mark.parametrize("fails", [True, False])
 def test_regret_bound_waits_until_every_bound_was_completed(workspace, fails):
     rule = tb.RegretBound(eps=0.9, delta=0.5, patience=2, min_missions=2)
-    campaign = tb.Campaign(workspace, *ENDS, sampler="exact")
+    campaign = tb.Campaign(workspace, *ENDS, sampler="importance")
     for seed in range(2):
         other = ((3, 0), (2, 1), (1, 2), (0, 2), (0, 3))
         campaign.tell(ModelSimulator(workspace).run(other, seed=seed))
@@ -180,7 +183,7 @@ def test_rules_are_callables_that_are_asked_between_missions(workspace):
 
 
 def test_generator_gives_each_mission_once_it_is_learned_from(workspace):
-    campaign = tb.Campaign(workspace, *ENDS, sampler="exact")
+    campaign = tb.Campaign(workspace, *ENDS, sampler="importance")
     for plan, mission in itertools.islice(campaign.run(ModelSimulator(workspace), 5), 2):
         assert mission.path == plan.path == campaign.missions[-1].path
     assert len(campaign.missions) == 2

@@ -15,7 +15,7 @@ from trustbo.data import Bound
 from trustbo.models import PooledTrust, Priors
 
 ENDS = ((2, 0), (0, 2))
-OPTIONS = {"policy": "thompson", "sampler": "exact", "seed": 3, "fit": {"draws": 50}}
+OPTIONS = {"policy": "thompson", "sampler": "importance", "seed": 3, "fit": {"draws": 50}}
 
 
 @pytest.fixture(scope="module")
@@ -260,7 +260,7 @@ def test_missions_and_workspace_on_terrain_are_read_back_with_ticks(tmp_path):
 def test_files_of_a_campaign_do_not_grow_with_its_missions(workspace, tmp_path):
     tb.iterate(
         workspace, *ENDS, n_iterations=4, simulator=ModelSimulator(workspace, blind=True),
-        directory=tmp_path, model=PooledTrust(), sampler="exact", progress=False,
+        directory=tmp_path, model=PooledTrust(), sampler="importance", progress=False,
     )  # fmt: skip
     for room in ("missions", "posteriors"):
         sizes = [file.stat().st_size for file in (tmp_path / room).glob("*.nc")]

@@ -13,7 +13,7 @@ def result():
     """Of a workspace whose north-western cell is impassable."""
     workspace = unequal_robots(blocked=[(0, 0)])
     return tb.iterate(
-        workspace, (2, 0), (0, 3), objective="terminal", n_iterations=2, sampler="exact", seed=3,
+        workspace, (2, 0), (0, 3), objective="terminal", n_iterations=2, seed=3,
         progress=False,
     )  # fmt: skip
 

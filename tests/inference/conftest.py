@@ -1,4 +1,4 @@
-"""One small posterior, sampled once: compiling takes longer than sampling."""
+"""One small posterior for all tests."""
 
 import pytest
 from missions import simulate_missions
@@ -14,4 +14,4 @@ def missions():
 
 @pytest.fixture(scope="session")
 def posterior(missions):
-    return fit(missions, PooledTrust(), sampler="nuts", seed=1)
+    return fit(missions, PooledTrust(), seed=1)

@@ -1,23 +1,16 @@
-"""Groups of a posterior that ArviZ's functions read, against numpyro and dense normals."""
-
-from dataclasses import replace
-from pathlib import Path
+"""Groups of a posterior that ArviZ's functions read, against dense normals."""
 
 import arviz as az
 import jax
 import numpy as np
 import numpyro.distributions as dist
 import pytest
-import xarray as xr
-from numpyro import handlers
 
 import trustbo as tb
-from trustbo.inference.log_prior import log_prior
-from trustbo.models import CoupledTrust, HierarchicalTrust, PlaceEffect, PooledTrust, Priors
-from trustbo.models.backend import call, own_settings
+from trustbo.models import CoupledTrust, PlaceEffect, PooledTrust, Priors, RobotEffect
+from trustbo.models.backend import own_settings
 
 FEATURES = ("traversability", "line_of_sight")
-ROOT = Path(__file__).resolve().parents[2]
 
 
 def campaign(n_missions=5, seed=0):
@@ -42,75 +35,11 @@ def posterior(missions):
     return tb.fit(missions, PooledTrust())
 
 
-# --- the prior ---
-
-
-@pytest.mark.parametrize(
-    ("model", "stationary"),
-    [
-        (PooledTrust(place=PlaceEffect()), True),
-        pytest.param(CoupledTrust(inter_robot="none"), True, marks=pytest.mark.slow),
-        pytest.param(CoupledTrust(), False, marks=pytest.mark.slow),
-        (HierarchicalTrust(), True),
-    ],
-    ids=["places", "none", "full", "hierarchical"],
-)
-def test_log_priors_are_those_of_the_sample_statements(model, stationary):
-    """Each site's own log density in a numpyro trace; of correlations, differences of draws."""
-    features = FEATURES if stationary else ("traversability", "visibility")
-    model = replace(model.for_features(features))
-    assert model.priors.stationary == stationary
-    with own_settings():
-        traces = [
-            handlers.trace(handlers.seed(model.sample_params, jax.random.key(j))).get_trace(3, 2)
-            for j in range(2)
-        ]
-    sites = {
-        name: np.stack([np.asarray(trace[name]["value"], float) for trace in traces])[:, None]
-        for name in model.dims
-        if name not in model.place_dims
-    }
-    place = {} if model.place is None else model.place.draw(2, np.random.default_rng(0))
-    found = log_prior(model, sites | {name: values[:, None] for name, values in place.items()})
-    named = {"B0": "B0_diagonal", "B": "B_diagonal"}
-    compared = 0
-    for label, values in found.items():
-        if label.startswith("correlation"):
-            label = label.replace("correlation", "corr")
-        if label in model.place_dims:
-            continue
-        with own_settings():
-            asked = [
-                float(np.sum(np.asarray(call(site["fn"], "log_prob", site["value"]))))
-                for site in (trace[named.get(label, label)] for trace in traces)
-            ]
-        own = values[:, 0]
-        if label.startswith("corr"):
-            # numpyro's density is of the Cholesky factor L: |dR / dL| is the product of the powers
-            # n - i of its diagonal, i = 2, ..., n.
-            n, factors = 3, [np.asarray(trace[label]["value"], float) for trace in traces]
-            asked = [
-                a - sum((n - i) * np.log(L[i - 1, i - 1]) for i in range(2, n + 1))
-                for a, L in zip(asked, factors, strict=True)
-            ]
-            asked, own = np.diff(asked), np.diff(own)
-        np.testing.assert_allclose(own, asked, rtol=1e-6, atol=1e-6)  # draws are of float32 priors
-        compared += 1
-    assert compared == len(found) - len(model.place_dims)
-    for name, values in place.items():
-        priors = {
-            "tau_s": dist.HalfNormal(0.2),
-            "tau_e": dist.HalfNormal(0.2),
-            "length_scale": dist.LogNormal(np.log(2.0), 0.5),
-        }
-        np.testing.assert_allclose(found[name][:, 0], priors[name].log_prob(values), rtol=1e-5)
-
-
 def test_sensitivity_flags_a_prior_in_conflict_with_the_data(missions, posterior):
     """The data put the intercept at a half below; the prior says 3 +- .2."""
     assert set(posterior["log_prior"].data_vars) == {"beta0", "beta", "b", "delta_w", "delta_v"}
     wrong = PooledTrust(Priors(b=dist.Normal(3.0, 0.2)))
-    conflict = tb.fit(missions, wrong)
+    conflict = tb.fit(missions, wrong, check=False)
     calm = PooledTrust(Priors(b=dist.Normal(0.0, 5.0)))
     vague = tb.fit(missions, calm)
     verdict, other = (
@@ -165,9 +94,7 @@ def test_each_rate_is_predicted_by_dense_conditioning_on_those_before(missions, 
     np.testing.assert_allclose(pieces.values[own, 7], expected, rtol=1e-9, atol=1e-9)
 
 
-def test_the_view_by_rate_has_the_priors_and_of_weighted_missions_no_likelihood_for_loo(
-    missions, posterior
-):
+def test_the_view_by_rate_has_the_priors(posterior):
     sensitivity = az.psense_summary(tb.inference.by_rate(posterior), var_names=["b"])
     expected = az.psense_summary(posterior, var_names=["b"])
     columns = ["prior", "likelihood"]
@@ -184,14 +111,25 @@ def test_the_view_by_rate_has_the_priors_and_of_weighted_missions_no_likelihood_
         view["prior_predictive"]["contact_rate"],
         posterior["prior_predictive"]["contact_rate"].values[..., measured],
     )
-    weighted = tb.fit(missions, PooledTrust(), weights=[0.5, 0.6, 0.7, 0.8, 0.9])
-    view = tb.inference.by_rate(weighted)
-    assert "log_likelihood" not in view.children
-    assert view["rate_log_likelihood"]["contact_rate"].dims == ("chain", "draw", "rate")
-    with pytest.raises(TypeError, match="log likelihood not found"):
-        az.loo(view)
-    with pytest.raises(tb.TrustboError, match=r"of a view by rate, give the posterior itself\.$"):
+    with pytest.raises(tb.TrustboError, match="by rate"):
         tb.inference.loo(view)
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        CoupledTrust(),
+        PooledTrust(shared_noise=True, effects=(PlaceEffect(), RobotEffect())),
+        PooledTrust(memory="deviation"),
+    ],
+    ids=["coupled", "shared noise", "deviation"],
+)
+def test_pieces_of_every_gaussian_model_add_up(missions, model):
+    posterior = tb.fit(missions, model, draws=25, check=False, progress=False)
+    pieces = tb.inference.by_rate(posterior)["log_likelihood"]["contact_rate"]
+    summed = pieces.groupby("mission").sum("rate").transpose("chain", "draw", "mission")
+    whole = posterior["log_likelihood"]["contact_rate"].values
+    np.testing.assert_allclose(summed.values, whole, atol=1e-9)
 
 
 def test_predictions_by_rate_are_calibrated_under_the_model():
@@ -218,8 +156,6 @@ def test_every_draw_has_predictions(posterior):
 
 
 def test_what_has_no_single_predictions_is_named(missions):
-    counted = xr.DataTree.from_dict({"posterior": xr.Dataset()})
-    counted.attrs = {"observation": "censored", "inter_robot": "none"}
-    counted.attrs |= {"x0_mean": 0.5, "x0_sd": 0.5}
-    with pytest.raises(tb.TrustboError, match='observation "censored" and inter_robot="none"'):
-        tb.inference.by_rate(counted)
+    posterior = tb.fit(missions, PooledTrust(observation="censored"), draws=25, whole=False)
+    with pytest.raises(tb.TrustboError, match="censored"):
+        tb.inference.by_rate(posterior)

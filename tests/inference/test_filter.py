@@ -14,7 +14,7 @@ from trustbo.models import CoupledParams, PooledTrust, TrustParams
 
 @pytest.fixture(scope="module")
 def posterior(missions):
-    return fit(missions, PooledTrust(), sampler="exact", seed=1)
+    return fit(missions, PooledTrust(), seed=1)
 
 
 def mixture(n_draws=4, seed=0):
@@ -121,11 +121,6 @@ def test_impossible_values_leave_the_filter_as_it_was(posterior):
     with pytest.raises(TrustboError, match=r"in_contact: \[0\] = 85 is outside"):
         live.update_tick([85, 90, np.nan])
     assert 0.0 < live.update_tick([True, False, np.nan]).mean[0] < 1.5
-    with pytest.raises(ShapeError, match="posterior is of 3 robots; got n_robots=2"):
-        TrustFilter(posterior, 2)
-    with pytest.raises(TrustboError, match=r"has observation='gaussian'; got 'censored'\. Leave"):
-        TrustFilter(posterior, observation="censored")
-    TrustFilter(posterior, 3, observation="gaussian")
     for most in (0, 2.5):
         with pytest.raises(TrustboError, match="max_draws must be a whole number from 1 on"):
             TrustFilter(params, 3, max_draws=most)
@@ -169,11 +164,7 @@ def test_families_are_followed_to_the_trust_of_a_grid(family):
         expected, mean, sd = on_a_grid(family, p, z[j, :, 0], y[j, :, 0], last_trust=True)
         assert abs(state.mean[0] - mean) < 0.05 * sd
         assert abs(state.sd[0] / sd - 1.0) < 0.05
-        # The constant of each density within the limits is left out of the weights.
-        found = live._log_weight[0]
-        if family == "censored":
-            found -= 0.5 * np.log(2.0 * np.pi) * (~np.isnan(y[j])).sum()
-        assert abs(found - expected) < 0.03
+        assert abs(live._log_weight[0] - expected) < 0.03
 
 
 @pytest.mark.parametrize("family", ["gaussian", "censored", "beta_binomial"])
@@ -294,5 +285,3 @@ def test_a_campaign_s_posterior_of_parameters_alone_is_followed():
     assert alone.state.mean.shape == (2,)
     expected = TrustFilter(params_of(whole), 2).update(z[0], y[0])
     np.testing.assert_array_equal(alone.update(z[0], y[0]).mean, expected.mean)
-    with pytest.raises(ShapeError, match="posterior is of 2 robots; got n_robots=3"):
-        TrustFilter(campaign.posteriors[-1], 3)

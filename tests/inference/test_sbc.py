@@ -1,89 +1,113 @@
 """Calibration of the samplers, and of the test itself."""
 
 from importlib import import_module
-from pathlib import Path
 
-import arviz as az
-import matplotlib.pyplot as plt
 import numpy as np
 import numpyro.distributions as dist
 import pytest
-import xarray as xr
+from missions import N_TICKS
 
+import trustbo as tb
 from trustbo.errors import PosteriorError, TrustboError
 from trustbo.inference import sbc
 from trustbo.inference.sbc import _uniformity
-from trustbo.models import CoupledTrust, PlaceEffect, PooledTrust, Priors
+from trustbo.models import (
+    CoupledTrust,
+    HierarchicalTrust,
+    HumanTrust,
+    PlaceEffect,
+    PooledTrust,
+    RobotEffect,
+)
+
+EFFECTS = (PlaceEffect(), RobotEffect())
+ROWS = {
+    "pooled": PooledTrust(),
+    "deviation": PooledTrust(memory="deviation"),
+    "shared noise": PooledTrust(shared_noise=True),
+    "places and robots": PooledTrust(effects=EFFECTS),
+    "hierarchical": HierarchicalTrust(effects=(RobotEffect(),)),
+    "coupled": CoupledTrust(),
+    "censored": PooledTrust(observation="censored", effects=(RobotEffect(),)),
+    "counts": PooledTrust(observation="beta_binomial"),
+}
 
 
-@pytest.mark.slow  # many data sets; others rank a few
-def test_the_exact_sampler_is_calibrated():
-    ranks = sbc(n_datasets=200, shape=(2, 4, 2, 2), progress=False)
-    assert list(ranks["parameter"].values) == [
-        "beta0",
-        "beta[0]",
-        "beta[1]",
-        "b",
-        "delta_w",
-        "delta_v",
-    ]
+def design(n_missions=3, n_bounds=5, features=("line_of_sight",)):
+    """Missions over a line of cells with gaps, whose rates are replaced."""
+    rng, path = np.random.default_rng(0), [(0, k) for k in range(n_bounds + 1)]
+    missions = []
+    for _ in range(n_missions):
+        z, y = rng.uniform(size=(n_bounds, 2, len(features))), np.full((n_bounds, 2), 0.5)
+        y[rng.integers(n_bounds), 0] = np.nan
+        ticks = np.full(y.shape, float(N_TICKS))
+        missions.append(tb.Mission.from_arrays(path, z, y, n_ticks=ticks, features=list(features)))
+    return missions
+
+
+@pytest.mark.slow  # many data sets
+@pytest.mark.parametrize("name", ROWS)
+def test_a_model_is_calibrated(name):
+    ranks = sbc(ROWS[name], design(), n_datasets=60, max_refused=0.02, progress=False)
+    # One chance in a thousand over all parameters (Bonferroni).
+    assert float(ranks["p_value"].min()) > 0.001 / ranks.sizes["parameter"]
+
+
+def test_every_parameter_and_the_ends_of_effects_are_ranked():
+    ranks = sbc(PooledTrust(effects=EFFECTS), design(), n_datasets=3, n_ranked=40, progress=False)
+
+    names = {"beta0", "beta[0]", "b", "delta_w", "delta_v", "tau_s", "length_scale", "tau_e"}
+    names |= {"tau_slow", "tau_day", "robot_effect[0,0]", "robot_effect[2,1]"}
+    assert names < set(ranks["parameter"].values)
+    assert {"place[0]", "place_bound[0]"} < set(ranks["parameter"].values)
     assert ranks["rank"].dims == ("dataset", "parameter")
-    # One chance in a thousand over the six parameters (Bonferroni).
-    assert float(ranks["p_value"].min()) > 0.001 / 6
+    assert ranks["rank"].min() >= 0
+    assert ranks["rank"].max() <= 40
+
+
+def test_people_are_ranked_without_their_own_parts():
+    people = []
+    for _ in range(4):
+        z = np.random.default_rng(len(people)).uniform(size=(3, 1, 2))
+        y, ticks = np.full((3, 1), 0.5), np.full((3, 1), 6.0)
+        features = ["success", "failure"]
+        people.append(tb.Mission.from_arrays(None, z, y, n_ticks=ticks, features=features))
+    ranks = sbc(HumanTrust(scale="likert7"), people, n_datasets=2, max_refused=1.0, progress=False)
+
+    assert {"beta0", "tau_gain", "beta[1]"} <= set(ranks["parameter"].values)
 
 
 def test_a_posterior_of_another_prior_is_found_out(monkeypatch):
     calibration = import_module("trustbo.inference.sbc")  # the package's `sbc` is the function
-    draw = calibration.draw_posterior
-    wrong = PooledTrust(Priors(delta_v=dist.HalfNormal(0.02)))
+    draw = calibration.by_importance
 
-    def of_another_prior(model, *args, **options):
-        return draw(wrong, *args, **options)
+    def of_another_prior(posterior, n, seed):
+        prior = posterior.scores.priors
+        prior["delta_v"] = dist.HalfNormal(0.02)
+        return draw(posterior, n, seed)
 
-    monkeypatch.setattr(calibration, "draw_posterior", of_another_prior)
-    ranks = sbc(n_datasets=50, shape=(2, 6, 2, 2), progress=False)
+    monkeypatch.setattr(calibration, "by_importance", of_another_prior)
+    ranks = sbc(PooledTrust(), design(), n_datasets=40, max_refused=0.5, progress=False)
+
     assert float(ranks["p_value"].sel(parameter="delta_v")) < 1e-6
-
-
-def test_effects_of_places_are_ranked_as_parameters_are(monkeypatch):
-    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "benchmarks")
-    walks = import_module("sbc_places").Walks.random((2, 5), seed=0)
-    model = PooledTrust(place=PlaceEffect())
-    options = {"shape": (2, 5, 2, 1), "n_datasets": 12, "n_ranked": 40, "progress": False}
-    with pytest.raises(TrustboError, match=r"design=None and place=PlaceEffect.*needs a design"):
-        sbc(model, "exact", **options)
-    options["design"] = walks
-    with pytest.raises(TrustboError, match=r"and place=None: .* one without takes none"):
-        sbc(PooledTrust(), "exact", **options)
-    ranks = sbc(model, "exact", **options)
-    names = ["beta0", "beta[0]", "b", "delta_w", "delta_v", "tau_s", "length_scale", "tau_e"]
-    effects = ["place[first]", "place[last]", "place_bound[first]", "place_bound[second]"]
-    assert sorted(ranks["parameter"].values) == sorted(names + effects)
-    # In twelve data sets no true effect leaves all draws on one side each time: 2 / 41^11.
-    assert (np.ptp(ranks["rank"].values, axis=0) > 10).all()
-    one_kind = PooledTrust(place=PlaceEffect(cells=False))
-    options["n_datasets"] = 1
-    assert not {"tau_s", "place[last]"} & set(sbc(one_kind, "exact", **options)["parameter"].values)
 
 
 def test_data_sets_that_the_sampler_refuses_are_counted(monkeypatch):
     calibration = import_module("trustbo.inference.sbc")
-    tried, draw = [], calibration.draw_posterior
+    tried, draw = [], calibration.by_importance
 
-    def refuses(model, sampler, settings, seed, *args, **kwargs):
+    def refuses(posterior, n, seed):
         tried.append(seed)
-        if seed % 5 == 0:
-            raise PosteriorError("weights are too uneven.")
-        return draw(model, sampler, settings, seed, *args, **kwargs)
+        drawn, stats, summary = draw(posterior, n, seed)
+        return drawn, stats, summary | ({"k_hat": 1.0} if len(tried) % 5 == 0 else {})
 
-    monkeypatch.setattr(calibration, "draw_posterior", refuses)
-    few = {"n_datasets": 10, "progress": False}
-    ranks = sbc(PooledTrust(), seed=1, max_refused=0.2, **few)
+    monkeypatch.setattr(calibration, "by_importance", refuses)
+    few = {"n_datasets": 10, "n_ranked": 40, "progress": False}
+    ranks = sbc(PooledTrust(), design(), max_refused=0.2, **few)
     assert ranks.attrs["n_refused"] == 2
     assert ranks.sizes["dataset"] == 8
-    with pytest.raises(PosteriorError, match="too uneven"):
-        sbc(PooledTrust(), seed=1, max_refused=0.1, **few)
-    assert len(tried) == 10 + 10  # the second run ends at its second refusal
+    with pytest.raises(PosteriorError):
+        sbc(PooledTrust(), design(), max_refused=0.1, **few)
 
 
 def test_uniform_ranks_pass_and_others_do_not():
@@ -92,43 +116,15 @@ def test_uniform_ranks_pass_and_others_do_not():
     assert _uniformity(rng.binomial(399, 0.5, 5000), 399) < 1e-6
 
 
-def test_a_run_goes_on_where_it_stopped(tmp_path):
-    file = tmp_path / "ranks.json"
-    options = {"shape": (2, 4, 2, 2), "progress": False, "n_ranked": 40}
-    sbc(n_datasets=3, checkpoint=file, **options)
-    kept = file.read_text()
-    resumed = sbc(n_datasets=6, checkpoint=file, **options)
-    np.testing.assert_array_equal(resumed["rank"], sbc(n_datasets=6, **options)["rank"])
-    assert kept[:-2] in file.read_text()  # the first three were not sampled again
-    with pytest.raises(TrustboError, match="holds ranks of other arguments"):
-        sbc(seed=1, n_datasets=6, checkpoint=file, **options)
-
-
-def test_arviz_draws_the_ranks_and_their_coverage():
-    ranks = sbc(n_datasets=60, shape=(2, 4, 2, 2), progress=False)
-    assert ranks["pit"].dims == ("dataset", "parameter")
-    tree = xr.DataTree.from_dict({"prior_sbc": ranks[["pit"]]})
-    az.plot_ecdf_pit(tree, sample_dims="dataset")
-    plt.close("all")
-    inside = (np.abs(ranks["pit"] - 0.5) < 0.45).mean("dataset")
-    np.testing.assert_allclose(ranks["coverage"].sel(interval=0.9), inside)
-    # 360 intervals of 90 %: 4 standard errors, were they independent.
-    assert abs(float(inside.mean()) - 0.9) < 4 * np.sqrt(0.09 / 360)
-
-
-def test_models_and_families_are_ranked_too():
-    ranks = sbc(
-        CoupledTrust(inter_robot="none"),
-        n_datasets=3,
-        shape=(2, 4, 2, 1),
-        progress=False,
-    )
-    names = list(ranks["parameter"].values)
-    assert names[:4] == ["beta0[0]", "beta0[1]", "beta[0,0]", "beta[1,0]"]
+def test_the_same_seed_gives_the_same_ranks():
+    few = {"n_datasets": 2, "n_ranked": 20, "progress": False}
+    one, same, other = (sbc(PooledTrust(), design(), seed=s, **few)["rank"] for s in (0, 0, 1))
+    np.testing.assert_array_equal(one, same)
+    assert (one != other).any()
 
 
 def test_bad_input():
-    with pytest.raises(TrustboError, match="unknown sampler 'gibbs'"):
-        sbc(sampler="gibbs")
-    with pytest.raises(TrustboError, match="n_datasets must be a whole number from 1 on; got 0"):
-        sbc(n_datasets=0)
+    with pytest.raises(TrustboError, match="sampler"):
+        sbc(PooledTrust(), design(), sampler="gibbs")
+    with pytest.raises(TrustboError, match="n_datasets"):
+        sbc(PooledTrust(), design(), n_datasets=0)

@@ -31,7 +31,7 @@ def placed():
     """Missions, the last to be predicted, a posterior of the others, and the exact prediction."""
     missions, place = walking_missions(2, n_bounds=(4, 9), missing=0.0), PlaceEffect()
     workspace = tb.Workspace.from_awareness(np.zeros((3, *SHAPE, 2)))
-    posterior = fit(missions[:-1], PooledTrust(place=place), sampler="exact", workspace=workspace)
+    posterior = fit(missions[:-1], PooledTrust(effects=place), workspace=workspace)
     draws = posterior["posterior"].to_dataset()
     names = ("beta0", "delta_w", "delta_v", "tau_s", "length_scale", "tau_e")
     theta = np.column_stack([draws[name].values.ravel() for name in names])
@@ -60,7 +60,7 @@ def test_a_prediction_is_the_joint_normal_given_earlier_missions_averaged_over_d
 def test_log_scores_are_shares_of_simulated_rates(family):
     """Counts and limits have probabilities; rates inside, a density in bins around them."""
     z, _, missions = counted_missions(family)
-    posterior = fit(missions[:3], PooledTrust(observation=family), sampler="exact", progress=False)
+    posterior = fit(missions[:3], PooledTrust(observation=family), progress=False)
     mission = missions[4]
     scores = score(posterior, [mission])
     params, rng, n = params_of(posterior).flat(), np.random.default_rng(1), 100
@@ -72,8 +72,7 @@ def test_log_scores_are_shares_of_simulated_rates(family):
         for k in range(len(z)):
             x = params.beta0 * x + params.beta @ z[k, 0] + params.b
             x = x + params.delta_w * rng.standard_normal(len(x))
-            rate = x + params.delta_v * rng.standard_normal(len(x))
-            path.append(measured.draw_rates(rng, x, rate, params.delta_v, np.full(len(x), N_TICKS)))
+            path.append(measured.sample(x, params.delta_v, np.full(len(x), N_TICKS), rng))
         drawn.append(path)
     drawn = np.moveaxis(np.array(drawn), 1, 0).reshape(len(z), -1)
     assert scores.attrs["log_score_of"] == "ticks"
@@ -95,7 +94,7 @@ def test_log_scores_are_shares_of_simulated_rates(family):
 @pytest.mark.filterwarnings("ignore")
 def test_log_scores_of_robots_that_differ_are_marginals_of_their_joint_normal(model):
     missions = simulate_missions(5)
-    posterior = fit(missions[:4], model, n_chains=2, draws=100, check=False, progress=False)
+    posterior = fit(missions[:4], model, chains=2, draws=100, check=False, progress=False)
     scores, z = score(posterior, missions[4:]), missions[4].awareness
     params = params_of(posterior).flat()
     y, densities = missions[4].contact_rate, []
@@ -121,7 +120,7 @@ def test_pit_of_rates_that_the_model_draws_are_uniform_with_limits_of_censored_o
     assert 0.2 < np.isin(y, (0.0, 1.0)).mean() < 0.8
     path = [(0, k) for k in range(6)]
     missions = [Mission.from_arrays(path, a, b) for a, b in zip(z, y, strict=True)]
-    posterior = fit(missions[:20], model, sampler="exact", progress=False)
+    posterior = fit(missions[:20], model, progress=False)
     scores = score(posterior, missions[20:])
     # Of 200 rates, those of a mission alike: 4 standard errors of some 80 that are independent.
     assert float(scores["coverage_50"].sel(among="all")) == pytest.approx(0.5, abs=0.22)
@@ -140,7 +139,7 @@ def test_posteriors_of_a_campaign_predict_the_next_mission_on_bounds_seen_and_ne
     missions[3] = Mission.from_arrays(
         missions[0].path, missions[0].awareness, missions[0].contact_rate
     )
-    posteriors = [fit(missions[: j + 1], PooledTrust(), sampler="exact", seed=j) for j in range(4)]
+    posteriors = [fit(missions[: j + 1], PooledTrust(), seed=j) for j in range(4)]
     scores = score(posteriors, missions)
     assert scores["mission"].values.tolist() == [1, 2, 3]
     n = len(missions[3].bounds)

@@ -1,48 +1,14 @@
-"""Contact rates given any drift, against the joint normal of all rates."""
+"""Contact rates given any drift, of programs of users."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import numpyro
-import pytest
-from joint_normal import Dense
-from missions import walking_missions
 from numpyro import handlers
-from scipy import sparse
 
 from trustbo.models import ContactRate
-from trustbo.models.effects.effect import Prior, Slots
-from trustbo.stacking import stack_missions
 
 X0 = 0.4, 0.6
-
-
-class Fixed:
-    """A column that is added to the drift as it is."""
-
-    joined = ()
-
-    def __init__(self, column):
-        self.columns = sparse.csr_array(column.reshape(-1, 1))
-
-    def prior(self, theta):
-        return Prior(np.ones((1, 1)), np.zeros((1, 1)), ())
-
-
-@pytest.mark.parametrize("missing", [0.0, 0.3])
-def test_the_density_is_that_of_the_joint_normal_of_all_rates(missing):
-    missions = walking_missions(1, 4, missing=missing)
-    batch, rng = stack_missions(missions, pad=False), np.random.default_rng(0)
-    drift = rng.normal(0.3, 0.2, batch.contact_rate.shape)
-    with jax.enable_x64(True):
-        law = ContactRate(jnp.asarray(drift), 0.6, 0.1, 0.05, *X0)
-        found = law.log_prob(jnp.asarray(batch.contact_rate))
-    slots = Slots.of(batch, len(missions), ())
-    of_chains = drift[slots.mission, :, slots.robot][:, : slots.y.shape[1]]
-    theta = {"beta0": [[0.6]], "delta_w": [0.1], "delta_v": [0.05]}
-    dense = Dense(slots, [Fixed(of_chains)], {n: np.array(v) for n, v in theta.items()}, X0)
-    assert found.shape == (4,)
-    np.testing.assert_allclose(np.sum(found), dense.log_density(), rtol=1e-10)
 
 
 def test_rates_that_are_drawn_have_the_moments_of_equations_3_and_4():

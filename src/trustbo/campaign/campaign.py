@@ -43,7 +43,7 @@ from trustbo.hazard import Hazard
 from trustbo.hazard.exposures import CAUSES
 from trustbo.hazard.risk import BoundRisk
 from trustbo.inference import diagnostics, fit, params_of
-from trustbo.inference.samplers.choice import resolve_sampler
+from trustbo.inference.fit import SAMPLERS
 from trustbo.models import HumanTrust, default_model
 from trustbo.models.model import TrustModel, require_model
 from trustbo.models.params import Params
@@ -58,7 +58,7 @@ from trustbo.workspace.location import Location
 _ARRIVES = 0.9
 """Chance to arrive of a plan below which a campaign without a price of failures warns."""
 _FIT = (
-    "missions", "model", "sampler", "workspace", "earlier", "seed", "progress", "whole", "check",
+    "missions", "model", "sampler", "workspace", "seed", "progress", "whole", "check",
 )  # fmt: skip
 """Arguments of `fit` that a campaign gives itself."""
 
@@ -88,7 +88,7 @@ class Campaign(Summary):
         model: TrustModel | None = None,
         policy: str | Policy = "greedy",
         objective: str = "lost_contact",
-        sampler: str = "auto",
+        sampler: str = "importance",
         seed: int = 0,
         directory: FilePath | None = None,
         overwrite: bool = False,
@@ -585,7 +585,7 @@ def _require_learnable(model: TrustModel, sampler: str) -> None:
     require_model(model)
     if isinstance(model, HumanTrust):
         raise TrustboError("model: HumanTrust is for reports of people, and plans no paths.")
-    resolve_sampler(model, sampler)
+    require_choice("sampler", sampler, SAMPLERS)
 
 
 def _require_options_of_fit(options: Mapping[str, Any]) -> None:

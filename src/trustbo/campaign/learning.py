@@ -1,7 +1,7 @@
 """From missions to what the next plan is based on: a posterior, a hazard, and a planner."""
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,9 +14,8 @@ from trustbo.errors import PosteriorError, TrustboError
 from trustbo.hazard import Hazard, fit_hazard
 from trustbo.hazard.exposures import LostMission
 from trustbo.hazard.risk import BoundRisk
-from trustbo.inference import fit, sample_prior
-from trustbo.inference.posterior_groups import parameters_alone
-from trustbo.inference.samplers.choice import resolve_sampler
+from trustbo.inference import fit, prior_mean, sample_prior
+from trustbo.inference.tree import parameters_alone
 from trustbo.models.model import TrustModel
 from trustbo.models.params import Params
 from trustbo.planning import InfeasibleError, Plan, Planner
@@ -33,13 +32,9 @@ def prior_belief(model: TrustModel, initial: str, workspace: Workspace, seed: in
     """Mean of the prior, or one draw of it, with a leading axis (draw,) of length 1."""
     n_robots, n_features = len(workspace.team.robots), len(workspace.features)
     model = model.for_features(workspace.features)
-    if initial == "prior_mean" and model.priors_are_independent:
-        values, sizes = model.priors.mean(n_features), model.sizes(n_robots, n_features)
-        means = {name: np.broadcast_to(values[name], (1, *sizes[name])) for name in sizes}
-        return model.params(means, n_features).flat()
-    # The mean of parameters that robots are drawn around has no closed form.
-    n_draws = 1 if initial == "prior_draw" else _N_DRAWS
-    return sample_prior(model, n_features, n_draws, seed, n_robots=n_robots).mean().flat()
+    if initial == "prior_mean":
+        return prior_mean(model, n_features, n_robots=n_robots).flat()
+    return sample_prior(model, n_features, 1, seed, n_robots=n_robots).flat()
 
 
 def known_along(path: Sequence[Cell], workspace: Workspace) -> np.ndarray:
@@ -86,8 +81,8 @@ def learn(
 ) -> xr.DataTree | None:
     """Posterior of the parameters given all missions that are not excluded.
 
-    A posterior that is refused is drawn again with twice the draws, then by the other sampler. If
-    all are refused, the missions that were not learned from yet stay so, with a warning.
+    A posterior that is refused is drawn again with twice the draws. If that is refused too, the
+    missions that were not learned from yet stay so, with a warning.
 
     Args:
         state: State of the campaign, whose missions change theirs.
@@ -103,15 +98,17 @@ def learn(
     """
     waiting, numbers = state.numbers(TOLD), state.numbers(TOLD, LEARNED)
     missions = [state.entries[j].mission for j in numbers]
-    earlier = None if state.last is None else state.last()
+    # Draws of importance sampling are independent, and effects of places make them large.
+    few = sampler == "importance" and model.place is not None
+    usual = options.get("draws", _N_DRAWS // 4 if few else _N_DRAWS)
     reason = ""
-    for shift, (how, sampling) in enumerate(_attempts(model, sampler, options)):
+    for shift, draws in enumerate((usual, 2 * usual)):
         if reason and progress:
-            say(f'retrying with sampler "{how}" and {sampling["draws"]} draws: {reason}.')
+            say(f"retrying with {draws} draws: {reason}.")
         try:
             tree = fit(
-                missions, model, how, workspace=workspace, earlier=earlier, seed=seed + shift,
-                progress=progress, whole=False, **sampling,
+                missions, model, sampler=sampler, workspace=workspace, seed=seed + shift,
+                progress=progress, whole=False, **{**options, "draws": draws},
             )  # fmt: skip
         except PosteriorError as error:
             reason = error.reason
@@ -133,30 +130,11 @@ def learn(
     warnings.warn(
         f"mission {len(state.entries)} is recorded, but cannot be learned from yet: "
         f"{reason.rstrip('.')}. The campaign continues with the "
-        f"{'prior' if earlier is None else 'previous posterior'}, and tries again with the next "
+        f"{'prior' if state.last is None else 'previous posterior'}, and tries again with the next "
         "mission.",
         stacklevel=5,
     )
     return None
-
-
-def _attempts(
-    model: TrustModel, sampler: str, options: Mapping[str, Any]
-) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Sampler and options of each attempt to fit a posterior."""
-    usual, _ = resolve_sampler(model, sampler)
-    # Draws of the exact sampler are nearly independent, and effects of places make them large.
-    draws = _N_DRAWS // 4 if usual == "exact" and model.place else _N_DRAWS
-    asked = {"draws": draws, **options}
-    yield sampler, asked
-    yield sampler, asked | {"draws": 2 * asked["draws"]}
-    other = "nuts" if usual == "exact" else "exact"
-    try:
-        resolve_sampler(model, other)
-    except TrustboError:
-        return
-    chains = {name: asked[name] for name in ("n_chains",) if name in asked}
-    yield other, chains | {"draws": 2 * max(asked["draws"], _N_DRAWS)}
 
 
 def learn_hazard(state: State, workspace: Workspace, prior: Hazard) -> xr.Dataset:

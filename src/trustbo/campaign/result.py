@@ -26,7 +26,8 @@ from trustbo.files import FilePath
 from trustbo.hazard import Hazard
 from trustbo.hazard.risk import BoundRisk
 from trustbo.inference import complete, params_of, place_maps
-from trustbo.inference.samplers.convergence import GOOD_KHAT, MAX_RHAT
+from trustbo.inference.diagnostics import MAX_RHAT
+from trustbo.inference.importance import GOOD_KHAT
 from trustbo.models.backend import VERSIONS
 from trustbo.models.model import TrustModel
 from trustbo.models.params import Params

@@ -1,6 +1,6 @@
-"""Criticism: tests of a fitted trust model against what may be wrong with it."""
+"""Criticism: what may be wrong with a fitted trust model."""
 
-from trustbo.criticism.criticise import criticise
+from trustbo.criticism.check import check
 
-__all__ = ["criticise"]
+__all__ = ["check"]
 __dir__ = __all__.copy  # completion lists public names alone

@@ -1,120 +1,41 @@
 """Hazard of bounds: the chance that a bound ends the mission, learned from missions.
 
 Bound e, from one cell to the next, fails with chance p_e ~ Beta(s m_e, s (1 - m_e)). Its prior mean
-follows from how difficult the way is, and how steep, t_e degrees beyond the assumed slope limit,
+depends on how difficult the route is and by how many degrees t_e it exceeds the slope limit,
 
     1 - m_e = sigma(-logit_e) sigma(-(t_e + margin) / width),
-    logit_e = intercept + sum_j coefficient_j (difficulty_ej - 1/2),
+    logit_e = intercept + sum_j coefficient_j (difficulty_ej - 1/2).
 
-where the margin, by which the true limit is below the assumed one, is not known. Its prior believes
-the assumed limit, with some doubt. A bound that was never tried is judged by others like it, and
-one that was tried mostly by what happened there, the less strength s, the more. Derivation:
-docs/failures.md.
+The chances are integrated out. Given the parameters, n exposures with f failures have probability
+B(a_e + f, b_e + n - f) / B(a_e, b_e), with a_e = s m_e and b_e = s (1 - m_e). The few parameters
+are drawn by importance sampling of their normal scores.
+
+Where a lost mission failed is not known. While the proposals adapt, lost missions are treated as
+independent. Then the places are imputed at every point, one mission after the other (sequential
+imputation; Kong, Liu and Wong 1994), each with a lookahead factor for later missions that share its
+bounds. The weights are corrected accordingly, so the draws are of the joint posterior.
 """
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import ArrayLike
+from scipy import special, stats
 
 from trustbo.data import Mission
-from trustbo.errors import (
-    PosteriorError,
-    TrustboError,
-    require_not_negative,
-    require_positive,
-    require_whole,
-)
-from trustbo.hazard.difficulty import difficulty_of
+from trustbo.errors import PosteriorError, TrustboError, require_whole
 from trustbo.hazard.exposures import CAUSES, Exposures, LostMission
-from trustbo.hazard.risk import BoundRisk
-from trustbo.hazard.sampler import (
-    LIMIT,
-    LIMIT_NAMES,
-    TILT,
-    BetaPriors,
-    Points,
-    sample,
-    steepness_of,
-)
-from trustbo.inference.samplers.weights import systematic
+from trustbo.hazard.prior import FLOOR, LIMIT_NAMES, REFERENCE, TILT, BoundPrior, Hazard
+from trustbo.hazard.risk import BoundRisk, add_lost
+from trustbo.inference import importance
 from trustbo.workspace import Workspace
+from trustbo.workspace.difficulty import difficulty_of
 from trustbo.workspace.moves import MOVE_NAMES
 
-REFERENCE = 0.5
-"""Difficulty at which the intercept is the logit of the prior mean."""
-
-
-@dataclass(frozen=True)
-class Hazard:
-    """Priors of the chance that a bound ends the mission; normal ones are (mean, sd).
-
-    The prior of the margin is a mixture of two normals with the same mean. By default the stated
-    slope limit is right to half a degree with probability .9, and off by some 4 degrees with .1.
-
-    Attributes:
-        intercept: Prior of the logit of the mean chance at medium difficulty.
-        coefficient: Prior of the weight of each measure of difficulty, from easy (0) to the robots'
-            limit (1), but for the tilt.
-        margin: Prior of the degrees by which the team's true slope limit is below the assumed one.
-            Bounds share it: a failure on one raises the chance of all that are as steep. This is
-            the part of the prior for a limit that is right as stated.
-        doubt: Probability that the stated limit is wrong, and the sd of the margin then, degrees.
-            With a probability of 0 the prior is `margin` alone, as for a limit that was measured.
-        log_width: Prior of the log of the width of the limit in degrees: the chance to fail rises
-            from .1 to .9 within 4.4 widths of tilt.
-        log_strength: Prior of the log of the strength s: the prior mean in units of observations,
-            few where bounds fail always or never.
-        cause: Concentration of the Dirichlet over the causes of failure, for each.
-
-    Raises:
-        TrustboError: An sd or a concentration that is not positive, or a share outside [0, 1).
-    """
-
-    intercept: tuple[float, float] = (-7.5, 1.5)
-    coefficient: tuple[float, float] = (2.0, 2.0)
-    margin: tuple[float, float] = (0.0, 0.5)
-    doubt: tuple[float, float] = (0.1, 4.0)
-    log_width: tuple[float, float] = (0.0, 0.5)
-    log_strength: tuple[float, float] = (-0.5, 1.0)
-    cause: float = 0.2
-
-    def __post_init__(self) -> None:
-        for name in _NORMALS:
-            mean, sd = getattr(self, name)
-            value = float(mean), require_positive(f"sd of {name}", sd)
-            object.__setattr__(self, name, value)
-        share, sd = self.doubt
-        doubt = require_not_negative("share of doubt", share), require_positive("sd of doubt", sd)
-        if doubt[0] >= 1.0:
-            raise TrustboError(f"share of doubt must be in [0, 1); got {share!r}.")
-        object.__setattr__(self, "doubt", doubt)
-        require_positive("cause", self.cause)
-
-    def beta_priors(
-        self, difficulty: np.ndarray, measures: Sequence[str], max_slope: float
-    ) -> BetaPriors:
-        """Prior of the bounds' chances given difficulties (bound, measure) and their names.
-
-        The tilt is judged by the limit, `max_slope` in rad less the margin, the other measures by
-        weights.
-        """
-        has_weight = np.array([name != TILT for name in measures], dtype=bool)
-        weights, limit, steepness = [self.coefficient] * int(has_weight.sum()), [], None
-        if TILT in measures:
-            limit = [self.margin, self.log_width]
-            steepness = steepness_of(difficulty[:, list(measures).index(TILT)], max_slope)
-        center, scale = np.array([self.intercept, *weights, *limit, self.log_strength]).T
-        is_log = np.array([*[False] * (1 + len(weights)), *[False, True][: len(limit)], True])
-        difficulty = difficulty[:, has_weight] - REFERENCE
-        return BetaPriors(center, scale, is_log, difficulty, steepness, self.doubt)
-
-    def prior(self, workspace: Workspace, *, seed: int = 0, n_draws: int = 1000) -> BoundRisk:
-        """Risk of the bounds of a workspace before any mission."""
-        return BoundRisk.of(fit_hazard([], workspace, self, seed=seed, n_draws=n_draws), workspace)
+_ROUND, _ENOUGH = 1024, 500.0
 
 
 def fit_hazard(
@@ -123,26 +44,18 @@ def fit_hazard(
     hazard: Hazard | None = None,
     *,
     lost: Sequence[LostMission] = (),
-    weights: ArrayLike | None = None,
-    lost_weights: ArrayLike | None = None,
     seed: int = 0,
     n_draws: int = 1000,
     check: bool = True,
 ) -> xr.Dataset:
-    """Learn the chance to fail of every bound, by importance sampling in NumPy.
-
-    Bounds completed are exposures survived, the last bound of a mission that failed is one that
-    failed; an aborted bound counts for nothing. Where a lost mission failed is imputed with the
-    hyperparameters: draws are of the joint posterior.
+    """Learn the chance to fail of every bound, by importance sampling.
 
     Args:
-        missions: Missions as measured, none needed.
+        missions: Missions as measured; there may be none.
         workspace: Workspace of their paths, whose terrain gives the difficulty of bounds; without
-            one, the mean has an intercept only.
+            a terrain, all bounds have the same prior mean.
         hazard: Priors; by default `Hazard()`.
         lost: Missions that failed and did not report.
-        weights: Weight of each mission, shape (mission,); 1 by default.
-        lost_weights: Weight of each lost mission, shape (lost,); 1 by default.
         seed: Seed; the same seed gives the same posterior.
         n_draws: Number of draws.
         check: Refuse a posterior with k-hat > 0.7; `False` returns it unchecked.
@@ -159,34 +72,31 @@ def fit_hazard(
         TrustboError: A mission's path jumps or leaves the grid, or an unknown cause.
         PosteriorError: k-hat is beyond its limit.
     """
-    started, hazard = time.perf_counter(), Hazard() if hazard is None else hazard
+    started, hazard = time.perf_counter(), hazard or Hazard()
     n_draws, seed = require_whole("n_draws", n_draws, 1), require_whole("seed", seed, 0)
-    exposures = Exposures.of(missions, lost, weights, lost_weights)
-    difficulty, names = difficulty_of(workspace).values, measures_of(workspace)
-    _require_on_grid(exposures, difficulty.shape[1:3])
-    met = difficulty[*exposures.bounds.T]
-    # A driven bound that does not exist on the map: largest difficulty.
-    betas = hazard.beta_priors(np.nan_to_num(met, nan=1.0), names, workspace.team.max_slope)
-    points = sample(betas, exposures, seed)
-    group = _dataset(hazard, betas, exposures, points, workspace, n_draws, seed)
-    risk = BoundRisk.of(group, workspace)
-    dims = ("move", "row", "col")
-    group = group.assign(p_fail=(dims, risk.mean), p_fail_sd=(dims, risk.sd))
+    exposures, difficulty = Exposures.of(missions, lost), difficulty_of(workspace)
+    shape, cells = difficulty.shape[1:3], exposures.bounds[:, 1:]
+    for cell in cells[((cells < 0) | (cells >= shape)).any(1)]:
+        name = tuple(cell.tolist())
+        raise TrustboError(f"a mission enters {name}, outside the grid of {shape} rows and cols.")
+
+    # A driven bound that does not exist on the map gets the largest difficulty.
+    met = np.nan_to_num(difficulty.values[*exposures.bounds.T], nan=1.0)
+    prior = hazard.of_bounds(met, measures_of(workspace), workspace.team.max_slope)
+    posterior = sample(prior, exposures, np.random.default_rng(seed))
+
+    group = _to_dataset(hazard, prior, exposures, posterior, workspace, n_draws, seed)
+    risk, maps = BoundRisk.of(group, workspace), ("move", "row", "col")
+    group = group.assign(p_fail=(maps, risk.mean), p_fail_sd=(maps, risk.sd))
     group.attrs["seconds"] = time.perf_counter() - started
-    if check and not points.k_hat <= LIMIT:
+    k_hat = posterior.points.k_hat
+    if check and not k_hat <= importance.MAX_KHAT:
         raise PosteriorError(
-            f"hazard refused: k-hat = {points.k_hat:.2f} > {LIMIT:g}.",
+            f"hazard refused: k-hat = {k_hat:.2f} > {importance.MAX_KHAT:g}.",
             group,
             "Give firmer priors, Hazard(...), or pass check=False to have it as it is.",
         )
     return group
-
-
-def _require_on_grid(exposures: Exposures, shape: tuple[int, ...]) -> None:
-    cells = exposures.bounds[:, 1:]
-    if (off := ((cells < 0) | (cells >= shape)).any(1)).any():
-        cell = tuple(cells[np.argmax(off)].tolist())
-        raise TrustboError(f"a mission enters {cell}, outside the grid of {shape} rows and cols.")
 
 
 def measures_of(workspace: Workspace) -> list[str]:
@@ -194,38 +104,149 @@ def measures_of(workspace: Workspace) -> list[str]:
     return [str(name) for name in difficulty_of(workspace)["measure"].values]
 
 
-def _dataset(
+class HazardPoints(NamedTuple):
+    """Weighted points, and the bound of its path, from 0, where each lost mission failed."""
+
+    points: importance.Points
+    places: np.ndarray  # (point, lost mission)
+
+
+def sample(prior: BoundPrior, exposures: Exposures, rng: np.random.Generator) -> HazardPoints:
+    """Draw weighted points of the joint posterior of scores and places; check their k-hat."""
+    met, on_lost = exposures.n > 0.0, np.unique([e for path in exposures.lost for e in path])
+    n, failed = exposures.n[met], exposures.failed[met]
+    prior_met, prior_lost = prior.of(met), prior.of(on_lost.astype(int))
+    counts, kind = np.unique(n, return_inverse=True)
+    times = np.bincount(kind, minlength=len(counts))
+    bad = failed > 0.0
+    paths = [np.searchsorted(on_lost, path) for path in exposures.lost]
+
+    def lost_betas(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Posterior Betas of the bounds of lost missions, without these missions."""
+        alpha, beta = prior_lost.betas(z)
+        index = on_lost.astype(int)
+        return alpha + exposures.failed[index], beta + (exposures.n - exposures.failed)[index]
+
+    def log_any_fails(z: np.ndarray) -> np.ndarray:
+        """Log probability that all lost missions fail if they are independent."""
+        a, b = lost_betas(z)
+        passed = np.log1p(-np.minimum(a / (a + b), 1.0 - 1e-12))
+        fail = [np.log(-np.expm1(passed[:, path].sum(1))) for path in paths]
+        return np.sum(fail, axis=0) if fail else np.zeros(len(z))
+
+    def log_density(z: np.ndarray) -> np.ndarray:
+        alpha, beta = prior_met.betas(z)
+        strength = prior.values(z)[2][:, None] + 2.0 * FLOOR
+        total = stats.norm.logpdf(z).sum(1) + log_any_fails(z)
+        total += _log_rising(beta, n - failed).sum(1)
+        total += _log_rising(alpha[:, bad], failed[bad]).sum(1)
+        return total - _log_rising(strength, counts) @ times
+
+    starts = np.zeros((3, len(prior.center)))
+    starts[1:, -1] = -1.5, 1.5  # modes of the strength: certain outcomes, equal bounds
+    for more in (1, 8):  # a second time with more points, should the weights be uneven
+        size, enough = more * _ROUND, more * _ENOUGH
+        points = importance.sample(log_density, starts, rng, size=size, enough=enough)
+        places = np.zeros((len(points.z), len(paths)), int)
+        if paths:
+            places, log_fail = impute(*lost_betas(points.z), paths, rng)
+            ratio = points.log_ratio + log_fail - log_any_fails(points.z)
+            points = importance.Points.of(points.z, points.log_p, ratio)
+        posterior = HazardPoints(points, places)
+        if points.k_hat <= importance.MAX_KHAT:
+            break
+    return posterior
+
+
+def _log_rising(x: np.ndarray, k: np.ndarray) -> np.ndarray:
+    """Log of Gamma(x + k) / Gamma(x)."""
+    return special.gammaln(x + k) - special.gammaln(x)
+
+
+def impute(
+    a: np.ndarray, b: np.ndarray, paths: Sequence[np.ndarray], rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Draw where lost missions failed, one after the other.
+
+    Args:
+        a: Alpha of the Betas of the bounds without the lost missions, shape (point, bound).
+        b: Beta of them.
+        paths: Bounds of each lost mission.
+        rng: Generator of random numbers.
+
+    Returns:
+        Places (point, mission), bounds of their paths from 0; and log weights (point,), whose
+        exponential has for its mean the probability that all of the missions fail.
+    """
+    a, b, uniform = a.copy(), b.copy(), rng.random((len(a), len(paths)))
+    places, log_weight = np.zeros(uniform.shape, int), np.zeros(len(a))
+    for j, path in enumerate(paths):
+        survived, within, done = np.ones(len(a)), np.empty((len(a), len(path))), b.copy()
+        for k, e in enumerate(path):
+            fails = a[:, e] / (a[:, e] + done[:, e])
+            within[:, k] = survived * fails
+            survived = survived * (1.0 - fails)
+            done[:, e] += 1.0  # a path may enter a cell again
+        favour = _lookahead(path, paths[j + 1 :], a, b)
+        cumulative = (within * favour).cumsum(1)
+        total = cumulative[:, -1]
+        places[:, j] = (cumulative < uniform[:, j, None] * total[:, None]).sum(1)
+        drawn = np.take_along_axis(favour, places[:, j, None], axis=1)[:, 0]
+        log_weight += np.log(total / drawn)
+        add_lost(path, places[:, j], a, b)
+    return places, log_weight
+
+
+def _lookahead(
+    path: np.ndarray, later: Sequence[np.ndarray], a: np.ndarray, b: np.ndarray
+) -> np.ndarray:
+    """Factor by which a failure at each bound of a path makes that of later missions likelier.
+
+    Shape (point, bound). Without it, the rare points that blame a bound that several missions share
+    would have large weights.
+    """
+    favour = np.ones((len(a), len(path)))
+    for other in later:
+        chance = a[:, other] / (a[:, other] + b[:, other])
+        arrives = (1.0 - chance).prod(1)
+        for k, e in enumerate(path):
+            if e in other:
+                ratio = (a[:, e] + b[:, e]) / (a[:, e] + b[:, e] + 1.0)
+                favour[:, k] *= (1.0 - arrives * ratio) / np.maximum(1.0 - arrives, 1e-12)
+    return favour
+
+
+def _to_dataset(
     hazard: Hazard,
-    betas: BetaPriors,
+    prior: BoundPrior,
     exposures: Exposures,
-    points: Points,
+    posterior: HazardPoints,
     workspace: Workspace,
     n_draws: int,
     seed: int,
 ) -> xr.Dataset:
     """The group without the maps of chances."""
-    rng = np.random.default_rng([seed, 2])
-    chosen = rng.permutation(systematic(points.weights, n_draws, rng))
-    weights, limit, strength = betas.split(betas.values(points.z[chosen]))
-    degrees = {"units": "degrees"}  # absent without a limit
-    of_limit = {n: ("draw", v, degrees) for n, v in zip(LIMIT_NAMES, limit.T, strict=False)}
-    shape = difficulty_of(workspace).shape[:3]
+    rng, (points, places) = np.random.default_rng([seed, 2]), posterior
+    chosen = rng.permutation(points.resample(n_draws, rng))
+    weights, limit, strength = prior.values(points.z[chosen])
+    degrees = {"units": "degrees"}
+    of_limit = {name: ("draw", v, degrees) for name, v in zip(LIMIT_NAMES, limit.T, strict=False)}
+    maps, shape = ("move", "row", "col"), difficulty_of(workspace).shape[:3]
     n, failed = np.zeros(shape), np.zeros(shape)
     n[*exposures.bounds.T], failed[*exposures.bounds.T] = exposures.n, exposures.failed
     longest = max((len(path) for path in exposures.lost), default=0)
     lost = np.full((len(exposures.lost), longest, 3), -1)
     for j, path in enumerate(exposures.lost):
         lost[j, : len(path)] = exposures.bounds[path]
-    maps = ("move", "row", "col")
+    priors = {f"prior_{k}": list(v) for k, v in asdict(hazard).items() if k != "cause"}
     return xr.Dataset(
         {
             "intercept": ("draw", weights[:, 0]),
             "coefficient": (("draw", "measure"), weights[:, 1:]),
             **of_limit,
             "strength": ("draw", strength),
-            "place": (("draw", "lost"), points.places[chosen] + 1),
+            "place": (("draw", "lost"), places[chosen] + 1),
             "lost_bound": (("lost", "bound", "axis"), lost),
-            "lost_weight": ("lost", exposures.lost_weights),
             "exposures": (maps, n),
             "failures": (maps, failed),
             "failures_by_cause": ("cause", exposures.causes),
@@ -238,14 +259,11 @@ def _dataset(
             "move": list(MOVE_NAMES),
         },
         {
-            "k_hat": points.k_hat if np.isfinite(points.k_hat) else float(np.sign(points.k_hat)),
-            "kish": float(1.0 / (points.weights**2).sum()),
+            "k_hat": float(np.clip(points.k_hat, -1.0, 1e3)),
+            "kish": points.kish,
             "seed": seed,
             "reference": REFERENCE,
             "cause_concentration": hazard.cause,
-            **{f"prior_{n}": list(getattr(hazard, n)) for n in (*_NORMALS, "doubt")},
+            **priors,
         },
     )
-
-
-_NORMALS = ("intercept", "coefficient", "margin", "log_width", "log_strength")

@@ -1,4 +1,4 @@
-"""Risk: the posterior of the chances of bounds to fail, and those of a path, for planning."""
+"""Risk: the posterior of the chances that bounds fail, and of those of a path, for planning."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -11,10 +11,10 @@ from numpy.typing import ArrayLike
 
 from trustbo.data import Cell
 from trustbo.errors import ShapeError, TrustboError, require_whole
-from trustbo.hazard.difficulty import difficulty_of
-from trustbo.hazard.sampler import LIMIT_NAMES, TILT, add_lost, prior_betas, steepness_of
+from trustbo.hazard.prior import LIMIT_NAMES, TILT, prior_betas, steepness_of
 from trustbo.hazard.strata import MOST, Strata, partition
 from trustbo.workspace import Workspace
+from trustbo.workspace.difficulty import difficulty_of
 from trustbo.workspace.moves import moves_along
 
 ROUNDING = 1e-12
@@ -28,8 +28,8 @@ _SOME = 256  # number of bounds whose mean chance orders the draws
 class BoundRisk:
     """Posterior of the chance that each bound ends the mission.
 
-    Maps have shape (move, row, col): the bound that enters a cell by one of the eight `MOVES`. They
-    are NaN where there is no bound.
+    Maps have shape (move, row, col): the bound that enters a cell by one of the eight `MOVES`; NaN
+    where there is none.
 
     Attributes:
         coefficients: Weights in the logit of the prior mean, intercept first, (draw, 1 + measure).
@@ -42,7 +42,6 @@ class BoundRisk:
         exposures: Known exposures, (move, row, col).
         failures: Known failures, (move, row, col).
         lost: Bounds of each mission lost somewhere unknown, each (bound, 3).
-        lost_weights: Their weights, (lost,).
         place: Bound at which each failed, from 1, (draw, lost).
         causes: Posterior mean share of each cause among failures.
     """
@@ -56,7 +55,6 @@ class BoundRisk:
     exposures: np.ndarray
     failures: np.ndarray
     lost: tuple[np.ndarray, ...]
-    lost_weights: np.ndarray
     place: np.ndarray
     causes: dict[str, float]
 
@@ -66,13 +64,13 @@ class BoundRisk:
         count = hazard["failures_by_cause"].values + hazard.attrs["cause_concentration"]
         names = [str(name) for name in hazard["cause"].values]
         terms = [hazard["intercept"].values[:, None], hazard["coefficient"].values]
-        limit = [hazard[name].values for name in LIMIT_NAMES if name in hazard]  # 0.2 has none
+        limit = [hazard[name].values for name in LIMIT_NAMES if name in hazard]
         difficulty, steepness = difficulty_of(workspace), None
         if limit:
             tilt = difficulty.sel(measure=TILT).values
             steepness = steepness_of(tilt, workspace.team.max_slope)
         measures = hazard["measure"].values.tolist()
-        risk = cls(
+        return cls(
             np.concatenate(terms, axis=1),
             np.reshape(limit, (len(limit), hazard.sizes["draw"])).T,
             hazard["strength"].values,
@@ -82,13 +80,9 @@ class BoundRisk:
             hazard["exposures"].values,
             hazard["failures"].values,
             tuple(path[path[:, 0] >= 0] for path in hazard["lost_bound"].values),
-            hazard["lost_weight"].values,
             hazard["place"].values,
             dict(zip(names, (count / count.sum()).tolist(), strict=True)),
         )
-        if "p_fail" in hazard:  # located failures
-            risk.__dict__["_moments"] = hazard["p_fail"].values, hazard["p_fail_sd"].values
-        return risk
 
     @property
     def mean(self) -> np.ndarray:
@@ -109,9 +103,9 @@ class BoundRisk:
     def stopped(self) -> np.ndarray:
         """Posterior expected number of past failures, shape (move, row, col)."""
         counts = self.failures.copy()
-        for j, (path, weight) in enumerate(zip(self.lost, self.lost_weights, strict=True)):
+        for j, path in enumerate(self.lost):
             for k, bound in enumerate(path, start=1):
-                counts[*bound] += weight * (self.place[:, j] == k).mean()
+                counts[*bound] += (self.place[:, j] == k).mean()
         return counts
 
     def draw(self, n: int, seed: int = 0) -> np.ndarray:
@@ -184,10 +178,21 @@ class BoundRisk:
         a, b = prior_betas(*drawn, self.difficulty[where], steepness)
         n, failed = self.exposures.ravel()[bounds], self.failures.ravel()[bounds]
         a, b = a + failed, b + n - failed
-        for j, (path, weight) in enumerate(zip(self.lost, self.lost_weights, strict=True)):
+        for j, path in enumerate(self.lost):
             met = np.asarray(np.ravel_multi_index(tuple(path.T), self.exists.shape))
-            add_lost(_places_in(bounds, met), weight, self.place[draws, j] - 1, a, b)
+            add_lost(_places_in(bounds, met), self.place[draws, j] - 1, a, b)
         return a, b
+
+
+def add_lost(path: np.ndarray, place: np.ndarray, a: np.ndarray, b: np.ndarray) -> None:
+    """Add a mission that failed at `place` (point,) of its path to Betas a, b (point, bound).
+
+    A negative index in the path is a bound that is not among these.
+    """
+    for k, e in enumerate(path):
+        if e >= 0:
+            a[:, e] += place == k
+            b[:, e] += place > k
 
 
 def _places_in(bounds: np.ndarray, wanted: np.ndarray) -> np.ndarray:
@@ -287,12 +292,11 @@ def _index_of(path: Sequence[Cell] | np.ndarray) -> tuple[Any, ...]:
 
 
 def _dependence(draws: np.ndarray) -> np.ndarray:
-    """Ratio of the mean over draws of the product of 1 - p to the product of the means, (bound,).
+    """Mean over draws (draw, bound) of the product of 1 - p, over the product of the means.
 
-    For draws (draw, bound), of the first bound, the first two, and so on: the factor by which
-    bounds are likelier to be passed together than if they were independent. Multiplied by the
-    product of 1 - p_fail it estimates the mean over draws without the error that few draws make in
-    each p_fail.
+    Shape (bound,): of the first bound, the first two, and so on. It is the factor by which bounds
+    are likelier to be passed together than if they were independent; multiplied by the product of
+    1 - p_fail it has none of the error that few draws make in each p_fail.
     """
     together = np.cumprod(1.0 - draws, axis=1).mean(0)
     apart = np.cumprod((1.0 - draws).mean(0))

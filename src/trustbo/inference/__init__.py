@@ -5,18 +5,17 @@ from trustbo.models import backend as backend  # first: it loads numpyro
 # isort: split
 from trustbo.inference.by_rate import by_rate
 from trustbo.inference.compare import compare
-from trustbo.inference.draws import params_of
+from trustbo.inference.diagnostics import diagnostics
+from trustbo.inference.draws import params_of, prior_mean, sample_prior
 from trustbo.inference.filter import TrustFilter
 from trustbo.inference.fit import fit
 from trustbo.inference.loo import loo
 from trustbo.inference.memory import memory
-from trustbo.inference.people import predict_reports
 from trustbo.inference.place_maps import place_maps
-from trustbo.inference.posterior_groups import complete
-from trustbo.inference.prior_predictive import prior_predictive, sample_prior
-from trustbo.inference.samplers.convergence import diagnostics
+from trustbo.inference.reports import predict_reports
 from trustbo.inference.sbc import sbc
 from trustbo.inference.score import score
+from trustbo.inference.tree import complete
 
 __all__ = [
     "TrustFilter",
@@ -30,7 +29,7 @@ __all__ = [
     "params_of",
     "place_maps",
     "predict_reports",
-    "prior_predictive",
+    "prior_mean",
     "sample_prior",
     "sbc",
     "score",

@@ -8,8 +8,8 @@ import xarray as xr
 from arviz_stats.loo.compare import compare as ranked
 
 from trustbo.errors import TrustboError, one_line
+from trustbo.inference.draws import require_posterior
 from trustbo.inference.loo import loo
-from trustbo.inference.posterior_tree import require_posterior
 
 
 def compare(posteriors: Mapping[str, xr.DataTree]) -> pd.DataFrame:

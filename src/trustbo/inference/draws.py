@@ -1,36 +1,69 @@
-"""Parameters from the draws of a posterior."""
+"""Draws of a posterior, read by the names of its variables, features and robots."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from trustbo.data import Mission
-from trustbo.errors import TrustboError
+from trustbo.errors import TrustboError, require_whole
 from trustbo.inference.place_maps import place_maps_of
-from trustbo.inference.posterior_tree import require_posterior
-from trustbo.models.effects.effect import (
-    Effect,
-    NextMission,
-    Slots,
-    Theta,
-    drift_of,
-    rest_of,
+from trustbo.inference.posterior import Draws, Posterior
+from trustbo.models.effects.effect import Effect, NextMission, Theta
+from trustbo.models.effects.place import PlaceEffect
+from trustbo.models.model import TrustModel, require_model
+from trustbo.models.params import (
+    DeviationRobotParams,
+    Params,
+    RobotParams,
+    assemble_params,
 )
-from trustbo.models.params import DeviationRobotParams, Params, RobotParams, params_from
-from trustbo.models.place import bounds_of
-from trustbo.models.record import effects_from_record
-from trustbo.stacking import MissionBatch
+from trustbo.models.people import HumanTrust
+from trustbo.models.record import effects_from_record, model_from_record
+from trustbo.models.slots import Slots
+from trustbo.workspace import Workspace
 
 _DAYS = 20261123  # seed of the next mission's effects: the same posterior has the same bands
+_N_MEAN = 4096  # draws of a prior mean
+_ATTRIBUTES = "observation", "x0_mean", "x0_sd", "model_record"
+
+
+def require_posterior(who: str, value: object) -> xr.DataTree:
+    """Return `value` if it is a posterior from `fit`, else raise TrustboError for `who`."""
+    if not isinstance(value, xr.DataTree):
+        remedy = " Give its .posterior." if hasattr(value, "posterior") else ""
+        raise TrustboError(
+            f"{who} takes a posterior from fit; got a {type(value).__name__}.{remedy}"
+        )
+    missing = [] if "posterior" in value.children else ["posterior"]
+    missing += [name for name in _ATTRIBUTES if name not in value.attrs]
+    if missing:
+        raise TrustboError(
+            f"{who} takes a posterior from fit; this DataTree has no {missing[0]!r}. Give one of "
+            "trustbo.fit, whole."
+        )
+    return value
 
 
 def sites_of(posterior: xr.DataTree) -> dict[str, np.ndarray]:
-    """All draws of a posterior by name, chains joined: leading axis (draw,)."""
+    """All draws of a posterior by name, chains joined: leading axis (draw,).
+
+    Raises:
+        TrustboError: Some draws are NaN, as if masked.
+    """
     draws = posterior["posterior"].to_dataset()
-    return {str(name): _joined(array) for name, array in draws.items()}
+    sites = {str(name): _joined(array) for name, array in draws.items()}
+    for name, values in sites.items():
+        bad = np.isnan(values.reshape(len(values), -1)).any(1).sum()
+        if bad:
+            raise TrustboError(
+                f"{bad} of {len(values)} draws of {name!r} are NaN; drop them with "
+                "posterior.isel(draw=...) instead of masking them."
+            )
+    return sites
 
 
 def _joined(array: xr.DataArray, axes: Sequence[Any] = (...,)) -> np.ndarray:
@@ -43,11 +76,14 @@ def _joined(array: xr.DataArray, axes: Sequence[Any] = (...,)) -> np.ndarray:
     return values.reshape(values.shape[0] * values.shape[1], *values.shape[2:])  # also of none
 
 
-def params_of(posterior: xr.DataTree, *, day: bool = False) -> Params:
+def params_of(
+    posterior: xr.DataTree, workspace: Workspace | None = None, *, day: bool = False
+) -> Params:
     """All draws of a posterior as parameters, chains joined: leading axis (draw,).
 
     Args:
         posterior: DataTree from `fit`.
+        workspace: Workspace to plan on: features and robots are put in its order, by name.
         day: Whether each draw has effects drawn for the next mission, a bad day of a robot among
             them, for bands and predictions of rates; by default it has the expected ones, for
             plans. Without effects other than of places there is no difference.
@@ -59,72 +95,103 @@ def params_of(posterior: xr.DataTree, *, day: bool = False) -> Params:
         stays fades.
 
     Raises:
-        TrustboError: No posterior of `fit`.
+        TrustboError: No posterior of `fit`; a variable is missing, or draws are NaN; or the
+            posterior is of other features or robots than the workspace's.
     """
     if is_of_people(require_posterior("params_of", posterior)):
         raise TrustboError(
             "a posterior of HumanTrust has no parameters of paths: for reports use "
             "trustbo.inference.predict_reports."
         )
-    params, sites = _params(posterior)
-    effects = effects_of(posterior)
+    if workspace is not None:
+        posterior = _in_order_of(workspace, posterior)
+    sites, attrs = sites_of(posterior), posterior.attrs
+    effects = [e for e in effects_of(posterior) if not isinstance(e, PlaceEffect)]
+    needed = ("B0", "B") if "B0" in sites else ("beta0", "beta", "b", "delta_w", "delta_v")
+    if missing := [name for name in needed if name not in sites]:
+        raise TrustboError(
+            f"the posterior has no variable {missing[0]!r}; it has {', '.join(sites)}. Give one "
+            "of trustbo.fit with its own names."
+        )
+    x0 = {name: attrs[name] for name in ("x0_mean", "x0_sd")}
+    params, memory = assemble_params(sites, x0, attrs.get("memory", "level")), attrs.get("memory")
+    if "places" in posterior.children:
+        maps = place_maps_of(posterior["places"].to_dataset(), sites)
+        params = params._replace(**maps)  # pyright: ignore
     if not effects:
         return params
-    attrs, features = posterior.attrs, posterior["posterior"].to_dataset()["feature"].values
+    features = posterior["posterior"].to_dataset()["feature"].values
     rng = np.random.default_rng(_DAYS) if day else None
     mission = NextMission(attrs["n_missions"], features.tolist(), attrs["n_robots"], rng)
-    memory, robots = memory_of(posterior), (len(sites["beta0"]), mission.n_robots)
-    theta = theta_of(sites, memory)
+    theta = theta_of(posterior, sites)
+    if "B0" in sites:
+        return _coupled_ahead(params, effects, posterior, theta, mission)
+    robots = (len(sites["beta0"]), mission.n_robots)
     fields = {
-        name: np.broadcast_to(sites[name][:, None], robots)
+        name: np.broadcast_to(values.reshape(len(values), -1), robots)
         for name in ("beta0", "b", "delta_w", "delta_v")
+        for values in (sites[name],)
     }
-    beta = np.repeat(sites["beta"][:, None], mission.n_robots, axis=1)
+    beta = sites["beta"] if sites["beta"].ndim == 3 else sites["beta"][:, None]
+    beta = np.broadcast_to(beta, (*robots, beta.shape[2]))
     for effect in effects:
         weights, intercept = effect.ahead(values_of(posterior, effect), theta, mission)
         beta, fields["b"] = beta + weights, fields["b"] + intercept
-    x0 = {name: getattr(params, name) for name in ("x0_mean", "x0_sd")}
-    kind = RobotParams if memory == "level" else DeviationRobotParams
+    kind = DeviationRobotParams if memory == "deviation" else RobotParams
     return kind(beta=beta, **fields, **x0, **params.places)
 
 
-def params_of_missions(
-    posterior: xr.DataTree, missions: Sequence[Mission], batch: MissionBatch
-) -> Params:
-    """All draws as parameters of the missions that the posterior was fitted to.
-
-    Effects of their places, and of robots in them, are in the intercepts.
-    """
-    params, sites = _params(posterior)
-    params, effects = params.flat(), effects_of(posterior)
-    if params.places:
-        params = params.on(bounds_of(missions, batch.contact_rate.shape[:2]))
-    values = [values_of(posterior, effect) for effect in effects]
-    theta = theta_of(sites, memory_of(posterior))
-    return with_effects(params, effects, values, theta, slots_of(missions, batch))
-
-
-def with_effects(
-    params: Params,
+def _coupled_ahead(
+    params: Any,
     effects: Sequence[Effect],
-    values: Sequence[Mapping[str, np.ndarray]],
+    posterior: xr.DataTree,
     theta: Theta,
-    slots: Slots,
+    mission: NextMission,
 ) -> Params:
-    """Parameters of missions with effects, of which `values` are the variables, in the intercept.
+    """Parameters of coupled robots with the effects of the next mission."""
+    B, b, robot = np.array(params.B), np.array(params.b), np.arange(mission.n_robots)
+    for effect in effects:
+        weights, intercept = effect.ahead(values_of(posterior, effect), theta, mission)
+        B[:, :, robot, robot] += np.swapaxes(np.broadcast_to(weights, (*b.shape, B.shape[1])), 1, 2)
+        b = b + intercept
+    return params._replace(B=B, b=b)
 
-    Params, values and theta are of draws, `slots` of every bound of the missions.
-    """
-    for effect, of_effect in zip(effects, values, strict=True):
-        b = np.asarray(params.b)
-        b = b if b.ndim == 4 else b[:, None, None, None]
-        params = params._replace(b=b + drift_of(effect, of_effect, theta, slots))
-    return params
+
+def _in_order_of(workspace: Workspace, posterior: xr.DataTree) -> xr.DataTree:
+    """The posterior with features and robots in a workspace's order; TrustboError: others."""
+    draws, order = posterior["posterior"].to_dataset(), {}
+    data = posterior["constant_data"].to_dataset() if "constant_data" in posterior else draws
+    wanted = {"feature": list(workspace.features), "robot": list(workspace.team.names)}
+    for axis, names in wanted.items():
+        with_axis = draws if axis in draws.coords else data
+        if axis not in with_axis.coords:
+            continue
+        have = [str(name) for name in with_axis[axis].values]
+        of_all = axis == "robot" and axis not in draws.dims and "robots" not in posterior.children
+        if of_all:  # parameters that all robots share are for any team
+            continue
+        if sorted(have) != sorted(names):
+            raise TrustboError(
+                f"the posterior is of the {axis}s {', '.join(have)}, the workspace has "
+                f"{', '.join(names)}; fit missions of this workspace."
+            )
+        order[axis] = names
+    if "robot" in order:
+        order["robot_"] = order["robot"]
+
+    def sort(group: xr.Dataset) -> xr.Dataset:
+        return group.sel({axis: names for axis, names in order.items() if axis in group.indexes})
+
+    ordered = xr.DataTree.from_dict(
+        {n: sort(g.to_dataset()) for n, g in posterior.children.items()}
+    )
+    ordered.attrs = posterior.attrs
+    return ordered
 
 
 def effects_of(posterior: xr.DataTree) -> tuple[Effect, ...]:
-    """Effects in the model of a posterior, but those of places."""
-    return effects_from_record(json.loads(posterior.attrs.get("model_record", "{}")))
+    """Effects in the model of a posterior."""
+    return effects_from_record(json.loads(posterior.attrs["model_record"]))
 
 
 def is_of_people(posterior: xr.DataTree) -> bool:
@@ -132,35 +199,148 @@ def is_of_people(posterior: xr.DataTree) -> bool:
     return posterior.attrs.get("model") == "HumanTrust"
 
 
-def memory_of(posterior: xr.DataTree) -> str:
-    """Memory of the model of a posterior, see `PooledTrust`."""
-    return posterior.attrs.get("memory", "level")
-
-
 def values_of(posterior: xr.DataTree, effect: Effect) -> dict[str, np.ndarray]:
     """Variables of an effect by name, chains joined: leading axis (draw,)."""
     group = posterior[effect.noun].to_dataset()
+    if isinstance(effect, PlaceEffect):
+        return {name: _joined(group[name]) for name in effect.variables if name in group}
     return {name: _joined(group[name], effect.variables[name]) for name in effect.variables}
 
 
-def theta_of(sites: Mapping[str, np.ndarray], memory: str) -> Theta:
-    """Hyperparameters and `rest` of draws by name, under the memory of `PooledTrust`.
+def theta_of(posterior: xr.DataTree, sites: Mapping[str, np.ndarray]) -> Theta:
+    """Hyperparameters and `rest` of draws by name."""
+    if "B0" in sites:
+        return {**sites, "rest": 1.0 - np.diagonal(sites["B0"], axis1=1, axis2=2)}
+    level = posterior.attrs.get("memory", "level") == "level"
+    return {**sites, "rest": 1.0 - sites["beta0"] if level else np.ones_like(sites["beta0"])}
 
-    Without `rest` where memory is a matrix: no effect is of such a model.
+
+def model_of(posterior: xr.DataTree, model: TrustModel | None = None) -> TrustModel:
+    """Model of a posterior, with its family and priors.
+
+    TrustboError: Its priors are its own, or its class, and `model` is not given.
     """
-    return {**sites, "rest": rest_of(sites["beta0"], memory)} if "beta0" in sites else {**sites}
+    data = "constant_data" if "constant_data" in posterior.children else "posterior"
+    coords = posterior[data].to_dataset().coords
+    features = [str(n) for n in coords["feature"].values] if "feature" in coords else []
+    if model is None:
+        model = model_from_record(json.loads(posterior.attrs["model_record"]), features=features)
+    return model.for_features(features)
 
 
-def slots_of(missions: Sequence[Mission], batch: MissionBatch) -> Slots:
-    """All bounds of missions that effects other than of places are at."""
-    return Slots.every(batch, len(missions), missions[0].features, None)
+def read_posterior(
+    posterior: xr.DataTree,
+    missions: Sequence[Mission] | None = None,
+    *,
+    model: TrustModel | None = None,
+    workspace: Workspace | None = None,
+) -> tuple[Posterior, Draws]:
+    """The posterior of a DataTree as `fit` had it, and its draws, chains joined.
+
+    Args:
+        posterior: DataTree from `fit`.
+        missions: Missions that it was fitted to; needed where it holds no data.
+        model: Its model; needed with custom priors.
+        workspace: Workspace of the missions, to fill in awareness that they lack.
+
+    Raises:
+        TrustboError: The posterior holds no data and no missions are given, or its model is not on
+            record.
+    """
+    missions = missions_of(posterior) if missions is None else list(missions)
+    missions = missions if workspace is None else [workspace.fill(m) for m in missions]
+    model = model_of(posterior, model)
+    slots = model.slots(missions)
+    fitted = Posterior(model, slots)
+    groups = {"posterior": sites_of(posterior)}
+    groups |= {effect.noun: values_of(posterior, effect) for effect in model.effects}
+    return fitted, fitted.draws_of(groups)
 
 
-def _params(posterior: xr.DataTree) -> tuple[Params, dict[str, np.ndarray]]:
-    """Parameters with no effects but those of places, and all draws by name."""
-    sites = sites_of(posterior)
-    params = params_from(sites, posterior.attrs)
-    if "places" not in posterior.children:
-        return params, sites
-    maps = place_maps_of(posterior["places"].to_dataset(), sites)
-    return params._replace(**maps), sites  # pyright: ignore
+def sample_prior(
+    model: TrustModel, n_features: int, n_draws: int, seed: int, *, n_robots: int = 1
+) -> Params:
+    """Draws of the parameters from the prior, without effects; leading axis (draw,).
+
+    Args:
+        model: Trust model.
+        n_features: Number of features.
+        n_draws: Number of draws.
+        seed: Seed; the same seed gives the same draws.
+        n_robots: Number of robots, for models with separate parameters for each robot.
+    """
+    require_model(model)
+    n_draws, seed = require_whole("n_draws", n_draws, 1), require_whole("seed", seed, 0)
+    prior, rng = _prior(model, n_features, n_robots), np.random.default_rng(seed)
+    return model.params(prior.named(prior.draw_prior(n_draws, rng), rng)["posterior"])
+
+
+def prior_mean(model: TrustModel, n_features: int, *, n_robots: int = 1) -> Params:
+    """Mean of the parameters under the prior, without effects; arguments as of `sample_prior`."""
+    prior, rng = _prior(model, n_features, n_robots), np.random.default_rng(0)
+    draws = prior.draw_prior(_N_MEAN, rng)
+    draws = draws._replace(c=prior.prior(draws.theta).mean)
+    sites = prior.named(draws, rng)["posterior"]
+    return model.params({name: values.mean(0, keepdims=True) for name, values in sites.items()})
+
+
+def _prior(model: TrustModel, n_features: int, n_robots: int) -> Posterior:
+    """The posterior given nothing, without effects."""
+    sizes = {"n_features": n_features, "n_robots": n_robots}
+    n_features, n_robots = (require_whole(name, n, 1) for name, n in sizes.items())
+    none = np.full((1, 1, n_robots), np.nan)
+    z = np.zeros((1, 1, n_robots, n_features))
+    bare = model if isinstance(model, HumanTrust) else replace(model, effects=())
+    return Posterior(bare, Slots(none, z, none, ("",) * n_features))
+
+
+def of_no_map(posterior: xr.DataTree) -> bool:
+    """Whether the posterior's missions, all that it holds, are of logs without a map."""
+    if "constant_data" not in posterior.children:
+        return False
+    return bool((posterior["constant_data"].to_dataset()["row"].values < 0).all())
+
+
+def missions_of(posterior: xr.DataTree) -> list[Mission]:
+    """Missions rebuilt from the data in a posterior; TrustboError: it holds parameters alone."""
+    if "constant_data" not in posterior.children:
+        raise TrustboError(
+            "this posterior holds parameters alone: give the missions it was fitted to, of "
+            "result.posteriors[j] those of result.missions[: j + 1]."
+        )
+    data = posterior["constant_data"].to_dataset()
+    data = data.assign(contact_rate=posterior["observed_data"].to_dataset()["contact_rate"])
+    robots, features = ([str(n) for n in data[dim].values] for dim in ("robot", "feature"))
+    missions = []
+    for j in range(data.sizes["mission"]):
+        one = data.isel(mission=j)
+        made = one["row"].values >= 0
+        has_map = bool(made.any())
+        one = one.isel(bound=made if has_map else slice(int(one["n_bounds"])))
+        cells = list(zip(one["row"].values, one["col"].values, strict=True))
+        start = (int(one["start_row"]), int(one["start_col"]))
+        z, y, seconds = (one[name].values for name in ("awareness", "contact_rate", "duration"))
+        missions.append(
+            Mission.from_arrays(
+                [start, *cells] if has_map else None,
+                z,
+                y,
+                seconds,
+                str(one["status"].values),
+                n_ticks=one["n_ticks"].values,
+                robots=robots,
+                features=features,
+            )
+        )
+    return missions
+
+
+def labelled_draws(sites: xr.Dataset) -> Iterator[tuple[str, str, tuple[int, ...], np.ndarray]]:
+    """Label such as "beta[visibility]", name, index and draws (draw,) of every parameter."""
+    for name, array in sites.data_vars.items():
+        draws = array.transpose("chain", "draw", ...)
+        dims, values = draws.dims[2:], draws.values.reshape(-1, *draws.shape[2:])
+        for where in np.ndindex(*draws.shape[2:]):
+            places = [str(draws[d].values[i]) for d, i in zip(dims, where, strict=True)]
+            label = f"{name}[{', '.join(places)}]" if places else str(name)
+            yield label, str(name), where, values[:, *where]

@@ -1,7 +1,7 @@
 """Trust in real time, bound by bound or tick by tick of a running mission."""
 
 from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import xarray as xr
@@ -10,48 +10,181 @@ from numpy.typing import ArrayLike
 from trustbo.arrays import as_array, require_unit_interval
 from trustbo.bound import require_shares
 from trustbo.data import Cell
-from trustbo.errors import (
-    ShapeError,
-    TrustboError,
-    one_line,
-    require_choice,
-    require_pair,
-    require_whole,
+from trustbo.errors import ShapeError, TrustboError, one_line, require_pair, require_whole
+from trustbo.inference.draws import of_no_map, params_of, require_posterior, sites_of
+from trustbo.inference.importance import systematic
+from trustbo.models.families import Family, family_of
+from trustbo.models.params import (
+    CoupledParams,
+    DeviationParams,
+    DeviationRobotParams,
+    Params,
+    check_params,
 )
-from trustbo.inference.draws import params_of
-from trustbo.inference.evidence.live import Effect, Rates, live_filter
-from trustbo.inference.posterior_tree import of_no_map, require_posterior
-from trustbo.inference.samplers.weights import systematic
-from trustbo.models.families import FAMILIES, Family
-from trustbo.models.params import Params, check_params
 from trustbo.models.ticks import broadcast_ticks
 from trustbo.workspace.moves import bounds_along, moves_along, require_on_grid
 
+Effect = np.ndarray | float
+"""Effect of a bound's place, (draw, robot or 1)."""
+
+
+class Beliefs(NamedTuple):
+    """Normal distribution of trust under each draw of the parameters.
+
+    A group is a set of robots whose trust or noise is dependent: all of them, or each one.
+    """
+
+    mean: np.ndarray  # (draw, group, member)
+    cov: np.ndarray  # (draw, group, member, member)
+    drift: np.ndarray  # (draw, group, member), of the bound before
+
+
+class Dynamics:
+    """One bound of the Kalman filter under many draws of the parameters, for any model.
+
+    Predicted trust x ~ N(m, V) has the signal f = x + n, n ~ N(0, noise). Rates enter one robot
+    after the other: the family matches the moments of f, exactly for Gaussian rates, and the gain
+    of x on f carries them over.
+    """
+
+    def __init__(
+        self, params: Params, family: Family, n_robots: int, delta_s: np.ndarray | None = None
+    ) -> None:
+        """Take draws (draw, ...), and the sd of noise that robots share in a bound (draw,)."""
+        p: Any = params
+        coupled = isinstance(params, CoupledParams)
+        joint = coupled or delta_s is not None
+        n, members = len(p.b), n_robots if joint else 1
+        self.shape = (n, n_robots // members, members)
+        self.family, self._params = family, p
+        self._deviates = isinstance(params, DeviationParams | DeviationRobotParams)
+        self._b = p.b.reshape(n, -1)
+        one = np.eye(members)
+        if coupled:
+            own = 0.5 * np.linalg.eigvalsh(p.Delta_v)[:, :1]
+            if not family.correlates:
+                own = np.diagonal(p.Delta_v, axis1=1, axis2=2)
+            self._B0, self._Q = p.B0[:, None], p.Delta_w[:, None]
+            self._noise = (p.Delta_v - own[:, None] * one)[:, None]
+            self.sd = self._grouped(np.sqrt(own))
+            self._beta = np.moveaxis(p.B, 1, -1).reshape(n, n_robots, -1)
+        else:
+            beta0, delta_w = (self._grouped(v)[..., None] for v in (p.beta0, p.delta_w))
+            self._B0, self._Q = beta0 * one, delta_w**2 * one
+            shared = np.zeros(n) if delta_s is None else delta_s
+            self._noise = shared[:, None, None, None] ** 2 * np.ones((members, members))
+            self.sd = self._grouped(p.delta_v)
+            self._beta = p.beta if p.beta.ndim == 3 else p.beta[:, None]
+
+    def _grouped(self, values: np.ndarray) -> np.ndarray:
+        """Values (draw,) or (draw, robot) as (draw, group, member)."""
+        n, groups, members = self.shape
+        values = np.broadcast_to(values.reshape(n, -1), (n, groups * members))
+        return values.reshape(self.shape)
+
+    def start(self) -> Beliefs:
+        """Trust before the first bound."""
+        mean, sd = (
+            self._grouped(np.broadcast_to(getattr(self._params, name), self.shape[:1]))
+            for name in ("x0_mean", "x0_sd")
+        )
+        return Beliefs(mean, sd[..., None] ** 2 * np.eye(self.shape[2]), mean)
+
+    def predict(self, beliefs: Beliefs, z: np.ndarray, effect: Effect = 0.0) -> Beliefs:
+        """Trust after a bound of awareness z (robot, feature), nothing measured."""
+        if isinstance(self._params, CoupledParams):
+            z = z.reshape(1, -1)
+        drift = self._grouped((self._beta * z).sum(-1) + self._b + effect)
+        mean = _times(self._B0, beliefs.mean) + drift
+        if self._deviates:
+            mean = mean - _times(self._B0, beliefs.drift)
+        cov = self._B0 @ beliefs.cov @ np.swapaxes(self._B0, 2, 3) + self._Q
+        return Beliefs(mean, cov, drift)
+
+    def log_densities(self, predicted: Beliefs, y: np.ndarray, n_ticks: np.ndarray) -> np.ndarray:
+        """Log density of each robot's rate alone, 0 where not measured; (draw, robot)."""
+        y, n_ticks = (a.reshape(self.shape[1:]) for a in (y, n_ticks))
+        var = np.diagonal(predicted.cov + self._noise, axis1=2, axis2=3)
+        log_mass = self.family.match(y, n_ticks, predicted.mean, var, self.sd)[0]
+        return np.where(np.isnan(y), 0.0, log_mass).reshape(len(var), -1)
+
+    def update(
+        self, predicted: Beliefs, y: np.ndarray, n_ticks: np.ndarray
+    ) -> tuple[Beliefs, np.ndarray]:
+        """Trust given rates (robot,), NaN where not measured, and their log density (draw,)."""
+        y, n_ticks = (a.reshape(self.shape[1:]) for a in (y, n_ticks))
+        members, V = self.shape[2], predicted.cov
+        mean = np.concatenate([predicted.mean, predicted.mean], axis=2)  # of trust, of signals
+        J = np.block([[V, V], [V, V + self._noise]])
+        log_density = np.zeros(self.shape[0])
+        for i in range(members):
+            if np.isnan(y[:, i]).all():
+                continue
+            k = members + i
+            m, v = mean[..., k], J[..., k, k]
+            log_mass, after, left = self.family.match(y[:, i], n_ticks[:, i], m, v, self.sd[..., i])
+            gain = J[..., k] / v[..., None]
+            mean = mean + gain * (after - m)[..., None]
+            J = J - gain[..., :, None] * gain[..., None, :] * (v - left)[..., None, None]
+            log_density += np.broadcast_to(log_mass, m.shape).sum(1)
+        after = predicted._replace(mean=mean[..., :members], cov=J[..., :members, :members])
+        return after, log_density
+
+    def draw(self, beliefs: Beliefs, rng: np.random.Generator) -> Beliefs:
+        """Trust drawn, as beliefs without variance."""
+        mean = beliefs.mean + _noise(beliefs.cov, rng)
+        return beliefs._replace(mean=mean, cov=np.zeros_like(beliefs.cov))
+
+    def roll(
+        self,
+        drawn: Beliefs,
+        z: np.ndarray,
+        n_ticks: np.ndarray,
+        rng: np.random.Generator,
+        effect: Effect = 0.0,
+    ) -> tuple[Beliefs, np.ndarray]:
+        """Trust after a bound drawn given that before it, and rates of it, (draw, robot)."""
+        now = self.draw(self.predict(drawn, z, effect), rng)
+        signal = now.mean + _noise(np.broadcast_to(self._noise, now.cov.shape), rng)
+        rates = self.family.sample(signal, self.sd, n_ticks.reshape(self.shape[1:]), rng)
+        return now, rates.reshape(len(rates), -1)
+
+
+def _times(M: np.ndarray, x: np.ndarray) -> np.ndarray:
+    return (M @ x[..., None])[..., 0]
+
+
+def _noise(cov: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Normal noise of covariances (..., member, member) that may be singular."""
+    root = np.linalg.cholesky(cov + 1e-12 * np.eye(cov.shape[-1]))
+    return _times(root, rng.standard_normal(cov.shape[:-1]))
+
 
 class TrustState(NamedTuple):
-    """Mean and sd of trust, averaged over parameter draws."""
+    """Mean and sd of trust, averaged over parameter draws; shape (robot,)."""
 
     mean: np.ndarray
-    """Shape (robot,) now, or (bound, robot) ahead."""
     sd: np.ndarray
-    """Standard deviation, of the same shape."""
 
 
 class TrustForecast(NamedTuple):
-    """Trust and contact rates along bounds to come, averaged over parameter draws."""
+    """Trust and contact rates along bounds to come, averaged over parameter draws.
+
+    Attributes:
+        mean: Mean of trust, (bound, robot).
+        sd: Standard deviation of trust.
+        rate: Mean contact rate.
+        rate_low: 5 % quantile of the contact rate.
+        rate_high: 95 % quantile of the contact rate.
+        draws: Contact rates drawn together for all bounds, of equal weight, (draw, bound, robot).
+    """
 
     mean: np.ndarray
-    """Mean of trust, (bound, robot)."""
     sd: np.ndarray
-    """Standard deviation of trust."""
     rate: np.ndarray
-    """Mean contact rate."""
     rate_low: np.ndarray
-    """5 % quantile of the contact rate."""
     rate_high: np.ndarray
-    """95 % quantile of the contact rate."""
     draws: np.ndarray
-    """Contact rates drawn together for all bounds, of equal weight, (draw, bound, robot)."""
 
 
 class TrustFilter:
@@ -59,9 +192,9 @@ class TrustFilter:
 
     Given a draw of the parameters, trust under Gaussian rates is Gaussian and the Kalman filter
     exact; under other families its moments are matched after each rate (assumed-density filtering).
-    The draws themselves are reweighted by the density with which they predicted each contact rate.
-    So after bound k the filter holds p(trust, parameters | earlier missions, bounds 1..k), exactly
-    but for the number of draws and the moments.
+    The draws are reweighted by the density with which they predicted each contact rate. After bound
+    k the filter holds p(trust, parameters | earlier missions, bounds 1..k), exactly but for the
+    number of draws and the moments.
 
     A bound is taken in when it is over, by `update`; or while it runs, tick by tick, by
     `begin_bound`, `update_tick` or `update_ticks`, and `end_bound`: each tick gives the trust if
@@ -78,35 +211,28 @@ class TrustFilter:
         posterior: xr.DataTree | Params,
         n_robots: int | None = None,
         *,
-        observation: str | None = None,
+        observation: str = "gaussian",
         max_draws: int = 1000,
     ) -> None:
         """Start before the first bound of a mission.
 
         Args:
             posterior: DataTree from `fit`, or draws with leading axis (draw,).
-            n_robots: Number of robots; needed with `TrustParams`, which all robots share.
-            observation: Family of observations, with draws; `"gaussian"` by default. A posterior
-                records it.
+            n_robots: Number of robots; needed with `TrustParams`, which all robots share. A
+                posterior records it.
+            observation: Family of observations, with draws. A posterior records it.
             max_draws: Largest number of draws to follow; they are evenly spaced.
 
         Raises:
-            ShapeError: Draws or a posterior of another number of robots or features.
-            TrustboError: No posterior, `TrustParams` without `n_robots`, an unknown
-                family, or one that is not the posterior's.
+            ShapeError: Draws of another number of robots.
+            TrustboError: No posterior, or `TrustParams` without `n_robots`.
         """
-        self._bounded = True
+        delta_s, self._bounded = None, True
         if isinstance(posterior, xr.DataTree):
             require_posterior("TrustFilter", posterior)
             self._bounded = not of_no_map(posterior)
-            recorded = _robots_of(posterior)
-            if n_robots is not None and recorded not in (None, n_robots):
-                raise ShapeError(
-                    f"the posterior is of {recorded} robots; got n_robots={n_robots!r}. "
-                    "Leave it out."
-                )
-            n_robots = n_robots if recorded is None else recorded
-            observation = _of_posterior(posterior, "observation", observation)
+            n_robots, observation = posterior.attrs["n_robots"], posterior.attrs["observation"]
+            delta_s = sites_of(posterior).get("delta_s")
             posterior = params_of(posterior, day=True)
         elif not isinstance(posterior, Params):
             raise TrustboError(
@@ -117,33 +243,29 @@ class TrustFilter:
         n_robots = posterior.n_robots if n_robots is None else n_robots
         if n_robots is None:
             raise TrustboError("with draws of the parameters, say how many robots: n_robots=.")
-        n_robots = require_whole("n_robots", n_robots, 1)
+        self._n_robots = require_whole("n_robots", n_robots, 1)
         self._n_features = posterior.n_features
-        check_params(posterior, n_robots, self._n_features)
+        check_params(posterior, self._n_robots, self._n_features)
         flat = posterior.flat()
         n, most = len(flat.b), require_whole("max_draws", max_draws, 1)
         kept = np.linspace(0, n - 1, min(n, most)).astype(int)
-        self.params = flat.draw(kept)  # pyright: ignore[reportArgumentType]
-        self._n_robots = n_robots
-        family = require_choice("observation", observation or "gaussian", FAMILIES)
-        self._family = FAMILIES[family]
-        self._core = live_filter(self.params, n_robots)
-        self._grids = {np.shape(value)[-2:] for value in self.params.places.values()}
+        self.params: Params = flat.draw(kept)  # pyright: ignore[reportArgumentType]
+        self._family = family_of(observation)
+        delta_s = None if delta_s is None else delta_s[kept]
+        self._dynamics = Dynamics(self.params, self._family, self._n_robots, delta_s)
         self.reset()
 
     def reset(self) -> None:
         """Go back to before the first bound of a new mission, all draws of equal weight."""
         n = len(self.params.b)
-        self._mean, self._var = self._core.start()
-        self._log_weight = np.zeros(n)
-        self.weights = np.full(n, 1.0 / n)
+        self._beliefs = self._dynamics.start()
+        self._log_weight, self.weights = np.zeros(n), np.full(n, 1.0 / n)
         self.n_bounds, self._running = 0, None
-        self._behind: tuple[Any, ...] = ()  # awareness and effect of the bound before
 
     @property
     def state(self) -> TrustState:
         """Trust after the bounds so far, shapes (robot,)."""
-        return self._average(self._core.trust(self._mean, *self._behind), self._var)
+        return _average(self._beliefs, self.weights)
 
     def update(
         self,
@@ -171,21 +293,19 @@ class TrustFilter:
                 cells that are no neighbours, or one that is running.
         """
         self._require_running(running=False)
-        z, effect = self._bound(awareness, bound)
+        predicted = self._predicted(awareness, bound)
         y = self._by_robot("contact_rate", contact_rate)
         if n_ticks is not None:
             n_ticks = as_array("n_ticks", n_ticks)
             n_ticks = n_ticks if n_ticks.ndim else np.full(y.shape, n_ticks)
             require_shares(y, n_ticks)
-        ticks = broadcast_ticks(self._family, n_ticks, y.shape)
-        self._commit(z, effect, Rates(self._family, y, ticks))
+        self._commit(predicted, y, broadcast_ticks(self._family, n_ticks, y.shape))
         return self.state
 
     def begin_bound(self, awareness: ArrayLike, bound: tuple[Cell, Cell] | None = None) -> None:
         """Begin a bound, before its ticks (`update_tick`); arguments as those of `update`."""
         self._require_running(running=False)
-        z, effect = self._bound(awareness, bound)
-        self._running = _Running(z, effect, *np.zeros((2, self._n_robots)))
+        self._running = _Running(self._predicted(awareness, bound), *np.zeros((2, self._n_robots)))
 
     def update_tick(self, in_contact: ArrayLike) -> TrustState:
         """Take in one tick of the bound that runs.
@@ -228,13 +348,9 @@ class TrustFilter:
             raise TrustboError(
                 f"n_contact must be from 0 to n_ticks; got {contacts} of {ticks} ticks."
             )
-        running.contacts[:] += contacts
-        running.ticks[:] += ticks
-        mean, var, increment = self._core.update(
-            self._mean, self._var, running.z, running.rates(self._family), running.effect
-        )
-        trust = self._core.trust(mean, running.z, running.effect)
-        return self._average(trust, var, _normalised(self._log_weight + increment))
+        self._running = running.plus(contacts, ticks)
+        beliefs, gained = self._dynamics.update(running.predicted, *self._running.rates)
+        return _average(beliefs, _normalised(self._log_weight + gained))
 
     def end_bound(self) -> TrustState:
         """End the bound that runs: its rate is taken in as `update` would.
@@ -244,7 +360,7 @@ class TrustFilter:
         """
         running = self._require_running(running=True)
         self._running = None
-        self._commit(running.z, running.effect, running.rates(self._family))
+        self._commit(running.predicted, *running.rates)
         return self.state
 
     def predict(
@@ -264,41 +380,40 @@ class TrustFilter:
                 effects.
             n_ticks: Ticks of the bounds, (), (bound,) or (bound, robot), where rates are counts.
 
-        Returns:
-            Shapes (bound, robot), and draws (draw, bound, robot).
-
         Raises:
             ShapeError: Another number of robots, features or ticks.
             TrustboError: Awareness that is NaN or outside [0, 1], ticks that are no whole numbers,
                 or a path that is missing, of another length, that jumps or that leaves the grid.
         """
-        mean, var, ahead = self._mean, self._var, []
         given, rng = self._checked(awareness, 3), np.random.default_rng(self.n_bounds)
-        ticks = ticks_ahead(n_ticks, given.shape[:2])
-        cells = self._cells(path, len(given))
-        x, drawn = self._core.draw(rng, mean, var), []
-        for z, effect, n in zip(given, self._effects(cells, len(given)), ticks, strict=True):
-            mean, var = self._core.predict(mean, var, z, effect)
-            x, rates = self._core.roll(rng, self._family, x, z, effect, n)
-            drawn.append(rates)
+        ticks, columns, drawn = ticks_ahead(n_ticks, given.shape[:2]), [], []
+        beliefs, x = self._beliefs, self._dynamics.draw(self._beliefs, rng)
+        for z, effect, n in zip(given, self._effects(path, len(given)), ticks, strict=True):
+            beliefs = self._dynamics.predict(beliefs, z, effect)
+            x, rates = self._dynamics.roll(x, z, n, rng, effect)
             order = np.argsort(rates, axis=0)
             below = np.cumsum(self.weights[order], axis=0)
-            low, high = (np.argmax(below >= share, axis=0) for share in (0.05, 0.95))
             ranked = np.take_along_axis(rates, order, axis=0)
-            robots = np.arange(self._n_robots)
-            forecast = self.weights @ rates, ranked[low, robots], ranked[high, robots]
-            trust = self._core.trust(mean, z, effect)
-            ahead.append((*self._average(trust, var), *forecast))
-        columns = (np.stack(column) for column in zip(*ahead, strict=True))
+            low, high = (
+                np.take_along_axis(ranked, np.argmax(below >= share, axis=0)[None], axis=0)[0]
+                for share in (0.05, 0.95)
+            )
+            columns.append((*_average(beliefs, self.weights), self.weights @ rates, low, high))
+            drawn.append(rates)
         chosen = systematic(self.weights, len(self.weights), rng)
-        return TrustForecast(*columns, draws=np.stack(drawn, axis=1)[chosen])
+        forecast = (np.stack(column) for column in zip(*columns, strict=True))
+        return TrustForecast(*forecast, draws=np.stack(drawn, axis=1)[chosen])
 
-    def _commit(self, z: np.ndarray, effect: Effect, rates: Rates) -> None:
-        predicted = self._mean, self._var, z, rates, effect
-        self._mean, self._var, increment = self._core.update(*predicted)
-        self._log_weight = self._log_weight + increment  # a copy of the filter keeps its own
+    def _predicted(self, awareness: ArrayLike, bound: tuple[Cell, Cell] | None) -> Beliefs:
+        """Trust after a bound, nothing measured."""
+        z, effect = self._checked(awareness, 2), self._effects(bound, 1)[0]
+        return self._dynamics.predict(self._beliefs, z, effect)
+
+    def _commit(self, predicted: Beliefs, y: np.ndarray, n_ticks: np.ndarray) -> None:
+        self._beliefs, gained = self._dynamics.update(predicted, y, n_ticks)
+        self._log_weight = self._log_weight + gained  # a copy of the filter keeps its own
         self.weights = _normalised(self._log_weight)
-        self.n_bounds, self._behind = self.n_bounds + 1, (z, effect)
+        self.n_bounds += 1
 
     def _require_running(self, *, running: bool) -> Any:
         """Running bound, or None; TrustboError unless a bound runs as `running` asks."""
@@ -308,42 +423,28 @@ class TrustFilter:
             raise TrustboError("a bound runs: call end_bound() first.")
         return self._running
 
-    def _cells(self, path: Sequence[Cell] | None, n_bounds: int) -> list[Cell] | None:
-        """Cells of a path of `n_bounds` bounds, checked; None where there is no path."""
-        if path is None:
-            return None
-        path = list(path) if isinstance(path, Iterable) else []
-        if len(path) != n_bounds + 1:
-            raise TrustboError(
-                f"say which {n_bounds + 1} cells the {n_bounds} bounds lead over, the cell left "
-                f"first; got {path!r}."
-            )
-        cells = [require_pair("a cell", cell) for cell in path]
-        for shape in self._grids:
-            require_on_grid(cells, shape)
-        moves_along(cells)
-        return cells
-
-    def _effects(self, cells: Sequence[Cell] | None, n_bounds: int) -> Sequence[np.ndarray | float]:
-        """Effect of each bound's place (draw, robot or 1); 0 where there are none."""
+    def _effects(self, path: Sequence[Cell] | None, n_bounds: int) -> Sequence[Effect]:
+        """Effect of each bound's place; 0 where there are none. Checks the path's cells."""
+        cells = []
+        if path is not None:
+            path = list(path) if isinstance(path, Iterable) else []
+            cells = [require_pair("a cell", cell) for cell in path]
+            if len(cells) != n_bounds + 1:
+                raise TrustboError(
+                    f"say which {n_bounds + 1} cells the {n_bounds} bounds lead over, the cell "
+                    f"left first; got {path!r}."
+                )
+            for grid in {np.shape(value)[-2:] for value in self.params.places.values()}:
+                require_on_grid(cells, grid)
+            moves_along(cells)
         if not self.params.places:
             return [0.0] * n_bounds
-        if cells is None:
+        if not cells:
             raise TrustboError(
                 f"places have effects: say which {n_bounds + 1} cells the bounds lead over, the "
                 "cell left first."
             )
         return list(np.moveaxis(self.params.of_places(bounds_along(cells)), -2, 0))
-
-    def _average(
-        self, mean: np.ndarray, var: np.ndarray, weights: np.ndarray | None = None
-    ) -> TrustState:
-        """Mean and sd of the mixture over draws."""
-        weights = self.weights if weights is None else weights
-        var = var if var.ndim == 2 else np.diagonal(var, axis1=1, axis2=2)
-        center = weights @ mean
-        spread = weights @ (var + (mean - center) ** 2)
-        return TrustState(center, np.sqrt(spread))
 
     def _checked(self, awareness: ArrayLike, n_axes: int) -> np.ndarray:
         z = as_array("awareness", awareness)
@@ -370,40 +471,23 @@ class TrustFilter:
         require_unit_interval(what, array)
         return array
 
-    def _bound(
-        self, awareness: ArrayLike, bound: tuple[Cell, Cell] | None
-    ) -> tuple[np.ndarray, np.ndarray | float]:
-        """Awareness of a bound, (robot, feature), and its effect."""
-        return self._checked(awareness, 2), self._effects(self._cells(bound, 1), 1)[0]
-
 
 class _Running(NamedTuple):
-    """A bound that runs."""
+    """A bound that runs: trust predicted at its end, ticks with contact and ticks (robot,)."""
 
-    z: np.ndarray  # (robot, feature)
-    effect: Effect
-    contacts: np.ndarray  # (robot,), ticks in contact
-    ticks: np.ndarray  # (robot,)
+    predicted: Beliefs
+    contacts: np.ndarray
+    ticks: np.ndarray
 
-    def rates(self, family: Family) -> Rates:
-        """Rates so far."""
-        with np.errstate(invalid="ignore"):
-            return Rates(family, self.contacts / self.ticks, self.ticks)
+    def plus(self, contacts: np.ndarray, ticks: np.ndarray) -> Self:
+        """The bound with further ticks."""
+        return self._replace(contacts=self.contacts + contacts, ticks=self.ticks + ticks)
 
-
-def _robots_of(posterior: xr.DataTree) -> int | None:
-    """Number of robots; None where version 0.2.0 kept parameters alone, which all share."""
-    if "constant_data" in posterior.children:
-        return posterior["constant_data"].sizes["robot"]
-    return posterior.attrs.get("n_robots")
-
-
-def _of_posterior(posterior: xr.DataTree, name: str, given: str | None) -> str:
-    """Observation of the posterior; TrustboError if another is given."""
-    recorded = posterior.attrs[name]
-    if given not in (None, recorded):
-        raise TrustboError(f"the posterior has {name}={recorded!r}; got {given!r}. Leave it out.")
-    return recorded
+    @property
+    def rates(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rates so far, NaN before the first tick, and ticks."""
+        some = self.ticks > 0.0
+        return np.where(some, self.contacts / np.where(some, self.ticks, 1.0), np.nan), self.ticks
 
 
 def ticks_ahead(n_ticks: ArrayLike, shape: tuple[int, int]) -> np.ndarray:
@@ -415,6 +499,14 @@ def ticks_ahead(n_ticks: ArrayLike, shape: tuple[int, int]) -> np.ndarray:
     if not ((given >= 1.0) & (given == np.round(given))).all():
         raise TrustboError(f"n_ticks must be whole numbers of ticks from 1; got {given.min():g}.")
     return np.broadcast_to(given, shape)
+
+
+def _average(beliefs: Beliefs, weights: np.ndarray) -> TrustState:
+    """Mean and sd of the mixture over draws."""
+    mean = beliefs.mean.reshape(len(weights), -1)
+    var = np.diagonal(beliefs.cov, axis1=2, axis2=3).reshape(mean.shape)
+    center = weights @ mean
+    return TrustState(center, np.sqrt(weights @ (var + (mean - center) ** 2)))
 
 
 def _normalised(log_weight: np.ndarray) -> np.ndarray:

@@ -2,60 +2,49 @@
 
 import json
 import time
-import warnings
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import ArrayLike
 
-from trustbo.arrays import as_array
 from trustbo.data import Mission
-from trustbo.errors import PosteriorError, ShapeError, TrustboError, require_kind, require_whole
-from trustbo.inference.place_maps import place_group
-from trustbo.inference.posterior_groups import add_weights, complete
-from trustbo.inference.posterior_tree import require_posterior, to_datatree
-from trustbo.inference.prior_predictive import draw_sites
-from trustbo.inference.samplers.choice import (
-    faster_than_nuts,
-    needs_evidence,
-    resolve_sampler,
-    slow_places,
-    with_warmup,
+from trustbo.errors import (
+    PosteriorError,
+    TrustboError,
+    require_choice,
+    require_kind,
+    require_whole,
 )
-from trustbo.inference.samplers.run import draw_posterior
-from trustbo.inference.samplers.settings import NutsSettings
-from trustbo.inference.samplers.student import proposal_of
-from trustbo.inference.samplers.watching import Watch
+from trustbo.inference.importance import MAX_KHAT, sample
+from trustbo.inference.place_maps import place_group
+from trustbo.inference.posterior import Draws, Posterior
+from trustbo.inference.tree import complete, to_datatree
 from trustbo.models.backend import VERSIONS
 from trustbo.models.default import default_model
-from trustbo.models.effects.effect import Slots
 from trustbo.models.model import TrustModel, require_model
 from trustbo.models.people import HumanTrust
-from trustbo.models.place import has_places, places_of
 from trustbo.models.record import model_to_record
-from trustbo.models.ticks import TickWeights, require_ticks, resolution, weigh_ticks
-from trustbo.stacking import MissionBatch, require_same_team, stack_missions
+from trustbo.models.visited import has_places
+from trustbo.parallel import one_blas_thread
+from trustbo.stacking import require_same_team
 from trustbo.workspace import Workspace
 
+SAMPLERS = ("importance", "nuts")
 _N_PRIOR = 500
 
 
 def fit(
     missions: Sequence[Mission],
     model: TrustModel | None = None,
-    sampler: str = "auto",
     *,
+    sampler: str = "importance",
     workspace: Workspace | None = None,
-    earlier: xr.DataTree | None = None,
-    weights: ArrayLike | None = None,
+    draws: int = 1000,
+    chains: int = 4,
+    warmup: int = 300,
     seed: int = 0,
     progress: bool = True,
-    n_chains: int = 4,
-    warmup: int | None = None,
-    draws: int | None = None,
-    target_accept: float = 0.9,
-    max_tree_depth: int = 10,
     check: bool = True,
     whole: bool = True,
 ) -> xr.DataTree:
@@ -67,39 +56,27 @@ def fit(
             places and robots. Missions without places, which are those of no map and those whose
             paths jump, have effects of robots alone; reports of people, as of `logs.read_reports`,
             have `HumanTrust` of their scale.
-        sampler: `"auto"`: the exact sampler where it applies, else NUTS; the posterior's
-            attributes record which, and why. `"exact"`: near-independent draws by importance
-            sampling, without compiling, for robots that share their parameters, have nothing in
-            common, are partially pooled or influence each other; where its weights are too uneven,
-            NUTS is used for Gaussian rates, with a warning. `"nuts"`, for Gaussian rates.
+        sampler: `"importance"`: independent draws by adaptive importance sampling of the
+            hyperparameters, all else integrated out; nothing is compiled. `"nuts"`: NumPyro's NUTS,
+            on the same density for Gaussian rates, else with trust sampled too.
         workspace: Workspace of the missions. Their features and robots are then in its order, and
             awareness that they lack, such as line of sight, is filled in, see `Workspace.fill`. A
             model with effects of places has them over the whole grid, else up to the last row and
             column visited.
-        earlier: Posterior of earlier missions, to begin the exact sampler of effects of places or
-            coupled robots from; the posterior is the same but for Monte Carlo error.
-        weights: Weight of each mission, shape (mission,), in [0, 1]; 1 by default. For Gaussian
-            observations.
+        draws: Draws kept per chain.
+        chains: Number of chains; draws of importance sampling are divided among them.
+        warmup: Warm-up draws per chain of NUTS, not kept.
         seed: Seed; the same seed gives the same posterior.
-        progress: Whether a slow fit shows its stages, and NUTS a progress bar and first an estimate
-            of a long run's time. A file, which has no bar, gets a line about a long fit, and one
-            about a retry.
-        n_chains: Number of chains; the exact sampler's draws are divided among them.
-        warmup: Warm-up draws per chain of NUTS, not kept; 300 by default, 150 where weights
-            are integrated out and the exact sampler gives the metric.
-        draws: Draws kept per chain; 1000 by default.
-        target_accept: Acceptance rate that NUTS adapts its steps to: towards 1, steps are
-            smaller, and divergences fewer.
-        max_tree_depth: Doublings of a trajectory of NUTS at most: 10 allow 1023 steps for a draw.
-        check: Refuse a posterior with R-hat > 1.01, bulk ESS < 400 or a divergence that a longer
-            run does not cure; `False` returns it unchecked.
+        progress: Whether NUTS shows a progress bar.
+        check: Refuse a posterior with bad diagnostics: k-hat > 0.7 of importance sampling; R-hat >
+            1.01, bulk ESS < 400 or a divergence of NUTS. `False` returns it unchecked.
         whole: Whether to add latent trust, log-likelihoods and predictions at once; `complete` adds
-            them later, where trust follows from the parameters.
+            them later.
 
     Returns:
         An ArviZ DataTree with the groups `posterior` (for `PooledTrust` beta0, beta[feature], b,
-        delta_w, delta_v), `latent` (trust[chain, draw, mission, bound, robot] by backward sampling,
-        and trust_mean and trust_sd over all draws), `posterior_predictive`, `prior`,
+        delta_w, delta_v), one for each kind of effects, `latent` (trust[chain, draw, mission,
+        bound, robot], and trust_mean and trust_sd over all draws), `posterior_predictive`, `prior`,
         `prior_predictive`, `log_prior`, `log_likelihood` (contact_rate[chain, draw, mission]: a
         whole mission is one observation, so LOO leaves out missions; see `by_rate`),
         `sample_stats`, `observed_data` and
@@ -109,69 +86,98 @@ def fit(
 
     Raises:
         ShapeError: There are no missions, or they disagree on robots or features.
-        TrustboError: An awareness value is NaN, the sampler is unknown or does not suit the model,
-            no contact rate was measured, a path leaves the workspace, a number of draws or the
-            seed is no whole number, or a setting of NUTS is given and the sampler is another.
+        TrustboError: An awareness value is NaN, the sampler is unknown, no contact rate was
+            measured, a path leaves the workspace, or a number of draws or the seed is no whole
+            number.
         PosteriorError: The diagnostics are beyond their limits.
     """
+    started = time.perf_counter()
     missions = _filled(missions, workspace)
     model = _default_of(missions) if model is None else model
     require_model(model)
-    given = {"warmup": warmup, "draws": draws, "n_chains": n_chains}
-    care = {"target_accept": target_accept, "max_tree_depth": max_tree_depth}
-    settings = NutsSettings.of({**given, **care})
+    require_choice("sampler", sampler, SAMPLERS)
+    sizes = {"draws": draws, "chains": chains, "warmup": warmup}
+    draws, chains, warmup = (require_whole(name, n, 1) for name, n in sizes.items())
     seed = require_whole("seed", seed, 0)
-    if earlier is not None:
-        require_posterior("earlier=", earlier)
-    batch = stack_missions(missions)
-    places = places_of(missions, model.place, batch.contact_rate.shape, workspace)
-    require_ticks(model.family, batch)
-    weight = _weights(weights, model, batch, len(missions))
-    ticks = _weigh_rates(batch, weight)
-    started = time.perf_counter()
-
     model = model.for_features(missions[0].features)
-    chosen, reason = resolve_sampler(model, sampler)
-    settings.require_sampler(chosen)
-    if sampler == "auto" and chosen != "exact" and model.place is not None:
-        warnings.warn(slow_places(reason), stacklevel=2)
-    floored = model.at_resolution(ticks)
-    # Of a campaign, only the first fit warns.
-    watch = Watch(progress, estimates=earlier is None)
-    watch.faster = "" if chosen == "exact" else faster_than_nuts(model)
-    with watch:
-        prior = draw_sites(floored, batch.awareness.shape[2:], _N_PRIOR, seed + 2)
-        chains = batch, len(missions), missions[0].features, weight, places
-        slots = Slots.of(*chains) if needs_evidence(model, chosen) else None
-        sampled, complaints = draw_posterior(
-            floored, chosen,
-            settings if warmup is not None else with_warmup(settings, model),
-            seed, batch, weight, places, proposal_of(earlier), slots, check=check, watch=watch,
-        )  # fmt: skip
-    groups = {
-        "posterior": {name: sampled.params[name] for name in model.dims},
-        "sample_stats": sampled.stats,
-        "prior": {name: values[None] for name, values in prior.items()},
-        **{noun: dict(variables) for noun, variables in sampled.effects.items()},
-    }
-    posterior = to_datatree(groups, missions, model.dims, model.effects)
-    if places is not None:
-        posterior["places"] = xr.DataTree(place_group(sampled.places, places, seed))
-    posterior.attrs |= {
-        **_record(model, batch, len(missions), resolution(ticks)),
-        **sampled.summary,
-        "sampler": sampled.sampler,
-        "sampler_reason": sampled.fallback or reason,
-        "seed": seed,
-    }
-    if weights is not None:
-        add_weights(posterior, weight[: len(missions)])
+    slots = model.slots(missions, workspace)
+    if np.isnan(slots.y).all():
+        raise TrustboError(
+            "every contact rate is NaN: nothing was measured. Give one rate at least."
+        )
+    posterior = Posterior(model, slots)
+    with one_blas_thread():
+        if sampler == "importance":
+            drawn, stats, summary = by_importance(posterior, chains * draws, seed)
+            complaints = [] if summary["k_hat"] <= MAX_KHAT else [
+                f"importance weights are uneven (k-hat {summary['k_hat']:.2f}, limit {MAX_KHAT})"
+            ]  # fmt: skip
+        else:
+            from trustbo.inference.nuts import sample_by_nuts  # compiles NumPyro's kernels
+
+            drawn, stats, summary, complaints = sample_by_nuts(
+                posterior, chains=chains, draws=draws, warmup=warmup, seed=seed, progress=progress
+            )
+        tree = _laid_out(posterior, drawn, stats, (chains, draws), missions, seed)
+    tree.attrs |= _record(model, posterior) | summary | {"sampler": sampler, "seed": seed}
+    if check and complaints:
+        raise PosteriorError(
+            f"posterior refused: {'; '.join(complaints)}.",
+            tree,
+            "Give more missions or firmer priors, or pass check=False to have it as it is.",
+        )
     if whole:
-        with watch:
-            watch.stage("latent trust and predictions")
-            posterior = complete(posterior, missions, model=model)
-    posterior.attrs["seconds"] = time.perf_counter() - started
-    return _require_sound(posterior, complaints)
+        tree = complete(tree, missions, model=model)
+    tree.attrs["seconds"] = time.perf_counter() - started
+    return tree
+
+
+def by_importance(
+    posterior: Posterior, n: int, seed: int
+) -> tuple[Draws, dict[str, np.ndarray], dict[str, Any]]:
+    """Draws by importance sampling, their statistics (draw,), and a summary; tried twice."""
+    rng = np.random.default_rng(seed)
+    for size in (256, 1024):
+        start = posterior.start()[None]
+        size = size if len(start[0]) < 12 else 4 * size
+        points = sample(posterior.log_density, start, rng, size=size, defensive=posterior.defensive)
+        chosen = points.resample(n, rng)
+        drawn = posterior.draw(points.z[chosen], points.log_p[chosen], n, rng)
+        k_hat = max(points.k_hat, drawn.k_hat)
+        if k_hat <= MAX_KHAT:
+            break
+    shuffled = rng.permutation(n)
+    theta = {name: values[shuffled] for name, values in drawn.theta.items()}
+    f = None if drawn.f is None else drawn.f[shuffled]
+    drawn = drawn._replace(theta=theta, c=drawn.c[shuffled], f=f)
+    log_evidence = points.log_evidence + drawn.log_correction
+    summary = {"k_hat": k_hat, "kish": points.kish, "log_evidence": log_evidence}
+    return drawn, {"lp": points.log_p[chosen][shuffled]}, summary
+
+
+def _laid_out(
+    posterior: Posterior,
+    drawn: Draws,
+    stats: dict[str, np.ndarray],
+    shape: tuple[int, int],
+    missions: Sequence[Mission],
+    seed: int,
+) -> xr.DataTree:
+    """Draws of parameters and effects, and of the prior, as a DataTree with the data."""
+    rng = np.random.default_rng([seed, 3])
+    groups = posterior.named(drawn, rng)
+    groups = {
+        group: {name: v.reshape(*shape, *v.shape[1:]) for name, v in values.items()}
+        for group, values in groups.items()
+    }
+    places, model = groups.pop("places", None), posterior.model
+    before = posterior.named(posterior.draw_prior(_N_PRIOR, rng), rng)["posterior"]
+    groups["sample_stats"] = {name: v.reshape(*shape, *v.shape[1:]) for name, v in stats.items()}
+    groups["prior"] = {name: values[None] for name, values in before.items()}
+    tree = to_datatree(groups, missions, model.dims, model.effects)
+    if places is not None:
+        tree["places"] = xr.DataTree(place_group(places, posterior.slots.visited, seed))
+    return tree
 
 
 def _default_of(missions: Sequence[Mission]) -> TrustModel:
@@ -190,68 +196,19 @@ def _filled(missions: Sequence[Mission], workspace: Workspace | None) -> list[Mi
     return [workspace.fill(mission) for mission in missions]
 
 
-def _require_sound(posterior: xr.DataTree, complaints: Sequence[str]) -> xr.DataTree:
-    if complaints:
-        raise PosteriorError(
-            f"posterior refused after a longer retry: {'; '.join(complaints)}.",
-            posterior,
-            "Give more missions or firmer priors, or pass check=False to have it as it is.",
-        )
-    return posterior
-
-
-def _record(
-    model: TrustModel, batch: MissionBatch, n_missions: int, finest: float
-) -> dict[str, object]:
-    """Attributes of a posterior: model, data, sampler; `finest` is the resolution of the rates."""
+def _record(model: TrustModel, posterior: Posterior) -> dict[str, Any]:
+    """Attributes of a posterior: its model and data."""
+    slots = posterior.slots
+    options = {name: int(v) if isinstance(v, bool) else v for name, v in model.options().items()}
     return {
         "model": type(model).__name__,
-        "inter_robot": "none",
-        **model.options(),
-        "place": "none" if model.place is None else json.dumps(model.place.to_record()),
+        **options,
         "model_record": json.dumps(model_to_record(model)),
-        "n_robots": batch.awareness.shape[2],
-        **({"n_missions": n_missions} if model.effects else {}),
+        "n_robots": slots.n_robots,
+        "n_missions": slots.n_missions,
         "x0_mean": float(model.priors.x0_mean),
         "x0_sd": float(model.priors.x0_sd),
-        "delta_v_floor": finest if model.family.rounds else 0.0,
+        "resolution": slots.resolution if model.family.rounds else 0.0,
         **{f"prior_{name}": text for name, text in model.priors.describe().items()},
         **{f"{name}_version": version for name, version in VERSIONS.items()},
     }
-
-
-def _weigh_rates(batch: MissionBatch, weight: np.ndarray) -> TickWeights:
-    """Weight of the rates by their ticks; TrustboError if no rate was measured."""
-    ticks = weigh_ticks(batch, weight)
-    if not ticks:
-        raise TrustboError(
-            "every contact rate is NaN: nothing was measured. Give one rate at least."
-        )
-    if not sum(ticks.values()) > 0.0:
-        raise TrustboError(
-            f"only missions of weight 0 have a contact rate: nothing is left to learn from. Give "
-            f"one of them a positive weight; got {weight}."
-        )
-    return ticks
-
-
-def _weights(
-    weights: ArrayLike | None, model: TrustModel, batch: MissionBatch, n_missions: int
-) -> np.ndarray:
-    """One weight per mission of the batch, padding included."""
-    padded = np.ones(len(batch.contact_rate))
-    if weights is None:
-        return padded
-    given = as_array("weights", weights)
-    if given.shape != (n_missions,):
-        raise ShapeError(f"weights must be ({n_missions},), one per mission; got {given.shape}.")
-    bad = ~((given >= 0.0) & (given <= 1.0))
-    if bad.any() or not given.any():
-        raise TrustboError(f"weights must be in [0, 1], and one of them positive; got {given}.")
-    if not model.family.integrates_out:
-        raise TrustboError(
-            f'weights are for observation "gaussian"; with "{model.observation}" a fractional '
-            "mission would no longer have its trust integrated out. Leave missions out instead."
-        )
-    padded[:n_missions] = given
-    return padded

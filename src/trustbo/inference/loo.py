@@ -1,148 +1,126 @@
-"""Leave-one-mission-out cross-validation of any posterior, weighted ones among them."""
+"""Leave-one-mission-out cross-validation, for every model, family and effect.
+
+With coefficients, effects and trust integrated out, few hyperparameters theta are left, and
+
+    p(y_j | y_-j) = 1 / E[ p(y_-j | theta) / p(y | theta) | y ],
+
+so that importance weights are ratios of the evidence without and with a mission. Weights of whole
+draws would not follow effects of bounds that only the mission made.
+"""
 
 import warnings
-from dataclasses import replace
-from typing import Any, cast
 
 import numpy as np
 import xarray as xr
-from arviz_stats.loo import loo as unweighted
 from arviz_stats.utils import ELPDData
+from scipy.special import logsumexp
 
 from trustbo.errors import TrustboError
-from trustbo.inference.left_out import LeftOut, by_hyperparameters, by_refit, weights_of
-from trustbo.inference.log_prior import model_of
-from trustbo.inference.posterior_groups import LIKELIHOODS, complete
-from trustbo.inference.posterior_tree import missions_of, require_posterior
-from trustbo.models.families import FAMILIES
+from trustbo.inference.draws import read_posterior, require_posterior
+from trustbo.inference.fit import by_importance
+from trustbo.inference.importance import MAX_KHAT, smoothed
+from trustbo.inference.posterior import Posterior, at
 from trustbo.models.model import TrustModel
-from trustbo.stacking import stack_missions
+from trustbo.parallel import one_blas_thread
+
+_POINTS = 500  # distinct hyperparameters at most
 
 
+@one_blas_thread()
 def loo(posterior: xr.DataTree, *, model: TrustModel | None = None) -> ELPDData:
     """Expected log predictive density of a mission left out, p(rates of it | all other missions).
 
-    By Pareto-smoothed importance weights where these hold: of draws, or, with effects of places, of
-    hyperparameters alone, all else integrated out. A mission whose weights are too uneven
-    (k-hat above `good_k`) is left out of a refit, and has the difference of log evidence.
-    Of draws of a posterior with weights w_j, which holds p(y_j | parameters)^w_j, the ratios are
-    p(y_j | parameters)^-w_j. Missions without any rate have nothing to predict and are left out of
-    the sum.
+    By Pareto-smoothed weights of hyperparameters, all else integrated out; for families that are
+    not Gaussian, by expectation propagation. A mission whose weights are too uneven (k-hat above
+    0.7) is left out of a refit, and has the difference of log evidence. Missions without any rate
+    have nothing to predict and are left out of the sum.
 
     Args:
-        posterior: DataTree from `fit`.
-        model: Its model; needed where it has custom priors. Without it, a mission
-            that needs a refit keeps the density by weights of draws, with a warning.
+        posterior: DataTree from `fit`, with its data.
+        model: Its model; needed where it has custom priors.
 
     Returns:
         ArviZ's `ELPDData`, pointwise, for `az.compare({name: loo(posterior), ...})`. `elpd_i` and
-        `pareto_k` have a coordinate `refitted` (mission,); there `pareto_k` is that of the refit's
-        sampler, 0 for NUTS. Other than for weights of draws, `log_weights` are NaN.
+        `pareto_k` have a coordinate `refitted` (mission,); there `pareto_k` is that of the refit.
 
     Raises:
-        TrustboError: Fewer than two missions have rates, a view `by_rate`; or see `complete`.
+        TrustboError: Fewer than two missions have rates, or a view `by_rate`.
     """
     posterior = require_posterior("loo", posterior)
     if "observed_data" in posterior.children and "rate" in posterior["observed_data"].dims:
         raise TrustboError("loo leaves out missions; of a view by rate, give the posterior itself.")
-    posterior = complete(posterior, model=model)
-    measured = _measured(posterior)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # missions may be refitted
-        result = _by_draws(posterior, measured)
-    model = model_of(posterior, model)
-    left_out: dict[int, LeftOut] = {}
-    refitted = np.zeros(len(measured), dtype=bool)
-    if model is not None:
-        left_out = dict(enumerate(by_hyperparameters(posterior, model) or []))
-        for i, j in enumerate(measured):
-            khat = left_out[j].khat if j in left_out else float(result.pareto_k[i])
-            if not khat <= result.good_k:
-                left_out[j], refitted[i] = by_refit(posterior, model, int(j)), True
-    result = _replaced(result, {i: left_out[j] for i, j in enumerate(measured) if j in left_out},
-                       _log_resolution(posterior)[measured], refitted)  # fmt: skip
-    if result.warning:
-        warnings.warn(
-            f"Estimated shape parameter of Pareto distribution is greater than {result.good_k:.2f} "
-            f"for missions {measured[~(result.pareto_k.values <= result.good_k)].tolist()}: their "
-            "densities may be off; see the argument model=.",
-            stacklevel=2,
-        )
-    return result
-
-
-def _measured(posterior: xr.DataTree) -> np.ndarray:
-    """Missions with a rate; TrustboError: fewer than two."""
-    rates = posterior["observed_data"].to_dataset()["contact_rate"]
-    has_rates = rates.notnull().any(("bound", "robot")).values
-    if has_rates.sum() < 2:
+    fitted, draws = read_posterior(posterior, model=model)
+    fitted.settle_at(draws)
+    measured = np.flatnonzero(~np.isnan(fitted.slots.y).all((1, 2)))
+    if len(measured) < 2:
         raise TrustboError(
-            f"LOO leaves out one of several missions; {has_rates.sum()} of {len(has_rates)} have "
-            "rates. Give a posterior of two at least."
+            f"LOO leaves out one of several missions; {len(measured)} of {fitted.slots.n_missions} "
+            "have rates. Give a posterior of two at least."
         )
-    return np.flatnonzero(has_rates)
+
+    rows = np.column_stack([v.reshape(len(draws.c), -1) for v in draws.theta.values()])
+    _, first, count = np.unique(rows, axis=0, return_index=True, return_counts=True)
+    some = np.linspace(0, len(first) - 1, min(len(first), _POINTS)).astype(int)
+    theta, log_count = at(draws.theta, first[some]), np.log(count[some] / count[some].sum())
+
+    whole = fitted.log_evidence(theta)
+    density, k_hat, average = np.zeros((3, len(measured)))
+    refitted, whole_refit = np.zeros(len(measured), dtype=bool), None
+    for i, j in enumerate(measured):
+        others = fitted.without(j)
+        ratio = others.log_evidence(theta) - whole
+        weight, k_hat[i], _ = smoothed(ratio + log_count)
+        density[i] = logsumexp(-ratio, b=weight)
+        average[i] = logsumexp(log_count - ratio)
+        if not k_hat[i] <= MAX_KHAT:
+            seed = int(posterior.attrs["seed"])
+            if whole_refit is None:
+                whole_refit = _log_evidence(fitted, seed)
+            rest, k_hat[i] = _log_evidence(others, seed)
+            density[i], refitted[i] = whole_refit[0] - rest, True
+
+    shift = fitted.model.family.log_resolution(fitted.slots.y, fitted.slots.n_ticks).sum((1, 2))
+    if not np.isnan(shift).any():
+        density, average = density + shift[measured], average + shift[measured]
+    return _elpd(density, average, k_hat, measured, refitted, len(draws.c))
 
 
-def _by_draws(posterior: xr.DataTree, measured: np.ndarray) -> Any:
-    """ELPDData by weights of draws."""
-    (group,) = (name for name in LIKELIHOODS if name in posterior.children)
-    log_p = posterior[group].to_dataset()["contact_rate"].isel(mission=measured)
-    weight = weights_of(posterior)[measured]
-    counted = np.flatnonzero(weight > 0.0)
-    powers = log_p.isel(mission=counted) * xr.DataArray(weight[counted], dims="mission")
-    elpd: Any = unweighted(_tree(posterior, powers), pointwise=True)
-    # The posterior is already without a mission of weight 0: equal weights.
-    log_weights = xr.full_like(log_p, -np.log(log_p.sizes["chain"] * log_p.sizes["draw"]))
-    log_weights = log_weights.transpose(*elpd.log_weights.dims)
-    log_weights[{"mission": counted}] = elpd.log_weights.values
-    pareto_k = xr.zeros_like(log_p.isel(chain=0, draw=0, drop=True))
-    pareto_k[counted] = elpd.pareto_k.values
-    tree = _tree(posterior, log_p)
-    return unweighted(tree, pointwise=True, log_weights=log_weights, pareto_k=pareto_k)
+def _log_evidence(posterior: Posterior, seed: int) -> tuple[float, float]:
+    """Log evidence of a posterior, and the k-hat of its weights."""
+    summary = by_importance(posterior, 1000, seed)[2]
+    return summary["log_evidence"], summary["k_hat"]
 
 
-def _tree(posterior: xr.DataTree, log_likelihood: xr.DataArray) -> xr.DataTree:
-    """Build the tree that `az.loo` reads, whose draws give the relative effective sample size."""
-    return xr.DataTree.from_dict(
-        {
-            "posterior": posterior["posterior"].to_dataset(),
-            "log_likelihood": log_likelihood.to_dataset(name="contact_rate"),
-        }
-    )
-
-
-def _log_resolution(posterior: xr.DataTree) -> np.ndarray:
-    """Log ratio of the probability of each mission's counts of ticks to the density of its rates.
-
-    0 where the posterior's log-likelihoods are densities; shape (mission,).
-    """
-    batch = stack_missions(missions_of(posterior), pad=False)
-    if posterior.attrs["log_likelihood_of"] != "ticks":
-        return np.zeros(len(batch.contact_rate))
-    family = FAMILIES[posterior.attrs["observation"]]
-    return family.log_resolution(batch.contact_rate, batch.n_ticks).sum((1, 2))
-
-
-def _replaced(
-    result: Any, left_out: dict[int, LeftOut], log_resolution: np.ndarray, refitted: np.ndarray
+def _elpd(
+    density: np.ndarray,
+    average: np.ndarray,
+    k_hat: np.ndarray,
+    measured: np.ndarray,
+    refitted: np.ndarray,
+    n_samples: int,
 ) -> ELPDData:
-    """ELPDData with the densities and k-hats of some missions replaced."""
-    elpd_i, pareto_k, log_weights = (
-        getattr(result, name).copy() for name in ("elpd_i", "pareto_k", "log_weights")
-    )
-    for i, one in left_out.items():
-        elpd_i[i], pareto_k[i] = one.log_density + log_resolution[i], one.khat
-        log_weights[{"mission": i}] = np.nan
-    elpd_i, pareto_k = (a.assign_coords(refitted=("mission", refitted)) for a in (elpd_i, pareto_k))
-    elpd = float(elpd_i.sum())
-    changed = replace(
-        result,
+    """ArviZ's result of log densities of missions left out.
+
+    `average` is the log density of each mission, averaged over the posterior that had it.
+    """
+    coords = {"mission": measured, "refitted": ("mission", refitted)}
+    elpd, n = float(density.sum()), len(density)
+    bad = ~(k_hat <= MAX_KHAT)
+    if bad.any():
+        warnings.warn(
+            f"Estimated shape parameter of Pareto distribution is greater than {MAX_KHAT:.2f} for "
+            f"missions {measured[bad].tolist()}: their densities may be off.",
+            stacklevel=3,
+        )
+    return ELPDData(
         elpd=elpd,
-        se=float(np.sqrt(len(elpd_i) * elpd_i.var())),
-        p=float(result.p + result.elpd - elpd),
-        warning=bool((~(pareto_k <= result.good_k)).any()),
-        elpd_i=elpd_i,
-        pareto_k=pareto_k,
-        log_weights=log_weights,
+        se=float(np.sqrt(n * density.var())),
+        p=float(average.sum()) - elpd,
+        n_samples=n_samples,
+        n_data_points=n,
+        scale="log",
+        warning=bool(bad.any()),
+        good_k=MAX_KHAT,
+        elpd_i=xr.DataArray(density, coords, "mission"),
+        pareto_k=xr.DataArray(k_hat, coords, "mission"),
     )
-    return cast(ELPDData, changed)

@@ -14,30 +14,29 @@ from scipy.special import expit
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError, require_whole
-from trustbo.inference.fit_data import FitData
-from trustbo.inference.posterior_tree import require_posterior
-from trustbo.inference.samplers.choice import resolve_sampler
-from trustbo.inference.samplers.importance import sample_scores
-from trustbo.inference.samplers.people import PeoplePosterior
-from trustbo.inference.samplers.posterior import posterior_of
+from trustbo.inference.draws import read_posterior, require_posterior
+from trustbo.inference.fit import by_importance
+from trustbo.inference.posterior import Posterior
 from trustbo.models.model import TrustModel
-from trustbo.models.people import HumanTrust
 from trustbo.models.pooled import PooledTrust
+from trustbo.parallel import one_blas_thread
 from trustbo.workspace import Workspace
 
-_N_DRAWS = 400
 _SURE = 0.95
 
 
 class Memory(NamedTuple):
-    """Evidence that trust carries over from one bound to the next."""
+    """Evidence that trust carries over from one bound to the next.
+
+    Attributes:
+        log_bf: Log evidence of the model, beta0 > 0, less that of beta0 = 0.
+        beta0: Posterior mean of beta0 where it is not 0.
+        sd: Its standard deviation.
+    """
 
     log_bf: float
-    """Log evidence of the model, beta0 > 0, less that of beta0 = 0."""
     beta0: float
-    """Posterior mean of beta0 where it is not 0."""
     sd: float
-    """Its standard deviation."""
 
     @property
     def p_none(self) -> float:
@@ -56,6 +55,7 @@ class Memory(NamedTuple):
         return f"open whether trust carries over from one bound to the next: {factor} {side}"
 
 
+@one_blas_thread()
 def memory(
     posterior: xr.DataTree,
     missions: Sequence[Mission] | None = None,
@@ -67,17 +67,12 @@ def memory(
     """Weigh whether trust carries over from one bound to the next, against beta0 = 0.
 
     Args:
-        posterior: Posterior of `PooledTrust`, with any effects, or of `HumanTrust`, by the exact
-            sampler.
-        missions: Missions that it was fitted to, or those of a campaign whose reports it is of; by
-            default those it holds.
+        posterior: Posterior of a model with one beta0, `PooledTrust`, `HierarchicalTrust` or
+            `HumanTrust`, by importance sampling.
+        missions: Missions that it was fitted to; by default those it holds.
         workspace: Workspace of the missions, to fill in awareness that they lack, as for `fit`.
         model: Model of the posterior; needed with custom priors.
         seed: Seed of the draws without memory.
-
-    Returns:
-        The log Bayes factor `log_bf` of beta0 > 0 against beta0 = 0, the probability `p_none` of
-        the latter, and the mean and sd of beta0; as text, the finding in words.
 
     Raises:
         TrustboError: A posterior of another model or sampler, without its missions, or with custom
@@ -85,20 +80,14 @@ def memory(
     """
     seed = require_whole("seed", seed, 0)
     attrs = require_posterior("memory", posterior).attrs
-    data = FitData.of(posterior, missions, workspace, model)
-    model = data.model
-    exact = isinstance(model, PooledTrust) and "log_evidence" in attrs
-    if not exact or resolve_sampler(model, "auto")[0] != "exact":
+    fitted, _ = read_posterior(posterior, missions, model=model, workspace=workspace)
+    if not isinstance(fitted.model, PooledTrust) or "log_evidence" not in attrs:
         raise TrustboError(
-            "memory is weighed under PooledTrust for rates of trust, by the exact sampler; got "
-            f'{model.describe()} by "{attrs.get("sampler")}".'
+            "memory is weighed under models with one beta0, by importance sampling; got "
+            f'{fitted.model.in_short()} by "{attrs["sampler"]}".'
         )
-    slots = data.slots(model.place)
-    if isinstance(model, HumanTrust):
-        target = PeoplePosterior(model, slots, carries=False)
-    else:
-        target = posterior_of(model, slots, carries=False)
-    without = sample_scores(target, _N_DRAWS, seed).draws.log_evidence
+    without = Posterior(fitted.model, fitted.slots, memoryless=True)
+    log_evidence = by_importance(without, 1000, seed)[2]["log_evidence"]
     beta0 = np.asarray(posterior["posterior"]["beta0"])
-    log_bf = float(attrs["log_evidence"]) - without
+    log_bf = float(attrs["log_evidence"] - log_evidence)
     return Memory(log_bf, float(beta0.mean()), float(beta0.std()))

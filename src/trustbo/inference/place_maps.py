@@ -19,7 +19,7 @@ from scipy import fft
 from scipy.linalg import cho_factor, cho_solve
 
 from trustbo.errors import TrustboError, require_kind
-from trustbo.models.place import N_MOVES, Visited, correlation, matern
+from trustbo.models.visited import N_MOVES, Visited, correlation, matern
 from trustbo.parallel import one_blas_thread
 from trustbo.workspace.moves import MOVE_NAMES, existing_bounds
 
@@ -75,12 +75,6 @@ def draw_maps(
         _centre(place_bound)
         place_bound[:, *places.units.T] = e
     return place, place_bound
-
-
-def nowhere(shape: tuple[int, int], n_effects: int) -> Visited:
-    """No visited places, on a grid."""
-    nothing = np.zeros((0, 3), dtype=int), np.zeros((0, 4), dtype=int), np.zeros(0, dtype=int)
-    return Visited(shape, *nothing, np.zeros((0, 0, n_effects), dtype=int))
 
 
 @one_blas_thread()
@@ -196,16 +190,6 @@ def place_maps_of(
     return dict(zip(_AXIS, maps, strict=True))
 
 
-def prior_maps(group: xr.Dataset, sites: Mapping[str, np.ndarray]) -> dict[str, np.ndarray | None]:
-    """Effects drawn from their prior over the grid of a posterior's group `places`."""
-    places, scales = visited_of(group), scales_of(sites)
-    n = len(scales.tau_s)
-    no = {name: np.zeros((n, 0)) if name in group else None for name in _AXIS}
-    empty = nowhere(places.shape, places.n_effects)
-    maps = draw_maps(scales, empty, no["place"], no["place_bound"], int(group.attrs["seed"]) + 1)
-    return dict(zip(_AXIS, maps, strict=True))
-
-
 def place_maps(posterior: xr.DataTree) -> xr.Dataset:
     """Mean and standard deviation of the effect of every cell and bound, over a posterior.
 
@@ -229,7 +213,7 @@ def place_maps(posterior: xr.DataTree) -> xr.Dataset:
     if "places" not in posterior.children:
         raise TrustboError(
             f"a posterior of {posterior.attrs.get('model', 'a model')} without effects of places "
-            "has no maps of them; fit a model with place=PlaceEffect()."
+            "has no maps of them; fit a model with effects=PlaceEffect()."
         )
     group = posterior["places"].to_dataset()
     draws = posterior["posterior"].to_dataset()

@@ -8,16 +8,12 @@ import xarray as xr
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError, require_whole
-from trustbo.inference.draws import params_of
-from trustbo.inference.evidence.live import Rates, live_filter
-from trustbo.inference.posterior_groups import Conditional
-from trustbo.inference.posterior_tree import missions_of, require_posterior
-from trustbo.inference.samplers.weights import systematic
-from trustbo.models.families import Family
-from trustbo.models.params import Params
-from trustbo.models.place import bounds_of
-from trustbo.models.state_space.generate import draw_missions
+from trustbo.inference.draws import missions_of, params_of, require_posterior, sites_of
+from trustbo.inference.filter import Dynamics
+from trustbo.inference.importance import systematic
+from trustbo.models.families import Family, family_of
 from trustbo.models.ticks import require_ticks
+from trustbo.models.visited import bounds_of
 from trustbo.stacking import MissionBatch, stack_missions
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import require_on_grid
@@ -73,24 +69,17 @@ def score(
     missions = [m if workspace is None else workspace.fill(m) for m in missions]
     pairs = _pairs(posterior, missions, require_whole("ahead", ahead, 1))
     batch = stack_missions([mission for _, mission, _ in pairs], pad=False)
-    shape = batch.contact_rate.shape
+    shape, latest = batch.contact_rate.shape, None
     columns = {name: np.full(shape, np.nan) for name in ("mean", "pit", "log_score")}
     quantile, seen = np.full((*shape, len(QUANTILES)), np.nan), np.zeros(shape[:2], dtype=bool)
-    latest, params = pairs[0][0], params_of(pairs[0][0], day=True).flat()
     for j, (tree, mission, learned) in enumerate(pairs):
         if tree is not latest:
-            latest, params = tree, params_of(tree, day=True).flat()
-        conditional = Conditional.of(tree)
-        one = MissionBatch(*(a[j : j + 1, : len(mission.bounds)] for a in batch))
-        require_ticks(conditional.family, one)
-        rng = np.random.default_rng([seed, j])
-        there = _on_path(params, mission)
+            latest, predictor = tree, _Predictor(tree)
         k = slice(len(mission.bounds))
-        y = one.contact_rate[0]
-        log_scores, drawn = _bound_by_bound(conditional, params, mission, one, filtered, rng)
-        if drawn is None:
-            drawn = draw_missions(conditional.family, there, one.awareness,
-                                  one.n_ticks, rng).contact_rate[:, 0]  # fmt: skip
+        one = MissionBatch(*(a[j, k] for a in batch))
+        require_ticks(predictor.family, one.contact_rate, one.n_ticks)
+        rng, y = np.random.default_rng([seed, j]), one.contact_rate
+        log_scores, drawn = predictor.predict(mission, one, filtered, rng)
         columns["mean"][j, k] = np.where(np.isnan(y), np.nan, drawn.mean(0))
         columns["pit"][j, k] = _pit(drawn, y, rng)
         columns["log_score"][j, k] = log_scores
@@ -98,8 +87,54 @@ def score(
         made = {bound for other in learned for bound in _bounds(other) if other.has_map}
         seen[j, k] = [bound in made for bound in _bounds(mission)]
     first = len(missions) - len(pairs)
-    family = Conditional.of(latest).family
-    return _dataset(batch, columns, quantile, seen, family, missions[first:], first)
+    return _dataset(batch, columns, quantile, seen, predictor.family, missions[first:], first)
+
+
+class _Predictor:
+    """Predictions of missions by one posterior."""
+
+    def __init__(self, posterior: xr.DataTree) -> None:
+        self._params = params_of(posterior, day=True).flat()
+        n_robots = posterior.attrs["n_robots"]
+        self.family = family_of(posterior.attrs["observation"])
+        delta_s = sites_of(posterior).get("delta_s")
+        self._dynamics = Dynamics(self._params, self.family, n_robots, delta_s)
+
+    def predict(
+        self, mission: Mission, batch: MissionBatch, filtered: bool, rng: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Log density of each rate (bound, robot), and draws of rates (draw, bound, robot).
+
+        With `filtered` draws are weighted by the rates before, and rates are drawn given these.
+        """
+        dynamics, (z, y, ticks) = self._dynamics, batch
+        n = len(self._params.b)
+        log_weight, log_scores, drawn = np.full(n, -np.log(n)), np.full(y.shape, np.nan), []
+        beliefs = dynamics.start()
+        x = dynamics.draw(beliefs, rng)
+        for k, effect in enumerate(self._effects(mission)):
+            if filtered:
+                x = dynamics.draw(beliefs, rng)
+            x, rates = dynamics.roll(x, z[k], ticks[k], rng, effect)
+            beliefs = dynamics.predict(beliefs, z[k], effect)
+            density = dynamics.log_densities(beliefs, y[k], ticks[k])
+            one = np.logaddexp.reduce(density + log_weight[:, None], axis=0)
+            log_scores[k] = np.where(np.isnan(y[k]), np.nan, one)
+            if filtered:
+                rates = rates[systematic(np.exp(log_weight), n, rng)]
+                beliefs, gained = dynamics.update(beliefs, y[k], ticks[k])
+                log_weight = log_weight + gained
+                log_weight -= np.logaddexp.reduce(log_weight)
+            drawn.append(rates)
+        return log_scores, np.stack(drawn, axis=1)
+
+    def _effects(self, mission: Mission) -> Sequence[np.ndarray | float]:
+        """Effect of each bound's place; TrustboError: the path leaves the grid of places."""
+        if not self._params.places:
+            return [0.0] * len(mission.bounds)
+        for effects in self._params.places.values():
+            require_on_grid(mission.path, effects.shape[-2:])
+        return list(np.moveaxis(self._params.of_places(bounds_of([mission])[0]), -2, 0))
 
 
 def summarize_scores(
@@ -156,59 +191,11 @@ def _pairs(
     ]
 
 
-def _on_path(params: Params, mission: Mission) -> Params:
-    """Parameters of one mission; TrustboError: its path leaves the grid of places."""
-    if not params.places:
-        return params
-    for effects in params.places.values():
-        require_on_grid(mission.path, effects.shape[-2:])
-    return params.on(bounds_of([mission]))
-
-
 def _pit(drawn: np.ndarray, y: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Randomised PIT of rates (bound, robot) among draws (draw, bound, robot)."""
     below, equal = (drawn < y).sum(0), (drawn == y).sum(0)
     pit = (below + rng.random(y.shape) * (equal + 1.0)) / (len(drawn) + 1.0)
     return np.where(np.isnan(y), np.nan, pit)
-
-
-def _bound_by_bound(
-    conditional: Conditional,
-    params: Params,
-    mission: Mission,
-    batch: MissionBatch,
-    filtered: bool,
-    rng: np.random.Generator,
-) -> tuple[np.ndarray, np.ndarray | None]:
-    """Log density of each rate (bound, robot) averaged over draws, nats, and draws of the rates.
-
-    With `filtered` draws are weighted by the rates before, and rates (draw, bound, robot) are drawn
-    given these; otherwise nothing of the mission is measured, and rates are not drawn.
-    """
-    z, y, ticks = (a[0] for a in batch)
-    family, n_robots = conditional.family, y.shape[1]
-    core = live_filter(params, n_robots)
-    effects = [0.0] * len(y)
-    if params.places:
-        effects = np.moveaxis(params.of_places(bounds_of([mission])[0]), -2, 0)
-    (mean, var), log_scores = core.start(), np.full(y.shape, np.nan)
-    log_weight, drawn = np.full(len(mean), -np.log(len(mean))), []
-    for k, effect in enumerate(effects):
-        for i in np.flatnonzero(~np.isnan(y[k])):
-            alone = Rates(family, np.where(np.arange(n_robots) == i, y[k], np.nan), ticks[k])
-            density = core.update(mean, var, z[k], alone, effect)[2]
-            log_scores[k, i] = np.logaddexp.reduce(density + log_weight)
-        if not filtered:
-            mean, var = core.predict(mean, var, z[k], effect)
-            continue
-        x = core.draw(rng, mean, var)
-        rates = core.roll(rng, family, x, z[k], effect, ticks[k])[1]
-        drawn.append(rates[systematic(np.exp(log_weight), len(log_weight), rng)])
-        mean, var, gained = core.update(mean, var, z[k], Rates(family, y[k], ticks[k]), effect)
-        log_weight = log_weight + gained
-        log_weight -= np.logaddexp.reduce(log_weight)
-    log_scores += family.log_constant
-    return log_scores, np.stack(drawn, axis=1) if filtered else None
 
 
 def _bounds(mission: Mission) -> list[tuple[tuple[int, ...], ...]]:
@@ -237,14 +224,13 @@ def _dataset(
     quantile[np.isnan(y)] = np.nan
     made = np.arange(y.shape[1]) < np.array([len(m.bounds) for m in missions])[:, None]
     groups = {"all": made, "seen": made & seen, "new": made & ~seen}
-    names = ("mean", "pit", "log_score")
+    values = [y, *(columns[name] for name in ("mean", "pit", "log_score"))]
     rows = [
-        summarize_scores(*(np.where(mask[..., None], a, np.nan)
-                           for a in (y, *(columns[name] for name in names))))
-        for mask in (groups[name] for name in AMONG)
-    ]  # fmt: skip
+        summarize_scores(*(np.where(groups[name][..., None], a, np.nan) for a in values))
+        for name in AMONG
+    ]
     variables = {"contact_rate": (_DIMS, y), "quantile": ((*_DIMS, "level"), quantile)}
-    variables |= {name: (_DIMS, values) for name, values in columns.items()}
+    variables |= {name: (_DIMS, column) for name, column in columns.items()}
     variables |= {"seen": (("mission", "bound"), seen)}
     variables |= {name: (("among",), [row[name] for row in rows]) for name in rows[0]}
     coords = {

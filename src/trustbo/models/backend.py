@@ -11,7 +11,7 @@ something first avoids it; where it has happened already, the submodules are put
 
 import sys
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 from importlib.metadata import version
@@ -48,23 +48,6 @@ def namespace(x: Any) -> ModuleType:
 def call(prior: Any, method: str, x: jax.Array) -> jax.Array:
     """Call a method of a distribution as one program; else each operation in it is compiled."""
     return getattr(prior, method)(x)
-
-
-def in_batches(compiled: Callable[[Any], Any], inputs: Any, size: int) -> Any:
-    """Results of compiled code in batches of one size, so that any number meets one program.
-
-    Args:
-        compiled: Function of inputs with a leading axis of length `size`; its arrays have the same.
-        inputs: Arrays with one leading axis.
-        size: Number computed at once.
-    """
-    n = len(jax.tree.leaves(inputs)[0])
-    rows = np.minimum(np.arange(-(-n // size) * size), n - 1).reshape(-1, size)
-    parts = [
-        jax.tree.map(np.asarray, compiled(jax.tree.map(lambda a, row=row: a[row], inputs)))
-        for row in rows
-    ]
-    return jax.tree.map(lambda *arrays: np.concatenate(arrays)[:n], *parts)
 
 
 @contextmanager

@@ -1,12 +1,13 @@
-"""The state space as a NumPyro distribution, for models of your own."""
+"""The state space as NumPyro distributions, for models of your own and the programs of ours."""
 
+from typing import Any
+
+import jax
 import jax.numpy as jnp
 import numpyro.distributions as dist
-from jax import Array, random, vmap
+from jax import Array, lax, random
 from jax.typing import ArrayLike
 from numpyro.distributions import constraints
-
-from trustbo.models.state_space.scalar import ScalarSSM
 
 
 class ContactRate(dist.Distribution):
@@ -25,7 +26,7 @@ class ContactRate(dist.Distribution):
     """
 
     support = constraints.independent(constraints.real, 2)  # pyright: ignore
-    pytree_data_fields = ("ssm",)
+    pytree_data_fields = ("drift", "parameters")
 
     def __init__(
         self,
@@ -46,24 +47,106 @@ class ContactRate(dist.Distribution):
             x0_mean: Mean of trust before the first bound, shape ().
             x0_sd: Its standard deviation, shape ().
         """
-        parameters = (jnp.asarray(p) for p in (beta0, delta_w, delta_v, x0_mean, x0_sd))
-        beta0, delta_w, delta_v, x0_mean, x0_sd = parameters
-        bounds = jnp.swapaxes(drift, 0, 1)
-        self.ssm = ScalarSSM(beta0, bounds, delta_w, delta_v, x0_mean, x0_sd)
-        super().__init__(drift.shape[:1], drift.shape[1:])
+        self.drift = jnp.asarray(drift)
+        self.parameters = tuple(jnp.asarray(p) for p in (beta0, delta_w, delta_v, x0_mean, x0_sd))
+        super().__init__(self.drift.shape[:1], self.drift.shape[1:])
 
+    @jax.numpy_rank_promotion("allow")
     def log_prob(self, value: Array) -> Array:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Log density of each mission in nats, shape (mission,)."""
-        return self.ssm.log_likelihood(jnp.swapaxes(value, 0, 1)).sum(1)
+        """Log density of each mission in nats, shape (mission,): Kalman's filter."""
+        beta0, delta_w, delta_v, x0_mean, x0_sd = self.parameters
+        seen = ~jnp.isnan(value)
+        y = jnp.where(seen, value, 0.0)
 
+        def step(state: Any, inputs: Any) -> Any:
+            (m, P), (y, seen, u) = state, inputs
+            m, P = beta0 * m + u, beta0**2 * P + delta_w**2  # predict
+            F = P + delta_v**2
+            gain, e = jnp.where(seen, P / F, 0.0), y - m
+            log_p = jnp.where(seen, -0.5 * (e**2 / F + jnp.log(2.0 * jnp.pi * F)), 0.0)
+            return (m + gain * e, P * (1.0 - gain)), log_p  # update
+
+        start = (jnp.full(y[:, 0].shape, x) for x in (x0_mean, x0_sd**2))
+        bounds = tuple(jnp.swapaxes(a, 0, 1) for a in (y, seen, self.drift))
+        return lax.scan(step, tuple(start), bounds)[1].sum((0, 2))
+
+    @jax.numpy_rank_promotion("allow")
     def sample(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, key: Array, sample_shape: tuple[int, ...] = ()
     ) -> Array:
         """Contact rates, shape `(*sample_shape, mission, bound, robot)`."""
+        beta0, delta_w, delta_v, x0_mean, x0_sd = self.parameters
+        shape = *sample_shape, *self.drift.shape
+        w, v, e = (random.normal(k, shape) for k in random.split(key, 3))
+        x, rates = x0_mean + x0_sd * e[..., 0, :], []
+        for k in range(self.drift.shape[1]):
+            x = beta0 * x + self.drift[:, k] + delta_w * w[..., k, :]
+            rates.append(x + delta_v * v[..., k, :])
+        return jnp.stack(rates, axis=-2)
 
-        def one(key: Array) -> Array:
-            return jnp.swapaxes(self.ssm.simulate(key)[1], 0, 1)
 
-        for _ in sample_shape:
-            one = vmap(one)
-        return one(random.split(key, sample_shape))
+class CoupledContactRate(dist.Distribution):
+    """Contact rates of robots that influence each other, equations (1)-(2), trust integrated out.
+
+    x_k = B0 x_{k-1} + drift_k + w_k, y_k = x_k + v_k, with covariances Delta_w and Delta_v of w and
+    v, (robot, robot). Shapes and missing rates are as in `ContactRate`.
+    """
+
+    support = constraints.independent(constraints.real, 2)  # pyright: ignore
+    pytree_data_fields = ("drift", "parameters")
+
+    def __init__(
+        self,
+        drift: Array,
+        B0: Array,
+        Delta_w: Array,
+        Delta_v: Array,
+        x0_mean: ArrayLike = 0.5,
+        x0_sd: ArrayLike = 0.5,
+    ) -> None:
+        """Take the drift (mission, bound, robot) and the parameters."""
+        self.drift = jnp.asarray(drift)
+        self.parameters = tuple(jnp.asarray(p) for p in (B0, Delta_w, Delta_v, x0_mean, x0_sd))
+        super().__init__(self.drift.shape[:1], self.drift.shape[1:])
+
+    @jax.numpy_rank_promotion("allow")
+    def log_prob(self, value: Array) -> Array:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Log density of each mission in nats, shape (mission,): Kalman's filter."""
+        B0, Delta_w, Delta_v, x0_mean, x0_sd = self.parameters
+        n_missions, _, n = self.drift.shape
+        seen = ~jnp.isnan(value)
+        y = jnp.where(seen, value, 0.0)
+
+        def step(state: Any, inputs: Any) -> Any:
+            (m, P), (y, seen, u) = state, inputs
+            m, P = m @ B0.T + u, B0 @ P @ B0.T + Delta_w  # predict
+            both = seen[:, :, None] & seen[:, None, :]
+            F = jnp.where(both, P + Delta_v, jnp.eye(n))  # robots not measured: 1, apart
+            e = jnp.where(seen, y - m, 0.0)
+            H = jnp.where(seen[:, :, None], P, 0.0)
+            gain = jnp.swapaxes(jnp.linalg.solve(F, H), 1, 2)
+            log_p = -0.5 * (e * jnp.linalg.solve(F, e[..., None])[..., 0]).sum(1)
+            log_p -= 0.5 * (jnp.linalg.slogdet(F)[1] + seen.sum(1) * jnp.log(2.0 * jnp.pi))
+            return (m + (gain @ e[..., None])[..., 0], P - gain @ H), log_p  # update
+
+        start = (
+            jnp.full((n_missions, n), x0_mean),
+            jnp.tile(x0_sd**2 * jnp.eye(n), (n_missions, 1, 1)),
+        )
+        bounds = tuple(jnp.swapaxes(a, 0, 1) for a in (y, seen, self.drift))
+        return lax.scan(step, start, bounds)[1].sum(0)
+
+    @jax.numpy_rank_promotion("allow")
+    def sample(  # pyright: ignore[reportIncompatibleMethodOverride]
+        self, key: Array, sample_shape: tuple[int, ...] = ()
+    ) -> Array:
+        """Contact rates, shape `(*sample_shape, mission, bound, robot)`."""
+        B0, Delta_w, Delta_v, x0_mean, x0_sd = self.parameters
+        w, v = (jnp.linalg.cholesky(covariance) for covariance in (Delta_w, Delta_v))
+        shape = *sample_shape, *self.drift.shape
+        e_w, e_v, e = (random.normal(k, shape) for k in random.split(key, 3))
+        x, rates = x0_mean + x0_sd * e[..., 0, :], []
+        for k in range(self.drift.shape[1]):
+            x = x @ B0.T + self.drift[:, k] + e_w[..., k, :] @ w.T
+            rates.append(x + e_v[..., k, :] @ v.T)
+        return jnp.stack(rates, axis=-2)

@@ -4,130 +4,115 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
-import numpyro
-from jax import Array
-from numpyro.distributions import Distribution, LKJCholesky
+import numpyro.distributions as dist
+from numpyro.distributions import Distribution
 
-from trustbo.errors import TrustboError, require_choice
-from trustbo.models.model import TrustModel, register, sample
-from trustbo.models.params import CoupledParams, Params, RobotParams
-from trustbo.models.priors_numpy import draw, draw_lkj_cholesky
+from trustbo.models.backend import namespace
+from trustbo.models.contact_rate import CoupledContactRate
+from trustbo.models.effects.effect import Theta
+from trustbo.models.effects.weights import CoupledWeights
+from trustbo.models.model import TrustModel
+from trustbo.models.params import CoupledParams
+from trustbo.models.signal import Signal
+from trustbo.models.slots import Layout, Slots
 
-INTER_ROBOT = ("full", "none")
+_DIAGONALS = {"beta0", "coupling", "delta_w", "delta_v", "partial_w", "partial_v"}
 
 
-@register
 @dataclass(frozen=True, repr=False)
 class CoupledTrust(TrustModel):
-    """Trust model with separate parameters for each robot, equations (1)-(2).
+    """Robots that influence each other, with separate parameters, equations (1)-(2).
 
-    Attributes:
-        inter_robot: `"full"`, the paper's: matrices B0 and B_m, shrunk towards their diagonals by
-            `Priors.coupling`, and covariances diag(sd) LKJ diag(sd). `"none"`: diagonals only,
-            robots apart.
+    x_k = B0 x_{k-1} + sum_m B_m z_{k,m} + b + w_k,  y_k = x_k + v_k,  w ~ N(0, Delta_w),
+    v ~ N(0, Delta_v)
+
+    B0 and B_m are shrunk towards their diagonals by `Priors.coupling`; the covariances are
+    diag(sd) LKJ diag(sd).
     """
 
-    inter_robot: str = "full"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_choice("inter_robot", self.inter_robot, INTER_ROBOT)
-        if self.place is not None and self.inter_robot == "full":
-            raise TrustboError(
-                f'effects of places need inter_robot="none"; got {self.inter_robot!r}. Give '
-                "place=None."
-            )
-
-    def sample_params(self, n_robots: int, n_features: int) -> Params:
-        """Sample statements; see the class for the coupling of the robots."""
-        if self.inter_robot == "full":
-            return self._sample_full(n_robots, n_features)
-        priors, robot = self.priors, (n_robots,)
-        beta0 = sample("beta0", priors.beta0, robot)
-        return RobotParams(
-            beta0=beta0,
-            beta=sample("beta", priors.weights(beta0), (n_robots, n_features)),
-            b=sample("b", priors.intercept(beta0), robot),
-            delta_w=sample("delta_w", priors.delta_w, robot),
-            delta_v=sample("delta_v", priors.delta_v, robot),
-            x0_mean=priors.x0_mean,
-            x0_sd=priors.x0_sd,
-        )
-
-    def _sample_full(self, n_robots: int, n_features: int) -> CoupledParams:
-        priors, off = self.priors, n_robots * (n_robots - 1)
-        beta0 = sample("B0_diagonal", priors.beta0, (n_robots,))
-        B0 = _matrix(beta0, sample("B0_coupling", priors.coupling, (off,)))
-        # (robot, feature): a prior that differs by feature has it last.
-        diagonal = sample("B_diagonal", priors.weights(beta0), (n_robots, n_features)).T
-        B = _matrix(diagonal, sample("B_coupling", priors.coupling, (n_features, off)))
-        return CoupledParams(
-            B0=numpyro.deterministic("B0", B0),
-            B=numpyro.deterministic("B", B),
-            b=sample("b", priors.intercept(beta0), (n_robots,)),
-            Delta_w=self._covariance("w", priors.delta_w, n_robots),
-            Delta_v=self._covariance("v", priors.delta_v, n_robots),
-            x0_mean=priors.x0_mean,
-            x0_sd=priors.x0_sd,
-        )
-
-    def _covariance(self, noise: str, sd_prior: Distribution, n_robots: int) -> Array:
-        sd = sample(f"delta_{noise}", sd_prior, (n_robots,))
-        factor = jnp.eye(n_robots)
-        if n_robots > 1 and self._correlates(noise):
-            lkj = LKJCholesky(n_robots, self.priors.concentration)
-            factor = jnp.asarray(numpyro.sample(f"corr_{noise}", lkj))
-        factor = sd[:, None] * factor
-        return jnp.asarray(numpyro.deterministic(f"Delta_{noise}", factor @ factor.T))
-
-    def draw_prior(
-        self, shape: tuple[int, int], n: int, rng: np.random.Generator
-    ) -> dict[str, np.ndarray]:
-        """See `TrustModel.draw_prior`."""
-        (n_robots, n_features), priors = shape, self.priors
-        shapes = {"beta": (n_robots, n_features)}
-        drawn = priors.of_stationary({
-            name: draw(getattr(priors, name), (n, *shapes.get(name, (n_robots,))), rng)
-            for name in RobotParams._fields[:5]
-        })  # fmt: skip
-        if self.inter_robot != "full":
-            return drawn
-        off, diagonal = n_robots * (n_robots - 1), np.swapaxes(drawn["beta"], 1, 2)
-        return {
-            "B0": _matrix(drawn["beta0"], draw(priors.coupling, (n, off), rng)),
-            "B": _matrix(diagonal, draw(priors.coupling, (n, n_features, off), rng)),
-            "b": drawn["b"],
-            "Delta_w": self._draw_covariance("w", drawn["delta_w"], rng),
-            "Delta_v": self._draw_covariance("v", drawn["delta_v"], rng),
-        }
-
-    def _draw_covariance(self, noise: str, sd: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        factor = np.eye(sd.shape[-1])
-        if self._correlates(noise):
-            factor = draw_lkj_cholesky(self.priors.concentration, sd.shape, rng)
-        factor = sd[..., None] * factor
-        return factor @ np.swapaxes(factor, 1, 2)
-
-    def _correlates(self, noise: str) -> bool:
-        # Rates that are independent given trust have noise without correlations.
-        return noise == "w" or self.family.correlates
-
     @property
-    def dims(self) -> dict[str, tuple[str, ...]]:
-        """Axes of the matrices, or of each robot's coefficients if robots are apart."""
-        if self.inter_robot == "full":
-            return {name: CoupledParams.AXES[name] for name in CoupledParams._fields[:5]}
-        return {name: RobotParams.AXES[name] for name in RobotParams._fields[:5]} | self.place_dims
+    def weights(self) -> CoupledWeights:
+        """See `TrustModel.weights`."""
+        return CoupledWeights(self.priors)
+
+    def hyperpriors(self, n_robots: int, n_features: int) -> dict[str, Distribution]:
+        """See `TrustModel.hyperpriors`: correlations by canonical partial correlations."""
+        n, priors = n_robots, self.priors
+        sizes = {"beta0": n, "delta_w": n, "delta_v": n}
+        named = {name: getattr(priors, name).expand((size,)) for name, size in sizes.items()}
+        if n == 1:
+            return named
+        named["coupling"] = priors.coupling.expand((n * (n - 1),))
+        column = np.tril_indices(n, -1)[1]
+        shape = priors.concentration + 0.5 * (n - 2 - column)
+        partials = {"partial_w": dist.Beta(shape, shape)}
+        if self.family.correlates:
+            partials["partial_v"] = dist.Beta(shape, shape)
+        return named | partials
+
+    def derived(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """See `TrustModel.derived`: B0, Delta_w and Delta_v of diagonals and correlations."""
+        if "B0" in values:
+            B0 = values["B0"]
+            return {**values, "rest": 1.0 - namespace(B0).diagonal(B0, axis1=1, axis2=2)}
+        beta0, xp = values["beta0"], namespace(values["beta0"])
+        n = beta0.shape[1]
+        B0 = beta0[:, :, None] * np.eye(n)
+        if n > 1:
+            place = np.zeros((n * (n - 1), n * n))
+            place[np.arange(n * (n - 1)), np.flatnonzero(~np.eye(n, dtype=bool))] = 1.0
+            B0 = B0 + (values["coupling"] @ place).reshape(-1, n, n)
+        derived: dict[str, Any] = {"B0": B0, "rest": 1.0 - beta0}
+        for noise in ("w", "v"):
+            factor = xp.broadcast_to(np.eye(n), B0.shape)
+            if f"partial_{noise}" in values:
+                factor = correlation_factor(2.0 * values[f"partial_{noise}"] - 1.0, n)
+            factor = values[f"delta_{noise}"][:, :, None] * factor
+            derived[f"Delta_{noise}"] = factor @ xp.swapaxes(factor, 1, 2)
+        return derived | {name: values[name] for name in values.keys() - _DIAGONALS}
+
+    def layout(self, slots: Slots, *, contrasts: bool = True) -> Layout:
+        """See `TrustModel.layout`: a block is a mission."""
+        return Layout(slots.y.shape, joint=True)
+
+    def signal(self, theta: Theta, slots: Slots, layout: Layout) -> Signal:
+        """Trust of all robots at all bounds; rows are (bound, robot).
+
+        Rates' noise is Delta_v - eps 1, which robots share, and independent noise of variance eps.
+        """
+        B0, K, (n, R, _) = theta["B0"], slots.n_bounds, theta["B0"].shape
+        xp: Any = namespace(B0)
+        powers = [xp.broadcast_to(xp.eye(R), B0.shape)]
+        for _ in range(K):
+            powers.append(powers[-1] @ B0)
+        zero = xp.zeros_like(B0)
+        rows = [
+            xp.stack([powers[k - j] if k >= j else zero for j in range(K)], 1) for k in range(K)
+        ]
+        T = xp.swapaxes(xp.stack(rows, 1), 2, 3).reshape(n, K * R, K * R)
+        start = xp.stack(powers[1:], 1).reshape(n, K * R, R)
+        S = T @ _of_bounds(theta["Delta_w"], K) @ xp.swapaxes(T, 1, 2)
+        S = S + self.x0["x0_sd"] ** 2 * start @ xp.swapaxes(start, 1, 2)
+        m, noise = (self.x0["x0_mean"] * start.sum(2))[:, None], theta["Delta_v"]
+        if not self.family.correlates:
+            sd = xp.sqrt(xp.diagonal(noise, axis1=1, axis2=2))
+            return Signal(m, T[:, None], S[:, None], xp.tile(sd[:, None], (1, 1, K)))
+        eps = 0.5 * xp.linalg.eigvalsh(noise)[:, 0]
+        noise = _of_bounds(noise - eps[:, None, None] * np.eye(R), K)
+        return Signal(m, T[:, None], S[:, None], xp.sqrt(eps)[:, None, None], noise[:, None])
+
+    def rates(self, theta: Theta, drift: Any) -> CoupledContactRate:
+        """See `TrustModel.rates`."""
+        B0, Delta_w, Delta_v = (theta[name][0] for name in ("B0", "Delta_w", "Delta_v"))
+        return CoupledContactRate(drift, B0, Delta_w, Delta_v, **self.x0)
 
     def prior_terms(self, sites: Mapping[str, np.ndarray]) -> dict[str, tuple[str, np.ndarray]]:
-        """See `TrustModel.prior_terms`: diagonals, off-diagonals and noises, correlations apart."""
-        if self.inter_robot == "none":
-            return super().prior_terms(sites)
-        n = sites["b"].shape[-1]
-        off = ~np.eye(n, dtype=bool)
-        diagonal = {name: np.einsum("...ii->...i", sites[name]) for name in sites if name != "b"}
+        """See `TrustModel.prior_terms`: diagonals, off-diagonals and noises."""
+        off = ~np.eye(sites["b"].shape[-1], dtype=bool)
+        diagonal = {
+            name: np.einsum("...ii->...i", sites[name]) for name in self.dims if name != "b"
+        }
         return {
             "B0": ("beta0", diagonal["B0"]),
             "B0_coupling": ("coupling", sites["B0"][..., off]),
@@ -139,15 +124,27 @@ class CoupledTrust(TrustModel):
         }
 
     @property
-    def robot_sets(self) -> str:
-        """See `TrustModel.robot_sets`."""
-        return "each" if self.inter_robot == "none" else "coupled"
+    def dims(self) -> dict[str, tuple[str, ...]]:
+        """See `TrustModel.dims`."""
+        return {name: CoupledParams.AXES[name] for name in CoupledParams._fields[:5]}
 
 
-def _matrix(diagonal: Any, off_diagonal: Any) -> Any:
-    """Square matrices of a diagonal (..., robot) and the other entries, row by row."""
-    xp = np if isinstance(diagonal, np.ndarray) else jnp
-    n = diagonal.shape[-1]
-    place = np.diag(np.arange(n))
-    place[~np.eye(n, dtype=bool)] = np.arange(n, n * n)
-    return xp.concatenate([diagonal, off_diagonal], axis=-1)[..., place]
+def correlation_factor(r: Any, n: int) -> Any:
+    """Cholesky factors (point, n, n) of correlations, of partial ones (point, n (n - 1) / 2)."""
+    xp, k, rows = namespace(r), 0, []
+    for i in range(n):
+        left, row = xp.ones(len(r)), []
+        for _ in range(i):
+            row.append(r[:, k] * left)
+            left = left * xp.sqrt(1.0 - r[:, k] ** 2)
+            k += 1
+        zeros = [xp.zeros(len(r))] * (n - 1 - i)
+        rows.append(xp.stack([*row, left, *zeros], axis=1))
+    return xp.stack(rows, axis=1)
+
+
+def _of_bounds(Q: Any, K: int) -> Any:
+    """Block diagonal matrices of K copies of matrices (point, n, n)."""
+    n, R, _ = Q.shape
+    blocks = np.eye(K)[None, :, None, :, None] * Q[:, None, :, None, :]
+    return blocks.reshape(n, K * R, K * R)

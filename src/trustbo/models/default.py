@@ -16,5 +16,5 @@ def default_model(observation: str = "gaussian", *, places: bool = True) -> Pool
     Raises:
         TrustboError: The family is unknown.
     """
-    place = PlaceEffect() if places else None
-    return PooledTrust(observation=observation, place=place, effects=(RobotEffect(),))
+    effects = (PlaceEffect(),) * places + (RobotEffect(),)
+    return PooledTrust(observation=observation, effects=effects)

@@ -1,42 +1,47 @@
-"""The base of all trust models: numpyro model, likelihood, simulation, sufficient statistics."""
+"""The protocol of trust models: an equation as matrices, its priors, and a NumPyro program."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import partial
 from typing import Any, ClassVar, Self
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import numpyro
 import numpyro.distributions as dist
 from jax import Array
 from numpy.typing import ArrayLike
+from numpyro.distributions import Distribution
+from scipy import sparse
 
 from trustbo.data import Mission
 from trustbo.display import Rows, Summary
 from trustbo.errors import ShapeError, TrustboError, require_choice
-from trustbo.models.backend import own_settings
-from trustbo.models.effects.effect import Effect, Slots, rest_of
+from trustbo.models.backend import namespace
+from trustbo.models.effects.effect import EFFECTS, Effect, Theta, sample_columns
 from trustbo.models.effects.place import PlaceEffect
-from trustbo.models.effects.sampled import SampledDrift
-from trustbo.models.exactness import why_not_exact
+from trustbo.models.effects.weights import Weights
 from trustbo.models.families import FAMILIES, Family, family_of
 from trustbo.models.params import Params, assemble_params, check_params
-from trustbo.models.place import bounds_of, places_of
 from trustbo.models.priors import Priors
-from trustbo.models.priors_numpy import draw
-from trustbo.models.state_space.contact_rate import ModelRates, mission_log_likelihood
-from trustbo.models.state_space.generate import TrustSample, draw_missions
-from trustbo.models.ticks import broadcast_ticks, require_ticks, resolution, weigh_ticks
-from trustbo.stacking import stack_missions
+from trustbo.models.signal import Signal
+from trustbo.models.simulate import TrustSample, draw_missions
+from trustbo.models.slots import Layout, Slots
+from trustbo.models.ticks import broadcast_ticks, require_ticks
+from trustbo.models.visited import places_of
+from trustbo.workspace import Workspace
 
 _STREAM = 0x6D697373  # of `simulate`, among all that a seed gives
 
 
 @dataclass(frozen=True, repr=False)
 class TrustModel(Summary, ABC):
-    """Trust model; callable as a numpyro model, so that `MCMC(NUTS(model))` works.
+    """A trust model.
+
+    A model is a file with `weights`, `hyperpriors`, `derived`, `layout`, `signal` (the equation as
+    matrices), `rates` (the equation as a distribution) and `dims`. Inference, posteriors and plans
+    need no more.
 
     Attributes:
         priors: Prior of each parameter; by default those of the family of observations and of the
@@ -44,17 +49,16 @@ class TrustModel(Summary, ABC):
         observation: Family of observations: `"gaussian"`, the paper's; `"censored"`, rates of 0
             and 1 being limits; `"beta_binomial"`, ticks in contact out of `Bound.n_ticks` ticks,
             trust being a logit.
-        place: Effects of places that awareness does not explain; None is the paper's model.
+        effects: Effects that add to trust, such as `PlaceEffect()`, of places that awareness does
+            not explain, and `RobotEffect()`, of each robot in each mission; none in the paper.
 
     Raises:
-        TrustboError: A name is unknown, or robots that influence each other are to have effects of
-            places.
+        TrustboError: A name is unknown, or effects are no effects, or two of one kind.
     """
 
     priors: Priors = None  # pyright: ignore[reportAssignmentType]
     observation: str = "gaussian"
-    place: PlaceEffect | None = None
-    effects: ClassVar[tuple[Effect, ...]] = ()  # see `PooledTrust`
+    effects: tuple[Effect, ...] = ()
     memory: ClassVar[str] = "level"  # see `PooledTrust`
 
     def __post_init__(self) -> None:
@@ -63,125 +67,69 @@ class TrustModel(Summary, ABC):
             object.__setattr__(self, "priors", Priors.default(self.observation))
         elif not isinstance(self.priors, Priors):
             raise TrustboError(f"priors must be a trustbo.models.Priors; got {self.priors!r}.")
-        if not isinstance(self.place, PlaceEffect | None):
-            raise TrustboError(f"place must be a PlaceEffect or None; got {self.place!r}.")
+        given: Any = self.effects
+        effects = (given,) if isinstance(given, Effect) else tuple(given)
+        if unknown := [e for e in effects if type(e) not in EFFECTS.values()]:
+            raise TrustboError(
+                f"effects must be of {', '.join(f'{n}()' for n in EFFECTS)}, or of a class that is "
+                f"registered; got {unknown[0]!r}."
+            )
+        if len({type(effect) for effect in effects}) < len(effects):
+            raise TrustboError(f"effects must be of different kinds; got {effects!r}.")
+        object.__setattr__(self, "effects", effects)
 
     # --- defined by each model ---
 
+    @property
     @abstractmethod
-    def sample_params(self, n_robots: int, n_features: int) -> Params:
-        """Sample statements of the parameters, assembled."""
+    def weights(self) -> Weights:
+        """The columns of features and of the intercept."""
+
+    @abstractmethod
+    def hyperpriors(self, n_robots: int, n_features: int) -> dict[str, Distribution]:
+        """Priors of the parameters that do not integrate out, numbers or vectors, by name."""
+
+    @abstractmethod
+    def derived(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Hyperparameters as `signal` takes them, and `rest`, see `effects.effect.Theta`.
+
+        `values` are hyperparameters (point, ...) by the names of `hyperpriors`, or those of a
+        posterior.
+        """
+
+    @abstractmethod
+    def layout(self, slots: Slots, *, contrasts: bool = True) -> Layout:
+        """The blocks that slots form; without contrasts, rows are rates of robots."""
+
+    @abstractmethod
+    def signal(self, theta: Theta, slots: Slots, layout: Layout) -> Signal:
+        """The equation of the model: trust along all bounds, in NumPy or JAX."""
+
+    @abstractmethod
+    def rates(self, theta: Theta, drift: Any) -> Distribution:
+        """Distribution of Gaussian rates given the drift (mission, bound, robot); one point."""
 
     @property
     @abstractmethod
     def dims(self) -> dict[str, tuple[str, ...]]:
-        """Axes of each parameter in a posterior."""
+        """Axes of each parameter in a posterior, but those of effects."""
+
+    # --- shared by all models ---
 
     @property
-    def place_dims(self) -> dict[str, tuple[str, ...]]:
-        """Axes of the hyperparameters of places, where these have effects."""
-        return {} if self.place is None else {name: () for name in self.place.names}
+    def columns(self) -> tuple[Effect, ...]:
+        """Weights and effects, whose columns the blocks share."""
+        return self.weights, *self.effects
+
+    @property
+    def place(self) -> PlaceEffect | None:
+        """The effects of places, if there are any."""
+        return next((e for e in self.effects if isinstance(e, PlaceEffect)), None)
 
     @property
     def effect_dims(self) -> dict[str, tuple[str, ...]]:
-        """Axes of the hyperparameters of all effects, those of places among them."""
-        return {name: () for effect in self.all_effects for name in effect.names}
-
-    @property
-    def all_effects(self) -> list[Effect]:
-        """All effects, those of places first, as columns of the evidence."""
-        return [*([] if self.place is None else [self.place]), *self.effects]
-
-    @property
-    def robot_sets(self) -> str:
-        """Kind of the robots' parameters, by which samplers choose scores and an evidence.
-
-        `"all"` robots share them, `"each"` has separate ones; these two have sufficient statistics.
-        Those of `"pooled"` robots have a common distribution, `"coupled"` robots influence each
-        other. Only NUTS takes any `"other"`.
-        """
-        return "other"
-
-    @property
-    def priors_are_independent(self) -> bool:
-        """Whether each field of the parameters has an independent prior of that name."""
-        return self.robot_sets in ("all", "each")
-
-    def prior_terms(self, sites: Mapping[str, np.ndarray]) -> dict[str, tuple[str, np.ndarray]]:
-        """Field of `Priors` and values of each parameter with an independent prior, by label.
-
-        Args:
-            sites: Parameters of a posterior, leading axes (...), with the axes of `dims`.
-        """
-        return {name: (name, sites[name]) for name in self.dims if name not in self.effect_dims}
-
-    def own_log_prior(self, sites: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Log prior density (chain, draw), by label, of parameters without a field in `Priors`."""
-        return {}
-
-    def draw_prior(
-        self, shape: tuple[int, int], n: int, rng: np.random.Generator
-    ) -> dict[str, np.ndarray] | None:
-        """Draws of the parameters but those of effects, (draw, ...), by name.
-
-        None where only the numpyro model can draw them, which takes long to compile.
-        """
-        if not self.priors_are_independent:
-            return None
-        priors = self.priors
-        drawn = {
-            name: draw(getattr(priors, name), (n, *size), rng)
-            for name, size in self.sizes(*shape).items()
-        }
-        return priors.of_stationary(drawn, rest_of(drawn["beta0"], self.memory))
-
-    def for_features(self, features: Sequence[str]) -> Self:
-        """The model with default priors for features of these names; custom priors stay.
-
-        See `Priors.of`. `fit` and campaigns call it.
-        """
-        if self.priors is not Priors.default(self.observation):
-            return self
-        return replace(self, priors=Priors.of(tuple(features), self.observation))
-
-    def at_resolution(self, ticks: Mapping[float, float]) -> Self:
-        """The model whose delta_v is no less than the resolution of rates of so many ticks.
-
-        Without this floor the density of rates that fit perfectly, constant ones among them, would
-        grow without bound as the noises go to 0.
-
-        Args:
-            ticks: Weight of the rates by their number of ticks.
-
-        Raises:
-            TrustboError: The prior of delta_v has next to no mass above the floor.
-        """
-        if not self.family.rounds:
-            return self
-        return replace(self, priors=self.priors.above_resolution(resolution(ticks)))
-
-    def sizes(self, n_robots: int, n_features: int) -> dict[str, tuple[int, ...]]:
-        """Shape of each parameter in a posterior, without those of effects."""
-        length = {"robot": n_robots, "robot_": n_robots}
-        length["feature"] = n_features
-        dims = {name: axes for name, axes in self.dims.items() if name not in self.effect_dims}
-        return {name: tuple(length[axis] for axis in axes) for name, axes in dims.items()}
-
-    def options(self) -> dict[str, str]:
-        """Options by name, without the priors and the effects, nor the usual memory."""
-        others = ("priors", "place", "effects", *("memory",) * (self.memory == "level"))
-        return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in others}
-
-    def params(self, sites: Mapping[str, Any], n_features: int) -> Params:
-        """Build parameters from values by name, leading axes (draw,) or none.
-
-        Args:
-            sites: Values with the axes of `dims`.
-            n_features: Number of features.
-        """
-        return assemble_params(sites, self.x0, self.memory)
-
-    # --- shared by all models ---
+        """Axes of the hyperparameters of effects."""
+        return {name: () for effect in self.effects for name in effect.names}
 
     @property
     def family(self) -> Family:
@@ -193,89 +141,91 @@ class TrustModel(Summary, ABC):
         """Mean and sd of trust before the first bound, by name."""
         return {name: float(getattr(self.priors, name)) for name in ("x0_mean", "x0_sd")}
 
-    def __call__(
-        self,
-        awareness: Array,
-        contact_rate: Array | None = None,
-        *,
-        n_ticks: Array | None = None,
-        drift: Callable[[Any], Array] | None = None,
-    ) -> None:
-        """The numpyro model.
+    def all_hyperpriors(self, slots: Slots) -> dict[str, Distribution]:
+        """Priors of all hyperparameters, those of effects last, by name."""
+        priors = self.hyperpriors(slots.n_robots, slots.z.shape[3])
+        return priors | {n: p for e in self.effects for n, p in e.hyperpriors().items()}
 
-        Args:
-            awareness: Shape (mission, bound, robot, feature).
-            contact_rate: Shape (mission, bound, robot), NaN where not measured; None draws it.
-            n_ticks: Ticks, of that shape; the beta-binomial family needs them.
-            drift: Function of parameters, to what effects add to the drift, of that shape.
+    def theta(self, values: Mapping[str, Any], resolution: float) -> dict[str, Any]:
+        """Hyperparameters as `signal` takes them, of values under `all_hyperpriors`.
+
+        Rates recorded to a resolution have independent noise of that sd too: without it the density
+        of rates that fit perfectly, constant ones among them, would grow without bound.
         """
-        n_missions, n_bounds, n_robots, n_features = awareness.shape
-        params, innovations = self.sample_params(n_robots, n_features), None
-        if drift is not None:
-            params: Any = params._replace(b=params.b + drift(params))  # pyright: ignore
-        if not self.family.integrates_out:
-            innovations = sample_innovations((n_bounds, n_missions, n_robots))
-        rates = ModelRates(
-            params,
-            awareness,
-            n_ticks=n_ticks,
-            innovations=innovations,
-            observation=self.observation,
-        )
-        with numpyro.plate("mission", n_missions):
-            numpyro.sample("contact_rate", rates, obs=contact_rate)
+        if self.family.rounds:
+            noise = values["delta_v"]
+            noise = namespace(noise).hypot(noise, resolution)
+            values = {**values, "delta_v": noise}
+        return self.derived(values)
 
-    def numpyro_model(self, missions: Sequence[Mission]) -> Callable[[], None]:
-        """The numpyro model of missions, as a function without arguments.
+    def prior_terms(self, sites: Mapping[str, np.ndarray]) -> dict[str, tuple[str, np.ndarray]]:
+        """Field of `Priors` and values of each parameter with an independent prior, by label."""
+        return {name: (name, sites[name]) for name in self.dims}
 
-        With the effects of places and of robots, and the priors that `fit` takes for these
-        missions: for a kernel of numpyro, SVI, or `numpyro.render_model`. Effects are sampled as
-        white coefficients, and not integrated out as in `fit`, which is much faster. Call
-        it, and the kernel, within `jax.enable_x64(True)`: effects need double precision.
+    def slots(self, missions: Sequence[Mission], workspace: Workspace | None = None) -> Slots:
+        """Rates and features of missions, with the places that the model's effects are of.
 
         Raises:
             ShapeError: There are no missions, or they disagree on robots or features.
-            TrustboError: An awareness value is NaN, or no rate was measured.
+            TrustboError: An awareness value is NaN, a measured rate lacks the number of ticks that
+                the family needs, or a path jumps or leaves the workspace.
         """
-        batch = stack_missions(missions)
-        ticks = weigh_ticks(batch, np.ones(len(batch.contact_rate)))
-        if not ticks:
-            raise TrustboError("every contact rate is NaN: nothing was measured.")
-        model = self.for_features(missions[0].features).at_resolution(ticks)
-        require_ticks(model.family, batch)
-        drift, shape = None, batch.contact_rate.shape
-        if model.place is not None or model.effects:
-            places = places_of(missions, model.place, shape)
-            slots = Slots.of(batch, len(missions), missions[0].features, places=places)
-            drift = SampledDrift(model.all_effects, slots, shape, model.memory)
-        rates: Any = batch.awareness, batch.contact_rate
-        return partial(model, *rates, n_ticks=batch.n_ticks, drift=drift)
+        slots = Slots.of(missions)
+        require_ticks(self.family, slots.y, slots.n_ticks)
+        return slots._replace(visited=places_of(missions, self.place, slots.y.shape, workspace))
 
-    def log_likelihood(
-        self, params: Params, missions: Sequence[Mission], *, seed: int = 0
-    ) -> np.ndarray:
-        """Log p(contact rates | parameters), latent trust integrated out; nats, (..., mission).
+    def for_features(self, features: Sequence[str]) -> Self:
+        """The model with default priors for features of these names; custom priors stay.
 
-        Exact for Gaussian observations, else importance sampling over 32 antithetic trajectories by
-        `seed`. A density of rates; for censored ones with mass at 0 and 1, for counts a
-        probability. Parameters have leading axes (...,); a contact rate that is NaN was not
-        measured.
-
-        Raises:
-            ShapeError: The parameters are for another number of features or robots.
-            TrustboError: Awareness is NaN, a covariance is not positive definite, or n_ticks is
-                missing where the family needs it.
+        See `Priors.of`. `fit` and campaigns call it.
         """
-        batch = stack_missions(missions)
-        check_params(params, batch.awareness.shape[2], batch.awareness.shape[3])
-        require_ticks(self.family, batch)
-        leading, flat = params.leading, params.flat()
-        if params.places:
-            flat = flat.on(bounds_of(missions, batch.contact_rate.shape[:2]))
-        with own_settings():
-            key = jax.random.key(seed)
-            values = mission_log_likelihood(self.family, flat, *batch, key)
-        return np.asarray(values)[:, : len(missions)].reshape(*leading, len(missions))
+        if self.priors is not Priors.default(self.observation):
+            return self
+        return replace(self, priors=Priors.of(tuple(features), self.observation))
+
+    def program(self, slots: Slots, *, observed: bool = True) -> None:
+        """The model as a plain NumPyro program, for any kernel: `MCMC(NUTS(model.program))`.
+
+        Everything is sampled but trust, which integrates out of Gaussian rates alone. Call it
+        within `jax.enable_x64(True)`: effects need double precision.
+
+        Args:
+            slots: Rates and features, see `slots`.
+            observed: Whether to condition on the rates; else they are sampled.
+        """
+        values = {
+            name: numpyro.sample(name, prior.to_event(len(prior.batch_shape)))
+            for name, prior in self.all_hyperpriors(slots).items()
+        }
+        values = {name: jnp.asarray(value)[None] for name, value in values.items()}
+        theta = self.theta(values, slots.resolution)
+        c = sample_columns(self.columns, theta, slots)
+        U = sparse.hstack([effect.columns(slots) for effect in self.columns], format="csr")
+        if self.family.gaussian and "delta_s" not in theta:
+            drift = (U.toarray() @ c).reshape(slots.y.shape)
+            with numpyro.plate("mission", slots.n_missions):
+                rates = self.rates(theta, drift)
+                numpyro.sample("contact_rate", rates, obs=slots.y if observed else None)
+        else:
+            layout = self.layout(slots, contrasts=False)
+            u = (layout.columns(U).toarray() @ c).reshape(len(layout.label), -1)
+            self._program_of_trust(self.signal(theta, slots, layout), layout, u, slots)
+
+    def _program_of_trust(self, signal: Signal, layout: Layout, u: Any, slots: Slots) -> None:
+        """Sample statements of the signal given the drift, and the factor of the rates."""
+        y, ticks = layout.rows(slots.y), layout.rows(slots.n_ticks)
+        root = jnp.linalg.cholesky(signal.covariance[0] + 1e-10 * jnp.eye(y.shape[1]))
+        white = dist.Normal(0.0, 1.0).expand(y.shape).to_event(2)
+        e = numpyro.sample("trust_noise", white)
+        f = signal.m[0] + (signal.T[0] @ u[..., None])[..., 0] + (root @ e[..., None])[..., 0]
+        seen = ~np.isnan(y)
+        some, N = np.where(seen, y, 0.5), np.where(ticks > 0.0, ticks, 1.0)
+        log_p = self.family.log_prob(some, N, f, signal.sd[0])
+        numpyro.factor("contact_rate", jnp.where(seen, log_p, 0.0).sum())
+
+    def params(self, sites: Mapping[str, Any]) -> Params:
+        """Parameters of values by name, (draw, ...), with the axes of `dims`."""
+        return assemble_params(sites, self.x0, self.memory)
 
     def simulate(
         self,
@@ -314,28 +264,25 @@ class TrustModel(Summary, ABC):
         drawn = draw_missions(self.family, one, z, ticks, rng)
         return TrustSample(*(values[0] for values in drawn))
 
-    @property
-    def why_not_exact(self) -> str | None:
-        """Reason why the exact sampler cannot treat the model; None if it can."""
-        return why_not_exact(self)
+    def options(self) -> dict[str, Any]:
+        """Options to record, by name; priors, effects and the usual memory are left out."""
+        others = ("priors", "effects", *("memory",) * (self.memory == "level"))
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in others}
 
     def _rows(self) -> Rows:
-        rows = [
+        return [
             ("rates", self.observation),
             *((n, str(v)) for n, v in self.options().items() if n != "observation"),
-            ("places", "no effects" if self.place is None else self.place.in_short()),
             *(("effects", effect.in_short()) for effect in self.effects),
-            ("sampler", "exact" if self.why_not_exact is None else f"nuts: {self.why_not_exact}"),
         ]
-        return rows
 
     def in_short(self) -> str:
-        """Name, effects of places, family, and the options that differ from their defaults."""
+        """Name, effects, family, and the options that differ from their defaults."""
         usual = {f.name: f.default for f in fields(self)}
         others = [
             f"{name} {value}"
             for name, value in self.options().items()
-            if name not in ("observation", "parameters") and value != usual.get(name)
+            if name != "observation" and value != usual.get(name)
         ]
         return ", ".join([type(self).__name__, *self.nouns, self.observation, *others])
 
@@ -348,31 +295,7 @@ class TrustModel(Summary, ABC):
     @property
     def nouns(self) -> list[str]:
         """Plural of what has effects."""
-        return ["places"] * (self.place is not None) + [e.noun for e in self.effects]
-
-    def describe(self) -> str:
-        """Text of the model's name and options."""
-        listed = ", ".join(f'{name}="{value}"' for name, value in self.options().items())
-        listed += "" if self.place is None else f", place={self.place}"
-        listed += f", effects={list(self.effects)}" if self.effects else ""
-        return f"{type(self).__name__}({listed})"
-
-
-def sample(name: str, prior: dist.Distribution, shape: tuple[int, ...] = ()) -> Array:
-    """A sample statement of independent parameters of that shape."""
-    return numpyro.sample(name, prior.expand(shape).to_event(len(shape)))  # pyright: ignore
-
-
-def sample_innovations(shape: tuple[int, int, int]) -> Array:
-    """Sample statement of the innovations of latent trust, (bound, mission, robot)."""
-    innovations = dist.Normal(0.0, 1.0).expand(shape).to_event(3)
-    return numpyro.sample("innovations", innovations)  # pyright: ignore[reportReturnType]
-
-
-def register[Model: TrustModel](cls: type[Model]) -> type[Model]:
-    """Make a model a pytree, so that compiled samplers take its priors as data."""
-    meta = [f.name for f in fields(cls) if f.name != "priors"]
-    return jax.tree_util.register_dataclass(cls, data_fields=["priors"], meta_fields=meta)
+        return [effect.noun for effect in self.effects]
 
 
 def require_model(model: object) -> None:

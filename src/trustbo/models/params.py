@@ -3,30 +3,10 @@
 from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple, cast
 
-import jax.numpy as jnp
 import numpy as np
-from jax import Array
 
 from trustbo.errors import ShapeError, TrustboError
 from trustbo.models.parameter_draws import PLACES, Numbers, ParameterDraws
-from trustbo.models.state_space.scalar import ScalarSSM
-from trustbo.models.state_space.vector import VectorSSM
-
-
-class _Apart(ParameterDraws):
-    """Methods of parameters of robots that do not influence each other."""
-
-    __slots__ = ()
-
-    def _drift(self, awareness: Array) -> Array:
-        """Drift of bounds with awareness (mission, bound, robot, feature), without that axis."""
-        raise NotImplementedError
-
-    def ssm(self, awareness: Array) -> ScalarSSM:
-        """The state space of missions with awareness (mission, bound, robot, feature)."""
-        p: Any = self
-        drift = jnp.swapaxes(self._drift(awareness), 0, 1)
-        return ScalarSSM(p.beta0, drift, p.delta_w, p.delta_v, p.x0_mean, p.x0_sd)
 
 
 class _Trust(NamedTuple):
@@ -52,7 +32,7 @@ class _Trust(NamedTuple):
     None: there is none."""
 
 
-class TrustParams(_Apart, _Trust):
+class TrustParams(ParameterDraws, _Trust):
     """Parameters of the pooled model, equations (3)-(4); leading axes (...,) such as (draw,).
 
     Fields: beta0 (...,), beta (..., feature), b (...,), delta_w (...,), delta_v (...,),
@@ -63,9 +43,6 @@ class TrustParams(_Apart, _Trust):
     __slots__ = ()
     AXES: ClassVar = {"beta": ("feature",), **PLACES}
 
-    def _drift(self, awareness: Array) -> Array:
-        return awareness @ self.beta + self.b
-
     def increments(self, awareness: np.ndarray) -> np.ndarray:
         """See `ParameterDraws.increments`."""
         beta = np.asarray(self.beta, dtype=float)
@@ -74,7 +51,7 @@ class TrustParams(_Apart, _Trust):
         return np.einsum("nm,nidrcm->nidrc", beta, awareness)
 
 
-class RobotParams(_Apart, _Trust):
+class RobotParams(ParameterDraws, _Trust):
     """Parameters of robots with separate coefficients and no influence on each other.
 
     Fields: beta0 (..., robot), beta (..., robot, feature), b, delta_w and delta_v (..., robot),
@@ -92,15 +69,12 @@ class RobotParams(_Apart, _Trust):
         **PLACES,
     }
 
-    def _drift(self, awareness: Array) -> Array:
-        return jnp.einsum("jkim,im->jki", awareness, self.beta) + self.b
-
     def increments(self, awareness: np.ndarray) -> np.ndarray:
         """See `ParameterDraws.increments`."""
         return np.einsum("...im,...idrcm->...idrc", np.asarray(self.beta, dtype=float), awareness)
 
 
-class _Deviation(_Apart):
+class _Deviation(ParameterDraws):
     """Methods of parameters under which what lasts is the deviation from expected trust.
 
     x_k = u_k + beta0 (x_{k-1} - u_{k-1}) + w_k with u_0 = E x_0: along a path, trust is carried on
@@ -108,11 +82,6 @@ class _Deviation(_Apart):
     """
 
     __slots__ = ()
-
-    def _drift(self, awareness: Array) -> Array:
-        u, p = super()._drift(awareness), cast(Any, self)
-        first = jnp.broadcast_to(p.x0_mean, u[:, :1].shape)
-        return u - p.beta0 * jnp.concatenate([first, u[:, :-1]], axis=1)
 
     def expected_transition(self, n_robots: int) -> np.ndarray:
         """See `ParameterDraws.expected_transition`."""
@@ -185,20 +154,8 @@ class CoupledParams(ParameterDraws, _Coupled):
         """See `ParameterDraws.increments`."""
         return np.einsum("...mai,...idrcm->...adrc", np.asarray(self.B, dtype=float), awareness)
 
-    def ssm(self, awareness: Array) -> VectorSSM:
-        """The state space of missions with awareness (mission, bound, robot, feature)."""
-        drift = jnp.einsum("jkim,mai->kja", awareness, self.B) + jnp.reshape(self.b, (1, 1, -1))
-        p = self
-        return VectorSSM(p.B0, drift, p.Delta_w, p.Delta_v, p.x0_mean, p.x0_sd)
-
 
 Params = TrustParams | RobotParams | CoupledParams
-
-
-def params_from(sites: Mapping[str, np.ndarray], about: Mapping[Any, Any]) -> Params:
-    """Parameters from draws by name, leading axis (draw,), and the attributes of a posterior."""
-    x0 = {name: about[name] for name in ("x0_mean", "x0_sd")}
-    return assemble_params(sites, x0, about.get("memory", "level"))
 
 
 def assemble_params(
@@ -211,12 +168,11 @@ def assemble_params(
     if "B0" in sites:
         return CoupledParams(**{name: sites[name] for name in CoupledParams._fields[:5]}, **x0)
     values = {name: sites[name] for name in TrustParams._fields[:5]}
-    if sites["beta0"].ndim == 1:
+    if sites["b"].ndim == 1:
         return (TrustParams if memory == "level" else DeviationParams)(**values, **x0)
-    for name in ("delta_w", "delta_v"):  # the hierarchical model's are shared
-        values[name] = values[name].reshape(len(values[name]), -1)
-        values[name] = np.broadcast_to(values[name], sites["beta0"].shape)
-    return RobotParams(**values, **x0)
+    for name in ("beta0", "delta_w", "delta_v"):  # the hierarchical model's are shared
+        values[name] = np.broadcast_to(values[name][:, None], sites["b"].shape)
+    return (RobotParams if memory == "level" else DeviationRobotParams)(**values, **x0)
 
 
 def check_params(params: Params, n_robots: int | None, n_features: int) -> None:

@@ -1,80 +1,114 @@
-"""The paper's one-robot form (3)-(4): all robots share one set of parameters."""
+"""The paper's pooled trust model, equations (3)-(4)."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import jax.numpy as jnp
+import numpy as np
+from numpyro.distributions import Distribution
+from scipy.linalg import helmert
 
 from trustbo.errors import TrustboError, require_choice
-from trustbo.models.effects.effect import EFFECTS, MEMORIES, Effect
-from trustbo.models.effects.place import PlaceEffect
-from trustbo.models.model import TrustModel, register, sample
-from trustbo.models.params import DeviationParams, TrustParams
+from trustbo.models.backend import namespace
+from trustbo.models.contact_rate import ContactRate
+from trustbo.models.effects.effect import Theta
+from trustbo.models.effects.weights import Weights
+from trustbo.models.model import TrustModel
+from trustbo.models.signal import Signal, powers
+from trustbo.models.slots import Layout, Slots
+
+MEMORIES = ("level", "deviation")
+"""Lasting from one bound to the next: trust, or its deviation from what effects expect."""
 
 
-@register
 @dataclass(frozen=True, repr=False)
 class PooledTrust(TrustModel):
     """One set of parameters for all robots, equations (3)-(4).
 
-    Attributes:
-        effects: Effects that add to trust: `PlaceEffect()`, of which `place` is the short form, and
-            `RobotEffect()`, of each robot in each mission, and any that is registered.
-        memory: Quantity that lasts between bounds: trust, `"level"`, as in the paper, or its
-            `"deviation"` from what features and effects expect at a bound. NUTS has it for
-            Gaussian rates alone.
+    x_k = beta0 x_{k-1} + beta . z_k + b + delta_w w_k,  y_k = x_k + delta_v v_k
 
-    Raises:
-        TrustboError: An effect is unknown, or of a kind that the model already has.
+    Attributes:
+        memory: Quantity that lasts between bounds: trust, `"level"`, as in the paper, or its
+            `"deviation"` from what features and effects expect at a bound.
+        shared_noise: Whether robots share noise in a bound: delta_s s_k is added to the rates of
+            all robots, s_k standard normal.
     """
 
-    effects: tuple[Effect, ...] = ()  # pyright: ignore[reportIncompatibleVariableOverride]
     memory: str = "level"  # pyright: ignore[reportIncompatibleVariableOverride]
+    shared_noise: bool = False
 
     def __post_init__(self) -> None:
-        one = isinstance(self.effects, Effect)
-        effects: tuple[Any, ...] = (self.effects,) if one else tuple(self.effects)
-        kinds = [type(effect).__name__ for effect in effects]
-        if unknown := [e for e in effects if not isinstance(e, (PlaceEffect, *EFFECTS.values()))]:
-            raise TrustboError(
-                f"effects must be of PlaceEffect() and {', '.join(f'{n}()' for n in EFFECTS)}, "
-                f"or of a class that is registered; got {unknown[0]!r}."
-            )
-        places = [effect for effect in effects if isinstance(effect, PlaceEffect)]
-        if len(places) + (self.place is not None) > 1 or len(set(kinds)) < len(kinds):
-            raise TrustboError(
-                f"effects must be of different kinds; got {effects!r} and place={self.place!r}."
-            )
-        if places:
-            object.__setattr__(self, "place", places[0])
-        others = tuple(effect for effect in effects if not isinstance(effect, PlaceEffect))
-        object.__setattr__(self, "effects", others)
-        require_choice("memory", self.memory, MEMORIES)
         super().__post_init__()
+        require_choice("memory", self.memory, MEMORIES)
+        if self.shared_noise not in (0, 1):
+            raise TrustboError(f"shared_noise must be True or False; got {self.shared_noise!r}.")
+        object.__setattr__(self, "shared_noise", bool(self.shared_noise))
 
-    def sample_params(self, n_robots: int, n_features: int) -> TrustParams:
-        """Sample statements of beta0, beta, b, delta_w and delta_v."""
-        priors = self.priors
-        beta0 = sample("beta0", priors.beta0)
-        carried = beta0 if self.memory == "level" else jnp.zeros_like(beta0)
-        kind = TrustParams if self.memory == "level" else DeviationParams
-        return kind(
-            beta0=beta0,
-            beta=sample("beta", priors.weights(carried), (n_features,)),
-            b=sample("b", priors.intercept(carried)),
-            delta_w=sample("delta_w", priors.delta_w),
-            delta_v=sample("delta_v", priors.delta_v),
-            x0_mean=priors.x0_mean,
-            x0_sd=priors.x0_sd,
-        )
+    @property
+    def weights(self) -> Weights:
+        """See `TrustModel.weights`."""
+        return Weights(self.priors)
+
+    def hyperpriors(self, n_robots: int, n_features: int) -> dict[str, Distribution]:
+        """See `TrustModel.hyperpriors`."""
+        names = ("beta0", "delta_w", "delta_v", *("delta_s",) * self.shared_noise)
+        return {name: getattr(self.priors, name) for name in names}
+
+    def derived(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """See `TrustModel.derived`."""
+        beta0 = values["beta0"]
+        rest = 1.0 - beta0 if self.memory == "level" else 0.0 * beta0 + 1.0
+        return {**values, "rest": rest}
+
+    def layout(self, slots: Slots, *, contrasts: bool = True) -> Layout:
+        """A block for each robot; with shared noise for each contrast of robots, or each mission.
+
+        Helmert's contrasts of the robots' rates are independent where all robots are measured.
+        """
+        n = slots.n_robots
+        if not self.shared_noise or n == 1:
+            return Layout(slots.y.shape)
+        seen = ~np.isnan(slots.y)
+        if contrasts and self.family.gaussian and (seen.all(2) == seen.any(2)).all():
+            return Layout(slots.y.shape, rotation=helmert(n, full=True))
+        return Layout(slots.y.shape, joint=True)
+
+    def signal(self, theta: Theta, slots: Slots, layout: Layout) -> Signal:
+        """Trust of all bounds at once, T = (1 - beta0 Lag)^-1 its response to the drift."""
+        xp: Any = namespace(theta["beta0"])
+        n, K = slots.n_robots, slots.n_bounds
+        beta0, delta_w = theta["beta0"][:, None], theta["delta_w"][:, None, None]
+        T = powers(theta["beta0"], K)
+        start = beta0 ** np.arange(1, K + 1)
+        S = delta_w**2 * (T @ xp.swapaxes(T, 1, 2))
+        S = S + self.x0["x0_sd"] ** 2 * start[:, :, None] * start[:, None, :]
+        m = self.x0["x0_mean"] * start
+        if self.memory == "deviation":  # x - u lasts, and is 0 on average at first
+            m, T = 0.0 * m, xp.broadcast_to(xp.eye(K), T.shape)
+        m, T, S = m[:, None], T[:, None], S[:, None]
+        sd = theta["delta_v"][:, None, None]
+        if not self.shared_noise:
+            return Signal(m, T, S, sd)
+        noise = theta["delta_s"][:, None, None, None] ** 2 * xp.eye(K)
+        if layout.joint:
+            m, T, S = xp.repeat(m, n, axis=2), xp.kron(T, np.eye(n)), xp.kron(S, np.eye(n))
+            return Signal(m, T, S, sd, xp.kron(noise, np.ones((n, n))))
+        if n == 1:
+            return Signal(m, T, S, sd, noise)
+        first = np.array([1.0, 0.0])[:, None]  # the mean of the robots has it, contrasts have not
+        return Signal(np.sqrt(n) * first * m, T, S, sd, n * first[..., None] * noise)
+
+    def rates(self, theta: Theta, drift: Any) -> ContactRate:
+        """See `TrustModel.rates`."""
+        beta0, x0 = theta["beta0"][0], self.x0
+        if self.memory == "deviation":
+            xp = namespace(drift)
+            first = xp.full_like(drift[:, :1], x0["x0_mean"])
+            drift = drift - beta0 * xp.concatenate([first, drift[:, :-1]], axis=1)
+        return ContactRate(drift, beta0, theta["delta_w"][0], theta["delta_v"][0], **x0)
 
     @property
     def dims(self) -> dict[str, tuple[str, ...]]:
-        """Axes of beta0, beta, b, delta_w and delta_v."""
+        """See `TrustModel.dims`."""
         axes = {"beta0": (), "beta": ("feature",), "b": (), "delta_w": (), "delta_v": ()}
-        return axes | self.effect_dims
-
-    @property
-    def robot_sets(self) -> str:
-        """See `TrustModel.robot_sets`."""
-        return "all"
+        return axes | ({"delta_s": ()} if self.shared_noise else {})

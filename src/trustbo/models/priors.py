@@ -1,14 +1,12 @@
 """Priors of the trust models' parameters."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from typing import Any, Self, cast
 
-import jax
 import numpy as np
 import numpyro.distributions as dist
-from jax import Array
 from numpyro.distributions import Distribution, constraints
 
 from trustbo.data import is_line_of_sight
@@ -16,19 +14,20 @@ from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError, require_positive
 from trustbo.models.backend import own_settings
 from trustbo.models.families import family_of
-from trustbo.models.floored import Floored
-from trustbo.models.priors_numpy import floored, log_prob
+from trustbo.models.scores import log_density
 
-_SCALES = ("delta_w", "delta_v", "tau")
+_SCALES = ("delta_w", "delta_v", "delta_s", "tau")
+_NORMAL = ("beta", "b", "coupling")
 
 
 @dataclass(frozen=True, repr=False)
 class Priors(Summary):
-    """Prior of each parameter, any scalar numpyro distribution, and of trust before bound 1.
+    """Prior of each parameter, a scalar numpyro distribution, and of trust before bound 1.
 
     `Priors()` has the defaults: beta0 ~ Beta(2, 2), beta_m ~ N(0, 1), b ~ N(0, 0.5), delta_w and
     delta_v ~ HalfNormal(0.2), the second argument being a standard deviation, and x_0 ~
-    N(0.5, 0.5^2), which the paper leaves open. A model ignores parameters it does not have.
+    N(0.5, 0.5^2), which the paper leaves open. A model ignores parameters it does not have. Weights
+    integrate out under Normal priors; those of memory and noises need quantiles (icdf).
 
     Attributes:
         beta0: Autoregression; the diagonal of B0 in the coupled model.
@@ -36,9 +35,10 @@ class Priors(Summary):
             distribution of batch shape (feature,) gives each feature a separate prior.
         b: Intercept.
         delta_w: Standard deviation of the process noise.
-        delta_v: Standard deviation of the observation noise, cut off below the resolution of the
-            rates; in the beta-binomial family, the
-            square root of the ratio of excess to binomial variance (concentration delta_v^-2).
+        delta_v: Standard deviation of the observation noise, to which the resolution of the rates
+            adds as independent noise; in the beta-binomial family, the square root of the ratio of
+            excess to binomial variance (concentration delta_v^-2).
+        delta_s: Standard deviation of the noise that robots share in a bound.
         coupling: Influence of robots on each other: off-diagonals of B0 and B_m, and gamma.
         tau: Spread of the robots' coefficients in the hierarchical model.
         concentration: Concentration of the LKJ prior of noise correlations, coupled model.
@@ -49,8 +49,8 @@ class Priors(Summary):
             features.
 
     Raises:
-        TrustboError: A prior is no such distribution, a noise or tau can be negative, `x0_sd` is
-            negative, or priors of stationary trust are not Normal, or beta0's not on (0, 1).
+        TrustboError: A prior is no such distribution, that of a weight is not Normal, that of beta0
+            not on (0, 1), a noise or tau can be negative, or `x0_sd` is negative.
     """
 
     # Built on demand: importing trustbo must create no JAX array.
@@ -59,6 +59,7 @@ class Priors(Summary):
     b: Distribution = None  # pyright: ignore[reportAssignmentType]
     delta_w: Distribution = None  # pyright: ignore[reportAssignmentType]
     delta_v: Distribution = None  # pyright: ignore[reportAssignmentType]
+    delta_s: Distribution = None  # pyright: ignore[reportAssignmentType]
     coupling: Distribution = None  # pyright: ignore[reportAssignmentType]
     tau: Distribution = None  # pyright: ignore[reportAssignmentType]
     concentration: float = 2.0
@@ -77,6 +78,7 @@ class Priors(Summary):
                 "b": dist.Normal(0.0, 0.5),
                 "delta_w": dist.HalfNormal(0.2),
                 "delta_v": dist.HalfNormal(0.2),
+                "delta_s": dist.HalfNormal(0.2),
                 "coupling": dist.Normal(0.0, 0.1),
                 "tau": dist.HalfNormal(0.3),
             }
@@ -101,13 +103,16 @@ class Priors(Summary):
             raise TrustboError(f"Priors.x0_mean must be finite; got {self.x0_mean!r}.")
         if not 0.0 <= self.x0_sd < np.inf:
             raise TrustboError(f"Priors.x0_sd must be finite, not negative; got {self.x0_sd!r}.")
-        if self.stationary:
-            normal = all(isinstance(p, dist.Normal) for p in (self.beta, self.b))
-            if not normal or self.beta0.support is not constraints.unit_interval:
+        for name in _NORMAL:
+            if not isinstance(prior := getattr(self, name), dist.Normal):
                 raise TrustboError(
-                    "priors of stationary trust need Normal beta and b, and beta0 on (0, 1); got "
-                    f"{self.beta!r}, {self.b!r} and {self.beta0!r}."
+                    f"Priors.{name} must be Normal, so that it integrates out; got {prior!r}. "
+                    "Sample a model of your own with NumPyro for another, see models.ContactRate."
                 )
+        if self.beta0.support is not constraints.unit_interval:
+            raise TrustboError(
+                f"Priors.beta0 must live on (0, 1), e.g. Beta(2.0, 2.0); got {self.beta0!r}."
+            )
 
     @classmethod
     def default(cls, observation: str = "gaussian") -> Self:
@@ -142,56 +147,34 @@ class Priors(Summary):
                 stationary=True,
             )
 
-    def weights(self, beta0: Array) -> Distribution:
-        """Prior of the weights given beta0, of batch shape (..., feature) for beta0 (...)."""
-        return self._given((1.0 - beta0)[..., None], self.beta) if self.stationary else self.beta
+    def coefficients(self, n_features: int) -> tuple[np.ndarray, np.ndarray]:
+        """Means and sds of the weights and, last, the intercept, each (feature + 1,)."""
+        beta, b = (_moments(prior) for prior in (self.beta, self.b))
+        mean, sd = (
+            np.append(np.broadcast_to(of_beta, n_features), of_b)
+            for of_beta, of_b in zip(beta, b, strict=True)
+        )
+        return mean, sd
 
-    def intercept(self, beta0: Array) -> Distribution:
-        """Prior of the intercept given beta0, of batch shape (...) as beta0."""
-        return self._given(1.0 - beta0, self.b) if self.stationary else self.b
+    @property
+    def coupling_moments(self) -> tuple[float, float]:
+        """Mean and sd of the influence of robots on each other."""
+        mean, sd = _moments(self.coupling)
+        return float(mean), float(sd)
 
-    @staticmethod
-    def _given(rest: Array, prior: Any) -> Distribution:
-        return dist.Normal(prior.loc * rest, prior.scale * rest)
-
-    def log_density(self, name: str, values: np.ndarray, beta0: np.ndarray) -> np.ndarray:
+    def log_density(self, name: str, values: np.ndarray, rest: np.ndarray) -> np.ndarray:
         """Log density of the prior of that name at values of a parameter, one for each of them.
 
         Args:
             name: Name of a field.
             values: Shape (...), or (..., feature) for `beta`.
-            beta0: Autoregression (...), on which priors of stationary trust depend.
+            rest: Drift by which stationary trust rises by 1, on which priors of stationary trust
+                depend; broadcasts to the values.
         """
         prior = getattr(self, name)
         if not self.stationary or name not in ("beta", "b"):
-            return log_prob(prior, values)
-        rest = 1.0 - (beta0[..., None] if name == "beta" else beta0)
-        return log_prob(prior, values / rest) - np.log(rest)
-
-    def above_resolution(self, resolution: float) -> Self:
-        """The same priors with delta_v truncated below at the resolution of a rate."""
-        return replace(self, delta_v=floored(self.delta_v, resolution))
-
-    def mean(self, n_features: int) -> dict[str, np.ndarray]:
-        """Prior mean of each parameter; 0 for one without a mean, such as a Cauchy."""
-        means = {}
-        for name in ("beta0", "beta", "b", "delta_w", "delta_v"):
-            value = np.asarray(getattr(self, name).mean, dtype=float)
-            shape = (n_features,) if name == "beta" else ()
-            means[name] = np.broadcast_to(np.where(np.isfinite(value), value, 0.0), shape)
-        return self.of_stationary(means)
-
-    def of_stationary(
-        self, values: dict[str, np.ndarray], rest: np.ndarray | None = None
-    ) -> dict[str, np.ndarray]:
-        """Convert `beta` and `b` of stationary trust to weights and intercept.
-
-        `rest` is the drift by which stationary trust rises by 1, by default 1 - beta0.
-        """
-        if not self.stationary:
-            return values
-        rest = 1.0 - values["beta0"] if rest is None else rest
-        return values | {"beta": values["beta"] * rest[..., None], "b": values["b"] * rest}
+            return log_density(prior, values)
+        return log_density(prior, values / rest) - np.log(rest)
 
     def describe(self) -> dict[str, str]:
         """Each prior as text, for the record kept with a result."""
@@ -206,35 +189,19 @@ def _default(observation: str) -> Priors:
     return Priors(**family_of(observation).priors())
 
 
-def _flatten(priors: Priors) -> tuple[tuple[object, ...], bool]:
-    names = [f.name for f in fields(priors) if f.name != "stationary"]
-    return tuple(getattr(priors, name) for name in names), priors.stationary
-
-
-def _unflatten(stationary: bool, children: Iterable[object]) -> Priors:
-    # Not through __init__: in a compiled program the values are tracers, which no check can read.
-    priors = object.__new__(Priors)
-    names = [f.name for f in fields(Priors) if f.name != "stationary"]
-    for name, child in zip(names, children, strict=True):
-        object.__setattr__(priors, name, child)
-    object.__setattr__(priors, "stationary", stationary)
-    return priors
-
-
-# A pytree, so that compiled samplers take priors as data: other numbers need no recompilation.
-jax.tree_util.register_pytree_node(Priors, _flatten, _unflatten)
-
-
 def as_text(prior: Distribution | float) -> str:
     """Distribution or number as text."""
     if isinstance(prior, bool):
         return "yes" if prior else "no"
     if not isinstance(prior, Distribution):
         return f"{prior:g}"
-    if isinstance(prior, Floored):  # the floor belongs to the data, not to the prior
-        return as_text(prior.base)
     numbers = ", ".join(f"{n}={_numbers(getattr(prior, n))}" for n in type(prior).arg_constraints)
     return f"{type(prior).__name__}({numbers})"
+
+
+def _moments(prior: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and sd of a Normal prior."""
+    return np.asarray(prior.loc, dtype=float), np.asarray(prior.scale, dtype=float)
 
 
 def _numbers(values: object) -> str:

@@ -7,7 +7,6 @@ from typing import Any
 from trustbo.errors import TrustboError
 from trustbo.models.coupled import CoupledTrust
 from trustbo.models.effects.effect import EFFECTS, Effect
-from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.hierarchical import HierarchicalTrust
 from trustbo.models.model import TrustModel
 from trustbo.models.people import HumanTrust
@@ -17,21 +16,20 @@ from trustbo.models.priors import Priors
 _MODELS = {
     model.__name__: model for model in (PooledTrust, HierarchicalTrust, CoupledTrust, HumanTrust)
 }
-_FIRST = "RobotEffect"  # records without a kind are of it
 
 
 def model_to_record(model: TrustModel) -> dict[str, Any]:
-    """Record of class, options, priors as text, and whether these depend on the features' names."""
-    custom = {
+    """Record of class, options, effects, and priors as text.
+
+    `by_feature` states that the priors depend on the features' names.
+    """
+    return {
         "class": type(model).__name__,
         **model.options(),
-        "place": None if model.place is None else model.place.to_record(),
         "priors": model.priors.describe(),
+        "effects": [{"kind": type(e).__name__, **e.to_record()} for e in model.effects],
+        "by_feature": model.priors is Priors.default(model.observation),
     }
-    by_feature = model.priors is Priors.default(model.observation)
-    effects = [_effect_to_record(effect) for effect in model.effects]
-    custom |= {"effects": effects} if effects else {}
-    return custom | ({"by_feature": True} if by_feature else {})
 
 
 def model_from_record(
@@ -48,18 +46,13 @@ def model_from_record(
                 f"the campaign's model is {record}; the one given is {model_to_record(given)}."
             )
         return given
-    ours = ("class", "priors", "place", "by_feature", "effects")
-    options = {name: value for name, value in record.items() if name not in ours}
-    if effects := effects_from_record(record):
-        options["effects"] = effects
-    kind = _MODELS.get(record["class"])
-    place = None if record["place"] is None else PlaceEffect(**record["place"])
-    if kind is not None:
-        fixed = replace(Priors.default(record["observation"]))
+    if (kind := _MODELS.get(record["class"])) is not None:
+        ours = ("class", "priors", "by_feature", "effects")
+        options = {name: value for name, value in record.items() if name not in ours}
+        usual = kind(effects=effects_from_record(record), **options)
         of_features = Priors.of(features, record["observation"])
-        known = [None, fixed, of_features]
-        for priors in known:
-            model = kind(priors=priors, place=place, **options)  # pyright: ignore
+        for priors in (usual.priors, replace(usual.priors), of_features):
+            model = replace(usual, priors=priors)
             if model_to_record(model) == record:
                 return model
     raise TrustboError(
@@ -69,19 +62,14 @@ def model_from_record(
 
 
 def effects_from_record(record: Mapping[str, Any]) -> tuple[Effect, ...]:
-    """Effects of a model's record, but those of places.
+    """Effects of a model's record.
 
     TrustboError: one of them is of a class that is not registered in this process.
     """
     return tuple(_effect_from_record(**effect) for effect in record.get("effects", ()))
 
 
-def _effect_to_record(effect: Effect) -> dict[str, Any]:
-    kind = type(effect).__name__
-    return ({} if kind == _FIRST else {"kind": kind}) | effect.to_record()
-
-
-def _effect_from_record(kind: str = _FIRST, **settings: Any) -> Effect:
+def _effect_from_record(kind: str, **settings: Any) -> Effect:
     if kind not in EFFECTS:
         raise TrustboError(
             f"the model has an effect {kind!r}, which this process does not have; import the "

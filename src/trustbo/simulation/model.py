@@ -96,7 +96,7 @@ class ModelSimulator(DescribedSimulator):
         """Return the model and its true parameters."""
         about: dict[str, object] = {
             "simulator": type(self).__name__,
-            "simulator_model": self.model.describe(),
+            "simulator_model": self.model.in_short(),
             "truth": {n: np.asarray(value).tolist() for n, value in self.params.by_name.items()},
         }
         if self.p_fail is not None:

@@ -1,30 +1,27 @@
-"""Effects of places: s of the cell entered, and e of the directed bound.
+"""Effects of places: s of the cell entered, a Gaussian process, and e of the directed bound."""
 
-The sum g = B s + e of visited bounds has covariance tau_e^2 I + tau_s^2 B K B', B naming the cell
-that each enters. Helmert's rotation of the n_c bounds into each cell, independent of theta, leaves
-
-    mean of each cell times sqrt(n_c): covariance tau_e^2 I + tau_s^2 W K W, W = diag(sqrt(n_c)),
-    contrasts between its bounds:      independent, of variance tau_e^2,
-
-so that D bounds cost the root of a matrix of C cells, and neither tau is ever inverted.
-"""
-
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 import numpyro.distributions as dist
 from scipy import sparse
-from scipy.linalg import helmert
 
 from trustbo.errors import TrustboError, require_positive
 from trustbo.models.backend import namespace
-from trustbo.models.effects.effect import Columns, Effect, Prior, Slots, Theta, hypot, share_of
-from trustbo.models.place import Visited, matern
-from trustbo.models.priors_numpy import half_normal
+from trustbo.models.effects.effect import (
+    LEAST,
+    Effect,
+    NextMission,
+    Theta,
+    precision,
+    register,
+)
+from trustbo.models.slots import Slots
+from trustbo.models.visited import Visited, matern
 
-_JITTER = 1e-12  # of a correlation, times the number of cells: below, rounding decides
-_TOGETHER = 16  # points whose cells are split at once
+_JITTER = 1e-8  # of a correlation of cells
 _LENGTH_SCALES = 1e-6, 1e6  # cells: outside, cells are independent, or equal
 _MOST = {
     "length_scale": (1000.0, "cells, not metres"),
@@ -32,6 +29,7 @@ _MOST = {
 }
 
 
+@register
 @dataclass(frozen=True)
 class PlaceEffect(Effect):
     """Effect of a place on trust that awareness does not explain.
@@ -62,15 +60,15 @@ class PlaceEffect(Effect):
     tau_e: float = 0.2
     length_scale: float = 2.0
     length_scale_sd: float = 0.5
+    noun = "places"
+    variables: ClassVar = {"place": (), "place_bound": ()}  # laid out by `place_maps.place_group`
 
     def __post_init__(self) -> None:
         for name in ("cells", "bounds", "shared"):
             if not isinstance(value := getattr(self, name), bool | np.bool_):
                 raise TrustboError(f"PlaceEffect.{name} must be True or False; got {value!r}.")
         if not (self.cells or self.bounds):
-            raise TrustboError(
-                "PlaceEffect needs an effect of cells or of bounds; for neither, give place=None."
-            )
+            raise TrustboError("PlaceEffect needs an effect of cells or of bounds; got neither.")
         for name in ("tau_s", "tau_e", "length_scale", "length_scale_sd"):
             value = require_positive(f"PlaceEffect.{name}", getattr(self, name))
             most, scale = _MOST.get(name, (100.0, "trust, which is between 0 and 1"))
@@ -84,16 +82,6 @@ class PlaceEffect(Effect):
         """Names of the hyperparameters: tau_s and length_scale of s, tau_e of e."""
         return ("tau_s", "length_scale") * self.cells + ("tau_e",) * self.bounds
 
-    def draw(self, n: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
-        """See `Effect.draw`."""
-        scores = rng.standard_normal((3, n))
-        drawn = {
-            "tau_s": self.tau_s * np.abs(scores[0]),
-            "length_scale": self.length_scale * np.exp(self.length_scale_sd * scores[1]),
-            "tau_e": self.tau_e * np.abs(scores[2]),
-        }
-        return {name: drawn[name] for name in self.names}
-
     def hyperpriors(self) -> dict[str, dist.Distribution]:
         """See `Effect.hyperpriors`."""
         priors = {
@@ -103,181 +91,70 @@ class PlaceEffect(Effect):
         }
         return {name: priors[name] for name in self.names}
 
+    def columns(self, slots: Slots) -> Any:
+        """Indicators of the cells entered and of the bounds made; each robot's where not shared."""
+        visited = _visited(slots)
+        unit = np.broadcast_to(visited.unit, slots.y.shape).ravel()
+        met = np.flatnonzero(unit >= 0)
+        parts = []
+        if self.cells:
+            parts.append((visited.cell_of[unit[met]], len(visited.cells)))
+        if self.bounds:
+            parts.append((unit[met], len(visited.units)))
+        ones = np.ones(len(met))
+        return sparse.hstack(
+            [sparse.csr_array((ones, (met, at)), shape=(len(unit), n)) for at, n in parts],
+            format="csr",
+        )
+
+    def prior(self, theta: Theta, slots: Slots) -> tuple[Any, list[Any]]:
+        """A Gaussian process over the visited cells, and independent bounds."""
+        visited, parts = _visited(slots), []
+        if self.cells:
+            mine = visited.cells[:, 0] == visited.cells[0, 0]  # all robots visit the same cells
+            parts += [self._cells(theta, visited.cells[mine])] * visited.n_effects
+        if self.bounds:
+            xp: Any = namespace(theta["tau_e"])
+            lam = xp.maximum(theta["tau_e"], LEAST) ** -2.0
+            parts.append(xp.repeat(lam[:, None], len(visited.units), axis=1))
+        return None, parts
+
+    def _cells(self, theta: Theta, cells: np.ndarray) -> Any:
+        """Precision (point, cell, cell) of s at cells (cell, 3)."""
+        xp: Any = namespace(theta["tau_s"])
+        gap = cells[:, None, 1:].astype(float) - cells[None, :, 1:]
+        square, pair = np.unique((gap**2).sum(-1), return_inverse=True)
+        scale = xp.clip(theta["length_scale"], *_LENGTH_SCALES)
+        K = matern(np.sqrt(square), scale[:, None])[:, pair.reshape(gap.shape[:2])]
+        tau = xp.maximum(theta["tau_s"], LEAST)[:, None, None]
+        return precision(tau**2 * (K + _JITTER * np.eye(len(cells))))
+
+    def named(self, c: np.ndarray, theta: Theta, slots: Slots) -> dict[str, np.ndarray]:
+        """Effects of visited cells, place (draw, cell), and bounds, place_bound (draw, unit)."""
+        n = len(_visited(slots).cells) if self.cells else 0
+        named = {"place": c[:, :n], "place_bound": c[:, n:]}
+        return {name: values for name, values in named.items() if values.shape[1]}
+
+    def coefficients(
+        self, values: Mapping[str, np.ndarray], theta: Theta, slots: Slots
+    ) -> np.ndarray:
+        """See `Effect.coefficients`."""
+        return np.column_stack([values[name] for name in self.variables if name in values])
+
+    def ahead(
+        self, values: Mapping[str, np.ndarray], theta: Theta, mission: NextMission
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Nothing: parameters hold maps of the places of every path."""
+        n = len(theta["rest"])
+        return np.zeros((n, 1, len(mission.features))), np.zeros((n, 1))
+
     def in_short(self) -> str:
         """Places that have effects, and whether robots share them."""
         places = " and ".join(["cells"] * self.cells + ["bounds"] * self.bounds)
         return f"of {places}, {'shared by robots' if self.shared else 'by robot'}"
 
-    def scales(self, scores: np.ndarray) -> dict[str, np.ndarray]:
-        """See `Effect.scales`."""
-        xp: Any = namespace(scores)
-        named = {}
-        for name, score in zip(self.names, scores.T, strict=True):
-            if name == "length_scale":
-                length_scale = self.length_scale * xp.exp(self.length_scale_sd * score)
-                named[name] = xp.clip(length_scale, *_LENGTH_SCALES)
-            else:
-                named[name] = half_normal(score, getattr(self, name))
-        return named
 
-    def group(self, slots: Slots) -> "PlaceColumns":
-        """See `Effect.group`.
-
-        Raises:
-            TrustboError: Visited places are not given.
-        """
-        if slots.places is None:
-            raise TrustboError("effects of places need the visited places; got None.")
-        return PlaceColumns.of(self, slots, slots.places)
-
-
-class PlaceColumns(NamedTuple):
-    """Rotated indicators of visited places: means of cells first, then contrasts, by robot."""
-
-    columns: Columns
-    rotation: Columns  # (column, unit), orthogonal
-    cells: "tuple[_Cells, ...]"
-    """One for each robot with separate effects."""
-    place: PlaceEffect
-    visited: Visited
-    fades = False
-
-    @classmethod
-    def of(cls, place: PlaceEffect, slots: Slots, visited: Visited) -> "PlaceColumns":
-        """Columns of some slots."""
-        shared = visited.unit.shape[2] == 1
-        robot = np.zeros_like(slots.robot) if shared else slots.robot
-        unit = visited.unit[slots.mission, : slots.y.shape[1], robot].ravel()
-        met = np.flatnonzero(unit >= 0)
-        shape = len(unit), len(visited.units)
-        indicator = sparse.csr_array((np.ones(len(met)), (met, unit[met])), shape=shape)
-        rotation, cells = _rotation(visited)
-        columns = (indicator @ rotation.T).tocsr()
-        return cls(columns, rotation, cells, place, visited)
-
-    @property
-    def joined(self) -> list[slice]:
-        """Means of the cells of each robot."""
-        return [slice(c.first, c.first + len(c.w)) for c in self.cells if self.place.cells]
-
-    def prior(self, theta: Theta) -> Prior:
-        """Gaussian process over the cells' means, independent contrasts."""
-        xp: Any = namespace(theta["beta0"])
-        n, place = len(theta["beta0"]), self.place
-        tau_e = theta["tau_e"] if place.bounds else xp.zeros(n)
-        mean = np.zeros((n, self.columns.shape[1]))
-        if not place.cells:
-            return Prior(mean, xp.repeat(tau_e[:, None], mean.shape[1], axis=1))
-        tau_s, roots, sds = theta["tau_s"], [], []
-        scale = hypot(tau_s, tau_e)
-        share = share_of(tau_s, scale)[:, None, None]
-        stops = [cells.first for cells in self.cells[1:]] + [mean.shape[1]]
-        for cells, stop in zip(self.cells, stops, strict=True):
-            first, w = cells.first, cells.w
-            eye, K = np.eye(len(w)), cells.correlation(theta["length_scale"])
-            C = share * (w[:, None] * w * K) + (1.0 - share + _JITTER * len(w) * w.max() ** 2) * eye
-            roots.append(xp.linalg.cholesky(C))
-            sds.append(xp.repeat(scale[:, None], len(w), axis=1))
-            sds.append(xp.repeat(tau_e[:, None], stop - first - len(w), axis=1))
-        return Prior(mean, xp.concatenate(sds, axis=1), roots)
-
-    def name(self, c: np.ndarray, theta: Theta, rng: np.random.Generator) -> dict[str, np.ndarray]:
-        """Effects of cells, place (draw, cell), and of bounds, place_bound (draw, unit)."""
-        return split_units(self.place, self.visited, c @ self.rotation, theta, rng)
-
-
-def split_units(
-    place: PlaceEffect, visited: Visited, g: np.ndarray, theta: Theta, rng: np.random.Generator
-) -> dict[str, np.ndarray]:
-    """Effects of cells, place (draw, cell), and of bounds, place_bound (draw, unit), of their sums.
-
-    Args:
-        place: Effects in the model.
-        visited: Visited places.
-        g: Sums of the effects of visited bounds (draw, unit).
-        theta: Hyperparameters by name, each (draw,).
-        rng: Random number generator.
-    """
-    if not place.bounds:
-        return {"place": g}
-    if not place.cells:
-        return {"place_bound": g}
-    s = np.empty((len(g), len(visited.cells)))
-    theta_of = np.stack([theta[name] for name in ("tau_s", "length_scale", "tau_e")], axis=1)
-    values, point, count = np.unique(theta_of, axis=0, return_inverse=True, return_counts=True)
-    order, start = np.argsort(point.ravel(), kind="stable"), np.cumsum(count) - count
-    rotation, robots = _rotation(visited)
-    c = g @ rotation.T
-    by_count = np.argsort(-count)
-    for i in range(0, len(values), _TOGETHER):  # points of about as many draws
-        some = by_count[i : i + _TOGETHER]
-        of_point = np.arange(count[some].max())
-        there = of_point < count[some, None]
-        draw = order[np.where(there, start[some, None] + of_point, 0)]
-        for robot, cells in zip(np.unique(visited.cells[:, 0]), robots, strict=True):
-            mean = c[draw, cells.first : cells.first + len(cells.w)]
-            drawn = _split(mean, cells, values[some], rng)
-            s[draw[there][:, None], np.flatnonzero(visited.cells[:, 0] == robot)] = drawn[there]
-    return {"place": s, "place_bound": g - s[:, visited.cell_of]}
-
-
-class _Cells(NamedTuple):
-    """Visited cells of a robot."""
-
-    first: int  # column
-    distance: np.ndarray  # (distinct,), in cells
-    pair: np.ndarray  # (cell, cell), index of the distance between two
-    w: np.ndarray  # (cell,), root of the number of bounds into each
-
-    @classmethod
-    def of(cls, first: int, position: np.ndarray, n_bounds: np.ndarray) -> "_Cells":
-        """Cells at positions (cell, 2)."""
-        gap = np.abs(position[:, None] - position[None])
-        square, pair = np.unique((gap**2).sum(-1), return_inverse=True)
-        return cls(first, np.sqrt(square), pair.reshape(gap.shape[:2]), np.sqrt(n_bounds))
-
-    def correlation(self, length_scale: Any) -> Any:
-        """Correlation of s between cells (point, cell, cell), of length scales (point,)."""
-        return matern(self.distance, length_scale[:, None])[:, self.pair]
-
-
-def _rotation(visited: Visited) -> tuple[Columns, tuple[_Cells, ...]]:
-    """Helmert's rotation within each cell (column, unit), and the cells of each robot."""
-    rows, cols, values, cells, start = [], [], [], [], 0
-    for robot in np.unique(visited.cells[:, 0]):
-        mine = np.flatnonzero(visited.cells[:, 0] == robot)
-        position, n_units = visited.cells[mine, 1:].astype(float), []
-        contrast = start + len(mine)
-        for i, cell in enumerate(mine):
-            units = np.flatnonzero(visited.cell_of == cell)
-            n_units.append(len(units))
-            of_cell = np.append(start + i, contrast + np.arange(len(units) - 1))
-            contrast += len(units) - 1
-            at_row, at_col = np.meshgrid(of_cell, units, indexing="ij")
-            rows.append(at_row.ravel())
-            cols.append(at_col.ravel())
-            values.append(helmert(len(units), full=True).ravel())
-        cells.append(_Cells.of(start, position, np.array(n_units)))
-        start = contrast
-    entries = np.concatenate(rows), np.concatenate(cols)
-    shape = start, len(visited.units)
-    return sparse.csr_array((np.concatenate(values), entries), shape=shape), tuple(cells)
-
-
-def _split(
-    mean: np.ndarray, cells: _Cells, theta: np.ndarray, rng: np.random.Generator
-) -> np.ndarray:
-    """S (point, draw, cell) given means w s + e of cells, by Matheron's rule.
-
-    A prior draw is corrected by its misfit; theta is (point, 3).
-    """
-    tau_s, _, tau_e = theta.T[:, :, None, None]
-    w, eye = cells.w, np.eye(len(cells.w))
-    unit = np.where(tau_s > 0.0, tau_s, 1.0)
-    ratio = (tau_e / unit) ** 2
-    K = cells.correlation(theta[:, 1]) + _JITTER * len(w) * eye
-    s = rng.standard_normal(mean.shape) @ np.swapaxes(np.linalg.cholesky(K), 1, 2)
-    off = mean / unit - w * s - np.sqrt(ratio) * rng.standard_normal(mean.shape)
-    M = w[:, None] * w * K + ratio * eye
-    gain = np.swapaxes(np.linalg.solve(M, np.swapaxes(off, 1, 2)), 1, 2)
-    return tau_s * (s + gain @ (w[:, None] * K))
+def _visited(slots: Slots) -> Visited:
+    if slots.visited is None:
+        raise TrustboError("effects of places need the visited places; got None.")
+    return slots.visited

@@ -9,7 +9,7 @@ independent between robots with covariance over missions
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 from scipy import sparse
@@ -17,17 +17,15 @@ from scipy import sparse
 from trustbo.errors import TrustboError, require_positive
 from trustbo.models.backend import namespace
 from trustbo.models.effects.effect import (
-    Columns,
+    LEAST,
     Effect,
-    Fading,
     NextMission,
-    Prior,
-    Slots,
     Theta,
-    hypot,
+    by_robot,
+    precision,
     register,
-    share_of,
 )
+from trustbo.models.slots import Slots
 
 
 @register
@@ -59,16 +57,36 @@ class RobotEffect(Effect):
         if not 0.0 < self.rho < 1.0:
             raise TrustboError(f"RobotEffect.rho must be between 0 and 1; got {self.rho!r}.")
 
-    def group(self, slots: Slots) -> "RobotColumns":
-        """See `Effect.group`."""
-        index = slots.robot * slots.n_missions + slots.mission
-        size = slots.n_robots * slots.n_missions
-        where = np.repeat(index, slots.y.shape[1])
-        start = np.arange(len(where) + 1)
-        columns = sparse.csr_array(
-            (slots.line_of_sight.ravel(), where, start), shape=(len(where), size)
+    def columns(self, slots: Slots) -> Any:
+        """Line of sight of one robot in one mission, for each pair of them, the mission fastest."""
+        n_missions, n_robots = slots.n_missions, slots.n_robots
+        mission, _, robot = np.indices(slots.y.shape)
+        where = (robot * n_missions + mission).ravel()
+        at = np.arange(len(where)), where
+        return sparse.csr_array(
+            (slots.line_of_sight.ravel(), at), shape=(len(where), n_robots * n_missions)
         )
-        return RobotColumns(columns, self.rho, (slots.n_robots, slots.n_missions))
+
+    def prior(self, theta: Theta, slots: Slots) -> tuple[Any, list[Any]]:
+        """Robots are alike and independent."""
+        Q = precision(self._covariance(theta, slots.n_missions))
+        rests, parts = by_robot(theta["rest"], slots.n_robots), {}
+        for rest in rests:
+            if id(rest) not in parts:
+                parts[id(rest)] = Q / rest[:, None, None] ** 2
+        return None, [parts[id(rest)] for rest in rests]
+
+    def named(self, c: np.ndarray, theta: Theta, slots: Slots) -> dict[str, np.ndarray]:
+        """Effects d on stationary trust, robot_effect (draw, mission, robot)."""
+        d = c.reshape(len(c), slots.n_robots, slots.n_missions) / _rest(theta)
+        return {"robot_effect": np.swapaxes(d, 1, 2)}
+
+    def coefficients(
+        self, values: Mapping[str, np.ndarray], theta: Theta, slots: Slots
+    ) -> np.ndarray:
+        """See `Effect.coefficients`."""
+        d = np.swapaxes(values["robot_effect"], 1, 2) * _rest(theta)
+        return d.reshape(len(d), -1)
 
     def in_short(self) -> str:
         """Text of what the effect is of."""
@@ -78,64 +96,28 @@ class RobotEffect(Effect):
         self, values: Mapping[str, np.ndarray], theta: Theta, mission: NextMission
     ) -> tuple[np.ndarray, np.ndarray]:
         """See `Effect.ahead`."""
-        d, sd = next_mission(values["robot_effect"], theta, self.rho)
+        d, sd = self.next_mission(values["robot_effect"], theta)
         if mission.rng is not None:
             d = d + sd[:, None] * mission.rng.standard_normal(d.shape)
-        return mission.by_sight(theta["rest"][:, None] * d)
+        return mission.by_sight(_rest(theta)[..., 0] * d)
+
+    def next_mission(self, effect: np.ndarray, theta: Theta) -> tuple[np.ndarray, np.ndarray]:
+        """Mean (draw, robot) and sd (draw,) of the next d, given d (draw, mission, robot)."""
+        n = effect.shape[1]
+        C, slow = self._covariance(theta, n), np.maximum(theta["tau_slow"], LEAST) ** 2
+        k = slow[:, None] * self.rho ** np.arange(n, 0, -1)
+        gain = np.linalg.solve(C, k[..., None])[..., 0]
+        left = np.maximum(C[:, 0, 0] - (gain * k).sum(1), 0.0)
+        return np.einsum("nm,nmi->ni", gain, effect), np.sqrt(left)
+
+    def _covariance(self, theta: Theta, n: int) -> Any:
+        """Covariance (point, mission, mission) of d of one robot."""
+        xp, i = namespace(theta["tau_slow"]), np.arange(n)
+        slow, day = (xp.maximum(theta[name], LEAST)[:, None, None] ** 2 for name in self.names)
+        return slow * self.rho ** np.abs(i[:, None] - i) + day * np.eye(n)
 
 
-class RobotColumns(NamedTuple):
-    """Line of sight of one robot in one mission, for each pair of them, the mission fastest."""
-
-    columns: Columns
-    rho: float
-    shape: tuple[int, int]  # robots, missions
-    fades = True
-
-    @property
-    def joined(self) -> list[slice]:
-        """Missions of each robot."""
-        n_robots, n = self.shape
-        return [slice(i * n, i * n + n) for i in range(n_robots)]
-
-    def prior(self, theta: Theta) -> Prior:
-        """Robots alike and independent."""
-        n_robots, n_missions = self.shape
-        scale, fading = _correlation(theta, self.rho, n_missions)
-        xp: Any = namespace(scale)
-        sd = xp.abs(theta["rest"]) * scale
-        sds = xp.broadcast_to(sd[:, None], (len(sd), n_robots * n_missions))
-        return Prior(np.zeros(sds.shape), sds, [fading] * n_robots)
-
-    def name(self, c: np.ndarray, theta: Theta, rng: np.random.Generator) -> dict[str, np.ndarray]:
-        """Effects d on stationary trust, robot_effect (draw, mission, robot)."""
-        d = (c / theta["rest"][:, None]).reshape(len(c), *self.shape)
-        return {"robot_effect": np.swapaxes(d, 1, 2)}
-
-    def coefficients(self, values: Mapping[str, np.ndarray], theta: Theta) -> np.ndarray:
-        """See `ModelGroup.coefficients`."""
-        d = np.swapaxes(values["robot_effect"], 1, 2)
-        return theta["rest"][:, None] * d.reshape(len(d), -1)
-
-
-def next_mission(effect: np.ndarray, theta: Theta, rho: float) -> tuple[np.ndarray, np.ndarray]:
-    """Mean (draw, robot) and sd (draw,) of d in the mission that follows those of some draws.
-
-    Args:
-        effect: Effects d, (draw, mission, robot).
-        theta: Hyperparameters tau_slow and tau_day, (draw,).
-        rho: Correlation of what stays.
-    """
-    n_missions = effect.shape[1]
-    scale, fading = _correlation(theta, rho, n_missions)
-    C, k = fading.correlation(), fading.share[:, None] * rho ** np.arange(n_missions, 0, -1)
-    gain = np.linalg.solve(C, k[..., None])[..., 0]
-    left = np.maximum(1.0 - (gain * k).sum(1), 0.0)
-    return np.einsum("nm,nmi->ni", gain, effect), scale * np.sqrt(left)
-
-
-def _correlation(theta: Theta, rho: float, n_missions: int) -> tuple[np.ndarray, Fading]:
-    """Sd (point,) and correlation of d; never singular, as rho < 1."""
-    slow, day = theta["tau_slow"], theta["tau_day"]
-    scale = hypot(slow, day)
-    return scale, Fading(share_of(slow, scale), rho, n_missions)
+def _rest(theta: Theta) -> np.ndarray:
+    """Drift (draw, robot or 1, 1) by which stationary trust rises by 1."""
+    rest = theta["rest"]
+    return rest.reshape(len(rest), -1, 1)

@@ -1,115 +1,140 @@
-"""Weights of features and the intercept, which all robots share, or drawn for each of them."""
+"""Weights of features and the intercept: shared by robots, drawn for each, or of coupled robots."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
+from scipy import sparse
 
 from trustbo.models.backend import namespace
-from trustbo.models.effects.effect import (
-    Columns,
-    Effect,
-    Prior,
-    Slots,
-    Theta,
-    dense_columns,
-    hypot,
-    share_of,
-)
+from trustbo.models.effects.effect import LEAST, Effect, Theta
 from trustbo.models.priors import Priors
-from trustbo.models.priors_numpy import of_coefficients
-
-_LEAST = 1e-8  # share of robots' differences in a variance: EP inverts the correlations
+from trustbo.models.slots import Slots
 
 
 @dataclass(frozen=True)
 class Weights(Effect):
-    """Effect of features and of a constant, under the priors of `beta` and `b`, both Normal.
-
-    With `by_robot` these are the priors of the means mu of the coefficients c_i of each robot,
-    N(mu, tau^2); the spreads tau_beta and tau_b come with theta.
-    """
+    """Effect of features and of a constant, under the priors of `beta` and `b`, both Normal."""
 
     priors: Priors
-    by_robot: bool = False
 
-    def group(self, slots: Slots) -> "FeatureColumns | FeatureColumnsByRobot":
-        """See `Effect.group`."""
-        constant = np.ones((*slots.z.shape[:2], 1))
-        mean, precision = of_coefficients(self.priors.beta, self.priors.b, slots.z.shape[2])
-        values = np.concatenate([slots.z, constant], axis=2)
-        moments = mean, precision**-0.5, self.priors.stationary
-        shared = FeatureColumns(dense_columns(values), *moments)
-        if not self.by_robot:
-            return shared
-        mine = slots.robot[:, None] == np.arange(n := slots.n_robots)
-        apart = values[..., None] * mine[:, None, None]
-        return FeatureColumnsByRobot(dense_columns(apart.reshape(*slots.y.shape, -1)), shared, n)
+    def columns(self, slots: Slots) -> Any:
+        """Features, and 1."""
+        return sparse.csr_array(_inputs(slots))
 
-
-class FeatureColumns(NamedTuple):
-    """Features, and 1."""
-
-    columns: Columns
-    mean: np.ndarray  # (column,)
-    sd: np.ndarray
-    stationary: bool
-    joined = ()
-    fades = False
-
-    def prior(self, theta: Theta) -> Prior:
+    def prior(self, theta: Theta, slots: Slots) -> tuple[Any, list[Any]]:
         """Independent coefficients, of stationary trust if these are what the priors are of."""
-        rest = theta["rest"][:, None] if self.stationary else np.ones((len(theta["beta0"]), 1))
-        return Prior(rest * self.mean, rest * self.sd)
+        mean, sd = self.moments(theta, slots)
+        return mean, [sd**-2.0]
 
-    def name(self, c: np.ndarray, theta: Theta, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    def moments(self, theta: Theta, slots: Slots) -> tuple[Any, Any]:
+        """Means and sds of the coefficients, (point, column)."""
+        mean, sd = self.priors.coefficients(slots.z.shape[3])
+        rest = theta["rest"][:, None]
+        rest = rest if self.priors.stationary else 0.0 * rest + 1.0
+        return rest * mean, rest * sd
+
+    def named(self, c: np.ndarray, theta: Theta, slots: Slots) -> dict[str, np.ndarray]:
         """Weights beta (draw, feature) and intercept b (draw,)."""
         return {"beta": c[:, :-1], "b": c[:, -1]}
 
+    def coefficients(
+        self, values: Mapping[str, np.ndarray], theta: Theta, slots: Slots
+    ) -> np.ndarray:
+        """See `Effect.coefficients`."""
+        return np.column_stack([values["beta"], values["b"]])
 
-class FeatureColumnsByRobot(NamedTuple):
-    """Features, and 1, of one robot each, the robot fastest."""
 
-    columns: Columns
-    shared: FeatureColumns
-    n_robots: int
-    fades = False
+@dataclass(frozen=True)
+class RobotWeights(Weights):
+    """Coefficients of each robot, N(mu, tau^2), mu under the priors; theta has the spreads tau."""
 
-    @property
-    def joined(self) -> list[slice]:
-        """Robots' coefficients of one feature."""
-        n = self.n_robots
-        return [slice(i, i + n) for i in range(0, n * len(self.shared.mean), n)]
+    def columns(self, slots: Slots) -> Any:
+        """Features, and 1, of one robot each, the robot fastest."""
+        values = _inputs(slots)
+        mine = np.tile(np.eye(slots.n_robots), (len(values) // slots.n_robots, 1))
+        return sparse.csr_array((values[..., None] * mine[:, None]).reshape(len(values), -1))
 
-    def prior(self, theta: Theta) -> Prior:
-        """Coefficients of one feature alike, as they share its mean."""
-        n, of_mean, tau = self.n_robots, self.shared.prior(theta), _spreads(theta)
-        xp: Any = namespace(tau)
-        sd = hypot(of_mean.sd, tau)
-        apart = xp.maximum(share_of(tau, sd), _LEAST)  # the correlation is apart I + alike 11'
-        alike, diagonal, below = 1.0 - apart, [], []
-        for _ in range(n):  # columns of its root, alike below the diagonal
-            diagonal.append(xp.sqrt(apart + alike))
-            below.append(alike / diagonal[-1])
-            alike = alike * apart / (apart + alike)
-        columns = (xp.stack(column, axis=-1)[..., None, :] for column in (diagonal, below))
-        root = sum(
-            x * where for x, where in zip(columns, (np.eye(n), np.tri(n, k=-1)), strict=True)
-        )
-        mean, sd = (xp.repeat(moment, n, axis=1) for moment in (of_mean.mean, sd))
-        return Prior(mean, sd, list(xp.moveaxis(root, 1, 0)))
+    def prior(self, theta: Theta, slots: Slots) -> tuple[Any, list[Any]]:
+        """Coefficients of one feature are alike, as they share its mean."""
+        n, (mean, sd) = slots.n_robots, self.moments(theta, slots)
+        tau = namespace(mean).maximum(_spreads(theta), LEAST)
+        alike = sd**2 / (tau**2 + n * sd**2)  # (sd^2 11' + tau^2 1)^-1 in closed form
+        parts = [
+            (np.eye(n) - alike[:, m, None, None]) / tau[:, m, None, None] ** 2
+            for m in range(mean.shape[1])
+        ]
+        return namespace(mean).repeat(mean, n, axis=1), parts
 
-    def name(self, c: np.ndarray, theta: Theta, rng: np.random.Generator) -> dict[str, np.ndarray]:
-        """Weights beta (draw, robot, feature), intercepts b (draw, robot), and a draw of means."""
-        c = np.swapaxes(c.reshape(len(c), -1, self.n_robots), 1, 2)
-        prior, var = self.shared.prior(theta), _spreads(theta) ** 2 / self.n_robots
-        gain = share_of(prior.sd, np.hypot(prior.sd, np.sqrt(var)))
-        mu = prior.mean + gain * (c.mean(1) - prior.mean)
-        mu += np.sqrt(gain * var) * rng.standard_normal(mu.shape)
+    def named(self, c: np.ndarray, theta: Theta, slots: Slots) -> dict[str, np.ndarray]:
+        """Weights beta (draw, robot, feature), intercepts b (draw, robot), and their means.
+
+        `mean_beta` and `mean_b` are expectations given the coefficients.
+        """
+        c = np.swapaxes(c.reshape(len(c), -1, slots.n_robots), 1, 2)
+        mean, sd = self.moments(theta, slots)
+        gain = sd**2 / (sd**2 + _spreads(theta) ** 2 / slots.n_robots)
+        mu = mean + gain * (c.mean(1) - mean)
         means = {"mean_beta": mu[:, :-1], "mean_b": mu[:, -1]}
         return {"beta": c[..., :-1], "b": c[..., -1]} | means
 
+    def coefficients(
+        self, values: Mapping[str, np.ndarray], theta: Theta, slots: Slots
+    ) -> np.ndarray:
+        """See `Effect.coefficients`."""
+        c = np.concatenate([values["beta"], values["b"][..., None]], axis=-1)
+        return np.swapaxes(c, 1, 2).reshape(len(c), -1)
 
-def _spreads(theta: Theta) -> np.ndarray:
+
+@dataclass(frozen=True)
+class CoupledWeights(Weights):
+    """Weight of feature m at robot l in the trust of robot i, matrices B_m, and intercepts b_i."""
+
+    def columns(self, slots: Slots) -> Any:
+        """Features of all robots, and 1, for each robot."""
+        n = slots.n_robots
+        inputs = slots.z.reshape(-1, 1, n * slots.z.shape[3])  # (mission * bound, 1, (robot, m))
+        inputs = np.concatenate([inputs, np.ones((*inputs.shape[:2], 1))], axis=2)
+        values = np.eye(n)[:, :, None] * inputs[:, :, None]  # (..., robot, of robot, input)
+        return sparse.csr_array(values.reshape(slots.y.size, -1))
+
+    def prior(self, theta: Theta, slots: Slots) -> tuple[Any, list[Any]]:
+        """Weights of a robot's own features as of other models; of others', `Priors.coupling`."""
+        n, (mean, sd) = slots.n_robots, self.priors.coefficients(slots.z.shape[3])
+        n_features = len(mean) - 1
+        own = np.repeat(np.eye(n, dtype=bool), n_features, axis=1)
+        own = np.column_stack([own, np.ones(n, dtype=bool)])  # (robot, input)
+        feature = np.append(np.tile(np.arange(n_features), n), n_features)
+        coupling = self.priors.coupling_moments
+        xp, rest = namespace(theta["rest"]), theta["rest"][..., None]
+        rest = rest if self.priors.stationary else 0.0 * rest + 1.0
+        means = xp.where(own, rest * mean[feature], coupling[0])
+        sds = xp.where(own, rest * sd[feature], coupling[1])
+        return means.reshape(len(means), -1), [sds.reshape(len(sds), -1) ** -2.0]
+
+    def named(self, c: np.ndarray, theta: Theta, slots: Slots) -> dict[str, np.ndarray]:
+        """Matrices B (draw, feature, robot, robot') and intercepts b (draw, robot)."""
+        n = slots.n_robots
+        c = c.reshape(len(c), n, -1)
+        B = c[..., :-1].reshape(len(c), n, n, -1)
+        return {"B": np.moveaxis(B, -1, 1), "b": c[..., -1]}
+
+    def coefficients(
+        self, values: Mapping[str, np.ndarray], theta: Theta, slots: Slots
+    ) -> np.ndarray:
+        """See `Effect.coefficients`."""
+        B = np.moveaxis(values["B"], 1, -1)
+        B = B.reshape(*B.shape[:2], -1)
+        return np.concatenate([B, values["b"][..., None]], axis=2).reshape(len(B), -1)
+
+
+def _inputs(slots: Slots) -> np.ndarray:
+    """Features and 1, (slot, feature + 1)."""
+    z = slots.z.reshape(-1, slots.z.shape[3])
+    return np.column_stack([z, np.ones(len(z))])
+
+
+def _spreads(theta: Theta) -> Any:
     xp: Any = namespace(theta["tau_b"])
     return xp.concatenate([theta["tau_beta"], theta["tau_b"][:, None]], axis=1)

@@ -1,14 +1,14 @@
 """Families of observations: distributions of a contact rate given trust, one file each.
 
-To add one, write its file after `gaussian` (trust integrates out), `censored` (a filter that
-completes rates) or `beta_binomial` (any log-concave distribution, by its derivatives), and list it
-here.
+To add one, write its file with `match` and `draw`, after `censored` (closed forms) or
+`beta_binomial` (any density, by Gauss-Hermite nodes), and list it here.
 """
 
 from trustbo.models.families.beta_binomial import BetaBinomial
 from trustbo.models.families.censored import Censored
-from trustbo.models.families.family import Family, Observed
+from trustbo.models.families.family import Family
 from trustbo.models.families.gaussian import Gaussian
+from trustbo.models.families.levels import Levels
 
 FAMILIES: dict[str, Family] = {
     family.name: family for family in (Gaussian(), Censored(), BetaBinomial())
@@ -20,4 +20,4 @@ def family_of(observation: str) -> Family:
     return FAMILIES[observation]
 
 
-__all__ = ["FAMILIES", "Family", "Observed", "family_of"]
+__all__ = ["FAMILIES", "Family", "Levels", "family_of"]

@@ -1,162 +1,109 @@
-"""The interface of a family of observations.
+"""The protocol of a family of observations: rates given a signal, and a signal given rates.
 
-Where latent trust does not integrate out, it is sampled with the parameters, as a smooth function
-of standard normal innovations conditioned on the data. The remaining factor of the density is a
-weight. So the innovations stay close to standard normal a posteriori, NUTS meets no funnel, and the
-mean weight over innovations is the likelihood of a mission with its trust integrated out: all
-families can be compared.
+A signal f is trust with the noise that rates share. A new family is a file with a subclass of
+`Family`, and a row in `families/__init__`; `match` of a density without a closed form takes
+`match_by_nodes`.
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jax import Array, random
 from numpy import ndarray
 from numpy.random import Generator
+from scipy import special
 
-from trustbo.models.families.terms import Terms
-from trustbo.models.state_space.scalar import ScalarSSM
-from trustbo.models.state_space.vector import VectorSSM
+from trustbo.models.backend import namespace
 
-SSM = ScalarSSM | VectorSSM
 Moments = tuple[ndarray, ndarray, ndarray]
-N_IMPORTANCE = 32
-"""Trajectories to average the likelihood over where trust does not integrate out."""
-
-
-class Observed(NamedTuple):
-    """Measured data, bound first: axes (bound, mission, robot)."""
-
-    y: Array
-    """Contact rates; NaN where not measured."""
-    n_ticks: Array
-    """Ticks of the bound; NaN where not known."""
-    linearisation: Array | None = None
-    """Linearisation point: trust around which a likelihood is fitted by a Gaussian."""
-
-    @classmethod
-    def of(cls, y: Array, n_ticks: Array | None = None, linearisation: Array | None = None) -> Self:
-        """Put the bound first in rates and ticks of shape (mission, bound, robot)."""
-        n_ticks = jnp.full_like(y, jnp.nan) if n_ticks is None else n_ticks
-        return cls(jnp.swapaxes(y, 0, 1), jnp.swapaxes(n_ticks, 0, 1), linearisation)
+_NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(9)
+_LOG_WEIGHTS = np.log(_WEIGHTS / _WEIGHTS.sum())
+_STEP = 0.05  # of differences in a search for the mode
 
 
 @dataclass(frozen=True)
 class Family(ABC):
-    """A family of observations; without state, so that compiled code takes it as static."""
+    """A family of observations. All arrays broadcast; `delta_v` is the sd of the noise."""
 
     name: ClassVar[str]
     """Name that users give."""
-    integrates_out: ClassVar[bool] = False
-    """Whether latent trust integrates out in closed form: rates are linear in it, and Gaussian."""
+    gaussian: ClassVar[bool] = False
+    """Whether rates are the signal plus normal noise, so that everything integrates out exactly."""
     needs_ticks: ClassVar[bool] = False
     """Whether each measured rate needs its number of ticks."""
     rounds: ClassVar[bool] = True
     """Whether delta_v is the sd of a rate, recorded to the resolution of its ticks."""
-    observes_trust: ClassVar[bool] = False
-    """Whether `observe` maps moments of trust, not of the rate before clipping."""
     correlates: ClassVar[bool] = True
     """Whether observation noise may be correlated between robots."""
-
-    log_constant: ClassVar[float] = 0.0
-    """Term that the log density of `observe` lacks, nats."""
     expected_rate: ClassVar[str] = "identity"
     """Form of E[rate | trust] in compiled planning: `"identity"` (trust itself), `"logistic"`, or
     `"clipped"` (of a normal with sd delta_v, cut to [0, 1]); the mean of `rate_moments`."""
 
     @abstractmethod
-    def log_density(self, ssm: SSM, observed: Observed, e: Array, complete: bool = False) -> Array:
-        """Log density of the rates, latent trust integrated out or weighted given innovations.
+    def sample(self, trust: ndarray, delta_v: ndarray, n_ticks: ndarray, rng: Generator) -> ndarray:
+        """Rates given the signal."""
 
-        Its exponential's mean over standard normal innovations is the marginal likelihood.
+    @abstractmethod
+    def log_prob(self, y: Any, n_ticks: Any, trust: Any, delta_v: Any) -> Any:
+        """Log density or probability of measured rates given the signal, in NumPy or JAX."""
 
-        Args:
-            ssm: State space.
-            observed: Rates.
-            e: Innovations, standard normal, shape (bound, mission, robot); not read if trust
-                integrates out.
-            complete: Whether no rate is missing before the last of a mission.
+    @abstractmethod
+    def match(
+        self, y: ndarray, n_ticks: ndarray, m: ndarray, v: ndarray, delta_v: ndarray
+    ) -> Moments:
+        """Log mass, mean and variance of N(f; m, v) times the term of a rate.
 
-        Returns:
-            Nats, shape (mission, robot) where robots are independent, else (mission, 1).
+        Where y is NaN these are 0, m and v.
         """
 
     @abstractmethod
-    def measure(self, key: Array, ssm: SSM, trust: Array, y: Array, n_ticks: Array) -> Array:
-        """Contact rates given simulated trust, and given the linear Gaussian rates `y` of it."""
+    def draw(
+        self,
+        y: ndarray,
+        n_ticks: ndarray,
+        m: ndarray,
+        v: ndarray,
+        delta_v: ndarray,
+        rng: Generator,
+    ) -> tuple[ndarray, ndarray]:
+        """A draw of the signal from N(f; m, v) times the term of a rate, and its log weight.
 
-    @abstractmethod
-    def draw_rates(
-        self, rng: Generator, trust: ndarray, y: ndarray, noise_sd: ndarray, n_ticks: ndarray
-    ) -> ndarray:
-        """`measure` in NumPy; `noise_sd` is delta_v, all arrays broadcast to trust."""
-
-    @abstractmethod
-    def observe(
-        self, mean: ndarray, var: ndarray, y: ndarray, n_ticks: ndarray, noise_sd: ndarray
-    ) -> Moments:
-        """Moments given a rate that was predicted N(mean, var), and its log probability or density.
-
-        Moments are of the rate before clipping, noise included, or of trust where `observes_trust`.
-        Arrays broadcast; `y` is not NaN.
+        The mean weight is the mass; it does not vary where the draw is exact.
         """
 
     @abstractmethod
     def probabilities(
-        self, trust: np.ndarray, noise_sd: np.ndarray, y: np.ndarray, n_ticks: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Probabilities of a rate below y, and of one up to y, given trust; arrays broadcast."""
-
-    @abstractmethod
-    def terms(self, y: np.ndarray, n_ticks: np.ndarray) -> Terms:
-        """Terms of measured rates of any shape, for expectation propagation; see `ep.terms`."""
-
-    @abstractmethod
-    def is_density(self, y: np.ndarray) -> np.ndarray:
-        """Mask of the measured rates that have a density, not a probability."""
+        self, trust: ndarray, noise_sd: ndarray, y: ndarray, n_ticks: ndarray
+    ) -> tuple[ndarray, ndarray]:
+        """Probabilities of a rate below y, and of one up to y, given trust."""
 
     @abstractmethod
     def rate_moments(self, trust: ndarray, noise_sd: ndarray) -> Moments:
         """Mean of a rate given trust, its slope in trust, and the variance of the rate.
 
-        `noise_sd` is delta_v, broadcast to trust. For counts, the number of ticks is that of a rate
-        recorded to .005.
+        For counts, the number of ticks is that of a rate recorded to .005.
         """
+
+    def is_density(self, y: ndarray) -> ndarray:
+        """Mask of the measured rates that have a density, not a probability."""
+        return np.zeros(y.shape, dtype=bool)
+
+    def is_linear(self, y: ndarray) -> ndarray:
+        """Mask of the measured rates that are the signal plus normal noise."""
+        return self.is_density(y)
 
     @property
     def line_of_sight(self) -> tuple[float, float]:
-        """Trust equivalent of a line of sight of 1, and the line of sight of trust 0."""
+        """Slope and zero of the map from line of sight to trust: trust = slope (sight - zero)."""
         return 1.0, 0.0
 
     def priors(self) -> dict[str, Any]:
         """Default priors that differ from those of `Priors()`, by name."""
         return {}
 
-    def refine(self, ssm: SSM, observed: Observed) -> Observed:
-        """Find the linearisation point, if the family has one."""
-        return observed
-
-    def marginal_log_likelihood(self, ssm: SSM, observed: Observed, key: Array) -> Array:
-        """Log p(rates of each mission), latent trust integrated out, shape (mission,), nats.
-
-        Exact where trust integrates out; else by importance sampling with antithetic innovations.
-        """
-        if self.integrates_out:
-            return self.log_density(ssm, observed, jnp.zeros_like(observed.y)).sum(1)
-        observed = self.refine(ssm, observed)
-        half = random.normal(key, (N_IMPORTANCE // 2, *observed.y.shape), observed.y.dtype)
-
-        weights = jax.vmap(lambda e: self.log_density(ssm, observed, e))(
-            jnp.concatenate([half, -half])
-        )
-        # Over innovations first, sequence by sequence: these are independent.
-        return (jax.nn.logsumexp(weights, axis=0) - np.log(len(weights))).sum(1)
-
-    def log_resolution(self, y: np.ndarray, n_ticks: np.ndarray) -> np.ndarray:
+    def log_resolution(self, y: ndarray, n_ticks: ndarray) -> ndarray:
         """Log ratio of the probability of a count of ticks to the density of its rate.
 
         A density covers 1/N per tick. Shape of `y`; 0 where not measured or where the rate itself
@@ -164,3 +111,94 @@ class Family(ABC):
         """
         is_density = ~np.isnan(y) & self.is_density(y)
         return np.where(is_density, -np.log(np.where(is_density, n_ticks, 1.0)), 0.0)
+
+
+def log_normal(e: Any, variance: Any) -> Any:
+    """Log density of N(0, variance) at e."""
+    return -0.5 * (e**2 / variance + namespace(variance).log(2.0 * np.pi * variance))
+
+
+def match_interval(low: ndarray, high: ndarray, m: ndarray, v: ndarray, noise: ndarray) -> Moments:
+    """Moments of N(f; m, v) where f plus normal noise lies between two numbers."""
+    total = v + noise**2
+    sd = np.sqrt(total)
+    log_p, e, spread = truncated(*((end - m) / sd for end in (low, high)))
+    return log_p, m + v / sd * e, v - v**2 / total * (1.0 - spread)
+
+
+def truncated(a: ndarray, b: ndarray) -> Moments:
+    """Log probability, mean and variance of a standard normal between a and b."""
+    mirror = a > -b  # the lower tail is the accurate one
+    a, b = np.where(mirror, -b, a), np.where(mirror, -a, b)
+    log_p = log_between(a, b)
+    with np.errstate(invalid="ignore"):
+        at_a, at_b = (np.exp(-0.5 * x**2 - 0.5 * np.log(2.0 * np.pi) - log_p) for x in (a, b))
+        slope = np.where(np.isfinite(a), a, 0.0) * at_a - np.where(np.isfinite(b), b, 0.0) * at_b
+    mean = at_a - at_b
+    return log_p, np.where(mirror, -mean, mean), np.clip(1.0 + slope - mean**2, 0.0, 1.0)
+
+
+def log_between(a: ndarray, b: ndarray) -> ndarray:
+    """Log of Phi(b) - Phi(a), for a + b <= 0."""
+    with np.errstate(divide="ignore"):
+        log_b = special.log_ndtr(b)
+        gap = np.minimum(special.log_ndtr(a) - log_b, -1e-300)
+        return log_b + np.log(-np.expm1(gap))
+
+
+def draw_between(a: ndarray, b: ndarray, rng: Generator) -> ndarray:
+    """Standard normal draws between a and b."""
+    mirror = a > -b
+    a, b = np.where(mirror, -b, a), np.where(mirror, -a, b)
+    with np.errstate(divide="ignore"):
+        log_b = special.log_ndtr(b)
+        below = np.exp(np.minimum(special.log_ndtr(a) - log_b, 0.0))
+        share = rng.random(np.broadcast(a, b).shape)
+        z = special.ndtri_exp(log_b + np.log(below + (1.0 - below) * share))
+    z = np.clip(z, a, b)
+    return np.where(mirror, -z, z)
+
+
+def draw_between_knots(knots: ndarray, log_f: ndarray, rng: Generator) -> tuple[ndarray, ndarray]:
+    """Draws from a density that is log-linear between knots (..., knot), and their log density."""
+    width, rise = np.diff(knots), np.diff(log_f)
+    flat = np.abs(rise) < 1e-9
+    slope = np.where(flat, 1.0, rise)
+    log_mass = log_f[..., :-1] + np.log(width)
+    log_mass = log_mass + np.where(flat, 0.0, np.log(np.expm1(slope) / slope))
+    piece = np.argmax(log_mass + rng.gumbel(size=log_mass.shape), axis=-1)[..., None]
+    start, width, slope, low = (
+        np.take_along_axis(a, piece, axis=-1)[..., 0] for a in (knots, width, rise, log_f)
+    )
+    u, flat = rng.random(start.shape), np.abs(slope) < 1e-9
+    steep = np.where(flat, 1.0, slope)
+    share = np.where(flat, u, np.log1p(u * np.expm1(steep)) / steep)
+    log_total = special.logsumexp(log_mass, axis=-1)
+    return start + share * width, low + share * slope - log_total
+
+
+def match_by_nodes(
+    log_prob: Callable[[ndarray], ndarray], start: ndarray, m: ndarray, v: ndarray
+) -> Moments:
+    """Moments of N(f; m, v) times a term, by Gauss-Hermite nodes around the mode.
+
+    Args:
+        log_prob: Log of the term at nodes (..., node).
+        start: Start of the search for the mode, of the shape of the arrays.
+        m: Means.
+        v: Variances.
+    """
+    x, q = np.array(start), 1.0 / v
+    for _ in range(3):
+        low, middle, high = np.moveaxis(log_prob(x[..., None] + _STEP * np.arange(-1, 2)), -1, 0)
+        q = 1.0 / v - np.minimum((high - 2.0 * middle + low) / _STEP**2, 0.0)
+        x = x + np.clip(((high - low) / (2.0 * _STEP) - (x - m) / v) / q, -2.0, 2.0)
+    sd = 1.1 / np.sqrt(q)
+    node = x[..., None] + sd[..., None] * _NODES
+    log_f = log_prob(node) - 0.5 * (node - m[..., None]) ** 2 / v[..., None]
+    log_f += _LOG_WEIGHTS + 0.5 * _NODES**2
+    log_mass = special.logsumexp(log_f, axis=-1)
+    weight = np.exp(log_f - log_mass[..., None])
+    mean = (weight * node).sum(-1)
+    var = (weight * (node - mean[..., None]) ** 2).sum(-1)
+    return log_mass + np.log(sd / np.sqrt(v)), mean, np.maximum(var, 1e-9)

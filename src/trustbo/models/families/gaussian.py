@@ -1,17 +1,14 @@
-"""Gaussian rates, the paper's equation (4): y = x + v, latent trust integrated out exactly."""
+"""Gaussian rates, the paper's equation (4): y = x + v."""
 
-import math
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
-from jax import Array
 from numpy import ndarray
 from numpy.random import Generator
 from scipy.stats import norm
 
-from trustbo.models.families.family import SSM, Family, Moments, Observed
-from trustbo.models.families.terms import GAUSSIAN, NONE, Terms
+from trustbo.models.families.family import Family, Moments, log_normal
 
 
 @dataclass(frozen=True)
@@ -19,45 +16,49 @@ class Gaussian(Family):
     """Rates that are trust plus normal noise."""
 
     name: ClassVar[str] = "gaussian"
-    integrates_out: ClassVar[bool] = True
-    log_constant: ClassVar[float] = -0.5 * math.log(2.0 * math.pi)
+    gaussian: ClassVar[bool] = True
 
-    def log_density(self, ssm: SSM, observed: Observed, e: Array, complete: bool = False) -> Array:
-        """See `Family.log_density`; innovations are not read."""
-        return ssm.log_likelihood(observed.y, complete=complete)
+    def sample(self, trust: ndarray, delta_v: ndarray, n_ticks: ndarray, rng: Generator) -> ndarray:
+        """See `Family.sample`: rates may leave [0, 1]."""
+        return trust + delta_v * rng.standard_normal(np.broadcast(trust, delta_v, n_ticks).shape)
 
-    def measure(self, key: Array, ssm: SSM, trust: Array, y: Array, n_ticks: Array) -> Array:
-        """See `Family.measure`: `y` unclipped, which may leave [0, 1]."""
-        return y
+    def log_prob(self, y: Any, n_ticks: Any, trust: Any, delta_v: Any) -> Any:
+        """See `Family.log_prob`."""
+        return log_normal(y - trust, delta_v**2)
+
+    def match(
+        self, y: ndarray, n_ticks: ndarray, m: ndarray, v: ndarray, delta_v: ndarray
+    ) -> Moments:
+        """See `Family.match`."""
+        seen, total = ~np.isnan(y), v + delta_v**2
+        off = np.where(seen, y - m, 0.0)
+        var = np.where(seen, v - v**2 / total, v)
+        return np.where(seen, log_normal(off, total), 0.0), m + v / total * off, var
+
+    def draw(
+        self,
+        y: ndarray,
+        n_ticks: ndarray,
+        m: ndarray,
+        v: ndarray,
+        delta_v: ndarray,
+        rng: Generator,
+    ) -> tuple[ndarray, ndarray]:
+        """See `Family.draw`: exact."""
+        log_p, mean, var = self.match(y, n_ticks, m, v, delta_v)
+        return mean + np.sqrt(var) * rng.standard_normal(mean.shape), log_p
+
+    def probabilities(
+        self, trust: ndarray, noise_sd: ndarray, y: ndarray, n_ticks: ndarray
+    ) -> tuple[ndarray, ndarray]:
+        """See `Family.probabilities`."""
+        p = norm.cdf((y - trust) / noise_sd)
+        return p, p
 
     def rate_moments(self, trust: ndarray, noise_sd: ndarray) -> Moments:
         """See `Family.rate_moments`."""
         return trust, np.ones(trust.shape), np.broadcast_to(noise_sd**2, trust.shape)
 
-    def draw_rates(
-        self, rng: Generator, trust: ndarray, y: ndarray, noise_sd: ndarray, n_ticks: ndarray
-    ) -> ndarray:
-        """See `Family.draw_rates`."""
-        return y
-
-    def observe(
-        self, mean: ndarray, var: ndarray, y: ndarray, n_ticks: ndarray, noise_sd: ndarray
-    ) -> Moments:
-        """See `Family.observe`; the density without its constant."""
-        value = np.broadcast_to(y, mean.shape)
-        return value, np.zeros(mean.shape), -0.5 * ((y - mean) ** 2 / var + np.log(var))
-
-    def probabilities(
-        self, trust: np.ndarray, noise_sd: np.ndarray, y: np.ndarray, n_ticks: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """See `Family.probabilities`."""
-        p = norm.cdf((y - trust) / noise_sd)
-        return p, p
-
-    def terms(self, y: np.ndarray, n_ticks: np.ndarray) -> Terms:
-        """See `Family.terms`."""
-        return Terms.of(np.where(np.isnan(y), NONE, GAUSSIAN))
-
-    def is_density(self, y: np.ndarray) -> np.ndarray:
+    def is_density(self, y: ndarray) -> ndarray:
         """See `Family.is_density`: every rate has a density."""
         return np.ones(y.shape, dtype=bool)

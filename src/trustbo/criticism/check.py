@@ -1,0 +1,253 @@
+"""Check of a fitted model: what its posterior, its predictions and LOO say may be wrong."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from trustbo.data import Mission
+from trustbo.display import Rows, Summary, joined
+from trustbo.errors import TrustboError
+from trustbo.inference.compare import compare as ranked
+from trustbo.inference.draws import is_of_people, missions_of, model_of, require_posterior
+from trustbo.inference.fit import fit
+from trustbo.inference.score import score
+from trustbo.models.effects.place import PlaceEffect
+from trustbo.models.effects.robot import RobotEffect
+from trustbo.models.families import family_of
+from trustbo.models.model import TrustModel
+from trustbo.models.visited import has_places
+
+SIZE, SURE = 0.1, 0.95
+"""Contact from which on an effect may change a plan, and the probability that it is that large."""
+_SIGNED = 0.6  # prior probability of one sign from which on a weight has an expected sign
+_TOLERANCE = 0.05  # of the share of rates in 90 % intervals
+_ERRORS = 2.0  # standard errors of a difference that counts
+_GIVEN = "the model"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Check(Summary):
+    """Check of a fitted model.
+
+    Attributes:
+        verdict: The findings that stand out, in words.
+        table: Row of each check (index `check`): the label that is most affected, the size of the
+            finding, its probability, whether it `stands_out`, and the finding in words.
+        robots: Row of each mission and robot: its effect as a share of line of sight, less the
+            median of all, sd, the probability of more than .1, and whether it `stands_out`.
+        loo: Table of `compare` of the model, the model without each of its effects, and with each
+            that it lacks; empty without `compare`.
+    """
+
+    verdict: str
+    table: pd.DataFrame
+    robots: pd.DataFrame
+    loo: pd.DataFrame
+
+    def _rows(self) -> Rows:
+        rows = [(str(name), str(row["finding"])) for name, row in self.table.iterrows()]
+        return [("verdict", self.verdict), *rows]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A row of the table of a check."""
+
+    finding: str
+    stands_out: bool = False
+    label: str = ""
+    size: float = np.nan
+    probability: float = np.nan
+
+
+def check(
+    posterior: xr.DataTree | Sequence[xr.DataTree],
+    missions: Sequence[Mission] | None = None,
+    *,
+    compare: bool = True,
+    model: TrustModel | None = None,
+) -> Check:
+    """Check a fitted model of contact rates.
+
+    A robot stands out in a mission if its share of line of sight differs by more than .1 from the
+    team's median with a probability above .95; a place, if its effect exceeds .1 of contact; a
+    weight, if its sign contradicts the prior's; coverage, if 90 % intervals one mission ahead hold
+    a share of the rates that differs by more than .05 and two standard errors over missions; a
+    comparison, if another model predicts missions left out better by two standard errors. The
+    shape of predictions is seen in `az.plot_loo_pit(tb.inference.by_rate(posterior))`, the weight
+    of the priors in `az.psense_summary(posterior)`.
+
+    Args:
+        posterior: DataTree from `fit`; or all of a campaign, `Result.posteriors`, the last of which
+            is checked and whose predictions one mission ahead are scored.
+        missions: Missions that it was fitted to, needed where it holds no data; those of the
+            campaign.
+        compare: Whether to compare, by LOO, with other models, each of which is a fit.
+        model: Its model, needed if its priors are custom.
+
+    Raises:
+        TrustboError: No posterior of `fit`, one of people's reports, or one that holds no data
+            and no missions are given.
+    """
+    trees = list(posterior) if isinstance(posterior, Sequence) else [posterior]
+    tree = require_posterior("check", trees[-1])
+    if is_of_people(tree):
+        raise TrustboError("check is of robots' contact; this posterior is of people's reports.")
+    missions = missions_of(tree) if missions is None else missions
+
+    robots = effects_of_robots(tree)
+    findings = {
+        "robots": _check_robots(robots),
+        "places": _check_places(tree),
+        "weights": _check_weights(tree),
+        "coverage": _check_coverage(trees, missions),
+    }
+    loo = _compare(tree, missions, model) if compare else pd.DataFrame()
+    if len(loo):
+        findings["comparison"] = _check_comparison(loo)
+    rows = {name: asdict(finding) for name, finding in findings.items()}
+    table = pd.DataFrame.from_dict(rows, orient="index").rename_axis("check")
+    odd = [finding.finding for finding in findings.values() if finding.stands_out]
+    return Check(("; ".join(odd) or "nothing stands out") + ".", table, robots, loo)
+
+
+def effects_of_robots(posterior: xr.DataTree) -> pd.DataFrame:
+    """Row of each mission and robot, see `Check.robots`; none if the model has no such effects."""
+    if "robots" not in posterior.children:
+        return pd.DataFrame()
+    group, draws = posterior["robots"].to_dataset(), draws_of(posterior, "robots", "robot_effect")
+    # The weight of line of sight fits the level of all effects.
+    draws = draws - np.median(draws, axis=(1, 2), keepdims=True)
+    draws = draws / family_of(posterior.attrs["observation"]).line_of_sight[0]
+    probability = np.maximum((draws < -SIZE).mean(0), (draws > SIZE).mean(0))
+    columns = {"effect": draws.mean(0), "sd": draws.std(0), "probability": probability}
+    columns["stands_out"] = probability > SURE
+    dims = ("mission", "robot")
+    coords = {name: group[name].values for name in dims}
+    table = xr.Dataset({name: (dims, values) for name, values in columns.items()}, coords)
+    return table.to_dataframe().reset_index()
+
+
+def draws_of(posterior: xr.DataTree, group: str, name: str) -> np.ndarray:
+    """Draws of a variable, shape (draw, ...), the chains joined."""
+    values = posterior[group].to_dataset()[name].transpose("chain", "draw", ...).values
+    return values.reshape(-1, *values.shape[2:])
+
+
+def _check_robots(robots: pd.DataFrame) -> Finding:
+    if not len(robots):
+        return Finding("not tested: the model has no effects of robots")
+    effect, odd = robots["effect"].to_numpy(), robots["stands_out"].to_numpy()
+    if not odd.any():
+        return Finding("no robot stands out", size=float(np.abs(effect).max()))
+    mission, robot = robots["mission"].to_numpy(), robots["robot"].to_numpy()
+    words = []
+    for name in dict.fromkeys(robot[odd]):
+        rows = odd & (robot == name)
+        everywhere = rows.sum() == (robot == name).sum()
+        when = (
+            "all missions"
+            if everywhere
+            else f"mission {joined(mission[rows].astype(str).tolist())}"
+        )
+        side = "less" if effect[rows].mean() < 0.0 else "more"
+        mean = abs(effect[rows].mean())
+        words.append(f"{name} has {mean:.2f} {side} contact in full sight in {when}")
+    most = int(np.argmax(np.abs(effect) * odd))
+    size, p = float(effect[most]), float(robots["probability"].to_numpy()[most])
+    return Finding(joined(words), True, str(robot[most]), size, p)
+
+
+def _check_places(posterior: xr.DataTree) -> Finding:
+    if "places" not in posterior.children:
+        return Finding("not tested: the model has no effects of places")
+    places = posterior["places"].to_dataset()
+    cells = list(zip(places["cell_row"].values, places["cell_col"].values, strict=True))
+    bounds = list(zip(places["bound_row"].values, places["bound_col"].values, strict=True))
+    total, where = np.zeros(1), bounds
+    if "place_bound" in places:
+        total = draws_of(posterior, "places", "place_bound")
+    if "place" in places:
+        where = bounds if "place_bound" in places else cells
+        of_cells = draws_of(posterior, "places", "place")
+        total = total + of_cells[:, [cells.index(cell) for cell in where]]
+    beta0 = draws_of(posterior, "posterior", "beta0")
+    draws = total / (1.0 - beta0[:, None])  # stationary trust
+    effect = draws.mean(0)
+    sure = (draws * np.sign(effect) > 0.0).mean(0)
+    odd = (sure > SURE) & (np.abs(effect) > SIZE)
+    most = int(np.argmax(np.abs(effect) * (odd if odd.any() else 1.0)))
+    row, col = (int(i) for i in where[most])
+    words = f"{odd.sum()} of {len(odd)} places stand out, the largest effect is {effect[most]:+.2f}"
+    size, p = float(effect[most]), float(sure[most])
+    return Finding(words, bool(odd.any()), f"({row}, {col})", size, p)
+
+
+def _check_weights(posterior: xr.DataTree) -> Finding:
+    name = "beta" if "beta" in posterior["posterior"] else "B"
+    if "prior" not in posterior.children or name not in posterior["prior"]:
+        return Finding("not tested: the posterior holds no draws of the prior")
+    features = posterior["posterior"].to_dataset()["feature"].values
+    prior, draws = (
+        draws_of(posterior, group, name).reshape(-1, len(features))
+        for group in ("prior", "posterior")
+    )
+    sign = np.sign(prior.mean(0))
+    expected = (prior * sign > 0.0).mean(0) > _SIGNED
+    wrong = (draws * sign < 0.0).mean(0) * expected
+    most, odd = int(wrong.argmax()), [str(feature) for feature in features[wrong > SURE]]
+    words = "every weight agrees with its prior"
+    if odd:
+        words = f"the weight of {joined(odd)} has another sign than the prior expects"
+    size, p = float(draws[:, most].mean()), float(wrong[most])
+    return Finding(words, bool(odd), str(features[most]), size, p)
+
+
+def _check_coverage(trees: Sequence[xr.DataTree], missions: Sequence[Mission]) -> Finding:
+    if len(trees) < 2:
+        return Finding("not tested: give all posteriors of a campaign")
+    pit = score(trees, missions)["pit"]
+    within = (abs(pit - 0.5) <= 0.45).where(pit.notnull()).mean(("bound", "robot")).values
+    within = within[np.isfinite(within)]
+    off = float(within.mean() - 0.9)
+    error = within.std(ddof=1) / np.sqrt(len(within)) if len(within) > 1 else np.inf
+    words = f"90 % intervals one mission ahead hold {within.mean():.0%} of the rates"
+    return Finding(words, bool(abs(off) > max(_TOLERANCE, _ERRORS * error)), "90 %", off)
+
+
+def _compare(
+    posterior: xr.DataTree, missions: Sequence[Mission], model: TrustModel | None
+) -> pd.DataFrame:
+    """Table of `compare` of the model and its variants."""
+    others = {
+        name: fit(missions, other, seed=int(posterior.attrs["seed"]), progress=False)
+        for name, other in variants(model_of(posterior, model), missions).items()
+    }
+    return ranked({_GIVEN: posterior, **others}) if others else pd.DataFrame()
+
+
+def variants(model: TrustModel, missions: Sequence[Mission]) -> dict[str, TrustModel]:
+    """The model without each of its effects, and with each that it lacks, by name."""
+    named: dict[str, TrustModel] = {}
+    for effect in model.effects:
+        others = tuple(other for other in model.effects if other is not effect)
+        named[f"without effects of {effect.noun}"] = replace(model, effects=others)
+    kinds = (PlaceEffect, RobotEffect) if has_places(missions) else (RobotEffect,)
+    for kind in kinds:
+        if not any(isinstance(effect, kind) for effect in model.effects):
+            effects = (*model.effects, kind())
+            named[f"with effects of {kind.noun}"] = replace(model, effects=effects)
+    return named
+
+
+def _check_comparison(loo: pd.DataFrame) -> Finding:
+    best = str(loo.index[0])
+    if best == _GIVEN:
+        return Finding("no other model predicts missions left out better")
+    given = loo.index.get_loc(_GIVEN)
+    difference, error = (float(loo[name].to_numpy()[given]) for name in ("elpd_diff", "dse"))
+    words = f"{best} it predicts missions left out better by {abs(difference):.1f} nats"
+    return Finding(words, abs(difference) > _ERRORS * error, best, difference)

@@ -1,0 +1,179 @@
+"""Prior of the chance that a bound fails, as a function of normal scores."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import NamedTuple, Self
+
+import numpy as np
+from scipy import special
+from scipy.interpolate import PchipInterpolator
+
+from trustbo.errors import TrustboError, require_not_negative, require_positive
+
+REFERENCE = 0.5
+"""Difficulty at which the intercept is the logit of the prior mean."""
+TILT = "tilt"
+"""Measure of difficulty to which the slope limit applies."""
+LIMIT_NAMES = ("margin", "width")
+"""Parameters of the robots' slope limit, degrees."""
+FLOOR = 1e-12
+"""Least alpha and beta of a prior Beta: the logistic of a mean may round to 0 or 1."""
+_LARGEST_LOG = 50.0
+_FARTHEST = 40.0  # sds of the wide normal up to which the margin's quantile is tabulated
+
+
+@dataclass(frozen=True)
+class Hazard:
+    """Priors of the chance that a bound ends the mission; normal ones are (mean, sd).
+
+    By default the stated slope limit is right to half a degree with probability .9, and off by some
+    4 degrees with probability .1.
+
+    Attributes:
+        intercept: Prior of the logit of the mean chance at medium difficulty.
+        coefficient: Prior of the weight of each measure of difficulty, which ranges from easy (0)
+            to the robots' limit (1). The tilt has no weight: it is judged by the limit.
+        margin: Prior of the degrees by which the team's true slope limit is below the stated one,
+            if that is right. All bounds share the margin: a failure on one raises the chance of all
+            that are as steep.
+        doubt: Probability that the stated limit is wrong, and the sd of the margin then, degrees;
+            the prior of the margin is a mixture of two normals with the same mean. Give a
+            probability of 0 for a limit that was measured.
+        log_width: Prior of the log of the width of the limit in degrees: the chance to fail rises
+            from .1 to .9 within 4.4 widths of tilt.
+        log_strength: Prior of the log of the strength s: the weight of the prior mean in units of
+            observations, small if bounds fail always or never.
+        cause: Concentration of the Dirichlet prior over the causes of failure.
+
+    Raises:
+        TrustboError: An sd or a concentration that is not positive, or a share outside [0, 1).
+    """
+
+    intercept: tuple[float, float] = (-7.5, 1.5)
+    coefficient: tuple[float, float] = (2.0, 2.0)
+    margin: tuple[float, float] = (0.0, 0.5)
+    doubt: tuple[float, float] = (0.1, 4.0)
+    log_width: tuple[float, float] = (0.0, 0.5)
+    log_strength: tuple[float, float] = (-0.5, 1.0)
+    cause: float = 0.2
+
+    def __post_init__(self) -> None:
+        for name in ("intercept", "coefficient", "margin", "log_width", "log_strength"):
+            mean, sd = getattr(self, name)
+            object.__setattr__(self, name, (float(mean), require_positive(f"sd of {name}", sd)))
+        share, sd = self.doubt
+        doubt = require_not_negative("share of doubt", share), require_positive("sd of doubt", sd)
+        if doubt[0] >= 1.0:
+            raise TrustboError(f"share of doubt must be in [0, 1); got {share!r}.")
+        object.__setattr__(self, "doubt", doubt)
+        require_positive("cause", self.cause)
+
+    def of_bounds(
+        self, difficulty: np.ndarray, measures: Sequence[str], max_slope: float
+    ) -> "BoundPrior":
+        """Prior of bounds with difficulties (bound, measure); `max_slope` is the limit in rad."""
+        weighted = np.array([name != TILT for name in measures], dtype=bool)
+        normals, is_log, steepness = [self.intercept], [False], None
+        normals += [self.coefficient] * int(weighted.sum())
+        is_log += [False] * int(weighted.sum())
+        if TILT in measures:
+            normals += [self.margin, self.log_width]
+            is_log += [False, True]
+            steepness = steepness_of(difficulty[:, list(measures).index(TILT)], max_slope)
+        center, scale = np.array([*normals, self.log_strength]).T
+        difficulty = difficulty[:, weighted] - REFERENCE
+        is_log = np.array([*is_log, True])
+        return BoundPrior(center, scale, is_log, difficulty, steepness, self.doubt)
+
+
+class BoundPrior(NamedTuple):
+    """Beta priors of the chances of some bounds, as functions of normal scores.
+
+    A parameter is center + scale z or the exponential of it; the margin is the quantile of its
+    mixture.
+    """
+
+    center: np.ndarray  # (parameter,)
+    scale: np.ndarray  # (parameter,)
+    is_log: np.ndarray  # (parameter,)
+    difficulty: np.ndarray  # (bound, measure), less the reference
+    steepness: np.ndarray | None  # (bound,), degrees beyond the stated limit; None: no limit
+    doubt: tuple[float, float]
+
+    def of(self, bounds: np.ndarray) -> Self:
+        """Restrict to some of the bounds."""
+        steepness = None if self.steepness is None else self.steepness[bounds]
+        return self._replace(difficulty=self.difficulty[bounds], steepness=steepness)
+
+    def values(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Parameters at scores (point, parameter).
+
+        Returns:
+            Intercept and coefficients (point, 1 + measure); margin and width of the limit (point,
+            2), or (point, 0) without one; strength (point,).
+        """
+        values = self.center + self.scale * z
+        n = 1 + self.difficulty.shape[1]
+        if self.steepness is not None and self.doubt[0] > 0.0:
+            values[:, n] = self.center[n] + mixture_quantile(
+                z[:, n], float(self.scale[n]), *self.doubt
+            )
+        logs = np.clip(values[:, self.is_log], -_LARGEST_LOG, _LARGEST_LOG)
+        values[:, self.is_log] = np.exp(logs)
+        return values[:, :n], values[:, n:-1], values[:, -1]
+
+    def betas(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Alpha and beta of the Betas at scores (point, parameter), each (point, bound)."""
+        return prior_betas(*self.values(z), self.difficulty, self.steepness)
+
+
+def prior_betas(
+    weights: np.ndarray,
+    limit: np.ndarray,
+    strength: np.ndarray,
+    difficulty: np.ndarray,
+    steepness: np.ndarray | None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Compute alpha and beta of the prior Beta of each bound, each (point, bound).
+
+    A bound is passed if neither its difficulty nor the limit stops the robots: 1 - m is the product
+    of sigma(-logit) and sigma(-(steepness + margin) / width).
+    """
+    logit = weights[:, :1] + weights[:, 1:] @ difficulty.T
+    fails, passes = special.expit(logit), special.expit(-logit)
+    if steepness is not None:
+        beyond = (steepness + limit[:, :1]) / limit[:, 1:]
+        fails, passes = fails + passes * special.expit(beyond), passes * special.expit(-beyond)
+    return strength[:, None] * fails + FLOOR, strength[:, None] * passes + FLOOR
+
+
+def steepness_of(tilt: np.ndarray, max_slope: float) -> np.ndarray:
+    """Degrees beyond the limit, in rad, of a tilt as a share of the limit's tangent."""
+    return np.rad2deg(np.arctan(tilt * np.tan(max_slope)) - max_slope)
+
+
+def mixture_quantile(z: np.ndarray, narrow: float, share: float, wide: float) -> np.ndarray:
+    """Value x(z) with Phi(z) = (1 - share) Phi(x / narrow) + share Phi(x / wide).
+
+    Interpolated to 1e-5 of `narrow`; far out in the tails linear with the larger sd as its slope.
+    """
+    curve = _quantile_curve(float(narrow), share, wide)
+    end = curve.x[-1]
+    within = np.clip(z, -end, end)
+    return np.sign(z) * curve(np.abs(within)) + max(narrow, wide) * (z - within)
+
+
+@cache
+def _quantile_curve(narrow: float, share: float, wide: float) -> PchipInterpolator:
+    """The quantile for z >= 0; the mixture is symmetric."""
+    largest = _FARTHEST * max(narrow, wide)
+    x = narrow * np.sinh(np.linspace(0.0, np.arcsinh(largest / narrow), 4000))
+    # Upper tails by their logs, as 1 - F rounds to 0 from 38 sds on.
+    tails = (
+        np.log1p(-share) + special.log_ndtr(-x / narrow),
+        np.log(share) + special.log_ndtr(-x / wide),
+    )
+    z = -special.ndtri_exp(np.logaddexp(*tails))
+    z[0] = 0.0
+    return PchipInterpolator(z, x)

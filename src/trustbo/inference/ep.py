@@ -1,0 +1,217 @@
+"""Expectation propagation on the engine, for observations that are not linear in the signal.
+
+Each term t(f) is replaced by a site exp(-lam f^2 / 2 + eta f). Under the sites the engine is exact;
+it gives the marginal of each signal, hence its cavity, and a family matches the site to cavity
+times term. The log evidence is that of the sites plus, for every term, the log ratio of the masses
+of cavity times term and of cavity times site; it is stationary in the sites. What it leaves out is
+corrected by weights of draws, whose mean is the evidence.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy import special
+
+from trustbo.inference.engine import (
+    Blocks,
+    Prior,
+    cholesky,
+    evidence,
+    expected,
+    marginals,
+    whiten,
+)
+from trustbo.models.families.family import Family, log_normal
+from trustbo.models.signal import Signal, each
+
+_LEAST = 1e-9  # precision of a cavity or a site
+_TEMPERED = 0.6  # share of the sites' precision in the wider proposal of columns
+
+
+class Terms(NamedTuple):
+    """Observations of blocks, one kind for each, and their family."""
+
+    family: Family
+    y: np.ndarray  # (block, row), NaN where not measured
+    n_ticks: np.ndarray  # (block, row)
+
+    @property
+    def linear(self) -> np.ndarray:
+        """Observations whose sites are exact, (block, row)."""
+        return ~np.isnan(self.y) & self.family.is_linear(self.y)
+
+
+class Sites(NamedTuple):
+    """Sites (point, block, row): precision, and precision times mean."""
+
+    lam: np.ndarray
+    eta: np.ndarray
+
+    @property
+    def y(self) -> np.ndarray:
+        """Means of the sites, 0 where there is none."""
+        some = self.lam != 0.0
+        return np.where(some, self.eta / np.where(some, self.lam, 1.0), 0.0)
+
+    def at(self, terms: Terms, sd: np.ndarray) -> "Sites":
+        """Sites at noises of that sd: those of linear observations are exact."""
+        lam = np.where(terms.linear, sd**-2.0, self.lam)
+        eta = np.where(terms.linear, np.nan_to_num(terms.y) * sd**-2.0, self.eta)
+        return Sites(*np.broadcast_arrays(lam, eta))
+
+
+def first_sites(terms: Terms) -> Sites:
+    """Sites to begin with, (1, block, row): matched where trust is vague."""
+    unit, zero = terms.family.line_of_sight
+    y = terms.y
+    m, v = np.full(y.shape, unit * (0.5 - zero)), np.full(y.shape, (0.3 * unit) ** 2)
+    noise = np.full(y.shape, 0.2)
+    _, mean, var = terms.family.match(y, terms.n_ticks, m, v, noise)
+    return _matched(terms, 1.0 / v[None], m / v, mean, var)
+
+
+def _matched(
+    terms: Terms, rest: np.ndarray, slope: np.ndarray, mean: np.ndarray, var: np.ndarray
+) -> Sites:
+    """Sites that turn cavities of precision `rest` and mean slope / rest into given moments."""
+    seen = ~np.isnan(terms.y)
+    lam = np.where(seen, np.maximum(1.0 / var - rest, _LEAST), 0.0)
+    return Sites(lam, np.where(seen, mean * (lam + rest) - slope, 0.0))
+
+
+def log_evidence(
+    blocks: Blocks,
+    signal: Signal,
+    prior: Prior,
+    terms: Terms,
+    sites: Sites,
+    n_sweeps: int,
+    damp: float = 1.0,
+) -> tuple[np.ndarray, Sites]:
+    """EP's log evidence (point,) after some sweeps over all sites, and the sites."""
+    seen, sd = ~np.isnan(terms.y), signal.sd
+    sites = sites.at(terms, sd)
+    total = np.zeros(len(sd))
+    for sweep in range(n_sweeps + 1):
+        lam, eta, y = *sites, sites.y
+        fit = evidence(blocks, signal, prior, lam, y)
+        mean, var = marginals(blocks, signal, prior, fit, y)
+        rest = np.maximum(1.0 / var - lam, _LEAST)  # of the cavities
+        slope = mean / var - eta
+        m, v = slope / rest, 1.0 / rest
+        log_mass, mean, var = terms.family.match(terms.y, terms.n_ticks, m, v, sd)
+        total = fit.log_p + np.where(seen, log_mass - _overlap(y, lam, m, v), 0.0).sum((1, 2))
+        if sweep < n_sweeps:
+            new = _matched(terms, rest, slope, mean, np.maximum(var, 1e-12))
+            sites = Sites(lam + damp * (new.lam - lam), eta + damp * (new.eta - eta))
+            sites = sites.at(terms, sd)
+    return total, sites
+
+
+def _overlap(y: np.ndarray, lam: np.ndarray, m: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Log mass of N(f; m, v) times the site N(y; f, 1 / lam); 0 where there is no site."""
+    some = lam > 0.0
+    total = v + 1.0 / np.where(some, lam, 1.0)
+    return np.where(some, log_normal(y - m, total), 0.0)
+
+
+def draw(
+    blocks: Blocks,
+    signal: Signal,
+    prior: Prior,
+    terms: Terms,
+    sites: Sites,
+    rng: np.random.Generator,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Columns and signals at each theta with log weights, whose mean weight is the evidence.
+
+    Columns are of a mixture of two Student-t: EP's law, and that under sites of less precision.
+
+    Returns:
+        Columns (point, column), signals (point, block, row) and log weights (point,).
+    """
+    n, p = len(signal.sd), blocks.n_columns
+    nu = max(8.0, 2.0 * p)
+    laws = []
+    for share in (1.0, _TEMPERED):
+        share = np.where(terms.linear, 1.0, share)
+        lam, y = share * sites.lam, sites.y
+        fit = evidence(blocks, signal, prior, lam, y)
+        F = np.tril(fit.F)
+        laws.append((prior.mean + _back(F, fit.half), F))
+    wide = rng.random(n) < 0.5
+    t = rng.standard_normal((n, p)) / np.sqrt(rng.chisquare(nu, (n, 1)) / nu)
+    center, F = (
+        np.where(wide.reshape(n, *(1,) * (a.ndim - 1)), b, a) for a, b in zip(*laws, strict=True)
+    )
+    c = center + _back(F, t)
+    log_q = np.logaddexp(*(_log_student(c, *law, nu) for law in laws)) - np.log(2.0)
+    off = c - prior.mean
+    Q = prior.add_to(np.zeros((n, p, p)))
+    log_prior = (
+        prior.log_det - p * np.log(2.0 * np.pi) - (off * (Q @ off[..., None])[..., 0]).sum(1)
+    )
+    f, log_block = draw_signals(blocks, signal, expected(blocks, signal, c), terms, sites, rng)
+    return c, f, 0.5 * log_prior - log_q + log_block.sum(1)
+
+
+def draw_signals(
+    blocks: Blocks,
+    signal: Signal,
+    at: np.ndarray,
+    terms: Terms,
+    sites: Sites,
+    rng: np.random.Generator,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Signals given their means and the observations, row by row, each with its own term.
+
+    Args:
+        blocks: Data of all blocks.
+        signal: Distribution of the signals given the columns.
+        at: Mean of the signals given the columns (draw, block, row).
+        terms: Observations.
+        sites: Sites that stand for the terms of later rows.
+        rng: Random number generator.
+
+    Returns:
+        Signals (draw, block, row) and log weights (draw, block), whose mean weight is the
+        likelihood of a block given the columns.
+    """
+    lam, eta, y = *sites, sites.y
+    seen = ~np.isnan(terms.y)
+    W, log_sites = whiten(blocks, signal, lam)
+    V = each(signal.covariance, blocks.label)
+    gain = V @ (np.swapaxes(W, 2, 3) @ W)
+    w = (W @ (y - at)[..., None])[..., 0]
+    mean = at + (gain @ (y - at)[..., None])[..., 0]
+    C = V - gain @ V
+    G = cholesky(0.5 * (C + np.swapaxes(C, 2, 3)) + 1e-12 * np.eye(V.shape[-1]))
+    sd = np.broadcast_to(signal.sd, (len(signal.sd), 1, V.shape[-1]))
+    f, e = np.zeros(mean.shape), np.zeros(mean.shape)
+    total = log_sites - 0.5 * (w**2).sum(2)
+    for k in range(V.shape[-1]):
+        a, d = mean[..., k] + (G[..., k, :k] * e[..., :k]).sum(-1), G[..., k, k]
+        d2 = np.broadcast_to(d**2, a.shape)
+        rest = np.maximum(1.0 / d2 - lam[..., k], _LEAST)
+        m, v = (a / d2 - eta[..., k]) / rest, 1.0 / rest
+        of_row = terms.y[:, k], terms.n_ticks[:, k]
+        own, log_p = terms.family.draw(*of_row, m, v, sd[..., k], rng)
+        exact = ~seen[:, k] | terms.linear[:, k]
+        f[..., k] = np.where(exact, a + d * rng.standard_normal(a.shape), own)
+        total = total + np.where(exact, 0.0, log_p - _overlap(y[..., k], lam[..., k], m, v))
+        e[..., k] = (f[..., k] - a) / d
+    return f, total
+
+
+def _back(F: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """F'^-1 x."""
+    return np.linalg.solve(np.swapaxes(F, 1, 2), x[..., None])[..., 0]
+
+
+def _log_student(c: np.ndarray, center: np.ndarray, F: np.ndarray, nu: float) -> np.ndarray:
+    """Log density of a multivariate Student-t; F is the factor of its precision."""
+    p, z = c.shape[1], (np.swapaxes(F, 1, 2) @ (c - center)[..., None])[..., 0]
+    constant: Any = special.gammaln(0.5 * (nu + p)) - special.gammaln(0.5 * nu)
+    constant = constant - 0.5 * p * np.log(nu * np.pi)
+    log_det = np.log(np.diagonal(F, axis1=1, axis2=2)).sum(1)
+    return constant + log_det - 0.5 * (nu + p) * np.log1p((z**2).sum(1) / nu)

@@ -1,1 +1,0 @@
-"""Likelihoods of contact rates, latent trust integrated out."""

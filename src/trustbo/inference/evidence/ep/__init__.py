@@ -1,1 +1,0 @@
-"""Expectation propagation for rates that are no linear function of trust; see `joint`."""

@@ -1,0 +1,152 @@
+"""NumPyro's NUTS: on the density of the importance sampler, or on a model's plain program.
+
+Where rates are Gaussian, coefficients and signals integrate out, and NUTS samples the few
+hyperparameters under the same evidence, differentiated by JAX. The covariance of the importance
+sampler's points, in NumPyro's unconstrained coordinates, is the inverse mass matrix, which whitens
+the density: warm-up tunes the step size alone. Chains start at points of that sampler.
+
+Of other families that evidence is EP's approximation. There NUTS samples the plain program,
+`model.program`, coefficients and signals included.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+from numpyro.distributions import biject_to
+from numpyro.infer import MCMC, NUTS, init_to_value
+
+from trustbo.inference import importance
+from trustbo.inference.diagnostics import complaints_of
+from trustbo.inference.engine import cholesky, draw_columns, evidence, expected
+from trustbo.inference.posterior import Draws, Posterior, at
+from trustbo.models.backend import own_settings
+from trustbo.models.signal import each
+
+_POINTS = 2000  # resampled points that the covariance is taken of
+_TARGET = 0.9
+_FIELDS = {
+    "num_steps": "n_steps",
+    "diverging": "diverging",
+    "accept_prob": "acceptance_rate",
+    "energy": "energy",
+    "potential_energy": "lp",
+}
+"""Names of NumPyro's statistics in ArviZ."""
+
+
+def sample_by_nuts(
+    posterior: Posterior, *, chains: int, draws: int, warmup: int, seed: int, progress: bool = True
+) -> tuple[Draws, dict[str, np.ndarray], dict[str, Any], list[str]]:
+    """Sample a posterior with NumPyro's `MCMC(NUTS)`, the chains vectorised.
+
+    Args:
+        posterior: Model given missions.
+        chains: Number of chains.
+        draws: Draws of each chain that are kept.
+        warmup: Draws of each chain that tune the sampler.
+        seed: Seed.
+        progress: Whether to show a progress bar.
+
+    Returns:
+        Draws, one chain after the other; statistics (draw,) by name; a summary; and complaints
+        about the convergence.
+    """
+    rng = np.random.default_rng([seed, 1])
+    points = importance.sample(
+        posterior.log_density, posterior.start()[None], rng, defensive=posterior.defensive
+    )
+    values = posterior.scores.values(points.z[points.resample(_POINTS, rng)])
+    with own_settings():
+        kernel, starts = _kernel(posterior, values, chains, rng)
+        mcmc = MCMC(
+            kernel, num_warmup=warmup, num_samples=draws, num_chains=chains,
+            chain_method="vectorized", progress_bar=progress,
+        )  # fmt: skip
+        mcmc.run(jax.random.key(seed), init_params=starts, extra_fields=tuple(_FIELDS))
+        fields, samples = (
+            {name: np.asarray(v) for name, v in found.items()}
+            for found in (mcmc.get_extra_fields(), mcmc.get_samples())
+        )
+    stats = {ours: fields[theirs] for theirs, ours in _FIELDS.items()}
+    drawn = _draws_of(posterior, samples, rng)
+    by_chain = {
+        name: v.reshape(chains, draws, *v.shape[1:])
+        for name, v in drawn.theta.items()
+        if name in posterior.scores.priors
+    }
+    found, complaints = complaints_of(by_chain, stats["diverging"])
+    return drawn, stats | {"lp": -stats["lp"]}, found, complaints
+
+
+def _kernel(
+    posterior: Posterior, values: dict[str, np.ndarray], chains: int, rng: np.random.Generator
+) -> tuple[NUTS, dict[str, jax.Array] | None]:
+    """Kernel, and starts of the chains, given hyperparameters at points of the posterior."""
+    if not posterior.exact:
+        center = {name: jnp.asarray(np.median(v, axis=0)) for name, v in values.items()}
+        strategy = init_to_value(values=center)
+
+        def program() -> None:
+            posterior.model.program(posterior.slots)
+
+        return NUTS(program, init_strategy=strategy, target_accept_prob=_TARGET), None
+    free = {
+        name: biject_to(prior.support).inv(jnp.asarray(values[name]))
+        for name, prior in posterior.scores.priors.items()
+    }
+    flat = np.column_stack([np.asarray(free[name]).reshape(_POINTS, -1) for name in sorted(free)])
+    finite = np.flatnonzero(np.isfinite(flat).all(1))
+    inverse_mass = np.atleast_2d(np.cov(flat[finite].T)) + 1e-6 * np.eye(flat.shape[1])
+    kernel = NUTS(
+        marginal_program(posterior), dense_mass=True, adapt_mass_matrix=False,
+        inverse_mass_matrix=jnp.asarray(inverse_mass), target_accept_prob=_TARGET,
+    )  # fmt: skip
+    first = rng.choice(finite, chains, replace=False)
+    return kernel, {name: value[first] for name, value in free.items()}
+
+
+def marginal_program(posterior: Posterior) -> Callable[[], None]:
+    """NumPyro program of the hyperparameters, the evidence being a factor."""
+
+    def program() -> None:
+        values = {
+            name: numpyro.sample(name, prior.to_event(len(prior.batch_shape)))
+            for name, prior in posterior.scores.priors.items()
+        }
+        values = {name: jnp.asarray(value)[None] for name, value in values.items()}
+        theta = posterior.model.theta(values, posterior.slots.resolution)
+        numpyro.factor("contact_rate", posterior.log_evidence(theta)[0])
+
+    return program
+
+
+def _draws_of(
+    posterior: Posterior, samples: dict[str, np.ndarray], rng: np.random.Generator
+) -> Draws:
+    """Draws of hyperparameters, coefficients and, where they were sampled, signals."""
+    model, slots, blocks = posterior.model, posterior.slots, posterior.blocks
+    values = {name: samples[name] for name in posterior.scores.priors}
+    theta, c, f = model.theta(values, slots.resolution), [], []
+    for i in range(len(theta["rest"])):
+        one = at(theta, slice(i, i + 1))
+        signal = model.signal(one, slots, posterior.layout)
+        if posterior.exact:
+            prior = posterior.prior(one)
+            fit = evidence(blocks, signal, prior, blocks.seen / signal.sd**2)
+            c.append(draw_columns(prior, fit, np.ones(1, dtype=int), rng))
+            continue
+        columns = []
+        for effect in model.columns:
+            mean, parts = effect.prior(one, slots)
+            label = effect.noun or "weights"
+            white = np.concatenate([samples[f"{label}_{k}"][i] for k in range(len(parts))])
+            columns.append(white if mean is None else white + mean[0])
+        c.append(np.concatenate(columns)[None])
+        root = cholesky(signal.covariance + 1e-10 * np.eye(signal.covariance.shape[-1]))
+        noise = each(root, blocks.label) @ samples["trust_noise"][i][None, ..., None]
+        f.append(expected(blocks, signal, c[-1]) + noise[..., 0])
+    return Draws(theta, np.concatenate(c), np.concatenate(f) if f else None, 0.0, 0.0)

@@ -1,0 +1,393 @@
+"""A model given missions: the density that samplers take, and all else given its points."""
+
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy import sparse
+from scipy.special import logsumexp
+
+from trustbo.inference import ep
+from trustbo.inference.engine import (
+    Blocks,
+    Prior,
+    cholesky,
+    draw_columns,
+    evidence,
+    expected,
+    marginals,
+    whiten,
+)
+from trustbo.inference.importance import Student, find_mode, smoothed, systematic
+from trustbo.models.backend import namespace
+from trustbo.models.effects.effect import Theta
+from trustbo.models.model import TrustModel
+from trustbo.models.people import HumanTrust
+from trustbo.models.scores import Scores
+from trustbo.models.signal import Signal, each
+from trustbo.models.slots import Slots
+
+_CHUNK = 16  # points evaluated at once
+_SIZES = (0.3, 1.0, 1.8, 2.6)  # logs by which starts of the noises fall below the rates' spread
+_LARGEST_NOISE, _LEAST_NOISE = 50.0, 1e-6
+_SWEEPS = 1  # of EP at each point, from the sites of the mode
+_SETTLED, _DAMPING = 12, 0.7  # sweeps to find those
+_WEIGHTED = 512  # draws that correct EP
+_PARTICLES = 4  # signals for each of them
+
+
+class Draws(NamedTuple):
+    """Draws of hyperparameters and columns; signals where EP drew them too."""
+
+    theta: dict[str, np.ndarray]  # (draw, ...)
+    c: np.ndarray  # (draw, column)
+    f: np.ndarray | None  # (draw, block, row)
+    k_hat: float
+    """Pareto shape of the weights that correct EP, 0 where the evidence is exact."""
+    log_correction: float
+    """What those weights add to the log evidence."""
+
+
+class Given(NamedTuple):
+    """Trust, likelihoods and predictions under draws."""
+
+    trust: np.ndarray  # (kept draw, mission, bound, robot)
+    mean: np.ndarray  # (mission, bound, robot), over all draws
+    sd: np.ndarray
+    log_likelihood: np.ndarray  # (draw, mission)
+    predicted: np.ndarray  # (draw, mission, bound, robot), rates drawn anew
+
+
+class Posterior:
+    """Posterior of a trust model's hyperparameters, coefficients and signals."""
+
+    def __init__(self, model: TrustModel, slots: Slots, *, memoryless: bool = False) -> None:
+        """Lay out the columns of missions; without memory, beta0 is fixed at 0."""
+        self.model, self.slots, self.memoryless = model, slots, memoryless
+        self.layout = model.layout(slots)
+        hyperpriors = model.all_hyperpriors(slots)
+        if memoryless:
+            del hyperpriors["beta0"]
+        self.scores = Scores(hyperpriors)
+        self.n_scores = self.scores.n_scores
+        columns = [effect.columns(slots) for effect in model.columns]
+        self._ends = np.cumsum([0, *(U.shape[1] for U in columns)])
+        self._columns = sparse.hstack(columns, format="csr")
+        self._U = self.layout.columns(self._columns)
+        self.exact = model.family.gaussian
+        self._measure()
+
+    def _measure(self) -> None:
+        y, n_ticks = self.layout.rows(self.slots.y), self.slots.n_ticks
+        self.blocks = Blocks.of(y, self._U, self.layout.label, apart=not self.exact)
+        if not self.exact:
+            self.terms = ep.Terms(self.model.family, y, self.layout.rows(n_ticks))
+            self.sites = ep.first_sites(self.terms)
+
+    def without(self, mission: int) -> "Posterior":
+        """The same posterior as if a mission had not been measured."""
+        other = object.__new__(Posterior)
+        vars(other).update(vars(self), slots=self.slots.without([mission]))
+        other._measure()
+        if not self.exact:
+            kept = ~np.isnan(other.terms.y)
+            other.sites = ep.Sites(*(np.where(kept, site, 0.0) for site in self.sites))
+        return other
+
+    def theta(self, z: np.ndarray) -> dict[str, np.ndarray]:
+        """Hyperparameters as the model's signal takes them, at scores (point, score)."""
+        values = self.scores.values(z)
+        if self.memoryless:
+            shape = (len(z), *self.model.all_hyperpriors(self.slots)["beta0"].batch_shape)
+            values["beta0"] = np.zeros(shape)
+        return self.model.theta(values, self.slots.resolution)
+
+    def log_density(self, z: np.ndarray) -> np.ndarray:
+        """Log posterior density of scores (point, score), up to the evidence; shape (point,)."""
+        out = np.full(len(z), -np.inf)
+        with np.errstate(all="ignore"):  # far out, scores over- and underflow: no density there
+            theta, log_prior = self.theta(z), self.scores.log_prior(z)
+            size = np.exp(z[:, self.scores.sizes])
+            flat = [np.asarray(values).reshape(len(z), -1) for values in theta.values()]
+            possible = np.isfinite(np.column_stack([*flat, log_prior])).all(1)
+            possible &= ((size > _LEAST_NOISE) & (size < _LARGEST_NOISE)).all(1)
+            some = np.flatnonzero(possible & (theta["rest"].reshape(len(z), -1) != 0.0).all(1))
+            out[some] = self.log_evidence(at(theta, some)) + log_prior[some]
+        return np.where(np.isfinite(out), out, -np.inf)
+
+    def log_evidence(self, theta: Theta) -> Any:
+        """Log p(rates | theta), (point,), of EP where rates are not Gaussian; NumPy or JAX."""
+        if namespace(theta["rest"]) is not np:
+            signal, prior = self._at(theta)
+            return evidence(self.blocks, signal, prior, self._lam(signal)).log_p
+        found = np.empty(len(theta["rest"]))
+        for i, chunk in _chunks(theta):
+            signal, prior = self._at(chunk)
+            if self.exact:
+                found[i] = evidence(self.blocks, signal, prior, self._lam(signal)).log_p
+            else:
+                found[i] = ep.log_evidence(*self._with_terms(signal, prior), self.sites, _SWEEPS)[0]
+        return found
+
+    def settle(self, z: np.ndarray) -> None:
+        """Find the sites of EP at a point (score,), from which those elsewhere start."""
+        if not self.exact:
+            self._settle(self.theta(z[None]))
+
+    def _settle(self, theta: Theta) -> None:
+        args = self._with_terms(*self._at(theta))
+        self.sites = ep.log_evidence(*args, self.sites, _SETTLED, _DAMPING)[1]
+
+    def settle_at(self, draws: Draws) -> None:
+        """Find the sites of EP at the mean of draws."""
+        if not self.exact:
+            theta = {name: values.mean(0, keepdims=True) for name, values in draws.theta.items()}
+            self._settle(theta)
+
+    def start(self) -> np.ndarray:
+        """The best of four points to search the mode from, or with EP the mode; (score,)."""
+        starts = np.zeros((len(_SIZES), self.n_scores))
+        unit = self.model.family.line_of_sight[0]
+        spread = np.log(np.clip(unit * np.nanstd(self.slots.y) / 0.2, 1e-2, 3.0))
+        starts[:, self.scores.sizes] = spread - np.array(_SIZES)[:, None]
+        self.settle(starts[1])
+        best = starts[self.log_density(starts).argmax()]
+        if not self.exact:
+            self.settle(best)
+            best = find_mode(self.log_density, best).center
+            self.settle(best)
+        return best
+
+    def defensive(self, proposal: Student) -> Student:
+        """Fitted memory and noises, and the prior of the scores of all else."""
+        core = self.scores.core
+        others = np.setdiff1d(np.arange(self.n_scores), core)
+        cov = 1.5 * proposal.scale @ proposal.scale.T
+        center = proposal.center.copy()
+        cov[others], cov[:, others], center[others] = 0.0, 0.0, 0.0
+        cov[others, others] = 1.2
+        return Student(center, np.linalg.cholesky(cov))
+
+    def draw(self, z: np.ndarray, log_p: np.ndarray, n: int, rng: np.random.Generator) -> Draws:
+        """Draws of all else given equally weighted points, sorted as `Points.resample` does.
+
+        Args:
+            z: Scores (point, score).
+            log_p: Log density at these points.
+            n: Number of draws; without correction one for each point.
+            rng: Random number generator.
+        """
+        unique, index, count = np.unique(z, axis=0, return_inverse=True, return_counts=True)
+        if self.exact:
+            theta, drawn = self.theta(unique), []
+            for i, chunk in _chunks(theta):
+                signal, prior = self._at(chunk)
+                fit = evidence(self.blocks, signal, prior, self._lam(signal))
+                drawn.append(draw_columns(prior, fit, count[i], rng))
+            order = np.argsort(np.argsort(index.ravel(), kind="stable"), kind="stable")
+            return Draws(at(theta, index.ravel()), np.concatenate(drawn)[order], None, 0.0, 0.0)
+        some = np.linspace(0, len(z) - 1, min(_WEIGHTED, len(z))).astype(int)
+        theta, parts = self.theta(z[some]), []
+        for _, chunk in _chunks(theta):
+            args = self._with_terms(*self._at(chunk))
+            sites = ep.log_evidence(*args, self.sites, _SWEEPS)[1]
+            parts.append(ep.draw(*args, sites, rng))
+        c, f, log_weight = (np.concatenate(part) for part in zip(*parts, strict=True))
+        raw = log_weight + self.scores.log_prior(z[some]) - log_p[some]
+        weight, k_hat, log_mean = smoothed(raw)
+        chosen = systematic(weight, n, rng)
+        return Draws(at(theta, chosen), c[chosen], f[chosen], k_hat, log_mean)
+
+    def draw_columns(self, theta: Theta, rng: np.random.Generator) -> np.ndarray:
+        """One draw of the columns at each point given Gaussian rates, (point, column)."""
+        drawn = []
+        for _, chunk in _chunks(theta):
+            signal, prior = self._at(chunk)
+            fit = evidence(self.blocks, signal, prior, self._lam(signal))
+            drawn.append(draw_columns(prior, fit, np.ones(len(signal.sd), dtype=int), rng))
+        return np.concatenate(drawn)
+
+    def named(self, draws: Draws, rng: np.random.Generator) -> dict[str, dict[str, np.ndarray]]:
+        """Variables of draws by group and name: `posterior`, and one for each effect."""
+        model, theta = self.model, draws.theta
+        names = model.dims.keys() | model.effect_dims.keys()
+        groups = {"posterior": {n: values for n, values in theta.items() if n in names}}
+        for effect, a, b in zip(model.columns, self._ends[:-1], self._ends[1:], strict=True):
+            named = effect.named(draws.c[:, a:b], theta, self.slots)
+            groups.setdefault(effect.noun or "posterior", {}).update(named)
+        if isinstance(model, HumanTrust) and draws.f is not None:
+            persons = np.empty((len(draws.c), self.slots.n_missions, 4))
+            for i, chunk in _chunks(theta):
+                mean = expected(
+                    self.blocks, model.signal(chunk, self.slots, self.layout), draws.c[i]
+                )
+                persons[i] = model.persons(chunk, draws.f[i], mean, self.slots, rng)
+            groups[model.effect.noun]["person"] = persons
+        return groups
+
+    def draws_of(self, groups: Mapping[str, Mapping[str, np.ndarray]]) -> Draws:
+        """Draws of variables by group and name, as `named` gives them."""
+        sites, model = groups["posterior"], self.model
+        theta = model.derived({n: sites[n] for n in model.dims | model.effect_dims if n in sites})
+        theta = {name: v for name, v in theta.items() if name not in ("beta", "b", "B")}
+        c = [
+            effect.coefficients(groups[effect.noun or "posterior"], theta, self.slots)
+            for effect in model.columns
+        ]
+        return Draws(theta, np.column_stack(c), None, 0.0, 0.0)
+
+    def draw_prior(self, n: int, rng: np.random.Generator) -> Draws:
+        """Draws of hyperparameters and columns from the prior."""
+        values = self.scores.draw(n, rng)
+        if self.memoryless:
+            values["beta0"] = np.zeros(n)
+        theta = self.model.theta(values, self.slots.resolution)
+        c = [self.prior(chunk).draw(rng) for _, chunk in _chunks(theta)]
+        return Draws(theta, np.concatenate(c), None, 0.0, 0.0)
+
+    def given(self, draws: Draws, kept: np.ndarray, rng: np.random.Generator) -> Given:
+        """Trust, likelihoods and predictions under draws.
+
+        Args:
+            draws: Draws of hyperparameters and columns.
+            kept: Indices of the draws whose trust is kept.
+            rng: Random number generator.
+        """
+        if not self.exact:  # draws repeat, see `draw`: each is evaluated once
+            rows = [v.reshape(len(draws.c), -1) for v in draws.theta.values()]
+            rows, some, index = np.unique(
+                np.column_stack([*rows, draws.c]), axis=0, return_index=True, return_inverse=True
+            )
+            of_point = [slice(i, i + _CHUNK) for i in range(0, len(rows), _CHUNK)]
+            draws, index = (
+                Draws(at(draws.theta, some), draws.c[some], None, 0.0, 0.0),
+                index.ravel(),
+            )
+        else:
+            rows = [v.reshape(len(draws.c), -1) for v in draws.theta.values()]
+            _, point = np.unique(np.column_stack(rows), axis=0, return_inverse=True)
+            order, index = np.argsort(point.ravel(), kind="stable"), np.arange(len(draws.c))
+            of_point = np.split(order, np.cumsum(np.bincount(point.ravel()))[:-1])
+        shape = (len(draws.c), *self.slots.y.shape)
+        trust, predicted = np.empty(shape), np.empty(shape)
+        log_likelihood = np.empty(shape[:2])
+        for where in of_point:
+            one = where[:1] if self.exact else where
+            theta = at(draws.theta, one)
+            signal = self.model.signal(theta, self.slots, self.layout)
+            mean = expected(self.blocks, signal, draws.c[where])
+            x, log_p = (self._exact_trust if self.exact else self._ep_trust)(
+                theta, signal, mean, rng
+            )
+            trust[where] = self.layout.slots(x)
+            log_likelihood[where] = log_p.reshape(len(log_p), shape[1], -1).sum(2)
+            predicted[where] = self._anew(signal, mean, rng)
+        many = np.bincount(index, minlength=shape[0]) / len(index)
+        mean = np.tensordot(many, trust, 1)
+        sd = np.sqrt(np.maximum(np.tensordot(many, trust**2, 1) - mean**2, 0.0))
+        return Given(trust[index[kept]], mean, sd, log_likelihood[index], predicted[index])
+
+    def anew(self, draws: Draws, rng: np.random.Generator) -> np.ndarray:
+        """Rates of the same missions drawn anew, (draw, mission, bound, robot)."""
+        rates = np.empty((len(draws.c), *self.slots.y.shape))
+        for i, theta in _chunks(draws.theta):
+            signal = self.model.signal(theta, self.slots, self.layout)
+            rates[i] = self._anew(signal, expected(self.blocks, signal, draws.c[i]), rng)
+        return rates
+
+    def _exact_trust(
+        self, theta: Theta, signal: Signal, mean: np.ndarray, rng: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Trust (draw, block, row) given Gaussian rates, and their log likelihood (draw, block)."""
+        b, S = self.blocks, each(signal.S, self.blocks.label)
+        W, log_sites = whiten(b, signal, self._lam(signal))
+        off = b.y - mean
+        w = (W[:, b.kind] @ off[..., None])[..., 0]
+        gain = S @ (np.swapaxes(W, 2, 3) @ W)
+        root = _root(S - gain @ S)[:, b.kind]
+        x = mean + (gain[:, b.kind] @ off[..., None])[..., 0]
+        x += (root @ rng.standard_normal((*x.shape, 1)))[..., 0]
+        return x, log_sites[:, b.kind] - 0.5 * (w**2).sum(2)
+
+    def _ep_trust(
+        self, theta: Theta, signal: Signal, mean: np.ndarray, rng: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The same for other rates: by weighted particles of each block."""
+        args = self._with_terms(signal, self.prior(theta))
+        sites = ep.log_evidence(*args, self.sites, _SWEEPS)[1]
+        drawn = [
+            ep.draw_signals(self.blocks, signal, mean, self.terms, sites, rng)
+            for _ in range(_PARTICLES)
+        ]
+        f, log_w = (np.stack(part) for part in zip(*drawn, strict=True))
+        chosen = np.argmax(log_w + rng.gumbel(size=log_w.shape), axis=0)
+        f = np.take_along_axis(f, chosen[None, ..., None], axis=0)[0]
+        log_p = logsumexp(log_w, axis=0) - np.log(_PARTICLES)
+        if signal.noise is None:
+            return f, log_p
+        V, S = (each(C, self.blocks.label) for C in (signal.covariance, signal.S))
+        gain = np.swapaxes(np.linalg.solve(V, S), 2, 3)
+        x = mean + (gain @ (f - mean)[..., None])[..., 0]
+        return x + (_root(S - gain @ S) @ rng.standard_normal((*x.shape, 1)))[..., 0], log_p
+
+    def _anew(self, signal: Signal, mean: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Rates of the same missions drawn anew, (draw, mission, bound, robot)."""
+        root = each(_root(signal.covariance), self.blocks.label[self.blocks.kind])
+        f = self.layout.slots(mean + (root @ rng.standard_normal((*mean.shape, 1)))[..., 0])
+        sd = signal.sd[..., None] if signal.sd.shape[2] == 1 else self.layout.slots(signal.sd)
+        return self.model.family.sample(f, sd, self.slots.n_ticks, rng)
+
+    def marginals(self, theta: Theta) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Mean and variance of every signal given all rates, and the precision of its site.
+
+        Each is (point, mission, bound, robot); the layout has no rotation.
+        """
+        blocks = self.blocks
+        if self.exact:
+            y = self.layout.rows(self.slots.y)
+            blocks = Blocks.of(y, self._U, self.layout.label, apart=True)
+        found = []
+        for _, chunk in _chunks(theta):
+            signal, prior = self._at(chunk)
+            if self.exact:
+                sites = ep.Sites(blocks.seen / signal.sd**2, blocks.y / signal.sd**2)
+            else:
+                args = self._with_terms(signal, prior)
+                sites = ep.log_evidence(*args, self.sites, _SWEEPS)[1]
+            fit = evidence(blocks, signal, prior, sites.lam, sites.y)
+            found.append((*marginals(blocks, signal, prior, fit, sites.y), sites.lam))
+        mean, var, lam = (np.concatenate(part) for part in zip(*found, strict=True))
+        return self.layout.slots(mean), self.layout.slots(var), self.layout.slots(lam)
+
+    def _at(self, theta: Theta) -> tuple[Signal, Prior]:
+        return self.model.signal(theta, self.slots, self.layout), self.prior(theta)
+
+    def prior(self, theta: Theta) -> Prior:
+        """Prior of all columns at each theta."""
+        return Prior.of([effect.prior(theta, self.slots) for effect in self.model.columns])
+
+    def _lam(self, signal: Signal) -> Any:
+        return self.blocks.seen / signal.sd**2
+
+    def _with_terms(self, signal: Signal, prior: Prior) -> tuple[Any, ...]:
+        return self.blocks, signal, prior, self.terms
+
+
+def at(theta: Mapping[str, Any], index: Any) -> dict[str, Any]:
+    """Hyperparameters at some points."""
+    return {name: values[index] for name, values in theta.items()}
+
+
+def _root(covariance: np.ndarray) -> np.ndarray:
+    """Lower factors of covariances (..., row, row) that rounding may have made singular."""
+    n = covariance.shape[-1]
+    even = 0.5 * (covariance + np.swapaxes(covariance, -1, -2))
+    scale = np.trace(even, axis1=-2, axis2=-1)[..., None, None] / n
+    return cholesky(even + (1e-10 * scale + 1e-20) * np.eye(n))
+
+
+def _chunks(theta: Mapping[str, Any]) -> Iterator[tuple[slice, dict[str, Any]]]:
+    """Points evaluated at once: their slice and hyperparameters."""
+    for start in range(0, len(theta["rest"]), _CHUNK):
+        where = slice(start, start + _CHUNK)
+        yield where, at(theta, where)

@@ -1,0 +1,195 @@
+"""Predictions of people's reports under a posterior of `HumanTrust`."""
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from trustbo.answers import answer_of, levels_of
+from trustbo.data import Mission
+from trustbo.errors import TrustboError, require_choice, require_whole
+from trustbo.inference.draws import is_of_people, read_posterior, require_posterior
+from trustbo.inference.engine import expected
+from trustbo.inference.posterior import Draws, Posterior, at
+from trustbo.models.model import TrustModel
+from trustbo.models.signal import each
+from trustbo.parallel import one_blas_thread
+
+QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
+GIVEN = ("earlier", "none")
+_ALIKE = 16  # draws of a person's trust for each draw of what persons share
+
+
+@one_blas_thread()
+def predict_reports(
+    posterior: xr.DataTree,
+    missions: Sequence[Mission],
+    *,
+    given: str = "earlier",
+    fitted: bool = False,
+    n_draws: int = 2000,
+    seed: int = 0,
+    model: TrustModel | None = None,
+) -> xr.Dataset:
+    """Predict each report of persons, who may be new, from their reports at earlier bounds.
+
+    Reports weigh the draws of the posterior, by which a person's start, level and gains are
+    learned; reports of one bound do not predict each other.
+
+    Args:
+        posterior: Posterior of `HumanTrust`.
+        missions: Persons; where a report is NaN it is predicted too.
+        given: `"earlier"`, or `"none"`: no report of the person is known.
+        fitted: Whether the fit had the earlier reports of these persons: they then weigh no draws
+            of what all persons share a second time.
+        n_draws: Number of draws of a person's trust at most.
+        seed: Seed of the draws.
+        model: Model of the posterior; needed with custom priors.
+
+    Returns:
+        Dataset over (mission, bound, robot): `report`, its `mean` and `quantile` (also over
+        `level`), on the scale that was answered, such as 1 to 7; `log_score`, nats, of the report's
+        mass (on the unit scale its density, but at 0 and 1 its mass), and with levels the
+        `probability` of each `answer`. Attributes: the mean absolute error `mae` of medians, the
+        `mean_log_score`, and `coverage_90` of central intervals.
+
+    Raises:
+        TrustboError: No posterior of `HumanTrust`; missions of other inputs, or of another scale.
+    """
+    if not is_of_people(require_posterior("predict_reports", posterior)):
+        raise TrustboError(
+            "predict_reports takes a posterior of HumanTrust; got one of "
+            f"{posterior.attrs.get('model')}. Use trustbo.inference.score."
+        )
+    require_choice("given", given, GIVEN)
+    seed, n = require_whole("seed", seed, 0), require_whole("n_draws", n_draws, 1)
+    of_fit, draws = read_posterior(posterior, model=model)
+    if missions[0].features != of_fit.slots.features:
+        raise TrustboError(
+            f"the posterior has inputs {of_fit.slots.features}, the missions "
+            f"{missions[0].features}; give missions of the same."
+        )
+    levels = levels_of(posterior.attrs["scale"])
+    ahead = Posterior(of_fit.model, of_fit.model.slots(missions))
+    n = max(1, n // _ALIKE) if fitted else n
+    some = np.unique(np.linspace(0, len(draws.c) - 1, n).astype(int))
+    some = np.repeat(some, _ALIKE) if fitted else some
+    draws = Draws(at(draws.theta, some), draws.c[some], None, 0.0, 0.0)
+
+    shape = ahead.slots.y.shape
+    out = {name: np.full(shape, np.nan) for name in ("mean", "log_score")}
+    out["quantile"] = np.full((*shape, len(QUANTILES)), np.nan)
+    if levels:
+        out["probability"] = np.full((*shape, levels), np.nan)
+    for j, mission in enumerate(missions):
+        alike = _ALIKE if fitted else len(some)
+        rng = np.random.default_rng([seed, j])
+        person = _of_person(ahead, draws, j, given == "earlier", alike, rng)
+        for (k, i), weight, center, var in person:
+            if k < len(mission.bounds):
+                found = _prediction(ahead, (j, k, i), weight, center, var, draws, levels, rng)
+                for name, value in found.items():
+                    out[name][j, k, i] = value
+    for name in ("mean", "quantile"):
+        out[name] = answer_of(out[name], levels)
+    return _dataset(answer_of(ahead.slots.y, levels), out, levels, missions[0].robots)
+
+
+def _of_person(
+    ahead: Posterior, draws: Draws, j: int, earlier: bool, alike: int, rng: np.random.Generator
+) -> Iterator[tuple[tuple[int, int], np.ndarray, np.ndarray, np.ndarray]]:
+    """Yield (bound, robot), weights of draws, and mean and variance of trust of each report.
+
+    The person's trust is drawn row by row given the reports so far. Runs of `alike` draws have one
+    weight in all.
+    """
+    slots, family = ahead.slots, ahead.model.family
+    _, n_bounds, n_robots = slots.y.shape
+    mean, root = [], []
+    for start in range(0, len(draws.c), 64):
+        where = slice(start, start + 64)
+        signal = ahead.model.signal(at(draws.theta, where), slots, ahead.layout)
+        mean.append(expected(ahead.blocks, signal, draws.c[where])[:, j])
+        cov = each(signal.covariance, ahead.blocks.label)
+        cov = np.broadcast_to(cov, (len(mean[-1]), cov.shape[1], *cov.shape[2:]))
+        cov = cov[:, j % cov.shape[1]]
+        root.append(np.linalg.cholesky(cov + 1e-12 * np.eye(cov.shape[-1])))
+    mean, root, sd = np.concatenate(mean), np.concatenate(root), draws.theta["delta_v"]
+    y, ticks = (a[j].ravel() for a in (slots.y, slots.n_ticks))
+    white, log_weight = np.zeros(mean.shape), np.zeros(len(mean))
+    for k in range(n_bounds):
+        runs = log_weight.reshape(-1, alike)
+        weight = np.exp(runs - np.logaddexp.reduce(runs, axis=1, keepdims=True)).ravel()
+        for i in range(n_robots):
+            r, known = k * n_robots + i, k * n_robots * earlier
+            center = mean[:, r] + (root[:, r, :known] * white[:, :known]).sum(1)
+            var = (root[:, r, known : r + 1] ** 2).sum(1)
+            yield (k, i), weight / len(runs), center, var
+
+            # Trust given the report, and those before: rows of one bound tell of each other here.
+            a = mean[:, r] + (root[:, r, :r] * white[:, :r]).sum(1)
+            d = root[:, r, r]
+            white[:, r] = rng.standard_normal(len(mean))
+            if earlier and not np.isnan(y[r]):
+                f, log_mass = family.draw(y[r], ticks[r], a, d**2, sd, rng)
+                white[:, r], log_weight = (f - a) / d, log_weight + log_mass
+
+
+def _prediction(
+    ahead: Posterior,
+    slot: tuple[int, int, int],
+    weight: np.ndarray,
+    center: np.ndarray,
+    var: np.ndarray,
+    draws: Draws,
+    levels: int,
+    rng: np.random.Generator,
+) -> dict[str, Any]:
+    """Prediction of a report of which trust is N(center, var) in each draw."""
+    family, sd = ahead.model.family, draws.theta["delta_v"]
+    y, ticks = ahead.slots.y[slot], ahead.slots.n_ticks[slot]
+    found: dict[str, Any] = {}
+    if not np.isnan(y):
+        mass = weight @ np.exp(family.match(y, ticks, center, var, sd)[0])
+        found["log_score"] = np.log(max(mass, 1e-300))
+    if levels:
+        answers = np.arange(levels) / (levels - 1.0)
+        many = [family.match(a, ticks, center, var, sd)[0] for a in answers]
+        mass = weight @ np.exp(np.stack(many, axis=1))
+        mass = np.maximum(mass, 1e-300) / mass.sum()
+        which = np.searchsorted(np.cumsum(mass) - 1e-12, QUANTILES)
+        quantile = answers[np.minimum(which, levels - 1)]
+        return found | {"mean": mass @ answers, "quantile": quantile, "probability": mass}
+    trust = center + np.sqrt(var) * rng.standard_normal(len(var))
+    drawn = family.sample(trust, sd, ticks, rng)
+    order = np.argsort(drawn)
+    which = np.searchsorted(np.cumsum(weight[order]), QUANTILES)
+    quantile = drawn[order][np.minimum(which, len(drawn) - 1)]
+    return found | {"mean": weight @ drawn, "quantile": quantile}
+
+
+def _dataset(
+    report: np.ndarray, out: dict[str, np.ndarray], levels: int, robots: Sequence[str]
+) -> xr.Dataset:
+    """Predictions by name, with their summaries as attributes."""
+    axes = {"quantile": ("level",), "probability": ("answer",)}
+    dims = ("mission", "bound", "robot")
+    variables = {"report": (dims, report)}
+    variables |= {name: ((*dims, *axes.get(name, ())), values) for name, values in out.items()}
+    coords: dict[str, Any] = {
+        "mission": np.arange(len(report)),
+        "bound": np.arange(1, report.shape[1] + 1),
+        "robot": list(robots),
+        "level": list(QUANTILES),
+    }
+    if levels:
+        coords["answer"] = np.arange(1, levels + 1)
+    seen = ~np.isnan(report)
+    low, middle, high = (out["quantile"][..., i][seen] for i in (0, 2, 4))
+    attrs: dict[str, Any] = {"n": int(seen.sum())}
+    if seen.any():
+        attrs["mae"] = float(np.abs(report[seen] - middle).mean())
+        attrs["mean_log_score"] = float(out["log_score"][seen].mean())
+        attrs["coverage_90"] = float(((low <= report[seen]) & (report[seen] <= high)).mean())
+    return xr.Dataset(variables, coords, attrs)

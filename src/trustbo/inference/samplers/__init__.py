@@ -1,1 +1,0 @@
-"""Samplers of a trust model's posterior."""

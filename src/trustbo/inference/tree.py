@@ -1,0 +1,224 @@
+"""Layout of a posterior for ArviZ: named axes, no padding, the data included."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from trustbo.data import NOWHERE, Mission
+from trustbo.inference.draws import (
+    effects_of,
+    missions_of,
+    read_posterior,
+    require_posterior,
+    sites_of,
+)
+from trustbo.inference.posterior import Posterior
+from trustbo.models.effects.effect import Effect
+from trustbo.models.model import TrustModel
+from trustbo.models.scores import log_density
+from trustbo.stacking import MissionBatch, stack_missions
+
+_DIMS = {
+    "trust": ("mission", "bound", "robot"),
+    "trust_mean": ("mission", "bound", "robot"),
+    "trust_sd": ("mission", "bound", "robot"),
+    "contact_rate": ("mission", "bound", "robot"),
+}
+_N_TRAJECTORIES = 200  # draws, spread evenly over the chains, that latent trust is kept of
+_N_PRIOR = 500
+_KEPT = ("posterior", "sample_stats", "prior", "hazard")
+
+
+def to_datatree(
+    groups: dict[str, dict[str, Any]],
+    missions: Sequence[Mission],
+    site_dims: dict[str, tuple[str, ...]],
+    effects: Sequence[Effect] = (),
+) -> xr.DataTree:
+    """Name the axes, remove the padding, and set values after a mission's end to NaN.
+
+    Args:
+        groups: Arrays by group and name, with leading axes (chain, draw) except moments.
+        missions: Missions of the posterior.
+        site_dims: Axes of the model's parameters.
+        effects: Effects of the model, whose variables are in some groups.
+    """
+    observed = stack_missions(missions, pad=False)
+    n_missions, n_bounds = observed.contact_rate.shape[:2]
+    lengths = np.array([len(m.bounds) for m in missions])
+    ended = (np.arange(1, n_bounds + 1) > lengths[:, None])[..., None]  # (mission, bound, robot)
+    coords = {
+        "mission": np.arange(n_missions),
+        "bound": np.arange(1, n_bounds + 1),
+        "robot": list(missions[0].robots),
+        "robot_": list(missions[0].robots),
+        "feature": list(missions[0].features),
+    }
+    dims_of = _DIMS | site_dims
+    for effect in effects:
+        dims_of |= effect.variables
+        coords |= effect.coords
+    tree = {}
+    for group, arrays in groups.items():
+        draw = arrays.pop("draw", None)
+        variables, used, shape = {}, set(), (0, 0)
+        for name, array in arrays.items():
+            dims = ("mission",) if group.endswith("log_likelihood") else dims_of.get(name, ())
+            kept = array[(..., *(slice(len(coords[d])) for d in dims))]
+            if "bound" in dims:
+                kept = np.where(ended, np.nan, kept)
+            if len(dims) < array.ndim:
+                dims, shape = ("chain", "draw", *dims), array.shape[:2]
+            variables[name] = (dims, kept)
+            used |= set(dims)
+        index = {"chain": np.arange(shape[0]), "draw": np.arange(shape[1])}
+        index = index if draw is None else index | {"draw": draw}
+        labelled = {name: labels for name, labels in (coords | index).items() if name in used}
+        tree[group] = xr.Dataset(variables, labelled)
+    tree["observed_data"], tree["constant_data"] = _data_groups(observed, missions, coords)
+    return xr.DataTree.from_dict(tree)
+
+
+def _data_groups(
+    observed: MissionBatch, missions: Sequence[Mission], coords: dict[str, object]
+) -> tuple[xr.Dataset, xr.Dataset]:
+    shape = observed.contact_rate.shape
+    duration, cell = np.full(shape, np.nan), np.full((*shape[:2], 2), -1)
+    for j, mission in enumerate(missions):
+        duration[j, : len(mission.bounds)] = mission.duration
+        cell[j, : len(mission.bounds)] = [bound.cell for bound in mission.bounds]
+    starts = [mission.path[0] if mission.has_map else NOWHERE for mission in missions]
+    # Cells tell how many bounds a mission has, but where there are none.
+    n_bounds = [len(mission.bounds) for mission in missions]
+    counted = {} if all(m.has_map for m in missions) else {"n_bounds": (("mission",), n_bounds)}
+    dims = ("mission", "bound", "robot")
+    labelled = {name: coords[name] for name in dims}
+    rates = xr.Dataset({"contact_rate": (dims, observed.contact_rate)}, labelled)
+    constant = xr.Dataset(
+        {
+            "awareness": ((*dims, "feature"), observed.awareness),
+            "duration": (dims, duration, {"units": "s"}),
+            "n_ticks": (dims, observed.n_ticks, {"units": "1"}),
+            "row": (("mission", "bound"), cell[..., 0]),
+            "col": (("mission", "bound"), cell[..., 1]),
+            "status": (("mission",), [mission.status for mission in missions]),
+            "start_row": (("mission",), [row for row, _ in starts]),
+            "start_col": (("mission",), [col for _, col in starts]),
+            **counted,
+        },
+        labelled | {"feature": coords["feature"]},
+    )
+    return rates, constant
+
+
+def parameters_alone(posterior: xr.DataTree) -> xr.DataTree:
+    """Posterior without the groups that grow with the number of missions; see `complete`."""
+    kept = [*_KEPT, *(effect.noun for effect in effects_of(posterior))]
+    kept = [name for name in kept if name in posterior.children]
+    alone = xr.DataTree.from_dict({name: posterior[name].to_dataset() for name in kept})
+    alone.attrs = posterior.attrs
+    return alone
+
+
+def complete(
+    posterior: xr.DataTree,
+    missions: Sequence[Mission] | None = None,
+    *,
+    model: TrustModel | None = None,
+) -> xr.DataTree:
+    """Add latent trust, log-likelihoods and predictions to a posterior of parameters alone.
+
+    A campaign keeps the parameters of its posteriors; these groups grow with the number of
+    missions, and are the same whenever they are computed.
+
+    Args:
+        posterior: DataTree from `fit`, or one of `Result.posteriors`.
+        missions: Missions that it was fitted to; needed where it holds no data.
+        model: Its model; needed with custom priors.
+
+    Returns:
+        The posterior with the groups `latent`, `posterior_predictive`, `prior_predictive`,
+        `log_prior` and `log_likelihood`; itself, if it has them.
+
+    Raises:
+        TrustboError: The posterior holds no data and no missions are given.
+    """
+    if "latent" in require_posterior("complete", posterior).children:
+        return posterior
+    missions = missions_of(posterior) if missions is None else missions
+    fitted, draws = read_posterior(posterior, missions, model=model)
+    if not fitted.exact:
+        fitted.settle_at(draws)
+    seed, sizes = posterior.attrs["seed"], posterior["posterior"].sizes
+    n_chains, n_draws = sizes["chain"], sizes["draw"]
+    kept = np.linspace(0, n_draws - 1, min(n_draws, max(1, _N_TRAJECTORIES // n_chains)))
+    kept = kept.astype(int)
+    some = (np.arange(n_chains)[:, None] * n_draws + kept).ravel()
+    given = fitted.given(draws, some, np.random.default_rng([seed, 1]))
+    rng = np.random.default_rng([seed, 2])
+    anew = fitted.anew(fitted.draw_prior(_N_PRIOR, rng), rng)
+    likelihood, data_name = _of_ticks(fitted, given.log_likelihood)
+
+    def by_chain(array: np.ndarray) -> np.ndarray:
+        return array.reshape(n_chains, -1, *array.shape[1:])
+
+    groups = {
+        "log_likelihood": {"contact_rate": by_chain(likelihood)},
+        "latent": {
+            "trust": by_chain(given.trust),
+            "trust_mean": given.mean,
+            "trust_sd": given.sd,
+            "draw": kept,
+        },
+        "posterior_predictive": {"contact_rate": by_chain(given.predicted)},
+        "prior_predictive": {"contact_rate": anew[None]},
+    }
+    added = to_datatree(groups, missions, {})
+    parts = {**posterior.children, **added.children}
+    whole = xr.DataTree.from_dict({name: part.to_dataset() for name, part in parts.items()})
+    index = {name: posterior["posterior"][name] for name in ("chain", "draw")}
+    densities = {
+        name: (("chain", "draw"), by_chain(values))
+        for name, values in log_prior(fitted.model, sites_of(posterior)).items()
+    }
+    whole["log_prior"] = xr.DataTree(xr.Dataset(densities, index))
+    whole.attrs = posterior.attrs | {"log_likelihood_of": data_name}
+    return whole
+
+
+def _of_ticks(fitted: Posterior, likelihood: np.ndarray) -> tuple[np.ndarray, str]:
+    """Log-likelihoods, of counts of ticks where these are known, and the name of their data."""
+    slots = fitted.slots
+    shift = fitted.model.family.log_resolution(slots.y, slots.n_ticks).sum((1, 2))
+    if np.isnan(shift).any():
+        return likelihood, "contact_rate"
+    return likelihood + shift, "ticks"
+
+
+def log_prior(model: TrustModel, sites: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Log prior density (draw,) of each parameter with an independent prior, up to a constant.
+
+    Deviations of robots from a common mean belong to the model, not to the prior: of a
+    `HierarchicalTrust` only means and spreads are here. The LKJ prior of correlations R of the
+    coupled model has density det(R)^(concentration - 1).
+
+    Args:
+        model: Trust model.
+        sites: Parameters of the posterior, (draw, ...).
+    """
+    rest, densities = model.derived(sites)["rest"], {}
+    for name, (field, values) in model.prior_terms(sites).items():
+        given = rest.reshape(*rest.shape, *(1,) * (values.ndim - rest.ndim))
+        densities[name] = model.priors.log_density(field, values, given)
+    for noise in ("Delta_w", "Delta_v"):
+        if noise in sites:
+            sd = np.sqrt(np.einsum("...ii->...i", sites[noise]))
+            correlation = sites[noise] / (sd[..., :, None] * sd[..., None, :])
+            log_det = np.linalg.slogdet(correlation)[1]
+            densities[f"correlation_{noise[-1]}"] = (model.priors.concentration - 1.0) * log_det
+    for effect in model.effects:
+        for name, prior in effect.hyperpriors().items():
+            densities[name] = log_density(prior, sites[name])
+    return {name: values.reshape(len(values), -1).sum(1) for name, values in densities.items()}

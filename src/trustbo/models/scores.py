@@ -1,0 +1,136 @@
+"""Hyperparameters as normal scores of their priors: the coordinates that samplers move in.
+
+A score is standard normal a priori. The two noises are the exception: with half-normal scores
+(a_w, a_v) = size (sin(angle), cos(angle)), the coordinates are log size, which the rates determine,
+and a normal score of the angle, which they may not.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro.distributions as dist
+from numpyro.distributions import Distribution
+from scipy import special, stats
+
+from trustbo.errors import TrustboError
+from trustbo.models.backend import call, own_settings
+
+NOISES = "delta_w", "delta_v"
+_LOG_ROOT_2PI = 0.5 * np.log(2.0 * np.pi)
+
+
+class Scores:
+    """Scores (point, score) of hyperparameters with independent priors."""
+
+    def __init__(self, priors: Mapping[str, Distribution]) -> None:
+        """Take the prior of each hyperparameter, a number or a vector, in order."""
+        self.priors = dict(priors)
+        sizes = {name: int(np.prod(prior.batch_shape)) for name, prior in priors.items()}
+        ends = np.cumsum([0, *sizes.values()])
+        self.at = {n: slice(a, b) for n, a, b in zip(sizes, ends[:-1], ends[1:], strict=True)}
+        self.n_scores = int(ends[-1])
+        for name, prior in self.priors.items():
+            quantile(prior, np.zeros(sizes[name]), name)  # refuses one without quantiles
+
+    @property
+    def core(self) -> np.ndarray:
+        """Indices of the scores of memory and noises, which the rates determine."""
+        names = ("beta0", *NOISES)
+        return np.concatenate([np.arange(self.n_scores)[self.at[n]] for n in names if n in self.at])
+
+    @property
+    def sizes(self) -> slice:
+        """Scores that are logarithms of the size of the noises."""
+        return self.at[NOISES[0]]
+
+    def values(self, z: np.ndarray) -> dict[str, np.ndarray]:
+        """Hyperparameters at scores (point, score), by name, each (point,) or (point, k)."""
+        size, angle = np.exp(z[:, self.at["delta_w"]]), z[:, self.at["delta_v"]]
+        found = {}
+        for name, prior in self.priors.items():
+            if name in NOISES:
+                side = 1.0 if name == "delta_w" else -1.0
+                share = np.sin(0.5 * np.pi * special.ndtr(side * angle))
+                values = of_size(prior, size * share, name)
+            else:
+                values = quantile(prior, z[:, self.at[name]], name)
+            found[name] = values if prior.batch_shape else values[:, 0]
+        return found
+
+    def log_prior(self, z: np.ndarray) -> np.ndarray:
+        """Log prior density of scores, (point,)."""
+        size = z[:, self.sizes]
+        others = np.delete(z, np.arange(self.n_scores)[self.sizes], axis=1)
+        normal = -0.5 * (others**2).sum(1) - others.shape[1] * _LOG_ROOT_2PI
+        return normal + (2.0 * size - 0.5 * np.exp(2.0 * size)).sum(1)
+
+    def draw(self, n: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
+        """Draws of the hyperparameters from their priors, (draw,) or (draw, k)."""
+        return {
+            name: quantile(prior, rng.standard_normal((n, *prior.batch_shape)), name)
+            for name, prior in self.priors.items()
+        }
+
+
+def quantile(prior: Distribution, score: np.ndarray, name: str = "") -> np.ndarray:
+    """Quantile of a prior at Phi(score), accurate in both tails."""
+    prior = _base(prior)
+    if isinstance(prior, dist.Normal):
+        return np.asarray(prior.loc) + np.asarray(prior.scale) * score
+    if isinstance(prior, dist.LogNormal):
+        return np.exp(np.asarray(prior.loc) + np.asarray(prior.scale) * score)
+    if isinstance(prior, dist.Beta):
+        a, b = np.asarray(prior.concentration1), np.asarray(prior.concentration0)
+        low = special.betaincinv(a, b, special.ndtr(np.minimum(score, 0.0)))
+        high = 1.0 - special.betaincinv(b, a, special.ndtr(-np.maximum(score, 0.0)))
+        return np.where(score < 0.0, low, high)
+    if isinstance(prior, dist.HalfNormal):
+        low = special.erfinv(special.ndtr(np.minimum(score, 0.0)))
+        high = special.erfcinv(special.ndtr(-np.maximum(score, 0.0)))
+        return np.asarray(prior.scale) * np.sqrt(2.0) * np.where(score < 0.0, low, high)
+    return _by_numpyro(prior, special.ndtr(score), name)
+
+
+def of_size(prior: Distribution, size: np.ndarray, name: str = "") -> np.ndarray:
+    """Quantile of a prior at P(|N(0, 1)| < size)."""
+    prior = _base(prior)
+    if isinstance(prior, dist.HalfNormal):
+        return np.asarray(prior.scale) * size
+    return _by_numpyro(prior, special.erf(size / np.sqrt(2.0)), name)
+
+
+def log_density(prior: Distribution, x: np.ndarray) -> np.ndarray:
+    """Log density of a prior, in closed form for the usual ones: compiling takes longer."""
+    prior = _base(prior)
+    if isinstance(prior, dist.HalfNormal):
+        return stats.halfnorm.logpdf(x, scale=np.asarray(prior.scale))
+    if isinstance(prior, dist.Beta):
+        a, b = np.asarray(prior.concentration1), np.asarray(prior.concentration0)
+        return stats.beta.logpdf(x, a, b)
+    if isinstance(prior, dist.Normal):
+        return stats.norm.logpdf(x, np.asarray(prior.loc), np.asarray(prior.scale))
+    if isinstance(prior, dist.LogNormal):
+        scale = np.exp(np.asarray(prior.loc))
+        return stats.lognorm.logpdf(x, np.asarray(prior.scale), scale=scale)
+    with own_settings():
+        return np.asarray(call(prior, "log_prob", jnp.asarray(x)), dtype=float)
+
+
+def _base(prior: Any) -> Any:
+    """The distribution of each of equal, independent variables."""
+    return prior.base_dist if isinstance(prior, dist.ExpandedDistribution) else prior
+
+
+def _by_numpyro(prior: Distribution, p: np.ndarray, name: str) -> np.ndarray:
+    try:
+        with own_settings():
+            share = jax.numpy.asarray(np.clip(p, 1e-300, 1.0 - 1e-16))
+            return np.asarray(call(prior, "icdf", share), dtype=float)
+    except (NotImplementedError, ImportError):  # quantiles of a few need another package
+        raise TrustboError(
+            f"the prior of {name} must have quantiles (icdf); {prior!r} has none. Give another, or "
+            "sample model.program with a kernel of NumPyro."
+        ) from None

@@ -1,1 +1,0 @@
-"""The state space that trust models share, filtered, smoothed and simulated."""

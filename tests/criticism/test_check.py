@@ -1,0 +1,101 @@
+"""Check of a fitted model: planted faults stand out, and nothing does without one."""
+
+import numpy as np
+import pytest
+
+import trustbo as tb
+from trustbo.criticism.check import variants
+from trustbo.models import PlaceEffect, PooledTrust, RobotEffect
+
+MODEL = PooledTrust(effects=(PlaceEffect(), RobotEffect()))
+
+
+def drawn(seed=0, *, robot=0.0, place=0.0, slope=0.8, n_missions=8):
+    """Missions over a line of cells, of rates that follow line of sight, with planted effects."""
+    rng, path = np.random.default_rng(seed), [(0, k) for k in range(9)]
+    missions = []
+    for j in range(n_missions):
+        z = rng.uniform(size=(8, 3, 1))
+        rate = 0.5 + slope * (z[..., 0] - 0.5) + 0.03 * rng.normal(size=(8, 3))
+        rate[:, 1] += robot * z[:, 1, 0] * (j >= n_missions // 2)
+        rate[4] += place
+        rate = np.clip(rate, 0.0, 1.0)
+        missions.append(tb.Mission.from_arrays(path, z, rate, features=["line_of_sight"]))
+    return missions
+
+
+def checked(missions, model=MODEL, **options):
+    return tb.check(tb.fit(missions, model, progress=False), compare=False, **options)
+
+
+def test_nothing_stands_out_where_nothing_is_wrong():
+    found = checked(drawn())
+
+    assert not found.table["stands_out"].any()
+    assert not found.robots["stands_out"].any()
+    assert len(found.loo) == 0
+
+
+def test_a_robot_that_degrades_stands_out_from_then_on():
+    found = checked(drawn(robot=-0.5))
+
+    odd = found.robots[found.robots["stands_out"]]
+    assert found.table.loc["robots", "label"] == "r2"
+    assert set(zip(odd["mission"], odd["robot"], strict=True)) == {(j, "r2") for j in range(4, 8)}
+
+
+def test_a_place_with_less_contact_stands_out():
+    found = checked(drawn(place=-0.35))
+
+    assert found.table.loc["places", "stands_out"]
+    assert found.table.loc["places", "label"] == "(0, 5)"
+    assert found.table.loc["places", "size"] < -0.1
+
+
+def test_a_weight_of_the_wrong_sign_stands_out():
+    found = checked(drawn(slope=-0.8), PooledTrust())
+
+    assert found.table.loc["weights", "stands_out"]
+    assert found.table.loc["weights", "label"] == "line_of_sight"
+    assert found.table.loc["weights", "size"] < 0.0
+
+
+def test_intervals_of_a_campaign_that_are_too_narrow_stand_out():
+    """Posteriors of quiet missions predict noisy ones."""
+    quiet, rng = drawn(n_missions=6), np.random.default_rng(1)
+    noisy = [
+        tb.Mission.from_arrays(
+            m.path, m.awareness, rng.uniform(size=m.contact_rate.shape), features=m.features
+        )
+        for m in quiet
+    ]
+    posteriors = [tb.fit(quiet, PooledTrust(), progress=False)] * 6
+
+    assert not tb.check(posteriors, quiet, compare=False).table.loc["coverage", "stands_out"]
+    assert tb.check(posteriors, noisy, compare=False).table.loc["coverage", "stands_out"]
+
+
+def test_a_model_without_a_planted_effect_loses_the_comparison():
+    posterior = tb.fit(drawn(place=-0.35, n_missions=5), PooledTrust(), progress=False)
+    found = tb.check(posterior)
+
+    assert found.loo.index[0] == "with effects of places"
+    assert found.table.loc["comparison", "size"] < 0.0
+
+
+def test_variants_leave_out_each_effect_and_add_each_that_is_absent():
+    missions = drawn(n_missions=1)
+
+    assert list(variants(MODEL, missions)) == [
+        "without effects of places",
+        "without effects of robots",
+    ]
+    assert list(variants(PooledTrust(), missions)) == [
+        "with effects of places",
+        "with effects of robots",
+    ]
+
+
+def test_what_is_no_posterior_of_contact_is_refused():
+    with pytest.raises(tb.TrustboError):
+        tb.check({})

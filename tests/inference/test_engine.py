@@ -1,0 +1,144 @@
+"""The engine against the joint normal of all rates, and a plain NumPyro program."""
+
+import jax
+import numpy as np
+import pytest
+from joint_normal import Dense
+from numpyro import handlers
+
+from trustbo.inference import engine
+from trustbo.inference.posterior import Posterior, at
+from trustbo.models import (
+    CoupledTrust,
+    HierarchicalTrust,
+    PlaceEffect,
+    PooledTrust,
+    RobotEffect,
+)
+from trustbo.models.backend import own_settings
+from trustbo.models.slots import Slots
+from trustbo.models.visited import visited
+
+FEATURES = ("line_of_sight", "vegetation")
+EFFECTS = (PlaceEffect(), RobotEffect())
+MODELS = {
+    "pooled": PooledTrust(),
+    "places and robots": PooledTrust(effects=EFFECTS),
+    "deviation": PooledTrust(effects=(RobotEffect(),), memory="deviation"),
+    "shared noise": PooledTrust(effects=EFFECTS, shared_noise=True),
+    "places by robot": PooledTrust(effects=(PlaceEffect(shared=False),)),
+    "cells alone": PooledTrust(effects=(PlaceEffect(bounds=False),)),
+    "hierarchical": HierarchicalTrust(effects=(RobotEffect(),)),
+    "hierarchical, shared noise": HierarchicalTrust(shared_noise=True),
+    "coupled": CoupledTrust(),
+    "coupled, places and robots": CoupledTrust(effects=EFFECTS),
+}
+
+
+def slots_of(model, *, gaps=False, shape=(4, 5, 3)):
+    rng = np.random.default_rng(0)
+    z, y = rng.uniform(size=(*shape, 2)), rng.uniform(size=shape)
+    if gaps:
+        y[rng.random(shape) < 0.15] = np.nan
+        y[1, 3:] = np.nan
+    slots = Slots(y, z, np.full(shape, 50.0), FEATURES)
+    if model.place is None:
+        return slots
+    steps = [rng.integers(0, n, shape[:2]) for n in (8, 4, 4)]
+    return slots._replace(visited=visited(np.stack(steps, -1), model.place, shape[2], (4, 4)))
+
+
+def posterior_of(name, **options):
+    model = MODELS[name].for_features(FEATURES)
+    posterior = Posterior(model, slots_of(model, **options))
+    z = 0.5 * np.random.default_rng(1).standard_normal((3, posterior.n_scores))
+    return posterior, posterior.theta(z)
+
+
+@pytest.mark.parametrize("gaps", [False, True])
+@pytest.mark.parametrize("name", MODELS)
+def test_the_evidence_is_the_density_of_the_dense_joint_normal(name, gaps):
+    posterior, theta = posterior_of(name, gaps=gaps)
+    for i, value in enumerate(posterior.log_evidence(theta)):
+        dense = Dense(posterior.model, posterior.slots, at(theta, slice(i, i + 1)))
+        np.testing.assert_allclose(value, dense.log_density(), rtol=1e-9)
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1), (2, 1, 3), (3, 4, 1)])
+def test_one_bound_and_one_robot_are_cases_like_others(shape):
+    posterior, theta = posterior_of("shared noise", shape=shape)
+    dense = Dense(posterior.model, posterior.slots, at(theta, slice(0, 1)))
+    np.testing.assert_allclose(posterior.log_evidence(theta)[0], dense.log_density(), rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("beta0", 0.0), ("beta0", 1 - 1e-6), ("delta_w", 1e-3), ("delta_v", 3.0), ("tau_e", 0.0)],
+)
+def test_the_evidence_holds_at_extreme_hyperparameters(name, value):
+    posterior, theta = posterior_of("places and robots", gaps=True)
+    theta = {**theta, name: np.full(3, value)}
+    theta["rest"] = 1.0 - theta["beta0"]
+    dense = Dense(posterior.model, posterior.slots, at(theta, slice(0, 1)))
+    np.testing.assert_allclose(posterior.log_evidence(theta)[0], dense.log_density(), rtol=1e-7)
+
+
+def test_a_matrix_that_is_not_positive_definite_costs_its_point_alone():
+    A = np.stack([np.eye(2), -np.eye(2), 4.0 * np.eye(2)])
+    factors = engine.cholesky(A)
+    assert np.isnan(factors[1]).any()
+    np.testing.assert_allclose(factors[[0, 2]], np.stack([np.eye(2), 2.0 * np.eye(2)]))
+
+
+@pytest.mark.parametrize("name", ["shared noise", "coupled, places and robots"])
+def test_drawn_columns_have_the_moments_of_the_joint_normal(name):
+    posterior, theta = posterior_of(name)
+    one = at(theta, slice(0, 1))
+    drawn = posterior.draw_columns(at(theta, np.zeros(20_000, int)), np.random.default_rng(0))
+    mean, cov = Dense(posterior.model, posterior.slots, one).coefficients()
+    sd = np.sqrt(np.diag(cov))
+    assert (np.abs(drawn.mean(0) - mean) < 5.0 * sd / np.sqrt(20_000)).all()
+    np.testing.assert_allclose(drawn.std(0), sd, rtol=0.04)
+
+
+@pytest.mark.parametrize("name", ["pooled", "deviation", "hierarchical", "coupled"])
+def test_the_plain_program_has_the_density_of_the_equations(name):
+    """Given coefficients: signals by the program's filter, and by the matrices of `signal`."""
+    posterior, theta = posterior_of(name, gaps=True)
+    model, slots, rng = posterior.model, posterior.slots, np.random.default_rng(2)
+    values = posterior.scores.draw(20, rng)
+    theta = model.theta(values, slots.resolution)
+    with own_settings():
+        for i in range(20):
+            given = {n: jax.numpy.asarray(v[i]) for n, v in values.items()}
+            c, start = posterior.prior(at(theta, slice(i, i + 1))).draw(rng)[0], 0
+            for effect in model.columns:
+                mean, parts = effect.prior(at(theta, slice(i, i + 1)), slots)
+                first = start
+                for k, part in enumerate(parts):
+                    stop = start + part.shape[1]
+                    of_part = c[start:stop] - (
+                        0.0 if mean is None else mean[0, start - first : stop - first]
+                    )
+                    given[f"{effect.noun or 'weights'}_{k}"] = jax.numpy.asarray(of_part)
+                    start = stop
+            program = handlers.trace(handlers.substitute(handlers.seed(model.program, 0), given))
+            site = program.get_trace(slots)["contact_rate"]
+            found = float(site["fn"].log_prob(site["value"]).sum())
+            signal = model.signal(at(theta, slice(i, i + 1)), slots, posterior.layout)
+            at_ = engine.expected(posterior.blocks, signal, c[None])
+            W, log_sites = engine.whiten(
+                posterior.blocks, signal, posterior.blocks.seen / signal.sd**2
+            )
+            w = W[:, posterior.blocks.kind] @ (posterior.blocks.y - at_)[..., None]
+            wanted = log_sites[:, posterior.blocks.kind].sum() - 0.5 * (w**2).sum()
+            np.testing.assert_allclose(found, wanted, rtol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["places and robots", "coupled"])
+def test_jax_and_numpy_give_one_evidence(name):
+    posterior, theta = posterior_of(name, gaps=True)
+    with own_settings():
+        in_jax = {key: jax.numpy.asarray(values) for key, values in theta.items()}
+        found = np.asarray(posterior.log_evidence(in_jax))
+    np.testing.assert_allclose(found, posterior.log_evidence(theta), rtol=1e-9)

@@ -1,0 +1,38 @@
+"""Difficulty of bounds, from the ways that robots drive."""
+
+import numpy as np
+from worlds import random_cells, terrain_of
+
+import trustbo as tb
+from trustbo.workspace.difficulty import MEASURES, difficulty_of
+
+
+def behind_a_wall(gap):
+    """Workspace of flat ground with a wall in the middle of column 1, but in some rows."""
+    dem = np.zeros((60, 60))
+    dem[:, 30] = 30.0
+    dem[gap, 30] = 0.0
+    return tb.Workspace.from_terrain(terrain_of(dem), (3, 3), sight=tb.workspace.Sight(0.0))
+
+
+def test_difficulty_is_that_of_the_largest_tilt_and_the_least_room():
+    """A plane of tan 0.3, under limits of tan 1 and tan 0.4; then gaps of two widths."""
+    plane, measured = terrain_of(np.zeros((60, 60)) + 0.3 * np.arange(60.0)[:, None]), []
+    for limit in (1.0, 0.4):
+        robot = tb.Robot(max_slope=float(np.arctan(limit)))
+        team = tb.Team(robots=(robot,) * 2, lead=robot)
+        workspace = tb.Workspace.from_terrain(plane, (3, 3), team, sight=tb.workspace.Sight(0.0))
+        measured.append(difficulty_of(workspace).sel(move="e").values[1, 1])
+    for (_, tilt, narrow, tight), limit in zip(measured, (1.0, 0.4), strict=True):
+        # Roll along the contour; no robot's way is but straight down, with the whole as pitch.
+        np.testing.assert_allclose(tilt, 0.3 / limit, rtol=1e-10)
+        assert narrow == tight == 0.0  # no impassable pixel
+    wide, slim = (difficulty_of(behind_a_wall(gap)) for gap in (slice(20, 40), slice(28, 32)))
+    assert wide["measure"].values.tolist() == list(MEASURES)
+    assert np.nanmean(slim[..., 2]) > np.nanmean(wide[..., 2])
+    # The wall's slope closes a pixel on either side: the way through touches these.
+    assert np.nanmax(slim[..., 3]) > 0.0
+
+
+def test_without_a_terrain_there_is_no_measure():
+    assert difficulty_of(random_cells()).shape == (8, 4, 4, 0)
