@@ -56,7 +56,8 @@ def test_first_plan_is_from_the_mean_of_the_prior_or_from_one_draw(workspace):
     assert np.shape(first[0].beta) == (1, 2)
     assert first[0].beta0[0] != first[1].beta0[0]
     mean = begin(workspace).belief
-    assert (mean.beta0.tolist(), mean.beta.tolist()) == ([0.5], [[0.0, 0.0]])
+    np.testing.assert_allclose(mean.beta0, [0.5])
+    np.testing.assert_allclose(mean.beta, [[0.0, 0.0]])
 
 
 def test_default_model_is_that_of_fit(workspace):

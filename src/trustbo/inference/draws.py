@@ -278,7 +278,7 @@ def sample_prior(
 def prior_mean(model: TrustModel, n_features: int, *, n_robots: int = 1) -> Params:
     """Mean of the parameters under the prior, without effects; arguments as of `sample_prior`."""
     prior, rng = _prior(model, n_features, n_robots), np.random.default_rng(0)
-    draws = prior.draw_prior(_N_MEAN, rng)
+    draws = prior.draw_prior(_N_MEAN, rng, even=True)
     draws = draws._replace(c=prior.prior(draws.theta).mean)
     sites = prior.named(draws, rng)["posterior"]
     return model.params({name: values.mean(0, keepdims=True) for name, values in sites.items()})

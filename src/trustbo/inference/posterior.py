@@ -236,9 +236,9 @@ class Posterior:
         ]
         return Draws(theta, np.column_stack(c), None, 0.0, 0.0)
 
-    def draw_prior(self, n: int, rng: np.random.Generator) -> Draws:
-        """Draws of hyperparameters and columns from the prior."""
-        values = self.scores.draw(n, rng)
+    def draw_prior(self, n: int, rng: np.random.Generator, *, even: bool = False) -> Draws:
+        """Draws of hyperparameters and columns from the prior; `even` as of `Scores.draw`."""
+        values = self.scores.draw(n, rng, even=even)
         if self.memoryless:
             values["beta0"] = np.zeros(n)
         theta = self.model.theta(values, self.slots.resolution)

@@ -67,12 +67,21 @@ class Scores:
         normal = -0.5 * (others**2).sum(1) - others.shape[1] * _LOG_ROOT_2PI
         return normal + (2.0 * size - 0.5 * np.exp(2.0 * size)).sum(1)
 
-    def draw(self, n: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
-        """Draws of the hyperparameters from their priors, (draw,) or (draw, k)."""
-        return {
-            name: quantile(prior, rng.standard_normal((n, *prior.batch_shape)), name)
-            for name, prior in self.priors.items()
-        }
+    def draw(
+        self, n: int, rng: np.random.Generator, *, even: bool = False
+    ) -> dict[str, np.ndarray]:
+        """Draws of the hyperparameters from their priors, (draw,) or (draw, k).
+
+        Even ones are spread evenly over each prior, in random order.
+        """
+        found = {}
+        for name, prior in self.priors.items():
+            score = rng.standard_normal((n, *prior.batch_shape))
+            if even:
+                spread = special.ndtri((np.arange(n) + 0.5) / n)
+                score = spread[np.argsort(score, axis=0)]
+            found[name] = quantile(prior, score, name)
+        return found
 
 
 def quantile(prior: Distribution, score: np.ndarray, name: str = "") -> np.ndarray:
