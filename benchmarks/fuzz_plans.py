@@ -191,6 +191,19 @@ def faults(planner, params, world, best):
     return wrong, plan.exact
 
 
+def problem_of(seed, index, most=_MOST_WALKS):
+    """A random problem that can be enumerated, and the score of its best walk."""
+    rng = np.random.default_rng([seed, index])
+    while True:
+        planner, params, world = draw_problem(rng)
+        try:
+            best, _ = best_walk(world, most)
+        except TooManyError:
+            continue
+        if not np.isnan(best):
+            return planner, params, world, best
+
+
 def main():
     words = arguments(__doc__, n=1000, quick="200 problems")
     for name in ("--first", "--seed"):
@@ -199,15 +212,8 @@ def main():
     given = parsed(words)
     n, outcome = 200 if given.quick else given.n, Counter()
     for index in range(given.first, given.first + n):
-        rng = np.random.default_rng([given.seed, index])
-        while True:
-            planner, params, world = draw_problem(rng)
-            try:
-                best, _ = best_walk(world, 2000 if given.networkx else _MOST_WALKS)
-            except TooManyError:
-                continue
-            if not np.isnan(best):
-                break
+        most = 2000 if given.networkx else _MOST_WALKS
+        planner, params, world, best = problem_of(given.seed, index, most)
         wrong, exact = faults(planner, params, world, best)
         if given.networkx and not wrong and best > -np.inf:
             ours, theirs = planner.plan(params), reference.plan(planner, params)

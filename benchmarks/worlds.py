@@ -45,7 +45,7 @@ def beside_pooled(make: Any, scene: tb.study.Scene) -> dict[str, Any]:
 METHODS: dict[str, Any] = {
     OURS: {},
     "trustbo, optimistic": {"policy": "optimistic"},
-    "trustbo, places": {"model": tb.models.PooledTrust(place=tb.models.PlaceEffect())},
+    "trustbo, places": {"model": tb.models.PooledTrust(effects=(tb.models.PlaceEffect(),))},
     "trustbo, no places": {"model": tb.models.PooledTrust(), "policy": "greedy"},
     "running mean": lambda scene: {"policy": running_mean.greedy()},
     "running mean, optimistic": lambda scene: {"policy": running_mean.optimistic()},
@@ -54,7 +54,7 @@ METHODS: dict[str, Any] = {
     "oracle": lambda scene: {"policy": oracle.Oracle(scene.truth)},
     "random path": lambda scene: {"policy": unlearned.RandomPath()},
     "shortest path": lambda scene: {"policy": unlearned.shortest()},
-    "paper": {**tb.paper.CAMPAIGN, "sampler": "auto"},
+    "paper": {**tb.paper.CAMPAIGN, "sampler": "importance"},
 }
 """Methods by the names of their rows; that of the paper has awareness of cells."""
 for _name, _make in METHODS.items():

@@ -23,15 +23,14 @@ import trustbo as tb
 
 STORED = Path(__file__).parent / "golden.json"
 EXACT = {
-    "pooled exact": {},
-    "apart exact": {"model": ("CoupledTrust", {"inter_robot": "none"})},
+    "pooled": {},
     **{f"policy {name}": {"policy": name} for name in tb.planning.POLICIES},
     **{f"objective {name}": {"objective": name} for name in tb.planning.OBJECTIVES},
     "objective lost_contact": {"objective": "lost_contact", "planner": {"failure_cost": 0.0}},
     "places": {
         "objective": "lost_contact",
         "policy": "optimistic",
-        "model": ("PooledTrust", {"place": tb.models.PlaceEffect()}),
+        "model": ("PooledTrust", {"effects": (tb.models.PlaceEffect(),)}),
         "bounds": True,
         "planner": {"failure_cost": 0.0},
     },
@@ -47,11 +46,10 @@ NUTS = {
         "model": ("HierarchicalTrust", {"observation": "beta_binomial"})
     },
     "coupled full": {"model": ("CoupledTrust", {})},
-    "apart nuts": {"model": ("CoupledTrust", {"inter_robot": "none"})},
 }
 
 FEW = (
-    "pooled exact", "policy ucb", "objective terminal", "objective lost_contact", "bounds", "places"
+    "pooled", "policy ucb", "objective terminal", "objective lost_contact", "bounds", "places"
 )  # fmt: skip
 
 
@@ -89,7 +87,7 @@ def campaign(options: dict, *, sampler: str, n_iterations: int) -> dict:
         for name, array in sorted(result.posterior[group].to_dataset().data_vars.items()):
             values = np.ascontiguousarray(np.nan_to_num(array.values, nan=-9.0))
             found[f"{group} {name}"] = float(values.mean())
-            if group == "posterior":  # draws of the exact sampler are nearly independent
+            if group == "posterior":  # draws of the importance sampler are nearly independent
                 of_draws = values.reshape(values.shape[0] * values.shape[1], -1).mean(1)
                 found[f"{group} {name} se"] = float(of_draws.std() / np.sqrt(len(of_draws)))
             found[f"{group} {name} bits"] = hashlib.sha256(values.tobytes()).hexdigest()

@@ -53,14 +53,14 @@ def test_files_and_posteriors_give_them_back(missions, posterior, tmp_path):
 def test_the_default_model_has_effects_of_places_where_missions_have_places(missions):
     z, y = np.random.default_rng(1).uniform(0.3, 0.9, (2, 3, 2, 2))
     whole, jumps = [(0, 0), (0, 1), (1, 2), (1, 3)], [(0, 0), (0, 1), (2, 3), (1, 3)]
-    for given, place in (
-        (missions, None),
-        ([Mission.from_arrays(jumps, z, y[..., 0])], None),
-        ([Mission.from_arrays(whole, z, y[..., 0])], PlaceEffect()),
+    for given, places in (
+        (missions, ()),
+        ([Mission.from_arrays(jumps, z, y[..., 0])], ()),
+        ([Mission.from_arrays(whole, z, y[..., 0])], (PlaceEffect(),)),
     ):
         posterior = tb.fit(given, draws=50, whole=False, check=False, progress=False)
         model = model_from_record(json.loads(posterior.attrs["model_record"]))
-        assert (model.place, model.effects) == (place, (RobotEffect(),))
+        assert model.effects == (*places, RobotEffect())
 
 
 def test_they_have_fits_and_scores(missions, posterior):

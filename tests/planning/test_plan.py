@@ -51,7 +51,7 @@ def test_a_record_has_no_ways_and_the_plan_read_from_it_does(plan, workspace):
 def test_plans_of_a_campaign_from_disk_have_them(workspace, tmp_path):
     ends = (2, 0), (0, 3)
     with tb.Campaign(
-        workspace, *ends, sampler="exact", directory=tmp_path / "campaign"
+        workspace, *ends, sampler="importance", directory=tmp_path / "campaign"
     ) as campaign:
         asked = campaign.ask()
     with tb.Campaign.load(tmp_path / "campaign") as again:
