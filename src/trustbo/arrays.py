@@ -1,8 +1,11 @@
 """Checks of arrays and names that a user gives."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
+import pandas as pd
+import xarray as xr
 from numpy.typing import ArrayLike
 
 from trustbo.errors import ShapeError, TrustboError
@@ -16,6 +19,27 @@ def as_array(what: str, values: ArrayLike) -> np.ndarray:
         return np.asarray(values, dtype=float)
     except (TypeError, ValueError):
         raise ShapeError(f"{what} must be an array of numbers; got {values!r}.") from None
+
+
+def in_order(what: str, values: Any, dims: Sequence[str], **names: Sequence[str]) -> Any:
+    """Values in the order of dims, and of the names of some, where these are labelled.
+
+    Labels are the dims and coordinates of a DataArray, or the columns of a DataFrame that are
+    texts, of the last dim. TrustboError: labels that are not these names.
+    """
+    if isinstance(values, pd.DataFrame) and all(isinstance(name, str) for name in values):
+        values = xr.DataArray(values.to_numpy(), dims=dims, coords={dims[-1]: list(values)})
+    if not isinstance(values, xr.DataArray):
+        return values
+    if {*values.dims} != {*dims}:
+        raise TrustboError(f"{what} must have the dims {tuple(dims)}; got {values.dims}.")
+    for dim, given in names.items():
+        there = [str(name) for name in values[dim].values] if dim in values.coords else []
+        if there and given and sorted(there) != sorted(given):
+            raise TrustboError(f"{what} has the {dim}s {there}, not {list(given)}.")
+        if there and given:
+            values = values.isel({dim: [there.index(name) for name in given]})
+    return values.transpose(*dims)
 
 
 def as_names(what: str, given: Iterable[str]) -> tuple[str, ...]:

@@ -4,6 +4,7 @@ Only the command that runs imports what it needs, so that `--help` takes a tenth
 """
 
 import argparse
+import io
 import sys
 import warnings
 from collections.abc import Callable, Sequence
@@ -36,6 +37,9 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     folder = getattr(args, "folder", getattr(args, "out", None))
     resume_later = f"continue with: trustbo resume {folder}"
     warnings.showwarning = _show_warning
+    for stream in (sys.stdout, sys.stderr):  # a terminal may lack letters of a path
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
     try:
         args.run(args)
     except KeyboardInterrupt:
@@ -241,7 +245,6 @@ def _finish(result: "Result", folder: Path, quiet: bool) -> None:
 
     mpl.use("agg")
     write_report(folder / "report.html", result)
-    result.explore().save(folder / "explore.html")
     if result.workspace.terrain is not None:
         export_result(result, folder, ("geotiff", "geojson"))
     if not quiet:

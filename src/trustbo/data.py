@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from trustbo.answers import levels_of
-from trustbo.arrays import as_array, as_names
+from trustbo.arrays import as_array, as_names, in_order
 from trustbo.bound import NOWHERE, STATUSES, Bound, Cell
 from trustbo.display import Rows, Summary, joined, number
 from trustbo.errors import (
@@ -170,6 +170,9 @@ class Mission(Summary):
                 the path, more than a bound after the arrays, before measurements, or together with
                 a status.
         """
+        labels = {"robot": robots, "feature": features}
+        awareness = in_order("awareness", awareness, ("bound", "robot", "feature"), **labels)
+        contact_rate = in_order("contact_rate", contact_rate, ("bound", "robot"), robot=robots)
         z, y = as_array("awareness", awareness), as_array("contact_rate", contact_rate)
         if failed_at is not None or reason:
             n_planned = len(y) if path is None else len(path) - 1
