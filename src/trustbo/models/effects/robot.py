@@ -114,7 +114,8 @@ class RobotEffect(Effect):
         """Covariance (point, mission, mission) of d of one robot."""
         xp, i = namespace(theta["tau_slow"]), np.arange(n)
         slow, day = (xp.maximum(theta[name], LEAST)[:, None, None] ** 2 for name in self.names)
-        return slow * self.rho ** np.abs(i[:, None] - i) + day * np.eye(n)
+        fading = self.rho ** np.abs(i[:, None] - i)
+        return slow * fading[None] + day * np.eye(n)[None]
 
 
 def _rest(theta: Theta) -> np.ndarray:

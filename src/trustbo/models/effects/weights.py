@@ -33,7 +33,7 @@ class Weights(Effect):
         mean, sd = self.priors.coefficients(slots.z.shape[3])
         rest = theta["rest"][:, None]
         rest = rest if self.priors.stationary else 0.0 * rest + 1.0
-        return rest * mean, rest * sd
+        return rest * mean[None], rest * sd[None]
 
     def named(self, c: np.ndarray, theta: Theta, slots: Slots) -> dict[str, np.ndarray]:
         """Weights beta (draw, feature) and intercept b (draw,)."""
