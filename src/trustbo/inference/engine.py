@@ -189,7 +189,7 @@ def draw_columns(prior: Prior, fit: Fit, count: np.ndarray, rng: np.random.Gener
     drawn = []
     for mean, F, half, many in zip(prior.mean, fit.F, fit.half, count, strict=True):
         white = half + rng.standard_normal((many, len(half)))
-        drawn.append(mean + solve_triangular(F, white.T, lower=True, trans="T").T)
+        drawn.append(mean + solve_triangular(F, white.T, lower=True, trans="T").T)  # pyright: ignore[reportArgumentType]
     return np.concatenate(drawn)
 
 
@@ -202,10 +202,10 @@ def marginals(
     """
     V, T = each(signal.covariance, blocks.label), each(signal.T, blocks.label)
     n, rows = len(V), V.shape[-1]
-    inverse = np.stack([lapack.dpotri(F, lower=1)[0] for F in fit.F])
+    inverse = np.stack([lapack.dpotri(F, lower=1)[0] for F in fit.F])  # pyright: ignore[reportAttributeAccessIssue]
     c = prior.mean + np.stack(
         [
-            solve_triangular(F, h, lower=True, trans="T")
+            solve_triangular(F, h, lower=True, trans="T")  # pyright: ignore[reportArgumentType]
             for F, h in zip(fit.F, fit.half, strict=True)
         ]
     )
@@ -256,6 +256,6 @@ def forward(F: Any, h: Any) -> Any:
     """F^-1 h of lower factors (point, column, column) and vectors (point, column)."""
     if isinstance(F, np.ndarray):
         return np.stack(
-            [lapack.dtrtrs(f.T, x, lower=0, trans=1)[0] for f, x in zip(F, h, strict=True)]
+            [lapack.dtrtrs(f.T, x, lower=0, trans=1)[0] for f, x in zip(F, h, strict=True)]  # pyright: ignore[reportAttributeAccessIssue]
         )
     return jax.lax.linalg.triangular_solve(F, h[..., None], left_side=True, lower=True)[..., 0]

@@ -145,7 +145,7 @@ def draw(
         np.where(wide.reshape(n, *(1,) * (a.ndim - 1)), b, a) for a, b in zip(*laws, strict=True)
     )
     c = center + _back(F, t)
-    log_q = np.logaddexp(*(_log_student(c, *law, nu) for law in laws)) - np.log(2.0)
+    log_q = np.logaddexp(*(_log_student(c, *law, nu) for law in laws)) - np.log(2.0)  # pyright: ignore[reportCallIssue]
     off = c - prior.mean
     Q = prior.add_to(np.zeros((n, p, p)))
     log_prior = (

@@ -176,7 +176,7 @@ def _laid_out(
     groups["prior"] = {name: values[None] for name, values in before.items()}
     tree = to_datatree(groups, missions, model.dims, model.effects)
     if places is not None:
-        tree["places"] = xr.DataTree(place_group(places, posterior.slots.visited, seed))
+        tree["places"] = xr.DataTree(place_group(places, posterior.slots.visited, seed))  # pyright: ignore[reportArgumentType]
     return tree
 
 

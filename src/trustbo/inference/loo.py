@@ -67,7 +67,7 @@ def loo(posterior: xr.DataTree, *, model: TrustModel | None = None) -> ELPDData:
     density, k_hat, average = np.zeros((3, len(measured)))
     refitted, whole_refit = np.zeros(len(measured), dtype=bool), None
     for i, j in enumerate(measured):
-        others = fitted.without(j)
+        others = fitted.without(j)  # pyright: ignore[reportArgumentType]
         ratio = others.log_evidence(theta) - whole
         weight, k_hat[i], _ = smoothed(ratio + log_count)
         density[i] = logsumexp(-ratio, b=weight)

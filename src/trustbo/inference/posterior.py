@@ -126,7 +126,7 @@ class Posterior:
             if self.exact:
                 found[i] = evidence(self.blocks, signal, prior, self._lam(signal)).log_p
             else:
-                found[i] = ep.log_evidence(*self._with_terms(signal, prior), self.sites, _SWEEPS)[0]
+                found[i] = ep.log_evidence(*self._with_terms(signal, prior), self.sites, _SWEEPS)[0]  # pyright: ignore[reportCallIssue]
         return found
 
     def settle(self, z: np.ndarray) -> None:
@@ -136,7 +136,7 @@ class Posterior:
 
     def _settle(self, theta: Theta) -> None:
         args = self._with_terms(*self._at(theta))
-        self.sites = ep.log_evidence(*args, self.sites, _SETTLED, _DAMPING)[1]
+        self.sites = ep.log_evidence(*args, self.sites, _SETTLED, _DAMPING)[1]  # pyright: ignore[reportCallIssue]
 
     def settle_at(self, draws: Draws) -> None:
         """Find the sites of EP at the mean of draws."""
@@ -190,8 +190,8 @@ class Posterior:
         theta, parts = self.theta(z[some]), []
         for _, chunk in _chunks(theta):
             args = self._with_terms(*self._at(chunk))
-            sites = ep.log_evidence(*args, self.sites, _SWEEPS)[1]
-            parts.append(ep.draw(*args, sites, rng))
+            sites = ep.log_evidence(*args, self.sites, _SWEEPS)[1]  # pyright: ignore[reportCallIssue]
+            parts.append(ep.draw(*args, sites, rng))  # pyright: ignore[reportCallIssue]
         c, f, log_weight = (np.concatenate(part) for part in zip(*parts, strict=True))
         raw = log_weight + self.scores.log_prior(z[some]) - log_p[some]
         weight, k_hat, log_mean = smoothed(raw)
@@ -272,7 +272,7 @@ class Posterior:
         trust, predicted = np.empty(shape), np.empty(shape)
         log_likelihood = np.empty(shape[:2])
         for where in of_point:
-            one = where[:1] if self.exact else where
+            one = where[:1] if self.exact else where  # pyright: ignore[reportIndexIssue]
             theta = at(draws.theta, one)
             signal = self.model.signal(theta, self.slots, self.layout)
             mean = expected(self.blocks, signal, draws.c[where])
@@ -314,7 +314,7 @@ class Posterior:
     ) -> tuple[np.ndarray, np.ndarray]:
         """The same for other rates: by weighted particles of each block."""
         args = self._with_terms(signal, self.prior(theta))
-        sites = ep.log_evidence(*args, self.sites, _SWEEPS)[1]
+        sites = ep.log_evidence(*args, self.sites, _SWEEPS)[1]  # pyright: ignore[reportCallIssue]
         drawn = [
             ep.draw_signals(self.blocks, signal, mean, self.terms, sites, rng)
             for _ in range(_PARTICLES)
@@ -353,7 +353,7 @@ class Posterior:
                 sites = ep.Sites(blocks.seen / signal.sd**2, blocks.y / signal.sd**2)
             else:
                 args = self._with_terms(signal, prior)
-                sites = ep.log_evidence(*args, self.sites, _SWEEPS)[1]
+                sites = ep.log_evidence(*args, self.sites, _SWEEPS)[1]  # pyright: ignore[reportCallIssue]
             fit = evidence(blocks, signal, prior, sites.lam, sites.y)
             found.append((*marginals(blocks, signal, prior, fit, sites.y), sites.lam))
         mean, var, lam = (np.concatenate(part) for part in zip(*found, strict=True))

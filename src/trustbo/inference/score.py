@@ -77,9 +77,9 @@ def score(
             latest, predictor = tree, _Predictor(tree)
         k = slice(len(mission.bounds))
         one = MissionBatch(*(a[j, k] for a in batch))
-        require_ticks(predictor.family, one.contact_rate, one.n_ticks)
+        require_ticks(predictor.family, one.contact_rate, one.n_ticks)  # pyright: ignore[reportPossiblyUnboundVariable]
         rng, y = np.random.default_rng([seed, j]), one.contact_rate
-        log_scores, drawn = predictor.predict(mission, one, filtered, rng)
+        log_scores, drawn = predictor.predict(mission, one, filtered, rng)  # pyright: ignore[reportPossiblyUnboundVariable]
         columns["mean"][j, k] = np.where(np.isnan(y), np.nan, drawn.mean(0))
         columns["pit"][j, k] = _pit(drawn, y, rng)
         columns["log_score"][j, k] = log_scores
@@ -87,7 +87,7 @@ def score(
         made = {bound for other in learned for bound in _bounds(other) if other.has_map}
         seen[j, k] = [bound in made for bound in _bounds(mission)]
     first = len(missions) - len(pairs)
-    return _dataset(batch, columns, quantile, seen, predictor.family, missions[first:], first)
+    return _dataset(batch, columns, quantile, seen, predictor.family, missions[first:], first)  # pyright: ignore[reportPossiblyUnboundVariable]
 
 
 class _Predictor:

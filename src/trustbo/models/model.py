@@ -217,7 +217,7 @@ class TrustModel(Summary, ABC):
         root = jnp.linalg.cholesky(signal.covariance[0] + 1e-10 * jnp.eye(y.shape[1]))
         white = dist.Normal(0.0, 1.0).expand(y.shape).to_event(2)
         e = numpyro.sample("trust_noise", white)
-        f = signal.m[0] + (signal.T[0] @ u[..., None])[..., 0] + (root @ e[..., None])[..., 0]
+        f = signal.m[0] + (signal.T[0] @ u[..., None])[..., 0] + (root @ e[..., None])[..., 0]  # pyright: ignore[reportArgumentType, reportCallIssue, reportIndexIssue]
         seen = ~np.isnan(y)
         some, N = np.where(seen, y, 0.5), np.where(ticks > 0.0, ticks, 1.0)
         log_p = self.family.log_prob(some, N, f, signal.sd[0])

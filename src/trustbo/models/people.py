@@ -68,7 +68,7 @@ class HumanTrust(PooledTrust):
         return tuple(self.inputs.split(",")) if self.inputs else ()
 
     @cached_property
-    def family(self) -> Family:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def family(self) -> Family:  # pyright: ignore
         """See `TrustModel.family`."""
         levels = levels_of(self.scale)
         return Levels(levels) if levels else FAMILIES["censored"]

@@ -61,7 +61,7 @@ class RadioSimulator(DescribedSimulator):
         rng = np.random.default_rng(require_whole("seed", seed, 0))
         rates = np.clip(mean + SCALE * rng.standard_t(FREEDOM, mean.shape), 0.0, 1.0)
         names = {"features": self.workspace.features, "robots": self.workspace.team.names}
-        return Mission.from_arrays(cells, self.workspace.along(cells), rates, **names)
+        return Mission.from_arrays(cells, self.workspace.along(cells), rates, **names)  # pyright: ignore[reportArgumentType]
 
     def expected_contact(self) -> xr.Dataset:
         """Return the expected contact of every bound in closed form, see `Truth.bounds`."""
@@ -104,7 +104,7 @@ def _mean_contact(workspace: Workspace, terrain: xr.Dataset, seed: int) -> np.nd
     field = (field - field.mean()) / field.std()
     radios = 0.25 * rng.standard_normal(workspace.team.n_robots)
 
-    b = np.stack(np.indices(grid.shape), -1)  # (row, col, axis), in cells
+    b = np.stack(np.indices(grid.shape), -1)  # (row, col, axis), in cells  # pyright: ignore[reportArgumentType, reportCallIssue]
     a = b - np.array(MOVES[8])[:, None, None]  # (move, row, col, axis)
 
     def read(raster: np.ndarray, at: np.ndarray) -> np.ndarray:

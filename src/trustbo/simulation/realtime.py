@@ -52,7 +52,7 @@ class RealtimeAwareness:
 
     def inputs(self, bound: Bound) -> dict[str, dict[str, np.ndarray]]:
         """Inputs of each feature, see `SIGNS`, arrays (robot,)."""
-        world, pixels, poses = self._world, self._workspace.pixels, bound.poses[:, 1:]
+        world, pixels, poses = self._world, self._workspace.pixels, bound.poses[:, 1:]  # pyright: ignore[reportOptionalSubscript]
         way = np.diff(poses[..., :2], axis=0, prepend=poses[:1, :, :2])
         speed = np.hypot(way[..., 0], way[..., 1]) / self._tick
         gx, gy = world.surface.gradient[:, *world.surface.nearest(poses[..., 0], poses[..., 1])]
@@ -65,12 +65,12 @@ class RealtimeAwareness:
             "return_range": return_range,
             "visible_share": visible_share,
         }
-        place = self._workspace.surface.nearest(poses[..., 0], poses[..., 1])
+        place = self._workspace.surface.nearest(poses[..., 0], poses[..., 1])  # pyright: ignore[reportOptionalMemberAccess]
         moved = speed > 0.0
         moved[0] |= ~moved.any(0)
         found = {}
         for feature, signs in SIGNS.items():
-            ticks = state | {"map": pixels[feature].values[place]}
+            ticks = state | {"map": pixels[feature].values[place]}  # pyright: ignore[reportOptionalSubscript]
             found[feature] = {n: (ticks[n] * moved).sum(0) / moved.sum(0) for n in signs}
         return found
 
@@ -100,4 +100,4 @@ class RealtimeAwareness:
         rays = eye.reshape(-1, 2), target.reshape(-1, 2), optics(robot, world.team.lead)
         clear = detection_probability(world.surface, world.sight, *rays).reshape(eye.shape[:-1])
         seen = np.insert(clear.mean(-1), 0, 1.0, axis=-1)  # (tick, robot, 1 + share)
-        return reach * np.trapezoid(seen, [0.0, *_SHARES], axis=-1), seen[..., -1]
+        return reach * np.trapezoid(seen, [0.0, *_SHARES], axis=-1), seen[..., -1]  # pyright: ignore[reportReturnType]

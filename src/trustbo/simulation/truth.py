@@ -214,7 +214,7 @@ def _longest(exists: np.ndarray, start: Cell, goal: Cell, max_bounds: int | str)
     for move, row, col in np.argwhere(exists).tolist():
         down, right = MOVES[8][move]
         graph.add_edge((row - down, col - right), (row, col))
-    return nx.shortest_path_length(graph, start, goal) + int(named[1] or 0)
+    return nx.shortest_path_length(graph, start, goal) + int(named[1] or 0)  # pyright: ignore[reportReturnType]
 
 
 def _most_kept(

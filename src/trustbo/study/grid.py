@@ -120,7 +120,7 @@ def _run(
             where = scene()
             rows = [
                 labels | dict(where.labels) | row
-                for row in _rows(case, where, labels["seed"], n_missions)
+                for row in _rows(case, where, labels["seed"], n_missions)  # pyright: ignore[reportArgumentType]
             ]
         write_file(file, lambda path: pd.DataFrame(rows).to_csv(path, index=False))
     except Exception as error:  # of one run, which does not stop the others
@@ -142,7 +142,7 @@ def _rows(case: Case, scene: Scene, seed: int, n_missions: int) -> Iterator[dict
         driven = campaign.run(scene.simulator, n_missions)
         for number, (_, mission) in enumerate(driven, start=1):
             if hasattr(policy, "learn"):
-                policy.learn(campaign, mission)
+                policy.learn(campaign, mission)  # pyright: ignore[reportFunctionMemberAccess]
             row = {"mission": number, **_recommended(campaign, scene, number)}
             row |= {"status": mission.status, "contact_rate": mission.contact_rate.mean()}
             yield (

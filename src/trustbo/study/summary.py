@@ -75,7 +75,7 @@ def summary(
         require_choice("column", n, numbers.columns) for n in ([by] if isinstance(by, str) else by)
     ]
     rows = {
-        key if len(by) > 1 else key[0]: bootstrap(_values(rows), rows[clusters].to_numpy())
+        key if len(by) > 1 else key[0]: bootstrap(_values(rows), rows[clusters].to_numpy())  # pyright: ignore[reportIndexIssue]
         for key, rows in numbers.groupby(by, sort=False)
     }
     return _table(rows, by)
@@ -112,7 +112,7 @@ def differences(
         row = bootstrap(less, apart, np.nanmean)
         if len(set(apart)) == 1:
             row |= {(name, end): np.nan for name in names for end in ("low", "high")}
-        rows[key if by else key[0]] = {("pairs", "value"): float(len(some))} | row
+        rows[key if by else key[0]] = {("pairs", "value"): float(len(some))} | row  # pyright: ignore[reportIndexIssue]
     return _table(rows, [*by, f"{ours} less"])
 
 

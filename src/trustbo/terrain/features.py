@@ -162,7 +162,7 @@ def _local_mean(terrain: xr.Dataset, values: np.ndarray) -> np.ndarray:
     size = [2 * max(1, round(COVER_RADIUS / step)) + 1 for step in pixel_size(terrain)]
     has_ground, valid = np.isfinite(terrain["dem"].values), np.isfinite(values)
     total, weight = (
-        np.asarray(ndimage.uniform_filter(a, size, mode="nearest"))
+        np.asarray(ndimage.uniform_filter(a, size, mode="nearest"))  # pyright: ignore[reportArgumentType]
         for a in (np.where(valid, values, 0.0), valid.astype(float))
     )
     with np.errstate(invalid="ignore", divide="ignore"):

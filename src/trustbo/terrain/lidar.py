@@ -50,7 +50,7 @@ def read_lidar(
     tiles = [_read_tile(fspath(file), crs) for file in files]
     if not tiles or len({tile[2].to_wkt() for tile in tiles}) > 1:
         raise TerrainError("give one LAS or LAZ file or more, all in one CRS.")
-    xyz, label = (np.concatenate([tile[k] for tile in tiles]) for k in (0, 1))
+    xyz, label = (np.concatenate([tile[k] for tile in tiles]) for k in (0, 1))  # pyright: ignore[reportArgumentType, reportCallIssue]
     ground = xyz[label == GROUND_CLASS]
     if len(ground) < 3:
         raise TerrainError(
@@ -93,7 +93,7 @@ def _read_tile(path: str, given: object) -> tuple[np.ndarray, np.ndarray, pyproj
         raise TerrainError(f"{path!r} cannot be read as LAS or LAZ: {error}.") from None
     label = np.asarray(cloud.classification, np.uint8)
     usable = ~np.isin(label, NOISE_CLASSES) & (np.asarray(cloud.withheld) == 0)
-    xyz = np.column_stack([cloud.x, cloud.y, cloud.z])[usable]
+    xyz = np.column_stack([cloud.x, cloud.y, cloud.z])[usable]  # pyright: ignore[reportArgumentType, reportCallIssue]
     wrong = (xyz[:, 2] < LOWEST) | (xyz[:, 2] > HIGHEST)
     if wrong.any():
         raise TerrainError(

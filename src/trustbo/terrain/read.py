@@ -340,7 +340,7 @@ def _of_array(array: xr.DataArray, name: str) -> _Source:
         for names, default in ((("scale_factor", "scales"), 1.0), (("add_offset", "offsets"), 0.0))
     )
     coding = Coding(name, _declared_fills(array), scale, offset)
-    return _Source(name, *axes, array.rio.crs, coding, array.attrs.get("units"), read)
+    return _Source(name, *axes, array.rio.crs, coding, array.attrs.get("units"), read)  # pyright: ignore[reportCallIssue]
 
 
 def _declared_fills(array: xr.DataArray) -> tuple[float, ...]:

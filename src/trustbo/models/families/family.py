@@ -198,7 +198,7 @@ def match_by_nodes(
     log_f = log_prob(node) - 0.5 * (node - m[..., None]) ** 2 / v[..., None]
     log_f += _LOG_WEIGHTS + 0.5 * _NODES**2
     log_mass = special.logsumexp(log_f, axis=-1)
-    weight = np.exp(log_f - log_mass[..., None])
+    weight = np.exp(log_f - log_mass[..., None])  # pyright: ignore[reportArgumentType, reportCallIssue]
     mean = (weight * node).sum(-1)
     var = (weight * (node - mean[..., None]) ** 2).sum(-1)
     return log_mass + np.log(sd / np.sqrt(v)), mean, np.maximum(var, 1e-9)

@@ -65,7 +65,7 @@ class Levels(Family):
         w = np.exp(log_p - total)
         center = (w * mean).sum(0)
         spread = (w * (var + (mean - center) ** 2)).sum(0)
-        return np.where(seen, total, 0.0), np.where(seen, center, m), np.where(seen, spread, v)
+        return np.where(seen, total, 0.0), np.where(seen, center, m), np.where(seen, spread, v)  # pyright: ignore[reportArgumentType, reportCallIssue]
 
     def draw(
         self,
@@ -87,7 +87,7 @@ class Levels(Family):
         white = rng.standard_normal(m.shape)
         f = m + v / np.sqrt(total) * e + np.sqrt(v) * noise / np.sqrt(total) * white
         blind = m + np.sqrt(v) * white
-        return np.where(seen, f, blind), np.where(seen, special.logsumexp(log_p, axis=0), 0.0)
+        return np.where(seen, f, blind), np.where(seen, special.logsumexp(log_p, axis=0), 0.0)  # pyright: ignore[reportArgumentType, reportCallIssue]
 
     def _components(self, y: ndarray, m: ndarray, v: ndarray, delta_v: ndarray) -> Any:
         """Moments (component, ...) of each normal of the mixture, log shares in the first."""
