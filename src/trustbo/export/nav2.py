@@ -196,7 +196,7 @@ def _graph(result: Result, frame: Frame) -> str:
             "hold; take larger cells."
         )
     planner, ground = result.planner.with_objective("lost_contact"), workspace.ground
-    graph = planner.graph(mean_of(result.posterior))
+    graph = planner.graph(mean_of(result.posterior, result.workspace))
     place = workspace.grid.center if ground is None else ground.posts.stop
     where = {cell: frame.of_crs(place(cell)).tolist() for cell in graph.nodes}
     features = []

@@ -201,7 +201,7 @@ class Planner(Summary):
             InfeasibleError: No path respects `max_failure`.
         """
         started = time.perf_counter()
-        mean = mean_of(params)
+        mean = mean_of(params, self.workspace)
         best = self.problem.best(self.dynamics(mean, x0))
         path = self.problem.paths.cells(best.paths[0])
         plan = self.evaluate(path, mean, x0=x0)
@@ -237,7 +237,7 @@ class Planner(Summary):
             TrustboError: beta0 of a draw is outside the range the objective is exact for.
             InfeasibleError: No path respects `max_failure`.
         """
-        params, chosen = choose_draws(draws_of(posterior), n_draws, seed)
+        params, chosen = choose_draws(draws_of(posterior, self.workspace), n_draws, seed)
         dynamics = self.problem.dynamics(params)
         best = self.problem.best(dynamics)
         return DrawnPaths(self.problem, dynamics, best.paths, best.limit - best.score, chosen)
@@ -260,7 +260,7 @@ class Planner(Summary):
             TrustboError: A path that is broken, or does not lead from start to goal.
         """
         path, problem = self.require_path(path), self.problem
-        draws, cells = draws_of(params, day=True), np.array(path)
+        draws, cells = draws_of(params, self.workspace, day=True), np.array(path)
         trust, value, values = _value_along(problem, cells, draws, x0)
         cost, (rows, cols) = problem.failure_along(cells), cells.T
         bands = np.repeat(trust, len(QUANTILES), axis=0), None
@@ -302,7 +302,7 @@ class Planner(Summary):
         Raises:
             TrustboError: abs(beta0) >= 1, for which trust settles nowhere.
         """
-        problem, dynamics = self.problem, self.dynamics(mean_of(params))
+        problem, dynamics = self.problem, self.dynamics(mean_of(params, self.workspace))
         if (radius := np.abs(np.linalg.eigvals(dynamics.transition)).max()) >= 1.0:
             raise TrustboError(f"a graph of settled trust needs abs(beta0) < 1; got {radius:g}.")
         contact = capped(OBJECTIVES["lost_contact"], problem.family, dynamics)
@@ -345,7 +345,7 @@ class Planner(Summary):
             per_robot: True for one map per robot instead of the team's.
             x0: Expected trust at the start, shape () or (robot,); by default `params.x0_mean`.
         """
-        return trust_map(self.problem, draws_of(params), per_robot=per_robot, x0=x0)
+        return trust_map(self.problem, draws_of(params, self.workspace), per_robot=per_robot, x0=x0)
 
     def cost_map(
         self, params: Params | xr.DataTree, *, per_robot: bool = False, x0: ArrayLike | None = None
@@ -363,7 +363,7 @@ class Planner(Summary):
             n_draws: Number of draws, taken at random without replacement.
             seed: Seed of the choice of draws.
         """
-        params, _ = choose_draws(draws_of(posterior), n_draws, seed)
+        params, _ = choose_draws(draws_of(posterior, self.workspace), n_draws, seed)
         return summary_of(trust_map(self.problem, params))
 
     def path_posterior(

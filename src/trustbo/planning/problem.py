@@ -20,6 +20,7 @@ from trustbo.planning.labels import LOSSES, SUM, TINY_SD, Costs, best_labels
 from trustbo.planning.objectives import Objective, Weights, capped, has_history, weights_of
 from trustbo.planning.paths import AdmissiblePaths
 from trustbo.planning.sums import best_sums
+from trustbo.workspace import Workspace
 from trustbo.workspace.moves import MOVE_NAMES, along, bounds_along
 
 EXACT = 1e-12
@@ -234,17 +235,18 @@ def risk_of(p_fail: np.ndarray) -> np.ndarray:
         return np.minimum(-np.log1p(-np.nan_to_num(p_fail)), _CERTAIN)
 
 
-def draws_of(posterior: Params | xr.DataTree, *, day: bool = False) -> Params:
+def draws_of(posterior: Params | xr.DataTree, workspace: Workspace, *, day: bool = False) -> Params:
     """Return parameters unchanged, or the draws of a posterior: leading axis (draw,).
 
-    `day`: see `params_of`. TrustboError: another object.
+    Features and robots of a posterior are put in the order of the workspace by their names.
+    `day`: see `params_of`. TrustboError: another object, or other features or robots.
     """
     if isinstance(posterior, xr.DataTree):
-        return params_of(posterior, day=day)
+        return params_of(posterior, workspace, day=day)
     return require_kind("posterior", posterior, Params, "give one of fit, or draws of parameters")
 
 
-def mean_of(params: Params | xr.DataTree) -> Params:
+def mean_of(params: Params | xr.DataTree, workspace: Workspace) -> Params:
     """Return one draw of parameters unchanged, or the mean of several, or of a posterior."""
-    draws = draws_of(params)
+    draws = draws_of(params, workspace)
     return draws.mean() if draws.leading else draws

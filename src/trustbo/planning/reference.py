@@ -34,7 +34,7 @@ def plan(planner: Planner, params: Params | xr.DataTree) -> Plan:
     Raises:
         InfeasibleError: No path respects `max_failure`.
     """
-    problem, mean = planner.problem, mean_of(params)
+    problem, mean = planner.problem, mean_of(params, planner.workspace)
     if problem.risks is not None or has_history(problem.objective, problem.family):
         plans = [planner.evaluate(path, mean) for path in every_path(problem.paths)]
         within = [one for one in plans if not one.infeasible]
