@@ -3,7 +3,7 @@
 import pytest
 
 from trustbo.errors import DamagedFileError, TrustboError
-from trustbo.files import read_record, read_yaml, require_file, require_folder, write_file
+from trustbo.files import read_record, require_file, require_folder, write_file
 
 
 def test_failed_write_leaves_the_file_before(tmp_path):
@@ -41,7 +41,6 @@ def test_impossible_names_are_refused(tmp_path):
         lambda: require_file(tmp_path / "a.png", ".csv"),
         lambda: require_file(7),
         lambda: require_folder(tmp_path / "file" / "deep"),
-        lambda: read_yaml(tmp_path / "nothing.yaml"),
     ):
         with pytest.raises(TrustboError):
             check()

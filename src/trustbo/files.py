@@ -136,17 +136,3 @@ def as_path(path: FilePath) -> Path:
     if not isinstance(path, str | os.PathLike):
         raise TrustboError(f"give the path of a file or folder; got a {type(path).__name__}.")
     return Path(path)
-
-
-def read_yaml(file: Path) -> Any:
-    """Read a YAML file; TrustboError if there is none, or it is not YAML."""
-    import yaml  # loaded only where YAML is read
-
-    if not file.exists():
-        raise TrustboError(f"cannot read {str(file)!r}: No such file or directory.")
-    try:
-        return yaml.safe_load(read_file(file).decode("utf-8"))
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        if isinstance(error, TrustboError):
-            raise
-        raise TrustboError(f"{str(file)!r} is no YAML: {' '.join(str(error).split())}") from None

@@ -20,11 +20,6 @@ PART: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
 They are not cached on disk; their compiled callers are.
 """
-LEAF: dict[str, Any] = {**PART, "_nrt": False}
-"""Options of parts that make no arrays: references are not counted.
-
-Taking a record of arrays apart counts each of them up and down, two thirds of the time of a label.
-"""
 
 
 def plain(values: np.ndarray) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Draws of a posterior, read by the names of its variables, features and robots."""
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -333,14 +333,3 @@ def missions_of(posterior: xr.DataTree) -> list[Mission]:
             )
         )
     return missions
-
-
-def labelled_draws(sites: xr.Dataset) -> Iterator[tuple[str, str, tuple[int, ...], np.ndarray]]:
-    """Label such as "beta[visibility]", name, index and draws (draw,) of every parameter."""
-    for name, array in sites.data_vars.items():
-        draws = array.transpose("chain", "draw", ...)
-        dims, values = draws.dims[2:], draws.values.reshape(-1, *draws.shape[2:])
-        for where in np.ndindex(*draws.shape[2:]):
-            places = [str(draws[d].values[i]) for d, i in zip(dims, where, strict=True)]
-            label = f"{name}[{', '.join(places)}]" if places else str(name)
-            yield label, str(name), where, values[:, *where]

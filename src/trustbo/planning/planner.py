@@ -131,10 +131,6 @@ class Planner(Summary):
         """Return the planner of paths without some bounds; see `AdmissiblePaths.avoiding`."""
         return self._with(paths=self.problem.paths.avoiding(bounds, risk))
 
-    def with_family(self, family: str) -> Self:
-        """Return the planner for contact rates of another family, see `Planner`."""
-        return self._with(family=FAMILIES[require_choice("family", family, FAMILIES)])
-
     def with_objective(self, objective: str) -> Self:
         """Return the planner of another objective, with the same paths and tolls.
 

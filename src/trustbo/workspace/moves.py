@@ -24,11 +24,6 @@ def require_connectivity(connectivity: int) -> int:
     return connectivity
 
 
-def move_indices(connectivity: int) -> np.ndarray:
-    """Indices of a connectivity's moves among the eight of `MOVES[8]`, shape (move,)."""
-    return np.array([MOVES[8].index(step) for step in MOVES[require_connectivity(connectivity)]])
-
-
 def require_on_grid(path: Sequence[Cell] | np.ndarray, shape: tuple[int, ...]) -> list[Cell]:
     """Return the cells of a path as pairs of ints.
 

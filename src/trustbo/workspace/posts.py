@@ -101,17 +101,6 @@ class Posts:
                 linked[m, *c] = linked[n_moves - 1 - m, *a] = region[end[0] - top, end[1] - left]
         return linked
 
-    def is_linked(self, cell: Cell, position: np.ndarray) -> bool:
-        """Whether robots can drive from the stop in a cell to a position near by, (2,)."""
-        if not np.isfinite(position).all():
-            return False
-        row, col = (round(float(i)) for i in self.surface.to_pixel(*position))
-        top, bottom, left, right = window = self.window(cell, cell)
-        if not (top <= row < bottom and left <= col < right):
-            return False
-        start = self.surface.pixel_at(*self.stop(cell).tolist())
-        return bool(linked_to(self.surface.passable, window, start)[row - top, col - left])
-
     def lead_way(self, a: Cell, c: Cell) -> np.ndarray | None:
         """Way of the lead from stop to stop, (point, 2); None if none."""
         return self.routes.find(self.team.lead, self.stop(a), self.stop(c), self.window(a, c))
