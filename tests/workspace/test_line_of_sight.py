@@ -18,7 +18,7 @@ from trustbo.workspace import Sight, Workspace
 from trustbo.workspace.line_of_sight import N_SAMPLES, bound_features, geometry
 from trustbo.workspace.moves import MOVES, existing_bounds
 from trustbo.workspace.netcdf import workspace_from_tree, workspace_to_tree
-from trustbo.workspace.posts import SPACING, doubted
+from trustbo.workspace.posts import SPACING
 
 A, C, NEXT = (3, 0), (2, 1), (1, 2)
 
@@ -69,15 +69,15 @@ def test_line_of_sight_is_what_scalar_code_computes():
     """On level ground with bumps all robots drive at one speed, so both phases last as long."""
     team = Team(robots=(Robot(vertical_fov=1.4),), lead=Robot(vertical_fov=1.4))
     workspace = workspace_on(bumpy(1), team)
-    surface, (_, pairs) = workspace.surface, bounds_of(workspace)
-    given = geometry(workspace.ground, pairs, workspace.passable.values)
+    surface, (index, pairs) = workspace.surface, bounds_of(workspace)
+    given = geometry(workspace.ground.posts, np.array(index), workspace.passable.values)
     found, _ = bound_features(surface, Sight(0.0), team, given, surface.ground)
 
     def pixel(xy):
         return np.array([xy[0] - surface.origin[0], surface.origin[1] - xy[1]])
 
     for b in range(0, len(pairs), 5):
-        way, post = given.ways[b], given.posts[b, 0]
+        way, post = given.routes[b], given.posts[b, 0]
         length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(way, axis=0).T))])
         seen = []
         for k in range(N_SAMPLES):
@@ -94,7 +94,8 @@ def test_a_higher_sensor_sees_no_less_and_changes_its_robot_alone():
     low = Robot(vertical_fov=np.deg2rad(80.0))
     team = Team(robots=(low,) * 3, lead=low)
     workspace = workspace_on(2.0 * bumpy(1), team)
-    given = geometry(workspace.ground, bounds_of(workspace)[1], workspace.passable.values)
+    index = np.array(bounds_of(workspace)[0])
+    given = geometry(workspace.ground.posts, index, workspace.passable.values)
     higher = Team(robots=(low, replace(low, sensor_height=3.0), low), lead=low)
     level, raised = (
         bound_features(workspace.surface, Sight(0.0), t, given, workspace.surface.ground)[0]
@@ -104,7 +105,7 @@ def test_a_higher_sensor_sees_no_less_and_changes_its_robot_alone():
     # From 3 m, 80 degrees and the slope leave out what passes within a metre of one's feet.
     gap = [
         np.linalg.norm(w - p, axis=1).min()
-        for w, p in zip(given.ways, given.posts[:, 1], strict=True)
+        for w, p in zip(given.routes, given.posts[:, 1], strict=True)
     ]
     beside = np.array(gap) > 1.0
     assert beside.mean() > 0.5
@@ -163,15 +164,6 @@ def test_equal_robots_keep_their_sides(wooded):
         east, north = ground.stop(c) - ground.stop(a)
         to_right = wooded.posts(a, c) @ np.array([north, -east])
         assert to_right[0] <= to_right[1]
-
-
-def test_sight_is_doubted_by_distance_and_never_surely_none():
-    seen, distance = np.array([0.0, 0.5, 1.0]), np.array([[1.0], [20.0], [80.0]])
-    found = doubted(seen, distance)
-    assert (np.diff(found, axis=0) < 0.0).all()  # the farther, the less
-    assert (np.diff(found, axis=1) > 0.0).all()
-    assert (found[:, 0] > 0.0).all()
-    assert (found[:, 2] < 1.0).all()
 
 
 def test_ways_lead_from_post_to_post(wooded):

@@ -9,7 +9,7 @@ import trustbo as tb
 from trustbo.errors import TrustboError
 from trustbo.planning import Planner
 from trustbo.simulation import ModelSimulator
-from trustbo.workspace import Workspace, survey
+from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Grid
 from trustbo.workspace.location import cell_of, position_near
 
@@ -144,20 +144,3 @@ def test_an_impassable_cell_names_the_nearest_and_degrees_need_a_crs(walled):
         Planner(walled, (2, 2), (0, 0))
     with pytest.raises(TrustboError, match="no coordinate reference system"):
         walled.locate("lon=1,lat=2")
-
-
-def test_a_survey_knows_the_cells_that_are_impassable_before_awareness():
-    terrain = tb.terrain.synthetic_terrain((160.0, 160.0), seed=2, relief=60.0)
-    dem = terrain["dem"].values
-    dem[:40, :60] = np.nan
-    found = survey(terrain, (8, 8))
-    slow = Workspace.from_terrain(terrain, (8, 8), bounds=False)
-    np.testing.assert_array_equal(found.passable, slow.passable.values)
-    assert not found.passable.all()
-    expected = np.isnan(dem).reshape(8, 20, 8, 20).mean((1, 3))
-    np.testing.assert_allclose(found.cells["missing"], expected)
-    assert found.heights == (np.nanmin(dem), np.nanmax(dem))
-    assert found.ends[0] == (7, 0)
-    with pytest.raises(TrustboError, match=r"\(0, 0\) is impassable: 100% of it has no data"):
-        found.require_cell("location", (0, 0))
-    assert "no data     9.4% of the area" in repr(found)

@@ -1,8 +1,7 @@
 """Planning grid: awareness, passability, positions, routes and sight of every cell."""
 
 from trustbo.workspace.sight import Sight
-from trustbo.workspace.survey import survey
 from trustbo.workspace.workspace import Workspace
 
-__all__ = ["Sight", "Workspace", "survey"]
+__all__ = ["Sight", "Workspace"]
 __dir__ = __all__.copy  # completion lists public names alone

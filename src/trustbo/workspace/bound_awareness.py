@@ -7,9 +7,8 @@ import numpy as np
 
 from trustbo.data import is_line_of_sight
 from trustbo.errors import TrustboError
-from trustbo.workspace.line_of_sight import Geometry, bound_features, over_bounds
+from trustbo.workspace.line_of_sight import bound_maps
 from trustbo.workspace.moves import existing_bounds
-from trustbo.workspace.sight import Sight
 from trustbo.workspace.ways import Ways
 
 TRAVERSABLE = "traversability"
@@ -32,7 +31,6 @@ def require_names(features: Mapping[str, object]) -> None:
 
 def of_bounds(
     ways: Ways,
-    sight: Sight,
     cells: np.ndarray,
     passable: np.ndarray,
     features: Sequence[str],
@@ -45,25 +43,18 @@ def of_bounds(
     is one. TerrainError: a cell without standing room
     for the team.
     """
+    for row, col in np.argwhere(passable).tolist():
+        ways.posts.require_room((row, col))
     exists = existing_bounds(passable)
     n_robots, n_features = len(cells), cells.shape[-1]
     maps = np.full((n_robots, *exists.shape, n_features + 1), np.nan)
     maps[..., :n_features] = np.where(exists[..., None], cells[:, None], np.nan)
-    surface = ways.posts.surface
     if traversability is None:
-        traversability = np.full(surface.ground.shape, np.nan)
-    for row, col in np.argwhere(passable).tolist():
-        ways.posts.require_room((row, col))
-
-    def work(given: Geometry) -> tuple[np.ndarray, np.ndarray]:
-        return bound_features(surface, sight, ways.posts.team, given, traversability)
-
-    for bounds, (seen, easy) in over_bounds(ways, passable, work):
-        maps[:, *bounds, -1] = seen.T
-        if TRAVERSABLE in features:
-            m = list(features).index(TRAVERSABLE)
-            filled = np.where(np.isfinite(easy.T), easy.T, maps[:, *bounds, m])
-            maps[:, *bounds, m] = filled
+        traversability = np.full(ways.posts.surface.ground.shape, np.nan)
+    maps[..., -1], easy = bound_maps(ways.posts, passable, traversability)
+    if TRAVERSABLE in features:
+        of_way = maps[..., list(features).index(TRAVERSABLE)]
+        of_way[...] = np.where(np.isfinite(easy), easy, of_way)
     maps = np.clip(maps, 0.0, 1.0)
     into = np.maximum(exists.sum(0), 1)[..., None]
     seen = np.nansum(maps[..., n_features:], axis=1) / into

@@ -12,8 +12,8 @@ beyond the edge of the cell, out of the lead's way, on ground that is well below
 linked to the stop over such ground. The lead stops where the ways from the cell to the stops around
 are seen best.
 
-Maps lack things that block sight, and have things that do not, so that sight is doubted (`doubted`)
-where posts and stops are chosen, and nowhere else: the path's line of sight is as predicted.
+Maps lack things that block sight, and have things that do not. Where posts and stops are chosen,
+and nowhere else, sight is therefore doubted (`_doubted`); the line of sight is as predicted.
 """
 
 from collections.abc import Sequence
@@ -62,7 +62,7 @@ class Posts:
         """Prepare the maps of pixels; `traversability` has shape (row, col) of pixels."""
         self.grid, self.team, self.surface = grid, team, surface
         self.routes = Routes(surface, clear=True)
-        self._sight = sight
+        self.sight = sight
         self._traversability = _smoothed(traversability, surface.pixel)
         self._standable = largest_region(surface.passable)
         steep = np.arctan(np.hypot(*surface.gradient))
@@ -172,22 +172,6 @@ class Posts:
         t2 = [self.watching(a, c) for a, c in zip(path, [*path[1:], None], strict=True)]
         return np.stack(lead), np.stack(t2)
 
-    def candidates(self, cell: Cell, next_cell: Cell | None, n: int) -> np.ndarray:
-        """Up to `n` posts to choose from, (post, 2): those of `watching`, then the next best.
-
-        Next best for the robots on average, at the least distance from all before.
-        """
-        posts = self.watching(cell, next_cell)
-        position, gap = self._standing(cell)
-        score = self._scores(cell, [next_cell], position).mean(0)[0]
-        while len(posts) < n:
-            gaps = np.linalg.norm(position[:, None] - posts, axis=-1).min(1)
-            if not (gaps >= gap).any():
-                break
-            best = np.argmax(np.where(gaps >= gap, score, -np.inf))
-            posts = np.concatenate([posts, position[best, None]])
-        return posts
-
     def _aimed(self, cell: Cell, ahead: list[Cell | None]) -> np.ndarray:
         """Posts of T2 by the next cell, (next cell, robot, 2), with a least distance."""
         here, n_robots = self.stop(cell), len(self.team.robots)
@@ -249,8 +233,8 @@ class Posts:
 
     def _seen(self, eye: np.ndarray, target: np.ndarray, lidar: np.ndarray) -> np.ndarray:
         """Probability of detection of targets (..., 2) where maps may be wrong; broadcasts."""
-        seen = detection_between(self.surface, self._sight, eye, target, lidar)
-        return doubted(seen, np.linalg.norm(target - eye, axis=-1))
+        seen = detection_between(self.surface, self.sight, eye, target, lidar)
+        return _doubted(seen, np.linalg.norm(target - eye, axis=-1))
 
     # --- pixels ---
 
@@ -331,7 +315,7 @@ class Posts:
         return np.stack([x[col], y[row]], axis=-1)
 
 
-def doubted(seen: np.ndarray, distance: np.ndarray) -> np.ndarray:
+def _doubted(seen: np.ndarray, distance: np.ndarray) -> np.ndarray:
     """Chance of detection where maps may be wrong, from that of the map and the distance, m.
 
     A share exp(-discount x distance) of what is expected to be seen is, and of the rest a share

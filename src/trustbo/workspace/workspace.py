@@ -21,7 +21,7 @@ from trustbo.data import (
     require_map,
 )
 from trustbo.display import Rows, Summary, compiling
-from trustbo.errors import ShapeError, require_choice, require_positive
+from trustbo.errors import ShapeError, require_positive
 from trustbo.stacking import fill_awareness
 from trustbo.team import Team
 from trustbo.terrain.composite import CompositeIndex
@@ -33,14 +33,12 @@ from trustbo.workspace.bound_awareness import (
     of_bounds,
     require_names,
 )
-from trustbo.workspace.grid import Grid
+from trustbo.workspace.grid import MAX_MISSING, Grid
 from trustbo.workspace.location import Location, cell_of
 from trustbo.workspace.moves import MOVE_NAMES, along, existing_bounds, moves_along
 from trustbo.workspace.posts import Posts
 from trustbo.workspace.sight import Sight
 from trustbo.workspace.surface import Surface, surface_of
-from trustbo.workspace.survey import reason_impassable
-from trustbo.workspace.watch import WatchTable
 from trustbo.workspace.ways import Ways
 
 
@@ -201,7 +199,6 @@ class Workspace(Summary):
         easy = pixels[TRAVERSABLE].values if TRAVERSABLE in pixels else None
         maps = of_bounds(
             ways,
-            self.sight or Sight(),
             self.awareness.values,
             self.passable.values,
             self.features,
@@ -240,30 +237,6 @@ class Workspace(Summary):
         like = self.passable.expand_dims(move=list(MOVE_NAMES), axis=0)
         return like.copy(data=exists).rename("passable_bounds")
 
-    @cached_property
-    def watch(self) -> WatchTable | None:
-        """Posts from which bounds can be watched, and what is seen from them by the first sight.
-
-        None without a terrain or an assumed sight.
-        """
-        if self.ground is None or self.sight is None:
-            return None
-        return WatchTable(self.ground, self.sight)
-
-    @cached_property
-    def unseen_bounds(self) -> xr.DataArray | None:
-        """Share of the time of each bound in which nobody sees anybody, DataArray (move, row, col).
-
-        Expected by the map, with T2 at the workspace's posts, over the cells that a path may go on
-        to; in [0, 1], NaN where there is no bound. The bound enters the cell (row, col) by the
-        move, one of the eight of `MOVES`. It is that of the assumed sight, the first of several;
-        None without a terrain or an assumed sight.
-        """
-        if (table := self.watch) is None:
-            return None
-        like = self.passable.expand_dims(move=list(MOVE_NAMES), axis=0)
-        return like.copy(data=table.unseen(self.passable.values)).rename("unseen")
-
     def ways_over(self, surface: Surface, sight: Sight | None = None) -> Ways:
         """Posts and ways over another surface of the same terrain, such as one with closed areas.
 
@@ -284,30 +257,6 @@ class Workspace(Summary):
         """
         a, c = self._require_bound(a, c)
         return None if self.ground is None else self.ground.posts.watching(a, c)
-
-    def overwatch_map(
-        self, bound: tuple[Cell, Cell], *, robot: str | None = None
-    ) -> xr.DataArray | None:
-        """Map how much of a bound one would see: the share of the lead's way seen from each point.
-
-        Args:
-            bound: Cells a and c, neighbours, the lead's way leads from a to c.
-            robot: Name of the robot that watches; by default the first of the team.
-
-        Returns:
-            DataArray (y, x) in [0, 1], points of the raster in CRS metres, 2 m apart or a pixel,
-            within half a cell around the two; NaN where robots cannot stand. It is that of the
-            assumed sight, the first of several, without what is expected to be wrong with it.
-            `rio` has the CRS and writes rasters. None without a terrain or an assumed sight.
-
-        Raises:
-            TrustboError: A cell that is off the grid or impassable, two that are no neighbours, or
-                an unknown robot.
-        """
-        a, c = self._require_bound(*bound)
-        name = self.team.names[0] if robot is None else robot
-        require_choice("robot", name, self.team.names)
-        return None if self.watch is None else self.watch.overwatch_map(a, c, name)
 
     def ways(
         self, a: Cell, c: Cell, next_cell: Cell | None = None
@@ -429,7 +378,13 @@ class Workspace(Summary):
         return cell_of(what, cell, self.grid, free, self._why_impassable)
 
     def _why_impassable(self, row: int, col: int) -> str:
+        """Text of the reason why a cell is impassable; empty without a terrain."""
         if self.terrain is None:
             return ""
         missing = 1.0 - self.grid.cell_share(self.terrain["dem"].notnull())[row, col]
-        return reason_impassable(missing, self.team)
+        if missing > MAX_MISSING:
+            return f": {missing:.0%} of it has no data"
+        steep = np.rad2deg(self.team.max_slope)
+        return (
+            f": over half of it is missing or steeper than the {steep:.0f} degrees the team stands"
+        )
