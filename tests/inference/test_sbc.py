@@ -10,7 +10,7 @@ from missions import N_TICKS
 import trustbo as tb
 from trustbo.errors import PosteriorError, TrustboError
 from trustbo.inference import sbc
-from trustbo.inference.sbc import _uniformity
+from trustbo.inference.sbc import uniformity
 from trustbo.models import (
     CoupledTrust,
     HierarchicalTrust,
@@ -112,8 +112,8 @@ def test_data_sets_that_the_sampler_refuses_are_counted(monkeypatch):
 
 def test_uniform_ranks_pass_and_others_do_not():
     rng = np.random.default_rng(0)
-    assert _uniformity(rng.integers(0, 400, 5000), 399) > 0.001
-    assert _uniformity(rng.binomial(399, 0.5, 5000), 399) < 1e-6
+    assert uniformity(rng.integers(0, 400, 5000), 399) > 0.001
+    assert uniformity(rng.binomial(399, 0.5, 5000), 399) < 1e-6
 
 
 def test_the_same_seed_gives_the_same_ranks():

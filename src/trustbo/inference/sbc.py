@@ -57,7 +57,7 @@ def sbc(
         `n_refused` is the number of data sets left out.
 
     Raises:
-        PosteriorError: The sampler refuses more data sets than that.
+        PosteriorError: The sampler refuses more data sets than that, or all.
     """
     require_choice("sampler", sampler, SAMPLERS)
     n_datasets, n_ranked = (
@@ -75,7 +75,7 @@ def sbc(
         drawn = _sample(posterior, sampler, n_ranked, int(rng.integers(2**31)))
         if drawn is None:
             n_refused += 1
-            if n_refused > max_refused * n_datasets:
+            if n_refused > max_refused * n_datasets or n_refused == n_datasets:
                 raise PosteriorError(
                     f"the sampler refused data set {j}.", None, "Change the priors."
                 )
@@ -131,7 +131,7 @@ def _summary(ranks: list[dict[str, int]], n_ranked: int, n_refused: int) -> xr.D
         {
             "rank": (("dataset", "parameter"), table),
             "pit": (("dataset", "parameter"), pit),
-            "p_value": ("parameter", [_uniformity(column, n_ranked) for column in table.T]),
+            "p_value": ("parameter", [uniformity(column, n_ranked) for column in table.T]),
             "coverage": (("interval", "parameter"), coverage),
         },
         {"parameter": names, "interval": list(_INTERVALS)},
@@ -139,7 +139,7 @@ def _summary(ranks: list[dict[str, int]], n_ranked: int, n_refused: int) -> xr.D
     )
 
 
-def _uniformity(ranks: np.ndarray, n_ranked: int) -> float:
+def uniformity(ranks: np.ndarray, n_ranked: int) -> float:
     """P-value of a chi-squared test; bins hold as many of the n_ranked + 1 ranks as they can."""
     n_bins = min(20, max(2, len(ranks) // 5))  # five ranks to a bin, for the test to hold
     edges = np.linspace(0, n_ranked + 1, n_bins + 1).astype(int)
