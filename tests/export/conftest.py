@@ -27,5 +27,5 @@ def maps(result):
 def nowhere(result):
     """The same without a terrain."""
     workspace, grid = result.workspace, dataclasses.replace(result.workspace.grid, crs=None)
-    bare = dataclasses.replace(workspace, terrain=None, pixels=None, grid=grid)
+    bare = dataclasses.replace(workspace, terrain=None, pixels=None, posts=None, grid=grid)
     return dataclasses.replace(result, workspace=bare)

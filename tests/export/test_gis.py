@@ -30,7 +30,7 @@ def test_places_in_geojson_are_those_of_the_plan(result, tmp_path):
     features = json.loads((tmp_path / "高度.geojson").read_text("utf-8"))["features"]
     plan, crs = result.plan, result.workspace.grid.crs
     layers = {layer: [f for f in features if f["properties"]["layer"] == layer]
-              for layer in ("path", "bounds", "posts", "ways")}  # fmt: skip
+              for layer in ("path", "bounds", "posts", "routes")}  # fmt: skip
     assert len(layers["bounds"]) == len(plan.path)
     line = np.array(layers["path"][0]["geometry"]["coordinates"])
     x, y = transform("EPSG:4326", crs, *line.T.tolist())
@@ -42,7 +42,7 @@ def test_places_in_geojson_are_those_of_the_plan(result, tmp_path):
     posts = [f["geometry"]["coordinates"] for f in layers["posts"]]
     x, y = transform("EPSG:4326", crs, *np.transpose(posts).tolist())
     np.testing.assert_allclose(np.transpose([x, y]), plan.posts.reshape(-1, 2), atol=0.01)
-    assert len(layers["ways"]) == sum(way is not None for ways in plan.ways for way in ways)
+    assert len(layers["routes"]) == sum(one is not None for bound in plan.routes for one in bound)
 
 
 @pytest.mark.parametrize("west", [-180.5, 179.5])

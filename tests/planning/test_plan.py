@@ -1,4 +1,4 @@
-"""A plan's stops, posts and ways are the workspace's, also of one read from a record."""
+"""A plan's stops, posts and routes are the workspace's, also of one read from a record."""
 
 import itertools
 import json
@@ -28,12 +28,14 @@ def assert_is_of_its_path(plan, workspace):
     path = plan.path
     assert plan.posts.shape == (len(path) - 1, 2, 2)
     for k, (a, c) in enumerate(itertools.pairwise(path)):
-        np.testing.assert_array_equal(plan.posts[k], workspace.posts(a, c))
-        ways = workspace.ways(a, c, path[k + 2] if k + 2 < len(path) else None)
-        for found, way in zip(plan.ways[k], ways, strict=True):
-            np.testing.assert_array_equal(found, way)
-        np.testing.assert_array_equal(plan.ways[k][0][[0, -1]], plan.stops[k : k + 2])
-    assert len(plan.ways) == len(path) - 1
+        np.testing.assert_array_equal(plan.posts[k], workspace.posts.watching(a, c))
+        ahead = path[k + 2] if k + 2 < len(path) else None
+        for found, route in zip(
+            plan.routes[k], workspace.posts.bound_routes(a, c, ahead), strict=True
+        ):
+            np.testing.assert_array_equal(found, route)
+        np.testing.assert_array_equal(plan.routes[k][0][[0, -1]], plan.stops[k : k + 2])
+    assert len(plan.routes) == len(path) - 1
 
 
 def test_a_plan_has_what_each_robot_is_to_do(plan, workspace):
@@ -44,7 +46,7 @@ def test_a_plan_has_what_each_robot_is_to_do(plan, workspace):
 def test_a_record_has_no_ways_and_the_plan_read_from_it_does(plan, workspace):
     assert_is_of_its_path(plan, workspace)  # they are known now
     record = json.loads(json.dumps(plan_to_record(plan)))
-    assert not {"stops", "posts", "ways", "workspace"} & set(record)
+    assert not {"stops", "posts", "routes", "workspace"} & set(record)
     assert_is_of_its_path(plan_from_record(record, workspace), workspace)
 
 
@@ -62,7 +64,7 @@ def test_plans_of_a_campaign_from_disk_have_them(workspace, tmp_path):
 def test_without_a_terrain_there_are_none():
     bare = tb.Workspace.from_awareness(np.full((2, 3, 3, 3), 0.5))
     plan = tb.planning.Planner(bare, (2, 0), (0, 2)).plan(PARAMS)
-    assert (plan.stops, plan.posts, plan.ways) == (None, None, None)
+    assert (plan.stops, plan.posts, plan.routes) == (None, None, None)
 
 
 def test_an_unknown_name_of_a_room_is_an_attribute_error():

@@ -45,11 +45,11 @@ def test_a_bound_is_passable_if_and_only_if_all_its_ways_exist():
     exists = existing_bounds(workspace.passable.values)
     assert (passable <= exists).all()
     assert 0 < passable.sum() < exists.sum()
-    ground = workspace.ground
+    posts = workspace.posts
     for m, row, col in np.argwhere(exists).tolist():
         a = row - MOVES[8][m][0], col - MOVES[8][m][1]
         ahead = [c for c in np.ndindex(3, 3) if max(abs(c[0] - row), abs(c[1] - col)) == 1]
-        ways = [way for c in (None, *ahead) for way in ground.bound(a, (row, col), c)]
+        ways = [way for c in (None, *ahead) for way in posts.bound_routes(a, (row, col), c)]
         assert {way is not None for way in ways} == {bool(passable[m, row, col])}
 
 

@@ -1,4 +1,4 @@
-"""Files for GIS: maps as GeoTIFF; the path, posts and ways of a plan as GeoJSON; CSV."""
+"""Files for GIS: maps as GeoTIFF; the path, posts and routes of a plan as GeoJSON; CSV."""
 
 import json
 from typing import Any
@@ -62,8 +62,8 @@ def write_geojson(path: FilePath, plan: Plan | Result) -> None:
 
     It has a LineString from start to goal, a Point for each cell with its `bound`, `cell`, expected
     trust of each robot and its 90 % band, and chance to fail; and on a terrain a Point for each
-    post and a LineString for each way. The property `layer` is "path", "bounds", "posts" or "ways".
-    Lines across 180 degrees are cut in two there.
+    post and a LineString for each route. The property `layer` is "path", "bounds", "posts" or
+    "routes". Lines across 180 degrees are cut in two there.
 
     Args:
         path: File to write, or to replace.
@@ -87,11 +87,11 @@ def write_geojson(path: FilePath, plan: Plan | Result) -> None:
             features.append(
                 _feature(plan, "posts", place, {"bound": k, "robot": robot, "cell": [*cell]})
             )
-    for k, ways in enumerate(_of(plan.ways), start=1):
-        for robot, way in zip((LEAD, *names), ways, strict=True):
-            if way is not None:
-                about = {"bound": k, "robot": robot, "length_m": shapely.LineString(way).length}
-                features.append(_feature(plan, "ways", way, about))
+    for k, routes in enumerate(_of(plan.routes), start=1):
+        for robot, route in zip((LEAD, *names), routes, strict=True):
+            if route is not None:
+                about = {"bound": k, "robot": robot, "length_m": shapely.LineString(route).length}
+                features.append(_feature(plan, "routes", route, about))
     write_text(target, json.dumps({"type": "FeatureCollection", "features": features}))
 
 

@@ -69,8 +69,8 @@ def write_nav2(
         pixel: Side of a pixel of the map, m; by default a tenth of a cell's shorter side.
 
     Raises:
-        TrustboError: A robot has no way in a bound; more cells than ids of Nav2; a map of too many
-            pixels; or a file cannot be written.
+        TrustboError: A robot has no route in a bound; more cells than ids of Nav2; a map of too
+            many pixels; or a file cannot be written.
     """
     folder, workspace = Path(folder), result.workspace
     place = frame or Frame(workspace.grid.center(result.path[0]))
@@ -155,20 +155,20 @@ def stops_of(plan: Plan, robot: str, frame: Frame) -> np.ndarray:
     """Poses of a robot's stops in a frame, (stop, 3): x, y and heading.
 
     The lead's stops look at the next; a robot's posts, and its place at the goal, at the lead's
-    next stop. No robot waits for the others by the file. TrustboError: no terrain or way.
+    next stop. No robot waits for the others by the file. TrustboError: no terrain or route.
     """
     require_choice("robot", robot, (LEAD, *plan.workspace.team.names))
-    if plan.stops is None or plan.posts is None or plan.ways is None:
+    if plan.stops is None or plan.posts is None or plan.routes is None:
         raise TrustboError("waypoints need a terrain; use Workspace.from_terrain.")
     lead = frame.of_crs(plan.stops)
     if robot == LEAD:
         steps = np.diff(lead, axis=0)
         return _towards(lead, np.vstack([steps, steps[-1:]]))
     i = plan.workspace.team.names.index(robot)
-    ways = [of_bound[i + 1] for of_bound in plan.ways]
-    if any(way is None for way in ways) or ways[-1] is None:
-        raise TrustboError(f"{robot} has no way in a bound; plan another path.")
-    places = frame.of_crs(np.vstack([plan.posts[:, i], ways[-1][-1:]]))
+    routes = [of_bound[i + 1] for of_bound in plan.routes]
+    if any(route is None for route in routes) or routes[-1] is None:
+        raise TrustboError(f"{robot} has no route in a bound; plan another path.")
+    places = frame.of_crs(np.vstack([plan.posts[:, i], routes[-1][-1:]]))
     return _towards(places, np.vstack([lead[1:], lead[-1:]]) - places)
 
 
@@ -195,9 +195,9 @@ def _graph(result: Result, frame: Frame) -> str:
             f"a route graph of {n_cells} cells has ids beyond {_MOST_IDS}, which messages of Nav2 "
             "hold; take larger cells."
         )
-    planner, ground = result.planner.with_objective("lost_contact"), workspace.ground
+    planner, posts = result.planner.with_objective("lost_contact"), workspace.posts
     graph = planner.graph(mean_of(result.posterior, result.workspace))
-    place = workspace.grid.center if ground is None else ground.posts.stop
+    place = workspace.grid.center if posts is None else posts.stop
     where = {cell: frame.of_crs(place(cell)).tolist() for cell in graph.nodes}
     features = []
     for (row, col), xy in where.items():

@@ -19,7 +19,7 @@ QUANTILES = (0.05, 0.25, 0.75, 0.95)
 class Plan(Summary):
     """A path with its expected trust, value and exactness.
 
-    What robots are to do, `stops`, `posts` and `ways`, in CRS metres, is computed on demand from
+    What robots are to do, `stops`, `posts` and `routes`, in CRS metres, is computed on demand from
     the workspace, and None without a terrain in memory.
 
     Attributes:
@@ -103,24 +103,26 @@ class Plan(Summary):
     @cached_property
     def stops(self) -> np.ndarray | None:
         """Stops of the lead in the cells of the path, shape (bound + 1, 2)."""
-        ground = self.workspace.ground
-        return None if ground is None else ground.posts.places(self.path)[0]
+        posts = self.workspace.posts
+        return None if posts is None else np.stack([posts.stop(cell) for cell in self.path])
 
     @cached_property
     def posts(self) -> np.ndarray | None:
         """Posts where T2 stands before each bound, shape (bound, robot, 2)."""
-        ground = self.workspace.ground
-        return None if ground is None else ground.posts.along(self.path)
+        posts, path = self.workspace.posts, self.path
+        return None if posts is None else np.stack([*map(posts.watching, path, path[1:])])
 
     @cached_property
-    def ways(self) -> tuple[tuple[np.ndarray | None, ...], ...] | None:
-        """Ways of each bound: the lead's, then each of T2's, polylines of shape (point, 2).
+    def routes(self) -> tuple[tuple[np.ndarray | None, ...], ...] | None:
+        """Routes of each bound: the lead's, then each of T2's, polylines of shape (point, 2).
 
         T2 closes up to its posts for the next bound, at the goal around the lead. None for a robot
-        that has no way.
+        that has no route.
         """
-        ground = self.workspace.ground
-        return None if ground is None else tuple(ground.along(self.path))
+        posts, path = self.workspace.posts, self.path
+        if posts is None:
+            return None
+        return tuple(map(posts.bound_routes, path, path[1:], [*path[2:], None]))
 
 
 def plan_to_record(plan: Plan) -> dict[str, Any]:

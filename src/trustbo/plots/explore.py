@@ -167,14 +167,14 @@ def _draw_plan(plot: Any, plan: Plan) -> None:
     for k, marker in ((0, "circle"), (-1, "star")):
         end = [path["x"][k]], [path["y"][k]]
         plot.scatter(*end, marker=marker, size=14, color="white", line_color="black")
-    if plan.posts is None or plan.ways is None:
+    if plan.posts is None or plan.routes is None:
         return
     for i, name in enumerate(plan.workspace.team.names):
         x, y = (plan.posts[:, i] - corner).T
         look = {"color": ROBOTS[i % len(ROBOTS)], "legend_label": f"{name}: posts, routes"}
         marker = _MARKERS[i % len(_MARKERS)]
         plot.scatter(x, y, marker=marker, size=8, line_color="white", **look)
-        routes = [ways[i + 1] - corner for ways in plan.ways if ways[i + 1] is not None]
+        routes = [bound[i + 1] - corner for bound in plan.routes if bound[i + 1] is not None]
         plot.multi_line([r[:, 0] for r in routes], [r[:, 1] for r in routes], **look)
 
 

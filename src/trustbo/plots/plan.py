@@ -58,7 +58,7 @@ def plan_map(plan: Plan, *, bounds: Sequence[int] | None = None, ax: Any = None)
 
 def _draw_bound(ax: Axes, plan: Plan, k: int) -> None:
     """Draw the bound of index k and its surroundings."""
-    stops, posts, routes = plan.stops, plan.posts, plan.ways
+    stops, posts, routes = plan.stops, plan.posts, plan.routes
     assert stops is not None and posts is not None and routes is not None  # noqa: S101, PT018
     corner = np.array(plan.workspace.grid.corner)
     lead, *others = [None if route is None else route - corner for route in routes[k]]
@@ -75,7 +75,7 @@ def _draw_bound(ax: Axes, plan: Plan, k: int) -> None:
     ax.plot(*np.stack([before, after]).T, "*", **_filled(ink(), 11), linestyle="none", zorder=6)
 
     seen = np.concatenate([
-        [before, after], posts[k] - corner, *(way for way in (lead, *others) if way is not None)
+        [before, after], posts[k] - corner, *(one for one in (lead, *others) if one is not None)
     ])  # fmt: skip
     middle = (seen.min(0) + seen.max(0)) / 2.0
     half = 0.56 * float(np.ptp(seen, axis=0).max()) + 2.0

@@ -16,6 +16,7 @@ from trustbo.simulation.sensing import Drive, contact_of, detections, new_tracks
 from trustbo.simulation.world import World, true_surface, world_of
 from trustbo.team import Robot, Team
 from trustbo.workspace import Workspace
+from trustbo.workspace.posts import Posts
 from trustbo.workspace.sight import Sight
 
 
@@ -87,7 +88,7 @@ class KinematicSimulator(DescribedSimulator):
         self._usual, self.events = world_of(surface, self.sight, self.team), tuple(events)  # pyright: ignore[reportArgumentType]
         for event in self.events:
             event.change(self._usual)  # refuses what does not fit
-        self._ways = workspace.ground
+        self._posts: Posts = workspace.posts  # pyright: ignore[reportAttributeAccessIssue]
 
     def describe(self) -> dict[str, object]:
         """Return the settings that decide what a mission measures."""
@@ -142,7 +143,7 @@ class KinematicSimulator(DescribedSimulator):
 
     def standing(self, cell: Cell, next_cell: Cell | None) -> State:
         """State of a team with all robots in their places in a cell, to go to the next."""
-        posts = self._ways.posts  # pyright: ignore[reportOptionalMemberAccess]
+        posts = self._posts
         stops = np.concatenate([posts.stop(cell)[None], posts.watching(cell, next_cell)])
         poses = np.concatenate([stops, np.zeros((len(stops), 1))], axis=1)
         return State(cell, poses, stops, new_tracks(len(stops) - 1))
@@ -197,7 +198,7 @@ class KinematicSimulator(DescribedSimulator):
         for next_cell in ahead:
             run = [0]
             if lead.status == "ok":
-                goals = self._ways.posts.watching(cell, next_cell)  # pyright: ignore[reportOptionalMemberAccess]
+                goals = self._posts.watching(cell, next_cell)
                 if (key := goals.tobytes()) not in moves:
                     moves[key] = len(drives)
                     drives.append(self._close_up(world, state, lead, cell, goals, rng))
@@ -231,7 +232,7 @@ class KinematicSimulator(DescribedSimulator):
         """Run bound k: movements, contact at each tick (tick, robot), and the state after it."""
         drive = self._advance(world, state, cell, rng)
         if drive.status == "ok":
-            goals = self._ways.posts.watching(cell, next_cell)  # pyright: ignore[reportOptionalMemberAccess]
+            goals = self._posts.watching(cell, next_cell)
             drive = _joined([drive, self._close_up(world, state, drive, cell, goals, rng)])
         probability = detections(world, [drive], k)[0]
         contact, tracks = self._contact(world, state.tracks, drive, probability, rng)
@@ -240,7 +241,7 @@ class KinematicSimulator(DescribedSimulator):
     def _advance(self, world: World, state: State, cell: Cell, rng: np.random.Generator) -> Drive:
         """Drive the lead to its stop in a cell while T2 stands."""
         robots = [world.team.lead], [self.workspace.team.lead]
-        goals = self._ways.posts.stop(cell)[None]  # pyright: ignore[reportOptionalMemberAccess]
+        goals = self._posts.stop(cell)[None]
         return self._move(world, state, cell, slice(0, 1), robots, goals, self._max_ticks, rng)
 
     def _close_up(
@@ -274,12 +275,12 @@ class KinematicSimulator(DescribedSimulator):
         Routes start at the planned places, robots at their current poses.
         """
         true, planned = robots
-        now, window = state.poses, self._ways.posts.window(state.cell, cell)  # pyright: ignore[reportOptionalMemberAccess]
+        now, window = state.poses, self._posts.window(state.cell, cell)
         routes: list[np.ndarray | None] = []
         for robot, start, goal, pose in zip(
             planned, state.stops[members], goals, now[members], strict=True
         ):
-            route = self._ways.routes.find(robot, start, goal, window)  # pyright: ignore[reportOptionalMemberAccess]
+            route = self._posts.routes.find(robot, start, goal, window)
             routes.append(None if route is None else np.concatenate([pose[None, :2], route[1:]]))
         moved, status = self.drive(world, now[members], true, routes, window, max_ticks, rng)
         poses = np.repeat(now[None], len(moved), axis=0)

@@ -129,7 +129,7 @@ class World:
         return _workspace(assumed, tuple(sorted(options.items())))
 
     def simulator(self, workspace: Workspace) -> KinematicSimulator | RadioSimulator:
-        """Simulator of the true world, with posts and ways of a workspace on the assumed one."""
+        """Simulator of the true world, with posts and routes of a workspace on the assumed one."""
         terrain = self.true_terrain()
         if self.radio:
             return RadioSimulator(workspace, terrain=terrain)

@@ -1,4 +1,4 @@
-"""Awareness of bounds on a terrain: traversability of the way, line of sight, and maps of cells."""
+"""Awareness of bounds on a terrain: traversability, line of sight, and maps of cells."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -9,10 +9,7 @@ from trustbo.data import is_line_of_sight
 from trustbo.errors import TrustboError
 from trustbo.workspace.line_of_sight import bound_maps
 from trustbo.workspace.moves import existing_bounds
-from trustbo.workspace.ways import Ways
-
-TRAVERSABLE = "traversability"
-"""Name of the feature that is averaged along the way, instead of over the cell entered."""
+from trustbo.workspace.posts import TRAVERSABLE, Posts
 
 
 class BoundMaps(NamedTuple):
@@ -30,7 +27,7 @@ def require_names(features: Mapping[str, object]) -> None:
 
 
 def of_bounds(
-    ways: Ways,
+    posts: Posts,
     cells: np.ndarray,
     passable: np.ndarray,
     features: Sequence[str],
@@ -44,17 +41,17 @@ def of_bounds(
     for the team.
     """
     for row, col in np.argwhere(passable).tolist():
-        ways.posts.require_room((row, col))
+        posts.require_room((row, col))
     exists = existing_bounds(passable)
     n_robots, n_features = len(cells), cells.shape[-1]
     maps = np.full((n_robots, *exists.shape, n_features + 1), np.nan)
     maps[..., :n_features] = np.where(exists[..., None], cells[:, None], np.nan)
     if traversability is None:
-        traversability = np.full(ways.posts.surface.ground.shape, np.nan)
-    maps[..., -1], easy = bound_maps(ways.posts, passable, traversability)
+        traversability = np.full(posts.surface.ground.shape, np.nan)
+    maps[..., -1], easy = bound_maps(posts, passable, traversability)
     if TRAVERSABLE in features:
-        of_way = maps[..., list(features).index(TRAVERSABLE)]
-        of_way[...] = np.where(np.isfinite(easy), easy, of_way)
+        of_route = maps[..., list(features).index(TRAVERSABLE)]
+        of_route[...] = np.where(np.isfinite(easy), easy, of_route)
     maps = np.clip(maps, 0.0, 1.0)
     into = np.maximum(exists.sum(0), 1)[..., None]
     seen = np.nansum(maps[..., n_features:], axis=1) / into

@@ -16,9 +16,8 @@ from scipy import ndimage
 
 from trustbo.parallel import in_order
 from trustbo.workspace import Workspace
-from trustbo.workspace.bound_awareness import TRAVERSABLE
 from trustbo.workspace.moves import MOVES
-from trustbo.workspace.ways import Ways
+from trustbo.workspace.posts import TRAVERSABLE, Posts
 
 MEASURES = ("untraversable", "tilt", "narrowness", "tightness")
 """Measures of difficulty, see `difficulty_of`."""
@@ -47,20 +46,20 @@ def difficulty_of(workspace: Workspace) -> xr.DataArray:
         without a terrain in memory.
     """
     if workspace not in _cached:
-        exists, ground = workspace.passable_bounds, workspace.ground
-        names = () if ground is None else MEASURES
+        exists, posts = workspace.passable_bounds, workspace.posts
+        names = () if posts is None else MEASURES
         values = np.full((*exists.shape, len(names)), np.nan)
-        if ground is not None:
-            _measure(workspace, ground, exists.values, values)
+        if posts is not None:
+            _measure(workspace, posts, exists.values, values)
         coords = {**exists.coords, "measure": list(names)}
         difficulty = xr.DataArray(values, coords, (*exists.dims, "measure"), "difficulty")
         _cached[workspace] = difficulty
     return _cached[workspace]
 
 
-def _measure(workspace: Workspace, ways: Ways, exists: np.ndarray, out: np.ndarray) -> None:
+def _measure(workspace: Workspace, posts: Posts, exists: np.ndarray, out: np.ndarray) -> None:
     """Write the measures of bounds that exist, (move, row, col, measure)."""
-    surface, pixels = ways.posts.surface, workspace.pixels
+    surface, pixels = posts.surface, workspace.pixels
     room = np.full(surface.ground.shape, np.inf)  # distance to the nearest impassable pixel, m
     if not surface.passable.all():
         room = np.asarray(ndimage.distance_transform_edt(surface.passable, sampling=surface.pixel))
@@ -74,17 +73,17 @@ def _measure(workspace: Workspace, ways: Ways, exists: np.ndarray, out: np.ndarr
             left, ahead = (row - down, col - right), (row + down, col + right)
             inside = 0 <= ahead[0] < exists.shape[1] and 0 <= ahead[1] < exists.shape[2]
             onward = ahead if inside and exists[m, *ahead] else None
-            out[m, row, col] = _of_bound(ways, easy, room, ways.bound(left, cell, onward))
+            out[m, row, col] = _of_bound(posts, easy, room, posts.bound_routes(left, cell, onward))
 
     for _ in in_order(work, batched(np.argwhere(exists).tolist(), _BLOCK)):
         pass
 
 
 def _of_bound(
-    ways: Ways, easy: np.ndarray, room: np.ndarray, bound: Sequence[np.ndarray | None]
+    posts: Posts, easy: np.ndarray, room: np.ndarray, bound: Sequence[np.ndarray | None]
 ) -> np.ndarray:
     """Maximum of each measure over the robots' ways in a bound, with maps of pixels (row, col)."""
-    surface, team = ways.posts.surface, ways.posts.team
+    surface, team = posts.surface, posts.team
     ground = surface.gradient, surface.pixel, surface.origin
     robots = team.lead, *team.robots
     worst = np.zeros(len(MEASURES))

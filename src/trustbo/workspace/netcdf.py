@@ -9,6 +9,7 @@ from trustbo.files import to_json
 from trustbo.team import Robot, Team
 from trustbo.terrain import CompositeIndex
 from trustbo.workspace.grid import Grid
+from trustbo.workspace.posts import Posts
 from trustbo.workspace.sight import Sight
 from trustbo.workspace.workspace import Workspace
 
@@ -36,23 +37,25 @@ def workspace_from_tree(tree: xr.DataTree) -> Workspace:
     """Convert a tree of `workspace_to_tree` back."""
     cells = tree["cells"].to_dataset()
     grid, team = json.loads(tree.attrs["grid"]), json.loads(tree.attrs["team"])
-    sight = json.loads(tree.attrs["sight"])
-    terrain = pixels = None
+    grid = Grid(**grid | {"shape": tuple(grid["shape"])})
+    team = Team(
+        robots=tuple(Robot(**robot) for robot in team["robots"]),
+        lead=Robot(**team["lead"]),
+        names=tuple(team["names"]),
+    )
+    terrain = pixels = posts = None
     if "terrain" in tree:
         terrain = tree["terrain"].to_dataset().set_coords("spatial_ref")
         for array in terrain.data_vars.values():  # rioxarray's place for it
             if "grid_mapping" in array.attrs:
                 array.encoding["grid_mapping"] = array.attrs.pop("grid_mapping")
         pixels = tree["pixels"].to_dataset().assign_coords(spatial_ref=terrain["spatial_ref"])
+        posts = Posts(grid, team, Sight(**json.loads(tree.attrs["sight"])), terrain, pixels)
     return Workspace(
         cells["awareness"],
         cells["passable"],
-        Grid(**grid | {"shape": tuple(grid["shape"])}),
-        Team(
-            robots=tuple(Robot(**robot) for robot in team["robots"]),
-            lead=Robot(**team["lead"]),
-            names=tuple(team["names"]),
-        ),
+        grid,
+        team,
         terrain,
         pixels,
         {
@@ -60,5 +63,5 @@ def workspace_from_tree(tree: xr.DataTree) -> Workspace:
             for name, node in (tree["composites"].children if "composites" in tree else {}).items()
         },
         cells.get("bound_awareness"),
-        Sight(**sight) if sight else None,
+        posts,
     )

@@ -28,18 +28,13 @@ from trustbo.terrain.composite import CompositeIndex
 from trustbo.terrain.features import PAPER_VISIBILITY, TRAVERSABILITY, VISIBILITY
 from trustbo.terrain.read import require_terrain
 from trustbo.workspace.awareness import cell_maps, labelled, of_cells, unlabelled
-from trustbo.workspace.bound_awareness import (
-    TRAVERSABLE,
-    of_bounds,
-    require_names,
-)
+from trustbo.workspace.bound_awareness import of_bounds, require_names
 from trustbo.workspace.grid import MAX_MISSING, Grid
 from trustbo.workspace.location import Location, cell_of
-from trustbo.workspace.moves import MOVE_NAMES, along, existing_bounds, moves_along
-from trustbo.workspace.posts import Posts
+from trustbo.workspace.moves import MOVE_NAMES, along, existing_bounds
+from trustbo.workspace.posts import TRAVERSABLE, Posts
 from trustbo.workspace.sight import Sight
-from trustbo.workspace.surface import Surface, surface_of
-from trustbo.workspace.ways import Ways
+from trustbo.workspace.surface import Surface
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -57,7 +52,7 @@ class Workspace(Summary):
         of_bounds: DataArray (robot, move, row, col, feature) of what the bound into a cell by a
             move meets, in [0, 1], NaN where there is no such bound; None where awareness is that of
             the cell entered, for any move.
-        sight: Assumed model of sight, by which posts are chosen; None without a terrain.
+        posts: Stops, posts and routes of the robots over the terrain; None without a terrain.
     """
 
     awareness: xr.DataArray
@@ -68,7 +63,7 @@ class Workspace(Summary):
     pixels: xr.Dataset | None = None
     composites: dict[str, CompositeIndex] = field(default_factory=dict)
     of_bounds: xr.DataArray | None = None
-    sight: Sight | None = None
+    posts: Posts | None = None
 
     @classmethod
     def from_terrain(
@@ -111,7 +106,7 @@ class Workspace(Summary):
                 or a dataset that is no terrain.
             TrustboError: No cell is passable, or a feature has the name of the line of sight.
         """
-        terrain, sight = require_terrain(terrain), sight or Sight()
+        terrain = require_terrain(terrain)
         team = Team.of(team)
         grid = Grid.over(terrain, shape)
         if bounds:
@@ -125,8 +120,9 @@ class Workspace(Summary):
             z = np.repeat(z[None], team.n_robots, axis=0)
             names = [str(name) for name in pixels.data_vars if name != "passable"]
             cells = labelled(z, free, grid, team, names)
-            workspace = cls(*cells, grid, team, terrain, pixels, composites, sight=sight)
-            return workspace._with_line_of_sight() if bounds else workspace
+            posts = Posts(grid, team, sight or Sight(), terrain, pixels)
+            workspace = cls(*cells, grid, team, terrain, pixels, composites, posts=posts)
+            return workspace._with_line_of_sight(posts, pixels) if bounds else workspace
 
     @classmethod
     def from_awareness(
@@ -193,96 +189,38 @@ class Workspace(Summary):
         ]
         return rows
 
-    def _with_line_of_sight(self) -> Self:
-        ways, pixels = self.ground, self.pixels
-        assert ways is not None and pixels is not None  # noqa: S101, PT018  # `require_sight`
+    def _with_line_of_sight(self, posts: Posts, pixels: xr.Dataset) -> Self:
         easy = pixels[TRAVERSABLE].values if TRAVERSABLE in pixels else None
-        maps = of_bounds(
-            ways,
-            self.awareness.values,
-            self.passable.values,
-            self.features,
-            easy,
-        )
+        maps = of_bounds(posts, self.awareness.values, self.passable.values, self.features, easy)
         names = [*self.features, LINE_OF_SIGHT]
         like = self.awareness.isel(feature=[0] * len(names)).assign_coords(feature=names)
-        made = dataclasses.replace(self, awareness=like.copy(data=maps.cells))
-        made = made.with_bounds(maps.bounds)
-        made.__dict__["ground"] = ways  # with the posts and routes cached so far
-        return made
+        return dataclasses.replace(self, awareness=like.copy(data=maps.cells)).with_bounds(
+            maps.bounds
+        )
 
-    @cached_property
-    def ground(self) -> Ways | None:
-        """Posts and ways over the terrain; None without a terrain."""
-        return self.ways_over(self.surface) if self.surface is not None else None
-
-    @cached_property
+    @property
     def surface(self) -> Surface | None:
         """Rasters for position, motion and sight; None without a terrain."""
-        if self.terrain is None or self.pixels is None:
-            return None
-        return surface_of(self.terrain, self.pixels["passable"].values.astype(bool))
+        return None if self.posts is None else self.posts.surface
+
+    @property
+    def sight(self) -> Sight | None:
+        """Assumed model of sight, by which posts are chosen; None without a terrain."""
+        return None if self.posts is None else self.posts.sight
 
     @cached_property
     def passable_bounds(self) -> xr.DataArray:
-        """Bounds between passable cells that the robots have a way for, (move, row, col), bool.
+        """Bounds between passable cells that the robots have a route for, (move, row, col), bool.
 
-        The bound enters the cell (row, col) by the move, one of the eight of `MOVES`. Ways are
-        those of the map of pixels, within two cells and half a cell around; without a terrain in
-        memory there is one between any two neighbours.
+        The bound enters the cell (row, col) by the move, one of the eight of `MOVES`. Routes are
+        searched within two cells and half a cell around; without a terrain there is one between
+        any two neighbours.
         """
         exists = existing_bounds(self.passable.values)
-        if self.ground is not None:
-            exists = self.ground.posts.linked_bounds(exists)
+        if self.posts is not None:
+            exists = self.posts.linked_bounds(exists)
         like = self.passable.expand_dims(move=list(MOVE_NAMES), axis=0)
         return like.copy(data=exists).rename("passable_bounds")
-
-    def ways_over(self, surface: Surface, sight: Sight | None = None) -> Ways:
-        """Posts and ways over another surface of the same terrain, such as one with closed areas.
-
-        Posts are chosen by the workspace's sight, or by `sight` where it has none.
-        """
-        assumed = self.sight or sight or Sight()
-        assert self.pixels is not None  # noqa: S101  # there is a surface
-        easy = self.pixels[TRAVERSABLE].values if TRAVERSABLE in self.pixels else surface.passable
-        return Ways(Posts(self.grid, self.team, surface, assumed, easy))
-
-    def posts(self, a: Cell, c: Cell) -> np.ndarray | None:
-        """Overwatch points of T2 in cell a while the lead moves to c, shape (robot, 2).
-
-        X and y in CRS metres; None without a terrain.
-
-        Raises:
-            TrustboError: A cell that is off the grid or impassable, or two that are no neighbours.
-        """
-        a, c = self._require_bound(a, c)
-        return None if self.ground is None else self.ground.posts.watching(a, c)
-
-    def ways(
-        self, a: Cell, c: Cell, next_cell: Cell | None = None
-    ) -> tuple[np.ndarray | None, ...] | None:
-        """Ways that the robots drive in the bound a -> c: the lead's, then each of T2's.
-
-        The lead drives to its stop in c, then T2 from its posts in a to those from which it watches
-        the bound from c to `next_cell`; at the goal (None) it closes up around the lead. See
-        `Plan.ways` for those of a path.
-
-        Returns:
-            Polylines, shape (point, 2), x and y in CRS metres; None for one without a way. None
-            without a terrain.
-
-        Raises:
-            TrustboError: A cell that is off the grid or impassable, or two that are no neighbours.
-        """
-        a, c = self._require_bound(a, c)
-        if next_cell is not None:
-            next_cell = self._require_bound(c, next_cell)[1]
-        return None if self.ground is None else tuple(self.ground.bound(a, c, next_cell))
-
-    def _require_bound(self, a: Cell, c: Cell) -> tuple[Cell, Cell]:
-        a, c = self.require_cell("cell", a), self.require_cell("cell", c)
-        moves_along([a, c])
-        return a, c
 
     def along(self, path: Sequence[Cell]) -> np.ndarray:
         """Awareness of the bounds of a path, shape (bound, robot, feature), in [0, 1].
