@@ -89,16 +89,17 @@ class Follower:
                 was not measured.
 
         Raises:
-            ShapeError: Another number of robots.
-            TrustboError: No bound runs, a value other than 0, 1 and NaN, or a time before the last.
+            TrustboError: No bound runs, values other than a 0, 1 or NaN for each robot, or a time
+                before the last.
         """
         self._require(running=True, t=t)
         seen = as_array("in_contact", in_contact)
         measured = ~np.isnan(seen)
-        if not np.isin(seen[measured], (0.0, 1.0)).all():
+        if seen.shape != (self._n_robots,) or not np.isin(seen[measured], (0.0, 1.0)).all():
             raise TrustboError(f"in_contact must be 0, 1 or NaN for each robot; got {seen}.")
-        self.trust = self._filter.update_tick(seen)
-        self._counts += np.nan_to_num(seen), measured
+        ticks = np.nan_to_num(seen), measured
+        self.trust = self._filter.update_ticks(*ticks)
+        self._counts += ticks
         self._now = t
 
     def end(self, t: float, status: str = "ok") -> None:

@@ -1,7 +1,7 @@
 """Trust in real time, bound by bound or tick by tick of a running mission."""
 
 from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -52,15 +52,12 @@ class Dynamics:
     ) -> None:
         """Take draws (draw, ...), and the sd of noise that robots share in a bound (draw,)."""
         p: Any = params
-        coupled = isinstance(params, CoupledParams)
-        joint = coupled or delta_s is not None
-        n, members = len(p.b), n_robots if joint else 1
+        self.family, self._params, self._coupled = family, p, isinstance(p, CoupledParams)
+        n, members = len(p.b), n_robots if self._coupled or delta_s is not None else 1
         self.shape = (n, n_robots // members, members)
-        self.family, self._params = family, p
-        self._deviates = isinstance(params, DeviationParams | DeviationRobotParams)
-        self._b = p.b.reshape(n, -1)
-        one = np.eye(members)
-        if coupled:
+        self._deviates = isinstance(p, DeviationParams | DeviationRobotParams)
+        self._b, self._noise, one = p.b.reshape(n, -1), None, np.eye(members)
+        if self._coupled:
             own = 0.5 * np.linalg.eigvalsh(p.Delta_v)[:, :1]
             if not family.correlates:
                 own = np.diagonal(p.Delta_v, axis1=1, axis2=2)
@@ -68,19 +65,18 @@ class Dynamics:
             self._noise = (p.Delta_v - own[:, None] * one)[:, None]
             self.sd = self._grouped(np.sqrt(own))
             self._beta = np.moveaxis(p.B, 1, -1).reshape(n, n_robots, -1)
-        else:
-            beta0, delta_w = (self._grouped(v)[..., None] for v in (p.beta0, p.delta_w))
-            self._B0, self._Q = beta0 * one, delta_w**2 * one
-            shared = np.zeros(n) if delta_s is None else delta_s
-            self._noise = shared[:, None, None, None] ** 2 * np.ones((members, members))
-            self.sd = self._grouped(p.delta_v)
-            self._beta = p.beta if p.beta.ndim == 3 else p.beta[:, None]
+            return
+        beta0, delta_w = (self._grouped(v)[..., None] for v in (p.beta0, p.delta_w))
+        self._B0, self._Q = beta0 * one, delta_w**2 * one
+        if delta_s is not None:
+            self._noise = delta_s[:, None, None, None] ** 2 * np.ones((members, members))
+        self.sd = self._grouped(p.delta_v)
+        self._beta = p.beta if p.beta.ndim == 3 else p.beta[:, None]
 
     def _grouped(self, values: np.ndarray) -> np.ndarray:
         """Values (draw,) or (draw, robot) as (draw, group, member)."""
         n, groups, members = self.shape
-        values = np.broadcast_to(values.reshape(n, -1), (n, groups * members))
-        return values.reshape(self.shape)
+        return np.broadcast_to(values.reshape(n, -1), (n, groups * members)).reshape(self.shape)
 
     def start(self) -> Beliefs:
         """Trust before the first bound."""
@@ -92,19 +88,18 @@ class Dynamics:
 
     def predict(self, beliefs: Beliefs, z: np.ndarray, effect: Effect = 0.0) -> Beliefs:
         """Trust after a bound of awareness z (robot, feature), nothing measured."""
-        if isinstance(self._params, CoupledParams):
-            z = z.reshape(1, -1)
+        z = z.reshape(1, -1) if self._coupled else z
         drift = self._grouped((self._beta * z).sum(-1) + self._b + effect)
-        mean = _times(self._B0, beliefs.mean) + drift
-        if self._deviates:
-            mean = mean - _times(self._B0, beliefs.drift)
-        cov = self._B0 @ beliefs.cov @ np.swapaxes(self._B0, 2, 3) + self._Q
+        before = beliefs.mean - beliefs.drift if self._deviates else beliefs.mean
+        mean = _product(self._B0, before[..., None])[..., 0] + drift
+        cov = _product(_product(self._B0, beliefs.cov), np.swapaxes(self._B0, 2, 3)) + self._Q
         return Beliefs(mean, cov, drift)
 
     def log_densities(self, predicted: Beliefs, y: np.ndarray, n_ticks: np.ndarray) -> np.ndarray:
         """Log density of each robot's rate alone, 0 where not measured; (draw, robot)."""
         y, n_ticks = (a.reshape(self.shape[1:]) for a in (y, n_ticks))
-        var = np.diagonal(predicted.cov + self._noise, axis1=2, axis2=3)
+        cov = predicted.cov if self._noise is None else predicted.cov + self._noise
+        var = np.diagonal(cov, axis1=2, axis2=3)
         log_mass = self.family.match(y, n_ticks, predicted.mean, var, self.sd)[0]
         return np.where(np.isnan(y), 0.0, log_mass).reshape(len(var), -1)
 
@@ -113,22 +108,20 @@ class Dynamics:
     ) -> tuple[Beliefs, np.ndarray]:
         """Trust given rates (robot,), NaN where not measured, and their log density (draw,)."""
         y, n_ticks = (a.reshape(self.shape[1:]) for a in (y, n_ticks))
-        members, V = self.shape[2], predicted.cov
-        mean = np.concatenate([predicted.mean, predicted.mean], axis=2)  # of trust, of signals
-        J = np.block([[V, V], [V, V + self._noise]])
+        members, (mean, J, drift), first = self.shape[2], predicted, 0
+        if self._noise is not None:  # signals differ from trust, and follow it in the joint normal
+            mean, first = np.concatenate([mean, mean], axis=2), members
+            J = np.block([[J, J], [J, J + self._noise]])
         log_density = np.zeros(self.shape[0])
-        for i in range(members):
-            if np.isnan(y[:, i]).all():
-                continue
-            k = members + i
+        for i in np.flatnonzero(~np.isnan(y).all(0)):
+            k = first + i
             m, v = mean[..., k], J[..., k, k]
             log_mass, after, left = self.family.match(y[:, i], n_ticks[:, i], m, v, self.sd[..., i])
             gain = J[..., k] / v[..., None]
             mean = mean + gain * (after - m)[..., None]
             J = J - gain[..., :, None] * gain[..., None, :] * (v - left)[..., None, None]
             log_density += np.broadcast_to(log_mass, m.shape).sum(1)
-        after = predicted._replace(mean=mean[..., :members], cov=J[..., :members, :members])
-        return after, log_density
+        return Beliefs(mean[..., :members], J[..., :members, :members], drift), log_density
 
     def draw(self, beliefs: Beliefs, rng: np.random.Generator) -> Beliefs:
         """Trust drawn, as beliefs without variance."""
@@ -145,19 +138,22 @@ class Dynamics:
     ) -> tuple[Beliefs, np.ndarray]:
         """Trust after a bound drawn given that before it, and rates of it, (draw, robot)."""
         now = self.draw(self.predict(drawn, z, effect), rng)
-        signal = now.mean + _noise(np.broadcast_to(self._noise, now.cov.shape), rng)
+        signal = now.mean
+        if self._noise is not None:
+            signal = signal + _noise(np.broadcast_to(self._noise, now.cov.shape), rng)
         rates = self.family.sample(signal, self.sd, n_ticks.reshape(self.shape[1:]), rng)
         return now, rates.reshape(len(rates), -1)
 
 
-def _times(M: np.ndarray, x: np.ndarray) -> np.ndarray:
-    return (M @ x[..., None])[..., 0]
+def _product(A: np.ndarray, B: np.ndarray) -> np.ndarray:
+    """Matrix products; those of single numbers are many times as fast without matmul."""
+    return A * B if A.shape[-1] == 1 else A @ B
 
 
 def _noise(cov: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Normal noise of covariances (..., member, member) that may be singular."""
     root = np.linalg.cholesky(cov + 1e-12 * np.eye(cov.shape[-1]))
-    return _times(root, rng.standard_normal(cov.shape[:-1]))
+    return _product(root, rng.standard_normal(cov.shape[:-1])[..., None])[..., 0]
 
 
 class TrustState(NamedTuple):
@@ -196,9 +192,8 @@ class TrustFilter:
     k the filter holds p(trust, parameters | earlier missions, bounds 1..k), exactly but for the
     number of draws and the moments.
 
-    A bound is taken in when it is over, by `update`; or while it runs, tick by tick, by
-    `begin_bound`, `update_tick` or `update_ticks`, and `end_bound`: each tick gives the trust if
-    the bound ended now.
+    A bound is taken in when it is over, by `update`; or while it runs, by `begin_bound`,
+    `update_ticks` and `end_bound`: after any ticks trust is that if the bound ended now.
 
     Attributes:
         params: Parameter draws, leading axis (draw,).
@@ -260,7 +255,8 @@ class TrustFilter:
         n = len(self.params.b)
         self._beliefs = self._dynamics.start()
         self._log_weight, self.weights = np.zeros(n), np.full(n, 1.0 / n)
-        self.n_bounds, self._running = 0, None
+        self.n_bounds = 0
+        self._running: Any = None  # predicted trust at its end, and its counts of ticks
 
     @property
     def state(self) -> TrustState:
@@ -294,38 +290,22 @@ class TrustFilter:
         """
         self._require_running(running=False)
         predicted = self._predicted(awareness, bound)
-        y = self._by_robot("contact_rate", contact_rate)
+        y = as_array("contact_rate", contact_rate)
+        self._require_shape("contact_rate", y)
+        require_unit_interval("contact_rate", y)
         if n_ticks is not None:
             n_ticks = as_array("n_ticks", n_ticks)
             n_ticks = n_ticks if n_ticks.ndim else np.full(y.shape, n_ticks)
             require_shares(y, n_ticks)
-        self._commit(predicted, y, broadcast_ticks(self._family, n_ticks, y.shape))
-        return self.state
+        return self._commit(predicted, y, broadcast_ticks(self._family, n_ticks, y.shape))
 
     def begin_bound(self, awareness: ArrayLike, bound: tuple[Cell, Cell] | None = None) -> None:
-        """Begin a bound, before its ticks (`update_tick`); arguments as those of `update`."""
+        """Begin a bound, before its ticks; arguments and errors are those of `update`."""
         self._require_running(running=False)
-        self._running = _Running(self._predicted(awareness, bound), *np.zeros((2, self._n_robots)))
-
-    def update_tick(self, in_contact: ArrayLike) -> TrustState:
-        """Take in one tick of the bound that runs.
-
-        Args:
-            in_contact: Whether each robot has contact, (robot,); NaN where it was not measured.
-
-        Returns:
-            Trust after the bound if it ended now, with the rate so far; shapes (robot,).
-
-        Raises:
-            ShapeError: Another number of robots.
-            TrustboError: No bound was begun, or a value outside [0, 1].
-        """
-        self._require_running(running=True)
-        seen = self._by_robot("in_contact", in_contact)
-        return self.update_ticks(np.nan_to_num(seen), ~np.isnan(seen))
+        self._running = self._predicted(awareness, bound), np.zeros((2, self._n_robots))
 
     def update_ticks(self, n_contact: ArrayLike, n_ticks: ArrayLike) -> TrustState:
-        """Take in several ticks of the bound that runs, as `update_tick` would one by one.
+        """Take in one or more ticks of the bound that runs.
 
         Args:
             n_contact: Number of these ticks with contact, (robot,).
@@ -339,17 +319,17 @@ class TrustFilter:
             TrustboError: No bound was begun, a number that is negative or NaN, or more ticks with
                 contact than ticks.
         """
-        running = self._require_running(running=True)
+        self._require_running(running=True)
         contacts, ticks = as_array("n_contact", n_contact), as_array("n_ticks", n_ticks)
         for name, numbers in (("n_contact", contacts), ("n_ticks", ticks)):
-            if numbers.shape != (self._n_robots,):
-                raise ShapeError(f"{name} must be ({self._n_robots},); got shape {numbers.shape}.")
+            self._require_shape(name, numbers)
         if not ((contacts >= 0.0) & (contacts <= ticks)).all():
             raise TrustboError(
                 f"n_contact must be from 0 to n_ticks; got {contacts} of {ticks} ticks."
             )
-        self._running = running.plus(contacts, ticks)
-        beliefs, gained = self._dynamics.update(running.predicted, *self._running.rates)
+        predicted, counts = self._running
+        self._running = predicted, counts + np.array([contacts, ticks])
+        beliefs, gained = self._dynamics.update(predicted, *_rates(self._running[1]))
         return _average(beliefs, _normalised(self._log_weight + gained))
 
     def end_bound(self) -> TrustState:
@@ -358,10 +338,9 @@ class TrustFilter:
         Raises:
             TrustboError: No bound was begun.
         """
-        running = self._require_running(running=True)
-        self._running = None
-        self._commit(running.predicted, *running.rates)
-        return self.state
+        self._require_running(running=True)
+        (predicted, counts), self._running = self._running, None
+        return self._commit(predicted, *_rates(counts))
 
     def predict(
         self,
@@ -386,42 +365,38 @@ class TrustFilter:
                 or a path that is missing, of another length, that jumps or that leaves the grid.
         """
         given, rng = self._checked(awareness, 3), np.random.default_rng(self.n_bounds)
-        ticks, columns, drawn = ticks_ahead(n_ticks, given.shape[:2]), [], []
+        ticks, trust, rates = ticks_ahead(n_ticks, given.shape[:2]), [], []
         beliefs, x = self._beliefs, self._dynamics.draw(self._beliefs, rng)
         for z, effect, n in zip(given, self._effects(path, len(given)), ticks, strict=True):
             beliefs = self._dynamics.predict(beliefs, z, effect)
-            x, rates = self._dynamics.roll(x, z, n, rng, effect)
-            order = np.argsort(rates, axis=0)
-            below = np.cumsum(self.weights[order], axis=0)
-            ranked = np.take_along_axis(rates, order, axis=0)
-            low, high = (
-                np.take_along_axis(ranked, np.argmax(below >= share, axis=0)[None], axis=0)[0]
-                for share in (0.05, 0.95)
-            )
-            columns.append((*_average(beliefs, self.weights), self.weights @ rates, low, high))
-            drawn.append(rates)
-        chosen = systematic(self.weights, len(self.weights), rng)
-        forecast = (np.stack(column) for column in zip(*columns, strict=True))
-        return TrustForecast(*forecast, draws=np.stack(drawn, axis=1)[chosen])
+            x, drawn = self._dynamics.roll(x, z, n, rng, effect)
+            trust.append(_average(beliefs, self.weights))
+            rates.append(drawn)
+        draws = np.stack(rates, axis=1)[systematic(self.weights, len(self.weights), rng)]
+        mean, sd = (np.stack(column) for column in zip(*trust, strict=True))
+        low, high = np.quantile(draws, (0.05, 0.95), axis=0)
+        return TrustForecast(mean, sd, draws.mean(0), low, high, draws)
 
     def _predicted(self, awareness: ArrayLike, bound: tuple[Cell, Cell] | None) -> Beliefs:
         """Trust after a bound, nothing measured."""
         z, effect = self._checked(awareness, 2), self._effects(bound, 1)[0]
         return self._dynamics.predict(self._beliefs, z, effect)
 
-    def _commit(self, predicted: Beliefs, y: np.ndarray, n_ticks: np.ndarray) -> None:
+    def _commit(self, predicted: Beliefs, y: np.ndarray, n_ticks: np.ndarray) -> TrustState:
         self._beliefs, gained = self._dynamics.update(predicted, y, n_ticks)
         self._log_weight = self._log_weight + gained  # a copy of the filter keeps its own
         self.weights = _normalised(self._log_weight)
         self.n_bounds += 1
+        return self.state
 
-    def _require_running(self, *, running: bool) -> Any:
-        """Running bound, or None; TrustboError unless a bound runs as `running` asks."""
-        if running and self._running is None:
-            raise TrustboError("no bound runs: call begin_bound(awareness) first.")
-        if not running and self._running is not None:
-            raise TrustboError("a bound runs: call end_bound() first.")
-        return self._running
+    def _require_running(self, *, running: bool) -> None:
+        """Refuse calls that need another state: TrustboError."""
+        if running != (self._running is not None):
+            raise TrustboError(
+                "no bound runs: call begin_bound(awareness) first."
+                if running
+                else "a bound runs: call end_bound() first."
+            )
 
     def _effects(self, path: Sequence[Cell] | None, n_bounds: int) -> Sequence[Effect]:
         """Effect of each bound's place; 0 where there are none. Checks the path's cells."""
@@ -463,31 +438,15 @@ class TrustFilter:
             require_unit_interval("awareness", z)
         return z
 
-    def _by_robot(self, what: str, values: ArrayLike) -> np.ndarray:
-        """Values of the robots, in [0, 1] or NaN."""
-        array = as_array(what, values)
-        if array.shape != (self._n_robots,):
-            raise ShapeError(f"{what} must be ({self._n_robots},); got shape {array.shape}.")
-        require_unit_interval(what, array)
-        return array
+    def _require_shape(self, name: str, values: np.ndarray) -> None:
+        if values.shape != (self._n_robots,):
+            raise ShapeError(f"{name} must be ({self._n_robots},); got shape {values.shape}.")
 
 
-class _Running(NamedTuple):
-    """A bound that runs: trust predicted at its end, ticks with contact and ticks (robot,)."""
-
-    predicted: Beliefs
-    contacts: np.ndarray
-    ticks: np.ndarray
-
-    def plus(self, contacts: np.ndarray, ticks: np.ndarray) -> Self:
-        """The bound with further ticks."""
-        return self._replace(contacts=self.contacts + contacts, ticks=self.ticks + ticks)
-
-    @property
-    def rates(self) -> tuple[np.ndarray, np.ndarray]:
-        """Rates so far, NaN before the first tick, and ticks."""
-        some = self.ticks > 0.0
-        return np.where(some, self.contacts / np.where(some, self.ticks, 1.0), np.nan), self.ticks
+def _rates(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rates of ticks with contact and ticks (2, robot), NaN without a tick; and the ticks."""
+    contacts, ticks = counts
+    return contacts / np.where(ticks > 0.0, ticks, np.nan), ticks
 
 
 def ticks_ahead(n_ticks: ArrayLike, shape: tuple[int, int]) -> np.ndarray:
