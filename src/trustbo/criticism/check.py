@@ -10,9 +10,9 @@ import xarray as xr
 from trustbo.data import Mission
 from trustbo.display import Rows, Summary, joined
 from trustbo.errors import TrustboError
-from trustbo.inference.compare import compare as ranked
 from trustbo.inference.draws import is_of_people, missions_of, model_of, require_posterior
 from trustbo.inference.fit import fit
+from trustbo.inference.loo import compare as ranked
 from trustbo.inference.score import score
 from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.effects.robot import RobotEffect

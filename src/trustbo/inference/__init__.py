@@ -4,12 +4,11 @@ from trustbo.models import backend as backend  # first: it loads numpyro
 
 # isort: split
 from trustbo.inference.by_rate import by_rate
-from trustbo.inference.compare import compare
 from trustbo.inference.diagnostics import diagnostics
 from trustbo.inference.draws import params_of, prior_mean, sample_prior
 from trustbo.inference.filter import TrustFilter
 from trustbo.inference.fit import fit
-from trustbo.inference.loo import loo
+from trustbo.inference.loo import compare, loo
 from trustbo.inference.memory import memory
 from trustbo.inference.place_maps import place_maps
 from trustbo.inference.reports import predict_reports

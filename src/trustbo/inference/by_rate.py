@@ -9,8 +9,9 @@ from trustbo.data import Mission
 from trustbo.errors import TrustboError
 from trustbo.inference.draws import missions_of, read_posterior, require_posterior
 from trustbo.inference.engine import cholesky, expected
-from trustbo.inference.posterior import Posterior, at
+from trustbo.inference.posterior import Draws, Posterior, chunks
 from trustbo.inference.tree import complete
+from trustbo.models.families.family import log_normal
 from trustbo.models.model import TrustModel
 from trustbo.models.signal import each
 from trustbo.parallel import one_blas_thread
@@ -54,70 +55,50 @@ def by_rate(
             f'rates are predicted one by one for observation "gaussian"; this posterior has '
             f'"{fitted.model.observation}". Use its own groups, by mission.'
         )
-    y, n = fitted.slots.y, len(draws.c)
+    y, robots = fitted.slots.y, (missions or missions_of(posterior))[0].robots
     measured = ~np.isnan(y)
-    mean, sd = np.empty((2, n, int(measured.sum())))
-    for i in range(n):
-        one = slice(i, i + 1)
-        mean[i], sd[i] = (
-            a[measured] for a in _one_step(fitted, at(draws.theta, one), draws.c[one])
-        )
-
+    mean, sd = (a[:, measured] for a in _one_step(fitted, draws))
     seen, rng = y[measured], np.random.default_rng([posterior.attrs["seed"], 2])
     drawn = mean + sd * rng.standard_normal(mean.shape)
-    density = -0.5 * ((seen - mean) / sd) ** 2 - np.log(sd * np.sqrt(2.0 * np.pi))
+    density = log_normal(seen - mean, sd**2)
     if posterior.attrs["log_likelihood_of"] == "ticks":
         density += fitted.model.family.log_resolution(y, fitted.slots.n_ticks)[measured]
 
-    sites = posterior["posterior"].to_dataset()
-    shape = sites.sizes["chain"], sites.sizes["draw"], len(seen)
     j, k, i = np.nonzero(measured)
-    robots = np.array((missions or missions_of(posterior))[0].robots)
-    coords = {
-        "rate": np.arange(len(seen)),
-        "mission": ("rate", j),
-        "bound": ("rate", k + 1),
-        "robot": ("rate", robots[i]),
-    }
-    index, dims = (
-        coords | {"chain": sites["chain"], "draw": sites["draw"]},
-        ("chain", "draw", "rate"),
-    )
+    coords = {"rate": np.arange(len(seen)), "mission": ("rate", j), "bound": ("rate", k + 1)}
+    coords["robot"] = "rate", np.array(robots)[i]
     before = posterior["prior_predictive"].to_dataset()["contact_rate"].values[..., measured]
     groups = {name: posterior[name].to_dataset() for name in _KEPT if name in posterior.children}
-    for name, values in (("posterior_predictive", drawn), ("log_likelihood", density)):
-        groups[name] = xr.Dataset({"contact_rate": (dims, values.reshape(shape))}, index)
-    groups["observed_data"] = xr.Dataset({"contact_rate": ("rate", seen)}, coords)
-    groups["prior_predictive"] = xr.Dataset({"contact_rate": (dims, before)}, coords)
+    sizes = posterior["posterior"].sizes
+    shape, dims = (sizes["chain"], sizes["draw"], len(seen)), ("chain", "draw", "rate")
+    for name, axes, values in (
+        ("posterior_predictive", dims, drawn.reshape(shape)),
+        ("log_likelihood", dims, density.reshape(shape)),
+        ("prior_predictive", dims, before),
+        ("observed_data", "rate", seen),
+    ):
+        groups[name] = xr.Dataset({"contact_rate": (axes, values)}, coords)
     view = xr.DataTree.from_dict(groups)
     view.attrs = posterior.attrs
     return view
 
 
-def _one_step(
-    fitted: Posterior, theta: dict[str, np.ndarray], c: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and sd of each rate given those before it in its mission, (mission, bound, robot).
+def _one_step(fitted: Posterior, draws: Draws) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and sd (draw, mission, bound, robot) of each rate given those before it in its mission.
 
-    One draw. The joint covariance of a mission's rates is factored in the order (bound, robot).
+    The covariance of the rates of a block is factored in their order, (bound, robot).
     """
-    slots, layout = fitted.slots, fitted.layout
-    signal = fitted.model.signal(theta, slots, fitted.layout)
-    mean = layout.slots(expected(fitted.blocks, signal, c))[0]
-    n, K, R = slots.y.shape
-    V = each(signal.covariance, layout.label)[0]
-    if layout.joint:
-        V = np.broadcast_to(V, (n, K * R, K * R))
-    else:
-        V = np.broadcast_to(V, (n * R, K, K)).reshape(n, R, K, K)
-        rotation = np.eye(R) if layout.rotation is None else layout.rotation
-        V = np.einsum("ri,rj,nrkl->nkilj", rotation, rotation, V).reshape(n, K * R, K * R)
-    noise = np.broadcast_to(signal.sd[0, 0] ** 2, K * R)
-    seen = ~np.isnan(slots.y).reshape(n, -1)
-    both = seen[:, :, None] & seen[:, None, :]
-    L = cholesky(np.where(both, V + np.diag(noise), np.eye(K * R)))
-    off = np.where(seen, slots.y.reshape(n, -1) - mean.reshape(n, -1), 0.0)
-    white = np.linalg.solve(L, off[..., None])[..., 0]
-    sd = np.diagonal(L, axis1=1, axis2=2)
-    given = np.where(seen, slots.y.reshape(n, -1), np.nan) - sd * white
-    return given.reshape(n, K, R), sd.reshape(n, K, R)
+    model, slots = fitted.model, fitted.slots
+    blocks, layout = fitted.by_robot()
+    seen, y, found = blocks.seen[blocks.kind], blocks.y, []
+    both, one = seen[:, :, None] & seen[:, None, :], np.eye(y.shape[1])
+    for where, theta in chunks(draws.theta):
+        signal = model.signal(theta, slots, layout)
+        V = each(signal.covariance, blocks.label) + signal.sd[..., None] ** 2 * one
+        V = each(V, blocks.kind) if V.shape[1] > 1 else V
+        L = cholesky(np.where(both, V, one))
+        off = np.where(seen, y - expected(blocks, signal, draws.c[where]), 0.0)
+        sd = np.diagonal(L, axis1=2, axis2=3)
+        found.append((y - sd * np.linalg.solve(L, off[..., None])[..., 0], sd))
+    mean, sd = (np.concatenate(part) for part in zip(*found, strict=True))
+    return layout.slots(mean), layout.slots(sd)

@@ -233,7 +233,6 @@ def read_posterior(
     missions: Sequence[Mission] | None = None,
     *,
     model: TrustModel | None = None,
-    workspace: Workspace | None = None,
 ) -> tuple[Posterior, Draws]:
     """The posterior of a DataTree as `fit` had it, and its draws, chains joined.
 
@@ -241,14 +240,12 @@ def read_posterior(
         posterior: DataTree from `fit`.
         missions: Missions that it was fitted to; needed where it holds no data.
         model: Its model; needed with custom priors.
-        workspace: Workspace of the missions, to fill in awareness that they lack.
 
     Raises:
         TrustboError: The posterior holds no data and no missions are given, or its model is not on
             record.
     """
     missions = missions_of(posterior) if missions is None else list(missions)
-    missions = missions if workspace is None else [workspace.fill(m) for m in missions]
     model = model_of(posterior, model)
     slots = model.slots(missions)
     fitted = Posterior(model, slots)

@@ -1,4 +1,4 @@
-"""Leave-one-mission-out cross-validation, for every model, family and effect.
+"""Leave-one-mission-out cross-validation, and comparison of models by it.
 
 With coefficients, effects and trust integrated out, few hyperparameters theta are left, and
 
@@ -9,13 +9,16 @@ draws would not follow effects of bounds that only the mission made.
 """
 
 import warnings
+from collections.abc import Mapping
 
 import numpy as np
+import pandas as pd
 import xarray as xr
+from arviz_stats.loo.compare import compare as ranked
 from arviz_stats.utils import ELPDData
 from scipy.special import logsumexp
 
-from trustbo.errors import TrustboError
+from trustbo.errors import TrustboError, one_line
 from trustbo.inference.draws import read_posterior, require_posterior
 from trustbo.inference.fit import by_importance
 from trustbo.inference.importance import MAX_KHAT, smoothed
@@ -124,3 +127,40 @@ def _elpd(
         elpd_i=xr.DataArray(density, coords, "mission"),
         pareto_k=xr.DataArray(k_hat, coords, "mission"),
     )
+
+
+def compare(posteriors: Mapping[str, xr.DataTree]) -> pd.DataFrame:
+    """Rank posteriors by leave-one-mission-out cross-validation, see `loo` and `arviz.compare`.
+
+    Args:
+        posteriors: Two or more posteriors from `fit`, by name, each of the same missions; families
+            of observations may differ.
+
+    Returns:
+        Table of `arviz.compare`, one row a posterior, the best first: `elpd` and `elpd_diff` in
+        nats, its standard error `dse`, stacking `weight`, and `warning` where a Pareto k is high.
+
+    Raises:
+        TrustboError: Fewer than two posteriors, or other missions in one of them.
+    """
+    if not isinstance(posteriors, Mapping) or len(posteriors) < 2:
+        raise TrustboError(
+            "compare takes two or more posteriors by name, {'pooled': one, 'apart': other}; got "
+            f"{one_line(posteriors)}."
+        )
+    trees = {name: require_posterior("compare", tree) for name, tree in posteriors.items()}
+    (first, reference), *others = ((name, _rates(tree)) for name, tree in trees.items())
+    for name, rates in others:
+        if not np.array_equal(reference, rates, equal_nan=True):
+            raise TrustboError(
+                f"{name!r} and {first!r} are posteriors of different missions, with rates "
+                f"{rates.shape} and {reference.shape}; fit both to the same."
+            )
+    return ranked({name: loo(tree) for name, tree in trees.items()})
+
+
+def _rates(posterior: xr.DataTree) -> np.ndarray:
+    """Rates as measured, (mission, bound, robot)."""
+    if "observed_data" not in posterior.children:
+        raise TrustboError("compare needs the group observed_data; give posteriors of fit, whole.")
+    return posterior["observed_data"].to_dataset()["contact_rate"].values

@@ -15,7 +15,6 @@ from trustbo.inference.engine import (
     draw_columns,
     evidence,
     expected,
-    marginals,
     whiten,
 )
 from trustbo.inference.importance import Student, find_mode, smoothed, systematic
@@ -25,7 +24,7 @@ from trustbo.models.model import TrustModel
 from trustbo.models.people import HumanTrust
 from trustbo.models.scores import Scores
 from trustbo.models.signal import Signal, each
-from trustbo.models.slots import Slots
+from trustbo.models.slots import Layout, Slots
 
 _CHUNK = 16  # points evaluated at once
 _SIZES = (0.3, 1.0, 1.8, 2.6)  # logs by which starts of the noises fall below the rates' spread
@@ -121,7 +120,7 @@ class Posterior:
             signal, prior = self._at(theta)
             return evidence(self.blocks, signal, prior, self._lam(signal)).log_p
         found = np.empty(len(theta["rest"]))
-        for i, chunk in _chunks(theta):
+        for i, chunk in chunks(theta):
             signal, prior = self._at(chunk)
             if self.exact:
                 found[i] = evidence(self.blocks, signal, prior, self._lam(signal)).log_p
@@ -180,7 +179,7 @@ class Posterior:
         unique, index, count = np.unique(z, axis=0, return_inverse=True, return_counts=True)
         if self.exact:
             theta, drawn = self.theta(unique), []
-            for i, chunk in _chunks(theta):
+            for i, chunk in chunks(theta):
                 signal, prior = self._at(chunk)
                 fit = evidence(self.blocks, signal, prior, self._lam(signal))
                 drawn.append(draw_columns(prior, fit, count[i], rng))
@@ -188,7 +187,7 @@ class Posterior:
             return Draws(at(theta, index.ravel()), np.concatenate(drawn)[order], None, 0.0, 0.0)
         some = np.linspace(0, len(z) - 1, min(_WEIGHTED, len(z))).astype(int)
         theta, parts = self.theta(z[some]), []
-        for _, chunk in _chunks(theta):
+        for _, chunk in chunks(theta):
             args = self._with_terms(*self._at(chunk))
             sites = ep.log_evidence(*args, self.sites, _SWEEPS)[1]  # pyright: ignore[reportCallIssue]
             parts.append(ep.draw(*args, sites, rng))  # pyright: ignore[reportCallIssue]
@@ -201,7 +200,7 @@ class Posterior:
     def draw_columns(self, theta: Theta, rng: np.random.Generator) -> np.ndarray:
         """One draw of the columns at each point given Gaussian rates, (point, column)."""
         drawn = []
-        for _, chunk in _chunks(theta):
+        for _, chunk in chunks(theta):
             signal, prior = self._at(chunk)
             fit = evidence(self.blocks, signal, prior, self._lam(signal))
             drawn.append(draw_columns(prior, fit, np.ones(len(signal.sd), dtype=int), rng))
@@ -217,7 +216,7 @@ class Posterior:
             groups.setdefault(effect.noun or "posterior", {}).update(named)
         if isinstance(model, HumanTrust) and draws.f is not None:
             persons = np.empty((len(draws.c), self.slots.n_missions, 4))
-            for i, chunk in _chunks(theta):
+            for i, chunk in chunks(theta):
                 mean = expected(
                     self.blocks, model.signal(chunk, self.slots, self.layout), draws.c[i]
                 )
@@ -242,7 +241,7 @@ class Posterior:
         if self.memoryless:
             values["beta0"] = np.zeros(n)
         theta = self.model.theta(values, self.slots.resolution)
-        c = [self.prior(chunk).draw(rng) for _, chunk in _chunks(theta)]
+        c = [self.prior(chunk).draw(rng) for _, chunk in chunks(theta)]
         return Draws(theta, np.concatenate(c), None, 0.0, 0.0)
 
     def given(self, draws: Draws, kept: np.ndarray, rng: np.random.Generator) -> Given:
@@ -290,7 +289,7 @@ class Posterior:
     def anew(self, draws: Draws, rng: np.random.Generator) -> np.ndarray:
         """Rates of the same missions drawn anew, (draw, mission, bound, robot)."""
         rates = np.empty((len(draws.c), *self.slots.y.shape))
-        for i, theta in _chunks(draws.theta):
+        for i, theta in chunks(draws.theta):
             signal = self.model.signal(theta, self.slots, self.layout)
             rates[i] = self._anew(signal, expected(self.blocks, signal, draws.c[i]), rng)
         return rates
@@ -337,27 +336,11 @@ class Posterior:
         sd = signal.sd[..., None] if signal.sd.shape[2] == 1 else self.layout.slots(signal.sd)
         return self.model.family.sample(f, sd, self.slots.n_ticks, rng)
 
-    def marginals(self, theta: Theta) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Mean and variance of every signal given all rates, and the precision of its site.
-
-        Each is (point, mission, bound, robot); the layout has no rotation.
-        """
-        blocks = self.blocks
-        if self.exact:
-            y = self.layout.rows(self.slots.y)
-            blocks = Blocks.of(y, self._U, self.layout.label, apart=True)
-        found = []
-        for _, chunk in _chunks(theta):
-            signal, prior = self._at(chunk)
-            if self.exact:
-                sites = ep.Sites(blocks.seen / signal.sd**2, blocks.y / signal.sd**2)
-            else:
-                args = self._with_terms(signal, prior)
-                sites = ep.log_evidence(*args, self.sites, _SWEEPS)[1]  # pyright: ignore[reportCallIssue]
-            fit = evidence(blocks, signal, prior, sites.lam, sites.y)
-            found.append((*marginals(blocks, signal, prior, fit, sites.y), sites.lam))
-        mean, var, lam = (np.concatenate(part) for part in zip(*found, strict=True))
-        return self.layout.slots(mean), self.layout.slots(var), self.layout.slots(lam)
+    def by_robot(self) -> tuple[Blocks, Layout]:
+        """Blocks whose rows are rates of robots, not contrasts of them, and their layout."""
+        layout = self.model.layout(self.slots, contrasts=False)
+        U = layout.columns(self._columns)
+        return Blocks.of(layout.rows(self.slots.y), U, layout.label), layout
 
     def _at(self, theta: Theta) -> tuple[Signal, Prior]:
         return self.model.signal(theta, self.slots, self.layout), self.prior(theta)
@@ -386,7 +369,7 @@ def _root(covariance: np.ndarray) -> np.ndarray:
     return cholesky(even + (1e-10 * scale + 1e-20) * np.eye(n))
 
 
-def _chunks(theta: Mapping[str, Any]) -> Iterator[tuple[slice, dict[str, Any]]]:
+def chunks(theta: Mapping[str, Any]) -> Iterator[tuple[slice, dict[str, Any]]]:
     """Points evaluated at once: their slice and hyperparameters."""
     for start in range(0, len(theta["rest"]), _CHUNK):
         where = slice(start, start + _CHUNK)
