@@ -32,8 +32,7 @@ def name_of(page):
 
 
 # Pages that compile models, or draw all figures.
-_SLOW = ("gallery", "howto/use-arviz", "howto/your-own-model", "howto/compare-models",
-         "index")  # fmt: skip
+_SLOW = ("howto/use-arviz", "howto/your-own-model", "inference")
 SLOW = {f"docs/{page}.md" for page in _SLOW}
 EXAMPLES = [
     pytest.param(page, marks=pytest.mark.slow if name_of(page) in SLOW else (), id=name_of(page))
