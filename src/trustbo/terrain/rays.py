@@ -7,7 +7,8 @@ layer from g + crown_base (s - g) to the surface s. A ray with m metres inside i
 
 or nothing if it meets the ground or leaves the data. It is followed from square to square between
 four pixel centres; within one, heights along a ray are quadratic, so that the metres inside are
-exact.
+exact. As no point is both below the canopy and above it, the share of a ray inside is the share
+above the crown base, plus the share below the surface, minus 1.
 """
 
 import math
@@ -40,62 +41,42 @@ def bilinear(heights, r, c):
 
 
 @_part
-def _quadratic(corners, p0, q0, p1, q1):
-    """Coefficients of a bilinear height along the line from (p0, q0) to (p1, q1) of a square."""
-    h, right, down, both = corners
-    right, down, both = right - h, down - h, both - right - down + h
-    dp, dq = p1 - p0, q1 - q0
-    first = dp * down + dq * right + both * (p0 * dq + q0 * dp)
-    return h + p0 * down + q0 * right + both * p0 * q0, first, both * dp * dq
+def _along(raster, i, j, p, q, dp, dq):
+    """Coefficients of the height along a line in a square, from (p, q) to (p + dp, q + dq)."""
+    corner = raster[i, j]
+    down, right = raster[i + 1, j] - corner, raster[i, j + 1] - corner
+    both = raster[i + 1, j + 1] - raster[i, j + 1] - down
+    start = corner + p * down + q * right + p * q * both
+    return start, dp * down + dq * right + both * (p * dq + q * dp), both * dp * dq
 
 
 @_part
-def _roots(c0, c1, c2):
-    """Roots of c0 + c1 t + c2 t^2 in [0, 1], in order; 0 or 1 for those that are not."""
-    square = c1 * c1 - 4.0 * c2 * c0
-    if not square > 0.0:
-        return 0.0, 0.0
-    half = -0.5 * (c1 + math.copysign(math.sqrt(square), c1))
-    a, b = half / c2 if c2 != 0.0 else 2.0, c0 / half if half != 0.0 else 2.0
-    a, b = min(max(a, 0.0), 1.0), min(max(b, 0.0), 1.0)
-    return min(a, b), max(a, b)
+def _share_positive(c0, c1, c2):
+    """Share of [0, 1] in which c0 + c1 t + c2 t^2 is positive."""
+    sign = 1.0 if c0 > 0.0 else -1.0
+    c0, c1, c2 = sign * c0, sign * c1, sign * c2
+    square, share = c1 * c1 - 4.0 * c2 * c0, 1.0  # of the sign at 0
+    if c0 + c1 + c2 < 0.0:  # one root
+        half = -0.5 * (c1 + math.copysign(math.sqrt(square), c1))
+        share = c0 / half if c1 < 0.0 else half / c2
+    elif square > 0.0 and 0.0 < -c1 < 2.0 * c2:  # two roots
+        share = 1.0 - math.sqrt(square) / c2
+    return share if sign > 0.0 else 1.0 - share
 
 
 @_part
-def _share_inside(above, below):
-    """Share of [0, 1] in which two quadratics are both positive."""
-    (a, b), (u, v) = _roots(*above), _roots(*below)
-    first, last, low, high = min(a, u), max(b, v), max(a, u), min(b, v)
-    ends = (first, min(low, high), max(low, high), last, 1.0)
-    start, inside = 0.0, 0.0
-    for end in ends:
-        if end == start:
-            continue
-        t = 0.5 * (start + end)
-        is_above = above[0] + t * (above[1] + t * above[2]) > 0.0
-        if is_above and below[0] + t * (below[1] + t * below[2]) > 0.0:
-            inside += end - start
-        start = end
-    return inside
+def _first_square(x0, dx, n):
+    """First of n - 1 squares along an axis, step to the next, and where on the ray squares end.
 
-
-@_part
-def _least(c0, c1, c2):
-    """Least value of c0 + c1 t + c2 t^2 in [0, 1]."""
-    least = min(c0, c0 + c1 + c2)
-    if c2 > 0.0 and 0.0 < -c1 < 2.0 * c2:
-        least = c0 - c1 * c1 / (4.0 * c2)
-    return least
-
-
-@_part
-def _next_line(x0, dx, t):
-    """Position on the ray, above t, of its next crossing with a line through pixel centres."""
-    if dx == 0.0:
-        return 1.0
-    x = x0 + t * dx
-    line = math.floor(x + 1e-9) + 1.0 if dx > 0.0 else math.ceil(x - 1e-9) - 1.0
-    return (line - x0) / dx
+    The last two are the position of the first crossing, and its distance from the next.
+    """
+    if dx > 0.0:
+        square = min(int(x0), n - 2)
+        return square, 1, (square + 1 - x0) / dx, 1.0 / dx
+    if dx < 0.0:
+        square = max(math.ceil(x0) - 1, 0)
+        return square, -1, (square - x0) / dx, -1.0 / dx
+    return min(int(x0), n - 2), 0, math.inf, math.inf
 
 
 @_part
@@ -104,42 +85,43 @@ def transmittance(ground, surface, pixel, start, end, extinction, crown_base):
 
     0 where the ground blocks, off the raster, and where a pixel beside the ray has no data.
     """
-    (r0, c0, z0), (r1, c1, z1) = start, end
-    rows, cols = ground.shape
-    # Not the reverse comparison: it is false for NaN.
+    (r0, c0, z0), (r1, c1, z1), (rows, cols) = start, end, ground.shape
+    # Not the reverse comparisons: they are false for NaN.
     if not (r0 >= 0.0 and r1 >= 0.0 and r0 <= rows - 1 and r1 <= rows - 1):
         return 0.0
     if not (c0 >= 0.0 and c1 >= 0.0 and c0 <= cols - 1 and c1 <= cols - 1):
         return 0.0
     dr, dc, dz = r1 - r0, c1 - c0, z1 - z0
+    i, down, next_row, rows_apart = _first_square(r0, dr, rows)
+    j, right, next_col, cols_apart = _first_square(c0, dc, cols)
     inside, t = 0.0, 0.0
     while t < 1.0:
-        then = min(1.0, _next_line(r0, dr, t), _next_line(c0, dc, t))
-        middle = 0.5 * (t + then)
-        i = min(int(r0 + middle * dr), rows - 2)
-        j = min(int(c0 + middle * dc), cols - 2)
-        tops = surface[i, j], surface[i, j + 1], surface[i + 1, j], surface[i + 1, j + 1]
-        z = z0 + t * dz
-        if not min(z, z0 + then * dz) > max(max(tops[0], tops[1]), max(tops[2], tops[3])):
-            lows = ground[i, j], ground[i, j + 1], ground[i + 1, j], ground[i + 1, j + 1]
-            way = (r0 + t * dr - i, c0 + t * dc - j, r0 + then * dr - i, c0 + then * dc - j)
-            g, s = _quadratic(lows, *way), _quadratic(tops, *way)
-            rise = (then - t) * dz
-            if not _least(z - g[0], rise - g[1], -g[2]) >= -1e-9:
+        then = min(next_row, next_col, 1.0)
+        z, rise = z0 + t * dz, (then - t) * dz
+        upper = max(surface[i, j], surface[i, j + 1])
+        lower = max(surface[i + 1, j], surface[i + 1, j + 1])
+        if not min(z, z + rise) > max(upper, lower):
+            line = r0 + t * dr - i, c0 + t * dc - j, (then - t) * dr, (then - t) * dc
+            g, s = _along(ground, i, j, *line), _along(surface, i, j, *line)
+            a0, a1, a2 = z - g[0], rise - g[1], -g[2]  # height above the ground
+            dip = a1 * a1 / (4.0 * a2) if a2 > 0.0 and 0.0 < -a1 < 2.0 * a2 else 0.0
+            if not min(a0 - dip, a0 + a1 + a2) >= -1e-9:
                 return 0.0
-            base = crown_base
-            above = (
-                z - g[0] - base * (s[0] - g[0]),
-                rise - g[1] - base * (s[1] - g[1]),
-                -g[2] - base * (s[2] - g[2]),
+            h0, h1, h2 = s[0] - g[0], s[1] - g[1], s[2] - g[2]  # of the canopy
+            above = _share_positive(
+                a0 - crown_base * h0, a1 - crown_base * h1, a2 - crown_base * h2
             )
-            inside += (then - t) * _share_inside(above, (s[0] - z, s[1] - rise, s[2]))
+            below = _share_positive(h0 - a0, h1 - a1, h2 - a2)
+            inside += (then - t) * max(above + below - 1.0, 0.0)
+        if next_row <= next_col:
+            i, next_row = min(max(i + down, 0), rows - 2), next_row + rows_apart
+        else:
+            j, next_col = min(max(j + right, 0), cols - 2), next_col + cols_apart
         t = then
     if inside == 0.0:  # also where the extinction is infinite
         return 1.0
-    return math.exp(
-        -extinction * inside * math.sqrt((dr * pixel[0]) ** 2 + (dc * pixel[1]) ** 2 + dz**2)
-    )
+    length = math.sqrt((dr * pixel[0]) ** 2 + (dc * pixel[1]) ** 2 + dz**2)
+    return math.exp(-extinction * inside * length)
 
 
 @_kernel
