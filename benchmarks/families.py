@@ -77,7 +77,7 @@ def driven(world: World, course: str, n: int, family: str, out) -> dict[str, Any
         regret.append(now.regret(campaign.recommend().path))
         lost.append(now.lost(mission.path) - now.lost(best))
     missions = [workspace.fill(mission) for mission in campaign.missions]
-    scores = tb.inference.score(campaign.posteriors, missions, workspace=workspace)
+    scores = tb.inference.score(campaign.result().posteriors, missions, workspace=workspace)
     far = np.abs(scores["pit"].values - 0.5)
     inside = [float((far[np.isfinite(far)] <= 0.5 * p).mean()) for p in (0.5, 0.9)]
     campaign.save(out / "campaigns" / f"{world.name} {course} {n} {family}", overwrite=True)

@@ -61,7 +61,7 @@ def main(faster=10.0):
     campaign = tb.Campaign(workspace, (9, 0), (0, 9), sampler="importance")
     follower, robots = tb.Follower(campaign), workspace.team.names
     driven = tb.simulation.KinematicSimulator(workspace).run(follower.path, seed=0)
-    trust_map = campaign.trust_map().values
+    trust_map = campaign.trust_map.values
     for bound in driven.bounds:
         follower.begin(bound.t0)
         times = np.linspace(bound.t0, bound.t1, len(bound.contact) + 1)[1:]

@@ -34,7 +34,7 @@ def test_a_campaign_learns_equations_3_and_4_by_nuts_and_plans_by_equation_6(wor
     assert set(posterior["posterior"].data_vars) == {"beta0", "beta", "b", "delta_w", "delta_v"}
     assert not {"places", "robots"} & set(posterior.children)
     trust = result.plan.trust[-1]  # of each robot, at the goal
-    assert result.value == pytest.approx(expit(np.mean(trust)), rel=1e-6)
+    assert result.plan.value == pytest.approx(expit(np.mean(trust)), rel=1e-6)
 
 
 def test_the_first_path_is_of_one_draw_of_the_prior(workspace):

@@ -6,7 +6,6 @@ Less than 0.01 s a mission, once the truth is there.
 """
 
 from trustbo.campaign.campaign import Campaign
-from trustbo.campaign.running import path_class
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
 from trustbo.planning import Planner
@@ -33,4 +32,4 @@ class Oracle(PathPolicy):
         if self._truth is None:
             raise TrustboError("the oracle needs the truth of the scene, which has none.")
         world = self._truth.at(self._n_missions)
-        return world.best(planner.start, planner.goal, **path_class(planner))
+        return world.best(planner.start, planner.goal, max_bounds=planner.max_bounds)

@@ -93,7 +93,7 @@ def test_trust_within_a_bound_and_what_is_ahead_are_as_if_it_ended_now():
     campaign = begun()
     reference, follower = filter_of(campaign), tb.Follower(campaign)
     path = follower.path
-    z = campaign.known_along(path)
+    z = campaign.workspace.along(path)
     follower.begin(0.0)
     predicted = follower.trust
     expected = [values[0] for values in reference.predict(z, path)[:2]]
@@ -170,7 +170,7 @@ def test_a_mission_that_fails_keeps_its_last_bound_and_one_that_stops_is_aborted
 def test_robots_that_leave_the_path_are_followed_where_they_go():
     campaign = begun()
     follower, reference = tb.Follower(campaign), filter_of(campaign)
-    z, seen = campaign.known_along(DETOUR), looks(4)
+    z, seen = campaign.workspace.along(DETOUR), looks(4)
     made = whole(DETOUR, seen)
     for k, cell in enumerate(DETOUR[1:]):
         follower.begin(10.0 * k, cell)

@@ -56,8 +56,8 @@ def test_result_recommends_the_best_path_under_the_last_posterior(result, worksp
     risk = tb.hazard.risk.BoundRisk.of(result.posterior["hazard"].to_dataset(), workspace)
     assert {mission.status for mission in result.missions} == {"ok"}  # so that no failure is priced
     plan = Planner(workspace, *ENDS, failure_cost=0.0).with_risk(risk.mean).plan(params)
-    assert (result.path, result.value) == (list(plan.path), plan.value)
-    np.testing.assert_array_equal(result.trust, plan.trust)
+    assert (result.path, result.plan.value) == (list(plan.path), plan.value)
+    np.testing.assert_array_equal(result.plan.trust, plan.trust)
     assert (result.plan.bands[0] < result.plan.bands[-1]).all()
     np.testing.assert_allclose(result.trust_map, Planner(workspace, *ENDS).trust_map(params))
 

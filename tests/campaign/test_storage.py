@@ -25,7 +25,7 @@ def workspace():
 
 def numbers(result):
     """All numbers of a result but the seconds, by name."""
-    found = {"path": np.array(result.path), "trust": result.trust, "map": result.trust_map.values}
+    found = {"path": np.array(result.path), "trust": result.plan.trust, "map": result.trust_map.values}
     for name, column in result.history.data_vars.items():
         if not str(name).startswith("seconds"):
             found[name] = column.values
@@ -38,7 +38,7 @@ def numbers(result):
     for j, mission in enumerate(result.missions):
         found[f"awareness of {j + 1}"] = mission.awareness
         found[f"rates of {j + 1}"] = mission.contact_rate
-    return found | {"failures": np.array([str(f) for f in result.failures])}
+    return found | {"failures": np.array([str(f) for f in result.state.failures])}
 
 
 def same(one, other):

@@ -12,20 +12,19 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from trustbo.campaign.learning import (
-    as_learned,
-    base_planner,
-    best_plan,
-    informed_planner,
-    known_along,
-    learn,
-    learn_hazard,
-    prior_belief,
-    why_never_learned,
-)
-from trustbo.campaign.result import Result, evidence_of, whole_posterior
+from trustbo.campaign.learning import as_learned, base_planner, learn, why_never_learned
+from trustbo.campaign.result import Result, evidence_of
 from trustbo.campaign.running import run_missions
-from trustbo.campaign.state import EXCLUDED, LEARNED, TOLD, Entry, Failure, Posterior, State
+from trustbo.campaign.state import (
+    EXCLUDED,
+    GIVEN_UP,
+    LEARNED,
+    TOLD,
+    Entry,
+    Failure,
+    Posterior,
+    State,
+)
 from trustbo.campaign.stopping import Stop
 from trustbo.campaign.storage import Storage, read_campaign
 from trustbo.data import Cell, Mission
@@ -34,7 +33,6 @@ from trustbo.errors import (
     TrustboError,
     require_choice,
     require_kind,
-    require_known,
     require_pair,
     require_whole,
 )
@@ -42,7 +40,7 @@ from trustbo.files import FilePath, to_json
 from trustbo.hazard import Hazard
 from trustbo.hazard.exposures import CAUSES
 from trustbo.hazard.risk import BoundRisk
-from trustbo.inference import diagnostics, fit, params_of
+from trustbo.inference import diagnostics, fit
 from trustbo.inference.fit import SAMPLERS
 from trustbo.models import HumanTrust, default_model
 from trustbo.models.model import TrustModel, require_model
@@ -57,10 +55,7 @@ from trustbo.workspace.location import Location
 
 _ARRIVES = 0.9
 """Chance to arrive of a plan below which a campaign without a price of failures warns."""
-_FIT = (
-    "missions", "model", "sampler", "workspace", "seed", "progress", "whole", "check",
-)  # fmt: skip
-"""Arguments of `fit` that a campaign gives itself."""
+_FIT = inspect.signature(fit)
 
 
 class Campaign(Summary):
@@ -127,12 +122,14 @@ class Campaign(Summary):
         """
         require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
         require_choice("initial", initial, ("prior_mean", "prior_draw"))
+        require_choice("sampler", sampler, SAMPLERS)
+        hazard = Hazard() if hazard is None else hazard
+        require_kind("hazard", hazard, Hazard, "give a trustbo.hazard.Hazard")
+        own = {"workspace": workspace, "seed": seed, "progress": True, "whole": False}
+        _FIT.bind([], model, sampler=sampler, **own, **(fit or {}))  # a wrong option: TypeError
         model = default_model() if model is None else model
-        _require_learnable(model, sampler)
-        self._fit = dict(fit or {})
-        _require_options_of_fit(self._fit)
-        self._hazard_prior = Hazard() if hazard is None else hazard
-        require_kind("hazard", self._hazard_prior, Hazard, "give a trustbo.hazard.Hazard")
+        if isinstance(require_model(model), HumanTrust):
+            raise TrustboError("model: HumanTrust is for reports of people, and plans no paths.")
         self.workspace, self.model, self.policy = workspace, model, resolve_policy(policy)
         settings = {
             "policy": policy if isinstance(policy, str) else _name_of(policy),
@@ -149,26 +146,28 @@ class Campaign(Summary):
             "start": self._base.start,
             "goal": self._base.goal,
             "max_bounds": self._base.max_bounds,
-            "fit": self._fit,
-            "hazard": asdict(self._hazard_prior),
+            "fit": dict(fit or {}),
+            "hazard": asdict(hazard),
             "model": model.named_with_effects,
             "model_record": model_to_record(model),
         }
         self.state = State(json.loads(to_json(settings)))  # as a file returns them
-        self._prior = prior_belief(model, initial, workspace, self.state.seed_of("prior"))
-        self._hazard: tuple[object, xr.Dataset] | None = None  # with what it was learned from
-        self._cached: dict[str, Any] = {}  # until the next mission or failure
         self._asked_at = (0.0, 0.0)  # seconds that planning took, and the time when it was done
         self._warned_of_risk = False
         self.progress = True
         self.storage: Storage | None = None
+        self._renew()
         if directory is not None:
             self.keep_in(directory, overwrite=overwrite)
+
+    def _renew(self) -> None:
+        """Forget what was computed from the missions and failures, which have changed."""
+        self._known = Result(self.workspace, self.state, self.model, self._base)
 
     def _rows(self) -> Rows:
         settings, state = self.state.settings, self.state
         counts = {name: len(state.numbers(name)) for name in (LEARNED, TOLD, EXCLUDED)}
-        counts["given up"] = len(state.failures)
+        counts[GIVEN_UP] = len(state.failures)
         shown = [f"{number} {name}" for name, number in counts.items() if number]
         rows = [
             ("course", f"{tuple(settings['start'])} to {tuple(settings['goal'])}"),
@@ -186,21 +185,20 @@ class Campaign(Summary):
         Raises:
             TrustboError: The policy returned a path that is broken, or no plan.
         """
-        if self.state.asked is None:
-            started = time.perf_counter()
-            rng = np.random.default_rng(self.state.seed_of("policy"))
-            try:
-                plan = self.policy(rng, self.belief, self.planner)
-            except InfeasibleError as error:  # `_accept` warns
-                plan = self.planner.evaluate(error.path, self.belief.mean())
-            name = f"policy {self.state.settings['policy']!r}"
-            require_kind(name, plan, Plan, "a policy returns a trustbo.planning.Plan")
-            try:
-                self.planner.require_path(plan.path)
-            except TrustboError as error:
-                raise TrustboError(f"{name}: {error}") from None
-            return self._accept(plan, started)
-        return self.state.asked
+        if self.state.asked is not None:
+            return self.state.asked
+        started, name = time.perf_counter(), f"policy {self.state.settings['policy']!r}"
+        rng = np.random.default_rng(self.state.seed_of("policy"))
+        try:
+            plan = self.policy(rng, self.belief, self.planner)
+        except InfeasibleError as error:  # `_accept` warns
+            plan = self.planner.evaluate(error.path, self.belief.mean())
+        require_kind(name, plan, Plan, "a policy returns a trustbo.planning.Plan")
+        try:
+            self.planner.require_path(plan.path)
+        except TrustboError as error:
+            raise TrustboError(f"{name}: {error}") from None
+        return self._accept(plan, started)
 
     def suggest(self, path: Sequence[Cell]) -> Plan:
         """Choose the next path by hand; `ask` then returns it.
@@ -280,8 +278,9 @@ class Campaign(Summary):
         learned, row = as_learned(mission, self.workspace), state.row_of(plan, mission, extra)
         started = time.perf_counter()
         row |= {"seconds_plan": self._asked_at[0], "seconds_run": started - self._asked_at[1]}
-        entry = Entry(plan, mission, learned, self.trust_map(), row, state.last)
+        entry = Entry(plan, mission, learned, self.trust_map, row, state.last)
         state.entries.append(entry)
+        self._renew()
         if self.storage is not None:
             self.storage.add_mission(len(state.entries), entry, extra)
         if reason := why_never_learned(learned):
@@ -298,10 +297,7 @@ class Campaign(Summary):
         if not (n_learned := len(state.numbers(TOLD, LEARNED))):
             entry.posterior = None
             return
-        tree = learn(
-            state, self.model, self.state.settings["sampler"], self._fit, self.workspace, seed,
-            self.progress,
-        )  # fmt: skip
+        tree = learn(state, self.model, self.workspace, seed, self.progress)
         if tree is None:
             return
         tree["hazard"] = xr.DataTree(self.hazard)
@@ -315,8 +311,8 @@ class Campaign(Summary):
             self.storage.add_posterior(entry.posterior)
 
     def _continue(self) -> None:
-        """Drop the plan that was run or given up and what was computed for it; write the state."""
-        self.state.asked, self._cached = None, {}
+        """Drop the plan that was run or given up, and write the state."""
+        self.state.asked = None
         self._write()
 
     def _write(self) -> None:
@@ -346,6 +342,7 @@ class Campaign(Summary):
         if (entry := self.state.entries[n - 1]).state == EXCLUDED:
             raise TrustboError(f"mission {n} is excluded already: {entry.row['reason']}")
         entry.become(EXCLUDED, str(reason))
+        self._renew()
         self._learn(self.state.seed_of("fit"))
         self._continue()
         return None if self.state.last is None else self.state.last()
@@ -389,6 +386,7 @@ class Campaign(Summary):
                 )
         n = len(self.state.entries)
         self.state.failures.append(Failure(n, reason, tuple(path), where, mission is not None))
+        self._renew()
         self._continue()
         return posterior
 
@@ -414,87 +412,50 @@ class Campaign(Summary):
         """
         return run_missions(self, simulator, n_iterations, truth, stop, progress)
 
-    # --- what is believed ---
+    # --- what is known ---
 
     def recommend(self) -> Plan:
         """Plan the best path under the mean of the belief, regardless of the policy."""
-        return best_plan(self.planner, self.belief.mean())
-
-    def trust_map(self) -> xr.DataArray:
-        """Compute the team's trust map under the mean of the belief, dims (row, col)."""
-        return self.planner.trust_map(self.belief.mean())
-
-    @property
-    def belief(self) -> Params:
-        """Parameter draws of the next plan: the posterior's, or, at first, those of `initial`."""
-        if self.state.last is None:
-            return self._prior
-        if "belief" not in self._cached:
-            self._cached["belief"] = params_of(self.state.last())
-        return self._cached["belief"]
-
-    @property
-    def hazard(self) -> xr.Dataset:
-        """Group `hazard` of the posterior, see `hazard.fit_hazard`; of the prior at first."""
-        state = self.state
-        key = len(state.entries), len(state.failures), tuple(state.numbers(EXCLUDED))
-        if self._hazard is None or self._hazard[0] != key:
-            self._hazard = key, learn_hazard(state, self.workspace, self._hazard_prior)
-        return self._hazard[1]
-
-    @property
-    def risk(self) -> BoundRisk:
-        """Chances of the bounds to fail, given all missions so far."""
-        if "risk" not in self._cached:
-            self._cached["risk"] = BoundRisk.of(self.hazard, self.workspace)
-        return self._cached["risk"]
-
-    @property
-    def planner(self) -> Planner:
-        """Planner that takes the failures so far into account.
-
-        A bound that failed twice is not entered again unless there is no other way, or its chance
-        to fail fell below 0.2.
-        """
-        if "planner" not in self._cached:
-            any_run = bool(self.state.entries or self.state.failures)
-            self._cached["planner"] = informed_planner(self._base, self.risk, avoid=any_run)
-        return self._cached["planner"]
-
-    def known_along(self, path: Sequence[Cell]) -> np.ndarray:
-        """Awareness of the map in the bounds of a path, shape (bound, robot, feature).
-
-        `TrustFilter` needs it, as robots do not measure awareness.
-
-        Args:
-            path: Current cell of the team and the cells to be entered; need not begin at the start.
-
-        Raises:
-            TrustboError: A cell is off the grid, or no neighbour of the one before.
-        """
-        return known_along(path, self.workspace)
+        return self._known.recommend()
 
     @property
     def missions(self) -> list[Mission]:
         """Missions recorded so far, with the awareness that they are learned from."""
-        return [entry.mission for entry in self.state.entries]
-
-    @property
-    def posteriors(self) -> list[xr.DataTree | None]:
-        """Posterior of the parameters after each mission; None where nothing was learned yet."""
-        return [entry.posterior and entry.posterior() for entry in self.state.entries]
+        return self._known.missions
 
     @property
     def posterior(self) -> xr.DataTree | None:
         """Posterior after the last mission, with all groups; None before anything is learned."""
-        if self.state.last is not None and "posterior" not in self._cached:
-            whole = whole_posterior(self.state.last(), self.missions, self.hazard, self.model)
-            self._cached["posterior"] = whole
-        return self._cached.get("posterior")
+        return None if self.state.last is None else self._known.posterior
+
+    @property
+    def belief(self) -> Params:
+        """Parameter draws of the next plan: the posterior's, or, at first, those of `initial`."""
+        return self._known.belief
+
+    @property
+    def hazard(self) -> xr.Dataset:
+        """Group `hazard` of the posterior, see `hazard.fit_hazard`; of the prior at first."""
+        return self._known.hazard
+
+    @property
+    def risk(self) -> BoundRisk:
+        """Chances of the bounds to fail, given all missions so far."""
+        return self._known.risk
+
+    @property
+    def planner(self) -> Planner:
+        """Planner that takes the failures so far into account, see `Result.planner`."""
+        return self._known.planner
+
+    @property
+    def trust_map(self) -> xr.DataArray:
+        """Trust map of the team under the mean of the belief, dims (row, col)."""
+        return self._known.trust_map
 
     def table(self) -> pd.DataFrame:
         """Table with a row for each mission, as `Result.table`."""
-        return self.state.table()
+        return self._known.table()
 
     def result(self) -> Result:
         """Collect everything learned so far, as `iterate` returns it.
@@ -504,8 +465,7 @@ class Campaign(Summary):
         """
         if not self.state.entries:
             raise TrustboError("the campaign has no mission yet; tell it one first.")
-        parts = self.workspace, self.state.copy(), self.planner, self.belief
-        return Result(*parts, self.hazard, self.model)
+        return self._known.copy()
 
     # --- the folder ---
 
@@ -560,6 +520,7 @@ class Campaign(Summary):
                 planner=given["planner"], fit=given["fit"],
             )  # fmt: skip
             campaign.state, campaign.storage = state, storage
+            campaign._renew()
             for mission, extra in pending:
                 campaign._take(mission, extra)
         except BaseException:
@@ -578,17 +539,3 @@ class Campaign(Summary):
 
 def _name_of(policy: Policy) -> str:
     return getattr(policy, "__name__", type(policy).__name__)
-
-
-def _require_learnable(model: TrustModel, sampler: str) -> None:
-    """Refuse a model that plans no paths, or has no such sampler: TrustboError."""
-    require_model(model)
-    if isinstance(model, HumanTrust):
-        raise TrustboError("model: HumanTrust is for reports of people, and plans no paths.")
-    require_choice("sampler", sampler, SAMPLERS)
-
-
-def _require_options_of_fit(options: Mapping[str, Any]) -> None:
-    """Refuse an option that `fit` does not have before a mission is run: TrustboError."""
-    names = [name for name in inspect.signature(fit).parameters if name not in _FIT]
-    require_known("option of fit", options, names)

@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 
 from trustbo.arrays import as_array
 from trustbo.campaign.campaign import Campaign
+from trustbo.campaign.learning import known_along
 from trustbo.data import Bound, Cell, Mission
 from trustbo.errors import TrustboError, require_cells, require_pair
 from trustbo.inference import TrustFilter, sample_prior
@@ -20,7 +21,7 @@ class Follower:
     Each bound is begun, gets its ticks and is ended; after the last one `to_mission` gives the
     mission for `Campaign.tell`. Times are in seconds, of any one clock. Trust is that of a
     `TrustFilter` of the campaign's last posterior, or of its prior before there is one. Awareness
-    is that of the campaign, `Campaign.known_along`.
+    is that of the map.
 
     Attributes:
         path: Cells of the mission, start first: those entered, then those planned.
@@ -41,7 +42,7 @@ class Follower:
         """
         cells = campaign.ask().path if path is None else path
         self.path: tuple[Cell, ...] = tuple(require_cells("path", cells))
-        campaign.known_along(self.path)  # refuses a path that cannot be
+        known_along(self.path, campaign.workspace)  # refuses a path that cannot be
         self._campaign, self._goal = campaign, self.path[-1]
         self._n_robots = campaign.workspace.team.n_robots
         self._filter = _filter_of(campaign)
@@ -72,7 +73,8 @@ class Follower:
         if cell is None and not planned:
             raise TrustboError(f"no cell is planned after {here}; give the cell of the bound.")
         cell = planned[0] if cell is None else require_pair("cell", cell)
-        self._filter.begin_bound(self._campaign.known_along((here, cell))[0], (here, cell))
+        known = known_along((here, cell), self._campaign.workspace)
+        self._filter.begin_bound(known[0], (here, cell))
         if planned != (cell,):
             self.path = (*self.path[: len(self.bounds) + 1], cell)
         self._started = self._started if self.bounds else t
@@ -135,7 +137,7 @@ class Follower:
         after = copy(self._filter)  # which replaces its arrays, and changes none of them
         if self.running:
             after.end_bound()
-        return after.predict(self._campaign.known_along(rest), rest)
+        return after.predict(known_along(rest, self._campaign.workspace), rest)
 
     def to_mission(self) -> Mission:
         """Mission of the bounds that have ended, with awareness that is not measured (NaN).

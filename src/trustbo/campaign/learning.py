@@ -71,13 +71,7 @@ def why_never_learned(mission: Mission) -> str:
 
 
 def learn(
-    state: State,
-    model: TrustModel,
-    sampler: str,
-    options: Mapping[str, Any],
-    workspace: Workspace,
-    seed: int,
-    progress: bool,
+    state: State, model: TrustModel, workspace: Workspace, seed: int, progress: bool
 ) -> xr.DataTree | None:
     """Posterior of the parameters given all missions that are not excluded.
 
@@ -87,8 +81,6 @@ def learn(
     Args:
         state: State of the campaign, whose missions change theirs.
         model: Trust model.
-        sampler: Sampler, as of `trustbo.fit`.
-        options: Further options of `trustbo.fit`.
         workspace: Workspace of the missions.
         seed: Seed of the first attempt.
         progress: Whether fits show their progress.
@@ -98,6 +90,7 @@ def learn(
     """
     waiting, numbers = state.numbers(TOLD), state.numbers(TOLD, LEARNED)
     missions = [state.entries[j].mission for j in numbers]
+    sampler, options = state.settings["sampler"], state.settings["fit"]
     # Draws of importance sampling are independent, and effects of places make them large.
     few = sampler == "importance" and model.place is not None
     usual = options.get("draws", _N_DRAWS // 4 if few else _N_DRAWS)
@@ -137,7 +130,7 @@ def learn(
     return None
 
 
-def learn_hazard(state: State, workspace: Workspace, prior: Hazard) -> xr.Dataset:
+def learn_hazard(state: State, workspace: Workspace) -> xr.Dataset:
     """Posterior of the chance that a bound fails, given all missions; see `fit_hazard`.
 
     A mission that was excluded because it measured no contact rate still shows where it failed. If
@@ -149,6 +142,7 @@ def learn_hazard(state: State, workspace: Workspace, prior: Hazard) -> xr.Datase
         if entry.state != EXCLUDED or why_never_learned(entry.mission)
     ]
     lost = [LostMission(f.path, f.reason, f.where) for f in state.failures if f.path]
+    prior = Hazard(**state.settings["hazard"])
     try:
         return fit_hazard(measured, workspace, prior, lost=lost, seed=state.seed_of("hazard"))
     except PosteriorError as error:
@@ -174,15 +168,17 @@ def best_plan(planner: Planner, params: Params) -> Plan:
         return planner.evaluate(error.path, params)
 
 
-def informed_planner(planner: Planner, risk: BoundRisk, *, avoid: bool) -> Planner:
-    """Planner given the failure chances of bounds; with `avoid`, away from those that failed twice.
+def informed_planner(planner: Planner, risk: BoundRisk) -> Planner:
+    """Planner given the failure chances of bounds.
 
-    The slope limit that the user states is believed until a failure contradicts it: before the
-    first one, a failure costs nothing unless the user gave `failure_cost`. Its price under the
-    prior alone would forbid longer paths that keep contact and on which nothing fails. From then on
-    it is joint over strata of the posterior, since bounds share the slope limit.
+    A bound that failed twice is not entered again unless there is no other way, or its failure
+    chance fell below 0.2. The slope limit that the user states is believed until a failure
+    contradicts it: before the first one, a failure costs nothing unless the user gave
+    `failure_cost`. Its price under the prior alone would forbid longer paths that keep contact and
+    on which nothing fails. From then on it is joint over strata of the posterior, since bounds
+    share the slope limit.
     """
-    if avoid and (stopped := to_avoid(risk)).any():
+    if (stopped := to_avoid(risk)).any():
         planner = planner.avoiding(stopped, risk.mean)
     if planner.problem.failure_cost is None and not risk.has_failures:
         planner = planner.with_failure_cost(0.0)

@@ -1,9 +1,8 @@
 """Result of a campaign: what was learned, and the path to take."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from copy import copy
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import pandas as pd
@@ -17,13 +16,12 @@ from trustbo.campaign.learning import (
     learn_hazard,
     prior_belief,
 )
-from trustbo.campaign.state import Failure, State
+from trustbo.campaign.state import State
 from trustbo.campaign.storage import Storage, read_campaign
 from trustbo.data import Cell, Mission
 from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError
 from trustbo.files import FilePath
-from trustbo.hazard import Hazard
 from trustbo.hazard.risk import BoundRisk
 from trustbo.inference import complete, params_of, place_maps
 from trustbo.inference.diagnostics import MAX_RHAT
@@ -39,36 +37,56 @@ if TYPE_CHECKING:
     from trustbo.plots.explore import Explorer
 
 
-@dataclass(frozen=True, eq=False, repr=False)
 class Result(Summary):
-    """Result of a campaign.
+    """What is known after the missions of a campaign, computed when it is first asked for.
 
     Attributes:
         workspace: Workspace of the campaign.
         state: Missions with their plans and posteriors, failures, and settings.
-        planner: Planner of the campaign after the last mission.
-        belief: Parameter draws after the last mission.
-        hazard: Posterior of the chance that a bound fails, see `hazard.fit_hazard`.
         model: Trust model; None if it is custom and the result was read from files.
     """
 
-    workspace: Workspace
-    state: State
-    planner: Planner
-    belief: Params
-    hazard: xr.Dataset
-    model: TrustModel | None = None
+    def __init__(
+        self,
+        workspace: Workspace,
+        state: State,
+        model: TrustModel | None,
+        base: Planner | None = None,
+    ) -> None:
+        """Collect the state of a campaign; `base` is its planner before anything is learned."""
+        self.workspace, self.state, self.model = workspace, state, model
+        self._base = base_planner(workspace, state.settings) if base is None else base
+        self._maps: dict[tuple[int, int], xr.Dataset] = {}  # by number of draws and seed
+
+    def copy(self) -> Self:
+        """Result that later missions leave unchanged."""
+        result = copy(self)
+        result.state = self.state.copy()
+        return result
 
     def _rows(self) -> Rows:
-        n, history = len(self.missions), self.history
+        n, row = len(self.missions), self.state.entries[-1].row
         rows = [
             ("missions", f"{n}; stopped: {self.stop_reason}"),
             ("recommended", f"{self.path[0]} to {self.path[-1]}, {len(self.path) - 1} bounds"),
-            ("value", f"{self.value:.3g} ({self.settings['objective']})"),
-            ("contact rate", f"{history['contact_rate'].values[-1]:.3f} on the last mission"),
-            ("outcomes", ", ".join(map(str, history["status"].values))),
+            ("value", f"{self.plan.value:.3g} ({self.settings['objective']})"),
+            ("contact rate", f"{row['contact_rate']:.3f} on the last mission"),
+            ("outcomes", ", ".join(mission.status for mission in self.missions)),
         ]
         return rows + evidence_of(self.state)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Settings of the campaign, its model and its simulator."""
+        version = {"trustbo_version": VERSIONS["trustbo"]}
+        return {**self.state.settings, **self.state.simulation, **version}
+
+    @property
+    def stop_reason(self) -> str:
+        """Why the campaign ended."""
+        return self.state.stop_reason
+
+    # --- what was learned ---
 
     @property
     def missions(self) -> list[Mission]:
@@ -96,12 +114,53 @@ class Result(Summary):
                 f"from yet ({self.state.entries[-1].row['reason']}). They are recorded; continue "
                 "with more missions."
             )
-        return whole_posterior(self.state.last(), self.missions, self.hazard, self.model)
+        stored = self.state.last()
+        numbers = np.atleast_1d(stored.attrs["missions"]).astype(int).tolist()
+        # The model is needed for `log_prior` if its priors are not the default.
+        whole = complete(stored, [self.missions[j] for j in numbers], model=self.model)
+        groups = {name: group.to_dataset() for name, group in whole.children.items()}
+        for name, group in groups.items():
+            if "mission" in group.dims:
+                groups[name] = group.assign_coords(mission=numbers)
+        labelled = xr.DataTree.from_dict({**groups, "hazard": self.hazard})
+        labelled.attrs = whole.attrs
+        return labelled
+
+    @cached_property
+    def belief(self) -> Params:
+        """Parameter draws of the last posterior, or those of `initial` while there is none."""
+        if self.state.last is not None:
+            return params_of(self.state.last())
+        settings = self.state.settings
+        seed = State(settings).seed_of("prior")
+        model: Any = self.model  # which `load_result` requires then
+        return prior_belief(model, settings["initial"], self.workspace, seed)
+
+    @cached_property
+    def hazard(self) -> xr.Dataset:
+        """Group `hazard` of the posterior, see `hazard.fit_hazard`."""
+        return learn_hazard(self.state, self.workspace)
+
+    @cached_property
+    def risk(self) -> BoundRisk:
+        """Chances of the bounds to fail."""
+        return BoundRisk.of(self.hazard, self.workspace)
+
+    @cached_property
+    def planner(self) -> Planner:
+        """Planner that takes the failures so far into account, see `informed_planner`."""
+        return informed_planner(self._base, self.risk)
+
+    # --- the path to take ---
+
+    def recommend(self) -> Plan:
+        """Plan the best path under the mean of the belief."""
+        return best_plan(self.planner, self.belief.mean())
 
     @cached_property
     def plan(self) -> Plan:
         """Recommended path, the best under the posterior mean, with bands over the posterior."""
-        best = best_plan(self.planner, self.belief.mean())
+        best = self.recommend()
         draws = self.belief if self.state.last is None else self.state.last()
         return best.with_draws(self.planner.evaluate(best.path, draws))
 
@@ -109,16 +168,6 @@ class Result(Summary):
     def path(self) -> list[Cell]:
         """Recommended path."""
         return list(self.plan.path)
-
-    @property
-    def trust(self) -> np.ndarray:
-        """Expected trust along the recommended path, shape (bound, robot)."""
-        return self.plan.trust
-
-    @property
-    def value(self) -> float:
-        """Objective of the recommended path."""
-        return self.plan.value
 
     @cached_property
     def trust_map(self) -> xr.DataArray:
@@ -137,23 +186,6 @@ class Result(Summary):
         posterior (see `inference.diagnostics`), and the seconds of planning, running and fitting.
         """
         return self.state.history()
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """Settings of the campaign, its model and its simulator."""
-        return {
-            **self.state.settings, **self.state.simulation, "trustbo_version": VERSIONS["trustbo"]
-        }  # fmt: skip
-
-    @property
-    def stop_reason(self) -> str:
-        """Why the campaign ended."""
-        return self.state.stop_reason
-
-    @property
-    def failures(self) -> Sequence[Failure]:
-        """Missions that were given up, see `Campaign.fail`."""
-        return self.state.failures
 
     def table(self) -> pd.DataFrame:
         """Table with a row for each mission, labelled by its number, from 1.
@@ -189,11 +221,6 @@ class Result(Summary):
         if (n_draws, seed) not in self._maps:
             self._maps[n_draws, seed] = self._compute_maps(n_draws, seed)
         return self._maps[n_draws, seed].copy(deep=True)  # the caller may write into it
-
-    @cached_property
-    def _maps(self) -> dict[tuple[int, int], xr.Dataset]:
-        """Maps that were computed, by number of draws and seed."""
-        return {}
 
     def _compute_maps(self, n_draws: int, seed: int) -> xr.Dataset:
         summary = self.planner.trust_summary(self.posterior, n_draws=n_draws, seed=seed)
@@ -277,41 +304,13 @@ def load_result(directory: FilePath) -> Result:
     state, workspace, _ = read_campaign(directory)
     if not state.entries:
         raise TrustboError(f"the campaign in {str(directory)!r} has no mission yet.")
-    settings = state.settings
     model = None
     try:
-        model = model_from_record(settings["model_record"])
+        model = model_from_record(state.settings["model_record"])
     except TrustboError:  # a custom model, which is needed only while nothing was learned
         if state.last is None:
             raise
-    hazard = learn_hazard(state, workspace, Hazard(**settings["hazard"]))
-    risk = BoundRisk.of(hazard, workspace)
-    planner = informed_planner(base_planner(workspace, settings), risk, avoid=True)
-    if state.last is not None:
-        belief = params_of(state.last())
-    else:
-        seed = State(settings).seed_of("prior")
-        belief = prior_belief(model, settings["initial"], workspace, seed)  # pyright: ignore
-    return Result(workspace, state, planner, belief, hazard, model)
-
-
-def whole_posterior(
-    stored: xr.DataTree, missions: Sequence[Mission], hazard: xr.Dataset, model: TrustModel | None
-) -> xr.DataTree:
-    """Posterior with all groups, its missions labelled by their numbers in the campaign, from 0.
-
-    `missions` are all that were recorded. The model is needed for `log_prior` if its priors are not
-    the default.
-    """
-    numbers = np.atleast_1d(stored.attrs["missions"]).astype(int).tolist()
-    whole = complete(stored, [missions[j] for j in numbers], model=model)
-    groups = {name: group.to_dataset() for name, group in whole.children.items()}
-    for name, group in groups.items():
-        if "mission" in group.dims:
-            groups[name] = group.assign_coords(mission=numbers)
-    labelled = xr.DataTree.from_dict({**groups, "hazard": hazard})
-    labelled.attrs = whole.attrs
-    return labelled
+    return Result(workspace, state, model)
 
 
 def evidence_of(state: State) -> Rows:

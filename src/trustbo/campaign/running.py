@@ -6,12 +6,12 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 from trustbo.campaign.state import LEARNED
-from trustbo.campaign.stopping import Stop, reason_to_stop, require_stops
+from trustbo.campaign.stopping import Stop
 from trustbo.data import Mission
 from trustbo.display import compiling, progress_bar
 from trustbo.errors import TrustboError, require_kind, require_whole
 from trustbo.files import to_json
-from trustbo.planning import Plan, Planner
+from trustbo.planning import Plan
 from trustbo.simulation import KinematicSimulator, Truth
 from trustbo.simulation.protocol import Simulator
 
@@ -38,7 +38,10 @@ def run_missions(
         )
     if truth is not None:
         require_kind("truth", truth, Truth, "give Truth.of(simulator)")
-    rules = require_stops(stop)
+    rules: list[Stop] = [] if stop is None else [stop] if callable(stop) else list(stop)
+    for rule in rules:
+        if not callable(rule):
+            raise TrustboError(f"stop must be stop(campaign) -> reason or None; got {rule!r}.")
     describe = getattr(runner, "describe", lambda: {"simulator": type(runner).__name__})
     described = json.loads(to_json(describe()))  # as a file returns it
     campaign.state.simulation = described | {"n_iterations": n_iterations}
@@ -64,10 +67,10 @@ def _run_missions(
                 mission = runner.run(plan.path, seed=state.seed_of("mission"), mission=n)
                 extra = {}
                 if truth is not None:
-                    admitted = path_class(campaign.planner)
-                    extra["regret"] = truth.at(n).regret(plan.path, **admitted)
+                    longest = campaign.planner.max_bounds
+                    extra["regret"] = truth.at(n).regret(plan.path, max_bounds=longest)
                 campaign.tell(mission, **extra)
-                line = report_of(campaign)
+                line = _in_a_line(state.entries[-1].row)
                 bar.set_postfix_str(line, refresh=False)
                 bar.update()
                 _log.info("mission %d: %s", n + 1, line)
@@ -78,21 +81,17 @@ def _run_missions(
 
 
 def _reason_to_end(campaign: "Campaign", n_iterations: int, rules: Sequence[Stop]) -> str | None:
-    """Why no further mission is run; None if one is."""
+    """Why no further mission is run: what the first rule says, by default its name; or None."""
     n = len(campaign.state.entries)
-    if n and (reason := reason_to_stop(rules, campaign)):
-        return reason
+    for rule in rules if n else ():
+        if verdict := rule(campaign):
+            name = getattr(rule, "__name__", type(rule).__name__)
+            return verdict if isinstance(verdict, str) else name
     return "n_iterations" if n >= n_iterations else None
 
 
-def path_class(planner: Planner) -> dict[str, Any]:
-    """Arguments of `Truth.best` and `Truth.regret` for the planner's admissible paths."""
-    return {"max_bounds": planner.max_bounds}
-
-
-def report_of(campaign: "Campaign") -> str:
-    """Describe the last mission in a line."""
-    row = campaign.state.entries[-1].row
+def _in_a_line(row: dict[str, Any]) -> str:
+    """Describe a mission in a line."""
     regret = f", regret {row['regret']:.1f} %" if "regret" in row else ""
     name, label = ("r_hat", "R-hat") if "r_hat" in row else ("k_hat", "k-hat")
     learned = f"{label} {row[name]:.3f}" if row["state"] == LEARNED else row["state"]

@@ -1,7 +1,7 @@
 """Rules that end a campaign which has learned enough."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -102,21 +102,3 @@ class TimeLimit:
     def __call__(self, campaign: "Campaign") -> str | None:
         """Reason to stop, or None."""
         return f"seconds: {self.limit:g}" if time.monotonic() - self._start > self.limit else None
-
-
-def require_stops(stop: Stop | Sequence[Stop] | None) -> list[Stop]:
-    """List the rules; TrustboError if one of them is not callable."""
-    rules: list[Stop] = [] if stop is None else [stop] if callable(stop) else list(stop)
-    for rule in rules:
-        if not callable(rule):
-            raise TrustboError(f"stop must be stop(campaign) -> reason or None; got {rule!r}.")
-    return rules
-
-
-def reason_to_stop(rules: Sequence[Stop], campaign: "Campaign") -> str | None:
-    """Reason of the first rule that ends the campaign, by default its name; or None."""
-    for rule in rules:
-        if verdict := rule(campaign):
-            name = getattr(rule, "__name__", type(rule).__name__)
-            return verdict if isinstance(verdict, str) else name
-    return None

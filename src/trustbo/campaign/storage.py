@@ -9,6 +9,7 @@ Every file is written to a temporary name, flushed to disk and renamed. A proces
 write loses nothing: missions beyond the record's count are learned from when the folder is opened.
 """
 
+import itertools
 import json
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from filelock import FileLock, Timeout
 from trustbo.campaign.learning import as_learned
 from trustbo.campaign.state import Entry, Failure, Posterior, State
 from trustbo.data import Mission
-from trustbo.errors import DamagedFileError, TrustboError
+from trustbo.errors import TrustboError
 from trustbo.files import (
     FilePath,
     as_path,
@@ -143,55 +144,37 @@ def read_campaign(
     """
     folder = as_path(directory)
     _require_campaign(folder)
-    record, workspace = read_record(folder / RECORD), read_workspace(folder)
+    record, tree = read_record(folder / RECORD), read_tree(folder / WORKSPACE)
+    with interpreting(folder / WORKSPACE):
+        workspace = archive.workspace_from_tree(tree)
     with interpreting(folder / RECORD):
         asked = record["asked"] and plan_from_record(record["asked"], workspace)
-        failures = [_failure(*failure) for failure in record["failures"]]
-        state = State(record["settings"], [], failures, asked, record["simulation"])
-        state.stop_reason = str(record["stop_reason"])
+        failures = [
+            Failure(after, reason, tuple(map(tuple, path)), where and tuple(where), reported)
+            for after, reason, path, where, reported in record["failures"]
+        ]
+        reason = str(record["stop_reason"])
+        state = State(record["settings"], [], failures, asked, record["simulation"], reason)
         rows, names = list(record["rows"]), list(record["posteriors"])
-    posteriors: dict[str, Posterior] = {}
-    for n, (row, name) in enumerate(zip(rows, names, strict=True), start=1):
-        file = folder / MISSIONS / f"{n:04d}.nc"
-        measured, planned = _read_mission(file)
-        if name is not None and name not in posteriors:
-            stored = folder / POSTERIORS / f"{name}.nc"
-            if not stored.exists():
-                raise DamagedFileError(f"{str(stored)!r} is missing.")
-            posteriors[name] = Posterior(name, file=stored)
-        with interpreting(file):
-            plan = plan_from_record(json.loads(planned.attrs["plan"]), workspace)
-            learned, trust_map = as_learned(measured, workspace), planned["trust_map"]
-            posterior = None if name is None else posteriors[name]
-            state.entries.append(Entry(plan, measured, learned, trust_map, row, posterior))
+        posteriors = {n: Posterior(n, file=folder / POSTERIORS / f"{n}.nc") for n in names if n}
     pending = []
-    while (file := folder / MISSIONS / f"{len(rows) + len(pending) + 1:04d}.nc").exists():
-        measured, planned = _read_mission(file)
+    for n in itertools.count(1):
+        file = folder / MISSIONS / f"{n:04d}.nc"
+        if n > len(rows) and not file.exists():
+            break
+        tree = read_tree(file)
         with interpreting(file):
-            pending.append((measured, json.loads(planned.attrs["extra"])))
+            measured, planned = mission_from_tree(tree), tree["planned"].to_dataset()
+            if n > len(rows):
+                pending.append((measured, json.loads(planned.attrs["extra"])))
+                continue
+            plan = plan_from_record(json.loads(planned.attrs["plan"]), workspace)
+            learned, row = as_learned(measured, workspace), rows[n - 1]
+            posterior = posteriors.get(names[n - 1])
+            state.entries.append(
+                Entry(plan, measured, learned, planned["trust_map"], row, posterior)
+            )
     return state, workspace, pending
-
-
-def read_workspace(folder: Path) -> Workspace:
-    """Read the workspace of a campaign; DamagedFileError if it is missing or damaged."""
-    tree = read_tree(folder / WORKSPACE)
-    with interpreting(folder / WORKSPACE):
-        return archive.workspace_from_tree(tree)
-
-
-def _read_mission(file: Path) -> tuple[Mission, xr.Dataset]:
-    """Mission as measured, and what was planned."""
-    tree = read_tree(file)
-    with interpreting(file):
-        return mission_from_tree(tree), tree["planned"].to_dataset()
-
-
-def _failure(
-    after: int, reason: str, path: list[list[int]], where: list[int] | None, reported: bool
-) -> Failure:
-    """Failure of its record."""
-    cells = tuple((row, col) for row, col in path)
-    return Failure(after, reason, cells, None if where is None else (where[0], where[1]), reported)
 
 
 def _require_campaign(folder: Path) -> None:

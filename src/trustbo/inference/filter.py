@@ -432,7 +432,7 @@ class TrustFilter:
         if np.isnan(z).any():
             raise TrustboError(
                 "awareness must not be NaN; take unmeasured values from the map: "
-                "campaign.known_along(path), or workspace.along(path), (bound, robot, feature)."
+                "workspace.along(path), (bound, robot, feature)."
             )
         if self._bounded:
             require_unit_interval("awareness", z)
