@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from trustbo.data import Bound, Mission
-from trustbo.errors import ShapeError, TrustboError
+from trustbo.errors import TrustboError
 from trustbo.stacking import fill_awareness
 from trustbo.team import Robot, Team
 
@@ -38,7 +38,7 @@ def test_a_failed_mission_keeps_its_bounds():
     z, y = arrays(1)
     mission = Mission.from_arrays(PATH, z, y, status="stuck")
     assert mission.status == mission.bounds[-1].status == "stuck"
-    with pytest.raises(ShapeError, match="only 1 of 2 bounds were run; give the status"):
+    with pytest.raises(TrustboError, match="only 1 of 2 bounds were run; give the status"):
         Mission.from_arrays(PATH, z, y)
 
 
@@ -90,7 +90,7 @@ def test_a_mission_without_durations_does_not_take_0_s():
 def test_bounds_before_the_failure_must_be_there():
     z, y = arrays(1)
     path = [*PATH, (0, 3)]
-    with pytest.raises(ShapeError, match="failed_at = 3, but the arrays have 1 bounds"):
+    with pytest.raises(TrustboError, match="failed_at = 3, but the arrays have 1 bounds"):
         Mission.from_arrays(path, z, y, failed_at=3)
 
 
@@ -113,15 +113,15 @@ def test_awareness_outside_the_unit_interval_is_named():
 
 def test_axes_that_do_not_fit_are_shown():
     z, y = arrays()
-    with pytest.raises(ShapeError, match=r"got \(2, 3, 2\) and \(2, 2\)"):
+    with pytest.raises(TrustboError, match=r"got \(2, 3, 2\) and \(2, 2\)"):
         Mission.from_arrays(PATH, z, y[:, :2])
-    with pytest.raises(ShapeError, match="2 bounds need 3 cells; the path has 2"):
+    with pytest.raises(TrustboError, match="2 bounds need 3 cells; the path has 2"):
         Mission.from_arrays(PATH[:2], z, y)
-    with pytest.raises(ShapeError, match="duration must be"):
+    with pytest.raises(TrustboError, match="duration must be"):
         Mission.from_arrays(PATH, z, y, duration=[1.0, 2.0, 3.0])
-    with pytest.raises(ShapeError, match="features must be 2 names"):
+    with pytest.raises(TrustboError, match="features must be 2 names"):
         Mission.from_arrays(PATH, z, y, features=["one"])
-    with pytest.raises(ShapeError, match="at least one; got 0"):
+    with pytest.raises(TrustboError, match="at least one; got 0"):
         Mission(tuple(PATH), (), "aborted")
 
 
@@ -132,7 +132,7 @@ def test_unknown_statuses_are_refused_with_the_known_ones():
 
 
 def test_a_bound_s_rows_must_be_robots():
-    with pytest.raises(ShapeError, match="one row per robot; got 2, 3, 2"):
+    with pytest.raises(TrustboError, match="one row per robot; got 2, 3, 2"):
         Bound((0, 0), np.zeros((2, 2)), np.zeros(3), np.ones(2))
     with pytest.raises(TrustboError, match=r"duration\[1\] = 0 s must be positive"):
         Bound((0, 0), np.zeros((2, 2)), np.zeros(2), np.array([1.0, 0.0]))
@@ -146,10 +146,10 @@ def test_a_path_must_be_cells_and_arrays_numbers():
         Mission.from_arrays([(2, 0), (1, 1, 0), (0, 2)], z, y)
     with pytest.raises(TrustboError, match=r"path\[0\] must be two whole numbers .* \(2.5, 0\)"):
         Mission.from_arrays([(2.5, 0), (1, 1), (0, 2)], z, y)
-    with pytest.raises(ShapeError, match="awareness must be an array of numbers; got 'abc'"):
+    with pytest.raises(TrustboError, match="awareness must be an array of numbers; got 'abc'"):
         Mission.from_arrays(PATH, "abc", y)
     bound = Bound((1, 1), [[0.5, 0.5]], [0.5], [10.0])  # lists will do
-    with pytest.raises(ShapeError, match=r"bound 1 enters \(1, 1\), but the path has \(0, 2\)"):
+    with pytest.raises(TrustboError, match=r"bound 1 enters \(1, 1\), but the path has \(0, 2\)"):
         Mission(((0, 1), (0, 2)), (bound,))
 
 
@@ -187,12 +187,12 @@ def test_robots_and_teams_are_checked():
 
 def test_bounds_of_odd_shapes_are_named():
     z, y, seconds = np.full((3, 2), 0.5), np.full(3, 0.4), np.full(3, 10.0)
-    with pytest.raises(ShapeError, match=r"awareness of a bound must be \(robot, feature\)"):
+    with pytest.raises(TrustboError, match=r"awareness of a bound must be \(robot, feature\)"):
         Bound((1, 1), z[0], y, seconds)
-    with pytest.raises(ShapeError, match="one row per robot; got 3, 2, 3"):
+    with pytest.raises(TrustboError, match="one row per robot; got 3, 2, 3"):
         Bound((1, 1), z, y[:2], seconds)
-    with pytest.raises(ShapeError, match=r"n_ticks of a bound must be \(3,\); got shape \(2,\)"):
+    with pytest.raises(TrustboError, match=r"n_ticks of a bound must be \(3,\); got shape \(2,\)"):
         Bound((1, 1), z, y, seconds, n_ticks=np.full(2, 5.0))
     bounds = [Bound((1, 1), z, y, seconds), Bound((0, 2), z[:, :1], y, seconds)]
-    with pytest.raises(ShapeError, match=r"bounds disagree on \(robot, feature\)"):
+    with pytest.raises(TrustboError, match=r"bounds disagree on \(robot, feature\)"):
         Mission(tuple(PATH), tuple(bounds))

@@ -7,7 +7,7 @@ import pytest
 
 import trustbo as tb
 from trustbo.data import NOWHERE, Bound, Mission
-from trustbo.errors import ShapeError, TrustboError
+from trustbo.errors import TrustboError
 from trustbo.inference.draws import missions_of
 from trustbo.logs import read_missions, read_table, to_frame, write_missions
 from trustbo.models import PlaceEffect, PooledTrust, RobotEffect
@@ -102,14 +102,14 @@ def test_what_needs_a_map_refuses_them_in_a_sentence(missions, posterior):
 
 def test_a_path_is_given_or_not():
     z, y = np.zeros((2, 1, 1)), np.zeros((2, 1))
-    with pytest.raises(ShapeError, match="path is empty; give its cells, or None for a log"):
+    with pytest.raises(TrustboError, match="path is empty; give its cells, or None for a log"):
         Mission.from_arrays([], z, y)
     with pytest.raises(TrustboError, match="awareness of a bound of no map must be finite"):
         Mission.from_arrays(None, z + np.inf, y)
     bound = Bound((0, 1), z[0], y[0], np.ones(1))
-    with pytest.raises(ShapeError, match=r"enters \(0, 1\), but the mission has no path"):
+    with pytest.raises(TrustboError, match=r"enters \(0, 1\), but the mission has no path"):
         Mission((), (bound,))
-    with pytest.raises(ShapeError, match="at least one bound; got 0"):
+    with pytest.raises(TrustboError, match="at least one bound; got 0"):
         Mission((), ())
     failed = Mission.from_arrays(None, z, y, failed_at=2, reason="stuck")
     assert failed.status == failed.bounds[-1].status == "stuck"

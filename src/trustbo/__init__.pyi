@@ -26,7 +26,7 @@ from .campaign import (
 )
 from .criticism import check
 from .data import Bound, Mission
-from .errors import DamagedFileError, PosteriorError, ShapeError, TerrainError, TrustboError
+from .errors import DamagedFileError, PosteriorError, TrustboError
 from .inference import compare, fit
 from .planning.paths import NoPathError
 from .team import Robot, Team
@@ -43,9 +43,7 @@ __all__ = [
     "RegretBound",
     "Result",
     "Robot",
-    "ShapeError",
     "Team",
-    "TerrainError",
     "TimeLimit",
     "TrustboError",
     "Workspace",

@@ -8,17 +8,17 @@ import pandas as pd
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from trustbo.errors import ShapeError, TrustboError
+from trustbo.errors import TrustboError
 
 _RATING = 10.0  # largest value that may be an answer on a scale from 1
 
 
 def as_array(what: str, values: ArrayLike) -> np.ndarray:
-    """Return an array of floats; ShapeError if these are no numbers."""
+    """Return an array of floats; TrustboError if these are no numbers."""
     try:
         return np.asarray(values, dtype=float)
     except (TypeError, ValueError):
-        raise ShapeError(f"{what} must be an array of numbers; got {values!r}.") from None
+        raise TrustboError(f"{what} must be an array of numbers; got {values!r}.") from None
 
 
 def in_order(what: str, values: Any, dims: Sequence[str], **names: Sequence[str]) -> Any:

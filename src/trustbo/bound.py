@@ -7,7 +7,7 @@ import numpy as np
 
 from trustbo.arrays import as_array, require_unit_interval
 from trustbo.display import Rows, Summary, number
-from trustbo.errors import ShapeError, TrustboError, require_choice
+from trustbo.errors import TrustboError, require_choice
 
 Cell = tuple[int, int]
 Status = Literal["ok", "stuck", "tipped", "timeout", "collision", "lost_contact", "aborted"]
@@ -38,9 +38,9 @@ class Bound(Summary):
             None where not recorded.
 
     Raises:
-        ShapeError: The arrays disagree on the number of robots.
-        TrustboError: A value outside [0, 1], a duration that is not positive, an n_ticks below 1,
-            a rate that is not a share of the ticks, or an unknown status.
+        TrustboError: The arrays disagree on the number of robots; a value outside [0, 1], a
+            duration that is not positive, an n_ticks below 1, a rate that is not a share of the
+            ticks, or an unknown status.
     """
 
     cell: Cell
@@ -59,16 +59,16 @@ class Bound(Summary):
             array = as_array(name, getattr(self, name))
             if array.ndim != n_axes:
                 axes = "(robot, feature)" if n_axes == 2 else "(robot,)"
-                raise ShapeError(f"{name} of a bound must be {axes}; got shape {array.shape}.")
+                raise TrustboError(f"{name} of a bound must be {axes}; got shape {array.shape}.")
             object.__setattr__(self, name, array)
         lengths = [len(self.awareness), len(self.contact_rate), len(self.duration)]
         if len(set(lengths)) != 1:
-            raise ShapeError(
+            raise TrustboError(
                 "awareness, contact_rate and duration must have one row per robot; "
                 f"got {lengths[0]}, {lengths[1]}, {lengths[2]}."
             )
         if not self.awareness.size:
-            raise ShapeError(
+            raise TrustboError(
                 "a bound is of one robot and one feature at least; got awareness of shape "
                 f"{self.awareness.shape}. Without features, give one that is 0 everywhere."
             )
@@ -110,7 +110,7 @@ class Bound(Summary):
 def require_shares(rate: np.ndarray, ticks: np.ndarray) -> None:
     """Refuse ticks that are not whole, and rates that are not a share of them; both (robot,)."""
     if ticks.shape != rate.shape:
-        raise ShapeError(f"n_ticks of a bound must be {rate.shape}; got shape {ticks.shape}.")
+        raise TrustboError(f"n_ticks of a bound must be {rate.shape}; got shape {ticks.shape}.")
     for i in np.flatnonzero((ticks < 1.0) | (ticks != np.round(ticks)) & ~np.isnan(ticks)):
         raise TrustboError(f"n_ticks[{i}] = {ticks[i]:g} must be a whole number of ticks.")
     off = np.abs(rate * ticks - np.round(rate * ticks)) > 1e-6 * ticks

@@ -13,7 +13,6 @@ from trustbo.arrays import as_array, as_names, in_order
 from trustbo.bound import NOWHERE, STATUSES, Bound, Cell
 from trustbo.display import Rows, Summary, joined, number
 from trustbo.errors import (
-    ShapeError,
     TrustboError,
     require_cells,
     require_choice,
@@ -41,8 +40,8 @@ class Mission(Summary):
             as `"likert7"`, in missions of `logs.read_reports`; empty in all others.
 
     Raises:
-        ShapeError: Bounds that do not fit the path, or disagree on robots or features.
-        TrustboError: An unknown status or scale.
+        TrustboError: Bounds that do not fit the path, or disagree on robots or features; an unknown
+            status or scale.
     """
 
     path: tuple[Cell, ...]
@@ -59,7 +58,7 @@ class Mission(Summary):
         (self._require_path if self.path else self._require_no_map)()
         shapes = {bound.awareness.shape for bound in self.bounds}
         if len(shapes) != 1:
-            raise ShapeError(f"bounds disagree on (robot, feature): {sorted(shapes)}.")
+            raise TrustboError(f"bounds disagree on (robot, feature): {sorted(shapes)}.")
         n_robots, n_features = shapes.pop()
         names = {
             "features": tuple(self.features) or default_features(n_features),
@@ -67,33 +66,33 @@ class Mission(Summary):
         }
         for (name, labels), size in zip(names.items(), (n_features, n_robots), strict=True):
             if len(labels) != size:
-                raise ShapeError(f"{name} must be {size} names; got {labels}.")
+                raise TrustboError(f"{name} must be {size} names; got {labels}.")
             object.__setattr__(self, name, labels)
 
     def _require_path(self) -> None:
         """Refuse bounds that do not fit the path."""
         if not self.bounds or len(self.bounds) > len(self.path) - 1:
-            raise ShapeError(
+            raise TrustboError(
                 f"a path of {len(self.path)} cells has {len(self.path) - 1} bounds, and a mission "
                 f"at least one; got {len(self.bounds)}."
             )
         if self.status == "ok" and len(self.bounds) < len(self.path) - 1:
-            raise ShapeError(
+            raise TrustboError(
                 f'status "ok" says the goal was reached, but only {len(self.bounds)} of '
                 f"{len(self.path) - 1} bounds were run; give the status it ended with."
             )
         for k, bound in enumerate(self.bounds, start=1):
             if bound.cell != self.path[k]:
-                raise ShapeError(
+                raise TrustboError(
                     f"bound {k} enters {bound.cell}, but the path has {self.path[k]} there."
                 )
 
     def _require_no_map(self) -> None:
         """Refuse bounds that enter cells in a mission without a path."""
         if not self.bounds:
-            raise ShapeError("a mission has at least one bound; got 0.")
+            raise TrustboError("a mission has at least one bound; got 0.")
         if entered := [bound.cell for bound in self.bounds if bound.cell != NOWHERE]:
-            raise ShapeError(
+            raise TrustboError(
                 f"a bound enters {entered[0]}, but the mission has no path; give the path, or "
                 f"bounds of cell {NOWHERE}, trustbo.data.NOWHERE."
             )
@@ -165,10 +164,9 @@ class Mission(Summary):
             robots: Names of the robots; by default r1, r2, ...
 
         Raises:
-            ShapeError: Axes that do not fit together.
-            TrustboError: A value outside [0, 1]; an unknown status or reason; or `failed_at` beyond
-                the path, more than a bound after the arrays, before measurements, or together with
-                a status.
+            TrustboError: Axes that do not fit together; a value outside [0, 1]; an unknown status
+                or reason; or `failed_at` beyond the path, more than a bound after the arrays,
+                before measurements, or together with a status.
         """
         labels = {"robot": robots, "feature": features}
         awareness = in_order("awareness", awareness, ("bound", "robot", "feature"), **labels)
@@ -187,12 +185,12 @@ class Mission(Summary):
                 for name, values in (("duration", duration), ("n_ticks", n_ticks))
             )
         if z.ndim == 3 and z.shape[:1] == y.shape[:1] == (0,):
-            raise ShapeError(
+            raise TrustboError(
                 "a mission has at least one bound; got 0. If the robots were stopped before "
                 'bound 1 ended, tell campaign.fail("stuck", where=cell).'
             )
         if z.ndim != 3 or y.shape != z.shape[:2] or not y.size:
-            raise ShapeError(
+            raise TrustboError(
                 "awareness must be (bound, robot, feature) and contact_rate (bound, robot); "
                 f"got {z.shape} and {y.shape}."
             )
@@ -202,9 +200,11 @@ class Mission(Summary):
         )
         cells = () if path is None else require_cells("path", path)
         if path is not None and not cells:
-            raise ShapeError("path is empty; give its cells, or None for a log without a map.")
+            raise TrustboError("path is empty; give its cells, or None for a log without a map.")
         if cells and len(y) > len(cells) - 1:
-            raise ShapeError(f"{len(y)} bounds need {len(y) + 1} cells; the path has {len(cells)}.")
+            raise TrustboError(
+                f"{len(y)} bounds need {len(y) + 1} cells; the path has {len(cells)}."
+            )
         longest = np.nanmax(np.where(np.isnan(seconds), 0.0, seconds), axis=1)
         last, starts = len(y) - 1, np.concatenate([[0.0], np.cumsum(longest)])
         statuses = ["ok"] * last + [status]
@@ -225,7 +225,7 @@ class Mission(Summary):
             unmeasured: Features that the mission may lack; their values are then NaN.
 
         Raises:
-            ShapeError: It has other robots or features.
+            TrustboError: It has other robots or features.
         """
         if (tuple(robots), tuple(features)) == (self.robots, self.features):
             return self
@@ -236,7 +236,7 @@ class Mission(Summary):
             ("features", own_features, features),
         ):
             if sorted(names_of) != sorted(wanted):
-                raise ShapeError(
+                raise TrustboError(
                     f"the mission has {what} {getattr(self, what)}, not {tuple(wanted)}; give "
                     f"{what}= these names, or use the workspace of this team."
                 )
@@ -329,7 +329,7 @@ def _until(last: int, values: np.ndarray) -> np.ndarray:
     if not values.ndim:
         return values
     if len(values) < last - 1:
-        raise ShapeError(
+        raise TrustboError(
             f"failed_at = {last}, but the arrays have {len(values)} bounds; give all before it."
         )
     rest = np.full((max(last - len(values), 0), *values.shape[1:]), np.nan)
@@ -357,4 +357,4 @@ def _per_robot(what: str, values: ArrayLike | None, shape: tuple[int, ...]) -> n
     try:
         return np.broadcast_to(array, shape)
     except ValueError:
-        raise ShapeError(f"{what} must be {shape}; got {array.shape}.") from None
+        raise TrustboError(f"{what} must be {shape}; got {array.shape}.") from None

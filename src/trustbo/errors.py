@@ -13,14 +13,6 @@ class TrustboError(ValueError):
     """Input that trustbo refuses; the message names the value and the remedy."""
 
 
-class ShapeError(TrustboError):
-    """Arrays whose axes do not fit together."""
-
-
-class TerrainError(TrustboError):
-    """A raster that cannot serve as terrain."""
-
-
 class DamagedFileError(TrustboError):
     """A file of a campaign or a result that is missing, was changed, or cannot be read."""
 

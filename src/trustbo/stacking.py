@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from trustbo.data import Mission
-from trustbo.errors import ShapeError, TrustboError, one_line
+from trustbo.errors import TrustboError, one_line
 
 
 class MissionBatch(NamedTuple):
@@ -29,8 +29,8 @@ def stack_missions(missions: Sequence[Mission], *, pad: bool = True) -> MissionB
     """Stack missions of any length, of the same robots and features, into one batch.
 
     With `pad`, axes are padded to buckets: bounds to a multiple of 8, missions to a power of two
-    from 8 on; otherwise bounds to the longest mission. ShapeError: no missions, or they disagree on
-    robots or features. TrustboError: an awareness value is NaN; only contact rates may be missing.
+    from 8 on; otherwise bounds to the longest mission. TrustboError: no missions, they disagree on
+    robots or features, or an awareness value is NaN; only contact rates may be missing.
     """
     require_same_team(missions)
     first = missions[0]
@@ -54,22 +54,22 @@ def stack_missions(missions: Sequence[Mission], *, pad: bool = True) -> MissionB
 
 
 def require_same_team(missions: Sequence[Mission]) -> None:
-    """Check that there are missions, all with the same robots and features: ShapeError if not."""
+    """Check that there are missions, all with the same robots and features: TrustboError if not."""
     if isinstance(missions, Mission):
-        raise ShapeError("missions must be a list of missions; got one. Write [mission].")
+        raise TrustboError("missions must be a list of missions; got one. Write [mission].")
     if not isinstance(missions, Sequence):
         remedy = " Give its .missions." if hasattr(missions, "missions") else ""
-        raise ShapeError(
+        raise TrustboError(
             f"missions must be a list of missions; got a {type(missions).__name__}.{remedy}"
         )
     if not missions:
-        raise ShapeError("there are no missions; give at least one.")
+        raise TrustboError("there are no missions; give at least one.")
     first = missions[0]
     for j, mission in enumerate(missions):
         if not isinstance(mission, Mission):
-            raise ShapeError(f"mission {j} is no Mission; got {one_line(mission)}.")
+            raise TrustboError(f"mission {j} is no Mission; got {one_line(mission)}.")
         if (mission.robots, mission.features) != (first.robots, first.features):
-            raise ShapeError(
+            raise TrustboError(
                 f"mission {j} has robots {mission.robots} and features {mission.features}, mission "
                 f"0 has {first.robots} and {first.features}; all must agree."
             )

@@ -159,7 +159,7 @@ def test_mission_on_an_impossible_path_is_refused_and_not_recorded(workspace, tm
 def test_mission_of_another_team_or_with_a_reserved_number_is_refused(workspace):
     campaign = begin(workspace)
     other = Mission.from_arrays(DIAGONAL[:2], np.full((1, 2, 2), 0.5), np.full((1, 2), 0.5))
-    with pytest.raises(tb.ShapeError, match="robots"):
+    with pytest.raises(tb.TrustboError, match="robots"):
         campaign.tell(other)
     with pytest.raises(tb.TrustboError, match="status"):
         campaign.tell(rates(workspace, DIAGONAL), objective=1.0, status=1.0)

@@ -25,7 +25,11 @@ def workspace():
 
 def numbers(result):
     """All numbers of a result but the seconds, by name."""
-    found = {"path": np.array(result.path), "trust": result.plan.trust, "map": result.trust_map.values}
+    found = {
+        "path": np.array(result.path),
+        "trust": result.plan.trust,
+        "map": result.trust_map.values,
+    }
     for name, column in result.history.data_vars.items():
         if not str(name).startswith("seconds"):
             found[name] = column.values

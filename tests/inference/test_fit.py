@@ -8,7 +8,7 @@ import xarray as xr
 from missions import walking_missions
 
 import trustbo as tb
-from trustbo.errors import ShapeError, TrustboError
+from trustbo.errors import TrustboError
 from trustbo.inference import complete, diagnostics, fit, params_of, prior_mean, sample_prior
 from trustbo.inference.draws import read_posterior
 from trustbo.inference.tree import parameters_alone
@@ -138,7 +138,7 @@ def test_the_prior_mean_is_that_of_prior_draws():
 
 
 def test_mistakes_are_refused_before_sampling(missions):
-    with pytest.raises(ShapeError):
+    with pytest.raises(TrustboError):
         fit([])
     with pytest.raises(TrustboError, match="sampler"):
         fit(missions, sampler="gibbs")

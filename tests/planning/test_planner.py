@@ -4,7 +4,7 @@ import networkx as nx
 import numpy as np
 import pytest
 
-from trustbo.errors import ShapeError, TrustboError
+from trustbo.errors import TrustboError
 from trustbo.inference import sample_prior
 from trustbo.models import PooledTrust, TrustParams
 from trustbo.planning import Planner, reference, roll_trust
@@ -42,7 +42,7 @@ def test_expected_trust_follows_equation_3():
         np.testing.assert_allclose(trust[k], x)
     many = TrustParams(*(np.stack([v, v]) for v in PARAMS[:5]), 0.3, 0.5)
     np.testing.assert_allclose(roll_trust(many, z)[1], trust)
-    with pytest.raises(ShapeError):
+    with pytest.raises(TrustboError):
         roll_trust(PARAMS, np.zeros((4, 2, 3)))
 
 
@@ -66,8 +66,8 @@ def test_a_toll_is_taken_from_the_value_of_its_bounds(workspace):
     plan = Planner(workspace, *ENDS, toll=0.001 * metres).plan(PARAMS)
     free = Planner(workspace, *ENDS).evaluate(plan.path, PARAMS)
     assert plan.value == pytest.approx(free.value - 0.001 * plan.length, rel=1e-12)
-    for toll, error in ((np.zeros((3, 5, 6)), ShapeError), (np.nan, TrustboError)):
-        with pytest.raises(error, match="toll"):
+    for toll in (np.zeros((3, 5, 6)), np.nan):
+        with pytest.raises(TrustboError, match="toll"):
             Planner(workspace, *ENDS, toll=toll)
 
 
@@ -159,7 +159,7 @@ def test_what_cannot_be_planned_is_refused(workspace):
     for path in ([(4, 0), (0, 5)], [(4, 0), (3, 0)], [(4, 0), "a", (0, 5)]):
         with pytest.raises(TrustboError):
             planner.evaluate(path, PARAMS)
-    with pytest.raises(ShapeError, match="p_fail"):
+    with pytest.raises(TrustboError, match="p_fail"):
         planner.with_risk(np.zeros((8, 3, 3)))
     with pytest.raises(TrustboError, match="p_fail"):
         planner.with_risk(np.full((8, 5, 6), np.nan)).plan(PARAMS)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from trustbo.errors import TerrainError, TrustboError
+from trustbo.errors import TrustboError
 from trustbo.terrain import CompositeIndex
 
 
@@ -92,10 +92,10 @@ def test_a_few_obstacles_on_flat_ground_are_the_low_end():
 
 
 def test_bad_input():
-    with pytest.raises(TerrainError, match="open"):
+    with pytest.raises(TrustboError, match="open"):
         CompositeIndex(SIGNS).fit(correlated().drop_vars("open"))
     empty = xr.Dataset({name: ("pixel", np.full(5, np.nan)) for name in SIGNS})
-    with pytest.raises(TerrainError, match="no pixel"):
+    with pytest.raises(TrustboError, match="no pixel"):
         CompositeIndex(SIGNS).fit(empty)
 
 

@@ -8,7 +8,7 @@ import rasterio
 from scipy.interpolate import interpn
 from worlds import terrain_of
 
-from trustbo.errors import TerrainError, TrustboError
+from trustbo.errors import TrustboError
 from trustbo.terrain import (
     FEATURES,
     feature,
@@ -193,11 +193,11 @@ def test_a_feature_of_one_s_own():
         values = pixel_features(falls_north, ["northness", "slope"])
         assert list(values) == ["northness", "slope"]
         np.testing.assert_allclose(values["northness"].values[INSIDE], 1.0)
-        with pytest.raises(TerrainError, match="northness"):
+        with pytest.raises(TrustboError, match="northness"):
             feature("northness", sign=1)
     finally:
         del FEATURES["northness"]
-    with pytest.raises(TerrainError, match="sign"):
+    with pytest.raises(TrustboError, match="sign"):
         feature("other", sign=0)
     with pytest.raises(TrustboError, match="stepheight"):
         pixel_features(rough_terrain(), ["stepheight"])

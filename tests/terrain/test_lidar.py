@@ -7,7 +7,7 @@ import pyproj
 import pytest
 import xarray as xr
 
-from trustbo.errors import TerrainError, TrustboError
+from trustbo.errors import TrustboError
 from trustbo.terrain import pixel_size, read_lidar
 
 laspy = pytest.importorskip("laspy", reason="needs the extra lidar")
@@ -163,7 +163,7 @@ def test_tiles_of_one_survey_are_gridded_together(tmp_path):
     whole = read_lidar(write_las(tmp_path / "whole.las", x, y, z))
     xr.testing.assert_allclose(read_lidar(tiles), whole)
     other = write_las(tmp_path / "other.las", x, y, z, crs="EPSG:32632")
-    with pytest.raises(TerrainError, match="CRS"):
+    with pytest.raises(TrustboError, match="CRS"):
         read_lidar([tiles[0], other])
 
 
@@ -183,7 +183,7 @@ def test_points_that_make_no_terrain_are_refused(tmp_path):
         write_las(tmp_path / "nowhere.las", x, y, z, crs=None),
         cut, tmp_path / "text.las", tmp_path / "absent.las", [],
     ):  # fmt: skip
-        with pytest.raises(TerrainError):
+        with pytest.raises(TrustboError):
             read_lidar(wrong)
     nowhere = read_lidar(tmp_path / "nowhere.las", crs=UTM)
     assert nowhere.rio.crs.to_epsg() == 32633
@@ -193,7 +193,7 @@ def test_points_that_make_no_terrain_are_refused(tmp_path):
 
 def test_laspy_is_named_where_it_is_missing(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "laspy", None)
-    with pytest.raises(TerrainError, match="laspy"):
+    with pytest.raises(TrustboError, match="laspy"):
         read_lidar(tmp_path / "points.las")
 
 

@@ -15,7 +15,7 @@ from rasterio.control import GroundControlPoint
 from rasterio.enums import ColorInterp
 from rasterio.transform import from_origin
 
-from trustbo.errors import TerrainError, TrustboError
+from trustbo.errors import TrustboError
 from trustbo.terrain import pixel_size, read_terrain
 from trustbo.terrain.read import require_terrain
 
@@ -98,7 +98,7 @@ def test_paths_datasets_and_arrays_are_read_alike(tif):
     with rasterio.open(tif) as dataset, rioxarray.open_rasterio(tif) as opened:
         for source in (tif, str(tif), dataset, opened, opened[0], array(plane(np.nan))):
             assert_is_the_plane(read_terrain(source, source))
-    with pytest.raises(TerrainError, match="closed"):
+    with pytest.raises(TrustboError, match="closed"):
         read_terrain(dataset)
 
 
@@ -161,11 +161,11 @@ def test_fills_that_an_array_declares_are_missing(marked):
 )  # fmt: skip
 def test_undeclared_and_blended_fills_are_refused_and_the_remedy_works(tmp_path, fill, dtype):
     path = write(tmp_path / "dem.tif", plane(fill, dtype))
-    with pytest.raises(TerrainError, match="row 2, column 3") as caught:
+    with pytest.raises(TrustboError, match="row 2, column 3") as caught:
         read_terrain(path)
     named = float(str(caught.value).split("nodata=")[1].split(", or")[0])
     assert_is_the_plane(read_terrain(path, path, nodata=named))
-    with pytest.raises(TerrainError, match="row 2, column 3"):
+    with pytest.raises(TrustboError, match="row 2, column 3"):
         read_terrain(array(plane(fill, dtype)))
 
 
@@ -177,13 +177,13 @@ def test_low_land_is_land():
 @pytest.mark.parametrize("scale", [(0.1, 0.0), (0.01, 0.0), (0.1, 1000.0)])
 def test_a_fill_times_a_scale_is_refused(tmp_path, scale):
     path = write(tmp_path / "dem.tif", plane(-9999, "int16"), scale=scale)
-    with pytest.raises(TerrainError, match="row 2, column 3"):
+    with pytest.raises(TrustboError, match="row 2, column 3"):
         read_terrain(path)
 
 
 def test_heights_in_centimetres_are_said_to_be_in_another_unit(tmp_path):
     path = write(tmp_path / "dem.tif", (plane() * 200).astype("uint16"))
-    with pytest.raises(TerrainError, match="unit"):
+    with pytest.raises(TrustboError, match="unit"):
         read_terrain(path)
 
 
@@ -199,7 +199,7 @@ def test_zeros_apart_from_all_heights_are_warned_of_and_a_coast_is_not():
 def test_pictures_are_refused_and_bands_of_elevation_are_found(tmp_path):
     byte = plane(dtype="uint8")
     picture = write(tmp_path / "rgb.tif", byte, byte, byte, photometric="RGB")
-    with pytest.raises(TerrainError, match="red"):
+    with pytest.raises(TrustboError, match="red"):
         read_terrain(picture)
     named = {"descriptions": ("red", "green", "blue", "Elevation (m)")}
     four = write(tmp_path / "four.tif", *[0 * plane()] * 3, plane(np.nan), **named)
@@ -226,7 +226,7 @@ def test_heights_in_feet_become_metres_with_a_warning(tmp_path):
         path = write(tmp_path / "dem.tif", plane(np.nan), unit=unit)
         assert_is_the_plane(read_terrain(path, path))
     for unit, crs in (("furlong", UTM), ("cm", UTM), ("m", "EPSG:32611+6360")):
-        with pytest.raises(TerrainError, match="unit"):
+        with pytest.raises(TrustboError, match="unit"):
             read_terrain(write(tmp_path / "dem.tif", plane(), crs=crs, unit=unit))
 
 
@@ -234,7 +234,7 @@ def test_two_vertical_datums_are_refused_and_depths_turned(tmp_path):
     geoid = write(tmp_path / "geoid.tif", plane(), crs=UTM + "+5773")
     above = rasterio.crs.CRS.from_wkt(pyproj.CRS(UTM).to_3d().to_wkt())
     ellipsoid = write(tmp_path / "ellipsoid.tif", plane() + 45.0, crs=above)
-    with pytest.raises(TerrainError, match="EGM96"):
+    with pytest.raises(TrustboError, match="EGM96"):
         read_terrain(geoid, ellipsoid)
     read_terrain(geoid, geoid)
     depth = write(tmp_path / "depth.tif", plane(), crs=UTM + "+6357")
@@ -274,7 +274,7 @@ def test_south_up_and_east_first_rasters_are_turned_round(tmp_path):
 
 def test_rotated_grids_are_refused_and_rounding_is_no_rotation(tmp_path):
     turned = write(tmp_path / "turned.tif", plane(), transform=CORNER * Affine.rotation(10))
-    with pytest.raises(TerrainError, match="rotated"):
+    with pytest.raises(TrustboError, match="rotated"):
         read_terrain(turned)
     rounded = Affine(1.0, 1e-16, 500_000.0, -1e-16, -1.0, 5_000_000.0)
     path = write(tmp_path / "rounded.tif", plane(np.nan), transform=rounded)
@@ -290,18 +290,18 @@ SITE = (
 @pytest.mark.parametrize("crs", ["EPSG:2225", None, SITE])
 def test_maps_in_feet_of_no_place_or_without_crs_are_refused(tmp_path, crs):
     path = write(tmp_path / "dem.tif", plane(), crs=crs)
-    with pytest.raises(TerrainError):
+    with pytest.raises(TrustboError):
         read_terrain(path)
 
 
 def test_crs_is_for_rasters_without_one(tmp_path):
     path = write(tmp_path / "dem.tif", plane(), crs=None)
     assert read_terrain(path, path, crs=UTM).rio.crs.to_epsg() == 32633
-    with pytest.raises(TerrainError, match="PROJ"):
+    with pytest.raises(TrustboError, match="PROJ"):
         read_terrain(path, crs="nonsense")
     other = write(tmp_path / "other.tif", plane())
     read_terrain(other, other, crs=UTM)
-    with pytest.raises(TerrainError, match="zone 33N"):
+    with pytest.raises(TrustboError, match="zone 33N"):
         read_terrain(other, crs="EPSG:32632")
 
 
@@ -312,11 +312,11 @@ def test_rasters_without_a_place_are_refused(tmp_path):
     gcps = points, rasterio.crs.CRS.from_epsg(32633)
     placed = write(tmp_path / "gcps.tif", plane(), crs=None, transform=None, gcps=gcps)
     bare = write(tmp_path / "bare.tif", plane(), crs=None, transform=Affine.identity())
-    with pytest.raises(TerrainError, match="georeference"):
+    with pytest.raises(TrustboError, match="georeference"):
         read_terrain(bare, crs=UTM)
-    with pytest.raises(TerrainError, match="control points"):
+    with pytest.raises(TrustboError, match="control points"):
         read_terrain(placed)
-    with pytest.raises(TerrainError, match="coordinates"):
+    with pytest.raises(TrustboError, match="coordinates"):
         read_terrain(array(plane()).drop_vars(["x", "y"]))
 
 
@@ -345,7 +345,7 @@ def test_coordinates_rounded_to_float32_are_even():
     rounded = degrees.assign_coords({a: degrees[a].astype("float32") for a in ("y", "x")})
     assert read_terrain(rounded, rounded)["dem"].notnull().mean() > 0.5
     uneven = array(plane()).isel(x=[0, 1, 3, 4])
-    with pytest.raises(TerrainError, match="evenly"):
+    with pytest.raises(TrustboError, match="evenly"):
         read_terrain(uneven)
 
 
@@ -389,14 +389,14 @@ def test_national_grids_are_left_as_they_are():
     [("EPSG:4326", 1.0, 500_000.0, 5_000_000.0), (UTM, 1.0, 5e9, 5e9), (UTM, 1e-4, 15.2, 47.1)],
 )
 def test_coordinates_of_another_crs_are_refused(crs, step, x, y):
-    with pytest.raises(TerrainError, match="CRS"):
+    with pytest.raises(TrustboError, match="CRS"):
         read_terrain(array(plane(), crs, step, x, y))
 
 
 def test_rasters_of_two_places_or_all_nodata_are_refused(tif):
-    with pytest.raises(TerrainError, match="two places"):
+    with pytest.raises(TrustboError, match="two places"):
         read_terrain(tif, array(plane(), left=600_000.0))
-    with pytest.raises(TerrainError, match="nodata"):
+    with pytest.raises(TrustboError, match="nodata"):
         read_terrain(tif, array(np.full((8, 10), np.nan)))
 
 
@@ -411,13 +411,13 @@ def test_what_is_no_raster_of_heights_is_refused(tmp_path, tif):
         array(plane().astype(complex)), array(plane())[:1], array(plane()).expand_dims(t=2, b=3),
         array(plane()).rename(y="north", x="east"), array(plane())[:0],
     ):  # fmt: skip
-        with pytest.raises(TerrainError):
+        with pytest.raises(TrustboError):
             read_terrain(wrong)
     assert_is_the_plane(read_terrain(*[f"netcdf:{tmp_path / 'both.nc'}:dem"] * 2))
     for wrong in (both["dem"], both.drop_vars("dsm"), both.drop_vars("spatial_ref")):
-        with pytest.raises(TerrainError):
+        with pytest.raises(TrustboError):
             require_terrain(wrong)
-    with pytest.raises(TerrainError, match="nodata"):
+    with pytest.raises(TrustboError, match="nodata"):
         read_terrain(tif, nodata="none")
 
 
@@ -440,7 +440,7 @@ def test_resolution_averages_whole_numbers_of_pixels(tmp_path, monkeypatch):
         with pytest.raises(TrustboError, match="resolution"):
             read_terrain(path, resolution=wrong)
     monkeypatch.setattr("trustbo.terrain.read._MOST_PIXELS", 1000.0)
-    with pytest.raises(TerrainError, match="resolution"):
+    with pytest.raises(TrustboError, match="resolution"):
         read_terrain(path)
 
 

@@ -9,7 +9,7 @@ import pytest
 from worlds import Steady
 
 from trustbo.data import Mission
-from trustbo.errors import ShapeError, TerrainError, TrustboError
+from trustbo.errors import TrustboError
 from trustbo.inference import fit
 from trustbo.models import PooledTrust
 from trustbo.simulation import KinematicSimulator
@@ -265,7 +265,7 @@ def test_arrays_with_a_place_for_line_of_sight_are_those_of_the_workspace(wooded
     np.testing.assert_array_equal(filled.awareness[..., 2], wooded.along([A, C, NEXT])[..., 2])
     np.testing.assert_array_equal(filled.awareness[..., :2], z[..., :2])
     own = Mission.from_arrays([A, C, NEXT], np.nan_to_num(z), y, features=("mud", "fog", "sand"))
-    with pytest.raises(ShapeError, match=r"has features \('mud', 'fog', 'sand'\)"):
+    with pytest.raises(TrustboError, match=r"has features \('mud', 'fog', 'sand'\)"):
         wooded.in_order(own)
 
 
@@ -292,6 +292,6 @@ def test_a_feature_of_cells_has_another_name(wooded):
 def test_no_room_to_stand_is_named():
     terrain = synthetic_terrain((12.0, 12.0), resolution=2.0, seed=0)
     with pytest.raises(
-        TerrainError, match=r"cell \(0, 0\) has 2 passable pixels, on which robot 'r2'"
+        TrustboError, match=r"cell \(0, 0\) has 2 passable pixels, on which robot 'r2'"
     ):
         Workspace.from_terrain(terrain, (3, 3), Team(n_robots=6))

@@ -259,9 +259,9 @@ class Campaign(Summary):
             the previous one, or None, if this mission cannot be learned from yet, or never.
 
         Raises:
-            ShapeError: Robots or features differ from the workspace's.
-            TrustboError: The path leaves the grid, jumps, or begins in another cell than the one
-                asked for; or an extra has the name of a column. Nothing is stored then.
+            TrustboError: Robots or features differ from the workspace's; the path leaves the grid,
+                jumps, or begins in another cell than the one asked for; or an extra has the name of
+                a column. Nothing is stored then.
         """
         require_kind("mission", mission, Mission, "tell one trustbo.Mission at a time")
         mission = self.workspace.in_order(mission)

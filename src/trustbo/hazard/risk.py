@@ -10,7 +10,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from trustbo.data import Cell
-from trustbo.errors import ShapeError, TrustboError, require_whole
+from trustbo.errors import TrustboError, require_whole
 from trustbo.hazard.prior import LIMIT_NAMES, TILT, prior_betas, steepness_of
 from trustbo.hazard.strata import MOST, Strata, partition
 from trustbo.workspace import Workspace
@@ -221,8 +221,7 @@ class Risk:
             if bounds were independent.
 
     Raises:
-        ShapeError: Another shape.
-        TrustboError: A chance outside [0, 1], or shares that do not add up to 1.
+        TrustboError: Another shape; a chance outside [0, 1], or shares that do not add up to 1.
     """
 
     p_fail: np.ndarray
@@ -241,14 +240,14 @@ class Risk:
                 continue
             if p.shape[-3:] != self.p_fail.shape or p.ndim != 3 + bool(axis):
                 expected = axis + "move, row, col"
-                raise ShapeError(f"{name} must have axes ({expected}); got shape {p.shape}.")
+                raise TrustboError(f"{name} must have axes ({expected}); got shape {p.shape}.")
             if ((p < 0.0) | (p > 1.0)).any():
                 worst = float(p[(p < 0.0) | (p > 1.0)][0])
                 raise TrustboError(f"{name} must be in [0, 1]; got {worst:g}.")
         if self.strata is not None:
             shares = np.asarray(self.strata.shares)
             if shares.shape != self.strata.p_fail.shape[:1]:
-                raise ShapeError(f"strata need a share each; got shape {shares.shape}.")
+                raise TrustboError(f"strata need a share each; got shape {shares.shape}.")
             if (shares < 0.0).any() or abs(shares.sum() - 1.0) > 1e-9:
                 raise TrustboError(f"shares of strata must add up to 1; got {shares}.")
 

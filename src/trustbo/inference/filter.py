@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from trustbo.arrays import as_array, require_unit_interval
 from trustbo.bound import require_shares
 from trustbo.data import Cell
-from trustbo.errors import ShapeError, TrustboError, one_line, require_pair, require_whole
+from trustbo.errors import TrustboError, one_line, require_pair, require_whole
 from trustbo.inference.draws import of_no_map, params_of, require_posterior, sites_of
 from trustbo.inference.importance import systematic
 from trustbo.models.families import Family, family_of
@@ -219,8 +219,8 @@ class TrustFilter:
             max_draws: Largest number of draws to follow; they are evenly spaced.
 
         Raises:
-            ShapeError: Draws of another number of robots.
-            TrustboError: No posterior, or `TrustParams` without `n_robots`.
+            TrustboError: Draws of another number of robots; no posterior, or `TrustParams` without
+                `n_robots`.
         """
         delta_s, self._bounded = None, True
         if isinstance(posterior, xr.DataTree):
@@ -283,10 +283,10 @@ class TrustFilter:
             Trust after it, shapes (robot,).
 
         Raises:
-            ShapeError: Another number of robots or features.
-            TrustboError: Awareness that is NaN, a value outside [0, 1], ticks that are missing or
-                of which the rate is no share, a bound that is missing, off the grid or between
-                cells that are no neighbours, or one that is running.
+            TrustboError: Another number of robots or features; awareness that is NaN, a value
+                outside [0, 1], ticks that are missing or of which the rate is no share, a bound
+                that is missing, off the grid or between cells that are no neighbours, or one that
+                is running.
         """
         self._require_running(running=False)
         predicted = self._predicted(awareness, bound)
@@ -315,9 +315,8 @@ class TrustFilter:
             Trust after the bound if it ended now, with the rate so far; shapes (robot,).
 
         Raises:
-            ShapeError: Another number of robots.
-            TrustboError: No bound was begun, a number that is negative or NaN, or more ticks with
-                contact than ticks.
+            TrustboError: Another number of robots; no bound was begun, a number that is negative or
+                NaN, or more ticks with contact than ticks.
         """
         self._require_running(running=True)
         contacts, ticks = as_array("n_contact", n_contact), as_array("n_ticks", n_ticks)
@@ -360,9 +359,9 @@ class TrustFilter:
             n_ticks: Ticks of the bounds, (), (bound,) or (bound, robot), where rates are counts.
 
         Raises:
-            ShapeError: Another number of robots, features or ticks.
-            TrustboError: Awareness that is NaN or outside [0, 1], ticks that are no whole numbers,
-                or a path that is missing, of another length, that jumps or that leaves the grid.
+            TrustboError: Another number of robots, features or ticks; awareness that is NaN or
+                outside [0, 1], ticks that are no whole numbers, or a path that is missing, of
+                another length, that jumps or that leaves the grid.
         """
         given, rng = self._checked(awareness, 3), np.random.default_rng(self.n_bounds)
         ticks, trust, rates = ticks_ahead(n_ticks, given.shape[:2]), [], []
@@ -425,7 +424,7 @@ class TrustFilter:
         z = as_array("awareness", awareness)
         expected = (self._n_robots, self._n_features)
         if z.ndim != n_axes or z.shape[-2:] != expected or not len(z):
-            raise ShapeError(
+            raise TrustboError(
                 f"awareness must be {'(bound, ' if n_axes == 3 else '('}{expected[0]} robots, "
                 f"{expected[1]} features); got shape {z.shape}."
             )
@@ -440,7 +439,7 @@ class TrustFilter:
 
     def _require_shape(self, name: str, values: np.ndarray) -> None:
         if values.shape != (self._n_robots,):
-            raise ShapeError(f"{name} must be ({self._n_robots},); got shape {values.shape}.")
+            raise TrustboError(f"{name} must be ({self._n_robots},); got shape {values.shape}.")
 
 
 def _rates(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -450,11 +449,11 @@ def _rates(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def ticks_ahead(n_ticks: ArrayLike, shape: tuple[int, int]) -> np.ndarray:
-    """Ticks of bounds to come as (bound, robot); ShapeError, TrustboError if they are none."""
+    """Ticks of bounds to come as (bound, robot); TrustboError, TrustboError if they are none."""
     given = as_array("n_ticks", n_ticks)
     given = given[:, None] if given.ndim == 1 else given
     if given.ndim > 2 or any(n not in (1, m) for n, m in zip(given.shape, shape, strict=False)):
-        raise ShapeError(f"n_ticks must be (), (bound,) or {shape}; got shape {given.shape}.")
+        raise TrustboError(f"n_ticks must be (), (bound,) or {shape}; got shape {given.shape}.")
     if not ((given >= 1.0) & (given == np.round(given))).all():
         raise TrustboError(f"n_ticks must be whole numbers of ticks from 1; got {given.min():g}.")
     return np.broadcast_to(given, shape)

@@ -85,10 +85,9 @@ def fit(
         for all families of observations; the attribute `log_likelihood_of` states it.
 
     Raises:
-        ShapeError: There are no missions, or they disagree on robots or features.
-        TrustboError: An awareness value is NaN, the sampler is unknown, no contact rate was
-            measured, a path leaves the workspace, or a number of draws or the seed is no whole
-            number.
+        TrustboError: There are no missions, or they disagree on robots or features; an awareness
+            value is NaN, the sampler is unknown, no contact rate was measured, a path leaves the
+            workspace, or a number of draws or the seed is no whole number.
         PosteriorError: The diagnostics are beyond their limits.
     """
     started = time.perf_counter()

@@ -157,7 +157,7 @@ def missions_of_tree(tree: xr.DataTree, path: FilePath) -> list[Mission]:
 
 
 def _table(missions: Sequence[Mission]) -> xr.Dataset:
-    """Arrays of missions, padded with NaN; ShapeError if robots or features differ."""
+    """Arrays of missions, padded with NaN; TrustboError if robots or features differ."""
     require_same_team(missions)
     n_steps = max(max(len(mission.path), len(mission.bounds) + 1) for mission in missions)
     shape = (len(missions), n_steps - 1)

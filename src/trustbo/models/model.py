@@ -17,7 +17,7 @@ from scipy import sparse
 
 from trustbo.data import Mission
 from trustbo.display import Rows, Summary
-from trustbo.errors import ShapeError, TrustboError, require_choice
+from trustbo.errors import TrustboError, require_choice
 from trustbo.models.backend import namespace
 from trustbo.models.effects.effect import EFFECTS, Effect, Theta, sample_columns
 from trustbo.models.effects.place import PlaceEffect
@@ -166,9 +166,9 @@ class TrustModel(Summary, ABC):
         """Rates and features of missions, with the places that the model's effects are of.
 
         Raises:
-            ShapeError: There are no missions, or they disagree on robots or features.
-            TrustboError: An awareness value is NaN, a measured rate lacks the number of ticks that
-                the family needs, or a path jumps or leaves the workspace.
+            TrustboError: There are no missions, or they disagree on robots or features; an
+                awareness value is NaN, a measured rate lacks the number of ticks that the family
+                needs, or a path jumps or leaves the workspace.
         """
         slots = Slots.of(missions)
         require_ticks(self.family, slots.y, slots.n_ticks)
@@ -245,13 +245,12 @@ class TrustModel(Summary, ABC):
                 beta-binomial family needs them.
 
         Raises:
-            ShapeError: Awareness has other axes; parameters with leading axes, or of other robots
-                or features.
-            TrustboError: A covariance is not positive definite, or n_ticks is missing.
+            TrustboError: Awareness has other axes; parameters with leading axes, or of other robots
+                or features; a covariance is not positive definite, or n_ticks is missing.
         """
         z = np.asarray(awareness, dtype=float)
         if z.ndim != 4 or params.leading:
-            raise ShapeError(
+            raise TrustboError(
                 "awareness must be (mission, bound, robot, feature) and the parameters one draw; "
                 f"got {z.shape}, and parameters with leading axes {params.leading}."
             )

@@ -5,7 +5,7 @@ from typing import Any, ClassVar, NamedTuple, cast
 
 import numpy as np
 
-from trustbo.errors import ShapeError, TrustboError
+from trustbo.errors import TrustboError
 from trustbo.models.parameter_draws import PLACES, Numbers, ParameterDraws
 
 
@@ -178,31 +178,33 @@ def assemble_params(
 def check_params(params: Params, n_robots: int | None, n_features: int) -> None:
     """Refuse parameters that do not match the data; `n_robots` None leaves robots unchecked.
 
-    ShapeError: another number of robots or features. TrustboError: a covariance that is not
+    TrustboError: another number of robots or features, or a covariance that is not
     symmetric and positive definite.
     """
     for field, value in params.places.items():
         if (n := value.shape[-len(PLACES[field])]) not in (1, n_robots or n):
-            raise ShapeError(f"params.{field} is of {n} robots, but the missions have {n_robots}.")
+            raise TrustboError(
+                f"params.{field} is of {n} robots, but the missions have {n_robots}."
+            )
     name = params.WEIGHTS
     axes, shape = params.AXES[name], np.shape(getattr(params, name))
     if len(shape) < len(axes):
-        raise ShapeError(f"params.{name} must end in the axes {axes}; got shape {shape}.")
+        raise TrustboError(f"params.{name} must end in the axes {axes}; got shape {shape}.")
     sizes = dict(zip(axes, shape[len(shape) - len(axes) :], strict=True))
     if sizes["feature"] != n_features:
-        raise ShapeError(
+        raise TrustboError(
             f"params.{name} has {sizes['feature']} weights, but awareness has {n_features} "
             "features."
         )
     if n_robots is not None and sizes.get("robot", n_robots) != n_robots:
-        raise ShapeError(
+        raise TrustboError(
             f"params.{name} is of {sizes['robot']} robots, but the missions have {n_robots}."
         )
     for field in params.AXES.keys() - PLACES.keys():
         field_axes, value = params.AXES[field], np.asarray(getattr(params, field))
         expected = tuple(sizes[axis.strip("_")] for axis in field_axes)
         if value.shape[value.ndim - len(expected) :] != expected or value.ndim < len(expected):
-            raise ShapeError(
+            raise TrustboError(
                 f"params.{field} must end in the axes {field_axes}, here {expected}; got shape "
                 f"{value.shape}."
             )

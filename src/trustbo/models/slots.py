@@ -28,8 +28,8 @@ class Slots(NamedTuple):
         """Stack missions of one team.
 
         Raises:
-            ShapeError: There are no missions, or they disagree on robots or features.
-            TrustboError: An awareness value is NaN.
+            TrustboError: There are no missions, or they disagree on robots or features; an
+                awareness value is NaN.
         """
         batch = stack_missions(missions, pad=False)
         features = tuple(missions[0].features)

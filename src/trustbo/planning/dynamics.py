@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from trustbo.data import Cell
-from trustbo.errors import ShapeError
+from trustbo.errors import TrustboError
 from trustbo.models.params import Params, check_params
 from trustbo.workspace.moves import moves_along
 
@@ -71,7 +71,7 @@ def trust_dynamics(
         by_robot: Whether each robot is a state also where their mean would suffice.
 
     Raises:
-        ShapeError: Parameters of other numbers of robots or features.
+        TrustboError: Parameters of other numbers of robots or features.
     """
     z = np.asarray(awareness, dtype=float)
     n_robots, leading = z.shape[-5], params.leading
@@ -100,12 +100,12 @@ def drift(params: Params, awareness: ArrayLike) -> np.ndarray:
             parameters'.
 
     Raises:
-        ShapeError: Other numbers of robots, features, cells or draws than the parameters'.
+        TrustboError: Other numbers of robots, features, cells or draws than the parameters'.
     """
     z = np.asarray(awareness, dtype=float)
     check_params(params, None if params.places else z.shape[-5], z.shape[-1])
     if z.ndim == 6 and params.leading != z.shape[:1]:
-        raise ShapeError(
+        raise TrustboError(
             f"{z.shape[0]} maps of awareness need as many draws of the parameters; got "
             f"{params.leading}."
         )
@@ -117,7 +117,7 @@ def drift(params: Params, awareness: ArrayLike) -> np.ndarray:
     u += b[..., None, None, None]  # in place: over many draws and cells this is large
     for name, effect in params.places.items():
         if effect.shape[-2:] != u.shape[-2:]:
-            raise ShapeError(
+            raise TrustboError(
                 f"params.{name} is of {effect.shape[-2:]} cells, the awareness of {u.shape[-2:]}. "
                 "With the awareness of a path's bounds, give params.along(path)."
             )
@@ -140,8 +140,8 @@ def roll_trust(params: Params, awareness: ArrayLike, x0: ArrayLike | None = None
         Shape (..., bound, robot).
 
     Raises:
-        ShapeError: The number of robots or features differs from that of the parameters, or effects
-            of places are of a map, not of the path's bounds.
+        TrustboError: The number of robots or features differs from that of the parameters, or
+            effects of places are of a map, not of the path's bounds.
     """
     z = as_map(np.asarray(awareness, dtype=float))
     return roll(trust_dynamics(params, z, x0, by_robot=True))

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from trustbo.data import Cell
 from trustbo.display import Rows, Summary
-from trustbo.errors import ShapeError, TrustboError, require_choice
+from trustbo.errors import TrustboError, require_choice
 from trustbo.hazard.risk import Risk
 from trustbo.hazard.strata import Strata
 from trustbo.models.families import FAMILIES
@@ -72,9 +72,8 @@ class Planner(Summary):
             family: Family of the contact rates, that of the trust model; for lost_contact.
 
         Raises:
-            ShapeError: A toll of another shape.
-            TrustboError: Start or goal off the grid, impassable, or equal; an unknown name;
-                `max_bounds` below the fewest possible; a number out of its range.
+            TrustboError: A toll of another shape; start or goal off the grid, impassable, or equal;
+                an unknown name; `max_bounds` below the fewest possible; a number out of its range.
             NoPathError: The goal cannot be reached.
         """
         row = OBJECTIVES[require_choice("objective", objective, OBJECTIVES)]
@@ -160,8 +159,7 @@ class Planner(Summary):
                 is priced; by default `p_fail`, as if bounds failed independently.
 
         Raises:
-            ShapeError: Other shapes.
-            TrustboError: A chance outside [0, 1].
+            TrustboError: Other shapes; a chance outside [0, 1].
         """
         if p_fail is None:
             return self._with(risk=None)
@@ -192,8 +190,8 @@ class Planner(Summary):
             x0: Expected trust at the start, shape () or (robot,); by default `params.x0_mean`.
 
         Raises:
-            ShapeError: Parameters of other robots or features.
-            TrustboError: beta0 outside the range that the objective is exact for.
+            TrustboError: Parameters of other robots or features; beta0 outside the range that the
+                objective is exact for.
             InfeasibleError: No path respects `max_failure`.
         """
         started = time.perf_counter()
@@ -252,8 +250,8 @@ class Planner(Summary):
             x0: Expected trust at the start; by default `params.x0_mean`.
 
         Raises:
-            ShapeError: Parameters of other robots or features.
-            TrustboError: A path that is broken, or does not lead from start to goal.
+            TrustboError: Parameters of other robots or features; a path that is broken, or does not
+                lead from start to goal.
         """
         path, problem = self.require_path(path), self.problem
         draws, cells = draws_of(params, self.workspace, day=True), np.array(path)
@@ -386,13 +384,13 @@ class Planner(Summary):
 def _toll_of(toll: ArrayLike, bounds: np.ndarray) -> np.ndarray:
     """Tolls (move, row, col), 0 where there is no bound.
 
-    ShapeError: they do not broadcast. TrustboError: that of a bound is not finite.
+    TrustboError: they do not broadcast, or that of a bound is not finite.
     """
     given = np.asarray(toll, dtype=float)
     try:
         tolls = np.where(bounds, np.broadcast_to(given, bounds.shape), 0.0)
     except ValueError:
-        raise ShapeError(
+        raise TrustboError(
             f"toll must be (move, row, col), {bounds.shape}; got {given.shape}."
         ) from None
     if not np.isfinite(tolls).all():

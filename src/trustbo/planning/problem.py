@@ -10,7 +10,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from trustbo.data import Cell
-from trustbo.errors import ShapeError, TrustboError, require_kind, require_not_negative
+from trustbo.errors import TrustboError, require_kind, require_not_negative
 from trustbo.hazard.risk import ROUNDING, Risk
 from trustbo.inference.draws import params_of
 from trustbo.models.families import Family
@@ -85,7 +85,7 @@ class Problem:
                 )
         shape = self.paths.bounds.shape
         if self.risk is not None and self.risk.p_fail.shape != shape:
-            raise ShapeError(f"p_fail must have shape {shape}; got {self.risk.p_fail.shape}.")
+            raise TrustboError(f"p_fail must have shape {shape}; got {self.risk.p_fail.shape}.")
 
     @property
     def price(self) -> float:

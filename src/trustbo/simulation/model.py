@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from trustbo.data import Cell, Mission
-from trustbo.errors import ShapeError, TrustboError, require_kind, require_whole
+from trustbo.errors import TrustboError, require_kind, require_whole
 from trustbo.models import PooledTrust
 from trustbo.models.backend import own_settings
 from trustbo.models.model import TrustModel
@@ -49,9 +49,9 @@ class ModelSimulator(DescribedSimulator):
                 draw of `hazard.risk.BoundRisk`; robots are "stuck" then. None for no failures.
 
         Raises:
-            ShapeError: Parameters or awareness of other robots or features, or of many draws; or
-                probabilities of other bounds.
-            TrustboError: An `n_ticks` that is missing or not used; a probability outside [0, 1].
+            TrustboError: Parameters or awareness of other robots or features, or of many draws; or
+                probabilities of other bounds; an `n_ticks` that is missing or not used; a
+                probability outside [0, 1].
         """
         require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
         require_kind("params", params, Params, "give parameters, such as TrustParams(...)")
@@ -61,12 +61,12 @@ class ModelSimulator(DescribedSimulator):
         given = workspace.bound_maps if awareness is None else np.asarray(awareness)
         self.awareness = given[:, None] if given.ndim == 4 else given
         if self.awareness.shape not in ((shape[0], n, *shape[1:]) for n in (1, len(MOVES[8]))):
-            raise ShapeError(
+            raise TrustboError(
                 f"awareness must be {shape}, or with an axis of 8 moves behind the robots; got "
                 f"shape {given.shape}."
             )
         if params.leading:
-            raise ShapeError(f"give one draw of params; they have leading axes {params.leading}.")
+            raise TrustboError(f"give one draw of params; they have leading axes {params.leading}.")
         check_params(params, shape[0], shape[3])
         self.n_ticks = None if n_ticks is None else require_whole("n_ticks", n_ticks, 1)
         if (self.n_ticks is not None) != self.model.family.needs_ticks:
@@ -118,7 +118,7 @@ def _require_probabilities(p_fail: ArrayLike, shape: tuple[int, ...]) -> np.ndar
     """Probabilities of failure, NaN where there is no bound, as an array (move, row, col)."""
     p = np.asarray(p_fail, dtype=float)
     if p.shape != shape:
-        raise ShapeError(f"p_fail must be (move, row, col) = {shape}; got {p.shape}.")
+        raise TrustboError(f"p_fail must be (move, row, col) = {shape}; got {p.shape}.")
     if (bad := (p < 0.0) | (p > 1.0)).any():
         raise TrustboError(f"p_fail must be in [0, 1]; got {p[bad][0]:g}.")
     return p

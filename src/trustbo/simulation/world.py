@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 import xarray as xr
 
-from trustbo.errors import TerrainError, TrustboError
+from trustbo.errors import TrustboError
 from trustbo.team import Team
 from trustbo.terrain.read import require_terrain
 from trustbo.workspace import Workspace
@@ -43,8 +43,8 @@ def true_surface(workspace: Workspace, terrain: xr.Dataset | None) -> Surface:
     """Surface that robots are simulated on: the workspace's, or that of another terrain.
 
     Raises:
-        TerrainError: The terrain does not cover the grid, or has another CRS.
-        TrustboError: The workspace has no terrain.
+        TrustboError: The terrain does not cover the grid, or has another CRS; the workspace has no
+            terrain.
     """
     planned = workspace.surface
     if planned is None or workspace.terrain is None:
@@ -56,7 +56,7 @@ def true_surface(workspace: Workspace, terrain: xr.Dataset | None) -> Surface:
         return planned
     terrain = require_terrain(terrain)
     if terrain.rio.crs != workspace.terrain.rio.crs:
-        raise TerrainError(
+        raise TrustboError(
             f"the true terrain has CRS {terrain.rio.crs}, the workspace "
             f"{workspace.terrain.rio.crs}; reproject the terrain."
         )
@@ -64,7 +64,7 @@ def true_surface(workspace: Workspace, terrain: xr.Dataset | None) -> Surface:
     extent, needed, pixel = surface.extent, planned.extent, max(*surface.pixel, *planned.pixel)
     short = max(*np.subtract(extent, needed)[:2], *np.subtract(needed, extent)[2:])
     if short > pixel:
-        raise TerrainError(
+        raise TrustboError(
             f"the true terrain ends {short:.3g} m inside the planning grid; give one that "
             "covers it."
         )

@@ -8,7 +8,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 from sklearn.decomposition import PCA
 
-from trustbo.errors import TerrainError, TrustboError
+from trustbo.errors import TrustboError
 from trustbo.terrain.heights import warn
 
 MAX_PIXELS = 1_000_000
@@ -43,12 +43,12 @@ class CompositeIndex:
             features: Values by feature, arrays of one shape; samples with a NaN are left out.
 
         Raises:
-            TerrainError: A declared feature is missing, or no sample has all of them.
+            TrustboError: A declared feature is missing, or no sample has all of them.
         """
         x = np.stack([column.ravel() for column in self._columns(features)], axis=1)
         x = x[np.isfinite(x).all(1)]
         if not len(x):
-            raise TerrainError(f"no pixel has all of the features {', '.join(self.signs)}.")
+            raise TrustboError(f"no pixel has all of the features {', '.join(self.signs)}.")
         x = x[:: -(-len(x) // MAX_PIXELS)]
         self._low, self._high = np.percentile(x, [1, 99], axis=0)
         x = np.clip(x, self._low, self._high)
@@ -81,8 +81,7 @@ class CompositeIndex:
         NaN where a feature is; 0.5 everywhere if all features were constant.
 
         Raises:
-            TerrainError: A declared feature is missing.
-            TrustboError: The index has not been fitted.
+            TrustboError: A declared feature is missing; the index has not been fitted.
         """
         if not hasattr(self, "loadings_"):
             raise TrustboError("this CompositeIndex is not fitted; call fit first.")
@@ -122,7 +121,7 @@ class CompositeIndex:
     def _columns(self, features: Mapping[str, ArrayLike] | xr.Dataset) -> list[np.ndarray]:
         missing = [name for name in self.signs if name not in features]
         if missing:
-            raise TerrainError(f"the composite needs {', '.join(missing)}; got {list(features)}.")
+            raise TrustboError(f"the composite needs {', '.join(missing)}; got {list(features)}.")
         return [np.asarray(features[name], float) for name in self.signs]
 
     def _warn(self) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 import xarray as xr
 from scipy import ndimage
 
-from trustbo.errors import TerrainError, require_choice
+from trustbo.errors import TrustboError, require_choice
 from trustbo.terrain import rays
 from trustbo.terrain.read import pixel_size
 
@@ -48,12 +48,12 @@ FEATURES: dict[str, Feature] = {}
 def feature[F: Callable[..., np.ndarray]](name: str, *, sign: int) -> Callable[[F], F]:
     """Register a feature of pixels under a new name, by a decorator.
 
-    TerrainError: the name is taken, or the sign is neither 1 nor -1.
+    TrustboError: the name is taken, or the sign is neither 1 nor -1.
     """
     if name in FEATURES:
-        raise TerrainError(f"there is a feature {name!r} already; take another name.")
+        raise TrustboError(f"there is a feature {name!r} already; take another name.")
     if sign not in (1, -1):
-        raise TerrainError(f"sign must be 1 or -1; got {sign!r}.")
+        raise TrustboError(f"sign must be 1 or -1; got {sign!r}.")
 
     def register(compute: F) -> F:
         FEATURES[name] = Feature(compute, sign)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import pyproj
 
-from trustbo.errors import TerrainError
+from trustbo.errors import TrustboError
 
 LOWEST, HIGHEST = -450.0, 9000.0
 """Range of heights on land, m: the Dead Sea's shore is at -430 m, Everest's summit at 8849 m."""
@@ -70,11 +70,11 @@ def decoded(
         row: Position of the first row in the raster, for messages.
 
     Raises:
-        TerrainError: Values that are no real numbers, or that no height on land has: undeclared
+        TrustboError: Values that are no real numbers, or that no height on land has: undeclared
             fill values, fill values blended with heights, or heights in another unit.
     """
     if stored.dtype.kind not in "iuf":
-        raise TerrainError(
+        raise TrustboError(
             f"{coding.name} holds {stored.dtype}, which are no heights; give real numbers."
         )
     values = stored.astype(float)
@@ -92,7 +92,7 @@ def decoded(
 
 def _no_heights(
     coding: Coding, stored: np.ndarray, heights: np.ndarray, wrong: np.ndarray, row: int
-) -> TerrainError:
+) -> TrustboError:
     """Error about values that are no heights, with the first of them and the likely cause."""
     r, c = np.unravel_index(np.argmax(wrong), wrong.shape)
     value, height = float(stored[r, c]), heights[r, c]
@@ -100,12 +100,12 @@ def _no_heights(
     where = f"{coding.name} holds {value!r}{scaled} at row {row + r}, column {c}"
     share = wrong.sum() / np.isfinite(heights).sum()
     if share > 0.5:
-        return TerrainError(
+        return TrustboError(
             f"{where}, and {share:.0%} of its heights lie outside {LOWEST:g} to {HIGHEST:g} m: "
             "they may be in another unit, such as centimetres; convert them, or declare their "
             "scale, e.g. with gdal_edit.py -scale 0.01."
         )
-    return TerrainError(
+    return TrustboError(
         f"{where}, no height on land: a fill value that no tag declares, or one that resampling "
         f"has blended with heights. Pass nodata={value!r}, or resample the raster again with its "
         "fill value declared."
@@ -138,7 +138,7 @@ def vertical_of(name: str, declared: object, crs: pyproj.CRS | None) -> Vertical
         crs: Coordinate reference system, which may have a vertical axis.
 
     Raises:
-        TerrainError: An unknown unit, or a band and a CRS that disagree.
+        TrustboError: An unknown unit, or a band and a CRS that disagree.
     """
     axis = _vertical_axis(crs)
     text = str(np.ravel(np.array(declared, object))[0] or "").strip()
@@ -150,12 +150,12 @@ def vertical_of(name: str, declared: object, crs: pyproj.CRS | None) -> Vertical
     elif words & _FOOT and not words & _METRE:
         unit, length = text, 1200.0 / 3937.0 if words & _US else 0.3048
     else:
-        raise TerrainError(
+        raise TrustboError(
             f"{name} has heights in {text!r}; metres and feet are known: convert them, or declare "
             "the true unit, e.g. with gdal_edit.py -units m."
         )
     if axis and abs(length / abs(axis.metres) - 1.0) > 1e-5:
-        raise TerrainError(
+        raise TrustboError(
             f"{name} has heights in {text!r} by its band, but in {axis.unit!r} by its CRS; declare "
             "the true unit, e.g. with gdal_edit.py -units m, or the true CRS, with -a_srs."
         )

@@ -12,7 +12,7 @@ from scipy.interpolate import LinearNDInterpolator
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import KDTree, QhullError
 
-from trustbo.errors import TerrainError, pip_install, require_positive
+from trustbo.errors import TrustboError, pip_install, require_positive
 from trustbo.files import FilePath
 from trustbo.terrain.heights import HIGHEST, LOWEST
 from trustbo.terrain.read import read_terrain
@@ -42,18 +42,18 @@ def read_lidar(
         Dataset with `dem` and `dsm` as from `read_terrain`.
 
     Raises:
-        TerrainError: No laspy; an unreadable file; no ground points, or points at heights that no
+        TrustboError: No laspy; an unreadable file; no ground points, or points at heights that no
             land has; no projected CRS, or two; no pixel with both heights.
     """
     step = require_positive("resolution", resolution)
     files = [points] if isinstance(points, str | PathLike) else list(points)
     tiles = [_read_tile(fspath(file), crs) for file in files]
     if not tiles or len({tile[2].to_wkt() for tile in tiles}) > 1:
-        raise TerrainError("give one LAS or LAZ file or more, all in one CRS.")
+        raise TrustboError("give one LAS or LAZ file or more, all in one CRS.")
     xyz, label = (np.concatenate([tile[k] for tile in tiles]) for k in (0, 1))  # pyright: ignore[reportArgumentType, reportCallIssue]
     ground = xyz[label == GROUND_CLASS]
     if len(ground) < 3:
-        raise TerrainError(
+        raise TrustboError(
             f"{files[0]!r} has {len(ground)} ground points (class {GROUND_CLASS}), too few to span "
             "an area; classify its ground, e.g. with PDAL's filters.smrf."
         )
@@ -62,7 +62,7 @@ def read_lidar(
     n_cols = max(1, int(np.ceil(right / step - 1e-6) - first))
     n_rows = max(1, int(last - np.floor(bottom / step + 1e-6)))
     if n_rows * n_cols > _MOST_PIXELS:
-        raise TerrainError(
+        raise TrustboError(
             f"resolution {step:g} m makes {n_rows} x {n_cols} pixels; take a larger one."
         )
     x, y = (first + 0.5 + np.arange(n_cols)) * step, (last - 0.5 - np.arange(n_rows)) * step
@@ -85,27 +85,27 @@ def _read_tile(path: str, given: object) -> tuple[np.ndarray, np.ndarray, pyproj
     try:
         import laspy
     except ImportError:
-        raise TerrainError(f"lidar needs laspy: {pip_install('laspy[lazrs]')}") from None
+        raise TrustboError(f"lidar needs laspy: {pip_install('laspy[lazrs]')}") from None
     try:
         cloud = laspy.read(path)
     # A file cut short is a ValueError of NumPy's or a RuntimeError of lazrs'.
     except (laspy.errors.LaspyException, OSError, RuntimeError, ValueError) as error:
-        raise TerrainError(f"{path!r} cannot be read as LAS or LAZ: {error}.") from None
+        raise TrustboError(f"{path!r} cannot be read as LAS or LAZ: {error}.") from None
     label = np.asarray(cloud.classification, np.uint8)
     usable = ~np.isin(label, NOISE_CLASSES) & (np.asarray(cloud.withheld) == 0)
     xyz = np.column_stack([cloud.x, cloud.y, cloud.z])[usable]  # pyright: ignore[reportArgumentType, reportCallIssue]
     wrong = (xyz[:, 2] < LOWEST) | (xyz[:, 2] > HIGHEST)
     if wrong.any():
-        raise TerrainError(
+        raise TrustboError(
             f"{path!r} has {wrong.sum()} points at heights that no land has, such as "
             f"{xyz[np.argmax(wrong), 2]:g} m; classify them as noise (7), or correct the unit."
         )
     try:
         crs = cloud.header.parse_crs() or pyproj.CRS.from_user_input(given)
     except CRSError:
-        raise TerrainError(f"{path!r} has no CRS that PROJ knows; pass crs=.") from None
+        raise TrustboError(f"{path!r} has no CRS that PROJ knows; pass crs=.") from None
     if not crs.is_projected:
-        raise TerrainError(f"{path!r} is in {crs.name!r}; reproject its points to a UTM zone.")
+        raise TrustboError(f"{path!r} is in {crs.name!r}; reproject its points to a UTM zone.")
     return xyz, label[usable], crs
 
 
@@ -118,7 +118,7 @@ def _triangulated(ground: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarra
     try:
         heights = LinearNDInterpolator(places, ground[lowest, 2])(centres)
     except QhullError:
-        raise TerrainError(
+        raise TrustboError(
             "the ground points (class 2) lie on a line; they must span an area."
         ) from None
     return np.where(KDTree(places).query(centres)[0] <= GROUND_GAP, heights, np.nan)

@@ -26,7 +26,7 @@ from rasterio.vrt import WarpedVRT
 from rasterio.windows import Window
 from rioxarray.exceptions import MissingSpatialDimensionError
 
-from trustbo.errors import TerrainError, require_positive
+from trustbo.errors import TrustboError, require_positive
 from trustbo.files import FilePath
 from trustbo.terrain.heights import Coding, decoded, vertical_of, warn, warn_of_zeros
 
@@ -97,7 +97,7 @@ def read_terrain(
         `clipped_share` is the share of pixels whose surface was raised.
 
     Raises:
-        TerrainError: A source that is no raster of heights, has no place on Earth, or is too large
+        TrustboError: A source that is no raster of heights, has no place on Earth, or is too large
             for the memory; values that are no heights on land; two vertical datums; no pixel with
             both heights.
     """
@@ -109,7 +109,7 @@ def read_terrain(
         return _paired(heights, heights)
     surface = _heights(dsm, "dsm", given, resolution, nodata)
     if ground.datum and surface.datum and ground.datum != surface.datum:
-        raise TerrainError(
+        raise TrustboError(
             f"{ground.name} has heights above {ground.datum!r}, but {surface.name} above "
             f"{surface.datum!r}; transform one of them, e.g. with gdalwarp -t_srs."
         )
@@ -124,10 +124,10 @@ def read_terrain(
 def require_terrain(terrain: xr.Dataset) -> xr.Dataset:
     """Check a user's dataset of `dem` and `dsm` as `read_terrain` does, and return what it gives.
 
-    TerrainError: no `dem` or `dsm`, or what `read_terrain` refuses.
+    TrustboError: no `dem` or `dsm`, or what `read_terrain` refuses.
     """
     if not isinstance(terrain, xr.Dataset) or not {"dem", "dsm"} <= set(terrain.data_vars):
-        raise TerrainError(
+        raise TrustboError(
             "a terrain is a Dataset with dem and dsm over (y, x), as read_terrain gives it; got "
             f"{type(terrain).__name__}."
         )
@@ -164,9 +164,9 @@ def _heights(
         try:
             values = _averaged(source, own._replace(fills=fills, vertical=vertical), factor)
         except RasterioError as error:
-            raise TerrainError(f"{source.name} is damaged or out of reach: {error}.") from None
+            raise TrustboError(f"{source.name} is damaged or out of reach: {error}.") from None
     if not np.isfinite(values).any():
-        raise TerrainError(f"{source.name} is all nodata; check its nodata value.")
+        raise TrustboError(f"{source.name} is all nodata; check its nodata value.")
     warn_of_zeros(values, source.name)
     y, x = (
         axis[: len(axis) // factor * factor].reshape(-1, factor).mean(1) if factor > 1 else axis
@@ -205,15 +205,15 @@ def _factor(source: _Source, crs: pyproj.CRS, resolution: float | None) -> int:
     shape = len(source.y), len(source.x)
     size = f"{source.name} has {shape[0]} x {shape[1]} pixels"
     if min(shape) < 2:
-        raise TerrainError(f"{size}; a terrain needs at least two rows and two columns.")
+        raise TrustboError(f"{size}; a terrain needs at least two rows and two columns.")
     factor = 1
     if resolution is not None:
         side = abs(source.y[1] - source.y[0]) * (_DEGREE if crs.is_geographic else 1.0)
         factor = max(1, round(require_positive("resolution", resolution) / side))
     if min(shape) < 2 * factor:
-        raise TerrainError(f"{size}, too few to average {factor} x {factor}; lower resolution=.")
+        raise TrustboError(f"{size}, too few to average {factor} x {factor}; lower resolution=.")
     if math.prod(shape) > _MOST_PIXELS * factor**2:
-        raise TerrainError(f"{size}, too many for the memory; average them by resolution=, in m.")
+        raise TrustboError(f"{size}, too many for the memory; average them by resolution=, in m.")
     return factor
 
 
@@ -227,7 +227,7 @@ def _opened(raster: RasterLike, role: str) -> Iterator[_Source]:
         yield _of_array(raster, f"{role}: DataArray" + (f" {raster.name!r}" if raster.name else ""))
     elif isinstance(raster, DatasetReader | WarpedVRT):
         if raster.closed:
-            raise TerrainError(f"{role}: {raster.name!r} is closed; open it again.")
+            raise TrustboError(f"{role}: {raster.name!r} is closed; open it again.")
         yield _of_file(raster, f"{role}: {raster.name!r}")
     elif isinstance(raster, str | PathLike):
         path = os.fspath(raster)
@@ -236,11 +236,11 @@ def _opened(raster: RasterLike, role: str) -> Iterator[_Source]:
                 warnings.simplefilter("ignore", NotGeoreferencedWarning)
                 file = rasterio.open(path)
         except RasterioError as error:
-            raise TerrainError(f"{role}: {path!r} is no raster that GDAL reads: {error}.") from None
+            raise TrustboError(f"{role}: {path!r} is no raster that GDAL reads: {error}.") from None
         with file:
             yield _of_file(file, f"{role}: {path!r}")
     else:
-        raise TerrainError(
+        raise TrustboError(
             f"{role} must be a path, an open rasterio dataset or an xarray.DataArray; got "
             f"{type(raster).__name__}."
         )
@@ -250,21 +250,21 @@ def _of_file(file: DatasetReader | WarpedVRT, name: str) -> _Source:
     """Describe the band of heights of a GDAL dataset."""
     if not file.count:
         parts = ", ".join(file.subdatasets) or "nothing"
-        raise TerrainError(f"{name} has no band of its own; give one of its parts: {parts}.")
+        raise TrustboError(f"{name} has no band of its own; give one of its parts: {parts}.")
     colours = file.colorinterp
     alpha = [k for k, colour in enumerate(colours, 1) if colour == ColorInterp.alpha]
     bands = [k for k in range(1, file.count + 1) if k not in alpha] or [1]
     named = _band_of_heights([file.descriptions[k - 1] for k in bands])
     band = bands[named or 0]
     if (colour := colours[band - 1]) not in (ColorInterp.undefined, ColorInterp.gray):
-        raise TerrainError(
+        raise TrustboError(
             f"{name} is a picture: band {band} has the colour {colour.name!r}; give a raster of "
             "heights."
         )
     if named is None:
         _warn_of_bands(len(bands), name)
     if (dtype := file.dtypes[band - 1]).startswith("complex"):
-        raise TerrainError(f"{name} holds {dtype}, which are no heights; give real numbers.")
+        raise TrustboError(f"{name} holds {dtype}, which are no heights; give real numbers.")
     masked = MaskFlags.all_valid not in file.mask_flag_enums[band - 1]
 
     def read(rows: slice) -> tuple[np.ndarray, np.ndarray | None]:
@@ -297,17 +297,17 @@ def _axes_of(file: DatasetReader | WarpedVRT, name: str) -> tuple[np.ndarray, np
     """Y of the rows and x of the columns of a GDAL dataset."""
     t = file.transform
     if t.is_identity and (file.gcps[0] or file.rpcs):
-        raise TerrainError(
+        raise TrustboError(
             f"{name} is placed by ground control points or RPCs; warp it to a map first, e.g. with "
             "gdalwarp -t_srs EPSG:32633."
         )
     if t.is_identity:
-        raise TerrainError(
+        raise TrustboError(
             f"{name} has no georeference; add one, e.g. with gdal_translate -a_ullr -a_srs."
         )
     # Less than a thousandth of a pixel over the whole raster is rounding.
     if abs(t.b) * file.height > 1e-3 * abs(t.a) or abs(t.d) * file.width > 1e-3 * abs(t.e):
-        raise TerrainError(f"{name} is on a rotated grid; warp it first, e.g. with gdalwarp.")
+        raise TrustboError(f"{name} is on a rotated grid; warp it first, e.g. with gdalwarp.")
     rows, cols = np.arange(file.height) + 0.5, np.arange(file.width) + 0.5
     return t.f + rows * t.e, t.c + cols * t.a
 
@@ -320,12 +320,12 @@ def _of_array(array: xr.DataArray, name: str) -> _Source:
         y, x = "lat", "lon"
     bands = [dim for dim in array.dims if dim not in (y, x)]
     if not {y, x} <= set(array.dims) or len(bands) > 1 or not array.size:
-        raise TerrainError(
+        raise TrustboError(
             f"{name} has axes {dict(array.sizes)}; need rows and columns, named (y, x), and one "
             "axis of bands at most."
         )
     if not {y, x} <= set(array.coords):
-        raise TerrainError(f"{name} has no coordinates along {y} and {x}; assign them, in m.")
+        raise TrustboError(f"{name} has no coordinates along {y} and {x}; assign them, in m.")
     _warn_of_bands(max([array.sizes[dim] for dim in bands], default=1), name)
     array = array.isel(dict.fromkeys(bands, 0)).transpose(y, x)
 
@@ -354,7 +354,7 @@ def _declared_fills(array: xr.DataArray) -> tuple[float, ...]:
 
 
 def _even(values: np.ndarray, axis: Hashable, name: str) -> np.ndarray:
-    """Evenly spaced coordinates; TerrainError if they differ from even ones by over rounding.
+    """Evenly spaced coordinates; TrustboError if they differ from even ones by over rounding.
 
     Coordinates that passed through float32 are rounded to 0.5 m in the north of a UTM zone.
     """
@@ -367,7 +367,7 @@ def _even(values: np.ndarray, axis: Hashable, name: str) -> np.ndarray:
     single = (given.astype(np.float32) == given).all()
     rounding = 2.0 * np.finfo(np.float32).eps * np.abs(given).max() if single else 0.0
     if not off <= max(1e-3 * step, min(rounding, 0.5 * step)) or step == 0.0:
-        raise TerrainError(f"{name}'s {axis} is not evenly spaced; resample it to a regular grid.")
+        raise TrustboError(f"{name}'s {axis} is not evenly spaced; resample it to a regular grid.")
     return given if off <= 1e-6 * step else even
 
 
@@ -375,7 +375,7 @@ def _number(what: str, value: Any) -> float:
     try:
         return float(value)
     except (TypeError, ValueError):
-        raise TerrainError(f"{what} must be a number; got {value!r}.") from None
+        raise TrustboError(f"{what} must be a number; got {value!r}.") from None
 
 
 # --- place on Earth ---
@@ -385,17 +385,17 @@ def _known_crs(crs: Any) -> pyproj.CRS:
     try:
         return pyproj.CRS.from_user_input(crs)
     except CRSError:
-        raise TerrainError(f"crs {crs!r} is not one PROJ knows; give e.g. 'EPSG:32633'.") from None
+        raise TrustboError(f"crs {crs!r} is not one PROJ knows; give e.g. 'EPSG:32633'.") from None
 
 
 def _crs_of(source: _Source, given: pyproj.CRS | None) -> pyproj.CRS:
     """CRS of a raster, in degrees or metres; the given one if it has none of its own."""
     if source.crs is None and given is None:
-        raise TerrainError(f"{source.name} has no coordinate reference system; pass crs=.")
+        raise TrustboError(f"{source.name} has no coordinate reference system; pass crs=.")
     crs = given if source.crs is None else _known_crs(source.crs)
     assert crs is not None  # noqa: S101
     if given is not None and not crs.to_2d().equals(given.to_2d(), ignore_axis_order=True):
-        raise TerrainError(
+        raise TrustboError(
             f"{source.name} is in {crs.name!r}, but crs= is {given.name!r}; leave crs= out, or "
             "correct the raster's own CRS, e.g. with gdal_edit.py -a_srs."
         )
@@ -403,9 +403,9 @@ def _crs_of(source: _Source, given: pyproj.CRS | None) -> pyproj.CRS:
     if flat.is_geographic:
         return crs
     if not flat.is_projected:
-        raise TerrainError(f"{source.name} is in {crs.name!r}, no map of the Earth; reproject it.")
+        raise TrustboError(f"{source.name} is in {crs.name!r}, no map of the Earth; reproject it.")
     if any(abs(axis.unit_conversion_factor - 1.0) > 1e-9 for axis in flat.axis_info):
-        raise TerrainError(
+        raise TrustboError(
             f"{source.name} has a map in {flat.axis_info[0].unit_name}, not metres; warp it, e.g. "
             "with gdalwarp -t_srs EPSG:32633."
         )
@@ -421,13 +421,13 @@ def _placed(heights: xr.DataArray, name: str) -> xr.DataArray:
             return heights.assign_coords(x=x - 360.0 * round(middle / 360.0))
     else:
         if min(abs(x[1] - x[0]), abs(y[1] - y[0])) < 0.01:
-            raise TerrainError(
+            raise TrustboError(
                 f"{name} has pixels of {abs(x[1] - x[0]):.2g} m in {crs.to_string()}: its "
                 "coordinates look like degrees; correct its CRS."
             )
         if np.isfinite(_lonlat(heights)).all():
             return heights
-    raise TerrainError(
+    raise TrustboError(
         f"{name} has coordinates around ({middle:.8g}, {y[len(y) // 2]:.8g}), no place on Earth in "
         f"its CRS, {crs.to_string()}; correct the CRS."
     )
@@ -477,7 +477,7 @@ def _paired(ground: xr.DataArray, surface: xr.DataArray) -> xr.Dataset:
     dem, dsm = ground.values, surface.values
     valid = np.isfinite(dem) & np.isfinite(dsm)
     if not valid.any():
-        raise TerrainError(
+        raise TrustboError(
             "no pixel has both a DEM and a DSM height: they are of two places, or one of them is "
             "all nodata where they overlap."
         )

@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 from scipy import ndimage
 
-from trustbo.errors import TerrainError, require_positive, require_whole
+from trustbo.errors import TrustboError, require_positive, require_whole
 from trustbo.terrain.read import read_terrain
 
 _MOST_PIXELS = 1e8  # some 6 GB while it is made
@@ -37,20 +37,20 @@ def synthetic_terrain(
             zone of northern Michigan, with the terrain on the Keweenaw peninsula.
 
     Raises:
-        TerrainError: A size under 4 pixels, or a parameter out of its range.
+        TrustboError: A size under 4 pixels, or a parameter out of its range.
     """
     step = require_positive("resolution", resolution)
     height, width = (require_positive(f"size[{i}]", side) for i, side in enumerate(size))
     shape = (round(height / step), round(width / step))
     if math.prod(shape) > _MOST_PIXELS:
-        raise TerrainError(
+        raise TrustboError(
             f"size {size} m at {resolution} m is {shape[0]} x {shape[1]} pixels, more than "
             f"{_MOST_PIXELS:g}; give a larger resolution."
         )
     if min(shape) < 4:
-        raise TerrainError(f"size {size} m at {resolution} m is {shape} pixels; need 4 x 4.")
+        raise TrustboError(f"size {size} m at {resolution} m is {shape} pixels; need 4 x 4.")
     if not (0.0 < hurst <= 1.0 and 0.0 <= canopy_cover <= 1.0 and relief >= 0.0 <= canopy_height):
-        raise TerrainError(
+        raise TrustboError(
             "need hurst in (0, 1], canopy_cover in [0, 1], relief and canopy_height >= 0; got "
             f"{hurst}, {canopy_cover}, {relief}, {canopy_height}."
         )

@@ -7,7 +7,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from trustbo.arrays import as_array
-from trustbo.errors import ShapeError, TrustboError, require_choice, require_kind
+from trustbo.errors import TrustboError, require_choice, require_kind
 from trustbo.team import Team
 from trustbo.terrain import FEATURES, CompositeIndex, pixel_size
 from trustbo.terrain.features import slope
@@ -111,20 +111,20 @@ def unlabelled(
     """Array of awareness in the order of axes that `of_cells` takes, names of robots and features.
 
     A DataArray is put in order by the names of its dims, and of its moves; names that are not given
-    are its labels. ShapeError: other dims, or labels that contradict the names given.
+    are its labels. TrustboError: other dims, or labels that contradict the names given.
     """
     if not isinstance(awareness, xr.DataArray):
         return as_array("awareness", awareness), tuple(names), tuple(features)
     axes = [axis for axis in _DIMS if axis != "move" or "move" in awareness.dims]
     if set(awareness.dims) != set(axes):
-        raise ShapeError(f"awareness must have dims {_AXES}; got {awareness.dims}.")
+        raise TrustboError(f"awareness must have dims {_AXES}; got {awareness.dims}.")
     if "move" in awareness.coords:
         awareness = awareness.sel(move=list(MOVE_NAMES))
     chosen = []
     for axis, given in (("robot", names), ("feature", features)):
         labels = awareness[axis].values.astype(str).tolist() if axis in awareness.coords else []
         if labels and given and set(labels) != set(given):
-            raise ShapeError(f"awareness has labels {labels} of {axis}; got {list(given)}.")
+            raise TrustboError(f"awareness has labels {labels} of {axis}; got {list(given)}.")
         if labels and given:
             awareness = awareness.sel({axis: list(given)})
         chosen.append(tuple(given or labels))
@@ -139,14 +139,14 @@ def of_cells(
     Returns awareness of cells (robot, row, col, feature), passability (row, col), and awareness of
     bounds (robot, move, row, col, feature), or None where it is that of the cells.
 
-    ShapeError: other axes. TrustboError: a value outside [0, 1], NaN in a passable cell or in a
+    TrustboError: other axes, a value outside [0, 1], NaN in a passable cell or in a
     bound between two.
     """
     z = as_array("awareness", awareness)
     if z.ndim not in (4, 5) or (z.ndim == 5 and z.shape[1] != len(MOVES[8])):
-        raise ShapeError(f"awareness must be {_AXES}; got shape {z.shape}.")
+        raise TrustboError(f"awareness must be {_AXES}; got shape {z.shape}.")
     if not z.size:
-        raise ShapeError(
+        raise TrustboError(
             f"awareness has an axis of length 0; got shape {z.shape}. Without features, give one "
             "that is 0 everywhere."
         )
@@ -157,7 +157,7 @@ def of_cells(
     reached = finite if z.ndim == 4 else finite.any(0)
     free = reached if passable is None else np.asarray(passable, dtype=bool)
     if free.shape != z.shape[-3:-1]:
-        raise ShapeError(f"passable must be (row, col) = {z.shape[-3:-1]}; got {free.shape}.")
+        raise TrustboError(f"passable must be (row, col) = {z.shape[-3:-1]}; got {free.shape}.")
     if (free & ~reached).any():
         cell = tuple(int(i) for i in np.argwhere(free & ~reached)[0])
         raise TrustboError(

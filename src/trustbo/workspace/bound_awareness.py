@@ -37,7 +37,7 @@ def of_bounds(
 
     Of the maps of `cells` (robot, row, col, feature) under the names `features`, followed by the
     line of sight; `traversability` is the map of pixels (row, col), if there
-    is one. TerrainError: a cell without standing room
+    is one. TrustboError: a cell without standing room
     for the team.
     """
     for row, col in np.argwhere(passable).tolist():

@@ -11,7 +11,7 @@ from rasterio.transform import from_origin
 
 from trustbo.data import Cell
 from trustbo.display import Rows, Summary
-from trustbo.errors import TerrainError, TrustboError, require_pair
+from trustbo.errors import TrustboError, require_pair
 from trustbo.workspace.location import Location, cell_of, crs_name, lonlat_of
 
 MAX_MISSING = 0.5
@@ -43,14 +43,14 @@ class Grid(Summary):
         """Make the grid of a given shape that covers a terrain.
 
         Raises:
-            TerrainError: Fewer than 2 cells, or cells smaller than 2 pixels.
+            TrustboError: Fewer than 2 cells, or cells smaller than 2 pixels.
         """
         rows, cols = require_pair("shape", shape)
         pixels = terrain["dem"].shape
         if min(rows, cols) < 1 or rows * cols < 2:
-            raise TerrainError(f"shape must be (rows, cols) with at least two cells; got {shape}.")
+            raise TrustboError(f"shape must be (rows, cols) with at least two cells; got {shape}.")
         if pixels[0] < 2 * rows or pixels[1] < 2 * cols:
-            raise TerrainError(
+            raise TrustboError(
                 f"a grid of {rows} x {cols} cells needs at least 2 x 2 pixels per cell; the "
                 f"terrain has {pixels[0]} x {pixels[1]} pixels. Take a smaller shape or a finer "
                 "raster."

@@ -24,7 +24,7 @@ from scipy import ndimage
 from scipy.spatial.distance import cdist
 
 from trustbo.data import Cell
-from trustbo.errors import TerrainError
+from trustbo.errors import TrustboError
 from trustbo.team import Robot, Team
 from trustbo.workspace.grid import Grid
 from trustbo.workspace.moves import MOVES
@@ -293,10 +293,10 @@ class Posts:
         return position[near]
 
     def require_room(self, cell: Cell) -> None:
-        """Refuse a cell without a pixel for each robot: TerrainError that names cell and robot."""
+        """Refuse a cell without a pixel for each robot: TrustboError that names cell and robot."""
         n_pixels, names = len(self._pixels_of(cell)[0]), self.team.names
         if n_pixels <= len(names):
-            raise TerrainError(
+            raise TrustboError(
                 f"cell {cell} has {n_pixels} passable pixels, on which robot "
                 f"{names[max(0, n_pixels - 1)]!r} finds no post beside the lead; take larger "
                 "cells, a finer raster or fewer robots."

@@ -21,7 +21,7 @@ from trustbo.data import (
     require_map,
 )
 from trustbo.display import Rows, Summary, compiling
-from trustbo.errors import ShapeError, require_positive
+from trustbo.errors import TrustboError, require_positive
 from trustbo.stacking import fill_awareness
 from trustbo.team import Team
 from trustbo.terrain.composite import CompositeIndex
@@ -102,9 +102,9 @@ class Workspace(Summary):
             sight: Assumed model of sight; by default `Sight()`.
 
         Raises:
-            TerrainError: A grid too fine for the raster, a cell without standing room for the team,
-                or a dataset that is no terrain.
-            TrustboError: No cell is passable, or a feature has the name of the line of sight.
+            TrustboError: A grid too fine for the raster, a cell without standing room for the team,
+                or a dataset that is no terrain; no cell is passable, or a feature has the name of
+                the line of sight.
         """
         terrain = require_terrain(terrain)
         team = Team.of(team)
@@ -147,8 +147,8 @@ class Workspace(Summary):
             features: Names of the features; by default traversability, visibility, z3, ...
 
         Raises:
-            ShapeError: Axes that do not fit together.
-            TrustboError: A value outside [0, 1], NaN in a passable cell, or no passable cell.
+            TrustboError: Axes that do not fit together; a value outside [0, 1], NaN in a passable
+                cell, or no passable cell.
         """
         known = () if team is None else Team.of(team).names
         features = as_names("features", features)
@@ -156,12 +156,12 @@ class Workspace(Summary):
         z, free, bounds = of_cells(z, passable)
         team = Team(len(z), names=robots) if team is None else Team.of(team)
         if len(team.robots) != len(z):
-            raise ShapeError(f"awareness has {len(z)} robots, the team {len(team.robots)}.")
+            raise TrustboError(f"awareness has {len(z)} robots, the team {len(team.robots)}.")
         side = require_positive("cell_size", cell_size)
         grid = Grid((z.shape[1], z.shape[2]), 0.0, z.shape[1] * side, side, side)
         names = features or default_features(z.shape[3])
         if len(names) != z.shape[3]:
-            raise ShapeError(f"features must be {z.shape[3]} names; got {names}.")
+            raise TrustboError(f"features must be {z.shape[3]} names; got {names}.")
         made = cls(*labelled(z, free, grid, team, names), grid, team)
         return made if bounds is None else made.with_bounds(bounds)
 
@@ -241,8 +241,7 @@ class Workspace(Summary):
         Features with default names, z3, z4, ..., take the workspace's names at the same positions.
 
         Raises:
-            ShapeError: It has other robots or features.
-            TrustboError: It is of a log without a map.
+            TrustboError: It has other robots or features; it is of a log without a map.
         """
         require_map("a workspace", [mission])
         unnamed = default_features(len(mission.features))
