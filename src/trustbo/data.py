@@ -1,28 +1,116 @@
 """Missions of a team of robots, bound by bound."""
 
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Self
+from typing import Any, Literal, Self, get_args
 
 import numpy as np
+import pandas as pd
+import xarray as xr
 from numpy.typing import ArrayLike
 
-from trustbo.answers import levels_of
-from trustbo.arrays import as_array, as_names, in_order
-from trustbo.bound import NOWHERE, STATUSES, Bound, Cell
 from trustbo.display import Rows, Summary, joined, number
 from trustbo.errors import (
     TrustboError,
+    as_array,
+    as_names,
     require_cells,
     require_choice,
+    require_unit_interval,
     require_whole,
 )
 
+Cell = tuple[int, int]
+Status = Literal["ok", "stuck", "tipped", "timeout", "collision", "lost_contact", "aborted"]
+STATUSES: tuple[str, ...] = get_args(Status)
+NOWHERE: Cell = (-1, -1)
+"""Cell of a bound of a log without a map."""
 FEATURES = ("traversability", "visibility")
 """Names of the first two features, z1 and z2 of the paper."""
 LINE_OF_SIGHT = "line_of_sight"
 """Name of the predicted contact rate; `line_of_sight_1`, `_2`, ... where several are assumed."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Bound(Summary):
+    """Measurements of one bound, one row per overwatching robot.
+
+    Attributes:
+        cell: Planning cell entered, (row, col); `NOWHERE` in a log without a map.
+        awareness: Situational awareness, shape (robot, feature), in [0, 1], or of any finite values
+            in a log without a map; NaN where not measured.
+        contact_rate: Share of the running time in contact, shape (robot,); NaN where not measured.
+        duration: Running time of the bound, shape (robot,), s; NaN where not recorded.
+        status: Outcome of the bound, `"ok"` or the reason that ended the mission.
+        t0: Start of the bound, s since the mission's start.
+        poses: Shape (tick, 1 + robot, 3), the lead first: x and y in CRS metres, heading in rad
+            from east, anticlockwise. None where not recorded.
+        contact: Contact of each robot at each tick, shape (tick, robot). None where not recorded.
+        n_ticks: Number of ticks, shape (robot,), of which `contact_rate` is the share with contact;
+            NaN where not recorded.
+        states: Motion and sensing of each robot, shape (tick, robot, state): share of its speed on
+            level ground, pitch and roll (rad), mean range of returns (m), share of clear beams.
+            None where not recorded.
+
+    Raises:
+        TrustboError: The arrays disagree on the number of robots; a value outside [0, 1], a
+            duration that is not positive, an n_ticks below 1, a rate that is not a share of the
+            ticks, or an unknown status.
+    """
+
+    cell: Cell
+    awareness: np.ndarray
+    contact_rate: np.ndarray
+    duration: np.ndarray
+    status: str = "ok"
+    t0: float = 0.0
+    poses: np.ndarray | None = None
+    contact: np.ndarray | None = None
+    n_ticks: np.ndarray = None  # pyright: ignore[reportAssignmentType]
+    states: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("awareness", "contact_rate", "duration", "n_ticks"):
+            given = getattr(self, name)
+            values = np.full(len(self.awareness), np.nan) if given is None else given
+            object.__setattr__(self, name, as_array(name, values))
+        if self.awareness.ndim != 2 or not self.awareness.size:
+            raise TrustboError(
+                "awareness of a bound must be (robot, feature), of one robot and one feature at "
+                f"least; got shape {self.awareness.shape}. Without features, give one that is 0."
+            )
+        per_robot = self.awareness.shape[:1]
+        for name in ("contact_rate", "duration", "n_ticks"):
+            if (shape := getattr(self, name).shape) != per_robot:
+                raise TrustboError(f"{name} of a bound must be {per_robot}; got shape {shape}.")
+        require_choice("status", self.status, STATUSES)
+        mapped = self.cell != NOWHERE
+        where = f"the bound into cell {self.cell}" if mapped else "a bound of no map"
+        require_unit_interval(f"contact_rate of {where}", self.contact_rate)
+        if mapped:
+            require_unit_interval(f"awareness of {where}", self.awareness)
+        elif np.isinf(self.awareness).any():
+            raise TrustboError(f"awareness of {where} must be finite, or NaN where not measured.")
+        if (self.duration <= 0).any():
+            robot = int(np.argmax(self.duration <= 0))
+            raise TrustboError(f"duration[{robot}] = {self.duration[robot]:g} s must be positive.")
+        require_shares(self.contact_rate, self.n_ticks)
+
+    @property
+    def t1(self) -> float:
+        """End of the bound, s since the mission's start."""
+        return self.t0 + float(np.nanmax(self.duration, initial=0.0))
+
+    def _rows(self) -> Rows:
+        return [
+            ("cell", str(self.cell) if self.cell != NOWHERE else "none: no map"),
+            ("status", self.status),
+            ("contact rate", np.array2string(self.contact_rate, precision=2)),
+            ("duration", f"{np.array2string(self.duration, precision=1)} s"),
+            ("begins", number(self.t0, "s", 4)),
+        ]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -53,11 +141,9 @@ class Mission(Summary):
 
     def __post_init__(self) -> None:
         require_choice("status", self.status, STATUSES)
-        if self.scale:
-            levels_of(self.scale)
-        (self._require_path if self.path else self._require_no_map)()
+        self._require_path()
         shapes = {bound.awareness.shape for bound in self.bounds}
-        if len(shapes) != 1:
+        if len(shapes) > 1:
             raise TrustboError(f"bounds disagree on (robot, feature): {sorted(shapes)}.")
         n_robots, n_features = shapes.pop()
         names = {
@@ -70,32 +156,22 @@ class Mission(Summary):
             object.__setattr__(self, name, labels)
 
     def _require_path(self) -> None:
-        """Refuse bounds that do not fit the path."""
-        if not self.bounds or len(self.bounds) > len(self.path) - 1:
+        """Refuse bounds that do not fit the path, or enter cells where there is none."""
+        n_run, n_planned = len(self.bounds), len(self.path) - 1
+        if not n_run or (self.path and n_run > n_planned):
             raise TrustboError(
-                f"a path of {len(self.path)} cells has {len(self.path) - 1} bounds, and a mission "
-                f"at least one; got {len(self.bounds)}."
+                f"a path of {len(self.path)} cells has {max(n_planned, 0)} bounds, and a mission "
+                f"at least one; got {n_run}."
             )
-        if self.status == "ok" and len(self.bounds) < len(self.path) - 1:
+        if self.status == "ok" and n_run < n_planned:
             raise TrustboError(
-                f'status "ok" says the goal was reached, but only {len(self.bounds)} of '
-                f"{len(self.path) - 1} bounds were run; give the status it ended with."
+                f'status "ok" says the goal was reached, but only {n_run} of {n_planned} bounds '
+                "were run; give the status it ended with."
             )
         for k, bound in enumerate(self.bounds, start=1):
-            if bound.cell != self.path[k]:
-                raise TrustboError(
-                    f"bound {k} enters {bound.cell}, but the path has {self.path[k]} there."
-                )
-
-    def _require_no_map(self) -> None:
-        """Refuse bounds that enter cells in a mission without a path."""
-        if not self.bounds:
-            raise TrustboError("a mission has at least one bound; got 0.")
-        if entered := [bound.cell for bound in self.bounds if bound.cell != NOWHERE]:
-            raise TrustboError(
-                f"a bound enters {entered[0]}, but the mission has no path; give the path, or "
-                f"bounds of cell {NOWHERE}, trustbo.data.NOWHERE."
-            )
+            if bound.cell != (expected := self.path[k] if self.path else NOWHERE):
+                there = "there is no path" if expected == NOWHERE else f"the path has {expected}"
+                raise TrustboError(f"bound {k} enters {bound.cell}, but {there}.")
 
     @property
     def has_map(self) -> bool:
@@ -104,29 +180,27 @@ class Mission(Summary):
 
     def _rows(self) -> Rows:
         rates = self.contact_rate
-        measured = np.isfinite(rates)
+        n_measured = np.isfinite(rates).sum(0)
         if self.scale:
-            rows = [
-                ("trust reported", f"{measured.sum()} times, scale {self.scale}"),
+            return [
+                ("trust reported", f"{n_measured.sum()} times, scale {self.scale}"),
                 ("steps", str(len(self.bounds))),
                 ("tasks", joined(self.robots)),
                 ("inputs", joined(self.features)),
             ]
-            return rows
-        mean = f"{np.nanmean(rates):.3f}" if measured.any() else "not measured"
-        took = self.bounds[-1].t1
         ends = f"{path_text(self.path[:1])} to {path_text(self.path[-1:])}"
-        path = f"{ends}, {len(self.path) - 1} bounds planned" if self.path else "none: no map"
-        with np.errstate(all="ignore"):
-            means = np.where(measured, rates, 0.0).sum(0) / measured.sum(0)
-        rows = [
-            ("path", path),
+        planned = f"{ends}, {len(self.path) - 1} bounds planned" if self.path else "none: no map"
+        with np.errstate(invalid="ignore"):
+            means = np.nansum(rates, axis=0) / n_measured
+            mean = np.nansum(rates) / n_measured.sum()
+        took = self.bounds[-1].t1
+        return [
+            ("path", planned),
             ("outcome", f"{self.status}, {len(self.bounds)} bounds run"),
-            ("contact rate", f"{mean} on average; {(~measured).sum()} of {rates.size} missing"),
+            ("contact rate", f"{mean:.3f} on average; {np.isnan(rates).sum()} missing"),
             *((f"  {name}", f"{rate:.3f}") for name, rate in zip(self.robots, means, strict=True)),
             ("takes", number(took, "s", 4) if took > 0.0 else "not measured"),
         ]
-        return rows
 
     @classmethod
     def from_arrays(
@@ -138,14 +212,13 @@ class Mission(Summary):
         status: str = "ok",
         *,
         failed_at: int | None = None,
-        reason: str = "",
         n_ticks: ArrayLike | None = None,
         features: Sequence[str] = (),
         robots: Sequence[str] = (),
     ) -> Self:
         """Make a mission from the arrays of a log.
 
-        A mission that ended early is `from_arrays(path, z, y, failed_at=4, reason="stuck")`.
+        A mission that ended early is `from_arrays(path, z, y, status="stuck")`.
 
         Args:
             path: Planned cells, start first; None for a log without a map, whose missions have
@@ -154,9 +227,9 @@ class Mission(Summary):
             contact_rate: Shape (bound, robot), in [0, 1].
             duration: Shape (bound, robot) or (bound,), s; None where not recorded.
             status: Outcome of the mission.
-            failed_at: Number of the bound, from 1, that ended the mission. Nothing may be measured
-                after it; where the arrays end before it, nothing was measured of it.
-            reason: Outcome of that bound, by default "aborted".
+            failed_at: Number of the bound, from 1, that ended the mission; by default the last of
+                the arrays. Nothing may be measured after it; where the arrays end before it,
+                nothing was measured of it.
             n_ticks: Number of ticks, shape (bound, robot) or (bound,), of which `contact_rate` is
                 the share with contact; None where not recorded.
             features: Names of the features; by default traversability, visibility, z3, ...; a
@@ -164,52 +237,41 @@ class Mission(Summary):
             robots: Names of the robots; by default r1, r2, ...
 
         Raises:
-            TrustboError: Axes that do not fit together; a value outside [0, 1]; an unknown status
-                or reason; or `failed_at` beyond the path, more than a bound after the arrays,
-                before measurements, or together with a status.
+            TrustboError: Axes that do not fit together; a value outside [0, 1]; an unknown status;
+                or `failed_at` beyond the path, more than a bound after the arrays, before
+                measurements, or of a mission with status "ok".
         """
         labels = {"robot": robots, "feature": features}
-        awareness = in_order("awareness", awareness, ("bound", "robot", "feature"), **labels)
-        contact_rate = in_order("contact_rate", contact_rate, ("bound", "robot"), robot=robots)
-        z, y = as_array("awareness", awareness), as_array("contact_rate", contact_rate)
-        if failed_at is not None or reason:
-            n_planned = len(y) if path is None else len(path) - 1
-            last, status = _failure(failed_at, reason, status, n_planned)
-            measured = {"contact_rate": y, "duration": duration, "n_ticks": n_ticks}
-            for name, values in measured.items():
-                if values is not None:
-                    _require_none_after(last, name, as_array(name, values))
-            z, y = _until(last, z), _until(last, y)
-            duration, n_ticks = (
-                None if values is None else _until(last, as_array(name, values))
-                for name, values in (("duration", duration), ("n_ticks", n_ticks))
-            )
-        if z.ndim == 3 and z.shape[:1] == y.shape[:1] == (0,):
-            raise TrustboError(
-                "a mission has at least one bound; got 0. If the robots were stopped before "
-                'bound 1 ended, tell campaign.fail("stuck", where=cell).'
-            )
-        if z.ndim != 3 or y.shape != z.shape[:2] or not y.size:
+        z = _labelled("awareness", awareness, ("bound", "robot", "feature"), **labels)
+        y = _labelled("contact_rate", contact_rate, ("bound", "robot"), robot=robots)
+        given = {"awareness": z, "contact_rate": y, "duration": duration, "n_ticks": n_ticks}
+        arrays = {n: as_array(n, np.nan if v is None else v) for n, v in given.items()}
+        if failed_at is not None:
+            if status == "ok":
+                raise TrustboError(f'failed_at = {failed_at} needs a status, such as "stuck".')
+            last = require_whole("failed_at", failed_at, 1)
+            arrays = {name: _until(last, name, values) for name, values in arrays.items()}
+        z, y, seconds, ticks = arrays.values()
+        if z.ndim != 3 or y.shape != z.shape[:2]:
             raise TrustboError(
                 "awareness must be (bound, robot, feature) and contact_rate (bound, robot); "
                 f"got {z.shape} and {y.shape}."
             )
-        seconds, ticks = (
-            _per_robot(name, values, y.shape)
-            for name, values in (("duration", duration), ("n_ticks", n_ticks))
-        )
-        cells = () if path is None else require_cells("path", path)
-        if path is not None and not cells:
-            raise TrustboError("path is empty; give its cells, or None for a log without a map.")
-        if cells and len(y) > len(cells) - 1:
+        if not len(y):
             raise TrustboError(
-                f"{len(y)} bounds need {len(y) + 1} cells; the path has {len(cells)}."
+                "a mission has at least one bound; got 0. If the robots were stopped before "
+                'bound 1 ended, tell campaign.fail("stuck", where=cell).'
             )
-        longest = np.nanmax(np.where(np.isnan(seconds), 0.0, seconds), axis=1)
-        last, starts = len(y) - 1, np.concatenate([[0.0], np.cumsum(longest)])
-        statuses = ["ok"] * last + [status]
-        entered = cells[1:] or (NOWHERE,) * len(y)
-        measured = zip(entered, z, y, seconds, statuses, map(float, starts), ticks, strict=False)
+        seconds, ticks = _per_robot("duration", seconds, y), _per_robot("n_ticks", ticks, y)
+        cells = () if path is None else require_cells("path", path)
+        if path is not None and len(cells) <= len(y):
+            raise TrustboError(
+                f"{len(y)} bounds need a path of {len(y) + 1} cells; got {len(cells)}. Give None "
+                "for a log without a map."
+            )
+        ends = np.cumsum(np.nan_to_num(seconds).max(axis=1)).tolist()
+        entered, statuses = cells[1:] or (NOWHERE,) * len(y), ["ok"] * (len(y) - 1) + [status]
+        measured = zip(entered, z, y, seconds, statuses, [0.0, *ends], ticks, strict=False)
         bounds = tuple(Bound(*values, n_ticks=n) for *values, n in measured)
         named = as_names("features", features), as_names("robots", robots)
         return cls(cells, bounds, status, *named)
@@ -227,34 +289,27 @@ class Mission(Summary):
         Raises:
             TrustboError: It has other robots or features.
         """
-        if (tuple(robots), tuple(features)) == (self.robots, self.features):
+        names = {"robots": tuple(robots), "features": tuple(features)}
+        if names == {"robots": self.robots, "features": self.features}:
             return self
         lacks = [name for name in features if name in unmeasured and name not in self.features]
-        own_features = (*self.features, *lacks)
-        for what, names_of, wanted in (
-            ("robots", self.robots, robots),
-            ("features", own_features, features),
-        ):
-            if sorted(names_of) != sorted(wanted):
+        own = {"robots": self.robots, "features": (*self.features, *lacks)}
+        for what, wanted in names.items():
+            if sorted(own[what]) != sorted(wanted):
                 raise TrustboError(
-                    f"the mission has {what} {getattr(self, what)}, not {tuple(wanted)}; give "
-                    f"{what}= these names, or use the workspace of this team."
+                    f"the mission has {what} {getattr(self, what)}, not {wanted}; give {what}= "
+                    "these names, or use the workspace of this team."
                 )
-        i, m = (
-            [names_of.index(n) for n in names]
-            for names_of, names in ((self.robots, robots), (own_features, features))
-        )
+        i, m = ([own[what].index(name) for name in wanted] for what, wanted in names.items())
         bounds = []
         for b in self.bounds:
-            optional = {
-                "poses": None if b.poses is None else b.poses[:, [0, *(1 + j for j in i)]],
-                "contact": None if b.contact is None else b.contact[:, i],
-                "states": None if b.states is None else b.states[:, i],
-            }
-            rates = {n: getattr(b, n)[i] for n in ("contact_rate", "duration", "n_ticks")}
             z = np.pad(b.awareness, ((0, 0), (0, len(lacks))), constant_values=np.nan)
-            bounds.append(replace(b, awareness=z[np.ix_(i, m)], **rates, **optional))
-        names = {"robots": tuple(robots), "features": tuple(features)}
+            per_robot = {n: getattr(b, n)[i] for n in ("contact_rate", "duration", "n_ticks")}
+            ticks = {n: getattr(b, n) for n in ("contact", "states")}
+            per_robot |= {n: values[:, i] for n, values in ticks.items() if values is not None}
+            if b.poses is not None:
+                per_robot["poses"] = b.poses[:, [0, *(1 + j for j in i)]]
+            bounds.append(replace(b, awareness=z[np.ix_(i, m)], **per_robot))
         return replace(self, bounds=tuple(bounds), **names)
 
     # Stacked once: every refit reads these of every mission.
@@ -285,6 +340,20 @@ class Mission(Summary):
         return array
 
 
+def levels_of(scale: object) -> int:
+    """Number of levels of a scale, 0 of "unit".
+
+    TrustboError: the name is none of "unit", "likert7" and "ordinal7", with any number from 2.
+    """
+    found = re.fullmatch(r"(likert|ordinal)(\d*)", scale) if isinstance(scale, str) else None
+    if scale != "unit" and found is None:
+        raise TrustboError(
+            f'scale must be "unit", "likert7" or "ordinal7", the number being that of levels; '
+            f"got {scale!r}."
+        )
+    return 0 if found is None else require_whole("levels of a scale", int(found[2] or 7), 2)
+
+
 def require_map(what: str, missions: Iterable[Mission]) -> None:
     """Refuse missions of a log without a map: TrustboError."""
     for j, mission in enumerate(missions):
@@ -310,51 +379,63 @@ def default_features(n_features: int) -> tuple[str, ...]:
     return (*FEATURES, *(f"z{m + 1}" for m in range(2, n_features)))[:n_features]
 
 
-def _failure(failed_at: int | None, reason: str, status: str, n_bounds: int) -> tuple[int, str]:
-    """Bound in which a mission failed, from 1, and its status."""
-    if failed_at is None:
+def require_shares(rate: np.ndarray, ticks: np.ndarray) -> None:
+    """Refuse ticks that are not whole, and rates that are not a share of them; both (robot,)."""
+    if ticks.shape != rate.shape:
+        raise TrustboError(f"n_ticks of a bound must be {rate.shape}; got shape {ticks.shape}.")
+    for i in np.flatnonzero((ticks < 1.0) | (ticks != np.round(ticks)) & ~np.isnan(ticks)):
+        raise TrustboError(f"n_ticks[{i}] = {ticks[i]:g} must be a whole number of ticks.")
+    off = np.abs(rate * ticks - np.round(rate * ticks)) > 1e-6 * ticks
+    for i in np.flatnonzero(off):
         raise TrustboError(
-            f"reason={reason!r} needs failed_at=, the number of the bound, from 1, that ended the "
-            "mission."
+            f"contact_rate[{i}] = {rate[i]:g} is no share of {ticks[i]:g} ticks (n_ticks)."
         )
-    if (last := require_whole("failed_at", failed_at, 1)) > n_bounds:
-        raise TrustboError(f"failed_at = {last}, but the path has {n_bounds} bounds.")
-    if status != "ok":
-        raise TrustboError(f"status={status!r} is given beside failed_at=; give reason= instead.")
-    return last, require_choice("reason", reason or "aborted", STATUSES[1:])
 
 
-def _until(last: int, values: np.ndarray) -> np.ndarray:
-    """Rows of the first `last` bounds; NaN for the last one where the arrays end before it."""
+def _labelled(what: str, values: Any, dims: Sequence[str], **names: Sequence[str]) -> Any:
+    """Values in the order of dims, and of the names of some, where these are labelled.
+
+    Labels are the dims and coordinates of a DataArray, or the columns of a DataFrame that are
+    texts, of the last dim. TrustboError: labels that are not these names.
+    """
+    if isinstance(values, pd.DataFrame) and all(isinstance(name, str) for name in values):
+        values = xr.DataArray(values.to_numpy(), dims=dims, coords={dims[-1]: list(values)})
+    if not isinstance(values, xr.DataArray):
+        return values
+    if {*values.dims} != {*dims}:
+        raise TrustboError(f"{what} must have the dims {tuple(dims)}; got {values.dims}.")
+    for dim, given in names.items():
+        there = [str(name) for name in values[dim].values] if dim in values.coords else []
+        if there and given and sorted(there) != sorted(given):
+            raise TrustboError(f"{what} has the {dim}s {there}, not {list(given)}.")
+        if there and given:
+            values = values.isel({dim: [there.index(name) for name in given]})
+    return values.transpose(*dims)
+
+
+def _until(last: int, what: str, values: np.ndarray) -> np.ndarray:
+    """Rows of the first `last` bounds; NaN for the last one where the arrays end before it.
+
+    TrustboError: bounds before it are missing, or something was measured after it.
+    """
     if not values.ndim:
         return values
     if len(values) < last - 1:
         raise TrustboError(
-            f"failed_at = {last}, but the arrays have {len(values)} bounds; give all before it."
+            f"failed_at = {last}, but {what} has {len(values)} bounds; give all before it."
+        )
+    if what != "awareness" and np.isfinite(values[last:]).any():
+        raise TrustboError(
+            f"failed_at = {last}, but {what} has values of later bounds too; leave them out or "
+            "NaN, or give the bound that really failed."
         )
     rest = np.full((max(last - len(values), 0), *values.shape[1:]), np.nan)
     return np.concatenate([values[:last], rest])
 
 
-def _require_none_after(last: int, what: str, values: np.ndarray) -> None:
-    """Refuse measurements of bounds after the one that ended the mission: TrustboError."""
-    if not values.ndim:
-        return
-    after = np.isfinite(values[last:])
-    later = np.flatnonzero(after.any(tuple(range(1, after.ndim))))
-    if later.size:
-        raise TrustboError(
-            f"failed_at = {last}, but {what} has values of bound {last + 1 + later[0]} too; leave "
-            f"the rows after bound {last} out or NaN, or give the bound that really failed."
-        )
-
-
-def _per_robot(what: str, values: ArrayLike | None, shape: tuple[int, ...]) -> np.ndarray:
-    """Values per (bound, robot), from values per (bound, robot), per bound, or None."""
-    array = as_array(what, np.nan if values is None else values)
-    if array.ndim == 1:
-        array = array[:, None]
+def _per_robot(what: str, values: np.ndarray, rates: np.ndarray) -> np.ndarray:
+    """Values of the shape of the rates, (bound, robot), of such, or of one for each bound."""
     try:
-        return np.broadcast_to(array, shape)
+        return np.broadcast_to(values[:, None] if values.ndim == 1 else values, rates.shape)
     except ValueError:
-        raise TrustboError(f"{what} must be {shape}; got {array.shape}.") from None
+        raise TrustboError(f"{what} must be {rates.shape}; got {values.shape}.") from None

@@ -1,12 +1,12 @@
 """Errors that trustbo raises for input it refuses; each is also a ValueError."""
 
-import difflib
-import importlib.util
 import math
 import operator
-import shlex
 from collections.abc import Iterable
 from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
 
 
 class TrustboError(ValueError):
@@ -28,20 +28,6 @@ class PosteriorError(TrustboError):
     def __init__(self, reason: str, posterior: object = None, remedy: str = "") -> None:
         super().__init__(f"{reason} {remedy}".rstrip())
         self.posterior, self.reason = posterior, reason.rstrip(".")
-
-
-def pip_install(*packages: str) -> str:
-    """Command that installs packages of the registry."""
-    return shlex.join(["python", "-m", "pip", "install", *packages])
-
-
-def require_package(what: str, package: str, module: str) -> None:
-    """Refuse to go on without a package: TrustboError, such as "ROS bags need PACKAGE: REMEDY".
-
-    `what` is the beginning of the sentence, with its verb.
-    """
-    if importlib.util.find_spec(module) is None:
-        raise TrustboError(f"{what} {package}: {pip_install(package)}")
 
 
 def require_choice(what: str, value: object, choices: Iterable[str]) -> str:
@@ -113,17 +99,31 @@ def require_pair(what: str, value: object) -> tuple[int, int]:
     return first, second
 
 
-def unknown(what: str, name: str, names: Iterable[str]) -> TrustboError:
-    """Error for an unknown name, with those that may be meant."""
-    names = list(names)
-    near = difflib.get_close_matches(name, names, n=3, cutoff=0.5)
-    advice = f"did you mean {', '.join(near)}?" if near else f"choose one of {', '.join(names)}."
-    return TrustboError(f"unknown {what} {name!r}; {advice}")
+def as_array(what: str, values: ArrayLike) -> np.ndarray:
+    """Return an array of floats; TrustboError if these are no numbers."""
+    try:
+        return np.asarray(values, dtype=float)
+    except (TypeError, ValueError):
+        raise TrustboError(f"{what} must be an array of numbers; got {values!r:.60}.") from None
 
 
-def require_known(what: str, given: Iterable[object], names: Iterable[str]) -> None:
-    """Refuse the first name that is unknown, with those that may be meant: TrustboError."""
-    names = list(names)
-    for name in given:
-        if name not in names:
-            raise unknown(what, str(name)[:60], names)
+def as_names(what: str, given: Iterable[str]) -> tuple[str, ...]:
+    """Names as a tuple; TrustboError where one is no text, or repeated."""
+    listed = isinstance(given, Iterable) and not isinstance(given, str)
+    names = tuple(given) if listed else ()
+    if not listed or not all(isinstance(name, str) for name in names):
+        raise TrustboError(f"{what} must be a list of names; got {given!r:.60}.")
+    if len(set(names)) < len(names):
+        raise TrustboError(f"{what} must be distinct names; got {names}.")
+    return names
+
+
+def require_unit_interval(what: str, values: np.ndarray) -> None:
+    """Refuse values outside [0, 1], except NaN: TrustboError."""
+    bad = (values < 0.0) | (values > 1.0)
+    if bad.any():
+        index = ", ".join(str(i) for i in np.argwhere(bad)[0])
+        is_rating = np.nanmax(values) <= 10.0
+        rating = "; rating from 1 to n? (rating - 1) / (n - 1)" if is_rating else ""
+        hint = f" (percent? divide by 100{rating})" if np.nanmin(values) >= 0.0 else ""
+        raise TrustboError(f"{what}: [{index}] = {values[bad][0]:g} is outside [0, 1]{hint}.")

@@ -162,7 +162,7 @@ def test_mission_of_another_team_or_with_a_reserved_number_is_refused(workspace)
     with pytest.raises(tb.TrustboError, match="robots"):
         campaign.tell(other)
     with pytest.raises(tb.TrustboError, match="status"):
-        campaign.tell(rates(workspace, DIAGONAL), objective=1.0, status=1.0)
+        campaign.tell(rates(workspace, DIAGONAL), status=1.0)
     with pytest.raises(tb.TrustboError, match="mission"):
         campaign.tell([rates(workspace, DIAGONAL)])
     assert campaign.missions == []

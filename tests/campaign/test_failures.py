@@ -158,7 +158,7 @@ def test_result_prices_failures_as_its_campaign_does(hills):
     campaign.fail("stuck", where=campaign.ask().path[1])
     after = campaign.result()
     assert after.planner.problem.price == campaign.planner.problem.paths.shortest
-    assert after.plan.value == campaign.recommend().value < before.value
+    assert after.plan.value == campaign.recommend().value < before.plan.value
     assert before.planner.problem.price == 0.0
 
 

@@ -167,8 +167,9 @@ class State:
             "state": TOLD,
             "reason": "",
         }
-        for name in extra.keys() & {*row, *_COLUMNS, "mission", "iteration", "trust_map"}:
-            raise TrustboError(f"{name!r} is a column of the history; give it another name.")
+        for name in extra:
+            if name in {*row, *_COLUMNS, "mission", "iteration", "trust_map"}:
+                raise TrustboError(f"{name!r} is a column of the history; give it another name.")
         return row | {name: float(value) for name, value in extra.items()}
 
     def history(self) -> xr.Dataset:

@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from trustbo.answers import answer_of, levels_of
-from trustbo.data import Mission
+from trustbo.data import Mission, levels_of
 from trustbo.errors import TrustboError, require_choice, require_whole
 from trustbo.inference.draws import is_of_people, read_posterior, require_posterior
 from trustbo.inference.engine import expected
@@ -92,8 +91,8 @@ def predict_reports(
                 for name, value in found.items():
                     out[name][j, k, i] = value
     for name in ("mean", "quantile"):
-        out[name] = answer_of(out[name], levels)
-    return _dataset(answer_of(ahead.slots.y, levels), out, levels, missions[0].robots)
+        out[name] = _answer_of(out[name], levels)
+    return _dataset(_answer_of(ahead.slots.y, levels), out, levels, missions[0].robots)
 
 
 def _of_person(
@@ -193,3 +192,8 @@ def _dataset(
         attrs["mean_log_score"] = float(out["log_score"][seen].mean())
         attrs["coverage_90"] = float(((low <= report[seen]) & (report[seen] <= high)).mean())
     return xr.Dataset(variables, coords, attrs)
+
+
+def _answer_of(report: Any, levels: int) -> Any:
+    """Answers on a scale of levels, 1 to their number, of reports in [0, 1]; or these."""
+    return np.round(report * (levels - 1.0) * 1e6) / 1e6 + 1.0 if levels else report

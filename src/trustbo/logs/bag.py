@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from trustbo.data import Bound, Cell, Mission
-from trustbo.errors import TrustboError, require_package, require_pair, require_whole
+from trustbo.errors import TrustboError, require_pair, require_whole
 from trustbo.files import FilePath
 from trustbo.workspace import Workspace
 
@@ -138,9 +138,11 @@ def _messages(
     path: Path, needed: list[str], optional: list[str]
 ) -> dict[str, list[tuple[int, Any]]]:
     """Time of recording (ns) and content of each message, by topic."""
-    require_package("ROS bags need", "rosbags", "rosbags")
-    from rosbags.highlevel import AnyReader
-    from rosbags.typesys import Stores, get_typestore
+    try:
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError:
+        raise TrustboError("ROS bags need rosbags: python -m pip install rosbags") from None
 
     messages: dict[str, list[tuple[int, Any]]] = {topic: [] for topic in (*needed, *optional)}
     there = {}

@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from trustbo.answers import levels_of, report_of
-from trustbo.data import Mission
+from trustbo.data import Mission, levels_of
 from trustbo.errors import TrustboError
 from trustbo.logs.columns import Columns
 
@@ -73,7 +72,7 @@ def read_reports(
         raise TrustboError("a person or a task is blank; leave the row out.")
     k, answers = columns.numbers(step, blank=False), columns.numbers(report)
     rows = columns.frame.index
-    y = [report_of(f"row {i}: {report}", answer, levels)
+    y = [_report_of(f"row {i}: {report}", answer, levels)
          for i, answer in zip(rows, answers.tolist(), strict=True)]  # fmt: skip
     seen = _seen(columns, outcome, demand, inputs)
     every = list(dict.fromkeys(tasks))
@@ -147,3 +146,21 @@ def _mission(
         features=[*(f"task_{name}" for name in tasks), *seen], robots=tasks or ["report"],
     )  # fmt: skip
     return replace(made, scale=scale)
+
+
+def _report_of(what: str, answer: float, levels: int) -> float:
+    """Report in [0, 1] of an answer, NaN of NaN; TrustboError: it is not on the scale."""
+    if np.isnan(answer):
+        return np.nan
+    if levels:
+        if not (answer == np.round(answer) and 1 <= answer <= levels):
+            raise TrustboError(
+                f"{what} = {answer:g} is no whole number from 1 to {levels}; leave out what was "
+                "not answered."
+            )
+        return (answer - 1.0) / (levels - 1.0)
+    if not 0.0 <= answer <= 1.0:
+        hint = "; divide it by 100" if answer > 11 else ""
+        hint = '; give its scale, such as scale="likert7"' if 1 < answer <= 11 else hint
+        raise TrustboError(f"{what} = {answer:g} is outside [0, 1]{hint}.")
+    return float(answer)

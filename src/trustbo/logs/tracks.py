@@ -8,9 +8,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from trustbo.arrays import as_array
 from trustbo.data import NOWHERE, Bound, Cell, Mission
-from trustbo.errors import TrustboError, require_positive, unknown
+from trustbo.errors import TrustboError, as_array, require_choice, require_positive
 from trustbo.logs.columns import Columns, require_one_spelling, seconds_of
 from trustbo.workspace import Workspace
 
@@ -298,8 +297,7 @@ def _leads(
         rows = [(a, name, b) for a, (_, name), b
                 in zip(firsts, changes, [*firsts[1:], len(starts)], strict=True)]  # fmt: skip
     for _, name, _ in rows:
-        if name not in tracks.robots:
-            raise unknown("robot", str(name), (*tracks.robots, EACH))
+        require_choice("robot", name, tracks.robots)
     return [(tracks.robots.index(str(name)), a, b) for a, name, b in rows]
 
 

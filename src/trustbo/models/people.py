@@ -8,7 +8,7 @@ from typing import Any, NoReturn, Self, cast
 import numpy as np
 import numpyro.distributions as dist
 
-from trustbo.answers import levels_of
+from trustbo.data import levels_of
 from trustbo.display import Rows
 from trustbo.errors import TrustboError
 from trustbo.models.backend import namespace, own_settings

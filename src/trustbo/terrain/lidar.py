@@ -12,7 +12,7 @@ from scipy.interpolate import LinearNDInterpolator
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import KDTree, QhullError
 
-from trustbo.errors import TrustboError, pip_install, require_positive
+from trustbo.errors import TrustboError, require_positive
 from trustbo.files import FilePath
 from trustbo.terrain.heights import HIGHEST, LOWEST
 from trustbo.terrain.read import read_terrain
@@ -85,7 +85,7 @@ def _read_tile(path: str, given: object) -> tuple[np.ndarray, np.ndarray, pyproj
     try:
         import laspy
     except ImportError:
-        raise TrustboError(f"lidar needs laspy: {pip_install('laspy[lazrs]')}") from None
+        raise TrustboError("lidar needs laspy: python -m pip install 'laspy[lazrs]'") from None
     try:
         cloud = laspy.read(path)
     # A file cut short is a ValueError of NumPy's or a RuntimeError of lazrs'.

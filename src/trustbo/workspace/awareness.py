@@ -6,8 +6,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from trustbo.arrays import as_array
-from trustbo.errors import TrustboError, require_choice, require_kind
+from trustbo.errors import TrustboError, as_array, require_choice, require_kind
 from trustbo.team import Team
 from trustbo.terrain import FEATURES, CompositeIndex, pixel_size
 from trustbo.terrain.features import slope
