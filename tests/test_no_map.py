@@ -102,14 +102,14 @@ def test_what_needs_a_map_refuses_them_in_a_sentence(missions, posterior):
 
 def test_a_path_is_given_or_not():
     z, y = np.zeros((2, 1, 1)), np.zeros((2, 1))
-    with pytest.raises(TrustboError, match="path is empty; give its cells, or None for a log"):
+    with pytest.raises(TrustboError, match="path"):
         Mission.from_arrays([], z, y)
-    with pytest.raises(TrustboError, match="awareness of a bound of no map must be finite"):
+    with pytest.raises(TrustboError, match="awareness"):
         Mission.from_arrays(None, z + np.inf, y)
     bound = Bound((0, 1), z[0], y[0], np.ones(1))
-    with pytest.raises(TrustboError, match=r"enters \(0, 1\), but the mission has no path"):
+    with pytest.raises(TrustboError, match=r"\(0, 1\)"):
         Mission((), (bound,))
-    with pytest.raises(TrustboError, match="at least one bound; got 0"):
+    with pytest.raises(TrustboError, match="at least one"):
         Mission((), ())
     failed = Mission.from_arrays(None, z, y, failed_at=2, status="stuck")
     assert failed.status == failed.bounds[-1].status == "stuck"
