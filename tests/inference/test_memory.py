@@ -12,7 +12,6 @@ from trustbo.inference.fit import by_importance
 from trustbo.inference.memory import Memory
 from trustbo.inference.posterior import Posterior
 from trustbo.models import CoupledTrust, PlaceEffect, PooledTrust, RobotEffect, TrustParams
-from trustbo.models.params import DeviationParams, DeviationRobotParams
 
 FEATURES = ["line_of_sight", "slope"]
 
@@ -85,7 +84,9 @@ def test_models_without_one_beta0_are_refused():
 @pytest.fixture(scope="module")
 def deviations():
     """Missions whose deviations from expected trust last."""
-    return simulated(DeviationParams(0.8, np.array([0.6, 0.1]), 0.15, 0.08, 0.02), 5)
+    return simulated(
+        TrustParams(0.8, np.array([0.6, 0.1]), 0.15, 0.08, 0.02, memory="deviation"), 5
+    )
 
 
 def test_deviations_that_last_are_told_from_trust_that_does(deviations):
@@ -103,7 +104,7 @@ def test_likelihoods_are_those_of_a_chain_of_deviations(deviations):
     draws = posterior["posterior"].isel(chain=0, draw=7)
     d = posterior["robots"]["robot_effect"].values[0, 7]
     params = tb.inference.params_of(posterior)
-    assert isinstance(params, DeviationRobotParams)
+    assert params.memory == "deviation"
     noises = float(draws["delta_w"]), float(draws["delta_v"])
     for j, mission in enumerate(deviations):
         place = params.draw(7).of_places(tb.workspace.moves.bounds_along(mission.path))

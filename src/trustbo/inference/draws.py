@@ -15,12 +15,7 @@ from trustbo.inference.posterior import Draws, Posterior
 from trustbo.models.effects.effect import Effect, NextMission, Theta
 from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.model import TrustModel, require_model
-from trustbo.models.params import (
-    DeviationRobotParams,
-    Params,
-    RobotParams,
-    assemble_params,
-)
+from trustbo.models.params import Params, RobotParams, assemble_params
 from trustbo.models.people import HumanTrust
 from trustbo.models.record import effects_from_record, model_from_record
 from trustbo.models.slots import Slots
@@ -114,7 +109,7 @@ def params_of(
             "of trustbo.fit with its own names."
         )
     x0 = {name: attrs[name] for name in ("x0_mean", "x0_sd")}
-    params, memory = assemble_params(sites, x0, attrs.get("memory", "level")), attrs.get("memory")
+    params = assemble_params(sites, x0, attrs.get("memory", "level"))
     if "places" in posterior.children:
         maps = place_maps_of(posterior["places"].to_dataset(), sites)
         params = params._replace(**maps)  # pyright: ignore
@@ -137,8 +132,7 @@ def params_of(
     for effect in effects:
         weights, intercept = effect.ahead(values_of(posterior, effect), theta, mission)
         beta, fields["b"] = beta + weights, fields["b"] + intercept
-    kind = DeviationRobotParams if memory == "deviation" else RobotParams
-    return kind(beta=beta, **fields, **x0, **params.places)
+    return RobotParams(beta=beta, **fields, **x0, **params.places, memory=params.memory)
 
 
 def _coupled_ahead(

@@ -19,13 +19,7 @@ from trustbo.errors import (
 from trustbo.inference.draws import of_no_map, params_of, require_posterior, sites_of
 from trustbo.inference.importance import systematic
 from trustbo.models.families import Family, family_of
-from trustbo.models.params import (
-    CoupledParams,
-    DeviationParams,
-    DeviationRobotParams,
-    Params,
-    check_params,
-)
+from trustbo.models.params import CoupledParams, Params, check_params
 from trustbo.models.ticks import broadcast_ticks
 from trustbo.workspace.moves import bounds_along, moves_along, require_on_grid
 
@@ -60,7 +54,7 @@ class Dynamics:
         self.family, self._params, self._coupled = family, p, isinstance(p, CoupledParams)
         n, members = len(p.b), n_robots if self._coupled or delta_s is not None else 1
         self.shape = (n, n_robots // members, members)
-        self._deviates = isinstance(p, DeviationParams | DeviationRobotParams)
+        self._deviates = p.memory == "deviation"
         self._b, self._noise, one = p.b.reshape(n, -1), None, np.eye(members)
         if self._coupled:
             own = 0.5 * np.linalg.eigvalsh(p.Delta_v)[:, :1]

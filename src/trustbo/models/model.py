@@ -256,12 +256,10 @@ class TrustModel(Summary, ABC):
             )
         check_params(params, z.shape[2], z.shape[3])
         ticks = broadcast_ticks(self.family, n_ticks, z.shape[:3])
-        one = params.map(lambda value, _: np.asarray(value, dtype=float)[None])
         # The last number: else key 0 would give the stream of `default_rng(0)`, which awareness
         # may well have been drawn from.
         rng = np.random.default_rng([*np.asarray(jax.random.key_data(key)).ravel(), _STREAM])
-        drawn = draw_missions(self.family, one, z, ticks, rng)
-        return TrustSample(*(values[0] for values in drawn))
+        return draw_missions(self.family, params, z, ticks, rng)
 
     def options(self) -> dict[str, Any]:
         """Options to record, by name; priors, effects and the usual memory are left out."""

@@ -1,43 +1,194 @@
 """Parameters of the trust models as tuples of arrays, with leading axes such as (draw,)."""
 
-from collections.abc import Mapping
-from typing import Any, ClassVar, NamedTuple, cast
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 
+from trustbo.data import Cell
+from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError
-from trustbo.models.parameter_draws import PLACES, Numbers, ParameterDraws
+from trustbo.workspace.moves import bounds_along
+
+Numbers = Any
+"""A float, a NumPy array, or a JAX array or tracer."""
+PLACES: Mapping[str, tuple[str, ...]] = {
+    "place": ("effect", "row", "col"),
+    "place_bound": ("effect", "move", "row", "col"),
+}
+
+
+class ParameterDraws(Summary):
+    """Methods of parameters of every model; mixed into their tuples."""
+
+    __slots__ = ()
+
+    AXES: ClassVar[Mapping[str, tuple[str, ...]]]
+    """Axes of each field behind the leading ones; none where not listed."""
+    WEIGHTS: ClassVar[str] = "beta"
+    """Name of the field with the weights of features."""
+    BY_ROBOT: ClassVar[bool] = False
+    """Whether coefficients differ by robot; b then has the axis (robot,)."""
+    _fields: ClassVar[tuple[str, ...]]
+
+    def _rows(self) -> Rows:
+        leading = self.leading
+        rows = [("draws", f"{np.prod(leading)} draws, mean +- sd" if leading else "one draw")]
+        for name, value in self.flat().by_name.items():
+            rows.append((name, _written(value)))
+        return rows
+
+    @property
+    def by_name(self) -> dict[str, Numbers]:
+        """Numbers by name; fields that are None left out."""
+        values = {name: getattr(self, name) for name in self._fields if name != "memory"}
+        return {name: value for name, value in values.items() if value is not None}
+
+    @property
+    def leading(self) -> tuple[int, ...]:
+        """The leading axes, (draw,) or none."""
+        shape = np.shape(getattr(self, self.WEIGHTS))
+        return shape[: len(shape) - len(self.AXES[self.WEIGHTS])]
+
+    @property
+    def n_robots(self) -> int | None:
+        """Number of robots; None where all share their parameters."""
+        return np.shape(self.b)[-1] if self.BY_ROBOT else None  # pyright: ignore
+
+    @property
+    def n_features(self) -> int:
+        """Number of features."""
+        axes = self.AXES[self.WEIGHTS]
+        return np.shape(getattr(self, self.WEIGHTS))[axes.index("feature") - len(axes)]
+
+    def transition(self, n_robots: int) -> np.ndarray:
+        """B0 of equation (1), shape (..., robot, robot); diagonal where robots do not interact."""
+        beta0 = np.asarray(self.beta0, dtype=float)  # pyright: ignore
+        if not self.BY_ROBOT:
+            beta0 = beta0[..., None]
+        return np.broadcast_to(beta0, (*self.leading, n_robots))[..., None] * np.eye(n_robots)
+
+    def expected_transition(self, n_robots: int) -> np.ndarray:
+        """Matrix by which expected trust depends on that before: 0 where deviations last."""
+        B0 = self.transition(n_robots)
+        return B0 if self.memory == "level" else np.zeros_like(B0)  # pyright: ignore
+
+    def increments(self, awareness: np.ndarray) -> np.ndarray:
+        """Drift without intercept, (..., robot, move, row, col).
+
+        Awareness is (robot, move, row, col, feature), or has a leading axis (draw,) like the
+        parameters'.
+        """
+        raise NotImplementedError
+
+    @property
+    def places(self) -> dict[str, np.ndarray]:
+        """Effects of places in the model, place and place_bound, by name."""
+        effects = {name: getattr(self, name, None) for name in PLACES}
+        return {name: np.asarray(value) for name, value in effects.items() if value is not None}
+
+    def of_places(self, bounds: np.ndarray) -> np.ndarray:
+        """Effect of each bound, that of the cell entered included; shape (..., bound, effect).
+
+        Args:
+            bounds: Move, row and column of each bound (bound, 3), moves as in `MOVES[8]`; the
+                effect is 0 where the move is negative.
+        """
+        moves, rows, cols = np.asarray(bounds).T
+        total: Any = 0.0
+        if "place" in self.places:
+            total = total + self.places["place"][..., rows, cols]
+        if "place_bound" in self.places:
+            total = total + self.places["place_bound"][..., moves, rows, cols]
+        return np.swapaxes(np.where(moves < 0, 0.0, total), -1, -2)
+
+    def along(self, path: Sequence[Cell] | np.ndarray) -> Self:
+        """Parameters of the bounds of a path, as of one mission in `on`."""
+        if not self.places:
+            return self
+        return self.on(bounds_along(path)[None])
+
+    def on(self, bounds: np.ndarray | None) -> Self:
+        """Parameters of given missions: the effects of their bounds' places are in the intercept.
+
+        Args:
+            bounds: Move, row and column of each bound, (mission, bound, 3).
+
+        Returns:
+            Parameters without places, b (..., mission, bound, robot), the last axis of length 1
+            where all robots share it; the same parameters where there are no places.
+        """
+        if not self.places or bounds is None:
+            return self
+        effect = self.of_places(bounds.reshape(-1, 3))
+        effect = effect.reshape(*effect.shape[:-2], *bounds.shape[:2], effect.shape[-1])
+        b = np.asarray(self.b)  # pyright: ignore[reportAttributeAccessIssue]
+        b = b[..., None, None, :] if self.BY_ROBOT else b[..., None, None, None]
+        return self._replace(b=b + effect, place=None, place_bound=None)  # pyright: ignore
+
+    def draw(self, index: int) -> Self:
+        """One draw out of many, with its leading axis dropped."""
+        return self.map(lambda value, n: np.asarray(value)[index] if np.ndim(value) > n else value)
+
+    def mean(self) -> Self:
+        """Mean over all leading axes."""
+
+        def average(value: Numbers, n: int) -> Numbers:
+            core = np.shape(value)[np.ndim(value) - n :]
+            mean = np.asarray(value, dtype=float).reshape(-1, *core).mean(0)
+            return mean if n else float(mean)
+
+        return self.map(average)
+
+    def flat(self) -> Self:
+        """Every field with exactly one leading axis (draw,), float64."""
+        leading = self.leading
+
+        def expand(value: Numbers, n: int) -> np.ndarray:
+            core = np.shape(value)[np.ndim(value) - n :]
+            full = np.broadcast_to(np.asarray(value, dtype=float), leading + core)
+            return full.reshape(int(np.prod(leading)), *core)
+
+        return self.map(expand)
+
+    def map(self, function: Callable[[Numbers, int], Numbers]) -> Self:
+        """Apply a function to each field and the number of its trailing axes."""
+        values = {
+            name: function(value, len(self.AXES.get(name, ())))
+            for name, value in self.by_name.items()
+        }
+        return self._replace(**values)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 class _Trust(NamedTuple):
     beta0: Numbers
-    """Autoregression, shape (...,)."""
     beta: Numbers
-    """Weights, shape (..., feature)."""
     b: Numbers
-    """Intercept, shape (...,)."""
     delta_w: Numbers
-    """Standard deviation of the process noise, shape (...,)."""
     delta_v: Numbers
-    """Standard deviation of the observation noise, shape (...,)."""
     x0_mean: Numbers = 0.5
-    """Mean of trust before the first bound, shape () or (...,)."""
     x0_sd: Numbers = 0.5
-    """Its standard deviation, shape () or (...,)."""
     place: Numbers | None = None
-    """Effect of each cell entered, shape (..., effect, row, col); None: there is none. The axis
-    effect is of robots, or of length 1 where all share them."""
     place_bound: Numbers | None = None
-    """Effect of each bound, shape (..., effect, move, row, col), moves as in `workspace.MOVES[8]`;
-    None: there is none."""
+    memory: str = "level"
 
 
 class TrustParams(ParameterDraws, _Trust):
     """Parameters of the pooled model, equations (3)-(4); leading axes (...,) such as (draw,).
 
-    Fields: beta0 (...,), beta (..., feature), b (...,), delta_w (...,), delta_v (...,),
-    x0_mean and x0_sd, () or (...,), and effects of places, place (..., effect, row, col) and
-    place_bound (..., effect, move, row, col), or None.
+    Attributes:
+        beta0: Autoregression, (...,).
+        beta: Weights, (..., feature).
+        b: Intercept, (...,).
+        delta_w: Standard deviation of the process noise, (...,).
+        delta_v: Standard deviation of the observation noise, (...,).
+        x0_mean: Mean of trust before the first bound, () or (...,).
+        x0_sd: Its standard deviation, () or (...,).
+        place: Effect of each cell entered, (..., effect, row, col), or None. The axis effect is of
+            robots, or of length 1 where all share them.
+        place_bound: Effect of each bound, (..., effect, move, row, col), moves as in
+            `workspace.MOVES[8]`, or None.
+        memory: What lasts between bounds, `"level"` or `"deviation"`, see `PooledTrust`.
     """
 
     __slots__ = ()
@@ -54,8 +205,8 @@ class TrustParams(ParameterDraws, _Trust):
 class RobotParams(ParameterDraws, _Trust):
     """Parameters of robots with separate coefficients and no influence on each other.
 
-    Fields: beta0 (..., robot), beta (..., robot, feature), b, delta_w and delta_v (..., robot),
-    x0_mean, x0_sd, place and place_bound as in `TrustParams`.
+    The fields are those of `TrustParams`, with beta (..., robot, feature), and beta0, b, delta_w
+    and delta_v (..., robot).
     """
 
     __slots__ = ()
@@ -72,45 +223,6 @@ class RobotParams(ParameterDraws, _Trust):
     def increments(self, awareness: np.ndarray) -> np.ndarray:
         """See `ParameterDraws.increments`."""
         return np.einsum("...im,...idrcm->...idrc", np.asarray(self.beta, dtype=float), awareness)
-
-
-class _Deviation(ParameterDraws):
-    """Methods of parameters under which what lasts is the deviation from expected trust.
-
-    x_k = u_k + beta0 (x_{k-1} - u_{k-1}) + w_k with u_0 = E x_0: along a path, trust is carried on
-    under the drift u_k - beta0 u_{k-1}. Its expectation is u_k, without memory.
-    """
-
-    __slots__ = ()
-
-    def expected_transition(self, n_robots: int) -> np.ndarray:
-        """See `ParameterDraws.expected_transition`."""
-        return np.zeros_like(self.transition(n_robots))
-
-    def with_drift(self, awareness: np.ndarray) -> "TrustParams | RobotParams":
-        """See `ParameterDraws.with_drift`: what is carried on, with the drift as the intercept."""
-        p = cast(Any, self)
-        b, beta0 = np.asarray(p.b), p.beta0.reshape(len(p.beta0), 1, 1, -1)
-        weights = "nim" if self.BY_ROBOT else "nm"
-        u = np.einsum(f"jkim,{weights}->njki", awareness, p.beta)
-        u = u + (b if b.ndim == 4 else b.reshape(len(b), 1, 1, -1))
-        first = np.reshape(p.x0_mean, (-1, 1, 1, 1))
-        first = np.broadcast_to(first, u[:, :, :1].shape)
-        u = u - beta0 * np.concatenate([first, u[:, :, :-1]], axis=2)
-        carried = RobotParams if self.BY_ROBOT else TrustParams
-        return carried(*p._replace(beta=np.zeros_like(p.beta), b=u))
-
-
-class DeviationParams(_Deviation, TrustParams):
-    """`TrustParams` with memory of the deviation from expected trust."""
-
-    __slots__ = ()
-
-
-class DeviationRobotParams(_Deviation, RobotParams):
-    """`RobotParams` with memory of the deviation from expected trust."""
-
-    __slots__ = ()
 
 
 class _Coupled(NamedTuple):
@@ -132,6 +244,7 @@ class CoupledParams(ParameterDraws, _Coupled):
 
     __slots__ = ()
     WEIGHTS: ClassVar = "B"
+    memory: ClassVar = "level"
     BY_ROBOT: ClassVar = True
     AXES: ClassVar = {
         "B": ("feature", "robot", "robot_"),
@@ -163,50 +276,36 @@ def assemble_params(
 ) -> Params:
     """Parameters from their sites by name, with leading axis (draw,), and x0_mean and x0_sd.
 
-    `memory`: what trust carries on, see `PooledTrust`.
+    `memory`: what lasts between bounds, see `PooledTrust`.
     """
     if "B0" in sites:
         return CoupledParams(**{name: sites[name] for name in CoupledParams._fields[:5]}, **x0)
     values = {name: sites[name] for name in TrustParams._fields[:5]}
     if sites["b"].ndim == 1:
-        return (TrustParams if memory == "level" else DeviationParams)(**values, **x0)
+        return TrustParams(**values, **x0, memory=memory)
     for name in ("beta0", "delta_w", "delta_v"):  # the hierarchical model's are shared
         values[name] = np.broadcast_to(values[name][:, None], sites["b"].shape)
-    return (RobotParams if memory == "level" else DeviationRobotParams)(**values, **x0)
+    return RobotParams(**values, **x0, memory=memory)
 
 
 def check_params(params: Params, n_robots: int | None, n_features: int) -> None:
     """Refuse parameters that do not match the data; `n_robots` None leaves robots unchecked.
 
-    TrustboError: another number of robots or features, or a covariance that is not
-    symmetric and positive definite.
+    TrustboError: another number of robots or features, or a covariance that is not symmetric and
+    positive definite.
     """
-    for field, value in params.places.items():
-        if (n := value.shape[-len(PLACES[field])]) not in (1, n_robots or n):
+    n = params.n_robots if n_robots is None else n_robots
+    sizes = {"feature": {n_features}, "robot": {n}, "robot_": {n}, "effect": {1, n}}
+    for field, axes in params.AXES.items():
+        if getattr(params, field) is None:
+            continue
+        value = np.asarray(getattr(params, field))
+        ends = dict(zip(axes, value.shape[-len(axes) :], strict=False))
+        wrong = [axis for axis, size in ends.items() if size not in sizes.get(axis, {size})]
+        if len(ends) < len(axes) or (wrong and (n is not None or "feature" in wrong)):
             raise TrustboError(
-                f"params.{field} is of {n} robots, but the missions have {n_robots}."
-            )
-    name = params.WEIGHTS
-    axes, shape = params.AXES[name], np.shape(getattr(params, name))
-    if len(shape) < len(axes):
-        raise TrustboError(f"params.{name} must end in the axes {axes}; got shape {shape}.")
-    sizes = dict(zip(axes, shape[len(shape) - len(axes) :], strict=True))
-    if sizes["feature"] != n_features:
-        raise TrustboError(
-            f"params.{name} has {sizes['feature']} weights, but awareness has {n_features} "
-            "features."
-        )
-    if n_robots is not None and sizes.get("robot", n_robots) != n_robots:
-        raise TrustboError(
-            f"params.{name} is of {sizes['robot']} robots, but the missions have {n_robots}."
-        )
-    for field in params.AXES.keys() - PLACES.keys():
-        field_axes, value = params.AXES[field], np.asarray(getattr(params, field))
-        expected = tuple(sizes[axis.strip("_")] for axis in field_axes)
-        if value.shape[value.ndim - len(expected) :] != expected or value.ndim < len(expected):
-            raise TrustboError(
-                f"params.{field} must end in the axes {field_axes}, here {expected}; got shape "
-                f"{value.shape}."
+                f"params.{field} must end in the axes {axes}, of {n_features} features and "
+                f"{n or 'any'} robots; got shape {value.shape}."
             )
         if field.startswith("Delta"):
             _require_covariance(f"params.{field}", value)
@@ -221,3 +320,12 @@ def _require_covariance(name: str, value: np.ndarray) -> None:
             f"{name} must be positive definite; its smallest eigenvalue is {smallest:.3g}. Robots "
             "cannot be perfectly correlated, nor have no noise at all."
         )
+
+
+def _written(draws: np.ndarray) -> str:
+    """Text of the mean and sd over draws (draw, ...) of a field."""
+    mean, sd = draws.mean(0), draws.std(0)
+    if mean.size > 6:
+        return f"{mean.shape}, {mean.min():.3g} to {mean.max():.3g}"
+    spread = zip(np.ravel(mean), np.ravel(sd), strict=True)
+    return ", ".join(f"{m:.3g}" + (f" +- {s:.2g}" if len(draws) > 1 else "") for m, s in spread)
