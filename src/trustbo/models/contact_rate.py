@@ -54,21 +54,25 @@ class ContactRate(dist.Distribution):
     @jax.numpy_rank_promotion("allow")
     def log_prob(self, value: Array) -> Array:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Log density of each mission in nats, shape (mission,): Kalman's filter."""
-        beta0, delta_w, delta_v, x0_mean, x0_sd = self.parameters
         seen = ~jnp.isnan(value)
-        y = jnp.where(seen, value, 0.0)
+        bounds = (jnp.where(seen, value, 0.0), seen, self.drift)
+        by_bound = tuple(jnp.swapaxes(a, 0, 1) for a in bounds)
+        return lax.scan(self._filter, self._start(), by_bound)[1].sum(0)
 
-        def step(state: Any, inputs: Any) -> Any:
-            (m, P), (y, seen, u) = state, inputs
-            m, P = beta0 * m + u, beta0**2 * P + delta_w**2  # predict
-            F = P + delta_v**2
-            gain, e = jnp.where(seen, P / F, 0.0), y - m
-            log_p = jnp.where(seen, -0.5 * (e**2 / F + jnp.log(2.0 * jnp.pi * F)), 0.0)
-            return (m + gain * e, P * (1.0 - gain)), log_p  # update
+    def _start(self) -> tuple[Array, Array]:
+        """Mean and variance of trust before the first bound, each (mission, robot)."""
+        *_, x0_mean, x0_sd = self.parameters
+        shape = self.drift[:, 0].shape
+        return jnp.full(shape, x0_mean), jnp.full(shape, x0_sd**2)
 
-        start = (jnp.full(y[:, 0].shape, x) for x in (x0_mean, x0_sd**2))
-        bounds = tuple(jnp.swapaxes(a, 0, 1) for a in (y, seen, self.drift))
-        return lax.scan(step, tuple(start), bounds)[1].sum((0, 2))
+    def _filter(self, state: Any, inputs: Any) -> Any:
+        """One bound: trust after it, and the log density of its rates (mission,)."""
+        (m, P), (y, seen, u), (beta0, delta_w, delta_v, *_) = state, inputs, self.parameters
+        m, P = beta0 * m + u, beta0**2 * P + delta_w**2  # predict
+        F = P + delta_v**2
+        gain, e = jnp.where(seen, P / F, 0.0), y - m
+        log_p = jnp.where(seen, -0.5 * (e**2 / F + jnp.log(2.0 * jnp.pi * F)), 0.0)
+        return (m + gain * e, P * (1.0 - gain)), log_p.sum(1)  # update
 
     @jax.numpy_rank_promotion("allow")
     def sample(  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -76,77 +80,47 @@ class ContactRate(dist.Distribution):
     ) -> Array:
         """Contact rates, shape `(*sample_shape, mission, bound, robot)`."""
         beta0, delta_w, delta_v, x0_mean, x0_sd = self.parameters
-        shape = *sample_shape, *self.drift.shape
-        w, v, e = (random.normal(k, shape) for k in random.split(key, 3))
-        x, rates = x0_mean + x0_sd * e[..., 0, :], []
-        for k in range(self.drift.shape[1]):
-            x = beta0 * x + self.drift[:, k] + delta_w * w[..., k, :]
-            rates.append(x + delta_v * v[..., k, :])
-        return jnp.stack(rates, axis=-2)
-
-
-class CoupledContactRate(dist.Distribution):
-    """Contact rates of robots that influence each other, equations (1)-(2), trust integrated out.
-
-    x_k = B0 x_{k-1} + drift_k + w_k, y_k = x_k + v_k, with covariances Delta_w and Delta_v of w and
-    v, (robot, robot). Shapes and missing rates are as in `ContactRate`.
-    """
-
-    support = constraints.independent(constraints.real, 2)  # pyright: ignore
-    pytree_data_fields = ("drift", "parameters")
-
-    def __init__(
-        self,
-        drift: Array,
-        B0: Array,
-        Delta_w: Array,
-        Delta_v: Array,
-        x0_mean: ArrayLike = 0.5,
-        x0_sd: ArrayLike = 0.5,
-    ) -> None:
-        """Take the drift (mission, bound, robot) and the parameters."""
-        self.drift = jnp.asarray(drift)
-        self.parameters = tuple(jnp.asarray(p) for p in (B0, Delta_w, Delta_v, x0_mean, x0_sd))
-        super().__init__(self.drift.shape[:1], self.drift.shape[1:])
-
-    @jax.numpy_rank_promotion("allow")
-    def log_prob(self, value: Array) -> Array:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Log density of each mission in nats, shape (mission,): Kalman's filter."""
-        B0, Delta_w, Delta_v, x0_mean, x0_sd = self.parameters
-        n_missions, _, n = self.drift.shape
-        seen = ~jnp.isnan(value)
-        y = jnp.where(seen, value, 0.0)
-
-        def step(state: Any, inputs: Any) -> Any:
-            (m, P), (y, seen, u) = state, inputs
-            m, P = m @ B0.T + u, B0 @ P @ B0.T + Delta_w  # predict
-            both = seen[:, :, None] & seen[:, None, :]
-            F = jnp.where(both, P + Delta_v, jnp.eye(n))  # robots not measured: 1, apart
-            e = jnp.where(seen, y - m, 0.0)
-            H = jnp.where(seen[:, :, None], P, 0.0)
-            gain = jnp.swapaxes(jnp.linalg.solve(F, H), 1, 2)
-            log_p = -0.5 * (e * jnp.linalg.solve(F, e[..., None])[..., 0]).sum(1)
-            log_p -= 0.5 * (jnp.linalg.slogdet(F)[1] + seen.sum(1) * jnp.log(2.0 * jnp.pi))
-            return (m + (gain @ e[..., None])[..., 0], P - gain @ H), log_p  # update
-
-        start = (
-            jnp.full((n_missions, n), x0_mean),
-            jnp.tile(x0_sd**2 * jnp.eye(n), (n_missions, 1, 1)),
-        )
-        bounds = tuple(jnp.swapaxes(a, 0, 1) for a in (y, seen, self.drift))
-        return lax.scan(step, start, bounds)[1].sum(0)
-
-    @jax.numpy_rank_promotion("allow")
-    def sample(  # pyright: ignore[reportIncompatibleMethodOverride]
-        self, key: Array, sample_shape: tuple[int, ...] = ()
-    ) -> Array:
-        """Contact rates, shape `(*sample_shape, mission, bound, robot)`."""
-        B0, Delta_w, Delta_v, x0_mean, x0_sd = self.parameters
-        w, v = (jnp.linalg.cholesky(covariance) for covariance in (Delta_w, Delta_v))
         shape = *sample_shape, *self.drift.shape
         e_w, e_v, e = (random.normal(k, shape) for k in random.split(key, 3))
+        w, v = self._noise(delta_w, e_w), self._noise(delta_v, e_v)
         x, rates = x0_mean + x0_sd * e[..., 0, :], []
         for k in range(self.drift.shape[1]):
-            x = x @ B0.T + self.drift[:, k] + e_w[..., k, :] @ w.T
-            rates.append(x + e_v[..., k, :] @ v.T)
+            x = self._carried(beta0, x) + self.drift[:, k] + w[..., k, :]
+            rates.append(x + v[..., k, :])
         return jnp.stack(rates, axis=-2)
+
+    def _noise(self, delta: Array, white: Array) -> Array:
+        return delta * white
+
+    def _carried(self, beta0: Array, x: Array) -> Array:
+        return beta0 * x
+
+
+class CoupledContactRate(ContactRate):
+    """Contact rates of robots that influence each other, equations (1)-(2), trust integrated out.
+
+    x_k = B0 x_{k-1} + drift_k + w_k, y_k = x_k + v_k. Of the arguments of `ContactRate`, beta0 is
+    B0, and delta_w and delta_v are the covariances Delta_w and Delta_v of w and v, (robot, robot).
+    """
+
+    def _start(self) -> tuple[Array, Array]:
+        mean, var = super()._start()
+        return mean, var[:, :, None] * jnp.eye(var.shape[1])
+
+    def _filter(self, state: Any, inputs: Any) -> Any:
+        (m, P), (y, seen, u), (B0, Delta_w, Delta_v, *_) = state, inputs, self.parameters
+        m, P = m @ B0.T + u, B0 @ P @ B0.T + Delta_w  # predict
+        both = seen[:, :, None] & seen[:, None, :]
+        F = jnp.where(both, P + Delta_v, jnp.eye(m.shape[1]))  # robots not measured: 1, apart
+        e = jnp.where(seen, y - m, 0.0)
+        H = jnp.where(seen[:, :, None], P, 0.0)
+        gain = jnp.swapaxes(jnp.linalg.solve(F, H), 1, 2)
+        log_p = -0.5 * (e * jnp.linalg.solve(F, e[..., None])[..., 0]).sum(1)
+        log_p -= 0.5 * (jnp.linalg.slogdet(F)[1] + seen.sum(1) * jnp.log(2.0 * jnp.pi))
+        return (m + (gain @ e[..., None])[..., 0], P - gain @ H), log_p  # update
+
+    def _noise(self, delta: Array, white: Array) -> Array:
+        return white @ jnp.linalg.cholesky(delta).T
+
+    def _carried(self, beta0: Array, x: Array) -> Array:
+        return x @ beta0.T
