@@ -1,9 +1,9 @@
 """Priors of the trust models' parameters."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
-from functools import cache
-from typing import Any, Self, cast
+from dataclasses import dataclass, field, fields, replace
+from functools import cache, partial
+from typing import Any
 
 import numpy as np
 import numpyro.distributions as dist
@@ -11,23 +11,25 @@ from numpyro.distributions import Distribution, constraints
 
 from trustbo.data import is_line_of_sight
 from trustbo.display import Rows, Summary
-from trustbo.errors import TrustboError, require_positive
+from trustbo.errors import TrustboError, require_not_negative, require_positive
 from trustbo.models.backend import own_settings
 from trustbo.models.families import family_of
 from trustbo.models.scores import log_density
 
-_SCALES = ("delta_w", "delta_v", "delta_s", "tau")
-_NORMAL = ("beta", "b", "coupling")
+
+def _built(kind: Any, *parameters: float) -> Distribution:
+    """Distribution in our precision, on demand: importing trustbo must create no JAX array."""
+    with own_settings():
+        return kind(*parameters)
 
 
 @dataclass(frozen=True, repr=False)
 class Priors(Summary):
     """Prior of each parameter, a scalar numpyro distribution, and of trust before bound 1.
 
-    `Priors()` has the defaults: beta0 ~ Beta(2, 2), beta_m ~ N(0, 1), b ~ N(0, 0.5), delta_w and
-    delta_v ~ HalfNormal(0.2), the second argument being a standard deviation, and x_0 ~
-    N(0.5, 0.5^2), which the paper leaves open. A model ignores parameters it does not have. Weights
-    integrate out under Normal priors; those of memory and noises need quantiles (icdf).
+    The defaults are below; the second argument of a normal is a standard deviation, and the paper
+    leaves x_0 ~ N(0.5, 0.5^2) open. A model ignores parameters it does not have. Weights integrate
+    out under Normal priors; those of memory and noises need quantiles (icdf).
 
     Attributes:
         beta0: Autoregression; the diagonal of B0 in the coupled model.
@@ -39,92 +41,56 @@ class Priors(Summary):
             adds as independent noise; in the beta-binomial family, the square root of the ratio of
             excess to binomial variance (concentration delta_v^-2).
         delta_s: Standard deviation of the noise that robots share in a bound.
-        coupling: Influence of robots on each other: off-diagonals of B0 and B_m, and gamma.
+        coupling: Influence of robots on each other: off-diagonals of B0 and B_m.
         tau: Spread of the robots' coefficients in the hierarchical model.
         concentration: Concentration of the LKJ prior of noise correlations, coupled model.
         x0_mean: Mean of trust before the first bound.
         x0_sd: Its standard deviation; 0 fixes it.
-        stationary: True if `beta` and `b`, both Normal, are priors of the weights and intercept of
-            stationary trust, beta / (1 - beta0) and b / (1 - beta0), the limit under constant
-            features.
+        stationary: True if `beta` and `b` are priors of the weights and intercept of stationary
+            trust, beta / (1 - beta0) and b / (1 - beta0), the limit under constant features.
 
     Raises:
         TrustboError: A prior is no such distribution, that of a weight is not Normal, that of beta0
             not on (0, 1), a noise or tau can be negative, or `x0_sd` is negative.
     """
 
-    # Built on demand: importing trustbo must create no JAX array.
-    beta0: Distribution = None  # pyright: ignore[reportAssignmentType]
-    beta: Distribution = None  # pyright: ignore[reportAssignmentType]
-    b: Distribution = None  # pyright: ignore[reportAssignmentType]
-    delta_w: Distribution = None  # pyright: ignore[reportAssignmentType]
-    delta_v: Distribution = None  # pyright: ignore[reportAssignmentType]
-    delta_s: Distribution = None  # pyright: ignore[reportAssignmentType]
-    coupling: Distribution = None  # pyright: ignore[reportAssignmentType]
-    tau: Distribution = None  # pyright: ignore[reportAssignmentType]
+    beta0: Distribution = field(default_factory=partial(_built, dist.Beta, 2.0, 2.0))
+    beta: Distribution = field(default_factory=partial(_built, dist.Normal, 0.0, 1.0))
+    b: Distribution = field(default_factory=partial(_built, dist.Normal, 0.0, 0.5))
+    delta_w: Distribution = field(default_factory=partial(_built, dist.HalfNormal, 0.2))
+    delta_v: Distribution = field(default_factory=partial(_built, dist.HalfNormal, 0.2))
+    delta_s: Distribution = field(default_factory=partial(_built, dist.HalfNormal, 0.2))
+    coupling: Distribution = field(default_factory=partial(_built, dist.Normal, 0.0, 0.1))
+    tau: Distribution = field(default_factory=partial(_built, dist.HalfNormal, 0.3))
     concentration: float = 2.0
     x0_mean: float = 0.5
     x0_sd: float = 0.5
     stationary: bool = False
 
     def _rows(self) -> Rows:
-        return [(one.name, as_text(getattr(self, one.name))) for one in fields(self)]
+        return list(self.describe().items())
 
     def __post_init__(self) -> None:
-        with own_settings():
-            defaults = {
-                "beta0": dist.Beta(2.0, 2.0),
-                "beta": dist.Normal(0.0, 1.0),
-                "b": dist.Normal(0.0, 0.5),
-                "delta_w": dist.HalfNormal(0.2),
-                "delta_v": dist.HalfNormal(0.2),
-                "delta_s": dist.HalfNormal(0.2),
-                "coupling": dist.Normal(0.0, 0.1),
-                "tau": dist.HalfNormal(0.3),
-            }
-        for name, default in defaults.items():
+        for name in (one.name for one in fields(self) if one.type is Distribution):
             prior = getattr(self, name)
-            if prior is None:
-                object.__setattr__(self, name, default)
-                continue
-            scalar = isinstance(prior, Distribution) and not prior.event_shape
-            if not scalar or len(prior.batch_shape) > (name == "beta"):
-                raise TrustboError(
-                    f"Priors.{name} must be a scalar numpyro distribution, e.g. "
-                    f"numpyro.distributions.{as_text(default)}; got {prior!r}."
-                )
-            if name in _SCALES and not _is_positive(prior):
-                raise TrustboError(
-                    f"Priors.{name} is a standard deviation: its prior must live on (0, inf) or "
-                    f"part of it, e.g. numpyro.distributions.{as_text(default)}; got {prior!r}."
-                )
+            if wanted := _wanted(name, prior):
+                raise TrustboError(f"the prior of Priors.{name} must be {wanted}; got {prior!r}.")
         require_positive("Priors.concentration", self.concentration)
+        require_not_negative("Priors.x0_sd", self.x0_sd)
         if not np.isfinite(self.x0_mean):
             raise TrustboError(f"Priors.x0_mean must be finite; got {self.x0_mean!r}.")
-        if not 0.0 <= self.x0_sd < np.inf:
-            raise TrustboError(f"Priors.x0_sd must be finite, not negative; got {self.x0_sd!r}.")
-        for name in _NORMAL:
-            if not isinstance(prior := getattr(self, name), dist.Normal):
-                raise TrustboError(
-                    f"Priors.{name} must be Normal, so that it integrates out; got {prior!r}. "
-                    "Sample a model of your own with NumPyro for another, see models.ContactRate."
-                )
-        if self.beta0.support is not constraints.unit_interval:
-            raise TrustboError(
-                f"Priors.beta0 must live on (0, 1), e.g. Beta(2.0, 2.0); got {self.beta0!r}."
-            )
 
     @classmethod
-    def default(cls, observation: str = "gaussian") -> Self:
+    def default(cls, observation: str = "gaussian") -> "Priors":
         """Default priors of a family of observations, one cached object.
 
         Counts (`"beta_binomial"`) have wider ones, as trust is a logit: beta_m ~ N(0, 2),
         b ~ N(0, 1), delta_w ~ HalfNormal(0.5), x_0 ~ N(0, 1.5^2).
         """
-        return cast(Self, _default(observation))
+        return _of_family(observation)
 
     @classmethod
-    def of(cls, features: Sequence[str], observation: str = "gaussian") -> Self:
+    def of(cls, features: Sequence[str], observation: str = "gaussian") -> "Priors":
         """Default priors for features of these names.
 
         `line_of_sight` is a predicted contact rate: stationary trust has slope 1 in it, or in the
@@ -147,20 +113,18 @@ class Priors(Summary):
                 stationary=True,
             )
 
+    def moments(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Mean and sd of the Normal prior of that name."""
+        prior: Any = getattr(self, name)
+        return np.asarray(prior.loc, dtype=float), np.asarray(prior.scale, dtype=float)
+
     def coefficients(self, n_features: int) -> tuple[np.ndarray, np.ndarray]:
         """Means and sds of the weights and, last, the intercept, each (feature + 1,)."""
-        beta, b = (_moments(prior) for prior in (self.beta, self.b))
         mean, sd = (
             np.append(np.broadcast_to(of_beta, n_features), of_b)
-            for of_beta, of_b in zip(beta, b, strict=True)
+            for of_beta, of_b in zip(self.moments("beta"), self.moments("b"), strict=True)
         )
         return mean, sd
-
-    @property
-    def coupling_moments(self) -> tuple[float, float]:
-        """Mean and sd of the influence of robots on each other."""
-        mean, sd = _moments(self.coupling)
-        return float(mean), float(sd)
 
     def log_density(self, name: str, values: np.ndarray, rest: np.ndarray) -> np.ndarray:
         """Log density of the prior of that name at values of a parameter, one for each of them.
@@ -178,18 +142,30 @@ class Priors(Summary):
 
     def describe(self) -> dict[str, str]:
         """Each prior as text, for the record kept with a result."""
-        named = {f.name: getattr(self, f.name) for f in fields(self)}
-        if not named.pop("stationary"):
-            return {name: as_text(value) for name, value in named.items()}
-        return {name: as_text(value) for name, value in named.items()} | {"stationary": "True"}
+        return {one.name: _as_text(getattr(self, one.name)) for one in fields(self)}
 
 
 @cache
-def _default(observation: str) -> Priors:
+def _of_family(observation: str) -> Priors:
     return Priors(**family_of(observation).priors())
 
 
-def as_text(prior: Distribution | float) -> str:
+def _wanted(name: str, prior: Any) -> str:
+    """Text of what a prior of that name must be, empty where it is."""
+    if not isinstance(prior, Distribution) or len(prior.shape()) > (name == "beta"):
+        return "a scalar numpyro distribution, e.g. Normal(0.0, 1.0)"
+    if name in ("beta", "b", "coupling"):
+        wanted, good = "Normal, so that it integrates out", isinstance(prior, dist.Normal)
+        wanted += " (for another, write a NumPyro model of your own, see models.ContactRate)"
+    elif name == "beta0":
+        wanted, good = "on (0, 1), e.g. Beta(2.0, 2.0)", prior.support is constraints.unit_interval
+    else:
+        wanted = "positive, e.g. HalfNormal(0.2), as it is of a standard deviation"
+        good = np.all(np.asarray(getattr(prior.support, "lower_bound", -np.inf)) >= 0.0)
+    return "" if good else wanted
+
+
+def _as_text(prior: Distribution | float) -> str:
     """Distribution or number as text."""
     if isinstance(prior, bool):
         return "yes" if prior else "no"
@@ -199,18 +175,6 @@ def as_text(prior: Distribution | float) -> str:
     return f"{type(prior).__name__}({numbers})"
 
 
-def _moments(prior: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and sd of a Normal prior."""
-    return np.asarray(prior.loc, dtype=float), np.asarray(prior.scale, dtype=float)
-
-
 def _numbers(values: object) -> str:
     array = np.asarray(values, dtype=float)
     return f"{array:g}" if not array.ndim else f"[{', '.join(f'{v:g}' for v in array)}]"
-
-
-def _is_positive(prior: Distribution) -> bool:
-    support = prior.support
-    if support is constraints.positive or support is constraints.unit_interval:
-        return True
-    return bool((np.asarray(getattr(support, "lower_bound", -np.inf)) >= 0.0).all())

@@ -106,7 +106,7 @@ class CoupledWeights(Weights):
         own = np.repeat(np.eye(n, dtype=bool), n_features, axis=1)
         own = np.column_stack([own, np.ones(n, dtype=bool)])  # (robot, input)
         feature = np.append(np.tile(np.arange(n_features), n), n_features)
-        coupling = self.priors.coupling_moments
+        coupling = self.priors.moments("coupling")
         xp, rest = namespace(theta["rest"]), theta["rest"][..., None]
         rest = rest if self.priors.stationary else 0.0 * rest + 1.0
         means = xp.where(own, rest * mean[feature], coupling[0])
