@@ -71,14 +71,13 @@ def test_a_rate_that_was_not_measured_teaches_nothing(name):
     np.testing.assert_allclose(np.ravel(ALL[name].match(*none)), [0.0, 0.3, 0.2])
 
 
-@pytest.mark.parametrize("name", ALL)
-def test_drawn_rates_have_the_moments_that_plans_take(name):
+@pytest.mark.parametrize("name", FAMILIES)
+def test_drawn_rates_have_the_mean_that_plans_take(name):
     family, n = ALL[name], 100_000
     trust, sd = np.full(n, 0.45), np.full(n, 0.2)
     rates = family.sample(trust, sd, np.full(n, 200.0), np.random.default_rng(1))
-    mean, _, var = (float(x[0]) for x in family.rate_moments(trust[:1], sd[:1]))
-    assert abs(rates.mean() - mean) < 5.0 * np.sqrt(var / n)
-    np.testing.assert_allclose(rates.var(), var, rtol=0.03)
+    mean = float(family.mean_rate(trust[:1], sd[:1])[0])
+    assert abs(rates.mean() - mean) < 5.0 * rates.std() / np.sqrt(n)
 
 
 @pytest.mark.parametrize("name", ALL)

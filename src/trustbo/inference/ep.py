@@ -21,7 +21,8 @@ from trustbo.inference.engine import (
     marginals,
     whiten,
 )
-from trustbo.models.families.family import Family, log_normal
+from trustbo.models.families import Family
+from trustbo.models.families.moments import log_normal
 from trustbo.models.signal import Signal, each
 
 _LEAST = 1e-9  # precision of a cavity or a site
@@ -38,7 +39,7 @@ class Terms(NamedTuple):
     @property
     def linear(self) -> np.ndarray:
         """Observations whose sites are exact, (block, row)."""
-        return ~np.isnan(self.y) & self.family.is_linear(self.y)
+        return ~np.isnan(self.y) & self.family.is_density(self.y)
 
 
 class Sites(NamedTuple):

@@ -21,6 +21,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy import special
 
 with warnings.catch_warnings():
     warnings.filterwarnings("ignore", "IProgress not found")
@@ -42,6 +43,11 @@ for _name, _module in list(sys.modules.items()):
 def namespace(x: Any) -> ModuleType:
     """`jax.numpy` for arrays of JAX, else NumPy: formulas written once serve both."""
     return jnp if isinstance(x, jax.Array) else np
+
+
+def special_functions(x: Any) -> Any:
+    """`jax.scipy.special` for arrays of JAX, else SciPy's."""
+    return jax.scipy.special if isinstance(x, jax.Array) else special
 
 
 @partial(jax.jit, static_argnums=1)

@@ -139,7 +139,7 @@ def score_of(
         toll: Sum of the tolls of the path.
     """
     if objective.of_contact:
-        lost = 1.0 - family.rate_moments(trust, noise_sd[..., None])[0]
+        lost = 1.0 - family.mean_rate(trust, noise_sd[..., None])
         return -lost.sum(-1) - toll
     n_bounds = trust.shape[-1]
     credit = objective.credit(np.arange(n_bounds))[::-1]

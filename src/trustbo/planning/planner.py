@@ -306,7 +306,7 @@ class Planner(Summary):
             return np.broadcast_to(values, bounds.shape)[bounds]
 
         toll, settled = of_bounds(problem.toll), of_bounds(dynamics.settled())
-        rate = problem.family.rate_moments(of_bounds(contact.settled()), dynamics.noise_sd)[0]
+        rate = problem.family.mean_rate(of_bounds(contact.settled()), dynamics.noise_sd)
         values = {
             "length": of_bounds(problem.paths.lengths[:, None, None]),
             "drift": of_bounds(dynamics.drift.mean(0)),

@@ -1,31 +1,31 @@
 """The protocol of a family of observations: rates given a signal, and a signal given rates.
 
 A signal f is trust with the noise that rates share. A new family is a file with a subclass of
-`Family`, and a row in `families/__init__`; `match` of a density without a closed form takes
-`match_by_nodes`.
+`Family` and a row in `families/__init__`; `moments` has what its methods need.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy import ndarray
 from numpy.random import Generator
-from scipy import special
 
-from trustbo.models.backend import namespace
-
-Moments = tuple[ndarray, ndarray, ndarray]
-_NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(9)
-_LOG_WEIGHTS = np.log(_WEIGHTS / _WEIGHTS.sum())
-_STEP = 0.05  # of differences in a search for the mode
+Array = Any
+"""An array of NumPy; in `log_prob` also of JAX."""
+Moments = Any
+"""Log mass, mean and variance, each an array."""
+Drawn = tuple[Array, Array]
+"""Draws of the signal, and their log weights."""
 
 
 @dataclass(frozen=True)
 class Family(ABC):
-    """A family of observations. All arrays broadcast; `delta_v` is the sd of the noise."""
+    """A family of observations.
+
+    Arguments of all methods are arrays that broadcast: rates y, their numbers of ticks N, and the
+    sd of the observation noise, delta_v. `_match` and `_draw` get measured rates of one shape.
+    """
 
     name: ClassVar[str]
     """Name that users give."""
@@ -38,167 +38,65 @@ class Family(ABC):
     correlates: ClassVar[bool] = True
     """Whether observation noise may be correlated between robots."""
     expected_rate: ClassVar[str] = "identity"
-    """Form of E[rate | trust] in compiled planning: `"identity"` (trust itself), `"logistic"`, or
-    `"clipped"` (of a normal with sd delta_v, cut to [0, 1]); the mean of `rate_moments`."""
+    """Form of `mean_rate` in compiled planning: `"identity"` (trust itself), `"logistic"`, or
+    `"clipped"` (of a normal with sd delta_v, cut to [0, 1])."""
+    line_of_sight: ClassVar[tuple[float, float]] = 1.0, 0.0
+    """Slope and zero of the map from line of sight to trust: trust = slope (sight - zero)."""
 
     @abstractmethod
-    def sample(self, trust: ndarray, delta_v: ndarray, n_ticks: ndarray, rng: Generator) -> ndarray:
-        """Rates given the signal."""
+    def sample(self, trust: Array, sd: Array, N: Array, rng: Generator) -> Array:
+        """Rates drawn given the signal."""
 
     @abstractmethod
-    def log_prob(self, y: Any, n_ticks: Any, trust: Any, delta_v: Any) -> Any:
+    def log_prob(self, y: Array, N: Array, trust: Array, sd: Array) -> Array:
         """Log density or probability of measured rates given the signal, in NumPy or JAX."""
 
     @abstractmethod
-    def match(
-        self, y: ndarray, n_ticks: ndarray, m: ndarray, v: ndarray, delta_v: ndarray
-    ) -> Moments:
-        """Log mass, mean and variance of N(f; m, v) times the term of a rate.
-
-        Where y is NaN these are 0, m and v.
-        """
+    def _match(self, y: Array, N: Array, m: Array, v: Array, sd: Array) -> Moments:
+        """Log mass, mean and variance of N(f; m, v) times the term of a rate."""
 
     @abstractmethod
-    def draw(
-        self,
-        y: ndarray,
-        n_ticks: ndarray,
-        m: ndarray,
-        v: ndarray,
-        delta_v: ndarray,
-        rng: Generator,
-    ) -> tuple[ndarray, ndarray]:
+    def _draw(self, y: Array, N: Array, m: Array, v: Array, sd: Array, rng: Generator) -> Drawn:
         """A draw of the signal from N(f; m, v) times the term of a rate, and its log weight.
 
         The mean weight is the mass; it does not vary where the draw is exact.
         """
 
-    @abstractmethod
-    def probabilities(
-        self, trust: ndarray, noise_sd: ndarray, y: ndarray, n_ticks: ndarray
-    ) -> tuple[ndarray, ndarray]:
-        """Probabilities of a rate below y, and of one up to y, given trust."""
+    def mean_rate(self, trust: Array, sd: Array) -> Array:
+        """Mean of a rate given trust, for plans."""
+        return trust
 
-    @abstractmethod
-    def rate_moments(self, trust: ndarray, noise_sd: ndarray) -> Moments:
-        """Mean of a rate given trust, its slope in trust, and the variance of the rate.
-
-        For counts, the number of ticks is that of a rate recorded to .005.
-        """
-
-    def is_density(self, y: ndarray) -> ndarray:
-        """Mask of the measured rates that have a density, not a probability."""
+    def is_density(self, y: Array) -> Array:
+        """Mask of the measured rates that have a density: they are the signal plus normal noise."""
         return np.zeros(y.shape, dtype=bool)
-
-    def is_linear(self, y: ndarray) -> ndarray:
-        """Mask of the measured rates that are the signal plus normal noise."""
-        return self.is_density(y)
-
-    @property
-    def line_of_sight(self) -> tuple[float, float]:
-        """Slope and zero of the map from line of sight to trust: trust = slope (sight - zero)."""
-        return 1.0, 0.0
 
     def priors(self) -> dict[str, Any]:
         """Default priors that differ from those of `Priors()`, by name."""
         return {}
 
-    def log_resolution(self, y: ndarray, n_ticks: ndarray) -> ndarray:
+    def match(self, y: Array, N: Array, m: Array, v: Array, sd: Array) -> Moments:
+        """Moments of N(f; m, v) times the term of a rate; 0, m and v where y is NaN."""
+        seen, arrays = _measured(y, N, m, v, sd)
+        one, mean, var = self._match(*arrays)
+        return np.where(seen, one, 0.0), np.where(seen, mean, m), np.where(seen, var, v)
+
+    def draw(self, y: Array, N: Array, m: Array, v: Array, sd: Array, rng: Generator) -> Drawn:
+        """Draws of signals given measured rates, see `_draw`; arbitrary ones where y is NaN."""
+        _, (y, N, m, v, sd) = _measured(y, N, m, v, sd)
+        return self._draw(y, N, m, v, sd, rng)
+
+    def log_resolution(self, y: Array, N: Array) -> Array:
         """Log ratio of the probability of a count of ticks to the density of its rate.
 
         A density covers 1/N per tick. Shape of `y`; 0 where not measured or where the rate itself
         has a probability, NaN where the number of ticks is unknown.
         """
         is_density = ~np.isnan(y) & self.is_density(y)
-        return np.where(is_density, -np.log(np.where(is_density, n_ticks, 1.0)), 0.0)
+        return np.where(is_density, -np.log(np.where(is_density, N, 1.0)), 0.0)
 
 
-def log_normal(e: Any, variance: Any) -> Any:
-    """Log density of N(0, variance) at e."""
-    return -0.5 * (e**2 / variance + namespace(variance).log(2.0 * np.pi * variance))
-
-
-def match_interval(low: ndarray, high: ndarray, m: ndarray, v: ndarray, noise: ndarray) -> Moments:
-    """Moments of N(f; m, v) where f plus normal noise lies between two numbers."""
-    total = v + noise**2
-    sd = np.sqrt(total)
-    log_p, e, spread = truncated(*((end - m) / sd for end in (low, high)))
-    return log_p, m + v / sd * e, v - v**2 / total * (1.0 - spread)
-
-
-def truncated(a: ndarray, b: ndarray) -> Moments:
-    """Log probability, mean and variance of a standard normal between a and b."""
-    mirror = a > -b  # the lower tail is the accurate one
-    a, b = np.where(mirror, -b, a), np.where(mirror, -a, b)
-    log_p = log_between(a, b)
-    with np.errstate(invalid="ignore"):
-        at_a, at_b = (np.exp(-0.5 * x**2 - 0.5 * np.log(2.0 * np.pi) - log_p) for x in (a, b))
-        slope = np.where(np.isfinite(a), a, 0.0) * at_a - np.where(np.isfinite(b), b, 0.0) * at_b
-    mean = at_a - at_b
-    return log_p, np.where(mirror, -mean, mean), np.clip(1.0 + slope - mean**2, 0.0, 1.0)
-
-
-def log_between(a: ndarray, b: ndarray) -> ndarray:
-    """Log of Phi(b) - Phi(a), for a + b <= 0."""
-    with np.errstate(divide="ignore"):
-        log_b = special.log_ndtr(b)
-        gap = np.minimum(special.log_ndtr(a) - log_b, -1e-300)
-        return log_b + np.log(-np.expm1(gap))
-
-
-def draw_between(a: ndarray, b: ndarray, rng: Generator) -> ndarray:
-    """Standard normal draws between a and b."""
-    mirror = a > -b
-    a, b = np.where(mirror, -b, a), np.where(mirror, -a, b)
-    with np.errstate(divide="ignore"):
-        log_b = special.log_ndtr(b)
-        below = np.exp(np.minimum(special.log_ndtr(a) - log_b, 0.0))
-        share = rng.random(np.broadcast(a, b).shape)
-        z = special.ndtri_exp(log_b + np.log(below + (1.0 - below) * share))
-    z = np.clip(z, a, b)
-    return np.where(mirror, -z, z)
-
-
-def draw_between_knots(knots: ndarray, log_f: ndarray, rng: Generator) -> tuple[ndarray, ndarray]:
-    """Draws from a density that is log-linear between knots (..., knot), and their log density."""
-    width, rise = np.diff(knots), np.diff(log_f)
-    flat = np.abs(rise) < 1e-9
-    slope = np.where(flat, 1.0, rise)
-    log_mass = log_f[..., :-1] + np.log(width)
-    log_mass = log_mass + np.where(flat, 0.0, np.log(np.expm1(slope) / slope))
-    piece = np.argmax(log_mass + rng.gumbel(size=log_mass.shape), axis=-1)[..., None]
-    start, width, slope, low = (
-        np.take_along_axis(a, piece, axis=-1)[..., 0] for a in (knots, width, rise, log_f)
-    )
-    u, flat = rng.random(start.shape), np.abs(slope) < 1e-9
-    steep = np.where(flat, 1.0, slope)
-    share = np.where(flat, u, np.log1p(u * np.expm1(steep)) / steep)
-    log_total = special.logsumexp(log_mass, axis=-1)
-    return start + share * width, low + share * slope - log_total
-
-
-def match_by_nodes(
-    log_prob: Callable[[ndarray], ndarray], start: ndarray, m: ndarray, v: ndarray
-) -> Moments:
-    """Moments of N(f; m, v) times a term, by Gauss-Hermite nodes around the mode.
-
-    Args:
-        log_prob: Log of the term at nodes (..., node).
-        start: Start of the search for the mode, of the shape of the arrays.
-        m: Means.
-        v: Variances.
-    """
-    x, q = np.array(start), 1.0 / v
-    for _ in range(3):
-        low, middle, high = np.moveaxis(log_prob(x[..., None] + _STEP * np.arange(-1, 2)), -1, 0)
-        q = 1.0 / v - np.minimum((high - 2.0 * middle + low) / _STEP**2, 0.0)
-        x = x + np.clip(((high - low) / (2.0 * _STEP) - (x - m) / v) / q, -2.0, 2.0)
-    sd = 1.1 / np.sqrt(q)
-    node = x[..., None] + sd[..., None] * _NODES
-    log_f = log_prob(node) - 0.5 * (node - m[..., None]) ** 2 / v[..., None]
-    log_f += _LOG_WEIGHTS + 0.5 * _NODES**2
-    log_mass = special.logsumexp(log_f, axis=-1)
-    weight = np.exp(log_f - log_mass[..., None])  # pyright: ignore[reportArgumentType, reportCallIssue]
-    mean = (weight * node).sum(-1)
-    var = (weight * (node - mean[..., None]) ** 2).sum(-1)
-    return log_mass + np.log(sd / np.sqrt(v)), mean, np.maximum(var, 1e-9)
+def _measured(y: Array, N: Array, *others: Array) -> tuple[Array, list[Array]]:
+    """Mask of the measured rates, and arrays of one shape with stand-ins for the other rates."""
+    y, N, *others = np.broadcast_arrays(y, N, *others)  # pyright: ignore[reportAssignmentType]
+    seen = ~np.isnan(y)
+    return seen, [np.where(seen, y, 0.5), np.where(N > 0.0, N, 1.0), *others]

@@ -1,0 +1,102 @@
+"""Moments and draws of a normal signal times the term of a rate, which families share."""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy import ndarray
+from numpy.random import Generator
+from scipy import special
+
+from trustbo.models.backend import namespace
+from trustbo.models.families.family import Array, Drawn, Moments
+
+_NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(9)
+_LOG_WEIGHTS = np.log(_WEIGHTS / _WEIGHTS.sum())
+_STEP = 0.05  # of differences in a search for the mode
+
+
+def log_normal(e: Array, variance: Array) -> Array:
+    """Log density of N(0, variance) at e."""
+    return -0.5 * (e**2 / variance + namespace(variance).log(2.0 * np.pi * variance))
+
+
+def match_interval(low: ndarray, high: ndarray, m: ndarray, v: ndarray, noise: ndarray) -> Moments:
+    """Moments of N(f; m, v) where f plus normal noise lies between two numbers."""
+    total = v + noise**2
+    sd = np.sqrt(total)
+    log_p, e, spread = truncated(*((end - m) / sd for end in (low, high)))
+    return log_p, m + v / sd * e, v - v**2 / total * (1.0 - spread)
+
+
+def truncated(a: ndarray, b: ndarray) -> Moments:
+    """Log probability, mean and variance of a standard normal between a and b."""
+    mirror = a > -b  # the lower tail is the accurate one
+    a, b = np.where(mirror, -b, a), np.where(mirror, -a, b)
+    log_p = log_between(a, b)
+    with np.errstate(invalid="ignore"):
+        at_a, at_b = (np.exp(-0.5 * x**2 - 0.5 * np.log(2.0 * np.pi) - log_p) for x in (a, b))
+        slope = np.where(np.isfinite(a), a, 0.0) * at_a - np.where(np.isfinite(b), b, 0.0) * at_b
+    mean = at_a - at_b
+    return log_p, np.where(mirror, -mean, mean), np.clip(1.0 + slope - mean**2, 0.0, 1.0)
+
+
+def log_between(a: ndarray, b: ndarray) -> ndarray:
+    """Log of Phi(b) - Phi(a), for a + b <= 0."""
+    with np.errstate(divide="ignore"):
+        log_b = special.log_ndtr(b)
+        gap = np.minimum(special.log_ndtr(a) - log_b, -1e-300)
+        return log_b + np.log(-np.expm1(gap))
+
+
+def draw_between(a: ndarray, b: ndarray, rng: Generator) -> ndarray:
+    """Standard normal draws between a and b."""
+    mirror = a > -b
+    a, b = np.where(mirror, -b, a), np.where(mirror, -a, b)
+    with np.errstate(divide="ignore"):
+        log_b = special.log_ndtr(b)
+        below = np.exp(np.minimum(special.log_ndtr(a) - log_b, 0.0))
+        share = rng.random(np.broadcast(a, b).shape)
+        z = special.ndtri_exp(log_b + np.log(below + (1.0 - below) * share))
+    z = np.clip(z, a, b)
+    return np.where(mirror, -z, z)
+
+
+def draw_between_knots(knots: ndarray, log_f: ndarray, rng: Generator) -> Drawn:
+    """Draws from a density that is log-linear between knots (..., knot), and their log density."""
+    width, rise = np.diff(knots), np.diff(log_f)
+    rise = np.where(np.abs(rise) < 1e-9, 1e-9, rise)
+    log_mass = log_f[..., :-1] + np.log(width) + np.log(np.expm1(rise) / rise)
+    piece = np.argmax(log_mass + rng.gumbel(size=log_mass.shape), axis=-1)[..., None]
+    start, width, slope, low = (
+        np.take_along_axis(a, piece, axis=-1)[..., 0] for a in (knots, width, rise, log_f)
+    )
+    share = np.log1p(rng.random(start.shape) * np.expm1(slope)) / slope
+    log_total = special.logsumexp(log_mass, axis=-1)
+    return start + share * width, low + share * slope - log_total
+
+
+def match_by_nodes(
+    log_prob: Callable[[ndarray], ndarray], start: ndarray, m: ndarray, v: ndarray
+) -> Moments:
+    """Moments of N(f; m, v) times a term, by Gauss-Hermite nodes around the mode.
+
+    Args:
+        log_prob: Log of the term at nodes (..., node).
+        start: Start of the search for the mode, of the shape of the arrays.
+        m: Means.
+        v: Variances.
+    """
+    x, q = np.array(start), 1.0 / v
+    for _ in range(3):
+        low, middle, high = np.moveaxis(log_prob(x[..., None] + _STEP * np.arange(-1, 2)), -1, 0)
+        q = 1.0 / v - np.minimum((high - 2.0 * middle + low) / _STEP**2, 0.0)
+        x = x + np.clip(((high - low) / (2.0 * _STEP) - (x - m) / v) / q, -2.0, 2.0)
+    sd = 1.1 / np.sqrt(q)
+    node = x[..., None] + sd[..., None] * _NODES
+    log_f = log_prob(node) - 0.5 * (node - m[..., None]) ** 2 / v[..., None]
+    log_f += _LOG_WEIGHTS + 0.5 * _NODES**2
+    log_mass = special.logsumexp(log_f, axis=-1)
+    weight = np.exp(log_f - log_mass[..., None])  # pyright: ignore[reportArgumentType, reportCallIssue]
+    mean = (weight * node).sum(-1)
+    var = (weight * (node - mean[..., None]) ** 2).sum(-1)
+    return log_mass + np.log(sd / np.sqrt(v)), mean, np.maximum(var, 1e-9)
