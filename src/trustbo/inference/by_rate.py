@@ -11,7 +11,7 @@ from trustbo.inference.draws import missions_of, read_posterior, require_posteri
 from trustbo.inference.engine import cholesky, expected
 from trustbo.inference.posterior import Draws, Posterior, chunks
 from trustbo.inference.tree import complete
-from trustbo.models.families.family import log_normal
+from trustbo.models.families.moments import log_normal
 from trustbo.models.model import TrustModel
 from trustbo.models.signal import each
 from trustbo.parallel import one_blas_thread
