@@ -55,7 +55,7 @@ def test_a_mission_records_what_happened(wooded):
     assert first.duration[0] == pytest.approx(0.5 * len(first.poses))
     np.testing.assert_allclose(first.contact_rate, first.contact.mean(0))
     # All end in the cell entered, the lead at its stop and T2 around it.
-    ends = [wooded.grid.cell_at(x, y) for x, y in second.poses[-1, :, :2]]
+    ends = [wooded.grid.locate({"x": x, "y": y}) for x, y in second.poses[-1, :, :2]]
     assert ends == [(0, 2)] * 4
     gaps = np.linalg.norm(second.poses[-1, 1:, :2] - second.poses[-1, 0, :2], axis=1)
     assert (gaps <= 9.0).all()

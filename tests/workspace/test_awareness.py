@@ -35,17 +35,6 @@ def test_features_that_are_none_are_refused(terrain, features):
         Workspace.from_terrain(terrain, (4, 3), features=features)
 
 
-def test_cells_in_degrees(terrain):
-    grid = Workspace.from_terrain(terrain, (4, 3)).grid
-    assert grid.cell_at_lonlat(*grid.lonlat((2, 1))) == (2, 1)
-    lon, lat = grid.lonlat((0, 0))
-    assert -180.0 <= lon <= 180.0
-    assert -90.0 <= lat <= 90.0
-    bare = Workspace.from_awareness(np.full((1, 2, 2, 1), 0.5)).grid
-    with pytest.raises(TrustboError, match="this grid has no coordinate reference system"):
-        bare.lonlat((0, 0))
-
-
 def test_pixel_maps_are_those_of_the_terrain(terrain):
     workspace = Workspace.from_terrain(terrain, (4, 3))
     assert isinstance(workspace.pixels, xr.Dataset)

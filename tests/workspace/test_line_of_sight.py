@@ -30,6 +30,10 @@ def wooded():
     return Workspace.from_terrain(terrain, (4, 4), Team(n_robots=2))
 
 
+def cell_at(workspace, position):
+    return workspace.grid.locate(dict(zip(("x", "y"), position, strict=True)))
+
+
 def bounds_of(workspace):
     """Bounds as (move, row, col), and as pairs of cells."""
     index = np.argwhere(existing_bounds(workspace.passable.values)).tolist()
@@ -150,13 +154,13 @@ def test_posts_by_the_way_are_on_safe_ground_apart_linked_and_not_in_the_way(woo
         pixels = ground.surface.nearest(*posts.T)
         assert (slope[pixels] <= 0.7 * wooded.team.max_slope).all()
         assert all(way is not None for way in wooded.posts.bound_routes(a, c, None))
-    assert any(wooded.grid.cell_at(*post) != a for a, c in bounds_of(wooded)[1]
+    assert any(cell_at(wooded, post) != a for a, c in bounds_of(wooded)[1]
                for post in wooded.posts.watching(a, c))  # fmt: skip
 
 
 def test_stops_stay_in_their_cell(wooded):
     for row, col in np.argwhere(wooded.passable.values).tolist():
-        assert wooded.grid.cell_at(*wooded.posts.stop((row, col))) == (row, col)
+        assert cell_at(wooded, wooded.posts.stop((row, col))) == (row, col)
 
 
 def test_equal_robots_keep_their_sides(wooded):

@@ -7,45 +7,11 @@ from trustbo.errors import TrustboError
 from trustbo.team import Robot, Team
 from trustbo.terrain import pixel_size, read_terrain, synthetic_terrain
 from trustbo.workspace import Workspace
-from trustbo.workspace.grid import Grid
 
 
 @pytest.fixture(scope="module")
 def terrain():
     return synthetic_terrain((120.0, 90.0), seed=2, relief=6.0)
-
-
-def test_a_grid_covers_the_terrain(terrain):
-    grid = Grid.over(terrain, (4, 3))
-    left, bottom, right, top = terrain.rio.bounds()
-    assert (grid.left, grid.top) == (left, top)
-    assert grid.cell_height == pytest.approx((top - bottom) / 4)
-    assert grid.cell_width == pytest.approx((right - left) / 3)
-    for cell in ((0, 0), (3, 2), (1, 2)):
-        assert grid.cell_at(*grid.center(cell)) == cell
-    with pytest.raises(TrustboError, match="is outside the grid of 4 rows and 3"):
-        grid.cell_at(left - 1.0, top)
-
-
-def test_cell_means_are_means_of_the_pixels_inside(terrain):
-    grid = Grid.over(terrain, (4, 3))
-    dem = terrain["dem"].copy()
-    dem[:10, :10] = np.nan
-    expected = [
-        [np.nanmean(dem.values[30 * r : 30 * (r + 1), 30 * c : 30 * (c + 1)]) for c in range(3)]
-        for r in range(4)
-    ]
-    np.testing.assert_allclose(grid.cell_means(dem), expected)
-    share = grid.cell_means(dem.notnull().astype(float))
-    assert share[0, 0] == pytest.approx(1 - 100 / 900)
-    assert share[1, 1] == 1.0
-
-
-def test_a_grid_too_fine_or_empty_is_refused(terrain):
-    with pytest.raises(TrustboError, match="needs at least 2 x 2 pixels per cell"):
-        Grid.over(terrain, (100, 3))
-    with pytest.raises(TrustboError, match=r"at least two cells; got \(1, 1\)"):
-        Grid.over(terrain, (1, 1))
 
 
 def test_a_workspace_of_a_terrain(terrain):
@@ -68,8 +34,8 @@ def test_steep_cells_are_impassable(terrain):
     careful = Workspace.from_terrain(terrain, (4, 3), Team(robots=(robot,) * 3, lead=robot))
     assert int(careful.passable.sum()) < int(gentle.passable.sum())
     steep = tuple(int(i) for i in np.argwhere(~careful.passable.values)[0])
-    with pytest.raises(TrustboError, match="steeper than the 6 degrees the team stands"):
-        careful.require_cell("start", steep)
+    with pytest.raises(TrustboError, match="steeper than 6 degrees"):
+        careful.locate(steep)
 
 
 def test_a_terrain_nobody_can_stand_on_is_refused(terrain):
@@ -85,7 +51,7 @@ def test_a_cell_mostly_without_data_is_impassable_and_named(real_terrain):
     with pytest.raises(
         TrustboError, match=r"start \(39, 15\) is impassable: \d+% of it has no data; the nearest"
     ):
-        workspace.require_cell("start", (39, 15))
+        workspace.locate((39, 15), "start")
 
 
 @pytest.mark.filterwarnings("ignore:the loading of")  # 40 x 30 coarse pixels
@@ -147,20 +113,3 @@ def test_bad_arrays_are_refused():
         Workspace.from_awareness(hole, np.ones((3, 4)))
     with pytest.raises(TrustboError, match="no cell is passable"):
         Workspace.from_awareness(awareness, np.zeros((3, 4)))
-
-
-def test_cells_off_the_grid_or_impassable_are_named():
-    passable = np.ones((3, 4), bool)
-    passable[1, 1] = False
-    workspace = Workspace.from_awareness(np.full((1, 3, 4, 2), 0.5), passable)
-    assert workspace.require_cell("start", (2, 3)) == (2, 3)
-    with pytest.raises(TrustboError, match=r"goal \(3, 0\) is outside the grid of 3 rows"):
-        workspace.require_cell("goal", (3, 0))
-    with pytest.raises(
-        TrustboError, match=r"start \(1, 1\) is impassable; the nearest passable cell is \(0, 1\)"
-    ):
-        workspace.require_cell("start", (1, 1))
-    with pytest.raises(
-        TrustboError, match=r"start must be two whole numbers \(row, col\), or .* got 7"
-    ):
-        workspace.require_cell("start", 7)

@@ -51,7 +51,7 @@ from trustbo.planning.policies import resolve_policy
 from trustbo.simulation import Truth
 from trustbo.simulation.protocol import Simulator
 from trustbo.workspace import Workspace
-from trustbo.workspace.location import Location
+from trustbo.workspace.grid import Location
 
 _ARRIVES = 0.9
 """Chance to arrive of a plan below which a campaign without a price of failures warns."""

@@ -13,7 +13,7 @@ from trustbo.planning import Policy
 from trustbo.simulation import Truth
 from trustbo.simulation.protocol import Simulator
 from trustbo.workspace import Workspace
-from trustbo.workspace.location import Location
+from trustbo.workspace.grid import Location
 
 
 def iterate(

@@ -20,7 +20,6 @@ from trustbo.files import FilePath, require_file, write_file, write_text
 from trustbo.planning import Plan
 from trustbo.planning.problem import mean_of
 from trustbo.workspace import Workspace
-from trustbo.workspace.location import crs_name
 from trustbo.workspace.moves import MOVES
 
 IMPASSABLE, UNKNOWN, WORST = 100, 255, 98
@@ -83,7 +82,7 @@ def write_nav2(
         listed = [_pose(place.name, *pose) for pose in poses.tolist()]
         write_text(folder / f"waypoints_{robot}.yaml", json.dumps({"poses": listed}, indent=1))
     write_text(folder / "route_graph.geojson", graph)
-    parent = "grid" if workspace.grid.crs is None else crs_name(workspace.grid)
+    parent = "grid" if workspace.grid.crs is None else workspace.grid.crs_name
     about = {"frame": place.name, "parent": parent, "origin": [*place.origin]}
     write_text(folder / "frame.yaml", json.dumps(about | {"rotation": place.rotation}))
 

@@ -92,7 +92,8 @@ def read_table(
         columns.require(features)
     frame = _parsed(columns, features, places if is_mapped else ())
     if at_metres and workspace is not None:
-        cells = [workspace.grid.cell_at(x, y) for x, y in frame[["x", "y"]].to_numpy()]
+        pairs = frame[["x", "y"]].to_numpy()
+        cells = [workspace.grid.locate({"x": x, "y": y}, "position") for x, y in pairs]
         frame["row"], frame["col"] = np.transpose(cells)
     named = frame.loc[frame["robot"] != "", "robot"]
     robots = tuple(dict.fromkeys(named) if workspace is None else workspace.team.names)

@@ -306,7 +306,7 @@ def _crossings(xy: np.ndarray, first: int, workspace: Workspace) -> list[_Stretc
     cells: list[Cell] = []
     for x, y in xy:
         try:
-            cells.append(workspace.grid.cell_at(x, y))
+            cells.append(workspace.grid.locate({"x": x, "y": y}, "position"))
         except TrustboError:  # off the grid, or not known
             cells.append(NOWHERE)
     stretches, path, edges = [], [], []

@@ -12,7 +12,7 @@ from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_kind, require_whole
 from trustbo.planning.unrolled import Unrolled, numbers_left
 from trustbo.workspace import Workspace
-from trustbo.workspace.location import Location
+from trustbo.workspace.grid import Location
 from trustbo.workspace.moves import MOVES, moves_along, require_on_grid
 
 SIMPLE_EXTRA = 2
@@ -55,8 +55,8 @@ class AdmissiblePaths:
     ) -> None:
         """Check the ends and find the fewest bounds; see `Planner` for what is refused."""
         self.workspace = require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
-        self.start = workspace.require_cell("start", start)
-        self.goal = workspace.require_cell("goal", goal)
+        self.start = workspace.locate(start, "start")
+        self.goal = workspace.locate(goal, "goal")
         if self.start == self.goal:
             raise TrustboError(f"start and goal are the same cell {self.start}; choose two.")
         self.avoided = avoided

@@ -26,7 +26,7 @@ from trustbo.planning.plan import QUANTILES, Plan
 from trustbo.planning.problem import EXACT, InfeasibleError, Problem, draws_of, mean_of, risk_of
 from trustbo.planning.trust_map import cost_of, summary_of, trust_map
 from trustbo.workspace import Workspace
-from trustbo.workspace.location import Location
+from trustbo.workspace.grid import Location
 from trustbo.workspace.moves import MOVES
 
 

@@ -7,7 +7,6 @@ from matplotlib.colors import ListedColormap
 
 from trustbo.plots.style import figure_of, panels, styled
 from trustbo.workspace import Workspace
-from trustbo.workspace.location import crs_name
 
 _WIDTH = 7.0
 _MOST_NAMED = 24
@@ -47,5 +46,5 @@ def grid_map(workspace: Workspace, *, ax: Axes | None = None) -> Axes:
             one.text(col, row, f"{row},{col}", ha="center", va="center", size=size, color="black")
     one.set(xlabel="column", ylabel="row", xlim=(-0.5, cols - 0.5), ylim=(rows - 0.5, -0.5))
     one.set_aspect(tall)
-    one.set_title(f"{crs_name(grid)}\nhatched: without data or too steep")
+    one.set_title(f"{grid.crs_name}\nhatched: without data or too steep")
     return one

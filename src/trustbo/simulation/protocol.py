@@ -48,7 +48,7 @@ class DescribedSimulator(Summary):
 def require_path(workspace: Workspace, path: Sequence[Cell]) -> list[Cell]:
     """Return the cells of a path, at least two, all passable: TrustboError if not."""
     path = require_cells("path", path)
-    cells = [workspace.require_cell(f"path[{k}]", cell) for k, cell in enumerate(path)]
+    cells = [workspace.locate(cell, f"path[{k}]") for k, cell in enumerate(path)]
     if len(cells) < 2:
         raise TrustboError(f"a path needs at least two cells; got {cells}.")
     return cells

@@ -22,7 +22,7 @@ from trustbo.simulation.model import ModelSimulator
 from trustbo.simulation.protocol import digest, require_path
 from trustbo.simulation.replicates import END, replicated
 from trustbo.workspace import Workspace
-from trustbo.workspace.location import Location
+from trustbo.workspace.grid import Location
 from trustbo.workspace.moves import MOVES, moves_along
 
 _MAX_BOUNDS = re.compile(r"shortest(?:\+(\d+))?")
@@ -148,7 +148,7 @@ class Truth(Summary):
             TrustboError: A cell off the grid, or impassable.
             NetworkXNoPath: The goal cannot be reached.
         """
-        a, b = (self.workspace.require_cell(*e) for e in (("start", start), ("goal", goal)))
+        a, b = (self.workspace.locate(*e) for e in ((start, "start"), (goal, "goal")))
         contact, passed = (self.bounds[name].values for name in ("contact", "passed"))
         passed = passed if failures else np.ones(passed.shape)
         longest = _longest(self.workspace.passable_bounds.values, a, b, max_bounds)

@@ -1,6 +1,9 @@
 """Planning grid: cells of positions and of pixels, means over cells."""
 
 import math
+import operator
+import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,12 +11,16 @@ import xarray as xr
 from numpy.typing import ArrayLike
 from rasterio.crs import CRS
 from rasterio.transform import from_origin
+from rasterio.warp import transform as transform_points
+from rasterio.warp import transform_bounds
 
 from trustbo.data import Cell
 from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError, require_pair
-from trustbo.workspace.location import Location, cell_of, crs_name, lonlat_of
 
+type Location = Cell | Mapping[str, float]
+"""A cell (row, col), or a position with names, see `Grid.locate`."""
+WGS84 = CRS.from_epsg(4326)
 MAX_MISSING = 0.5
 """Largest share of missing or too steep pixels in a passable cell."""
 
@@ -72,7 +79,7 @@ class Grid(Summary):
             ("cells", f"{self.shape[0]} rows x {self.shape[1]} columns"),
             ("cell", f"{self.cell_height:.4g} m (north-south) x {self.cell_width:.4g} m"),
             ("corner", f"x {left:.10g}, y {bottom:.10g} m, lower left"),
-            ("CRS", "none" if self.crs is None else crs_name(self)),
+            ("CRS", self.crs_name),
         ]
         return rows
 
@@ -103,26 +110,82 @@ class Grid(Summary):
         """Y of the rows' centres, CRS metres, shape (row,)."""
         return self.top - (np.arange(self.shape[0]) + 0.5) * self.cell_height
 
-    def locate(self, location: Location | None = None, **named: float) -> Cell:
+    @property
+    def crs_name(self) -> str:
+        """Short name of the CRS, such as EPSG:2193."""
+        if self.crs is None:
+            return "no CRS"
+        crs = self.require_crs()
+        code = crs.to_epsg()
+        return f"EPSG:{code}" if code else re.findall(r'"(.*?)"', crs.to_wkt())[0]
+
+    def locate(self, location: Location, what: str = "location") -> Cell:
         """Cell of a location, by the georeference alone; it may be impassable.
 
         Args:
-            location: Cell (row, col), or a position with names: `"lon=174.7,lat=-41.3"`,
-                `"x=1748000,y=5427000"`, or a mapping of these names to numbers.
-            **named: The same names, in place of a location: `locate(lon=174.7, lat=-41.3)`.
+            location: Cell (row, col); or a position, `{"x": 1748000.0, "y": 5427000.0}` in metres
+                of the CRS, or `{"lon": 174.7, "lat": -41.3}` in degrees (WGS 84).
+            what: Name of the location in messages.
 
         Raises:
-            TrustboError: The location is off the grid, or none; or in degrees, without a CRS.
+            TrustboError: Not a location, off the grid, or in degrees on a grid without a CRS.
         """
-        return cell_of("location", named if location is None else location, self)
+        try:
+            row, col = self._row_and_col(location)
+        except TrustboError:  # no CRS
+            raise
+        except (TypeError, ValueError, KeyError, OverflowError):
+            raise TrustboError(
+                f"{what} must be a cell (row, col), whole numbers; or a position, "
+                '{"x": ..., "y": ...} in metres or {"lon": ..., "lat": ...} in degrees; '
+                f"got {location!r}."
+            ) from None
+        rows, cols = self.shape
+        if not (0 <= row < rows and 0 <= col < cols):
+            raise TrustboError(
+                f"{what} {location!r} is outside the grid of {rows} rows and {cols} columns; rows "
+                f"are 0..{rows - 1} from the top, columns 0..{cols - 1}{self._extent_text()}."
+            )
+        return int(row), int(col)
 
-    def cell_at(self, x: float, y: float) -> Cell:
-        """Cell at a position in CRS metres.
+    def _row_and_col(self, location: Location) -> tuple[float, float]:
+        """Row and column of a location, fractional ones of a position; also beyond the grid."""
+        if not isinstance(location, Mapping):
+            row, col = (operator.index(i) for i in location)
+            return row, col
+        names = ("lon", "lat") if "lon" in location else ("x", "y")
+        x, y = (float(location[name]) for name in names)
+        if len(location) > 2 or not math.isfinite(x + y):
+            raise ValueError
+        if names == ("lon", "lat"):
+            x, y = _moved(WGS84, self.require_crs(), x, y)
+        return (self.top - y) / self.cell_height, (x - self.left) / self.cell_width
+
+    def _extent_text(self) -> str:
+        """Text of the extent in the CRS and in degrees; empty without a CRS."""
+        if self.crs is None:
+            return ""
+        left, bottom, right, top = self.bounds
+        west, south, east, north = transform_bounds(self.require_crs(), WGS84, *self.bounds)
+        return (
+            f", x {left:.1f} to {right:.1f} and y {bottom:.1f} to {top:.1f} m in {self.crs_name}, "
+            f"longitude {west:.5f} to {east:.5f} and latitude {south:.5f} to {north:.5f}"
+        )
+
+    def lonlat(self, cell: Cell) -> tuple[float, float]:
+        """Longitude and latitude of a cell's centre, degrees (WGS 84).
 
         Raises:
-            TrustboError: The position is off the grid.
+            TrustboError: No cell; or the grid has no CRS, or is no place on Earth in it.
         """
-        return cell_of("position", {"x": x, "y": y}, self)
+        x, y = self.center(cell)
+        lon, lat = _moved(self.require_crs(), WGS84, x, y)
+        if not math.isfinite(lon + lat):
+            raise TrustboError(
+                f"({x:.10g}, {y:.10g}) is no place on Earth in {self.crs_name}; give the terrain "
+                "the CRS that its coordinates are in."
+            )
+        return lon, lat
 
     def place(self, maps: xr.Dataset) -> xr.Dataset:
         """Georeference maps of the cells (row, col): dims (y, x), with the transform and CRS."""
@@ -134,22 +197,6 @@ class Grid(Summary):
             placed = placed.rio.write_crs(self.require_crs())
         step = self.cell_width, self.cell_height
         return placed.rio.write_transform(from_origin(self.left, self.top, *step))
-
-    def lonlat(self, cell: Cell) -> tuple[float, float]:
-        """Longitude and latitude of a cell's centre, degrees (WGS 84).
-
-        Raises:
-            TrustboError: No cell; or the grid has no CRS, or is no place on Earth in it.
-        """
-        return lonlat_of(self, self.center(cell))
-
-    def cell_at_lonlat(self, lon: float, lat: float) -> Cell:
-        """Cell at a position in degrees (WGS 84).
-
-        Raises:
-            TrustboError: The position is off the grid, or the grid has no CRS.
-        """
-        return cell_of("position", {"lon": lon, "lat": lat}, self)
 
     def cell_means(self, values: xr.DataArray) -> np.ndarray:
         """Mean over each cell's pixels with data.
@@ -169,10 +216,6 @@ class Grid(Summary):
         with np.errstate(invalid="ignore"):
             return (total / count).reshape(self.shape)
 
-    def cell_share(self, condition: xr.DataArray) -> np.ndarray:
-        """Share of each cell's pixels where a condition holds, shape (row, col)."""
-        return self.cell_means(condition.astype(float))
-
     def cells_along(self, y: ArrayLike, x: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Rows of the cells of pixels at `y`, and columns of those at `x`."""
         rows, cols = self.shape
@@ -185,13 +228,22 @@ class Grid(Summary):
         if self.crs is None:
             raise TrustboError(
                 "this grid has no coordinate reference system: its workspace was not made from a "
-                "terrain. Use cell_at and center, in metres."
+                "terrain. Give positions as x and y, in metres."
             )
         return CRS.from_user_input(self.crs)
 
 
+def _moved(source: CRS, target: CRS, x: float, y: float) -> tuple[float, float]:
+    """Position in another CRS; infinite if it is no place on Earth in one of them."""
+    try:
+        (u,), (v,) = transform_points(source, target, [x], [y])[:2]
+    except Exception:  # PROJ's errors are GDAL's, without a common base
+        return math.inf, math.inf
+    return u, v
+
+
 def over_cells[Map: (xr.Dataset, xr.DataArray)](maps: Map) -> Map:
-    """Maps with dims row and col, converted from (y, x), those of `Result.maps`."""
+    """Rename the dimensions (y, x) of `Result.maps` to (row, col)."""
     if not {"y", "x"} <= set(maps.dims):
         return maps
     return maps.drop_vars(["y", "x"], errors="ignore").rename(y="row", x="col")

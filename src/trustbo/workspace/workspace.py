@@ -28,8 +28,7 @@ from trustbo.terrain.features import PAPER_VISIBILITY, TRAVERSABILITY, VISIBILIT
 from trustbo.terrain.read import require_terrain
 from trustbo.workspace.awareness import cell_maps, labelled, of_cells, unlabelled
 from trustbo.workspace.bound_awareness import of_bounds, require_names
-from trustbo.workspace.grid import MAX_MISSING, Grid
-from trustbo.workspace.location import Location, cell_of
+from trustbo.workspace.grid import MAX_MISSING, Grid, Location
 from trustbo.workspace.moves import MOVE_NAMES, along, existing_bounds
 from trustbo.workspace.posts import TRAVERSABLE, Posts
 from trustbo.workspace.sight import Sight
@@ -230,7 +229,7 @@ class Workspace(Summary):
         Raises:
             TrustboError: A cell is off the grid or impassable, or no neighbour of the one before.
         """
-        cells = [self.require_cell(f"path[{k}]", cell) for k, cell in enumerate(path)]
+        cells = [self.locate(cell, f"path[{k}]") for k, cell in enumerate(path)]
         return np.swapaxes(along(self.bound_maps, cells), 0, 1)
 
     def in_order(self, mission: Mission) -> Mission:
@@ -291,36 +290,34 @@ class Workspace(Summary):
         values = self.awareness.values[:, None]
         return values if self.of_bounds is None else self.of_bounds.values
 
-    def locate(self, location: Location | None = None, **named: float) -> Cell:
-        """Cell of a location.
+    def locate(self, location: Location, what: str = "location") -> Cell:
+        """Cell of a location, which must be passable.
 
         Args:
-            location: Cell (row, col), or a position with names: `"lon=174.7,lat=-41.3"`,
-                `"x=1748000,y=5427000"`, or a mapping of these names to numbers.
-            **named: The same names, in place of a location: `locate(lon=174.7, lat=-41.3)`.
+            location: Cell (row, col); or a position, `{"x": 1748000.0, "y": 5427000.0}` in metres
+                of the CRS, or `{"lon": 174.7, "lat": -41.3}` in degrees (WGS 84).
+            what: Name of the location in messages.
 
         Raises:
-            TrustboError: The location is off the grid, without data, impassable, or none.
+            TrustboError: Not a location, off the grid, without data, or impassable.
         """
-        return self.require_cell("location", named if location is None else location)
+        cell, grid = self.grid.locate(location, what), self.grid
+        if not self.passable.values[cell]:
+            free = np.argwhere(self.passable.values)
+            steps = (free - cell) * (grid.cell_height, grid.cell_width)
+            near = tuple(free[np.argmin(np.hypot(*steps.T))].tolist())
+            raise TrustboError(
+                f"{what} {cell} is impassable{self._why_impassable(cell)}; the nearest passable "
+                f"cell is {near}."
+            )
+        return cell
 
-    def require_cell(self, what: str, cell: Location) -> Cell:
-        """Check that a location is in a passable cell, and return the cell as a pair of ints.
-
-        Raises:
-            TrustboError: It is no location, off the grid, without data, or impassable.
-        """
-        free = self.passable.values
-        return cell_of(what, cell, self.grid, free, self._why_impassable)
-
-    def _why_impassable(self, row: int, col: int) -> str:
+    def _why_impassable(self, cell: Cell) -> str:
         """Text of the reason why a cell is impassable; empty without a terrain."""
         if self.terrain is None:
             return ""
-        missing = 1.0 - self.grid.cell_share(self.terrain["dem"].notnull())[row, col]
+        missing = self.grid.cell_means(self.terrain["dem"].isnull().astype(float))[cell]
         if missing > MAX_MISSING:
             return f": {missing:.0%} of it has no data"
         steep = np.rad2deg(self.team.max_slope)
-        return (
-            f": over half of it is missing or steeper than the {steep:.0f} degrees the team stands"
-        )
+        return f": over half of it is missing or steeper than {steep:.0f} degrees, the team's limit"
