@@ -30,7 +30,7 @@ from trustbo.files import (
     to_json,
     write_text,
 )  # fmt: skip
-from trustbo.logs.netcdf import mission_from_tree, mission_to_tree, read_tree, write_tree
+from trustbo.logs.netcdf import missions_from_tree, missions_to_tree, read_tree, write_tree
 from trustbo.models.backend import VERSIONS
 from trustbo.planning.plan import plan_from_record, plan_to_record
 from trustbo.workspace import Workspace
@@ -101,7 +101,7 @@ class Storage:
         """Write mission n, from 1, as measured, with its plan and the numbers told with it."""
         planned = xr.Dataset({"trust_map": entry.trust_map})
         planned.attrs = {"plan": to_json(plan_to_record(entry.plan)), "extra": to_json(extra)}
-        tree = mission_to_tree(entry.measured)
+        tree = missions_to_tree([entry.measured])
         tree["planned"] = xr.DataTree(planned)
         write_tree(self.path / MISSIONS / f"{n:04d}.nc", tree)
 
@@ -164,7 +164,7 @@ def read_campaign(
             break
         tree = read_tree(file)
         with interpreting(file):
-            measured, planned = mission_from_tree(tree), tree["planned"].to_dataset()
+            [measured], planned = missions_from_tree(tree), tree["planned"].to_dataset()
             if n > len(rows):
                 pending.append((measured, json.loads(planned.attrs["extra"])))
                 continue
