@@ -6,7 +6,6 @@ import math
 import numpy as np
 
 S = 1_000_000_000  # ns
-STATES = ("speed_ratio", "pitch", "roll", "return_range", "visible_share")
 
 
 class Log:
@@ -24,11 +23,8 @@ class Log:
     def say(self, seconds, topic, kind, **fields):
         self.messages.append((round(seconds * S), topic, kind, self.type(kind)(**fields)))
 
-    def bound(self, seconds, *values):
-        layout = self.type("std_msgs/msg/MultiArrayLayout")(dim=[], data_offset=0)
-        data = np.array(values, np.int32)
-        kind = "std_msgs/msg/Int32MultiArray"
-        self.say(seconds, "/mission/bound", kind, layout=layout, data=data)
+    def bound(self, seconds, k, *cell):
+        self.text(seconds, "/mission/bound", json.dumps({"bound": k, "cell": cell}))
 
     def text(self, seconds, topic, text):
         self.say(seconds, topic, "std_msgs/msg/String", data=text)
@@ -36,18 +32,6 @@ class Log:
     def contact(self, robot, *looks, kind="std_msgs/msg/Bool"):
         for seconds, value in looks:
             self.say(seconds, f"/{robot}/contact", kind, data=value)
-
-    def vector(self, seconds, topic, values, label=None, bits=64):
-        dim = []
-        if label is not None:
-            make = self.type("std_msgs/msg/MultiArrayDimension")
-            dim = [make(label=label, size=len(values), stride=len(values))]
-        layout = self.type("std_msgs/msg/MultiArrayLayout")(dim=dim, data_offset=0)
-        data, kind = np.array(values, f"f{bits // 8}"), f"std_msgs/msg/Float{bits}MultiArray"
-        self.say(seconds, topic, kind, layout=layout, data=data)
-
-    def awareness(self, seconds, robot, values, label=None):
-        self.vector(seconds, f"/{robot}/awareness", values, label, bits=32)
 
     def odometry(self, seconds, robot, x, y, quaternion=(0.0, 0.0, 0.0, 1.0), stamp=None):
         t, make = round((seconds if stamp is None else stamp) * S), self.type
@@ -104,8 +88,6 @@ def record(missions, path, *, storage="sqlite3", names=None):
             for tick in range(len(bound.contact)):
                 time = (begin + (end - begin) * (tick + 1) // len(bound.contact)) / S
                 _say_tick(log, time, mission.robots, bound, tick)
-            for robot, values in zip(mission.robots, bound.awareness, strict=True):
-                log.vector(end / S, f"/{robot}/awareness", values, ",".join(mission.features))
             log.text(end / S, "/mission/status", bound.status)
         if mission.status != mission.bounds[-1].status:
             log.text((end + 1) / S, "/mission/status", mission.status)
@@ -117,8 +99,6 @@ def record(missions, path, *, storage="sqlite3", names=None):
 def _say_tick(log, seconds, robots, bound, tick):
     for i, robot in enumerate(robots):
         log.contact(robot, (seconds, bool(bound.contact[tick, i])))
-        if bound.states is not None:
-            log.vector(seconds, f"/{robot}/state", bound.states[tick, i], ",".join(STATES))
     if bound.poses is not None:
         for robot, pose in zip(("lead", *robots), bound.poses[tick].tolist(), strict=True):
             x, y, heading = pose

@@ -37,21 +37,6 @@ def test_a_person_is_a_mission_and_outcomes_are_inputs():
     assert np.isnan(first.n_ticks).all()
 
 
-def test_tasks_are_rows_with_what_was_seen_at_the_step():
-    rows = {
-        "person": ["a"] * 3,
-        "step": [1, 1, 2],
-        "about": ["cook", "drive", "cook"],
-        "outcome": ["", "", 1],
-        "report": [0.2, 0.4, 0.6],
-    }
-    (one,) = read_reports(rows, outcome="outcome", task="about")
-    assert one.robots == ("cook", "drive")
-    assert one.features == ("task_cook", "task_drive", "success", "failure")
-    np.testing.assert_allclose(one.awareness[1], [[1, 0, 1, 0], [0, 1, 1, 0]])
-    np.testing.assert_allclose(one.contact_rate, [[0.2, 0.4], [0.6, np.nan]])
-
-
 @pytest.mark.parametrize(
     ("changes", "options"),
     [
@@ -73,7 +58,6 @@ def test_tasks_are_rows_with_what_was_seen_at_the_step():
         ({}, {"outcome": "result"}),
         ({}, {"inputs": ["demand"]}),
         ({"age": [9, 9, 9, 61, 61]}, {"inputs": ["age"]}),
-        ({"about": ["x", "x", "", "x", "x"]}, {"task": "about"}),
     ],
 )
 def test_an_odd_table_is_refused_in_one_line(changes, options):

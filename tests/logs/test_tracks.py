@@ -41,12 +41,10 @@ def test_windows_are_bounds_and_rates_are_shares_of_their_ticks():
     np.testing.assert_array_equal(one.n_ticks[:, 1], [4.0, 4.0])
     np.testing.assert_allclose(one.awareness[:, 1], [[0.5, 0.0, 1.0]] * 2)
     assert [bound.t0 for bound in one.bounds] == [0.0, 4.0]
-    made = missions_of(Tracks(POSES, SEEN), 2.0, lead=[(0.0, "a"), (4.0, "b")])
-    np.testing.assert_array_equal(made[1].contact_rate[:, 1], np.full(2, np.nan))
-    far = missions_of(
-        Tracks(POSES, SEEN), 4.0, lead="a", features=lambda known: known[["range"]] / 3.0
-    )
-    np.testing.assert_allclose(far[0].awareness[:, 1, 0], 1.0)
+    made = missions_of(Tracks(POSES, SEEN), 2.0)
+    assert np.isnan([made[0].contact_rate[:, 0], made[1].contact_rate[:, 1]]).all()
+    with pytest.raises(TrustboError, match="robot"):
+        missions_of(Tracks(POSES, SEEN), lead="c")
 
 
 def test_crossings_of_the_lead_are_bounds_of_a_map():

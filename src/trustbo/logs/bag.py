@@ -1,8 +1,8 @@
 """Missions in ROS bags: `.bag` files of ROS 1, folders of ROS 2, read by rosbags (extra `ros`).
 
     /mission/bound    std_msgs/String, JSON {"bound": k, "cell": [row, col]}, at the start of bound
-                      k; or Int32MultiArray [k, row, col]. Bound 0 is the start of a mission, in its
-                      start cell, and may have "path", the planned cells.
+                      k. Bound 0 is the start of a mission, in its start cell, and may have "path",
+                      the planned cells.
     /mission/status   std_msgs/String, "ok", "stuck", ..., at the end of a bound, optional; a second
                       one after the last bound is the mission's.
     /{robot}/contact  std_msgs/Bool, or Float32 and Float64 in [0, 1], at each tick
@@ -14,7 +14,9 @@ contact rate is the share of a robot's ticks with contact; NaN was not measured,
 
 import json
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -105,13 +107,14 @@ def read_bag(path: FilePath, workspace: Workspace, *, topics: Topics = Topics())
     if not starts or starts[0] > 0:
         raise TrustboError(f"{str(path)!r} must begin with the marker of bound 0, the start cell.")
     missions = []
-    for first, end in zip(starts, [*starts[1:], len(found.markers)], strict=True):
+    for first, end in pairwise([*starts, len(found.markers)]):
+        if end - first < 2:  # nothing was driven
+            continue
         until = found.markers[end].time if end < len(found.markers) else _NEVER
-        if end - first > 1:
-            try:
-                missions.append(_mission(found, found.markers[first:end], until, workspace))
-            except TrustboError as error:
-                raise TrustboError(f"{str(path)!r}, mission {len(missions) + 1}: {error}") from None
+        try:
+            missions.append(_mission(found, found.markers[first:end], until, workspace))
+        except TrustboError as error:
+            raise TrustboError(f"{str(path)!r}, mission {len(missions) + 1}: {error}") from None
     return missions
 
 
@@ -120,18 +123,22 @@ def _recording(path: Path, topics: Topics, robots: tuple[str, ...]) -> _Recordin
     contact = [topics.contact.replace("{robot}", robot) for robot in robots]
     poses = [topics.pose.replace("{robot}", robot) for robot in (topics.lead, *robots)]
     messages = _messages(path, [topics.bound, *contact], [topics.status, *poses])
-    markers = [_marker(time, message) for time, message in messages[topics.bound]]
-    status = _series(topics.status, [(t, str(m.data)) for t, m in messages[topics.status]])
-    moved = [[(t, _pose(m)) for t, m in messages[topic]] for topic in poses]
-    return _Recording(
-        sorted(markers, key=lambda marker: (marker.time, marker.bound)),
-        status._replace(value=status.value.astype(object)),
-        [
-            _series(topic, [(t, _contact(topic, m)) for t, m in messages[topic]])
-            for topic in contact
-        ],
-        [_series(*pair) for pair in zip(poses, moved, strict=True)] if all(moved) else [],
+
+    def series(topic: str, read: Callable[[str, Any], Any]) -> _Series:
+        time = np.array([t for t, _ in messages[topic]], dtype=np.int64)
+        if (np.diff(time) < 0).any():
+            raise TrustboError(f"the clock of {topic} goes backwards.")
+        return _Series(time, np.array([read(topic, message) for _, message in messages[topic]]))
+
+    markers = sorted(
+        (_marker(time, message) for time, message in messages[topics.bound]),
+        key=lambda marker: (marker.time, marker.bound),
     )
+    moved = [series(topic, _pose) for topic in poses] if all(map(messages.get, poses)) else []
+    for track in moved:
+        track.value[:, 2] = np.unwrap(track.value[:, 2])
+    status = series(topics.status, lambda _, message: str(message.data))
+    return _Recording(markers, status, [series(topic, _contact) for topic in contact], moved)
 
 
 def _messages(
@@ -167,27 +174,16 @@ def _messages(
     return messages
 
 
-def _series(topic: str, records: list[tuple[int, Any]]) -> _Series:
-    time = np.array([t for t, _ in records], dtype=np.int64)
-    if (np.diff(time) < 0).any():
-        raise TrustboError(f"the clock of {topic} goes backwards.")
-    return _Series(time, np.array([value for _, value in records]))
-
-
 def _marker(time: int, message: Any) -> _Marker:
     """Start of a bound in a message."""
     try:
-        if isinstance(message.data, str):
-            content = json.loads(message.data)
-        else:
-            bound, *cell = message.data.tolist()
-            content = {"bound": bound, "cell": cell}
+        content = json.loads(message.data)
         path = tuple(require_pair("path", cell) for cell in content.get("path", ()))
         k = require_whole("bound", content["bound"], 0)
         return _Marker(time, k, require_pair("cell", content["cell"]), path)
     except (AttributeError, KeyError, TypeError, ValueError):
         raise TrustboError(
-            "a marker must be JSON with a bound and a cell, or [bound, row, col]; got "
+            "a marker must be JSON with a bound and a cell; got "
             f"{getattr(message, 'data', message)!r:.60}."
         ) from None
 
@@ -199,7 +195,7 @@ def _contact(topic: str, message: Any) -> float:
     return value
 
 
-def _pose(message: Any) -> list[float]:
+def _pose(topic: str, message: Any) -> list[float]:
     """Position x and y, and heading in rad from the x axis, in [-pi, pi]."""
     pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
     p, q = pose.position, pose.orientation
@@ -217,10 +213,9 @@ def _mission(
     path = start.path or cells
     if path[0] != cells[0]:
         raise TrustboError(f"it starts in {cells[0]}, but its path in {path[0]}.")
-    poses = [_continuous(series, start.time, until) for series in found.poses]
     ends = [*(marker.time for marker in markers[2:]), until]
     bounds = tuple(
-        _bound(found, poses, marker, end, start.time, len(workspace.features))
+        _bound(found, marker, end, start.time, len(workspace.features))
         for marker, end in zip(markers[1:], ends, strict=True)
     )
     statuses = found.status.between(markers[-1].time, until).value
@@ -230,14 +225,7 @@ def _mission(
     return Mission(path, bounds, status, workspace.features, workspace.team.names)
 
 
-def _bound(
-    found: _Recording,
-    poses: list[_Series],
-    marker: _Marker,
-    until: int,
-    start: int,
-    n_features: int,
-) -> Bound:
+def _bound(found: _Recording, marker: _Marker, until: int, start: int, n_features: int) -> Bound:
     """Bound from its marker to the next, at `until`, of a mission from `start`."""
     statuses = found.status.between(marker.time, until)
     end = int(statuses.time[0]) if len(statuses.time) else until
@@ -259,16 +247,7 @@ def _bound(
         np.full(len(contacts), seconds),
         str(statuses.value[0]) if len(statuses.time) else "ok",
         (marker.time - start) / _NS,
-        np.stack([series.held(ticks) for series in poses], axis=1) if poses else None,
+        np.stack([series.held(ticks) for series in found.poses], axis=1) if found.poses else None,
         np.stack(of_ticks, axis=1) if of_ticks else None,
         np.where(n_ticks > 0, n_ticks, np.nan),
     )
-
-
-def _continuous(poses: _Series, start: int, until: int) -> _Series:
-    """Poses of a mission, and the last before it; headings without jumps from its start on."""
-    first, last = np.searchsorted(poses.time, (start, until), side="right")
-    values = poses.value[max(first - 1, 0) : last].copy()
-    kept = slice(min(int(first), 1), None)
-    values[kept, 2] = np.unwrap(values[kept, 2])
-    return _Series(poses.time[max(first - 1, 0) : last], values)

@@ -24,7 +24,6 @@ def read_reports(
     report: str = "report",
     outcome: str | None = None,
     demand: str | None = None,
-    task: str | None = None,
     inputs: Sequence[str] = (),
     scale: str = "unit",
 ) -> list[Mission]:
@@ -32,8 +31,8 @@ def read_reports(
 
     A report is given after the outcome of its step. A first row without an outcome is the report
     before anything was seen. Steps are taken in order; a blank report was not given. A person
-    becomes a mission without a map, a step a bound, an asked task a robot, a report a rate in
-    [0, 1], and inputs of a step become features: what the person saw since the report before.
+    becomes a mission without a map, a step a bound of one robot, a report a rate in [0, 1], and
+    inputs of a step become features: what the person saw since the report before.
 
     Args:
         table: Path of a CSV file with a header, separated by commas, semicolons or tabs; or a
@@ -45,8 +44,6 @@ def read_reports(
             `failure`, or blank. It becomes the features `success` and `failure`.
         demand: Column with the demand of what was seen, from 0, easy, to 1. It becomes the features
             `success_demand`, success times demand, and `failure_demand`, failure times 1 - demand.
-        task: Column of the task that the report is about. Each becomes a row of the mission, its
-            feature `task_...` being 1; rows of one step are about different tasks.
         inputs: Columns of further features, numbers of size 1: centre and scale other units.
         scale: `"unit"`, reports in [0, 1]; `"likert7"` (or `"ordinal7"`), whole numbers 1 to 7.
 
@@ -59,31 +56,32 @@ def read_reports(
             scale, a large input, a person without reports, or neither an outcome nor an input.
     """
     levels = levels_of(scale)
-    if outcome is None and (demand is not None or not (inputs or task)):
+    if outcome is None and (demand is not None or not inputs):
         raise TrustboError("reports need what was seen: give outcome=, a column, or inputs=.")
-    named = {"person": person, "step": step, "report": report, "outcome": outcome}
-    named |= {"demand": demand, "task": task}
+    named = {"person": person, "step": step, "report": report, "outcome": outcome, "demand": demand}
     columns = Columns(table)
     for argument, column in named.items():
         if column is not None:
             columns.require([column], f' Name its columns, such as {argument}="...".')
-    people, tasks = columns.names(person), columns.names(task) if task else []
-    if "" in (*people, *tasks):
-        raise TrustboError("a person or a task is blank; leave the row out.")
-    k, answers = columns.numbers(step, blank=False), columns.numbers(report)
-    rows = columns.frame.index
-    y = [_report_of(f"row {i}: {report}", answer, levels)
-         for i, answer in zip(rows, answers.tolist(), strict=True)]  # fmt: skip
+    people, steps = np.array(columns.names(person)), columns.numbers(step, blank=False)
+    if "" in people:
+        raise TrustboError("a person is blank; leave the row out.")
+    answers = zip(columns.frame.index, columns.numbers(report).tolist(), strict=True)
+    y = np.array([_report_of(f"row {i}: {report}", answer, levels) for i, answer in answers])
     seen = _seen(columns, outcome, demand, inputs)
-    every = list(dict.fromkeys(tasks))
-    r = np.array([every.index(name) for name in tasks] if task else [0] * len(rows))
-    who, missions = np.array(people), []
-    for name in dict.fromkeys(people):
-        of = who == name
-        try:
-            missions.append(_mission(k[of], r[of], np.array(y)[of], seen, of, every, scale))
-        except TrustboError as error:
-            raise TrustboError(f"{person} {name}: {error}") from None
+    z, missions = np.column_stack([*seen.values()]), []
+    for name in dict.fromkeys(people.tolist()):
+        of = np.flatnonzero(people == name)
+        of = of[np.argsort(steps[of])]
+        if (np.diff(steps[of]) == 0.0).any():
+            raise TrustboError(f"{person} {name}: a step is there twice.")
+        if np.isnan(y[of]).all():
+            raise TrustboError(f"{person} {name}: there is no report; leave out the rows.")
+        made = Mission.from_arrays(
+            None, z[of][:, None], y[of][:, None], n_ticks=levels - 1.0 if levels else None,
+            features=[*seen], robots=["report"],
+        )  # fmt: skip
+        missions.append(replace(made, scale=scale))
     return missions
 
 
@@ -117,35 +115,6 @@ def _seen(
                 "column, such as (column - column.mean()) / column.std()."
             )
     return seen
-
-
-def _mission(
-    k: np.ndarray,
-    r: np.ndarray,
-    y: np.ndarray,
-    seen: dict[str, np.ndarray],
-    of: np.ndarray,
-    tasks: Sequence[str],
-    scale: str,
-) -> Mission:
-    """Mission of one person: steps k, tasks r and reports y of the rows `of` the table, (row,)."""
-    steps, first, s = np.unique(k, return_index=True, return_inverse=True)
-    if len({*zip(s.tolist(), r.tolist(), strict=True)}) < len(s):
-        raise TrustboError("a step, or a step and task, is there twice.")
-    if np.isnan(y).all():
-        raise TrustboError("there is no report; leave out the rows.")
-    shape, n_tasks = (len(steps), max(len(tasks), 1)), len(tasks)
-    z, rates = np.zeros((*shape, n_tasks + len(seen))), np.full(shape, np.nan)
-    z[:, range(n_tasks), range(n_tasks)] = 1.0
-    inputs = np.column_stack([values[of] for values in seen.values()] or [np.empty((len(s), 0))])
-    z[..., n_tasks:] = inputs[first][:, None]  # what was seen is of the step, whatever was asked
-    z[s, r, n_tasks:], rates[s, r] = inputs, y
-    levels = levels_of(scale)
-    made = Mission.from_arrays(
-        None, z, rates, n_ticks=levels - 1.0 if levels else None,
-        features=[*(f"task_{name}" for name in tasks), *seen], robots=tasks or ["report"],
-    )  # fmt: skip
-    return replace(made, scale=scale)
 
 
 def _report_of(what: str, answer: float, levels: int) -> float:

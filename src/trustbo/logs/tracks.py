@@ -1,7 +1,6 @@
 """Logs of poses and detections: who saw whom, as missions of robots that watch one of them."""
 
 import warnings
-from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,8 +19,6 @@ _CLOSE = 0.1
 """Distance to either end of a line of sight within which nothing hides, and least extent, m."""
 _FEWEST = 2
 """Bounds of a mission."""
-
-Features = Callable[[xr.Dataset], xr.Dataset]
 
 
 class Tracks:
@@ -177,10 +174,8 @@ def missions_of(
     tracks: Tracks,
     window: float = 20.0,
     *,
-    lead: str | Sequence[tuple[float, str]] = EACH,
-    features: Features | None = None,
+    lead: str = EACH,
     workspace: Workspace | None = None,
-    length: int | None = None,
     tick: float = 1.0,
 ) -> list[Mission]:
     """Make missions of a log: all robots watch one, the lead, bound after bound.
@@ -188,19 +183,16 @@ def missions_of(
     A contact rate is the share of a bound's ticks in which a robot detected the lead, and `n_ticks`
     their number. The lead is a robot of the mission too, so that all have the same: its rates are
     not measured (NaN), its features 0. A bound in which a pose is not known in any tick is not
-    measured, and has the mean of each feature over the others of its robot.
+    measured, and has the mean of each feature over the others of its robot. Features are the means
+    over a bound of `near`, r / (r + range) with the median range r of the log; `ahead`, whether the
+    lead is within 30 degrees of the heading; and `clear`, whether nothing hides it.
 
     Args:
         tracks: Poses and detections.
         window: Length of a bound, s; not used with a workspace.
-        lead: `"each"`: missions for each robot that the others watch; the name of one; or a list of
-            (time, name), who leads from when on.
-        features: Function of `Tracks.geometry` to a Dataset of features over its dims, of which a
-            bound has the means. By default `near`, r / (r + range) with the median range r of the
-            log; `ahead`, within 30 degrees of the heading; and `clear`, not hidden.
+        lead: Name of the lead; or `"each"`: missions for each robot that the others watch.
         workspace: Map; bounds then are the lead's crossings from cell to cell, and missions end
             where it leaves the grid or comes to a cell that is no neighbour.
-        length: Most bounds of a mission; by default trust carries over the whole log.
         tick: Length of a tick, s.
 
     Returns:
@@ -210,25 +202,30 @@ def missions_of(
         TrustboError: An unknown robot, a window below a tick, or a log too short for two bounds.
     """
     known = tracks.geometry(tick)
-    seen, n = np.isfinite(known["range"].values), known.sizes["time"]
-    if not seen.any():
+    n = known.sizes["time"]
+    if not known["range"].notnull().any():
         raise TrustboError(
             f"in no tick of {tick:g} s are the poses of two robots known: they are of different "
             f"times, or further apart than max_gap, {tracks.max_gap:g} s."
         )
-    means = (_simple if features is None else features)(known)
-    start = tracks.span[0]
+    usual = max(float(known["range"].median()), 1e-9)
+    features = {
+        "near": usual / (usual + known["range"]),
+        "ahead": abs(known["bearing"]) < _AHEAD,
+        "clear": known["hidden"] == 0.0,
+    }
+    require_choice("robot", lead, (*tracks.robots, EACH))
     missions = []
-    for one, first, last in _leads(tracks, lead, start + np.arange(n) * tick):
+    for i, name in enumerate(tracks.robots):
+        if lead not in (name, EACH):
+            continue
         if workspace is None:
             step = max(round(require_positive("window", window) / tick), 1)
-            stretches = [_Stretch(np.arange(first, last + 1, step), ())]
+            stretches = [_Stretch(np.arange(0, n + 1, step), ())]
         else:
-            xy = tracks.at(known["time"].values)[one, first:last, :2]
-            stretches = _crossings(xy, first, workspace)
-        for stretch in stretches:
-            for part in _parts(stretch, length):
-                missions.append(_mission(tracks.robots, one, part, known, means))
+            stretches = _crossings(tracks.at(known["time"].values)[i, :, :2], workspace)
+        missions += [_mission(tracks.robots, i, stretch, known, features)
+                     for stretch in stretches if len(stretch.edges) > _FEWEST]  # fmt: skip
     if not missions:
         raise TrustboError(f"the log of {n * tick:g} s has no two bounds; give a shorter window.")
     return missions
@@ -241,37 +238,27 @@ class _Stretch(NamedTuple):
     path: tuple[Cell, ...]  # empty without a map
 
 
-def _simple(known: xr.Dataset) -> xr.Dataset:
-    """Features of the geometry in [0, 1]."""
-    usual = max(float(known["range"].median()), 1e-9)
-    return xr.Dataset(
-        {
-            "near": usual / (usual + known["range"]),
-            "ahead": (abs(known["bearing"]) < _AHEAD) * 1.0,
-            "clear": 1.0 - known["hidden"],
-        }
-    )
-
-
 def _mission(
-    robots: tuple[str, ...], lead: int, stretch: _Stretch, known: xr.Dataset, means: xr.Dataset
+    robots: tuple[str, ...],
+    lead: int,
+    stretch: _Stretch,
+    known: xr.Dataset,
+    features: dict[str, xr.DataArray],
 ) -> Mission:
-    """Mission of a stretch."""
+    """Mission of a stretch; features are over (watcher, seen, time)."""
     edges, tick = stretch.edges, known.attrs["tick"]
     cut, starts = slice(int(edges[0]), int(edges[-1])), edges[:-1] - edges[0]
-    dims = ("watcher", "seen", "time")
 
-    def total(values: xr.DataArray | np.ndarray) -> np.ndarray:
+    def total(values: xr.DataArray) -> np.ndarray:
         """Sums over the known ticks of each bound, (bound, robot)."""
-        array = values.transpose(*dims).values if isinstance(values, xr.DataArray) else values
-        ticks = np.where(seen, array[:, lead, cut], 0.0)
+        ticks = np.where(seen, values.values[:, lead, cut], 0.0)
         return np.add.reduceat(ticks, starts, axis=1).T
 
     seen = np.isfinite(known["range"].values[:, lead, cut])
     n_ticks = np.add.reduceat(seen.astype(float), starts, axis=1).T
     with np.errstate(invalid="ignore"):
         rate = total(known["contact"]) / n_ticks
-        z = np.stack([total(values) / n_ticks for values in means.data_vars.values()], axis=-1)
+        z = np.stack([total(values) / n_ticks for values in features.values()], axis=-1)
     for i in range(len(robots)):
         mean = np.nanmean(z[:, i], axis=0) if np.isfinite(z[:, i]).any() else 0.0
         z[:, i] = np.where(np.isnan(z[:, i]), mean, z[:, i])
@@ -282,26 +269,10 @@ def _mission(
         cell, duration = stretch.path[k + 1] if stretch.path else NOWHERE, [seconds] * len(robots)
         bounds.append(Bound(cell, z[k], rate[k], np.array(duration), "ok", t0, n_ticks=n_ticks[k]))
         t0 += seconds
-    return Mission(stretch.path, tuple(bounds), "ok", tuple(map(str, means)), robots)
+    return Mission(stretch.path, tuple(bounds), "ok", tuple(features), robots)
 
 
-def _leads(
-    tracks: Tracks, lead: str | Sequence[tuple[float, str]], starts: np.ndarray
-) -> list[tuple[int, int, int]]:
-    """Index of each lead, and its first and last tick; `starts` are those of the ticks, s."""
-    names = tracks.robots if lead == EACH else (lead,)
-    rows = [(0, name, len(starts)) for name in names]
-    if not isinstance(lead, str):
-        changes = sorted((float(t), name) for t, name in lead)
-        firsts = [int(np.searchsorted(starts, t - 1e-9)) for t, _ in changes]
-        rows = [(a, name, b) for a, (_, name), b
-                in zip(firsts, changes, [*firsts[1:], len(starts)], strict=True)]  # fmt: skip
-    for _, name, _ in rows:
-        require_choice("robot", name, tracks.robots)
-    return [(tracks.robots.index(str(name)), a, b) for a, name, b in rows]
-
-
-def _crossings(xy: np.ndarray, first: int, workspace: Workspace) -> list[_Stretch]:
+def _crossings(xy: np.ndarray, workspace: Workspace) -> list[_Stretch]:
     """Stretches along neighbouring cells that the lead, at xy (tick, 2), entered in order."""
     cells: list[Cell] = []
     for x, y in xy:
@@ -315,21 +286,12 @@ def _crossings(xy: np.ndarray, first: int, workspace: Workspace) -> list[_Stretc
             continue
         if path and (cell == NOWHERE or np.abs(np.subtract(path[-1], cell)).max() > 1):
             if len(path) > 1:
-                stretches.append(_Stretch(np.array([*edges[1:], k]) + first, tuple(path)))
+                stretches.append(_Stretch(np.array([*edges[1:], k]), tuple(path)))
             path, edges = [], []
         if cell != NOWHERE:
             path.append(cell)
             edges.append(k)
     return stretches
-
-
-def _parts(stretch: _Stretch, length: int | None) -> list[_Stretch]:
-    """Parts of at most `length` bounds; those of a single bound are left out."""
-    n = len(stretch.edges) - 1
-    step = max(n if length is None else length, _FEWEST)
-    ends = [(a, min(a + step, n)) for a in range(0, n, step)]
-    return [_Stretch(stretch.edges[a : b + 1], stretch.path[a : b + 1])
-            for a, b in ends if b - a >= _FEWEST]  # fmt: skip
 
 
 def _track(name: str, rows: np.ndarray) -> np.ndarray:
