@@ -45,7 +45,7 @@ def by_quadrature(posterior, theta):
 def test_the_evidence_and_the_mean_weight_are_those_of_quadrature(observation, y):
     posterior = small(observation, y)
     theta = posterior.theta(np.array([[0.0, -0.5, 0.2]]))
-    posterior.settle(np.array([0.0, -0.5, 0.2]))
+    posterior.settle(theta)
     wanted = by_quadrature(posterior, theta)
     args = posterior._with_terms(*posterior._at(theta))
     found, _ = ep.log_evidence(*args, posterior.sites, 10)

@@ -233,7 +233,7 @@ def log_diagonal(L: Any) -> Any:
 def times(M: Any, x: Any) -> Any:
     """Products (point, row) of a sparse matrix with vectors x (point, column)."""
     if isinstance(x, np.ndarray):
-        return (M @ x.T).T
+        return np.ascontiguousarray((M @ x.T).T)
     M = M.tocoo()
     order = np.argsort(M.row, kind="stable")
     terms = M.data[order, None] * x.T[M.col[order]]

@@ -53,7 +53,7 @@ def loo(posterior: xr.DataTree, *, model: TrustModel | None = None) -> ELPDData:
     if "observed_data" in posterior.children and "rate" in posterior["observed_data"].dims:
         raise TrustboError("loo leaves out missions; of a view by rate, give the posterior itself.")
     fitted, draws = read_posterior(posterior, model=model)
-    fitted.settle_at(draws)
+    fitted.settle(draws.theta)
     measured = np.flatnonzero(~np.isnan(fitted.slots.y).all((1, 2)))
     if len(measured) < 2:
         raise TrustboError(

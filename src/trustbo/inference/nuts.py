@@ -21,8 +21,8 @@ from numpyro.infer import MCMC, NUTS, init_to_value
 
 from trustbo.inference import importance
 from trustbo.inference.diagnostics import complaints_of
-from trustbo.inference.engine import cholesky, draw_columns, evidence, expected
-from trustbo.inference.posterior import Draws, Posterior, at
+from trustbo.inference.engine import cholesky, expected
+from trustbo.inference.posterior import Draws, Posterior, chunks
 from trustbo.models.backend import own_settings
 from trustbo.models.signal import each
 
@@ -131,22 +131,19 @@ def _draws_of(
     model, slots, blocks = posterior.model, posterior.slots, posterior.blocks
     values = {name: samples[name] for name in posterior.scores.priors}
     theta, c, f = model.theta(values, slots.resolution), [], []
-    for i in range(len(theta["rest"])):
-        one = at(theta, slice(i, i + 1))
-        signal = model.signal(one, slots, posterior.layout)
-        if posterior.exact:
-            prior = posterior.prior(one)
-            fit = evidence(blocks, signal, prior, blocks.seen / signal.sd**2)
-            c.append(draw_columns(prior, fit, np.ones(1, dtype=int), rng))
-            continue
+    if posterior.exact:
+        return Draws(theta, posterior.draw_columns(theta, rng), None, 0.0, 0.0)
+    for where, some in chunks(theta):
         columns = []
         for effect in model.columns:
-            mean, parts = effect.prior(one, slots)
+            mean, parts = effect.prior(some, slots)
             label = effect.noun or "weights"
-            white = np.concatenate([samples[f"{label}_{k}"][i] for k in range(len(parts))])
-            columns.append(white if mean is None else white + mean[0])
-        c.append(np.concatenate(columns)[None])
+            white = [samples[f"{label}_{k}"][where] for k in range(len(parts))]
+            if parts:
+                columns.append(np.concatenate(white, axis=1) + (0.0 if mean is None else mean))
+        c.append(np.concatenate(columns, axis=1))
+        signal = model.signal(some, slots, posterior.layout)
         root = cholesky(signal.covariance + 1e-10 * np.eye(signal.covariance.shape[-1]))
-        noise = each(root, blocks.label) @ samples["trust_noise"][i][None, ..., None]
+        noise = each(root, blocks.label) @ samples["trust_noise"][where][..., None]
         f.append(expected(blocks, signal, c[-1]) + noise[..., 0])
-    return Draws(theta, np.concatenate(c), np.concatenate(f) if f else None, 0.0, 0.0)
+    return Draws(theta, np.concatenate(c), np.concatenate(f), 0.0, 0.0)

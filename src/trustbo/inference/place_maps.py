@@ -11,7 +11,6 @@ effects, without Monte Carlo error where nothing was measured.
 """
 
 from collections.abc import Iterator, Mapping
-from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -32,54 +31,53 @@ _MOMENTS = "mean", "standard deviation of the"
 _OF_CELL, _OF_BOUND = ("effect", "row", "col"), ("effect", "move", "row", "col")
 
 
-class PlaceScales(NamedTuple):
-    """Hyperparameters of places, each (draw,); 0 for an absent effect."""
-
-    tau_s: np.ndarray
-    length_scale: np.ndarray
-    tau_e: np.ndarray
+Scales = Mapping[str, np.ndarray]
+"""Hyperparameters of places by name, each (draw,)."""
 
 
 def draw_maps(
-    scales: PlaceScales,
-    places: Visited,
-    s: np.ndarray | None,
-    e: np.ndarray | None,
-    seed: int,
-) -> tuple[np.ndarray | None, np.ndarray | None]:
+    scales: Scales, places: Visited, visited: Mapping[str, np.ndarray], seed: int
+) -> dict[str, np.ndarray]:
     """Draw the effects of all cells and bounds given those of visited places.
 
     Args:
         scales: Hyperparameters of each draw.
         places: Visited places, the grid's shape among them.
-        s: Effects of visited cells (draw, cell); None where cells have none.
-        e: Effects of visited bounds (draw, unit); None where bounds have none.
+        visited: Effects `place` (draw, cell) and `place_bound` (draw, unit), as the model has them.
         seed: Seed of the effects of places not visited.
 
     Returns:
-        place (draw, effect, row, col) and place_bound (draw, effect, move, row, col), None where
-        the model has no such effect. The axis effect is of robots, of length 1 where all share
-        them.
+        place (draw, effect, row, col) and place_bound (draw, effect, move, row, col). The axis
+        effect is of robots, of length 1 where all share them.
     """
-    n, n_effects = len(scales.tau_s), places.n_effects
-    place = place_bound = None
-    if s is not None:
-        place = np.empty((n, n_effects, *places.shape))
-        for i in range(n_effects):
-            mine = places.cells[:, 0] == i
-            place[:, i] = _cells(scales, places.shape, places.cells[mine], s[:, mine], [seed, i])
-    if e is not None:
-        rng = np.random.default_rng([seed, n_effects])
-        place_bound = rng.standard_normal((n, n_effects, N_MOVES, *places.shape))
-        place_bound *= scales.tau_e[:, None, None, None, None]
-        _centre(place_bound)
-        place_bound[:, *places.units.T] = e
-    return place, place_bound
+    maps, n_effects = {}, places.n_effects
+    if "place" in visited:
+        maps["place"] = np.stack(
+            [
+                _cells(scales, places.shape, cells, s, [seed, i])
+                for i, (cells, s) in enumerate(_by_robot(places, visited["place"]))
+            ],
+            axis=1,
+        )
+    if "place_bound" in visited:
+        shape = len(visited["place_bound"]), n_effects, N_MOVES, *places.shape
+        e = np.random.default_rng([seed, n_effects]).standard_normal(shape)
+        e *= scales["tau_e"][:, None, None, None, None]
+        maps["place_bound"] = _centre(e)
+        e[:, *places.units.T] = visited["place_bound"]
+    return maps
+
+
+def _by_robot(places: Visited, s: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Visited cells of each robot, or of all that share effects, and their draws."""
+    for i in range(places.n_effects):
+        mine = places.cells[:, 0] == i
+        yield places.cells[mine], s[:, mine]
 
 
 @one_blas_thread()
 def _cells(
-    scales: PlaceScales,
+    scales: Scales,
     shape: tuple[int, int],
     cells: np.ndarray,
     values: np.ndarray,
@@ -89,9 +87,9 @@ def _cells(
     flat = cells[:, 1] * shape[1] + cells[:, 2]
     centre = np.zeros((len(values), shape[0] * shape[1]))
     off = np.empty(centre.shape)
-    for step, rows, length_scale, weights, _ in _kriging(scales.length_scale, shape, cells):
+    for step, rows, length_scale, weights, _ in _kriging(scales["length_scale"], shape, cells):
         rng = np.random.default_rng([*seed, step + 1000])
-        free = _prior(shape, length_scale, int(rows.sum()), rng) * scales.tau_s[rows, None]
+        free = _prior(shape, length_scale, int(rows.sum()), rng) * scales["tau_s"][rows, None]
         centre[rows] = values[rows] @ weights
         off[rows] = free - free[:, flat] @ weights
     return (centre + _centre(off)).reshape(-1, *shape)
@@ -173,21 +171,14 @@ def visited_of(group: xr.Dataset) -> Visited:
     return Visited(shape, cells, units, np.zeros(0, dtype=int), nothing)  # pyright: ignore
 
 
-def place_maps_of(
-    group: xr.Dataset, sites: Mapping[str, np.ndarray]
-) -> dict[str, np.ndarray | None]:
+def place_maps_of(group: xr.Dataset, sites: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Effects over the whole grid for each draw of a posterior, see `draw_maps`.
 
     Args:
         group: Group `places` of a posterior.
         sites: Its hyperparameters by name, (draw,), chains joined.
     """
-    visited = _visited_draws(group)
-    maps = draw_maps(
-        scales_of(sites), visited_of(group), visited.get("place"), visited.get("place_bound"),
-        int(group.attrs["seed"]),
-    )  # fmt: skip
-    return dict(zip(_AXIS, maps, strict=True))
+    return draw_maps(sites, visited_of(group), _visited_draws(group), int(group.attrs["seed"]))
 
 
 def place_maps(posterior: xr.DataTree) -> xr.Dataset:
@@ -216,21 +207,20 @@ def place_maps(posterior: xr.DataTree) -> xr.Dataset:
             "has no maps of them; fit a model with effects=PlaceEffect()."
         )
     group = posterior["places"].to_dataset()
-    draws = posterior["posterior"].to_dataset()
-    names = ("beta0", "tau_s", "length_scale", "tau_e")
-    scales = scales_of({n: draws[n].values.reshape(-1) for n in names if n in draws})
+    sites = posterior["posterior"].to_dataset()
+    names = [name for name in ("tau_s", "length_scale", "tau_e") if name in sites]
+    scales = {name: sites[name].values.reshape(-1) for name in names}
     places, visited, maps = visited_of(group), _visited_draws(group), xr.Dataset()
     if "place" in visited:
         moments = [
-            _moments_of_cells(scales, places.shape, places.cells[mine], visited["place"][:, mine])
-            for i in range(places.n_effects)
-            for mine in [places.cells[:, 0] == i]
+            _moments_of_cells(scales, places.shape, cells, s)
+            for cells, s in _by_robot(places, visited["place"])
         ]
         _add(maps, "place", "effect of the cell", ("row", "col"), np.stack(moments, axis=1))
     if "place_bound" in visited:
         e, axes = visited["place_bound"], ("move", "row", "col")
         effects_by_bound = np.zeros((2, places.n_effects, N_MOVES, *places.shape))
-        effects_by_bound[1] = np.sqrt((scales.tau_e**2).mean())
+        effects_by_bound[1] = np.sqrt((scales["tau_e"] ** 2).mean())
         effects_by_bound[:, *places.units.T] = e.mean(0), e.std(0)
         effects_by_bound[..., ~existing_bounds(np.ones(places.shape, bool))] = np.nan
         _add(maps, "place_bound", "effect of the bound by a move", axes, effects_by_bound)
@@ -243,14 +233,14 @@ def place_maps(posterior: xr.DataTree) -> xr.Dataset:
 
 @one_blas_thread()
 def _moments_of_cells(
-    scales: PlaceScales, shape: tuple[int, int], cells: np.ndarray, draws: np.ndarray
+    scales: Scales, shape: tuple[int, int], cells: np.ndarray, draws: np.ndarray
 ) -> np.ndarray:
     """Mean and standard deviation of s over the grid, (2, row, col)."""
     centre = np.zeros((len(draws), shape[0] * shape[1]))
     variance = np.zeros(shape[0] * shape[1])
-    for _, rows, _, weights, left in _kriging(scales.length_scale, shape, cells):
+    for _, rows, _, weights, left in _kriging(scales["length_scale"], shape, cells):
         centre[rows] = draws[rows] @ weights
-        variance += (scales.tau_s[rows] ** 2).sum() * left / len(draws)
+        variance += (scales["tau_s"][rows] ** 2).sum() * left / len(draws)
     return np.stack([centre.mean(0), np.sqrt(centre.var(0) + variance)]).reshape(2, *shape)
 
 
@@ -270,12 +260,3 @@ def _visited_draws(group: xr.Dataset) -> dict[str, np.ndarray]:
         for name, axis in _AXIS.items()
         if name in group
     }
-
-
-def scales_of(sites: Mapping[str, np.ndarray]) -> PlaceScales:
-    """Hyperparameters by name; 0 for those of an absent effect."""
-    nothing = np.zeros(len(sites["beta0"]))
-    return PlaceScales(
-        sites.get("tau_s", nothing), sites.get("length_scale", nothing + 1.0),
-        sites.get("tau_e", nothing),
-    )  # fmt: skip

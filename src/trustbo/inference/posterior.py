@@ -74,20 +74,15 @@ class Posterior:
         self._columns = sparse.hstack(columns, format="csr")
         self._U = self.layout.columns(self._columns)
         self.exact = model.family.gaussian
-        self._measure()
-
-    def _measure(self) -> None:
-        y, n_ticks = self.layout.rows(self.slots.y), self.slots.n_ticks
+        y = self.layout.rows(slots.y)
         self.blocks = Blocks.of(y, self._U, self.layout.label, apart=not self.exact)
         if not self.exact:
-            self.terms = ep.Terms(self.model.family, y, self.layout.rows(n_ticks))
+            self.terms = ep.Terms(model.family, y, self.layout.rows(slots.n_ticks))
             self.sites = ep.first_sites(self.terms)
 
     def without(self, mission: int) -> "Posterior":
         """The same posterior as if a mission had not been measured."""
-        other = object.__new__(Posterior)
-        vars(other).update(vars(self), slots=self.slots.without([mission]))
-        other._measure()
+        other = Posterior(self.model, self.slots.without([mission]), memoryless=self.memoryless)
         if not self.exact:
             kept = ~np.isnan(other.terms.y)
             other.sites = ep.Sites(*(np.where(kept, site, 0.0) for site in self.sites))
@@ -128,20 +123,12 @@ class Posterior:
                 found[i] = ep.log_evidence(*self._with_terms(signal, prior), self.sites, _SWEEPS)[0]  # pyright: ignore[reportCallIssue]
         return found
 
-    def settle(self, z: np.ndarray) -> None:
-        """Find the sites of EP at a point (score,), from which those elsewhere start."""
+    def settle(self, theta: Theta) -> None:
+        """Find the sites of EP at the mean of some points, from which those elsewhere start."""
         if not self.exact:
-            self._settle(self.theta(z[None]))
-
-    def _settle(self, theta: Theta) -> None:
-        args = self._with_terms(*self._at(theta))
-        self.sites = ep.log_evidence(*args, self.sites, _SETTLED, _DAMPING)[1]  # pyright: ignore[reportCallIssue]
-
-    def settle_at(self, draws: Draws) -> None:
-        """Find the sites of EP at the mean of draws."""
-        if not self.exact:
-            theta = {name: values.mean(0, keepdims=True) for name, values in draws.theta.items()}
-            self._settle(theta)
+            center = {name: values.mean(0, keepdims=True) for name, values in theta.items()}
+            args = self._with_terms(*self._at(center))
+            self.sites = ep.log_evidence(*args, self.sites, _SETTLED, _DAMPING)[1]  # pyright: ignore[reportCallIssue]
 
     def start(self) -> np.ndarray:
         """The best of four points to search the mode from, or with EP the mode; (score,)."""
@@ -149,12 +136,12 @@ class Posterior:
         unit = self.model.family.line_of_sight[0]
         spread = np.log(np.clip(unit * np.nanstd(self.slots.y) / 0.2, 1e-2, 3.0))
         starts[:, self.scores.sizes] = spread - np.array(_SIZES)[:, None]
-        self.settle(starts[1])
+        self.settle(self.theta(starts[1:2]))
         best = starts[self.log_density(starts).argmax()]
         if not self.exact:
-            self.settle(best)
+            self.settle(self.theta(best[None]))
             best = find_mode(self.log_density, best).center
-            self.settle(best)
+            self.settle(self.theta(best[None]))
         return best
 
     def defensive(self, proposal: Student) -> Student:
@@ -178,13 +165,9 @@ class Posterior:
         """
         unique, index, count = np.unique(z, axis=0, return_inverse=True, return_counts=True)
         if self.exact:
-            theta, drawn = self.theta(unique), []
-            for i, chunk in chunks(theta):
-                signal, prior = self._at(chunk)
-                fit = evidence(self.blocks, signal, prior, self._lam(signal))
-                drawn.append(draw_columns(prior, fit, count[i], rng))
+            c = self.draw_columns(self.theta(unique), rng, count)
             order = np.argsort(np.argsort(index.ravel(), kind="stable"), kind="stable")
-            return Draws(at(theta, index.ravel()), np.concatenate(drawn)[order], None, 0.0, 0.0)
+            return Draws(at(self.theta(unique), index.ravel()), c[order], None, 0.0, 0.0)
         some = np.linspace(0, len(z) - 1, min(_WEIGHTED, len(z))).astype(int)
         theta, parts = self.theta(z[some]), []
         for _, chunk in chunks(theta):
@@ -197,13 +180,15 @@ class Posterior:
         chosen = systematic(weight, n, rng)
         return Draws(at(theta, chosen), c[chosen], f[chosen], k_hat, log_mean)
 
-    def draw_columns(self, theta: Theta, rng: np.random.Generator) -> np.ndarray:
-        """One draw of the columns at each point given Gaussian rates, (point, column)."""
-        drawn = []
-        for _, chunk in chunks(theta):
+    def draw_columns(
+        self, theta: Theta, rng: np.random.Generator, count: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Draws of the columns at each point given Gaussian rates, one or `count` of each."""
+        count, drawn = np.ones(len(theta["rest"]), dtype=int) if count is None else count, []
+        for where, chunk in chunks(theta):
             signal, prior = self._at(chunk)
             fit = evidence(self.blocks, signal, prior, self._lam(signal))
-            drawn.append(draw_columns(prior, fit, np.ones(len(signal.sd), dtype=int), rng))
+            drawn.append(draw_columns(prior, fit, count[where], rng))
         return np.concatenate(drawn)
 
     def named(self, draws: Draws, rng: np.random.Generator) -> dict[str, dict[str, np.ndarray]]:
@@ -252,32 +237,18 @@ class Posterior:
             kept: Indices of the draws whose trust is kept.
             rng: Random number generator.
         """
-        if not self.exact:  # draws repeat, see `draw`: each is evaluated once
-            rows = [v.reshape(len(draws.c), -1) for v in draws.theta.values()]
-            rows, some, index = np.unique(
-                np.column_stack([*rows, draws.c]), axis=0, return_index=True, return_inverse=True
-            )
-            of_point = [slice(i, i + _CHUNK) for i in range(0, len(rows), _CHUNK)]
-            draws, index = (
-                Draws(at(draws.theta, some), draws.c[some], None, 0.0, 0.0),
-                index.ravel(),
-            )
-        else:
-            rows = [v.reshape(len(draws.c), -1) for v in draws.theta.values()]
-            _, point = np.unique(np.column_stack(rows), axis=0, return_inverse=True)
-            order, index = np.argsort(point.ravel(), kind="stable"), np.arange(len(draws.c))
-            of_point = np.split(order, np.cumsum(np.bincount(point.ravel()))[:-1])
-        shape = (len(draws.c), *self.slots.y.shape)
-        trust, predicted = np.empty(shape), np.empty(shape)
-        log_likelihood = np.empty(shape[:2])
-        for where in of_point:
-            one = where[:1] if self.exact else where  # pyright: ignore[reportIndexIssue]
-            theta = at(draws.theta, one)
+        rows = [v.reshape(len(draws.c), -1) for v in draws.theta.values()]
+        _, some, index = np.unique(  # under EP draws repeat: each is evaluated once
+            np.column_stack([*rows, draws.c]), axis=0, return_index=True, return_inverse=True
+        )
+        index, draws = index.ravel(), Draws(at(draws.theta, some), draws.c[some], None, 0.0, 0.0)
+        shape = (len(some), *self.slots.y.shape)
+        trust, predicted, log_likelihood = np.empty(shape), np.empty(shape), np.empty(shape[:2])
+        for where, theta in chunks(draws.theta):
             signal = self.model.signal(theta, self.slots, self.layout)
             mean = expected(self.blocks, signal, draws.c[where])
-            x, log_p = (self._exact_trust if self.exact else self._ep_trust)(
-                theta, signal, mean, rng
-            )
+            given_mean = self._exact_trust if self.exact else self._ep_trust
+            x, log_p = given_mean(theta, signal, mean, rng)
             trust[where] = self.layout.slots(x)
             log_likelihood[where] = log_p.reshape(len(log_p), shape[1], -1).sum(2)
             predicted[where] = self._anew(signal, mean, rng)

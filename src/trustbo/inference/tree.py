@@ -149,8 +149,7 @@ def complete(
         return posterior
     missions = missions_of(posterior) if missions is None else missions
     fitted, draws = read_posterior(posterior, missions, model=model)
-    if not fitted.exact:
-        fitted.settle_at(draws)
+    fitted.settle(draws.theta)
     seed, sizes = posterior.attrs["seed"], posterior["posterior"].sizes
     n_chains, n_draws = sizes["chain"], sizes["draw"]
     kept = np.linspace(0, n_draws - 1, min(n_draws, max(1, _N_TRAJECTORIES // n_chains)))
