@@ -1,17 +1,12 @@
-"""Arguments, timer, tables and kept records of the benchmark scripts."""
+"""Arguments, timer and tables of the benchmark scripts."""
 
 import argparse
 import csv
-import json
 import os
-import statistics
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from trustbo.study.world import World
+from typing import Any
 
 
 def arguments(
@@ -78,34 +73,9 @@ def timed(work: Callable[[], Any]) -> tuple[float, Any]:
     return time.perf_counter() - started, result
 
 
-def median_seconds(work: Callable[[], object], n: int = 5) -> float:
-    """Median seconds of n calls, after one that compiles."""
-    work()
-    return statistics.median(timed(work)[0] for _ in range(n))
-
-
-def median_processor_seconds(work: Callable[[], object], n: int = 3) -> float:
-    """The same of processor seconds, which other work on the machine lengthens less."""
-    work()
-    seconds = []
-    for _ in range(n):
-        started = time.process_time()
-        work()
-        seconds.append(time.process_time() - started)
-    return statistics.median(seconds)
-
-
 def verdict(met: bool) -> str:
     """Word for a target that is met or missed."""
     return "yes" if met else "NO"
-
-
-def faster(theirs: float, ours: float, least: float | None = None) -> str:
-    """Ratio of two times and, where there is a target, whether it is met."""
-    text = f"{theirs / ours:.1f} x"
-    return (
-        text if least is None else f"{text} (target {least:g} x: {verdict(theirs >= least * ours)})"
-    )
 
 
 # --- tables ---
@@ -138,47 +108,3 @@ class Table:
             for i, (cell, width) in enumerate(zip(cells, self._widths, strict=True))
         ]
         print(f"| {' | '.join(texts)} |", flush=True)
-
-
-# --- records that a script goes on from ---
-
-
-def read_records(file: Path) -> list[Any]:
-    """Records that a file of JSON lines has so far; none where there is no file."""
-    return [json.loads(line) for line in file.open()] if file.exists() else []
-
-
-def add_record(file: Path, record: object) -> None:
-    """Append a record to a file of JSON lines."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    with file.open("a") as stream:
-        stream.write(json.dumps(record) + "\n")
-
-
-def records_of(
-    file: Path,
-    worlds: "Iterable[World]",
-    courses: Sequence[str],
-    n: int,
-    measure: "Callable[[World, str, int], dict[str, Any]]",
-) -> list[dict[str, Any]]:
-    """Records of a campaign of n missions for each course and world; what is kept is not redone.
-
-    Args:
-        file: File of JSON lines, of records with "world", "course" and "n".
-        worlds: Worlds.
-        courses: Names of courses.
-        n: Missions of a campaign.
-        measure: Drives one campaign; its record.
-    """
-    names = {world.name: world for world in worlds}
-    done = {(r["world"], r["course"], r["n"]) for r in read_records(file)}
-    for course in courses:
-        for name, world in names.items():
-            if (name, course, n) not in done:
-                add_record(file, measure(world, course, n))
-                print(f"{name}, {course}", flush=True)
-    return [
-        r for r in read_records(file)
-        if r["n"] == n and r["world"] in names and r["course"] in courses
-    ]  # fmt: skip

@@ -6,7 +6,7 @@
 and 200 missions, of shared noise and of censored rates; the first in a process, and the median of
 three. `nuts`: the default model on eight missions by `sampler="nuts"`, compiling included, and the
 distance of its means from those of importance sampling. `paper`: effective draws per second on the
-paper's model with 600 rates, against `MCMC(NUTS(model.program))`.
+paper's model with 600 rates, against `MCMC(NUTS(model.program))` and PyMC with nutpie.
 """
 
 import sys
@@ -74,11 +74,19 @@ def nuts():
 
 
 def paper():
-    """Effective draws per second of the paper's model."""
+    """Effective draws per second of the paper's model, beside NumPyro and PyMC with nutpie."""
     data, model = missions(20), PooledTrust().for_features(["line_of_sight", "slope"])
     tb.fit(data, model, whole=False)
     started = time.process_time()
     ours = tb.fit(data, model, whole=False).attrs["kish"] / (time.process_time() - started)
+    print(f"paper's model, 600 rates: {ours:.0f} effective draws a second")
+    for peer, (draws, seconds) in {"NumPyro": by_numpyro(model, data), **by_nutpie(data)}.items():
+        least = min(float(sampling_diagnostics.ess(draws[n])) for n in ("beta0", "delta_w"))
+        print(f"{peer}: {least / seconds:.0f} a second, a ratio of {ours * seconds / least:.1f}")
+
+
+def by_numpyro(model, data):
+    """Draws of NumPyro's NUTS on the plain program, and seconds without compiling."""
     with own_settings():
         mcmc = MCMC(
             NUTS(model.program), num_warmup=500, num_samples=1000, num_chains=4,
@@ -88,12 +96,19 @@ def paper():
         mcmc.run(jax.random.key(0), slots)
         started = time.process_time()
         mcmc.run(jax.random.key(1), slots)
-        draws = mcmc.get_samples(group_by_chain=True)
-    seconds = time.process_time() - started
-    least = min(sampling_diagnostics.ess(np.asarray(draws[n])) for n in ("beta0", "delta_w"))
-    theirs = float(np.min(least)) / seconds
-    ratio = ours / theirs
-    print(f"paper's model, 600 rates: {ours:.0f} a second, NumPyro {theirs:.0f}: {ratio:.0f} x")
+        draws = {n: np.asarray(v) for n, v in mcmc.get_samples(group_by_chain=True).items()}
+    return draws, time.process_time() - started
+
+
+def by_nutpie(data):
+    """The same of PyMC with nutpie; nothing where these are not installed."""
+    try:
+        from peers.pymc_nutpie import pooled, sampled
+    except ImportError as error:
+        print(f"left out: {error}")
+        return {}
+    z, y = (np.stack([getattr(m, name) for m in data]) for name in ("awareness", "contact_rate"))
+    return {"PyMC with nutpie": sampled(pooled(z, y), ("beta0", "delta_w"))}
 
 
 if __name__ == "__main__":

@@ -1,48 +1,39 @@
-"""HumanTrust on the reports of three studies, beside baselines; people predicted are left out.
+"""HumanTrust on the reports of two studies, beside baselines, for people left out of the fit.
 
-Run: python benchmarks/people.py [soh] [azevedo] [du] [--data FOLDER]
+Run: python benchmarks/people.py [soh] [azevedo] [--data FOLDER]
 
-The folder (`TRUSTBO_DATA` by default, or its `humans/`) holds tables that are not ours to ship,
-made of the public files of clear-nus/human-trust-transfer (soh_household.csv, soh_driving.csv),
-hazevedosa/bidirectional-trust (azevedo_sa.csv) and Du et al. 2025 (du_real.csv, du_vr.csv); the
-columns are those that the readers below name. Du's changes of trust are almost a function of level
-and event: a test of inputs, no evidence on people.
+The folder (`TRUSTBO_DATA` by default, or its `humans/`) holds tables that this project may not
+ship, made from the public files of clear-nus/human-trust-transfer (soh_household.csv,
+soh_driving.csv) and hazevedosa/bidirectional-trust (azevedo_sa.csv). The readers below name the
+columns.
 """
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 from common import Table, arguments, parsed, timed, verdict
-from scipy import special
 from scipy.special import expit, logit
 
 import trustbo as tb
 from trustbo.inference import loo, predict_reports
 from trustbo.models import HumanTrust
-from trustbo.models.people import FAILURE, SUCCESS
-from trustbo.stacking import stack_missions
 
 LEVELS = np.arange(7.0)
-_PENALTY = 2.0  # of a standardised weight of the ridge, in reports
-_LEAST = 0.02  # sd of a baseline's errors
 SOH = {"household": (0.181, 0.160, 0.120), "driving": (0.206, 0.175, 0.135)}
 
 
 def main():
-    parser = arguments(
-        __doc__, names=("soh", "azevedo", "du"), data=True, quick="likert scale alone"
-    )
+    parser = arguments(__doc__, names=("soh", "azevedo"), data=True)
     given = parsed(parser)
     if given.data is None:
         parser.error("give --data, or set TRUSTBO_DATA: the head of the script says what it holds")
     folder = given.data / "humans" if (given.data / "humans").is_dir() else given.data
     for name in given.names:
-        {"soh": soh, "azevedo": azevedo, "du": du}[name](folder, quick=given.quick)
+        {"soh": soh, "azevedo": azevedo}[name](folder)
 
 
-def soh(folder, *, quick):
+def soh(folder):
     """Their scale, expit(rating - 3.5), and protocol: 10 folds of people, of C, D and E alone."""
     table = Table("study", "method", "given", "MAE", "target", "met")
     for name, (means, transfer, own) in SOH.items():
@@ -83,19 +74,17 @@ def soh(folder, *, quick):
             table.row(f"{name}, {n} people", label, known, f"{mae:.3f}", aim or "", met)
 
 
-def azevedo(folder, *, quick):
+def azevedo(folder):
     """A third rating given two, of half of the people; and each part of the model by LOO."""
     people = read_azevedo_sa(folder / "azevedo_sa.csv")
     n = len(people)
     out = np.random.default_rng(0).permutation(n)[: n // 2]
     known = [without_last(m) if i in set(out.tolist()) else m for i, m in enumerate(people)]
-    scale = "likert7" if quick else "ordinal7"
     models = {
-        "HumanTrust": HumanTrust(scale=scale),
-        "even cut points": HumanTrust(scale="likert7"),
-        "symmetric": HumanTrust(scale=scale, asymmetric=False),
-        "persons alike": HumanTrust(scale=scale, persons=False),
-        "memory of the level": HumanTrust(scale=scale, memory="level"),
+        "HumanTrust": HumanTrust(scale="likert7"),
+        "symmetric": HumanTrust(scale="likert7", asymmetric=False),
+        "persons alike": HumanTrust(scale="likert7", persons=False),
+        "memory of the level": HumanTrust(scale="likert7", memory="level"),
     }
     table = Table("third rating given two", "log score", "MAE", "k-hat", "seconds")
     own = expit(LEVELS - 3.0)
@@ -117,18 +106,6 @@ def azevedo(folder, *, quick):
         dse = np.sqrt(len(gap) * gap.var())
         bad = int((one.pareto_k.values > 0.7).sum())
         table.row(name, f"{one.elpd:.1f}", f"{gap.sum():.1f}", f"{dse:.1f}", bad)
-    print()
-    print(compare_people(people, {"HumanTrust": models["HumanTrust"]}).round(3).to_string())
-
-
-def du(folder, *, quick):
-    """One step ahead, people left out: a test of inputs."""
-    for study in ("real", "vr"):
-        for events in (False, True):
-            people = read_du(folder / f"du_{study}.csv", events=events)
-            found = compare_people(people, {"HumanTrust": HumanTrust()})
-            print(f"\n{study}, {len(people)} people, {'events' if events else 'outcomes'}")
-            print(found.round(4).to_string())
 
 
 def read_soh(file):
@@ -176,32 +153,6 @@ def read_azevedo_sa(file):
     )
 
 
-def read_du(file, *, events=False):
-    """Missions of Du et al. (2025): trust before and after each of ten steps.
-
-    With `events`, outcomes are apart by the level of trust before (from .5, or below) and the
-    state, in place of two inputs.
-    """
-    table = pd.read_csv(file)
-    kinds = [f"{o}_{h}_{s}" for o in ("success", "failure") for h in ("high", "low") for s in "01"]
-    rows = []
-    for person, steps in table.groupby("person", sort=False):
-        before = dict.fromkeys(kinds, 0.0)
-        rows.append(
-            {"person": person, "step": 0, "report": steps["trust_before"].iloc[0], **before}
-        )
-        for one in steps.to_dict("records"):
-            outcome = "success" if one["task_result"] > 0.0 else "failure"
-            level = "high" if one["trust_before"] >= 0.5 else "low"
-            happened = before | {f"{outcome}_{level}_{int(one['state'])}": 1.0}
-            rows.append({"person": person, "step": one["step"], "report": one["trust_after"],
-                         "outcome": outcome, **happened})  # fmt: skip
-    answers = pd.DataFrame(rows)
-    if events:
-        return tb.logs.read_reports(answers, inputs=kinds)
-    return tb.logs.read_reports(answers, outcome="outcome")
-
-
 def median_of(probability, values):
     """Median of levels with these values."""
     at = (np.cumsum(probability, axis=-1) < 0.5).sum(-1)
@@ -216,118 +167,6 @@ def without_last(mission):
         None, mission.awareness, y, n_ticks=mission.n_ticks, features=mission.features,
         robots=mission.robots,
     )  # fmt: skip
-
-
-def compare_people(missions, models, *, given="earlier", folds=5, seed=0):
-    """Score predictions of reports by models and baselines, on people that none was fitted to.
-
-    People are divided into folds at random, and those of each predicted by fits to all others.
-    Baselines: `persistence`, the last report about the same task; `means`, that of reports before
-    any outcome, after a success and after a failure; and `ridge`, a linear regression on the
-    inputs and, given earlier reports, the last one and the person's mean. Their errors are normal.
-    A row for each method: the mean absolute error `mae`, of medians, the root mean square error
-    `rmse`, of means, both on the scale that was answered, the mean `log_score` (nats a report; of
-    its level, or density), `coverage_90`, and the number `n` of reports.
-    """
-    batch = stack_missions(missions, pad=False)
-    order = np.random.default_rng(seed).permutation(len(missions))
-    names = [*(["persistence"] if given == "earlier" else []), "means", "ridge", *models]
-    parts = {name: [] for name in names}
-    for test in np.array_split(order, folds):
-        train = np.setdiff1d(order, test)
-        table = _Table.of(batch, missions[0].features, given)
-        for name in names:
-            if name in models:
-                others = [missions[int(i)] for i in train]
-                tree = tb.fit(others, models[name], seed=seed, whole=False, progress=False)
-                people = [missions[int(i)] for i in test]
-                parts[name].append(_of_model(tree, people, table.scored[test], given, seed))
-            else:
-                parts[name].append(table.baseline(name, train, test))
-    found = pd.concat({name: pd.concat(of_folds) for name, of_folds in parts.items()})
-    by_name = found.groupby(level=0, sort=False)
-    scores = by_name.mean()
-    return scores.assign(rmse=np.sqrt(scores["rmse"]), n=by_name.size().astype(float))
-
-
-class _Table(NamedTuple):
-    """Reports of all people with what they are predicted from; axes (mission, bound, robot)."""
-
-    y: np.ndarray
-    steps: np.ndarray  # of the scale, NaN on the unit scale
-    kind: np.ndarray  # 0 before any outcome, 1 after a success, 2 after a failure
-    inputs: np.ndarray  # (mission, bound, robot, column)
-    last: np.ndarray  # NaN where there is none
-    scored: np.ndarray
-
-    @classmethod
-    def of(cls, batch, features, given):
-        """Columns of a batch."""
-        y, z = batch.contact_rate, batch.awareness
-        happened = [
-            z[..., [name.startswith(start) for name in features]].sum(-1) > 0.0
-            for start in (SUCCESS, FAILURE)
-        ]
-        kind = np.where(happened[0], 1, np.where(happened[1], 2, 0))
-        last, mean = np.full(y.shape, np.nan), np.full(y.shape, np.nan)
-        for k in range(1, y.shape[1]):
-            last[:, k] = np.where(np.isnan(y[:, k - 1]), last[:, k - 1], y[:, k - 1])
-            known = ~np.isnan(y[:, :k])
-            total = np.where(known, y[:, :k], 0.0).sum((1, 2))
-            with np.errstate(invalid="ignore"):
-                mean[:, k] = (total / known.sum((1, 2)))[:, None]
-        last = np.where(np.isnan(last), mean, last)
-        seen, inputs = ~np.isnan(y), [z, np.ones_like(z[..., :1])]
-        if given == "earlier":
-            seen &= ~np.isnan(last)
-            own = np.nan_to_num(np.stack([last, mean], axis=-1))
-            inputs += [own, own[..., :1] * (kind == 1)[..., None]]
-        return cls(y, batch.n_ticks, kind, np.concatenate(inputs, -1), last, seen)
-
-    def baseline(self, name, train, test):
-        """Predictions of a baseline."""
-        a, b = (self.scored & np.isin(np.arange(len(self.y)), some)[:, None, None]
-                for some in (train, test))  # fmt: skip
-        if name == "persistence":
-            fitted, mean = self.last[a], self.last[b]
-        elif name == "means":
-            means = np.array([self.y[a & (self.kind == k)].mean() if (a & (self.kind == k)).any()
-                              else self.y[a].mean() for k in range(3)])  # fmt: skip
-            fitted, mean = means[self.kind[a]], means[self.kind[b]]
-        else:
-            X, center = self.inputs[a], self.y[a].mean()
-            scale = X.std(0) + 1e-9
-            penalty = _PENALTY * np.where(X.std(0) > 0.0, scale**2, 1e-9)
-            w = np.linalg.solve(X.T @ X + np.diag(penalty), X.T @ (self.y[a] - center))
-            fitted, mean = (np.clip(v @ w + center, 0.0, 1.0) for v in (X, self.inputs[b]))
-        sd = max(float((self.y[a] - fitted).std()), _LEAST)
-        return _normal(self.y[b], self.steps[b], mean, sd)
-
-
-def _normal(y, steps, mean, sd):
-    """Normal predictions, of the level where reports have levels."""
-    half = 0.5 / steps
-    low, high = np.where(y <= 0.0, -np.inf, y - half), np.where(y >= 1.0, np.inf, y + half)
-    mass = np.diff(special.ndtr((np.stack([low, high]) - mean) / sd), axis=0)[0]
-    density = -0.5 * ((y - mean) / sd) ** 2 - np.log(sd * np.sqrt(2.0 * np.pi))
-    log_score = np.where(np.isnan(steps), density, np.log(np.maximum(mass, 1e-12)))
-    within = np.abs(y - mean) <= 1.6449 * sd + np.nan_to_num(half)
-    unit = np.nan_to_num(steps, nan=1.0)
-    return _scored(unit * y, unit * mean, unit * mean, log_score, within)
-
-
-def _of_model(tree, people, scored, given, seed):
-    found = predict_reports(tree, people, given=given, seed=seed)
-    scored = scored[:, : found.sizes["bound"]]
-    y, mean, log_score = (found[name].values[scored] for name in ("report", "mean", "log_score"))
-    low, median, high = (found["quantile"].values[scored][:, i] for i in (0, 2, 4))
-    return _scored(y, mean, median, log_score, (low <= y + 1e-9) & (y <= high + 1e-9))
-
-
-def _scored(y, mean, median, log_score, covered):
-    """Errors and scores of some reports, a row for each."""
-    off = {"mae": np.abs(y - median), "rmse": (y - mean) ** 2}
-    return pd.DataFrame({**off, "log_score": log_score, "coverage_90": covered.astype(float)})
 
 
 if __name__ == "__main__":
