@@ -1,4 +1,4 @@
-# make demo       install into .venv and run the main job on a real hillside
+# make demo       install into .venv and run a campaign on a real hillside, whose map is old
 # make test       install what the tests need too, and run them
 # make notebooks  run the notebooks, with fewer missions than they show
 # make slow       run the tests that take long, which make test leaves out
@@ -19,7 +19,7 @@ unexport PYTHONDONTWRITEBYTECODE
 .PHONY: demo test notebooks slow lint docs bench peers clean
 
 demo: $(VENV)/.installed
-	$(BIN)/trustbo demo --out out/demo --overwrite
+	$(BIN)/python scripts/demo.py --out out/demo
 
 # A fresh clone compiles for long what these tests run for short: with no optimisation, half as long.
 test: $(VENV)/.installed-dev

@@ -1,0 +1,164 @@
+"""A campaign on an old map: what a bound is, and trust and path before and after eight missions.
+
+Run: python scripts/demo.py [--out out/demo] [--picture FILE]
+
+On the hillside near Wellington that comes with the package, 3 m of scrub have grown within 45 m of
+the middle of the first path since the survey. The map does not show it. The folder has the
+campaign, its report, and maps and path for GIS; `--picture` also runs the campaign in a world where
+the map is right, finds the best path of both worlds, and draws the first figure of the docs.
+"""
+
+import argparse
+from pathlib import Path
+
+import matplotlib as mpl
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+from matplotlib.ticker import MaxNLocator
+
+import trustbo as tb
+from trustbo.plots.maps import draw_cells, draw_ground, draw_scale, robust_limits
+from trustbo.plots.style import GREY, ROBOTS, outlined
+
+START, GOAL, MISSIONS = (9, 0), (0, 9), 8
+HEIGHT, RADIUS = 3.0, 45.0
+BOUND = 10
+"""Bound of the new path that is drawn, from 1."""
+ASPECT = 1.43
+"""Width of a panel divided by its height, that of the hillside."""
+
+
+def main() -> None:
+    """Run the campaign, print what it learned, and draw the picture."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--out", type=Path, default=Path("out/demo"))
+    parser.add_argument("--picture", type=Path)
+    given = parser.parse_args()
+
+    mpl.use("agg")
+    workspace = tb.Workspace.from_terrain(tb.terrain.example(), shape=(10, 10))
+    with tb.Campaign(workspace, START, GOAL, directory=given.out, overwrite=True) as campaign:
+        path = campaign.ask().path
+        center = workspace.grid.center(path[len(path) // 2])
+        scrub = tb.simulation.Trees(HEIGHT, center, RADIUS)
+        changed = tb.simulation.KinematicSimulator(workspace, events=[scrub])
+        for _ in campaign.run(changed, MISSIONS):
+            pass
+        result = campaign.result()
+
+    tb.report.write_report(given.out / "report.html", result)
+    tb.export.export_result(result, given.out)
+    lost = result.history["contact_lost"].values
+    print(
+        f"learned: scrub that the map does not show cost {lost[0]:.1f} of {len(path) - 1} "
+        f"bounds of contact in mission 1; the new path lost {lost[-1]:.1f} in mission {MISSIONS}"
+    )
+    print(f"results are in {given.out}; open {given.out / 'report.html'}")
+    if given.picture is not None:
+        draw(result, changed, center, given.picture)
+
+
+def draw(
+    result: tb.Result,
+    changed: tb.simulation.KinematicSimulator,
+    center: tuple[float, float],
+    file: Path,
+) -> None:
+    """Draw a bound, trust and path before and after, and the contact lost by mission."""
+    workspace = result.workspace
+    right = tb.simulation.KinematicSimulator(workspace)
+    known = tb.iterate(workspace, START, GOAL, n_iterations=MISSIONS, simulator=right)
+
+    style = {"font.size": 9, "axes.titlesize": 10, "legend.frameon": False}
+    with mpl.rc_context(style):
+        figure, axes = plt.subplots(2, 2, figsize=(8.0, 5.9), layout="constrained")
+        (bound, lost), maps = axes
+        draw_bound(bound, result.plan)
+        draw_trust(figure, maps, result, center)
+        worlds = {"old survey": (changed, result), "map is right": (right, known)}
+        for colour, (label, world) in zip((ROBOTS[1], ROBOTS[0]), worlds.items(), strict=True):
+            draw_lost(lost, *world, colour, label)
+        lost.set(title="(b) contact lost", xlabel="mission", ylabel="bounds of contact lost")
+        lost.xaxis.set_major_locator(MaxNLocator(integer=True))
+        lost.spines[["top", "right"]].set_visible(False)
+        lost.set_ylim(bottom=0.0)
+        lost.set_box_aspect(1.0 / ASPECT)
+        lost.legend()
+        figure.savefig(file, dpi=150, facecolor="white")
+    print(f"the picture is in {file}")
+
+
+def draw_bound(ax: Axes, plan: tb.planning.Plan) -> None:
+    """Draw one bound: T1 drives its route while T2 watches from its overwatch points."""
+    corner = np.array(plan.workspace.grid.corner)
+    draw_ground(ax, plan.workspace)
+    route, *others = (one - corner for one in plan.routes[BOUND - 1])
+    posts = plan.posts[BOUND - 1] - corner
+    for share in (0.3, 0.65, 1.0):
+        ends = np.broadcast_to(route[round(share * (len(route) - 1))], posts.shape)
+        sight = ax.plot(*np.stack([posts, ends], 1).T, color=GREY, linewidth=0.8)
+    (moves,) = ax.plot(*route.T, color="black", linewidth=2.5)
+    (lead,) = ax.plot(*route[0], "*", color="black", markersize=13, linestyle="none")
+    ax.plot(*route[-1], "*", color="black", markersize=13, markerfacecolor="white")
+    for other in others:
+        (follows,) = ax.plot(*other.T, "--", color=ROBOTS[0], linewidth=1.2)
+    (watches,) = ax.plot(*posts.T, "o", color=ROBOTS[0], markersize=7, markeredgecolor="white")
+    seen = np.concatenate([route, posts, *others])
+    low, high = seen.min(0) - 2.0, seen.max(0) + 2.0
+    height = 1.75 * max(high[1] - low[1], (high[0] - low[0]) / ASPECT)  # with room for the legend
+    x = (low[0] + high[0] - ASPECT * height) / 2.0
+    ax.set(xlim=(x, x + ASPECT * height), ylim=(high[1] - height, high[1]))
+    ax.set_title("(a) a bound")
+    legend = {
+        "T1, the lead": lead, "1. T1 moves": moves, "T2 at overwatch points": watches,
+        "T2 watches": sight[0], "2. T2 closes up": follows,
+    }  # fmt: skip
+    ax.legend(legend.values(), legend.keys(), loc="lower left", fontsize=8)
+    draw_scale(ax, plan.workspace.grid)
+
+
+def draw_trust(
+    figure: Figure, axes: np.ndarray, result: tb.Result, center: tuple[float, float]
+) -> None:
+    """Draw the trust map and path of the first plan and after the last mission, on one scale."""
+    workspace = result.workspace
+    maps = [result.history["trust_map"].sel(iteration=1), result.trust_map]
+    for values in maps:
+        values[START] = np.nan  # trust is assumed there
+    low, _ = robust_limits(np.stack(maps))
+    norm = mpl.colors.Normalize(low, 1.0)
+    paths = [result.missions[0].path, result.path]
+    titles = ["(c) trust by the old map, first path", f"(d) after {MISSIONS} missions, new path"]
+    x, y = np.array(center) - workspace.grid.corner
+    for ax, values, path, title in zip(axes, maps, paths, titles, strict=True):
+        image = draw_cells(ax, values, workspace, norm)
+        tb.plots.draw_path(ax, path, workspace.grid)
+        circle = Circle((x, y), RADIUS, fill=False, color="white", linestyle="--", linewidth=1.3)
+        circle.set_path_effects(outlined(2.6, "black"))
+        ax.add_patch(circle)
+        ax.set(xticks=[], yticks=[], title=title)
+        draw_scale(ax, workspace.grid)
+    figure.colorbar(image, ax=axes, extend="both", label="expected trust", shrink=0.9)
+
+
+def draw_lost(
+    ax: Axes,
+    simulator: tb.simulation.KinematicSimulator,
+    result: tb.Result,
+    colour: str,
+    label: str,
+) -> None:
+    """Draw the expected contact lost on the path of each mission, and on the best path."""
+    truth = tb.simulation.Truth.of(simulator)
+    values = [truth.lost(mission.path) for mission in result.missions]
+    best = truth.lost(truth.best(START, GOAL))
+    ax.plot(range(1, 1 + len(values)), values, "o-", color=colour, label=label)
+    ax.axhline(best, color=colour, linestyle=":", label=f"{label}: best path")
+    print(f"{label}: lost {np.round(values, 2)}, best {best:.2f}")
+
+
+if __name__ == "__main__":
+    main()
