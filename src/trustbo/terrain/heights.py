@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import pyproj
 
 from trustbo.errors import TrustboError
 
@@ -34,21 +33,21 @@ class Vertical(NamedTuple):
 
 
 class Coding(NamedTuple):
-    """How a raster stores heights: metres = vertical.metres * (scale * stored + offset).
+    """How a raster stores heights: in metres, they are metres * (scale * stored + offset).
 
     Attributes:
         name: Name of the raster, for messages.
         fills: Stored values that mean missing.
         scale: Scale.
         offset: Offset.
-        vertical: Unit and datum.
+        metres: Length of the unit of heights, negative for depths.
     """
 
     name: str
     fills: tuple[float, ...] = ()
     scale: float = 1.0
     offset: float = 0.0
-    vertical: Vertical = Vertical()
+    metres: float = 1.0
 
 
 def warn(message: str) -> None:
@@ -82,7 +81,7 @@ def decoded(
     for fill in coding.fills:
         missing |= values == _as_stored(fill, stored.dtype)
     suspicious = np.isin(values, _FILLS if coding.scale != 1.0 else (*_FILLS, -999.0))
-    heights = coding.vertical.metres * (coding.scale * values + coding.offset)
+    heights = coding.metres * (coding.scale * values + coding.offset)
     heights[missing] = np.nan
     wrong = ~missing & (suspicious | (heights < LOWEST) | (heights > HIGHEST))
     if wrong.any():
@@ -129,18 +128,17 @@ def warn_of_zeros(heights: np.ndarray, name: str) -> None:
         )
 
 
-def vertical_of(name: str, declared: object, crs: pyproj.CRS | None) -> Vertical:
+def vertical_of(name: str, declared: object, axis: Vertical | None) -> Vertical:
     """Find the unit and datum of heights; metres if nothing declares a unit.
 
     Args:
         name: Name of the raster.
         declared: Unit of the band, or of each band, of which the first counts; None if unknown.
-        crs: Coordinate reference system, which may have a vertical axis.
+        axis: Vertical axis of the CRS, if it has one.
 
     Raises:
         TrustboError: An unknown unit, or a band and a CRS that disagree.
     """
-    axis = _vertical_axis(crs)
     text = str(np.ravel(np.array(declared, object))[0] or "").strip()
     if not text:
         return axis or Vertical()
@@ -160,16 +158,3 @@ def vertical_of(name: str, declared: object, crs: pyproj.CRS | None) -> Vertical
             "the true unit, e.g. with gdal_edit.py -units m, or the true CRS, with -a_srs."
         )
     return axis._replace(unit=unit) if axis else Vertical(unit, length)
-
-
-def _vertical_axis(crs: pyproj.CRS | None) -> Vertical | None:
-    """Unit, direction and datum of a CRS's vertical axis, if it has one."""
-    for axis in crs.axis_info if crs else ():
-        if axis.direction in ("up", "down"):
-            part = crs.sub_crs_list[-1] if crs and crs.is_compound else None
-            datum = (
-                "the ellipsoid" if part is None else part.datum.name if part.datum else part.name
-            )
-            metres = axis.unit_conversion_factor * (1.0 if axis.direction == "up" else -1.0)
-            return Vertical("m" if abs(metres) == 1.0 else axis.unit_name, metres, datum)
-    return None

@@ -5,9 +5,8 @@ from os import PathLike, fspath
 from typing import Any
 
 import numpy as np
-import pyproj
 import xarray as xr
-from pyproj.exceptions import CRSError
+from rasterio.crs import CRS
 from scipy.interpolate import LinearNDInterpolator
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import KDTree, QhullError
@@ -15,6 +14,7 @@ from scipy.spatial import KDTree, QhullError
 from trustbo.errors import TrustboError, require_positive
 from trustbo.files import FilePath
 from trustbo.terrain.heights import HIGHEST, LOWEST
+from trustbo.terrain.place import known_crs, require_map
 from trustbo.terrain.read import read_terrain
 
 GROUND_CLASS, NOISE_CLASSES = 2, (7, 18)
@@ -45,42 +45,40 @@ def read_lidar(
         TrustboError: No laspy; an unreadable file; no ground points, or points at heights that no
             land has; no projected CRS, or two; no pixel with both heights.
     """
-    step = require_positive("resolution", resolution)
+    step, given = require_positive("resolution", resolution), crs and known_crs(crs)
     files = [points] if isinstance(points, str | PathLike) else list(points)
-    tiles = [_read_tile(fspath(file), crs) for file in files]
+    tiles = [_read_tile(fspath(file), given) for file in files]
     if not tiles or len({tile[2].to_wkt() for tile in tiles}) > 1:
         raise TrustboError("give one LAS or LAZ file or more, all in one CRS.")
     xyz, label = (np.concatenate([tile[k] for tile in tiles]) for k in (0, 1))  # pyright: ignore[reportArgumentType, reportCallIssue]
-    ground = xyz[label == GROUND_CLASS]
-    if len(ground) < 3:
+    if (label == GROUND_CLASS).sum() < 3:
         raise TrustboError(
-            f"{files[0]!r} has {len(ground)} ground points (class {GROUND_CLASS}), too few to span "
-            "an area; classify its ground, e.g. with PDAL's filters.smrf."
+            f"{files[0]!r} has under 3 ground points (class {GROUND_CLASS}); classify its "
+            "ground, e.g. with PDAL's filters.smrf."
         )
-    (left, bottom), (right, top) = xyz[:, :2].min(0), xyz[:, :2].max(0)
-    first, last = np.floor(left / step + 1e-6), np.ceil(top / step - 1e-6)
-    n_cols = max(1, int(np.ceil(right / step - 1e-6) - first))
-    n_rows = max(1, int(last - np.floor(bottom / step + 1e-6)))
-    if n_rows * n_cols > _MOST_PIXELS:
+    # Pixels count from the upper left corner; a point on an edge is in the pixel south or east.
+    place = np.array([[1.0, -1.0]]) * xyz[:, :2] / step
+    corner = np.floor(place.min(0) + 1e-6)
+    shape = np.maximum(np.ceil(place.max(0) - 1e-6) - corner, 1.0).astype(int)
+    if shape.prod() > _MOST_PIXELS:
         raise TrustboError(
-            f"resolution {step:g} m makes {n_rows} x {n_cols} pixels; take a larger one."
+            f"resolution {step:g} m makes {shape[1]} x {shape[0]} pixels; take a larger one."
         )
-    x, y = (first + 0.5 + np.arange(n_cols)) * step, (last - 0.5 - np.arange(n_rows)) * step
-    dem = _triangulated(ground, x, y)
-    highest = np.full((n_rows, n_cols), np.nan)
-    # A point on an edge belongs to the pixel east or south of it.
-    col = np.minimum((xyz[:, 0] / step - first + 1e-6).astype(int), n_cols - 1)
-    row = np.minimum((last - xyz[:, 1] / step + 1e-6).astype(int), n_rows - 1)
+    col, row = np.minimum((place - corner + 1e-6).astype(int), shape - 1).T
+    x, y = (corner[0] + 0.5 + np.arange(shape[0])), -(corner[1] + 0.5 + np.arange(shape[1]))
+    dem = _triangulated(xyz[label == GROUND_CLASS], x * step, y * step)
+    highest = np.full(dem.shape, np.nan)
     np.fmax.at(highest, (row, col), xyz[:, 2])
     # Heights above ground: on a slope, absolute heights would make steps and false canopy.
     canopy = np.maximum(highest - dem, 0.0)
     nearest: Any = distance_transform_edt(np.isnan(canopy), step, return_indices=True)
     canopy = np.where(nearest[0] <= MAX_GAP, canopy[tuple(nearest[1])], np.nan)
-    maps = (xr.DataArray(z, {"y": y, "x": x}, ("y", "x")) for z in (dem, dem + canopy))
-    return read_terrain(*(z.rio.write_crs(tiles[0][2].to_wkt()) for z in maps))
+    coords = {"y": y * step, "x": x * step}
+    maps = (xr.DataArray(z, coords, ("y", "x")) for z in (dem, dem + canopy))
+    return read_terrain(*(z.rio.write_crs(tiles[0][2]) for z in maps))
 
 
-def _read_tile(path: str, given: object) -> tuple[np.ndarray, np.ndarray, pyproj.CRS]:
+def _read_tile(path: str, given: CRS | None) -> tuple[np.ndarray, np.ndarray, CRS]:
     """Positions (point, 3) and classes (point,) of one file's usable points, and its CRS."""
     try:
         import laspy
@@ -88,7 +86,8 @@ def _read_tile(path: str, given: object) -> tuple[np.ndarray, np.ndarray, pyproj
         raise TrustboError("lidar needs laspy: python -m pip install 'laspy[lazrs]'") from None
     try:
         cloud = laspy.read(path)
-    # A file cut short is a ValueError of NumPy's or a RuntimeError of lazrs'.
+        own = cloud.header.parse_crs()
+    # A file cut short is a ValueError of NumPy's or a RuntimeError of lazrs' or PROJ's.
     except (laspy.errors.LaspyException, OSError, RuntimeError, ValueError) as error:
         raise TrustboError(f"{path!r} cannot be read as LAS or LAZ: {error}.") from None
     label = np.asarray(cloud.classification, np.uint8)
@@ -100,12 +99,9 @@ def _read_tile(path: str, given: object) -> tuple[np.ndarray, np.ndarray, pyproj
             f"{path!r} has {wrong.sum()} points at heights that no land has, such as "
             f"{xyz[np.argmax(wrong), 2]:g} m; classify them as noise (7), or correct the unit."
         )
-    try:
-        crs = cloud.header.parse_crs() or pyproj.CRS.from_user_input(given)
-    except CRSError:
-        raise TrustboError(f"{path!r} has no CRS that PROJ knows; pass crs=.") from None
-    if not crs.is_projected:
-        raise TrustboError(f"{path!r} is in {crs.name!r}; reproject its points to a UTM zone.")
+    crs = require_map(repr(path), own, given)
+    if crs.is_geographic:
+        raise TrustboError(f"{path!r} is in degrees; reproject its points to a UTM zone.")
     return xyz, label[usable], crs
 
 
@@ -118,7 +114,5 @@ def _triangulated(ground: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarra
     try:
         heights = LinearNDInterpolator(places, ground[lowest, 2])(centres)
     except QhullError:
-        raise TrustboError(
-            "the ground points (class 2) lie on a line; they must span an area."
-        ) from None
+        raise TrustboError("the ground points (class 2) must span an area, not a line.") from None
     return np.where(KDTree(places).query(centres)[0] <= GROUND_GAP, heights, np.nan)

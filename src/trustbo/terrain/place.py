@@ -1,0 +1,136 @@
+"""Where on Earth a raster lies, and maps in metres with north at the top."""
+
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from rasterio._err import CPLE_BaseError
+from rasterio.crs import CRS
+from rasterio.enums import Resampling
+from rasterio.errors import CRSError
+from rasterio.warp import transform
+
+from trustbo.errors import TrustboError
+from trustbo.terrain.heights import Vertical
+
+_NORTH = 22.5  # degrees between columns and north, half the angle between two of the eight moves
+
+
+def known_crs(crs: Any) -> CRS:
+    """CRS of anything that names one; TrustboError: PROJ does not know it."""
+    try:
+        return CRS.from_user_input(crs)
+    except CRSError:
+        raise TrustboError(f"crs {crs!r} is not one PROJ knows; give e.g. 'EPSG:32633'.") from None
+
+
+def require_map(name: str, own: object, given: CRS | None) -> CRS:
+    """CRS of a raster, in degrees or metres: its own, or the given one if it has none.
+
+    TrustboError: none, another one than given, or one that is no map in degrees or metres.
+    """
+    if own is None and given is None:
+        raise TrustboError(f"{name} has no coordinate reference system; pass crs=.")
+    crs = known_crs(given if own is None else own)
+    flat = horizontal(crs)
+    if given is not None and flat != horizontal(given):
+        raise TrustboError(
+            f"{name} is in {name_of(crs)!r}, but crs= is {name_of(given)!r}; leave crs= out, or "
+            "correct the raster's own CRS, e.g. with gdal_edit.py -a_srs."
+        )
+    if not flat.is_geographic and not flat.is_projected:
+        raise TrustboError(f"{name} is in {name_of(crs)!r}, no map of the Earth; reproject it.")
+    if flat.is_projected and abs(flat.linear_units_factor[1] - 1.0) > 1e-9:
+        raise TrustboError(
+            f"{name} has a map in {flat.linear_units_factor[0]}, not metres; warp it, e.g. with "
+            "gdalwarp -t_srs EPSG:32633."
+        )
+    return crs
+
+
+def name_of(crs: CRS) -> str:
+    """Name of a CRS, for messages."""
+    return crs.to_dict(projjson=True)["name"]
+
+
+def horizontal(crs: CRS) -> CRS:
+    """CRS without its vertical axis."""
+    whole = crs.to_dict(projjson=True)
+    if whole["type"] == "CompoundCRS":
+        return CRS.from_dict(whole["components"][0])
+    system = whole.get("coordinate_system", {"axis": []})
+    if len(system["axis"]) < 3:
+        return crs
+    flat = whole | {"coordinate_system": system | {"axis": system["axis"][:2]}}
+    return CRS.from_dict({key: value for key, value in flat.items() if key != "id"})
+
+
+def vertical_axis(crs: CRS) -> Vertical | None:
+    """Unit, direction and datum of a CRS's vertical axis, if it has one."""
+    whole = crs.to_dict(projjson=True)
+    part = whole.get("components", [whole])[-1]
+    part = part.get("source_crs", part)
+    axis = part.get("coordinate_system", {"axis": [{}]})["axis"][-1]
+    if axis.get("direction") not in ("up", "down"):
+        return None
+    unit = axis["unit"]
+    unit, length = ("m", 1.0) if unit == "metre" else (unit["name"], unit["conversion_factor"])
+    datum = part.get("datum", part)["name"] if part["type"] == "VerticalCRS" else "the ellipsoid"
+    return Vertical(unit, length if axis["direction"] == "up" else -length, datum)
+
+
+def placed(heights: xr.DataArray, name: str) -> xr.DataArray:
+    """Check that a raster is somewhere on Earth; count longitudes from -180 to 180."""
+    crs, (y, x) = heights.rio.crs, (heights[axis].values for axis in ("y", "x"))
+    middle = 0.5 * (x[0] + x[-1])
+    if crs.is_geographic:
+        if max(abs(y[0]), abs(y[-1])) <= 90.0 and abs(middle) <= 540.0:
+            return heights.assign_coords(x=x - 360.0 * round(middle / 360.0))
+    elif min(abs(x[1] - x[0]), abs(y[1] - y[0])) < 0.01:
+        raise TrustboError(
+            f"{name} has pixels of {abs(x[1] - x[0]):.2g} m in {crs.to_string()}: its coordinates "
+            "look like degrees; correct its CRS."
+        )
+    elif np.isfinite(_middle(heights, "EPSG:4326")).all():
+        return heights
+    raise TrustboError(
+        f"{name} has coordinates around ({middle:.8g}, {y[len(y) // 2]:.8g}), no place on Earth in "
+        f"its CRS, {crs.to_string()}; correct the CRS."
+    )
+
+
+def _middle(heights: xr.DataArray, crs: str, step: float = 0.0) -> np.ndarray:
+    """Middle of a raster in another CRS, and points a step to the east and north, (xy, point).
+
+    NaN where the middle is outside the domain of the raster's CRS.
+    """
+    x, y = (0.5 * float(heights[axis][0] + heights[axis][-1]) for axis in ("x", "y"))
+    try:
+        return np.array(transform(heights.rio.crs, crs, [x, x + step, x], [y, y, y + step]))
+    except CPLE_BaseError:
+        return np.full((2, 3), np.nan)
+
+
+def on_metric_grid(heights: xr.DataArray) -> xr.DataArray:
+    """Warp heights to a metric map with north at the top, unless they are on one."""
+    lon, lat = _middle(heights, "EPSG:4326")[:, 0].tolist()
+    at = f"+lat_0={lat} +lon_0={lon} +datum=WGS84 +units=m"
+    if not heights.rio.crs.is_geographic:
+        here, to_east, to_north = _middle(heights, f"+proj=aeqd {at}", step=100.0).T / 100.0
+        (east, up), (right, north) = to_east - here, to_north - here
+        turned = np.rad2deg(np.arctan2([up, right], [east, north]))
+        lengths = np.hypot([east, right], [up, north])
+        if (abs(lengths - 1.0) < 0.01).all() and np.abs(turned).max() < _NORTH:
+            return heights
+    zone = f"EPSG:{(32600 if lat >= 0.0 else 32700) + int((lon + 180.0) // 6.0) % 60 + 1}"
+    if not -80.0 <= lat <= 84.0:  # no UTM zone
+        zone = f"+proj=tmerc {at}"
+    return heights.rio.reproject(zone, resampling=Resampling.bilinear, nodata=np.nan)
+
+
+def same_grid(a: xr.DataArray, b: xr.DataArray) -> bool:
+    """Whether two rasters' pixels coincide to a thousandth of a pixel."""
+    if a.shape != b.shape or a.rio.crs != b.rio.crs:
+        return False
+    steps = {axis: abs(float(a[axis][1] - a[axis][0])) for axis in ("y", "x")}
+    return all(np.allclose(a[n], b[n], rtol=0.0, atol=1e-3 * step) for n, step in steps.items())
