@@ -1,5 +1,6 @@
-"""How Sphinx builds the site (`make docs`); neither it nor a reader needs the network."""
+"""Settings of the site that `make docs` builds; the build and the pages need no network."""
 
+import argparse
 import shutil
 import sys
 from importlib.metadata import version as installed_version
@@ -27,7 +28,7 @@ extensions = [
 exclude_patterns = ["_build", "extensions"]
 templates_path = ["_templates"]
 
-# Pages are Markdown; notebooks are kept executed, and `make test` runs them again.
+# Pages are Markdown. Notebooks are stored with their outputs and not executed here.
 myst_enable_extensions = ["attrs_inline", "colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 3
 nb_execution_mode = "off"
@@ -37,7 +38,7 @@ suppress_warnings = [
     "ref.ref", "ref.term",  # in docstrings inherited from scikit-learn
 ]  # fmt: skip
 
-# Docstrings are Google's. `Attributes:` as a list, lest a field be described twice.
+# Google docstrings. `Attributes:` is a list, so that no field is described twice.
 napoleon_numpy_docstring = False
 napoleon_custom_sections = [("Attributes", "params_style")]
 napoleon_use_rtype = False
@@ -47,7 +48,7 @@ autosummary_ignore_module_all = False
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
 autodoc_preserve_defaults = True
-autoclass_content = "both"  # what a class takes is often said by its `__init__`
+autoclass_content = "both"  # arguments of a class are often documented by `__init__`
 add_module_names = False
 python_maximum_signature_line_length = 120
 python_display_short_literal_types = True
@@ -66,7 +67,7 @@ copybutton_prompt_is_regexp = True
 
 
 def copy_notebooks(app: Sphinx) -> None:
-    """Put the notebooks where Sphinx finds them: it reads nothing outside its folder."""
+    """Copy the notebooks into the folder of the docs, as Sphinx reads nothing outside it."""
     target = HERE / "notebooks"
     shutil.rmtree(target, ignore_errors=True)
     target.mkdir()
@@ -74,22 +75,34 @@ def copy_notebooks(app: Sphinx) -> None:
         shutil.copy2(notebook, target)
 
 
+def write_help(app: Sphinx) -> None:
+    """Write the help of all commands to a file that the page of the command line includes."""
+    from trustbo.cli import parser
+
+    top = parser()
+    commands = next(a for a in top._actions if isinstance(a, argparse._SubParsersAction))
+    texts = [one.format_help() for one in (top, *commands.choices.values())]
+    (HERE / "generated").mkdir(exist_ok=True)
+    (HERE / "generated" / "cli.txt").write_text("\n\n".join(texts))
+
+
 def point_to_copies(app: Sphinx, docname: str, source: list[str]) -> None:
-    """Links to notebooks hold in the repository; on the site, they lead to its copies."""
+    """Let links to notebooks, which are written for the repository, point to the copies."""
     source[0] = source[0].replace("../notebooks/", "notebooks/").replace("../docs/", "../")
 
 
 def drop_words_of_python(
     app: Sphinx, kind: str, name: str, value: object, options: Any, lines: list[str]
 ) -> None:
-    """Leave out what Python itself says of a constant's type, and of making a named tuple."""
+    """Drop Python's own docstrings of a constant's type and of named tuples."""
     if kind == "data":
         lines.clear()
     lines[:] = [line for line in lines if not line.startswith("Create new instance of")]
 
 
 def setup(app: Sphinx) -> None:
-    """Connect the above."""
+    """Connect the functions above to Sphinx's events."""
     app.connect("builder-inited", copy_notebooks)
+    app.connect("builder-inited", write_help)
     app.connect("source-read", point_to_copies)
     app.connect("autodoc-process-docstring", drop_words_of_python)

@@ -1,4 +1,4 @@
-"""Formulas as MathML: every browser draws it, and nothing is fetched from anywhere.
+"""Formulas as MathML, which every browser draws without a script from the network.
 
 Sphinx's own renderers need a script from the network (MathJax) or a LaTeX installation (imgmath);
 docutils turns the LaTeX of a formula into MathML by itself.
@@ -14,10 +14,10 @@ from sphinx.util.math import get_node_equation_number
 
 
 def to_mathml(source: str, *, block: bool) -> str:
-    """The MathML of a formula.
+    """Convert a formula to MathML.
 
     Raises:
-        ExtensionError: docutils cannot read the formula.
+        ExtensionError: docutils cannot parse the formula.
     """
     try:
         return latex2mathml.tex2mathml(source, as_block=block)
@@ -42,7 +42,7 @@ def visit_block(self: Any, node: nodes.math_block) -> None:
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
-    """Make the renderer known to Sphinx as `mathml`."""
+    """Register the renderer as `mathml`."""
     app.add_html_math_renderer(
         "mathml", inline_renderers=(visit_inline, None), block_renderers=(visit_block, None)
     )
