@@ -7,7 +7,7 @@ world with the event. Places are x and y in CRS metres.
 import dataclasses
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from scipy.signal import lfilter
@@ -27,10 +27,16 @@ class Event:
         last: Last mission with the event; None if there is no last.
     """
 
+    SHARES: ClassVar[tuple[str, ...]] = ()
+    """Attributes that must be in [0, 1]."""
+
     first: int = 0
     last: int | None = None
 
     def __post_init__(self) -> None:
+        for name in self.SHARES:
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise TrustboError(f"{name} must be in [0, 1]; got {getattr(self, name)!r}.")
         require_whole("first", self.first, 0)
         if self.last is not None:
             require_whole("last", self.last, self.first)
@@ -54,13 +60,11 @@ class Jam(Event):
         strength: Strength, in [0, 1].
     """
 
+    SHARES = ("strength",)
+
     center: tuple[float, float]
     radius: float
     strength: float = 1.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _require_share("strength", self.strength)
 
     def change(self, world: World) -> World:
         """See `Event.change`."""
@@ -77,12 +81,10 @@ class Degradation(Event):
         detection: Factor on the probability of detection, in [0, 1].
     """
 
+    SHARES = ("detection",)
+
     robot: str
     detection: float
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _require_share("detection", self.detection)
 
     def change(self, world: World) -> World:
         """See `Event.change`."""
@@ -100,11 +102,9 @@ class Dust(Event):
         detection: Factor on the probability of detection, in [0, 1].
     """
 
-    detection: float
+    SHARES = ("detection",)
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _require_share("detection", self.detection)
+    detection: float
 
     def change(self, world: World) -> World:
         """See `Event.change`."""
@@ -175,6 +175,8 @@ class Fouling(Event):
         seed: Seed of the factors.
     """
 
+    SHARES = ("worst", "correlation")
+
     worst: float
     correlation: float = 0.95
     every: int = 16
@@ -182,8 +184,6 @@ class Fouling(Event):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _require_share("worst", self.worst)
-        _require_share("correlation", self.correlation)
         require_whole("every", self.every, 1)
 
     def change(self, world: World) -> World:
@@ -226,8 +226,3 @@ def _circle(surface: Surface, center: tuple[float, float], radius: float) -> np.
             f"{left:.9g} to {right:.9g} and y from {bottom:.9g} to {top:.9g}."
         )
     return inside
-
-
-def _require_share(name: str, value: float) -> None:
-    if not 0.0 <= value <= 1.0:
-        raise TrustboError(f"{name} must be in [0, 1]; got {value!r}.")

@@ -13,6 +13,7 @@ from trustbo.data import Cell, Mission
 from trustbo.errors import TrustboError, require_whole
 from trustbo.simulation.protocol import DescribedSimulator, digest, require_path
 from trustbo.simulation.replicates import table_of
+from trustbo.terrain import pixel_size
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import MOVES, moves_along
 
@@ -38,12 +39,9 @@ class RadioSimulator(DescribedSimulator):
         """Compute the mean contact of every bound.
 
         Args:
-            workspace: A workspace made from a terrain.
+            workspace: A workspace made from a terrain; TrustboError: it has none.
             terrain: True DEM and DSM, where they differ from the workspace's.
             seed: Seed of the field and of the radios; by default a hash of the terrain.
-
-        Raises:
-            TrustboError: A workspace without terrain.
         """
         terrain = workspace.terrain if terrain is None else terrain
         if terrain is None:
@@ -71,9 +69,8 @@ class RadioSimulator(DescribedSimulator):
 
     def describe(self) -> dict[str, object]:
         """Return the settings that decide what a mission measures."""
-        return {
-            "simulator": type(self).__name__, "true_terrain": self._terrain, "seed": self.seed,
-        }  # fmt: skip
+        name = type(self).__name__
+        return {"simulator": name, "true_terrain": self._terrain, "seed": self.seed}
 
 
 def expected_rate(mean: np.ndarray) -> np.ndarray:
@@ -92,8 +89,7 @@ def expected_rate(mean: np.ndarray) -> np.ndarray:
 
 def _mean_contact(workspace: Workspace, terrain: xr.Dataset, seed: int) -> np.ndarray:
     """Mean contact by the formula, shape (robot, move, row, col), also of absent bounds."""
-    grid, x, y = workspace.grid, terrain["x"].values, terrain["y"].values
-    step = abs(float(y[1] - y[0])), abs(float(x[1] - x[0]))
+    grid, step, x, y = workspace.grid, pixel_size(terrain), terrain["x"].values, terrain["y"].values
     dem, dsm = terrain["dem"].values, terrain["dsm"].values
     window: Any = [max(1, round(_WINDOW / one)) for one in step]
     cover = ndimage.uniform_filter((np.nan_to_num(dsm - dem) > 1.5).astype(float), window)
@@ -106,17 +102,16 @@ def _mean_contact(workspace: Workspace, terrain: xr.Dataset, seed: int) -> np.nd
 
     b = np.stack(np.indices(grid.shape), -1)  # (row, col, axis), in cells  # pyright: ignore[reportArgumentType, reportCallIssue]
     a = b - np.array(MOVES[8])[:, None, None]  # (move, row, col, axis)
+    sides = np.array([grid.cell_height, grid.cell_width])
 
     def read(raster: np.ndarray, at: np.ndarray) -> np.ndarray:
-        here_x = grid.left + (at[..., 1] + 0.5) * grid.cell_width
-        here_y = grid.top - (at[..., 0] + 0.5) * grid.cell_height
-        pixels = (y[0] - here_y) / step[0], (here_x - x[0]) / step[1]
+        south, east = np.moveaxis((at + 0.5) * sides, -1, 0)  # of the grid's corner
+        pixels = (y[0] - grid.top + south) / step[0], (grid.left + east - x[0]) / step[1]
         return ndimage.map_coordinates(raster, pixels, order=1, mode="nearest")
 
     c = np.mean([read(cover, a + share * (b - a)) for share in np.linspace(0.0, 1.0, 9)], axis=0)
     c = np.clip(c, 0.0, 1.0)  # a running mean has errors of rounding
-    way = (b - a) * np.array([grid.cell_height, grid.cell_width])
-    d = np.hypot(way[..., 0], way[..., 1]) / _REACH
+    d = np.hypot(*np.moveaxis((b - a) * sides, -1, 0)) / _REACH
     h = np.maximum(read(ground, b) - read(ground, a), 0.0)
     eta = 2.2 - 3.5 * c**1.5 * d - 0.1 * h + 0.9 * (0.3 + c) * np.tanh(read(field, b))
     return expit(eta + radios[:, None, None, None])

@@ -14,7 +14,7 @@ from trustbo.data import Bound, Mission
 from trustbo.errors import TrustboError
 from trustbo.simulation.kinematic import KinematicSimulator
 from trustbo.terrain import CompositeIndex
-from trustbo.workspace.sight import detection_probability, optics
+from trustbo.workspace.sight import detection_between, optics
 
 SIGNS = {
     "traversability": {"map": +1, "speed_ratio": +1, "pitch": -1, "roll": -1},
@@ -38,39 +38,31 @@ class RealtimeAwareness:
         self._workspace, self._world = simulator.workspace, simulator.world()
         self._tick = simulator.tick
         samples = [self.inputs(bound) for mission in missions for bound in mission.bounds]
-        n_samples = len(samples) * self._world.team.n_robots
-        if n_samples < MIN_SAMPLES:
-            raise TrustboError(
-                f"real-time awareness needs {MIN_SAMPLES} robots x bounds; got {n_samples}."
-            )
-        self.indices = {
-            feature: CompositeIndex(signs).fit(
-                {name: np.concatenate([one[feature][name] for one in samples]) for name in signs}
-            )
-            for feature, signs in SIGNS.items()
-        }
+        if (n := len(samples) * self._world.team.n_robots) < MIN_SAMPLES:
+            raise TrustboError(f"real-time awareness needs {MIN_SAMPLES} robots x bounds; got {n}.")
+        self.indices = {}
+        for feature, signs in SIGNS.items():
+            of_all = {n: np.concatenate([one[feature][n] for one in samples]) for n in signs}
+            self.indices[feature] = CompositeIndex(signs).fit(of_all)
 
     def inputs(self, bound: Bound) -> dict[str, dict[str, np.ndarray]]:
         """Inputs of each feature, see `SIGNS`, arrays (robot,)."""
-        world, pixels, poses = self._world, self._workspace.pixels, bound.poses[:, 1:]  # pyright: ignore[reportOptionalSubscript]
+        world, workspace, poses = self._world, self._workspace, bound.poses[:, 1:]  # pyright: ignore[reportOptionalSubscript]
         way = np.diff(poses[..., :2], axis=0, prepend=poses[:1, :, :2])
         speed = np.hypot(way[..., 0], way[..., 1]) / self._tick
         gx, gy = world.surface.gradient[:, *world.surface.nearest(poses[..., 0], poses[..., 1])]
         ahead, left = np.cos(poses[..., 2]), np.sin(poses[..., 2])
-        return_range, visible_share = self._lidar(poses)
-        state = {
+        state = self._lidar(poses) | {
             "speed_ratio": np.minimum(speed / [robot.speed for robot in world.team.robots], 1.0),
             "pitch": np.abs(np.arctan(gx * ahead + gy * left)),
             "roll": np.abs(np.arctan(gy * ahead - gx * left)),
-            "return_range": return_range,
-            "visible_share": visible_share,
         }
-        place = self._workspace.surface.nearest(poses[..., 0], poses[..., 1])  # pyright: ignore[reportOptionalMemberAccess]
+        place = workspace.surface.nearest(poses[..., 0], poses[..., 1])  # pyright: ignore[reportOptionalMemberAccess]
         moved = speed > 0.0
         moved[0] |= ~moved.any(0)
         found = {}
         for feature, signs in SIGNS.items():
-            ticks = state | {"map": pixels[feature].values[place]}  # pyright: ignore[reportOptionalSubscript]
+            ticks = state | {"map": workspace.pixels[feature].values[place]}  # pyright: ignore[reportOptionalSubscript]
             found[feature] = {n: (ticks[n] * moved).sum(0) / moved.sum(0) for n in signs}
         return found
 
@@ -85,19 +77,19 @@ class RealtimeAwareness:
             bounds.append(replace(bound, awareness=awareness))
         return replace(mission, bounds=tuple(bounds))
 
-    def _lidar(self, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Mean range of returns, m, and share of clear beams, both (tick, robot).
+    def _lidar(self, poses: np.ndarray) -> dict[str, np.ndarray]:
+        """Mean range of returns, m, and share of clear beams, each (tick, robot).
 
         The mean range is the integral over range of the share of beams that reach it.
         """
-        world = self._world
-        left, bottom, right, top = world.surface.extent
-        robot = world.team.robots[0]
-        reach = min(robot.lidar_range, 0.5 * (right - left), 0.5 * (top - bottom))
+        world, robot = self._world, self._world.team.robots[0]
+        low, high = np.reshape(world.surface.extent, (2, 2))
+        reach = min(robot.lidar_range, 0.5 * float((high - low).min()))
         beams = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
-        eye = np.broadcast_to(poses[..., None, None, :2], (*poses.shape[:2], 4, 12, 2))
-        target = np.clip(eye + reach * _SHARES[:, None, None] * beams, (left, bottom), (right, top))
-        rays = eye.reshape(-1, 2), target.reshape(-1, 2), optics(robot, world.team.lead)
-        clear = detection_probability(world.surface, world.sight, *rays).reshape(eye.shape[:-1])
-        seen = np.insert(clear.mean(-1), 0, 1.0, axis=-1)  # (tick, robot, 1 + share)
-        return reach * np.trapezoid(seen, [0.0, *_SHARES], axis=-1), seen[..., -1]  # pyright: ignore[reportReturnType]
+        eye = poses[..., None, None, :2]
+        target = np.clip(eye + reach * _SHARES[:, None, None] * beams, low, high)
+        lidar = optics(robot, world.team.lead)
+        clear = detection_between(world.surface, world.sight, eye, target, lidar).mean(-1)
+        seen = np.insert(clear, 0, 1.0, axis=-1)  # (tick, robot, 1 + share)
+        reached = np.trapezoid(seen, [0.0, *_SHARES], axis=-1)
+        return {"return_range": reach * reached, "visible_share": seen[..., -1]}

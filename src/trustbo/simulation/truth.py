@@ -5,12 +5,10 @@ next, as robots take posts that watch the next bound. The best path is then foun
 programming over bounds and the number of bounds that are left, which is exact.
 """
 
-import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Self
 
-import networkx as nx
 import numpy as np
 import xarray as xr
 
@@ -18,14 +16,13 @@ from trustbo.data import Cell
 from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError, require_whole
 from trustbo.files import FilePath, to_json, write_file
+from trustbo.planning.paths import AdmissiblePaths
 from trustbo.simulation.model import ModelSimulator
 from trustbo.simulation.protocol import digest, require_path
 from trustbo.simulation.replicates import END, replicated
 from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Location
 from trustbo.workspace.moves import MOVES, moves_along
-
-_MAX_BOUNDS = re.compile(r"shortest(?:\+(\d+))?")
 
 
 class Truth(Summary):
@@ -146,13 +143,13 @@ class Truth(Summary):
 
         Raises:
             TrustboError: A cell off the grid, or impassable.
-            NetworkXNoPath: The goal cannot be reached.
+            NoPathError: The goal cannot be reached.
         """
-        a, b = (self.workspace.locate(*e) for e in ((start, "start"), (goal, "goal")))
+        paths = AdmissiblePaths(self.workspace, start, goal, max_bounds)
         contact, passed = (self.bounds[name].values for name in ("contact", "passed"))
         passed = passed if failures else np.ones(passed.shape)
-        longest = _longest(self.workspace.passable_bounds.values, a, b, max_bounds)
-        return _most_kept(contact, passed, a, b, longest, u_turns=isinstance(max_bounds, int))
+        ends = paths.start, paths.goal
+        return _most_kept(contact, passed, *ends, paths.longest, u_turns=paths.turns)
 
     def regret(self, path: Sequence[Cell], max_bounds: int | str = "shortest+4") -> float:
         """Regret of a path, in % of the contact that the best path between its ends keeps.
@@ -202,19 +199,6 @@ def _kept(
         file.parent.mkdir(parents=True, exist_ok=True)
         write_file(file, table.to_netcdf)
     return xr.load_dataset(file)
-
-
-def _longest(exists: np.ndarray, start: Cell, goal: Cell, max_bounds: int | str) -> int:
-    """Largest number of bounds of a path, of bounds that exist, (move, row, col)."""
-    if isinstance(max_bounds, int):
-        return max_bounds
-    if (named := _MAX_BOUNDS.fullmatch(max_bounds)) is None:
-        raise TrustboError(f"max_bounds must be a number or shortest+n; got {max_bounds!r}.")
-    graph = nx.DiGraph()
-    for move, row, col in np.argwhere(exists).tolist():
-        down, right = MOVES[8][move]
-        graph.add_edge((row - down, col - right), (row, col))
-    return nx.shortest_path_length(graph, start, goal) + int(named[1] or 0)  # pyright: ignore[reportReturnType]
 
 
 def _most_kept(
