@@ -16,7 +16,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import numpyro
-from numpyro.distributions import biject_to
+import numpyro.distributions as dist
+from jax.scipy.special import erf, erfinv
+from numpyro.distributions import Distribution, biject_to
 from numpyro.infer import MCMC, NUTS, init_to_value
 
 from trustbo.inference import importance
@@ -24,6 +26,7 @@ from trustbo.inference.diagnostics import complaints_of
 from trustbo.inference.engine import cholesky, expected
 from trustbo.inference.posterior import Draws, Posterior, chunks
 from trustbo.models.backend import own_settings
+from trustbo.models.scores import NOISES
 from trustbo.models.signal import each
 
 _POINTS = 2000  # resampled points that the covariance is taken of
@@ -94,10 +97,7 @@ def _kernel(
             posterior.model.program(posterior.slots)
 
         return NUTS(program, init_strategy=strategy, target_accept_prob=_TARGET), None
-    free = {
-        name: biject_to(prior.support).inv(jnp.asarray(values[name]))
-        for name, prior in posterior.scores.priors.items()
-    }
+    free = _unconstrained(posterior, values)
     flat = np.column_stack([np.asarray(free[name]).reshape(_POINTS, -1) for name in sorted(free)])
     finite = np.flatnonzero(np.isfinite(flat).all(1))
     inverse_mass = np.atleast_2d(np.cov(flat[finite].T)) + 1e-6 * np.eye(flat.shape[1])
@@ -110,18 +110,62 @@ def _kernel(
 
 
 def marginal_program(posterior: Posterior) -> Callable[[], None]:
-    """NumPyro program of the hyperparameters, the evidence being a factor."""
+    """NumPyro program of the hyperparameters, the evidence being a factor.
+
+    Rates determine the size of the two noises together and may not tell them apart. Half-normal
+    scores (a_w, a_v) = size (sin(angle), cos(angle)) are independent if size^2 ~ Exponential(1/2)
+    and the angle is uniform, so these two are sampled, and the noises are functions of them.
+    """
+    priors = posterior.scores.priors
+    shape = priors["delta_w"].batch_shape
 
     def program() -> None:
         values = {
             name: numpyro.sample(name, prior.to_event(len(prior.batch_shape)))
-            for name, prior in posterior.scores.priors.items()
+            for name, prior in priors.items()
+            if name not in NOISES
         }
+        square = numpyro.sample("noise_square", dist.Exponential(0.5).expand(shape).to_event())
+        angle = numpyro.sample("noise_angle", dist.Uniform(0.0, 1.0).expand(shape).to_event())
+        angle, size = 0.5 * jnp.pi * jnp.asarray(angle), jnp.sqrt(jnp.asarray(square))
+        for name, share in zip(NOISES, (jnp.sin(angle), jnp.cos(angle)), strict=True):
+            values[name] = numpyro.deterministic(name, _of_size(priors[name], size * share))
         values = {name: jnp.asarray(value)[None] for name, value in values.items()}
         theta = posterior.model.theta(values, posterior.slots.resolution)
         numpyro.factor("contact_rate", posterior.log_evidence(theta)[0])
 
     return program
+
+
+def _unconstrained(posterior: Posterior, values: dict[str, np.ndarray]) -> dict[str, jax.Array]:
+    """Unconstrained coordinates (point, ...) of the sites of `marginal_program`."""
+    priors = posterior.scores.priors
+    sites = {
+        name: biject_to(prior.support).inv(jnp.asarray(values[name]))
+        for name, prior in priors.items()
+        if name not in NOISES
+    }
+    w, v = (_half_normal_score(priors[name], values[name]) for name in NOISES)
+    angle = np.arctan2(w, v)
+    sites["noise_square"] = jnp.log(w**2 + v**2)
+    sites["noise_angle"] = jnp.log(angle / (0.5 * np.pi - angle))
+    return sites
+
+
+def _of_size(prior: Distribution, score: jax.Array) -> jax.Array:
+    """Quantile of a prior at P(|N(0, 1)| < score)."""
+    base = prior.base_dist if isinstance(prior, dist.ExpandedDistribution) else prior
+    if isinstance(base, dist.HalfNormal):
+        return jnp.asarray(base.scale * score)
+    return jnp.asarray(prior.icdf(erf(score / np.sqrt(2.0))))
+
+
+def _half_normal_score(prior: Distribution, value: np.ndarray) -> np.ndarray:
+    """Inverse of `_of_size`."""
+    base = prior.base_dist if isinstance(prior, dist.ExpandedDistribution) else prior
+    if isinstance(base, dist.HalfNormal):
+        return np.asarray(value) / np.asarray(base.scale)
+    return np.sqrt(2.0) * np.asarray(erfinv(prior.cdf(jnp.asarray(value))))
 
 
 def _draws_of(
