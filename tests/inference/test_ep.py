@@ -25,7 +25,7 @@ def by_quadrature(posterior, theta):
     signal, prior = posterior._at(theta)
     layout = posterior.layout
     U = layout.columns(posterior._columns).toarray()
-    c_cov = np.linalg.inv(prior.add_to(np.zeros((1, U.shape[1], U.shape[1])))[0])
+    c_cov = np.diag(1.0 / np.concatenate([part[0] for part in prior.parts]))
     T = signal.T[0, 0]
     mean = signal.m[0, 0] + T @ U @ prior.mean[0]
     cov = signal.covariance[0, 0] + T @ U @ c_cov @ U.T @ T.T

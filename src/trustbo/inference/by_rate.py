@@ -8,7 +8,8 @@ import xarray as xr
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
 from trustbo.inference.draws import missions_of, read_posterior, require_posterior
-from trustbo.inference.engine import cholesky, expected
+from trustbo.inference.engine import expected
+from trustbo.inference.factor import cholesky
 from trustbo.inference.posterior import Draws, Posterior, chunks
 from trustbo.inference.tree import complete
 from trustbo.models.families.moments import log_normal

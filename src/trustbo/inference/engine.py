@@ -20,8 +20,8 @@ from typing import Any, NamedTuple, Self
 import jax
 import numpy as np
 from scipy import sparse
-from scipy.linalg import lapack, solve_triangular
 
+from trustbo.inference.factor import Factor, Order, cholesky, log_diagonal
 from trustbo.models.backend import namespace
 from trustbo.models.signal import Signal, each
 
@@ -34,10 +34,19 @@ class Blocks(NamedTuple):
     kind: np.ndarray  # (block,): blocks of one kind share their factors
     label: np.ndarray  # (kind,): index on the second axis of a `Signal`
     seen: np.ndarray  # (kind, row)
-    sums: Any  # sparse (column^2, kind * pair of inputs), lower triangle of the columns
+    sums: Any  # sparse (entry, kind * pair of inputs), entries of the precision, see `Order`
+    order: Order
 
     @classmethod
-    def of(cls, y: np.ndarray, U: Any, label: np.ndarray, *, apart: bool = False) -> Self:
+    def of(
+        cls,
+        y: np.ndarray,
+        U: Any,
+        label: np.ndarray,
+        *,
+        apart: bool = False,
+        order: Order | None = None,
+    ) -> Self:
         """Lay blocks out; those with the same label and the same gaps are of one kind.
 
         Args:
@@ -45,8 +54,10 @@ class Blocks(NamedTuple):
             U: Columns, sparse (block * input, column).
             label: Index (block,) on the second axis of a `Signal`.
             apart: Whether each block is a kind of its own, as sites that differ need it.
+            order: Order of elimination of the columns; by default all are of the core.
         """
         n, p = len(y), U.shape[1]
+        order = Order.of(np.full(p, -1), 0) if order is None else order
         inputs, U = U.shape[0] // n, sparse.csr_array(U)
         seen = ~np.isnan(y)
         kinds = np.column_stack([np.arange(n) if apart else np.zeros(n, dtype=int), label, seen])
@@ -61,15 +72,15 @@ class Blocks(NamedTuple):
             X = sparse.csr_array(U[rows].reshape(len(rows) // inputs, inputs * p))
             products = (X.T @ X).tocoo()
             (k, a), (j, b) = np.divmod(products.row, p), np.divmod(products.col, p)
-            lower = a >= b
-            at.append((a.astype(np.int64) * p + b)[lower])
-            where.append((g * len(upper[0]) + pair[k, j])[lower])
-            values.append(products.data[lower])
+            entry = order.entry(a, b)
+            at.append(entry[entry >= 0])
+            where.append((g * len(upper[0]) + pair[k, j])[entry >= 0])
+            values.append(products.data[entry >= 0])
         entries = np.concatenate(at), np.concatenate(where)
-        shape = p * p, len(kinds) * len(upper[0])
+        shape = order.size, len(kinds) * len(upper[0])
         sums = sparse.csr_array((np.concatenate(values), entries), shape=shape)
         seen_by_kind = kinds[:, 2:].astype(bool)
-        return cls(np.where(seen, y, 0.0), U, kind, kinds[:, 1], seen_by_kind, sums)
+        return cls(np.where(seen, y, 0.0), U, kind, kinds[:, 1], seen_by_kind, sums, order)
 
     @property
     def n_columns(self) -> int:
@@ -105,17 +116,30 @@ class Prior(NamedTuple):
         xp = namespace(parts[0])
         return cls(xp.concatenate(means, axis=1), parts, log_det)
 
-    def add_to(self, A: Any) -> Any:
-        """The precision of the columns added to matrices (point, column, column)."""
+    def add_to(self, A: Any, order: Order) -> Any:
+        """The precision of the columns added to entries (point, entry)."""
         start = 0
         for part in self.parts:
             i = np.arange(start, start := start + part.shape[1])
-            at = (slice(None), i, i) if part.ndim == 2 else (slice(None), i[:, None], i)
+            a = b = np.arange(len(i))
+            if part.ndim == 3:
+                a, b = np.tril_indices(len(i))
+            values = part if part.ndim == 2 else part[:, a, b]
+            at = order.entry(i[a], i[b])
             if isinstance(A, np.ndarray):
-                A[at] += part
+                A[:, at] += values
             else:
-                A = A.at[at].add(part)
+                A = A.at[:, at].add(values)
         return A
+
+    def log_density(self, c: np.ndarray) -> np.ndarray:
+        """Log density of columns (point, column), shape (point,)."""
+        start, off, square = 0, c - self.mean, 0.0
+        for part in self.parts:
+            x = off[:, start : (start := start + part.shape[1])]
+            weighted = part * x if part.ndim == 2 else (part @ x[..., None])[..., 0]
+            square = square + (weighted * x).sum(1)
+        return 0.5 * (self.log_det - c.shape[1] * np.log(2.0 * np.pi) - square)
 
     def draw(self, rng: np.random.Generator) -> np.ndarray:
         """One draw of the columns at each point, (point, column)."""
@@ -134,8 +158,8 @@ class Fit(NamedTuple):
     """Evidence and factors at each theta; the columns are mean + F'^-1 (half + white noise)."""
 
     log_p: Any  # (point,)
-    F: Any  # (point, column, column), lower factor of the precision of the columns
-    half: Any  # (point, column)
+    F: Factor  # of the precision of the columns
+    half: Any  # (point, column), a white vector
     W: Any  # (point, kind, row, row)
 
 
@@ -157,12 +181,12 @@ def evidence(blocks: Blocks, signal: Signal, prior: Prior, lam: Any, y: Any = No
     back = (xp.swapaxes(C, 2, 3)[:, b.kind] @ w[..., None])[..., 0]
     h = times(b.U.T, back.reshape(n, -1))
     pairs = (xp.swapaxes(C, 2, 3) @ C)[:, :, *np.triu_indices(C.shape[3])]
-    A = times(b.sums, pairs.reshape(n, -1)).reshape(n, b.n_columns, b.n_columns)
-    F = cholesky(prior.add_to(A))
-    half = forward(F, h)
+    A = prior.add_to(times(b.sums, pairs.reshape(n, -1)), b.order)
+    F = Factor.of(b.order, A)
+    half = F.forward(h)
     many = np.bincount(b.kind, minlength=len(b.seen)).astype(float)
     log_p = log_sites @ many + 0.5 * (prior.log_det - (w**2).sum((1, 2)) + (half**2).sum(1))
-    return Fit(log_p - log_diagonal(F), F, half, W)
+    return Fit(log_p - F.log_det, F, half, W)
 
 
 def whiten(blocks: Blocks, signal: Signal, lam: Any) -> tuple[Any, Any]:
@@ -187,9 +211,10 @@ def expected(blocks: Blocks, signal: Signal, c: Any) -> Any:
 def draw_columns(prior: Prior, fit: Fit, count: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Draws of the columns, so many at each point; shape (sum of count, column)."""
     drawn = []
-    for mean, F, half, many in zip(prior.mean, fit.F, fit.half, count, strict=True):
-        white = half + rng.standard_normal((many, len(half)))
-        drawn.append(mean + solve_triangular(F, white.T, lower=True, trans="T").T)  # pyright: ignore[reportArgumentType]
+    for i, many in enumerate(count):
+        one = Factor(fit.F.order, *(part[i : i + 1] for part in fit.F[1:]))
+        white = fit.half[i] + rng.standard_normal((1, many, fit.half.shape[1]))
+        drawn.append(prior.mean[i] + one.back(white)[0])
     return np.concatenate(drawn)
 
 
@@ -202,32 +227,17 @@ def marginals(
     """
     V, T = each(signal.covariance, blocks.label), each(signal.T, blocks.label)
     n, rows = len(V), V.shape[-1]
-    inverse = np.stack([lapack.dpotri(F, lower=1)[0] for F in fit.F])  # pyright: ignore[reportAttributeAccessIssue]
-    c = prior.mean + np.stack(
-        [
-            solve_triangular(F, h, lower=True, trans="T")  # pyright: ignore[reportArgumentType]
-            for F, h in zip(fit.F, fit.half, strict=True)
-        ]
-    )
+    c = prior.mean + fit.F.back(fit.half[:, None])[:, 0]
     gain = V @ (np.swapaxes(fit.W, 2, 3) @ fit.W)
     G = T - gain @ T
     at = expected(blocks, signal, c)
     mean = at + np.einsum("nbij,nbj->nbi", gain, y - at)
-    inverse = np.tril(inverse)
-    i = np.arange(blocks.n_columns)
-    inverse[:, i, i] *= 0.5
     k, j = np.triu_indices(T.shape[3])
     M = np.zeros((n, len(blocks.y), T.shape[3], T.shape[3]))  # U cov U' of each block
-    M[..., k, j] = times(blocks.sums.T, inverse.reshape(n, -1)).reshape(n, len(blocks.y), -1)
+    M[..., k, j] = times(blocks.sums.T, fit.F.covariance()).reshape(n, len(blocks.y), -1)
     M = M + np.swapaxes(M, 2, 3)
     var = np.diagonal(V - gain @ V, axis1=2, axis2=3) + ((G @ M) * G).sum(3)
     return mean, np.broadcast_to(var, (n, len(blocks.y), rows))
-
-
-def log_diagonal(L: Any) -> Any:
-    """Log determinant of triangular matrices."""
-    xp = namespace(L)
-    return xp.log(xp.diagonal(L, axis1=-2, axis2=-1)).sum(-1)
 
 
 def times(M: Any, x: Any) -> Any:
@@ -238,24 +248,3 @@ def times(M: Any, x: Any) -> Any:
     order = np.argsort(M.row, kind="stable")
     terms = M.data[order, None] * x.T[M.col[order]]
     return jax.ops.segment_sum(terms, M.row[order], M.shape[0], indices_are_sorted=True).T
-
-
-def cholesky(A: Any) -> Any:
-    """Lower factors, from the lower triangles; NaN where a matrix is not positive definite."""
-    if not isinstance(A, np.ndarray):
-        return jax.lax.linalg.cholesky(A, symmetrize_input=False)
-    try:
-        return np.linalg.cholesky(A)
-    except np.linalg.LinAlgError:  # one bad point must not cost the others
-        if A.ndim == 2:
-            return np.full(A.shape, np.nan)
-        return np.stack([cholesky(one) for one in A])
-
-
-def forward(F: Any, h: Any) -> Any:
-    """F^-1 h of lower factors (point, column, column) and vectors (point, column)."""
-    if isinstance(F, np.ndarray):
-        return np.stack(
-            [lapack.dtrtrs(f.T, x, lower=0, trans=1)[0] for f, x in zip(F, h, strict=True)]  # pyright: ignore[reportAttributeAccessIssue]
-        )
-    return jax.lax.linalg.triangular_solve(F, h[..., None], left_side=True, lower=True)[..., 0]

@@ -15,12 +15,12 @@ from scipy import special
 from trustbo.inference.engine import (
     Blocks,
     Prior,
-    cholesky,
     evidence,
     expected,
     marginals,
     whiten,
 )
+from trustbo.inference.factor import Factor, cholesky
 from trustbo.models.families import Family
 from trustbo.models.families.moments import log_normal
 from trustbo.models.signal import Signal, each
@@ -138,22 +138,14 @@ def draw(
         share = np.where(terms.linear, 1.0, share)
         lam, y = share * sites.lam, sites.y
         fit = evidence(blocks, signal, prior, lam, y)
-        F = np.tril(fit.F)
-        laws.append((prior.mean + _back(F, fit.half), F))
-    wide = rng.random(n) < 0.5
-    t = rng.standard_normal((n, p)) / np.sqrt(rng.chisquare(nu, (n, 1)) / nu)
-    center, F = (
-        np.where(wide.reshape(n, *(1,) * (a.ndim - 1)), b, a) for a, b in zip(*laws, strict=True)
-    )
-    c = center + _back(F, t)
+        laws.append((prior.mean + fit.F.back(fit.half[:, None])[:, 0], fit.F))
+    wide, t = rng.random(n) < 0.5, rng.standard_normal((n, 1, laws[0][1].size))
+    t /= np.sqrt(rng.chisquare(nu, (n, 1, 1)) / nu)
+    narrow, wider = (center + F.back(t)[:, 0] for center, F in laws)
+    c = np.where(wide[:, None], wider, narrow)
     log_q = np.logaddexp(*(_log_student(c, *law, nu) for law in laws)) - np.log(2.0)  # pyright: ignore[reportCallIssue]
-    off = c - prior.mean
-    Q = prior.add_to(np.zeros((n, p, p)))
-    log_prior = (
-        prior.log_det - p * np.log(2.0 * np.pi) - (off * (Q @ off[..., None])[..., 0]).sum(1)
-    )
     f, log_block = draw_signals(blocks, signal, expected(blocks, signal, c), terms, sites, rng)
-    return c, f, 0.5 * log_prior - log_q + log_block.sum(1)
+    return c, f, prior.log_density(c) - log_q + log_block.sum(1)
 
 
 def draw_signals(
@@ -204,15 +196,9 @@ def draw_signals(
     return f, total
 
 
-def _back(F: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """F'^-1 x."""
-    return np.linalg.solve(np.swapaxes(F, 1, 2), x[..., None])[..., 0]
-
-
-def _log_student(c: np.ndarray, center: np.ndarray, F: np.ndarray, nu: float) -> np.ndarray:
+def _log_student(c: np.ndarray, center: np.ndarray, F: Factor, nu: float) -> np.ndarray:
     """Log density of a multivariate Student-t; F is the factor of its precision."""
-    p, z = c.shape[1], (np.swapaxes(F, 1, 2) @ (c - center)[..., None])[..., 0]
+    p, z = c.shape[1], F.whitened(c - center)
     constant: Any = special.gammaln(0.5 * (nu + p)) - special.gammaln(0.5 * nu)
     constant = constant - 0.5 * p * np.log(nu * np.pi)
-    log_det = np.log(np.diagonal(F, axis1=1, axis2=2)).sum(1)
-    return constant + log_det - 0.5 * (nu + p) * np.log1p((z**2).sum(1) / nu)
+    return constant + F.log_det - 0.5 * (nu + p) * np.log1p((z**2).sum(1) / nu)

@@ -23,7 +23,8 @@ from numpyro.infer import MCMC, NUTS, init_to_value
 
 from trustbo.inference import importance
 from trustbo.inference.diagnostics import complaints_of
-from trustbo.inference.engine import cholesky, expected
+from trustbo.inference.engine import expected
+from trustbo.inference.factor import cholesky
 from trustbo.inference.posterior import Draws, Posterior, chunks
 from trustbo.models.backend import own_settings
 from trustbo.models.scores import NOISES

@@ -11,12 +11,12 @@ from trustbo.inference import ep
 from trustbo.inference.engine import (
     Blocks,
     Prior,
-    cholesky,
     draw_columns,
     evidence,
     expected,
     whiten,
 )
+from trustbo.inference.factor import Order, cholesky
 from trustbo.inference.importance import Student, find_mode, smoothed, systematic
 from trustbo.models.backend import namespace
 from trustbo.models.effects.effect import Theta
@@ -75,10 +75,21 @@ class Posterior:
         self._U = self.layout.columns(self._columns)
         self.exact = model.family.gaussian
         y = self.layout.rows(slots.y)
-        self.blocks = Blocks.of(y, self._U, self.layout.label, apart=not self.exact)
+        apart, order = not self.exact, self._order()
+        self.blocks = Blocks.of(y, self._U, self.layout.label, apart=apart, order=order)
         if not self.exact:
             self.terms = ep.Terms(model.family, y, self.layout.rows(slots.n_ticks))
             self.sites = ep.first_sites(self.terms)
+
+    def _order(self) -> Order:
+        """Order of elimination: independent columns of one mission alone are leaves."""
+        n, (rows, p) = self.slots.n_missions, self._U.shape
+        parts = self.prior(self.theta(np.zeros((1, self.n_scores)))).parts
+        free = np.concatenate([np.full(part.shape[1], part.ndim == 2) for part in parts])
+        at, first, last = self._U.tocoo(), np.full(p, n), np.full(p, -1)
+        np.minimum.at(first, at.col, at.row * n // rows)
+        np.maximum.at(last, at.col, at.row * n // rows)
+        return Order.of(np.where(free & (first == last) & (n > 1), first, -1), n)
 
     def without(self, mission: int) -> "Posterior":
         """The same posterior as if a mission had not been measured."""

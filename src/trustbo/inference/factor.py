@@ -1,0 +1,170 @@
+"""Cholesky factors of the precision of columns, most of which touch one mission alone.
+
+Columns that are independent a priori and that one mission alone has, such as bounds made once, are
+*leaves*: given all other columns, the *core*, those of different missions are independent. With
+leaves first, the precision A and its factor F, A = F F', are
+
+    A = [D  B ]    F = [G   0]    G G' = D,  X = G^-1 B,  H H' = C - X' X,
+        [B' C ]        [X'  H]
+
+with D and G block diagonal, a block for each mission. Only H is a large dense factor.
+"""
+
+from typing import Any, NamedTuple, Self
+
+import jax
+import numpy as np
+from scipy.linalg import lapack
+
+from trustbo.models.backend import namespace
+
+
+class Order(NamedTuple):
+    """Order in which columns are eliminated, and the layout of D, B and C in one vector."""
+
+    leaf: np.ndarray  # (mission, place), columns, padded with the number of columns
+    core: np.ndarray  # columns
+    group: np.ndarray  # (column,), mission of a leaf, -1 of the core
+    place: np.ndarray  # (column,), among the leaves of the mission, or in the core
+
+    @classmethod
+    def of(cls, only: np.ndarray, n_missions: int) -> Self:
+        """Order of columns, `only` (column,) being the mission of a leaf and -1 for the core."""
+        place = np.empty(len(only), dtype=int)
+        groups = [np.flatnonzero(only == j) for j in range(-1, n_missions)]
+        for columns in groups:
+            place[columns] = np.arange(len(columns))
+        groups = [groups[0], *(columns for columns in groups[1:] if len(columns))]
+        leaf = np.full((len(groups) - 1, max(map(len, groups[1:]), default=1)), len(only))
+        group = np.full(len(only), -1)
+        for g, columns in enumerate(groups[1:]):
+            leaf[g, : len(columns)], group[columns] = columns, g
+        return cls(leaf, groups[0], group, place)
+
+    @property
+    def shapes(self) -> tuple[tuple[int, ...], ...]:
+        """Shapes of D, B and C at a point."""
+        (g, k), q = self.leaf.shape, len(self.core)
+        return (g, k, k), (g, k, q), (q, q)
+
+    @property
+    def size(self) -> int:
+        """Length of the vector."""
+        return sum(int(np.prod(shape)) for shape in self.shapes)
+
+    def entry(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """Index of entries (a, b) of the precision; -1 where that of (b, a) stands for them."""
+        (g, k, _), (_, _, q), _ = self.shapes
+        of_leaf, of_both = self.group[a] >= 0, (self.group[a] >= 0) & (self.group[b] >= 0)
+        row = np.where(of_leaf, self.group[a] * k + self.place[a], self.place[a])
+        index = np.where(of_both, row * k, g * k * k + row * q) + self.place[b]
+        index = np.where(of_leaf, index, g * k * (k + q) + row * q + self.place[b])
+        other = (of_leaf == (self.group[b] >= 0)) & (self.place[a] < self.place[b])
+        return np.where(other | (~of_leaf & (self.group[b] >= 0)), -1, index)
+
+    def parts(self, A: Any) -> tuple[Any, Any, Any]:
+        """D, B and C, (point, ...), of vectors (point, entry)."""
+        ends = np.cumsum([0, *(int(np.prod(shape)) for shape in self.shapes)])
+        D, B, C = (
+            A[:, i:j].reshape(len(A), *shape)
+            for i, j, shape in zip(ends[:-1], ends[1:], self.shapes, strict=True)
+        )
+        padding = (self.leaf == len(self.place))[..., None] * np.eye(self.leaf.shape[1])
+        return D + padding, B, C
+
+
+class Factor(NamedTuple):
+    """Factor F at each point; white vectors have leaves first, their padding included."""
+
+    order: Order
+    inverse: Any  # (point, mission, place, place), G^-1
+    X: Any  # (point, mission, place, core)
+    H: Any  # (point, core, core)
+
+    @classmethod
+    def of(cls, order: Order, A: Any) -> Self:
+        """Factor precisions whose lower triangles are in vectors (point, entry)."""
+        D, B, C = order.parts(A)
+        xp = namespace(A)
+        inverse = xp.linalg.inv(cholesky(D))
+        X = inverse @ B
+        flat = X.reshape(len(X), -1, X.shape[-1])
+        return cls(order, inverse, X, cholesky(C - xp.swapaxes(flat, 1, 2) @ flat))
+
+    @property
+    def size(self) -> int:
+        """Length of a white vector."""
+        return self.order.leaf.size + len(self.order.core)
+
+    @property
+    def log_det(self) -> Any:
+        """Log determinant of F, (point,)."""
+        return log_diagonal(self.H) - log_diagonal(self.inverse).sum(1)
+
+    def forward(self, h: Any) -> Any:
+        """White vectors F^-1 h of vectors h (point, column)."""
+        xp, order = namespace(h), self.order
+        h = xp.concatenate([h, xp.zeros((len(h), 1))], axis=1)
+        leaf = (self.inverse @ h[:, order.leaf][..., None])[..., 0]
+        rest = h[:, order.core] - xp.einsum("ngkq,ngk->nq", self.X, leaf)
+        if isinstance(rest, np.ndarray):
+            pairs = zip(self.H, rest, strict=True)
+            core = np.stack([lapack.dtrtrs(H.T, x, lower=0, trans=1)[0] for H, x in pairs])  # pyright: ignore[reportAttributeAccessIssue]
+        else:
+            core = jax.lax.linalg.triangular_solve(
+                self.H, rest[..., None], left_side=True, lower=True
+            )[..., 0]
+        return xp.concatenate([leaf.reshape(len(h), -1), core], axis=1)
+
+    def back(self, white: np.ndarray) -> np.ndarray:
+        """Vectors F'^-1 w (point, draw, column) of white ones (point, draw, ...)."""
+        order, split = self.order, self.order.leaf.size
+        pairs = zip(self.H, white[..., split:], strict=True)
+        core = np.stack([lapack.dtrtrs(H.T, w.T, lower=0)[0].T for H, w in pairs])  # pyright: ignore[reportAttributeAccessIssue]
+        leaf = white[..., :split].reshape(*white.shape[:2], *order.leaf.shape)
+        leaf = leaf - np.einsum("ngkq,ndq->ndgk", self.X, core)
+        leaf = np.einsum("ngjk,ndgj->ndgk", self.inverse, leaf)
+        found = np.empty((*white.shape[:2], len(order.place) + 1))
+        found[..., order.leaf], found[..., order.core] = leaf, core
+        return found[..., :-1]
+
+    def whitened(self, c: np.ndarray) -> np.ndarray:
+        """White vectors F' c of vectors c (point, column)."""
+        order = self.order
+        c = np.column_stack([c, np.zeros(len(c))])
+        leaf, core = c[:, order.leaf], c[:, order.core]
+        leaf = np.linalg.solve(np.swapaxes(self.inverse, 2, 3), leaf[..., None])[..., 0]
+        leaf = leaf + np.einsum("ngkq,nq->ngk", self.X, core)
+        core = np.einsum("nij,ni->nj", self.H, core)
+        return np.concatenate([leaf.reshape(len(c), -1), core], axis=1)
+
+    def covariance(self) -> np.ndarray:
+        """Entries of A^-1 in the layout of A, diagonals halved, as sums over pairs need them."""
+        C = np.stack([np.tril(lapack.dpotri(H.T, lower=0)[0].T) for H in self.H])  # pyright: ignore[reportAttributeAccessIssue]
+        q = np.arange(C.shape[1])
+        whole = C + np.swapaxes(np.tril(C, -1), 1, 2)
+        turned = np.swapaxes(self.inverse, 2, 3)
+        B = -turned @ self.X @ whole[:, None]
+        D = np.tril(turned @ self.inverse - B @ np.swapaxes(turned @ self.X, 2, 3))
+        k = np.arange(D.shape[2])
+        C[:, q, q] *= 0.5
+        D[:, :, k, k] *= 0.5
+        return np.concatenate([part.reshape(len(C), -1) for part in (D, B, C)], axis=1)
+
+
+def log_diagonal(L: Any) -> Any:
+    """Log determinant of triangular matrices."""
+    xp = namespace(L)
+    return xp.log(xp.diagonal(L, axis1=-2, axis2=-1)).sum(-1)
+
+
+def cholesky(A: Any) -> Any:
+    """Lower factors, from the lower triangles; NaN where a matrix is not positive definite."""
+    if not isinstance(A, np.ndarray):
+        return jax.lax.linalg.cholesky(A, symmetrize_input=False)
+    try:
+        return np.linalg.cholesky(A)
+    except np.linalg.LinAlgError:  # one bad point must not cost the others
+        if A.ndim == 2:
+            return np.full(A.shape, np.nan)
+        return np.stack([cholesky(one) for one in A])
