@@ -124,7 +124,5 @@ def test_the_same_seed_gives_the_same_ranks():
 
 
 def test_bad_input():
-    with pytest.raises(TrustboError, match="sampler"):
-        sbc(PooledTrust(), design(), sampler="gibbs")
     with pytest.raises(TrustboError, match="n_datasets"):
         sbc(PooledTrust(), design(), n_datasets=0)

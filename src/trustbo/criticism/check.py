@@ -10,7 +10,13 @@ import xarray as xr
 from trustbo.data import Mission
 from trustbo.display import Rows, Summary, joined
 from trustbo.errors import TrustboError
-from trustbo.inference.draws import is_of_people, missions_of, model_of, require_posterior
+from trustbo.inference.draws import (
+    is_of_people,
+    joined_draws,
+    missions_of,
+    model_of,
+    require_posterior,
+)
 from trustbo.inference.fit import fit
 from trustbo.inference.loo import compare as ranked
 from trustbo.inference.score import score
@@ -118,7 +124,8 @@ def effects_of_robots(posterior: xr.DataTree) -> pd.DataFrame:
     """Row of each mission and robot, see `Check.robots`; none if the model has no such effects."""
     if "robots" not in posterior.children:
         return pd.DataFrame()
-    group, draws = posterior["robots"].to_dataset(), draws_of(posterior, "robots", "robot_effect")
+    group = posterior["robots"].to_dataset()
+    draws = joined_draws(group["robot_effect"])
     # The weight of line of sight fits the level of all effects.
     draws = draws - np.median(draws, axis=(1, 2), keepdims=True)
     draws = draws / family_of(posterior.attrs["observation"]).line_of_sight[0]
@@ -126,15 +133,8 @@ def effects_of_robots(posterior: xr.DataTree) -> pd.DataFrame:
     columns = {"effect": draws.mean(0), "sd": draws.std(0), "probability": probability}
     columns["stands_out"] = probability > SURE
     dims = ("mission", "robot")
-    coords = {name: group[name].values for name in dims}
-    table = xr.Dataset({name: (dims, values) for name, values in columns.items()}, coords)
-    return table.to_dataframe().reset_index()
-
-
-def draws_of(posterior: xr.DataTree, group: str, name: str) -> np.ndarray:
-    """Draws of a variable, shape (draw, ...), the chains joined."""
-    values = posterior[group].to_dataset()[name].transpose("chain", "draw", ...).values
-    return values.reshape(-1, *values.shape[2:])
+    index = pd.MultiIndex.from_product([group[name].values for name in dims], names=dims)
+    return pd.DataFrame({n: v.ravel() for n, v in columns.items()}, index).reset_index()
 
 
 def _check_robots(robots: pd.DataFrame) -> Finding:
@@ -147,15 +147,9 @@ def _check_robots(robots: pd.DataFrame) -> Finding:
     words = []
     for name in dict.fromkeys(robot[odd]):
         rows = odd & (robot == name)
-        everywhere = rows.sum() == (robot == name).sum()
-        when = (
-            "all missions"
-            if everywhere
-            else f"mission {joined(mission[rows].astype(str).tolist())}"
-        )
-        side = "less" if effect[rows].mean() < 0.0 else "more"
-        mean = abs(effect[rows].mean())
-        words.append(f"{name} has {mean:.2f} {side} contact in full sight in {when}")
+        when = f"mission {joined(mission[rows].astype(str).tolist())}"
+        when = "all missions" if rows.sum() == (robot == name).sum() else when
+        words.append(f"{name} has {effect[rows].mean():+.2f} contact in full sight in {when}")
     most = int(np.argmax(np.abs(effect) * odd))
     size, p = float(effect[most]), float(robots["probability"].to_numpy()[most])
     return Finding(joined(words), True, str(robot[most]), size, p)
@@ -164,17 +158,16 @@ def _check_robots(robots: pd.DataFrame) -> Finding:
 def _check_places(posterior: xr.DataTree) -> Finding:
     if "places" not in posterior.children:
         return Finding("not tested: the model has no effects of places")
-    places = posterior["places"].to_dataset()
-    cells = list(zip(places["cell_row"].values, places["cell_col"].values, strict=True))
-    bounds = list(zip(places["bound_row"].values, places["bound_col"].values, strict=True))
-    total, where = np.zeros(1), bounds
+    places, total = posterior["places"].to_dataset(), np.zeros(1)
+    cells, where = (
+        list(zip(places[f"{kind}_row"].values, places[f"{kind}_col"].values, strict=True))
+        for kind in ("cell", "bound" if "place_bound" in places else "cell")
+    )
     if "place_bound" in places:
-        total = draws_of(posterior, "places", "place_bound")
+        total = joined_draws(places["place_bound"])
     if "place" in places:
-        where = bounds if "place_bound" in places else cells
-        of_cells = draws_of(posterior, "places", "place")
-        total = total + of_cells[:, [cells.index(cell) for cell in where]]
-    beta0 = draws_of(posterior, "posterior", "beta0")
+        total = total + joined_draws(places["place"])[:, [cells.index(cell) for cell in where]]
+    beta0 = joined_draws(posterior["posterior"].to_dataset()["beta0"])
     draws = total / (1.0 - beta0[:, None])  # stationary trust
     effect = draws.mean(0)
     sure = (draws * np.sign(effect) > 0.0).mean(0)
@@ -192,7 +185,7 @@ def _check_weights(posterior: xr.DataTree) -> Finding:
         return Finding("not tested: the posterior holds no draws of the prior")
     features = posterior["posterior"].to_dataset()["feature"].values
     prior, draws = (
-        draws_of(posterior, group, name).reshape(-1, len(features))
+        joined_draws(posterior[group].to_dataset()[name]).reshape(-1, len(features))
         for group in ("prior", "posterior")
     )
     sign = np.sign(prior.mean(0))

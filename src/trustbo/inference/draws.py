@@ -50,7 +50,7 @@ def sites_of(posterior: xr.DataTree) -> dict[str, np.ndarray]:
         TrustboError: Some draws are NaN, as if masked.
     """
     draws = posterior["posterior"].to_dataset()
-    sites = {str(name): _joined(array) for name, array in draws.items()}
+    sites = {str(name): joined_draws(array) for name, array in draws.items()}
     for name, values in sites.items():
         bad = np.isnan(values.reshape(len(values), -1)).any(1).sum()
         if bad:
@@ -61,7 +61,7 @@ def sites_of(posterior: xr.DataTree) -> dict[str, np.ndarray]:
     return sites
 
 
-def _joined(array: xr.DataArray, axes: Sequence[Any] = (...,)) -> np.ndarray:
+def joined_draws(array: xr.DataArray, axes: Sequence[Any] = (...,)) -> np.ndarray:
     """Draws (draw, ...) with chains joined, other axes in an order, by default the given one.
 
     In one layout, whether just sampled or read from a file: sums over draws then round alike, and a
@@ -123,9 +123,8 @@ def params_of(
         return _coupled_ahead(params, effects, posterior, theta, mission)
     robots = (len(sites["beta0"]), mission.n_robots)
     fields = {
-        name: np.broadcast_to(values.reshape(len(values), -1), robots)
+        name: np.broadcast_to(sites[name].reshape(robots[0], -1), robots)
         for name in ("beta0", "b", "delta_w", "delta_v")
-        for values in (sites[name],)
     }
     beta = sites["beta"] if sites["beta"].ndim == 3 else sites["beta"][:, None]
     beta = np.broadcast_to(beta, (*robots, beta.shape[2]))
@@ -196,9 +195,8 @@ def is_of_people(posterior: xr.DataTree) -> bool:
 def values_of(posterior: xr.DataTree, effect: Effect) -> dict[str, np.ndarray]:
     """Variables of an effect by name, chains joined: leading axis (draw,)."""
     group = posterior[effect.noun].to_dataset()
-    if isinstance(effect, PlaceEffect):
-        return {name: _joined(group[name]) for name in effect.variables if name in group}
-    return {name: _joined(group[name], effect.variables[name]) for name in effect.variables}
+    axes = {name: axes or (...,) for name, axes in effect.variables.items() if name in group}
+    return {name: joined_draws(group[name], of_name) for name, of_name in axes.items()}
 
 
 def theta_of(posterior: xr.DataTree, sites: Mapping[str, np.ndarray]) -> Theta:
@@ -301,26 +299,22 @@ def missions_of(posterior: xr.DataTree) -> list[Mission]:
         )
     data = posterior["constant_data"].to_dataset()
     data = data.assign(contact_rate=posterior["observed_data"].to_dataset()["contact_rate"])
-    robots, features = ([str(n) for n in data[dim].values] for dim in ("robot", "feature"))
+    robots, features = ([str(n) for n in data[axis].values] for axis in ("robot", "feature"))
     missions = []
     for j in range(data.sizes["mission"]):
         one = data.isel(mission=j)
-        made = one["row"].values >= 0
-        has_map = bool(made.any())
-        one = one.isel(bound=made if has_map else slice(int(one["n_bounds"])))
-        cells = list(zip(one["row"].values, one["col"].values, strict=True))
-        start = (int(one["start_row"]), int(one["start_col"]))
+        made, path = one["row"].values >= 0, None
+        if made.any():
+            one = one.isel(bound=made)
+            cells = zip(one["row"].values, one["col"].values, strict=True)
+            path = [(int(one["start_row"]), int(one["start_col"])), *cells]
+        else:
+            one = one.isel(bound=slice(int(one["n_bounds"])))
         z, y, seconds = (one[name].values for name in ("awareness", "contact_rate", "duration"))
+        status, ticks = str(one["status"].values), one["n_ticks"].values
         missions.append(
             Mission.from_arrays(
-                [start, *cells] if has_map else None,
-                z,
-                y,
-                seconds,
-                str(one["status"].values),
-                n_ticks=one["n_ticks"].values,
-                robots=robots,
-                features=features,
+                path, z, y, seconds, status, n_ticks=ticks, robots=robots, features=features
             )
         )
     return missions

@@ -8,10 +8,10 @@ from scipy import stats
 
 from trustbo.data import Mission
 from trustbo.display import progress_bar
-from trustbo.errors import PosteriorError, require_choice, require_whole
-from trustbo.inference.fit import SAMPLERS, by_importance
+from trustbo.errors import PosteriorError, require_whole
+from trustbo.inference.fit import by_importance
 from trustbo.inference.importance import MAX_KHAT
-from trustbo.inference.posterior import Draws, Posterior, at
+from trustbo.inference.posterior import Posterior
 from trustbo.models.model import TrustModel
 from trustbo.parallel import one_blas_thread
 from trustbo.workspace import Workspace
@@ -24,7 +24,6 @@ def sbc(
     model: TrustModel,
     missions: Sequence[Mission],
     *,
-    sampler: str = "importance",
     workspace: Workspace | None = None,
     n_datasets: int = 100,
     n_ranked: int = 399,
@@ -40,7 +39,6 @@ def sbc(
     Args:
         model: Trust model.
         missions: Missions whose paths, awareness, ticks and gaps each data set has.
-        sampler: `"importance"` or `"nuts"`.
         workspace: Workspace of the missions, as for `fit`.
         n_datasets: Number of data sets.
         n_ranked: Number of draws that each truth is ranked among.
@@ -59,11 +57,8 @@ def sbc(
     Raises:
         PosteriorError: The sampler refuses more data sets than that, or all.
     """
-    require_choice("sampler", sampler, SAMPLERS)
-    n_datasets, n_ranked = (
-        require_whole("n_datasets", n_datasets, 1),
-        require_whole("n_ranked", n_ranked, 1),
-    )
+    n_datasets = require_whole("n_datasets", n_datasets, 1)
+    n_ranked = require_whole("n_ranked", n_ranked, 1)
     model = model.for_features(missions[0].features)
     slots = model.slots(missions, workspace)
     before, measured, ranks, n_refused = Posterior(model, slots), ~np.isnan(slots.y), [], 0
@@ -72,8 +67,8 @@ def sbc(
         truth = before.draw_prior(1, rng)
         rates = np.where(measured, before.anew(truth, rng)[0], np.nan)
         posterior = Posterior(model, slots._replace(y=rates))
-        drawn = _sample(posterior, sampler, n_ranked, int(rng.integers(2**31)))
-        if drawn is None:
+        drawn, _, summary = by_importance(posterior, n_ranked, int(rng.integers(2**31)))
+        if not summary["k_hat"] <= MAX_KHAT:
             n_refused += 1
             if n_refused > max_refused * n_datasets or n_refused == n_datasets:
                 raise PosteriorError(
@@ -83,20 +78,6 @@ def sbc(
         found, true = (_numbers(posterior.named(d, rng)) for d in (drawn, truth))
         ranks.append({name: int((found[name] < true[name][0]).sum()) for name in found})
     return _summary(ranks, n_ranked, n_refused)
-
-
-def _sample(posterior: Posterior, sampler: str, n: int, seed: int) -> Draws | None:
-    """Draws of a posterior; None where the importance sampler refuses it."""
-    if sampler == "importance":
-        drawn, _, summary = by_importance(posterior, n, seed)
-        return drawn if summary["k_hat"] <= MAX_KHAT else None
-    from trustbo.inference.nuts import sample_by_nuts  # compiles NumPyro's kernels
-
-    size = {"chains": 4, "draws": max(n, 500), "warmup": 300}
-    drawn = sample_by_nuts(posterior, **size, seed=seed, progress=False)[0]
-    kept = np.linspace(0, len(drawn.c) - 1, n).astype(int)
-    f = None if drawn.f is None else drawn.f[kept]
-    return drawn._replace(theta=at(drawn.theta, kept), c=drawn.c[kept], f=f)
 
 
 def _numbers(groups: dict[str, dict[str, np.ndarray]]) -> dict[str, np.ndarray]:

@@ -223,11 +223,10 @@ def _dataset(
         attrs["log_score_of"] = "ticks"
     quantile[np.isnan(y)] = np.nan
     made = np.arange(y.shape[1]) < np.array([len(m.bounds) for m in missions])[:, None]
-    groups = {"all": made, "seen": made & seen, "new": made & ~seen}
     values = [y, *(columns[name] for name in ("mean", "pit", "log_score"))]
     rows = [
-        summarize_scores(*(np.where(groups[name][..., None], a, np.nan) for a in values))
-        for name in AMONG
+        summarize_scores(*(np.where(group[..., None], a, np.nan) for a in values))
+        for group in (made, made & seen, made & ~seen)
     ]
     variables = {"contact_rate": (_DIMS, y), "quantile": ((*_DIMS, "level"), quantile)}
     variables |= {name: (_DIMS, column) for name, column in columns.items()}
