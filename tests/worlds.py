@@ -47,7 +47,7 @@ def unequal_robots(*, blocked=()):
     passable = workspace.passable.copy()
     for cell in blocked:
         passable[cell] = False
-    awareness = workspace.awareness * np.array([1.0, 0.8, 0.5])[:, None, None, None]
+    awareness = workspace.awareness * np.array([1.0, 0.8, 0.5])[:, None, None, None, None]
     return dataclasses.replace(workspace, passable=passable, awareness=awareness)
 
 
@@ -58,7 +58,7 @@ class ModelSimulator:
         self.workspace, self.truth, self.fail_at, self.blind = workspace, truth, fail_at, blind
 
     def run(self, path, *, seed, mission=0):
-        z = np.swapaxes(self.workspace.awareness.values[:, *zip(*path[1:], strict=True)], 0, 1)
+        z = self.workspace.along(path)
         status = "ok"
         if self.fail_at is not None:
             z, status = z[: self.fail_at], "stuck"

@@ -50,8 +50,7 @@ def line_of_sight(planner: Planner) -> np.ndarray:
     """Predicted rates of all bounds, mean over robots and assumed sights, (move, row, col)."""
     names = planner.workspace.features
     columns = [k for k, name in enumerate(names) if name.startswith(LINE_OF_SIGHT)]
-    rates = planner.workspace.bound_maps[..., columns].mean((0, -1))
-    return np.broadcast_to(rates, (8, *rates.shape[1:]))
+    return planner.workspace.awareness.values[..., columns].mean((0, -1))
 
 
 def best_paths(planner: Planner, rates: np.ndarray) -> list[Path]:

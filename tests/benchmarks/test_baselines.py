@@ -87,7 +87,7 @@ def test_best_paths_are_admissible_and_the_best_under_their_rates(planner, objec
 
 
 def test_line_of_sight_is_the_mean_over_robots_of_the_workspace_s_feature(planner):
-    feature = planner.workspace.bound_awareness.sel(feature="line_of_sight").values
+    feature = planner.workspace.awareness.sel(feature="line_of_sight").values
     table = paths.line_of_sight(planner)
     there = np.isfinite(table)
     np.testing.assert_allclose(table[there], feature.mean(0)[there])

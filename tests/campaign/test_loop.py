@@ -103,7 +103,7 @@ def test_maps_are_over_the_posterior_and_lie_in_their_place(tmp_path):
     assert {"trust_mean", "trust_sd", "path_probability", "visibility", "place_sd"} <= {*maps}
     assert maps["path_probability"][2, 0] == maps["path_probability"][0, 3] == 1.0
     np.testing.assert_allclose(maps["cost"], 1.0 - expit(maps["trust_mean"]), atol=1e-2)
-    known = workspace.awareness.sel(feature="visibility").mean("robot")
+    known = workspace.awareness.sel(feature="visibility").mean(("robot", "move"))
     np.testing.assert_allclose(maps["visibility"], known)
     assert result.maps(n_draws=50).identical(maps)
     assert maps.rio.crs == terrain.rio.crs

@@ -30,8 +30,7 @@ def draws():
 
 def trust_along(workspace, params, path):
     """Trust of the team along a path, rolled."""
-    z = workspace.awareness.values[:, *zip(*path[1:], strict=True)]
-    return roll_trust(params, np.swapaxes(z, 0, 1)).mean(-1)
+    return roll_trust(params, workspace.along(path)).mean(-1)
 
 
 def test_expected_trust_follows_equation_3():

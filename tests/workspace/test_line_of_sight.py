@@ -136,7 +136,7 @@ def test_line_of_sight_predicts_the_simulator_without_noise(name, real_terrain):
         if any(status != "ok" for _, status, _ in found):
             continue
         simulated.append(np.mean([contact for contact, _, _ in found]))
-        expected.append(workspace.bound_awareness.values[:, m, row, col, 2].mean())
+        expected.append(workspace.awareness.values[:, m, row, col, 2].mean())
     expected, simulated = np.array(expected), np.array(simulated)
     assert np.corrcoef(expected, simulated)[0, 1] > 0.95
     assert abs((expected - simulated).mean()) < 0.02
@@ -218,7 +218,7 @@ def test_robots_differ():
     terrain = synthetic_terrain((160.0, 160.0), seed=5, relief=8.0)
     blind = Robot(lidar_range=15.0)
     workspace = Workspace.from_terrain(terrain, (4, 4), Team(robots=(Robot(), blind)))
-    seen = workspace.bound_awareness.sel(feature="line_of_sight")
+    seen = workspace.awareness.sel(feature="line_of_sight")
     known = np.isfinite(seen.values[0])
     assert (seen.values[1][known] < seen.values[0][known] + 1e-12).mean() > 0.9
     assert seen.values[1][known].mean() < seen.values[0][known].mean() - 0.1
@@ -226,7 +226,7 @@ def test_robots_differ():
 
 def test_a_workspace_of_bounds_survives_a_file(wooded):
     again = workspace_from_tree(workspace_to_tree(wooded))
-    np.testing.assert_array_equal(again.bound_awareness, wooded.bound_awareness)
+    np.testing.assert_array_equal(again.awareness, wooded.awareness)
     assert again.sight == wooded.sight
     np.testing.assert_array_equal(again.posts.watching(A, C), wooded.posts.watching(A, C))
 
@@ -234,7 +234,6 @@ def test_a_workspace_of_bounds_survives_a_file(wooded):
 def test_the_paper_s_setting_has_maps_of_cells_alone(wooded):
     paper = Workspace.from_terrain(wooded.terrain, (4, 4), wooded.team, bounds=False)
     assert paper.features == ("traversability", "visibility")
-    assert paper.of_bounds is None
     assert list(paper.composites["visibility"].signs) == [
         "canopy_height",
         "canopy_cover",
@@ -253,7 +252,7 @@ def test_missing_awareness_of_a_mission_is_filled(wooded):
     names = wooded.features
     mission = Mission.from_arrays([A, C, NEXT], measured, np.full((2, 2), 0.5), features=names)
     filled = wooded.fill(mission)
-    expected = wooded.bound_awareness.sel(move="ne", feature="line_of_sight")
+    expected = wooded.awareness.sel(move="ne", feature="line_of_sight")
     np.testing.assert_array_equal(filled.awareness[0, :, 2], expected.sel(row=2, col=1))
     np.testing.assert_array_equal(filled.awareness[..., :2], mission.awareness[..., :2])
     np.testing.assert_array_equal(wooded.along(mission.path)[..., 2], filled.awareness[..., 2])

@@ -27,32 +27,22 @@ def test_bounds_of_a_path():
     found = along(maps, path)
     for k, (move, cell) in enumerate(zip(("ne", "e", "s"), path[1:], strict=True)):
         np.testing.assert_array_equal(found[:, k], maps[:, MOVE_NAMES.index(move), *cell])
-    np.testing.assert_array_equal(along(maps[:, :1], path)[:, 0], maps[:, 0, 2, 1])
     with pytest.raises(TrustboError, match=r"no bound leads from \(0, 0\) to \(0, 2\)"):
         moves_along([(0, 0), (0, 2)])
 
 
-def test_a_workspace_of_bounds():
-    z = RNG.random((2, 8, 3, 4, 2))
+@pytest.mark.parametrize("of_bounds", [False, True])
+def test_a_workspace_of_arrays_has_awareness_of_the_bounds_that_exist(of_bounds):
+    z = RNG.random((2, 8, 3, 4, 2) if of_bounds else (2, 3, 4, 2))
     passable = np.ones((3, 4), bool)
     passable[0, 0] = False
     ws = Workspace.from_awareness(z, passable)
+    assert ws.awareness.dims == ("robot", "move", "row", "col", "feature")
     exists = existing_bounds(passable)
-    inside = ws.bound_awareness.sel(move="w").values[:, exists[MOVE_NAMES.index("w")]]
-    np.testing.assert_array_equal(inside, z[:, MOVE_NAMES.index("w"), exists[3]])
-    assert np.isnan(ws.bound_awareness.values[:, ~exists]).all()
-    into = [z[1, m, 2, 3] for m in range(8) if exists[m, 2, 3]]
-    np.testing.assert_allclose(ws.awareness.values[1, 2, 3], np.mean(into, axis=0), rtol=1e-15)
-    assert np.isnan(ws.awareness.values[:, 0, 0]).all()
-    assert ws.bound_maps.shape == (2, 8, 3, 4, 2)
-
-
-def test_awareness_of_cells_is_met_by_every_move():
-    z = RNG.random((2, 3, 4, 2))
-    ws = Workspace.from_awareness(z)
-    assert ws.bound_awareness.dims == ("robot", "move", "row", "col", "feature")
-    np.testing.assert_array_equal(ws.bound_awareness.sel(move="n"), z)
-    assert ws.bound_maps.shape == (2, 1, 3, 4, 2)
+    for m, row, col in np.ndindex(8, 3, 4):
+        expected = z[:, m, row, col] if of_bounds else z[:, row, col]
+        found = ws.awareness.values[:, m, row, col]
+        np.testing.assert_array_equal(found, expected if exists[m, row, col] else np.nan)
 
 
 def test_a_bound_without_awareness_is_named():

@@ -17,14 +17,15 @@ def terrain():
 def test_a_workspace_of_a_terrain(terrain):
     team = Team(n_robots=2)
     workspace = Workspace.from_terrain(terrain, (4, 3), team)
-    assert workspace.awareness.dims == ("robot", "row", "col", "feature")
-    assert workspace.awareness.shape == (2, 4, 3, 3)
+    assert workspace.awareness.dims == ("robot", "move", "row", "col", "feature")
+    assert workspace.awareness.shape == (2, 8, 4, 3, 3)
     assert workspace.features == ("traversability", "visibility", "line_of_sight")
     assert float(workspace.awareness.min()) >= 0.0
     assert float(workspace.awareness.max()) <= 1.0
     assert workspace.passable.all()
     mean = workspace.grid.cell_means(workspace.pixels["visibility"])
-    np.testing.assert_allclose(workspace.awareness.sel(robot="r1", feature="visibility"), mean)
+    of_cells = workspace.awareness.sel(robot="r1", feature="visibility").mean("move")
+    np.testing.assert_allclose(of_cells, mean)
     assert set(workspace.composites) == {"traversability", "visibility"}
 
 

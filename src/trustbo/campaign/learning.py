@@ -44,7 +44,7 @@ def known_along(path: Sequence[Cell], workspace: Workspace) -> np.ndarray:
     """
     cells = require_on_grid(path, workspace.grid.shape)
     moves_along(cells)
-    return np.swapaxes(along(workspace.bound_maps, cells), 0, 1)
+    return np.swapaxes(along(workspace.awareness.values, cells), 0, 1)
 
 
 def as_learned(mission: Mission, workspace: Workspace) -> Mission:

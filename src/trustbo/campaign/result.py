@@ -229,7 +229,7 @@ class Result(Summary):
         awareness, places = self.workspace.awareness, self._places()
         taken = {*maps.variables, *maps.dims, "path_probability", "x", "y", "spatial_ref", *places}
         for name in self.workspace.features:
-            values = awareness.sel(feature=name, drop=True).mean("robot")
+            values = awareness.sel(feature=name, drop=True).mean(("robot", "move"))
             free = f"awareness_{name}" if name in taken else name
             maps[free] = values.assign_attrs(long_name=f"{name}, 0 worst, 1 best")
         maps["path_probability"] = share

@@ -194,7 +194,7 @@ def place_maps(posterior: xr.DataTree) -> xr.Dataset:
         place_mean and place_sd (row, col) of s, the effect of entering a cell, and place_bound_mean
         and place_bound_sd (move, row, col) of e, the further effect of entering it by that move, as
         the model has them. Where robots have separate effects, axis `robot` is first. Effects are
-        added to trust at each such bound. Moves have the names of `workspace.bound_awareness`, "n"
+        added to trust at each such bound. Moves have the names of `workspace.awareness`, "n"
         towards row 0; NaN where a move would come from outside the grid.
 
     Raises:

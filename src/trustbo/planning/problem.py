@@ -96,7 +96,7 @@ class Problem:
 
     def awareness_along(self, path: Sequence[Cell] | np.ndarray) -> np.ndarray:
         """Awareness of a path's bounds, shape (bound, robot, feature)."""
-        return np.swapaxes(along(self.paths.workspace.bound_maps, path), 0, 1)
+        return np.swapaxes(along(self.paths.workspace.awareness.values, path), 0, 1)
 
     def toll_along(self, path: Sequence[Cell] | np.ndarray) -> float:
         """Toll of a path."""
@@ -116,7 +116,7 @@ class Problem:
         self, params: Params, x0: ArrayLike | None = None, *, by_robot: bool = False
     ) -> Dynamics:
         """Build the recursion of expected trust; see `trust_dynamics`."""
-        return trust_dynamics(params, self.paths.workspace.bound_maps, x0, by_robot=by_robot)
+        return trust_dynamics(params, self.paths.workspace.awareness.values, x0, by_robot=by_robot)
 
     @cached_property
     def risks(self) -> "Risks | None":

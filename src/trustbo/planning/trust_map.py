@@ -22,7 +22,7 @@ def trust_map(
 ) -> xr.DataArray:
     """Compute the map of `Planner.trust_map`."""
     dynamics = problem.dynamics(params, x0, by_robot=per_robot).flat()
-    like = problem.paths.workspace.awareness.isel(feature=0, drop=True)
+    like = problem.paths.workspace.awareness.isel(move=0, feature=0, drop=True)
     n_states = dynamics.start.shape[-1]
     if per_robot:
         robots = [_largest(problem.paths, dynamics, view) for view in np.eye(n_states)]

@@ -101,7 +101,7 @@ def terrain_maps(workspace: Workspace, *, ax: Any = None) -> np.ndarray:
         raise TrustboError("terrain_maps needs a workspace made with Workspace.from_terrain.")
     axes = map_panels(grid, 1 + len(workspace.features), ax)
     surface, *others = axes
-    extent, of_cells = extent_of(grid), workspace.awareness.mean("robot")
+    extent, of_cells = extent_of(grid), workspace.awareness.mean(("robot", "move"))
     heights = surface.imshow(terrain["dsm"].values, cmap="cividis", extent=extent)
     surface.set_title("surface (DSM)")
     for one, name in zip(others, workspace.features, strict=True):

@@ -14,7 +14,7 @@ from trustbo.models.model import TrustModel
 from trustbo.models.params import Params, check_params
 from trustbo.simulation.protocol import DescribedSimulator, require_path
 from trustbo.workspace import Workspace
-from trustbo.workspace.moves import MOVES, along, moves_along
+from trustbo.workspace.moves import along, moves_along
 
 
 class ModelSimulator(DescribedSimulator):
@@ -41,9 +41,8 @@ class ModelSimulator(DescribedSimulator):
             params: True parameters, one draw of them.
             model: Trust model with these parameters; by default `PooledTrust()`. Gaussian rates are
                 clipped to [0, 1]: where many are, the data no longer follow the model.
-            awareness: True awareness, if it differs from the workspace's, of cells (robot, row,
-                col, feature) or of bounds (robot, move, row, col, feature); missions measure it
-                along their path.
+            awareness: True awareness, if it differs from the workspace's, of bounds (robot, move,
+                row, col, feature); missions measure it along their path.
             n_ticks: Ticks of each bound, for `"beta_binomial"`.
             p_fail: Probability that each bound ends the mission, shape (move, row, col), such as a
                 draw of `hazard.risk.BoundRisk`; robots are "stuck" then. None for no failures.
@@ -58,23 +57,19 @@ class ModelSimulator(DescribedSimulator):
         self.workspace, self.params = workspace, params
         self.model = PooledTrust() if model is None else model
         shape = workspace.awareness.shape
-        given = workspace.bound_maps if awareness is None else np.asarray(awareness)
-        self.awareness = given[:, None] if given.ndim == 4 else given
-        if self.awareness.shape not in ((shape[0], n, *shape[1:]) for n in (1, len(MOVES[8]))):
-            raise TrustboError(
-                f"awareness must be {shape}, or with an axis of 8 moves behind the robots; got "
-                f"shape {given.shape}."
-            )
+        self.awareness = workspace.awareness.values if awareness is None else np.asarray(awareness)
+        if self.awareness.shape != shape:
+            raise TrustboError(f"awareness must be {shape}; got shape {self.awareness.shape}.")
         if params.leading:
             raise TrustboError(f"give one draw of params; they have leading axes {params.leading}.")
-        check_params(params, shape[0], shape[3])
+        check_params(params, shape[0], shape[-1])
         self.n_ticks = None if n_ticks is None else require_whole("n_ticks", n_ticks, 1)
         if (self.n_ticks is not None) != self.model.family.needs_ticks:
             raise TrustboError(
                 f"n_ticks is for families that count ticks, and {self.model.family.name} "
                 f"{'does' if self.model.family.needs_ticks else 'does not'}; got {n_ticks}."
             )
-        bounds = len(MOVES[8]), *shape[1:3]
+        bounds = shape[1:4]
         self.p_fail = None if p_fail is None else _require_probabilities(p_fail, bounds)
 
     def run(self, path: Sequence[Cell], *, seed: int, mission: int = 0) -> Mission:

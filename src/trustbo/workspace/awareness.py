@@ -1,4 +1,8 @@
-"""Awareness of cells, from the pixels of a terrain or from a user's arrays."""
+"""Awareness of bounds, from the pixels of a terrain or from a user's arrays.
+
+Overwatch relates two cells, so awareness is that of a bound: a cell and the move into it. Maps of
+cells are copied to all moves.
+"""
 
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -6,12 +10,15 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
+from trustbo.data import is_line_of_sight
 from trustbo.errors import TrustboError, as_array, require_choice, require_kind
 from trustbo.team import Team
 from trustbo.terrain import FEATURES, CompositeIndex, pixel_size
 from trustbo.terrain.features import slope
 from trustbo.workspace.grid import MAX_MISSING, Grid
+from trustbo.workspace.line_of_sight import bound_maps
 from trustbo.workspace.moves import MOVE_NAMES, MOVES, existing_bounds
+from trustbo.workspace.posts import TRAVERSABLE, Posts
 
 _DIMS = ("robot", "move", "row", "col", "feature")
 _AXES = "(robot, row, col, feature) or (robot, move, row, col, feature) with 8 moves"
@@ -30,10 +37,13 @@ def cell_maps(
         col); maps of pixels, dims (y, x), of each feature and of passability; fitted composites.
 
     Raises:
-        TrustboError: An unknown feature, or one that is used unchanged outside [0, 1].
+        TrustboError: An unknown feature, one that is used unchanged outside [0, 1], or one with
+            the name of the line of sight.
     """
     remedy = "give names of pixel features by feature, e.g. {'ease': ('slope', 'tri')}"
-    require_kind("features", features, Mapping, remedy)
+    for name in require_kind("features", features, Mapping, remedy):
+        if is_line_of_sight(name):
+            raise TrustboError(f"{name!r} is the name of a feature of bounds; give yours another.")
     sides = [n * step for n, step in zip(terrain["dem"].shape, pixel_size(terrain), strict=True)]
     diagonal = float(np.hypot(grid.cell_height, grid.cell_width))
     ranges = [robot.lidar_range for robot in team.robots]
@@ -79,10 +89,38 @@ def _unit_values(name: str, values: np.ndarray) -> np.ndarray:
     return values
 
 
+def of_moves(cells: np.ndarray, passable: np.ndarray) -> np.ndarray:
+    """Copy maps (..., row, col, feature) to all bounds into a cell, (..., move, row, col, feature).
+
+    NaN where there is no bound between two passable cells, (row, col).
+    """
+    exists = existing_bounds(passable)[..., None]
+    return np.where(exists, cells[..., None, :, :, :], np.nan)
+
+
+def with_line_of_sight(
+    z: np.ndarray, features: Sequence[str], passable: np.ndarray, posts: Posts, pixels: xr.Dataset
+) -> np.ndarray:
+    """Append the line of sight to awareness of bounds (robot, move, row, col, feature).
+
+    Traversability, if it is one of the `features`, becomes the mean along the robots' tracks.
+    TrustboError: a cell without standing room for the team.
+    """
+    for row, col in np.argwhere(passable).tolist():
+        posts.require_room((row, col))
+    is_known = TRAVERSABLE in features
+    easy = pixels[TRAVERSABLE if is_known else "passable"].values
+    seen, easy = bound_maps(posts, passable, easy)
+    if is_known:
+        of_feature = z[..., list(features).index(TRAVERSABLE)]
+        of_feature[...] = np.where(np.isfinite(easy), easy, of_feature)
+    return np.clip(np.concatenate([z, seen[..., None]], axis=-1), 0.0, 1.0)
+
+
 def labelled(
     z: np.ndarray, passable: np.ndarray, grid: Grid, team: Team, features: Sequence[str]
 ) -> tuple[xr.DataArray, xr.DataArray]:
-    """Label awareness (robot, row, col, feature) and passability (row, col) of a grid.
+    """Label awareness (robot, move, row, col, feature) and passability (row, col) of a grid.
 
     TrustboError: no cell is passable.
     """
@@ -91,23 +129,22 @@ def labelled(
             "no cell is passable: more than half of every cell is missing or too steep. Use "
             "other cells, or a team with a larger max_slope."
         )
-    dims = ("robot", "row", "col", "feature")
     cells = {
-        **{axis: np.arange(n) for axis, n in zip(dims[1:3], grid.shape, strict=True)},
+        **{axis: np.arange(n) for axis, n in zip(("row", "col"), grid.shape, strict=True)},
         "y": ("row", grid.y),
         "x": ("col", grid.x),
     }
-    coords = {"robot": list(team.names), **cells, "feature": list(features)}
+    names = {"robot": list(team.names), "move": list(MOVE_NAMES), "feature": list(features)}
     return (
-        xr.DataArray(z, coords, dims, "awareness"),
-        xr.DataArray(passable, cells, dims[1:3], "passable"),
+        xr.DataArray(z, names | cells, _DIMS, "awareness"),
+        xr.DataArray(passable, cells, ("row", "col"), "passable"),
     )
 
 
 def unlabelled(
     awareness: ArrayLike | xr.DataArray, names: Sequence[str], features: Sequence[str]
 ) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...]]:
-    """Array of awareness in the order of axes that `of_cells` takes, names of robots and features.
+    """Array of awareness in the order of axes that `of_arrays` takes, names of robots and features.
 
     A DataArray is put in order by the names of its dims, and of its moves; names that are not given
     are its labels. TrustboError: other dims, or labels that contradict the names given.
@@ -130,16 +167,14 @@ def unlabelled(
     return as_array("awareness", awareness.transpose(*axes).values), chosen[0], chosen[1]
 
 
-def of_cells(
-    awareness: ArrayLike, passable: ArrayLike | None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+def of_arrays(awareness: ArrayLike, passable: ArrayLike | None) -> tuple[np.ndarray, np.ndarray]:
     """Check the arrays of `Workspace.from_awareness`.
 
-    Returns awareness of cells (robot, row, col, feature), passability (row, col), and awareness of
-    bounds (robot, move, row, col, feature), or None where it is that of the cells.
+    Returns awareness of bounds (robot, move, row, col, feature), NaN where there is none, and
+    passability (row, col).
 
-    TrustboError: other axes, a value outside [0, 1], NaN in a passable cell or in a
-    bound between two.
+    TrustboError: other axes; a value outside [0, 1], NaN in a passable cell or in a bound between
+    two.
     """
     z = as_array("awareness", awareness)
     if z.ndim not in (4, 5) or (z.ndim == 5 and z.shape[1] != len(MOVES[8])):
@@ -163,7 +198,7 @@ def of_cells(
             f"awareness of the passable cell {cell} is NaN; fill it, or mark it impassable."
         )
     if z.ndim == 4:
-        return z, free, None
+        return of_moves(z, free), free
     exists = existing_bounds(free)
     if (missing := exists & ~finite).any():
         m, row, col = (int(i) for i in np.argwhere(missing)[0])
@@ -172,11 +207,4 @@ def of_cells(
             f"awareness of the bound {(row - down, col - right)} -> {(row, col)} is NaN; fill it, "
             "or mark one of the cells impassable."
         )
-    bounds = np.where(exists[..., None], z, np.nan)
-    count = np.maximum(exists.sum(0), 1)[..., None]
-    cells = np.nansum(bounds, axis=1) / count
-    # A passable cell without a passable neighbour is entered by no bound.
-    alone = (free & ~exists.any(0))[..., None]
-    fallback = np.nanmean(np.where(free[..., None], z, np.nan), axis=1) if alone.any() else cells
-    cells = np.where(alone, fallback, cells)
-    return np.where(free[..., None], cells, np.nan), free, bounds
+    return np.where(exists[..., None], z, np.nan), free

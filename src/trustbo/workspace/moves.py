@@ -74,9 +74,7 @@ def existing_bounds(passable: np.ndarray) -> np.ndarray:
 def along(maps: np.ndarray, path: Sequence[Cell] | np.ndarray) -> np.ndarray:
     """Values of the bounds of a path, shape (..., bound, feature).
 
-    From maps (..., move, row, col, feature), whose axis of moves has length 1 where values are
-    those of the cell entered, for any move.
+    From maps (..., move, row, col, feature).
     """
-    rows, cols = np.asarray(path)[1:].T
-    moves = moves_along(path) if maps.shape[-4] > 1 else 0
+    moves, rows, cols = bounds_along(path).T
     return maps[..., moves, rows, cols, :]

@@ -17,8 +17,6 @@ from trustbo.workspace.workspace import Workspace
 def workspace_to_tree(workspace: Workspace) -> xr.DataTree:
     """Convert a workspace to a tree."""
     cells = xr.Dataset({"awareness": workspace.awareness, "passable": workspace.passable})
-    if workspace.of_bounds is not None:
-        cells["bound_awareness"] = workspace.of_bounds
     tree = {"cells": cells}
     tree |= {f"composites/{n}": index.to_dataset() for n, index in workspace.composites.items()}
     if workspace.terrain is not None and workspace.pixels is not None:
@@ -62,6 +60,5 @@ def workspace_from_tree(tree: xr.DataTree) -> Workspace:
             name: CompositeIndex.from_dataset(node.to_dataset())
             for name, node in (tree["composites"].children if "composites" in tree else {}).items()
         },
-        cells.get("bound_awareness"),
         posts,
     )

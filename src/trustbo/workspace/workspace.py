@@ -1,4 +1,4 @@
-"""Workspace of planner and simulator: awareness and passability of every cell."""
+"""Workspace of planner and simulator: awareness of every bound, passability of every cell."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -26,30 +26,34 @@ from trustbo.team import Team
 from trustbo.terrain.composite import CompositeIndex
 from trustbo.terrain.features import PAPER_VISIBILITY, TRAVERSABILITY, VISIBILITY
 from trustbo.terrain.read import require_terrain
-from trustbo.workspace.awareness import cell_maps, labelled, of_cells, unlabelled
-from trustbo.workspace.bound_awareness import of_bounds, require_names
+from trustbo.workspace.awareness import (
+    cell_maps,
+    labelled,
+    of_arrays,
+    of_moves,
+    unlabelled,
+    with_line_of_sight,
+)
 from trustbo.workspace.grid import MAX_MISSING, Grid, Location
 from trustbo.workspace.moves import MOVE_NAMES, along, existing_bounds
-from trustbo.workspace.posts import TRAVERSABLE, Posts
+from trustbo.workspace.posts import Posts
 from trustbo.workspace.sight import Sight
 from trustbo.workspace.surface import Surface
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Workspace(Summary):
-    """Planning grid with the situational awareness of each robot in each cell.
+    """Planning grid with the situational awareness of each robot in each bound.
 
     Attributes:
-        awareness: DataArray (robot, row, col, feature), in [0, 1]; NaN in cells without data.
+        awareness: DataArray (robot, move, row, col, feature), in [0, 1], of the bound into the cell
+            (row, col) by one of the eight `MOVES`; NaN where there is no such bound.
         passable: DataArray (row, col), bool.
         grid: Positions of the cells.
         team: Lead and robots.
         terrain: DEM and DSM; None without a terrain.
         pixels: Dataset (y, x) of traversability, visibility and passable; None without a terrain.
         composites: Fitted composites by feature.
-        of_bounds: DataArray (robot, move, row, col, feature) of what the bound into a cell by a
-            move meets, in [0, 1], NaN where there is no such bound; None where awareness is that of
-            the cell entered, for any move.
         posts: Stops, posts and routes of the robots over the terrain; None without a terrain.
     """
 
@@ -60,7 +64,6 @@ class Workspace(Summary):
     terrain: xr.Dataset | None = None
     pixels: xr.Dataset | None = None
     composites: dict[str, CompositeIndex] = field(default_factory=dict)
-    of_bounds: xr.DataArray | None = None
     posts: Posts | None = None
 
     @classmethod
@@ -76,16 +79,14 @@ class Workspace(Summary):
     ) -> Self:
         """Derive traversability, visibility and line of sight from a DEM and a DSM.
 
-        A cell's awareness is the mean of its pixels' composites, the same for every robot. A cell
+        Features are means of a cell's pixels, for all bounds into the cell and every robot. A cell
         is impassable if more than half of its pixels are missing or steeper than the slope limit.
         Openness is measured over the lidar's range, at most the diagonal of a cell: sight beyond
         one bound does not matter to overwatch.
 
-        Overwatch relates two cells, so a bound from one to the next has separate awareness,
-        `bound_awareness`: traversability along the way, the visibility of the cell entered, and
-        `line_of_sight`, the share of the bound's time in which a robot and the lead should see each
-        other under the assumed sight. The features of `awareness` are those of cells, with the mean
-        line of sight of the bounds into each.
+        Overwatch relates two cells. Traversability is therefore averaged along the robots' tracks
+        in a bound, and the feature `line_of_sight` is added: the share of the bound's time in which
+        a robot and the lead should see each other under the assumed sight.
 
         Args:
             terrain: Dataset of `read_terrain` or `synthetic_terrain`.
@@ -95,8 +96,8 @@ class Workspace(Summary):
                 `terrain.FEATURES`), or one name of a feature in [0, 1] that is used unchanged. By
                 default traversability and visibility, of `terrain.TRAVERSABILITY` and
                 `terrain.VISIBILITY`.
-            bounds: False for awareness of cells alone, as in the paper: traversability, and the
-                visibility of `terrain.PAPER_VISIBILITY`.
+            bounds: False for awareness of cells alone, as in the paper: without line of sight,
+                traversability of the cell entered, the visibility of `terrain.PAPER_VISIBILITY`.
             sight: Assumed model of sight; by default `Sight()`.
 
         Raises:
@@ -104,23 +105,20 @@ class Workspace(Summary):
                 or a dataset that is no terrain; no cell is passable, or a feature has the name of
                 the line of sight.
         """
-        terrain = require_terrain(terrain)
-        team = Team.of(team)
+        terrain, team = require_terrain(terrain), Team.of(team)
         grid = Grid.over(terrain, shape)
-        if bounds:
-            require_names(features or {})
-        defaults = {
-            "traversability": TRAVERSABILITY,
-            "visibility": VISIBILITY if bounds else PAPER_VISIBILITY,
-        }
+        if features is None:
+            visibility = VISIBILITY if bounds else PAPER_VISIBILITY
+            features = {"traversability": TRAVERSABILITY, "visibility": visibility}
         with compiling():
-            z, free, pixels, composites = cell_maps(terrain, grid, features or defaults, team)
-            z = np.repeat(z[None], team.n_robots, axis=0)
-            names = [str(name) for name in pixels.data_vars if name != "passable"]
-            cells = labelled(z, free, grid, team, names)
-            posts = Posts(grid, team, sight or Sight(), terrain, pixels)
-            workspace = cls(*cells, grid, team, terrain, pixels, composites, posts=posts)
-            return workspace._with_line_of_sight(posts, pixels) if bounds else workspace
+            cells, passable, pixels, composites = cell_maps(terrain, grid, features, team)
+            z = np.repeat(of_moves(cells, passable)[None], team.n_robots, axis=0)
+            posts, names = Posts(grid, team, sight or Sight(), terrain, pixels), [*features]
+            if bounds:
+                z = with_line_of_sight(z, names, passable, posts, pixels)
+                names.append(LINE_OF_SIGHT)
+        maps = labelled(z, passable, grid, team, names)
+        return cls(*maps, grid, team, terrain, pixels, composites, posts)
 
     @classmethod
     def from_awareness(
@@ -136,8 +134,8 @@ class Workspace(Summary):
 
         Args:
             awareness: Shape (robot, row, col, feature), in [0, 1]; or (robot, move, row, col,
-                feature), of the bound into a cell by each of the eight `MOVES`: a cell's awareness
-                is then the mean over the bounds into it.
+                feature), of the bound into a cell by each of the eight `MOVES`. Awareness of cells
+                is copied to all moves.
             passable: Shape (row, col); by default the cells without NaN in `awareness`, or with a
                 bound into them.
             cell_size: Side of a cell, m.
@@ -151,17 +149,16 @@ class Workspace(Summary):
         known = () if team is None else Team.of(team).names
         features = as_names("features", features)
         z, robots, features = unlabelled(awareness, known, features)
-        z, free, bounds = of_cells(z, passable)
+        z, free = of_arrays(z, passable)
         team = Team(len(z), names=robots) if team is None else Team.of(team)
         if len(team.robots) != len(z):
             raise TrustboError(f"awareness has {len(z)} robots, the team {len(team.robots)}.")
-        side = require_positive("cell_size", cell_size)
-        grid = Grid((z.shape[1], z.shape[2]), 0.0, z.shape[1] * side, side, side)
-        names = features or default_features(z.shape[3])
-        if len(names) != z.shape[3]:
-            raise TrustboError(f"features must be {z.shape[3]} names; got {names}.")
-        made = cls(*labelled(z, free, grid, team, names), grid, team)
-        return made if bounds is None else made.with_bounds(bounds)
+        names = features or default_features(z.shape[-1])
+        if len(names) != z.shape[-1]:
+            raise TrustboError(f"features must be {z.shape[-1]} names; got {names}.")
+        side, (rows, cols) = require_positive("cell_size", cell_size), free.shape
+        grid = Grid((rows, cols), 0.0, rows * side, side, side)
+        return cls(*labelled(z, free, grid, team, names), grid, team)
 
     @property
     def features(self) -> tuple[str, ...]:
@@ -171,30 +168,21 @@ class Workspace(Summary):
     def _rows(self) -> Rows:
         grid, free, team = self.grid, self.passable.values, self.team
         n_pixels = [] if self.terrain is None else self.terrain["dem"].shape
-        shown = self.awareness.mean("robot").where(self.passable)
+        shown = self.awareness.mean("robot")
         spread = [
-            (name, f"{float(one.quantile(0.1)):.2f} to {float(one.quantile(0.9)):.2f}")
+            (f"  {name}", f"{float(one.quantile(0.1)):.2f} to {float(one.quantile(0.9)):.2f}")
             for name, one in ((n, shown.sel(feature=n)) for n in self.features)
         ]
         rows = [
             ("cells", f"{grid.shape[0]} x {grid.shape[1]}, {free.mean():.0%} passable"),
             ("cell", f"{grid.cell_height:.4g} m x {grid.cell_width:.4g} m"),
             ("team", f"a lead and {', '.join(team.names)}"),
-            ("awareness", "of each bound" if self.of_bounds is not None else "of cells"),
-            *((f"  {name}", f"{values} (middle 80 % of cells)") for name, values in spread),
+            ("awareness", "of the middle 80 % of bounds"),
+            *spread,
             ("sight", "none assumed" if self.sight is None else str(self.sight)),
             ("terrain", " x ".join(map(str, n_pixels)) + " pixels" if n_pixels else "none"),
         ]
         return rows
-
-    def _with_line_of_sight(self, posts: Posts, pixels: xr.Dataset) -> Self:
-        easy = pixels[TRAVERSABLE].values if TRAVERSABLE in pixels else None
-        maps = of_bounds(posts, self.awareness.values, self.passable.values, self.features, easy)
-        names = [*self.features, LINE_OF_SIGHT]
-        like = self.awareness.isel(feature=[0] * len(names)).assign_coords(feature=names)
-        return dataclasses.replace(self, awareness=like.copy(data=maps.cells)).with_bounds(
-            maps.bounds
-        )
 
     @property
     def surface(self) -> Surface | None:
@@ -230,7 +218,7 @@ class Workspace(Summary):
             TrustboError: A cell is off the grid or impassable, or no neighbour of the one before.
         """
         cells = [self.locate(cell, f"path[{k}]") for k, cell in enumerate(path)]
-        return np.swapaxes(along(self.bound_maps, cells), 0, 1)
+        return np.swapaxes(along(self.awareness.values, cells), 0, 1)
 
     def in_order(self, mission: Mission) -> Mission:
         """Return a mission with its robots and features in the order of the workspace's.
@@ -264,31 +252,6 @@ class Workspace(Summary):
         if not np.isnan(ordered.awareness).any():
             return ordered
         return fill_awareness(ordered, self.along(ordered.path))
-
-    def with_bounds(self, values: np.ndarray) -> Self:
-        """Return the workspace with awareness of bounds, (robot, move, row, col, feature)."""
-        like = self.awareness.expand_dims(move=list(MOVE_NAMES), axis=1)
-        return dataclasses.replace(self, of_bounds=like.copy(data=values).rename("bound_awareness"))
-
-    @cached_property
-    def bound_awareness(self) -> xr.DataArray:
-        """Awareness of bounds, DataArray (robot, move, row, col, feature), in [0, 1].
-
-        The bound enters the cell (row, col) by the move, one of the eight of `MOVES`; NaN where
-        there is none. Where awareness is that of cells, every move meets that of the cell entered.
-        """
-        if self.of_bounds is not None:
-            return self.of_bounds
-        return self.awareness.expand_dims(move=list(MOVE_NAMES), axis=1).rename("bound_awareness")
-
-    @property
-    def bound_maps(self) -> np.ndarray:
-        """Values of `bound_awareness`; the axis of moves has length 1 if all moves meet the same.
-
-        Shape (robot, move, row, col, feature); see `moves.along`.
-        """
-        values = self.awareness.values[:, None]
-        return values if self.of_bounds is None else self.of_bounds.values
 
     def locate(self, location: Location, what: str = "location") -> Cell:
         """Cell of a location, which must be passable.
