@@ -87,6 +87,9 @@ class Team(Summary):
 
     Raises:
         TrustboError: There are no robots, or not one distinct name per robot.
+
+    Example:
+        >>> tb.Team(robots=(tb.Robot(lidar_range=60.0), tb.Robot()), names=("spot", "husky"))
     """
 
     n_robots: int = 3

@@ -72,6 +72,10 @@ class Campaign(Summary):
         state: Missions with their plans and posteriors, failures, and settings.
         storage: Folder of the campaign; None if it is in memory only.
         progress: Whether fits show their progress.
+
+    Example:
+        >>> with tb.Campaign(workspace, (9, 0), (0, 9), directory="field") as campaign:
+        ...     campaign.tell(drive(campaign.ask().path))  # your robots
     """
 
     def __init__(

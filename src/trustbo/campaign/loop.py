@@ -58,6 +58,10 @@ def iterate(
     Raises:
         TrustboError: Bad input, or a folder that holds a campaign, before any work starts.
         NoPathError: The goal cannot be reached.
+
+    Example:
+        >>> result = tb.iterate(workspace, start=(9, 0), goal=(0, 9), n_iterations=8)
+        >>> result.path
     """
     n_iterations = require_whole("n_iterations", n_iterations, 1)
     campaign = Campaign(workspace, start, goal, **options)

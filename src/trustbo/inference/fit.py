@@ -89,6 +89,10 @@ def fit(
             value is NaN, the sampler is unknown, no contact rate was measured, a path leaves the
             workspace, or a number of draws or the seed is no whole number.
         PosteriorError: The diagnostics are beyond their limits.
+
+    Example:
+        >>> posterior = tb.fit(missions, tb.models.PooledTrust())
+        >>> az.summary(posterior)
     """
     started = time.perf_counter()
     missions = _filled(missions, workspace)

@@ -142,6 +142,9 @@ def compare(posteriors: Mapping[str, xr.DataTree]) -> pd.DataFrame:
 
     Raises:
         TrustboError: Fewer than two posteriors, or other missions in one of them.
+
+    Example:
+        >>> tb.compare({"pooled": pooled, "hierarchical": hierarchical})
     """
     if not isinstance(posteriors, Mapping) or len(posteriors) < 2:
         raise TrustboError(

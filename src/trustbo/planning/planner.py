@@ -35,6 +35,10 @@ class Planner(Summary):
 
     Attributes:
         problem: Admissible paths, objective and costs.
+
+    Example:
+        >>> planner = tb.planning.Planner(workspace, start=(9, 0), goal=(0, 9))
+        >>> planner.plan(posterior).path
     """
 
     def __init__(

@@ -42,6 +42,10 @@ class KinematicSimulator(DescribedSimulator):
     with the lead. Awareness of a mission is that of the workspace's maps.
 
     A simulator with other motion derives from this class and replaces `drive`.
+
+    Example:
+        >>> jam = tb.simulation.Jam(center=(1748000.0, 5427000.0), radius=40.0, first=3)
+        >>> tb.simulation.KinematicSimulator(workspace, events=[jam]).run(path, seed=0)
     """
 
     def __init__(

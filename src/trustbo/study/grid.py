@@ -79,6 +79,10 @@ def run_grid(
 
     Raises:
         TrustboError: Some runs failed; they are run again at the next call.
+
+    Example:
+        >>> cases = {"greedy": {}, "thompson": {"policy": "thompson"}}
+        >>> table = tb.study.run_grid(cases, {"hills": make_scene}, "out", seeds=range(3))
     """
     require_whole("n_missions", n_missions, 1)
     kept, runs = Path(folder), list(product(seeds, scenes, cases))

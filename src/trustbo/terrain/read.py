@@ -107,6 +107,9 @@ def read_terrain(
         TrustboError: A source that is no raster of heights, has no place on Earth, or is too large
             for the memory; values that are no heights on land; two vertical datums; no pixel with
             both heights.
+
+    Example:
+        >>> terrain = tb.terrain.read_terrain("dem.tif", "dsm.tif", resolution=1.0)
     """
     given = None if crs is None else known_crs(crs)
     ground = _heights(dem, "dem", given, resolution, nodata)

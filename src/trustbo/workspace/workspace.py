@@ -104,6 +104,9 @@ class Workspace(Summary):
             TrustboError: A grid too fine for the raster, a cell without standing room for the team,
                 or a dataset that is no terrain; no cell is passable, or a feature has the name of
                 the line of sight.
+
+        Example:
+            >>> tb.Workspace.from_terrain(terrain, shape=(10, 10), team=tb.Team(n_robots=3))
         """
         terrain, team = require_terrain(terrain), Team.of(team)
         grid = Grid.over(terrain, shape)
