@@ -54,7 +54,8 @@ def test_on_open_ground_all_beams_are_clear(missions):
     )  # fmt: skip
     realtime = RealtimeAwareness.__new__(RealtimeAwareness)
     realtime._world = flat.world()
-    return_range, visible = realtime._lidar(missions[0].bounds[0].poses[:, 1:2])
+    seen = realtime._lidar(missions[0].bounds[0].poses[:, 1:2])
+    return_range, visible = seen["return_range"], seen["visible_share"]
     np.testing.assert_allclose(visible, 1.0)
     np.testing.assert_allclose(return_range, 45.0)
 
