@@ -237,13 +237,11 @@ class DenseOfPlaces:
         self.rows, self.T = rows, block_diag(*T)
         y = np.concatenate([m.contact_rate[:, i] for m in missions for i in range(3)])
         self.seen, self.U = ~np.isnan(y), np.concatenate(U)
-        own = np.array([i for i, _, _ in rows]) * (not place.shared)
         cells, before = (np.array([r[k] for r in rows]) for k in (2, 1))
-        same = own[:, None] == own[None]
         gap = np.linalg.norm(cells[:, None] - cells[None], axis=2) * np.sqrt(3.0) / ell
-        self.K_s = place.cells * tau_s**2 * (1.0 + gap) * np.exp(-gap) * same
+        self.K_s = tau_s**2 * (1.0 + gap) * np.exp(-gap)
         met = (cells[:, None] == cells[None]).all(2) & (before[:, None] == before[None]).all(2)
-        self.K_e = place.bounds * tau_e**2 * (met & same)
+        self.K_e = tau_e**2 * met
         rest = 1.0 - beta0 if priors.stationary else 1.0
         n = self.U.shape[1] - 1
         self.c_mean = rest * np.append(np.broadcast_to(priors.beta.loc, n), priors.b.loc)

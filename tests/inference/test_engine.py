@@ -26,8 +26,6 @@ MODELS = {
     "places and robots": PooledTrust(effects=EFFECTS),
     "deviation": PooledTrust(effects=(RobotEffect(),), memory="deviation"),
     "shared noise": PooledTrust(effects=EFFECTS, shared_noise=True),
-    "places by robot": PooledTrust(effects=(PlaceEffect(shared=False),)),
-    "cells alone": PooledTrust(effects=(PlaceEffect(bounds=False),)),
     "hierarchical": HierarchicalTrust(effects=(RobotEffect(),)),
     "hierarchical, shared noise": HierarchicalTrust(shared_noise=True),
     "coupled": CoupledTrust(),
@@ -42,10 +40,10 @@ def slots_of(model, *, gaps=False, shape=(4, 5, 3)):
         y[rng.random(shape) < 0.15] = np.nan
         y[1, 3:] = np.nan
     slots = Slots(y, z, np.full(shape, 50.0), FEATURES)
-    if model.place is None:
+    if PlaceEffect() not in model.effects:
         return slots
     steps = [rng.integers(0, n, shape[:2]) for n in (8, 4, 4)]
-    return slots._replace(visited=visited(np.stack(steps, -1), model.place, shape[2], (4, 4)))
+    return slots._replace(visited=visited(np.stack(steps, -1), (4, 4)))
 
 
 def posterior_of(name, **options):

@@ -63,7 +63,7 @@ def test_a_posterior_completed_later_is_the_same(posterior, missions):
 
 MODELS = {
     "places and robots": PooledTrust(effects=(PlaceEffect(), RobotEffect())),
-    "by robot": HierarchicalTrust(effects=(PlaceEffect(shared=False),)),
+    "by robot": HierarchicalTrust(effects=(PlaceEffect(),)),
     "coupled": CoupledTrust(effects=(RobotEffect(),)),
     "censored": PooledTrust(effects=(RobotEffect(),), observation="censored"),
     "shared noise": PooledTrust(shared_noise=True, memory="deviation"),

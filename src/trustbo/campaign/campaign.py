@@ -152,7 +152,7 @@ class Campaign(Summary):
             "max_bounds": self._base.max_bounds,
             "fit": dict(fit or {}),
             "hazard": asdict(hazard),
-            "model": model.named_with_effects,
+            "model": model.in_short(),
             "model_record": model_to_record(model),
         }
         self.state = State(json.loads(to_json(settings)))  # as a file returns them

@@ -16,6 +16,7 @@ from trustbo.hazard.exposures import LostMission
 from trustbo.hazard.risk import BoundRisk
 from trustbo.inference import fit, prior_mean, sample_prior
 from trustbo.inference.tree import parameters_alone
+from trustbo.models import PlaceEffect
 from trustbo.models.model import TrustModel
 from trustbo.models.params import Params
 from trustbo.planning import InfeasibleError, Plan, Planner
@@ -92,7 +93,9 @@ def learn(
     missions = [state.entries[j].mission for j in numbers]
     sampler, options = state.settings["sampler"], state.settings["fit"]
     # Draws of importance sampling are independent, and effects of places make them large.
-    few = sampler == "importance" and model.place is not None
+    few = sampler == "importance" and any(
+        isinstance(effect, PlaceEffect) for effect in model.effects
+    )
     usual = options.get("draws", _N_DRAWS // 4 if few else _N_DRAWS)
     reason = ""
     for shift, draws in enumerate((usual, 2 * usual)):

@@ -18,7 +18,8 @@ from scipy import fft
 from scipy.linalg import cho_factor, cho_solve
 
 from trustbo.errors import TrustboError, require_kind
-from trustbo.models.visited import N_MOVES, Visited, correlation, matern
+from trustbo.models.effects.place import matern
+from trustbo.models.visited import Visited
 from trustbo.parallel import one_blas_thread
 from trustbo.workspace.moves import MOVE_NAMES, existing_bounds
 
@@ -26,96 +27,106 @@ _STEP = 0.1  # of the logarithm of length scales
 _LARGEST = 4.0  # length scale in units of the grid's longer side
 _REACH = 5.0  # length scales at which the correlation is .002
 _JITTER = 1e-9
-_AXIS = {"place": "cell", "place_bound": "bound"}
 _MOMENTS = "mean", "standard deviation of the"
-_OF_CELL, _OF_BOUND = ("effect", "row", "col"), ("effect", "move", "row", "col")
+_MAP = "row", "col"
 
 
-Scales = Mapping[str, np.ndarray]
-"""Hyperparameters of places by name, each (draw,)."""
-
-
-def draw_maps(
-    scales: Scales, places: Visited, visited: Mapping[str, np.ndarray], seed: int
-) -> dict[str, np.ndarray]:
-    """Draw the effects of all cells and bounds given those of visited places.
+def place_group(draws: Mapping[str, np.ndarray], places: Visited, seed: int) -> xr.Dataset:
+    """Lay out the draws at visited places as a group of a posterior.
 
     Args:
-        scales: Hyperparameters of each draw.
-        places: Visited places, the grid's shape among them.
-        visited: Effects `place` (draw, cell) and `place_bound` (draw, unit), as the model has them.
-        seed: Seed of the effects of places not visited.
+        draws: place (chain, draw, cell) and place_bound (chain, draw, bound).
+        places: Visited places.
+        seed: Seed of the maps that `params_of` draws.
+    """
+    variables = {"place": (("chain", "draw", "cell"), draws["place"])}
+    variables["place_bound"] = ("chain", "draw", "bound"), draws["place_bound"]
+    n_chains, n_draws = draws["place"].shape[:2]
+    coords = {
+        "chain": np.arange(n_chains),
+        "draw": np.arange(n_draws),
+        **{f"cell_{name}": ("cell", places.cells[:, i]) for i, name in enumerate(_MAP)},
+        **{f"bound_{n}": ("bound", places.bounds[:, i]) for i, n in enumerate(("move", *_MAP))},
+    }
+    return xr.Dataset(variables, coords, {"shape": list(places.shape), "seed": seed})
+
+
+class _Visited:
+    """Visited places of a group `places`, and their effects with chains joined."""
+
+    def __init__(self, group: xr.Dataset) -> None:
+        rows, cols = (int(n) for n in group.attrs["shape"])
+        self.shape = rows, cols
+        self.cells = np.column_stack([group[f"cell_{name}"].values for name in _MAP])
+        self.bounds = tuple(group[f"bound_{name}"].values for name in ("move", *_MAP))
+        self.s, self.e = (
+            group[name].transpose("chain", "draw", ...).values.reshape(-1, group.sizes[axis])
+            for name, axis in (("place", "cell"), ("place_bound", "bound"))
+        )  # (draw, cell) and (draw, bound)
+
+
+def place_maps_of(group: xr.Dataset, sites: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Draw the effects of all cells and bounds, given those of visited places in each draw.
+
+    Args:
+        group: Group `places` of a posterior.
+        sites: Its hyperparameters by name, (draw,), chains joined.
 
     Returns:
-        place (draw, effect, row, col) and place_bound (draw, effect, move, row, col). The axis
-        effect is of robots, of length 1 where all share them.
+        place (draw, effect, row, col) and place_bound (draw, effect, move, row, col); the axis
+        effect has length 1, as robots share the effects.
     """
-    maps, n_effects = {}, places.n_effects
-    if "place" in visited:
-        maps["place"] = np.stack(
-            [
-                _cells(scales, places.shape, cells, s, [seed, i])
-                for i, (cells, s) in enumerate(_by_robot(places, visited["place"]))
-            ],
-            axis=1,
-        )
-    if "place_bound" in visited:
-        shape = len(visited["place_bound"]), n_effects, N_MOVES, *places.shape
-        e = np.random.default_rng([seed, n_effects]).standard_normal(shape)
-        e *= scales["tau_e"][:, None, None, None, None]
-        maps["place_bound"] = _centre(e)
-        e[:, *places.units.T] = visited["place_bound"]
-    return maps
-
-
-def _by_robot(places: Visited, s: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Visited cells of each robot, or of all that share effects, and their draws."""
-    for i in range(places.n_effects):
-        mine = places.cells[:, 0] == i
-        yield places.cells[mine], s[:, mine]
+    visited, seed = _Visited(group), int(group.attrs["seed"])
+    place = _cells(visited, sites, [seed, 0])
+    rng = np.random.default_rng([seed, 1])
+    place_bound = rng.standard_normal((len(place), len(MOVE_NAMES), *visited.shape))
+    place_bound *= sites["tau_e"][:, None, None, None]
+    _centre(place_bound)
+    place_bound[:, *visited.bounds] = visited.e
+    return {"place": place[:, None], "place_bound": place_bound[:, None]}
 
 
 @one_blas_thread()
-def _cells(
-    scales: Scales,
-    shape: tuple[int, int],
-    cells: np.ndarray,
-    values: np.ndarray,
-    seed: list[int],
-) -> np.ndarray:
-    """Effect s over the grid, (draw, row, col), given some cells."""
-    flat = cells[:, 1] * shape[1] + cells[:, 2]
-    centre = np.zeros((len(values), shape[0] * shape[1]))
+def _cells(visited: _Visited, sites: Mapping[str, np.ndarray], seed: list[int]) -> np.ndarray:
+    """Effect s over the grid, (draw, row, col), given that of visited cells."""
+    s, shape = visited.s, visited.shape
+    flat = visited.cells[:, 0] * shape[1] + visited.cells[:, 1]
+    centre = np.zeros((len(s), shape[0] * shape[1]))
     off = np.empty(centre.shape)
-    for step, rows, length_scale, weights, _ in _kriging(scales["length_scale"], shape, cells):
+    for step, rows, scale, weights, _ in _kriging(sites["length_scale"], visited):
         rng = np.random.default_rng([*seed, step + 1000])
-        free = _prior(shape, length_scale, int(rows.sum()), rng) * scales["tau_s"][rows, None]
-        centre[rows] = values[rows] @ weights
+        free = _prior(shape, scale, int(rows.sum()), rng) * sites["tau_s"][rows, None]
+        centre[rows] = s[rows] @ weights
         off[rows] = free - free[:, flat] @ weights
     return (centre + _centre(off)).reshape(-1, *shape)
 
 
 def _kriging(
-    length_scale: np.ndarray, shape: tuple[int, int], cells: np.ndarray
+    length_scale: np.ndarray, visited: _Visited
 ) -> Iterator[tuple[int, np.ndarray, float, np.ndarray, np.ndarray]]:
     """Yield each step of length scales, its draws and length scale, and how s follows from cells.
 
     That is weights (cell, all) of the effects of `cells` in the mean of s over the grid, and the
     variance (all,) that is left of a prior variance of 1.
     """
-    grid = np.column_stack([np.zeros(shape[0] * shape[1]), *np.indices(shape).reshape(2, -1)])
-    same_robot = np.column_stack([np.zeros(len(cells)), cells[:, 1:]])
+    cells, grid = visited.cells, np.indices(visited.shape).reshape(2, -1).T
     # Beyond, all cells are nearly equal, and `_prior` would need a far larger grid in memory.
-    length_scale = np.minimum(length_scale, _LARGEST * max(shape))
+    length_scale = np.minimum(length_scale, _LARGEST * max(visited.shape))
     steps = np.round(np.log(length_scale) / _STEP).astype(int)
     for step in np.unique(steps):
-        scale, weights = float(np.exp(_STEP * step)), np.zeros((len(same_robot), len(grid)))
-        cross = correlation(same_robot, grid, scale)
-        if len(same_robot):
-            K = correlation(same_robot, same_robot, scale) + _JITTER * np.eye(len(same_robot))
+        scale, weights = float(np.exp(_STEP * step)), np.zeros((len(cells), len(grid)))
+        cross = _correlation(cells, grid, scale)
+        if len(cells):
+            K = _correlation(cells, cells, scale) + _JITTER * np.eye(len(cells))
             weights = cho_solve(cho_factor(K), cross)
         left = np.maximum(1.0 - (weights * cross).sum(0), 0.0)
         yield int(step), steps == step, scale, weights, left
+
+
+def _correlation(cells: np.ndarray, others: np.ndarray, length_scale: float) -> np.ndarray:
+    """Correlation of s between cells (cell, 2) and others (other, 2)."""
+    gap = cells[:, None].astype(float) - others[None]
+    return matern(np.hypot(gap[..., 0], gap[..., 1]), length_scale)
 
 
 def _prior(
@@ -141,46 +152,6 @@ def _centre(draws: np.ndarray) -> np.ndarray:
     return draws
 
 
-def place_group(draws: Mapping[str, np.ndarray], places: Visited, seed: int) -> xr.Dataset:
-    """Lay out the draws at visited places as a group of a posterior.
-
-    Args:
-        draws: place (chain, draw, cell) and place_bound (chain, draw, unit), or one of these.
-        places: Visited places.
-        seed: Seed of the maps that `params_of` draws.
-    """
-    variables = {name: (("chain", "draw", _AXIS[name]), draws[name]) for name in draws}
-    n_chains, n_draws = next(iter(draws.values())).shape[:2]
-    coords = {
-        "chain": np.arange(n_chains),
-        "draw": np.arange(n_draws),
-        **{f"cell_{name}": ("cell", places.cells[:, i]) for i, name in enumerate(_OF_CELL)},
-        **{f"bound_{name}": ("bound", places.units[:, i]) for i, name in enumerate(_OF_BOUND)},
-    }
-    attrs = {"shape": list(places.shape), "n_effects": places.n_effects, "seed": seed}
-    return xr.Dataset(variables, coords, attrs)
-
-
-def visited_of(group: xr.Dataset) -> Visited:
-    """Visited places of such a group; of its `unit`, only the number of effects is kept."""
-    cells = np.column_stack([group[f"cell_{name}"].values for name in _OF_CELL])
-    units = np.column_stack([group[f"bound_{name}"].values for name in _OF_BOUND])
-    n_effects = int(group.attrs["n_effects"])
-    shape = tuple(int(n) for n in group.attrs["shape"])
-    nothing = np.zeros((0, 0, n_effects), dtype=int)
-    return Visited(shape, cells, units, np.zeros(0, dtype=int), nothing)  # pyright: ignore
-
-
-def place_maps_of(group: xr.Dataset, sites: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Effects over the whole grid for each draw of a posterior, see `draw_maps`.
-
-    Args:
-        group: Group `places` of a posterior.
-        sites: Its hyperparameters by name, (draw,), chains joined.
-    """
-    return draw_maps(sites, visited_of(group), _visited_draws(group), int(group.attrs["seed"]))
-
-
 def place_maps(posterior: xr.DataTree) -> xr.Dataset:
     """Mean and standard deviation of the effect of every cell and bound, over a posterior.
 
@@ -192,10 +163,9 @@ def place_maps(posterior: xr.DataTree) -> xr.Dataset:
 
     Returns:
         place_mean and place_sd (row, col) of s, the effect of entering a cell, and place_bound_mean
-        and place_bound_sd (move, row, col) of e, the further effect of entering it by that move, as
-        the model has them. Where robots have separate effects, axis `robot` is first. Effects are
-        added to trust at each such bound. Moves have the names of `workspace.awareness`, "n"
-        towards row 0; NaN where a move would come from outside the grid.
+        and place_bound_sd (move, row, col) of e, the further effect of entering it by that move.
+        Effects are added to trust at each such bound. Moves have the names of
+        `workspace.awareness`, "n" towards row 0; NaN where a move would come from outside the grid.
 
     Raises:
         TrustboError: No posterior of `fit`, or its model has no effects of places.
@@ -206,57 +176,35 @@ def place_maps(posterior: xr.DataTree) -> xr.Dataset:
             f"a posterior of {posterior.attrs.get('model', 'a model')} without effects of places "
             "has no maps of them; fit a model with effects=PlaceEffect()."
         )
-    group = posterior["places"].to_dataset()
-    sites = posterior["posterior"].to_dataset()
-    names = [name for name in ("tau_s", "length_scale", "tau_e") if name in sites]
-    scales = {name: sites[name].values.reshape(-1) for name in names}
-    places, visited, maps = visited_of(group), _visited_draws(group), xr.Dataset()
-    if "place" in visited:
-        moments = [
-            _moments_of_cells(scales, places.shape, cells, s)
-            for cells, s in _by_robot(places, visited["place"])
-        ]
-        _add(maps, "place", "effect of the cell", ("row", "col"), np.stack(moments, axis=1))
-    if "place_bound" in visited:
-        e, axes = visited["place_bound"], ("move", "row", "col")
-        effects_by_bound = np.zeros((2, places.n_effects, N_MOVES, *places.shape))
-        effects_by_bound[1] = np.sqrt((scales["tau_e"] ** 2).mean())
-        effects_by_bound[:, *places.units.T] = e.mean(0), e.std(0)
-        effects_by_bound[..., ~existing_bounds(np.ones(places.shape, bool))] = np.nan
-        _add(maps, "place_bound", "effect of the bound by a move", axes, effects_by_bound)
-        maps = maps.assign_coords(move=list(MOVE_NAMES))
-    maps = maps.assign_coords({axis: np.arange(maps.sizes[axis]) for axis in ("row", "col")})
-    if places.n_effects == 1:
-        return maps.isel(robot=0)
-    return maps.assign_coords(robot=posterior["observed_data"]["robot"].values)
+    visited = _Visited(posterior["places"].to_dataset())
+    draws = posterior["posterior"].to_dataset()
+    sites = {name: draws[name].values.ravel() for name in ("tau_s", "length_scale", "tau_e")}
+    of_bounds = np.zeros((2, len(MOVE_NAMES), *visited.shape))
+    of_bounds[1] = np.sqrt((sites["tau_e"] ** 2).mean())
+    of_bounds[:, *visited.bounds] = visited.e.mean(0), visited.e.std(0)
+    of_bounds[..., ~existing_bounds(np.ones(visited.shape, bool))] = np.nan
+    maps, (rows, cols) = xr.Dataset(), visited.shape
+    _add(maps, "place", "effect of the cell", _MAP, _moments_of_cells(visited, sites))
+    _add(maps, "place_bound", "effect of the bound by a move", ("move", *_MAP), of_bounds)
+    return maps.assign_coords(move=list(MOVE_NAMES), row=np.arange(rows), col=np.arange(cols))
 
 
 @one_blas_thread()
-def _moments_of_cells(
-    scales: Scales, shape: tuple[int, int], cells: np.ndarray, draws: np.ndarray
-) -> np.ndarray:
+def _moments_of_cells(visited: _Visited, sites: Mapping[str, np.ndarray]) -> np.ndarray:
     """Mean and standard deviation of s over the grid, (2, row, col)."""
-    centre = np.zeros((len(draws), shape[0] * shape[1]))
+    s, shape = visited.s, visited.shape
+    centre = np.zeros((len(s), shape[0] * shape[1]))
     variance = np.zeros(shape[0] * shape[1])
-    for _, rows, _, weights, left in _kriging(scales["length_scale"], shape, cells):
-        centre[rows] = draws[rows] @ weights
-        variance += (scales["tau_s"][rows] ** 2).sum() * left / len(draws)
+    for _, rows, _, weights, left in _kriging(sites["length_scale"], visited):
+        centre[rows] = s[rows] @ weights
+        variance += (sites["tau_s"][rows] ** 2).sum() * left / len(s)
     return np.stack([centre.mean(0), np.sqrt(centre.var(0) + variance)]).reshape(2, *shape)
 
 
 def _add(
     maps: xr.Dataset, name: str, text: str, axes: tuple[str, ...], moments: np.ndarray
 ) -> None:
-    """Add a mean and a standard deviation (2, robot, ...) to some maps."""
+    """Add a mean and a standard deviation (2, ...) to some maps."""
     for kind, long, values in zip(("mean", "sd"), _MOMENTS, moments, strict=True):
         attrs = {"long_name": f"{long} {text} on trust", "units": "1"}
-        maps[f"{name}_{kind}"] = ("robot", *axes), values, attrs
-
-
-def _visited_draws(group: xr.Dataset) -> dict[str, np.ndarray]:
-    """Draws at visited places by name, chains joined: (draw, cell) and (draw, unit)."""
-    return {
-        name: group[name].transpose("chain", "draw", ...).values.reshape(-1, group.sizes[axis])
-        for name, axis in _AXIS.items()
-        if name in group
-    }
+        maps[f"{name}_{kind}"] = axes, values, attrs

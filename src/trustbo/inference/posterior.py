@@ -217,7 +217,7 @@ class Posterior:
                     self.blocks, model.signal(chunk, self.slots, self.layout), draws.c[i]
                 )
                 persons[i] = model.persons(chunk, draws.f[i], mean, self.slots, rng)
-            groups[model.effect.noun]["person"] = persons
+            groups[model.effect.noun] = {"person": persons}
         return groups
 
     def draws_of(self, groups: Mapping[str, Mapping[str, np.ndarray]]) -> Draws:

@@ -19,8 +19,7 @@ from trustbo.data import Mission
 from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError, require_choice
 from trustbo.models.backend import namespace
-from trustbo.models.effects.effect import EFFECTS, Effect, Theta, sample_columns
-from trustbo.models.effects.place import PlaceEffect
+from trustbo.models.effects.effect import Effect, Theta, sample_columns
 from trustbo.models.effects.weights import Weights
 from trustbo.models.families import FAMILIES, Family, family_of
 from trustbo.models.params import Params, assemble_params, check_params
@@ -29,10 +28,13 @@ from trustbo.models.signal import Signal
 from trustbo.models.simulate import TrustSample, draw_missions
 from trustbo.models.slots import Layout, Slots
 from trustbo.models.ticks import broadcast_ticks, require_ticks
-from trustbo.models.visited import places_of
 from trustbo.workspace import Workspace
 
 _STREAM = 0x6D697373  # of `simulate`, among all that a seed gives
+
+
+MODELS: dict[str, type["TrustModel"]] = {}
+"""Classes of models by name, to read models from files."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -61,6 +63,9 @@ class TrustModel(Summary, ABC):
     effects: tuple[Effect, ...] = ()
     memory: ClassVar[str] = "level"  # see `PooledTrust`
 
+    def __init_subclass__(cls) -> None:
+        MODELS[cls.__name__] = cls
+
     def __post_init__(self) -> None:
         require_choice("observation", self.observation, FAMILIES)
         if self.priors is None:
@@ -69,11 +74,8 @@ class TrustModel(Summary, ABC):
             raise TrustboError(f"priors must be a trustbo.models.Priors; got {self.priors!r}.")
         given: Any = self.effects
         effects = (given,) if isinstance(given, Effect) else tuple(given)
-        if unknown := [e for e in effects if type(e) not in EFFECTS.values()]:
-            raise TrustboError(
-                f"effects must be of {', '.join(f'{n}()' for n in EFFECTS)}, or of a class that is "
-                f"registered; got {unknown[0]!r}."
-            )
+        if unknown := [effect for effect in effects if not isinstance(effect, Effect)]:
+            raise TrustboError(f"effects must be such as PlaceEffect(); got {unknown[0]!r}.")
         if len({type(effect) for effect in effects}) < len(effects):
             raise TrustboError(f"effects must be of different kinds; got {effects!r}.")
         object.__setattr__(self, "effects", effects)
@@ -122,11 +124,6 @@ class TrustModel(Summary, ABC):
         return self.weights, *self.effects
 
     @property
-    def place(self) -> PlaceEffect | None:
-        """The effects of places, if there are any."""
-        return next((e for e in self.effects if isinstance(e, PlaceEffect)), None)
-
-    @property
     def effect_dims(self) -> dict[str, tuple[str, ...]]:
         """Axes of the hyperparameters of effects."""
         return {name: () for effect in self.effects for name in effect.names}
@@ -163,7 +160,7 @@ class TrustModel(Summary, ABC):
         return {name: (name, sites[name]) for name in self.dims}
 
     def slots(self, missions: Sequence[Mission], workspace: Workspace | None = None) -> Slots:
-        """Rates and features of missions, with the places that the model's effects are of.
+        """Rates and features of missions, with what the model's effects need beside.
 
         Raises:
             TrustboError: There are no missions, or they disagree on robots or features; an
@@ -172,7 +169,9 @@ class TrustModel(Summary, ABC):
         """
         slots = Slots.of(missions)
         require_ticks(self.family, slots.y, slots.n_ticks)
-        return slots._replace(visited=places_of(missions, self.place, slots.y.shape, workspace))
+        for effect in self.effects:
+            slots = effect.slots(slots, missions, workspace)
+        return slots
 
     def for_features(self, features: Sequence[str]) -> Self:
         """The model with default priors for features of these names; custom priors stay.
@@ -270,7 +269,7 @@ class TrustModel(Summary, ABC):
         return [
             ("rates", self.observation),
             *((n, str(v)) for n, v in self.options().items() if n != "observation"),
-            *(("effects", effect.in_short()) for effect in self.effects),
+            *(("effects", f"of {effect.noun}") for effect in self.effects),
         ]
 
     def in_short(self) -> str:
@@ -281,18 +280,9 @@ class TrustModel(Summary, ABC):
             for name, value in self.options().items()
             if name != "observation" and value != usual.get(name)
         ]
-        return ", ".join([type(self).__name__, *self.nouns, self.observation, *others])
-
-    @property
-    def named_with_effects(self) -> str:
-        """Name of the class, and what has effects."""
-        effects = " and ".join(self.nouns)
-        return type(self).__name__ + (f" with {effects}" if effects else "")
-
-    @property
-    def nouns(self) -> list[str]:
-        """Plural of what has effects."""
-        return [effect.noun for effect in self.effects]
+        return ", ".join(
+            [type(self).__name__, *(e.noun for e in self.effects), self.observation, *others]
+        )
 
 
 def require_model(model: object) -> None:

@@ -12,7 +12,7 @@ from trustbo.data import levels_of
 from trustbo.display import Rows
 from trustbo.errors import TrustboError
 from trustbo.models.backend import namespace, own_settings
-from trustbo.models.effects.effect import Theta
+from trustbo.models.effects.effect import Effect, Theta
 from trustbo.models.effects.person import PersonEffect
 from trustbo.models.families import FAMILIES, Family, Levels
 from trustbo.models.pooled import PooledTrust
@@ -63,9 +63,9 @@ class HumanTrust(PooledTrust):
             )
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the features."""
-        return tuple(self.inputs.split(",")) if self.inputs else ()
+    def columns(self) -> tuple[Effect, ...]:
+        """See `TrustModel.columns`: those of weights, see `effects.person`."""
+        return (self.weights,)
 
     @cached_property
     def family(self) -> Family:  # pyright: ignore

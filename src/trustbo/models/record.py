@@ -5,17 +5,9 @@ from dataclasses import replace
 from typing import Any
 
 from trustbo.errors import TrustboError
-from trustbo.models.coupled import CoupledTrust
 from trustbo.models.effects.effect import EFFECTS, Effect
-from trustbo.models.hierarchical import HierarchicalTrust
-from trustbo.models.model import TrustModel
-from trustbo.models.people import HumanTrust
-from trustbo.models.pooled import PooledTrust
+from trustbo.models.model import MODELS, TrustModel
 from trustbo.models.priors import Priors
-
-_MODELS = {
-    model.__name__: model for model in (PooledTrust, HierarchicalTrust, CoupledTrust, HumanTrust)
-}
 
 
 def model_to_record(model: TrustModel) -> dict[str, Any]:
@@ -27,7 +19,7 @@ def model_to_record(model: TrustModel) -> dict[str, Any]:
         "class": type(model).__name__,
         **model.options(),
         "priors": model.priors.describe(),
-        "effects": [{"kind": type(e).__name__, **e.to_record()} for e in model.effects],
+        "effects": [effect.to_record() for effect in model.effects],
         "by_feature": model.priors is Priors.default(model.observation),
     }
 
@@ -46,7 +38,7 @@ def model_from_record(
                 f"the campaign's model is {record}; the one given is {model_to_record(given)}."
             )
         return given
-    if (kind := _MODELS.get(record["class"])) is not None:
+    if (kind := MODELS.get(record["class"])) is not None:
         ours = ("class", "priors", "by_feature", "effects")
         options = {name: value for name, value in record.items() if name not in ours}
         usual = kind(effects=effects_from_record(record), **options)
@@ -64,7 +56,7 @@ def model_from_record(
 def effects_from_record(record: Mapping[str, Any]) -> tuple[Effect, ...]:
     """Effects of a model's record.
 
-    TrustboError: one of them is of a class that is not registered in this process.
+    TrustboError: one of them is of a class that this process has not imported.
     """
     return tuple(_effect_from_record(**effect) for effect in record.get("effects", ()))
 
@@ -73,6 +65,6 @@ def _effect_from_record(kind: str, **settings: Any) -> Effect:
     if kind not in EFFECTS:
         raise TrustboError(
             f"the model has an effect {kind!r}, which this process does not have; import the "
-            f"module that registers it. There are {', '.join(sorted(EFFECTS))}."
+            f"module that defines it. There are {', '.join(sorted(EFFECTS))}."
         )
-    return EFFECTS[kind](**settings)
+    return EFFECTS[kind](**{n: tuple(v) if isinstance(v, list) else v for n, v in settings.items()})

@@ -1,12 +1,11 @@
 """The protocol of effects: columns that add to the drift of trust, and their weights' prior.
 
 The drift of a slot is u = U c, with coefficients c that are Gaussian given hyperparameters theta. A
-new effect is a frozen dataclass in a file of its own with the methods of `Effect`, registered by
-`register`; engine, samplers, posteriors and plans need no more.
+new effect is a frozen dataclass in a file of its own with the methods of `Effect`; engine,
+samplers, posteriors and plans need no more.
 """
 
 import json
-from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any, ClassVar, NamedTuple
@@ -17,10 +16,10 @@ import numpyro
 import numpyro.distributions as dist
 from numpyro.distributions import Distribution
 
-from trustbo.data import is_line_of_sight
-from trustbo.errors import TrustboError
+from trustbo.data import Mission, is_line_of_sight
 from trustbo.models.backend import namespace
 from trustbo.models.slots import Slots
+from trustbo.workspace import Workspace
 
 Theta = Mapping[str, Any]
 """Hyperparameters by name, each (point, ...), and `rest`, the drift by which stationary trust rises
@@ -28,6 +27,9 @@ by 1: 1 - beta0 where trust itself lasts; (point,), or (point, robot)."""
 
 LEAST = 1e-4
 """Least sd of an effect: precisions stay finite, and a smaller effect is none."""
+
+EFFECTS: dict[str, type["Effect"]] = {}
+"""Classes of effects by name, to read models from files."""
 
 
 class NextMission(NamedTuple):
@@ -50,11 +52,11 @@ class NextMission(NamedTuple):
         return weights, np.zeros_like(slope)
 
 
-class Effect(ABC):
+class Effect:
     """An effect on the drift, with the settings of its prior.
 
     Hyperparameters are sds with half-normal priors, whose scales are the fields of these names;
-    other effects override `hyperpriors`.
+    other effects override `hyperpriors`. A class with a noun is known to files by its name.
     """
 
     names: ClassVar[tuple[str, ...]] = ()
@@ -66,16 +68,14 @@ class Effect(ABC):
     coords: ClassVar[Mapping[str, Sequence[Any]]] = {}
     """Labels of axes other than those of missions, robots and features."""
 
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if isinstance(value, list):  # of a file; a model's settings are hashed
-                object.__setattr__(self, name, tuple(value))
+    def __init_subclass__(cls) -> None:
+        if cls.noun:
+            EFFECTS[cls.__name__] = cls
 
-    @abstractmethod
     def columns(self, slots: Slots) -> Any:
         """Sparse matrix (slot, column); slots are (mission, bound, robot), raveled."""
+        raise NotImplementedError
 
-    @abstractmethod
     def prior(self, theta: Theta, slots: Slots) -> tuple[Any, list[Any]]:
         """Prior of the coefficients at each theta, in NumPy or JAX.
 
@@ -83,6 +83,7 @@ class Effect(ABC):
             Mean (point, column), None for 0, and precisions of consecutive columns, (point, k, k)
             or (point, k) of independent ones.
         """
+        raise NotImplementedError
 
     def named(self, c: np.ndarray, theta: Theta, slots: Slots) -> dict[str, np.ndarray]:
         """Variables by name, each (draw, ...), of coefficients c (draw, column)."""
@@ -112,54 +113,15 @@ class Effect(ABC):
         """Priors of the hyperparameters, by name."""
         return {name: dist.HalfNormal(getattr(self, name)) for name in self.names}
 
-    def in_short(self) -> str:
-        """Text of what the effect is of."""
-        return f"of {self.noun}"
+    def slots(
+        self, slots: Slots, missions: Sequence[Mission], workspace: Workspace | None
+    ) -> Slots:
+        """Slots of missions with what the columns need beside rates and features."""
+        return slots
 
     def to_record(self) -> dict[str, Any]:
-        """Fields by name, as JSON has them: a tuple is a list."""
-        return json.loads(json.dumps(asdict(self)))  # pyright: ignore[reportArgumentType]
-
-
-EFFECTS: dict[str, type[Effect]] = {}
-"""Effects that models may have, by the names of their classes."""
-
-
-def register[Kind: Effect](cls: type[Kind]) -> type[Kind]:
-    """Let models have effects of a class, also those read from files.
-
-    Raises:
-        TrustboError: The class lacks a noun or variables, or shares a noun, a hyperparameter or a
-            variable with another.
-    """
-    if not (cls.noun and cls.variables):
-        raise TrustboError(f"effect {cls.__name__} needs a noun and variables; got none.")
-    own = () if isinstance(cls.names, property) else cls.names
-    names = {cls.noun, *own, *cls.variables}
-    for other in (one for one in EFFECTS.values() if one.__name__ != cls.__name__):
-        others = () if isinstance(other.names, property) else other.names
-        if shared := names & (_TAKEN | {other.noun, *others, *other.variables}):
-            raise TrustboError(
-                f"effect {cls.__name__} has {sorted(shared)[0]!r}, which another has; rename it."
-            )
-    EFFECTS[cls.__name__] = cls
-    return cls
-
-
-_TAKEN = {
-    "posterior", "sample_stats", "prior", "latent", "hazard", "tau_s", "tau_e",
-    "length_scale", "beta0", "beta", "b", "delta_w", "delta_v", "delta_s",
-}  # fmt: skip
-
-
-def precision(covariance: Any) -> Any:
-    """Inverse of positive definite matrices (point, k, k), in NumPy or JAX."""
-    return namespace(covariance).linalg.inv(covariance)
-
-
-def by_robot(rest: Any, n_robots: int) -> list[Any]:
-    """Drift (point,) by which stationary trust of each robot rises by 1; see `Theta`."""
-    return [rest] * n_robots if rest.ndim == 1 else list(rest.T)
+        """Class and fields by name, as JSON has them: a tuple is a list."""
+        return {"kind": type(self).__name__, **json.loads(json.dumps(asdict(self)))}  # pyright: ignore[reportArgumentType]
 
 
 def sample_columns(effects: Sequence[Effect], theta: Theta, slots: Slots) -> Any:

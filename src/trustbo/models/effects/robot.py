@@ -16,19 +16,10 @@ from scipy import sparse
 
 from trustbo.errors import TrustboError, require_positive
 from trustbo.models.backend import namespace
-from trustbo.models.effects.effect import (
-    LEAST,
-    Effect,
-    NextMission,
-    Theta,
-    by_robot,
-    precision,
-    register,
-)
+from trustbo.models.effects.effect import LEAST, Effect, NextMission, Theta
 from trustbo.models.slots import Slots
 
 
-@register
 @dataclass(frozen=True)
 class RobotEffect(Effect):
     """Effect of a robot in a mission, proportional to its line of sight.
@@ -68,13 +59,12 @@ class RobotEffect(Effect):
         )
 
     def prior(self, theta: Theta, slots: Slots) -> tuple[Any, list[Any]]:
-        """Robots are alike and independent."""
-        Q = precision(self._covariance(theta, slots.n_missions))
-        rests, parts = by_robot(theta["rest"], slots.n_robots), {}
-        for rest in rests:
-            if id(rest) not in parts:
-                parts[id(rest)] = Q / rest[:, None, None] ** 2
-        return None, [parts[id(rest)] for rest in rests]
+        """Robots are independent; alike, so one array, where they share `rest`."""
+        rest = theta["rest"]
+        Q = namespace(rest).linalg.inv(self._covariance(theta, slots.n_missions))
+        if rest.ndim == 1:
+            return None, [Q / rest[:, None, None] ** 2] * slots.n_robots
+        return None, [Q / of_robot[:, None, None] ** 2 for of_robot in rest.T]
 
     def named(self, c: np.ndarray, theta: Theta, slots: Slots) -> dict[str, np.ndarray]:
         """Effects d on stationary trust, robot_effect (draw, mission, robot)."""
@@ -87,10 +77,6 @@ class RobotEffect(Effect):
         """See `Effect.coefficients`."""
         d = np.swapaxes(values["robot_effect"], 1, 2) * _rest(theta)
         return d.reshape(len(d), -1)
-
-    def in_short(self) -> str:
-        """Text of what the effect is of."""
-        return "of robots by mission"
 
     def ahead(
         self, values: Mapping[str, np.ndarray], theta: Theta, mission: NextMission
