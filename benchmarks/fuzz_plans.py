@@ -160,7 +160,7 @@ def draw_problem(rng):
         planner = planner.avoiding(closed, np.zeros(closed.shape))
     risk, failure = np.zeros((1, 8, passable.size)), np.zeros(1)
     if p is not None:
-        planner = planner.with_risk(p, None, None, strata)
+        planner = planner.with_risk(p, None, strata)
         cost = options.get("failure_cost", float(shortest)) if objective == "lost_contact" else 0.0
         risk, failure = risks_of(p, strata, cost)
     limit = -np.log1p(-options["max_failure"]) if "max_failure" in options else np.inf

@@ -78,7 +78,7 @@ def one_plan(table, n):
         for label, options, risk in (
             ("", {}, None),
             (", failure cost of one stratum", {}, (mean,)),
-            (", failure cost of five strata", {}, (mean, None, None, strata)),
+            (", failure cost of five strata", {}, (mean, None, strata)),
             (", max_failure", {"max_failure": 0.2, "failure_cost": 0.0}, (mean,)),
         ):
             planner = Planner(workspace, (n - 1, 0), (0, n - 1), family=family, **options)

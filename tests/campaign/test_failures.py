@@ -81,7 +81,7 @@ def test_mission_without_a_report_is_learned_from_if_a_bound_failed(workspace):
 
 
 def test_prior_of_the_hazard_can_be_given(workspace):
-    prior = Hazard(intercept=(-3.0, 1.0), cause=0.5)
+    prior = Hazard(intercept=(-3.0, 1.0))
     campaign = begin(workspace, hazard=prior)
     expected = fit_hazard([], workspace, prior, seed=campaign.state.seed_of("hazard"))
     assert campaign.hazard.drop_attrs().identical(expected.drop_attrs())
@@ -120,7 +120,7 @@ def test_bounds_are_avoided_from_the_second_failure_until_they_recover(workspace
     path = ((3, 0), (2, 1), (1, 2), (0, 3))
     stuck, fine = (ModelSimulator(workspace, fail_at=n).run(path, seed=0) for n in (2, None))
     for told, avoided in (([stuck], 0), ([stuck] * 2, 1), ([stuck] * 2 + [fine] * 15, 0)):
-        risk = BoundRisk.of(fit_hazard(told, workspace), workspace)
+        risk = BoundRisk(fit_hazard(told, workspace), workspace)
         assert to_avoid(risk).sum() == to_avoid(risk)[at(path[1:3])] == avoided
 
 

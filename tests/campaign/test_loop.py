@@ -53,7 +53,7 @@ def test_history_has_a_row_for_each_mission(result):
 
 def test_result_recommends_the_best_path_under_the_last_posterior(result, workspace):
     params = params_of(result.posterior).mean()
-    risk = tb.hazard.risk.BoundRisk.of(result.posterior["hazard"].to_dataset(), workspace)
+    risk = tb.hazard.risk.BoundRisk(result.posterior["hazard"].to_dataset(), workspace)
     assert {mission.status for mission in result.missions} == {"ok"}  # so that no failure is priced
     plan = Planner(workspace, *ENDS, failure_cost=0.0).with_risk(risk.mean).plan(params)
     assert (result.path, result.plan.value) == (list(plan.path), plan.value)

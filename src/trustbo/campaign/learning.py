@@ -187,7 +187,7 @@ def informed_planner(planner: Planner, risk: BoundRisk) -> Planner:
         planner = planner.with_failure_cost(0.0)
     priced = planner.problem.objective.of_contact and planner.problem.failure_cost != 0.0
     strata = risk.strata() if priced else None
-    return planner.with_risk(risk.mean, risk.draw(_N_RISKS), risk.causes, strata)
+    return planner.with_risk(risk.mean, risk.draw(_N_RISKS), strata)
 
 
 def to_avoid(risk: BoundRisk) -> np.ndarray:

@@ -144,7 +144,7 @@ class Result(Summary):
     @cached_property
     def risk(self) -> BoundRisk:
         """Chances of the bounds to fail."""
-        return BoundRisk.of(self.hazard, self.workspace)
+        return BoundRisk(self.hazard, self.workspace)
 
     @cached_property
     def planner(self) -> Planner:

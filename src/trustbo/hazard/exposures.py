@@ -1,7 +1,6 @@
 """Exposures of bounds to failure: how often each was begun, and how often it ended a mission."""
 
 from collections.abc import Iterable, Sequence
-from itertools import pairwise
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -57,14 +56,12 @@ class Exposures(NamedTuple):
         """
         known = [_reported(mission) for mission in missions]
         known += [_located(mission) for mission in lost if mission.where is not None]
-        unknown = [mission for mission in lost if mission.where is None]
-        planned = [_bounds_of(mission.path) for mission in unknown]
+        unknown = [(mission.path, mission.cause) for mission in lost if mission.where is None]
 
-        met = [bounds for bounds, _ in known]
-        rows = np.concatenate([np.empty((0, 3), int), *met, *planned])
+        met = [_bounds_of(path) for path, _ in (*known, *unknown)]
+        rows = np.concatenate([np.empty((0, 3), int), *met])
         bounds, index = np.unique(rows, axis=0, return_inverse=True)
-        ends = np.cumsum([len(part) for part in (*met, *planned)])
-        paths = np.split(index, ends[:-1]) if len(ends) else []
+        paths = np.split(index, np.cumsum([len(part) for part in met])[:-1]) if met else []
 
         n, failed, causes = np.zeros(len(bounds)), np.zeros(len(bounds)), np.zeros(len(CAUSES))
         for path, (_, cause) in zip(paths, known, strict=False):
@@ -72,25 +69,22 @@ class Exposures(NamedTuple):
             if cause is not None:
                 failed[path[-1]] += 1.0
                 causes[CAUSES.index(cause)] += 1.0
-        for mission in unknown:
-            causes[CAUSES.index(require_choice("cause", mission.cause, CAUSES))] += 1.0
+        for _, cause in unknown:
+            causes[CAUSES.index(require_choice("cause", cause, CAUSES))] += 1.0
         return cls(bounds, n, failed, tuple(paths[len(known) :]), causes)
 
 
-def _reported(mission: Mission) -> tuple[np.ndarray, str | None]:
-    """Bounds with an outcome, and the cause of a failure of the last one."""
-    n = len(mission.bounds)
-    if mission.status in CAUSES:
-        return _bounds_of(mission.path[: n + 1]), mission.status
-    return _bounds_of(mission.path[: n + (mission.status == "ok")]), None
+def _reported(mission: Mission) -> tuple[Sequence[Cell], str | None]:
+    """Path of the bounds with an outcome, and the cause of a failure of the last one."""
+    n, cause = len(mission.bounds), mission.status if mission.status in CAUSES else None
+    return mission.path[: n + (cause is not None or mission.status == "ok")], cause
 
 
-def _located(mission: LostMission) -> tuple[np.ndarray, str | None]:
-    cause = require_choice("cause", mission.cause, CAUSES)
-    for k, (_, cell) in enumerate(pairwise(mission.path), start=1):
-        if cell == mission.where:
-            return _bounds_of(mission.path[: k + 1]), cause
-    raise TrustboError(f"the path {mission.path} never enters where = {mission.where}.")
+def _located(mission: LostMission) -> tuple[Sequence[Cell], str | None]:
+    if mission.where not in mission.path[1:]:
+        raise TrustboError(f"the path {mission.path} never enters where = {mission.where}.")
+    n = mission.path.index(mission.where, 1)
+    return mission.path[: n + 1], require_choice("cause", mission.cause, CAUSES)
 
 
 def _bounds_of(path: Iterable[Cell]) -> np.ndarray:

@@ -66,7 +66,7 @@ def fit_hazard(
         `strength` (draw), and `place` (draw, lost), the bound from 1 at which each mission lost
         somewhere unknown failed; `p_fail` and `p_fail_sd` (move, row, col), posterior mean and sd
         of the chance to fail, NaN where there is no bound; `exposures` and `failures` (move, row,
-        col), counts of the known ones; `failures_by_cause` (cause). `BoundRisk.of` draws from it.
+        col), counts of the known ones; `failures_by_cause` (cause). `BoundRisk` draws from it.
 
     Raises:
         TrustboError: A mission's path jumps or leaves the grid, or an unknown cause.
@@ -82,11 +82,13 @@ def fit_hazard(
 
     # A driven bound that does not exist on the map gets the largest difficulty.
     met = np.nan_to_num(difficulty.values[*exposures.bounds.T], nan=1.0)
-    prior = hazard.of_bounds(met, measures_of(workspace), workspace.team.max_slope)
+    measures = difficulty["measure"].values.tolist()
+    prior = hazard.of_bounds(met, measures, workspace.team.max_slope)
     posterior = sample(prior, exposures, np.random.default_rng(seed))
 
-    group = _to_dataset(hazard, prior, exposures, posterior, workspace, n_draws, seed)
-    risk, maps = BoundRisk.of(group, workspace), ("move", "row", "col")
+    group = _to_dataset(prior, exposures, posterior, difficulty, n_draws, seed)
+    group.attrs |= {f"prior_{name}": list(value) for name, value in asdict(hazard).items()}
+    risk, maps = BoundRisk(group, workspace), ("move", "row", "col")
     group = group.assign(p_fail=(maps, risk.mean), p_fail_sd=(maps, risk.sd))
     group.attrs["seconds"] = time.perf_counter() - started
     k_hat = posterior.points.k_hat
@@ -97,11 +99,6 @@ def fit_hazard(
             "Give firmer priors, Hazard(...), or pass check=False to have it as it is.",
         )
     return group
-
-
-def measures_of(workspace: Workspace) -> list[str]:
-    """Names of the measures of difficulty of a workspace, none without a terrain."""
-    return [str(name) for name in difficulty_of(workspace)["measure"].values]
 
 
 class HazardPoints(NamedTuple):
@@ -217,11 +214,10 @@ def _lookahead(
 
 
 def _to_dataset(
-    hazard: Hazard,
     prior: BoundPrior,
     exposures: Exposures,
     posterior: HazardPoints,
-    workspace: Workspace,
+    difficulty: xr.DataArray,
     n_draws: int,
     seed: int,
 ) -> xr.Dataset:
@@ -231,14 +227,13 @@ def _to_dataset(
     weights, limit, strength = prior.values(points.z[chosen])
     degrees = {"units": "degrees"}
     of_limit = {name: ("draw", v, degrees) for name, v in zip(LIMIT_NAMES, limit.T, strict=False)}
-    maps, shape = ("move", "row", "col"), difficulty_of(workspace).shape[:3]
-    n, failed = np.zeros(shape), np.zeros(shape)
+    maps = ("move", "row", "col")
+    n, failed = np.zeros((2, *difficulty.shape[:3]))
     n[*exposures.bounds.T], failed[*exposures.bounds.T] = exposures.n, exposures.failed
     longest = max((len(path) for path in exposures.lost), default=0)
     lost = np.full((len(exposures.lost), longest, 3), -1)
     for j, path in enumerate(exposures.lost):
         lost[j, : len(path)] = exposures.bounds[path]
-    priors = {f"prior_{k}": list(v) for k, v in asdict(hazard).items() if k != "cause"}
     return xr.Dataset(
         {
             "intercept": ("draw", weights[:, 0]),
@@ -253,7 +248,7 @@ def _to_dataset(
         },
         {
             "draw": np.arange(n_draws),
-            "measure": [name for name in measures_of(workspace) if name != TILT],
+            "measure": [m for m in difficulty["measure"].values.tolist() if m != TILT],
             "cause": list(CAUSES),
             "axis": list(maps),
             "move": list(MOVE_NAMES),
@@ -263,7 +258,5 @@ def _to_dataset(
             "kish": points.kish,
             "seed": seed,
             "reference": REFERENCE,
-            "cause_concentration": hazard.cause,
-            **priors,
         },
     )

@@ -44,10 +44,9 @@ class Hazard:
             from .1 to .9 within 4.4 widths of tilt.
         log_strength: Prior of the log of the strength s: the weight of the prior mean in units of
             observations, small if bounds fail always or never.
-        cause: Concentration of the Dirichlet prior over the causes of failure.
 
     Raises:
-        TrustboError: An sd or a concentration that is not positive, or a share outside [0, 1).
+        TrustboError: An sd that is not positive, or a share outside [0, 1).
     """
 
     intercept: tuple[float, float] = (-7.5, 1.5)
@@ -56,7 +55,6 @@ class Hazard:
     doubt: tuple[float, float] = (0.1, 4.0)
     log_width: tuple[float, float] = (0.0, 0.5)
     log_strength: tuple[float, float] = (-0.5, 1.0)
-    cause: float = 0.2
 
     def __post_init__(self) -> None:
         for name in ("intercept", "coefficient", "margin", "log_width", "log_strength"):
@@ -67,36 +65,29 @@ class Hazard:
         if doubt[0] >= 1.0:
             raise TrustboError(f"share of doubt must be in [0, 1); got {share!r}.")
         object.__setattr__(self, "doubt", doubt)
-        require_positive("cause", self.cause)
 
     def of_bounds(
         self, difficulty: np.ndarray, measures: Sequence[str], max_slope: float
     ) -> "BoundPrior":
         """Prior of bounds with difficulties (bound, measure); `max_slope` is the limit in rad."""
-        weighted = np.array([name != TILT for name in measures], dtype=bool)
-        normals, is_log, steepness = [self.intercept], [False], None
-        normals += [self.coefficient] * int(weighted.sum())
-        is_log += [False] * int(weighted.sum())
+        weighted = [m for m, name in enumerate(measures) if name != TILT]
+        normals, steepness = [self.intercept, *[self.coefficient] * len(weighted)], None
         if TILT in measures:
             normals += [self.margin, self.log_width]
-            is_log += [False, True]
             steepness = steepness_of(difficulty[:, list(measures).index(TILT)], max_slope)
         center, scale = np.array([*normals, self.log_strength]).T
-        difficulty = difficulty[:, weighted] - REFERENCE
-        is_log = np.array([*is_log, True])
-        return BoundPrior(center, scale, is_log, difficulty, steepness, self.doubt)
+        return BoundPrior(center, scale, difficulty[:, weighted] - REFERENCE, steepness, self.doubt)
 
 
 class BoundPrior(NamedTuple):
     """Beta priors of the chances of some bounds, as functions of normal scores.
 
-    A parameter is center + scale z or the exponential of it; the margin is the quantile of its
-    mixture.
+    A parameter is center + scale z; of width and strength that is the logarithm, and the margin is
+    the quantile of its mixture.
     """
 
     center: np.ndarray  # (parameter,)
     scale: np.ndarray  # (parameter,)
-    is_log: np.ndarray  # (parameter,)
     difficulty: np.ndarray  # (bound, measure), less the reference
     steepness: np.ndarray | None  # (bound,), degrees beyond the stated limit; None: no limit
     doubt: tuple[float, float]
@@ -116,11 +107,11 @@ class BoundPrior(NamedTuple):
         values = self.center + self.scale * z
         n = 1 + self.difficulty.shape[1]
         if self.steepness is not None and self.doubt[0] > 0.0:
-            values[:, n] = self.center[n] + mixture_quantile(
-                z[:, n], float(self.scale[n]), *self.doubt
-            )
-        logs = np.clip(values[:, self.is_log], -_LARGEST_LOG, _LARGEST_LOG)
-        values[:, self.is_log] = np.exp(logs)
+            off = mixture_quantile(z[:, n], float(self.scale[n]), *self.doubt)
+            values[:, n] = self.center[n] + off
+        first_log = n + (self.steepness is not None)
+        logs = np.clip(values[:, first_log:], -_LARGEST_LOG, _LARGEST_LOG)
+        values[:, first_log:] = np.exp(logs)
         return values[:, :n], values[:, n:-1], values[:, -1]
 
     def betas(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

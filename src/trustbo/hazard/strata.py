@@ -15,7 +15,6 @@ import numpy as np
 
 MOST = 5
 """Number of strata: labels of the path search carry a sum for each."""
-_SOME = 2000  # values that a partition looks at, which takes the square of their number
 
 
 class Strata(NamedTuple):
@@ -32,10 +31,8 @@ def partition(values: np.ndarray, n: int) -> np.ndarray:
 
     The optimal partition in one dimension, by dynamic programming (Fisher 1958). Group k is
     values[ends[k - 1] : ends[k]]; quantiles instead would mix a severe tail of few draws with mild
-    ones. Of more than 2000 values, every second, third and so on is used.
+    ones. Time and memory grow with the square of the number of values.
     """
-    step = 1 + (len(values) - 1) // _SOME
-    n_values, values = len(values), values[::step]
     size = len(values)
     total, squares = (np.concatenate([[0.0], np.cumsum(v)]) for v in (values, values**2))
     first, last = np.meshgrid(np.arange(size + 1), np.arange(size + 1), indexing="ij")
@@ -51,4 +48,4 @@ def partition(values: np.ndarray, n: int) -> np.ndarray:
     ends = [size]
     for cut in reversed(cuts):
         ends.append(int(cut[ends[-1]]))
-    return np.minimum(step * np.array(ends[::-1]), n_values)
+    return np.array(ends[::-1])

@@ -1,7 +1,7 @@
 """The planner of a user: one workspace, one start and goal, one objective."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import replace
 from typing import Any, Self
@@ -147,7 +147,6 @@ class Planner(Summary):
         self,
         p_fail: ArrayLike | None,
         draws: ArrayLike | None = None,
-        causes: Mapping[str, ArrayLike] | None = None,
         strata: Strata | None = None,
     ) -> Self:
         """Return the planner with the chance of each bound to end the mission.
@@ -158,7 +157,6 @@ class Planner(Summary):
             p_fail: Posterior mean, shape (move, row, col); NaN where there is no bound. None: no
                 risk.
             draws: Draws from its posterior, shape (draw, move, row, col), for bands of `p_arrive`.
-            causes: Share of each cause of failure, numbers or arrays (move, row, col).
             strata: Chances under groups of draws, such as `BoundRisk.strata()`, by which a failure
                 is priced; by default `p_fail`, as if bounds failed independently.
 
@@ -168,7 +166,7 @@ class Planner(Summary):
         if p_fail is None:
             return self._with(risk=None)
         drawn = None if draws is None else np.asarray(draws, dtype=float)
-        risk = Risk(np.asarray(p_fail, dtype=float), drawn, dict(causes or {}), strata)
+        risk = Risk(np.asarray(p_fail, dtype=float), drawn, strata)
         return self._with(risk=risk)
 
     def with_failure_cost(self, failure_cost: float) -> Self:
