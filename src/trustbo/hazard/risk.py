@@ -33,6 +33,8 @@ class BoundRisk:
         exists: Whether the bound exists, (move, row, col).
         exposures: Known exposures, (move, row, col).
         failures: Known failures, (move, row, col).
+        steepness: Degrees by which bounds are beyond the stated slope limit, (move, row, col), or
+            None without a limit.
     """
 
     def __init__(self, hazard: xr.Dataset, workspace: Workspace) -> None:
@@ -42,10 +44,10 @@ class BoundRisk:
         difficulty = difficulty_of(workspace)
         measures, limit = hazard["measure"].values.tolist(), [n for n in LIMIT_NAMES if n in hazard]
         self._difficulty = difficulty.sel(measure=measures).values - hazard.attrs["reference"]
-        self._steepness = None
+        self.steepness = None
         if limit:
             tilt = difficulty.sel(measure=TILT).values
-            self._steepness = steepness_of(tilt, workspace.team.max_slope)
+            self.steepness = steepness_of(tilt, workspace.team.max_slope)
         self._strength = hazard["strength"].values  # (draw,)
         weights = hazard["intercept"].values[:, None], hazard["coefficient"].values
         self._weights = np.concatenate(weights, axis=1)  # (draw, 1 + measure)
@@ -139,7 +141,7 @@ class BoundRisk:
     def _betas_of(self, bounds: np.ndarray, draws: Any = slice(None)) -> tuple[np.ndarray, ...]:
         """Alpha and beta of the posterior Betas of bounds, each (draw, bound)."""
         where = np.unravel_index(bounds, self.exists.shape)
-        steepness = None if self._steepness is None else self._steepness[where]
+        steepness = None if self.steepness is None else self.steepness[where]
         drawn = self._weights[draws], self._limit[draws], self._strength[draws]
         a, b = prior_betas(*drawn, self._difficulty[where], steepness)
         n, failed = self.exposures.ravel()[bounds], self.failures.ravel()[bounds]

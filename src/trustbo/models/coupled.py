@@ -60,8 +60,7 @@ class CoupledTrust(TrustModel):
         n = beta0.shape[1]
         B0 = beta0[:, :, None] * np.eye(n)
         if n > 1:
-            place = np.zeros((n * (n - 1), n * n))
-            place[np.arange(n * (n - 1)), np.flatnonzero(~np.eye(n, dtype=bool))] = 1.0
+            place = np.eye(n * n)[~np.eye(n, dtype=bool).ravel()]  # of each off-diagonal
             B0 = B0 + (values["coupling"] @ place).reshape(-1, n, n)
         derived: dict[str, Any] = {"B0": B0, "rest": 1.0 - beta0}
         for noise in ("w", "v"):
@@ -81,25 +80,18 @@ class CoupledTrust(TrustModel):
 
         Rates' noise is Delta_v - eps 1, which robots share, and independent noise of variance eps.
         """
-        B0, K, (n, R, _) = theta["B0"], slots.n_bounds, theta["B0"].shape
+        B0, K, R = theta["B0"], slots.n_bounds, slots.n_robots
         xp: Any = namespace(B0)
-        powers = [xp.broadcast_to(xp.eye(R), B0.shape)]
-        for _ in range(K):
-            powers.append(powers[-1] @ B0)
-        zero = xp.zeros_like(B0)
-        rows = [
-            xp.stack([powers[k - j] if k >= j else zero for j in range(K)], 1) for k in range(K)
-        ]
-        T = xp.swapaxes(xp.stack(rows, 1), 2, 3).reshape(n, K * R, K * R)
-        start = xp.stack(powers[1:], 1).reshape(n, K * R, R)
-        S = T @ _of_bounds(theta["Delta_w"], K) @ xp.swapaxes(T, 1, 2)
+        T = xp.linalg.inv(np.eye(K * R) - _kron(np.eye(K, k=-1), B0))  # (1 - Lag x B0)^-1
+        start = T[:, :, :R] @ B0
+        S = T @ _kron(np.eye(K), theta["Delta_w"]) @ xp.swapaxes(T, 1, 2)
         S = S + self.x0["x0_sd"] ** 2 * start @ xp.swapaxes(start, 1, 2)
         m, noise = (self.x0["x0_mean"] * start.sum(2))[:, None], theta["Delta_v"]
         if not self.family.correlates:
             sd = xp.sqrt(xp.diagonal(noise, axis1=1, axis2=2))
             return Signal(m, T[:, None], S[:, None], xp.tile(sd[:, None], (1, 1, K)))
         eps = 0.5 * xp.linalg.eigvalsh(noise)[:, 0]
-        noise = _of_bounds(noise - eps[:, None, None] * np.eye(R), K)
+        noise = _kron(np.eye(K), noise - eps[:, None, None] * np.eye(R))
         return Signal(m, T[:, None], S[:, None], xp.sqrt(eps)[:, None, None], noise[:, None])
 
     def rates(self, theta: Theta, drift: Any) -> CoupledContactRate:
@@ -143,8 +135,7 @@ def correlation_factor(r: Any, n: int) -> Any:
     return xp.stack(rows, axis=1)
 
 
-def _of_bounds(Q: Any, K: int) -> Any:
-    """Block diagonal matrices of K copies of matrices (point, n, n)."""
-    n, R, _ = Q.shape
-    blocks = np.eye(K)[None, :, None, :, None] * Q[:, None, :, None, :]
-    return blocks.reshape(n, K * R, K * R)
+def _kron(A: np.ndarray, Q: Any) -> Any:
+    """Kronecker products of a matrix (k, k) and matrices (point, n, n)."""
+    blocks = A[None, :, None, :, None] * Q[:, None, :, None, :]
+    return blocks.reshape(len(Q), *(len(A) * Q.shape[1],) * 2)

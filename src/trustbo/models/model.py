@@ -238,7 +238,7 @@ class TrustModel(Summary, ABC):
         Args:
             key: Random key.
             params: Parameters without leading axes; where places have effects, those of the
-                missions' bounds, `params.on(bounds)`.
+                missions' bounds, `params.along(path)`.
             awareness: Shape (mission, bound, robot, feature).
             n_ticks: Ticks of each bound, of shape (mission, bound, robot) or broadcast to it; the
                 beta-binomial family needs them.

@@ -103,28 +103,17 @@ class ParameterDraws(Summary):
         return np.swapaxes(np.where(moves < 0, 0.0, total), -1, -2)
 
     def along(self, path: Sequence[Cell] | np.ndarray) -> Self:
-        """Parameters of the bounds of a path, as of one mission in `on`."""
+        """Parameters of the bounds of a path: the effects of its places are in the intercept.
+
+        They have no places, and b (..., 1, bound, robot), the last axis of length 1 where all
+        robots share it; without places they are the same.
+        """
         if not self.places:
             return self
-        return self.on(bounds_along(path)[None])
-
-    def on(self, bounds: np.ndarray | None) -> Self:
-        """Parameters of given missions: the effects of their bounds' places are in the intercept.
-
-        Args:
-            bounds: Move, row and column of each bound, (mission, bound, 3).
-
-        Returns:
-            Parameters without places, b (..., mission, bound, robot), the last axis of length 1
-            where all robots share it; the same parameters where there are no places.
-        """
-        if not self.places or bounds is None:
-            return self
-        effect = self.of_places(bounds.reshape(-1, 3))
-        effect = effect.reshape(*effect.shape[:-2], *bounds.shape[:2], effect.shape[-1])
         b = np.asarray(self.b)  # pyright: ignore[reportAttributeAccessIssue]
         b = b[..., None, None, :] if self.BY_ROBOT else b[..., None, None, None]
-        return self._replace(b=b + effect, place=None, place_bound=None)  # pyright: ignore
+        b = b + self.of_places(bounds_along(path))[..., None, :, :]
+        return self._replace(b=b, place=None, place_bound=None)  # pyright: ignore[reportAttributeAccessIssue]
 
     def draw(self, index: int) -> Self:
         """One draw out of many, with its leading axis dropped."""

@@ -1,9 +1,8 @@
 """Trust that a person reports: the state space of `PooledTrust` under outcomes, of many persons."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, cached_property
-from typing import Any, NoReturn, Self, cast
+from typing import Any, NoReturn, cast
 
 import numpy as np
 import numpyro.distributions as dist
@@ -13,7 +12,7 @@ from trustbo.display import Rows
 from trustbo.errors import TrustboError
 from trustbo.models.backend import namespace, own_settings
 from trustbo.models.effects.effect import Effect, Theta
-from trustbo.models.effects.person import PersonEffect
+from trustbo.models.effects.person import PARTS, PersonEffect
 from trustbo.models.families import FAMILIES, Family, Levels
 from trustbo.models.pooled import PooledTrust
 from trustbo.models.priors import Priors
@@ -39,7 +38,6 @@ class HumanTrust(PooledTrust):
         scale: `"unit"`, numbers in [0, 1], 0 and 1 being limits, or `"likert7"`, so many levels
             with cut points halfway between them: trust plus noise lies between the two of a report.
             Noise of levels is logistic, with sd delta_v.
-        inputs: Names of the features, comma-separated; `fit` fills them in.
 
     Raises:
         TrustboError: The scale is unknown, or the model has effects but `PersonEffect`.
@@ -47,7 +45,6 @@ class HumanTrust(PooledTrust):
 
     memory: str = "deviation"
     scale: str = "unit"
-    inputs: str = ""
 
     def __post_init__(self) -> None:
         levels_of(self.scale)
@@ -78,63 +75,53 @@ class HumanTrust(PooledTrust):
         """The effects of persons."""
         return cast(PersonEffect, self.effects[0])
 
-    def for_features(self, features: Sequence[str]) -> Self:
-        """The model with inputs of these names."""
-        if any("," in name for name in features):
-            raise TrustboError(f"names of inputs may have no comma; got {tuple(features)}.")
-        return replace(self, inputs=",".join(features))
-
     def slots(self, missions: Any, workspace: Any = None) -> Slots:
         """See `TrustModel.slots`; TrustboError: reports are not on the scale."""
-        slots = super().slots(missions, workspace)
-        levels = levels_of(self.scale)
+        slots, levels = super().slots(missions, workspace), levels_of(self.scale)
         wanted = levels - 1.0 if levels else np.nan
         bad = ~np.isnan(slots.y) & ~np.isclose(slots.n_ticks, wanted, equal_nan=True)
         if bad.any():
-            ours, theirs = (
-                "in [0, 1]" if np.isnan(steps) else f"on {int(steps) + 1} levels"
-                for steps in (wanted, slots.n_ticks[bad][0])
-            )
             raise TrustboError(
-                f"the model is of reports {ours}, but the missions' are {theirs}: give the same "
-                "scale to read_reports and to HumanTrust, or n_ticks = levels - 1."
+                f"HumanTrust(scale={self.scale!r}) needs reports with n_ticks = {wanted:g} (levels "
+                f"less 1), but some have {slots.n_ticks[bad][0]:g}: give the same scale to "
+                "read_reports and to HumanTrust."
             )
         return slots
 
     def layout(self, slots: Slots, *, contrasts: bool = True) -> Layout:
         """See `TrustModel.layout`: a block is a person, whose steps add outcomes and the base."""
-        return Layout(slots.y.shape, joint=True, split=self._lasting(slots), apart=True)
+        outcomes = [name.startswith((SUCCESS, FAILURE)) for name in slots.features]
+        split = np.array([*outcomes, False])  # what beta0 carries on
+        return Layout(slots.y.shape, joint=True, split=split, apart=True)
 
     def signal(self, theta: Theta, slots: Slots, layout: Layout) -> Signal:
         """Trust of all bounds: inputs are what beta0 carries on, then what it does not."""
         xp: Any = namespace(theta["beta0"])
-        n, K, rows = slots.n_robots, slots.n_bounds, slots.n_bounds * slots.n_robots
-        lasting = xp.kron(powers(theta["beta0"], K), np.eye(n))  # (point, row, row)
-        S = theta["delta_w"][:, None, None] ** 2 * (lasting @ xp.swapaxes(lasting, 1, 2))
+        lasting = self._lasting(theta, slots)
         parts = self.parts(theta, slots)
+        S = theta["delta_w"][:, None, None] ** 2 * (lasting @ xp.swapaxes(lasting, 1, 2))
         S = S[:, None] + parts @ xp.swapaxes(parts, 2, 3)
-        base = xp.broadcast_to(np.eye(rows), lasting.shape)
+        base = xp.broadcast_to(np.eye(lasting.shape[1]), lasting.shape)
         T = xp.concatenate([lasting, base], axis=2)[:, None]
-        m = np.zeros((1, 1, rows)) * theta["beta0"][:, None, None]
+        m = 0.0 * lasting[:, None, :, 0]
         return Signal(m, T, S, theta["delta_v"][:, None, None])
+
+    def _lasting(self, theta: Theta, slots: Slots) -> Any:
+        """What remains at each row of an input at another, (point, row, row)."""
+        xp: Any = namespace(theta["beta0"])
+        return xp.kron(powers(theta["beta0"], slots.n_bounds), np.eye(slots.n_robots))
 
     def parts(self, theta: Theta, slots: Slots) -> Any:
         """Effect of a person's standardised parts on trust, (point, mission, row, part)."""
-        xp: Any = namespace(theta["beta0"])
-        n, K = slots.n_robots, slots.n_bounds
-        lasting = xp.kron(powers(theta["beta0"], K), np.eye(n))[:, None]
-        shape = (*slots.y.shape, 1)
-        inputs = np.zeros((*slots.y.shape, 3))  # start, success, failure
-        inputs[:, 0, :, 0] = 1.0
-        for i, name in enumerate((SUCCESS, FAILURE), start=1):
+        carried, level = np.zeros((2, *slots.y.shape, len(PARTS)))
+        carried[:, 0, :, 0] = 1.0  # start
+        level[..., 1] = 1.0
+        for i, name in ((2, SUCCESS), (3, FAILURE)):
             first = next((m for m, f in enumerate(slots.features) if f.startswith(name)), None)
             if first is not None:
-                inputs[..., i] = slots.z[..., first]
-        carried = lasting @ inputs.reshape(slots.n_missions, K * n, 3)
-        level = xp.broadcast_to(
-            np.ones(shape).reshape(slots.n_missions, K * n, 1), (*carried.shape[:3], 1)
-        )
-        parts = xp.concatenate([carried[..., :1], level, carried[..., 1:]], axis=3)
+                carried[..., i] = slots.z[..., first]
+        carried, level = (a.reshape(slots.n_missions, -1, len(PARTS)) for a in (carried, level))
+        parts = self._lasting(theta, slots)[:, None] @ carried + level
         return parts * self.effect.sds(theta)[:, None, None]
 
     def persons(
@@ -157,20 +144,15 @@ class HumanTrust(PooledTrust):
         W, S = self.parts(theta, slots), self.signal(theta, slots, self.layout(slots)).S
         gain = np.swapaxes(np.linalg.solve(S + 1e-12 * np.eye(S.shape[-1]), W), 2, 3)
         center = np.einsum("djpr,djr->djp", gain, trust - mean)
-        cov = np.eye(len(self.effect.coords["part"])) - gain @ W
+        cov = np.eye(len(PARTS)) - gain @ W
         values, vectors = np.linalg.eigh(cov)
         white = np.sqrt(np.maximum(values, 0.0)) * rng.standard_normal(values.shape)
         unit = center + np.einsum("djpq,djq->djp", vectors, white)
         return unit * self.effect.sds(theta)[:, None]
 
-    def _lasting(self, slots: Slots) -> np.ndarray:
-        """Mask of the columns that beta0 carries on: those of outcomes."""
-        return np.array([n.startswith((SUCCESS, FAILURE)) for n in slots.features] + [False])
-
     def options(self) -> dict[str, Any]:
         """See `TrustModel.options`."""
-        names = ("scale", "inputs", "memory")
-        return {"observation": self.observation} | {name: getattr(self, name) for name in names}
+        return {name: getattr(self, name) for name in ("observation", "scale", "memory")}
 
     def simulate(self, *args: Any, **options: Any) -> NoReturn:
         """Refuse: TrustboError."""
