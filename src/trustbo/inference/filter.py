@@ -20,7 +20,7 @@ from trustbo.inference.draws import of_no_map, params_of, require_posterior, sit
 from trustbo.inference.importance import systematic
 from trustbo.models.families import Family, family_of
 from trustbo.models.params import CoupledParams, Params, check_params
-from trustbo.models.ticks import broadcast_ticks
+from trustbo.models.slots import broadcast_ticks
 from trustbo.workspace.moves import bounds_along, moves_along, require_on_grid
 
 Effect = np.ndarray | float

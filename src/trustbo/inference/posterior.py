@@ -23,8 +23,8 @@ from trustbo.models.effects.effect import Theta
 from trustbo.models.model import TrustModel
 from trustbo.models.people import HumanTrust
 from trustbo.models.scores import Scores
-from trustbo.models.signal import Signal, each
-from trustbo.models.slots import Layout, Slots
+from trustbo.models.signal import Layout, Signal, each
+from trustbo.models.slots import Slots
 
 _CHUNK = 16  # points evaluated at once
 _SIZES = (0.3, 1.0, 1.8, 2.6)  # logs by which starts of the noises fall below the rates' spread

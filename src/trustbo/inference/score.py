@@ -12,7 +12,7 @@ from trustbo.inference.draws import missions_of, params_of, require_posterior, s
 from trustbo.inference.filter import Dynamics
 from trustbo.inference.importance import systematic
 from trustbo.models.families import Family, family_of
-from trustbo.models.ticks import require_ticks
+from trustbo.models.slots import require_ticks
 from trustbo.models.visited import bounds_of
 from trustbo.stacking import MissionBatch, stack_missions
 from trustbo.workspace import Workspace

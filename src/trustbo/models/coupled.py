@@ -14,8 +14,8 @@ from trustbo.models.effects.effect import Theta
 from trustbo.models.effects.weights import CoupledWeights
 from trustbo.models.model import TrustModel
 from trustbo.models.params import CoupledParams
-from trustbo.models.signal import Signal
-from trustbo.models.slots import Layout, Slots
+from trustbo.models.signal import Layout, Signal
+from trustbo.models.slots import Slots
 
 _DIAGONALS = {"beta0", "coupling", "delta_w", "delta_v", "partial_w", "partial_v"}
 

@@ -24,10 +24,9 @@ from trustbo.models.effects.weights import Weights
 from trustbo.models.families import FAMILIES, Family, family_of
 from trustbo.models.params import Params, assemble_params, check_params
 from trustbo.models.priors import Priors
-from trustbo.models.signal import Signal
+from trustbo.models.signal import Layout, Signal
 from trustbo.models.simulate import TrustSample, draw_missions
-from trustbo.models.slots import Layout, Slots
-from trustbo.models.ticks import broadcast_ticks, require_ticks
+from trustbo.models.slots import Slots, broadcast_ticks, require_ticks
 from trustbo.workspace import Workspace
 
 _STREAM = 0x6D697373  # of `simulate`, among all that a seed gives

@@ -121,13 +121,7 @@ class ParameterDraws(Summary):
 
     def mean(self) -> Self:
         """Mean over all leading axes."""
-
-        def average(value: Numbers, n: int) -> Numbers:
-            core = np.shape(value)[np.ndim(value) - n :]
-            mean = np.asarray(value, dtype=float).reshape(-1, *core).mean(0)
-            return mean if n else float(mean)
-
-        return self.map(average)
+        return self.flat().map(lambda value, _: value.mean(0))
 
     def flat(self) -> Self:
         """Every field with exactly one leading axis (draw,), float64."""

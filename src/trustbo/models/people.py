@@ -16,8 +16,8 @@ from trustbo.models.effects.person import PARTS, PersonEffect
 from trustbo.models.families import FAMILIES, Family, Levels
 from trustbo.models.pooled import PooledTrust
 from trustbo.models.priors import Priors
-from trustbo.models.signal import Signal, powers
-from trustbo.models.slots import Layout, Slots
+from trustbo.models.signal import Layout, Signal, powers
+from trustbo.models.slots import Slots
 
 SUCCESS, FAILURE = "success", "failure"
 """Beginnings of the names of features that are inputs of outcomes."""

@@ -14,8 +14,8 @@ from trustbo.models.contact_rate import ContactRate
 from trustbo.models.effects.effect import Theta
 from trustbo.models.effects.weights import Weights
 from trustbo.models.model import TrustModel
-from trustbo.models.signal import Signal, powers
-from trustbo.models.slots import Layout, Slots
+from trustbo.models.signal import Layout, Signal, powers
+from trustbo.models.slots import Slots
 
 MEMORIES = ("level", "deviation")
 """Lasting from one bound to the next: trust, or its deviation from what effects expect."""

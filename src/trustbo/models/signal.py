@@ -1,10 +1,68 @@
-"""Distribution of the signals of a block given its columns: what a model says, as matrices."""
+"""What a model says, as matrices: blocks of slots, and their signals given the columns."""
 
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy import sparse
 
 from trustbo.models.backend import namespace
+
+
+class Layout(NamedTuple):
+    """Blocks and rows that slots form.
+
+    A block is a robot in a mission, its rows bounds; or, if `joint`, a mission, its rows (bound,
+    robot). With a rotation, signals of blocks are orthonormal combinations of those of the robots.
+    """
+
+    shape: Any  # missions, bounds, robots
+    joint: bool = False
+    rotation: np.ndarray | None = None  # (combination, robot)
+    split: np.ndarray | None = None
+    """Mask of columns that are inputs of their own, before the inputs of the others."""
+    apart: bool = False
+    """Whether the signals of any two blocks differ."""
+
+    @property
+    def label(self) -> np.ndarray:
+        """Label of each block; the first of the rotated robots differs from the others."""
+        n_missions, _, n_robots = self.shape
+        if self.joint:
+            return np.arange(n_missions) * int(self.apart)
+        others = np.arange(n_robots) > 0 if self.rotation is not None else np.zeros(n_robots)
+        return np.tile(others.astype(int), n_missions)
+
+    def rows(self, values: np.ndarray) -> np.ndarray:
+        """Values (..., mission, bound, robot) as (..., block, row)."""
+        if self.rotation is not None:
+            values = values @ self.rotation.T
+        if not self.joint:
+            values = np.swapaxes(values, -1, -2)
+        *leading, n, a, b = values.shape
+        return values.reshape(*leading, n, a * b) if self.joint else values.reshape(*leading, -1, b)
+
+    def slots(self, values: np.ndarray) -> np.ndarray:
+        """Values (..., block, row) as (..., mission, bound, robot)."""
+        n, K, R = self.shape
+        if self.joint:
+            return values.reshape(*values.shape[:-2], n, K, R)
+        values = np.swapaxes(values.reshape(*values.shape[:-2], n, R, K), -1, -2)
+        return values if self.rotation is None else values @ self.rotation
+
+    def columns(self, U: Any) -> Any:
+        """Columns of slots, sparse (slot, column), as those of (block * row, column)."""
+        n, K, R = self.shape
+        if self.rotation is not None:
+            U = sparse.csr_array(sparse.kron(sparse.eye_array(n * K), self.rotation)) @ U
+        if self.split is not None:
+            p, halves = U.shape[1], (self.split, ~self.split)
+            parts = [U @ sparse.diags_array(mask.astype(float)) for mask in halves]
+            stacked = sparse.hstack([part.tocoo().reshape((n, K * R * p)) for part in parts])
+            return stacked.tocoo().reshape((2 * n * K * R, p)).tocsr()
+        if self.joint:
+            return U
+        order = np.arange(n * K * R).reshape(n, K, R).swapaxes(1, 2).ravel()
+        return sparse.csr_array(U)[order]
 
 
 class Signal(NamedTuple):

@@ -1,15 +1,21 @@
 """Rates and features of missions by slot: one bound of one robot in one mission."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import numpy as np
-from scipy import sparse
+from numpy.typing import ArrayLike
 
 from trustbo.data import Mission, is_line_of_sight
+from trustbo.errors import TrustboError
+from trustbo.models.families import Family
 from trustbo.models.visited import Visited
 from trustbo.stacking import stack_missions
 
+NO_TICKS = (
+    "The beta-binomial family counts ticks: give n_ticks, the number of ticks of each bound "
+    '(Mission.from_arrays(..., n_ticks=...)), or use observation "censored".'
+)
 UNKNOWN_RESOLUTION, COARSEST_RESOLUTION = 0.005, 0.1
 """Resolution of a rate with an unknown number of ticks, and the coarsest resolution."""
 
@@ -24,7 +30,7 @@ class Slots(NamedTuple):
     visited: Visited | None = None
 
     @classmethod
-    def of(cls, missions: Sequence[Mission], visited: Visited | None = None) -> Self:
+    def of(cls, missions: Sequence[Mission]) -> Self:
         """Stack missions of one team.
 
         Raises:
@@ -33,7 +39,7 @@ class Slots(NamedTuple):
         """
         batch = stack_missions(missions, pad=False)
         features = tuple(missions[0].features)
-        return cls(batch.contact_rate, batch.awareness, batch.n_ticks, features, visited)
+        return cls(batch.contact_rate, batch.awareness, batch.n_ticks, features)
 
     @property
     def n_missions(self) -> int:
@@ -73,58 +79,28 @@ class Slots(NamedTuple):
         return self._replace(y=y)
 
 
-class Layout(NamedTuple):
-    """Blocks and rows that slots form.
+def broadcast_ticks(
+    family: Family, n_ticks: ArrayLike | None, shape: tuple[int, ...]
+) -> np.ndarray:
+    """Ticks of that shape, NaN if not given.
 
-    A block is a robot in a mission, its rows bounds; or, if `joint`, a mission, its rows (bound,
-    robot). With a rotation, signals of blocks are orthonormal combinations of those of the robots.
+    Raises:
+        TrustboError: They are not given, and the family needs them.
     """
+    if n_ticks is None and family.needs_ticks:
+        raise TrustboError(NO_TICKS)
+    return np.broadcast_to(np.asarray(np.nan if n_ticks is None else n_ticks, dtype=float), shape)
 
-    shape: Any  # missions, bounds, robots
-    joint: bool = False
-    rotation: np.ndarray | None = None  # (combination, robot)
-    split: np.ndarray | None = None
-    """Mask of columns that are inputs of their own, before the inputs of the others."""
-    apart: bool = False
-    """Whether the signals of any two blocks differ."""
 
-    @property
-    def label(self) -> np.ndarray:
-        """Label of each block; the first of the rotated robots differs from the others."""
-        n_missions, _, n_robots = self.shape
-        if self.joint:
-            return np.arange(n_missions) * int(self.apart)
-        others = np.arange(n_robots) > 0 if self.rotation is not None else np.zeros(n_robots)
-        return np.tile(others.astype(int), n_missions)
+def require_ticks(family: Family, y: np.ndarray, n_ticks: np.ndarray) -> None:
+    """Refuse measured rates (mission, bound, robot) without n_ticks if the family needs them.
 
-    def rows(self, values: np.ndarray) -> np.ndarray:
-        """Values (..., mission, bound, robot) as (..., block, row)."""
-        if self.rotation is not None:
-            values = values @ self.rotation.T
-        if not self.joint:
-            values = np.swapaxes(values, -1, -2)
-        *leading, n, a, b = values.shape
-        return values.reshape(*leading, n, a * b) if self.joint else values.reshape(*leading, -1, b)
-
-    def slots(self, values: np.ndarray) -> np.ndarray:
-        """Values (..., block, row) as (..., mission, bound, robot)."""
-        n, K, R = self.shape
-        if self.joint:
-            return values.reshape(*values.shape[:-2], n, K, R)
-        values = np.swapaxes(values.reshape(*values.shape[:-2], n, R, K), -1, -2)
-        return values if self.rotation is None else values @ self.rotation
-
-    def columns(self, U: Any) -> Any:
-        """Columns of slots, sparse (slot, column), as those of (block * row, column)."""
-        n, K, R = self.shape
-        if self.rotation is not None:
-            U = sparse.csr_array(sparse.kron(sparse.eye_array(n * K), self.rotation)) @ U
-        if self.split is not None:
-            p, halves = U.shape[1], (self.split, ~self.split)
-            parts = [U @ sparse.diags_array(mask.astype(float)) for mask in halves]
-            stacked = sparse.hstack([part.tocoo().reshape((n, K * R * p)) for part in parts])
-            return stacked.tocoo().reshape((2 * n * K * R, p)).tocsr()
-        if self.joint:
-            return U
-        order = np.arange(n * K * R).reshape(n, K, R).swapaxes(1, 2).ravel()
-        return sparse.csr_array(U)[order]
+    Raises:
+        TrustboError: A measured rate has no number of ticks.
+    """
+    without = ~np.isnan(y) & ~(n_ticks >= 1.0)
+    if family.needs_ticks and without.any():
+        j, k, i = np.argwhere(without)[0]
+        raise TrustboError(
+            f"mission {j}, bound {k + 1}, robot {i} has a contact rate but no n_ticks. {NO_TICKS}"
+        )

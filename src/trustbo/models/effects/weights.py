@@ -31,9 +31,13 @@ class Weights(Effect):
     def moments(self, theta: Theta, slots: Slots) -> tuple[Any, Any]:
         """Means and sds of the coefficients, (point, column)."""
         mean, sd = self.priors.coefficients(slots.z.shape[3])
-        rest = theta["rest"][:, None]
-        rest = rest if self.priors.stationary else 0.0 * rest + 1.0
-        return rest * mean[None], rest * sd[None]
+        rest = self.unit(theta)
+        return rest * mean, rest * sd
+
+    def unit(self, theta: Theta) -> Any:
+        """Factor (point, [robot,] 1) of coefficients under priors of stationary trust, else 1."""
+        rest = theta["rest"][..., None]
+        return rest if self.priors.stationary else 0.0 * rest + 1.0
 
     def named(self, c: np.ndarray, theta: Theta, slots: Slots) -> dict[str, np.ndarray]:
         """Weights beta (draw, feature) and intercept b (draw,)."""
@@ -107,8 +111,7 @@ class CoupledWeights(Weights):
         own = np.column_stack([own, np.ones(n, dtype=bool)])  # (robot, input)
         feature = np.append(np.tile(np.arange(n_features), n), n_features)
         coupling = self.priors.moments("coupling")
-        xp, rest = namespace(theta["rest"]), theta["rest"][..., None]
-        rest = rest if self.priors.stationary else 0.0 * rest + 1.0
+        xp, rest = namespace(theta["rest"]), self.unit(theta)
         means = xp.where(own, rest * mean[feature], coupling[0])
         sds = xp.where(own, rest * sd[feature], coupling[1])
         return means.reshape(len(means), -1), [sds.reshape(len(sds), -1) ** -2.0]
