@@ -32,14 +32,9 @@ class HierarchicalTrust(PooledTrust):
 
     def prior_terms(self, sites: Mapping[str, np.ndarray]) -> dict[str, tuple[str, np.ndarray]]:
         """See `TrustModel.prior_terms`: means, spreads, memory and noises."""
-        return {
-            name: (
-                name.removeprefix("mean_").replace("tau_beta", "tau").replace("tau_b", "tau"),
-                sites[name],
-            )
-            for name in self.dims
-            if name not in ("beta", "b")
-        }
+        fields = {"mean_beta": "beta", "mean_b": "b", "tau_beta": "tau", "tau_b": "tau"}
+        names = [name for name in self.dims if name not in ("beta", "b")]
+        return {name: (fields.get(name, name), sites[name]) for name in names}
 
     @property
     def dims(self) -> dict[str, tuple[str, ...]]:
