@@ -66,7 +66,7 @@ def test_the_route_graph_has_the_costs_of_all_bounds(result, tmp_path):
     for one in edges:
         found.add_edge(nodes[one["startid"]], nodes[one["endid"]], cost=one["cost"])
         assert one["cost"] == one["metadata"]["penalty"] > 0.0
-    planner = result.planner.with_objective("lost_contact")
+    planner = result.planner
     graph = planner.graph(result.posterior)
     assert {*found.edges} == {*graph.edges}
     for a, c, lost in graph.edges(data="lost"):

@@ -194,8 +194,8 @@ def _graph(result: Result, frame: Frame) -> str:
             f"a route graph of {n_cells} cells has ids beyond {_MOST_IDS}, which messages of Nav2 "
             "hold; take larger cells."
         )
-    planner, posts = result.planner.with_objective("lost_contact"), workspace.posts
-    graph = planner.graph(mean_of(result.posterior, result.workspace))
+    posts = workspace.posts
+    graph = result.planner.graph(mean_of(result.posterior, result.workspace))
     place = workspace.grid.center if posts is None else posts.stop
     where = {cell: frame.of_crs(place(cell)).tolist() for cell in graph.nodes}
     features = []

@@ -38,20 +38,19 @@ class DrawnPaths:
     @cached_property
     def candidates(self) -> list[tuple[Cell, ...]]:
         """Distinct paths among them, the most frequent first."""
-        return [self.problem.paths.cells(self._unique[0][i]) for i in self._by_count]
+        return [self.problem.paths.cells(path) for path in self._distinct[0]]
 
     @property
     def counts(self) -> np.ndarray:
         """Number of draws for which each of `candidates` is best."""
-        return self._unique[2][self._by_count]
+        return self._distinct[2]
 
     @cached_property
     def values(self) -> np.ndarray:
         """Value of the best path of each draw, shape (draw,)."""
-        values, inverse = np.empty(len(self.paths)), self._unique[1]
-        for i, path in enumerate(self._unique[0]):
-            draws = np.flatnonzero(inverse == i)
-            values[draws] = self._value(self.dynamics.take(draws), self.problem.paths.cells(path))
+        values, which = np.empty(len(self.paths)), self._distinct[1]
+        for i, path in enumerate(self.candidates):
+            values[which == i] = self._value(self.dynamics.take(which == i), path)
         return values
 
     def values_of(self, paths: Sequence[Sequence[Cell]]) -> np.ndarray:
@@ -70,31 +69,18 @@ class DrawnPaths:
         """
         scale = np.abs(self.values)
         if self.problem.objective.of_contact:
-            tolls = [self.problem.toll_along(path) for path in map(self._cells, self._unique[0])]
-            n_bounds = (self.paths >= 0).sum(1) - 1
-            scale = np.maximum(0.0, n_bounds + self.values + np.array(tolls)[self._unique[1]])
+            most = [len(path) - 1 + self.problem.toll_along(path) for path in self.candidates]
+            scale = np.maximum(0.0, np.array(most)[self._distinct[1]] + self.values)
         regret = self.regret(path)
         nothing = np.where(regret > _ROUNDING, np.inf, 0.0)
         return np.divide(regret, scale, out=nothing, where=scale > 0.0)
 
-    def expected_value_of_information(self) -> float:
-        """Expected gain in value from knowing the parameters.
-
-        Mean of the draws' best values, less the best mean value of any one path. That path is
-        sought among `candidates`, so the number is an upper limit, tight where they include it.
-        """
-        return float(self.values.mean() - self.values_of(self.candidates).mean(0).max())
-
     def share(self) -> np.ndarray:
         """Share of the paths that enter each cell, shape (row, col)."""
-        passable = self.problem.paths.passable
-        count = np.zeros(passable.size)
-        for path, n in zip(self._unique[0], self._unique[2], strict=True):
-            count[np.unique(path[path >= 0])] += n
-        return (count / len(self.paths)).reshape(passable.shape)
-
-    def _cells(self, flat: np.ndarray) -> tuple[Cell, ...]:
-        return self.problem.paths.cells(flat)
+        count = np.zeros(self.problem.paths.passable.shape)
+        for path, n in zip(self.candidates, self.counts, strict=True):
+            count[tuple(np.array(path).T)] += n  # a cell entered twice counts once
+        return count / len(self.paths)
 
     def _value(self, dynamics: Dynamics, path: Sequence[Cell]) -> np.ndarray:
         problem, objective, family = self.problem, self.problem.objective, self.problem.family
@@ -104,15 +90,13 @@ class DrawnPaths:
         return objective.value(score) - problem.failure_along(path)
 
     @cached_property
-    def _unique(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        unique, inverse, counts = np.unique(
+    def _distinct(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Distinct paths by falling frequency, the index of each draw's, and their frequencies."""
+        paths, which, counts = np.unique(
             self.paths, axis=0, return_inverse=True, return_counts=True
         )
-        return unique, inverse.ravel(), counts
-
-    @cached_property
-    def _by_count(self) -> np.ndarray:
-        return np.argsort(-self._unique[2], kind="stable")
+        order = np.argsort(-counts, kind="stable")
+        return paths[order], np.argsort(order)[which.ravel()], counts[order]
 
 
 def choose_draws(params: Params, n_draws: int | None, seed: int) -> tuple[Params, np.ndarray]:

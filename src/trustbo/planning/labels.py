@@ -94,19 +94,8 @@ def best_labels(
 def _best_labels(graph, costs, most, cost, lower, paths, begin, end):
     loss, drift, weight, start, transition, x0, sd, toll, risk, failure, limit = costs
     for d in range(begin, end):
-        one = Costs(
-            loss,
-            drift[d],
-            weight[d],
-            start[d],
-            transition[d],
-            x0[d],
-            sd[d],
-            toll,
-            risk,
-            failure,
-            limit,
-        )
+        trust = transition[d], x0[d], sd[d]
+        one = Costs(loss, drift[d], weight[d], start[d], *trust, toll, risk, failure, limit)
         cost[d], lower[d] = _best_path(graph, one, most, paths[d])
 
 

@@ -38,27 +38,16 @@ class Objective(NamedTuple):
     """Divisor of the sum by the number of bounds of the path, both (length,)."""
     value: Callable[[Array], Array] = _same
     """Value to report for a score: an increasing function."""
-    inverse: Callable[[Array], Array] = _same
-    """Its inverse."""
     of_contact: bool = False
     """Whether contact is expected of trust by the family of the rates; a failure then loses it."""
     max_bounds: str = "shortest+2"
     """Default limit on the number of bounds."""
 
 
-OBJECTIVES: Mapping[str, Objective] = {
-    row.name: row
-    for row in (
-        Objective("lost_contact", of_contact=True, max_bounds="shortest+4"),
-        Objective(
-            "terminal",
-            credit=lambda left: np.where(left == 0, 1.0, 0.0),
-            value=expit,
-            inverse=lambda value: np.log(value) - np.log1p(-value),
-        ),
-        Objective("mean", scale=lambda n_bounds: np.maximum(n_bounds, 1.0)),
-    )
-}
+LOST_CONTACT = Objective("lost_contact", of_contact=True, max_bounds="shortest+4")
+TERMINAL = Objective("terminal", credit=lambda left: np.where(left == 0, 1.0, 0.0), value=expit)
+MEAN = Objective("mean", scale=lambda n_bounds: np.maximum(n_bounds, 1.0))
+OBJECTIVES: Mapping[str, Objective] = {row.name: row for row in (LOST_CONTACT, TERMINAL, MEAN)}
 """Objectives by name; values are to be maximised.
 
 lost_contact: minus the contact that is expected to be lost on the way, in bounds (9 bounds with an

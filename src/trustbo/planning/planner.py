@@ -20,7 +20,7 @@ from trustbo.models.families import FAMILIES
 from trustbo.models.params import Params
 from trustbo.planning.draws import DrawnPaths, choose_draws
 from trustbo.planning.dynamics import Dynamics, as_map, roll, trust_dynamics
-from trustbo.planning.objectives import OBJECTIVES, capped, score_of
+from trustbo.planning.objectives import LOST_CONTACT, OBJECTIVES, capped, score_of
 from trustbo.planning.paths import AdmissiblePaths
 from trustbo.planning.plan import QUANTILES, Plan
 from trustbo.planning.problem import EXACT, InfeasibleError, Problem, draws_of, mean_of, risk_of
@@ -133,15 +133,6 @@ class Planner(Summary):
     def avoiding(self, bounds: np.ndarray, risk: np.ndarray) -> Self:
         """Return the planner of paths without some bounds; see `AdmissiblePaths.avoiding`."""
         return self._with(paths=self.problem.paths.avoiding(bounds, risk))
-
-    def with_objective(self, objective: str) -> Self:
-        """Return the planner of another objective, with the same paths and tolls.
-
-        A cost of failure is dropped unless the objective is lost_contact.
-        """
-        row = OBJECTIVES[require_choice("objective", objective, OBJECTIVES)]
-        failure_cost = self.problem.failure_cost if row.of_contact else None
-        return self._with(objective=row, failure_cost=failure_cost)
 
     def with_risk(
         self,
@@ -301,7 +292,7 @@ class Planner(Summary):
         problem, dynamics = self.problem, self.dynamics(mean_of(params, self.workspace))
         if (radius := np.abs(np.linalg.eigvals(dynamics.transition)).max()) >= 1.0:
             raise TrustboError(f"a graph of settled trust needs abs(beta0) < 1; got {radius:g}.")
-        contact = capped(OBJECTIVES["lost_contact"], problem.family, dynamics)
+        contact = capped(LOST_CONTACT, problem.family, dynamics)
         grid, bounds = self.workspace.grid, problem.paths.bounds
 
         def of_bounds(values: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ from scipy.special import expit
 
 from trustbo.models.params import Params
 from trustbo.planning.dynamics import Dynamics
-from trustbo.planning.objectives import OBJECTIVES, weights_of
+from trustbo.planning.objectives import TERMINAL, weights_of
 from trustbo.planning.paths import SIMPLE_EXTRA, STEPS, AdmissiblePaths
 from trustbo.planning.problem import Problem
 from trustbo.planning.sums import best_sums
@@ -65,7 +65,7 @@ def _largest(paths: AdmissiblePaths, dynamics: Dynamics, view: np.ndarray) -> np
     values = np.full((len(drift), *paths.passable.shape), np.nan)
     for row, col in np.argwhere(paths.bounds_from_start > 0).tolist():
         graph = paths.to((row, col), extra).graph
-        weights = weights_of(OBJECTIVES["terminal"], dynamics, view, graph.longest)
+        weights = weights_of(TERMINAL, dynamics, view, graph.longest)
         no_toll = np.zeros(paths.bounds.size)
         values[:, row, col], _ = best_sums(graph, drift, weights, no_toll)
     values[:, *paths.start] = dynamics.start @ view
