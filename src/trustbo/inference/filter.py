@@ -88,7 +88,7 @@ class Dynamics:
     def predict(self, beliefs: Beliefs, z: np.ndarray, effect: Effect = 0.0) -> Beliefs:
         """Trust after a bound of awareness z (robot, feature), nothing measured."""
         z = z.reshape(1, -1) if self._coupled else z
-        drift = self._grouped((self._beta * z).sum(-1) + self._b + effect)
+        drift = self._grouped(np.einsum("nim,im->ni", self._beta, z) + self._b + effect)
         before = beliefs.mean - beliefs.drift if self._deviates else beliefs.mean
         mean = _product(self._B0, before[..., None])[..., 0] + drift
         cov = _product(_product(self._B0, beliefs.cov), np.swapaxes(self._B0, 2, 3)) + self._Q
