@@ -19,7 +19,8 @@ from peers.every_path import STEPS, TooManyError, World, best_walk, score_along,
 from scipy.special import logit
 
 from trustbo.hazard.strata import Strata
-from trustbo.models import CoupledParams, RobotParams, TrustParams
+from trustbo.models import TrustParams
+from trustbo.models.params import CoupledParams, RobotParams
 from trustbo.planning import InfeasibleError, Planner, reference
 from trustbo.workspace import Workspace
 

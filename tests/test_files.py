@@ -2,7 +2,7 @@
 
 import pytest
 
-from trustbo.errors import DamagedFileError, TrustboError
+from trustbo.errors import TrustboError
 from trustbo.files import read_record, require_file, require_folder, write_file
 
 
@@ -27,10 +27,10 @@ def test_refusal_of_the_system_names_the_file(tmp_path):
 
 @pytest.mark.parametrize("content", [b"", b"{", b"[1]", b"\xff", b"[" * 100000])
 def test_damaged_record_is_named(tmp_path, content):
-    with pytest.raises(DamagedFileError, match="missing"):
+    with pytest.raises(TrustboError, match="missing"):
         read_record(tmp_path / "a.json")
     (tmp_path / "a.json").write_bytes(content)
-    with pytest.raises(DamagedFileError, match=r"a\.json"):
+    with pytest.raises(TrustboError, match=r"a\.json"):
         read_record(tmp_path / "a.json")
 
 

@@ -19,14 +19,13 @@ from .campaign import (
     Follower,
     RegretBound,
     Result,
-    TimeLimit,
     iterate,
     load_result,
     resume,
 )
 from .criticism import check
 from .data import Bound, Mission
-from .errors import DamagedFileError, PosteriorError, TrustboError
+from .errors import PosteriorError, TrustboError
 from .inference import compare, fit
 from .planning.paths import NoPathError
 from .team import Robot, Team
@@ -35,7 +34,6 @@ from .workspace import Workspace
 __all__ = [
     "Bound",
     "Campaign",
-    "DamagedFileError",
     "Follower",
     "Mission",
     "NoPathError",
@@ -44,7 +42,6 @@ __all__ = [
     "Result",
     "Robot",
     "Team",
-    "TimeLimit",
     "TrustboError",
     "Workspace",
     "check",

@@ -13,10 +13,6 @@ class TrustboError(ValueError):
     """Input that trustbo refuses; the message names the value and the remedy."""
 
 
-class DamagedFileError(TrustboError):
-    """A file of a campaign or a result that is missing, was changed, or cannot be read."""
-
-
 class PosteriorError(TrustboError):
     """A posterior with diagnostics beyond their limits.
 

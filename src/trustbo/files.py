@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from trustbo.errors import DamagedFileError, TrustboError
+from trustbo.errors import TrustboError
 
 FilePath = str | PathLike[str]
 
@@ -39,35 +39,35 @@ def write_file(path: FilePath, write: Callable[[Path], object]) -> None:
 
 
 def read_file(path: FilePath) -> bytes:
-    """Read a file whole; DamagedFileError if it is missing or cannot be read."""
+    """Read a file whole; TrustboError if it is missing or cannot be read."""
     path = as_path(path)
     try:
         return path.read_bytes()
     except FileNotFoundError:
-        raise DamagedFileError(f"{str(path)!r} is missing.") from None
+        raise TrustboError(f"{str(path)!r} is missing.") from None
     except OSError as error:
-        raise DamagedFileError(f"{str(path)!r} cannot be read: {error.strerror}.") from None
+        raise TrustboError(f"{str(path)!r} cannot be read: {error.strerror}.") from None
 
 
 def read_record(path: FilePath) -> dict[str, Any]:
     """Read a JSON file of fields by name.
 
     Raises:
-        DamagedFileError: The file is missing, damaged, no JSON, or holds no fields.
+        TrustboError: The file is missing, damaged, no JSON, or holds no fields.
     """
     content = read_file(path)
     try:
         record = json.loads(content)
     except (ValueError, RecursionError) as error:
-        raise DamagedFileError(f"{str(path)!r} is damaged: no JSON ({error}).") from None
+        raise TrustboError(f"{str(path)!r} is damaged: no JSON ({error}).") from None
     if not isinstance(record, dict):
-        raise DamagedFileError(f"{str(path)!r} is damaged: no record of fields.")
+        raise TrustboError(f"{str(path)!r} is damaged: no record of fields.")
     return record
 
 
 @contextmanager
 def interpreting(path: FilePath) -> Iterator[None]:
-    """Convert errors from unexpected contents of a file to a DamagedFileError.
+    """Convert errors from unexpected contents of a file to a TrustboError.
 
     A TrustboError passes unchanged.
     """
@@ -80,7 +80,7 @@ def interpreting(path: FilePath) -> Iterator[None]:
         ValueError,
     ) as error:  # fmt: skip
         message = " ".join(str(error).split())[:200]
-        raise DamagedFileError(
+        raise TrustboError(
             f"{str(path)!r} is damaged: it does not hold what it should ({message})."
         ) from error
 

@@ -8,8 +8,9 @@ from worlds import ModelSimulator, random_cells
 
 import trustbo as tb
 from trustbo.campaign.learning import to_avoid
-from trustbo.hazard import Hazard, fit_hazard
+from trustbo.hazard import Hazard
 from trustbo.hazard.exposures import LostMission
+from trustbo.hazard.model import fit_hazard
 from trustbo.hazard.risk import BoundRisk
 from trustbo.workspace.moves import moves_along
 

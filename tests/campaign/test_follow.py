@@ -269,7 +269,7 @@ def test_the_example_of_a_ros_node_makes_the_mission_of_its_messages():
     assert take(follower, robots, "status", "stuck", 5.0)
 
 
-def test_the_example_for_foxglove_sends_trust_by_robot_and_maps_from_the_south():
+def test_the_example_for_foxglove_sends_trust_by_robot():
     live, campaign = example("live_foxglove"), begun(n_missions=0)
     follower, robots = tb.Follower(campaign), ("r1", "r2", "r3")
     before = live.state_of(follower, robots)
@@ -279,7 +279,3 @@ def test_the_example_for_foxglove_sends_trust_by_robot_and_maps_from_the_south()
         assert state["bound"] == k + 1
         assert [state[r]["mean"] for r in robots] == follower.trust.mean.tolist()
     assert state["r1"]["ahead"] == []
-    pytest.importorskip("foxglove")
-    rows = np.arange(16.0, dtype="<f4").reshape(4, 4)
-    sent = live.grid_of(rows, campaign.workspace.grid).encode()
-    assert rows[::-1].tobytes() in sent

@@ -239,7 +239,6 @@ def test_damaged_file_is_named(folder, tmp_path, name, damage):
         with pytest.raises(tb.TrustboError) as error:
             _ = load(copy).posterior
         if (name, damage) != ("campaign.json", "missing"):
-            assert isinstance(error.value, tb.DamagedFileError)
             assert name in str(error.value)
 
 

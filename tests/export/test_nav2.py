@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from trustbo.errors import TrustboError
-from trustbo.export import Frame, write_nav2, write_ros_map
+from trustbo.export import Frame, write_nav2
+from trustbo.export.nav2 import write_ros_map
 
 
 def picture(file):

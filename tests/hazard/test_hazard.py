@@ -9,9 +9,9 @@ from scipy import special, stats
 
 import trustbo as tb
 from trustbo.errors import PosteriorError, TrustboError
-from trustbo.hazard import Hazard, fit_hazard
+from trustbo.hazard import Hazard
 from trustbo.hazard.exposures import Exposures, LostMission
-from trustbo.hazard.model import HazardPoints, impute, sample
+from trustbo.hazard.model import HazardPoints, fit_hazard, impute, sample
 from trustbo.hazard.risk import BoundRisk
 from trustbo.workspace.difficulty import difficulty_of
 from trustbo.workspace.moves import MOVES

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import trustbo as tb
-from trustbo.hazard import fit_hazard
 from trustbo.hazard.exposures import LostMission
+from trustbo.hazard.model import fit_hazard
 from trustbo.hazard.risk import BoundRisk
 from trustbo.hazard.strata import partition
 

@@ -9,7 +9,8 @@ from scipy import stats
 import trustbo as tb
 from trustbo.errors import TrustboError
 from trustbo.inference import TrustFilter, fit, params_of
-from trustbo.models import CoupledParams, PooledTrust, TrustParams
+from trustbo.models import PooledTrust, TrustParams
+from trustbo.models.params import CoupledParams
 
 
 @pytest.fixture(scope="module")

@@ -9,8 +9,8 @@ from missions import walking_missions
 
 import trustbo as tb
 from trustbo.errors import TrustboError
-from trustbo.inference import complete, diagnostics, fit, params_of, prior_mean, sample_prior
-from trustbo.inference.draws import read_posterior
+from trustbo.inference import complete, diagnostics, fit, params_of, sample_prior
+from trustbo.inference.draws import prior_mean, read_posterior
 from trustbo.inference.tree import parameters_alone
 from trustbo.models import (
     CoupledTrust,

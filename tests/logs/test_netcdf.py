@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from missions import assert_same_missions, missions
 
 from trustbo.data import Mission
-from trustbo.errors import DamagedFileError
+from trustbo.errors import TrustboError
 from trustbo.logs import read_missions, write_missions
 from trustbo.logs.netcdf import write_tree
 
@@ -22,14 +22,14 @@ def test_missions_come_back_with_ticks_and_states_to_the_last_bit(tmp_path_facto
 
 def test_damage_is_named_with_its_file(tmp_path):
     file, other = tmp_path / "missions.nc", tmp_path / "other.nc"
-    with pytest.raises(DamagedFileError, match=r"missions.nc"):
+    with pytest.raises(TrustboError, match=r"missions.nc"):
         read_missions(file)
     write_missions(
         file, [Mission.from_arrays([(2, 0), (1, 1)], np.ones((1, 2, 3)), np.ones((1, 2)))]
     )
     other.write_bytes(file.read_bytes()[:1000])
-    with pytest.raises(DamagedFileError, match=r"other.nc"):
+    with pytest.raises(TrustboError, match=r"other.nc"):
         read_missions(other)
     write_tree(other, xr.DataTree(xr.Dataset({"x": 1})))
-    with pytest.raises(DamagedFileError, match=r"other.nc"):
+    with pytest.raises(TrustboError, match=r"other.nc"):
         read_missions(other)

@@ -7,15 +7,8 @@ import pytest
 
 import trustbo as tb
 from trustbo import plots
-from trustbo.plots.maps import contour_interval, contours, extent_of
+from trustbo.plots.maps import contour_interval, contours, draw_path, extent_of
 from trustbo.report import write_report
-
-RUNS = pd.DataFrame(
-    [
-        {"policy": policy, "mission": mission, "regret": run + 10.0 / mission}
-        for policy in ("greedy", "random") for run in range(5) for mission in (1, 2, 3)
-    ]
-)  # fmt: skip
 
 EFFECTS = pd.DataFrame(
     [
@@ -40,7 +33,6 @@ FIGURES = {
     "trust_curves": (lambda r, ax: plots.trust_curves(r.posterior, ax=ax), 3),
     "trust_curves of a plan": (lambda r, ax: plots.trust_curves(r.plan, ax=ax), 3),
     "campaign_history": (lambda r, ax: r.plot_history(ax=ax), 2),
-    "regret_curves": (lambda r, ax: plots.regret_curves(RUNS, ax=ax), 1),
     "robot_effects": (lambda r, ax: plots.robot_effects(EFFECTS, ax=ax), 1),
     "grid_map": (lambda r, ax: plots.grid_map(r.workspace, ax=ax), 1),
 }
@@ -85,7 +77,7 @@ def test_a_map_shows_the_values_of_passable_cells_in_metres(result):
 
 def test_a_path_goes_through_the_centres_of_its_cells(result):
     _, ax = plt.subplots()
-    plots.draw_path(ax, [(3, 0), (2, 1)], result.workspace.grid)
+    draw_path(ax, [(3, 0), (2, 1)], result.workspace.grid)
     np.testing.assert_allclose(ax.lines[0].get_xydata(), [(10.0, 10.0), (30.0, 30.0)])
 
 
@@ -97,13 +89,6 @@ def test_contour_lines_of_a_plane_are_level():
     assert len(lines) > 3
     assert all(np.ptp(line[:, 1]) < 1e-6 for line in lines)
     assert [contour_interval(relief) for relief in (0.0, 12.0, 60.0, 240.0)] == [None, 1, 5, 20]
-
-
-def test_regret_curves_show_medians(result):
-    ax = plots.regret_curves(RUNS)
-    np.testing.assert_allclose(ax.lines[0].get_ydata(), [12.0, 7.0, 2.0 + 10.0 / 3.0])
-    with pytest.raises(tb.TrustboError, match="column"):
-        plots.regret_curves(RUNS, by="model")
 
 
 def test_the_explorer_is_one_page_without_addresses(result, tmp_path):

@@ -5,7 +5,8 @@ import pytest
 from worlds import hillside
 
 from trustbo.errors import TrustboError
-from trustbo.simulation import KinematicSimulator, RealtimeAwareness
+from trustbo.simulation import KinematicSimulator
+from trustbo.simulation.realtime import RealtimeAwareness
 from trustbo.team import Team
 from trustbo.workspace import Workspace
 

@@ -9,18 +9,12 @@ from scipy.interpolate import interpn
 from worlds import terrain_of
 
 from trustbo.errors import TrustboError
-from trustbo.terrain import (
-    FEATURES,
-    feature,
-    gradient,
-    pixel_features,
-    pixel_size,
-    rays,
-)
+from trustbo.terrain import FEATURES, feature, gradient, pixel_size, rays
 from trustbo.terrain.features import (
     canopy_cover,
     canopy_height,
     openness,
+    pixel_features,
     roughness,
     slope,
     step_height,

@@ -5,7 +5,8 @@ import pytest
 import xarray as xr
 
 from trustbo.errors import TrustboError
-from trustbo.terrain import pixel_features, synthetic_terrain
+from trustbo.terrain import synthetic_terrain
+from trustbo.terrain.features import pixel_features
 from trustbo.workspace import Workspace
 
 

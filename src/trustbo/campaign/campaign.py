@@ -46,8 +46,8 @@ from trustbo.models import HumanTrust, default_model
 from trustbo.models.model import TrustModel, require_model
 from trustbo.models.params import Params
 from trustbo.models.record import model_from_record, model_to_record
-from trustbo.planning import InfeasibleError, Plan, Planner, Policy
-from trustbo.planning.policies import resolve_policy
+from trustbo.planning import InfeasibleError, Plan, Planner
+from trustbo.planning.policies import Policy, resolve_policy
 from trustbo.simulation import Truth
 from trustbo.simulation.protocol import Simulator
 from trustbo.workspace import Workspace
@@ -503,9 +503,8 @@ class Campaign(Summary):
             policy: The same policy, if it is custom.
 
         Raises:
-            TrustboError: There is no campaign; another process has locked it; or a custom object
-                is missing.
-            DamagedFileError: A file of the folder is missing or damaged.
+            TrustboError: There is no campaign; another process has locked it; a custom object is
+                missing; or a file of the folder is missing or damaged.
         """
         storage = Storage(directory, begun=True)
         try:

@@ -11,10 +11,12 @@ from trustbo.campaign.state import EXCLUDED, LEARNED, TOLD, State
 from trustbo.data import Cell, Mission
 from trustbo.display import say
 from trustbo.errors import PosteriorError, TrustboError
-from trustbo.hazard import Hazard, fit_hazard
+from trustbo.hazard import Hazard
 from trustbo.hazard.exposures import LostMission
+from trustbo.hazard.model import fit_hazard
 from trustbo.hazard.risk import BoundRisk
-from trustbo.inference import fit, prior_mean, sample_prior
+from trustbo.inference import fit, sample_prior
+from trustbo.inference.draws import prior_mean
 from trustbo.inference.tree import parameters_alone
 from trustbo.models import PlaceEffect
 from trustbo.models.model import TrustModel

@@ -9,7 +9,7 @@ from trustbo.campaign.stopping import Stop
 from trustbo.errors import TrustboError, require_whole
 from trustbo.files import FilePath
 from trustbo.models.model import TrustModel
-from trustbo.planning import Policy
+from trustbo.planning.policies import Policy
 from trustbo.simulation import Truth
 from trustbo.simulation.protocol import Simulator
 from trustbo.workspace import Workspace
@@ -44,7 +44,7 @@ def iterate(
         truth: Truth of the simulator, `simulation.Truth.of(simulator)`: the regret of each plan
             goes into the history, in % of the contact that the best admissible path keeps.
         stop: Rules to end before `n_iterations`, called between missions: a `RegretBound`,
-            `TimeLimit`, a callable `stop(campaign) -> reason or None`, or several of them.
+            callable `stop(campaign) -> reason or None`, or several of them.
         directory: Folder that is updated after each mission. If the process dies, `resume`
             continues from it.
         overwrite: Whether to remove another campaign from that folder first.
@@ -102,8 +102,7 @@ def resume(
 
     Raises:
         TrustboError: There is no campaign; another process has locked it; or a custom object, or
-            the simulator, is another one.
-        DamagedFileError: A file of the folder is missing or damaged.
+            the simulator, is another one; or a file of the folder is missing or damaged.
     """
     with Campaign.load(directory, model=model, policy=policy) as campaign:
         state, before = campaign.state, campaign.state.simulation

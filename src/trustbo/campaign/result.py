@@ -298,8 +298,8 @@ def load_result(directory: FilePath) -> Result:
         directory: Folder of a campaign, or one that `Result.save` wrote.
 
     Raises:
-        TrustboError: The folder holds no campaign, or one without missions.
-        DamagedFileError: A file is missing or damaged.
+        TrustboError: The folder holds no campaign, or one without missions; or a file is missing or
+            damaged.
     """
     state, workspace, _ = read_campaign(directory)
     if not state.entries:

@@ -69,7 +69,7 @@ class Posterior:
         self.name, self.file, self._tree = name, file, tree
 
     def __call__(self) -> xr.DataTree:
-        """Posterior, read from its file if need be; DamagedFileError if that is not possible."""
+        """Posterior, read from its file if need be; TrustboError if that is not possible."""
         if self._tree is None:
             self._tree = read_tree(self.file or "")
         return self._tree

@@ -1,13 +1,12 @@
 """Rules that end a campaign which has learned enough."""
 
-import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from trustbo.errors import TrustboError, require_positive, require_whole
+from trustbo.errors import TrustboError, require_whole
 from trustbo.inference import params_of
 from trustbo.planning import InfeasibleError
 from trustbo.workspace.moves import bounds_along
@@ -80,25 +79,3 @@ class RegretBound:
         except InfeasibleError:  # no path respects the limit
             return 0.0
         return float(np.mean(drawn.relative_regret(path) <= self.eps))
-
-
-@dataclass(frozen=True)
-class TimeLimit:
-    """Stop after a number of seconds from now, once the mission under way is done.
-
-    Attributes:
-        limit: Seconds.
-
-    Raises:
-        TrustboError: The limit is not positive.
-    """
-
-    limit: float
-    _start: float = field(default_factory=time.monotonic, repr=False)
-
-    def __post_init__(self) -> None:
-        require_positive("TimeLimit.limit", self.limit)
-
-    def __call__(self, campaign: "Campaign") -> str | None:
-        """Reason to stop, or None."""
-        return f"seconds: {self.limit:g}" if time.monotonic() - self._start > self.limit else None

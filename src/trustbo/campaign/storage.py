@@ -139,8 +139,7 @@ def read_campaign(
         were told with them.
 
     Raises:
-        TrustboError: The folder holds no campaign.
-        DamagedFileError: A file is missing or damaged.
+        TrustboError: The folder holds no campaign, or a file is missing or damaged.
     """
     folder = as_path(directory)
     _require_campaign(folder)

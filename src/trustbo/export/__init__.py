@@ -6,7 +6,7 @@ from pathlib import Path
 from trustbo.campaign.result import Result
 from trustbo.errors import require_choice
 from trustbo.export.gis import write_csv, write_geojson, write_geotiff
-from trustbo.export.nav2 import Frame, write_nav2, write_ros_map
+from trustbo.export.nav2 import Frame, write_nav2
 from trustbo.files import FilePath, require_folder
 
 WRITERS: dict[str, Callable[[Path, Result], None]] = {
@@ -16,7 +16,7 @@ WRITERS: dict[str, Callable[[Path, Result], None]] = {
     "nav2": write_nav2,
 }
 """Writers of a result to a path, by format."""
-FILES = {"geotiff": "maps.tif", "geojson": "path.geojson", "csv": "missions.csv", "nav2": "nav2"}
+_FILES = {"geotiff": "maps.tif", "geojson": "path.geojson", "csv": "missions.csv", "nav2": "nav2"}
 """Names of what `export_result` writes to a folder, by format."""
 
 
@@ -27,12 +27,12 @@ def export_result(
     target = require_folder(folder)
     chosen = [require_choice("format", name, WRITERS) for name in formats]
     for name in chosen:
-        WRITERS[name](target / FILES[name], result)
-    return [target / FILES[name] for name in chosen]
+        WRITERS[name](target / _FILES[name], result)
+    return [target / _FILES[name] for name in chosen]
 
 
 __all__ = [
-    "FILES", "WRITERS", "Frame", "export_result", "write_csv", "write_geojson", "write_geotiff",
-    "write_nav2", "write_ros_map",
+    "WRITERS", "Frame", "export_result", "write_csv", "write_geojson", "write_geotiff",
+    "write_nav2",
 ]  # fmt: skip
 __dir__ = __all__.copy  # completion lists public names alone

@@ -1,7 +1,6 @@
 """Hazard: the chance that a bound ends the mission, learned from missions that failed."""
 
-from trustbo.hazard.model import fit_hazard
 from trustbo.hazard.prior import Hazard
 
-__all__ = ["Hazard", "fit_hazard"]
+__all__ = ["Hazard"]
 __dir__ = __all__.copy  # completion lists public names alone

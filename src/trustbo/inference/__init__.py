@@ -5,7 +5,7 @@ from trustbo.models import backend as backend  # first: it loads numpyro
 # isort: split
 from trustbo.inference.by_rate import by_rate
 from trustbo.inference.diagnostics import diagnostics
-from trustbo.inference.draws import params_of, prior_mean, sample_prior
+from trustbo.inference.draws import params_of, sample_prior
 from trustbo.inference.filter import TrustFilter
 from trustbo.inference.fit import fit
 from trustbo.inference.loo import compare, loo
@@ -28,7 +28,6 @@ __all__ = [
     "params_of",
     "place_maps",
     "predict_reports",
-    "prior_mean",
     "sample_prior",
     "sbc",
     "score",

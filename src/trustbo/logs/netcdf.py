@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from trustbo.data import NOWHERE, Bound, Mission
-from trustbo.errors import DamagedFileError
+from trustbo.errors import TrustboError
 from trustbo.files import FilePath, interpreting, read_file, write_file
 from trustbo.stacking import require_same_team
 
@@ -21,14 +21,14 @@ def read_tree(path: FilePath) -> xr.DataTree:
     """Read a netCDF file of groups into memory.
 
     Raises:
-        DamagedFileError: There is no such file, it is damaged, or it is no netCDF.
+        TrustboError: There is no such file, it is damaged, or it is no netCDF.
     """
     content = read_file(path)
     try:
         with xr.open_datatree(content, engine="netcdf4") as tree:
             return tree.load()
     except Exception:  # the library raises many kinds for bytes that are no netCDF
-        raise DamagedFileError(f"{str(path)!r} is damaged, or no netCDF file.") from None
+        raise TrustboError(f"{str(path)!r} is damaged, or no netCDF file.") from None
 
 
 def write_tree(path: FilePath, tree: xr.DataTree) -> None:
@@ -48,7 +48,7 @@ def read_missions(path: FilePath) -> list[Mission]:
         path: File of missions; or folder of a campaign, whose missions are as measured.
 
     Raises:
-        DamagedFileError: There is no such file, it is damaged, or it holds no missions.
+        TrustboError: There is no such file, it is damaged, or it holds no missions.
     """
     missions = []
     for file in sorted(Path(path).glob("missions/[0-9]*.nc")) or [path]:

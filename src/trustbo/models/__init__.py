@@ -10,14 +10,13 @@ from trustbo.models.effects.person import PersonEffect
 from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.effects.robot import RobotEffect
 from trustbo.models.hierarchical import HierarchicalTrust
-from trustbo.models.params import CoupledParams, RobotParams, TrustParams
+from trustbo.models.params import TrustParams
 from trustbo.models.people import HumanTrust
 from trustbo.models.pooled import PooledTrust
 from trustbo.models.priors import Priors
 
 __all__ = [
     "ContactRate",
-    "CoupledParams",
     "CoupledTrust",
     "HierarchicalTrust",
     "HumanTrust",
@@ -26,7 +25,6 @@ __all__ = [
     "PooledTrust",
     "Priors",
     "RobotEffect",
-    "RobotParams",
     "TrustParams",
     "default_model",
 ]

@@ -6,11 +6,11 @@ from trustbo.planning.objectives import OBJECTIVES
 from trustbo.planning.paths import NoPathError
 from trustbo.planning.plan import Plan
 from trustbo.planning.planner import Planner
-from trustbo.planning.policies import POLICIES, Policy
+from trustbo.planning.policies import POLICIES
 from trustbo.planning.problem import InfeasibleError
 
 __all__ = [
-    "OBJECTIVES", "POLICIES", "InfeasibleError", "NoPathError", "Plan", "Planner", "Policy",
+    "OBJECTIVES", "POLICIES", "InfeasibleError", "NoPathError", "Plan", "Planner",
     "policies", "reference", "roll_trust",
 ]  # fmt: skip
 __dir__ = __all__.copy  # completion lists public names alone

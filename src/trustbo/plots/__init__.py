@@ -1,19 +1,17 @@
 """Figures. Each function takes data and optional `ax=`, and returns the axes it drew on."""
 
-from trustbo.plots.curves import campaign_history, regret_curves, robot_effects, trust_curves
+from trustbo.plots.curves import campaign_history, robot_effects, trust_curves
 from trustbo.plots.explore import explore
 from trustbo.plots.grid import grid_map
-from trustbo.plots.maps import cell_map, draw_path, terrain_maps, trust_maps
+from trustbo.plots.maps import cell_map, terrain_maps, trust_maps
 from trustbo.plots.plan import plan_map
 
 __all__ = [
     "campaign_history",
     "cell_map",
-    "draw_path",
     "explore",
     "grid_map",
     "plan_map",
-    "regret_curves",
     "robot_effects",
     "terrain_maps",
     "trust_curves",

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import xarray as xr
@@ -134,43 +133,6 @@ def campaign_history(history: xr.Dataset, *, ax: Any = None) -> np.ndarray:
     axes[-1].xaxis.set_major_locator(MaxNLocator(integer=True))
     add_legend(axes, axes[0].get_legend_handles_labels()[0])
     return axes
-
-
-@styled
-def regret_curves(table: pd.DataFrame, *, by: str = "policy", ax: Axes | None = None) -> Axes:
-    """Draw the regret of many campaigns by mission: its median, with bars of 50 % and 90 %.
-
-    Args:
-        table: A row for each campaign and mission, with the columns `mission`, `regret` and `by`.
-        by: Column with a value for each curve.
-        ax: Axes to draw on; by default a new figure.
-
-    Returns:
-        Axes of the curves.
-
-    Raises:
-        TrustboError: A column is missing, or no regret is known.
-    """
-    for name in ("mission", "regret", by):
-        require_choice("column", name, [str(column) for column in table.columns])
-    known = table.dropna(subset=["regret"])
-    if known.empty:
-        raise TrustboError("no regret is known: regret needs the truth of the simulator.")
-    (one,) = panels(1, ax, (5.0, 3.0))
-    groups = list(known.groupby(by, sort=False))
-    shades = plt.get_cmap()(np.linspace(0.25, 0.85, len(groups)))
-    shifts = np.linspace(-0.25, 0.25, len(groups)) if len(groups) > 1 else [0.0]
-    for i, (name, rows) in enumerate(groups):
-        ends = rows.groupby("mission")["regret"].quantile(np.array([*QUANTILES, 0.5])).unstack()
-        x, style = ends.index.to_numpy() + shifts[i], {"color": shades[i]}
-        low, lower, upper, high, middle = ends.to_numpy().T
-        one.vlines(x, low, high, linewidth=0.9, **style)
-        one.vlines(x, lower, upper, linewidth=3.2, **style)
-        one.plot(x, middle, marker=MARKERS[i % len(MARKERS)], linewidth=1.1, label=name, **style)
-    one.set(xlabel="mission", ylabel="regret of the recommended path (%)")
-    one.xaxis.set_major_locator(MaxNLocator(integer=True))
-    one.legend(title=f"{as_text(by)}: median, 50 % and 90 % of campaigns")
-    return one
 
 
 @styled

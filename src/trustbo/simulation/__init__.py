@@ -4,12 +4,11 @@ from trustbo.simulation.events import Degradation, Dust, Fouling, Jam, Season, T
 from trustbo.simulation.kinematic import KinematicSimulator
 from trustbo.simulation.model import ModelSimulator
 from trustbo.simulation.radio import RadioSimulator
-from trustbo.simulation.realtime import RealtimeAwareness
 from trustbo.simulation.replay import ReplaySimulator
 from trustbo.simulation.truth import Truth
 
 __all__ = [
     "Degradation", "Dust", "Fouling", "Jam", "KinematicSimulator", "ModelSimulator",
-    "RadioSimulator", "RealtimeAwareness", "ReplaySimulator", "Season", "Trees", "Truth",
+    "RadioSimulator", "ReplaySimulator", "Season", "Trees", "Truth",
 ]  # fmt: skip
 __dir__ = __all__.copy  # completion lists public names alone

@@ -9,7 +9,6 @@ from trustbo.terrain.features import (
     VISIBILITY,
     feature,
     gradient,
-    pixel_features,
 )
 from trustbo.terrain.lidar import read_lidar
 from trustbo.terrain.read import pixel_size, read_terrain
@@ -17,7 +16,7 @@ from trustbo.terrain.synthetic import synthetic_terrain
 
 __all__ = [
     "FEATURES", "PAPER_VISIBILITY", "TRAVERSABILITY", "VISIBILITY", "CompositeIndex", "example",
-    "feature", "gradient", "pixel_features", "pixel_size", "read_lidar", "read_terrain",
+    "feature", "gradient", "pixel_size", "read_lidar", "read_terrain",
     "synthetic_terrain",
 ]  # fmt: skip
 __dir__ = __all__.copy  # completion lists public names alone
