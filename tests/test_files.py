@@ -3,7 +3,7 @@
 import pytest
 
 from trustbo.errors import TrustboError
-from trustbo.files import read_record, require_file, require_folder, write_file
+from trustbo.files import read_record, require_suffix, write_file
 
 
 def test_failed_write_leaves_the_file_before(tmp_path):
@@ -34,13 +34,7 @@ def test_damaged_record_is_named(tmp_path, content):
         read_record(tmp_path / "a.json")
 
 
-def test_impossible_names_are_refused(tmp_path):
-    (tmp_path / "file").write_text("")
-    for check in (
-        lambda: require_file(tmp_path),
-        lambda: require_file(tmp_path / "a.png", ".csv"),
-        lambda: require_file(7),
-        lambda: require_folder(tmp_path / "file" / "deep"),
-    ):
-        with pytest.raises(TrustboError):
-            check()
+def test_files_are_written_with_the_suffix_of_their_format(tmp_path):
+    assert require_suffix(tmp_path / "a.CSV", ".csv").name == "a.CSV"
+    with pytest.raises(TrustboError, match=r"a\.png"):
+        require_suffix(tmp_path / "a.png", ".csv")

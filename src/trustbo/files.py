@@ -40,9 +40,8 @@ def write_file(path: FilePath, write: Callable[[Path], object]) -> None:
 
 def read_file(path: FilePath) -> bytes:
     """Read a file whole; TrustboError if it is missing or cannot be read."""
-    path = as_path(path)
     try:
-        return path.read_bytes()
+        return Path(path).read_bytes()
     except FileNotFoundError:
         raise TrustboError(f"{str(path)!r} is missing.") from None
     except OSError as error:
@@ -50,19 +49,10 @@ def read_file(path: FilePath) -> bytes:
 
 
 def read_record(path: FilePath) -> dict[str, Any]:
-    """Read a JSON file of fields by name.
-
-    Raises:
-        TrustboError: The file is missing, damaged, no JSON, or holds no fields.
-    """
+    """Read a JSON file of fields by name; TrustboError if it is missing or damaged."""
     content = read_file(path)
-    try:
-        record = json.loads(content)
-    except (ValueError, RecursionError) as error:
-        raise TrustboError(f"{str(path)!r} is damaged: no JSON ({error}).") from None
-    if not isinstance(record, dict):
-        raise TrustboError(f"{str(path)!r} is damaged: no record of fields.")
-    return record
+    with interpreting(path):
+        return dict(json.loads(content))
 
 
 @contextmanager
@@ -105,34 +95,9 @@ def to_json(record: object) -> str:
     return json.dumps(record, default=plain)
 
 
-def require_folder(directory: FilePath) -> Path:
-    """Return a folder, which need not exist; TrustboError if it or a parent is a file."""
-    folder = as_path(directory)
-    for part in (folder, *folder.parents):
-        if part.exists():
-            if not part.is_dir():
-                raise TrustboError(f"cannot write to {str(folder)!r}: {str(part)!r} is a file.")
-            break
-    return folder
-
-
-def require_file(path: FilePath, *suffixes: str) -> Path:
-    """Return a file to write, which may exist already.
-
-    `suffixes` are in lower case with the dot; none allow any. TrustboError: another suffix, a
-    folder of that name, or a file of that of its folder.
-    """
-    file = as_path(path)
-    if file.is_dir():
-        raise TrustboError(f"cannot write {str(file)!r}: it is a folder; name a file in it.")
-    if suffixes and file.suffix.lower() not in suffixes:
+def require_suffix(path: FilePath, *suffixes: str) -> Path:
+    """Return a file to write; TrustboError unless it ends in one of these, in lower case."""
+    file = Path(path)
+    if file.suffix.lower() not in suffixes:
         raise TrustboError(f"{str(file)!r} must end in {' or '.join(suffixes)}.")
-    require_folder(file.parent)
     return file
-
-
-def as_path(path: FilePath) -> Path:
-    """Return a path; TrustboError if it is neither text nor a path."""
-    if not isinstance(path, str | os.PathLike):
-        raise TrustboError(f"give the path of a file or folder; got a {type(path).__name__}.")
-    return Path(path)

@@ -23,10 +23,8 @@ from trustbo.data import Mission
 from trustbo.errors import TrustboError
 from trustbo.files import (
     FilePath,
-    as_path,
     interpreting,
     read_record,
-    require_folder,
     to_json,
     write_text,
 )  # fmt: skip
@@ -60,7 +58,7 @@ class Storage:
             TrustboError: The folder holds no campaign and must, or one and must not; another
                 process has locked it; or its name belongs to a file.
         """
-        self.path = require_folder(directory)
+        self.path = Path(directory)
         if begun:
             _require_campaign(self.path)
         elif not overwrite and any((self.path / n).exists() for n in (RECORD, MISSIONS)):
@@ -68,7 +66,10 @@ class Storage:
                 f"{str(directory)!r} holds a campaign: continue it by Campaign.load or resume, "
                 "give another folder, or replace it with overwrite=True."
             )
-        self.path.mkdir(parents=True, exist_ok=True)
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise TrustboError(f"cannot make {str(directory)!r}: {error.strerror}.") from None
         self._lock = FileLock(self.path / ".lock", timeout=0)
         try:
             self._lock.acquire()
@@ -141,7 +142,7 @@ def read_campaign(
     Raises:
         TrustboError: The folder holds no campaign, or a file is missing or damaged.
     """
-    folder = as_path(directory)
+    folder = Path(directory)
     _require_campaign(folder)
     record, tree = read_record(folder / RECORD), read_tree(folder / WORKSPACE)
     with interpreting(folder / WORKSPACE):

@@ -13,7 +13,7 @@ from shapely import affinity
 
 from trustbo.campaign.result import Result
 from trustbo.errors import TrustboError, require_kind
-from trustbo.files import FilePath, require_file, write_file, write_text
+from trustbo.files import FilePath, require_suffix, write_file, write_text
 from trustbo.logs.table import to_frame
 from trustbo.planning import Plan
 from trustbo.planning.plan import QUANTILES
@@ -36,7 +36,7 @@ def write_geotiff(path: FilePath, maps: Result | xr.Dataset) -> None:
         TrustboError: The maps have no CRS, or the file cannot be written.
     """
     maps = maps.maps() if isinstance(maps, Result) else maps
-    target = require_file(path, ".tif", ".tiff")
+    target = require_suffix(path, ".tif", ".tiff")
     if maps.rio.crs is None:
         raise TrustboError(_NO_CRS)
     profile = {
@@ -74,7 +74,6 @@ def write_geojson(path: FilePath, plan: Plan | Result) -> None:
     """
     plan = plan.plan if isinstance(plan, Result) else plan
     require_kind("plan", plan, Plan, "give a Plan, as Campaign.ask returns it, or a Result")
-    target = require_file(path)
     centres = np.array([plan.workspace.grid.center(cell) for cell in plan.path])
     facts = {"name": "most trustworthy path", "n_bounds": len(plan.path) - 1}
     facts |= {"value": float(plan.value), "objective": plan.objective}
@@ -92,7 +91,7 @@ def write_geojson(path: FilePath, plan: Plan | Result) -> None:
             if route is not None:
                 about = {"bound": k, "robot": robot, "length_m": shapely.LineString(route).length}
                 features.append(_feature(plan, "routes", route, about))
-    write_text(target, json.dumps({"type": "FeatureCollection", "features": features}))
+    write_text(path, json.dumps({"type": "FeatureCollection", "features": features}))
 
 
 def write_csv(path: FilePath, result: Result) -> None:
@@ -109,7 +108,6 @@ def write_csv(path: FilePath, result: Result) -> None:
     Raises:
         TrustboError: The file cannot be written.
     """
-    target = require_file(path)
     table, latent = to_frame(result.missions), result.posterior["latent"].to_dataset()
     # A posterior need not cover all missions: some are excluded, or wait to be learned from.
     of_mission = {int(j) + 1: i for i, j in enumerate(latent["mission"].values)}
@@ -121,7 +119,7 @@ def write_csv(path: FilePath, result: Result) -> None:
         table[name] = [
             values[i, k, r] if i >= 0 and 0 <= k < n_bounds else np.nan for i, k, r in at
         ]
-    write_text(target, table.to_csv(index=False, lineterminator="\n"))
+    write_text(path, table.to_csv(index=False, lineterminator="\n"))
 
 
 def _of(values: Any) -> Any:

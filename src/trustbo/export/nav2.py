@@ -16,7 +16,7 @@ import xarray as xr
 from trustbo.campaign.result import Result
 from trustbo.errors import TrustboError, require_choice, require_positive
 from trustbo.export.gis import LEAD
-from trustbo.files import FilePath, require_file, write_file, write_text
+from trustbo.files import FilePath, require_suffix, write_file, write_text
 from trustbo.planning import Plan
 from trustbo.planning.problem import mean_of
 from trustbo.workspace import Workspace
@@ -108,7 +108,7 @@ def write_ros_map(
     Raises:
         TrustboError: A cost outside [0, 1], or a map of too many pixels.
     """
-    target = require_file(path, ".yaml", ".yml")
+    target = require_suffix(path, ".yaml", ".yml")
     values, corner, side = occupancy(cost.values, workspace, frame, pixel)
     picture = target.with_suffix(".pgm")
     # Pictures begin in the north. In raw mode, map_server takes the byte of a pixel as its value.
