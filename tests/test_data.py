@@ -41,54 +41,9 @@ def test_a_failed_mission_keeps_its_bounds():
         Mission.from_arrays(PATH, z, y)
 
 
-@pytest.mark.parametrize("n_rows", [2, 1, 0])
-def test_a_mission_that_failed_needs_no_bounds_after_that(n_rows):
-    z, y = arrays(n_rows)
-    y[1:], duration = np.nan, np.ones(n_rows)
-    duration[1:] = np.nan
-    mission = Mission.from_arrays(PATH, z, y, duration, failed_at=1, status="stuck")
-    assert mission.status == mission.bounds[0].status == "stuck"
-    assert mission.path == tuple(PATH)
-    assert mission.contact_rate.shape == (1, 3)
-    assert np.isnan(mission.contact_rate).all() == (n_rows == 0)
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"failed_at": 3, "status": "stuck"},
-        {"failed_at": 0, "status": "stuck"},
-        {"failed_at": 1},
-        {"failed_at": 1, "status": "bored"},
-    ],
-)
-def test_a_failure_that_cannot_be_is_refused(options):
-    with pytest.raises(TrustboError):
-        Mission.from_arrays(PATH, *(values[:1] for values in arrays()), **options)
-
-
-@pytest.mark.parametrize("name", ["contact_rate", "duration", "n_ticks"])
-def test_measurements_after_the_failure_are_refused_not_cut(name):
-    z, y = arrays()
-    options = {"duration": np.ones(2), "n_ticks": np.full(2, np.nan)}
-    options |= {"contact_rate": y, name: np.ones(y.shape)}
-    for other in {*options} - {name}:
-        options[other] = options[other].copy()
-        options[other][1:] = np.nan
-    with pytest.raises(TrustboError, match=name):
-        Mission.from_arrays(PATH, z, failed_at=1, status="stuck", **options)
-
-
 def test_a_mission_without_durations_does_not_take_0_s():
     assert "takes         not measured" in repr(Mission.from_arrays(PATH, *arrays()))
     assert "takes         2 s" in repr(Mission.from_arrays(PATH, *arrays(), np.ones(2)))
-
-
-def test_bounds_before_the_failure_must_be_there():
-    z, y = arrays(1)
-    path = [*PATH, (0, 3)]
-    with pytest.raises(TrustboError, match="failed_at"):
-        Mission.from_arrays(path, z, y, failed_at=3, status="stuck")
 
 
 @pytest.mark.parametrize(("value", "shown"), [(1.5, "1.5"), (-0.1, "-0.1")])

@@ -111,5 +111,5 @@ def test_a_path_is_given_or_not():
         Mission((), (bound,))
     with pytest.raises(TrustboError, match="at least one"):
         Mission((), ())
-    failed = Mission.from_arrays(None, z, y, failed_at=2, status="stuck")
+    failed = Mission.from_arrays(None, z, y, status="stuck")
     assert failed.status == failed.bounds[-1].status == "stuck"

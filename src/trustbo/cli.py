@@ -4,6 +4,7 @@ Only the command that runs imports what it needs, so that `--help` takes a tenth
 """
 
 import argparse
+import importlib.metadata
 import io
 import sys
 import warnings
@@ -56,12 +57,6 @@ def _exit(message: str, code: int) -> NoReturn:
     sys.exit(code)
 
 
-def _show_version() -> None:
-    import trustbo as tb
-
-    print(f"trustbo {tb.__version__}")
-
-
 def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
     print(f"warning: {message}", file=sys.stderr)
 
@@ -74,7 +69,12 @@ def parser() -> argparse.ArgumentParser:
         epilog=EPILOG,
     )
     top.add_argument("--version", action="store_true", help="print the version and exit")
-    top.set_defaults(run=lambda args: _show_version() if args.version else top.print_help())
+    version = importlib.metadata.version
+    top.set_defaults(
+        run=lambda args: (
+            print(f"trustbo {version('trustbo')}") if args.version else top.print_help()
+        )
+    )
     commands = top.add_subparsers(metavar="COMMAND")
 
     def command(run: Callable[..., None], text: str, example: str) -> Any:
@@ -173,17 +173,16 @@ def demo(args: argparse.Namespace) -> None:
 
 def info(args: argparse.Namespace) -> None:
     """Print the workspace of a terrain and draw its cells."""
-    import matplotlib as mpl
+    import matplotlib.pyplot as plt
 
     import trustbo as tb
 
     terrain = tb.terrain.read_terrain(args.dem, args.dsm, resolution=args.resolution)
     workspace = tb.Workspace.from_terrain(terrain, args.shape)
     print(workspace)
-    mpl.use("agg")
-    figure = tb.plots.grid_map(workspace).get_figure(root=True)
-    assert figure is not None  # noqa: S101
-    figure.savefig(args.out, dpi=150)
+    plt.switch_backend("agg")
+    tb.plots.grid_map(workspace)
+    plt.savefig(args.out, dpi=150)
     print(f"the grid, with the names of its cells, is drawn in {args.out}")
 
 

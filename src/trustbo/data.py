@@ -211,14 +211,14 @@ class Mission(Summary):
         duration: ArrayLike | None = None,
         status: str = "ok",
         *,
-        failed_at: int | None = None,
         n_ticks: ArrayLike | None = None,
         features: Sequence[str] = (),
         robots: Sequence[str] = (),
     ) -> Self:
         """Make a mission from the arrays of a log.
 
-        A mission that ended early is `from_arrays(path, z, y, status="stuck")`.
+        A mission that ended early has fewer bounds than planned, and its status:
+        `from_arrays(path, z, y, status="stuck")`. A bound that was not measured is a row of NaN.
 
         Args:
             path: Planned cells, start first; None for a log without a map, whose missions have
@@ -227,9 +227,6 @@ class Mission(Summary):
             contact_rate: Shape (bound, robot), in [0, 1].
             duration: Shape (bound, robot) or (bound,), s; None where not recorded.
             status: Outcome of the mission.
-            failed_at: Number of the bound, from 1, that ended the mission; by default the last of
-                the arrays. Nothing may be measured after it; where the arrays end before it,
-                nothing was measured of it.
             n_ticks: Number of ticks, shape (bound, robot) or (bound,), of which `contact_rate` is
                 the share with contact; None where not recorded.
             features: Names of the features; by default traversability, visibility, z3, ...; a
@@ -237,20 +234,14 @@ class Mission(Summary):
             robots: Names of the robots; by default r1, r2, ...
 
         Raises:
-            TrustboError: Axes that do not fit together; a value outside [0, 1]; an unknown status;
-                or `failed_at` beyond the path, more than a bound after the arrays, before
-                measurements, or of a mission with status "ok".
+            TrustboError: Axes that do not fit together, a value outside [0, 1], or an unknown
+                status.
         """
         labels = {"robot": robots, "feature": features}
         z = _labelled("awareness", awareness, ("bound", "robot", "feature"), **labels)
         y = _labelled("contact_rate", contact_rate, ("bound", "robot"), robot=robots)
         given = {"awareness": z, "contact_rate": y, "duration": duration, "n_ticks": n_ticks}
         arrays = {n: as_array(n, np.nan if v is None else v) for n, v in given.items()}
-        if failed_at is not None:
-            if status == "ok":
-                raise TrustboError(f'failed_at = {failed_at} needs a status, such as "stuck".')
-            last = require_whole("failed_at", failed_at, 1)
-            arrays = {name: _until(last, name, values) for name, values in arrays.items()}
         z, y, seconds, ticks = arrays.values()
         if z.ndim != 3 or y.shape != z.shape[:2]:
             raise TrustboError(
@@ -411,26 +402,6 @@ def _labelled(what: str, values: Any, dims: Sequence[str], **names: Sequence[str
         if there and given:
             values = values.isel({dim: [there.index(name) for name in given]})
     return values.transpose(*dims)
-
-
-def _until(last: int, what: str, values: np.ndarray) -> np.ndarray:
-    """Rows of the first `last` bounds; NaN for the last one where the arrays end before it.
-
-    TrustboError: bounds before it are missing, or something was measured after it.
-    """
-    if not values.ndim:
-        return values
-    if len(values) < last - 1:
-        raise TrustboError(
-            f"failed_at = {last}, but {what} has {len(values)} bounds; give all before it."
-        )
-    if what != "awareness" and np.isfinite(values[last:]).any():
-        raise TrustboError(
-            f"failed_at = {last}, but {what} has values of later bounds too; leave them out or "
-            "NaN, or give the bound that really failed."
-        )
-    rest = np.full((max(last - len(values), 0), *values.shape[1:]), np.nan)
-    return np.concatenate([values[:last], rest])
 
 
 def _per_robot(what: str, values: np.ndarray, rates: np.ndarray) -> np.ndarray:

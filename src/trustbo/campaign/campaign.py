@@ -48,7 +48,7 @@ from trustbo.models.params import Params
 from trustbo.models.record import model_from_record, model_to_record
 from trustbo.planning import InfeasibleError, Plan, Planner
 from trustbo.planning.policies import Policy, resolve_policy
-from trustbo.simulation import Truth
+from trustbo.simulation import KinematicSimulator, Truth
 from trustbo.simulation.protocol import Simulator
 from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Location
@@ -156,13 +156,13 @@ class Campaign(Summary):
             "model_record": model_to_record(model),
         }
         self.state = State(json.loads(to_json(settings)))  # as a file returns them
-        self._asked_at = (0.0, 0.0)  # seconds that planning took, and the time when it was done
+        self._seconds_plan = 0.0
         self._warned_of_risk = False
         self.progress = True
         self.storage: Storage | None = None
         self._renew()
         if directory is not None:
-            self.keep_in(directory, overwrite=overwrite)
+            self._keep_in(directory, overwrite)
 
     def _renew(self) -> None:
         """Forget what was computed from the missions and failures, which have changed."""
@@ -219,8 +219,7 @@ class Campaign(Summary):
     def _accept(self, plan: Plan, started: float) -> Plan:
         """Store a plan, with bands over the posterior, as the next one to run."""
         given = self.planner.evaluate(plan.path, self.belief)
-        now = time.perf_counter()
-        self._asked_at = now - started, now
+        self._seconds_plan = time.perf_counter() - started
         self._warn_of_risk(plan, given)
         self.state.asked = accepted = plan.with_draws(given)
         self._write()
@@ -281,7 +280,7 @@ class Campaign(Summary):
         state, plan, seed = self.state, self.ask(), self.state.seed_of("fit")
         learned, row = as_learned(mission, self.workspace), state.row_of(plan, mission, extra)
         started = time.perf_counter()
-        row |= {"seconds_plan": self._asked_at[0], "seconds_run": started - self._asked_at[1]}
+        row["seconds_plan"] = self._seconds_plan
         entry = Entry(plan, mission, learned, self.trust_map, row, state.last)
         state.entries.append(entry)
         self._renew()
@@ -414,7 +413,21 @@ class Campaign(Summary):
         Raises:
             TrustboError: Bad input, before any work starts.
         """
-        return run_missions(self, simulator, n_iterations, truth, stop, progress)
+        require_whole("n_iterations", n_iterations, 1)
+        runner = KinematicSimulator(self.workspace) if simulator is None else simulator
+        if isinstance(runner, type) or not callable(getattr(runner, "run", None)):
+            raise TrustboError(
+                f"simulator must have run(path, *, seed, mission) -> Mission; got {runner!r}."
+            )
+        if truth is not None:
+            require_kind("truth", truth, Truth, "give Truth.of(simulator)")
+        rules: list[Any] = [] if stop is None else [stop] if callable(stop) else list(stop)
+        for rule in rules:
+            if not callable(rule):
+                raise TrustboError(f"stop must be stop(campaign) -> reason or None; got {rule!r}.")
+        describe = getattr(runner, "describe", lambda: {"simulator": type(runner).__name__})
+        self.state.simulation = json.loads(to_json({**describe(), "n_iterations": n_iterations}))
+        return run_missions(self, runner, n_iterations, truth, rules, progress)
 
     # --- what is known ---
 
@@ -473,16 +486,10 @@ class Campaign(Summary):
 
     # --- the folder ---
 
-    def keep_in(self, directory: FilePath, *, overwrite: bool = False) -> None:
-        """Write everything to a folder, and update it after each mission from now on.
-
-        Args:
-            directory: Folder, see `Campaign`.
-            overwrite: Whether to remove another campaign from it first.
-        """
+    def _keep_in(self, directory: FilePath, overwrite: bool) -> None:
+        """Write everything to a folder, and update it after each mission from now on."""
         storage = Storage(directory, overwrite=overwrite)
         storage.begin(self.workspace, self.state)
-        self.__exit__()
         self.storage = storage
 
     @classmethod

@@ -72,8 +72,8 @@ class Follower:
         if cell is None and not planned:
             raise TrustboError(f"no cell is planned after {here}; give the cell of the bound.")
         cell = planned[0] if cell is None else require_pair("cell", cell)
-        known = known_along((here, cell), self._campaign.workspace)
-        self._filter.begin_bound(known[0], (here, cell))
+        (known,) = known_along((here, cell), self._campaign.workspace)
+        self._filter.begin_bound(known, (here, cell))
         if planned != (cell,):
             self.path = (*self.path[: len(self.bounds) + 1], cell)
         self._started = self._started if self.bounds else t

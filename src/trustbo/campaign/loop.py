@@ -68,7 +68,7 @@ def iterate(
     steps = campaign.run(simulator, n_iterations, truth=truth, stop=stop, progress=progress)
     with campaign:
         if directory is not None:  # now that all input is checked
-            campaign.keep_in(directory, overwrite=overwrite)
+            campaign._keep_in(directory, overwrite)
         for _ in steps:
             pass
         return campaign.result()

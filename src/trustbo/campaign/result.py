@@ -183,7 +183,7 @@ class Result(Summary):
         and the `trust_map` it was planned on; the mean `contact_rate` of the mission, the
         `contact_lost` in bounds (those not run lose all), its `status`, its `state` with the
         `reason` (`"told"`: to be learned from later; `"learned"`; `"excluded"`), diagnostics of the
-        posterior (see `inference.diagnostics`), and the seconds of planning, running and fitting.
+        posterior (see `inference.diagnostics`), and the seconds of planning and fitting.
         """
         return self.state.history()
 

@@ -1,6 +1,5 @@
 """Missions of a campaign, run by a simulator."""
 
-import json
 import logging
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
@@ -9,10 +8,8 @@ from trustbo.campaign.state import LEARNED
 from trustbo.campaign.stopping import Stop
 from trustbo.data import Mission
 from trustbo.display import compiling, progress_bar
-from trustbo.errors import TrustboError, require_kind, require_whole
-from trustbo.files import to_json
 from trustbo.planning import Plan
-from trustbo.simulation import KinematicSimulator, Truth
+from trustbo.simulation import Truth
 from trustbo.simulation.protocol import Simulator
 
 if TYPE_CHECKING:
@@ -23,39 +20,13 @@ _log = logging.getLogger(__name__)
 
 def run_missions(
     campaign: "Campaign",
-    simulator: Simulator | None,
+    simulator: Simulator,
     n_iterations: int,
     truth: Truth | None,
-    stop: Stop | Sequence[Stop] | None,
+    rules: Sequence[Stop],
     progress: bool,
 ) -> Iterator[tuple[Plan, Mission]]:
-    """Check everything, then run the missions of a campaign, see `Campaign.run`."""
-    require_whole("n_iterations", n_iterations, 1)
-    runner: Any = KinematicSimulator(campaign.workspace) if simulator is None else simulator
-    if isinstance(runner, type) or not callable(getattr(runner, "run", None)):
-        raise TrustboError(
-            f"simulator must have run(path, *, seed, mission) -> Mission; got {runner!r}."
-        )
-    if truth is not None:
-        require_kind("truth", truth, Truth, "give Truth.of(simulator)")
-    rules: list[Stop] = [] if stop is None else [stop] if callable(stop) else list(stop)
-    for rule in rules:
-        if not callable(rule):
-            raise TrustboError(f"stop must be stop(campaign) -> reason or None; got {rule!r}.")
-    describe = getattr(runner, "describe", lambda: {"simulator": type(runner).__name__})
-    described = json.loads(to_json(describe()))  # as a file returns it
-    campaign.state.simulation = described | {"n_iterations": n_iterations}
-    return _run_missions(campaign, runner, n_iterations, truth, rules, progress)
-
-
-def _run_missions(
-    campaign: "Campaign",
-    runner: Any,
-    n_iterations: int,
-    truth: Truth | None,
-    rules: list[Stop],
-    progress: bool,
-) -> Iterator[tuple[Plan, Mission]]:
+    """Run the missions of a campaign, see `Campaign.run`, which checks the arguments."""
     state, shown = campaign.state, campaign.progress
     state.stop_reason, campaign.progress = "interrupted", progress
     bar = progress_bar(progress, total=n_iterations, initial=len(state.entries), desc="missions")
@@ -64,7 +35,7 @@ def _run_missions(
             # The rules are asked before each mission: they may hold already when one continues.
             while not (reason := _reason_to_end(campaign, n_iterations, rules)):
                 n, plan = len(state.entries), campaign.ask()
-                mission = runner.run(plan.path, seed=state.seed_of("mission"), mission=n)
+                mission = simulator.run(plan.path, seed=state.seed_of("mission"), mission=n)
                 extra = {}
                 if truth is not None:
                     longest = campaign.planner.max_bounds

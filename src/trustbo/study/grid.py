@@ -124,7 +124,7 @@ def _run(
             where = scene()
             rows = [
                 labels | dict(where.labels) | row
-                for row in _rows(case, where, labels["seed"], n_missions)  # pyright: ignore[reportArgumentType]
+                for row in _rows(case, where, names[2], n_missions)
             ]
         write_file(file, lambda path: pd.DataFrame(rows).to_csv(path, index=False))
     except Exception as error:  # of one run, which does not stop the others
@@ -149,11 +149,8 @@ def _rows(case: Case, scene: Scene, seed: int, n_missions: int) -> Iterator[dict
                 policy.learn(campaign, mission)  # pyright: ignore[reportFunctionMemberAccess]
             row = {"mission": number, **_recommended(campaign, scene, number)}
             row |= {"status": mission.status, "contact_rate": mission.contact_rate.mean()}
-            yield (
-                row
-                | _driven(mission.path, scene, number - 1)
-                | {"seconds": time.process_time() - began}
-            )
+            row |= _driven(mission.path, scene, number - 1)
+            yield row | {"seconds": time.process_time() - began}
             began = time.process_time()
 
 
