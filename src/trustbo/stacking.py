@@ -54,16 +54,12 @@ def stack_missions(missions: Sequence[Mission], *, pad: bool = True) -> MissionB
 
 
 def require_same_team(missions: Sequence[Mission]) -> None:
-    """Check that there are missions, all with the same robots and features: TrustboError if not."""
-    if isinstance(missions, Mission):
-        raise TrustboError("missions must be a list of missions; got one. Write [mission].")
-    if not isinstance(missions, Sequence):
-        remedy = " Give its .missions." if hasattr(missions, "missions") else ""
+    """Check that there are missions, all of the same robots and features: TrustboError if not."""
+    if not isinstance(missions, Sequence) or not missions:
         raise TrustboError(
-            f"missions must be a list of missions; got a {type(missions).__name__}.{remedy}"
+            f"missions must be a list of at least one mission; got {one_line(missions)}. Write "
+            "[mission] for one, and .missions of a result or campaign."
         )
-    if not missions:
-        raise TrustboError("there are no missions; give at least one.")
     first = missions[0]
     for j, mission in enumerate(missions):
         if not isinstance(mission, Mission):
