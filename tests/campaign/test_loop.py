@@ -147,7 +147,7 @@ def test_regret_bound_stops_when_the_path_is_nearly_the_best(workspace):
 
 @pytest.mark.parametrize("fails", [True, False])
 def test_regret_bound_waits_until_every_bound_was_completed(workspace, fails):
-    rule = tb.RegretBound(eps=0.9, delta=0.5, patience=2, min_missions=2)
+    rule = tb.RegretBound(eps=0.9, delta=0.5, patience=2)
     campaign = tb.Campaign(workspace, *ENDS, sampler="importance")
     for seed in range(2):
         other = ((3, 0), (2, 1), (1, 2), (0, 2), (0, 3))
@@ -237,7 +237,7 @@ def test_interrupted_campaign_resumes_with_the_same_simulator(workspace, tmp_pat
 
 def test_campaign_that_a_rule_has_ended_resumes_only_on_request(workspace, tmp_path):
     options = {"simulator": ModelSimulator(workspace, blind=True), "progress": False}
-    rule = tb.RegretBound(eps=0.9, delta=0.9, min_missions=2, patience=1)
+    rule = tb.RegretBound(eps=0.9, delta=0.9, patience=1)
     ended = run(
         workspace, objective="mean", n_iterations=5, stop=rule, directory=tmp_path, **options
     )

@@ -56,7 +56,7 @@ class Result(Summary):
         """Collect the state of a campaign; `base` is its planner before anything is learned."""
         self.workspace, self.state, self.model = workspace, state, model
         self._base = base_planner(workspace, state.settings) if base is None else base
-        self._maps: dict[tuple[int, int], xr.Dataset] = {}  # by number of draws and seed
+        self._maps: dict[int, xr.Dataset] = {}  # by number of draws
 
     def copy(self) -> Self:
         """Result that later missions leave unchanged."""
@@ -198,13 +198,12 @@ class Result(Summary):
         """
         return self.state.table()
 
-    def maps(self, *, n_draws: int | None = None, seed: int = 0) -> xr.Dataset:
+    def maps(self, *, n_draws: int | None = None) -> xr.Dataset:
         """Compute every map of the planning cells after the last mission, for GIS and figures.
 
         Args:
             n_draws: Number of draws of the posterior; by default 1000, or 100 for robots that
                 influence each other, of which each cell needs a separate search.
-            seed: Seed of the choice of draws.
 
         Returns:
             Dataset over (y, x), the centres of the cells' rows and columns in CRS metres, so that
@@ -218,14 +217,14 @@ class Result(Summary):
         """
         if n_draws is None:
             n_draws = 1000 if self.planner.dynamics(self.belief.mean()).is_scalar else 100
-        if (n_draws, seed) not in self._maps:
-            self._maps[n_draws, seed] = self._compute_maps(n_draws, seed)
-        return self._maps[n_draws, seed].copy(deep=True)  # the caller may write into it
+        if n_draws not in self._maps:
+            self._maps[n_draws] = self._compute_maps(n_draws)
+        return self._maps[n_draws].copy(deep=True)  # the caller may write into it
 
-    def _compute_maps(self, n_draws: int, seed: int) -> xr.Dataset:
-        summary = self.planner.trust_summary(self.posterior, n_draws=n_draws, seed=seed)
+    def _compute_maps(self, n_draws: int) -> xr.Dataset:
+        summary = self.planner.trust_summary(self.posterior, n_draws=n_draws)
         maps = summary.rename(mean="trust_mean", sd="trust_sd")
-        share = self.planner.path_posterior(self.posterior, n_draws=n_draws, seed=seed)
+        share = self.planner.path_posterior(self.posterior, n_draws=n_draws)
         awareness, places = self.workspace.awareness, self._places()
         taken = {*maps.variables, *maps.dims, "path_probability", "x", "y", "spatial_ref", *places}
         for name in self.workspace.features:

@@ -31,8 +31,7 @@ class RegretBound:
     Attributes:
         eps: Regret that is good enough, as a share; .05 is 5 %.
         delta: Probability of a larger regret.
-        patience: Number of missions in a row after which it has to hold.
-        min_missions: Least number of missions.
+        patience: Number of missions in a row after which it has to hold; one more is needed.
         n_draws: Number of draws to plan under.
 
     Raises:
@@ -42,7 +41,6 @@ class RegretBound:
     eps: float = 0.05
     delta: float = 0.1
     patience: int = 2
-    min_missions: int = 3
     n_draws: int = 500
 
     def __post_init__(self) -> None:
@@ -51,13 +49,13 @@ class RegretBound:
                 raise TrustboError(
                     f"RegretBound.{name} must be in (0, 1); got {getattr(self, name)!r}."
                 )
-        for name in ("patience", "min_missions", "n_draws"):
+        for name in ("patience", "n_draws"):
             require_whole(f"RegretBound.{name}", getattr(self, name), 1)
 
     def __call__(self, campaign: "Campaign") -> str | None:
         """Reason to stop, or None."""
         n = len(campaign.state.entries)
-        if n < max(self.min_missions, self.patience):
+        if n <= self.patience:
             return None
         sure = [self.probability(campaign, n - i) for i in range(self.patience)]
         if min(sure) < 1.0 - self.delta:
