@@ -14,11 +14,8 @@ from numpy.typing import ArrayLike
 from trustbo.display import Rows, Summary, joined, number
 from trustbo.errors import (
     TrustboError,
-    as_array,
-    as_names,
     require_cells,
     require_choice,
-    require_unit_interval,
     require_whole,
 )
 
@@ -381,6 +378,36 @@ def require_shares(rate: np.ndarray, ticks: np.ndarray) -> None:
         raise TrustboError(
             f"contact_rate[{i}] = {rate[i]:g} is no share of {ticks[i]:g} ticks (n_ticks)."
         )
+
+
+def as_array(what: str, values: ArrayLike) -> np.ndarray:
+    """Return an array of floats; TrustboError if these are no numbers."""
+    try:
+        return np.asarray(values, dtype=float)
+    except (TypeError, ValueError):
+        raise TrustboError(f"{what} must be an array of numbers; got {values!r:.60}.") from None
+
+
+def as_names(what: str, given: Iterable[str]) -> tuple[str, ...]:
+    """Names as a tuple; TrustboError where one is no text, or repeated."""
+    listed = isinstance(given, Iterable) and not isinstance(given, str)
+    names = tuple(given) if listed else ()
+    if not listed or not all(isinstance(name, str) for name in names):
+        raise TrustboError(f"{what} must be a list of names; got {given!r:.60}.")
+    if len(set(names)) < len(names):
+        raise TrustboError(f"{what} must be distinct names; got {names}.")
+    return names
+
+
+def require_unit_interval(what: str, values: np.ndarray) -> None:
+    """Refuse values outside [0, 1], except NaN: TrustboError."""
+    bad = (values < 0.0) | (values > 1.0)
+    if bad.any():
+        index = ", ".join(str(i) for i in np.argwhere(bad)[0])
+        is_rating = np.nanmax(values) <= 10.0
+        rating = "; rating from 1 to n? (rating - 1) / (n - 1)" if is_rating else ""
+        hint = f" (percent? divide by 100{rating})" if np.nanmin(values) >= 0.0 else ""
+        raise TrustboError(f"{what}: [{index}] = {values[bad][0]:g} is outside [0, 1]{hint}.")
 
 
 def _labelled(what: str, values: Any, dims: Sequence[str], **names: Sequence[str]) -> Any:

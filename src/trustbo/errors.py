@@ -5,9 +5,6 @@ import operator
 from collections.abc import Iterable
 from typing import Any
 
-import numpy as np
-from numpy.typing import ArrayLike
-
 
 class TrustboError(ValueError):
     """Input that trustbo refuses; the message names the value and the remedy."""
@@ -93,33 +90,3 @@ def require_pair(what: str, value: object) -> tuple[int, int]:
     except (TypeError, ValueError):
         raise TrustboError(f"{what} must be two whole numbers (row, col); got {value!r}.") from None
     return first, second
-
-
-def as_array(what: str, values: ArrayLike) -> np.ndarray:
-    """Return an array of floats; TrustboError if these are no numbers."""
-    try:
-        return np.asarray(values, dtype=float)
-    except (TypeError, ValueError):
-        raise TrustboError(f"{what} must be an array of numbers; got {values!r:.60}.") from None
-
-
-def as_names(what: str, given: Iterable[str]) -> tuple[str, ...]:
-    """Names as a tuple; TrustboError where one is no text, or repeated."""
-    listed = isinstance(given, Iterable) and not isinstance(given, str)
-    names = tuple(given) if listed else ()
-    if not listed or not all(isinstance(name, str) for name in names):
-        raise TrustboError(f"{what} must be a list of names; got {given!r:.60}.")
-    if len(set(names)) < len(names):
-        raise TrustboError(f"{what} must be distinct names; got {names}.")
-    return names
-
-
-def require_unit_interval(what: str, values: np.ndarray) -> None:
-    """Refuse values outside [0, 1], except NaN: TrustboError."""
-    bad = (values < 0.0) | (values > 1.0)
-    if bad.any():
-        index = ", ".join(str(i) for i in np.argwhere(bad)[0])
-        is_rating = np.nanmax(values) <= 10.0
-        rating = "; rating from 1 to n? (rating - 1) / (n - 1)" if is_rating else ""
-        hint = f" (percent? divide by 100{rating})" if np.nanmin(values) >= 0.0 else ""
-        raise TrustboError(f"{what}: [{index}] = {values[bad][0]:g} is outside [0, 1]{hint}.")

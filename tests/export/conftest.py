@@ -28,4 +28,6 @@ def nowhere(result):
     """The same without a terrain."""
     workspace, grid = result.workspace, dataclasses.replace(result.workspace.grid, crs=None)
     bare = dataclasses.replace(workspace, terrain=None, pixels=None, posts=None, grid=grid)
-    return dataclasses.replace(result, workspace=bare)
+    unplaced = result.copy()
+    unplaced.workspace = bare
+    return unplaced

@@ -8,8 +8,8 @@ from numpy.typing import ArrayLike
 
 from trustbo.campaign.campaign import Campaign
 from trustbo.campaign.learning import known_along
-from trustbo.data import Bound, Cell, Mission
-from trustbo.errors import TrustboError, as_array, require_cells, require_pair
+from trustbo.data import Bound, Cell, Mission, as_array
+from trustbo.errors import TrustboError, require_cells, require_pair
 from trustbo.inference import TrustFilter, sample_prior
 from trustbo.inference.filter import TrustForecast, TrustState
 

@@ -7,15 +7,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from trustbo.data import Cell, require_shares
-from trustbo.errors import (
-    TrustboError,
-    as_array,
-    one_line,
-    require_pair,
-    require_unit_interval,
-    require_whole,
-)
+from trustbo.data import Cell, as_array, require_shares, require_unit_interval
+from trustbo.errors import TrustboError, one_line, require_pair, require_whole
 from trustbo.inference.draws import of_no_map, params_of, require_posterior, sites_of
 from trustbo.inference.importance import systematic
 from trustbo.models.families import Family, family_of

@@ -7,8 +7,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from trustbo.data import NOWHERE, Bound, Cell, Mission
-from trustbo.errors import TrustboError, as_array, require_choice, require_positive
+from trustbo.data import NOWHERE, Bound, Cell, Mission, as_array
+from trustbo.errors import TrustboError, require_choice, require_positive
 from trustbo.logs.columns import Columns, require_one_spelling, seconds_of
 from trustbo.workspace import Workspace
 

@@ -10,8 +10,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from trustbo.data import is_line_of_sight
-from trustbo.errors import TrustboError, as_array, require_choice, require_kind
+from trustbo.data import as_array, is_line_of_sight
+from trustbo.errors import TrustboError, require_choice, require_kind
 from trustbo.team import Team
 from trustbo.terrain import FEATURES, CompositeIndex, pixel_size
 from trustbo.terrain.features import slope

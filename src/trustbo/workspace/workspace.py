@@ -15,12 +15,13 @@ from trustbo.data import (
     LINE_OF_SIGHT,
     Cell,
     Mission,
+    as_names,
     default_features,
     is_line_of_sight,
     require_map,
 )
 from trustbo.display import Rows, Summary, compiling
-from trustbo.errors import TrustboError, as_names, require_positive
+from trustbo.errors import TrustboError, require_positive
 from trustbo.stacking import fill_awareness
 from trustbo.team import Team
 from trustbo.terrain.composite import CompositeIndex
