@@ -36,7 +36,7 @@ def planner(workspace):
 
 def every_path(planner):
     """All walks without U-turns from start to goal, by depth first."""
-    steps, walks = MOVES[8], []
+    steps, walks = MOVES, []
     free = planner.workspace.passable_bounds.values
 
     def extend(walk):
@@ -46,7 +46,7 @@ def every_path(planner):
             for step in steps:
                 cell = (walk[-1][0] + step[0], walk[-1][1] + step[1])
                 inside = all(0 <= i < n for i, n in zip(cell, free.shape[1:], strict=True))
-                if inside and cell not in walk[-2:-1] and free[(MOVES[8].index(step), *cell)]:
+                if inside and cell not in walk[-2:-1] and free[(MOVES.index(step), *cell)]:
                     extend([*walk, cell])
 
     extend([planner.start])
@@ -146,7 +146,7 @@ def test_the_residual_process_is_the_closed_form_under_its_hyperparameters(plann
 
 
 def test_the_middle_of_a_bound_lies_between_its_cells_and_its_direction_has_length_1():
-    diagonal = MOVES[8].index((-1, 1))
+    diagonal = MOVES.index((-1, 1))
     place = residual_process.places(np.array([[diagonal, 2, 3]]))[0]
     np.testing.assert_allclose(place, [2.5, 2.5, -(0.5**0.5), 0.5**0.5])
 

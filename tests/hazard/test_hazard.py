@@ -316,7 +316,7 @@ def test_one_failure_on_steep_ground_teaches_all_that_is_as_steep(hilly):
     steepest = np.argsort(tilt.ravel())[::-1][:6]
     assert 0.8 < tilt.flat[steepest[-1]] < 1.05
     move, row, col = np.unravel_index(steepest, tilt.shape)
-    cells = [(row[0] - MOVES[8][move[0]][0], col[0] - MOVES[8][move[0]][1]), (row[0], col[0])]
+    cells = [(row[0] - MOVES[move[0]][0], col[0] - MOVES[move[0]][1]), (row[0], col[0])]
     path = [tuple(int(i) for i in cell) for cell in cells]
     prior, gone = prior_risk(hilly), fit_hazard([], hilly, lost=[LostMission(path, "tipped")])
     after = BoundRisk(gone, hilly)

@@ -52,7 +52,7 @@ def walks(workspace, start, goal, longest, *, u_turns):
         if path[-1] == goal:
             found.append(tuple(path))
         elif len(path) <= longest:
-            for down, right in MOVES[8]:
+            for down, right in MOVES:
                 r, c = path[-1][0] + down, path[-1][1] + right
                 inside = 0 <= r < passable.shape[0] and 0 <= c < passable.shape[1]
                 back = not u_turns and len(path) > 1 and (r, c) == path[-2]

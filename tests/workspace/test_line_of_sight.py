@@ -37,7 +37,7 @@ def cell_at(workspace, position):
 def bounds_of(workspace):
     """Bounds as (move, row, col), and as pairs of cells."""
     index = np.argwhere(existing_bounds(workspace.passable.values)).tolist()
-    pairs = [((r - MOVES[8][m][0], c - MOVES[8][m][1]), (r, c)) for m, r, c in index]
+    pairs = [((r - MOVES[m][0], c - MOVES[m][1]), (r, c)) for m, r, c in index]
     return index, pairs
 
 

@@ -47,7 +47,7 @@ def test_a_bound_is_passable_if_and_only_if_all_its_ways_exist():
     assert 0 < passable.sum() < exists.sum()
     posts = workspace.posts
     for m, row, col in np.argwhere(exists).tolist():
-        a = row - MOVES[8][m][0], col - MOVES[8][m][1]
+        a = row - MOVES[m][0], col - MOVES[m][1]
         ahead = [c for c in np.ndindex(3, 3) if max(abs(c[0] - row), abs(c[1] - col)) == 1]
         ways = [way for c in (None, *ahead) for way in posts.bound_routes(a, (row, col), c)]
         assert {way is not None for way in ways} == {bool(passable[m, row, col])}
@@ -56,7 +56,7 @@ def test_a_bound_is_passable_if_and_only_if_all_its_ways_exist():
 def test_a_bound_and_its_reverse_are_both_passable_or_neither():
     passable = walled(slice(6, 9)).passable_bounds.values
     for m, row, col in np.argwhere(passable).tolist():
-        assert passable[7 - m, row - MOVES[8][m][0], col - MOVES[8][m][1]]
+        assert passable[7 - m, row - MOVES[m][0], col - MOVES[m][1]]
 
 
 def test_without_a_terrain_every_bound_between_passable_cells_is_passable():

@@ -189,7 +189,7 @@ def _graph(result: Result, frame: Frame) -> str:
     """
     workspace = result.workspace
     cols, n_cells = workspace.grid.shape[1], math.prod(workspace.grid.shape)
-    if (1 + len(MOVES[8])) * n_cells - 1 > _MOST_IDS:
+    if (1 + len(MOVES)) * n_cells - 1 > _MOST_IDS:
         raise TrustboError(
             f"a route graph of {n_cells} cells has ids beyond {_MOST_IDS}, which messages of Nav2 "
             "hold; take larger cells."
@@ -203,7 +203,7 @@ def _graph(result: Result, frame: Frame) -> str:
         about = {"id": row * cols + col, "frame": frame.name, "metadata": {"row": row, "col": col}}
         features.append(_feature("Point", xy, about))
     for a, c, lost in graph.edges(data="lost"):
-        move = list(MOVES[8]).index((c[0] - a[0], c[1] - a[1]))
+        move = MOVES.index((c[0] - a[0], c[1] - a[1]))
         first, last = (row * cols + col for row, col in (a, c))
         cost = max(float(lost), _LEAST_COST)
         about = {"id": (1 + move) * n_cells + last, "startid": first, "endid": last, "cost": cost}

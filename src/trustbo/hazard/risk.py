@@ -169,7 +169,7 @@ class Risk:
     """Chance that a bound ends the mission, of all bounds of a workspace.
 
     Attributes:
-        p_fail: Posterior mean, shape (move, row, col) with the moves of `MOVES[8]`; NaN where there
+        p_fail: Posterior mean, shape (move, row, col) with the moves of `MOVES`; NaN where there
             is no bound.
         draws: Draws from its posterior, shape (draw, move, row, col), or None.
         strata: Chances under groups of draws, by which a failure is priced; None: by `p_fail`, as

@@ -91,7 +91,7 @@ class ParameterDraws(Summary):
         """Effect of each bound, that of the cell entered included; shape (..., bound, effect).
 
         Args:
-            bounds: Move, row and column of each bound (bound, 3), moves as in `MOVES[8]`; the
+            bounds: Move, row and column of each bound (bound, 3), moves as in `MOVES`; the
                 effect is 0 where the move is negative.
         """
         moves, rows, cols = np.asarray(bounds).T
@@ -170,7 +170,7 @@ class TrustParams(ParameterDraws, _Trust):
         place: Effect of each cell entered, (..., effect, row, col), or None. The axis effect is of
             robots, or of length 1 where all share them.
         place_bound: Effect of each bound, (..., effect, move, row, col), moves as in
-            `workspace.MOVES[8]`, or None.
+            `workspace.MOVES`, or None.
         memory: What lasts between bounds, `"level"` or `"deviation"`, see `PooledTrust`.
     """
 

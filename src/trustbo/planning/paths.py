@@ -17,7 +17,7 @@ from trustbo.workspace.moves import MOVES, moves_along, require_on_grid
 
 SIMPLE_EXTRA = 2
 """Bounds beyond the fewest possible up to which a path without U-turns enters no cell twice."""
-STEPS = np.array(MOVES[8])
+STEPS = np.array(MOVES)
 _SHORTEST = re.compile(r"shortest(?:\+(\d+))?")
 _MOST_STATES = 20_000_000
 """Most states of the unrolled graph, whose arrays take some 3 GB."""

@@ -66,7 +66,7 @@ class Planner(Summary):
                 4 for lost_contact); paths are simple for n up to 2, and `Plan.revisits` counts
                 cells entered again for larger n. An int: walks of at most that many bounds.
             toll: Cost of each bound apart from trust, such as its length or the time that it takes,
-                (move, row, col) with the moves of `workspace.moves.MOVES[8]`, or an array that
+                (move, row, col) with the moves of `workspace.moves.MOVES`, or an array that
                 broadcasts to it; in bounds for lost_contact, else in units of trust.
             max_failure: Largest chance that a path fails, in [0, 1), under the risk of `with_risk`;
                 by default no limit.
@@ -312,7 +312,7 @@ class Planner(Summary):
         for row, col in np.argwhere(problem.paths.passable).tolist():
             graph.add_node((row, col), x=float(grid.x[col]), y=float(grid.y[row]))
         for k, (move, row, col) in enumerate(np.argwhere(bounds).tolist()):
-            left = row - MOVES[8][move][0], col - MOVES[8][move][1]
+            left = row - MOVES[move][0], col - MOVES[move][1]
             graph.add_edge(left, (row, col), **{name: float(v[k]) for name, v in values.items()})
         return graph
 

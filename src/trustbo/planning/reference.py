@@ -77,7 +77,7 @@ def every_path(paths: AdmissiblePaths) -> Iterator[tuple[Cell, ...]]:
     """All admissible paths, written out: for small grids."""
     onward: dict[Cell, list[Cell]] = {}
     for move, row, col in np.argwhere(paths.bounds).tolist():
-        down, right = MOVES[8][move]
+        down, right = MOVES[move]
         onward.setdefault((row - down, col - right), []).append((row, col))
     stack: list[tuple[Cell, ...]] = [(paths.start,)]
     while stack:

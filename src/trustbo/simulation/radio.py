@@ -63,7 +63,7 @@ class RadioSimulator(DescribedSimulator):
 
     def expected_contact(self) -> xr.Dataset:
         """Return the expected contact of every bound in closed form, see `Truth.bounds`."""
-        contact = np.repeat(expected_rate(self.mean).mean(0)[..., None], len(MOVES[8]) + 1, -1)
+        contact = np.repeat(expected_rate(self.mean).mean(0)[..., None], len(MOVES) + 1, -1)
         contact = np.where(self.workspace.passable_bounds.values[..., None], contact, np.nan)
         return table_of(contact, np.where(np.isfinite(contact), 1.0, np.nan))
 
@@ -101,7 +101,7 @@ def _mean_contact(workspace: Workspace, terrain: xr.Dataset, seed: int) -> np.nd
     radios = 0.25 * rng.standard_normal(workspace.team.n_robots)
 
     b = np.stack(np.indices(grid.shape), -1)  # (row, col, axis), in cells  # pyright: ignore[reportArgumentType, reportCallIssue]
-    a = b - np.array(MOVES[8])[:, None, None]  # (move, row, col, axis)
+    a = b - np.array(MOVES)[:, None, None]  # (move, row, col, axis)
     sides = np.array([grid.cell_height, grid.cell_width])
 
     def read(raster: np.ndarray, at: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ from trustbo.simulation.kinematic import KinematicSimulator, State
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import MOVE_NAMES, MOVES
 
-END = len(MOVES[8])
+END = len(MOVES)
 """Index of "no next move": the bound enters the goal."""
 _DIMS = ("move", "row", "col", "next_move")
 
@@ -25,7 +25,7 @@ class Edge(NamedTuple):
     left: Cell
     cell: Cell
     next_moves: tuple[int, ...]
-    """Indices of `MOVES[8]`, and `END`."""
+    """Indices of `MOVES`, and `END`."""
     ahead: tuple[Cell | None, ...]
     """Next cells; None if the path ends."""
 
@@ -46,8 +46,8 @@ def edges_of(workspace: Workspace) -> list[Edge]:
     around = np.pad(exists, ((0, 0), (1, 1), (1, 1)))
     edges = []
     for move, row, col in np.argwhere(exists).tolist():
-        down, right = MOVES[8][move]
-        to = [(row + i, col + j) for i, j in MOVES[8]]
+        down, right = MOVES[move]
+        to = [(row + i, col + j) for i, j in MOVES]
         nexts = [n for n, (i, j) in enumerate(to) if around[n, i + 1, j + 1]]
         ahead = *(to[n] for n in nexts), None
         edges.append(Edge(move, (row - down, col - right), (row, col), (*nexts, END), ahead))

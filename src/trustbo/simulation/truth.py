@@ -232,7 +232,7 @@ def _most_kept(
     n = int(np.argmin(np.arange(1, longest + 1) - np.array(most)))
     path, move = [start], first[n]
     for choice in [*choices[:n][::-1], None]:
-        (row, col), (down, right) = path[-1], MOVES[8][move]
+        (row, col), (down, right) = path[-1], MOVES[move]
         path.append((row + down, col + right))
         move = move if choice is None else int(choice[move, *path[-1]])
     return tuple(path)
@@ -240,6 +240,6 @@ def _most_kept(
 
 def _by_cell_left(values: np.ndarray, move: int) -> np.ndarray:
     """Values of the cells that a move enters, (row, col), by the cell that it leaves."""
-    (down, right), (rows, cols) = MOVES[8][move], values.shape
+    (down, right), (rows, cols) = MOVES[move], values.shape
     framed = np.pad(values, 1, constant_values=-np.inf)
     return framed[1 + down :, 1 + right :][:rows, :cols]

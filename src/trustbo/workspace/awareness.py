@@ -177,7 +177,7 @@ def of_arrays(awareness: ArrayLike, passable: ArrayLike | None) -> tuple[np.ndar
     two.
     """
     z = as_array("awareness", awareness)
-    if z.ndim not in (4, 5) or (z.ndim == 5 and z.shape[1] != len(MOVES[8])):
+    if z.ndim not in (4, 5) or (z.ndim == 5 and z.shape[1] != len(MOVES)):
         raise TrustboError(f"awareness must be {_AXES}; got shape {z.shape}.")
     if not z.size:
         raise TrustboError(
@@ -202,7 +202,7 @@ def of_arrays(awareness: ArrayLike, passable: ArrayLike | None) -> tuple[np.ndar
     exists = existing_bounds(free)
     if (missing := exists & ~finite).any():
         m, row, col = (int(i) for i in np.argwhere(missing)[0])
-        down, right = MOVES[8][m]
+        down, right = MOVES[m]
         raise TrustboError(
             f"awareness of the bound {(row - down, col - right)} -> {(row, col)} is NaN; fill it, "
             "or mark one of the cells impassable."

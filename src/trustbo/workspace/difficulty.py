@@ -69,7 +69,7 @@ def _measure(workspace: Workspace, posts: Posts, exists: np.ndarray, out: np.nda
 
     def work(block: Sequence[list[int]]) -> None:
         for m, row, col in block:
-            (down, right), cell = MOVES[8][m], (row, col)
+            (down, right), cell = MOVES[m], (row, col)
             left, ahead = (row - down, col - right), (row + down, col + right)
             inside = 0 <= ahead[0] < exists.shape[1] and 0 <= ahead[1] < exists.shape[2]
             onward = ahead if inside and exists[m, *ahead] else None

@@ -77,7 +77,7 @@ def bound_maps(
 
 def geometry(posts: Posts, index: np.ndarray, passable: np.ndarray) -> Geometry:
     """Collect bounds (bound, (move, row, col)) between cells that are `passable`, (row, col)."""
-    left = (index[:, 1:] - np.array(MOVES[8])[index[:, 0]]).tolist()
+    left = (index[:, 1:] - np.array(MOVES)[index[:, 0]]).tolist()
     bounds = [
         ((i, j), (row, col)) for (i, j), (_, row, col) in zip(left, index.tolist(), strict=True)
     ]
@@ -98,7 +98,7 @@ def _cells_ahead(passable: np.ndarray, a: Cell, c: Cell) -> list[Cell | None]:
     (rows, cols), (down, right) = passable.shape, (c[0] - a[0], c[1] - a[1])
     onward: list[Cell | None] = []
     ahead: list[Cell | None] = []
-    for i, j in MOVES[8]:
+    for i, j in MOVES:
         b = c[0] + i, c[1] + j
         if b != a and 0 <= b[0] < rows and 0 <= b[1] < cols and passable[b]:
             onward.append(b)

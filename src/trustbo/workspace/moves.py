@@ -1,27 +1,16 @@
-"""Moves between neighbouring cells: a bound is the cell it enters, and the move that enters it."""
+"""Moves between neighbouring cells. A bound is identified by its move and the cell it enters."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_pair
 
-Steps = tuple[tuple[int, int], ...]
-MOVES: Mapping[int, Steps] = {
-    4: ((-1, 0), (0, -1), (0, 1), (1, 0)),
-    8: ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)),
-}
-"""Moves to the neighbouring cells, by connectivity; the reverse of move m is the m-th from last."""
+MOVES = ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1))
+"""Steps (down, right) to the neighbouring cells; the reverse of move m is the m-th from last."""
 MOVE_NAMES = ("nw", "n", "ne", "w", "e", "sw", "s", "se")
-"""Labels of the moves of `MOVES[8]`; row 0 is in the north."""
-
-
-def require_connectivity(connectivity: int) -> int:
-    """Return the connectivity if it is 4 or 8, else raise TrustboError."""
-    if connectivity not in MOVES:
-        raise TrustboError(f"connectivity must be 4 or 8; got {connectivity!r}.")
-    return connectivity
+"""Labels of the moves of `MOVES`; row 0 is in the north."""
 
 
 def require_on_grid(path: Sequence[Cell] | np.ndarray, shape: tuple[int, ...]) -> list[Cell]:
@@ -41,7 +30,7 @@ def require_on_grid(path: Sequence[Cell] | np.ndarray, shape: tuple[int, ...]) -
 
 
 def moves_along(path: Sequence[Cell] | np.ndarray) -> np.ndarray:
-    """Indices in `MOVES[8]` of the bounds of a path, shape (bound,).
+    """Indices in `MOVES` of the bounds of a path, shape (bound,).
 
     TrustboError: two successive cells are no neighbours.
     """
@@ -67,7 +56,7 @@ def existing_bounds(passable: np.ndarray) -> np.ndarray:
     """
     rows, cols = passable.shape
     framed = np.pad(passable, 1)
-    left = [framed[1 - down :, 1 - right :][:rows, :cols] for down, right in MOVES[8]]
+    left = [framed[1 - down :, 1 - right :][:rows, :cols] for down, right in MOVES]
     return np.stack(left) & passable
 
 

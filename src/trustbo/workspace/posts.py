@@ -67,7 +67,7 @@ class Posts:
         """Prepare the rasters; `pixels` (y, x) has `passable`, and traversability if known."""
         self.grid, self.team, self.sight = grid, team, sight
         self.surface = surface_of(terrain, pixels["passable"].values.astype(bool))
-        self.routes = Routes(self.surface, clear=True)
+        self.routes = Routes(self.surface)
         easy = pixels[TRAVERSABLE if TRAVERSABLE in pixels else "passable"].values.astype(float)
         self._easy = np.nan_to_num(easy)
         for axis, side in enumerate(self.surface.pixel):
@@ -98,13 +98,13 @@ class Posts:
         T2's posts in a cell are linked to its stop within half a cell around, so that one test,
         of the stops of both cells, holds for all robots, either way and any next cell.
         """
-        linked, n_moves = np.zeros_like(exists), len(exists)
-        for m, (down, right) in enumerate(MOVES[8][: n_moves // 2]):
+        linked, last = np.zeros_like(exists), len(MOVES) - 1
+        for m, (down, right) in enumerate(MOVES[: len(MOVES) // 2]):  # others are their reverses
             for row, col in np.argwhere(exists[m]).tolist():
                 a, c = (row - down, col - right), (row, col)
                 region, (top, left) = self._linked_to(self.stop(a), a, c)
                 end = self.surface.pixel_at(*self.stop(c).tolist())
-                linked[m, *c] = linked[n_moves - 1 - m, *a] = region[end[0] - top, end[1] - left]
+                linked[m, *c] = linked[last - m, *a] = region[end[0] - top, end[1] - left]
         return linked
 
     def bound_routes(
@@ -243,7 +243,7 @@ class Posts:
     def _around(self, cell: Cell) -> list[Cell]:
         """Neighbours on the grid."""
         rows, cols = self.grid.shape
-        near = [(cell[0] + down, cell[1] + right) for down, right in MOVES[8]]
+        near = [(cell[0] + down, cell[1] + right) for down, right in MOVES]
         return [c for c in near if 0 <= c[0] < rows and 0 <= c[1] < cols]
 
     def _is_in_region(self, position: np.ndarray) -> bool:

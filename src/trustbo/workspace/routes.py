@@ -10,6 +10,7 @@ from scipy import ndimage
 
 from trustbo.parallel import plain
 from trustbo.team import Robot
+from trustbo.workspace.regions import Window
 from trustbo.workspace.surface import Surface
 
 SLOWEST = 0.1
@@ -20,35 +21,29 @@ _compiled = njit(cache=True, nogil=True, error_model="numpy")
 
 
 class Routes:
-    """Fastest routes over passable pixels, by A*, cached.
+    """Fastest routes over passable pixels, by A*; cached, and shared by robots of a slope limit."""
 
-    Robots with one slope limit share them, and missions over one path need few.
-    """
-
-    def __init__(self, surface: Surface, *, clear: bool = False) -> None:
-        """Prepare the slope, with which a robot's speed falls; `clear`: keep off obstacles."""
+    def __init__(self, surface: Surface) -> None:
+        """Prepare the slope, with which a robot's speed falls, and the pixels near obstacles."""
         self._surface = surface
         self._slope = np.arctan(np.hypot(*surface.gradient))
-        self._is_close = np.zeros(surface.passable.shape, dtype=bool)
-        if clear:
-            free: Any = ndimage.distance_transform_edt(surface.passable, sampling=surface.pixel)
-            self._is_close = free <= max(_CLEARANCE, *surface.pixel)
+        free: Any = ndimage.distance_transform_edt(surface.passable, sampling=surface.pixel)
+        self._is_close = free <= max(_CLEARANCE, *surface.pixel)
         self._paces: dict[float, np.ndarray] = {}
         self._cached: dict[tuple[object, ...], np.ndarray] = {}
 
     def find(
-        self, robot: Robot, start: np.ndarray, goal: np.ndarray, window: tuple[int, int, int, int]
+        self, robot: Robot, start: np.ndarray, goal: np.ndarray, window: Window
     ) -> np.ndarray | None:
         """Find the fastest route from start to goal, (x, y) in CRS metres; None if there is none.
 
-        It stays in the window of pixels (first row, end row, first col, end col). Returns
-        positions, shape (point, 2), CRS metres.
+        It stays in the window of pixels. Returns positions, shape (point, 2), CRS metres.
         """
         ends = [self._surface.pixel_at(*p.tolist()) for p in (start, goal)]
         low, high = sorted(ends)  # the way back is the same
         key = low, high, window, robot.max_slope
         if key not in self._cached:
-            self._cached[key] = self._search(low, high, window, robot.max_slope)
+            self._cached[key] = self._search(*key)
         cached = self._cached[key]
         if not len(cached):
             return None
@@ -59,11 +54,7 @@ class Routes:
         return route
 
     def _search(
-        self,
-        start: tuple[int, ...],
-        goal: tuple[int, ...],
-        window: tuple[int, int, int, int],
-        max_slope: float,
+        self, start: tuple[int, int], goal: tuple[int, int], window: Window, max_slope: float
     ) -> np.ndarray:
         """Positions of the pixels from start to goal; empty if there is no route."""
         surface = self._surface
@@ -72,14 +63,14 @@ class Routes:
             pace = np.where(self._is_close, _CLOSE * pace, pace)
             self._paces[max_slope] = np.where(surface.passable, pace, np.inf)
         top, bottom, left, right = window
-        cells = _a_star(
+        pixels = _a_star(
             plain(self._paces[max_slope][top:bottom, left:right]),
             surface.pixel,
             (start[0] - top, start[1] - left),
             (goal[0] - top, goal[1] - left),
         )
-        x = surface.origin[0] + (cells[:, 1] + left) * surface.pixel[1]
-        y = surface.origin[1] - (cells[:, 0] + top) * surface.pixel[0]
+        x = surface.origin[0] + (pixels[:, 1] + left) * surface.pixel[1]
+        y = surface.origin[1] - (pixels[:, 0] + top) * surface.pixel[0]
         return np.stack([x, y], axis=1)
 
 
