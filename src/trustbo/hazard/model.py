@@ -110,31 +110,22 @@ class HazardPoints(NamedTuple):
 
 def sample(prior: BoundPrior, exposures: Exposures, rng: np.random.Generator) -> HazardPoints:
     """Draw weighted points of the joint posterior of scores and places; check their k-hat."""
-    met, on_lost = exposures.n > 0.0, np.unique([e for path in exposures.lost for e in path])
-    n, failed = exposures.n[met], exposures.failed[met]
-    prior_met, prior_lost = prior.of(met), prior.of(on_lost.astype(int))
+    n, failed, paths = exposures.n, exposures.failed, exposures.lost
     counts, kind = np.unique(n, return_inverse=True)
-    times = np.bincount(kind, minlength=len(counts))
-    bad = failed > 0.0
-    paths = [np.searchsorted(on_lost, path) for path in exposures.lost]
+    times, bad = np.bincount(kind, minlength=len(counts)), failed > 0.0
 
-    def lost_betas(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Posterior Betas of the bounds of lost missions, without these missions."""
-        alpha, beta = prior_lost.betas(z)
-        index = on_lost.astype(int)
-        return alpha + exposures.failed[index], beta + (exposures.n - exposures.failed)[index]
-
-    def log_any_fails(z: np.ndarray) -> np.ndarray:
+    def log_any_fails(alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
         """Log probability that all lost missions fail if they are independent."""
-        a, b = lost_betas(z)
+        if not paths:
+            return np.zeros(len(alpha))
+        a, b = alpha + failed, beta + n - failed
         passed = np.log1p(-np.minimum(a / (a + b), 1.0 - 1e-12))
-        fail = [np.log(-np.expm1(passed[:, path].sum(1))) for path in paths]
-        return np.sum(fail, axis=0) if fail else np.zeros(len(z))
+        return np.sum([np.log(-np.expm1(passed[:, path].sum(1))) for path in paths], axis=0)
 
     def log_density(z: np.ndarray) -> np.ndarray:
-        alpha, beta = prior_met.betas(z)
+        alpha, beta = prior.betas(z)
         strength = prior.values(z)[2][:, None] + 2.0 * FLOOR
-        total = stats.norm.logpdf(z).sum(1) + log_any_fails(z)
+        total = stats.norm.logpdf(z).sum(1) + log_any_fails(alpha, beta)
         total += _log_rising(beta, n - failed).sum(1)
         total += _log_rising(alpha[:, bad], failed[bad]).sum(1)
         return total - _log_rising(strength, counts) @ times
@@ -146,8 +137,9 @@ def sample(prior: BoundPrior, exposures: Exposures, rng: np.random.Generator) ->
         points = importance.sample(log_density, starts, rng, size=size, enough=enough)
         places = np.zeros((len(points.z), len(paths)), int)
         if paths:
-            places, log_fail = impute(*lost_betas(points.z), paths, rng)
-            ratio = points.log_ratio + log_fail - log_any_fails(points.z)
+            alpha, beta = prior.betas(points.z)
+            places, log_fail = impute(alpha + failed, beta + n - failed, paths, rng)
+            ratio = points.log_ratio + log_fail - log_any_fails(alpha, beta)
             points = importance.Points.of(points.z, points.log_p, ratio)
         posterior = HazardPoints(points, places)
         if points.k_hat <= importance.MAX_KHAT:

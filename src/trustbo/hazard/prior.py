@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 from scipy import special
@@ -91,11 +91,6 @@ class BoundPrior(NamedTuple):
     difficulty: np.ndarray  # (bound, measure), less the reference
     steepness: np.ndarray | None  # (bound,), degrees beyond the stated limit; None: no limit
     doubt: tuple[float, float]
-
-    def of(self, bounds: np.ndarray) -> Self:
-        """Restrict to some of the bounds."""
-        steepness = None if self.steepness is None else self.steepness[bounds]
-        return self._replace(difficulty=self.difficulty[bounds], steepness=steepness)
 
     def values(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Parameters at scores (point, parameter).
