@@ -1,12 +1,13 @@
 """Seconds and effective draws of fits, beside NumPyro's NUTS on the plain program.
 
-    python benchmarks/inference.py [fits] [nuts] [paper]
+    python benchmarks/inference.py [fits] [nuts] [paper] [filter]
 
 `fits`: processor seconds of the hyperparameters and coefficients of the default model over 15, 60
 and 200 missions, of shared noise and of censored rates; the first in a process, and the median of
 three. `nuts`: the default model on eight missions by `sampler="nuts"`, compiling included, and the
 distance of its means from those of importance sampling. `paper`: effective draws per second on the
-paper's model with 600 rates, against `MCMC(NUTS(model.program))` and PyMC with nutpie.
+paper's model with 600 rates, against `MCMC(NUTS(model.program))` and PyMC with nutpie. `filter`:
+milliseconds of a bound of three robots under 1000 draws.
 """
 
 import sys
@@ -18,7 +19,7 @@ from arviz_stats import sampling_diagnostics
 from numpyro.infer import MCMC, NUTS
 
 import trustbo as tb
-from trustbo.inference import diagnostics
+from trustbo.inference import TrustFilter, diagnostics, sample_prior
 from trustbo.models import PlaceEffect, PooledTrust, RobotEffect
 from trustbo.models.backend import own_settings
 
@@ -111,7 +112,18 @@ def by_nutpie(data):
     return {"PyMC with nutpie": sampled(pooled(z, y), ("beta0", "delta_w"))}
 
 
+def one_bound():
+    """Milliseconds of a bound of a filter, the least of many."""
+    live = TrustFilter(sample_prior(PooledTrust(), 2, 1000, 0), 3)
+    z, y, seconds = np.full((3, 2), 0.5), [0.5, 0.6, 0.7], []
+    for _ in range(300):
+        started = time.perf_counter()
+        live.update(z, y)
+        seconds.append(time.perf_counter() - started)
+    print(f"TrustFilter, a bound: {1000.0 * min(seconds):.2f} ms")
+
+
 if __name__ == "__main__":
-    parts = {"fits": timed_fits, "nuts": nuts, "paper": paper}
+    parts = {"fits": timed_fits, "nuts": nuts, "paper": paper, "filter": one_bound}
     for part in sys.argv[1:] or parts:
         parts[part]()
