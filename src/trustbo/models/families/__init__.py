@@ -1,6 +1,6 @@
 """Families of observations: distributions of a contact rate given trust, one file each.
 
-To add one, write its file after `censored` (closed forms) or `beta_binomial` (any density, by
+To add one, write its file after `censored` (closed forms) or `beta_binomial` (smooth ones, by
 Gauss-Hermite nodes), and list it here.
 """
 
