@@ -253,7 +253,7 @@ def test_missions_and_workspace_on_terrain_are_read_back_with_ticks(tmp_path):
     same(again, first)
     one, other = workspace, again.workspace
     assert (one.grid, one.team, one.sight) == (other.grid, other.team, other.sight)
-    for name in ("awareness", "passable", "terrain", "pixels", "of_bounds"):
+    for name in ("awareness", "passable", "terrain", "pixels"):
         assert getattr(one, name).identical(getattr(other, name)), name
     read = tb.logs.read_missions(tmp_path)
     assert read[0].bounds[0].poses is not None
