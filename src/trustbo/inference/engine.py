@@ -21,7 +21,7 @@ import jax
 import numpy as np
 from scipy import sparse
 
-from trustbo.inference.factor import Factor, Order, cholesky, log_diagonal
+from trustbo.inference.factor import Factor, Order, add, cholesky, log_diagonal
 from trustbo.models.backend import namespace
 from trustbo.models.signal import Signal, each
 
@@ -57,7 +57,11 @@ class Blocks(NamedTuple):
             order: Order of elimination of the columns; by default all are of the core.
         """
         n, p = len(y), U.shape[1]
-        order = Order.of(np.full(p, -1), 0) if order is None else order
+        order = (
+            Order.of(np.ones((1, p), dtype=bool), np.zeros(p, dtype=bool))
+            if order is None
+            else order
+        )
         inputs, U = U.shape[0] // n, sparse.csr_array(U)
         seen = ~np.isnan(y)
         kinds = np.column_stack([np.arange(n) if apart else np.zeros(n, dtype=int), label, seen])
@@ -125,11 +129,7 @@ class Prior(NamedTuple):
             if part.ndim == 3:
                 a, b = np.tril_indices(len(i))
             values = part if part.ndim == 2 else part[:, a, b]
-            at = order.entry(i[a], i[b])
-            if isinstance(A, np.ndarray):
-                A[:, at] += values
-            else:
-                A = A.at[:, at].add(values)
+            A = add(A, (slice(None), order.entry(i[a], i[b])), values)
         return A
 
     def log_density(self, c: np.ndarray) -> np.ndarray:

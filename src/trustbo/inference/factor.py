@@ -26,10 +26,20 @@ class Order(NamedTuple):
     core: np.ndarray  # columns
     group: np.ndarray  # (column,), mission of a leaf, -1 of the core
     place: np.ndarray  # (column,), among the leaves of the mission, or in the core
+    touched: np.ndarray  # (mission, number), places of core columns of a mission with leaves
+    number: np.ndarray  # (mission, column), where in `touched`
 
     @classmethod
-    def of(cls, only: np.ndarray, n_missions: int) -> Self:
-        """Order of columns, `only` (column,) being the mission of a leaf and -1 for the core."""
+    def of(cls, met: np.ndarray, free: np.ndarray) -> Self:
+        """Order of columns.
+
+        Args:
+            met: Whether a mission has a column, (mission, column).
+            free: Whether a column is independent of all others a priori, (column,).
+        """
+        n_missions = len(met)
+        alone = free & (met.sum(0) == 1) & (n_missions > 1)
+        only = np.where(alone, met.argmax(0), -1)
         place = np.empty(len(only), dtype=int)
         groups = [np.flatnonzero(only == j) for j in range(-1, n_missions)]
         for columns in groups:
@@ -37,15 +47,22 @@ class Order(NamedTuple):
         groups = [groups[0], *(columns for columns in groups[1:] if len(columns))]
         leaf = np.full((len(groups) - 1, max(map(len, groups[1:]), default=1)), len(only))
         group = np.full(len(only), -1)
+        of_mission = [np.empty(0, dtype=int)]
         for g, columns in enumerate(groups[1:]):
             leaf[g, : len(columns)], group[columns] = columns, g
-        return cls(leaf, groups[0], group, place)
+            of_mission.append(np.flatnonzero(met[only[columns[0]], groups[0]]))
+        touched = np.full((len(leaf), max(map(len, of_mission))), len(groups[0]))
+        number = np.full((len(leaf), len(only)), -1)
+        for g, places in enumerate(of_mission[1:]):
+            touched[g, : len(places)] = places
+            number[g, groups[0][places]] = np.arange(len(places))
+        return cls(leaf, groups[0], group, place, touched, number)
 
     @property
     def shapes(self) -> tuple[tuple[int, ...], ...]:
         """Shapes of D, B and C at a point."""
         (g, k), q = self.leaf.shape, len(self.core)
-        return (g, k, k), (g, k, q), (q, q)
+        return (g, k, k), (g, k, self.touched.shape[1]), (q, q)
 
     @property
     def size(self) -> int:
@@ -54,11 +71,12 @@ class Order(NamedTuple):
 
     def entry(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """Index of entries (a, b) of the precision; -1 where that of (b, a) stands for them."""
-        (g, k, _), (_, _, q), _ = self.shapes
+        (g, k, t), q = self.shapes[1], len(self.core)
         of_leaf, of_both = self.group[a] >= 0, (self.group[a] >= 0) & (self.group[b] >= 0)
-        row = np.where(of_leaf, self.group[a] * k + self.place[a], self.place[a])
-        index = np.where(of_both, row * k, g * k * k + row * q) + self.place[b]
-        index = np.where(of_leaf, index, g * k * (k + q) + row * q + self.place[b])
+        row = self.group[a] * k + self.place[a]
+        number = self.number[self.group[a], b] if g else 0
+        index = np.where(of_both, row * k + self.place[b], g * k * k + row * t + number)
+        index = np.where(of_leaf, index, g * k * (k + t) + self.place[a] * q + self.place[b])
         other = (of_leaf == (self.group[b] >= 0)) & (self.place[a] < self.place[b])
         return np.where(other | (~of_leaf & (self.group[b] >= 0)), -1, index)
 
@@ -78,7 +96,7 @@ class Factor(NamedTuple):
 
     order: Order
     inverse: Any  # (point, mission, place, place), G^-1
-    X: Any  # (point, mission, place, core)
+    X: Any  # (point, mission, place, touched), 0 elsewhere in the core
     H: Any  # (point, core, core)
 
     @classmethod
@@ -88,8 +106,11 @@ class Factor(NamedTuple):
         xp = namespace(A)
         inverse = xp.linalg.inv(cholesky(D))
         X = inverse @ B
-        flat = X.reshape(len(X), -1, X.shape[-1])
-        return cls(order, inverse, X, cholesky(C - xp.swapaxes(flat, 1, 2) @ flat))
+        square, q = xp.swapaxes(X, 2, 3) @ X, len(order.core)
+        C = xp.pad(C, ((0, 0), (0, 1), (0, 1)))  # padding of what is touched
+        for g, i in enumerate(order.touched):
+            C = add(C, (slice(None), i[:, None], i), -square[:, g])
+        return cls(order, inverse, X, cholesky(C[:, :q, :q]))
 
     @property
     def size(self) -> int:
@@ -106,7 +127,10 @@ class Factor(NamedTuple):
         xp, order = namespace(h), self.order
         h = xp.concatenate([h, xp.zeros((len(h), 1))], axis=1)
         leaf = (self.inverse @ h[:, order.leaf][..., None])[..., 0]
-        rest = h[:, order.core] - xp.einsum("ngkq,ngk->nq", self.X, leaf)
+        rest, back = h[:, np.append(order.core, -1)], xp.einsum("ngkt,ngk->ngt", self.X, leaf)
+        for g, i in enumerate(order.touched):
+            rest = add(rest, (slice(None), i), -back[:, g])
+        rest = rest[:, :-1]
         if isinstance(rest, np.ndarray):
             pairs = zip(self.H, rest, strict=True)
             core = np.stack([lapack.dtrtrs(H.T, x, lower=0, trans=1)[0] for H, x in pairs])  # pyright: ignore[reportAttributeAccessIssue]
@@ -122,7 +146,8 @@ class Factor(NamedTuple):
         pairs = zip(self.H, white[..., split:], strict=True)
         core = np.stack([lapack.dtrtrs(H.T, w.T, lower=0)[0].T for H, w in pairs])  # pyright: ignore[reportAttributeAccessIssue]
         leaf = white[..., :split].reshape(*white.shape[:2], *order.leaf.shape)
-        leaf = leaf - np.einsum("ngkq,ndq->ndgk", self.X, core)
+        padded = np.concatenate([core, np.zeros((*core.shape[:2], 1))], axis=2)
+        leaf = leaf - np.einsum("ngkt,ndgt->ndgk", self.X, padded[..., order.touched])
         leaf = np.einsum("ngjk,ndgj->ndgk", self.inverse, leaf)
         found = np.empty((*white.shape[:2], len(order.place) + 1))
         found[..., order.leaf], found[..., order.core] = leaf, core
@@ -134,7 +159,8 @@ class Factor(NamedTuple):
         c = np.column_stack([c, np.zeros(len(c))])
         leaf, core = c[:, order.leaf], c[:, order.core]
         leaf = np.linalg.solve(np.swapaxes(self.inverse, 2, 3), leaf[..., None])[..., 0]
-        leaf = leaf + np.einsum("ngkq,nq->ngk", self.X, core)
+        padded = np.column_stack([core, np.zeros(len(core))])
+        leaf = leaf + np.einsum("ngkt,ngt->ngk", self.X, padded[:, order.touched])
         core = np.einsum("nij,ni->nj", self.H, core)
         return np.concatenate([leaf.reshape(len(c), -1), core], axis=1)
 
@@ -143,13 +169,22 @@ class Factor(NamedTuple):
         C = np.stack([np.tril(lapack.dpotri(H.T, lower=0)[0].T) for H in self.H])  # pyright: ignore[reportAttributeAccessIssue]
         q = np.arange(C.shape[1])
         whole = C + np.swapaxes(np.tril(C, -1), 1, 2)
-        turned = np.swapaxes(self.inverse, 2, 3)
-        B = -turned @ self.X @ whole[:, None]
+        turned, i = np.swapaxes(self.inverse, 2, 3), self.order.touched
+        whole = np.pad(whole, ((0, 0), (0, 1), (0, 1)))[:, i[..., None], i[:, None]]
+        B = -turned @ self.X @ whole
         D = np.tril(turned @ self.inverse - B @ np.swapaxes(turned @ self.X, 2, 3))
         k = np.arange(D.shape[2])
         C[:, q, q] *= 0.5
         D[:, :, k, k] *= 0.5
         return np.concatenate([part.reshape(len(C), -1) for part in (D, B, C)], axis=1)
+
+
+def add(A: Any, at: Any, values: Any) -> Any:
+    """Array with values added at an index: in place in NumPy, a copy in JAX."""
+    if not isinstance(A, np.ndarray):
+        return A.at[at].add(values)
+    A[at] += values
+    return A
 
 
 def log_diagonal(L: Any) -> Any:

@@ -86,10 +86,9 @@ class Posterior:
         n, (rows, p) = self.slots.n_missions, self._U.shape
         parts = self.prior(self.theta(np.zeros((1, self.n_scores)))).parts
         free = np.concatenate([np.full(part.shape[1], part.ndim == 2) for part in parts])
-        at, first, last = self._U.tocoo(), np.full(p, n), np.full(p, -1)
-        np.minimum.at(first, at.col, at.row * n // rows)
-        np.maximum.at(last, at.col, at.row * n // rows)
-        return Order.of(np.where(free & (first == last) & (n > 1), first, -1), n)
+        at, met = self._U.tocoo(), np.zeros((n, p), dtype=bool)
+        met[at.row * n // rows, at.col] = True
+        return Order.of(met, free)
 
     def without(self, mission: int) -> "Posterior":
         """The same posterior as if a mission had not been measured."""
