@@ -21,7 +21,13 @@ from matplotlib.patches import Circle
 from matplotlib.ticker import MaxNLocator
 
 import trustbo as tb
-from trustbo.plots.maps import draw_cells, draw_ground, draw_scale, robust_limits
+from trustbo.plots.maps import (
+    draw_cells,
+    draw_ground,
+    draw_path,
+    draw_scale,
+    robust_limits,
+)
 from trustbo.plots.style import GREY, ROBOTS, outlined
 
 START, GOAL, MISSIONS = (9, 0), (0, 9), 8
@@ -138,7 +144,7 @@ def draw_trust(
     x, y = np.array(center) - workspace.grid.corner
     for ax, values, path, title in zip(axes, maps, paths, titles, strict=True):
         image = draw_cells(ax, values, workspace, norm)
-        tb.plots.draw_path(ax, path, workspace.grid)
+        draw_path(ax, path, workspace.grid)
         circle = Circle((x, y), RADIUS, fill=False, color="white", linestyle="--", linewidth=1.3)
         circle.set_path_effects(outlined(2.6, "black"))
         ax.add_patch(circle)
