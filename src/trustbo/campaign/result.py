@@ -216,7 +216,8 @@ class Result(Summary):
             it (see `inference.place_maps`); of robots' own effects, the mean over robots.
         """
         if n_draws is None:
-            n_draws = 1000 if self.planner.dynamics(self.belief.mean()).is_scalar else 100
+            dynamics = self.planner.problem.dynamics(self.belief.mean())
+            n_draws = 1000 if len(dynamics.start) == 1 else 100
         if n_draws not in self._maps:
             self._maps[n_draws] = self._compute_maps(n_draws)
         return self._maps[n_draws].copy(deep=True)  # the caller may write into it

@@ -76,8 +76,7 @@ class ParameterDraws(Summary):
     def increments(self, awareness: np.ndarray) -> np.ndarray:
         """Drift without intercept, (..., robot, move, row, col).
 
-        Awareness is (robot, move, row, col, feature), or has a leading axis (draw,) like the
-        parameters'.
+        Awareness is (robot, move, row, col, feature).
         """
         raise NotImplementedError
 
@@ -179,10 +178,7 @@ class TrustParams(ParameterDraws, _Trust):
 
     def increments(self, awareness: np.ndarray) -> np.ndarray:
         """See `ParameterDraws.increments`."""
-        beta = np.asarray(self.beta, dtype=float)
-        if awareness.ndim == 5:
-            return np.tensordot(beta, awareness, (-1, -1))
-        return np.einsum("nm,nidrcm->nidrc", beta, awareness)
+        return np.tensordot(np.asarray(self.beta, dtype=float), awareness, (-1, -1))
 
 
 class RobotParams(ParameterDraws, _Trust):

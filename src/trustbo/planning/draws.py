@@ -25,15 +25,11 @@ class DrawnPaths:
         problem: Planning problem.
         dynamics: Recursion of expected trust with leading axis (draw,).
         paths: Flat indices of cells, shape (draw, length), filled with -1.
-        gap: Optimality gap of each path, shape (draw,); 0 where exact.
-        chosen: Indices of the draws in the posterior, shape (draw,).
     """
 
     problem: Problem
     dynamics: Dynamics
     paths: np.ndarray
-    gap: np.ndarray
-    chosen: np.ndarray
 
     @cached_property
     def candidates(self) -> list[tuple[Cell, ...]]:
@@ -50,7 +46,8 @@ class DrawnPaths:
         """Value of the best path of each draw, shape (draw,)."""
         values, which = np.empty(len(self.paths)), self._distinct[1]
         for i, path in enumerate(self.candidates):
-            values[which == i] = self._value(self.dynamics.take(which == i), path)
+            some = Dynamics(*(value[which == i] for value in self.dynamics))
+            values[which == i] = self._value(some, path)
         return values
 
     def values_of(self, paths: Sequence[Sequence[Cell]]) -> np.ndarray:
@@ -99,11 +96,11 @@ class DrawnPaths:
         return paths[order], np.argsort(order)[which.ravel()], counts[order]
 
 
-def choose_draws(params: Params, n_draws: int | None, seed: int) -> tuple[Params, np.ndarray]:
-    """Choose some draws at random, kept in order, or all; return them and their indices."""
+def choose_draws(params: Params, n_draws: int | None, seed: int) -> Params:
+    """Choose some draws at random, kept in order, or all, with leading axis (draw,)."""
     flat = params.flat()
     n = flat.leading[0]
-    chosen = np.arange(n)
-    if n_draws is not None and require_whole("n_draws", n_draws, 1) < n:
-        chosen = np.sort(np.random.default_rng(seed).choice(n, n_draws, replace=False))
-    return flat.draw(chosen), chosen  # pyright: ignore[reportArgumentType]
+    if n_draws is None or require_whole("n_draws", n_draws, 1) >= n:
+        return flat
+    chosen = np.sort(np.random.default_rng(seed).choice(n, n_draws, replace=False))
+    return flat.draw(chosen)  # pyright: ignore[reportArgumentType]

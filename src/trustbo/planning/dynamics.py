@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from trustbo.data import Cell
 from trustbo.errors import TrustboError
 from trustbo.models.params import Params, check_params
-from trustbo.workspace.moves import moves_along
+from trustbo.workspace.moves import bounds_along
 
 
 class Dynamics(NamedTuple):
@@ -19,8 +19,7 @@ class Dynamics(NamedTuple):
     and noise_sd (...,), delta_v as the mean over robots. States are the robots, and trust of the
     team is their mean; one state, this mean, suffices where all have one beta0.
 
-    Drift is that of the bound into (row, col) by one of the eight moves; the axis of moves has
-    length 1 where all bounds into a cell are alike. NaN where there is no bound.
+    Drift is that of the bound into (row, col) by one of the eight moves, NaN where there is none.
     """
 
     transition: np.ndarray
@@ -28,28 +27,13 @@ class Dynamics(NamedTuple):
     start: np.ndarray
     noise_sd: np.ndarray
 
-    @property
-    def is_scalar(self) -> bool:
-        """True if the state is a single number, trust of the team."""
-        return self.start.shape[-1] == 1
-
-    def take(self, which: int | slice | np.ndarray) -> "Dynamics":
-        """Select some of the draws; one, by its index, without its leading axis."""
-        return Dynamics(*(value[which] for value in self))
-
     def flat(self) -> "Dynamics":
-        """Reshape to exactly one leading axis (draw,), of length 1 if there is none."""
-
-        def one(value: np.ndarray, core: int) -> np.ndarray:
-            return np.reshape(value, (-1, *np.shape(value)[np.ndim(value) - core :]))
-
-        transition, drift, start, sd = self
-        return Dynamics(one(transition, 2), one(drift, 4), one(start, 1), one(sd, 0))
+        """Return the dynamics with a leading axis (draw,), of length 1 where there was none."""
+        return self if self.start.ndim > 1 else Dynamics(*(value[None] for value in self))
 
     def along(self, path: Sequence[Cell] | np.ndarray) -> "Dynamics":
         """Select the bounds of a path: drift (..., state, 1, 1, bound)."""
-        rows, cols = np.asarray(path)[1:].T
-        moves = moves_along(path) if self.drift.shape[-3] > 1 else 0
+        moves, rows, cols = bounds_along(path).T
         return self._replace(drift=self.drift[..., moves, rows, cols][..., None, None, :])
 
     def settled(self) -> np.ndarray:
@@ -59,13 +43,13 @@ class Dynamics(NamedTuple):
 
 
 def trust_dynamics(
-    params: Params, awareness: ArrayLike, x0: ArrayLike | None = None, *, by_robot: bool = False
+    params: Params, z: np.ndarray, x0: ArrayLike | None = None, *, by_robot: bool = False
 ) -> Dynamics:
     """Build the recursion of expected trust under parameters with leading axes (...,).
 
     Args:
         params: Parameters of any model.
-        awareness: Shape (robot, move, row, col, feature).
+        z: Awareness, shape (robot, move, row, col, feature).
         x0: Expected trust before the first bound, () or (robot,), with leading axes or not; by
             default `params.x0_mean`.
         by_robot: Whether each robot is a state also where their mean would suffice.
@@ -73,8 +57,7 @@ def trust_dynamics(
     Raises:
         TrustboError: Parameters of other numbers of robots or features.
     """
-    z = np.asarray(awareness, dtype=float)
-    n_robots, leading = z.shape[-5], params.leading
+    n_robots, leading = len(z), params.leading
     start = np.asarray(params.x0_mean if x0 is None else x0, dtype=float)
     if x0 is None or not start.ndim:
         start = start[..., None]
@@ -84,32 +67,25 @@ def trust_dynamics(
     if params.BY_ROBOT or by_robot:
         return Dynamics(params.expected_transition(n_robots), drift(params, z), start, sd)
     # The mean over robots obeys the same equation.
-    z = z.mean(-5, keepdims=True) if n_robots > 1 else z
+    z = z.mean(0, keepdims=True) if n_robots > 1 else z
     u = drift(params, z).mean(-4, keepdims=True)  # robots may differ in effects of places
     return Dynamics(params.expected_transition(1), u, start.mean(-1, keepdims=True), sd)
 
 
-def drift(params: Params, awareness: ArrayLike) -> np.ndarray:
+def drift(params: Params, awareness: np.ndarray) -> np.ndarray:
     """Increment of trust by one bound, u = sum_m beta_m z_m + b, (..., robot, move, row, col).
 
     Effects of places are added, or those of the bounds of a path, see `Params.along`.
 
     Args:
         params: Parameters of any model, with leading axes (...,).
-        awareness: Shape (robot, move, row, col, feature), or with a leading axis (draw,) like the
-            parameters'.
+        awareness: Shape (robot, move, row, col, feature).
 
     Raises:
-        TrustboError: Other numbers of robots, features, cells or draws than the parameters'.
+        TrustboError: Other numbers of robots, features or cells than the parameters'.
     """
-    z = np.asarray(awareness, dtype=float)
-    check_params(params, None if params.places else z.shape[-5], z.shape[-1])
-    if z.ndim == 6 and params.leading != z.shape[:1]:
-        raise TrustboError(
-            f"{z.shape[0]} maps of awareness need as many draws of the parameters; got "
-            f"{params.leading}."
-        )
-    u, b = params.increments(z), np.asarray(params.b, dtype=float)
+    check_params(params, None if params.places else len(awareness), awareness.shape[-1])
+    u, b = params.increments(awareness), np.asarray(params.b, dtype=float)
     if not params.BY_ROBOT and b.ndim <= len(params.leading):
         b = b[..., None]
     if b.ndim == len(params.leading) + 3:  # (..., 1, bound, robot): of the bounds of a path
@@ -131,8 +107,7 @@ def roll_trust(params: Params, awareness: ArrayLike, x0: ArrayLike | None = None
     Args:
         params: Parameters of any model, with leading axes (...,) such as (draw,). Where places have
             effects, those of the path, `params.along(path)`.
-        awareness: Shape (bound, robot, feature), or (draw, bound, robot, feature) with one for each
-            draw of the parameters.
+        awareness: Shape (bound, robot, feature).
         x0: Expected trust before the first bound, shape (), (robot,) or (..., robot); by default
             `params.x0_mean`.
 
@@ -148,8 +123,8 @@ def roll_trust(params: Params, awareness: ArrayLike, x0: ArrayLike | None = None
 
 
 def as_map(awareness: np.ndarray) -> np.ndarray:
-    """Convert awareness of a path's bounds, (..., bound, robot, feature), to a map of one row."""
-    return np.swapaxes(awareness, -3, -2)[..., None, None, :, :]
+    """Convert awareness of a path's bounds, (bound, robot, feature), to a map of one row."""
+    return np.swapaxes(awareness, 0, 1)[:, None, None]
 
 
 def roll(along: Dynamics) -> np.ndarray:

@@ -66,7 +66,13 @@ class AdmissiblePaths:
         self.bounds_to_goal = fewest_bounds(self.bounds, self.goal, back=True)
         self.shortest = int(self.bounds_to_goal[self.start])
         if self.shortest < 0:
-            self._refuse_ends()
+            n_reached = int((self.bounds_from_start >= 0).sum())
+            raise NoPathError(
+                f"no path from {self.start} to {self.goal}: {n_reached} of "
+                f"{int(self.passable.sum())} passable cells can be reached from the start, and the "
+                f"goal from {int((self.bounds_to_goal >= 0).sum())}. Choose ends in one part, or a "
+                "team with a larger max_slope."
+            )
         self.turns = not isinstance(max_bounds, str)
         self.longest = _longest(max_bounds, self.shortest)
         self.max_bounds = self.longest if self.turns else max_bounds
@@ -75,15 +81,6 @@ class AdmissiblePaths:
                 f"max_bounds = {self.longest} is below the fewest possible from {self.start} to "
                 f"{self.goal}, which is {self.shortest}."
             )
-
-    def _refuse_ends(self) -> None:
-        n_reached = int((self.bounds_from_start >= 0).sum())
-        n_goal = int((self.bounds_to_goal >= 0).sum())
-        raise NoPathError(
-            f"no path from {self.start} to {self.goal}: {n_reached} of "
-            f"{int(self.passable.sum())} passable cells can be reached from the start, and the "
-            f"goal from {n_goal}. Choose ends in one part, or a team with a larger max_slope."
-        )
 
     @property
     def passable(self) -> np.ndarray:
@@ -106,12 +103,6 @@ class AdmissiblePaths:
                 f"whose search has {n_states:.3g} states, more than {_MOST_STATES:.3g}; give less."
             )
         return Unrolled.of_grid(self.bounds, STEPS, *fewest, self.longest, turns=self.turns)
-
-    @cached_property
-    def lengths(self) -> np.ndarray:
-        """Length of each move from centre to centre, m, (move,)."""
-        grid = self.workspace.grid
-        return np.hypot(*(STEPS * (grid.cell_height, grid.cell_width)).T)
 
     def avoiding(self, bounds: np.ndarray, risk: np.ndarray) -> "AdmissiblePaths":
         """Restrict to paths that take none of some bounds.

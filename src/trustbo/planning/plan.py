@@ -38,7 +38,8 @@ class Plan(Summary):
         revisits: Number of bounds that enter a cell again.
         seconds: Time of the search, s.
         workspace: Workspace of the path.
-        risk: Chance of each bound to end the mission, None without a hazard.
+        risk: Chances of the bounds to end the mission and of the path to arrive, with its band;
+            None without a hazard.
         infeasible: Whether its chance to fail exceeds `max_failure`, as that of a given path may.
         value_band: Ends of the 90 % band of the value over draws of the parameters, at the chance
             to fail expected; None where the plan is for one draw. Noise of rates is not in it.
@@ -82,7 +83,6 @@ class Plan(Summary):
             rows.append(("chance to arrive", f"{self.p_arrive:.3g}{beyond}"))
         if not np.isnan(self.limit):
             rows.append(("search", f"{1e3 * self.seconds:.1f} ms"))
-
         return rows
 
     @property
@@ -94,11 +94,6 @@ class Plan(Summary):
     def p_arrive(self) -> float | None:
         """Chance that the mission reaches the goal, the mean over draws of the risk."""
         return None if self.risk is None else self.risk.p_arrive
-
-    @property
-    def p_arrive_band(self) -> tuple[float, float] | None:
-        """Ends of the 90 % band of `p_arrive` over draws of the risk; None without draws."""
-        return None if self.risk is None else self.risk.p_arrive_band
 
     @cached_property
     def stops(self) -> np.ndarray | None:

@@ -21,13 +21,12 @@ from trustbo.models.params import Params
 from trustbo.planning.draws import DrawnPaths, choose_draws
 from trustbo.planning.dynamics import Dynamics, as_map, roll, trust_dynamics
 from trustbo.planning.objectives import LOST_CONTACT, OBJECTIVES, capped, score_of
-from trustbo.planning.paths import AdmissiblePaths
+from trustbo.planning.paths import STEPS, AdmissiblePaths
 from trustbo.planning.plan import QUANTILES, Plan
 from trustbo.planning.problem import EXACT, InfeasibleError, Problem, draws_of, mean_of, risk_of
 from trustbo.planning.trust_map import cost_of, summary_of, trust_map
 from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Location
-from trustbo.workspace.moves import MOVES
 
 
 class Planner(Summary):
@@ -136,7 +135,7 @@ class Planner(Summary):
 
     def with_risk(
         self,
-        p_fail: ArrayLike | None,
+        p_fail: ArrayLike,
         draws: ArrayLike | None = None,
         strata: Strata | None = None,
     ) -> Self:
@@ -145,8 +144,7 @@ class Planner(Summary):
         Plans then have `p_arrive`, respect `max_failure`, and pay `failure_cost` in lost_contact.
 
         Args:
-            p_fail: Posterior mean, shape (move, row, col); NaN where there is no bound. None: no
-                risk.
+            p_fail: Posterior mean, shape (move, row, col); NaN where there is no bound.
             draws: Draws from its posterior, shape (draw, move, row, col), for bands of `p_arrive`.
             strata: Chances under groups of draws, such as `BoundRisk.strata()`, by which a failure
                 is priced; by default `p_fail`, as if bounds failed independently.
@@ -154,8 +152,6 @@ class Planner(Summary):
         Raises:
             TrustboError: Other shapes; a chance outside [0, 1].
         """
-        if p_fail is None:
-            return self._with(risk=None)
         drawn = None if draws is None else np.asarray(draws, dtype=float)
         risk = Risk(np.asarray(p_fail, dtype=float), drawn, strata)
         return self._with(risk=risk)
@@ -169,10 +165,6 @@ class Planner(Summary):
             TrustboError: It is negative, or not finite.
         """
         return self._with(failure_cost=failure_cost) if self.problem.objective.of_contact else self
-
-    def dynamics(self, params: Params, x0: ArrayLike | None = None) -> Dynamics:
-        """Build the recursion of expected trust; see `trust_dynamics`."""
-        return self.problem.dynamics(params, x0)
 
     def plan(self, params: Params | xr.DataTree, *, x0: ArrayLike | None = None) -> Plan:
         """Find the best admissible path for given parameters, or for the mean of a posterior.
@@ -189,7 +181,7 @@ class Planner(Summary):
         """
         started = time.perf_counter()
         mean = mean_of(params, self.workspace)
-        best = self.problem.best(self.dynamics(mean, x0))
+        best = self.problem.best(self.problem.dynamics(mean, x0))
         path = self.problem.paths.cells(best.paths[0])
         plan = self.evaluate(path, mean, x0=x0)
         if mean is not params:
@@ -202,7 +194,7 @@ class Planner(Summary):
         """Find the best admissible path under other dynamics, such as an optimistic drift.
 
         Args:
-            dynamics: Recursion of expected trust without leading axes; see `dynamics`.
+            dynamics: Recursion of expected trust without leading axes; see `Problem.dynamics`.
 
         Raises:
             TrustboError: beta0 is outside the range the objective is exact for.
@@ -224,10 +216,9 @@ class Planner(Summary):
             TrustboError: beta0 of a draw is outside the range the objective is exact for.
             InfeasibleError: No path respects `max_failure`.
         """
-        params, chosen = choose_draws(draws_of(posterior, self.workspace), n_draws, seed)
+        params = choose_draws(draws_of(posterior, self.workspace), n_draws, seed)
         dynamics = self.problem.dynamics(params)
-        best = self.problem.best(dynamics)
-        return DrawnPaths(self.problem, dynamics, best.paths, best.limit - best.score, chosen)
+        return DrawnPaths(self.problem, dynamics, self.problem.best(dynamics).paths)
 
     def evaluate(
         self, path: Sequence[Cell], params: Params | xr.DataTree, *, x0: ArrayLike | None = None
@@ -289,11 +280,13 @@ class Planner(Summary):
         Raises:
             TrustboError: abs(beta0) >= 1, for which trust settles nowhere.
         """
-        problem, dynamics = self.problem, self.dynamics(mean_of(params, self.workspace))
+        problem, mean = self.problem, mean_of(params, self.workspace)
+        dynamics = problem.dynamics(mean)
         if (radius := np.abs(np.linalg.eigvals(dynamics.transition)).max()) >= 1.0:
             raise TrustboError(f"a graph of settled trust needs abs(beta0) < 1; got {radius:g}.")
         contact = capped(LOST_CONTACT, problem.family, dynamics)
         grid, bounds = self.workspace.grid, problem.paths.bounds
+        length = np.hypot(*(STEPS * (grid.cell_height, grid.cell_width)).T)  # (move,)
 
         def of_bounds(values: np.ndarray) -> np.ndarray:
             return np.broadcast_to(values, bounds.shape)[bounds]
@@ -301,7 +294,7 @@ class Planner(Summary):
         toll, settled = of_bounds(problem.toll), of_bounds(dynamics.settled())
         rate = problem.family.mean_rate(of_bounds(contact.settled()), dynamics.noise_sd)
         values = {
-            "length": of_bounds(problem.paths.lengths[:, None, None]),
+            "length": of_bounds(length[:, None, None]),
             "drift": of_bounds(dynamics.drift.mean(0)),
             "cost": toll + np.logaddexp(0.0, -settled),
             "lost": toll + 1.0 - rate,
@@ -312,7 +305,7 @@ class Planner(Summary):
         for row, col in np.argwhere(problem.paths.passable).tolist():
             graph.add_node((row, col), x=float(grid.x[col]), y=float(grid.y[row]))
         for k, (move, row, col) in enumerate(np.argwhere(bounds).tolist()):
-            left = row - MOVES[move][0], col - MOVES[move][1]
+            left = row - int(STEPS[move, 0]), col - int(STEPS[move, 1])
             graph.add_edge(left, (row, col), **{name: float(v[k]) for name, v in values.items()})
         return graph
 
@@ -350,7 +343,7 @@ class Planner(Summary):
             n_draws: Number of draws, taken at random without replacement.
             seed: Seed of the choice of draws.
         """
-        params, _ = choose_draws(draws_of(posterior, self.workspace), n_draws, seed)
+        params = choose_draws(draws_of(posterior, self.workspace), n_draws, seed)
         return summary_of(trust_map(self.problem, params))
 
     def path_posterior(

@@ -8,8 +8,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from trustbo.data import Cell
-from trustbo.errors import TrustboError, require_choice
+from trustbo.errors import require_choice
 from trustbo.models.params import Params
 from trustbo.planning.draws import choose_draws
 from trustbo.planning.dynamics import Dynamics
@@ -38,8 +37,8 @@ def optimistic(
     rng: np.random.Generator, params: Params, planner: Planner, *, quantile: float = 0.9
 ) -> Plan:
     """Best path under the upper quantile over draws of each bound's drift u."""
-    some, _ = choose_draws(params, 1000, seed_of(rng))
-    transition, drift, start, sd = planner.dynamics(some)
+    some = choose_draws(params, 1000, _seed(rng))
+    transition, drift, start, sd = planner.problem.dynamics(some)
     best = Dynamics(
         transition.mean(0), np.quantile(drift, quantile, axis=0), start.mean(0), sd.mean(0)
     )
@@ -48,21 +47,17 @@ def optimistic(
 
 def ucb(rng: np.random.Generator, params: Params, planner: Planner, *, kappa: float = 1.0) -> Plan:
     """Path with the highest mean plus `kappa` sd of its value, of the draws' best paths."""
-    drawn = planner.plan_draws(params, n_draws=N_DRAWS, seed=seed_of(rng))
+    drawn = planner.plan_draws(params, n_draws=N_DRAWS, seed=_seed(rng))
     values = drawn.values_of(drawn.candidates)
     chosen = int(np.argmax(values.mean(0) + kappa * values.std(0)))
     return planner.evaluate(drawn.candidates[chosen], params.mean())
 
 
 def random(rng: np.random.Generator, params: Params, planner: Planner) -> Plan:
-    """Best path under random drifts of the bounds, independent of the posterior."""
-    return planner.evaluate(random_path(rng, planner), params.mean())
-
-
-def random_path(rng: np.random.Generator, planner: Planner) -> tuple[Cell, ...]:
-    """Best path under drifts of the bounds that are uniform in [0, 1]."""
+    """Best path under drifts of the bounds that are uniform in [0, 1], whatever was learned."""
     drift = rng.uniform(size=(1, *planner.problem.paths.bounds.shape))
-    return planner.best_path(Dynamics(np.zeros((1, 1)), drift, np.zeros(1), np.full((), 0.1)))
+    dynamics = Dynamics(np.zeros((1, 1)), drift, np.zeros(1), np.full((), 0.1))
+    return planner.evaluate(planner.best_path(dynamics), params.mean())
 
 
 POLICIES: Mapping[str, Policy] = {
@@ -81,13 +76,9 @@ def resolve_policy(policy: str | Policy) -> Policy:
     Raises:
         TrustboError: It is neither.
     """
-    if callable(policy):
-        return policy
-    if not isinstance(policy, str):
-        raise TrustboError(f"policy must be a name or a callable; got {policy!r}.")
-    return POLICIES[require_choice("policy", policy, POLICIES)]
+    return policy if callable(policy) else POLICIES[require_choice("policy", policy, POLICIES)]
 
 
-def seed_of(rng: np.random.Generator) -> int:
+def _seed(rng: np.random.Generator) -> int:
     """Draw a seed."""
     return int(rng.integers(2**63))

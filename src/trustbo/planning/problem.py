@@ -174,8 +174,8 @@ class Problem:
         sd = np.maximum(dynamics.noise_sd, TINY_SD)
         costs = Costs(loss, drift, weights.per_bound, start, *trust, sd, toll, *risks)
         cost, lower, paths = best_labels(graph, costs, weights.scale)
-        if np.isinf(cost).any():
-            raise self._infeasible()
+        if self.risk is not None and np.isinf(cost).any():
+            raise self._infeasible(self.risk)
         return Best(paths, -cost, -lower)
 
     def _require_valid(self, dynamics: Dynamics, history: bool) -> None:
@@ -188,24 +188,14 @@ class Problem:
                 f"not linear in trust; got {dynamics.transition.min():g}. Use 'terminal' or 'mean'."
             )
 
-    def safest(self) -> tuple[tuple[Cell, ...], float]:
-        """Find the admissible path with the least chance to fail, and this chance.
-
-        Raises:
-            TrustboError: The problem has no risk.
-        """
-        if self.risk is None:
-            raise TrustboError("the safest path needs chances to fail; use planner.with_risk.")
+    def _infeasible(self, risk: Risk) -> InfeasibleError:
+        """Error of a problem in which no path respects the limit, with the safest path."""
         graph, n = self.paths.graph, self.paths.graph.longest + 1
         nothing = Weights(np.zeros((1, n, 1)), np.zeros((1, n)), np.ones(n))
-        of_bounds = risk_of(self.risk.p_fail).ravel()
+        of_bounds = risk_of(risk.p_fail).ravel()
         _, paths = best_sums(graph, np.zeros((1, 1, len(of_bounds))), nothing, of_bounds)
         path = self.paths.cells(paths[0])
-        return path, 1.0 - self.risk.survival(path)
-
-    def _infeasible(self) -> InfeasibleError:
-        """Error of a problem in which no path respects the limit."""
-        path, p_fail = self.safest()
+        p_fail = 1.0 - risk.survival(path)
         return InfeasibleError(
             f"no admissible path from {path[0]} to {path[-1]} fails with a chance of at most "
             f"max_failure = {self.max_failure:g}; the least is {p_fail:.4g}, on the path {path}. "

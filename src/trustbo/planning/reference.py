@@ -39,7 +39,7 @@ def plan(planner: Planner, params: Params | xr.DataTree) -> Plan:
         plans = [planner.evaluate(path, mean) for path in every_path(problem.paths)]
         within = [one for one in plans if not one.infeasible]
         return max(within, key=lambda one: one.value) if within else planner.plan(mean)
-    dynamics = capped(problem.objective, problem.family, planner.dynamics(mean))
+    dynamics = capped(problem.objective, problem.family, problem.dynamics(mean))
     plans = [planner.evaluate(path, mean) for path in shortest_paths(planner, dynamics)]
     return max(plans, key=lambda one: one.value)
 
