@@ -82,7 +82,7 @@ def score(logs, window):
         train, test = (tb.logs.missions_of(logs[name], window) for name in (learned, other))
         for name, model in MODELS.items():
             posterior = tb.fit(train, model, progress=False)
-            found = tb.inference.score(posterior, test).sel(among="all")
+            found = tb.inference.score(posterior, test)
             table.row(f"{window:g} s", learned, name, f"{float(found['mean_log_score']):.3f}",
                       int(found["n"]))  # fmt: skip
 

@@ -1,6 +1,6 @@
 """Trust in real time, bound by bound or tick by tick of a running mission."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -136,6 +136,21 @@ class Dynamics:
         rates = self.family.sample(signal, self.sd, n_ticks.reshape(self.shape[1:]), rng)
         return now, rates.reshape(len(rates), -1)
 
+    def ahead(
+        self,
+        beliefs: Beliefs,
+        z: np.ndarray,
+        n_ticks: np.ndarray,
+        effects: Sequence[Effect],
+        rng: np.random.Generator,
+    ) -> Iterator[tuple[Beliefs, np.ndarray]]:
+        """Yield trust after each bound, nothing measured, and rates drawn for all together."""
+        x = self.draw(beliefs, rng)
+        for of_bound, ticks, effect in zip(z, n_ticks, effects, strict=True):
+            beliefs = self.predict(beliefs, of_bound, effect)
+            x, rates = self.roll(x, of_bound, ticks, rng, effect)
+            yield beliefs, rates
+
 
 def _product(A: np.ndarray, B: np.ndarray) -> np.ndarray:
     """Matrix products; those of single numbers are many times as fast without matmul."""
@@ -191,6 +206,8 @@ class TrustFilter:
         params: Parameter draws, leading axis (draw,).
         weights: Their weights now, shape (draw,), sum 1.
         n_bounds: Bounds taken in since the last `reset`.
+        family: Family of observations.
+        dynamics: One bound of the Kalman filter under all draws.
     """
 
     def __init__(
@@ -237,15 +254,15 @@ class TrustFilter:
         n, most = len(flat.b), require_whole("max_draws", max_draws, 1)
         kept = np.linspace(0, n - 1, min(n, most)).astype(int)
         self.params: Params = flat.draw(kept)  # pyright: ignore[reportArgumentType]
-        self._family = family_of(observation)
+        self.family = family_of(observation)
         delta_s = None if delta_s is None else delta_s[kept]
-        self._dynamics = Dynamics(self.params, self._family, self._n_robots, delta_s)
+        self.dynamics = Dynamics(self.params, self.family, self._n_robots, delta_s)
         self.reset()
 
     def reset(self) -> None:
         """Go back to before the first bound of a new mission, all draws of equal weight."""
         n = len(self.params.b)
-        self._beliefs = self._dynamics.start()
+        self._beliefs = self.dynamics.start()
         self._log_weight, self.weights = np.zeros(n), np.full(n, 1.0 / n)
         self.n_bounds = 0
         self._running: Any = None  # predicted trust at its end, and its counts of ticks
@@ -289,7 +306,7 @@ class TrustFilter:
             n_ticks = as_array("n_ticks", n_ticks)
             n_ticks = n_ticks if n_ticks.ndim else np.full(y.shape, n_ticks)
             require_shares(y, n_ticks)
-        return self._commit(predicted, y, broadcast_ticks(self._family, n_ticks, y.shape))
+        return self._commit(predicted, y, broadcast_ticks(self.family, n_ticks, y.shape))
 
     def begin_bound(self, awareness: ArrayLike, bound: tuple[Cell, Cell] | None = None) -> None:
         """Begin a bound, before its ticks; arguments and errors are those of `update`."""
@@ -320,7 +337,7 @@ class TrustFilter:
             )
         predicted, counts = self._running
         self._running = predicted, counts + np.array([contacts, ticks])
-        beliefs, gained = self._dynamics.update(predicted, *_rates(self._running[1]))
+        beliefs, gained = self.dynamics.update(predicted, *_rates(self._running[1]))
         return _average(beliefs, _normalised(self._log_weight + gained))
 
     def end_bound(self) -> TrustState:
@@ -356,11 +373,9 @@ class TrustFilter:
                 another length, that jumps or that leaves the grid.
         """
         given, rng = self._checked(awareness, 3), np.random.default_rng(self.n_bounds)
-        ticks, trust, rates = ticks_ahead(n_ticks, given.shape[:2]), [], []
-        beliefs, x = self._beliefs, self._dynamics.draw(self._beliefs, rng)
-        for z, effect, n in zip(given, self._effects(path, len(given)), ticks, strict=True):
-            beliefs = self._dynamics.predict(beliefs, z, effect)
-            x, drawn = self._dynamics.roll(x, z, n, rng, effect)
+        ticks, effects = ticks_ahead(n_ticks, given.shape[:2]), self.effects(path, len(given))
+        trust, rates = [], []
+        for beliefs, drawn in self.dynamics.ahead(self._beliefs, given, ticks, effects, rng):
             trust.append(_average(beliefs, self.weights))
             rates.append(drawn)
         draws = np.stack(rates, axis=1)[systematic(self.weights, len(self.weights), rng)]
@@ -370,11 +385,11 @@ class TrustFilter:
 
     def _predicted(self, awareness: ArrayLike, bound: tuple[Cell, Cell] | None) -> Beliefs:
         """Trust after a bound, nothing measured."""
-        z, effect = self._checked(awareness, 2), self._effects(bound, 1)[0]
-        return self._dynamics.predict(self._beliefs, z, effect)
+        z, effect = self._checked(awareness, 2), self.effects(bound, 1)[0]
+        return self.dynamics.predict(self._beliefs, z, effect)
 
     def _commit(self, predicted: Beliefs, y: np.ndarray, n_ticks: np.ndarray) -> TrustState:
-        self._beliefs, gained = self._dynamics.update(predicted, y, n_ticks)
+        self._beliefs, gained = self.dynamics.update(predicted, y, n_ticks)
         self._log_weight = self._log_weight + gained  # a copy of the filter keeps its own
         self.weights = _normalised(self._log_weight)
         self.n_bounds += 1
@@ -389,7 +404,7 @@ class TrustFilter:
                 else "a bound runs: call end_bound() first."
             )
 
-    def _effects(self, path: Sequence[Cell] | None, n_bounds: int) -> Sequence[Effect]:
+    def effects(self, path: Sequence[Cell] | None, n_bounds: int) -> Sequence[Effect]:
         """Effect of each bound's place; 0 where there are none. Checks the path's cells."""
         cells = []
         if path is not None:
