@@ -155,11 +155,23 @@ def test_mistakes_are_refused_before_sampling(missions):
 
 
 @pytest.mark.slow
-def test_nuts_and_importance_sampling_agree(missions):
-    model = PooledTrust(effects=(RobotEffect(),))
-    ours = fit(missions, model, progress=False, whole=False)
-    nuts = fit(missions, model, sampler="nuts", progress=False, whole=False, check=False)
-    for name in ("beta0", "beta", "b", "delta_w", "delta_v"):
-        a, b = (tree["posterior"][name] for tree in (ours, nuts))
-        gap = np.abs(a.mean(("chain", "draw")) - b.mean(("chain", "draw")))
-        assert (gap < 0.15 * b.std(("chain", "draw"))).all()
+@pytest.mark.parametrize(
+    "model",
+    [
+        PooledTrust(effects=(PlaceEffect(), RobotEffect())),
+        PooledTrust(shared_noise=True),
+        HierarchicalTrust(),
+        CoupledTrust(),
+    ],
+    ids=lambda model: model.in_short(),
+)
+def test_nuts_and_importance_sampling_agree(missions, model):
+    """Means within .05 posterior sd, of which Monte Carlo error is a third."""
+    size = {"progress": False, "whole": False, "check": False}
+    ours = fit(missions, model, draws=8000, **size)["posterior"].to_dataset()
+    nuts = fit(missions, model, sampler="nuts", draws=3000, **size)["posterior"].to_dataset()
+    over = ("chain", "draw")
+    gap = abs(ours.mean(over) - nuts.mean(over)) / nuts.std(over)
+    for name in ("beta0", "beta", "b", "B0", "B", "delta_w", "delta_v", "Delta_w", "Delta_v"):
+        if name in gap:
+            assert float(gap[name].max()) < 0.05, name
