@@ -55,18 +55,10 @@ def warn(message: str) -> None:
     warnings.warn(message, skip_file_prefixes=(_PACKAGE,), stacklevel=2)
 
 
-def decoded(
-    stored: np.ndarray, coding: Coding, hidden: np.ndarray | None = None, row: int = 0
-) -> np.ndarray:
+def decoded(stored: np.ndarray, coding: Coding) -> np.ndarray:
     """Convert stored values (row, col) to heights in metres, NaN where missing.
 
-    Missing are values that are not finite, declared fills and pixels that a mask hides.
-
-    Args:
-        stored: Values of the raster, or of some of its rows.
-        coding: How they are stored.
-        hidden: Mask of hidden pixels, (row, col).
-        row: Position of the first row in the raster, for messages.
+    Missing are values that are not finite, and declared fills.
 
     Raises:
         TrustboError: Values that are no real numbers, or that no height on land has: undeclared
@@ -77,7 +69,7 @@ def decoded(
             f"{coding.name} holds {stored.dtype}, which are no heights; give real numbers."
         )
     values = stored.astype(float)
-    missing = ~np.isfinite(values) if hidden is None else hidden | ~np.isfinite(values)
+    missing = ~np.isfinite(values)
     for fill in coding.fills:
         missing |= values == _as_stored(fill, stored.dtype)
     suspicious = np.isin(values, _FILLS if coding.scale != 1.0 else (*_FILLS, -999.0))
@@ -85,18 +77,18 @@ def decoded(
     heights[missing] = np.nan
     wrong = ~missing & (suspicious | (heights < LOWEST) | (heights > HIGHEST))
     if wrong.any():
-        raise _no_heights(coding, stored, heights, wrong, row)
+        raise _no_heights(coding, stored, heights, wrong)
     return heights
 
 
 def _no_heights(
-    coding: Coding, stored: np.ndarray, heights: np.ndarray, wrong: np.ndarray, row: int
+    coding: Coding, stored: np.ndarray, heights: np.ndarray, wrong: np.ndarray
 ) -> TrustboError:
     """Error about values that are no heights, with the first of them and the likely cause."""
     r, c = np.unravel_index(np.argmax(wrong), wrong.shape)
     value, height = float(stored[r, c]), heights[r, c]
     scaled = "" if value == height else f" (scaled to {height:g} m)"
-    where = f"{coding.name} holds {value!r}{scaled} at row {row + r}, column {c}"
+    where = f"{coding.name} holds {value!r}{scaled} at row {r}, column {c}"
     share = wrong.sum() / np.isfinite(heights).sum()
     if share > 0.5:
         return TrustboError(

@@ -8,21 +8,19 @@ import math
 import os
 import re
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import nullcontext
 from os import PathLike
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import rasterio
 import rioxarray  # noqa: F401  # the accessor `rio`
 import xarray as xr
 from rasterio.crs import CRS
-from rasterio.enums import ColorInterp, MaskFlags, Resampling
+from rasterio.enums import ColorInterp, Resampling
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
 from rasterio.io import DatasetReader
 from rasterio.vrt import WarpedVRT
-from rasterio.windows import Window
 from rioxarray.exceptions import MissingSpatialDimensionError
 
 from trustbo.errors import TrustboError, require_positive
@@ -40,33 +38,12 @@ from trustbo.terrain.place import (
 
 type RasterLike = FilePath | DatasetReader | WarpedVRT | xr.DataArray
 
-_MOST_PIXELS = 1e8  # of a raster in memory: 0.8 GB
-_STRIP = 2**23  # pixels that are read together
+_MOST_PIXELS = 1e8  # of a raster: some 3 GB while it is read
 _CLIPPED = 0.02  # share of pixels with the surface below the ground, above which a warning is due
 _TALL, _RAISED = 60.0, 20.0  # m: unlikely medians and 5 % quantiles of canopy heights
 _DEGREE = 111_195.0  # of latitude, m
 _FILL_NAMES = ("_FillValue", "missing_value", "fill_value", "nodata")
 _HEIGHT_BANDS = re.compile(r"elev|height|altitude|\b(dem|dsm|dtm)\b", re.IGNORECASE)
-
-
-class _Source(NamedTuple):
-    """A raster as it is stored."""
-
-    name: str  # for messages
-    y: np.ndarray  # of rows, in the CRS
-    x: np.ndarray  # of columns
-    crs: Any  # None if it has none
-    coding: Coding
-    unit: object  # as declared
-    read: Callable[[slice], tuple[np.ndarray, np.ndarray | None]]  # rows: values, hidden pixels
-
-
-class _Raster(NamedTuple):
-    """Heights in metres, north up."""
-
-    name: str
-    heights: xr.DataArray  # dims (y, x), with a horizontal CRS
-    datum: str | None  # vertical datum, if declared
 
 
 def read_terrain(
@@ -113,22 +90,23 @@ def read_terrain(
     """
     given = None if crs is None else known_crs(crs)
     ground = _heights(dem, "dem", given, resolution, nodata)
-    heights = on_metric_grid(ground.heights)
+    heights = on_metric_grid(ground)
     if dsm is None:
         warn("no surface (DSM) is given, so no canopy is known: only the ground blocks sight.")
         return _paired(heights, heights)
     surface = _heights(dsm, "dsm", given, resolution, nodata)
-    if ground.datum and surface.datum and ground.datum != surface.datum:
+    datums = [heights.attrs["datum"] for heights in (ground, surface)]
+    if all(datums) and datums[0] != datums[1]:
         raise TrustboError(
-            f"{ground.name} has heights above {ground.datum!r}, but {surface.name} above "
-            f"{surface.datum!r}; transform one of them, e.g. with gdalwarp -t_srs."
+            f"{ground.name} has heights above {datums[0]!r}, but {surface.name} above "
+            f"{datums[1]!r}; transform one of them, e.g. with gdalwarp -t_srs."
         )
-    above = surface.heights
-    if same_grid(above, ground.heights):
-        above = on_metric_grid(above)  # exactly as the ground was
-    if not same_grid(heights, above):
-        above = above.rio.reproject_match(heights, resampling=Resampling.bilinear, nodata=np.nan)
-    return _paired(heights, above)
+    if same_grid(surface, ground):
+        surface = on_metric_grid(surface)  # exactly as the ground was
+    if not same_grid(heights, surface):
+        how = Resampling.bilinear
+        surface = surface.rio.reproject_match(heights, resampling=how, nodata=np.nan)
+    return _paired(heights, surface)
 
 
 def require_terrain(terrain: xr.Dataset) -> xr.Dataset:
@@ -161,98 +139,110 @@ def _heights(
     given: CRS | None,
     resolution: float | None,
     nodata: float | None,
-) -> _Raster:
-    """Read the heights of one raster, dem or dsm, averaged to a resolution."""
-    with _opened(raster, role) as source:
-        crs, coding = require_map(source.name, source.crs, given), source.coding
-        vertical = vertical_of(source.name, source.unit, vertical_axis(crs))
-        if abs(vertical.metres) != 1.0:
-            warn(f"{source.name} has heights in {vertical.unit!r}; they are converted to metres.")
-        if nodata is not None:
-            coding = coding._replace(fills=(*coding.fills, _number("nodata", nodata)))
-        factor = _factor(source, crs.is_geographic, resolution)
-        try:
-            heights = _averaged(source, coding._replace(metres=vertical.metres), factor)
-        except RasterioError as error:
-            raise TrustboError(f"{source.name} is damaged or out of reach: {error}.") from None
-    if not heights.notnull().any():
-        raise TrustboError(f"{source.name} is all nodata; check its nodata value.")
-    warn_of_zeros(heights.values, source.name)
-    heights = heights.sortby("y", ascending=False).sortby("x")
-    heights = placed(heights.rio.write_crs(horizontal(crs)), source.name)
-    return _Raster(source.name, heights, vertical.datum)
+) -> xr.DataArray:
+    """Heights of one raster, dem or dsm, in metres with north up, averaged to a resolution.
+
+    The attribute `datum` is the vertical datum, None if nothing declares one.
+    """
+    array = _stored(raster, role)
+    name = str(array.name)
+    crs = require_map(name, array.rio.crs, given)
+    vertical = vertical_of(name, array.attrs.get("units"), vertical_axis(crs))
+    if abs(vertical.metres) != 1.0:
+        warn(f"{name} has heights in {vertical.unit!r}; they are converted to metres.")
+
+    def note(default: float, *names: str) -> float:
+        found = [array.attrs[one] for one in names if one in array.attrs]
+        return _number(names[0], np.ravel(found[0])[0]) if found else default
+
+    fills = _declared_fills(array)
+    if nodata is not None:
+        fills = *fills, _number("nodata", nodata)
+    scale, offset = note(1.0, "scale_factor", "scales"), note(0.0, "add_offset", "offsets")
+    coding = Coding(name, fills, scale, offset, vertical.metres)
+    coords = {axis: array[axis].values for axis in ("y", "x")}
+    heights = xr.DataArray(decoded(array.to_numpy(), coding), coords, name=name)
+    heights = _averaged(heights, crs.is_geographic, resolution)
+    warn_of_zeros(heights.values, name)
+    heights = heights.sortby("y", ascending=False).sortby("x").assign_attrs(datum=vertical.datum)
+    return placed(heights.rio.write_crs(horizontal(crs)), name)
 
 
-def _averaged(source: _Source, coding: Coding, factor: int) -> xr.DataArray:
-    """Means of `factor` x `factor` pixels, strip by strip; over half missing make one missing.
+def _averaged(heights: xr.DataArray, in_degrees: bool, resolution: float | None) -> xr.DataArray:
+    """Means of squares of pixels of about a resolution, m; over half missing make one missing.
 
     Rows and columns at the edge that fill no such square are left out.
     """
-    strips: list[xr.DataArray] = []
-    step = factor * max(1, _STRIP // (factor * len(source.x)))
-    for top in range(0, len(source.y) // factor * factor, step):
-        rows = slice(top, top + step)
-        stored, hidden = source.read(rows)
-        coords = {"y": source.y[rows], "x": source.x}
-        strip = xr.DataArray(decoded(stored, coding, hidden, top), coords, ("y", "x"))
-        if factor > 1:
-            squares: Any = strip.coarsen(y=factor, x=factor, boundary="trim")
-            strip = squares.mean().where(2 * squares.count() >= factor**2)
-        strips.append(strip)
-    return xr.concat(strips, "y")
-
-
-def _factor(source: _Source, is_geographic: bool, resolution: float | None) -> int:
-    """Number of pixels along a side that are averaged to one; checks the number of pixels."""
-    shape, factor = (len(source.y), len(source.x)), 1
-    size = f"{source.name} has {shape[0]} x {shape[1]} pixels"
-    if min(shape) < 2:
-        raise TrustboError(f"{size}; a terrain needs at least two rows and two columns.")
-    if resolution is not None:
-        side = abs(source.y[1] - source.y[0]) * (_DEGREE if is_geographic else 1.0)
-        factor = max(1, round(require_positive("resolution", resolution) / side))
-    if min(shape) < 2 * factor:
-        raise TrustboError(f"{size}, too few to average {factor} x {factor}; lower resolution=.")
-    if math.prod(shape) > _MOST_PIXELS * factor**2:
-        raise TrustboError(f"{size}, too many for the memory; average them by resolution=, in m.")
-    return factor
+    if resolution is None:
+        return heights
+    side = abs(float(heights["y"][1] - heights["y"][0])) * (_DEGREE if in_degrees else 1.0)
+    factor = max(1, round(require_positive("resolution", resolution) / side))
+    if min(heights.shape) < 2 * factor:
+        raise TrustboError(
+            f"{heights.name} has {heights.shape} pixels, too few to average {factor} x {factor}; "
+            "lower resolution=."
+        )
+    squares: Any = heights.coarsen(y=factor, x=factor, boundary="trim")
+    return squares.mean().where(2 * squares.count() >= factor**2)
 
 
 # --- what is stored ---
 
 
-@contextmanager
-def _opened(raster: RasterLike, role: str) -> Iterator[_Source]:
-    """Open a raster of any kind; `role`, dem or dsm, is for messages."""
+def _stored(raster: RasterLike, role: str) -> xr.DataArray:
+    """Raster of any kind as it is stored, dims (y, x); its name, with `role`, is for messages."""
     if isinstance(raster, xr.DataArray):
-        yield _of_array(raster, f"{role}: DataArray" + (f" {raster.name!r}" if raster.name else ""))
+        name = f"{role}: DataArray" + (f" {raster.name!r}" if raster.name else "")
+        _check_size(raster.shape, name)
+        return _of_array(raster, name)
+    if isinstance(raster, str | PathLike):
+        name = f"{role}: {os.fspath(raster)!r}"
     elif isinstance(raster, DatasetReader | WarpedVRT):
-        yield _of_file(raster, f"{role}: {raster.name!r}")
-    elif isinstance(raster, str | PathLike):
-        path = os.fspath(raster)
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", NotGeoreferencedWarning)
-                file = rasterio.open(path)
-        except RasterioError as error:
-            raise TrustboError(f"{role}: {path!r} is no raster that GDAL reads: {error}.") from None
-        with file:
-            yield _of_file(file, f"{role}: {path!r}")
+        name = f"{role}: {raster.name!r}"
     else:
         raise TrustboError(
             f"{role} must be a path, an open rasterio dataset or an xarray.DataArray; got "
             f"{type(raster).__name__}."
         )
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)
+            is_open = isinstance(raster, DatasetReader | WarpedVRT)
+            opened = nullcontext(raster) if is_open else rasterio.open(raster)
+        with opened as file:
+            _check_size(file.shape, name)
+            return _of_array(_of_file(file, name), name)
+    except RasterioError as error:
+        raise TrustboError(f"{name} cannot be read by GDAL: {error}.") from None
 
 
-def _of_file(file: DatasetReader | WarpedVRT, name: str) -> _Source:
-    """Describe the band of heights of a GDAL dataset: that described as elevation, else the first.
+def _check_size(shape: tuple[int, ...], name: str) -> None:
+    """Check that a raster fits into memory."""
+    if math.prod(shape) > _MOST_PIXELS:
+        raise TrustboError(
+            f"{name} has {shape} pixels, too many for the memory; cut out a part, or average them "
+            "first, e.g. with gdalwarp -tr 5 5 -r average."
+        )
 
-    A mask or an alpha band hides the nodata tag from GDAL's own mask, so that all of them are read.
+
+def _of_file(file: DatasetReader | WarpedVRT, name: str) -> xr.DataArray:
+    """Band of heights of a GDAL dataset: that described as elevation, else the first.
+
+    What a mask or an alpha band hides is NaN. They hide the nodata tag from GDAL's own mask, so
+    that the tag is declared, too.
     """
     if not file.count:
         parts = ", ".join(file.subdatasets) or "nothing"
         raise TrustboError(f"{name} has no band of its own; give one of its parts: {parts}.")
+    t = file.transform
+    # Less than a thousandth of a pixel over the whole raster is rounding.
+    turned = abs(t.b) * file.height > 1e-3 * abs(t.a) or abs(t.d) * file.width > 1e-3 * abs(t.e)
+    if t.is_identity or turned:
+        raise TrustboError(
+            f"{name} has no georeference, or one by control points or a rotated grid; warp it to a "
+            "map, e.g. with gdalwarp -t_srs EPSG:32633, or declare its corners, e.g. with "
+            "gdal_edit.py -a_ullr."
+        )
     colours = dict(enumerate(file.colorinterp, 1))
     alpha = [k for k, colour in colours.items() if colour == ColorInterp.alpha]
     bands = [k for k in colours if k not in alpha] or [1]
@@ -265,21 +255,21 @@ def _of_file(file: DatasetReader | WarpedVRT, name: str) -> _Source:
         )
     if len(named) != 1:
         _warn_of_bands(len(bands), name)
-    tag, dtype, scale, offset, unit = (
-        of[band - 1] for of in (file.nodatavals, file.dtypes, file.scales, file.offsets, file.units)
-    )
-    if dtype.startswith("complex"):
-        raise TrustboError(f"{name} holds {dtype}, which are no heights; give real numbers.")
-    masked = MaskFlags.all_valid not in file.mask_flag_enums[band - 1]
-
-    def read(rows: slice) -> tuple[np.ndarray, np.ndarray | None]:
-        window = Window.from_slices(rows.indices(file.height)[:2], (0, file.width))
-        hidden = [file.read_masks(band, window=window) == 0] if masked else []
-        hidden += [file.read(k, window=window) == 0 for k in alpha]
-        return file.read(band, window=window), np.any(hidden, axis=0) if hidden else None
-
-    coding = Coding(name, () if tag is None else (tag,), scale, offset)
-    return _Source(name, *_axes_of(file, name), file.crs, coding, unit, read)
+    if file.dtypes[band - 1].startswith("complex"):
+        raise TrustboError(f"{name} holds complex numbers, no heights; give real numbers.")
+    stored = file.read(band, masked=True)
+    values = stored.astype(np.result_type(stored, np.float32)).filled(np.nan)
+    for k in alpha:  # GDAL's mask knows no alpha band of floats
+        values[file.read(k) == 0] = np.nan
+    names = {
+        "_FillValue": file.nodatavals, "scale_factor": file.scales, "add_offset": file.offsets,
+        "units": file.units,
+    }  # fmt: skip
+    attrs = {key: of_bands[band - 1] for key, of_bands in names.items()}
+    rows, cols = np.arange(file.height) + 0.5, np.arange(file.width) + 0.5
+    coords = {"y": t.f + rows * t.e, "x": t.c + cols * t.a}
+    array = xr.DataArray(values, coords, ("y", "x"), attrs=attrs)
+    return array if file.crs is None else array.rio.write_crs(file.crs)
 
 
 def _warn_of_bands(n: int, name: str) -> None:
@@ -287,58 +277,22 @@ def _warn_of_bands(n: int, name: str) -> None:
         warn(f"{name} has {n} bands; the first is taken as heights.")
 
 
-def _axes_of(file: DatasetReader | WarpedVRT, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Y of the rows and x of the columns of a GDAL dataset."""
-    t = file.transform
-    if t.is_identity and (file.gcps[0] or file.rpcs):
-        raise TrustboError(
-            f"{name} is placed by ground control points or RPCs; warp it to a map first, e.g. with "
-            "gdalwarp -t_srs EPSG:32633."
-        )
-    if t.is_identity:
-        raise TrustboError(
-            f"{name} has no georeference; add one, e.g. with gdal_translate -a_ullr -a_srs."
-        )
-    # Less than a thousandth of a pixel over the whole raster is rounding.
-    if abs(t.b) * file.height > 1e-3 * abs(t.a) or abs(t.d) * file.width > 1e-3 * abs(t.e):
-        raise TrustboError(f"{name} is on a rotated grid; warp it first, e.g. with gdalwarp.")
-    rows, cols = np.arange(file.height) + 0.5, np.arange(file.width) + 0.5
-    return t.f + rows * t.e, t.c + cols * t.a
-
-
-def _of_array(array: xr.DataArray, name: str) -> _Source:
-    """Describe a DataArray; of several bands, the first."""
+def _of_array(array: xr.DataArray, name: str) -> xr.DataArray:
+    """Array of dims (y, x), evenly spaced; of several bands, the first."""
     try:
         y, x = array.rio.y_dim, array.rio.x_dim
     except MissingSpatialDimensionError:
         y, x = "lat", "lon"
     bands = [dim for dim in array.dims if dim not in (y, x)]
-    if not {y, x} <= set(array.dims) or len(bands) > 1 or not array.size:
+    if not {y, x} <= set(array.dims) & set(array.coords) or len(bands) > 1 or not array.size:
         raise TrustboError(
-            f"{name} has axes {dict(array.sizes)}; need rows and columns, named (y, x), and one "
-            "axis of bands at most."
+            f"{name} has axes {dict(array.sizes)}; need rows and columns, named (y, x), with "
+            "coordinates, and one axis of bands at most."
         )
-    if not {y, x} <= set(array.coords):
-        raise TrustboError(f"{name} has no coordinates along {y} and {x}; assign them, in m.")
     _warn_of_bands(max([array.sizes[dim] for dim in bands], default=1), name)
     array = array.isel(dict.fromkeys(bands, 0)).transpose(y, x)
-
-    def note(default: float, *names: str) -> float:
-        found = [array.attrs[one] for one in names if one in array.attrs]
-        return _number(names[0], np.ravel(found[0])[0]) if found else default
-
-    coding = Coding(
-        name,
-        _declared_fills(array),
-        note(1.0, "scale_factor", "scales"),
-        note(0.0, "add_offset", "offsets"),
-    )
     rows, cols = (_even(array[axis].values, f"{name}'s {axis}") for axis in (y, x))
-
-    def read(part: slice) -> tuple[np.ndarray, None]:
-        return array[part].to_numpy(), None
-
-    return _Source(name, rows, cols, array.rio.crs, coding, array.attrs.get("units"), read)
+    return array.rename({y: "y", x: "x"}).assign_coords(y=rows, x=cols).rename(name)
 
 
 def _declared_fills(array: xr.DataArray) -> tuple[float, ...]:
@@ -352,13 +306,13 @@ def _declared_fills(array: xr.DataArray) -> tuple[float, ...]:
 
 
 def _even(values: np.ndarray, what: str) -> np.ndarray:
-    """Evenly spaced coordinates; TrustboError if they differ from even ones by over rounding.
+    """Evenly spaced coordinates; TrustboError: one alone, or further from even than rounding.
 
     Coordinates that passed through float32 are rounded to 0.5 m in the north of a UTM zone.
     """
     given = values.astype(float)
     if len(given) < 2:
-        return given
+        raise TrustboError(f"{what} has one value; a terrain needs two rows and columns at least.")
     even = np.linspace(given[0], given[-1], len(given))
     step, off = abs(even[1] - even[0]), np.abs(given - even).max()
     single = (given.astype(np.float32) == given).all()
