@@ -2,9 +2,9 @@
 
 Method: labels with dominance for the resource-constrained shortest path (Martins 1984; Irnich and
 Desaulniers 2005). A label at a state has the cost so far, the sums r_m of risks -log(1 - p), and
-trust of each robot that differs (none where the cost is a sum of weights). An edge costs its toll
-and a loss that falls in trust. A path pays besides sum_m F_m (1 - exp(-r_m)), and its last sum is
-within a limit.
+trust of each robot that differs (none where the cost is a sum of weights). An edge has a cost and,
+where there is trust, a loss that falls in it. A path pays besides sum_m F_m (1 - exp(-r_m)), and
+its last sum is within a limit.
 
 A label is dropped if another of its state costs no more, has no larger sums and as much trust of
 each robot: B0 >= 0 keeps trust in order, so that every completion of the one is as good for the
@@ -28,9 +28,9 @@ from trustbo.planning.unrolled import Unrolled, edges_from, fill_to_go, kernel, 
 
 MAX_LABELS = 300_000
 """Labels of one search: beyond, it returns the best path known and a lower limit on the cost."""
-SUM, LOGISTIC, CLIPPED = range(3)
-"""Losses of a bound: a weight; 1 - sigma(trust); 1 - E[y], y around trust and cut to [0, 1]."""
-LOSSES = {"identity": SUM, "logistic": LOGISTIC, "clipped": CLIPPED}
+LOGISTIC, CLIPPED = range(2)
+"""Losses of a bound: 1 - sigma(trust); 1 - E[y], y around trust and cut to [0, 1]."""
+LOSSES = {"logistic": LOGISTIC, "clipped": CLIPPED}
 """Loss by the expected rate of a family of observations."""
 TINY_SD = 1e-9
 """Least sd of a rate, instead of 0."""
@@ -39,10 +39,10 @@ TINY_SD = 1e-9
 class Costs(NamedTuple):
     """What paths cost under one draw.
 
-    Fields: loss, one of `LOSSES`; drift (robot, bound or cell); weight (left, robot) of the drift
-    where it is `SUM`; start, cost by the number of bounds (left,); transition (robot, robot) and x0
-    (robot,) of trust; sd of a rate; toll (bound,); risk (bound, sum); failure, the cost F_m of each
-    sum (sum,); and the limit of the last sum.
+    Fields: loss, one of `LOSSES`; drift (robot, bound) and its weight in the value (left, robot);
+    start, cost by the number of bounds (left,); transition (robot, robot) and x0 (robot,) of trust,
+    without robots where no loss depends on it; sd of a rate; toll (bound,); risk (bound, sum);
+    failure, the cost F_m of each sum (sum,); and the limit of the last sum.
     """
 
     loss: int
@@ -111,25 +111,25 @@ def _lost(loss, x, sd):
 
 
 @kernel
-def _enter(graph, costs, e, x, after):
-    """Cost of an edge without its risk, where trust counts; writes the trust after it."""
-    b, mean, n = graph.bound[e], 0.0, len(costs.x0)
-    column = b if costs.drift.shape[1] == len(costs.toll) else graph.cell[graph.head[e]]
+def _lost_on(graph, costs, e, x, after):
+    """Contact lost on an edge that is entered with trust x; writes the trust after it."""
+    mean, n = 0.0, len(costs.x0)
+    if n == 0:
+        return 0.0
     for i in range(n):
-        after[i] = costs.drift[i, column]
+        after[i] = costs.drift[i, graph.bound[e]]
         for j in range(n):
             after[i] += costs.transition[i, j] * x[j]
         mean += after[i] / n
-    return costs.toll[b] + _lost(costs.loss, mean, costs.sd)
+    return _lost(costs.loss, mean, costs.sd)
 
 
 @kernel
-def _least_costs(graph, costs):
+def _least_costs(graph, costs, edge_cost):
     """Cost of each edge with the most trust that it can be taken with, (edge,)."""
+    if len(costs.x0) == 0:
+        return edge_cost
     cost = np.full(len(graph.head), np.inf)
-    if costs.loss == SUM:
-        costs_of_sums(graph, costs.drift, costs.weight, costs.toll, cost)
-        return cost
     most, after = np.full((len(graph.cell), len(costs.x0)), -np.inf), np.empty(len(costs.x0))
     for s in graph.starts:
         most[s] = costs.x0
@@ -137,7 +137,7 @@ def _least_costs(graph, costs):
         if most[s, 0] == -np.inf:  # only beyond the goal
             continue
         for e in range(graph.first[s], graph.first[s + 1]):
-            cost[e] = _enter(graph, costs, e, most[s], after)
+            cost[e] = edge_cost[e] + _lost_on(graph, costs, e, most[s], after)
             most[graph.head[e]] = np.maximum(most[graph.head[e]], after)
     return cost
 
@@ -165,7 +165,7 @@ class Known(NamedTuple):
 
 
 @kernel
-def _try_paths(graph, costs, least_cost, to_go, known):
+def _try_paths(graph, costs, edge_cost, to_go, known):
     """Try the cheapest path by `to_go` from each start: the least of their costs to go.
 
     Keeps the best of them that is within the limit, and the sums of the cheapest.
@@ -180,11 +180,8 @@ def _try_paths(graph, costs, least_cost, to_go, known):
         n = edges_from(graph, to_go, s, known.trial)
         sums[:], x[:] = 0.0, costs.x0
         for e in known.trial[:n]:
-            if costs.loss == SUM:
-                cost += least_cost[e]
-            else:
-                cost += _enter(graph, costs, e, x, after)
-                x[:] = after
+            cost += edge_cost[e] + _lost_on(graph, costs, e, x, after)
+            x[:] = after
             sums += costs.risk[graph.bound[e]]
         cost += _failing(costs.failure, sums)
         if sums[-1] <= costs.limit and cost < known.cost[0]:
@@ -197,9 +194,9 @@ def _try_paths(graph, costs, least_cost, to_go, known):
 
 
 @kernel
-def _fill_priced(graph, costs, edge_cost, price, to_go):
+def _fill_priced(graph, costs, least_cost, price, to_go):
     """Write the costs to go of edges at a price of each risk, (sum,)."""
-    cost = edge_cost.copy()
+    cost = least_cost.copy()
     for e in range(len(cost)):
         for m in range(len(price)):
             cost[e] += price[m] * costs.risk[graph.bound[e], m]
@@ -223,7 +220,7 @@ class Limits(NamedTuple):
 
 
 @kernel
-def _limits(graph, costs, least_cost, known):
+def _limits(graph, costs, edge_cost, least_cost, known):
     """Find good paths and lower limits; the search is over where their costs are equal."""
     to_go, n_sums = new_to_go(len(graph.cell)), len(costs.failure)
     safest, low = np.empty((len(graph.cell), n_sums)), np.empty(n_sums)
@@ -231,10 +228,10 @@ def _limits(graph, costs, least_cost, known):
         _fill_priced(graph, costs, np.zeros(len(graph.head)), np.eye(n_sums)[m], to_go)
         safest[:, m] = to_go.least
         low[m] = to_go.least[graph.starts].min()
-    _try_paths(graph, costs, least_cost, to_go, known)  # the safest by the sum that is limited
+    _try_paths(graph, costs, edge_cost, to_go, known)  # the safest by the sum that is limited
     fill_to_go(graph, least_cost, to_go)
     free, price = to_go.least.copy(), np.zeros(n_sums)
-    least = _try_paths(graph, costs, least_cost, to_go, known)
+    least = _try_paths(graph, costs, edge_cost, to_go, known)
     if known.cost[0] == np.inf:
         return Limits(np.inf, safest, free, free, price, 0.0)
     for _ in range(8):  # tangents of the concave cost of failing give good paths
@@ -242,9 +239,10 @@ def _limits(graph, costs, least_cost, known):
         if np.abs(price - before).max() <= 1e-9 * costs.failure.max():
             break
         _fill_priced(graph, costs, least_cost, price, to_go)
-        _try_paths(graph, costs, least_cost, to_go, known)
+        _try_paths(graph, costs, edge_cost, to_go, known)
     chord, offset = _chords(costs, low, known.cost[0] - least)
-    lower, extra = _price_of_limit(graph, costs, least_cost, chord, offset, to_go, known)
+    of_edges = edge_cost, least_cost
+    lower, extra = _price_of_limit(graph, costs, *of_edges, chord, offset, to_go, known)
     chord[-1] += extra
     _fill_priced(graph, costs, least_cost, chord, to_go)
     offset -= extra * costs.limit if extra > 0.0 else 0.0
@@ -275,7 +273,7 @@ def _chords(costs, low, gap):
 
 
 @kernel
-def _price_of_limit(graph, costs, least_cost, chord, offset, to_go, known):
+def _price_of_limit(graph, costs, edge_cost, least_cost, chord, offset, to_go, known):
     """Best lower limit on the cost of all paths, and the price of the limited sum that gives it.
 
     The dual is concave in the price; its slope is the excess of the cheapest path's sum.
@@ -285,7 +283,7 @@ def _price_of_limit(graph, costs, least_cost, chord, offset, to_go, known):
     for _ in range(16):
         price[-1] = chord[-1] + extra
         _fill_priced(graph, costs, least_cost, price, to_go)
-        dual = offset + _try_paths(graph, costs, least_cost, to_go, known)
+        dual = offset + _try_paths(graph, costs, edge_cost, to_go, known)
         dual -= extra * limit if extra > 0.0 else 0.0
         if dual > lower:
             lower, chosen = dual, extra
@@ -299,12 +297,13 @@ def _price_of_limit(graph, costs, least_cost, chord, offset, to_go, known):
 @kernel
 def _best_path(graph, costs, most, path):
     """Write the path of least cost within the limit; its cost, inf if none, and a lower limit."""
-    least_cost, n, n_sums = _least_costs(graph, costs), len(path), len(costs.failure)
+    edge_cost, n, n_sums = np.empty(len(graph.head)), len(path), len(costs.failure)
+    costs_of_sums(graph, costs.drift, costs.weight, costs.toll, edge_cost)
     known = Known(np.full(1, np.inf), np.full(n, -1), np.full(n, -1), np.zeros(n_sums))
-    limits = _limits(graph, costs, least_cost, known)
+    limits = _limits(graph, costs, edge_cost, _least_costs(graph, costs, edge_cost), known)
     lower = limits.lower
     if lower < known.cost[0]:
-        lower = _search(graph, costs, most, least_cost, limits, known)
+        lower = _search(graph, costs, most, edge_cost, limits, known)
     if known.cost[0] < np.inf:
         path[0] = graph.cell[graph.starts[0]]
     for k, e in enumerate(known.edges[: n - 1]):
@@ -329,9 +328,9 @@ class Labels(NamedTuple):
 
 
 @kernel
-def _search(graph, costs, most, least_cost, limits, known):
+def _search(graph, costs, most, edge_cost, limits, known):
     """Label search: writes the best path; a lower limit on its cost, equal to it where exact."""
-    n_numbers = 1 + len(costs.failure) + (0 if costs.loss == SUM else len(costs.x0))
+    n_numbers = 1 + len(costs.failure) + len(costs.x0)
     made, last = np.empty((4, most), np.int64), np.full(len(graph.cell), -1)
     labels = Labels(np.empty((most, n_numbers)), made[0], made[1], made[2], made[3], last)
     n = 0
@@ -339,8 +338,7 @@ def _search(graph, costs, most, least_cost, limits, known):
         labels.number[n], labels.last[s] = 0.0, n
         labels.edge[n], labels.left[n], labels.parent[n], labels.before[n] = -1, -1, -1, -1
         labels.number[n, 0] = costs.start[graph.left[s]]
-        if costs.loss != SUM:
-            labels.number[n, -len(costs.x0) :] = costs.x0
+        labels.number[n, 1 + len(costs.failure) :] = costs.x0
         n += 1
     for s in range(len(graph.cell) - 1, 0, -1):
         label = labels.last[s]
@@ -348,13 +346,13 @@ def _search(graph, costs, most, least_cost, limits, known):
             if n + 8 > most:
                 return limits.lower
             if not _is_dominated(graph, labels, label, labels.last[s], len(costs.failure)):
-                n = _extend(graph, costs, least_cost, limits, known, labels, s, label, n)
+                n = _extend(graph, costs, edge_cost, limits, known, labels, s, label, n)
             label = labels.before[label]
     return known.cost[0]
 
 
 @kernel
-def _extend(graph, costs, least_cost, limits, known, labels, s, label, n):
+def _extend(graph, costs, edge_cost, limits, known, labels, s, label, n):
     """Make the labels that follow one of a state and can be best; the number of all labels."""
     n_sums = len(costs.failure)
     number, after, sums = labels.number[label], np.empty(len(costs.x0)), np.empty(n_sums)
@@ -362,17 +360,13 @@ def _extend(graph, costs, least_cost, limits, known, labels, s, label, n):
         h = graph.head[e]
         if not graph.turns and graph.cell[h] == labels.left[label]:
             continue
-        cost = number[0]
-        if costs.loss == SUM:
-            cost += least_cost[e]
-        else:
-            cost += _enter(graph, costs, e, number[1 + n_sums :], after)
+        lost = _lost_on(graph, costs, e, number[1 + n_sums :], after)
+        cost = number[0] + (edge_cost[e] + lost)
         sums[:] = number[1 : 1 + n_sums] + costs.risk[graph.bound[e]]
         if _is_hopeless(costs, limits, h, cost, sums, known.cost[0]):
             continue
         labels.number[n, 0], labels.number[n, 1 : 1 + n_sums] = cost, sums
-        if costs.loss != SUM:
-            labels.number[n, 1 + n_sums :] = after
+        labels.number[n, 1 + n_sums :] = after
         labels.edge[n], labels.left[n], labels.parent[n] = e, graph.cell[s], label
         labels.before[n], labels.last[h] = labels.last[h], n
         if h == 0:
@@ -387,14 +381,12 @@ def _is_hopeless(costs, limits, h, cost, sums, known):
     """Whether no path that enters a state with this cost and these sums beats the one known."""
     if sums[-1] + limits.safest[h, -1] > costs.limit:
         return True
-    at_least, failing = cost + limits.priced[h] + limits.offset, 0.0
+    at_least = cost + limits.priced[h] + limits.offset
     for m in range(len(sums)):
         at_least += limits.price[m] * sums[m]
     if at_least >= known:
         return True
-    for m in range(len(sums)):
-        failing -= costs.failure[m] * math.expm1(-sums[m] - limits.safest[h, m])
-    return cost + limits.free[h] + failing >= known
+    return cost + limits.free[h] + _failing(costs.failure, sums + limits.safest[h]) >= known
 
 
 @kernel

@@ -16,7 +16,7 @@ from trustbo.inference.draws import params_of
 from trustbo.models.families import Family
 from trustbo.models.params import Params
 from trustbo.planning.dynamics import Dynamics, trust_dynamics
-from trustbo.planning.labels import LOSSES, SUM, TINY_SD, Costs, best_labels
+from trustbo.planning.labels import LOGISTIC, LOSSES, TINY_SD, Costs, best_labels
 from trustbo.planning.objectives import Objective, Weights, capped, has_history, weights_of
 from trustbo.planning.paths import AdmissiblePaths
 from trustbo.planning.sums import best_sums
@@ -167,12 +167,14 @@ class Problem:
         if self.risks is None and not history:
             score, paths = best_sums(graph, drift, weights, toll)
             return Best(paths, score, score)
-        start = np.zeros_like(weights.constant) if history else -weights.constant
-        loss = LOSSES[self.family.expected_rate] if history else SUM
+        n_trust, loss = 0, LOGISTIC
+        if history:  # the cost is a loss of trust, and no sum of weights
+            n_trust, loss = n_states, LOSSES[self.family.expected_rate]
+            weights = Weights(0.0 * weights.per_bound, 0.0 * weights.constant, weights.scale)
+        transition, x0 = dynamics.transition[:, :n_trust, :n_trust], dynamics.start[:, :n_trust]
+        trust = transition.copy(), x0.copy(), np.maximum(dynamics.noise_sd, TINY_SD)
         risks = self.risks or Risks(np.zeros((len(toll), 1)), np.zeros(1), np.inf)
-        trust = np.array(dynamics.transition), np.array(dynamics.start)
-        sd = np.maximum(dynamics.noise_sd, TINY_SD)
-        costs = Costs(loss, drift, weights.per_bound, start, *trust, sd, toll, *risks)
+        costs = Costs(loss, drift, weights.per_bound, -weights.constant, *trust, toll, *risks)
         cost, lower, paths = best_labels(graph, costs, weights.scale)
         if self.risk is not None and np.isinf(cost).any():
             raise self._infeasible(self.risk)

@@ -58,8 +58,7 @@ def shortest_paths(planner: Planner, dynamics: Dynamics) -> Iterator[tuple[Cell,
     for j in range(graph.longest):
         carried = carried @ dynamics.transition + credit[j] * view
         weights.append(carried)
-    drift = np.broadcast_to(dynamics.drift, (n_states, *problem.paths.bounds.shape))
-    drift, toll = drift.reshape(n_states, -1), problem.toll.ravel()
+    drift, toll = dynamics.drift.reshape(n_states, -1), problem.toll.ravel()
     left = graph.left[graph.head]  # after each edge
     cost = [toll[b] - weights[j] @ drift[:, b] for b, j in zip(graph.bound, left, strict=True)]
     network = graph.to_networkx(cost)

@@ -19,7 +19,7 @@ def best_sums(
 
     Args:
         graph: Unrolled graph.
-        drift: Drift of trust, (draw, state of trust, bound), or by the cell entered.
+        drift: Drift of trust, (draw, state of trust, bound).
         weights: Weights of the drift.
         toll: Further cost of each bound, (bound,).
 
@@ -58,10 +58,8 @@ def _best_sums(graph, drift, per_bound, constant, scale, toll, scores, paths, be
 @kernel
 def costs_of_sums(graph, drift, per_bound, toll, cost) -> None:
     """Write the cost of each edge under one draw: its toll less w_j . u."""
-    by_bound = drift.shape[1] == len(toll)
     for e in range(len(graph.head)):
-        h, b = graph.head[e], graph.bound[e]
-        column = b if by_bound else graph.cell[h]
+        left, b = graph.left[graph.head[e]], graph.bound[e]
         cost[e] = toll[b]
         for i in range(len(drift)):
-            cost[e] -= per_bound[graph.left[h], i] * drift[i, column]
+            cost[e] -= per_bound[left, i] * drift[i, b]
