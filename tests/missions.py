@@ -24,7 +24,7 @@ def simulate_missions(n_missions=6, seed=0, truth=TRUTH, lengths=(7, 5, 8)):
     missions = []
     for j in range(n_missions):
         n = lengths[j % len(lengths)]
-        rates = np.clip(sample.contact_rate[j, :n], 0.0, 1.0)
+        rates = np.clip(sample[j, :n], 0.0, 1.0)
         path = [(0, k) for k in range(n + 1)]
         missions.append(Mission.from_arrays(path, awareness[j, :n], rates))
     return missions
@@ -35,7 +35,7 @@ def counted_missions(family, seed=0, n=6, low=0.0):
     rng = np.random.default_rng(seed)
     z = rng.uniform(size=(n, 5, 1, 2))
     model = PooledTrust(observation=family)
-    y = model.simulate(jax.random.key(seed), OF_FAMILY[family], z, n_ticks=N_TICKS).contact_rate
+    y = model.simulate(jax.random.key(seed), OF_FAMILY[family], z, n_ticks=N_TICKS)
     y = np.round(np.clip(y, low, 1.0 - low) * N_TICKS) / N_TICKS
     y[0, 2] = np.nan
     path = [(0, k) for k in range(6)]

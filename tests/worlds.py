@@ -67,7 +67,7 @@ class ModelSimulator:
         )
         if self.blind:
             z = np.full_like(z, np.nan)
-        rates = np.clip(sample.contact_rate[0], 0.0, 1.0)
+        rates = np.clip(sample[0], 0.0, 1.0)
         return Mission.from_arrays(path, z, rates, duration=np.full(len(z), 30.0), status=status)
 
 

@@ -139,7 +139,7 @@ def test_predictions_by_rate_are_calibrated_under_the_model():
     with own_settings():
         sample = PooledTrust().simulate(jax.random.key(0), truth, z)
     path = [(k, 0) for k in range(7)]
-    rates = np.clip(sample.contact_rate, 0.0, 1.0)
+    rates = np.clip(sample, 0.0, 1.0)
     missions = [tb.Mission.from_arrays(path, *pair) for pair in zip(z, rates, strict=True)]
     view = tb.inference.by_rate(tb.fit(missions, PooledTrust()))
     drawn = view["posterior_predictive"]["contact_rate"]

@@ -99,7 +99,7 @@ def test_drawn_columns_have_the_moments_of_the_joint_normal(name):
     np.testing.assert_allclose(drawn.std(0), sd, rtol=0.04)
 
 
-@pytest.mark.parametrize("name", ["pooled", "deviation", "hierarchical", "coupled"])
+@pytest.mark.parametrize("name", ["pooled", "deviation", "hierarchical"])
 def test_the_plain_program_has_the_density_of_the_equations(name):
     """Given coefficients: signals by the program's filter, and by the matrices of `signal`."""
     posterior, theta = posterior_of(name, gaps=True)

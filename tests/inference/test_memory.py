@@ -23,7 +23,7 @@ def simulated(truth, n=4, seed=0):
     for _ in range(n):
         z = rng.uniform(size=(12, 3, 2))
         key = jax.random.key(int(rng.integers(1000)))
-        y = np.clip(PooledTrust().simulate(key, truth, z[None]).contact_rate[0], 0.0, 1.0)
+        y = np.clip(PooledTrust().simulate(key, truth, z[None])[0], 0.0, 1.0)
         missions.append(tb.Mission.from_arrays(path, z, y, features=FEATURES))
     return missions
 

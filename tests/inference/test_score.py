@@ -116,7 +116,7 @@ def test_pit_of_rates_that_the_model_draws_are_uniform_with_limits_of_censored_o
     truth = OF_FAMILY["censored"]._replace(delta_w=0.4)
     z = np.random.default_rng(0).uniform(size=(60, 5, 1, 2))
     model = PooledTrust(observation="censored")
-    y = model.simulate(jax.random.key(0), truth, z).contact_rate
+    y = model.simulate(jax.random.key(0), truth, z)
     assert 0.2 < np.isin(y, (0.0, 1.0)).mean() < 0.8
     path = [(0, k) for k in range(6)]
     missions = [Mission.from_arrays(path, a, b) for a, b in zip(z, y, strict=True)]

@@ -43,7 +43,7 @@ from trustbo.hazard.risk import BoundRisk
 from trustbo.inference import diagnostics, fit
 from trustbo.inference.fit import SAMPLERS
 from trustbo.models import HumanTrust, default_model
-from trustbo.models.model import TrustModel, require_model
+from trustbo.models.model import TrustModel
 from trustbo.models.params import Params
 from trustbo.models.record import model_from_record, model_to_record
 from trustbo.planning import InfeasibleError, Plan, Planner
@@ -132,7 +132,8 @@ class Campaign(Summary):
         own = {"workspace": workspace, "seed": seed, "progress": True, "whole": False}
         _FIT.bind([], model, sampler=sampler, **own, **(fit or {}))  # a wrong option: TypeError
         model = default_model() if model is None else model
-        if isinstance(require_model(model), HumanTrust):
+        require_kind("model", model, TrustModel, "give one such as PooledTrust()")
+        if isinstance(model, HumanTrust):
             raise TrustboError("model: HumanTrust is for reports of people, and plans no paths.")
         self.workspace, self.model, self.policy = workspace, model, resolve_policy(policy)
         settings = {

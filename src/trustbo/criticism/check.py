@@ -22,7 +22,7 @@ from trustbo.inference.loo import compare as ranked
 from trustbo.inference.score import score
 from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.effects.robot import RobotEffect
-from trustbo.models.families import family_of
+from trustbo.models.families import FAMILIES
 from trustbo.models.model import TrustModel
 from trustbo.models.visited import has_places
 
@@ -128,7 +128,7 @@ def effects_of_robots(posterior: xr.DataTree) -> pd.DataFrame:
     draws = joined_draws(group["robot_effect"])
     # The weight of line of sight fits the level of all effects.
     draws = draws - np.median(draws, axis=(1, 2), keepdims=True)
-    draws = draws / family_of(posterior.attrs["observation"]).line_of_sight[0]
+    draws = draws / FAMILIES[posterior.attrs["observation"]].line_of_sight[0]
     probability = np.maximum((draws < -SIZE).mean(0), (draws > SIZE).mean(0))
     columns = {"effect": draws.mean(0), "sd": draws.std(0), "probability": probability}
     columns["stands_out"] = probability > SURE

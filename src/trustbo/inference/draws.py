@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from trustbo.data import Mission
-from trustbo.errors import TrustboError, require_whole
+from trustbo.data import Mission, is_line_of_sight
+from trustbo.errors import TrustboError, require_kind, require_whole
 from trustbo.inference.place_maps import place_maps_of
 from trustbo.inference.posterior import Draws, Posterior
-from trustbo.models.effects.effect import Effect, NextMission, Theta
+from trustbo.models.effects.effect import Effect, Theta
 from trustbo.models.effects.place import PlaceEffect
-from trustbo.models.model import TrustModel, require_model
+from trustbo.models.model import TrustModel
 from trustbo.models.params import Params, RobotParams, assemble_params
 from trustbo.models.people import HumanTrust
 from trustbo.models.record import effects_from_record, model_from_record
@@ -115,39 +115,27 @@ def params_of(
         params = params._replace(**maps)  # pyright: ignore
     if not effects:
         return params
-    features = posterior["posterior"].to_dataset()["feature"].values
-    rng = np.random.default_rng(_DAYS) if day else None
-    mission = NextMission(attrs["n_missions"], features.tolist(), attrs["n_robots"], rng)
-    theta = theta_of(posterior, sites)
+    theta, rng = theta_of(posterior, sites), np.random.default_rng(_DAYS) if day else None
+    robots = (len(theta["rest"]), attrs["n_robots"])
+    n = attrs["n_missions"]
+    slopes = [effect.ahead(values_of(posterior, effect), theta, n, rng) for effect in effects]
+    slope = np.broadcast_to(np.sum(slopes, axis=0), robots)
+    features = posterior["posterior"].to_dataset()["feature"].values.tolist()
+    sight = [m for m, name in enumerate(features) if is_line_of_sight(name)]
+    weights = np.zeros((*robots, len(features)))
+    if sight:
+        weights[:, :, sight], slope = slope[..., None] / len(sight), 0.0
     if "B0" in sites:
-        return _coupled_ahead(params, effects, posterior, theta, mission)
-    robots = (len(sites["beta0"]), mission.n_robots)
+        B, robot = np.array(params.B), np.arange(robots[1])  # pyright: ignore
+        B[:, :, robot, robot] += np.swapaxes(weights, 1, 2)
+        return params._replace(B=B, b=params.b + slope)
     fields = {
         name: np.broadcast_to(sites[name].reshape(robots[0], -1), robots)
         for name in ("beta0", "b", "delta_w", "delta_v")
     }
     beta = sites["beta"] if sites["beta"].ndim == 3 else sites["beta"][:, None]
-    beta = np.broadcast_to(beta, (*robots, beta.shape[2]))
-    for effect in effects:
-        weights, intercept = effect.ahead(values_of(posterior, effect), theta, mission)
-        beta, fields["b"] = beta + weights, fields["b"] + intercept
-    return RobotParams(beta=beta, **fields, **x0, **params.places, memory=params.memory)
-
-
-def _coupled_ahead(
-    params: Any,
-    effects: Sequence[Effect],
-    posterior: xr.DataTree,
-    theta: Theta,
-    mission: NextMission,
-) -> Params:
-    """Parameters of coupled robots with the effects of the next mission."""
-    B, b, robot = np.array(params.B), np.array(params.b), np.arange(mission.n_robots)
-    for effect in effects:
-        weights, intercept = effect.ahead(values_of(posterior, effect), theta, mission)
-        B[:, :, robot, robot] += np.swapaxes(np.broadcast_to(weights, (*b.shape, B.shape[1])), 1, 2)
-        b = b + intercept
-    return params._replace(B=B, b=b)
+    fields |= {"beta": beta + weights, "b": fields["b"] + slope}
+    return RobotParams(**fields, **x0, **params.places, memory=params.memory)
 
 
 def _in_order_of(workspace: Workspace, posterior: xr.DataTree) -> xr.DataTree:
@@ -258,7 +246,7 @@ def sample_prior(
         seed: Seed; the same seed gives the same draws.
         n_robots: Number of robots, for models with separate parameters for each robot.
     """
-    require_model(model)
+    require_kind("model", model, TrustModel, "give one such as PooledTrust()")
     n_draws, seed = require_whole("n_draws", n_draws, 1), require_whole("seed", seed, 0)
     prior, rng = _prior(model, n_features, n_robots), np.random.default_rng(seed)
     return model.params(prior.named(prior.draw_prior(n_draws, rng), rng)["posterior"])

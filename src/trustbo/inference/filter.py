@@ -11,7 +11,7 @@ from trustbo.data import Cell, as_array, require_shares, require_unit_interval
 from trustbo.errors import TrustboError, one_line, require_pair, require_whole
 from trustbo.inference.draws import of_no_map, params_of, require_posterior, sites_of
 from trustbo.inference.importance import systematic
-from trustbo.models.families import Family, family_of
+from trustbo.models.families import FAMILIES, Family
 from trustbo.models.params import CoupledParams, Params, check_params
 from trustbo.models.slots import broadcast_ticks
 from trustbo.workspace.moves import bounds_along, moves_along, require_on_grid
@@ -254,7 +254,7 @@ class TrustFilter:
         n, most = len(flat.b), require_whole("max_draws", max_draws, 1)
         kept = np.linspace(0, n - 1, min(n, most)).astype(int)
         self.params: Params = flat.draw(kept)  # pyright: ignore[reportArgumentType]
-        self.family = family_of(observation)
+        self.family = FAMILIES[observation]
         delta_s = None if delta_s is None else delta_s[kept]
         self.dynamics = Dynamics(self.params, self.family, self._n_robots, delta_s)
         self.reset()

@@ -22,7 +22,7 @@ from trustbo.inference.posterior import Draws, Posterior
 from trustbo.inference.tree import complete, to_datatree
 from trustbo.models.backend import VERSIONS
 from trustbo.models.default import default_model
-from trustbo.models.model import TrustModel, require_model
+from trustbo.models.model import TrustModel
 from trustbo.models.people import HumanTrust
 from trustbo.models.record import model_to_record
 from trustbo.models.visited import has_places
@@ -97,7 +97,7 @@ def fit(
     started = time.perf_counter()
     missions = _filled(missions, workspace)
     model = _default_of(missions) if model is None else model
-    require_model(model)
+    require_kind("model", model, TrustModel, "give one such as PooledTrust()")
     require_choice("sampler", sampler, SAMPLERS)
     sizes = {"draws": draws, "chains": chains, "warmup": warmup}
     draws, chains, warmup = (require_whole(name, n, 1) for name, n in sizes.items())

@@ -57,13 +57,10 @@ class ContactRate(dist.Distribution):
         seen = ~jnp.isnan(value)
         bounds = (jnp.where(seen, value, 0.0), seen, self.drift)
         by_bound = tuple(jnp.swapaxes(a, 0, 1) for a in bounds)
-        return lax.scan(self._filter, self._start(), by_bound)[1].sum(0)
-
-    def _start(self) -> tuple[Array, Array]:
-        """Mean and variance of trust before the first bound, each (mission, robot)."""
         *_, x0_mean, x0_sd = self.parameters
         shape = self.drift[:, 0].shape
-        return jnp.full(shape, x0_mean), jnp.full(shape, x0_sd**2)
+        start = jnp.full(shape, x0_mean), jnp.full(shape, x0_sd**2)
+        return lax.scan(self._filter, start, by_bound)[1].sum(0)
 
     def _filter(self, state: Any, inputs: Any) -> Any:
         """One bound: trust after it, and the log density of its rates (mission,)."""
@@ -81,46 +78,9 @@ class ContactRate(dist.Distribution):
         """Contact rates, shape `(*sample_shape, mission, bound, robot)`."""
         beta0, delta_w, delta_v, x0_mean, x0_sd = self.parameters
         shape = *sample_shape, *self.drift.shape
-        e_w, e_v, e = (random.normal(k, shape) for k in random.split(key, 3))
-        w, v = self._noise(delta_w, e_w), self._noise(delta_v, e_v)
+        w, v, e = (random.normal(k, shape) for k in random.split(key, 3))
         x, rates = x0_mean + x0_sd * e[..., 0, :], []
         for k in range(self.drift.shape[1]):
-            x = self._carried(beta0, x) + self.drift[:, k] + w[..., k, :]
-            rates.append(x + v[..., k, :])
+            x = beta0 * x + self.drift[:, k] + delta_w * w[..., k, :]
+            rates.append(x + delta_v * v[..., k, :])
         return jnp.stack(rates, axis=-2)
-
-    def _noise(self, delta: Array, white: Array) -> Array:
-        return delta * white
-
-    def _carried(self, beta0: Array, x: Array) -> Array:
-        return beta0 * x
-
-
-class CoupledContactRate(ContactRate):
-    """Contact rates of robots that influence each other, equations (1)-(2), trust integrated out.
-
-    x_k = B0 x_{k-1} + drift_k + w_k, y_k = x_k + v_k. Of the arguments of `ContactRate`, beta0 is
-    B0, and delta_w and delta_v are the covariances Delta_w and Delta_v of w and v, (robot, robot).
-    """
-
-    def _start(self) -> tuple[Array, Array]:
-        mean, var = super()._start()
-        return mean, var[:, :, None] * jnp.eye(var.shape[1])
-
-    def _filter(self, state: Any, inputs: Any) -> Any:
-        (m, P), (y, seen, u), (B0, Delta_w, Delta_v, *_) = state, inputs, self.parameters
-        m, P = m @ B0.T + u, B0 @ P @ B0.T + Delta_w  # predict
-        both = seen[:, :, None] & seen[:, None, :]
-        F = jnp.where(both, P + Delta_v, jnp.eye(m.shape[1]))  # robots not measured: 1, apart
-        e = jnp.where(seen, y - m, 0.0)
-        H = jnp.where(seen[:, :, None], P, 0.0)
-        gain = jnp.swapaxes(jnp.linalg.solve(F, H), 1, 2)
-        log_p = -0.5 * (e * jnp.linalg.solve(F, e[..., None])[..., 0]).sum(1)
-        log_p -= 0.5 * (jnp.linalg.slogdet(F)[1] + seen.sum(1) * jnp.log(2.0 * jnp.pi))
-        return (m + (gain @ e[..., None])[..., 0], P - gain @ H), log_p  # update
-
-    def _noise(self, delta: Array, white: Array) -> Array:
-        return white @ jnp.linalg.cholesky(delta).T
-
-    def _carried(self, beta0: Array, x: Array) -> Array:
-        return x @ beta0.T

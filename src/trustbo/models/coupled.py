@@ -9,7 +9,6 @@ import numpyro.distributions as dist
 from numpyro.distributions import Distribution
 
 from trustbo.models.backend import namespace
-from trustbo.models.contact_rate import CoupledContactRate
 from trustbo.models.effects.effect import Theta
 from trustbo.models.effects.weights import CoupledWeights
 from trustbo.models.model import TrustModel
@@ -39,8 +38,8 @@ class CoupledTrust(TrustModel):
     def hyperpriors(self, n_robots: int, n_features: int) -> dict[str, Distribution]:
         """See `TrustModel.hyperpriors`: correlations by canonical partial correlations."""
         n, priors = n_robots, self.priors
-        sizes = {"beta0": n, "delta_w": n, "delta_v": n}
-        named = {name: getattr(priors, name).expand((size,)) for name, size in sizes.items()}
+        names = ("beta0", "delta_w", "delta_v")
+        named = {name: getattr(priors, name).expand((n,)) for name in names}
         if n == 1:
             return named
         named["coupling"] = priors.coupling.expand((n * (n - 1),))
@@ -93,11 +92,6 @@ class CoupledTrust(TrustModel):
         eps = 0.5 * xp.linalg.eigvalsh(noise)[:, 0]
         noise = _kron(np.eye(K), noise - eps[:, None, None] * np.eye(R))
         return Signal(m, T[:, None], S[:, None], xp.sqrt(eps)[:, None, None], noise[:, None])
-
-    def rates(self, theta: Theta, drift: Any) -> CoupledContactRate:
-        """See `TrustModel.rates`."""
-        B0, Delta_w, Delta_v = (theta[name][0] for name in ("B0", "Delta_w", "Delta_v"))
-        return CoupledContactRate(drift, B0, Delta_w, Delta_v, **self.x0)
 
     def prior_terms(self, sites: Mapping[str, np.ndarray]) -> dict[str, tuple[str, np.ndarray]]:
         """See `TrustModel.prior_terms`: diagonals, off-diagonals and noises."""

@@ -21,12 +21,13 @@ from trustbo.errors import TrustboError, require_choice
 from trustbo.models.backend import namespace
 from trustbo.models.effects.effect import Effect, Theta, sample_columns
 from trustbo.models.effects.weights import Weights
-from trustbo.models.families import FAMILIES, Family, family_of
+from trustbo.models.families import FAMILIES, Family
 from trustbo.models.params import Params, assemble_params, check_params
 from trustbo.models.priors import Priors
 from trustbo.models.signal import Layout, Signal
-from trustbo.models.simulate import TrustSample, draw_missions
+from trustbo.models.simulate import draw_missions
 from trustbo.models.slots import Slots, broadcast_ticks, require_ticks
+from trustbo.stacking import stack_missions
 from trustbo.workspace import Workspace
 
 _STREAM = 0x6D697373  # of `simulate`, among all that a seed gives
@@ -106,10 +107,6 @@ class TrustModel(Summary, ABC):
     def signal(self, theta: Theta, slots: Slots, layout: Layout) -> Signal:
         """The equation of the model: trust along all bounds, in NumPy or JAX."""
 
-    @abstractmethod
-    def rates(self, theta: Theta, drift: Any) -> Distribution:
-        """Distribution of Gaussian rates given the drift (mission, bound, robot); one point."""
-
     @property
     @abstractmethod
     def dims(self) -> dict[str, tuple[str, ...]]:
@@ -130,7 +127,7 @@ class TrustModel(Summary, ABC):
     @property
     def family(self) -> Family:
         """The family of observations."""
-        return family_of(self.observation)
+        return FAMILIES[self.observation]
 
     @property
     def x0(self) -> dict[str, float]:
@@ -154,6 +151,13 @@ class TrustModel(Summary, ABC):
             values = {**values, "delta_v": noise}
         return self.derived(values)
 
+    def rates(self, theta: Theta, drift: Any) -> Distribution | None:
+        """Distribution of rates given the drift (mission, bound, robot); one point.
+
+        None where no distribution integrates trust out.
+        """
+        return None
+
     def prior_terms(self, sites: Mapping[str, np.ndarray]) -> dict[str, tuple[str, np.ndarray]]:
         """Field of `Priors` and values of each parameter with an independent prior, by label."""
         return {name: (name, sites[name]) for name in self.dims}
@@ -166,8 +170,10 @@ class TrustModel(Summary, ABC):
                 awareness value is NaN, a measured rate lacks the number of ticks that the family
                 needs, or a path jumps or leaves the workspace.
         """
-        slots = Slots.of(missions)
-        require_ticks(self.family, slots.y, slots.n_ticks)
+        batch = stack_missions(missions, pad=False)
+        require_ticks(self.family, batch.contact_rate, batch.n_ticks)
+        features = tuple(missions[0].features)
+        slots = Slots(batch.contact_rate, batch.awareness, batch.n_ticks, features)
         for effect in self.effects:
             slots = effect.slots(slots, missions, workspace)
         return slots
@@ -181,15 +187,11 @@ class TrustModel(Summary, ABC):
             return self
         return replace(self, priors=Priors.of(tuple(features), self.observation))
 
-    def program(self, slots: Slots, *, observed: bool = True) -> None:
+    def program(self, slots: Slots) -> None:
         """The model as a plain NumPyro program, for any kernel: `MCMC(NUTS(model.program))`.
 
-        Everything is sampled but trust, which integrates out of Gaussian rates alone. Call it
-        within `jax.enable_x64(True)`: effects need double precision.
-
-        Args:
-            slots: Rates and features, see `slots`.
-            observed: Whether to condition on the rates; else they are sampled.
+        Everything is sampled but trust, which integrates out where `rates` is a distribution. Call
+        it within `jax.enable_x64(True)`: effects need double precision.
         """
         values = {
             name: numpyro.sample(name, prior.to_event(len(prior.batch_shape)))
@@ -199,18 +201,14 @@ class TrustModel(Summary, ABC):
         theta = self.theta(values, slots.resolution)
         c = sample_columns(self.columns, theta, slots)
         U = sparse.hstack([effect.columns(slots) for effect in self.columns], format="csr")
-        if self.family.gaussian and "delta_s" not in theta:
-            drift = (U.toarray() @ c).reshape(slots.y.shape)
+        rates = self.rates(theta, (U.toarray() @ c).reshape(slots.y.shape))
+        if rates is not None:
             with numpyro.plate("mission", slots.n_missions):
-                rates = self.rates(theta, drift)
-                numpyro.sample("contact_rate", rates, obs=slots.y if observed else None)
-        else:
-            layout = self.layout(slots, contrasts=False)
-            u = (layout.columns(U).toarray() @ c).reshape(len(layout.label), -1)
-            self._program_of_trust(self.signal(theta, slots, layout), layout, u, slots)
-
-    def _program_of_trust(self, signal: Signal, layout: Layout, u: Any, slots: Slots) -> None:
-        """Sample statements of the signal given the drift, and the factor of the rates."""
+                numpyro.sample("contact_rate", rates, obs=slots.y)
+            return
+        layout = self.layout(slots, contrasts=False)
+        u = (layout.columns(U).toarray() @ c).reshape(len(layout.label), -1)
+        signal = self.signal(theta, slots, layout)
         y, ticks = layout.rows(slots.y), layout.rows(slots.n_ticks)
         root = jnp.linalg.cholesky(signal.covariance[0] + 1e-10 * jnp.eye(y.shape[1]))
         white = dist.Normal(0.0, 1.0).expand(y.shape).to_event(2)
@@ -231,8 +229,8 @@ class TrustModel(Summary, ABC):
         params: Params,
         awareness: ArrayLike,
         n_ticks: ArrayLike | None = None,
-    ) -> TrustSample:
-        """Missions drawn from the model for given parameters, one draw.
+    ) -> np.ndarray:
+        """Contact rates (mission, bound, robot) drawn from the model for given parameters.
 
         Args:
             key: Random key.
@@ -282,9 +280,3 @@ class TrustModel(Summary, ABC):
         return ", ".join(
             [type(self).__name__, *(e.noun for e in self.effects), self.observation, *others]
         )
-
-
-def require_model(model: object) -> None:
-    """Refuse anything but a trust model: TrustboError."""
-    if not isinstance(model, TrustModel):
-        raise TrustboError(f"model must be a trust model, e.g. PooledTrust(); got {model!r}.")

@@ -27,6 +27,8 @@ class ParameterDraws(Summary):
     """Axes of each field behind the leading ones; none where not listed."""
     WEIGHTS: ClassVar[str] = "beta"
     """Name of the field with the weights of features."""
+    SUM: ClassVar[str]
+    """Subscripts of `np.einsum` for the sum of weights times awareness."""
     BY_ROBOT: ClassVar[bool] = False
     """Whether coefficients differ by robot; b then has the axis (robot,)."""
     _fields: ClassVar[tuple[str, ...]]
@@ -78,7 +80,8 @@ class ParameterDraws(Summary):
 
         Awareness is (robot, move, row, col, feature).
         """
-        raise NotImplementedError
+        weights = np.asarray(getattr(self, self.WEIGHTS), dtype=float)
+        return np.einsum(self.SUM, weights, awareness)
 
     @property
     def places(self) -> dict[str, np.ndarray]:
@@ -192,16 +195,10 @@ class RobotParams(ParameterDraws, _Trust):
     BY_ROBOT: ClassVar = True
     AXES: ClassVar = {
         "beta": ("robot", "feature"),
-        "beta0": ("robot",),
-        "b": ("robot",),
-        "delta_w": ("robot",),
-        "delta_v": ("robot",),
+        **dict.fromkeys(("beta0", "b", "delta_w", "delta_v"), ("robot",)),
         **PLACES,
     }
-
-    def increments(self, awareness: np.ndarray) -> np.ndarray:
-        """See `ParameterDraws.increments`."""
-        return np.einsum("...im,...idrcm->...idrc", np.asarray(self.beta, dtype=float), awareness)
+    SUM: ClassVar = "...im,...idrcm->...idrc"
 
 
 class _Coupled(NamedTuple):
@@ -223,14 +220,13 @@ class CoupledParams(ParameterDraws, _Coupled):
 
     __slots__ = ()
     WEIGHTS: ClassVar = "B"
+    SUM: ClassVar = "...mai,...idrcm->...adrc"
     memory: ClassVar = "level"
     BY_ROBOT: ClassVar = True
     AXES: ClassVar = {
         "B": ("feature", "robot", "robot_"),
-        "B0": ("robot", "robot_"),
         "b": ("robot",),
-        "Delta_w": ("robot", "robot_"),
-        "Delta_v": ("robot", "robot_"),
+        **dict.fromkeys(("B0", "Delta_w", "Delta_v"), ("robot", "robot_")),
     }
 
     @property
@@ -241,10 +237,6 @@ class CoupledParams(ParameterDraws, _Coupled):
     def transition(self, n_robots: int) -> np.ndarray:
         """See `ParameterDraws.transition`."""
         return np.asarray(self.B0, dtype=float)
-
-    def increments(self, awareness: np.ndarray) -> np.ndarray:
-        """See `ParameterDraws.increments`."""
-        return np.einsum("...mai,...idrcm->...adrc", np.asarray(self.B, dtype=float), awareness)
 
 
 Params = TrustParams | RobotParams | CoupledParams
@@ -287,18 +279,11 @@ def check_params(params: Params, n_robots: int | None, n_features: int) -> None:
                 f"{n or 'any'} robots; got shape {value.shape}."
             )
         if field.startswith("Delta"):
-            _require_covariance(f"params.{field}", value)
-
-
-def _require_covariance(name: str, value: np.ndarray) -> None:
-    if not np.allclose(value, np.swapaxes(value, -1, -2), rtol=1e-8, atol=1e-12):
-        raise TrustboError(f"{name} must be symmetric; got {value!r}.")
-    smallest = np.linalg.eigvalsh(value).min()
-    if not smallest > 0.0:
-        raise TrustboError(
-            f"{name} must be positive definite; its smallest eigenvalue is {smallest:.3g}. Robots "
-            "cannot be perfectly correlated, nor have no noise at all."
-        )
+            same = np.allclose(value, np.swapaxes(value, -1, -2), rtol=1e-8, atol=1e-12)
+            if not (same and np.linalg.eigvalsh(value).min() > 0.0):
+                raise TrustboError(
+                    f"params.{field} must be symmetric and positive definite; got {value!r}."
+                )
 
 
 def _written(draws: np.ndarray) -> str:

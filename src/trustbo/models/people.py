@@ -150,10 +150,6 @@ class HumanTrust(PooledTrust):
         unit = center + np.einsum("djpq,djq->djp", vectors, white)
         return unit * self.effect.sds(theta)[:, None]
 
-    def options(self) -> dict[str, Any]:
-        """See `TrustModel.options`."""
-        return {name: getattr(self, name) for name in ("observation", "scale", "memory")}
-
     def simulate(self, *args: Any, **options: Any) -> NoReturn:
         """Refuse: TrustboError."""
         raise TrustboError(

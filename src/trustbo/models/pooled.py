@@ -98,8 +98,10 @@ class PooledTrust(TrustModel):
         first = np.array([1.0, 0.0])[:, None]  # the mean of the robots has it, contrasts have not
         return Signal(np.sqrt(n) * first * m, T, S, sd, n * first[..., None] * noise)
 
-    def rates(self, theta: Theta, drift: Any) -> ContactRate:
+    def rates(self, theta: Theta, drift: Any) -> ContactRate | None:
         """See `TrustModel.rates`."""
+        if self.shared_noise or not self.family.gaussian:
+            return None
         beta0, x0 = theta["beta0"][0], self.x0
         if self.memory == "deviation":
             xp = namespace(drift)

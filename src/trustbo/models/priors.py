@@ -13,7 +13,7 @@ from trustbo.data import is_line_of_sight
 from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError, require_not_negative, require_positive
 from trustbo.models.backend import own_settings
-from trustbo.models.families import family_of
+from trustbo.models.families import FAMILIES
 from trustbo.models.scores import log_density
 
 
@@ -81,13 +81,14 @@ class Priors(Summary):
             raise TrustboError(f"Priors.x0_mean must be finite; got {self.x0_mean!r}.")
 
     @classmethod
-    def default(cls, observation: str = "gaussian") -> "Priors":
+    @cache
+    def default(cls, observation: str) -> "Priors":
         """Default priors of a family of observations, one cached object.
 
         Counts (`"beta_binomial"`) have wider ones, as trust is a logit: beta_m ~ N(0, 2),
         b ~ N(0, 1), delta_w ~ HalfNormal(0.5), x_0 ~ N(0, 1.5^2).
         """
-        return _of_family(observation)
+        return cls(**FAMILIES[observation].priors())
 
     @classmethod
     def of(cls, features: Sequence[str], observation: str = "gaussian") -> "Priors":
@@ -103,7 +104,7 @@ class Priors(Summary):
         default, n = cls.default(observation), max(int(is_sight.sum()), 1)
         if not is_sight.any():
             return default
-        unit, centre = family_of(observation).line_of_sight
+        unit, centre = FAMILIES[observation].line_of_sight
         with own_settings():
             sd = np.where(is_sight, 0.3 / np.sqrt(n), 0.25)
             return replace(
@@ -143,11 +144,6 @@ class Priors(Summary):
     def describe(self) -> dict[str, str]:
         """Each prior as text, for the record kept with a result."""
         return {one.name: _as_text(getattr(self, one.name)) for one in fields(self)}
-
-
-@cache
-def _of_family(observation: str) -> Priors:
-    return Priors(**family_of(observation).priors())
 
 
 def _wanted(name: str, prior: Any) -> str:

@@ -1,7 +1,8 @@
 """JSON record of a model's settings, and the model rebuilt from it."""
 
+import json
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 from trustbo.errors import TrustboError
@@ -19,9 +20,14 @@ def model_to_record(model: TrustModel) -> dict[str, Any]:
         "class": type(model).__name__,
         **model.options(),
         "priors": model.priors.describe(),
-        "effects": [effect.to_record() for effect in model.effects],
+        "effects": [{"kind": type(e).__name__, **_as_json(e)} for e in model.effects],
         "by_feature": model.priors is Priors.default(model.observation),
     }
+
+
+def _as_json(effect: Any) -> dict[str, Any]:
+    """Fields by name, as JSON has them: a tuple is a list."""
+    return json.loads(json.dumps(asdict(effect)))
 
 
 def model_from_record(

@@ -1,18 +1,9 @@
 """Missions drawn from a model for given parameters, in NumPy: nothing is compiled."""
 
-from typing import NamedTuple
-
 import numpy as np
 
 from trustbo.models.families import Family
 from trustbo.models.params import CoupledParams, Params
-
-
-class TrustSample(NamedTuple):
-    """Latent trust and contact rates that were drawn, each (mission, bound, robot)."""
-
-    trust: np.ndarray
-    contact_rate: np.ndarray
 
 
 def draw_missions(
@@ -21,16 +12,8 @@ def draw_missions(
     awareness: np.ndarray,
     n_ticks: np.ndarray,
     rng: np.random.Generator,
-) -> TrustSample:
-    """Draw missions: x_k = B0 x_{k-1} + u_k + w_k, and rates given x_k by the family.
-
-    Args:
-        family: Family of observations.
-        params: Parameters without leading axes.
-        awareness: Shape (mission, bound, robot, feature).
-        n_ticks: Ticks, (mission, bound, robot).
-        rng: Random number generator.
-    """
+) -> np.ndarray:
+    """Contact rates, see `TrustModel.simulate`: x_k = B0 x_{k-1} + u_k + w_k, y_k by the family."""
     n_missions, n_bounds, n_robots = shape = awareness.shape[:3]
     B0 = params.transition(n_robots)
     as_map = np.moveaxis(awareness, 2, 0)[:, None]  # (robot, 1, mission, bound, feature)
@@ -42,11 +25,11 @@ def draw_missions(
     of_trust, shared, own = _noise(params, family, n_robots)
     w, v = rng.standard_normal((2, n_bounds, n_missions, n_robots))
     x = params.x0_mean + params.x0_sd * rng.standard_normal((n_missions, n_robots))
-    trust, rates = np.empty(shape), np.empty(shape)
+    rates = np.empty(shape)
     for k in range(n_bounds):
-        x = trust[:, k] = x @ B0.T + u[:, k] + w[k] @ of_trust.T
+        x = x @ B0.T + u[:, k] + w[k] @ of_trust.T
         rates[:, k] = family.sample(x + v[k] @ shared.T, own, n_ticks[:, k], rng)
-    return TrustSample(trust, rates)
+    return rates
 
 
 def _noise(params: Params, family: Family, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -6,11 +6,10 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from trustbo.data import Mission, is_line_of_sight
+from trustbo.data import is_line_of_sight
 from trustbo.errors import TrustboError
 from trustbo.models.families import Family
 from trustbo.models.visited import Visited
-from trustbo.stacking import stack_missions
 
 NO_TICKS = (
     "The beta-binomial family counts ticks: give n_ticks, the number of ticks of each bound "
@@ -28,18 +27,6 @@ class Slots(NamedTuple):
     n_ticks: np.ndarray  # (mission, bound, robot), NaN where not known
     features: tuple[str, ...] = ()
     visited: Visited | None = None
-
-    @classmethod
-    def of(cls, missions: Sequence[Mission]) -> Self:
-        """Stack missions of one team.
-
-        Raises:
-            TrustboError: There are no missions, or they disagree on robots or features; an
-                awareness value is NaN.
-        """
-        batch = stack_missions(missions, pad=False)
-        features = tuple(missions[0].features)
-        return cls(batch.contact_rate, batch.awareness, batch.n_ticks, features)
 
     @property
     def n_missions(self) -> int:
@@ -82,22 +69,14 @@ class Slots(NamedTuple):
 def broadcast_ticks(
     family: Family, n_ticks: ArrayLike | None, shape: tuple[int, ...]
 ) -> np.ndarray:
-    """Ticks of that shape, NaN if not given.
-
-    Raises:
-        TrustboError: They are not given, and the family needs them.
-    """
+    """Ticks of that shape, NaN if not given; TrustboError: the family needs them."""
     if n_ticks is None and family.needs_ticks:
         raise TrustboError(NO_TICKS)
     return np.broadcast_to(np.asarray(np.nan if n_ticks is None else n_ticks, dtype=float), shape)
 
 
 def require_ticks(family: Family, y: np.ndarray, n_ticks: np.ndarray) -> None:
-    """Refuse measured rates (mission, bound, robot) without n_ticks if the family needs them.
-
-    Raises:
-        TrustboError: A measured rate has no number of ticks.
-    """
+    """Refuse measured rates (mission, bound, robot) without n_ticks if the family needs them."""
     without = ~np.isnan(y) & ~(n_ticks >= 1.0)
     if family.needs_ticks and without.any():
         j, k, i = np.argwhere(without)[0]

@@ -79,7 +79,7 @@ class ModelSimulator(DescribedSimulator):
         with own_settings():  # else the caller's flags decide what is drawn
             key = jax.random.key(require_whole("seed", seed, 0))
         sample = self.model.simulate(key, self.params.along(cells), z[None], self.n_ticks)
-        rates = np.clip(sample.contact_rate[0], 0.0, 1.0)
+        rates = np.clip(sample[0], 0.0, 1.0)
         n, status = self._end(cells, seed)
         ticks = None if self.n_ticks is None else np.full(rates[:n].shape, self.n_ticks)
         return Mission.from_arrays(

@@ -5,18 +5,18 @@ new effect is a frozen dataclass in a file of its own with the methods of `Effec
 samplers, posteriors and plans need no more.
 """
 
-import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
 import numpyro
 import numpyro.distributions as dist
+from numpy.random import Generator
 from numpyro.distributions import Distribution
 
-from trustbo.data import Mission, is_line_of_sight
+from trustbo.data import Mission
+from trustbo.errors import require_positive
 from trustbo.models.backend import namespace
 from trustbo.models.slots import Slots
 from trustbo.workspace import Workspace
@@ -25,6 +25,9 @@ Theta = Mapping[str, Any]
 """Hyperparameters by name, each (point, ...), and `rest`, the drift by which stationary trust rises
 by 1: 1 - beta0 where trust itself lasts; (point,), or (point, robot)."""
 
+Values = Mapping[str, np.ndarray]
+"""Variables of an effect by name, each (draw, ...)."""
+
 LEAST = 1e-4
 """Least sd of an effect: precisions stay finite, and a smaller effect is none."""
 
@@ -32,31 +35,14 @@ EFFECTS: dict[str, type["Effect"]] = {}
 """Classes of effects by name, to read models from files."""
 
 
-class NextMission(NamedTuple):
-    """The mission that follows those of a posterior."""
-
-    n_before: int
-    """Number of missions of the posterior."""
-    features: Sequence[str]
-    n_robots: int
-    rng: np.random.Generator | None
-    """Random numbers to draw effects with; None for expected ones."""
-
-    def by_sight(self, slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Drift of slopes (draw, robot) times line of sight, as `Effect.ahead` returns it."""
-        weights = np.zeros((*slope.shape, len(self.features)))
-        sight = [m for m, name in enumerate(self.features) if is_line_of_sight(name)]
-        if not sight:
-            return weights, slope
-        weights[:, :, sight] = slope[..., None] / len(sight)
-        return weights, np.zeros_like(slope)
-
-
 class Effect:
     """An effect on the drift, with the settings of its prior.
 
     Hyperparameters are sds with half-normal priors, whose scales are the fields of these names;
     other effects override `hyperpriors`. A class with a noun is known to files by its name.
+
+    Raises:
+        TrustboError: A field of the name of a hyperparameter is not positive.
     """
 
     names: ClassVar[tuple[str, ...]] = ()
@@ -72,6 +58,11 @@ class Effect:
         if cls.noun:
             EFFECTS[cls.__name__] = cls
 
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if name in self.names:
+                require_positive(f"{type(self).__name__}.{name}", value)
+
     def columns(self, slots: Slots) -> Any:
         """Sparse matrix (slot, column); slots are (mission, bound, robot), raveled."""
         raise NotImplementedError
@@ -85,43 +76,28 @@ class Effect:
         """
         raise NotImplementedError
 
-    def named(self, c: np.ndarray, theta: Theta, slots: Slots) -> dict[str, np.ndarray]:
-        """Variables by name, each (draw, ...), of coefficients c (draw, column)."""
+    def named(self, c: np.ndarray, theta: Theta, slots: Slots) -> Values:
+        """Variables of coefficients c (draw, column)."""
         raise NotImplementedError
 
-    def coefficients(
-        self, values: Mapping[str, np.ndarray], theta: Theta, slots: Slots
-    ) -> np.ndarray:
-        """Coefficients (draw, column) of variables by name: the inverse of `named`."""
+    def coefficients(self, values: Values, theta: Theta, slots: Slots) -> np.ndarray:
+        """Coefficients (draw, column) of variables: the inverse of `named`."""
         raise NotImplementedError
 
-    def ahead(
-        self, values: Mapping[str, np.ndarray], theta: Theta, mission: NextMission
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Drift of the next mission: weights (draw, robot, feature), intercept (draw, robot).
+    def ahead(self, values: Values, theta: Theta, n: int, rng: Generator | None) -> np.ndarray:
+        """Slope (draw, robot) in line of sight of the drift of the mission after n, by default 0.
 
-        The axis robot is of length 1 where all robots have the same.
-
-        Args:
-            values: Variables by name, each (draw, ...).
-            theta: Hyperparameters, each (draw,).
-            mission: The next mission; with random numbers, effects of it alone are drawn.
+        With random numbers, effects of that mission alone are drawn; else they are the expected.
         """
-        raise NotImplementedError
+        return np.zeros((len(theta["rest"]), 1))
 
     def hyperpriors(self) -> dict[str, Distribution]:
         """Priors of the hyperparameters, by name."""
         return {name: dist.HalfNormal(getattr(self, name)) for name in self.names}
 
-    def slots(
-        self, slots: Slots, missions: Sequence[Mission], workspace: Workspace | None
-    ) -> Slots:
-        """Slots of missions with what the columns need beside rates and features."""
+    def slots(self, slots: Slots, missions: Sequence[Mission], on: Workspace | None) -> Slots:
+        """Slots of missions, on a workspace if known, with all that the columns need."""
         return slots
-
-    def to_record(self) -> dict[str, Any]:
-        """Class and fields by name, as JSON has them: a tuple is a list."""
-        return {"kind": type(self).__name__, **json.loads(json.dumps(asdict(self)))}  # pyright: ignore[reportArgumentType]
 
 
 def sample_columns(effects: Sequence[Effect], theta: Theta, slots: Slots) -> Any:

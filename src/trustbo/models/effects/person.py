@@ -13,7 +13,6 @@ block, see `HumanTrust.signal`.
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from trustbo.errors import require_positive
 from trustbo.models.backend import namespace
 from trustbo.models.effects.effect import Effect, Theta
 
@@ -40,10 +39,6 @@ class PersonEffect(Effect):
     noun = "persons"
     variables: ClassVar = {"person": ("mission", "part")}
     coords: ClassVar = {"part": PARTS}
-
-    def __post_init__(self) -> None:
-        for name in self.names:
-            require_positive(f"PersonEffect.{name}", getattr(self, name))
 
     def sds(self, theta: Theta) -> Any:
         """Sd of each part, (point, part)."""

@@ -1,6 +1,6 @@
 """Effects of places: s of the cell entered, a Gaussian process, and e of the directed bound."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -12,7 +12,7 @@ from scipy import sparse
 from trustbo.data import Mission
 from trustbo.errors import TrustboError, require_positive
 from trustbo.models.backend import namespace
-from trustbo.models.effects.effect import LEAST, Effect, NextMission, Theta
+from trustbo.models.effects.effect import LEAST, Effect, Theta, Values
 from trustbo.models.slots import Slots
 from trustbo.models.visited import bounds_of, visited
 from trustbo.workspace import Workspace
@@ -65,11 +65,9 @@ class PlaceEffect(Effect):
         length_scale = dist.LogNormal(np.log(self.length_scale), self.length_scale_sd)
         return super().hyperpriors() | {"length_scale": length_scale}
 
-    def slots(
-        self, slots: Slots, missions: Sequence[Mission], workspace: Workspace | None
-    ) -> Slots:
-        """See `Effect.slots`: with the visited places, on the grid of a workspace if given."""
-        grid = None if workspace is None else workspace.passable.shape
+    def slots(self, slots: Slots, missions: Sequence[Mission], on: Workspace | None) -> Slots:
+        """See `Effect.slots`: with the visited places."""
+        grid = None if on is None else on.passable.shape
         bounds = bounds_of(missions, slots.y.shape[:2])
         return slots._replace(visited=visited(bounds, grid))  # pyright: ignore[reportArgumentType]
 
@@ -103,24 +101,15 @@ class PlaceEffect(Effect):
         tau = xp.maximum(theta["tau_s"], LEAST)[:, None, None]
         return xp.linalg.inv(tau**2 * (K + _JITTER * np.eye(len(cells))))
 
-    def named(self, c: np.ndarray, theta: Theta, slots: Slots) -> dict[str, np.ndarray]:
+    def named(self, c: np.ndarray, theta: Theta, slots: Slots) -> Values:
         """Effects of visited cells, place (draw, cell), and bounds, place_bound (draw, bound)."""
         places: Any = slots.visited
         n = len(places.cells)
         return {"place": c[:, :n], "place_bound": c[:, n:]}
 
-    def coefficients(
-        self, values: Mapping[str, np.ndarray], theta: Theta, slots: Slots
-    ) -> np.ndarray:
+    def coefficients(self, values: Values, theta: Theta, slots: Slots) -> np.ndarray:
         """See `Effect.coefficients`."""
         return np.column_stack([values["place"], values["place_bound"]])
-
-    def ahead(
-        self, values: Mapping[str, np.ndarray], theta: Theta, mission: NextMission
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Nothing: parameters hold maps of the places of every path."""
-        n = len(theta["rest"])
-        return np.zeros((n, 1, len(mission.features))), np.zeros((n, 1))
 
 
 def matern(distance: ArrayLike, length_scale: ArrayLike) -> Any:

@@ -7,16 +7,16 @@ independent between robots with covariance over missions
     cov(d[i, m], d[i, m']) = tau_slow^2 rho^|m - m'| + tau_day^2 [m = m'].
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
+from numpy.random import Generator
 from scipy import sparse
 
-from trustbo.errors import TrustboError, require_positive
+from trustbo.errors import TrustboError
 from trustbo.models.backend import namespace
-from trustbo.models.effects.effect import LEAST, Effect, NextMission, Theta
+from trustbo.models.effects.effect import LEAST, Effect, Theta, Values
 from trustbo.models.slots import Slots
 
 
@@ -43,8 +43,7 @@ class RobotEffect(Effect):
     variables: ClassVar = {"robot_effect": ("mission", "robot")}
 
     def __post_init__(self) -> None:
-        for name in self.names:
-            require_positive(f"RobotEffect.{name}", getattr(self, name))
+        super().__post_init__()
         if not 0.0 < self.rho < 1.0:
             raise TrustboError(f"RobotEffect.rho must be between 0 and 1; got {self.rho!r}.")
 
@@ -66,26 +65,22 @@ class RobotEffect(Effect):
             return None, [Q / rest[:, None, None] ** 2] * slots.n_robots
         return None, [Q / of_robot[:, None, None] ** 2 for of_robot in rest.T]
 
-    def named(self, c: np.ndarray, theta: Theta, slots: Slots) -> dict[str, np.ndarray]:
+    def named(self, c: np.ndarray, theta: Theta, slots: Slots) -> Values:
         """Effects d on stationary trust, robot_effect (draw, mission, robot)."""
         d = c.reshape(len(c), slots.n_robots, slots.n_missions) / _rest(theta)
         return {"robot_effect": np.swapaxes(d, 1, 2)}
 
-    def coefficients(
-        self, values: Mapping[str, np.ndarray], theta: Theta, slots: Slots
-    ) -> np.ndarray:
+    def coefficients(self, values: Values, theta: Theta, slots: Slots) -> np.ndarray:
         """See `Effect.coefficients`."""
         d = np.swapaxes(values["robot_effect"], 1, 2) * _rest(theta)
         return d.reshape(len(d), -1)
 
-    def ahead(
-        self, values: Mapping[str, np.ndarray], theta: Theta, mission: NextMission
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def ahead(self, values: Values, theta: Theta, n: int, rng: Generator | None) -> np.ndarray:
         """See `Effect.ahead`."""
         d, sd = self.next_mission(values["robot_effect"], theta)
-        if mission.rng is not None:
-            d = d + sd[:, None] * mission.rng.standard_normal(d.shape)
-        return mission.by_sight(_rest(theta)[..., 0] * d)
+        if rng is not None:
+            d = d + sd[:, None] * rng.standard_normal(d.shape)
+        return _rest(theta)[..., 0] * d
 
     def next_mission(self, effect: np.ndarray, theta: Theta) -> tuple[np.ndarray, np.ndarray]:
         """Mean (draw, robot) and sd (draw,) of the next d, given d (draw, mission, robot)."""

@@ -1,6 +1,5 @@
 """Weights of features and the intercept: shared by robots, drawn for each, or of coupled robots."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,7 +7,7 @@ import numpy as np
 from scipy import sparse
 
 from trustbo.models.backend import namespace
-from trustbo.models.effects.effect import LEAST, Effect, Theta
+from trustbo.models.effects.effect import LEAST, Effect, Theta, Values
 from trustbo.models.priors import Priors
 from trustbo.models.slots import Slots
 
@@ -39,13 +38,11 @@ class Weights(Effect):
         rest = theta["rest"][..., None]
         return rest if self.priors.stationary else 0.0 * rest + 1.0
 
-    def named(self, c: np.ndarray, theta: Theta, slots: Slots) -> dict[str, np.ndarray]:
+    def named(self, c: np.ndarray, theta: Theta, slots: Slots) -> Values:
         """Weights beta (draw, feature) and intercept b (draw,)."""
         return {"beta": c[:, :-1], "b": c[:, -1]}
 
-    def coefficients(
-        self, values: Mapping[str, np.ndarray], theta: Theta, slots: Slots
-    ) -> np.ndarray:
+    def coefficients(self, values: Values, theta: Theta, slots: Slots) -> np.ndarray:
         """See `Effect.coefficients`."""
         return np.column_stack([values["beta"], values["b"]])
 
@@ -71,7 +68,7 @@ class RobotWeights(Weights):
         ]
         return namespace(mean).repeat(mean, n, axis=1), parts
 
-    def named(self, c: np.ndarray, theta: Theta, slots: Slots) -> dict[str, np.ndarray]:
+    def named(self, c: np.ndarray, theta: Theta, slots: Slots) -> Values:
         """Weights beta (draw, robot, feature), intercepts b (draw, robot), and their means.
 
         `mean_beta` and `mean_b` are expectations given the coefficients.
@@ -83,9 +80,7 @@ class RobotWeights(Weights):
         means = {"mean_beta": mu[:, :-1], "mean_b": mu[:, -1]}
         return {"beta": c[..., :-1], "b": c[..., -1]} | means
 
-    def coefficients(
-        self, values: Mapping[str, np.ndarray], theta: Theta, slots: Slots
-    ) -> np.ndarray:
+    def coefficients(self, values: Values, theta: Theta, slots: Slots) -> np.ndarray:
         """See `Effect.coefficients`."""
         c = np.concatenate([values["beta"], values["b"][..., None]], axis=-1)
         return np.swapaxes(c, 1, 2).reshape(len(c), -1)
@@ -116,16 +111,14 @@ class CoupledWeights(Weights):
         sds = xp.where(own, rest * sd[feature], coupling[1])
         return means.reshape(len(means), -1), [sds.reshape(len(sds), -1) ** -2.0]
 
-    def named(self, c: np.ndarray, theta: Theta, slots: Slots) -> dict[str, np.ndarray]:
+    def named(self, c: np.ndarray, theta: Theta, slots: Slots) -> Values:
         """Matrices B (draw, feature, robot, robot') and intercepts b (draw, robot)."""
         n = slots.n_robots
         c = c.reshape(len(c), n, -1)
         B = c[..., :-1].reshape(len(c), n, n, -1)
         return {"B": np.moveaxis(B, -1, 1), "b": c[..., -1]}
 
-    def coefficients(
-        self, values: Mapping[str, np.ndarray], theta: Theta, slots: Slots
-    ) -> np.ndarray:
+    def coefficients(self, values: Values, theta: Theta, slots: Slots) -> np.ndarray:
         """See `Effect.coefficients`."""
         B = np.moveaxis(values["B"], 1, -1)
         B = B.reshape(*B.shape[:2], -1)

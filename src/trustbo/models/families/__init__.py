@@ -15,9 +15,4 @@ FAMILIES: dict[str, Family] = {
 }
 
 
-def family_of(observation: str) -> Family:
-    """Family of a model's `observation`."""
-    return FAMILIES[observation]
-
-
-__all__ = ["FAMILIES", "Family", "Levels", "family_of"]
+__all__ = ["FAMILIES", "Family", "Levels"]
