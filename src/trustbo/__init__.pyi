@@ -1,68 +1,34 @@
-from . import (
-    criticism,
-    export,
-    hazard,
-    inference,
-    logs,
-    models,
-    paper,
-    planning,
-    plots,
-    report,
-    simulation,
-    study,
-    terrain,
-    workspace,
-)
-from .campaign import (
-    Campaign,
-    Follower,
-    RegretBound,
-    Result,
-    iterate,
-    load_result,
-    resume,
-)
-from .criticism import check
-from .data import Bound, Mission
-from .errors import PosteriorError, TrustboError
-from .inference import compare, fit
-from .planning.paths import NoPathError
-from .team import Robot, Team
-from .workspace import Workspace
+from . import criticism as criticism
+from . import export as export
+from . import hazard as hazard
+from . import inference as inference
+from . import logs as logs
+from . import models as models
+from . import paper as paper
+from . import planning as planning
+from . import plots as plots
+from . import report as report
+from . import simulation as simulation
+from . import study as study
+from . import terrain as terrain
+from . import workspace as workspace
+from .campaign import Campaign as Campaign
+from .campaign import Follower as Follower
+from .campaign import RegretBound as RegretBound
+from .campaign import Result as Result
+from .campaign import iterate as iterate
+from .campaign import load_result as load_result
+from .campaign import resume as resume
+from .criticism import check as check
+from .data import Bound as Bound
+from .data import Mission as Mission
+from .errors import PosteriorError as PosteriorError
+from .errors import TrustboError as TrustboError
+from .inference import compare as compare
+from .inference import fit as fit
+from .planning.paths import NoPathError as NoPathError
+from .team import Robot as Robot
+from .team import Team as Team
+from .workspace import Workspace as Workspace
 
-__all__ = [
-    "Bound",
-    "Campaign",
-    "Follower",
-    "Mission",
-    "NoPathError",
-    "PosteriorError",
-    "RegretBound",
-    "Result",
-    "Robot",
-    "Team",
-    "TrustboError",
-    "Workspace",
-    "check",
-    "compare",
-    "criticism",
-    "export",
-    "fit",
-    "hazard",
-    "inference",
-    "iterate",
-    "load_result",
-    "logs",
-    "models",
-    "paper",
-    "planning",
-    "plots",
-    "report",
-    "resume",
-    "simulation",
-    "study",
-    "terrain",
-    "workspace",
-]
 __version__: str

@@ -130,7 +130,7 @@ def _missions(result: Result) -> list[str]:
     shown.columns = [str(name).replace("_", " ") for name in shown.columns]
     return [
         _heading("Contact by mission"),
-        _image(lambda: plots.campaign_history(result.history), "contact and objective by mission"),
+        _image(result.plot_history, "contact and objective by mission"),
         _table(shown),
         _note(
             "The objective is that of the plan before the mission, under the posterior of the "

@@ -56,7 +56,7 @@ def begun(model=None, n_missions=1, **options):
 
 def filter_of(campaign):
     """Filter of the campaign's posterior, or of its prior."""
-    if campaign.posterior is not None:
+    if campaign.state.last is not None:
         return TrustFilter(campaign.posterior)
     model = campaign.model.for_features(campaign.workspace.features)
     draws = sample_prior(model, 2, 1000, campaign.state.seed_of("prior"), n_robots=3)

@@ -1,7 +1,6 @@
 """The loop of a campaign: it learns, stops by rules, resumes, and collects a result."""
 
 import itertools
-import logging
 import time
 
 import numpy as np
@@ -265,10 +264,8 @@ def test_bad_input_is_refused_before_anything_is_written(workspace, tmp_path, op
     assert not (tmp_path / "never").exists()
 
 
-def test_progress_is_a_line_and_the_log_has_it_too(workspace, capsys, caplog):
-    with caplog.at_level(logging.INFO, logger="trustbo"):
-        run(workspace, n_iterations=1)
+def test_progress_is_a_line(workspace, capsys):
+    run(workspace, n_iterations=1)
     assert capsys.readouterr() == ("", "")
-    assert "mission 1" in caplog.text
     run(workspace, n_iterations=1, progress=True)
     assert "k-hat" in capsys.readouterr().err

@@ -1,5 +1,6 @@
 """One small result for all formats."""
 
+import copy
 import dataclasses
 
 import pytest
@@ -28,6 +29,6 @@ def nowhere(result):
     """The same without a terrain."""
     workspace, grid = result.workspace, dataclasses.replace(result.workspace.grid, crs=None)
     bare = dataclasses.replace(workspace, terrain=None, pixels=None, posts=None, grid=grid)
-    unplaced = result.copy()
+    unplaced = copy.copy(result)
     unplaced.workspace = bare
     return unplaced

@@ -1,15 +1,7 @@
-from .campaign import Campaign
-from .follow import Follower
-from .loop import iterate, resume
-from .result import Result, load_result
-from .stopping import RegretBound
-
-__all__ = [
-    "Campaign",
-    "Follower",
-    "RegretBound",
-    "Result",
-    "iterate",
-    "load_result",
-    "resume",
-]
+from .campaign import Campaign as Campaign
+from .follow import Follower as Follower
+from .loop import iterate as iterate
+from .loop import resume as resume
+from .result import Result as Result
+from .result import load_result as load_result
+from .stopping import RegretBound as RegretBound

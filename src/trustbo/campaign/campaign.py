@@ -9,12 +9,10 @@ from dataclasses import asdict
 from typing import Any, Self
 
 import numpy as np
-import pandas as pd
 import xarray as xr
 
 from trustbo.campaign.learning import as_learned, base_planner, learn, why_never_learned
 from trustbo.campaign.result import Result, evidence_of
-from trustbo.campaign.running import run_missions
 from trustbo.campaign.state import (
     EXCLUDED,
     GIVEN_UP,
@@ -28,25 +26,17 @@ from trustbo.campaign.state import (
 from trustbo.campaign.stopping import Stop
 from trustbo.campaign.storage import Storage, read_campaign
 from trustbo.data import Cell, Mission
-from trustbo.display import Rows, Summary
-from trustbo.errors import (
-    TrustboError,
-    require_choice,
-    require_kind,
-    require_pair,
-    require_whole,
-)
+from trustbo.display import Rows, compiling, progress_bar
+from trustbo.errors import TrustboError, require_choice, require_kind, require_pair, require_whole
 from trustbo.files import FilePath, to_json
 from trustbo.hazard import Hazard
 from trustbo.hazard.exposures import CAUSES
-from trustbo.hazard.risk import BoundRisk
 from trustbo.inference import diagnostics, fit
 from trustbo.inference.fit import SAMPLERS
 from trustbo.models import HumanTrust, default_model
 from trustbo.models.model import TrustModel
-from trustbo.models.params import Params
 from trustbo.models.record import model_from_record, model_to_record
-from trustbo.planning import InfeasibleError, Plan, Planner
+from trustbo.planning import InfeasibleError, Plan
 from trustbo.planning.policies import Policy, resolve_policy
 from trustbo.simulation import KinematicSimulator, Truth
 from trustbo.simulation.protocol import Simulator
@@ -58,20 +48,17 @@ _ARRIVES = 0.9
 _FIT = inspect.signature(fit)
 
 
-class Campaign(Summary):
-    """Learns from missions and proposes the next path.
+class Campaign(Result):
+    """Result that grows: learns from missions and proposes the next path.
 
     `ask` plans a path, `tell` records the mission that was run and learns from it. With a
     `directory`, a mission is on disk before anything is learned from it, and `Campaign.load`
     continues where the process ended, with identical results.
 
     Attributes:
-        workspace: Workspace of the paths.
-        model: Trust model.
         policy: Policy that chooses the paths.
-        state: Missions with their plans and posteriors, failures, and settings.
         storage: Folder of the campaign; None if it is in memory only.
-        progress: Whether fits show their progress.
+        progress: Whether fits show their progress; `run` sets it.
 
     Example:
         >>> with tb.Campaign(workspace, (9, 0), (0, 9), directory="field") as campaign:
@@ -135,7 +122,7 @@ class Campaign(Summary):
         require_kind("model", model, TrustModel, "give one such as PooledTrust()")
         if isinstance(model, HumanTrust):
             raise TrustboError("model: HumanTrust is for reports of people, and plans no paths.")
-        self.workspace, self.model, self.policy = workspace, model, resolve_policy(policy)
+        self.policy = resolve_policy(policy)
         settings = {
             "policy": policy if isinstance(policy, str) else _name_of(policy),
             "own_policy": not isinstance(policy, str),
@@ -146,28 +133,30 @@ class Campaign(Summary):
             "observation": model.observation,
             "planner": dict(planner or {}),
         }
-        self._base = base_planner(workspace, {"start": start, "goal": goal, **settings})
+        base = base_planner(workspace, {"start": start, "goal": goal, **settings})
         settings |= {
-            "start": self._base.start,
-            "goal": self._base.goal,
-            "max_bounds": self._base.max_bounds,
+            "start": base.start,
+            "goal": base.goal,
+            "max_bounds": base.max_bounds,
             "fit": dict(fit or {}),
             "hazard": asdict(hazard),
             "model": model.in_short(),
             "model_record": model_to_record(model),
         }
-        self.state = State(json.loads(to_json(settings)))  # as a file returns them
+        state = State(json.loads(to_json(settings)))  # as a file returns them
+        super().__init__(workspace, state, model, base)
         self._seconds_plan = 0.0
         self._warned_of_risk = False
         self.progress = True
         self.storage: Storage | None = None
-        self._renew()
         if directory is not None:
             self._keep_in(directory, overwrite)
 
     def _renew(self) -> None:
         """Forget what was computed from the missions and failures, which have changed."""
-        self._known = Result(self.workspace, self.state, self.model, self._base)
+        for name in self._computed():
+            delattr(self, name)
+        self._maps.clear()
 
     def _rows(self) -> Rows:
         settings, state = self.state.settings, self.state
@@ -428,52 +417,42 @@ class Campaign(Summary):
                 raise TrustboError(f"stop must be stop(campaign) -> reason or None; got {rule!r}.")
         describe = getattr(runner, "describe", lambda: {"simulator": type(runner).__name__})
         self.state.simulation = json.loads(to_json({**describe(), "n_iterations": n_iterations}))
-        return run_missions(self, runner, n_iterations, truth, rules, progress)
+        self.progress = progress
+        return self._run(runner, n_iterations, truth, rules)
 
-    # --- what is known ---
+    def _run(
+        self, simulator: Simulator, n_iterations: int, truth: Truth | None, rules: Sequence[Stop]
+    ) -> Iterator[tuple[Plan, Mission]]:
+        """Run missions, see `run`, which checks the arguments."""
+        state = self.state
+        state.stop_reason = "interrupted"
+        bar = progress_bar(
+            self.progress, total=n_iterations, initial=len(state.entries), desc="missions"
+        )
+        with bar, compiling():
+            # The rules are asked before each mission: they may hold already when one continues.
+            while not (reason := self._reason_to_end(n_iterations, rules)):
+                n, plan = len(state.entries), self.ask()
+                mission = simulator.run(plan.path, seed=state.seed_of("mission"), mission=n)
+                extra = {}
+                if truth is not None:
+                    longest = self.planner.max_bounds
+                    extra["regret"] = truth.at(n).regret(plan.path, max_bounds=longest)
+                self.tell(mission, **extra)
+                bar.set_postfix_str(_in_a_line(state.entries[-1].row), refresh=False)
+                bar.update()
+                yield plan, mission
+        self.stop(reason)
 
-    def recommend(self) -> Plan:
-        """Plan the best path under the mean of the belief, regardless of the policy."""
-        return self._known.recommend()
+    def _reason_to_end(self, n_iterations: int, rules: Sequence[Stop]) -> str | None:
+        """Why no further mission is run: what the first rule says, by default its name; or None."""
+        n = len(self.state.entries)
+        for rule in rules if n else ():
+            if verdict := rule(self):
+                return verdict if isinstance(verdict, str) else _name_of(rule)
+        return "n_iterations" if n >= n_iterations else None
 
-    @property
-    def missions(self) -> list[Mission]:
-        """Missions recorded so far, with the awareness that they are learned from."""
-        return self._known.missions
-
-    @property
-    def posterior(self) -> xr.DataTree | None:
-        """Posterior after the last mission, with all groups; None before anything is learned."""
-        return None if self.state.last is None else self._known.posterior
-
-    @property
-    def belief(self) -> Params:
-        """Parameter draws of the next plan: the posterior's, or, at first, those of `initial`."""
-        return self._known.belief
-
-    @property
-    def hazard(self) -> xr.Dataset:
-        """Group `hazard` of the posterior, see `hazard.fit_hazard`; of the prior at first."""
-        return self._known.hazard
-
-    @property
-    def risk(self) -> BoundRisk:
-        """Chances of the bounds to fail, given all missions so far."""
-        return self._known.risk
-
-    @property
-    def planner(self) -> Planner:
-        """Planner that takes the failures so far into account, see `Result.planner`."""
-        return self._known.planner
-
-    @property
-    def trust_map(self) -> xr.DataArray:
-        """Trust map of the team under the mean of the belief, dims (row, col)."""
-        return self._known.trust_map
-
-    def table(self) -> pd.DataFrame:
-        """Table with a row for each mission, as `Result.table`."""
-        return self._known.table()
+    # --- what is known, and the folder ---
 
     def result(self) -> Result:
         """Collect everything learned so far, as `iterate` returns it.
@@ -483,9 +462,9 @@ class Campaign(Summary):
         """
         if not self.state.entries:
             raise TrustboError("the campaign has no mission yet; tell it one first.")
-        return self._known.copy()
-
-    # --- the folder ---
+        result = Result(self.workspace, self.state.copy(), self.model, self._base)
+        vars(result).update(self._computed())
+        return result
 
     def _keep_in(self, directory: FilePath, overwrite: bool) -> None:
         """Write everything to a folder, and update it after each mission from now on."""
@@ -548,5 +527,13 @@ class Campaign(Summary):
             self.storage = None
 
 
-def _name_of(policy: Policy) -> str:
-    return getattr(policy, "__name__", type(policy).__name__)
+def _name_of(function: object) -> str:
+    return getattr(function, "__name__", type(function).__name__)
+
+
+def _in_a_line(row: dict[str, Any]) -> str:
+    """Describe a mission in a line."""
+    regret = f", regret {row['regret']:.1f} %" if "regret" in row else ""
+    name, label = ("r_hat", "R-hat") if "r_hat" in row else ("k_hat", "k-hat")
+    learned = f"{label} {row[name]:.3f}" if row["state"] == LEARNED else row["state"]
+    return f"objective {row['objective']:.3f}{regret}, {learned}, {row['status']}"

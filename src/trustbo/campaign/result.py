@@ -1,8 +1,8 @@
 """Result of a campaign: what was learned, and the path to take."""
 
-from copy import copy
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Self
+from operator import itemgetter
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -16,9 +16,9 @@ from trustbo.campaign.learning import (
     learn_hazard,
     prior_belief,
 )
-from trustbo.campaign.state import State
+from trustbo.campaign.state import COLUMNS, State
 from trustbo.campaign.storage import Storage, read_campaign
-from trustbo.data import Cell, Mission
+from trustbo.data import Cell, Mission, path_text
 from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError
 from trustbo.files import FilePath
@@ -54,15 +54,15 @@ class Result(Summary):
         base: Planner | None = None,
     ) -> None:
         """Collect the state of a campaign; `base` is its planner before anything is learned."""
-        self.workspace, self.state, self.model = workspace, state, model
+        self.workspace, self.state = workspace, state
+        self.model: Any = model
         self._base = base_planner(workspace, state.settings) if base is None else base
         self._maps: dict[int, xr.Dataset] = {}  # by number of draws
 
-    def copy(self) -> Self:
-        """Result that later missions leave unchanged."""
-        result = copy(self)
-        result.state = self.state.copy()
-        return result
+    def _computed(self) -> dict[str, Any]:
+        """Properties that were asked for so far, by name."""
+        cached = (name for name, of in vars(Result).items() if isinstance(of, cached_property))
+        return {name: vars(self)[name] for name in cached if name in vars(self)}
 
     def _rows(self) -> Rows:
         n, row = len(self.missions), self.state.entries[-1].row
@@ -111,8 +111,7 @@ class Result(Summary):
         if self.state.last is None:
             raise TrustboError(
                 f"there is no posterior: none of {len(self.missions)} missions could be learned "
-                f"from yet ({self.state.entries[-1].row['reason']}). They are recorded; continue "
-                "with more missions."
+                "from yet. They are recorded; table() has the reasons."
             )
         stored = self.state.last()
         numbers = np.atleast_1d(stored.attrs["missions"]).astype(int).tolist()
@@ -133,8 +132,8 @@ class Result(Summary):
             return params_of(self.state.last())
         settings = self.state.settings
         seed = State(settings).seed_of("prior")
-        model: Any = self.model  # which `load_result` requires then
-        return prior_belief(model, settings["initial"], self.workspace, seed)
+        # `load_result` requires the model then.
+        return prior_belief(self.model, settings["initial"], self.workspace, seed)
 
     @cached_property
     def hazard(self) -> xr.Dataset:
@@ -185,7 +184,21 @@ class Result(Summary):
         `reason` (`"told"`: to be learned from later; `"learned"`; `"excluded"`), diagnostics of the
         posterior (see `inference.diagnostics`), and the seconds of planning and fitting.
         """
-        return self.state.history()
+        entries = self.state.entries
+        plans, first = [entry.plan for entry in entries], entries[0].trust_map
+        steps = np.full((len(plans), max(len(plan.path) for plan in plans), 2), -1)
+        for i, plan in enumerate(plans):
+            steps[i, : len(plan.path)] = plan.path
+        rows = pd.DataFrame([entry.row for entry in entries])
+        maps = np.stack([entry.trust_map.values for entry in entries])
+        variables: dict[str, Any] = {
+            name: ("iteration", rows[name].tolist(), {"units": "%"} if name == "regret" else {})
+            for name in rows
+        }
+        variables["path"] = ("iteration", "step", "axis"), steps
+        variables["trust_map"] = ("iteration", "row", "col"), maps, first.attrs
+        coords = {"iteration": np.arange(1, len(rows) + 1), "axis": ["row", "col"]}
+        return xr.Dataset(variables, coords | dict(first.coords))
 
     def table(self) -> pd.DataFrame:
         """Table with a row for each mission, labelled by its number, from 1.
@@ -196,7 +209,22 @@ class Result(Summary):
         "9,0 8,1"; then the other numbers of `history`. A mission given up without a report, see
         `Campaign.fail`, has no number and the state "given up".
         """
-        return self.state.table()
+        reasons = {f.after: f.reason for f in self.state.failures if f.reported}
+        rows = []
+        for n, entry in enumerate(self.state.entries, start=1):
+            mission = entry.measured
+            told = {
+                "reason": entry.row["reason"] or reasons.get(n, ""),
+                "where": path_text([mission.bounds[-1].cell]) if mission.status != "ok" else "",
+                "n_bounds": len(mission.bounds),
+                "path": path_text(entry.plan.path),
+            }
+            rows.append((n, n, {**entry.row, **told}))
+        rows += [(f.after, None, f.row()) for f in self.state.failures if not f.reported]
+        rows.sort(key=itemgetter(0))  # stable: those given up follow the mission before them
+        index = pd.Index([number for _, number, _ in rows], dtype="Int64", name="mission")
+        names = dict.fromkeys([*COLUMNS, *(name for *_, row in rows for name in row)])
+        return pd.DataFrame([row for *_, row in rows], index, list(names))
 
     def maps(self, *, n_draws: int | None = None) -> xr.Dataset:
         """Compute every map of the planning cells after the last mission, for GIS and figures.
@@ -256,10 +284,10 @@ class Result(Summary):
         return plots.trust_maps(self.history, self.trust_map, self.path, self.workspace, **options)
 
     def plot_history(self, **options: Any) -> np.ndarray:
-        """Draw contact and objective by mission, see `plots.campaign_history`."""
-        from trustbo import plots
+        """Draw contact and objective by mission, see `plots.curves.campaign_history`."""
+        from trustbo.plots.curves import campaign_history
 
-        return plots.campaign_history(self.history, **options)
+        return campaign_history(self.history, **options)
 
     def explore(self) -> "Explorer":
         """Draw an interactive map: layers, the numbers of each cell, and missions by a slider.

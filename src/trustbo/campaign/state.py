@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 import numpy as np
-import pandas as pd
 import xarray as xr
 
 from trustbo.data import Cell, Mission, path_text
@@ -17,7 +16,7 @@ TOLD, LEARNED, EXCLUDED, GIVEN_UP = "told", "learned", "excluded", "given up"
 """States of a mission: recorded, in the posterior, left out of it, or ended without a report."""
 _STREAMS = ("policy", "fit", "mission", "prior", "awareness", "hazard")
 """Streams of randomness; a seed depends on the position, so new names are added at the end."""
-_COLUMNS = (
+COLUMNS = (
     "status", "state", "reason", "where", "contact_rate", "objective", "n_bounds", "path_changed",
     "path",
 )  # fmt: skip
@@ -168,49 +167,6 @@ class State:
             "reason": "",
         }
         for name in extra:
-            if name in {*row, *_COLUMNS, "mission", "iteration", "trust_map"}:
+            if name in {*row, *COLUMNS, "mission", "iteration", "trust_map"}:
                 raise TrustboError(f"{name!r} is a column of the history; give it another name.")
         return row | {name: float(value) for name, value in extra.items()}
-
-    def history(self) -> xr.Dataset:
-        """Dataset as `Result.history`; empty before the first mission."""
-        if not self.entries:
-            return xr.Dataset()
-        plans, first = [entry.plan for entry in self.entries], self.entries[0].trust_map
-        steps = np.full((len(plans), max(len(plan.path) for plan in plans), 2), -1)
-        for i, plan in enumerate(plans):
-            steps[i, : len(plan.path)] = plan.path
-        rows = pd.DataFrame([entry.row for entry in self.entries])
-        maps = np.stack([entry.trust_map.values for entry in self.entries])
-        variables: dict[str, Any] = {
-            name: ("iteration", rows[name].tolist(), {"units": "%"} if name == "regret" else {})
-            for name in rows
-        }
-        variables["path"] = ("iteration", "step", "axis"), steps
-        variables["trust_map"] = ("iteration", "row", "col"), maps, first.attrs
-        coords = {"iteration": np.arange(1, len(rows) + 1), "axis": ["row", "col"]}
-        return xr.Dataset(variables, coords | dict(first.coords))
-
-    def table(self) -> pd.DataFrame:
-        """Table as `Result.table`; a mission given up follows the missions recorded before it."""
-        reasons = {f.after: f.reason for f in self.failures if f.reported}
-        numbers: list[int | None] = []
-        rows: list[dict[str, Any]] = []
-        for n in range(len(self.entries) + 1):
-            if n:
-                entry = self.entries[n - 1]
-                failed = entry.measured.status != "ok"
-                numbers.append(n)
-                rows.append({
-                    **entry.row,
-                    "reason": entry.row["reason"] or reasons.get(n, ""),
-                    "where": path_text([entry.measured.bounds[-1].cell]) if failed else "",
-                    "n_bounds": len(entry.measured.bounds),
-                    "path": path_text(entry.plan.path),
-                })  # fmt: skip
-            for failure in self.failures:
-                if failure.after == n and not failure.reported:
-                    numbers.append(None)
-                    rows.append(failure.row())
-        names = dict.fromkeys([*_COLUMNS, *(name for row in rows for name in row)])
-        return pd.DataFrame(rows, pd.Index(numbers, dtype="Int64", name="mission"), list(names))

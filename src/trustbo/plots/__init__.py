@@ -1,13 +1,12 @@
 """Figures. Each function takes data and optional `ax=`, and returns the axes it drew on."""
 
-from trustbo.plots.curves import campaign_history, robot_effects, trust_curves
+from trustbo.plots.curves import robot_effects, trust_curves
 from trustbo.plots.explore import explore
 from trustbo.plots.grid import grid_map
 from trustbo.plots.maps import cell_map, terrain_maps, trust_maps
 from trustbo.plots.plan import plan_map
 
 __all__ = [
-    "campaign_history",
     "cell_map",
     "explore",
     "grid_map",
