@@ -109,7 +109,7 @@ def main():
             difficulty, exposures = simulate(seed)
             prior = hazard.of_bounds(difficulty, MEASURES, LIMIT)
             started = time.process_time()
-            points = sample(prior, exposures, np.random.default_rng(seed)).points
+            points = sample(prior, exposures, np.random.default_rng(seed))[0]
             seconds = time.process_time() - started
             expected = reference(prior, exposures, given.particles, seed)
             off = np.abs(points.weight @ points.z - expected).max()

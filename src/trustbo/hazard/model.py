@@ -6,20 +6,15 @@ depends on how difficult the route is and by how many degrees t_e it exceeds the
     1 - m_e = sigma(-logit_e) sigma(-(t_e + margin) / width),
     logit_e = intercept + sum_j coefficient_j (difficulty_ej - 1/2).
 
-The chances are integrated out. Given the parameters, n exposures with f failures have probability
-B(a_e + f, b_e + n - f) / B(a_e, b_e), with a_e = s m_e and b_e = s (1 - m_e). The few parameters
-are drawn by importance sampling of their normal scores.
-
-Where a lost mission failed is not known. While the proposals adapt, lost missions are treated as
-independent. Then the places are imputed at every point, one mission after the other (sequential
-imputation; Kong, Liu and Wong 1994), each with a lookahead factor for later missions that share its
-bounds. The weights are corrected accordingly, so the draws are of the joint posterior.
+The chances are integrated out, and the few parameters drawn by importance sampling of their normal
+scores. While the proposals adapt, missions lost somewhere unknown are treated as independent. Then
+the places where they failed are imputed at every point (sequential imputation; Kong, Liu and Wong
+1994), and the weights corrected, so the draws are of the joint posterior.
 """
 
 import time
 from collections.abc import Sequence
 from dataclasses import asdict
-from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -35,7 +30,8 @@ from trustbo.workspace import Workspace
 from trustbo.workspace.difficulty import difficulty_of
 from trustbo.workspace.moves import MOVE_NAMES
 
-_ROUND, _ENOUGH = 1024, 500.0
+_ROUND, _ENOUGH, _N_DRAWS = 1024, 500.0, 1000
+_MAPS = "move", "row", "col"
 
 
 def fit_hazard(
@@ -45,8 +41,6 @@ def fit_hazard(
     *,
     lost: Sequence[LostMission] = (),
     seed: int = 0,
-    n_draws: int = 1000,
-    check: bool = True,
 ) -> xr.Dataset:
     """Learn the chance to fail of every bound, by importance sampling.
 
@@ -57,23 +51,20 @@ def fit_hazard(
         hazard: Priors; by default `Hazard()`.
         lost: Missions that failed and did not report.
         seed: Seed; the same seed gives the same posterior.
-        n_draws: Number of draws.
-        check: Refuse a posterior with k-hat > 0.7; `False` returns it unchecked.
 
     Returns:
         The group `hazard` of a posterior: `intercept` (draw), `coefficient` (draw, measure),
         `margin` and `width` of the slope limit (draw), in degrees, where there is a terrain,
         `strength` (draw), and `place` (draw, lost), the bound from 1 at which each mission lost
-        somewhere unknown failed; `p_fail` and `p_fail_sd` (move, row, col), posterior mean and sd
-        of the chance to fail, NaN where there is no bound; `exposures` and `failures` (move, row,
-        col), counts of the known ones; `failures_by_cause` (cause). `BoundRisk` draws from it.
+        somewhere unknown failed; `p_fail` (move, row, col), posterior mean of the chance to fail,
+        NaN where there is no bound; `exposures` and `failures` (move, row, col), counts of the
+        known ones; `failures_by_cause` (cause). `BoundRisk` draws from it.
 
     Raises:
         TrustboError: A mission's path jumps or leaves the grid, or an unknown cause.
-        PosteriorError: k-hat is beyond its limit.
+        PosteriorError: k-hat > 0.7.
     """
     started, hazard = time.perf_counter(), hazard or Hazard()
-    n_draws, seed = require_whole("n_draws", n_draws, 1), require_whole("seed", seed, 0)
     exposures, difficulty = Exposures.of(missions, lost), difficulty_of(workspace)
     shape, cells = difficulty.shape[1:3], exposures.bounds[:, 1:]
     for cell in cells[((cells < 0) | (cells >= shape)).any(1)]:
@@ -84,32 +75,22 @@ def fit_hazard(
     met = np.nan_to_num(difficulty.values[*exposures.bounds.T], nan=1.0)
     measures = difficulty["measure"].values.tolist()
     prior = hazard.of_bounds(met, measures, workspace.team.max_slope)
-    posterior = sample(prior, exposures, np.random.default_rng(seed))
+    points, places = sample(prior, exposures, np.random.default_rng(require_whole("seed", seed, 0)))
 
-    group = _to_dataset(prior, exposures, posterior, difficulty, n_draws, seed)
+    group = _to_dataset(prior, exposures, points, places, difficulty, seed)
     group.attrs |= {f"prior_{name}": list(value) for name, value in asdict(hazard).items()}
-    risk, maps = BoundRisk(group, workspace), ("move", "row", "col")
-    group = group.assign(p_fail=(maps, risk.mean), p_fail_sd=(maps, risk.sd))
+    group = group.assign(p_fail=(_MAPS, BoundRisk(group, workspace).mean))
     group.attrs["seconds"] = time.perf_counter() - started
-    k_hat = posterior.points.k_hat
-    if check and not k_hat <= importance.MAX_KHAT:
-        raise PosteriorError(
-            f"hazard refused: k-hat = {k_hat:.2f} > {importance.MAX_KHAT:g}.",
-            group,
-            "Give firmer priors, Hazard(...), or pass check=False to have it as it is.",
-        )
+    if not points.k_hat <= importance.MAX_KHAT:
+        reason = f"hazard refused: k-hat = {points.k_hat:.2f} > {importance.MAX_KHAT:g}."
+        raise PosteriorError(reason, group, "Give firmer priors, Hazard(...).")
     return group
 
 
-class HazardPoints(NamedTuple):
-    """Weighted points, and the bound of its path, from 0, where each lost mission failed."""
-
-    points: importance.Points
-    places: np.ndarray  # (point, lost mission)
-
-
-def sample(prior: BoundPrior, exposures: Exposures, rng: np.random.Generator) -> HazardPoints:
-    """Draw weighted points of the joint posterior of scores and places; check their k-hat."""
+def sample(
+    prior: BoundPrior, exposures: Exposures, rng: np.random.Generator
+) -> tuple[importance.Points, np.ndarray]:
+    """Weighted points of scores, and the bound, from 0, where each lost mission failed at each."""
     n, failed, paths = exposures.n, exposures.failed, exposures.lost
     counts, kind = np.unique(n, return_inverse=True)
     times, bad = np.bincount(kind, minlength=len(counts)), failed > 0.0
@@ -141,10 +122,9 @@ def sample(prior: BoundPrior, exposures: Exposures, rng: np.random.Generator) ->
             places, log_fail = impute(alpha + failed, beta + n - failed, paths, rng)
             ratio = points.log_ratio + log_fail - log_any_fails(alpha, beta)
             points = importance.Points.of(points.z, points.log_p, ratio)
-        posterior = HazardPoints(points, places)
         if points.k_hat <= importance.MAX_KHAT:
             break
-    return posterior
+    return points, places
 
 
 def _log_rising(x: np.ndarray, k: np.ndarray) -> np.ndarray:
@@ -208,18 +188,17 @@ def _lookahead(
 def _to_dataset(
     prior: BoundPrior,
     exposures: Exposures,
-    posterior: HazardPoints,
+    points: importance.Points,
+    places: np.ndarray,
     difficulty: xr.DataArray,
-    n_draws: int,
     seed: int,
 ) -> xr.Dataset:
     """The group without the maps of chances."""
-    rng, (points, places) = np.random.default_rng([seed, 2]), posterior
-    chosen = rng.permutation(points.resample(n_draws, rng))
+    rng = np.random.default_rng([seed, 2])
+    chosen = rng.permutation(points.resample(_N_DRAWS, rng))
     weights, limit, strength = prior.values(points.z[chosen])
     degrees = {"units": "degrees"}
     of_limit = {name: ("draw", v, degrees) for name, v in zip(LIMIT_NAMES, limit.T, strict=False)}
-    maps = ("move", "row", "col")
     n, failed = np.zeros((2, *difficulty.shape[:3]))
     n[*exposures.bounds.T], failed[*exposures.bounds.T] = exposures.n, exposures.failed
     longest = max((len(path) for path in exposures.lost), default=0)
@@ -234,15 +213,15 @@ def _to_dataset(
             "strength": ("draw", strength),
             "place": (("draw", "lost"), places[chosen] + 1),
             "lost_bound": (("lost", "bound", "axis"), lost),
-            "exposures": (maps, n),
-            "failures": (maps, failed),
+            "exposures": (_MAPS, n),
+            "failures": (_MAPS, failed),
             "failures_by_cause": ("cause", exposures.causes),
         },
         {
-            "draw": np.arange(n_draws),
+            "draw": np.arange(_N_DRAWS),
             "measure": [m for m in difficulty["measure"].values.tolist() if m != TILT],
             "cause": list(CAUSES),
-            "axis": list(maps),
+            "axis": list(_MAPS),
             "move": list(MOVE_NAMES),
         },
         {

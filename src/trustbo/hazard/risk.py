@@ -56,15 +56,13 @@ class BoundRisk:
         self._lost = [path[path[:, 0] >= 0] for path in hazard["lost_bound"].values]
         self._place = hazard["place"].values  # (draw, lost), from 1
 
-    @property
+    @cached_property
     def mean(self) -> np.ndarray:
         """Posterior mean of the chance to fail, shape (move, row, col)."""
-        return self._moments[0]
-
-    @property
-    def sd(self) -> np.ndarray:
-        """Posterior sd of the chance to fail, shape (move, row, col)."""
-        return self._moments[1]
+        mean = np.full(self.exists.shape, np.nan)
+        for bounds, a, b in self._betas():
+            mean.flat[bounds] = (a / (a + b)).mean(0)
+        return mean
 
     @property
     def has_failures(self) -> bool:
@@ -118,17 +116,6 @@ class BoundRisk:
         some = np.flatnonzero(self.exists)
         a, b = self._betas_of(some[:: 1 + len(some) // _SOME])
         return (a / (a + b)).mean(1)
-
-    @cached_property
-    def _moments(self) -> tuple[np.ndarray, np.ndarray]:
-        """Mean and sd over all draws, the Betas in closed form."""
-        mean, sd = np.full((2, *self.exists.shape), np.nan)
-        for bounds, a, b in self._betas():
-            total = a + b
-            first, second = a / total, a / total * (a + 1.0) / (total + 1.0)
-            mean.flat[bounds] = first.mean(0)
-            sd.flat[bounds] = np.sqrt(np.maximum(0.0, second.mean(0) - first.mean(0) ** 2))
-        return mean, sd
 
     def _betas(self, draws: Any = slice(None)) -> Iterator[tuple[np.ndarray, ...]]:
         """Yield bounds that exist, flat indices, some at a time; alpha and beta (draw, bound)."""
