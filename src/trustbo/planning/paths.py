@@ -6,21 +6,19 @@ from functools import cached_property
 
 import networkx as nx
 import numpy as np
-from numba import njit
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
 
 from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_kind, require_whole
-from trustbo.planning.unrolled import Unrolled, numbers_left
+from trustbo.planning.unrolled import STEPS, Unrolled
 from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Location
-from trustbo.workspace.moves import MOVES, moves_along, require_on_grid
+from trustbo.workspace.moves import moves_along, require_on_grid
 
 SIMPLE_EXTRA = 2
 """Bounds beyond the fewest possible up to which a path without U-turns enters no cell twice."""
-STEPS = np.array(MOVES)
 _SHORTEST = re.compile(r"shortest(?:\+(\d+))?")
-_MOST_STATES = 20_000_000
-"""Most states of the unrolled graph, whose arrays take some 3 GB."""
 
 
 class NoPathError(TrustboError, nx.NetworkXNoPath):
@@ -96,13 +94,7 @@ class AdmissiblePaths:
     def graph(self) -> Unrolled:
         """Unrolled graph of the paths; TrustboError: it is too large to be held."""
         fewest = self.bounds_to_goal, self.bounds_from_start
-        n_states = int(numbers_left(*fewest, self.longest).sum())
-        if n_states > _MOST_STATES:
-            raise TrustboError(
-                f"max_bounds = {self.max_bounds!r} admits paths of up to {self.longest} bounds, "
-                f"whose search has {n_states:.3g} states, more than {_MOST_STATES:.3g}; give less."
-            )
-        return Unrolled.of_grid(self.bounds, STEPS, *fewest, self.longest, turns=self.turns)
+        return Unrolled.of_grid(self.bounds, *fewest, self.longest, turns=self.turns)
 
     def avoiding(self, bounds: np.ndarray, risk: np.ndarray) -> "AdmissiblePaths":
         """Restrict to paths that take none of some bounds.
@@ -180,26 +172,10 @@ def fewest_bounds(bounds: np.ndarray, cell: Cell, *, back: bool = False) -> np.n
         cell: First cell.
         back: Whether to count from every other cell to this one instead.
     """
-    # A closed margin saves the test whether a move leaves the grid.
-    closed = np.pad(bounds, ((0, 0), (1, 1), (1, 1)))
-    rows, cols = closed.shape[1:]
-    fewest = np.full(rows * cols, -1, np.int32)
-    start = (cell[0] + 1) * cols + cell[1] + 1
-    _breadth_first(fewest, closed.reshape(len(bounds), -1), start, STEPS @ (cols, 1), back)
-    return fewest.reshape(rows, cols)[1:-1, 1:-1]
-
-
-@njit(cache=True, nogil=True)
-def _breadth_first(fewest, bounds, start, steps, back):
-    queue = np.empty(len(fewest), np.int32)
-    queue[0], fewest[start] = start, 0
-    first, last = 0, 1
-    while first < last:
-        c = queue[first]
-        first += 1
-        for m in range(len(steps)):
-            other = c - steps[m] if back else c + steps[m]
-            if bounds[m, c if back else other] and fewest[other] == -1:
-                fewest[other] = fewest[c] + 1
-                queue[last] = other
-                last += 1
+    rows, cols = bounds.shape[1:]
+    move, entered = np.nonzero(bounds.reshape(len(bounds), -1))
+    left = entered - (STEPS @ (cols, 1))[move]
+    ends = (entered, left) if back else (left, entered)
+    graph = csr_array((np.ones(len(move)), ends), shape=(rows * cols, rows * cols))
+    fewest = dijkstra(graph, indices=cell[0] * cols + cell[1], unweighted=True)
+    return np.where(np.isfinite(fewest), fewest, -1).astype(np.int32).reshape(rows, cols)

@@ -21,10 +21,11 @@ from trustbo.models.params import Params
 from trustbo.planning.draws import DrawnPaths, choose_draws
 from trustbo.planning.dynamics import Dynamics, as_map, roll, trust_dynamics
 from trustbo.planning.objectives import LOST_CONTACT, OBJECTIVES, capped, score_of
-from trustbo.planning.paths import STEPS, AdmissiblePaths
+from trustbo.planning.paths import AdmissiblePaths
 from trustbo.planning.plan import QUANTILES, Plan
 from trustbo.planning.problem import EXACT, InfeasibleError, Problem, draws_of, mean_of, risk_of
-from trustbo.planning.trust_map import cost_of, summary_of, trust_map
+from trustbo.planning.trust_map import cost_of, trust_map
+from trustbo.planning.unrolled import STEPS
 from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Location
 
@@ -181,13 +182,13 @@ class Planner(Summary):
         """
         started = time.perf_counter()
         mean = mean_of(params, self.workspace)
-        best = self.problem.best(self.problem.dynamics(mean, x0))
-        path = self.problem.paths.cells(best.paths[0])
+        score, limits, paths = self.problem.best(self.problem.dynamics(mean, x0))
+        path = self.problem.paths.cells(paths[0])
         plan = self.evaluate(path, mean, x0=x0)
         if mean is not params:
             plan = plan.with_draws(self.evaluate(path, params, x0=x0))
-        exact = bool(best.limit[0] - best.score[0] <= EXACT)
-        limit = plan.value if exact else float(self.problem.objective.value(best.limit[0]))
+        exact = bool(limits[0] - score[0] <= EXACT)
+        limit = plan.value if exact else float(self.problem.objective.value(limits[0]))
         return replace(plan, exact=exact, limit=limit, seconds=time.perf_counter() - started)
 
     def best_path(self, dynamics: Dynamics) -> tuple[Cell, ...]:
@@ -200,7 +201,7 @@ class Planner(Summary):
             TrustboError: beta0 is outside the range the objective is exact for.
             InfeasibleError: No path respects `max_failure`.
         """
-        return self.problem.paths.cells(self.problem.best(dynamics).paths[0])
+        return self.problem.paths.cells(self.problem.best(dynamics)[-1][0])
 
     def plan_draws(
         self, posterior: Params | xr.DataTree, *, n_draws: int | None = None, seed: int = 0
@@ -218,7 +219,7 @@ class Planner(Summary):
         """
         params = choose_draws(draws_of(posterior, self.workspace), n_draws, seed)
         dynamics = self.problem.dynamics(params)
-        return DrawnPaths(self.problem, dynamics, self.problem.best(dynamics).paths)
+        return DrawnPaths(self.problem, dynamics, self.problem.best(dynamics)[-1])
 
     def evaluate(
         self, path: Sequence[Cell], params: Params | xr.DataTree, *, x0: ArrayLike | None = None
@@ -344,7 +345,11 @@ class Planner(Summary):
             seed: Seed of the choice of draws.
         """
         params = choose_draws(draws_of(posterior, self.workspace), n_draws, seed)
-        return summary_of(trust_map(self.problem, params))
+        trust = trust_map(self.problem, params)
+        cost = cost_of(trust).mean("draw").assign_attrs(long_name="mean cost 1 - sigma(trust)")
+        mean = trust.mean("draw").assign_attrs(long_name="mean expected trust")
+        sd = trust.std("draw").assign_attrs(long_name="sd of expected trust")
+        return xr.Dataset({"mean": mean, "sd": sd, "cost": cost})
 
     def path_posterior(
         self, posterior: Params | xr.DataTree, *, n_draws: int | None = 1000, seed: int = 0

@@ -41,14 +41,6 @@ class InfeasibleError(TrustboError):
         self.path, self.p_fail = path, p_fail
 
 
-class Best(NamedTuple):
-    """Best path of each draw as flat cells (draw, cell), filled with -1; score and its limit."""
-
-    paths: np.ndarray
-    score: np.ndarray
-    limit: np.ndarray
-
-
 @dataclass(frozen=True, eq=False)
 class Problem:
     """Admissible paths, objective and costs: the data of a `Planner`, which explains them.
@@ -150,8 +142,12 @@ class Problem:
         of_bounds = risk_of(p_fail).reshape(len(p_fail), -1).T
         return Risks(np.ascontiguousarray(of_bounds), self.price * shares, limit)
 
-    def best(self, dynamics: Dynamics) -> Best:
+    def best(self, dynamics: Dynamics) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Find the best admissible path under every draw of `dynamics`, or the only one.
+
+        Returns:
+            Scores (draw,); upper limits on the score of any path, equal to them where exact; and
+            paths as flat cells, (draw, cell), filled with -1.
 
         Raises:
             TrustboError: beta0 outside the range for which the search is exact.
@@ -166,7 +162,7 @@ class Problem:
         weights = weights_of(self.objective, dynamics, view, graph.longest)
         if self.risks is None and not history:
             score, paths = best_sums(graph, drift, weights, toll)
-            return Best(paths, score, score)
+            return score, score, paths
         n_trust, loss = 0, LOGISTIC
         if history:  # the cost is a loss of trust, and no sum of weights
             n_trust, loss = n_states, LOSSES[self.family.expected_rate]
@@ -178,7 +174,7 @@ class Problem:
         cost, lower, paths = best_labels(graph, costs, weights.scale)
         if self.risk is not None and np.isinf(cost).any():
             raise self._infeasible(self.risk)
-        return Best(paths, -cost, -lower)
+        return -cost, -lower, paths
 
     def _require_valid(self, dynamics: Dynamics, history: bool) -> None:
         if not self.objective.of_contact:

@@ -8,9 +8,10 @@ from scipy.special import expit
 from trustbo.models.params import Params
 from trustbo.planning.dynamics import Dynamics
 from trustbo.planning.objectives import TERMINAL, weights_of
-from trustbo.planning.paths import SIMPLE_EXTRA, STEPS, AdmissiblePaths
+from trustbo.planning.paths import SIMPLE_EXTRA, AdmissiblePaths
 from trustbo.planning.problem import Problem
 from trustbo.planning.sums import best_sums
+from trustbo.planning.unrolled import STEPS
 
 
 def trust_map(
@@ -41,16 +42,6 @@ def cost_of(trust: xr.DataArray) -> xr.DataArray:
     return cost.assign_attrs(long_name="cost 1 - sigma(trust)")
 
 
-def summary_of(trust: xr.DataArray) -> xr.Dataset:
-    """Compute `mean` and `sd` of a trust map over its draws, and the mean `cost`."""
-    summary = {
-        "mean": trust.mean("draw").assign_attrs(long_name="mean expected trust"),
-        "sd": trust.std("draw").assign_attrs(long_name="sd of expected trust"),
-        "cost": cost_of(trust).mean("draw").assign_attrs(long_name="mean cost 1 - sigma(trust)"),
-    }
-    return xr.Dataset(summary)
-
-
 def _largest(paths: AdmissiblePaths, dynamics: Dynamics, view: np.ndarray) -> np.ndarray:
     """Largest trust view . x of every draw and cell, (draw, row, col); NaN if out of reach."""
     extra = min(SIMPLE_EXTRA, paths.longest - paths.shortest)
@@ -59,8 +50,7 @@ def _largest(paths: AdmissiblePaths, dynamics: Dynamics, view: np.ndarray) -> np
     if (weights == beta0.max(-1, keepdims=True) * view).all():  # view . x depends on itself alone
         drift = np.einsum("s,dsmrc->dmrc", view, dynamics.drift)
         drift = np.where(paths.bounds, drift, np.nan)
-        fewest = paths.bounds_from_start, paths.start, extra
-        return best_trust(drift, beta0.max(-1), dynamics.start @ view, *fewest)
+        return best_trust(paths, extra, drift, beta0.max(-1), dynamics.start @ view)
     drift = dynamics.drift.reshape(*dynamics.start.shape, -1)
     values = np.full((len(drift), *paths.passable.shape), np.nan)
     for row, col in np.argwhere(paths.bounds_from_start > 0).tolist():
@@ -73,12 +63,7 @@ def _largest(paths: AdmissiblePaths, dynamics: Dynamics, view: np.ndarray) -> np
 
 
 def best_trust(
-    drift: np.ndarray,
-    beta0: np.ndarray,
-    x0: np.ndarray,
-    fewest: np.ndarray,
-    start: tuple[int, int],
-    extra: int,
+    paths: AdmissiblePaths, extra: int, drift: np.ndarray, beta0: np.ndarray, x0: np.ndarray
 ) -> np.ndarray:
     """Largest trust with which each cell can be entered, (draw, row, col); NaN if out of reach.
 
@@ -86,13 +71,13 @@ def best_trust(
     keeps the largest trust by any move and by another. Exact for beta0 >= 0.
 
     Args:
+        paths: Admissible paths.
+        extra: Bounds beyond the fewest that a path to a cell may have.
         drift: Drift of bounds, (draw, move, row, col), NaN where there is none.
         beta0: Autoregression, (draw,).
         x0: Trust at the start, (draw,).
-        fewest: Fewest bounds from the start, (row, col), -1 where there is no path.
-        start: First cell.
-        extra: Bounds beyond the fewest that a path to a cell may have.
     """
+    start, fewest = paths.start, paths.bounds_from_start
     margin = ((0, 0), (0, 0), (1, 1), (1, 1))
     u = np.pad(np.where(np.isnan(drift), -np.inf, drift), margin, constant_values=-np.inf)
     n_draws, n_moves, rows, cols = u.shape
