@@ -70,7 +70,6 @@ def test_the_table_is_the_mean_of_many_missions(wooded, of_wooded):
     # table averages with arrivals.
     np.testing.assert_allclose(of_wooded._along(PATH)[0], rates, atol=0.02)
     assert of_wooded.lost(PATH) == pytest.approx(3.0 - rates.sum(), abs=0.03)
-    assert of_wooded.p_arrive(PATH) == 1.0
     assert of_wooded.lost_or_failed(PATH) == of_wooded.lost(PATH)
 
 
@@ -96,7 +95,7 @@ def test_bounds_that_fail_say_so_and_keep_no_contact(wooded):
     found = Truth.of(simulator, n_replicates=1)
     exists = existing_bounds(simulator.workspace.passable.values)
     assert (found.bounds["passed"].values[exists, 8] == 0.0).all()
-    assert (found.lost(PATH), found.lost_or_failed(PATH), found.p_arrive(PATH)) == (3.0, 3.0, 0.0)
+    assert found.lost(PATH) == found.lost_or_failed(PATH) == 3.0
 
 
 class Plain:

@@ -132,10 +132,11 @@ def test_line_of_sight_predicts_the_simulator_without_noise(name, real_terrain):
         (m, row, col), (a, c) = index[b], pairs[b]
         ahead = [n for p, n in pairs if p == c and n != a]
         world, state = simulator.world(), simulator.standing(a, c)
-        found = simulator.contact_ahead(world, state, c, ahead, np.random.default_rng(0))
-        if any(status != "ok" for _, status, _ in found):
+        rng_of_bound = np.random.default_rng(0)
+        found = simulator.outcomes(world, state, 1, c, ahead, rng_of_bound, expected=True)
+        if any(drive.status != "ok" for drive, _, _ in found):
             continue
-        simulated.append(np.mean([contact for contact, _, _ in found]))
+        simulated.append(np.mean([contact.mean() for _, contact, _ in found]))
         expected.append(workspace.awareness.values[:, m, row, col, 2].mean())
     expected, simulated = np.array(expected), np.array(simulated)
     assert np.corrcoef(expected, simulated)[0, 1] > 0.95

@@ -19,6 +19,8 @@ from trustbo.workspace import Workspace
 from trustbo.workspace.posts import Posts
 from trustbo.workspace.sight import Sight
 
+_LEAD, _T2 = slice(0, 1), slice(1, None)  # of the team's arrays
+
 
 class State(NamedTuple):
     """Team between two bounds; positions in CRS metres, headings in rad."""
@@ -135,7 +137,7 @@ class KinematicSimulator(DescribedSimulator):
         bounds: list[Bound] = []
         for k, (cell, after) in enumerate(zip(cells[1:], [*cells[2:], None], strict=True), start=1):
             rng = np.random.default_rng([seed, k])
-            drive, contact, state = self._run_bound(world, state, k, cell, after, rng)
+            [(drive, contact, state)] = self.outcomes(world, state, k, cell, [after], rng)
             n_ticks = np.full(self.team.n_robots, len(contact))
             measured = awareness[k - 1], contact.mean(0), n_ticks * self.tick
             bounds.append(Bound(cell, *measured, drive.status, time, drive.poses, contact, n_ticks))
@@ -179,24 +181,28 @@ class KinematicSimulator(DescribedSimulator):
         """
         return drive_together(world.surface, robots, routes, poses, self.tick, max_ticks, rng)
 
-    def contact_ahead(
+    def outcomes(
         self,
         world: World,
         state: State,
+        k: int,
         cell: Cell,
         ahead: Sequence[Cell | None],
         rng: np.random.Generator,
-    ) -> list[tuple[float, str, State]]:
-        """Simulate the first bound of a mission for each cell that may follow it.
+        *,
+        expected: bool = False,
+    ) -> list[tuple[Drive, np.ndarray, State]]:
+        """Simulate bound k of a mission, from 1, for each cell that may follow it.
 
-        Moves that alternatives share are simulated once. Where a scan decides by itself about
-        contact, the rate is the mean probability of detection, else that of simulated tracks.
+        Moves that alternatives share are simulated once. With `expected`, contact is the
+        probability of detection, if a scan decides by itself about contact.
 
         Returns:
-            For each next cell, the contact rate, mean over robots, the status, and the state
-            after the bound.
+            For each next cell, the movements, the contact at each tick, shape (tick, robot), and
+            the state after the bound.
         """
-        lead = self._advance(world, state, cell, rng)
+        goals = self._posts.stop(cell)[None]
+        lead = self._move(world, state, cell, _LEAD, goals, self._max_ticks, rng)
         drives, runs = [lead], []
         moves: dict[bytes, int] = {}  # by their goals
         for next_cell in ahead:
@@ -204,64 +210,23 @@ class KinematicSimulator(DescribedSimulator):
             if lead.status == "ok":
                 goals = self._posts.watching(cell, next_cell)
                 if (key := goals.tobytes()) not in moves:
+                    now = state._replace(poses=lead.poses[-1], stops=lead.stops)
+                    left = self._max_ticks - len(lead.poses)
                     moves[key] = len(drives)
-                    drives.append(self._close_up(world, state, lead, cell, goals, rng))
+                    drives.append(self._move(world, now, cell, _T2, goals, left, rng))
                 run.append(moves[key])
             runs.append(run)
         lidars = world.team.lead, *world.team.robots
-        independent = all(robot.acquire == robot.drop == 1 for robot in lidars)
-        seen = detections(world, drives, 1)
-        outcomes = []
+        expected &= all(robot.acquire == robot.drop == 1 for robot in lidars)
+        seen = detections(world, drives, k)
+        found = []
         for run in runs:
             whole = _joined([drives[i] for i in run])
-            probability = np.concatenate([seen[i] for i in run])
-            contact, tracks = probability, state.tracks
-            if not independent:
-                contact, tracks = self._contact(world, tracks, whole, probability, rng)
-            after = State(cell, whole.poses[-1], whole.stops, tracks)
-            outcomes.append((float(contact.mean()), whole.status, after))
-        return outcomes
-
-    # --- one bound ---
-
-    def _run_bound(
-        self,
-        world: World,
-        state: State,
-        k: int,
-        cell: Cell,
-        next_cell: Cell | None,
-        rng: np.random.Generator,
-    ) -> tuple[Drive, np.ndarray, State]:
-        """Run bound k: movements, contact at each tick (tick, robot), and the state after it."""
-        drive = self._advance(world, state, cell, rng)
-        if drive.status == "ok":
-            goals = self._posts.watching(cell, next_cell)
-            drive = _joined([drive, self._close_up(world, state, drive, cell, goals, rng)])
-        probability = detections(world, [drive], k)[0]
-        contact, tracks = self._contact(world, state.tracks, drive, probability, rng)
-        return drive, contact, State(cell, drive.poses[-1], drive.stops, tracks)
-
-    def _advance(self, world: World, state: State, cell: Cell, rng: np.random.Generator) -> Drive:
-        """Drive the lead to its stop in a cell while T2 stands."""
-        robots = [world.team.lead], [self.workspace.team.lead]
-        goals = self._posts.stop(cell)[None]
-        return self._move(world, state, cell, slice(0, 1), robots, goals, self._max_ticks, rng)
-
-    def _close_up(
-        self,
-        world: World,
-        state: State,
-        lead: Drive,
-        cell: Cell,
-        goals: np.ndarray,
-        rng: np.random.Generator,
-    ) -> Drive:
-        """Drive T2 to goals (robot, 2) in a cell while the lead stands."""
-        robots = world.team.robots, self.workspace.team.robots
-        now = state._replace(poses=lead.poses[-1], stops=lead.stops)
-        left = self._max_ticks - len(lead.poses)
-        return self._move(world, now, cell, slice(1, None), robots, goals, left, rng)
+            contact, tracks = np.concatenate([seen[i] for i in run]), state.tracks
+            if not expected:
+                contact, tracks = self._contact(world, tracks, whole, contact, rng)
+            found.append((whole, contact, State(cell, whole.poses[-1], whole.stops, tracks)))
+        return found
 
     def _move(
         self,
@@ -269,16 +234,17 @@ class KinematicSimulator(DescribedSimulator):
         state: State,
         cell: Cell,
         members: slice,
-        robots: tuple[Sequence[Robot], Sequence[Robot]],
         goals: np.ndarray,
         max_ticks: int,
         rng: np.random.Generator,
     ) -> Drive:
-        """Drive part of the team, the true `robots` as those that were planned for, to goals.
+        """Drive part of the team to goals (robot, 2) in a cell while the others stand.
 
         Routes start at the planned places, robots at their current poses.
         """
-        true, planned = robots
+        true, planned = (
+            (team.lead, *team.robots)[members] for team in (world.team, self.workspace.team)
+        )
         now, window = state.poses, self._posts.window(state.cell, cell)
         routes: list[np.ndarray | None] = []
         for robot, start, goal, pose in zip(
@@ -292,7 +258,7 @@ class KinematicSimulator(DescribedSimulator):
         stops = state.stops.copy()
         if status == "ok":
             stops[members] = goals
-        return Drive(poses, np.full(len(poses), members.start == 0), status, stops)
+        return Drive(poses, np.full(len(poses), members == _LEAD), status, stops)
 
     def _contact(
         self,

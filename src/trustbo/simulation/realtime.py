@@ -91,5 +91,5 @@ class RealtimeAwareness:
         lidar = optics(robot, world.team.lead)
         clear = detection_between(world.surface, world.sight, eye, target, lidar).mean(-1)
         seen = np.insert(clear, 0, 1.0, axis=-1)  # (tick, robot, 1 + share)
-        reached = np.trapezoid(seen, [0.0, *_SHARES], axis=-1)
+        reached = np.asarray(np.trapezoid(seen, [0.0, *_SHARES], axis=-1))
         return {"return_range": reach * reached, "visible_share": seen[..., -1]}

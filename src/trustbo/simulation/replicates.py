@@ -5,7 +5,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
-from tqdm import tqdm
 
 from trustbo.data import Cell
 from trustbo.parallel import in_order
@@ -54,9 +53,7 @@ def edges_of(workspace: Workspace) -> list[Edge]:
     return edges
 
 
-def replicated(
-    simulator: Any, mission: int, n_replicates: int, seed: int, progress: bool
-) -> xr.Dataset:
+def replicated(simulator: Any, mission: int, n_replicates: int, seed: int) -> xr.Dataset:
     """Means over replicates of all bounds."""
     if hasattr(simulator, "expected_contact"):
         return simulator.expected_contact()
@@ -65,9 +62,7 @@ def replicated(
     total, n_passed, n = np.zeros(shape), np.zeros(shape), np.zeros(shape)
     replicates = _of_bounds if isinstance(simulator, KinematicSimulator) else _of_missions
     edges = edges_of(workspace)
-    found = replicates(simulator, edges, mission, n_replicates, seed)
-    length = n_replicates * len(edges)
-    for edge, outcomes in tqdm(found, "truth", length, disable=not progress):
+    for edge, outcomes in replicates(simulator, edges, mission, n_replicates, seed):
         for next_move, (contact, status) in zip(edge.next_moves, outcomes, strict=True):
             where = edge.move, *edge.cell, next_move
             n[where] += 1.0
@@ -98,7 +93,8 @@ def _of_bounds(
             states = before.get((edge.left, edge.cell), {})
             state = states[sorted(states)[number % len(states)]] if states else None
             state = state or simulator.standing(edge.left, edge.cell)
-            return simulator.contact_ahead(world, state, edge.cell, edge.ahead, rng)
+            found = simulator.outcomes(world, state, 1, edge.cell, edge.ahead, rng, expected=True)
+            return [(float(contact.mean()), drive.status, after) for drive, contact, after in found]
 
         for edge, outcomes in zip(edges, in_order(replicate, edges), strict=True):
             for next_cell, (_, status, after) in zip(edge.ahead, outcomes, strict=True):

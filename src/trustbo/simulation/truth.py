@@ -6,6 +6,7 @@ programming over bounds and the number of bounds that are left, which is exact.
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
@@ -56,7 +57,6 @@ class Truth(Summary):
         n_replicates: int = 3,
         seed: int = 0,
         folder: FilePath | None = None,
-        progress: bool = False,
     ) -> Self:
         """Find the truth of a simulator by replicates of every bound with each that can follow.
 
@@ -71,7 +71,6 @@ class Truth(Summary):
             n_replicates: Replicates of every bound.
             seed: Seed of the replicates.
             folder: Folder where truths are kept; by default they are not.
-            progress: Whether to show a progress bar.
 
         Raises:
             TrustboError: A simulator without a workspace, or one whose contact has a memory.
@@ -89,12 +88,14 @@ class Truth(Summary):
         n_replicates = require_whole("n_replicates", n_replicates, 1)
         found: dict[str, Self] = {}
 
+        known = digest(workspace.awareness.values, workspace.passable_bounds.values)
+
         def of_mission(number: int) -> Self:
-            world = to_json(_settings(simulator, require_whole("mission", number, 0)))
+            settings = _settings(simulator, require_whole("mission", number, 0))
+            world = to_json([settings, known, n_replicates, seed])
             if world not in found:
-                replicates = number, n_replicates, seed, progress
-                table = _kept(folder, world, simulator, *replicates)
-                found[world] = cls(workspace, table, of_mission)
+                make = partial(replicated, simulator, number, n_replicates, seed)
+                found[world] = cls(workspace, _kept(folder, world, make), of_mission)
             return found[world]
 
         return of_mission(mission)
@@ -120,10 +121,6 @@ class Truth(Summary):
         """
         contact, passed = self._along(path)
         return float((1.0 - np.cumprod(passed) * contact).sum())
-
-    def p_arrive(self, path: Sequence[Cell]) -> float:
-        """Probability that no bound of a path fails; raises as `lost` does."""
-        return float(np.prod(self._along(path)[1]))
 
     def best(
         self,
@@ -177,25 +174,13 @@ def _settings(simulator: Any, mission: int) -> object:
     return getattr(simulator, "describe", lambda: type(simulator).__name__)()
 
 
-def _kept(
-    folder: FilePath | None,
-    world: str,
-    simulator: Any,
-    mission: int,
-    n_replicates: int,
-    seed: int,
-    progress: bool,
-) -> xr.Dataset:
-    """Table of bounds from its file in a folder, which is written if it is not there."""
-    replicates = simulator, mission, n_replicates, seed, progress
+def _kept(folder: FilePath | None, world: str, make: Callable[[], xr.Dataset]) -> xr.Dataset:
+    """Table of bounds of a world from its file in a folder, which is made if it is not there."""
     if folder is None:
-        return replicated(*replicates)
-    workspace = simulator.workspace
-    known = digest(workspace.awareness.values, workspace.passable_bounds.values)
-    about = to_json([world, known, n_replicates, seed])
-    file = Path(folder) / f"truth-{digest(np.frombuffer(about.encode(), np.uint8))}.nc"
+        return make()
+    file = Path(folder) / f"truth-{digest(np.frombuffer(world.encode(), np.uint8))}.nc"
     if not file.exists():
-        table = replicated(*replicates)
+        table = make()
         file.parent.mkdir(parents=True, exist_ok=True)
         write_file(file, table.to_netcdf)
     return xr.load_dataset(file)
