@@ -47,15 +47,14 @@ def test_the_evidence_and_the_mean_weight_are_those_of_quadrature(observation, y
     theta = posterior.theta(np.array([[0.0, -0.5, 0.2]]))
     posterior.settle(theta)
     wanted = by_quadrature(posterior, theta)
-    args = posterior._with_terms(*posterior._at(theta))
-    found, _ = ep.log_evidence(*args, posterior.sites, 10)
+    found, _ = ep.log_evidence(posterior._joint(theta), posterior.sites, 10)
     assert abs(found[0] - wanted) < 0.05  # EP's own error
     many = at(theta, np.zeros(20_000, int))
-    args = posterior._with_terms(*posterior._at(many))
+    joint = posterior._joint(many)
     sites = ep.Sites(*(np.repeat(s, 20_000, axis=0) for s in posterior.sites)).at(
-        posterior.terms, args[1].sd
+        posterior.terms, joint.signal.sd
     )
-    _, _, log_weight = ep.draw(*args, sites, np.random.default_rng(0))
+    _, _, log_weight = ep.draw(joint, sites, np.random.default_rng(0))
     weight = np.exp(log_weight - wanted)
     assert abs(weight.mean() - 1.0) < 5.0 * weight.std() / np.sqrt(len(weight)) + 2e-3
 

@@ -12,14 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import special
 
-from trustbo.inference.engine import (
-    Blocks,
-    Prior,
-    evidence,
-    expected,
-    marginals,
-    whiten,
-)
+from trustbo.inference.engine import Blocks, Prior, evidence, expected, marginals, whiten
 from trustbo.inference.factor import Factor, cholesky
 from trustbo.models.families import Family
 from trustbo.models.families.moments import log_normal
@@ -40,6 +33,15 @@ class Terms(NamedTuple):
     def linear(self) -> np.ndarray:
         """Observations whose sites are exact, (block, row)."""
         return ~np.isnan(self.y) & self.family.is_density(self.y)
+
+
+class Joint(NamedTuple):
+    """Columns, signals and observations of all blocks at each theta."""
+
+    blocks: Blocks
+    signal: Signal
+    prior: Prior
+    terms: Terms
 
 
 class Sites(NamedTuple):
@@ -81,15 +83,10 @@ def _matched(
 
 
 def log_evidence(
-    blocks: Blocks,
-    signal: Signal,
-    prior: Prior,
-    terms: Terms,
-    sites: Sites,
-    n_sweeps: int,
-    damp: float = 1.0,
+    joint: Joint, sites: Sites, n_sweeps: int, damp: float = 1.0
 ) -> tuple[np.ndarray, Sites]:
     """EP's log evidence (point,) after some sweeps over all sites, and the sites."""
+    blocks, signal, prior, terms = joint
     seen, sd = ~np.isnan(terms.y), signal.sd
     sites = sites.at(terms, sd)
     total = np.zeros(len(sd))
@@ -117,12 +114,7 @@ def _overlap(y: np.ndarray, lam: np.ndarray, m: np.ndarray, v: np.ndarray) -> np
 
 
 def draw(
-    blocks: Blocks,
-    signal: Signal,
-    prior: Prior,
-    terms: Terms,
-    sites: Sites,
-    rng: np.random.Generator,
+    joint: Joint, sites: Sites, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Columns and signals at each theta with log weights, whose mean weight is the evidence.
 
@@ -131,6 +123,7 @@ def draw(
     Returns:
         Columns (point, column), signals (point, block, row) and log weights (point,).
     """
+    blocks, signal, prior, terms = joint
     n, p = len(signal.sd), blocks.n_columns
     nu = max(8.0, 2.0 * p)
     laws = []
@@ -144,25 +137,18 @@ def draw(
     narrow, wider = (center + F.back(t)[:, 0] for center, F in laws)
     c = np.where(wide[:, None], wider, narrow)
     log_q = np.logaddexp(*(_log_student(c, *law, nu) for law in laws)) - np.log(2.0)  # pyright: ignore[reportCallIssue]
-    f, log_block = draw_signals(blocks, signal, expected(blocks, signal, c), terms, sites, rng)
+    f, log_block = draw_signals(joint, expected(blocks, signal, c), sites, rng)
     return c, f, prior.log_density(c) - log_q + log_block.sum(1)
 
 
 def draw_signals(
-    blocks: Blocks,
-    signal: Signal,
-    at: np.ndarray,
-    terms: Terms,
-    sites: Sites,
-    rng: np.random.Generator,
+    joint: Joint, at: np.ndarray, sites: Sites, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
     """Signals given their means and the observations, row by row, each with its own term.
 
     Args:
-        blocks: Data of all blocks.
-        signal: Distribution of the signals given the columns.
+        joint: Columns, signals and observations.
         at: Mean of the signals given the columns (draw, block, row).
-        terms: Observations.
         sites: Sites that stand for the terms of later rows.
         rng: Random number generator.
 
@@ -170,6 +156,7 @@ def draw_signals(
         Signals (draw, block, row) and log weights (draw, block), whose mean weight is the
         likelihood of a block given the columns.
     """
+    blocks, signal, _, terms = joint
     lam, eta, y = *sites, sites.y
     seen = ~np.isnan(terms.y)
     W, log_sites = whiten(blocks, signal, lam)

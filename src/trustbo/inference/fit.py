@@ -150,9 +150,7 @@ def by_importance(
         if k_hat <= MAX_KHAT:
             break
     shuffled = rng.permutation(n)
-    theta = {name: values[shuffled] for name, values in drawn.theta.items()}
-    f = None if drawn.f is None else drawn.f[shuffled]
-    drawn = drawn._replace(theta=theta, c=drawn.c[shuffled], f=f)
+    drawn = drawn.at(shuffled)
     log_evidence = points.log_evidence + drawn.log_correction
     summary = {"k_hat": k_hat, "kish": points.kish, "log_evidence": log_evidence}
     return drawn, {"lp": points.log_p[chosen][shuffled]}, summary

@@ -23,12 +23,9 @@ from numpyro.infer import MCMC, NUTS, init_to_value
 
 from trustbo.inference import importance
 from trustbo.inference.diagnostics import complaints_of
-from trustbo.inference.engine import expected
-from trustbo.inference.factor import cholesky
-from trustbo.inference.posterior import Draws, Posterior, chunks
+from trustbo.inference.posterior import Draws, Posterior
 from trustbo.models.backend import own_settings
 from trustbo.models.scores import NOISES
-from trustbo.models.signal import each
 
 _POINTS = 2000  # resampled points that the covariance is taken of
 _TARGET = 0.9
@@ -76,11 +73,14 @@ def sample_by_nuts(
             for found in (mcmc.get_extra_fields(), mcmc.get_samples())
         )
     stats = {ours: fields[theirs] for theirs, ours in _FIELDS.items()}
-    drawn = _draws_of(posterior, samples, rng)
+    values = {name: samples[name] for name in posterior.scores.priors}
+    theta = posterior.model.theta(values, posterior.slots.resolution)
+    if posterior.exact:
+        drawn = Draws(theta, posterior.draw_columns(theta, rng))
+    else:
+        drawn = Draws(theta, samples["columns"], samples["signal"])
     by_chain = {
-        name: v.reshape(chains, draws, *v.shape[1:])
-        for name, v in drawn.theta.items()
-        if name in posterior.scores.priors
+        name: v.reshape(chains, draws, *v.shape[1:]) for name, v in theta.items() if name in values
     }
     found, complaints = complaints_of(by_chain, stats["diverging"])
     return drawn, stats | {"lp": -stats["lp"]}, found, complaints
@@ -167,28 +167,3 @@ def _half_normal_score(prior: Distribution, value: np.ndarray) -> np.ndarray:
     if isinstance(base, dist.HalfNormal):
         return np.asarray(value) / np.asarray(base.scale)
     return np.sqrt(2.0) * np.asarray(erfinv(prior.cdf(jnp.asarray(value))))
-
-
-def _draws_of(
-    posterior: Posterior, samples: dict[str, np.ndarray], rng: np.random.Generator
-) -> Draws:
-    """Draws of hyperparameters, coefficients and, where they were sampled, signals."""
-    model, slots, blocks = posterior.model, posterior.slots, posterior.blocks
-    values = {name: samples[name] for name in posterior.scores.priors}
-    theta, c, f = model.theta(values, slots.resolution), [], []
-    if posterior.exact:
-        return Draws(theta, posterior.draw_columns(theta, rng), None, 0.0, 0.0)
-    for where, some in chunks(theta):
-        columns = []
-        for effect in model.columns:
-            mean, parts = effect.prior(some, slots)
-            label = effect.noun or "weights"
-            white = [samples[f"{label}_{k}"][where] for k in range(len(parts))]
-            if parts:
-                columns.append(np.concatenate(white, axis=1) + (0.0 if mean is None else mean))
-        c.append(np.concatenate(columns, axis=1))
-        signal = model.signal(some, slots, posterior.layout)
-        root = cholesky(signal.covariance + 1e-10 * np.eye(signal.covariance.shape[-1]))
-        noise = each(root, blocks.label) @ samples["trust_noise"][where][..., None]
-        f.append(expected(blocks, signal, c[-1]) + noise[..., 0])
-    return Draws(theta, np.concatenate(c), np.concatenate(f), 0.0, 0.0)

@@ -1,21 +1,14 @@
 """A model given missions: the density that samplers take, and all else given its points."""
 
 from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from scipy import sparse
 from scipy.special import logsumexp
 
 from trustbo.inference import ep
-from trustbo.inference.engine import (
-    Blocks,
-    Prior,
-    draw_columns,
-    evidence,
-    expected,
-    whiten,
-)
+from trustbo.inference.engine import Blocks, Prior, draw_columns, evidence, expected, whiten
 from trustbo.inference.factor import Order, cholesky
 from trustbo.inference.importance import Student, find_mode, smoothed, systematic
 from trustbo.models.backend import namespace
@@ -40,11 +33,16 @@ class Draws(NamedTuple):
 
     theta: dict[str, np.ndarray]  # (draw, ...)
     c: np.ndarray  # (draw, column)
-    f: np.ndarray | None  # (draw, block, row)
-    k_hat: float
+    f: np.ndarray | None = None  # (draw, block, row)
+    k_hat: float = 0.0
     """Pareto shape of the weights that correct EP, 0 where the evidence is exact."""
-    log_correction: float
+    log_correction: float = 0.0
     """What those weights add to the log evidence."""
+
+    def at(self, index: np.ndarray) -> Self:
+        """Draws of these indices."""
+        f = None if self.f is None else self.f[index]
+        return self._replace(theta=at(self.theta, index), c=self.c[index], f=f)
 
 
 class Given(NamedTuple):
@@ -126,19 +124,18 @@ class Posterior:
             return evidence(self.blocks, signal, prior, self._lam(signal)).log_p
         found = np.empty(len(theta["rest"]))
         for i, chunk in chunks(theta):
-            signal, prior = self._at(chunk)
             if self.exact:
+                signal, prior = self._at(chunk)
                 found[i] = evidence(self.blocks, signal, prior, self._lam(signal)).log_p
             else:
-                found[i] = ep.log_evidence(*self._with_terms(signal, prior), self.sites, _SWEEPS)[0]  # pyright: ignore[reportCallIssue]
+                found[i] = ep.log_evidence(self._joint(chunk), self.sites, _SWEEPS)[0]
         return found
 
     def settle(self, theta: Theta) -> None:
         """Find the sites of EP at the mean of some points, from which those elsewhere start."""
         if not self.exact:
             center = {name: values.mean(0, keepdims=True) for name, values in theta.items()}
-            args = self._with_terms(*self._at(center))
-            self.sites = ep.log_evidence(*args, self.sites, _SETTLED, _DAMPING)[1]  # pyright: ignore[reportCallIssue]
+            self.sites = ep.log_evidence(self._joint(center), self.sites, _SETTLED, _DAMPING)[1]
 
     def start(self) -> np.ndarray:
         """The best of four points to search the mode from, or with EP the mode; (score,)."""
@@ -177,13 +174,13 @@ class Posterior:
         if self.exact:
             c = self.draw_columns(self.theta(unique), rng, count)
             order = np.argsort(np.argsort(index.ravel(), kind="stable"), kind="stable")
-            return Draws(at(self.theta(unique), index.ravel()), c[order], None, 0.0, 0.0)
+            return Draws(at(self.theta(unique), index.ravel()), c[order])
         some = np.linspace(0, len(z) - 1, min(_WEIGHTED, len(z))).astype(int)
         theta, parts = self.theta(z[some]), []
         for _, chunk in chunks(theta):
-            args = self._with_terms(*self._at(chunk))
-            sites = ep.log_evidence(*args, self.sites, _SWEEPS)[1]  # pyright: ignore[reportCallIssue]
-            parts.append(ep.draw(*args, sites, rng))  # pyright: ignore[reportCallIssue]
+            joint = self._joint(chunk)
+            sites = ep.log_evidence(joint, self.sites, _SWEEPS)[1]
+            parts.append(ep.draw(joint, sites, rng))
         c, f, log_weight = (np.concatenate(part) for part in zip(*parts, strict=True))
         raw = log_weight + self.scores.log_prior(z[some]) - log_p[some]
         weight, k_hat, log_mean = smoothed(raw)
@@ -211,10 +208,7 @@ class Posterior:
             groups.setdefault(effect.noun or "posterior", {}).update(named)
         if isinstance(model, HumanTrust) and draws.f is not None:
             persons = np.empty((len(draws.c), self.slots.n_missions, 4))
-            for i, chunk in chunks(theta):
-                mean = expected(
-                    self.blocks, model.signal(chunk, self.slots, self.layout), draws.c[i]
-                )
+            for i, chunk, _, mean in self.signals(draws):
                 persons[i] = model.persons(chunk, draws.f[i], mean, self.slots, rng)
             groups[model.effect.noun] = {"person": persons}
         return groups
@@ -228,7 +222,7 @@ class Posterior:
             effect.coefficients(groups[effect.noun or "posterior"], theta, self.slots)
             for effect in model.columns
         ]
-        return Draws(theta, np.column_stack(c), None, 0.0, 0.0)
+        return Draws(theta, np.column_stack(c))
 
     def draw_prior(self, n: int, rng: np.random.Generator, *, even: bool = False) -> Draws:
         """Draws of hyperparameters and columns from the prior; `even` as of `Scores.draw`."""
@@ -237,7 +231,7 @@ class Posterior:
             values["beta0"] = np.zeros(n)
         theta = self.model.theta(values, self.slots.resolution)
         c = [self.prior(chunk).draw(rng) for _, chunk in chunks(theta)]
-        return Draws(theta, np.concatenate(c), None, 0.0, 0.0)
+        return Draws(theta, np.concatenate(c))
 
     def given(self, draws: Draws, kept: np.ndarray, rng: np.random.Generator) -> Given:
         """Trust, likelihoods and predictions under draws.
@@ -251,13 +245,11 @@ class Posterior:
         _, some, index = np.unique(  # under EP draws repeat: each is evaluated once
             np.column_stack([*rows, draws.c]), axis=0, return_index=True, return_inverse=True
         )
-        index, draws = index.ravel(), Draws(at(draws.theta, some), draws.c[some], None, 0.0, 0.0)
+        index, draws = index.ravel(), draws.at(some)
         shape = (len(some), *self.slots.y.shape)
         trust, predicted, log_likelihood = np.empty(shape), np.empty(shape), np.empty(shape[:2])
-        for where, theta in chunks(draws.theta):
-            signal = self.model.signal(theta, self.slots, self.layout)
-            mean = expected(self.blocks, signal, draws.c[where])
-            given_mean = self._exact_trust if self.exact else self._ep_trust
+        given_mean = self._exact_trust if self.exact else self._ep_trust
+        for where, theta, signal, mean in self.signals(draws):
             x, log_p = given_mean(theta, signal, mean, rng)
             trust[where] = self.layout.slots(x)
             log_likelihood[where] = log_p.reshape(len(log_p), shape[1], -1).sum(2)
@@ -270,10 +262,15 @@ class Posterior:
     def anew(self, draws: Draws, rng: np.random.Generator) -> np.ndarray:
         """Rates of the same missions drawn anew, (draw, mission, bound, robot)."""
         rates = np.empty((len(draws.c), *self.slots.y.shape))
-        for i, theta in chunks(draws.theta):
-            signal = self.model.signal(theta, self.slots, self.layout)
-            rates[i] = self._anew(signal, expected(self.blocks, signal, draws.c[i]), rng)
+        for i, _, signal, mean in self.signals(draws):
+            rates[i] = self._anew(signal, mean, rng)
         return rates
+
+    def signals(self, draws: Draws) -> Iterator[tuple[slice, Theta, Signal, np.ndarray]]:
+        """Yield draws evaluated at once: slice, hyperparameters, signals and their means."""
+        for where, theta in chunks(draws.theta):
+            signal = self.model.signal(theta, self.slots, self.layout)
+            yield where, theta, signal, expected(self.blocks, signal, draws.c[where])
 
     def _exact_trust(
         self, theta: Theta, signal: Signal, mean: np.ndarray, rng: np.random.Generator
@@ -293,12 +290,9 @@ class Posterior:
         self, theta: Theta, signal: Signal, mean: np.ndarray, rng: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
         """The same for other rates: by weighted particles of each block."""
-        args = self._with_terms(signal, self.prior(theta))
-        sites = ep.log_evidence(*args, self.sites, _SWEEPS)[1]  # pyright: ignore[reportCallIssue]
-        drawn = [
-            ep.draw_signals(self.blocks, signal, mean, self.terms, sites, rng)
-            for _ in range(_PARTICLES)
-        ]
+        joint = ep.Joint(self.blocks, signal, self.prior(theta), self.terms)
+        sites = ep.log_evidence(joint, self.sites, _SWEEPS)[1]
+        drawn = [ep.draw_signals(joint, mean, sites, rng) for _ in range(_PARTICLES)]
         f, log_w = (np.stack(part) for part in zip(*drawn, strict=True))
         chosen = np.argmax(log_w + rng.gumbel(size=log_w.shape), axis=0)
         f = np.take_along_axis(f, chosen[None, ..., None], axis=0)[0]
@@ -333,8 +327,8 @@ class Posterior:
     def _lam(self, signal: Signal) -> Any:
         return self.blocks.seen / signal.sd**2
 
-    def _with_terms(self, signal: Signal, prior: Prior) -> tuple[Any, ...]:
-        return self.blocks, signal, prior, self.terms
+    def _joint(self, theta: Theta) -> ep.Joint:
+        return ep.Joint(self.blocks, *self._at(theta), self.terms)
 
 
 def at(theta: Mapping[str, Any], index: Any) -> dict[str, Any]:

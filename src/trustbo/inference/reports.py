@@ -9,8 +9,7 @@ import xarray as xr
 from trustbo.data import Mission, levels_of
 from trustbo.errors import TrustboError, require_choice, require_whole
 from trustbo.inference.draws import is_of_people, read_posterior, require_posterior
-from trustbo.inference.engine import expected
-from trustbo.inference.posterior import Draws, Posterior, at
+from trustbo.inference.posterior import Draws, Posterior
 from trustbo.models.model import TrustModel
 from trustbo.models.signal import each
 from trustbo.parallel import one_blas_thread
@@ -74,7 +73,7 @@ def predict_reports(
     n = max(1, n // _ALIKE) if fitted else n
     some = np.unique(np.linspace(0, len(draws.c) - 1, n).astype(int))
     some = np.repeat(some, _ALIKE) if fitted else some
-    draws = Draws(at(draws.theta, some), draws.c[some], None, 0.0, 0.0)
+    draws = draws.at(some)
 
     shape = ahead.slots.y.shape
     out = {name: np.full(shape, np.nan) for name in ("mean", "log_score")}
@@ -106,13 +105,10 @@ def _of_person(
     slots, family = ahead.slots, ahead.model.family
     _, n_bounds, n_robots = slots.y.shape
     mean, root = [], []
-    for start in range(0, len(draws.c), 64):
-        where = slice(start, start + 64)
-        signal = ahead.model.signal(at(draws.theta, where), slots, ahead.layout)
-        mean.append(expected(ahead.blocks, signal, draws.c[where])[:, j])
+    for _, _, signal, of_all in ahead.signals(draws):
+        mean.append(of_all[:, j])
         cov = each(signal.covariance, ahead.blocks.label)
-        cov = np.broadcast_to(cov, (len(mean[-1]), cov.shape[1], *cov.shape[2:]))
-        cov = cov[:, j % cov.shape[1]]
+        cov = np.broadcast_to(cov, (len(of_all), *cov.shape[1:]))[:, j % cov.shape[1]]
         root.append(np.linalg.cholesky(cov + 1e-12 * np.eye(cov.shape[-1])))
     mean, root, sd = np.concatenate(mean), np.concatenate(root), draws.theta["delta_v"]
     y, ticks = (a[j].ravel() for a in (slots.y, slots.n_ticks))

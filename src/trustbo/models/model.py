@@ -199,7 +199,7 @@ class TrustModel(Summary, ABC):
         }
         values = {name: jnp.asarray(value)[None] for name, value in values.items()}
         theta = self.theta(values, slots.resolution)
-        c = sample_columns(self.columns, theta, slots)
+        c = numpyro.deterministic("columns", sample_columns(self.columns, theta, slots))
         U = sparse.hstack([effect.columns(slots) for effect in self.columns], format="csr")
         rates = self.rates(theta, (U.toarray() @ c).reshape(slots.y.shape))
         if rates is not None:
@@ -214,6 +214,7 @@ class TrustModel(Summary, ABC):
         white = dist.Normal(0.0, 1.0).expand(y.shape).to_event(2)
         e = numpyro.sample("trust_noise", white)
         f = signal.m[0] + (signal.T[0] @ u[..., None])[..., 0] + (root @ e[..., None])[..., 0]  # pyright: ignore[reportArgumentType, reportCallIssue, reportIndexIssue]
+        numpyro.deterministic("signal", f)
         seen = ~np.isnan(y)
         some, N = np.where(seen, y, 0.5), np.where(ticks > 0.0, ticks, 1.0)
         log_p = self.family.log_prob(some, N, f, signal.sd[0])
