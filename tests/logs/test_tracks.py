@@ -14,23 +14,33 @@ POSES = {"t": [0.0, 4.0, 8.0, 0.0, 4.0, 8.0], "robot": [*"aaabbb"], "x": [0.0, 4
 SEEN = {"t": [0.5, 0.7, 6.2], "watcher": [*"aab"], "seen": [*"bba"]}
 
 
+def features_of(tracks, watcher, lead):
+    """Features near, ahead and clear of one robot at each tick, (feature, tick)."""
+    (one,) = missions_of(tracks, 1.0, lead=lead)
+    return one.awareness[:, one.robots.index(watcher)].T
+
+
 def test_geometry_is_that_of_the_plane():
     poses = {"t": [0.0, 10.0] * 3, "robot": [*"aabbcc"], "x": [0, 0, 4, 4, 2, 2],
              "y": [0, 0, 0, 0, -2, 8], "heading": [0, 0, 0, 0, 0, 1.0]}  # fmt: skip
     with pytest.warns(UserWarning, match="no detection names c"):
         tracks = Tracks(poses, SEEN, landmarks=[[0.0, 5.0, 0.2]], robot_radius=0.3, max_gap=10.0)
-    found = tracks.geometry()
-    ab, ac = (found.sel(watcher="a", seen=name) for name in "bc")
-    np.testing.assert_allclose(ab["range"], 4.0)
-    np.testing.assert_allclose(ab["bearing"], 0.0)
-    np.testing.assert_allclose(np.abs(found["bearing"].sel(watcher="b", seen="a")), np.pi)
+    near, ahead, clear = features_of(tracks, "a", "b")
+    np.testing.assert_array_equal(ahead, features_of(tracks, "b", "a")[1] == 0.0)  # b faces east
     # c, at (2, t - 2), hides b from a where it is within .3 m of their line: never at t = k + .5.
-    assert not ab["hidden"].any()
-    np.testing.assert_allclose(ac["range"][-1], np.hypot(2.0, 7.5))
-    assert ab["contact"].values.tolist() == [1.0] + [0.0] * 9
-    assert np.isnan(found["range"].sel(watcher="a", seen="a")).all()
-    hidden = Tracks(POSES, SEEN, landmarks=[[2.0, 1.5, 0.6]]).geometry()["hidden"]
-    assert hidden.sel(watcher="a", seen="b").values.tolist() == [0, 1, 1, 0, 0, 0, 0, 0]
+    assert clear.all()
+    away = np.hypot(2.0, np.arange(10) - 1.5)  # of a and of b from c
+    usual = np.median([*away, *away, *[4.0] * 10])
+    np.testing.assert_allclose(near, usual / (usual + 4.0))
+    np.testing.assert_allclose(features_of(tracks, "a", "c")[0], usual / (usual + away))
+    (one,) = missions_of(tracks, 1.0, lead="b")
+    np.testing.assert_array_equal(one.contact_rate[:, 0], [1.0] + [0.0] * 9)
+    hidden = Tracks(POSES, SEEN, landmarks=[[2.0, 1.5, 0.6]])
+    assert features_of(hidden, "a", "b")[2].tolist() == [1, 0, 0, 1, 1, 1, 1, 1]
+    crossing = poses | {"y": [0.0] * 4 + [-2.5, 7.5]}
+    with pytest.warns(UserWarning, match="no detection names c"):
+        hidden = Tracks(crossing, SEEN, robot_radius=0.3, max_gap=10.0)
+    assert features_of(hidden, "a", "b")[2].tolist() == [1.0] * 2 + [0.0] + [1.0] * 7
 
 
 def test_windows_are_bounds_and_rates_are_shares_of_their_ticks():

@@ -1,12 +1,11 @@
 """Tables that users give: one reader, and one parser of names, numbers and times."""
 
-import codecs
 import csv
 import gzip
 import io
 import re
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -19,10 +18,8 @@ from trustbo.errors import TrustboError, one_line
 _SEPARATORS = ",;\t"
 _BLANK = ("", "na", "n/a", "#n/a", "#na", "nan", "nat", "none", "null", "<na>")
 """Cells without a value, in small letters, as R, Excel, pandas and SQL write them."""
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", re.IGNORECASE)
 _WHOLE = re.compile(r"^(-?\d+)\.0+$")
-_DECIMAL_COMMA = re.compile(r"([+-]?\d*),(\d+)")
-_ZONE = re.compile(r"(Z|[+-]\d\d:?\d\d)$", re.IGNORECASE)
+_DECIMAL_COMMA = re.compile(r"^\s*([+-]?\d*),(\d+)\s*$")
 _LONGEST = 7 * 86_400.0
 """Longest log, s: times that span more are in another unit, or have a stray stamp."""
 
@@ -39,10 +36,10 @@ class Columns:
     """
 
     def __init__(self, table: Any, what: str = "the table") -> None:
-        """Read a CSV file, separated by commas, semicolons or tabs; a DataFrame; or a mapping.
+        """Read a CSV file, separated by commas, semicolons or tabs; or any columns pandas takes.
 
         Raises:
-            TrustboError: No such file, or no CSV; a repeated column; or no rows.
+            TrustboError: No such file, or no table; a repeated column; or no rows.
         """
         self.what = what
         frame = _of_file(Path(table)) if isinstance(table, str | PathLike) else _of_values(table)
@@ -51,11 +48,10 @@ class Columns:
         if not frame.columns.is_unique:
             raise TrustboError(f"{what} has two columns of one name: {', '.join(frame.columns)}.")
         frame.index = pd.RangeIndex(1, len(frame) + 1)
-        numbers = frame.select_dtypes(["number", "bool", "datetime", "datetimetz"])
-        text = frame.drop(columns=numbers).astype(object).map(_cell).astype(object)
-        imports = text.iloc[:3].map(lambda cell: "ImportId" in str(cell)).any(axis=1)
-        skipped = int(imports[imports].index[-1]) if imports.any() else 0
-        self.frame = text.join(numbers)[list(frame)].iloc[skipped:].dropna(how="all")
+        text = [name for name in frame if frame[name].dtype.kind not in "biufM"]
+        frame = frame.assign(**{n: frame[n].astype(object).map(_cell).astype(object) for n in text})
+        imports = [i for i, row in frame.iloc[:3].iterrows() if "ImportId" in str(row.tolist())]
+        self.frame = frame.loc[max(imports, default=0) + 1 :].dropna(how="all")
         if frame.shape[1] and self.frame.empty:
             raise TrustboError(f"{what} has no rows.")
 
@@ -72,91 +68,81 @@ class Columns:
             there = ", ".join(self.frame) or "no columns"
             raise TrustboError(f"{self.what} lacks {', '.join(missing)}; it has {there}.{remedy}")
 
-    def texts(self, column: str) -> list[str]:
-        """Texts of a column, "" if blank; 1.0, which pandas makes of 1 beside a blank, is 1."""
-        cells = self._cells(column).astype(object)
-        texts = ["" if pd.isna(cell) else str(cell) for cell in cells]
-        return [_WHOLE.sub(r"\1", text) for text in texts]
+    def texts(self, column: str, *, required: bool = True) -> list[str]:
+        """Texts of a column, "" if blank; 1.0, which pandas makes of 1 beside a blank, is 1.
 
-    def names(self, column: str) -> list[str]:
-        """Names of robots, people or missions in a column, "" if blank, each in one spelling."""
-        names = self.texts(column)
-        require_one_spelling(f"column {column} of {self.what}", names)
-        return names
+        All are blank where the table lacks a column that is not `required`.
+        """
+        cells = self._cells(column, required).astype(object)
+        return ["" if pd.isna(cell) else _WHOLE.sub(r"\1", str(cell)) for cell in cells]
 
-    def numbers(self, column: str, *, blank: bool = True) -> np.ndarray:
-        """Numbers of a column, (row,); NaN where blank.
+    def numbers(
+        self, column: str, *, blank: bool = True, whole: bool = False, required: bool = True
+    ) -> np.ndarray:
+        """Numbers of a column, (row,); NaN where blank, or without a column not `required`.
 
         Raises:
-            TrustboError: Text that is no number, infinity, or a blank where none may be.
+            TrustboError: Text that is no number, infinity, a blank unless `blank`, or a fraction if
+                `whole`.
         """
-        cells = self._cells(column)
-        if cells.dtype == object:
-            text = cells.dropna()
-            for row, cell in text.items():
-                if not _is_number(cell):
-                    advice = _advice(cell)
-                    raise TrustboError(f"row {row}: {column} = {cell!r} is no number{advice}.")
-            cells = text.astype(float).reindex(cells.index)
-        values = cells.to_numpy(float, na_value=np.nan)
-        for bad, fault in ((np.isinf(values), "is infinite"), (np.isnan(values), "is blank")):
-            if bad.any() and not (blank and fault == "is blank"):
-                raise TrustboError(
-                    f"row {self.frame.index[bad][0]} of {self.what}: {column} {fault}."
-                )
-        return values
+        cells = self._cells(column, required)
+        parsed = _numbers(cells)
+        there = cells.notna().to_numpy()
+        faults = {
+            "is no finite number; write decimals with a point, and map words to numbers, such as "
+            "frame[column].map({'agree': 6})": np.isinf(parsed) | np.isnan(parsed) & there,
+            "is blank": np.isnan(parsed) & (not blank),
+            "must be a whole number": whole & (parsed > np.floor(parsed)),
+        }
+        for fault, bad in faults.items():
+            if bad.any():
+                row, value = self.frame.index[bad][0], one_line(cells.iloc[int(np.argmax(bad))])
+                raise TrustboError(f"row {row} of {self.what}: {column} = {value} {fault}.")
+        return cells.to_numpy(float, na_value=np.nan)
 
-    def whole(self, column: str) -> np.ndarray:
-        """Whole numbers of a column, (row,), none of them blank, or TrustboError."""
-        values = self.numbers(column, blank=False)
-        for row, value in zip(self.frame.index, values, strict=True):
-            if not value.is_integer():
-                raise TrustboError(f"row {row}: {column} = {value:g} must be a whole number.")
-        return values.astype(int)
-
-    def dates(self, column: str) -> pd.DatetimeIndex | None:
-        """Dates of a column, in UTC if they have a zone; None for a column of numbers."""
+    def times(self, column: str) -> pd.Series:
+        """Times of a column: numbers, or dates, in UTC if they have a zone."""
         cells = self._cells(column)
-        texts = [str(cell) for cell in cells]
-        if cells.dtype.kind != "M" and all(map(_is_number, cells.dropna().astype(str))):
-            return None
-        zoned = [_ZONE.search(text) is not None for text in texts]
-        dates = pd.to_datetime(pd.Index(texts), utc=True, format="ISO8601", errors="coerce")
-        bad = np.asarray(dates.isna()) | (np.array(zoned) != zoned[0])
-        if bad.any():
-            i = int(np.argmax(bad))
+        is_date = cells.dtype.kind == "M"
+        if not is_date and not np.isnan(_numbers(cells.dropna())).any():
+            return pd.Series(self.numbers(column, blank=False))
+        try:
+            dates = pd.to_datetime(cells, format="ISO8601")
+        except ValueError as error:
             raise TrustboError(
-                f"row {cells.index[i]} of {self.what}: {column} = {texts[i]!r} is neither seconds "
-                "nor a date such as 2026-11-24T10:00:00.5Z, with a time zone in all rows or none."
-            )
-        return pd.DatetimeIndex(dates if zoned[0] else dates.tz_localize(None))
+                f"{column} of {self.what} has neither seconds nor dates such as "
+                f"2026-11-24T10:00:00.5Z, all in one time zone or none: {one_line(str(error))}."
+            ) from None
+        if dates.isna().any():
+            raise TrustboError(f"{column} of {self.what} is blank in some rows.")
+        return dates
 
-    def _cells(self, column: str) -> pd.Series:
+    def _cells(self, column: str, required: bool = True) -> pd.Series:
+        if not required and self.find(column) is None:
+            return pd.Series(np.nan, index=self.frame.index)
         self.require([column])
         return self.frame[self.find(column)]
 
 
-def seconds_of(first: Columns, second: Columns, column: str = "t") -> tuple[np.ndarray, np.ndarray]:
+def seconds_of(first: Columns, second: Columns, column: str = "t") -> list[np.ndarray]:
     """Times of two tables by one clock, each (row,), s; those of dates since the first date.
 
     Raises:
         TrustboError: Numbers that cannot be seconds; dates in one table alone, or of which one
             table alone has a time zone; or clocks by which no time of the second is of the first.
     """
-    dates = [table.dates(column) for table in (first, second)]
-    a, b = dates
-    if a is None and b is None:
-        times = [table.numbers(column, blank=False) for table in (first, second)]
-    elif a is None or b is None or (a.tz is None) != (b.tz is None):
-        kinds = ["numbers" if d is None else "dates" + " with a zone" * (d.tz is not None)
-                 for d in dates]  # fmt: skip
+    tables, given = (first, second), [table.times(column) for table in (first, second)]
+    kinds = ["numbers" if t.dtype.kind != "M" else "dates with a zone" if t.dt.tz else "dates"
+             for t in given]  # fmt: skip
+    if kinds[0] != kinds[1]:
         raise TrustboError(
             f"{first.what} has times as {kinds[0]} and {second.what} as {kinds[1]}: clocks that "
             "cannot be compared; write both as dates in UTC, or both in seconds."
         )
-    else:
-        times = [pd.TimedeltaIndex(d - a.min()).total_seconds().to_numpy(float) for d in (a, b)]
-    for table, t in zip((first, second), times, strict=True):
+    if kinds[0] != "numbers":
+        given = [(t - given[0].min()).dt.total_seconds() for t in given]
+    times = [t.to_numpy(float) for t in given]
+    for table, t in zip(tables, times, strict=True):
         if np.ptp(t) > _LONGEST or np.abs(t).max() > 1e11:
             raise TrustboError(
                 f"times of {table.what} are from {t.min():.9g} to {t.max():.9g}, which as seconds "
@@ -165,16 +151,16 @@ def seconds_of(first: Columns, second: Columns, column: str = "t") -> tuple[np.n
             )
     start, end = times[0].min(), times[0].max()
     inside = ((times[1] >= start) & (times[1] <= end)).mean()
+    message = (
+        f"{inside:.0%} of the times of {second.what}, {times[1].min():.9g} to "
+        f"{times[1].max():.9g} s, lie in those of {first.what}, {start:.9g} to {end:.9g} s: do "
+        "the clocks differ in zero, unit or time zone?"
+    )
+    if not inside:
+        raise TrustboError(message)
     if inside < 0.5:
-        message = (
-            f"{inside:.0%} of the times of {second.what}, {times[1].min():.9g} to "
-            f"{times[1].max():.9g} s, lie in those of {first.what}, {start:.9g} to {end:.9g} s: do "
-            "the clocks differ in zero, unit or time zone?"
-        )
-        if not inside:
-            raise TrustboError(message)
         warnings.warn(message, stacklevel=3)
-    return times[0], times[1]
+    return times
 
 
 def require_one_spelling(what: str, names: Iterable[str]) -> None:
@@ -201,32 +187,20 @@ def _cell(value: object) -> str | None:
     return None if text.lower() in _BLANK else text
 
 
-def _is_number(text: str) -> bool:
-    return _NUMBER.fullmatch(text) is not None
-
-
-def _advice(text: str) -> str:
-    if _DECIMAL_COMMA.fullmatch(text):
-        return ": write decimals with a point, not a comma"
-    if _NUMBER.match(text) or text.replace(" ", "").isalpha():
-        return "; map words to numbers first, such as frame[column].map({'agree': 6})"
-    return "; is the row a second header, or the column another?"
+def _numbers(cells: pd.Series) -> np.ndarray:
+    """Numbers of cells, NaN for what is none."""
+    return pd.Series(pd.to_numeric(cells, errors="coerce")).to_numpy(float, na_value=np.nan)
 
 
 def _of_values(table: Any) -> pd.DataFrame:
-    """Copy of a DataFrame, or a frame of a mapping of columns or a structured array."""
-    if isinstance(table, pd.DataFrame):
-        return table.reset_index() if any(table.index.names) else table.copy()
-    names = list(table) if isinstance(table, Mapping) else getattr(table, "columns", None)
-    if names is None:
-        names = getattr(getattr(table, "dtype", None), "names", None)
-    if names is None:
-        raise TrustboError(f"give the path of a CSV file or a DataFrame; got {one_line(table)}.")
-    columns = {str(name): list(table[name]) for name in names}
-    if len({len(column) for column in columns.values()}) > 1:
-        lengths = {name: len(column) for name, column in columns.items()}
-        raise TrustboError(f"columns must have one length; got {lengths}.")
-    return pd.DataFrame(columns)
+    """Frame of a DataFrame, a mapping of columns or a structured array."""
+    try:
+        frame = pd.DataFrame(table)
+    except (TypeError, ValueError) as error:
+        raise TrustboError(
+            f"give the path of a CSV file or a DataFrame; got {one_line(table)}: {error}."
+        ) from None
+    return frame.reset_index() if any(frame.index.names) else frame.copy()
 
 
 def _of_file(file: Path) -> pd.DataFrame:
@@ -236,8 +210,8 @@ def _of_file(file: Path) -> pd.DataFrame:
     try:
         content = file.read_bytes()
         content = gzip.decompress(content) if file.suffix == ".gz" else content
-        wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
-        text = content.decode("utf-16" if wide else "utf-8-sig")
+        is_wide = content[:2] in (b"\xff\xfe", b"\xfe\xff")  # the byte order marks of UTF-16
+        text = content.decode("utf-16" if is_wide else "utf-8-sig")
         first, _, rest = text.partition("\n")
         separator = max(_SEPARATORS, key=first.count)
         if named := re.fullmatch(r'"?sep=(.)"?\s*', first, re.IGNORECASE):
@@ -254,7 +228,7 @@ def _of_file(file: Path) -> pd.DataFrame:
             raise TrustboError(
                 f"row {i} of {str(file)!r} has {len(row)} values, the header {len(header)}."
             )
-        if separator != ",":
-            row[:] = [_DECIMAL_COMMA.sub(r"\1.\2", c) if _DECIMAL_COMMA.fullmatch(c.strip()) else c
-                      for c in row]  # fmt: skip
-    return pd.DataFrame([row[: len(header)] for row in rows], columns=header, dtype=object)
+    frame = pd.DataFrame([row[: len(header)] for row in rows], columns=header, dtype=object)
+    if separator != ",":
+        frame = frame.replace(_DECIMAL_COMMA, r"\1.\2", regex=True)
+    return frame

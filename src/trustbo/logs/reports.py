@@ -8,7 +8,7 @@ import numpy as np
 
 from trustbo.data import Mission, levels_of
 from trustbo.errors import TrustboError
-from trustbo.logs.columns import Columns
+from trustbo.logs.columns import Columns, require_one_spelling
 
 _YES = ("1", "true", "yes", "success", "succeeded", "ok")
 _NO = ("0", "false", "no", "failure", "failed", "fail")
@@ -63,11 +63,11 @@ def read_reports(
     for argument, column in named.items():
         if column is not None:
             columns.require([column], f' Name its columns, such as {argument}="...".')
-    people, steps = np.array(columns.names(person)), columns.numbers(step, blank=False)
+    people, steps = np.array(columns.texts(person)), columns.numbers(step, blank=False)
+    require_one_spelling(f"column {person}", people.tolist())
     if "" in people:
         raise TrustboError("a person is blank; leave the row out.")
-    answers = zip(columns.frame.index, columns.numbers(report).tolist(), strict=True)
-    y = np.array([_report_of(f"row {i}: {report}", answer, levels) for i, answer in answers])
+    y = _unit_of(columns, report, levels)
     seen = _seen(columns, outcome, demand, inputs)
     z, missions = np.column_stack([*seen.values()]), []
     for name in dict.fromkeys(people.tolist()):
@@ -93,7 +93,7 @@ def _seen(
     if outcome is not None:
         given = [text.lower() for text in columns.texts(outcome)]
         for row, text in zip(rows, given, strict=True):
-            if text and text not in (*_YES, *_NO):
+            if text not in ("", *_YES, *_NO):
                 raise TrustboError(
                     f"row {row}: {outcome} = {text!r} is no outcome; give 1 or 0, success or "
                     "failure, or a blank."
@@ -117,19 +117,16 @@ def _seen(
     return seen
 
 
-def _report_of(what: str, answer: float, levels: int) -> float:
-    """Report in [0, 1] of an answer, NaN of NaN; TrustboError: it is not on the scale."""
-    if np.isnan(answer):
-        return np.nan
-    if levels:
-        if not (answer == np.round(answer) and 1 <= answer <= levels):
-            raise TrustboError(
-                f"{what} = {answer:g} is no whole number from 1 to {levels}; leave out what was "
-                "not answered."
-            )
-        return (answer - 1.0) / (levels - 1.0)
-    if not 0.0 <= answer <= 1.0:
-        hint = "; divide it by 100" if answer > 11 else ""
-        hint = '; give its scale, such as scale="likert7"' if 1 < answer <= 11 else hint
-        raise TrustboError(f"{what} = {answer:g} is outside [0, 1]{hint}.")
-    return float(answer)
+def _unit_of(columns: Columns, report: str, levels: int) -> np.ndarray:
+    """Reports in [0, 1], (row,), NaN where blank; TrustboError: one is not on the scale."""
+    y = columns.numbers(report)
+    low, high = (1.0, float(levels)) if levels else (0.0, 1.0)
+    off = (y < low) | (y > high) | (levels > 0) & (y > np.floor(y))
+    if off.any():
+        kind = "whole number" if levels else "number"
+        raise TrustboError(
+            f"row {columns.frame.index[off][0]}: {report} = {y[off][0]:g} is no {kind} from "
+            f'{low:g} to {high:g}; name the scale, such as scale="likert7", divide percentages by '
+            "100, and leave out what was not answered."
+        )
+    return (y - low) / (high - low)

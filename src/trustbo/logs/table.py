@@ -1,6 +1,6 @@
 """Missions as a table in long form: a row for each mission, bound and robot; and back."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -41,15 +41,15 @@ def to_frame(missions: Sequence[Mission]) -> pd.DataFrame:
             for i, robot in enumerate(mission.robots):
                 row: dict[str, Any] = dict(zip(KEYS, (j, k, robot), strict=True))
                 if mission.has_map:
-                    row |= dict(zip(("row", "col"), mission.path[k], strict=True))
-                row |= dict.fromkeys((*RATES, "t0", "status", "mission_status"))
+                    row["row"], row["col"] = mission.path[k]
                 if bound is not None:
                     row |= {name: getattr(bound, name)[i] for name in RATES}
                     row |= {"t0": bound.t0, "status": bound.status}
                     row |= {"mission_status": mission.status}
                     row |= dict(zip(mission.features, bound.awareness[i], strict=True))
                 rows.append(row)
-    return pd.DataFrame(rows)
+    names = [name for name in COLUMNS if missions[0].has_map or name not in ("row", "col")]
+    return pd.DataFrame(rows, columns=[*names, *missions[0].features])
 
 
 def read_table(
@@ -113,70 +113,63 @@ def read_table(
 
 
 def _parsed(columns: Columns, features: Sequence[str], places: Sequence[str]) -> pd.DataFrame:
-    """Columns by their names in this module, with the right types; NaN or "" where blank."""
-    values: dict[str, Any] = {name: columns.names(name) for name in ("mission", "robot")}
+    """Columns by their names in this module, with the right types; NaN or None where blank."""
+    values: dict[str, Any] = {name: columns.texts(name) for name in ("mission", "robot")}
+    require_one_spelling("column mission", values["mission"])
     if "" in values["mission"]:
         row = columns.frame.index[values["mission"].index("")]
         raise TrustboError(f"row {row}: mission is blank.")
-    values["bound"] = columns.whole("bound")
-    for name in places:
-        values[name] = columns.numbers(name) if name in "xy" else columns.whole(name)
-    blank = [""] * len(columns.frame)
+    for name in ("bound", *places):
+        values[name] = columns.numbers(name, blank=False, whole=name not in ("x", "y"))
     for name in (*RATES, "t0", *features):
-        there = columns.find(name) is not None
-        values[name] = columns.numbers(name) if there else np.full(len(blank), np.nan)
+        values[name] = columns.numbers(name, required=False)
     for name in ("status", "mission_status"):
-        values[name] = columns.texts(name) if columns.find(name) else blank
-    return pd.DataFrame(values, index=columns.frame.index)
+        values[name] = [text or None for text in columns.texts(name, required=False)]
+    return pd.DataFrame(values, index=columns.frame.index).astype({"bound": int})
 
 
 def _mission(
     rows: pd.DataFrame, features: tuple[str, ...], robots: tuple[str, ...], is_mapped: bool
 ) -> Mission:
     """Mission of its rows."""
-    of_bound: dict[int, list[int]] = {}
+    of_bound = rows.groupby("bound")
     numbers = rows["bound"].to_numpy(int)
-    for i, k in enumerate(numbers.tolist()):
-        of_bound.setdefault(k, []).append(i)
-    planned = list(range(0 if is_mapped else 1, max(of_bound) + 1))
-    if sorted(of_bound) != planned:
+    planned = list(range(0 if is_mapped else 1, int(numbers.max()) + 1))
+    if [*of_bound.groups] != planned:
         raise TrustboError(
-            f"bounds must be {planned}, from the start cell; got {sorted(of_bound)}."
+            f"bounds must be {planned}, from the start cell; got {[*of_bound.groups]}."
         )
-    path = ()
-    if is_mapped:
-        cells = list(zip(rows["row"].tolist(), rows["col"].tolist(), strict=True))
-        path = tuple(_agreed(k, "cell", [cells[i] for i in of_bound[k]]) for k in planned)
-    values = rows[[*RATES, "t0", *features]].to_numpy(float)
-    measured = ~np.isnan(values).all(axis=1) | (rows["status"] != "").to_numpy()
+    cells = ["row", "col"] if is_mapped else []
+    common = of_bound[[*cells, "t0", "status"]]
+    for name, differ in (common.nunique() > 1).items():
+        if differ.any():
+            raise TrustboError(f"rows of bound {differ.idxmax()} disagree on {name}.")
+    outcomes = rows["mission_status"].dropna().unique().tolist()
+    if len(outcomes) > 1:
+        raise TrustboError("rows disagree on mission_status.")
+    measured = rows[[*RATES, "t0", "status", *features]].notna().to_numpy().any(axis=1)
     if not measured.any() or numbers[measured].min() < 1:
         raise TrustboError(
             "bounds with a measurement are numbered from 1, and there is one or more."
         )
-    robot, status = rows["robot"].tolist(), rows["status"].tolist()
+    n_run = int(numbers[measured].max())
+    expected = pd.MultiIndex.from_product([range(1, n_run + 1), robots])
+    of_robot = rows.set_index(["bound", "robot"])
+    if missing := [pair for pair in expected if pair not in of_robot.index]:
+        raise TrustboError("bound {} has no row for {}.".format(*missing[0]))
+    values = of_robot.loc[expected, [*RATES, *features]].to_numpy(float)
+    values = values.reshape(n_run, len(robots), -1)
+    shared = common.first()
+    path = tuple((int(r), int(c)) for r, c in np.asarray(shared[cells])) if is_mapped else ()
     bounds: list[Bound] = []
-    for k in range(1, int(numbers[measured].max()) + 1):
-        of_robot = {robot[i]: i for i in of_bound[k]}
-        if missing := [name for name in robots if name not in of_robot]:
-            raise TrustboError(f"bound {k} has no row for {', '.join(missing)}.")
-        team = values[[of_robot[name] for name in robots]]
-        known = _agreed(k, "t0", [t for t in team[:, len(RATES)].tolist() if t == t])
-        t0 = known if known != "" else bounds[-1].t1 if bounds else 0.0
+    for k, team in enumerate(values, start=1):
+        t0, ended = shared.at[k, "t0"], shared.at[k, "status"]
+        t0 = float(t0) if pd.notna(t0) else bounds[-1].t1 if bounds else 0.0
         if bounds and t0 < bounds[-1].t0:
             raise TrustboError(f"bound {k} begins at t0 = {t0:g} s, before bound {k - 1}.")
         rate, duration, n_ticks = team[:, : len(RATES)].T
-        ended = _agreed(k, "status", [status[i] for i in of_robot.values()]) or "ok"
-        cell, z = path[k] if path else NOWHERE, team[:, len(RATES) + 1 :]
+        cell, z = path[k] if path else NOWHERE, team[:, len(RATES) :]
+        ended = str(ended) if pd.notna(ended) else "ok"
         bounds.append(Bound(cell, z, rate, duration, ended, t0, n_ticks=n_ticks))
-    outcome = _agreed(0, "mission_status", rows["mission_status"]) or bounds[-1].status
+    outcome = outcomes[0] if outcomes else bounds[-1].status
     return Mission(path, tuple(bounds), outcome, features, robots)
-
-
-def _agreed(bound: int, what: str, values: Iterable[Any]) -> Any:
-    """Common value of the rows of a bound that are not blank; "" if all are."""
-    distinct = list(dict.fromkeys(value for value in values if value != ""))
-    if len(distinct) > 1:
-        raise TrustboError(
-            f"rows of bound {bound} disagree on {what}: {distinct[0]} and {distinct[1]}."
-        )
-    return distinct[0] if distinct else ""

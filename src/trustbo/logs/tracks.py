@@ -1,18 +1,20 @@
 """Logs of poses and detections: who saw whom, as missions of robots that watch one of them."""
 
 import warnings
-from typing import Any, NamedTuple
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
-import xarray as xr
+import pandas as pd
 from numpy.typing import ArrayLike
 
-from trustbo.data import NOWHERE, Bound, Cell, Mission, as_array
+from trustbo.data import NOWHERE, Cell, Mission, as_array
 from trustbo.errors import TrustboError, require_choice, require_positive
 from trustbo.logs.columns import Columns, require_one_spelling, seconds_of
 from trustbo.workspace import Workspace
 
 EACH = "each"
+_FEATURES = ("near", "ahead", "clear")
 _AHEAD = np.pi / 6.0
 """Half of the angle in which a robot is ahead, rad."""
 _CLOSE = 0.1
@@ -63,11 +65,9 @@ class Tracks:
         self.max_gap, self.robot_radius = require_positive("max_gap", max_gap), robot_radius
         self.landmarks = as_array("landmarks", landmarks).reshape(-1, 3)
         where = Columns(poses, "the table of poses")
-        where.require(("t", "robot", "x", "y"))
         looks = Columns(detections, "the table of detections")
-        looks.require(("t", "watcher", "seen"))
         t, seen_at = seconds_of(where, looks)
-        names, pairs = where.names("robot"), [looks.names(end) for end in ("watcher", "seen")]
+        names, pairs = where.texts("robot"), [looks.texts(end) for end in ("watcher", "seen")]
         self.robots = tuple(dict.fromkeys(names))
         if len(self.robots) < 2 or "" in self.robots:
             raise TrustboError(f"a log is of two named robots at least; got {self.robots}.")
@@ -77,9 +77,7 @@ class Tracks:
             raise TrustboError(
                 f"all poses lie within {_CLOSE:g} m; x and y are metres, not degrees or kilometres."
             )
-        heading = np.full(len(t), np.nan)
-        if where.find("heading"):
-            heading = where.numbers("heading")
+        heading = where.numbers("heading", required=False)
         rows, of = np.column_stack([t, *xy, heading]), np.array(names)
         self.tracks = tuple(_track(name, rows[of == name]) for name in self.robots)
         index = {name: i for i, name in enumerate(self.robots)}
@@ -106,68 +104,12 @@ class Tracks:
         """Poses at some times, (robot, time, 3): x, y, heading; NaN in longer gaps."""
         poses = np.full((len(self.robots), len(times), 3), np.nan)
         for one, track in zip(poses, self.tracks, strict=True):
-            after = np.clip(np.searchsorted(track[:, 0], times), 1, len(track) - 1)
-            gap = track[after, 0] - track[after - 1, 0]
-            exact = (times == track[after, 0]) | (times == track[after - 1, 0])
-            known = (times >= track[0, 0]) & (times <= track[-1, 0])
-            known &= (gap <= self.max_gap) | exact
+            t = track[:, 0]
+            gap = np.diff(t)[np.clip(np.searchsorted(t, times), 1, len(t) - 1) - 1]
+            known = (times >= t[0]) & (times <= t[-1]) & (gap <= self.max_gap)
             for column, values in enumerate(track[:, 1:].T):
-                one[known, column] = np.interp(times[known], track[:, 0], values)
+                one[known, column] = np.interp(times[known], t, values)
         return poses
-
-    def geometry(self, tick: float = 1.0) -> xr.Dataset:
-        """Geometry of every pair of robots at every tick, and whether one detected the other.
-
-        Returns:
-            Dataset over (watcher, seen, time), NaN where a pose is not known, or of a robot with
-            itself: `range` (m); `bearing` from the watcher's heading, in [-pi, pi]; `hidden`, 1
-            where a landmark or another robot stands between, else 0; `contact`, 1 where it was
-            detected in the tick, else 0.
-        """
-        start, end = self.span
-        n = int(np.floor((end - start) / require_positive("tick", tick) + 1e-9))
-        if n < 1:
-            raise TrustboError(f"a tick of {tick:g} s is longer than the log, {end - start:g} s.")
-        time = start + (np.arange(n) + 0.5) * tick
-        poses = self.at(time)
-        across = poses[None, ..., :2] - poses[:, None, :, :2]  # (watcher, seen, time, 2)
-        away = np.hypot(across[..., 0], across[..., 1])
-        angle = np.arctan2(across[..., 1], across[..., 0]) - poses[:, None, :, 2]
-        away[np.eye(len(poses), dtype=bool)] = np.nan
-        contact = np.zeros(away.shape)
-        t, watcher, seen = self.detections.T
-        k = np.floor((t - start) / tick + 1e-9).astype(int)
-        there = (k >= 0) & (k < n)
-        contact[watcher[there].astype(int), seen[there].astype(int), k[there]] = 1.0
-        columns = {
-            "range": away,
-            "bearing": (angle + np.pi) % (2.0 * np.pi) - np.pi,
-            "hidden": self._hidden(poses[..., :2]).astype(float),
-            "contact": contact,
-        }
-        dims, names = ("watcher", "seen", "time"), list(self.robots)
-        known = {name: (dims, np.where(np.isnan(away), np.nan, values))
-                 for name, values in columns.items()}  # fmt: skip
-        return xr.Dataset(known, {"watcher": names, "seen": names, "time": time}, {"tick": tick})
-
-    def _hidden(self, xy: np.ndarray) -> np.ndarray:
-        """Whether a landmark or another robot is between two, (watcher, seen, time)."""
-        across = xy[None] - xy[:, None]
-        away = np.hypot(across[..., 0], across[..., 1])
-        hidden = np.zeros(away.shape, dtype=bool)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            unit = across / away[..., None]
-        cylinders = [(np.array([x, y]), radius, -1) for x, y, radius in self.landmarks]
-        cylinders += [(xy[k], self.robot_radius, k) for k in range(len(xy))]
-        for place, radius, k in cylinders:
-            to = (place - xy)[:, None]
-            along = (to * unit).sum(-1)
-            beside = np.abs(to[..., 0] * unit[..., 1] - to[..., 1] * unit[..., 0])
-            between = (along > _CLOSE) & (along < away - _CLOSE) & (beside < radius)
-            if k >= 0:  # a robot hides neither itself nor from itself
-                between[k], between[:, k] = False, False
-            hidden |= between
-        return hidden
 
 
 def missions_of(
@@ -201,124 +143,125 @@ def missions_of(
     Raises:
         TrustboError: An unknown robot, a window below a tick, or a log too short for two bounds.
     """
-    known = tracks.geometry(tick)
-    n = known.sizes["time"]
-    if not known["range"].notnull().any():
-        raise TrustboError(
-            f"in no tick of {tick:g} s are the poses of two robots known: they are of different "
-            f"times, or further apart than max_gap, {tracks.max_gap:g} s."
-        )
-    usual = max(float(known["range"].median()), 1e-9)
-    features = {
-        "near": usual / (usual + known["range"]),
-        "ahead": abs(known["bearing"]) < _AHEAD,
-        "clear": known["hidden"] == 0.0,
-    }
     require_choice("robot", lead, (*tracks.robots, EACH))
+    start, end = tracks.span
+    n = int(np.floor((end - start) / require_positive("tick", tick) + 1e-9))
+    poses = tracks.at(start + (np.arange(n) + 0.5) * tick)
+    ticks = _ticks(tracks, poses, tick)
     missions = []
     for i, name in enumerate(tracks.robots):
         if lead not in (name, EACH):
             continue
         if workspace is None:
             step = max(round(require_positive("window", window) / tick), 1)
-            stretches = [_Stretch(np.arange(0, n + 1, step), ())]
+            stretches = [(np.arange(0, n + 1, step), None)]
         else:
-            stretches = _crossings(tracks.at(known["time"].values)[i, :, :2], workspace)
-        missions += [_mission(tracks.robots, i, stretch, known, features)
-                     for stretch in stretches if len(stretch.edges) > _FEWEST]  # fmt: skip
+            stretches = _crossings(poses[i, :, :2], workspace)
+        missions += [_mission(tracks.robots, ticks[:, i], edges, tick, path)
+                     for edges, path in stretches if len(edges) > _FEWEST]  # fmt: skip
     if not missions:
         raise TrustboError(f"the log of {n * tick:g} s has no two bounds; give a shorter window.")
     return missions
 
 
-class _Stretch(NamedTuple):
-    """Bounds of one mission."""
+def _ticks(tracks: Tracks, poses: np.ndarray, tick: float) -> np.ndarray:
+    """What each robot has of each other at each tick, (watcher, seen, tick, 2 + feature).
 
-    edges: np.ndarray  # (bound + 1,), the first tick of each bound, and the end
-    path: tuple[Cell, ...]  # empty without a map
+    These are whether both poses are known, contact, and the features; all are 0 where a pose is
+    not known, and of a robot with itself.
+
+    Raises:
+        TrustboError: Two poses are known at no tick.
+    """
+    place = poses[..., 0] + 1j * poses[..., 1]  # a point of the plane is a complex number
+    across = place[None] - place[:, None]
+    away = np.abs(across)
+    away[np.eye(len(place), dtype=bool)] = np.nan
+    known = ~np.isnan(away)
+    if not known.any():
+        raise TrustboError(
+            f"in no tick of {tick:g} s are the poses of two robots known: the log is too short, or "
+            f"they are of different times, or further apart than max_gap, {tracks.max_gap:g} s."
+        )
+    usual = max(float(np.nanmedian(away)), 1e-9)
+    ahead = np.abs(np.angle(across * np.exp(-1j * poses[:, None, :, 2]))) < _AHEAD
+    clear = np.ones(known.shape, dtype=bool)
+    bodies = [(x + 1j * y, radius) for x, y, radius in tracks.landmarks]
+    bodies += [(one, tracks.robot_radius) for one in place]
+    for body, radius in bodies:
+        with np.errstate(invalid="ignore"):  # along the line of sight, and beside it
+            to = (body - place)[:, None] * np.conj(across) / away
+        clear &= ~((to.real > _CLOSE) & (to.real < away - _CLOSE) & (np.abs(to.imag) < radius))
+    contact = np.zeros(known.shape, dtype=bool)
+    t, watcher, seen = tracks.detections.T
+    k = np.floor((t - tracks.span[0]) / tick + 1e-9)
+    there = (k >= 0) & (k < known.shape[-1])
+    contact[tuple(np.stack([watcher, seen, k])[:, there].astype(int))] = True
+    values = np.stack([known, contact, usual / (usual + away), ahead, clear], axis=-1)
+    return np.where(known[..., None], values, 0.0)
 
 
 def _mission(
     robots: tuple[str, ...],
-    lead: int,
-    stretch: _Stretch,
-    known: xr.Dataset,
-    features: dict[str, xr.DataArray],
+    ticks: np.ndarray,
+    edges: np.ndarray,
+    tick: float,
+    path: list[Cell] | None,
 ) -> Mission:
-    """Mission of a stretch; features are over (watcher, seen, time)."""
-    edges, tick = stretch.edges, known.attrs["tick"]
-    cut, starts = slice(int(edges[0]), int(edges[-1])), edges[:-1] - edges[0]
+    """Mission of the ticks (watcher, tick, 2 + feature) of one lead.
 
-    def total(values: xr.DataArray) -> np.ndarray:
-        """Sums over the known ticks of each bound, (bound, robot)."""
-        ticks = np.where(seen, values.values[:, lead, cut], 0.0)
-        return np.add.reduceat(ticks, starts, axis=1).T
-
-    seen = np.isfinite(known["range"].values[:, lead, cut])
-    n_ticks = np.add.reduceat(seen.astype(float), starts, axis=1).T
-    with np.errstate(invalid="ignore"):
-        rate = total(known["contact"]) / n_ticks
-        z = np.stack([total(values) / n_ticks for values in features.values()], axis=-1)
-    for i in range(len(robots)):
-        mean = np.nanmean(z[:, i], axis=0) if np.isfinite(z[:, i]).any() else 0.0
-        z[:, i] = np.where(np.isnan(z[:, i]), mean, z[:, i])
-    z[:, lead], rate[:, lead], n_ticks[:, lead] = 0.0, np.nan, np.nan
-    n_ticks[n_ticks == 0.0] = np.nan
-    bounds, t0 = [], 0.0
-    for k, seconds in enumerate(np.diff(edges) * tick):
-        cell, duration = stretch.path[k + 1] if stretch.path else NOWHERE, [seconds] * len(robots)
-        bounds.append(Bound(cell, z[k], rate[k], np.array(duration), "ok", t0, n_ticks=n_ticks[k]))
-        t0 += seconds
-    return Mission(stretch.path, tuple(bounds), "ok", tuple(features), robots)
+    Its bounds are between the edges, (bound + 1,): the first tick of each bound, and the end.
+    """
+    sums = np.add.reduceat(ticks[:, : edges[-1]], edges[:-1], axis=1).swapaxes(0, 1)
+    n_ticks = np.where(sums[..., :1] > 0.0, sums[..., :1], np.nan)
+    means = sums[..., 1:] / n_ticks
+    z, measured = means[..., 1:], ~np.isnan(n_ticks)
+    usual = np.nansum(z, axis=0) / np.maximum(measured.sum(axis=0), 1)
+    return Mission.from_arrays(
+        path, np.where(measured, z, usual), means[..., 0], np.diff(edges) * tick,
+        n_ticks=n_ticks[..., 0], features=_FEATURES, robots=robots,
+    )  # fmt: skip
 
 
-def _crossings(xy: np.ndarray, workspace: Workspace) -> list[_Stretch]:
-    """Stretches along neighbouring cells that the lead, at xy (tick, 2), entered in order."""
+def _crossings(xy: np.ndarray, workspace: Workspace) -> list[tuple[np.ndarray, list[Cell]]]:
+    """Edges and path of each stretch of neighbouring cells that the lead, (tick, 2), entered."""
     cells: list[Cell] = []
     for x, y in xy:
         try:
             cells.append(workspace.grid.locate({"x": x, "y": y}, "position"))
         except TrustboError:  # off the grid, or not known
             cells.append(NOWHERE)
-    stretches, path, edges = [], [], []
-    for k, cell in enumerate([*cells, NOWHERE]):
-        if path and cell == path[-1]:
-            continue
-        if path and (cell == NOWHERE or np.abs(np.subtract(path[-1], cell)).max() > 1):
-            if len(path) > 1:
-                stretches.append(_Stretch(np.array([*edges[1:], k]), tuple(path)))
-            path, edges = [], []
-        if cell != NOWHERE:
-            path.append(cell)
-            edges.append(k)
-    return stretches
+    entered = [k for k, cell in enumerate(cells) if k == 0 or cell != cells[k - 1]]
+    path, edges = [cells[k] for k in entered], np.array([*entered, len(cells)])
+    ends = [i for i, (a, b) in enumerate(pairwise(path), start=1)
+            if NOWHERE in (a, b) or np.abs(np.subtract(a, b)).max() > 1]  # fmt: skip
+    stretches = pairwise([0, *ends, len(path)])
+    return [(edges[first + 1 : end + 1], path[first:end]) for first, end in stretches]
 
 
 def _track(name: str, rows: np.ndarray) -> np.ndarray:
     """Poses of one robot (sample, 4) by time, its heading unwound, or that of its motion."""
     rows = rows[np.argsort(rows[:, 0], kind="stable")]
-    if len(rows) < 2 or (np.diff(rows[:, 0]) <= 0.0).any():
+    t, x, y, heading = rows.T
+    if len(t) < 2 or (np.diff(t) <= 0.0).any():
         raise TrustboError(f"robot {name!r} has a single pose, or two at one time.")
-    dx, dy = (np.gradient(rows[:, i], rows[:, 0]) for i in (1, 2))
+    dx, dy = np.gradient(x, t), np.gradient(y, t)
     moves, course = np.hypot(dx, dy) > 1e-3, np.arctan2(dy, dx)  # m/s: one that stands looks on
-    blank = np.isnan(rows[:, 3])
-    if blank.all():
+    if np.isnan(heading).all():
         if not moves.any():
             raise TrustboError(
                 f"robot {name!r} has no heading, and moves by less than 1 mm/s: are times in "
                 "seconds and positions in metres? Else give its heading."
             )
-        latest = np.maximum.accumulate(np.where(moves, np.arange(len(rows)), -1))
-        rows[:, 3] = course[np.where(latest < 0, np.argmax(moves), latest)]
-    elif blank.any():
+        heading = pd.Series(np.where(moves, course, np.nan)).ffill().bfill().to_numpy()
+    elif np.isnan(heading).any():
         raise TrustboError(f"headings of robot {name!r} are blank in some poses; give all or none")
-    elif _in_degrees(rows[:, 3], course[moves], rows[moves, 3]):
+    elif _in_degrees(heading, course[moves], heading[moves]):
         raise TrustboError(
-            f"headings of robot {name!r} are up to {np.abs(rows[:, 3]).max():g}, in degrees; "
+            f"headings of robot {name!r} are up to {np.abs(heading).max():g}, in degrees; "
             "give rad from east, anticlockwise: radians(90 - compass heading)."
         )
-    rows[:, 3] = np.unwrap(rows[:, 3])
-    return rows
+    return np.column_stack([t, x, y, np.unwrap(heading)])
 
 
 def _in_degrees(heading: np.ndarray, course: np.ndarray, along: np.ndarray) -> bool:
