@@ -12,12 +12,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from trustbo.display import Rows, Summary, joined, number
-from trustbo.errors import (
-    TrustboError,
-    require_cells,
-    require_choice,
-    require_whole,
-)
+from trustbo.errors import TrustboError, require_cells, require_choice, require_whole
 
 Cell = tuple[int, int]
 Status = Literal["ok", "stuck", "tipped", "timeout", "collision", "lost_contact", "aborted"]
@@ -79,7 +74,7 @@ class Bound(Summary):
                 f"least; got shape {self.awareness.shape}. Without features, give one that is 0."
             )
         per_robot = self.awareness.shape[:1]
-        for name in ("contact_rate", "duration", "n_ticks"):
+        for name in ("contact_rate", "duration"):
             if (shape := getattr(self, name).shape) != per_robot:
                 raise TrustboError(f"{name} of a bound must be {per_robot}; got shape {shape}.")
         require_choice("status", self.status, STATUSES)
@@ -158,7 +153,7 @@ class Mission(Summary):
         if not n_run or (self.path and n_run > n_planned):
             raise TrustboError(
                 f"a path of {len(self.path)} cells has {max(n_planned, 0)} bounds, and a mission "
-                f"at least one; got {n_run}."
+                f"at least one; got {n_run}. Before a first bound, there is `Campaign.fail`."
             )
         if self.status == "ok" and n_run < n_planned:
             raise TrustboError(
@@ -244,11 +239,6 @@ class Mission(Summary):
             raise TrustboError(
                 "awareness must be (bound, robot, feature) and contact_rate (bound, robot); "
                 f"got {z.shape} and {y.shape}."
-            )
-        if not len(y):
-            raise TrustboError(
-                "a mission has at least one bound; got 0. If the robots were stopped before "
-                'bound 1 ended, tell campaign.fail("stuck", where=cell).'
             )
         seconds, ticks = _per_robot("duration", seconds, y), _per_robot("n_ticks", ticks, y)
         cells = () if path is None else require_cells("path", path)

@@ -42,26 +42,16 @@ def require_whole(what: str, value: object, minimum: int) -> int:
     return number
 
 
-def require_positive(what: str, value: object) -> float:
+def require_positive(what: str, value: Any, *, or_zero: bool = False) -> float:
     """Return `value` as a float if it is a positive, finite number, else raise TrustboError."""
-    if not 0.0 < (number := _number(value)) < math.inf:
-        raise TrustboError(f"{what} must be positive and finite; got {value!r}.")
-    return number
-
-
-def require_not_negative(what: str, value: object) -> float:
-    """Return `value` as a float if it is a finite number of 0 or more, else raise TrustboError."""
-    if not 0.0 <= (number := _number(value)) < math.inf:
-        raise TrustboError(f"{what} must be 0 or more, and finite; got {value!r}.")
-    return number
-
-
-def _number(value: Any) -> float:
-    """Number of a value, NaN of text and of what is none."""
     try:
-        return math.nan if isinstance(value, str) else float(value)
+        number = math.nan if isinstance(value, str) else float(value)
     except (TypeError, ValueError):
-        return math.nan
+        number = math.nan
+    if not 0.0 <= number < math.inf or (number == 0.0 and not or_zero):
+        least = "0 or more, and" if or_zero else "positive and"
+        raise TrustboError(f"{what} must be {least} finite; got {value!r}.")
+    return number
 
 
 def require_kind(what: str, value: Any, kind: Any, remedy: str) -> Any:

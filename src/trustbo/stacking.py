@@ -11,11 +11,7 @@ from trustbo.errors import TrustboError, one_line
 
 
 class MissionBatch(NamedTuple):
-    """Missions stacked and padded with NaN, ready for compiled code.
-
-    Both leading axes are padded to a bucket, so that compiled code is reused from one mission to
-    the next. A padded bound has NaN contact rates, which models take as not measured.
-    """
+    """Missions stacked, and padded to the longest by bounds whose rates were not measured."""
 
     awareness: np.ndarray
     """Shape (mission, bound, robot, feature); 0 in the padding."""
@@ -25,12 +21,11 @@ class MissionBatch(NamedTuple):
     """Number of ticks, shape (mission, bound, robot); NaN in the padding and where not recorded."""
 
 
-def stack_missions(missions: Sequence[Mission], *, pad: bool = True) -> MissionBatch:
+def stack_missions(missions: Sequence[Mission]) -> MissionBatch:
     """Stack missions of any length, of the same robots and features, into one batch.
 
-    With `pad`, axes are padded to buckets: bounds to a multiple of 8, missions to a power of two
-    from 8 on; otherwise bounds to the longest mission. TrustboError: no missions, they disagree on
-    robots or features, or an awareness value is NaN; only contact rates may be missing.
+    TrustboError: no missions, they disagree on robots or features, or an awareness value is NaN;
+    only contact rates may be missing.
     """
     require_same_team(missions)
     first = missions[0]
@@ -41,10 +36,8 @@ def stack_missions(missions: Sequence[Mission], *, pad: bool = True) -> MissionB
                 f"awareness of mission {j}, bound {k + 1}, robot {first.robots[i]}, feature "
                 f"{first.features[m]} is NaN; fill it from the awareness map or drop the bound."
             )
-    n_missions, n_bounds = len(missions), max(len(mission.bounds) for mission in missions)
-    if pad:
-        n_missions, n_bounds = max(8, 1 << (n_missions - 1).bit_length()), -(-n_bounds // 8) * 8
-    shape = (n_missions, n_bounds, len(first.robots), len(first.features))
+    n_bounds = max(len(mission.bounds) for mission in missions)
+    shape = (len(missions), n_bounds, len(first.robots), len(first.features))
     batch = MissionBatch(np.zeros(shape), *np.full((2, *shape[:-1]), np.nan))
     for j, mission in enumerate(missions):
         batch.awareness[j, : len(mission.bounds)] = mission.awareness
@@ -76,18 +69,12 @@ def fill_awareness(mission: Mission, awareness: np.ndarray) -> Mission:
 
     `awareness` has shape (bound, robot, feature).
     """
-    if not np.isnan(mission.awareness).any():
-        return mission
-    return replace_awareness(
-        mission,
-        [
-            np.where(np.isnan(b.awareness), awareness[k], np.nan)
-            for k, b in enumerate(mission.bounds)
-        ],
-    )
+    missing = np.isnan(mission.awareness)
+    filled = np.where(missing, awareness[: len(missing)], mission.awareness)
+    return replace_awareness(mission, filled) if missing.any() else mission
 
 
-def replace_awareness(mission: Mission, awareness: Sequence[np.ndarray] | np.ndarray) -> Mission:
+def replace_awareness(mission: Mission, awareness: np.ndarray) -> Mission:
     """Replace awareness of a mission by what is not NaN of that given, (bound, robot, feature)."""
     bounds = tuple(
         replace(b, awareness=np.where(np.isnan(awareness[k]), b.awareness, awareness[k]))

@@ -7,7 +7,7 @@ from typing import Self
 import numpy as np
 
 from trustbo.display import Rows, Summary, number
-from trustbo.errors import TrustboError, require_positive, require_whole
+from trustbo.errors import TrustboError, require_kind, require_positive, require_whole
 
 
 @dataclass(frozen=True, repr=False)
@@ -62,7 +62,7 @@ class Robot(Summary):
             number(float(np.rad2deg(angle)), "degrees")
             for angle in (2.0 * self.vertical_fov, self.max_slope)
         )
-        rows = [
+        return [
             ("speed", f"{number(self.speed, 'm/s')}, turns {number(self.turn_rate, 'rad/s')}"),
             ("slope limit", max_slope),
             ("lidar", f"range {number(self.lidar_range, 'm')}, {field_of_view} vertically"),
@@ -72,7 +72,6 @@ class Robot(Summary):
                 f"{self.detection:.0%} found; {self.acquire} to acquire, {self.drop} to drop",
             ),
         ]
-        return rows
 
 
 @dataclass(frozen=True, repr=False)
@@ -118,15 +117,12 @@ class Team(Summary):
         return min(robot.max_slope for robot in (self.lead, *self.robots))
 
     @classmethod
-    def of(cls, team: Self | None, n_robots: int = 3) -> Self:
-        """Return the team, by default one of equal robots; TrustboError: it is no team."""
-        if team is not None and not isinstance(team, Team):
-            raise TrustboError(f"team must be a Team, e.g. Team(n_robots=3); got {team!r}.")
-        return cls(n_robots=n_robots) if team is None else team
+    def of(cls, team: Self | None) -> Self:
+        """Return the team, by default one of three equal robots; TrustboError: it is no team."""
+        return cls() if team is None else require_kind("team", team, Team, "give Team(n_robots=3)")
 
     def _rows(self) -> Rows:
         members = {"lead": self.lead} | dict(zip(self.names, self.robots, strict=True))
         limit = number(float(np.rad2deg(self.max_slope)), "degrees")
         alike = "all alike" if len(set(members.values())) == 1 else "not all alike"
-        rows = [("robots", f"{', '.join(self.names)} ({alike})"), ("slope limit", limit)]
-        return rows
+        return [("robots", f"{', '.join(self.names)} ({alike})"), ("slope limit", limit)]

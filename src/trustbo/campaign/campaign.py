@@ -312,11 +312,6 @@ class Campaign(Result):
         if self.storage is not None:
             self.storage.write_record(self.state)
 
-    def stop(self, reason: str) -> None:
-        """Record why the campaign ends; it may continue later."""
-        self.state.stop_reason = reason
-        self._write()
-
     def exclude(self, n: int, reason: str) -> xr.DataTree | None:
         """Exclude a mission from learning for good; `tell` with the same mission adds it again.
 
@@ -442,7 +437,8 @@ class Campaign(Result):
                 bar.set_postfix_str(_in_a_line(state.entries[-1].row), refresh=False)
                 bar.update()
                 yield plan, mission
-        self.stop(reason)
+        state.stop_reason = reason
+        self._write()
 
     def _reason_to_end(self, n_iterations: int, rules: Sequence[Stop]) -> str | None:
         """Why no further mission is run: what the first rule says, by default its name; or None."""

@@ -15,13 +15,11 @@ from trustbo.hazard import Hazard
 from trustbo.hazard.exposures import LostMission
 from trustbo.hazard.model import fit_hazard
 from trustbo.hazard.risk import BoundRisk
-from trustbo.inference import fit, sample_prior
-from trustbo.inference.draws import prior_mean
+from trustbo.inference import fit
 from trustbo.inference.tree import parameters_alone
 from trustbo.models import PlaceEffect
 from trustbo.models.model import TrustModel
-from trustbo.models.params import Params
-from trustbo.planning import InfeasibleError, Plan, Planner
+from trustbo.planning import Planner
 from trustbo.stacking import replace_awareness
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import along, moves_along, require_on_grid
@@ -29,15 +27,6 @@ from trustbo.workspace.moves import along, moves_along, require_on_grid
 _N_DRAWS, _N_RISKS = 1000, 200
 _STOPPED, _RECOVERED = 2, 0.2
 """Number of failures that makes a bound avoided, and the failure chance below which it is not."""
-
-
-def prior_belief(model: TrustModel, initial: str, workspace: Workspace, seed: int) -> Params:
-    """Mean of the prior, or one draw of it, with a leading axis (draw,) of length 1."""
-    n_robots, n_features = len(workspace.team.robots), len(workspace.features)
-    model = model.for_features(workspace.features)
-    if initial == "prior_mean":
-        return prior_mean(model, n_features, n_robots=n_robots).flat()
-    return sample_prior(model, n_features, 1, seed, n_robots=n_robots).flat()
 
 
 def known_along(path: Sequence[Cell], workspace: Workspace) -> np.ndarray:
@@ -78,18 +67,9 @@ def learn(
 ) -> xr.DataTree | None:
     """Posterior of the parameters given all missions that are not excluded.
 
-    A posterior that is refused is drawn again with twice the draws. If that is refused too, the
-    missions that were not learned from yet stay so, with a warning.
-
-    Args:
-        state: State of the campaign, whose missions change theirs.
-        model: Trust model.
-        workspace: Workspace of the missions.
-        seed: Seed of the first attempt.
-        progress: Whether fits show their progress.
-
-    Returns:
-        Posterior whose attribute `missions` has the numbers, from 0, of its missions; or None.
+    Its attribute `missions` has their numbers, from 0. A posterior that is refused is drawn again
+    with twice the draws. If that is refused too, None is returned with a warning, and the missions
+    of the state that were not learned from yet stay so.
     """
     waiting, numbers = state.numbers(TOLD), state.numbers(TOLD, LEARNED)
     missions = [state.entries[j].mission for j in numbers]
@@ -163,14 +143,6 @@ def base_planner(workspace: Workspace, settings: Mapping[str, Any]) -> Planner:
         workspace, settings["start"], settings["goal"], settings["objective"],
         family=settings["observation"], **settings["planner"],
     )  # fmt: skip
-
-
-def best_plan(planner: Planner, params: Params) -> Plan:
-    """Best plan, or where no path respects `max_failure`, that of the safest path."""
-    try:
-        return planner.plan(params)
-    except InfeasibleError as error:
-        return planner.evaluate(error.path, params)
 
 
 def informed_planner(planner: Planner, risk: BoundRisk) -> Planner:

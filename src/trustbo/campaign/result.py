@@ -9,13 +9,7 @@ import pandas as pd
 import rioxarray  # noqa: F401  (registers the .rio accessor)
 import xarray as xr
 
-from trustbo.campaign.learning import (
-    base_planner,
-    best_plan,
-    informed_planner,
-    learn_hazard,
-    prior_belief,
-)
+from trustbo.campaign.learning import base_planner, informed_planner, learn_hazard
 from trustbo.campaign.state import COLUMNS, State
 from trustbo.campaign.storage import Storage, read_campaign
 from trustbo.data import Cell, Mission, path_text
@@ -23,14 +17,15 @@ from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError
 from trustbo.files import FilePath
 from trustbo.hazard.risk import BoundRisk
-from trustbo.inference import complete, params_of, place_maps
+from trustbo.inference import complete, params_of, place_maps, sample_prior
 from trustbo.inference.diagnostics import MAX_RHAT
+from trustbo.inference.draws import prior_mean
 from trustbo.inference.importance import GOOD_KHAT
 from trustbo.models.backend import VERSIONS
 from trustbo.models.model import TrustModel
 from trustbo.models.params import Params
 from trustbo.models.record import model_from_record
-from trustbo.planning import Plan, Planner
+from trustbo.planning import InfeasibleError, Plan, Planner
 from trustbo.workspace import Workspace
 
 if TYPE_CHECKING:
@@ -130,10 +125,12 @@ class Result(Summary):
         """Parameter draws of the last posterior, or those of `initial` while there is none."""
         if self.state.last is not None:
             return params_of(self.state.last())
-        settings = self.state.settings
-        seed = State(settings).seed_of("prior")
-        # `load_result` requires the model then.
-        return prior_belief(self.model, settings["initial"], self.workspace, seed)
+        features, n_robots = self.workspace.features, self.workspace.team.n_robots
+        model, n_features = self.model.for_features(features), len(features)
+        if self.state.settings["initial"] == "prior_mean":
+            return prior_mean(model, n_features, n_robots=n_robots).flat()
+        seed = State(self.state.settings).seed_of("prior")
+        return sample_prior(model, n_features, 1, seed, n_robots=n_robots).flat()
 
     @cached_property
     def hazard(self) -> xr.Dataset:
@@ -153,8 +150,15 @@ class Result(Summary):
     # --- the path to take ---
 
     def recommend(self) -> Plan:
-        """Plan the best path under the mean of the belief."""
-        return best_plan(self.planner, self.belief.mean())
+        """Plan the best path under the mean of the belief, regardless of the policy.
+
+        Where no path respects `max_failure`, it is the safest one.
+        """
+        mean = self.belief.mean()
+        try:
+            return self.planner.plan(mean)
+        except InfeasibleError as error:
+            return self.planner.evaluate(error.path, mean)
 
     @cached_property
     def plan(self) -> Plan:

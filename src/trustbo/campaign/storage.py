@@ -21,13 +21,7 @@ from trustbo.campaign.learning import as_learned
 from trustbo.campaign.state import Entry, Failure, Posterior, State
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
-from trustbo.files import (
-    FilePath,
-    interpreting,
-    read_record,
-    to_json,
-    write_text,
-)  # fmt: skip
+from trustbo.files import FilePath, interpreting, read_record, to_json, write_text
 from trustbo.logs.netcdf import missions_from_tree, missions_to_tree, read_tree, write_tree
 from trustbo.models.backend import VERSIONS
 from trustbo.planning.plan import plan_from_record, plan_to_record

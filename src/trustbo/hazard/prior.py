@@ -9,7 +9,7 @@ import numpy as np
 from scipy import special
 from scipy.interpolate import PchipInterpolator
 
-from trustbo.errors import TrustboError, require_not_negative, require_positive
+from trustbo.errors import TrustboError, require_positive
 
 REFERENCE = 0.5
 """Difficulty at which the intercept is the logit of the prior mean."""
@@ -61,10 +61,10 @@ class Hazard:
             mean, sd = getattr(self, name)
             object.__setattr__(self, name, (float(mean), require_positive(f"sd of {name}", sd)))
         share, sd = self.doubt
-        doubt = require_not_negative("share of doubt", share), require_positive("sd of doubt", sd)
-        if doubt[0] >= 1.0:
+        share = require_positive("share of doubt", share, or_zero=True)
+        if share >= 1.0:
             raise TrustboError(f"share of doubt must be in [0, 1); got {share!r}.")
-        object.__setattr__(self, "doubt", doubt)
+        object.__setattr__(self, "doubt", (share, require_positive("sd of doubt", sd)))
 
     def of_bounds(
         self, difficulty: np.ndarray, measures: Sequence[str], max_slope: float

@@ -55,7 +55,7 @@ def score(
     trees = _trees(posterior, missions)
     first = len(missions) - len(trees)
     missions = missions[first:]
-    batch = stack_missions(missions, pad=False)
+    batch = stack_missions(missions)
     y, trust = batch.contact_rate, _follow(trees[0])
     columns = {name: np.full(y.shape, np.nan) for name in ("mean", "pit", "log_score")}
     quantile = np.full((*y.shape, len(QUANTILES)), np.nan)

@@ -45,7 +45,7 @@ def to_datatree(
         site_dims: Axes of the model's parameters.
         effects: Effects of the model, whose variables are in some groups.
     """
-    observed = stack_missions(missions, pad=False)
+    observed = stack_missions(missions)
     n_missions, n_bounds = observed.contact_rate.shape[:2]
     lengths = np.array([len(m.bounds) for m in missions])
     ended = (np.arange(1, n_bounds + 1) > lengths[:, None])[..., None]  # (mission, bound, robot)

@@ -170,7 +170,7 @@ class TrustModel(Summary, ABC):
                 awareness value is NaN, a measured rate lacks the number of ticks that the family
                 needs, or a path jumps or leaves the workspace.
         """
-        batch = stack_missions(missions, pad=False)
+        batch = stack_missions(missions)
         require_ticks(self.family, batch.contact_rate, batch.n_ticks)
         features = tuple(missions[0].features)
         slots = Slots(batch.contact_rate, batch.awareness, batch.n_ticks, features)

@@ -11,7 +11,7 @@ from numpyro.distributions import Distribution, constraints
 
 from trustbo.data import is_line_of_sight
 from trustbo.display import Rows, Summary
-from trustbo.errors import TrustboError, require_not_negative, require_positive
+from trustbo.errors import TrustboError, require_positive
 from trustbo.models.backend import own_settings
 from trustbo.models.families import FAMILIES
 from trustbo.models.scores import log_density
@@ -76,7 +76,7 @@ class Priors(Summary):
             if wanted := _wanted(name, prior):
                 raise TrustboError(f"the prior of Priors.{name} must be {wanted}; got {prior!r}.")
         require_positive("Priors.concentration", self.concentration)
-        require_not_negative("Priors.x0_sd", self.x0_sd)
+        require_positive("Priors.x0_sd", self.x0_sd, or_zero=True)
         if not np.isfinite(self.x0_mean):
             raise TrustboError(f"Priors.x0_mean must be finite; got {self.x0_mean!r}.")
 

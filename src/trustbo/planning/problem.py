@@ -10,7 +10,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from trustbo.data import Cell
-from trustbo.errors import TrustboError, require_kind, require_not_negative
+from trustbo.errors import TrustboError, require_kind, require_positive
 from trustbo.hazard.risk import ROUNDING, Risk
 from trustbo.inference.draws import params_of
 from trustbo.models.families import Family
@@ -65,11 +65,11 @@ class Problem:
 
     def __post_init__(self) -> None:
         if self.max_failure is not None:
-            require_not_negative("max_failure", self.max_failure)
+            require_positive("max_failure", self.max_failure, or_zero=True)
             if self.max_failure >= 1.0:
                 raise TrustboError(f"max_failure must be below 1; got {self.max_failure!r}.")
         if self.failure_cost is not None:
-            require_not_negative("failure_cost", self.failure_cost)
+            require_positive("failure_cost", self.failure_cost, or_zero=True)
             if not self.objective.of_contact:
                 raise TrustboError(
                     f"failure_cost is a loss of contact, which {self.objective.name!r} does not "

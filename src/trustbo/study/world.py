@@ -93,20 +93,14 @@ class World:
 
         TrustboError: they are absent, with where to put them.
         """
-        names = [f"{self.ground}/{name}.tif" for name in ("dem", "dsm")]
         if self.data is None and self.is_packaged:
             return list(example_files(self.ground))
-        if self.data is None:
+        folder = "" if self.data is None else Path(self.data).absolute()
+        files = [Path(folder, self.ground, f"{name}.tif") for name in ("dem", "dsm")]
+        if absent := [str(f) for f in files if self.data is None or not f.is_file()]:
             raise TrustboError(
-                f"world {self.name!r} needs {' and '.join(names)}: name the folder that holds "
+                f"world {self.name!r} lacks {' and '.join(absent)}: name the folder that holds "
                 f"{self.ground}/ by data=, or leave the world out."
-            )
-        files = [Path(self.data).absolute() / name for name in names]
-        absent = [str(file) for file in files if not file.is_file()]
-        if absent:
-            raise TrustboError(
-                f"world {self.name!r} lacks {' and '.join(absent)}: put a DEM and a DSM there, or "
-                "name another folder by data=."
             )
         return [str(file) for file in files]
 
