@@ -271,13 +271,6 @@ def _prior(model: TrustModel, n_features: int, n_robots: int) -> Posterior:
     return Posterior(bare, Slots(none, z, none, ("",) * n_features))
 
 
-def of_no_map(posterior: xr.DataTree) -> bool:
-    """Whether the posterior's missions, all that it holds, are of logs without a map."""
-    if "constant_data" not in posterior.children:
-        return False
-    return bool((posterior["constant_data"].to_dataset()["row"].values < 0).all())
-
-
 def missions_of(posterior: xr.DataTree) -> list[Mission]:
     """Missions rebuilt from the data in a posterior; TrustboError: it holds parameters alone."""
     if "constant_data" not in posterior.children:

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from trustbo.data import Cell, as_array, require_shares, require_unit_interval
 from trustbo.errors import TrustboError, one_line, require_pair, require_whole
-from trustbo.inference.draws import of_no_map, params_of, require_posterior, sites_of
+from trustbo.inference.draws import params_of, require_posterior, sites_of
 from trustbo.inference.importance import systematic
 from trustbo.models.families import FAMILIES, Family
 from trustbo.models.params import CoupledParams, Params, check_params
@@ -234,7 +234,8 @@ class TrustFilter:
         delta_s, self._bounded = None, True
         if isinstance(posterior, xr.DataTree):
             require_posterior("TrustFilter", posterior)
-            self._bounded = not of_no_map(posterior)
+            if "constant_data" in posterior.children:  # logs without a map have any awareness
+                self._bounded = bool((posterior["constant_data"]["row"] >= 0).any())
             n_robots, observation = posterior.attrs["n_robots"], posterior.attrs["observation"]
             delta_s = sites_of(posterior).get("delta_s")
             posterior = params_of(posterior, day=True)
@@ -456,7 +457,7 @@ def _rates(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def ticks_ahead(n_ticks: ArrayLike, shape: tuple[int, int]) -> np.ndarray:
-    """Ticks of bounds to come as (bound, robot); TrustboError, TrustboError if they are none."""
+    """Ticks of bounds to come as (bound, robot); TrustboError if they are none."""
     given = as_array("n_ticks", n_ticks)
     given = given[:, None] if given.ndim == 1 else given
     if given.ndim > 2 or any(n not in (1, m) for n, m in zip(given.shape, shape, strict=False)):

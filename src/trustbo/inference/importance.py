@@ -50,10 +50,6 @@ class Student(NamedTuple):
         covariance = (z - mean).T * weight @ (z - mean)
         return cls(mean, np.linalg.cholesky(covariance + ridge * np.eye(z.shape[1])))
 
-    def widened(self, factor: float) -> Self:
-        """The same density with its scale multiplied by `factor`."""
-        return self._replace(scale=factor * self.scale)
-
     def draw(self, n: int, rng: np.random.Generator) -> np.ndarray:
         """Draw points of a scrambled Sobol sequence, shape (n, score); n is a power of 2."""
         d = len(self.center)
@@ -144,7 +140,7 @@ def sample(
         proposals = modes if len(modes) > 1 else []
         current = modes[0]
         while True:
-            own = [current.widened(_WIDER), *proposals]
+            own = [current._replace(scale=_WIDER * current.scale), *proposals]
             share = 1 << int(np.log2(size / 2 / len(own)))
             others = defensive(current) if defensive else prior
             for density, n in [*((one, share) for one in own), (others, size // 2)]:

@@ -184,8 +184,13 @@ def place_maps(posterior: xr.DataTree) -> xr.Dataset:
     of_bounds[:, *visited.bounds] = visited.e.mean(0), visited.e.std(0)
     of_bounds[..., ~existing_bounds(np.ones(visited.shape, bool))] = np.nan
     maps, (rows, cols) = xr.Dataset(), visited.shape
-    _add(maps, "place", "effect of the cell", _MAP, _moments_of_cells(visited, sites))
-    _add(maps, "place_bound", "effect of the bound by a move", ("move", *_MAP), of_bounds)
+    for name, text, axes, moments in (
+        ("place", "cell", _MAP, _moments_of_cells(visited, sites)),
+        ("place_bound", "bound by a move", ("move", *_MAP), of_bounds),
+    ):
+        for kind, long, values in zip(("mean", "sd"), _MOMENTS, moments, strict=True):
+            attrs = {"long_name": f"{long} effect of the {text} on trust", "units": "1"}
+            maps[f"{name}_{kind}"] = axes, values, attrs
     return maps.assign_coords(move=list(MOVE_NAMES), row=np.arange(rows), col=np.arange(cols))
 
 
@@ -199,12 +204,3 @@ def _moments_of_cells(visited: _Visited, sites: Mapping[str, np.ndarray]) -> np.
         centre[rows] = s[rows] @ weights
         variance += (sites["tau_s"][rows] ** 2).sum() * left / len(s)
     return np.stack([centre.mean(0), np.sqrt(centre.var(0) + variance)]).reshape(2, *shape)
-
-
-def _add(
-    maps: xr.Dataset, name: str, text: str, axes: tuple[str, ...], moments: np.ndarray
-) -> None:
-    """Add a mean and a standard deviation (2, ...) to some maps."""
-    for kind, long, values in zip(("mean", "sd"), _MOMENTS, moments, strict=True):
-        attrs = {"long_name": f"{long} {text} on trust", "units": "1"}
-        maps[f"{name}_{kind}"] = axes, values, attrs

@@ -14,18 +14,13 @@ from trustbo.inference.draws import (
     require_posterior,
     sites_of,
 )
-from trustbo.inference.posterior import Posterior
 from trustbo.models.effects.effect import Effect
 from trustbo.models.model import TrustModel
 from trustbo.models.scores import log_density
 from trustbo.stacking import MissionBatch, stack_missions
 
-_DIMS = {
-    "trust": ("mission", "bound", "robot"),
-    "trust_mean": ("mission", "bound", "robot"),
-    "trust_sd": ("mission", "bound", "robot"),
-    "contact_rate": ("mission", "bound", "robot"),
-}
+_OF_RATES = ("mission", "bound", "robot")
+_DIMS = dict.fromkeys(("trust", "trust_mean", "trust_sd", "contact_rate"), _OF_RATES)
 _N_TRAJECTORIES = 200  # draws, spread evenly over the chains, that latent trust is kept of
 _N_PRIOR = 500
 _KEPT = ("posterior", "sample_stats", "prior", "hazard")
@@ -93,8 +88,7 @@ def _data_groups(
     # Cells tell how many bounds a mission has, but where there are none.
     n_bounds = [len(mission.bounds) for mission in missions]
     counted = {} if all(m.has_map for m in missions) else {"n_bounds": (("mission",), n_bounds)}
-    dims = ("mission", "bound", "robot")
-    labelled = {name: coords[name] for name in dims}
+    dims, labelled = _OF_RATES, {name: coords[name] for name in _OF_RATES}
     rates = xr.Dataset({"contact_rate": (dims, observed.contact_rate)}, labelled)
     constant = xr.Dataset(
         {
@@ -158,7 +152,9 @@ def complete(
     given = fitted.given(draws, some, np.random.default_rng([seed, 1]))
     rng = np.random.default_rng([seed, 2])
     anew = fitted.anew(fitted.draw_prior(_N_PRIOR, rng), rng)
-    likelihood, data_name = _of_ticks(fitted, given.log_likelihood)
+    shift = fitted.model.family.log_resolution(fitted.slots.y, fitted.slots.n_ticks).sum((1, 2))
+    counted = not np.isnan(shift).any()
+    likelihood = given.log_likelihood + (shift if counted else 0.0)
 
     def by_chain(array: np.ndarray) -> np.ndarray:
         return array.reshape(n_chains, -1, *array.shape[1:])
@@ -183,17 +179,8 @@ def complete(
         for name, values in log_prior(fitted.model, sites_of(posterior)).items()
     }
     whole["log_prior"] = xr.DataTree(xr.Dataset(densities, index))
-    whole.attrs = posterior.attrs | {"log_likelihood_of": data_name}
+    whole.attrs = posterior.attrs | {"log_likelihood_of": "ticks" if counted else "contact_rate"}
     return whole
-
-
-def _of_ticks(fitted: Posterior, likelihood: np.ndarray) -> tuple[np.ndarray, str]:
-    """Log-likelihoods, of counts of ticks where these are known, and the name of their data."""
-    slots = fitted.slots
-    shift = fitted.model.family.log_resolution(slots.y, slots.n_ticks).sum((1, 2))
-    if np.isnan(shift).any():
-        return likelihood, "contact_rate"
-    return likelihood + shift, "ticks"
 
 
 def log_prior(model: TrustModel, sites: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
