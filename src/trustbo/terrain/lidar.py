@@ -15,12 +15,11 @@ from trustbo.errors import TrustboError, require_positive
 from trustbo.files import FilePath
 from trustbo.terrain.heights import HIGHEST, LOWEST
 from trustbo.terrain.place import known_crs, require_map
-from trustbo.terrain.read import read_terrain
+from trustbo.terrain.read import check_size, read_terrain
 
 GROUND_CLASS, NOISE_CLASSES = 2, (7, 18)
 GROUND_GAP, MAX_GAP = 10.0, 3.0
 """Largest distance of a pixel from a ground point, and over which a return fills pixels, m."""
-_MOST_PIXELS = 1e8
 
 
 def read_lidar(
@@ -51,19 +50,16 @@ def read_lidar(
     if not tiles or len({tile[2].to_wkt() for tile in tiles}) > 1:
         raise TrustboError("give one LAS or LAZ file or more, all in one CRS.")
     xyz, label = (np.concatenate([tile[k] for tile in tiles]) for k in (0, 1))  # pyright: ignore[reportArgumentType, reportCallIssue]
-    if (label == GROUND_CLASS).sum() < 3:
+    if not (label == GROUND_CLASS).any():
         raise TrustboError(
-            f"{files[0]!r} has under 3 ground points (class {GROUND_CLASS}); classify its "
-            "ground, e.g. with PDAL's filters.smrf."
+            f"{files[0]!r} has no ground points (class {GROUND_CLASS}); classify its ground, e.g. "
+            "with PDAL's filters.smrf."
         )
     # Pixels count from the upper left corner; a point on an edge is in the pixel south or east.
     place = np.array([[1.0, -1.0]]) * xyz[:, :2] / step
     corner = np.floor(place.min(0) + 1e-6)
     shape = np.maximum(np.ceil(place.max(0) - 1e-6) - corner, 1.0).astype(int)
-    if shape.prod() > _MOST_PIXELS:
-        raise TrustboError(
-            f"resolution {step:g} m makes {shape[1]} x {shape[0]} pixels; take a larger one."
-        )
+    check_size(tuple(shape.tolist()), f"a grid of {step:g} m")
     col, row = np.minimum((place - corner + 1e-6).astype(int), shape - 1).T
     x, y = (corner[0] + 0.5 + np.arange(shape[0])), -(corner[1] + 0.5 + np.arange(shape[1]))
     dem = _triangulated(xyz[label == GROUND_CLASS], x * step, y * step)
@@ -107,12 +103,12 @@ def _read_tile(path: str, given: CRS | None) -> tuple[np.ndarray, np.ndarray, CR
 
 def _triangulated(ground: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Heights of the triangulated ground points at pixel centres, NaN far from them, (row, col)."""
-    ground = ground[np.lexsort((ground[:, 2], ground[:, 1], ground[:, 0]))]
-    lowest = np.r_[True, (np.diff(ground[:, :2], axis=0) != 0.0).any(axis=1)]
+    lowest_first = ground[np.argsort(ground[:, 2], kind="stable")]
+    places, lowest = np.unique(lowest_first[:, :2], axis=0, return_index=True)
     corner = np.array([x[0], y[0]])  # small coordinates keep the triangulation exact
-    places, centres = ground[lowest, :2] - corner, np.stack(np.meshgrid(x, y), axis=-1) - corner
+    places, centres = places - corner, np.stack(np.meshgrid(x, y), axis=-1) - corner
     try:
-        heights = LinearNDInterpolator(places, ground[lowest, 2])(centres)
+        heights = LinearNDInterpolator(places, lowest_first[lowest, 2])(centres)
     except QhullError:
         raise TrustboError("the ground points (class 2) must span an area, not a line.") from None
     return np.where(KDTree(places).query(centres)[0] <= GROUND_GAP, heights, np.nan)

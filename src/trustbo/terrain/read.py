@@ -193,7 +193,7 @@ def _stored(raster: RasterLike, role: str) -> xr.DataArray:
     """Raster of any kind as it is stored, dims (y, x); its name, with `role`, is for messages."""
     if isinstance(raster, xr.DataArray):
         name = f"{role}: DataArray" + (f" {raster.name!r}" if raster.name else "")
-        _check_size(raster.shape, name)
+        check_size(raster.shape, name)
         return _of_array(raster, name)
     if isinstance(raster, str | PathLike):
         name = f"{role}: {os.fspath(raster)!r}"
@@ -210,18 +210,18 @@ def _stored(raster: RasterLike, role: str) -> xr.DataArray:
             is_open = isinstance(raster, DatasetReader | WarpedVRT)
             opened = nullcontext(raster) if is_open else rasterio.open(raster)
         with opened as file:
-            _check_size(file.shape, name)
+            check_size(file.shape, name)
             return _of_array(_of_file(file, name), name)
     except RasterioError as error:
         raise TrustboError(f"{name} cannot be read by GDAL: {error}.") from None
 
 
-def _check_size(shape: tuple[int, ...], name: str) -> None:
+def check_size(shape: tuple[int, ...], name: str) -> None:
     """Check that a raster fits into memory."""
     if math.prod(shape) > _MOST_PIXELS:
         raise TrustboError(
-            f"{name} has {shape} pixels, too many for the memory; cut out a part, or average them "
-            "first, e.g. with gdalwarp -tr 5 5 -r average."
+            f"{name} has {shape} pixels, too many for the memory; take a part of it or a larger "
+            "resolution, e.g. with gdalwarp -tr 5 5 -r average."
         )
 
 

@@ -1,15 +1,11 @@
 """Synthetic terrain with fractal relief and patches of vegetation."""
 
-import math
-
 import numpy as np
 import xarray as xr
 from scipy import ndimage
 
 from trustbo.errors import TrustboError, require_positive, require_whole
-from trustbo.terrain.read import read_terrain
-
-_MOST_PIXELS = 1e8  # some 6 GB while it is made
+from trustbo.terrain.read import check_size, read_terrain
 
 
 def synthetic_terrain(
@@ -42,11 +38,7 @@ def synthetic_terrain(
     step = require_positive("resolution", resolution)
     height, width = (require_positive(f"size[{i}]", side) for i, side in enumerate(size))
     shape = (round(height / step), round(width / step))
-    if math.prod(shape) > _MOST_PIXELS:
-        raise TrustboError(
-            f"size {size} m at {resolution} m is {shape[0]} x {shape[1]} pixels, more than "
-            f"{_MOST_PIXELS:g}; give a larger resolution."
-        )
+    check_size(shape, f"size {size} m at {resolution} m")
     if min(shape) < 4:
         raise TrustboError(f"size {size} m at {resolution} m is {shape} pixels; need 4 x 4.")
     if not (0.0 < hurst <= 1.0 and 0.0 <= canopy_cover <= 1.0 and relief >= 0.0 <= canopy_height):
