@@ -60,7 +60,7 @@ def best_paths(planner: Planner, rates: np.ndarray) -> list[Path]:
     """
     paths, n_draws = planner.problem.paths, len(rates)
     n_bounds = np.arange(paths.longest + 1.0)
-    is_mean = planner.objective == "mean"
+    is_mean = planner.problem.objective.name == "mean"
     weights = Weights(
         np.ones((n_draws, paths.longest + 1, 1)),
         np.tile(0.0 * n_bounds if is_mean else -n_bounds, (n_draws, 1)),
@@ -74,7 +74,9 @@ def best_paths(planner: Planner, rates: np.ndarray) -> list[Path]:
 def value(planner: Planner, rates: Sequence[float] | np.ndarray) -> float:
     """Value of a path with these rates of its bounds: what `best_paths` makes large."""
     rates = np.asarray(rates)
-    return float(rates.mean() if planner.objective == "mean" else rates.sum() - len(rates))
+    return float(
+        rates.mean() if planner.problem.objective.name == "mean" else rates.sum() - len(rates)
+    )
 
 
 def predicted(planner: Planner, path: Path) -> float:

@@ -8,7 +8,7 @@ from trustbo.errors import TrustboError
 from trustbo.inference import sample_prior
 from trustbo.models import PooledTrust, TrustParams
 from trustbo.planning import Planner, reference, roll_trust
-from trustbo.planning.unrolled import STEPS
+from trustbo.planning.paths import STEPS
 from trustbo.workspace import Workspace
 
 PARAMS = TrustParams(0.6, np.array([0.3, 0.2]), 0.05, 0.05, 0.05)

@@ -31,7 +31,7 @@ def test_a_trust_map_is_the_best_of_all_paths_to_each_cell(workspace, model):
             continue
         last = []
         for path in reference.every_path(planner.problem.paths.to((row, col), 2)):
-            z = planner.problem.awareness_along(path)
+            z = workspace.along(path)
             last.append(roll_trust(draws, z)[:, -1])
         last = np.stack(last)  # (path, draw, robot)
         np.testing.assert_allclose(maps[:, row, col], last.mean(-1).max(0), rtol=1e-12)

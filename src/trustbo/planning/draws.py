@@ -10,11 +10,8 @@ from trustbo.data import Cell
 from trustbo.errors import require_whole
 from trustbo.models.params import Params
 from trustbo.planning.dynamics import Dynamics, roll
-from trustbo.planning.objectives import capped, score_of
-from trustbo.planning.problem import Problem
-
-_ROUNDING = 1e-12
-"""Difference of the values of two paths that may be the same."""
+from trustbo.planning.objectives import capped
+from trustbo.planning.problem import EXACT, Problem
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,22 +66,21 @@ class DrawnPaths:
             most = [len(path) - 1 + self.problem.toll_along(path) for path in self.candidates]
             scale = np.maximum(0.0, np.array(most)[self._distinct[1]] + self.values)
         regret = self.regret(path)
-        nothing = np.where(regret > _ROUNDING, np.inf, 0.0)
+        nothing = np.where(regret > EXACT, np.inf, 0.0)
         return np.divide(regret, scale, out=nothing, where=scale > 0.0)
 
     def share(self) -> np.ndarray:
         """Share of the paths that enter each cell, shape (row, col)."""
-        count = np.zeros(self.problem.paths.passable.shape)
+        count = np.zeros(self.problem.paths.bounds.shape[1:])
         for path, n in zip(self.candidates, self.counts, strict=True):
             count[tuple(np.array(path).T)] += n  # a cell entered twice counts once
         return count / len(self.paths)
 
     def _value(self, dynamics: Dynamics, path: Sequence[Cell]) -> np.ndarray:
-        problem, objective, family = self.problem, self.problem.objective, self.problem.family
-        along = capped(objective, family, dynamics.along(path))
-        toll = problem.toll_along(path)
-        score = score_of(objective, family, roll(along).mean(-1), along.noise_sd, toll)
-        return objective.value(score) - problem.failure_along(path)
+        problem = self.problem
+        along = capped(problem.objective, problem.family, dynamics.along(path))
+        value = problem.value_along(path, roll(along).mean(-1), along.noise_sd)
+        return value - problem.failure_along(path)
 
     @cached_property
     def _distinct(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

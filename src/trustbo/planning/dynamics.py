@@ -118,13 +118,8 @@ def roll_trust(params: Params, awareness: ArrayLike, x0: ArrayLike | None = None
         TrustboError: The number of robots or features differs from that of the parameters, or
             effects of places are of a map, not of the path's bounds.
     """
-    z = as_map(np.asarray(awareness, dtype=float))
-    return roll(trust_dynamics(params, z, x0, by_robot=True))
-
-
-def as_map(awareness: np.ndarray) -> np.ndarray:
-    """Convert awareness of a path's bounds, (bound, robot, feature), to a map of one row."""
-    return np.swapaxes(awareness, 0, 1)[:, None, None]
+    of_robots = np.swapaxes(np.asarray(awareness, dtype=float), 0, 1)
+    return roll(trust_dynamics(params, of_robots[:, None, None], x0, by_robot=True))
 
 
 def roll(along: Dynamics) -> np.ndarray:

@@ -113,23 +113,3 @@ def capped(objective: Objective, family: Family, dynamics: Dynamics) -> Dynamics
     most = 1.0 - dynamics.transition.sum(-1)[..., None, None, None]
     drift, start = np.minimum(dynamics.drift, most), np.minimum(dynamics.start, 1.0)
     return dynamics._replace(drift=drift, start=start)
-
-
-def score_of(
-    objective: Objective, family: Family, trust: Array, noise_sd: Array, toll: float
-) -> Array:
-    """Score of paths from the team's trust after each bound, (..., bound); shape (...,).
-
-    Args:
-        objective: Row of `OBJECTIVES`.
-        family: Family of the contact rates.
-        trust: Trust of the team, (..., bound).
-        noise_sd: Standard deviation of a rate, (...,).
-        toll: Sum of the tolls of the path.
-    """
-    if objective.of_contact:
-        lost = 1.0 - family.mean_rate(trust, noise_sd[..., None])
-        return -lost.sum(-1) - toll
-    n_bounds = trust.shape[-1]
-    credit = objective.credit(np.arange(n_bounds))[::-1]
-    return (trust @ credit - toll) / objective.scale(np.array([float(n_bounds)]))[0]

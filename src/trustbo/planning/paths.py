@@ -11,13 +11,17 @@ from scipy.sparse.csgraph import dijkstra
 
 from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_kind, require_whole
-from trustbo.planning.unrolled import STEPS, Unrolled
+from trustbo.planning.unrolled import Unrolled
 from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Location
-from trustbo.workspace.moves import moves_along, require_on_grid
+from trustbo.workspace.moves import MOVES, moves_along, require_on_grid
 
 SIMPLE_EXTRA = 2
 """Bounds beyond the fewest possible up to which a path without U-turns enters no cell twice."""
+STEPS = np.array(MOVES)
+"""Rows and columns of each move, (move, 2)."""
+_MOST_STATES = 20_000_000
+"""Most states of the unrolled graph, whose arrays take some 3 GB."""
 _SHORTEST = re.compile(r"shortest(?:\+(\d+))?")
 
 
@@ -64,26 +68,30 @@ class AdmissiblePaths:
         self.bounds_to_goal = fewest_bounds(self.bounds, self.goal, back=True)
         self.shortest = int(self.bounds_to_goal[self.start])
         if self.shortest < 0:
+            n_cells = int(workspace.passable.sum())
             n_reached = int((self.bounds_from_start >= 0).sum())
+            n_goal = int((self.bounds_to_goal >= 0).sum())
             raise NoPathError(
-                f"no path from {self.start} to {self.goal}: {n_reached} of "
-                f"{int(self.passable.sum())} passable cells can be reached from the start, and the "
-                f"goal from {int((self.bounds_to_goal >= 0).sum())}. Choose ends in one part, or a "
-                "team with a larger max_slope."
+                f"no path from {self.start} to {self.goal}: {n_reached} of {n_cells} passable "
+                f"cells can be reached from the start, and the goal from {n_goal}. Choose "
+                "ends in one part, or a team with a larger max_slope."
             )
         self.turns = not isinstance(max_bounds, str)
-        self.longest = _longest(max_bounds, self.shortest)
-        self.max_bounds = self.longest if self.turns else max_bounds
+        self.max_bounds = max_bounds
+        if not isinstance(max_bounds, str):
+            self.max_bounds = self.longest = require_whole("max_bounds", max_bounds, 1)
+        elif named := _SHORTEST.fullmatch(max_bounds):
+            self.longest = self.shortest + int(named[1] or 0)
+        else:
+            raise TrustboError(
+                f"unknown max_bounds {max_bounds!r}; choose shortest, shortest+n for n bounds more "
+                "without U-turns, such as shortest+2, or a number of bounds."
+            )
         if self.longest < self.shortest:
             raise TrustboError(
                 f"max_bounds = {self.longest} is below the fewest possible from {self.start} to "
                 f"{self.goal}, which is {self.shortest}."
             )
-
-    @property
-    def passable(self) -> np.ndarray:
-        """Passable cells, (row, col)."""
-        return self.workspace.passable.values
 
     @cached_property
     def bounds_from_start(self) -> np.ndarray:
@@ -93,8 +101,38 @@ class AdmissiblePaths:
     @cached_property
     def graph(self) -> Unrolled:
         """Unrolled graph of the paths; TrustboError: it is too large to be held."""
-        fewest = self.bounds_to_goal, self.bounds_from_start
-        return Unrolled.of_grid(self.bounds, *fewest, self.longest, turns=self.turns)
+        n_moves, rows, cols = self.bounds.shape
+        bounds = self.bounds.reshape(n_moves, -1)
+        far, near = self.bounds_to_goal.ravel(), self.bounds_from_start.ravel()
+        # How many numbers of bounds can be left in each cell: `far` and more, one in the goal.
+        n_left = np.maximum(np.where(far == 0, 1, self.longest - near - far + 1), 0)
+        n_left[(far < 0) | (near < 0)] = 0
+        if (n_states := int(n_left.sum())) > _MOST_STATES:
+            raise TrustboError(
+                f"max_bounds = {self.max_bounds!r} admits paths of up to {self.longest} bounds, "
+                f"whose search has {n_states:.3g} states, more than {_MOST_STATES:.3g}; give less."
+            )
+        cell = np.repeat(np.arange(rows * cols, dtype=np.int32), n_left)
+        base = np.concatenate([[0], np.cumsum(n_left)])
+        left = (np.arange(n_states) - base[cell] + far[cell]).astype(np.int32)
+        order = np.argsort(left, kind="stable")
+        rank = np.empty(n_states, np.int32)
+        rank[order] = np.arange(n_states)
+        cell, left = cell[order], left[order]
+        head = np.full((n_states, n_moves), -1, np.int32)
+        for m, step in enumerate(STEPS @ (cols, 1)):  # no bound enters a cell across a border
+            tail = np.flatnonzero((cell + step >= 0) & (cell + step < rows * cols) & (left > 0))
+            other = cell[tail] + step
+            more = left[tail] - 1 - far[other]  # of the bounds left there, beyond the fewest
+            fits = bounds[m, other] & (more >= 0) & (more < n_left[other])
+            head[tail[fits], m] = rank[base[other[fits]] + more[fits]]
+        tail, move = np.nonzero(head >= 0)
+        head = head[tail, move]
+        first = np.searchsorted(tail, np.arange(n_states + 1))
+        start = np.flatnonzero(near == 0)[0]
+        starts = rank[base[start] : base[start + 1]]
+        bound = (move * rows * cols + cell[head]).astype(np.int32)
+        return Unrolled(cell, left, first, head, bound, starts, self.turns)
 
     def avoiding(self, bounds: np.ndarray, risk: np.ndarray) -> "AdmissiblePaths":
         """Restrict to paths that take none of some bounds.
@@ -127,7 +165,7 @@ class AdmissiblePaths:
 
     def cells(self, flat: np.ndarray) -> tuple[Cell, ...]:
         """Cells of flat indices, up to the first that is negative."""
-        rows, cols = np.divmod(flat[flat >= 0], self.passable.shape[1])
+        rows, cols = np.divmod(flat[flat >= 0], self.bounds.shape[-1])
         return tuple(zip(rows.tolist(), cols.tolist(), strict=True))
 
     def require_path(self, path: Sequence[Cell]) -> tuple[Cell, ...]:
@@ -136,7 +174,7 @@ class AdmissiblePaths:
         Raises:
             TrustboError: It is broken, or does not lead from start to goal.
         """
-        cells = tuple(require_on_grid(path, self.passable.shape))
+        cells = tuple(require_on_grid(path, self.bounds.shape[1:]))
         if len(cells) < 2 or (cells[0], cells[-1]) != (self.start, self.goal):
             raise TrustboError(
                 f"a path must lead from {self.start} to {self.goal}; got {len(cells)} cells, "
@@ -150,18 +188,6 @@ class AdmissiblePaths:
                 f"the path is broken: no bound leads from {cells[k]} to {cells[k + 1]}."
             )
         return cells
-
-
-def _longest(max_bounds: int | str, shortest: int) -> int:
-    """Largest number of bounds; TrustboError: an unknown name, or no whole number."""
-    if not isinstance(max_bounds, str):
-        return int(require_whole("max_bounds", max_bounds, 1))
-    if (named := _SHORTEST.fullmatch(max_bounds)) is None:
-        raise TrustboError(
-            f"unknown max_bounds {max_bounds!r}; choose shortest, shortest+n for n bounds more "
-            "without U-turns, such as shortest+2, or a number of bounds."
-        )
-    return shortest + int(named[1] or 0)
 
 
 def fewest_bounds(bounds: np.ndarray, cell: Cell, *, back: bool = False) -> np.ndarray:

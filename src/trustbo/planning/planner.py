@@ -19,15 +19,15 @@ from trustbo.hazard.strata import Strata
 from trustbo.models.families import FAMILIES
 from trustbo.models.params import Params
 from trustbo.planning.draws import DrawnPaths, choose_draws
-from trustbo.planning.dynamics import Dynamics, as_map, roll, trust_dynamics
-from trustbo.planning.objectives import LOST_CONTACT, OBJECTIVES, capped, score_of
-from trustbo.planning.paths import AdmissiblePaths
+from trustbo.planning.dynamics import Dynamics, roll, trust_dynamics
+from trustbo.planning.objectives import LOST_CONTACT, OBJECTIVES, capped
+from trustbo.planning.paths import STEPS, AdmissiblePaths
 from trustbo.planning.plan import QUANTILES, Plan
 from trustbo.planning.problem import EXACT, InfeasibleError, Problem, draws_of, mean_of, risk_of
 from trustbo.planning.trust_map import cost_of, trust_map
-from trustbo.planning.unrolled import STEPS
 from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Location
+from trustbo.workspace.moves import along
 
 
 class Planner(Summary):
@@ -110,11 +110,6 @@ class Planner(Summary):
     def goal(self) -> Cell:
         """Last cell."""
         return self.problem.paths.goal
-
-    @property
-    def objective(self) -> str:
-        """Name of the objective."""
-        return self.problem.objective.name
 
     @property
     def max_bounds(self) -> int | str:
@@ -255,7 +250,7 @@ class Planner(Summary):
             trust=trust.mean(0),
             bands=bands[0],
             value=value - cost,
-            objective=self.objective,
+            objective=problem.objective.name,
             exact=False,
             limit=np.nan,
             revisits=len(path) - len(set(path)),
@@ -303,7 +298,7 @@ class Planner(Summary):
         if problem.risk is not None:
             values["risk"] = of_bounds(risk_of(problem.risk.p_fail))
         graph = nx.DiGraph()
-        for row, col in np.argwhere(problem.paths.passable).tolist():
+        for row, col in np.argwhere(self.workspace.passable.values).tolist():
             graph.add_node((row, col), x=float(grid.x[col]), y=float(grid.y[row]))
         for k, (move, row, col) in enumerate(np.argwhere(bounds).tolist()):
             left = row - int(STEPS[move, 0]), col - int(STEPS[move, 1])
@@ -394,20 +389,17 @@ def _value_along(
     problem: Problem, cells: np.ndarray, params: Params, x0: ArrayLike | None
 ) -> tuple[np.ndarray, float, np.ndarray]:
     """Trust along a path (draw, bound, robot), its value without failures, and that of draws."""
-    z, of_path = as_map(problem.awareness_along(cells)), params.along(cells)
+    z, of_path = along(problem.paths.workspace.awareness.values, cells), params.along(cells)
+    z = z[:, None, None]  # a map of one row
     by_robot = trust_dynamics(of_path, z, x0, by_robot=True)
     trust = roll(by_robot)
     trust = trust.reshape(-1, *trust.shape[-2:])
-    toll, objective, family = problem.toll_along(cells), problem.objective, problem.family
-
-    def value(of_team: np.ndarray, sd: np.ndarray) -> np.ndarray:
-        return objective.value(score_of(objective, family, of_team, sd, toll))
-
-    values = np.atleast_1d(value(trust.mean(-1), by_robot.noise_sd))
-    if not objective.of_contact:
-        return trust, float(value(trust.mean((0, -1)), by_robot.noise_sd)), values
+    values = np.atleast_1d(problem.value_along(cells, trust.mean(-1), by_robot.noise_sd))
+    if not problem.objective.of_contact:
+        value = problem.value_along(cells, trust.mean((0, -1)), by_robot.noise_sd)
+        return trust, float(value), values
     # Trust capped draw by draw is biased, so that the band is of trust as it is; but no path loses
     # less than nothing.
-    team = capped(objective, family, trust_dynamics(of_path, z, x0))
-    mean = value(roll(team).mean(-1), team.noise_sd).mean()
-    return trust, float(mean), np.minimum(values, -toll)
+    team = capped(problem.objective, problem.family, trust_dynamics(of_path, z, x0))
+    mean = problem.value_along(cells, roll(team).mean(-1), team.noise_sd).mean()
+    return trust, float(mean), np.minimum(values, -problem.toll_along(cells))

@@ -21,10 +21,10 @@ from trustbo.planning.objectives import Objective, Weights, capped, has_history,
 from trustbo.planning.paths import AdmissiblePaths
 from trustbo.planning.sums import best_sums
 from trustbo.workspace import Workspace
-from trustbo.workspace.moves import MOVE_NAMES, along, bounds_along
+from trustbo.workspace.moves import MOVE_NAMES, bounds_along
 
 EXACT = 1e-12
-"""Largest optimality gap, in the unit of the score, of a path that counts as exact."""
+"""Largest gap, in the unit of the score, between a path and a better one that counts as none."""
 _CERTAIN = 700.0  # -log(1 - p) of a bound that always fails
 
 
@@ -86,13 +86,24 @@ class Problem:
             return 0.0
         return float(self.paths.shortest) if self.failure_cost is None else self.failure_cost
 
-    def awareness_along(self, path: Sequence[Cell] | np.ndarray) -> np.ndarray:
-        """Awareness of a path's bounds, shape (bound, robot, feature)."""
-        return np.swapaxes(along(self.paths.workspace.awareness.values, path), 0, 1)
-
     def toll_along(self, path: Sequence[Cell] | np.ndarray) -> float:
         """Toll of a path."""
         return float(self.toll[*bounds_along(path).T].sum())
+
+    def value_along(
+        self, path: Sequence[Cell] | np.ndarray, trust: np.ndarray, noise_sd: np.ndarray
+    ) -> np.ndarray:
+        """Value of a path without failures, shape (...,).
+
+        From the team's trust after each bound, (..., bound), and the sd of a rate, (...,).
+        """
+        objective, toll, n_bounds = self.objective, self.toll_along(path), trust.shape[-1]
+        if objective.of_contact:
+            lost = 1.0 - self.family.mean_rate(trust, noise_sd[..., None])
+            return objective.value(-lost.sum(-1) - toll)
+        credit = objective.credit(np.arange(n_bounds))[::-1]
+        scale = objective.scale(np.array([float(n_bounds)]))[0]
+        return objective.value((trust @ credit - toll) / scale)
 
     def failure_along(self, path: Sequence[Cell] | np.ndarray) -> float:
         """Cost of a failure times the chance that a path fails."""

@@ -8,18 +8,13 @@ from scipy.special import expit
 from trustbo.models.params import Params
 from trustbo.planning.dynamics import Dynamics
 from trustbo.planning.objectives import TERMINAL, weights_of
-from trustbo.planning.paths import SIMPLE_EXTRA, AdmissiblePaths
+from trustbo.planning.paths import SIMPLE_EXTRA, STEPS, AdmissiblePaths
 from trustbo.planning.problem import Problem
 from trustbo.planning.sums import best_sums
-from trustbo.planning.unrolled import STEPS
 
 
 def trust_map(
-    problem: Problem,
-    params: Params,
-    *,
-    per_robot: bool = False,
-    x0: ArrayLike | None = None,
+    problem: Problem, params: Params, *, per_robot: bool = False, x0: ArrayLike | None = None
 ) -> xr.DataArray:
     """Compute the map of `Planner.trust_map`."""
     dynamics = problem.dynamics(params, x0, by_robot=per_robot).flat()
@@ -52,7 +47,7 @@ def _largest(paths: AdmissiblePaths, dynamics: Dynamics, view: np.ndarray) -> np
         drift = np.where(paths.bounds, drift, np.nan)
         return best_trust(paths, extra, drift, beta0.max(-1), dynamics.start @ view)
     drift = dynamics.drift.reshape(*dynamics.start.shape, -1)
-    values = np.full((len(drift), *paths.passable.shape), np.nan)
+    values = np.full((len(drift), *paths.bounds.shape[1:]), np.nan)
     for row, col in np.argwhere(paths.bounds_from_start > 0).tolist():
         graph = paths.to((row, col), extra).graph
         weights = weights_of(TERMINAL, dynamics, view, graph.longest)

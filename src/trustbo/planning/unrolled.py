@@ -7,19 +7,12 @@ by `to_networkx`.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import networkx as nx
 import numpy as np
 from numba import njit
 
-from trustbo.errors import TrustboError
-from trustbo.workspace.moves import MOVES
-
-MOST_STATES = 20_000_000
-"""Most states of the graph, whose arrays take some 3 GB."""
-STEPS = np.array(MOVES)
-"""Rows and columns of each move, (move, 2)."""
 kernel = njit(cache=True, nogil=True, error_model="numpy")
 """Compiler of the kernels: cached on disk, without the interpreter's lock, 1 / 0 is inf."""
 
@@ -44,60 +37,6 @@ class Unrolled(NamedTuple):
     bound: np.ndarray
     starts: np.ndarray
     turns: bool
-
-    @classmethod
-    def of_grid(
-        cls,
-        bounds: np.ndarray,
-        to_goal: np.ndarray,
-        from_start: np.ndarray,
-        longest: int,
-        *,
-        turns: bool,
-    ) -> Self:
-        """Unroll the bounds of a grid.
-
-        Args:
-            bounds: Bounds that a path may take, (move, row, col), by the cell that they enter.
-            to_goal: Fewest bounds from each cell to the goal, (row, col), -1 without a path.
-            from_start: Fewest bounds from the start, likewise.
-            longest: Largest number of bounds of a path.
-            turns: Whether a bound may lead back to the cell before.
-
-        Raises:
-            TrustboError: There are more than `MOST_STATES` states.
-        """
-        n_moves, rows, cols = bounds.shape
-        far, near, bounds = to_goal.ravel(), from_start.ravel(), bounds.reshape(n_moves, -1)
-        # How many numbers of bounds can be left in each cell: `far` and more, one in the goal.
-        n_left = np.maximum(np.where(far == 0, 1, longest - near - far + 1), 0)
-        n_left[(far < 0) | (near < 0)] = 0
-        if (n_states := int(n_left.sum())) > MOST_STATES:
-            raise TrustboError(
-                f"max_bounds admits paths of up to {longest} bounds, whose search has "
-                f"{n_states:.3g} states, more than {MOST_STATES:.3g}; give less."
-            )
-        cell = np.repeat(np.arange(rows * cols, dtype=np.int32), n_left)
-        base = np.concatenate([[0], np.cumsum(n_left)])
-        left = (np.arange(len(cell)) - base[cell] + far[cell]).astype(np.int32)
-        order = np.argsort(left, kind="stable")
-        rank = np.empty(len(cell), np.int32)
-        rank[order] = np.arange(len(cell))
-        cell, left = cell[order], left[order]
-        head = np.full((len(cell), n_moves), -1, np.int32)
-        for m, step in enumerate(STEPS @ (cols, 1)):  # no bound enters a cell across a border
-            tail = np.flatnonzero((cell + step >= 0) & (cell + step < rows * cols) & (left > 0))
-            other = cell[tail] + step
-            more = left[tail] - 1 - far[other]  # of the bounds left there, beyond the fewest
-            fits = bounds[m, other] & (more >= 0) & (more < n_left[other])
-            head[tail[fits], m] = rank[base[other[fits]] + more[fits]]
-        tail, move = np.nonzero(head >= 0)
-        head = head[tail, move]
-        first = np.searchsorted(tail, np.arange(len(cell) + 1))
-        start = np.flatnonzero(near == 0)[0]
-        starts = rank[base[start] : base[start + 1]]
-        bound = (move * rows * cols + cell[head]).astype(np.int32)
-        return cls(cell, left, first, head, bound, starts, turns)
 
     @property
     def longest(self) -> int:
