@@ -79,9 +79,7 @@ def sample_by_nuts(
         drawn = Draws(theta, posterior.draw_columns(theta, rng))
     else:
         drawn = Draws(theta, samples["columns"], samples["signal"])
-    by_chain = {
-        name: v.reshape(chains, draws, *v.shape[1:]) for name, v in theta.items() if name in values
-    }
+    by_chain = {name: v.reshape(chains, draws, *v.shape[1:]) for name, v in values.items()}
     found, complaints = complaints_of(by_chain, stats["diverging"])
     return drawn, stats | {"lp": -stats["lp"]}, found, complaints
 
