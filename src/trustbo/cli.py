@@ -37,7 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     args = parser().parse_args(arguments)
     folder = getattr(args, "folder", getattr(args, "out", None))
     resume_later = f"continue with: trustbo resume {folder}"
-    warnings.showwarning = _show_warning
+    warnings.showwarning = lambda message, *_, **__: print(f"warning: {message}", file=sys.stderr)
     for stream in (sys.stdout, sys.stderr):  # a terminal may lack letters of a path
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
@@ -57,10 +57,6 @@ def _exit(message: str, code: int) -> NoReturn:
     sys.exit(code)
 
 
-def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
-    print(f"warning: {message}", file=sys.stderr)
-
-
 def parser() -> argparse.ArgumentParser:
     """Parser of all commands; its `run` is the function of the parsed arguments."""
     top = argparse.ArgumentParser(
@@ -68,13 +64,9 @@ def parser() -> argparse.ArgumentParser:
         description="Learn how trustworthy robots are on a terrain, and plan their best path.",
         epilog=EPILOG,
     )
-    top.add_argument("--version", action="store_true", help="print the version and exit")
-    version = importlib.metadata.version
-    top.set_defaults(
-        run=lambda args: (
-            print(f"trustbo {version('trustbo')}") if args.version else top.print_help()
-        )
-    )
+    version = f"trustbo {importlib.metadata.version('trustbo')}"
+    top.add_argument("--version", action="version", version=version)
+    top.set_defaults(run=lambda _: top.print_help())
     commands = top.add_subparsers(metavar="COMMAND")
 
     def command(run: Callable[..., None], text: str, example: str) -> Any:

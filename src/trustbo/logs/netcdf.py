@@ -1,7 +1,6 @@
 """Missions as trees of arrays, for netCDF files: a table of them all, and the ticks of robots."""
 
 from collections.abc import Sequence
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -151,14 +150,12 @@ def _ticks(missions: Sequence[Mission]) -> xr.Dataset | None:
 def _by_bound(ticks: xr.Dataset) -> dict[tuple[int, int], tuple[Any, Any, Any]]:
     """Poses, contact and states, None if not recorded, of each mission and bound with ticks."""
     of = np.column_stack([ticks["mission"].values, ticks["bound"].values])
-    edges = [0, *(np.flatnonzero(np.diff(of, axis=0).any(axis=1)) + 1), len(of)]
-    found = {}
-    for first, last in pairwise(edges):
-        mine = ticks.isel(tick=slice(first, last))
-        states = mine["states"].values if "states" in mine else np.array(np.nan)
-        found[tuple(of[first].tolist())] = (
-            mine["pose"].values,
-            mine["contact"].values.astype(bool),
-            None if np.isnan(states).all() else states,
-        )
-    return found
+    unknown = np.full(len(of), np.nan)
+    values = [of, ticks["pose"].values, ticks["contact"].values.astype(bool)]
+    values.append(ticks["states"].values if "states" in ticks else unknown)
+    edges = np.flatnonzero(np.diff(of, axis=0).any(axis=1)) + 1
+    parts = zip(*(np.split(array, edges) for array in values), strict=True)
+    return {
+        tuple(key[0].tolist()): (pose, contact, None if np.isnan(states).all() else states)
+        for key, pose, contact, states in parts
+    }
