@@ -1,6 +1,6 @@
 """Exposures of bounds to failure: how often each was begun, and how often it ended a mission."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -58,7 +58,7 @@ class Exposures(NamedTuple):
         known += [_located(mission) for mission in lost if mission.where is not None]
         unknown = [(mission.path, mission.cause) for mission in lost if mission.where is None]
 
-        met = [_bounds_of(path) for path, _ in (*known, *unknown)]
+        met = [bounds_along(path) for path, _ in (*known, *unknown)]
         rows = np.concatenate([np.empty((0, 3), int), *met])
         bounds, index = np.unique(rows, axis=0, return_inverse=True)
         paths = np.split(index, np.cumsum([len(part) for part in met])[:-1]) if met else []
@@ -85,8 +85,3 @@ def _located(mission: LostMission) -> tuple[Sequence[Cell], str | None]:
         raise TrustboError(f"the path {mission.path} never enters where = {mission.where}.")
     n = mission.path.index(mission.where, 1)
     return mission.path[: n + 1], require_choice("cause", mission.cause, CAUSES)
-
-
-def _bounds_of(path: Iterable[Cell]) -> np.ndarray:
-    cells = np.asarray(tuple(path))
-    return bounds_along(cells) if len(cells) > 1 else np.empty((0, 3), int)

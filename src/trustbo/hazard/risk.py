@@ -204,20 +204,13 @@ class Risk:
             return PathRisk(p, float(reach[-1]), (np.nan, np.nan))
         drawn = self.draws[:, *index]
         low, high = np.quantile(np.prod(1.0 - drawn, axis=1), _BAND).tolist()
-        reach = np.minimum.accumulate(np.minimum(reach * _dependence(drawn), 1.0 - p))
+        # Bounds are likelier to be passed together than if they were independent. The ratio of the
+        # two chances has none of the error that few draws make in each p_fail.
+        together = np.cumprod(1.0 - drawn, axis=1).mean(0)
+        apart = np.cumprod((1.0 - drawn).mean(0))
+        ratio = np.divide(together, apart, out=np.ones_like(apart), where=apart > 0.0)
+        reach = np.minimum.accumulate(np.minimum(reach * ratio, 1.0 - p))
         return PathRisk(p, float(reach[-1]), (low, high))
-
-
-def _dependence(draws: np.ndarray) -> np.ndarray:
-    """Mean over draws (draw, bound) of the product of 1 - p, over the product of the means.
-
-    Shape (bound,): of the first bound, the first two, and so on. It is the factor by which bounds
-    are likelier to be passed together than if they were independent; multiplied by the product of
-    1 - p_fail it has none of the error that few draws make in each p_fail.
-    """
-    together = np.cumprod(1.0 - draws, axis=1).mean(0)
-    apart = np.cumprod((1.0 - draws).mean(0))
-    return np.divide(together, apart, out=np.ones_like(apart), where=apart > 0.0)
 
 
 class PathRisk(NamedTuple):

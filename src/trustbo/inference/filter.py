@@ -51,7 +51,7 @@ class Dynamics:
         self._b, self._noise, one = p.b.reshape(n, -1), None, np.eye(members)
         if self._coupled:
             own = 0.5 * np.linalg.eigvalsh(p.Delta_v)[:, :1]
-            if not family.correlates:
+            if not family.adds_noise:
                 own = np.diagonal(p.Delta_v, axis1=1, axis2=2)
             self._B0, self._Q = p.B0[:, None], p.Delta_w[:, None]
             self._noise = (p.Delta_v - own[:, None] * one)[:, None]

@@ -209,7 +209,7 @@ def _record(model: TrustModel, posterior: Posterior) -> dict[str, Any]:
         "n_missions": slots.n_missions,
         "x0_mean": float(model.priors.x0_mean),
         "x0_sd": float(model.priors.x0_sd),
-        "resolution": slots.resolution if model.family.rounds else 0.0,
+        "resolution": slots.resolution if model.family.adds_noise else 0.0,
         **{f"prior_{name}": text for name, text in model.priors.describe().items()},
         **{f"{name}_version": version for name, version in VERSIONS.items()},
     }

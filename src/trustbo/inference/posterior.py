@@ -209,7 +209,7 @@ class Posterior:
         if isinstance(model, HumanTrust) and draws.f is not None:
             persons = np.empty((len(draws.c), self.slots.n_missions, 4))
             for i, chunk, _, mean in self.signals(draws):
-                persons[i] = model.persons(chunk, draws.f[i], mean, self.slots, rng)
+                persons[i] = model.persons(chunk, draws.f[i] - mean, self.slots, rng)
             groups[model.effect.noun] = {"person": persons}
         return groups
 

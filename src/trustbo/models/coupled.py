@@ -46,7 +46,7 @@ class CoupledTrust(TrustModel):
         column = np.tril_indices(n, -1)[1]
         shape = priors.concentration + 0.5 * (n - 2 - column)
         partials = {"partial_w": dist.Beta(shape, shape)}
-        if self.family.correlates:
+        if self.family.adds_noise:
             partials["partial_v"] = dist.Beta(shape, shape)
         return named | partials
 
@@ -86,7 +86,7 @@ class CoupledTrust(TrustModel):
         S = T @ _kron(np.eye(K), theta["Delta_w"]) @ xp.swapaxes(T, 1, 2)
         S = S + self.x0["x0_sd"] ** 2 * start @ xp.swapaxes(start, 1, 2)
         m, noise = (self.x0["x0_mean"] * start.sum(2))[:, None], theta["Delta_v"]
-        if not self.family.correlates:
+        if not self.family.adds_noise:
             sd = xp.sqrt(xp.diagonal(noise, axis1=1, axis2=2))
             return Signal(m, T[:, None], S[:, None], xp.tile(sd[:, None], (1, 1, K)))
         eps = 0.5 * xp.linalg.eigvalsh(noise)[:, 0]

@@ -145,7 +145,7 @@ class TrustModel(Summary, ABC):
         Rates recorded to a resolution have independent noise of that sd too: without it the density
         of rates that fit perfectly, constant ones among them, would grow without bound.
         """
-        if self.family.rounds:
+        if self.family.adds_noise:
             noise = values["delta_v"]
             noise = namespace(noise).hypot(noise, resolution)
             values = {**values, "delta_v": noise}

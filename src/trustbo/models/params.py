@@ -92,9 +92,7 @@ class ParameterDraws(Summary):
     def of_places(self, bounds: np.ndarray) -> np.ndarray:
         """Effect of each bound, that of the cell entered included; shape (..., bound, effect).
 
-        Args:
-            bounds: Move, row and column of each bound (bound, 3), moves as in `MOVES`; the
-                effect is 0 where the move is negative.
+        Bounds (bound, 3) are moves, rows and columns; the effect is 0 where the move is negative.
         """
         moves, rows, cols = np.asarray(bounds).T
         total: Any = 0.0

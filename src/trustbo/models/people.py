@@ -125,25 +125,15 @@ class HumanTrust(PooledTrust):
         return parts * self.effect.sds(theta)[:, None, None]
 
     def persons(
-        self,
-        theta: Theta,
-        trust: np.ndarray,
-        mean: np.ndarray,
-        slots: Slots,
-        rng: np.random.Generator,
+        self, theta: Theta, off: np.ndarray, slots: Slots, rng: np.random.Generator
     ) -> np.ndarray:
         """Draws of the parts of persons (draw, mission, part) given their trust.
 
-        Args:
-            theta: Hyperparameters, each (draw,).
-            trust: Trust (draw, mission, row).
-            mean: Its mean given the columns, of that shape.
-            slots: Reports.
-            rng: Random number generator.
+        `off` (draw, mission, row) is trust less its mean given the columns.
         """
         W, S = self.parts(theta, slots), self.signal(theta, slots, self.layout(slots)).S
         gain = np.swapaxes(np.linalg.solve(S + 1e-12 * np.eye(S.shape[-1]), W), 2, 3)
-        center = np.einsum("djpr,djr->djp", gain, trust - mean)
+        center = np.einsum("djpr,djr->djp", gain, off)
         cov = np.eye(len(PARTS)) - gain @ W
         values, vectors = np.linalg.eigh(cov)
         white = np.sqrt(np.maximum(values, 0.0)) * rng.standard_normal(values.shape)

@@ -16,18 +16,15 @@ def model_to_record(model: TrustModel) -> dict[str, Any]:
 
     `by_feature` states that the priors depend on the features' names.
     """
-    return {
+    effects: Any = model.effects
+    record = {
         "class": type(model).__name__,
         **model.options(),
         "priors": model.priors.describe(),
-        "effects": [{"kind": type(e).__name__, **_as_json(e)} for e in model.effects],
+        "effects": [{"kind": type(effect).__name__, **asdict(effect)} for effect in effects],
         "by_feature": model.priors is Priors.default(model.observation),
     }
-
-
-def _as_json(effect: Any) -> dict[str, Any]:
-    """Fields by name, as JSON has them: a tuple is a list."""
-    return json.loads(json.dumps(asdict(effect)))
+    return json.loads(json.dumps(record))  # a tuple is a list
 
 
 def model_from_record(

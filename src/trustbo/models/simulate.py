@@ -41,7 +41,7 @@ def _noise(params: Params, family: Family, n: int) -> tuple[np.ndarray, np.ndarr
     if not isinstance(params, CoupledParams):
         return params.delta_w * np.eye(n), none, np.asarray(params.delta_v)
     of_trust, Delta_v = np.linalg.cholesky(params.Delta_w), np.asarray(params.Delta_v)
-    if not family.correlates:
+    if not family.adds_noise:
         return of_trust, none, np.asarray(params.delta_v)
     own = 0.5 * np.linalg.eigvalsh(Delta_v)[0]
     return of_trust, np.linalg.cholesky(Delta_v - own * np.eye(n)), np.sqrt(own)

@@ -56,13 +56,8 @@ def has_places(missions: Sequence[Mission]) -> bool:
 def visited(bounds: np.ndarray, shape: tuple[int, int] | None = None) -> Visited:
     """Index the places of bounds (mission, bound, 3), see `bounds_of`.
 
-    Args:
-        bounds: Move, row and column of each bound; a negative move is padding.
-        shape: Rows and columns of the grid; by default up to the last ones visited.
-
-    Raises:
-        TrustboError: A cell lies outside the grid, or there are too many bounds for one dense
-            factor.
+    `shape` is that of the grid, by default up to the last row and column visited. TrustboError: a
+    cell lies outside it, or there are too many bounds for one dense factor.
     """
     there = bounds[..., 0] >= 0
     found, index_of = np.unique(bounds[there], axis=0, return_inverse=True)

@@ -25,8 +25,7 @@ class BetaBinomial(Family):
 
     name: ClassVar[str] = "beta_binomial"
     needs_ticks: ClassVar[bool] = True
-    rounds: ClassVar[bool] = False
-    correlates: ClassVar[bool] = False
+    adds_noise: ClassVar[bool] = False
     expected_rate: ClassVar[str] = "logistic"
     line_of_sight: ClassVar[tuple[float, float]] = 5.0, 0.5  # the logit's line by .5 and .92
 

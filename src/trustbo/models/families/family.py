@@ -33,10 +33,9 @@ class Family(ABC):
     """Whether rates are the signal plus normal noise, so that everything integrates out exactly."""
     needs_ticks: ClassVar[bool] = False
     """Whether each measured rate needs its number of ticks."""
-    rounds: ClassVar[bool] = True
-    """Whether delta_v is the sd of a rate, recorded to the resolution of its ticks."""
-    correlates: ClassVar[bool] = True
-    """Whether observation noise may be correlated between robots."""
+    adds_noise: ClassVar[bool] = True
+    """Whether a rate is the signal plus noise of sd delta_v, to which the resolution of its ticks
+    adds, and which may be correlated between robots."""
     expected_rate: ClassVar[str] = "identity"
     """Form of `mean_rate` in compiled planning: `"identity"` (trust itself), `"logistic"`, or
     `"clipped"` (of a normal with sd delta_v, cut to [0, 1])."""

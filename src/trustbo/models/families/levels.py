@@ -23,8 +23,7 @@ class Levels(Family):
 
     levels: int = 7
     name: ClassVar[str] = "levels"
-    rounds: ClassVar[bool] = False
-    correlates: ClassVar[bool] = False
+    adds_noise: ClassVar[bool] = False
 
     def cuts(self, y: Array) -> tuple[Array, Array]:
         """Cut points below and above reports."""

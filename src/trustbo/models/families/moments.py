@@ -80,11 +80,7 @@ def match_by_nodes(
 ) -> Moments:
     """Moments of N(f; m, v) times a term, by Gauss-Hermite nodes around the mode.
 
-    Args:
-        log_prob: Log of the term at nodes (..., node).
-        start: Start of the search for the mode, of the shape of the arrays.
-        m: Means.
-        v: Variances.
+    `log_prob` is the log of the term at nodes (..., node); the mode is searched from `start`.
     """
     x, q = np.array(start), 1.0 / v
     for _ in range(3):
