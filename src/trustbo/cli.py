@@ -1,6 +1,6 @@
 """The command line: `trustbo demo`, `info`, `run`, `resume` and `export`.
 
-Only the command that runs imports what it needs, so that `--help` takes a tenth of a second.
+Each command imports what it needs only when it runs, so that `--help` takes a tenth of a second.
 """
 
 import argparse
@@ -22,7 +22,7 @@ POLICIES = ("greedy", "optimistic", "thompson", "ucb", "random")
 OBJECTIVES = ("lost_contact", "terminal", "mean")
 FORMATS = ("geotiff", "geojson", "csv", "nav2")
 BAD_INPUT, REFUSED, INTERRUPTED = 2, 3, 130
-EPILOG = "exit codes: 0 done; 2 bad input; 3 the posterior was refused; 130 interrupted"
+EPILOG = "exit codes: 0 done; 2 bad input; 3 the posterior failed its diagnostics; 130 interrupted"
 PLACE = "ROW,COL, with row 0 in the north; or x=...,y=... in metres of the CRS; or lon=...,lat=..."
 _COLUMNS = ("status", "contact_rate", "objective", "k_hat", "r_hat", "path_changed")
 """Columns of the table that a finished campaign prints."""
@@ -32,7 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     """Run a command and exit; an error is one line on the standard error stream.
 
     Args:
-        arguments: Words after `trustbo`; by default those of this process.
+        arguments: Words after `trustbo`; by default the arguments of this process.
     """
     args = parser().parse_args(arguments)
     folder = getattr(args, "folder", getattr(args, "out", None))
@@ -58,7 +58,7 @@ def _exit(message: str, code: int) -> NoReturn:
 
 
 def parser() -> argparse.ArgumentParser:
-    """Parser of all commands; its `run` is the function of the parsed arguments."""
+    """Parser of all commands; `run` of the parsed arguments is the function that executes them."""
     top = argparse.ArgumentParser(
         prog="trustbo",
         description="Learn how trustworthy robots are on a terrain, and plan their best path.",
@@ -83,28 +83,28 @@ def parser() -> argparse.ArgumentParser:
     add("dem", type=Path, metavar="DEM", help="heights of the ground, such as a GeoTIFF")
     add("dsm", type=Path, nargs="?", metavar="DSM", help="heights of the canopy")
     _add_grid(add)
-    add("--out", type=Path, default=Path("grid.png"), metavar="FILE", help="picture of the grid")
+    add("--out", type=Path, default=Path("grid.png"), metavar="FILE", help="image of the grid")
 
     example = "--dem dem.tif --dsm dsm.tif --start 9,0 --goal 0,9"
-    add = command(run, "Run a simulated campaign on your terrain.", example)
+    add = command(run, "Run a simulated campaign on a given terrain.", example)
     add("--dem", type=Path, required=True, metavar="FILE", help="heights of the ground")
     add("--dsm", type=Path, metavar="FILE", help="heights of the canopy (default: no canopy)")
     add("--start", type=_place, required=True, metavar="PLACE", help=PLACE)
-    add("--goal", type=_place, required=True, metavar="PLACE", help="likewise")
+    add("--goal", type=_place, required=True, metavar="PLACE", help="as for --start")
     _add_grid(add)
-    add("--robots", type=_count, default=3, metavar="N", help="robots that overwatch (default 3)")
-    add("--max-slope", type=float, default=45.0, metavar="DEG", help="of robots (default 45)")
+    add("--robots", type=_count, default=3, metavar="N", help="overwatching robots (default 3)")
+    add("--max-slope", type=float, default=45.0, metavar="DEG", help="slope limit (default 45)")
     add("--policy", choices=POLICIES, help="how the next path is chosen (default greedy)")
     add("--objective", choices=OBJECTIVES, help="what a path optimises (default lost_contact)")
-    add("--paper", action="store_true", help="model, awareness and policy of the paper as printed")
+    add("--paper", action="store_true", help="use the model, awareness and policy of the paper")
     _add_stop(add)
     _add_campaign(add, "out")
 
     add = command(resume, "Continue a campaign, or add missions.", "out --missions 12")
     add("folder", type=Path, metavar="DIR", help="folder of the campaign")
-    add("--missions", type=_count, metavar="N", help="number of missions in all")
+    add("--missions", type=_count, metavar="N", help="total number of missions")
     _add_stop(add)
-    add("--quiet", "-q", action="store_true", help="show no progress bar and no table")
+    add("--quiet", "-q", action="store_true", help="hide progress bar and table")
 
     add = command(export, "Write a result for GIS, Nav2 or tables.", "out --format nav2")
     add("folder", type=Path, metavar="DIR", help="folder of the campaign")
@@ -114,41 +114,47 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _add_campaign(add: Any, folder: str) -> None:
-    """Flags of a campaign that is begun."""
-    add("--missions", type=_count, default=8, metavar="N", help="missions in all (default 8)")
+    """Add the flags of commands that start a campaign."""
+    add(
+        "--missions",
+        type=_count,
+        default=8,
+        metavar="N",
+        help="total number of missions (default 8)",
+    )
     add("--seed", type=int, default=0, metavar="N", help="random seed (default 0)")
     add("--out", type=Path, default=Path(folder), metavar="DIR", help=f"(default {folder})")
     add("--overwrite", action="store_true", help="replace the campaign in that folder")
-    add("--quiet", "-q", action="store_true", help="show no progress bar and no table")
+    add("--quiet", "-q", action="store_true", help="hide progress bar and table")
 
 
 def _add_grid(add: Any) -> None:
-    """Flags of a planning grid."""
+    """Add the flags of the planning grid."""
     add("--shape", type=_shape, default=(10, 10), metavar="ROWS,COLS", help="(default 10,10)")
     add("--resolution", type=float, metavar="M", help="average the rasters to pixels of M m")
 
 
 def _add_stop(add: Any) -> None:
-    """Flag of the stopping rule."""
+    """Add the flag of the stopping rule."""
     text = "stop when the path is within this share of the best with probability 0.9"
     add("--stop-regret", type=float, metavar="SHARE", help=text)
 
 
 def _count(text: str) -> int:
-    """Whole number from 1 on."""
+    """Parse a whole number of at least 1."""
     if not text.isdecimal() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"must be a whole number from 1 on; got {text!r}")
     return int(text)
 
 
 def _shape(text: str) -> tuple[int, int]:
-    """Two whole numbers, such as "10,12"."""
+    """Parse two whole numbers, such as "10,12"."""
     rows, cols = map(int, text.split(","))
     return rows, cols
 
 
 def _place(text: str) -> tuple[int, int] | dict[str, float]:
-    """Cell, such as "9,0"; or a position, such as "x=1748000,y=5427000"."""
+    """Parse a cell, such as "9,0", or a position, such as "x=1748000,y=5427000"."""
     if "=" not in text:
         return _shape(text)
     pairs = (part.split("=") for part in text.split(","))
@@ -179,7 +185,7 @@ def info(args: argparse.Namespace) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Run a simulated campaign on a terrain of the user."""
+    """Run a simulated campaign on the user's terrain."""
     from math import radians
 
     import trustbo as tb
@@ -200,7 +206,7 @@ def run(args: argparse.Namespace) -> None:
 
 
 def _run(args: argparse.Namespace, workspace: "Workspace", **options: Any) -> None:
-    """Run a campaign in a folder, and write its report."""
+    """Run a campaign in a folder and write its report."""
     import trustbo as tb
 
     result = tb.iterate(
@@ -211,14 +217,14 @@ def _run(args: argparse.Namespace, workspace: "Workspace", **options: Any) -> No
 
 
 def _stop(args: argparse.Namespace) -> Any:
-    """Stopping rule of the flag `--stop-regret`; None without it."""
+    """Stopping rule given by the flag `--stop-regret`; None without the flag."""
     from trustbo import RegretBound
 
     return None if args.stop_regret is None else RegretBound(eps=args.stop_regret)
 
 
 def resume(args: argparse.Namespace) -> None:
-    """Continue the campaign of a folder, and write its report again."""
+    """Continue the campaign in a folder and update its report."""
     import trustbo as tb
 
     result = tb.resume(

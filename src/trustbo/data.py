@@ -31,25 +31,26 @@ class Bound(Summary):
 
     Attributes:
         cell: Planning cell entered, (row, col); `NOWHERE` in a log without a map.
-        awareness: Situational awareness, shape (robot, feature), in [0, 1], or of any finite values
-            in a log without a map; NaN where not measured.
-        contact_rate: Share of the running time in contact, shape (robot,); NaN where not measured.
+        awareness: Situational awareness, shape (robot, feature), in [0, 1], or any finite values in
+            a log without a map; NaN where not measured.
+        contact_rate: Fraction of the running time in contact, shape (robot,); NaN where not
+            measured.
         duration: Running time of the bound, shape (robot,), s; NaN where not recorded.
         status: Outcome of the bound, `"ok"` or the reason that ended the mission.
         t0: Start of the bound, s since the mission's start.
         poses: Shape (tick, 1 + robot, 3), the lead first: x and y in CRS metres, heading in rad
             from east, anticlockwise. None where not recorded.
         contact: Contact of each robot at each tick, shape (tick, robot). None where not recorded.
-        n_ticks: Number of ticks, shape (robot,), of which `contact_rate` is the share with contact;
-            NaN where not recorded.
-        states: Motion and sensing of each robot, shape (tick, robot, state): share of its speed on
-            level ground, pitch and roll (rad), mean range of returns (m), share of clear beams.
-            None where not recorded.
+        n_ticks: Number of ticks over which `contact_rate` is averaged, shape (robot,); NaN where
+            not recorded.
+        states: Motion and sensing of each robot, shape (tick, robot, state): speed as a fraction of
+            its speed on level ground, pitch and roll (rad), mean range of returns (m), fraction of
+            clear beams. None where not recorded.
 
     Raises:
         TrustboError: The arrays disagree on the number of robots; a value outside [0, 1], a
-            duration that is not positive, an n_ticks below 1, a rate that is not a share of the
-            ticks, or an unknown status.
+            duration that is not positive, an n_ticks below 1, a rate that is not a whole number of
+            ticks divided by n_ticks, or an unknown status.
     """
 
     cell: Cell
@@ -111,13 +112,13 @@ class Mission(Summary):
 
     Attributes:
         path: Planned cells, start first, each (row, col); empty in a log without a map.
-        bounds: Bounds that were run; bound k enters `path[k]`. There are fewer than planned if the
-            mission ended early; the last one then has the status of the mission.
-        status: `"ok"` if the mission reached the goal, else the reason that it did not.
+        bounds: Bounds that were run; bound k enters `path[k]`. If the mission ended early, there
+            are fewer bounds than planned, and the last one has the status of the mission.
+        status: `"ok"` if the mission reached the goal, else the reason why it did not.
         features: Names of the features, in the order of the last axis of `awareness`.
         robots: Names of the overwatching robots.
-        scale: Scale of the reports of a person that `contact_rate` holds in place of contact, such
-            as `"likert7"`, in missions of `logs.read_reports`; empty in all others.
+        scale: Scale of a person's trust reports, such as `"likert7"`, which `contact_rate` then
+            contains instead of contact (see `logs.read_reports`); empty in all other missions.
 
     Raises:
         TrustboError: Bounds that do not fit the path, or disagree on robots or features; an unknown
@@ -148,7 +149,7 @@ class Mission(Summary):
             object.__setattr__(self, name, labels)
 
     def _require_path(self) -> None:
-        """Refuse bounds that do not fit the path, or enter cells where there is none."""
+        """Refuse bounds that do not match the path, or that enter cells when there is no path."""
         n_run, n_planned = len(self.bounds), len(self.path) - 1
         if not n_run or (self.path and n_run > n_planned):
             raise TrustboError(
@@ -167,7 +168,7 @@ class Mission(Summary):
 
     @property
     def has_map(self) -> bool:
-        """Whether its bounds enter cells of a map."""
+        """Whether the bounds enter cells of a map."""
         return bool(self.path)
 
     def _rows(self) -> Rows:
@@ -209,20 +210,22 @@ class Mission(Summary):
     ) -> Self:
         """Make a mission from the arrays of a log.
 
-        A mission that ended early has fewer bounds than planned, and its status:
-        `from_arrays(path, z, y, status="stuck")`. A bound that was not measured is a row of NaN.
+        A mission that ended early has fewer bounds than planned, and a status: `from_arrays(path,
+        z, y, status="stuck")`. A bound that was not measured is a row of NaN.
 
         Args:
-            path: Planned cells, start first; None for a log without a map, whose missions have
-                neither plans nor effects of places.
-            awareness: Shape (bound, robot, feature), in [0, 1], without a map of any finite values.
+            path: Planned cells, start first; None for a log without a map, whose missions have no
+                plans and no place effects.
+            awareness: Shape (bound, robot, feature), in [0, 1]; any finite values in a log without
+                a map.
             contact_rate: Shape (bound, robot), in [0, 1].
             duration: Shape (bound, robot) or (bound,), s; None where not recorded.
             status: Outcome of the mission.
-            n_ticks: Number of ticks, shape (bound, robot) or (bound,), of which `contact_rate` is
-                the share with contact; None where not recorded.
+            n_ticks: Number of ticks over which `contact_rate` is averaged, shape (bound, robot) or
+                (bound,); None where not recorded.
             features: Names of the features; by default traversability, visibility, z3, ...; a
-                workspace with as many features gives z3, ... their names, see `Workspace.in_order`.
+                workspace with the same number of features renames z3, ... to its own names, see
+                `Workspace.in_order`.
             robots: Names of the robots; by default r1, r2, ...
 
         Raises:
@@ -262,10 +265,10 @@ class Mission(Summary):
         Args:
             robots: Names of the robots.
             features: Names of the features.
-            unmeasured: Features that the mission may lack; their values are then NaN.
+            unmeasured: Features that may be missing from the mission; their values are then NaN.
 
         Raises:
-            TrustboError: It has other robots or features.
+            TrustboError: The mission has other robots or features.
         """
         names = {"robots": tuple(robots), "features": tuple(features)}
         if names == {"robots": self.robots, "features": self.features}:
@@ -319,9 +322,9 @@ class Mission(Summary):
 
 
 def levels_of(scale: object) -> int:
-    """Number of levels of a scale, 0 of "unit".
+    """Number of levels of a scale; 0 for "unit".
 
-    TrustboError: the name is none of "unit", "likert7" and "ordinal7", with any number from 2.
+    TrustboError: the name is not "unit", "likertN" or "ordinalN" with a number N of at least 2.
     """
     found = re.fullmatch(r"(likert|ordinal)(\d*)", scale) if isinstance(scale, str) else None
     if scale != "unit" and found is None:
@@ -333,7 +336,7 @@ def levels_of(scale: object) -> int:
 
 
 def require_map(what: str, missions: Iterable[Mission]) -> None:
-    """Refuse missions of a log without a map: TrustboError."""
+    """Raise TrustboError for missions of a log without a map."""
     for j, mission in enumerate(missions):
         if not mission.has_map:
             raise TrustboError(
@@ -353,12 +356,12 @@ def is_line_of_sight(feature: str) -> bool:
 
 
 def default_features(n_features: int) -> tuple[str, ...]:
-    """Names of the first features: traversability, visibility, z3, z4, ..."""
+    """Default names of features: traversability, visibility, z3, z4, ..."""
     return (*FEATURES, *(f"z{m + 1}" for m in range(2, n_features)))[:n_features]
 
 
 def require_shares(rate: np.ndarray, ticks: np.ndarray) -> None:
-    """Refuse ticks that are not whole, and rates that are not a share of them; both (robot,)."""
+    """Refuse ticks that are not whole and rates that are no multiples of 1 / ticks, (robot,)."""
     if ticks.shape != rate.shape:
         raise TrustboError(f"n_ticks of a bound must be {rate.shape}; got shape {ticks.shape}.")
     for i in np.flatnonzero((ticks < 1.0) | (ticks != np.round(ticks)) & ~np.isnan(ticks)):
@@ -371,7 +374,7 @@ def require_shares(rate: np.ndarray, ticks: np.ndarray) -> None:
 
 
 def as_array(what: str, values: ArrayLike) -> np.ndarray:
-    """Return an array of floats; TrustboError if these are no numbers."""
+    """Return an array of floats; TrustboError if the values are not numbers."""
     try:
         return np.asarray(values, dtype=float)
     except (TypeError, ValueError):
@@ -379,7 +382,7 @@ def as_array(what: str, values: ArrayLike) -> np.ndarray:
 
 
 def as_names(what: str, given: Iterable[str]) -> tuple[str, ...]:
-    """Names as a tuple; TrustboError where one is no text, or repeated."""
+    """Names as a tuple; TrustboError if one is not a string or is repeated."""
     listed = isinstance(given, Iterable) and not isinstance(given, str)
     names = tuple(given) if listed else ()
     if not listed or not all(isinstance(name, str) for name in names):
@@ -390,7 +393,7 @@ def as_names(what: str, given: Iterable[str]) -> tuple[str, ...]:
 
 
 def require_unit_interval(what: str, values: np.ndarray) -> None:
-    """Refuse values outside [0, 1], except NaN: TrustboError."""
+    """Raise TrustboError for values outside [0, 1]; NaN is allowed."""
     bad = (values < 0.0) | (values > 1.0)
     if bad.any():
         index = ", ".join(str(i) for i in np.argwhere(bad)[0])
@@ -401,10 +404,10 @@ def require_unit_interval(what: str, values: np.ndarray) -> None:
 
 
 def _labelled(what: str, values: Any, dims: Sequence[str], **names: Sequence[str]) -> Any:
-    """Values in the order of dims, and of the names of some, where these are labelled.
+    """Labelled values, reordered to the given dims and to the given names along some of them.
 
-    Labels are the dims and coordinates of a DataArray, or the columns of a DataFrame that are
-    texts, of the last dim. TrustboError: labels that are not these names.
+    Labels are the dims and coordinates of a DataArray, or the column names of a DataFrame for the
+    last dim, if they are strings. TrustboError: the labels are not the given names.
     """
     if isinstance(values, pd.DataFrame) and all(isinstance(name, str) for name in values):
         values = xr.DataArray(values.to_numpy(), dims=dims, coords={dims[-1]: list(values)})
@@ -422,7 +425,7 @@ def _labelled(what: str, values: Any, dims: Sequence[str], **names: Sequence[str
 
 
 def _per_robot(what: str, values: np.ndarray, rates: np.ndarray) -> np.ndarray:
-    """Values of the shape of the rates, (bound, robot), of such, or of one for each bound."""
+    """Values broadcast to shape (bound, robot); they may have one value for each bound."""
     try:
         return np.broadcast_to(values[:, None] if values.ndim == 1 else values, rates.shape)
     except ValueError:

@@ -53,12 +53,12 @@ def joined(names: Sequence[str]) -> str:
 
 
 def progress_bar(show: bool, **options: Any) -> tqdm:
-    """Bar in a terminal or a notebook, hidden unless `show`; `options` are those of tqdm."""
+    """Bar in a terminal or a notebook, hidden unless `show`; `options` are passed to tqdm."""
     return tqdm(disable=not show, **options)
 
 
 def say(line: str) -> None:
-    """Print a line above the bars."""
+    """Print a line above the progress bars."""
     tqdm.write(line, file=sys.stderr)
 
 

@@ -11,7 +11,7 @@ class TrustboError(ValueError):
 
 
 class PosteriorError(TrustboError):
-    """A posterior with diagnostics beyond their limits.
+    """A posterior whose diagnostics exceed their limits.
 
     Attributes:
         posterior: Refused posterior (ArviZ DataTree), for inspection.
@@ -24,7 +24,7 @@ class PosteriorError(TrustboError):
 
 
 def require_choice(what: str, value: object, choices: Iterable[str]) -> str:
-    """Return `value` if it is among `choices`, which the TrustboError lists if not."""
+    """Return `value` if it is among `choices`, else raise a TrustboError that lists them."""
     choices = tuple(choices)
     if not isinstance(value, str) or value not in choices:
         raise TrustboError(f"unknown {what} {value!r}; choose one of {', '.join(choices)}.")
@@ -32,7 +32,7 @@ def require_choice(what: str, value: object, choices: Iterable[str]) -> str:
 
 
 def require_whole(what: str, value: object, minimum: int) -> int:
-    """Return `value` as an int; TrustboError unless a whole number of at least `minimum`."""
+    """Return `value` as an int; TrustboError unless it is a whole number of at least `minimum`."""
     try:
         number = operator.index(value)  # pyright: ignore[reportArgumentType]
     except TypeError:
@@ -55,14 +55,14 @@ def require_positive(what: str, value: Any, *, or_zero: bool = False) -> float:
 
 
 def require_kind(what: str, value: Any, kind: Any, remedy: str) -> Any:
-    """Return `value` if it is of a class, or one of a union; TrustboError with a remedy if not."""
+    """Return `value` if it is an instance of `kind`, else raise TrustboError with a remedy."""
     if not isinstance(value, kind):
         raise TrustboError(f"{what}: got {type(value).__name__} {one_line(value)}; {remedy}.")
     return value
 
 
 def one_line(value: object) -> str:
-    """Show a value in a message, which has one line: the first 60 characters of its repr."""
+    """Format a value for a one-line message: the first 60 characters of its repr."""
     return f"{' '.join(repr(value).split()):.60}"
 
 

@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all, and errors for files that cannot be read."""
+"""Atomic writing of files, and errors for files that cannot be read."""
 
 import json
 import os
@@ -24,7 +24,7 @@ def write_file(path: FilePath, write: Callable[[Path], object]) -> None:
         write: Function that writes to a given path.
 
     Raises:
-        TrustboError: The system refuses to write; a file of that name is unchanged.
+        TrustboError: The file cannot be written; an existing file of that name is unchanged.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.stem}.tmp{path.suffix}")
@@ -39,7 +39,7 @@ def write_file(path: FilePath, write: Callable[[Path], object]) -> None:
 
 
 def read_file(path: FilePath) -> bytes:
-    """Read a file whole; TrustboError if it is missing or cannot be read."""
+    """Read a whole file; TrustboError if it is missing or cannot be read."""
     try:
         return Path(path).read_bytes()
     except FileNotFoundError:
@@ -96,7 +96,7 @@ def to_json(record: object) -> str:
 
 
 def require_suffix(path: FilePath, *suffixes: str) -> Path:
-    """Return a file to write; TrustboError unless it ends in one of these, in lower case."""
+    """Return the path of a file to write; TrustboError unless it ends in one of these suffixes."""
     file = Path(path)
     if file.suffix.lower() not in suffixes:
         raise TrustboError(f"{str(file)!r} must end in {' or '.join(suffixes)}.")

@@ -3,9 +3,9 @@
     >>> workspace = tb.Workspace.from_terrain(terrain, **tb.paper.WORKSPACE)
     >>> result = tb.iterate(workspace, start, goal, **tb.paper.CAMPAIGN)
 
-Of the paper are the model, the objective, the policy, the first path and the sampler. Not of it are
-the prior of trust before the first bound, which it does not give, and the integration of trust,
-which leaves the posterior unchanged.
+The model, the objective, the policy, the first path and the sampler are those of the paper. Two
+things differ: the prior of trust before the first bound, which the paper does not specify, and
+latent trust is integrated out, which leaves the posterior unchanged.
 """
 
 from collections.abc import Mapping

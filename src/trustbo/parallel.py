@@ -1,4 +1,4 @@
-"""Work distributed over cores by threads: compiled code releases the GIL."""
+"""Parallel work in threads, which use all cores because compiled code releases the GIL."""
 
 import os
 import threading
@@ -23,15 +23,16 @@ They are not cached on disk; their compiled callers are.
 
 
 def plain(values: np.ndarray) -> np.ndarray:
-    """Contiguous array that may be written to, a copy if need be.
+    """Contiguous, writable array; a copy if necessary.
 
-    Kernels are compiled for each layout of their arguments, which takes seconds: one suffices.
+    Kernels are compiled for each memory layout of their arguments, which takes seconds, so all
+    arguments have the same layout.
     """
     return np.require(values, requirements=["C", "W"])
 
 
 def over_rows(work: Callable[[int, int], None], n_rows: int) -> None:
-    """Call `work(first, last)` on blocks of rows, on all cores unless this is a worker already."""
+    """Call `work(first, last)` on blocks of rows, on all cores unless called in a worker thread."""
     blocks = [(first, min(first + _BLOCK, n_rows)) for first in range(0, n_rows, _BLOCK)]
     work(0, 0)  # compiles in one thread
     if len(blocks) == 1 or getattr(_here, "is_worker", False):
@@ -62,9 +63,9 @@ def in_order[T, R](work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
 
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
-    """Keep BLAS to one thread: with more, matrices of some 20 rows take 20 times as long.
+    """Limit BLAS to one thread: with more, matrices of about 20 rows take 20 times as long.
 
-    A decorator too.
+    Also usable as a decorator.
     """
     with _blas().limit(limits=1, user_api="blas"):
         yield
@@ -72,10 +73,10 @@ def one_blas_thread() -> Iterator[None]:
 
 @cache
 def _blas() -> ThreadpoolController:
-    """Loaded BLAS libraries: the search for them takes a fifth as long as exact sampling."""
+    """Loaded BLAS libraries; cached, as the search takes a fifth of the time of exact sampling."""
     return ThreadpoolController()
 
 
 def n_cores() -> int:
-    """Number of cores that this process may use, which the machine may exceed."""
+    """Number of cores that this process may use, which may be fewer than the machine has."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,4 +1,4 @@
-"""Report of a result: one HTML page with its figures, tables and diagnostics."""
+"""HTML report of a result, with its figures, tables and diagnostics."""
 
 import base64
 import io
@@ -46,17 +46,17 @@ td, th {{ padding: .2em .7em; text-align: right; border: 0; border-bottom: 1px s
 
 
 def write_report(path: FilePath, result: Result) -> None:
-    """Write a result as one HTML page that needs no other file.
+    """Write a result as one self-contained HTML page.
 
-    The page begins with the recommended path and what to expect on it; then come the trust map,
-    the missions, what is uncertain, and the diagnostics and settings.
+    The page begins with the recommended path and its predicted contact and risk, followed by the
+    trust map, the missions, the uncertainties, and the diagnostics and settings.
 
     Args:
         path: File to write.
         result: Result of a campaign with a posterior.
 
     Raises:
-        TrustboError: Nothing could be learned yet, or the file cannot be written.
+        TrustboError: There is no posterior yet, or the file cannot be written.
     """
     plan, body = result.plan, []
     body += [_facts(result), *_path(plan), *_trust(result), *_missions(result)]
@@ -67,7 +67,7 @@ def write_report(path: FilePath, result: Result) -> None:
 
 
 def _facts(result: Result) -> str:
-    """Table of what decides whether to take the path."""
+    """Table of the facts that decide whether to follow the path."""
     plan, trust = result.plan, np.minimum(result.plan.trust, 1.0).mean(1)
     worst = int(np.argmin(trust))
     cells = " → ".join(f"{row},{col}" for row, col in plan.path)
@@ -90,7 +90,7 @@ def _facts(result: Result) -> str:
 
 
 def _path(plan: Plan) -> list[str]:
-    """Recommended path on the terrain with posts, and its bounds."""
+    """Recommended path with its posts on the terrain, and its bounds."""
     content = [_heading("Recommended path")]
     if plan.stops is not None:
         weakest = sorted((np.argsort(plan.trust.mean(1))[:_SHOWN] + 1).tolist())
@@ -219,7 +219,7 @@ def _table(frame: pd.DataFrame) -> str:
 
 
 def _image(draw: Callable[[], Any], alt: str) -> str:
-    """Draw a figure and return it as an image of the page."""
+    """Draw a figure and return it as an image for the page."""
     with plt.style.context("default"):
         figure = np.ravel(draw())[0].get_figure(root=True)
         file = io.BytesIO()

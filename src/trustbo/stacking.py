@@ -1,4 +1,4 @@
-"""Stacking of missions of any length into one batch of arrays."""
+"""Stack missions of different lengths into one batch of arrays."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -11,7 +11,7 @@ from trustbo.errors import TrustboError, one_line
 
 
 class MissionBatch(NamedTuple):
-    """Missions stacked, and padded to the longest by bounds whose rates were not measured."""
+    """Stacked missions, padded to the longest one with bounds whose rates were not measured."""
 
     awareness: np.ndarray
     """Shape (mission, bound, robot, feature); 0 in the padding."""
@@ -22,10 +22,10 @@ class MissionBatch(NamedTuple):
 
 
 def stack_missions(missions: Sequence[Mission]) -> MissionBatch:
-    """Stack missions of any length, of the same robots and features, into one batch.
+    """Stack missions with the same robots and features, of any length, into one batch.
 
-    TrustboError: no missions, they disagree on robots or features, or an awareness value is NaN;
-    only contact rates may be missing.
+    TrustboError: there are no missions, they disagree on robots or features, or an awareness value
+    is NaN; only contact rates may be missing.
     """
     require_same_team(missions)
     first = missions[0]
@@ -47,7 +47,7 @@ def stack_missions(missions: Sequence[Mission]) -> MissionBatch:
 
 
 def require_same_team(missions: Sequence[Mission]) -> None:
-    """Check that there are missions, all of the same robots and features: TrustboError if not."""
+    """Raise TrustboError unless there are missions, all with the same robots and features."""
     if not isinstance(missions, Sequence) or not missions:
         raise TrustboError(
             f"missions must be a list of at least one mission; got {one_line(missions)}. Write "
@@ -65,7 +65,7 @@ def require_same_team(missions: Sequence[Mission]) -> None:
 
 
 def fill_awareness(mission: Mission, awareness: np.ndarray) -> Mission:
-    """Fill awareness that a mission did not measure (NaN) with given awareness of its bounds.
+    """Replace awareness that a mission did not measure (NaN) with given values.
 
     `awareness` has shape (bound, robot, feature).
     """
@@ -75,7 +75,7 @@ def fill_awareness(mission: Mission, awareness: np.ndarray) -> Mission:
 
 
 def replace_awareness(mission: Mission, awareness: np.ndarray) -> Mission:
-    """Replace awareness of a mission by what is not NaN of that given, (bound, robot, feature)."""
+    """Replace a mission's awareness by given values, (bound, robot, feature), that are not NaN."""
     bounds = tuple(
         replace(b, awareness=np.where(np.isnan(awareness[k]), b.awareness, awareness[k]))
         for k, b in enumerate(mission.bounds)

@@ -20,16 +20,17 @@ class Robot(Summary):
         lidar_range: Distance up to which the lidar tracks another robot, m.
         vertical_fov: Half the vertical field of view, rad, measured from the plane of the body.
         sensor_height: Height of the lidar above ground, m.
-        target_height: Height of the point others aim at, m above ground; by default the lidar.
+        target_height: Height of the point that other robots aim at, m above ground; by default the
+            lidar.
         max_slope: Steepest pitch or roll that the robot withstands, rad.
-        detection: Quality of the lidar: share of unobstructed scans that detect their target, in
+        detection: Quality of the lidar: fraction of unobstructed scans that detect their target, in
             (0, 1].
         acquire: Number of successive scans that must detect a target before contact begins.
         drop: Number of successive scans that must miss it before contact ends.
 
     Raises:
-        TrustboError: A value is not positive, an angle exceeds a quarter turn, a share exceeds 1,
-            or a number of scans is not whole.
+        TrustboError: A value is not positive, an angle exceeds 90 degrees, a fraction exceeds 1, or
+            a number of scans is not whole.
     """
 
     speed: float = 2.0
@@ -80,12 +81,12 @@ class Team(Summary):
 
     Attributes:
         n_robots: Number of robots in T2; taken from `robots` where these are given.
-        robots: Members of T2; by default `n_robots` equal ones.
+        robots: Members of T2; by default `n_robots` identical robots.
         lead: Lead robot T1.
         names: Names of the members of T2; by default r1, r2, ...
 
     Raises:
-        TrustboError: There are no robots, or not one distinct name per robot.
+        TrustboError: There are no robots, or the names are not one distinct name per robot.
 
     Example:
         >>> tb.Team(robots=(tb.Robot(lidar_range=60.0), tb.Robot()), names=("spot", "husky"))
@@ -118,7 +119,7 @@ class Team(Summary):
 
     @classmethod
     def of(cls, team: Self | None) -> Self:
-        """Return the team, by default one of three equal robots; TrustboError: it is no team."""
+        """Return the team, by default three identical robots; TrustboError if it is not a team."""
         return cls() if team is None else require_kind("team", team, Team, "give Team(n_robots=3)")
 
     def _rows(self) -> Rows:

@@ -49,11 +49,11 @@ _FIT = inspect.signature(fit)
 
 
 class Campaign(Result):
-    """Result that grows: learns from missions and proposes the next path.
+    """Campaign with an ask/tell interface: learns from missions and proposes the next path.
 
     `ask` plans a path, `tell` records the mission that was run and learns from it. With a
-    `directory`, a mission is on disk before anything is learned from it, and `Campaign.load`
-    continues where the process ended, with identical results.
+    `directory`, each mission is written to disk before the posterior is updated, and
+    `Campaign.load` continues after a crash with identical results.
 
     Attributes:
         policy: Policy that chooses the paths.
@@ -89,8 +89,7 @@ class Campaign(Result):
             workspace: Workspace of the paths.
             start: First cell of every path, or a position in it; see `Workspace.locate`.
             goal: Last cell of every path, or a position in it.
-            model: Trust model; by default `models.default_model()`, with effects of places and
-                robots.
+            model: Trust model; by default `models.default_model()`, with place and robot effects.
             policy: Name in `planning.POLICIES`, or a callable `policy(rng, draws, planner)` that
                 returns a Plan.
             objective: Objective of the paths, see `planning.Planner`.
@@ -98,17 +97,17 @@ class Campaign(Result):
             seed: Seed of everything random.
             directory: Folder that is updated after each mission. It is locked until the end of
                 `with campaign:`, or of the process.
-            overwrite: Whether to remove another campaign from that folder first.
-            initial: Belief of the first plan: `"prior_mean"`, or `"prior_draw"`, one random draw of
-                the prior, as in the paper.
-            hazard: Priors of the chance that a bound fails, by default `Hazard()`.
-            planner: Further options of `planning.Planner`, such as `{"max_failure": 0.1}`. A
-                failure costs nothing until one was recorded, unless `failure_cost` is given.
+            overwrite: Whether to remove an existing campaign from that folder first.
+            initial: Parameters for the first plan: `"prior_mean"`, or `"prior_draw"` for one random
+                draw of the prior, as in the paper.
+            hazard: Priors of the probability that a bound fails, by default `Hazard()`.
+            planner: Further options of `planning.Planner`, such as `{"max_failure": 0.1}`. Failures
+                have no cost until the first one is recorded, unless `failure_cost` is given.
             fit: Further options of `trustbo.fit`, such as `{"draws": 500}`.
 
         Raises:
-            TrustboError: Start, goal or a name that does not exist; a sampler that does not suit
-                the model; or a folder that holds a campaign, without `overwrite`.
+            TrustboError: Start, goal or a name does not exist; the sampler does not support the
+                model; or the folder already contains a campaign and `overwrite` is False.
             NoPathError: The goal cannot be reached.
         """
         require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
@@ -153,7 +152,7 @@ class Campaign(Result):
             self._keep_in(directory, overwrite)
 
     def _renew(self) -> None:
-        """Forget what was computed from the missions and failures, which have changed."""
+        """Clear what was computed from the missions and failures, which have changed."""
         for name in self._computed():
             delattr(self, name)
         self._maps.clear()
@@ -174,10 +173,10 @@ class Campaign(Result):
     # --- ask and tell ---
 
     def ask(self) -> Plan:
-        """Plan the next path; the same one until `tell`, `fail` or `suggest`.
+        """Plan the next path; further calls return the same plan until `tell`, `fail` or `suggest`.
 
         Raises:
-            TrustboError: The policy returned a path that is broken, or no plan.
+            TrustboError: The policy did not return a plan, or its path is invalid.
         """
         if self.state.asked is not None:
             return self.state.asked
@@ -195,13 +194,13 @@ class Campaign(Result):
         return self._accept(plan, started)
 
     def suggest(self, path: Sequence[Cell]) -> Plan:
-        """Choose the next path by hand; `ask` then returns it.
+        """Set the next path manually; `ask` then returns it.
 
         Args:
             path: Cells from start to goal.
 
         Raises:
-            TrustboError: The path is broken, or does not lead from start to goal.
+            TrustboError: The path is invalid, or does not lead from start to goal.
         """
         started = time.perf_counter()
         return self._accept(self.planner.evaluate(path, self.belief.mean()), started)
@@ -216,7 +215,7 @@ class Campaign(Result):
         return accepted
 
     def _warn_of_risk(self, plan: Plan, given: Plan) -> None:
-        """Warn of a plan beyond `max_failure`; or, once, of one that may well fail at no cost."""
+        """Warn of a plan that exceeds `max_failure`; or, once, of a likely failure at no cost."""
         options = self.state.settings["planner"]
         if plan.infeasible and plan.p_fail is not None:
             p_fail = 1.0 - np.prod(1.0 - plan.p_fail)  # by which max_failure goes
@@ -240,21 +239,21 @@ class Campaign(Result):
     def tell(self, mission: Mission, **extra: float) -> xr.DataTree | None:
         """Record a mission and learn from it.
 
-        It is learned from with the awareness of the map. Robots and features may be in any order of
-        their names, and the path may differ from the one asked for.
+        Learning uses the awareness of the map. Robots and features may be in any order, and the
+        path may differ from the planned one.
 
         Args:
             mission: Mission as measured, whether or not it reached the goal.
-            **extra: More numbers for its row of the history, such as its regret.
+            **extra: Additional numbers for the mission's row of the history, such as its regret.
 
         Returns:
-            Posterior of the parameters given all missions that can be learned from; with a warning
-            the previous one, or None, if this mission cannot be learned from yet, or never.
+            Posterior of the parameters given all usable missions. If this mission cannot be used,
+            or not yet, the previous posterior or None is returned with a warning.
 
         Raises:
             TrustboError: Robots or features differ from the workspace's; the path leaves the grid,
-                jumps, or begins in another cell than the one asked for; or an extra has the name of
-                a column. Nothing is stored then.
+                jumps, or begins in a different cell than the plan; or an extra has the name of a
+                column. The mission is then not stored.
         """
         require_kind("mission", mission, Mission, "tell one trustbo.Mission at a time")
         mission = self.workspace.in_order(mission)
@@ -304,7 +303,7 @@ class Campaign(Result):
             self.storage.add_posterior(entry.posterior)
 
     def _continue(self) -> None:
-        """Drop the plan that was run or given up, and write the state."""
+        """Discard the plan that was run or abandoned, and write the state."""
         self.state.asked = None
         self._write()
 
@@ -313,17 +312,17 @@ class Campaign(Result):
             self.storage.write_record(self.state)
 
     def exclude(self, n: int, reason: str) -> xr.DataTree | None:
-        """Exclude a mission from learning for good; `tell` with the same mission adds it again.
+        """Exclude a mission from learning permanently; `tell` with the same mission adds it again.
 
         Args:
             n: Number of the mission, from 1.
             reason: Reason, for the record.
 
         Returns:
-            Posterior of the parameters given the others; None if there is nothing to learn from.
+            Posterior of the parameters given the other missions; None if there are none.
 
         Raises:
-            TrustboError: There is no such mission, or it is excluded already.
+            TrustboError: There is no such mission, or it is already excluded.
         """
         if not 1 <= require_whole("n", n, 1) <= (n_told := len(self.state.entries)):
             raise TrustboError(f"there is no mission {n} to exclude; {n_told} were told.")
@@ -338,21 +337,21 @@ class Campaign(Result):
     def fail(
         self, reason: str, mission: Mission | None = None, *, where: Cell | None = None
     ) -> xr.DataTree | None:
-        """Give up the mission that was asked for; the next plan takes it into account.
+        """Report that the planned mission failed; the next plan takes the failure into account.
 
         Args:
             reason: Reason, for the record. One of `hazard.CAUSES`, such as "stuck", means that a
-                bound of the plan failed, and is learned from as a hazard.
+                bound of the plan failed; the failure then updates the hazard model.
             mission: Bounds that were run, to learn from; None if there are none.
-            where: Cell that the team failed to enter, if that is known without a report.
+            where: Cell that the team failed to enter, if known and no mission is given.
 
         Returns:
-            Posterior of the parameters, if there was something to learn.
+            Posterior of the parameters; None if there are no data.
 
         Raises:
-            TrustboError: The mission is one that `tell` refuses, or reached the goal in spite of
-                a cause; a reason that is empty; or a `where` that the plan does not enter, together
-                with a mission, or for another reason.
+            TrustboError: `tell` would refuse the mission, or it reached the goal although a cause
+                is given; the reason is empty; or `where` is not on the plan, or is given with a
+                mission or a reason that is not a cause.
         """
         if not isinstance(reason, str) or not reason.strip():
             raise TrustboError(f"reason must be text, such as {CAUSES[0]!r}; got {reason!r}.")
@@ -387,13 +386,13 @@ class Campaign(Result):
         stop: Stop | Sequence[Stop] | None = None,
         progress: bool = False,
     ) -> Iterator[tuple[Plan, Mission]]:
-        """Run missions in a simulator, one for each step of this iterator.
+        """Run missions in a simulator, one per step of the returned iterator.
 
-        Nothing is run until it is iterated over: `for plan, mission in campaign.run(simulator, 8)`.
+        No mission is run before the iteration: `for plan, mission in campaign.run(simulator, 8)`.
         The arguments are those of `iterate`; `n_iterations` counts earlier missions too.
 
         Yields:
-            Plan of each mission, and the mission, learned from already.
+            Plan of each mission and the mission, after the posterior was updated with it.
 
         Raises:
             TrustboError: Bad input, before any work starts.
@@ -441,7 +440,7 @@ class Campaign(Result):
         self._write()
 
     def _reason_to_end(self, n_iterations: int, rules: Sequence[Stop]) -> str | None:
-        """Why no further mission is run: what the first rule says, by default its name; or None."""
+        """Reason given by the first stopping rule that applies, by default its name; else None."""
         n = len(self.state.entries)
         for rule in rules if n else ():
             if verdict := rule(self):
@@ -451,7 +450,7 @@ class Campaign(Result):
     # --- what is known, and the folder ---
 
     def result(self) -> Result:
-        """Collect everything learned so far, as `iterate` returns it.
+        """Return the result so far, as `iterate` does.
 
         Raises:
             TrustboError: There is no mission yet.
@@ -463,7 +462,7 @@ class Campaign(Result):
         return result
 
     def _keep_in(self, directory: FilePath, overwrite: bool) -> None:
-        """Write everything to a folder, and update it after each mission from now on."""
+        """Write the campaign to a folder, and update the folder after each later mission."""
         storage = Storage(directory, overwrite=overwrite)
         storage.begin(self.workspace, self.state)
         self.storage = storage
@@ -478,7 +477,7 @@ class Campaign(Result):
     ) -> Self:
         """Continue a campaign where it stopped, in the same folder.
 
-        A mission that was recorded and not yet learned from is learned from now.
+        A mission that was recorded but not used for learning yet is used now.
 
         Args:
             directory: Folder that was passed as `directory`, or to `Result.save`.
@@ -486,8 +485,8 @@ class Campaign(Result):
             policy: The same policy, if it is custom.
 
         Raises:
-            TrustboError: There is no campaign; another process has locked it; a custom object is
-                missing; or a file of the folder is missing or damaged.
+            TrustboError: There is no campaign, another process has locked it, a custom object is
+                missing, or a file of the folder is missing or damaged.
         """
         storage = Storage(directory, begun=True)
         try:
@@ -528,7 +527,7 @@ def _name_of(function: object) -> str:
 
 
 def _in_a_line(row: dict[str, Any]) -> str:
-    """Describe a mission in a line."""
+    """Describe a mission in one line."""
     regret = f", regret {row['regret']:.1f} %" if "regret" in row else ""
     name, label = ("r_hat", "R-hat") if "r_hat" in row else ("k_hat", "k-hat")
     learned = f"{label} {row[name]:.3f}" if row["state"] == LEARNED else row["state"]

@@ -1,4 +1,4 @@
-"""Trust of each robot while a mission is driven, and the mission that comes of it."""
+"""Online estimates of each robot's trust during a mission."""
 
 from collections.abc import Sequence
 from copy import copy
@@ -17,16 +17,16 @@ from trustbo.inference.filter import TrustForecast, TrustState
 class Follower:
     """Follows a mission of a campaign bound by bound and tick by tick.
 
-    Each bound is begun, gets its ticks and is ended; after the last one `to_mission` gives the
-    mission for `Campaign.tell`. Times are in seconds, of any one clock. Trust is that of a
-    `TrustFilter` of the campaign's last posterior, or of its prior before there is one. Awareness
-    is that of the map.
+    Call `begin`, `tick` and `end` for each bound; after the last one, `to_mission` returns the
+    mission for `Campaign.tell`. Times are in seconds, from a single clock. Trust is estimated by a
+    `TrustFilter` with the campaign's last posterior, or with the prior before the first one.
+    Awareness is taken from the map.
 
     Attributes:
-        path: Cells of the mission, start first: those entered, then those planned.
+        path: Cells of the mission, start first: first the cells entered, then the planned ones.
         bounds: Bounds that have ended.
-        trust: Trust now, shapes (robot,); while a bound runs, the trust if it ended now.
-        running: Whether a bound runs.
+        trust: Current trust, shapes (robot,); during a bound, the trust if the bound ended now.
+        running: Whether a bound is in progress.
     """
 
     def __init__(self, campaign: Campaign, path: Sequence[Cell] | None = None) -> None:
@@ -34,10 +34,10 @@ class Follower:
 
         Args:
             campaign: Campaign whose mission is followed.
-            path: Planned cells, start first; by default those of `campaign.ask()`.
+            path: Planned cells, start first; by default the path of `campaign.ask()`.
 
         Raises:
-            TrustboError: Cells that are off the grid, or no neighbours of each other.
+            TrustboError: Cells are off the grid, or successive cells are not neighbours.
         """
         cells = campaign.ask().path if path is None else path
         self.path: tuple[Cell, ...] = tuple(require_cells("path", cells))
@@ -53,17 +53,18 @@ class Follower:
 
     @property
     def rest(self) -> tuple[Cell, ...]:
-        """Cell where the lead is, or that it is entering, and the planned cells after it."""
+        """Cell where the lead is or that it is entering, and the planned cells after it."""
         return self.path[len(self.bounds) + self.running :]
 
     def begin(self, t: float, cell: Cell | None = None) -> None:
         """Begin the next bound at time `t`, into the planned cell or another one.
 
-        After another one no cell is planned, and each bound needs its cell.
+        After an unplanned cell, the remaining plan is dropped, and `cell` is required for each
+        bound.
 
         Raises:
-            TrustboError: A bound runs, the mission is over, no cell is planned, the cell is no
-                neighbour, or the time is before the last one.
+            TrustboError: A bound is in progress, the mission is over, no cell is planned, the cell
+                is not a neighbour, or the time is before the last one.
         """
         self._require(running=False, t=t)
         if self.bounds and self.bounds[-1].status != "ok":
@@ -82,7 +83,7 @@ class Follower:
         self.trust = self._filter.update_ticks(*self._counts)  # as predicted
 
     def tick(self, t: float, in_contact: ArrayLike) -> None:
-        """Add a tick to the bound that runs.
+        """Add a tick to the bound in progress.
 
         Args:
             t: Time, s.
@@ -90,8 +91,8 @@ class Follower:
                 was not measured.
 
         Raises:
-            TrustboError: No bound runs, values other than a 0, 1 or NaN for each robot, or a time
-                before the last.
+            TrustboError: No bound is in progress, a value is not 0, 1 or NaN, there is not one
+                value per robot, or the time is before the last one.
         """
         self._require(running=True, t=t)
         seen = as_array("in_contact", in_contact)
@@ -104,10 +105,11 @@ class Follower:
         self._now = t
 
     def end(self, t: float, status: str = "ok") -> None:
-        """End the bound that runs; a status other than `"ok"` ends the mission.
+        """End the bound in progress; a status other than `"ok"` ends the mission.
 
         Raises:
-            TrustboError: No bound runs, an unknown status, or a bound that takes no time.
+            TrustboError: No bound is in progress, the status is unknown, or the bound has no
+                duration.
         """
         self._require(running=True, t=t)
         contacts, ticks = self._counts
@@ -125,7 +127,7 @@ class Follower:
     def ahead(self) -> TrustForecast:
         """Predict trust and contact rates in the bounds of `rest`, shapes (bound, robot).
 
-        The bound that runs counts as if it ended now.
+        A bound in progress is treated as if it ended now.
 
         Raises:
             TrustboError: No bound is planned.
@@ -139,12 +141,13 @@ class Follower:
         return after.predict(known_along(rest, self._campaign.workspace), rest)
 
     def to_mission(self) -> Mission:
-        """Mission of the bounds that have ended, with awareness that is not measured (NaN).
+        """Mission of the completed bounds; its awareness is NaN, because it is not measured.
 
-        Its status is that of the last bound; `"aborted"` if that is `"ok"` and not at the goal.
+        Its status is the status of the last bound, or `"aborted"` if that bound is `"ok"` but did
+        not reach the goal.
 
         Raises:
-            TrustboError: A bound runs, or none was run; use `Campaign.fail` for that.
+            TrustboError: A bound is in progress, or none was run (use `Campaign.fail`).
         """
         if self.running or not self.bounds:
             state = "a bound runs: end it first" if self.running else "no bound was run"
@@ -155,7 +158,7 @@ class Follower:
         return Mission(self.path, self.bounds, status, workspace.features, workspace.team.names)
 
     def _require(self, *, running: bool, t: float) -> None:
-        """Refuse what needs another state, or a time before the last one: TrustboError."""
+        """Raise TrustboError for a call in the wrong state, or a time before the last one."""
         if running != self.running:
             raise TrustboError(
                 "no bound runs: begin one first." if running else "a bound runs: end it first."
@@ -165,7 +168,7 @@ class Follower:
 
 
 def _filter_of(campaign: Campaign) -> TrustFilter:
-    """Filter of the last posterior of a campaign, or of the prior if nothing was learned yet."""
+    """Filter with a campaign's last posterior, or with the prior if there is none yet."""
     if campaign.state.last is not None:
         return TrustFilter(campaign.state.last())
     names, n_robots = campaign.workspace.features, campaign.workspace.team.n_robots

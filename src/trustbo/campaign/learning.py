@@ -1,4 +1,4 @@
-"""From missions to what the next plan is based on: a posterior, a hazard, and a planner."""
+"""From missions to the basis of the next plan: posterior, hazard and planner."""
 
 import warnings
 from collections.abc import Mapping, Sequence
@@ -32,7 +32,7 @@ _STOPPED, _RECOVERED = 2, 0.2
 def known_along(path: Sequence[Cell], workspace: Workspace) -> np.ndarray:
     """Awareness of the map in the bounds of a path, shape (bound, robot, feature).
 
-    TrustboError: a cell is off the grid, or no neighbour of the one before.
+    TrustboError: a cell is off the grid, or is not a neighbour of the previous one.
     """
     cells = require_on_grid(path, workspace.grid.shape)
     moves_along(cells)
@@ -40,16 +40,16 @@ def known_along(path: Sequence[Cell], workspace: Workspace) -> np.ndarray:
 
 
 def as_learned(mission: Mission, workspace: Workspace) -> Mission:
-    """Mission with the awareness that it is learned from: the map's, which plans go by.
+    """Mission with the awareness used for learning: that of the map, which the planner uses too.
 
-    Weights fitted to the awareness that robots measured would be applied to that of the map, and
-    plans would be off by the difference. TrustboError: see `known_along`.
+    Weights fitted to measured awareness would be biased when the planner applies them to the map's
+    awareness. TrustboError: see `known_along`.
     """
     return replace_awareness(mission, known_along(mission.path, workspace))
 
 
 def why_never_learned(mission: Mission) -> str:
-    """Reason why nothing can ever be learned from a mission, or an empty string."""
+    """Reason why a mission can never be used for learning, or an empty string."""
     if not np.isfinite(mission.contact_rate).any():
         return "no contact rate was measured."
     if np.isnan(mission.awareness).any():
@@ -67,9 +67,9 @@ def learn(
 ) -> xr.DataTree | None:
     """Posterior of the parameters given all missions that are not excluded.
 
-    Its attribute `missions` has their numbers, from 0. A posterior that is refused is drawn again
-    with twice the draws. If that is refused too, None is returned with a warning, and the missions
-    of the state that were not learned from yet stay so.
+    Its attribute `missions` lists their indices. If the diagnostics fail, sampling is repeated with
+    twice the draws. If they fail again, None is returned with a warning, and the states of the
+    missions do not change.
     """
     waiting, numbers = state.numbers(TOLD), state.numbers(TOLD, LEARNED)
     missions = [state.entries[j].mission for j in numbers]
@@ -116,10 +116,10 @@ def learn(
 
 
 def learn_hazard(state: State, workspace: Workspace) -> xr.Dataset:
-    """Posterior of the chance that a bound fails, given all missions; see `fit_hazard`.
+    """Posterior of the probability that a bound fails, given all missions; see `fit_hazard`.
 
     A mission that was excluded because it measured no contact rate still shows where it failed. If
-    the posterior is refused, that of the missions before is returned, with a warning.
+    the diagnostics fail, the previous posterior is returned with a warning.
     """
     measured = [
         entry.measured
@@ -138,7 +138,7 @@ def learn_hazard(state: State, workspace: Workspace) -> xr.Dataset:
 
 
 def base_planner(workspace: Workspace, settings: Mapping[str, Any]) -> Planner:
-    """Planner of the settings of a campaign, before anything is known about failures."""
+    """Planner with the settings of a campaign, before any failures are known."""
     return Planner(
         workspace, settings["start"], settings["goal"], settings["objective"],
         family=settings["observation"], **settings["planner"],
@@ -146,14 +146,14 @@ def base_planner(workspace: Workspace, settings: Mapping[str, Any]) -> Planner:
 
 
 def informed_planner(planner: Planner, risk: BoundRisk) -> Planner:
-    """Planner given the failure chances of bounds.
+    """Planner given the failure probabilities of bounds.
 
-    A bound that failed twice is not entered again unless there is no other way, or its failure
-    chance fell below 0.2. The slope limit that the user states is believed until a failure
-    contradicts it: before the first one, a failure costs nothing unless the user gave
-    `failure_cost`. Its price under the prior alone would forbid longer paths that keep contact and
-    on which nothing fails. From then on it is joint over strata of the posterior, since bounds
-    share the slope limit.
+    A bound that failed twice is avoided unless there is no other path, or its failure probability
+    fell below 0.2. The user's slope limit is trusted until a failure contradicts it: before the
+    first failure, failures have no cost unless the user gave `failure_cost`. With the prior alone,
+    the cost would rule out longer paths that keep contact and on which nothing fails. After the
+    first failure, the cost is computed jointly over strata of the posterior, since bounds share the
+    slope limit.
     """
     if (stopped := to_avoid(risk)).any():
         planner = planner.avoiding(stopped, risk.mean)
@@ -165,6 +165,6 @@ def informed_planner(planner: Planner, risk: BoundRisk) -> Planner:
 
 
 def to_avoid(risk: BoundRisk) -> np.ndarray:
-    """Bounds with two failures whose failure chance has not recovered, (move, row, col)."""
+    """Bounds with two failures whose failure probability is still high, (move, row, col)."""
     with np.errstate(invalid="ignore"):
         return (risk.stopped >= _STOPPED - 1e-9) & ~(risk.mean < _RECOVERED)

@@ -41,10 +41,10 @@ def iterate(
         n_iterations: Largest number of missions.
         simulator: Simulator with `run(path, *, seed, mission) -> Mission`; by default
             `KinematicSimulator(workspace)`.
-        truth: Truth of the simulator, `simulation.Truth.of(simulator)`: the regret of each plan
-            goes into the history, in % of the contact that the best admissible path keeps.
-        stop: Rules to end before `n_iterations`, called between missions: a `RegretBound`,
-            callable `stop(campaign) -> reason or None`, or several of them.
+        truth: Truth of the simulator, `simulation.Truth.of(simulator)`. If given, the history
+            records the regret of each plan, in % of the contact kept on the best admissible path.
+        stop: Stopping rules, called between missions: a `RegretBound`, a callable `stop(campaign)
+            -> reason or None`, or several of them.
         directory: Folder that is updated after each mission. If the process dies, `resume`
             continues from it.
         overwrite: Whether to remove another campaign from that folder first.
@@ -56,7 +56,8 @@ def iterate(
         Result of all missions.
 
     Raises:
-        TrustboError: Bad input, or a folder that holds a campaign, before any work starts.
+        TrustboError: The input is invalid, or the folder already contains a campaign; raised before
+            any work starts.
         NoPathError: The goal cannot be reached.
 
     Example:
@@ -87,22 +88,22 @@ def resume(
 ) -> Result:
     """Continue a campaign that `iterate(directory=...)` began, with identical results.
 
-    If a rule has ended the campaign, its result is returned, unless `stop` or more missions are
-    given. Rules are not stored: give them again.
+    If a stopping rule ended the campaign, its result is returned, unless `stop` or more missions
+    are given. Stopping rules are not stored and must be given again.
 
     Args:
         directory: Folder of the campaign.
         simulator: The same simulator, unless it was the default.
         truth: Truth of the simulator, see `iterate`.
-        n_iterations: Number of missions in all; by default the number it was started with.
+        n_iterations: Total number of missions; by default the number passed to `iterate`.
         model: The same model; see `Campaign.load`.
         policy: The same policy; see `Campaign.load`.
-        stop: Rules to end before `n_iterations`, as in `iterate`.
+        stop: Stopping rules, as in `iterate`.
         progress: Whether to show a progress bar.
 
     Raises:
-        TrustboError: There is no campaign; another process has locked it; or a custom object, or
-            the simulator, is another one; or a file of the folder is missing or damaged.
+        TrustboError: There is no campaign, another process has locked it, a custom object or the
+            simulator differs from the original one, or a file of the folder is missing or damaged.
     """
     with Campaign.load(directory, model=model, policy=policy) as campaign:
         state, before = campaign.state, campaign.state.simulation

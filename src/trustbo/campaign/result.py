@@ -1,4 +1,4 @@
-"""Result of a campaign: what was learned, and the path to take."""
+"""Result of a campaign: posterior, maps, history and recommended path."""
 
 from functools import cached_property
 from operator import itemgetter
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 class Result(Summary):
-    """What is known after the missions of a campaign, computed when it is first asked for.
+    """Result of the missions of a campaign; properties are computed at first access.
 
     Attributes:
         workspace: Workspace of the campaign.
@@ -48,14 +48,14 @@ class Result(Summary):
         model: TrustModel | None,
         base: Planner | None = None,
     ) -> None:
-        """Collect the state of a campaign; `base` is its planner before anything is learned."""
+        """Store the state of a campaign; `base` is its planner before any learning."""
         self.workspace, self.state = workspace, state
         self.model: Any = model
         self._base = base_planner(workspace, state.settings) if base is None else base
         self._maps: dict[int, xr.Dataset] = {}  # by number of draws
 
     def _computed(self) -> dict[str, Any]:
-        """Properties that were asked for so far, by name."""
+        """Cached properties by name."""
         cached = (name for name, of in vars(Result).items() if isinstance(of, cached_property))
         return {name: vars(self)[name] for name in cached if name in vars(self)}
 
@@ -85,12 +85,12 @@ class Result(Summary):
 
     @property
     def missions(self) -> list[Mission]:
-        """All missions in order, with the awareness that they are learned from."""
+        """All missions in order, with the awareness used for learning."""
         return [entry.mission for entry in self.state.entries]
 
     @property
     def posteriors(self) -> list[xr.DataTree | None]:
-        """Posterior of the parameters after each mission; None where nothing was learned yet."""
+        """Posterior of the parameters after each mission; None where there was none yet."""
         return [entry.posterior and entry.posterior() for entry in self.state.entries]
 
     @cached_property
@@ -122,7 +122,7 @@ class Result(Summary):
 
     @cached_property
     def belief(self) -> Params:
-        """Parameter draws of the last posterior, or those of `initial` while there is none."""
+        """Parameter draws of the last posterior, or of `initial` before the first posterior."""
         if self.state.last is not None:
             return params_of(self.state.last())
         features, n_robots = self.workspace.features, self.workspace.team.n_robots
@@ -139,20 +139,20 @@ class Result(Summary):
 
     @cached_property
     def risk(self) -> BoundRisk:
-        """Chances of the bounds to fail."""
+        """Failure probability of each bound, given all missions so far."""
         return BoundRisk(self.hazard, self.workspace)
 
     @cached_property
     def planner(self) -> Planner:
-        """Planner that takes the failures so far into account, see `informed_planner`."""
+        """Planner that accounts for the failures so far, see `informed_planner`."""
         return informed_planner(self._base, self.risk)
 
     # --- the path to take ---
 
     def recommend(self) -> Plan:
-        """Plan the best path under the mean of the belief, regardless of the policy.
+        """Plan the best path under the mean of `belief`, regardless of the policy.
 
-        Where no path respects `max_failure`, it is the safest one.
+        If no path satisfies `max_failure`, the safest path is returned.
         """
         mean = self.belief.mean()
         try:
@@ -162,7 +162,7 @@ class Result(Summary):
 
     @cached_property
     def plan(self) -> Plan:
-        """Recommended path, the best under the posterior mean, with bands over the posterior."""
+        """Recommended plan, the best under the posterior mean, with posterior credible bands."""
         best = self.recommend()
         draws = self.belief if self.state.last is None else self.state.last()
         return best.with_draws(self.planner.evaluate(best.path, draws))
@@ -179,14 +179,14 @@ class Result(Summary):
 
     @cached_property
     def history(self) -> xr.Dataset:
-        """Numbers of each mission over `iteration` (1, 2, ...).
+        """Dataset of the quantities of each mission, with dim `iteration` (1, 2, ...).
 
-        The path that was planned (`path`, row and col of each step, -1 after the goal), its
-        `objective` when it was planned, whether it differs from the plan before (`path_changed`)
-        and the `trust_map` it was planned on; the mean `contact_rate` of the mission, the
-        `contact_lost` in bounds (those not run lose all), its `status`, its `state` with the
-        `reason` (`"told"`: to be learned from later; `"learned"`; `"excluded"`), diagnostics of the
-        posterior (see `inference.diagnostics`), and the seconds of planning and fitting.
+        It contains the planned `path` (row and col of each step, -1 after the goal), its
+        `objective` when it was planned, whether it differs from the previous plan (`path_changed`)
+        and the `trust_map` used for planning; the mean `contact_rate` of the mission, the
+        `contact_lost` in bounds (bounds that were not run lose all contact), its `status`, its
+        `state` (`"told"`, not used yet; `"learned"`; `"excluded"`) with the `reason`, diagnostics
+        of the posterior (see `inference.diagnostics`), and the seconds of planning and fitting.
         """
         entries = self.state.entries
         plans, first = [entry.plan for entry in entries], entries[0].trust_map
@@ -205,13 +205,13 @@ class Result(Summary):
         return xr.Dataset(variables, coords | dict(first.coords))
 
     def table(self) -> pd.DataFrame:
-        """Table with a row for each mission, labelled by its number, from 1.
+        """Table with one row per mission, labelled by its number, from 1.
 
         Columns are the `status`, the `state` with its `reason`, or the reason of a failure, the
         cell `where` the mission failed, the mean `contact_rate`, the plan's `objective`, the number
         `n_bounds` of bounds run, including a failed one, `path_changed` and the `path` as text,
-        "9,0 8,1"; then the other numbers of `history`. A mission given up without a report, see
-        `Campaign.fail`, has no number and the state "given up".
+        "9,0 8,1"; then the other quantities of `history`. A mission that failed without a report,
+        see `Campaign.fail`, has no number and the state "given up".
         """
         reasons = {f.after: f.reason for f in self.state.failures if f.reported}
         rows = []
@@ -234,18 +234,19 @@ class Result(Summary):
         """Compute every map of the planning cells after the last mission, for GIS and figures.
 
         Args:
-            n_draws: Number of draws of the posterior; by default 1000, or 100 for robots that
-                influence each other, of which each cell needs a separate search.
+            n_draws: Number of posterior draws; by default 1000, or 100 for models in which robots
+                influence each other, which need a separate search for each cell.
 
         Returns:
             Dataset over (y, x), the centres of the cells' rows and columns in CRS metres, so that
             `isel(y=row, x=col)` is a cell; `maps.rio` has the CRS and writes rasters. It holds
             `trust_mean` and `trust_sd` over the posterior, the mean `cost` 1 - sigma(trust),
-            `path_probability` (of a cell to be on the best path), and each feature's awareness, the
-            mean over robots, by its name, or as `awareness_<name>` where another map or a dim has
-            that name. NaN where no robot can go. Where places have effects, also `place_mean` and
-            `place_sd` of the cell's, and `place_bounds_mean`, the mean of those of the bounds into
-            it (see `inference.place_maps`); of robots' own effects, the mean over robots.
+            `path_probability` (that a cell is on the best path), and the awareness of each feature,
+            averaged over robots, under its name, or as `awareness_<name>` if another map or a dim
+            has that name. Values are NaN where no robot can go. For models with place effects, it
+            also contains `place_mean` and `place_sd` of the effect of each cell, and
+            `place_bounds_mean`, the mean effect of the bounds into it (see `inference.place_maps`),
+            averaged over robots where the effects differ by robot.
         """
         if n_draws is None:
             dynamics = self.planner.problem.dynamics(self.belief.mean())
@@ -269,7 +270,7 @@ class Result(Summary):
         return self.workspace.grid.place(maps.where(self.workspace.passable))
 
     def _places(self) -> xr.Dataset:
-        """Maps of the effects of places, (row, col), if the model has them."""
+        """Maps of the place effects, (row, col), if the model has them."""
         if "places" not in self.posterior.children:
             return xr.Dataset()
         effects = place_maps(self.posterior)
@@ -282,7 +283,7 @@ class Result(Summary):
         return maps.mean("robot", keep_attrs=True) if "robot" in maps.dims else maps
 
     def plot_maps(self, **options: Any) -> np.ndarray:
-        """Draw trust maps and paths of four moments; options and Axes as of `plots.trust_maps`."""
+        """Draw trust maps and paths of four missions; options and Axes as in `plots.trust_maps`."""
         from trustbo import plots  # imports matplotlib
 
         return plots.trust_maps(self.history, self.trust_map, self.path, self.workspace, **options)
@@ -294,9 +295,9 @@ class Result(Summary):
         return campaign_history(self.history, **options)
 
     def explore(self) -> "Explorer":
-        """Draw an interactive map: layers, the numbers of each cell, and missions by a slider.
+        """Draw an interactive map with layers, the values of each cell, and a slider over missions.
 
-        A notebook displays it; `.save(path)` writes it to one HTML file that needs no network.
+        It is displayed in notebooks; `.save(path)` writes it to one HTML file that works offline.
 
         Raises:
             TrustboError: Nothing could be learned yet.
@@ -306,15 +307,15 @@ class Result(Summary):
         return plots.explore(self.plan, self.maps(), self.history)
 
     def save(self, directory: FilePath, *, overwrite: bool = False) -> None:
-        """Write everything to a folder that `load_result` and `Campaign.load` read.
+        """Write the campaign to a folder that `load_result` and `Campaign.load` read.
 
         Args:
             directory: Folder to write to.
-            overwrite: Whether to remove another campaign from it first.
+            overwrite: Whether to remove an existing campaign from it first.
 
         Raises:
-            TrustboError: The folder holds a campaign, without `overwrite`; another process has
-                locked it; or its name belongs to a file.
+            TrustboError: The folder already contains a campaign and `overwrite` is False, another
+                process has locked it, or the path is a file.
         """
         storage = Storage(directory, overwrite=overwrite)
         try:
@@ -330,8 +331,8 @@ def load_result(directory: FilePath) -> Result:
         directory: Folder of a campaign, or one that `Result.save` wrote.
 
     Raises:
-        TrustboError: The folder holds no campaign, or one without missions; or a file is missing or
-            damaged.
+        TrustboError: The folder contains no campaign, or one without missions; or a file is missing
+            or damaged.
     """
     state, workspace, _ = read_campaign(directory)
     if not state.entries:
@@ -346,7 +347,7 @@ def load_result(directory: FilePath) -> Result:
 
 
 def evidence_of(state: State) -> Rows:
-    """Row of the diagnostics of the last posterior, if there is one."""
+    """Row with the diagnostics of the last posterior, if there is one."""
     last = state.entries[-1].row if state.entries else {}
     if np.isfinite(last.get("k_hat", np.nan)):
         khat = f"k-hat {last['k_hat']:.2f} (good below {GOOD_KHAT:g})"

@@ -1,4 +1,4 @@
-"""State of a campaign: its missions with their plans and posteriors, and missions given up."""
+"""State of a campaign: missions with their plans and posteriors, and failed missions."""
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -24,14 +24,14 @@ COLUMNS = (
 
 
 class Failure(NamedTuple):
-    """A mission that was given up.
+    """A mission that failed.
 
     Attributes:
         after: Number of missions recorded before it.
         reason: Reason, one of `hazard.CAUSES` if a bound failed.
-        path: Path that was asked for, start first; empty if no bound is to blame.
+        path: Planned path, start first; empty if no bound caused the failure.
         where: Cell that the team failed to enter, if known.
-        reported: Whether the bounds that were run are recorded as a mission.
+        reported: Whether the completed bounds are recorded as a mission.
     """
 
     after: int
@@ -57,8 +57,8 @@ class Posterior:
     """Posterior of the parameters after a mission, in memory or in its file.
 
     Attributes:
-        name: Name of its file: the number of missions recorded when it was fitted, and the number
-            excluded from it if there are any, such as `"0003-1"`.
+        name: Name of its file: the number of missions recorded when it was fitted, followed by the
+            number of excluded missions if there are any, such as `"0003-1"`.
         file: File that holds it; None if it is in memory only.
     """
 
@@ -68,7 +68,7 @@ class Posterior:
         self.name, self.file, self._tree = name, file, tree
 
     def __call__(self) -> xr.DataTree:
-        """Posterior, read from its file if need be; TrustboError if that is not possible."""
+        """Posterior, read from its file if necessary; TrustboError if the file cannot be read."""
         if self._tree is None:
             self._tree = read_tree(self.file or "")
         return self._tree
@@ -86,10 +86,10 @@ class Entry:
     Attributes:
         plan: Plan that was asked for.
         measured: Mission as measured.
-        mission: Mission with the awareness that it is learned from, see `learning.as_learned`.
-        trust_map: Trust map that it was planned on, dims (row, col).
+        mission: Mission with the awareness used for learning, see `learning.as_learned`.
+        trust_map: Trust map used for planning, dims (row, col).
         row: Numbers of the mission by name, among them its `state` and the `reason` for that.
-        posterior: Posterior after it; None if nothing could be learned yet.
+        posterior: Posterior after this mission; None if there is none yet.
     """
 
     plan: Plan
@@ -111,13 +111,13 @@ class Entry:
 
 @dataclass(eq=False)
 class State:
-    """Data of a campaign: all that its folder holds, except for the workspace.
+    """Data of a campaign: the contents of its folder, except for the workspace.
 
     Attributes:
         settings: Arguments of the campaign, JSON-serialisable.
         entries: Recorded missions, in order.
-        failures: Missions given up.
-        asked: Plan that was asked for and not run yet.
+        failures: Failed missions.
+        asked: Plan returned by `ask` and not run yet.
         simulation: Settings that the simulator describes, and `n_iterations`.
         stop_reason: Why the last run ended.
     """
@@ -130,7 +130,7 @@ class State:
     stop_reason: str = "interrupted"
 
     def copy(self) -> Self:
-        """State that later missions leave unchanged."""
+        """Copy that later missions do not change."""
         entries = [replace(entry, row=dict(entry.row)) for entry in self.entries]
         return replace(self, entries=entries, failures=list(self.failures))
 
@@ -140,11 +140,11 @@ class State:
         return self.entries[-1].posterior if self.entries else None
 
     def numbers(self, *states: str) -> list[int]:
-        """Numbers, from 0, of the missions in one of these states."""
+        """Indices of the missions in one of these states."""
         return [j for j, entry in enumerate(self.entries) if entry.state in states]
 
     def seed_of(self, stream: str) -> int:
-        """Seed of one stream of randomness for the next mission."""
+        """Seed of one random stream for the next mission."""
         n = len(self.entries)
         entropy = [self.settings["seed"], _STREAMS.index(stream), n]
         if n_failures := sum(failure.after == n for failure in self.failures):

@@ -1,4 +1,4 @@
-"""Rules that end a campaign which has learned enough."""
+"""Stopping rules for campaigns."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,22 +20,24 @@ Stop = Callable[["Campaign"], str | bool | None]
 
 @dataclass(frozen=True)
 class RegretBound:
-    """Stop when the recommended path is nearly the best, with high probability, twice in a row.
+    """Stop when the recommended path is nearly optimal, with high probability, twice in a row.
 
     Under each of `n_draws` posterior draws the best path is planned exactly. The regret of the
     recommended path under a draw is, for lost_contact, the additional contact that it loses, as a
-    share of what the best path keeps; for other objectives, a share of the best path's value. Stop
-    when P(regret <= eps) >= 1 - delta after each of the last `patience` missions, and robots have
-    completed every bound of the path at least once, since the map may be wrong about others.
+    fraction of the contact that the best path keeps; for other objectives, a fraction of the best
+    path's value. Stop when P(regret <= eps) >= 1 - delta after each of the last `patience`
+    missions, and robots have completed every bound of the path at least once, since the map may be
+    wrong about bounds that were never driven.
 
     Attributes:
-        eps: Regret that is good enough, as a share; .05 is 5 %.
+        eps: Acceptable regret, as a fraction; 0.05 is 5 %.
         delta: Probability of a larger regret.
-        patience: Number of missions in a row after which it has to hold; one more is needed.
-        n_draws: Number of draws to plan under.
+        patience: Number of successive missions after which the condition must hold; `patience` + 1
+            missions are needed at least.
+        n_draws: Number of posterior draws.
 
     Raises:
-        TrustboError: A share outside (0, 1), or a number that is not whole.
+        TrustboError: A fraction is outside (0, 1), or a number is not whole.
     """
 
     eps: float = 0.05

@@ -44,13 +44,13 @@ class Storage:
         """Lock the folder.
 
         Args:
-            directory: Path of the folder, which is made if need be.
-            begun: Whether it holds the campaign already.
-            overwrite: Whether it may hold another campaign, which `begin` removes.
+            directory: Path of the folder, which is created if necessary.
+            begun: Whether the folder already contains the campaign.
+            overwrite: Whether the folder may contain another campaign, which `begin` removes.
 
         Raises:
-            TrustboError: The folder holds no campaign and must, or one and must not; another
-                process has locked it; or its name belongs to a file.
+            TrustboError: The folder contains no campaign although `begun`, or contains one and
+                `overwrite` is False; another process has locked it; or the path is a file.
         """
         self.path = Path(directory)
         if begun:
@@ -78,7 +78,7 @@ class Storage:
         self._lock.release()
 
     def begin(self, workspace: Workspace, state: State) -> None:
-        """Write a whole campaign; the files of another one are removed, its record first."""
+        """Write a whole campaign; files of another campaign are removed, its record first."""
         stored = {e.posterior.name: e.posterior for e in state.entries if e.posterior is not None}
         trees = [posterior() for posterior in stored.values()]  # may be in files that go
         (self.path / RECORD).unlink(missing_ok=True)
@@ -93,7 +93,7 @@ class Storage:
         self.write_record(state)
 
     def add_mission(self, n: int, entry: Entry, extra: dict[str, float]) -> None:
-        """Write mission n, from 1, as measured, with its plan and the numbers told with it."""
+        """Write mission n, from 1, as measured, with its plan and the extra numbers of `tell`."""
         planned = xr.Dataset({"trust_map": entry.trust_map})
         planned.attrs = {"plan": to_json(plan_to_record(entry.plan)), "extra": to_json(extra)}
         tree = missions_to_tree([entry.measured])
@@ -107,7 +107,7 @@ class Storage:
         posterior.file = file
 
     def write_record(self, state: State) -> None:
-        """Write all but arrays; last, as it counts the missions that are complete."""
+        """Write everything except arrays; called last, as the record counts complete missions."""
         record = {
             "settings": state.settings,
             "simulation": state.simulation,
@@ -130,11 +130,11 @@ def read_campaign(
     """Read a campaign from its folder.
 
     Returns:
-        State; workspace; and missions that the record does not count yet, with the numbers that
-        were told with them.
+        State; workspace; and the missions not yet counted in the record, each with the extra
+        numbers passed to `tell`.
 
     Raises:
-        TrustboError: The folder holds no campaign, or a file is missing or damaged.
+        TrustboError: The folder contains no campaign, or a file is missing or damaged.
     """
     folder = Path(directory)
     _require_campaign(folder)
