@@ -1,4 +1,4 @@
-"""Check of a fitted model: what its posterior, its predictions and LOO say may be wrong."""
+"""Check of a fitted model: problems indicated by its posterior, predictions and LOO."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -40,12 +40,12 @@ class Check(Summary):
 
     Attributes:
         verdict: The findings that stand out, in words.
-        table: Row of each check (index `check`): the label that is most affected, the size of the
+        table: One row per check (index `check`): the label that is most affected, the size of the
             finding, its probability, whether it `stands_out`, and the finding in words.
-        robots: Row of each mission and robot: its effect as a share of line of sight, less the
-            median of all, sd, the probability of more than .1, and whether it `stands_out`.
-        loo: Table of `compare` of the model, the model without each of its effects, and with each
-            that it lacks; empty without `compare`.
+        robots: One row per mission and robot: its effect as a share of line of sight minus the
+            team's median, the sd, the probability that it exceeds .1, and whether it `stands_out`.
+        loo: Table of `compare` for the model and its variants with one effect removed or added;
+            empty without `compare`.
     """
 
     verdict: str
@@ -80,22 +80,21 @@ def check(
 
     A robot stands out in a mission if its share of line of sight differs by more than .1 from the
     team's median with a probability above .95; a place, if its effect exceeds .1 of contact; a
-    weight, if its sign contradicts the prior's; coverage, if 90 % intervals one mission ahead hold
-    a share of the rates that differs by more than .05 and two standard errors over missions; a
-    comparison, if another model predicts missions left out better by two standard errors. The
-    shape of predictions is seen in `az.plot_loo_pit(tb.inference.by_rate(posterior))`, the weight
-    of the priors in `az.psense_summary(posterior)`.
+    weight, if its sign contradicts the prior's; coverage, if the share of rates inside 90 %
+    intervals one mission ahead differs from .9 by more than .05 and two standard errors over
+    missions; a comparison, if another model predicts left-out missions better by two standard
+    errors. For the shape of predictions see `az.plot_loo_pit(tb.inference.by_rate(posterior))`, for
+    the sensitivity to the priors `az.psense_summary(posterior)`.
 
     Args:
-        posterior: DataTree from `fit`; or all of a campaign, `Result.posteriors`, the last of which
-            is checked and whose predictions one mission ahead are scored.
-        missions: Missions that it was fitted to, needed where it holds no data; those of the
-            campaign.
-        compare: Whether to compare, by LOO, with other models, each of which is a fit.
-        model: Its model, needed if its priors are custom.
+        posterior: DataTree from `fit`; or all posteriors of a campaign, `Result.posteriors`: the
+            last is checked, and the predictions of each for the next mission are scored.
+        missions: Missions of the fit, needed where the posterior holds no data; or of the campaign.
+        compare: Whether to compare with other models by LOO; each of them is fitted.
+        model: Model of the posterior, needed if its priors are custom.
 
     Raises:
-        TrustboError: No posterior of `fit`, one of people's reports, or one that holds no data
+        TrustboError: If the posterior is not from `fit`, is of people's reports, or holds no data
             and no missions are given.
     """
     trees = list(posterior) if isinstance(posterior, Sequence) else [posterior]
@@ -121,7 +120,7 @@ def check(
 
 
 def effects_of_robots(posterior: xr.DataTree) -> pd.DataFrame:
-    """Row of each mission and robot, see `Check.robots`; none if the model has no such effects."""
+    """One row per mission and robot, see `Check.robots`; empty without robot effects."""
     if "robots" not in posterior.children:
         return pd.DataFrame()
     group = posterior["robots"].to_dataset()
@@ -223,7 +222,7 @@ def _compare(
 
 
 def variants(model: TrustModel, missions: Sequence[Mission]) -> dict[str, TrustModel]:
-    """The model without each of its effects, and with each that it lacks, by name."""
+    """Variants of the model with one effect removed or added, by name."""
     named: dict[str, TrustModel] = {}
     for effect in model.effects:
         others = tuple(other for other in model.effects if other is not effect)

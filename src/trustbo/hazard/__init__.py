@@ -1,4 +1,4 @@
-"""Hazard: the chance that a bound ends the mission, learned from missions that failed."""
+"""Hazard: the probability that a bound ends the mission, learned from failed missions."""
 
 from trustbo.hazard.prior import Hazard
 

@@ -1,4 +1,4 @@
-"""Exposures of bounds to failure: how often each was begun, and how often it ended a mission."""
+"""Exposures of bounds: how often each was begun, and how often it ended a mission."""
 
 from collections.abc import Sequence
 from typing import NamedTuple, Self
@@ -19,7 +19,8 @@ class LostMission(NamedTuple):
     Attributes:
         path: Planned cells, start first.
         cause: Cause of the failure, one of `CAUSES`.
-        where: Cell that it failed to enter, the first time that the path does; None: not known.
+        where: Cell that the team failed to enter, at its first occurrence in the path; None if
+            unknown.
     """
 
     path: tuple[Cell, ...]
@@ -28,14 +29,14 @@ class LostMission(NamedTuple):
 
 
 class Exposures(NamedTuple):
-    """Exposures of the bounds that missions met, the sufficient statistics of a hazard.
+    """Exposures of the bounds that missions attempted, the sufficient statistics of the hazard.
 
     Attributes:
-        bounds: Distinct bounds in lexicographic order, shape (bound, 3): move of the eight of
+        bounds: Distinct bounds in lexicographic order, shape (bound, 3): index of the move in
             `MOVES`, row and column of the cell entered.
         n: Number of exposures with a known outcome, shape (bound,).
-        failed: Number of those that failed, shape (bound,).
-        lost: Planned bounds of each mission lost somewhere unknown, indices in `bounds`.
+        failed: Number of these exposures that failed, shape (bound,).
+        lost: Planned bounds of each mission lost at an unknown place, as indices into `bounds`.
         causes: Number of failures by cause, shape (cause,).
     """
 
@@ -47,12 +48,12 @@ class Exposures(NamedTuple):
 
     @classmethod
     def of(cls, missions: Sequence[Mission], lost: Sequence[LostMission] = ()) -> Self:
-        """Count the exposures of missions that reported, and of those that were lost.
+        """Count the exposures of missions that reported and of missions that were lost.
 
-        The last bound of a mission that failed is a failure; an aborted bound counts for nothing.
+        The last bound of a mission that failed is a failure; an aborted bound is not counted.
 
         Raises:
-            TrustboError: A path that jumps, a `where` that it does not enter, an unknown cause.
+            TrustboError: If a path jumps or does not enter `where`, or a cause is unknown.
         """
         known = [_reported(mission) for mission in missions]
         known += [_located(mission) for mission in lost if mission.where is not None]
@@ -75,7 +76,7 @@ class Exposures(NamedTuple):
 
 
 def _reported(mission: Mission) -> tuple[Sequence[Cell], str | None]:
-    """Path of the bounds with an outcome, and the cause of a failure of the last one."""
+    """Path up to the last bound with an outcome, and the cause if that bound failed."""
     n, cause = len(mission.bounds), mission.status if mission.status in CAUSES else None
     return mission.path[: n + (cause is not None or mission.status == "ok")], cause
 

@@ -1,15 +1,16 @@
-"""Hazard of bounds: the chance that a bound ends the mission, learned from missions.
+"""Hazard of bounds: the probability that a bound ends the mission, learned from missions.
 
-Bound e, from one cell to the next, fails with chance p_e ~ Beta(s m_e, s (1 - m_e)). Its prior mean
-depends on how difficult the route is and by how many degrees t_e it exceeds the slope limit,
+Bound e, from one cell to the next, fails with probability p_e ~ Beta(s m_e, s (1 - m_e)). Its prior
+mean depends on the difficulty of the route and on t_e, the degrees by which it exceeds the slope
+limit,
 
     1 - m_e = sigma(-logit_e) sigma(-(t_e + margin) / width),
     logit_e = intercept + sum_j coefficient_j (difficulty_ej - 1/2).
 
-The chances are integrated out, and the few parameters drawn by importance sampling of their normal
-scores. While the proposals adapt, missions lost somewhere unknown are treated as independent. Then
+The p_e are integrated out, and the few parameters are drawn by importance sampling of their normal
+scores. While the proposals adapt, missions lost at unknown places are treated as independent. Then
 the places where they failed are imputed at every point (sequential imputation; Kong, Liu and Wong
-1994), and the weights corrected, so the draws are of the joint posterior.
+1994), and the weights are corrected, so that the draws follow the joint posterior.
 """
 
 import time
@@ -42,12 +43,12 @@ def fit_hazard(
     lost: Sequence[LostMission] = (),
     seed: int = 0,
 ) -> xr.Dataset:
-    """Learn the chance to fail of every bound, by importance sampling.
+    """Fit the failure probability of every bound by importance sampling.
 
     Args:
-        missions: Missions as measured; there may be none.
-        workspace: Workspace of their paths, whose terrain gives the difficulty of bounds; without
-            a terrain, all bounds have the same prior mean.
+        missions: Measured missions; may be empty.
+        workspace: Workspace of the missions; its terrain determines the difficulty of bounds.
+            Without a terrain, all bounds have the same prior mean.
         hazard: Priors; by default `Hazard()`.
         lost: Missions that failed and did not report.
         seed: Seed; the same seed gives the same posterior.
@@ -55,14 +56,14 @@ def fit_hazard(
     Returns:
         The group `hazard` of a posterior: `intercept` (draw), `coefficient` (draw, measure),
         `margin` and `width` of the slope limit (draw), in degrees, where there is a terrain,
-        `strength` (draw), and `place` (draw, lost), the bound from 1 at which each mission lost
-        somewhere unknown failed; `p_fail` (move, row, col), posterior mean of the chance to fail,
-        NaN where there is no bound; `exposures` and `failures` (move, row, col), counts of the
-        known ones; `failures_by_cause` (cause). `BoundRisk` draws from it.
+        `strength` (draw), and `place` (draw, lost), the bound, counted from 1, at which each
+        mission lost at an unknown place failed; `p_fail` (move, row, col), posterior mean of the
+        failure probability, NaN where there is no bound; `exposures` and `failures` (move, row,
+        col), counts of known outcomes; `failures_by_cause` (cause). `BoundRisk` draws from it.
 
     Raises:
-        TrustboError: A mission's path jumps or leaves the grid, or an unknown cause.
-        PosteriorError: k-hat > 0.7.
+        TrustboError: If a mission's path jumps or leaves the grid, or a cause is unknown.
+        PosteriorError: If k-hat > 0.7.
     """
     started, hazard = time.perf_counter(), hazard or Hazard()
     exposures, difficulty = Exposures.of(missions, lost), difficulty_of(workspace)
@@ -90,7 +91,7 @@ def fit_hazard(
 def sample(
     prior: BoundPrior, exposures: Exposures, rng: np.random.Generator
 ) -> tuple[importance.Points, np.ndarray]:
-    """Weighted points of scores, and the bound, from 0, where each lost mission failed at each."""
+    """Weighted points, and the index of the bound where each lost mission failed at each point."""
     n, failed, paths = exposures.n, exposures.failed, exposures.lost
     counts, kind = np.unique(n, return_inverse=True)
     times, bad = np.bincount(kind, minlength=len(counts)), failed > 0.0
@@ -138,14 +139,14 @@ def impute(
     """Draw where lost missions failed, one after the other.
 
     Args:
-        a: Alpha of the Betas of the bounds without the lost missions, shape (point, bound).
-        b: Beta of them.
+        a: Alpha of each bound's Beta distribution without the lost missions, shape (point, bound).
+        b: Beta of the same distributions, shape (point, bound).
         paths: Bounds of each lost mission.
         rng: Generator of random numbers.
 
     Returns:
-        Places (point, mission), bounds of their paths from 0; and log weights (point,), whose
-        exponential has for its mean the probability that all of the missions fail.
+        Places (point, mission), as indices into the missions' paths; and log weights (point,). The
+        weights have the probability that all missions fail as their mean.
     """
     a, b, uniform = a.copy(), b.copy(), rng.random((len(a), len(paths)))
     places, log_weight = np.zeros(uniform.shape, int), np.zeros(len(a))
@@ -169,9 +170,9 @@ def impute(
 def _lookahead(
     path: np.ndarray, later: Sequence[np.ndarray], a: np.ndarray, b: np.ndarray
 ) -> np.ndarray:
-    """Factor by which a failure at each bound of a path makes that of later missions likelier.
+    """Factor by which a failure at each bound of a path raises the probability of later ones.
 
-    Shape (point, bound). Without it, the rare points that blame a bound that several missions share
+    Shape (point, bound). Without it, the rare points that attribute several failures to one bound
     would have large weights.
     """
     favour = np.ones((len(a), len(path)))
@@ -193,7 +194,7 @@ def _to_dataset(
     difficulty: xr.DataArray,
     seed: int,
 ) -> xr.Dataset:
-    """The group without the maps of chances."""
+    """The group `hazard` without the maps of failure probabilities."""
     rng = np.random.default_rng([seed, 2])
     chosen = rng.permutation(points.resample(_N_DRAWS, rng))
     weights, limit, strength = prior.values(points.z[chosen])

@@ -1,4 +1,4 @@
-"""Prior of the chance that a bound fails, as a function of normal scores."""
+"""Prior of the probability that a bound fails, as a function of normal scores."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -25,28 +25,28 @@ _FARTHEST = 40.0  # sds of the wide normal up to which the margin's quantile is 
 
 @dataclass(frozen=True)
 class Hazard:
-    """Priors of the chance that a bound ends the mission; normal ones are (mean, sd).
+    """Priors of the probability that a bound ends the mission; normal priors are (mean, sd).
 
-    By default the stated slope limit is right to half a degree with probability .9, and off by some
-    4 degrees with probability .1.
+    By default, the stated slope limit is correct to half a degree with probability .9, and off by
+    about 4 degrees with probability .1.
 
     Attributes:
-        intercept: Prior of the logit of the mean chance at medium difficulty.
+        intercept: Prior of the logit of the mean failure probability at medium difficulty.
         coefficient: Prior of the weight of each measure of difficulty, which ranges from easy (0)
-            to the robots' limit (1). The tilt has no weight: it is judged by the limit.
-        margin: Prior of the degrees by which the team's true slope limit is below the stated one,
-            if that is right. All bounds share the margin: a failure on one raises the chance of all
-            that are as steep.
-        doubt: Probability that the stated limit is wrong, and the sd of the margin then, degrees;
-            the prior of the margin is a mixture of two normals with the same mean. Give a
-            probability of 0 for a limit that was measured.
-        log_width: Prior of the log of the width of the limit in degrees: the chance to fail rises
-            from .1 to .9 within 4.4 widths of tilt.
+            to the robots' limit (1). Tilt has no weight; it enters through the slope limit.
+        margin: Prior of the degrees by which the team's true slope limit is below the stated limit,
+            if the stated limit is right. All bounds share the margin, so a failure on one makes
+            failures on equally steep bounds more probable.
+        doubt: Probability that the stated limit is wrong, and the sd of the margin in that case,
+            degrees; the prior of the margin is a mixture of two normals with the same mean. Use a
+            probability of 0 for a measured limit.
+        log_width: Prior of the log of the width of the limit in degrees: the failure probability
+            rises from .1 to .9 within 4.4 widths of tilt.
         log_strength: Prior of the log of the strength s: the weight of the prior mean in units of
-            observations, small if bounds fail always or never.
+            observations, small if each bound fails either always or never.
 
     Raises:
-        TrustboError: An sd that is not positive, or a share outside [0, 1).
+        TrustboError: If an sd is not positive, or the probability of `doubt` is outside [0, 1).
     """
 
     intercept: tuple[float, float] = (-7.5, 1.5)
@@ -80,10 +80,10 @@ class Hazard:
 
 
 class BoundPrior(NamedTuple):
-    """Beta priors of the chances of some bounds, as functions of normal scores.
+    """Beta priors of the failure probabilities of bounds, as functions of normal scores.
 
-    A parameter is center + scale z; of width and strength that is the logarithm, and the margin is
-    the quantile of its mixture.
+    A parameter is center + scale z, on the log scale for width and strength; the margin is the
+    quantile of its mixture.
     """
 
     center: np.ndarray  # (parameter,)
@@ -110,7 +110,7 @@ class BoundPrior(NamedTuple):
         return values[:, :n], values[:, n:-1], values[:, -1]
 
     def betas(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Alpha and beta of the Betas at scores (point, parameter), each (point, bound)."""
+        """Alpha and beta of the Beta priors at scores (point, parameter), each (point, bound)."""
         return prior_betas(*self.values(z), self.difficulty, self.steepness)
 
 
@@ -142,7 +142,7 @@ def steepness_of(tilt: np.ndarray, max_slope: float) -> np.ndarray:
 def mixture_quantile(z: np.ndarray, narrow: float, share: float, wide: float) -> np.ndarray:
     """Value x(z) with Phi(z) = (1 - share) Phi(x / narrow) + share Phi(x / wide).
 
-    Interpolated to 1e-5 of `narrow`; far out in the tails linear with the larger sd as its slope.
+    Interpolated to 1e-5 of `narrow`; linear in the far tails, with the larger sd as its slope.
     """
     curve = _quantile_curve(float(narrow), share, wide)
     end = curve.x[-1]

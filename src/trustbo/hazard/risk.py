@@ -1,4 +1,4 @@
-"""Risk: the posterior of the chances that bounds fail, and of those of a path, for planning."""
+"""Risk: posterior failure probabilities of bounds and paths, for planning."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -24,17 +24,17 @@ _SOME = 256  # number of bounds whose mean chance orders the draws
 
 
 class BoundRisk:
-    """Posterior of the chance that each bound of a workspace ends the mission.
+    """Posterior of the probability that each bound of a workspace ends the mission.
 
-    Maps have shape (move, row, col): the bound that enters a cell by one of the eight `MOVES`; NaN
-    where there is none.
+    Maps have shape (move, row, col), the move (see `MOVES`) and the cell entered by each bound; NaN
+    where there is no bound.
 
     Attributes:
         exists: Whether the bound exists, (move, row, col).
         exposures: Known exposures, (move, row, col).
         failures: Known failures, (move, row, col).
-        steepness: Degrees by which bounds are beyond the stated slope limit, (move, row, col), or
-            None without a limit.
+        steepness: Degrees by which bounds exceed the stated slope limit, (move, row, col), or None
+            without a limit.
     """
 
     def __init__(self, hazard: xr.Dataset, workspace: Workspace) -> None:
@@ -58,7 +58,7 @@ class BoundRisk:
 
     @cached_property
     def mean(self) -> np.ndarray:
-        """Posterior mean of the chance to fail, shape (move, row, col)."""
+        """Posterior mean of the failure probability, shape (move, row, col)."""
         mean = np.full(self.exists.shape, np.nan)
         for bounds, a, b in self._betas():
             mean.flat[bounds] = (a / (a + b)).mean(0)
@@ -66,7 +66,7 @@ class BoundRisk:
 
     @property
     def has_failures(self) -> bool:
-        """Whether a failure was recorded, at a known bound or a mission lost somewhere."""
+        """Whether any failure was recorded, at a known or an unknown bound."""
         return bool(self.failures.any()) or len(self._lost) > 0
 
     @cached_property
@@ -79,12 +79,12 @@ class BoundRisk:
         return counts
 
     def draw(self, n: int, seed: int = 0) -> np.ndarray:
-        """Draws of the chances to fail, shape (draw, move, row, col).
+        """Draws of the failure probabilities, shape (draw, move, row, col).
 
         Args:
-            n: Number of draws. Those of the hyperparameters are taken at even steps from the
-                mildest to the worst, so that few draws have the posterior's mean chance to arrive.
-            seed: Seed of the draws from the Betas.
+            n: Number of draws. Hyperparameter draws are evenly spaced from the mildest to the most
+                severe, so that few draws suffice for the mean probability to arrive.
+            seed: Seed of the draws from the Beta distributions.
         """
         rng, order = np.random.default_rng(seed), np.argsort(self._severity)
         steps = (np.arange(require_whole("n", n, 1)) + 0.5) / n
@@ -95,9 +95,9 @@ class BoundRisk:
         return out
 
     def strata(self, n: int = MOST) -> Strata:
-        """Chances under at most `n` groups of draws, from mild to severe; see `Strata`.
+        """Failure probabilities under at most `n` groups of draws, mild to severe; see `Strata`.
 
-        Their mean, by the shares, is that over all draws.
+        Their mean, weighted by the shares, equals the mean over all draws.
         """
         order = np.argsort(self._severity)
         ends = partition(self._severity[order], require_whole("n", n, 1))
@@ -112,13 +112,13 @@ class BoundRisk:
 
     @cached_property
     def _severity(self) -> np.ndarray:
-        """Mean chance of some of the bounds under each draw of the hyperparameters, (draw,)."""
+        """Mean failure probability of some bounds under each hyperparameter draw, (draw,)."""
         some = np.flatnonzero(self.exists)
         a, b = self._betas_of(some[:: 1 + len(some) // _SOME])
         return (a / (a + b)).mean(1)
 
     def _betas(self, draws: Any = slice(None)) -> Iterator[tuple[np.ndarray, ...]]:
-        """Yield bounds that exist, flat indices, some at a time; alpha and beta (draw, bound)."""
+        """Yield existing bounds in chunks: flat indices, and alpha and beta (draw, bound)."""
         every, n_draws = np.flatnonzero(self.exists), len(self._strength[draws])
         step = max(1, _ENTRIES // n_draws)
         for start in range(0, len(every), step):
@@ -126,7 +126,7 @@ class BoundRisk:
             yield bounds, *self._betas_of(bounds, draws)
 
     def _betas_of(self, bounds: np.ndarray, draws: Any = slice(None)) -> tuple[np.ndarray, ...]:
-        """Alpha and beta of the posterior Betas of bounds, each (draw, bound)."""
+        """Alpha and beta of the posterior Beta distributions of bounds, each (draw, bound)."""
         where = np.unravel_index(bounds, self.exists.shape)
         steepness = None if self.steepness is None else self.steepness[where]
         drawn = self._weights[draws], self._limit[draws], self._strength[draws]
@@ -143,7 +143,7 @@ class BoundRisk:
 def add_lost(path: np.ndarray, place: np.ndarray, a: np.ndarray, b: np.ndarray) -> None:
     """Add a mission that failed at `place` (point,) of its path to Betas a, b (point, bound).
 
-    A negative index in the path is a bound that is not among these.
+    Negative indices in the path are bounds that are not among these.
     """
     for k, e in enumerate(path):
         if e >= 0:
@@ -153,17 +153,17 @@ def add_lost(path: np.ndarray, place: np.ndarray, a: np.ndarray, b: np.ndarray) 
 
 @dataclass(frozen=True, eq=False)
 class Risk:
-    """Chance that a bound ends the mission, of all bounds of a workspace.
+    """Probability that each bound of a workspace ends the mission.
 
     Attributes:
         p_fail: Posterior mean, shape (move, row, col) with the moves of `MOVES`; NaN where there
             is no bound.
-        draws: Draws from its posterior, shape (draw, move, row, col), or None.
-        strata: Chances under groups of draws, by which a failure is priced; None: by `p_fail`, as
-            if bounds were independent.
+        draws: Draws from the posterior, shape (draw, move, row, col), or None.
+        strata: Failure probabilities under groups of draws, used for the cost of a failure; if
+            None, `p_fail` is used, as if bounds were independent.
 
     Raises:
-        TrustboError: Another shape, or a chance outside [0, 1].
+        TrustboError: If a shape differs, or a probability is outside [0, 1].
     """
 
     p_fail: np.ndarray
@@ -181,14 +181,14 @@ class Risk:
                 raise TrustboError(f"{name} must be in [0, 1]; got {p[bad][0]:g}.")
 
     def survival(self, path: Sequence[Cell] | np.ndarray) -> float:
-        """Product of 1 - p_fail along a path, by which limits of plans go.
+        """Product of 1 - p_fail along a path, used for the limit `max_failure`.
 
-        The chance to arrive is larger where bounds fail together under the draws: see `along`.
+        The probability to arrive is larger if failures are correlated under the draws; see `along`.
         """
         return float(np.prod(1.0 - self.p_fail[*bounds_along(path).T]))
 
     def priced(self, path: Sequence[Cell] | np.ndarray) -> float:
-        """Chance that a path fails by which costs of plans go: the mean over the strata."""
+        """Probability that a path fails, averaged over the strata, for the cost of a failure."""
         if self.strata is None:
             return 1.0 - self.survival(path)
         p_fail, shares = self.strata
@@ -214,13 +214,13 @@ class Risk:
 
 
 class PathRisk(NamedTuple):
-    """Chance that a path's bounds end the mission, each given that it is begun."""
+    """Probability that each bound of a path ends the mission, given that it is begun."""
 
     p_fail: np.ndarray
     """Posterior mean, shape (bound,)."""
     p_arrive: float
-    """Chance to reach the goal: the mean over draws of the product of 1 - p_fail, as the chances of
-    bounds are correlated; without draws, the product of the means."""
+    """Probability to reach the goal: the mean over draws of the product of 1 - p_fail, as failures
+    are correlated; without draws, the product of the means."""
     p_arrive_band: tuple[float, float]
     """Ends of its 90 % band over draws; NaN without draws."""
 

@@ -1,12 +1,12 @@
-"""Strata: the posterior of the chances to fail as a mixture of few, for the price of a failure.
+"""Strata: the posterior failure probabilities as a small mixture, for the cost of a failure.
 
-Bounds fail together where they share an uncertain slope limit. Given the hyperparameters their
-chances are independent, so that a path fails with the chance
+Bounds fail together where they share an uncertain slope limit. Given the hyperparameters, they fail
+independently, so that a path fails with probability
 
     E[1 - prod_k (1 - p_k)] = mean over draws of 1 - prod_k (1 - E[p_k | draw]).
 
-Strata are groups of draws, from mild to severe, each taken for one draw with the mean chances of
-its members: a sum over few of them, which a search can carry.
+Strata are groups of draws, from mild to severe, each treated as one draw with the mean
+probabilities of its members, so that a search needs only a sum over a few strata.
 """
 
 from typing import NamedTuple
@@ -18,10 +18,10 @@ MOST = 5
 
 
 class Strata(NamedTuple):
-    """Chances to fail under each of some groups of draws."""
+    """Failure probabilities under each group of draws."""
 
     p_fail: np.ndarray
-    """Mean chance of each bound, (stratum, move, row, col), NaN where there is no bound."""
+    """Mean failure probability, (stratum, move, row, col), NaN where there is no bound."""
     shares: np.ndarray
     """Share of the draws, (stratum,); they add up to 1."""
 
@@ -30,8 +30,8 @@ def partition(values: np.ndarray, n: int) -> np.ndarray:
     """Ends of at most `n` groups of sorted values (value,) with the least squares within groups.
 
     The optimal partition in one dimension, by dynamic programming (Fisher 1958). Group k is
-    values[ends[k - 1] : ends[k]]; quantiles instead would mix a severe tail of few draws with mild
-    ones. Time and memory grow with the square of the number of values.
+    values[ends[k - 1] : ends[k]]; quantiles would mix the few severe draws with mild ones. Time and
+    memory grow with the square of the number of values.
     """
     size = len(values)
     total, squares = (np.concatenate([[0.0], np.cumsum(v)]) for v in (values, values**2))

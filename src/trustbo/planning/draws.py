@@ -16,7 +16,7 @@ from trustbo.planning.problem import EXACT, Problem
 
 @dataclass(frozen=True, eq=False)
 class DrawnPaths:
-    """Best path under each of some draws of a planning problem.
+    """Best path of a planning problem under each parameter draw.
 
     Attributes:
         problem: Planning problem.
@@ -30,7 +30,7 @@ class DrawnPaths:
 
     @cached_property
     def candidates(self) -> list[tuple[Cell, ...]]:
-        """Distinct paths among them, the most frequent first."""
+        """Distinct best paths, the most frequent first."""
         return [self.problem.paths.cells(path) for path in self._distinct[0]]
 
     @property
@@ -52,14 +52,15 @@ class DrawnPaths:
         return np.stack([self._value(self.dynamics, path) for path in paths], axis=1)
 
     def regret(self, path: Sequence[Cell]) -> np.ndarray:
-        """Value of each draw's best path less that of a given one, shape (draw,), >= 0."""
+        """Value of each draw's best path minus the value of a given path, shape (draw,), >= 0."""
         return np.maximum(0.0, self.values - self.values_of([path])[:, 0])
 
     def relative_regret(self, path: Sequence[Cell]) -> np.ndarray:
         """Regret of a path as a share of the value of each draw's best path, shape (draw,).
 
-        For lost_contact, of the contact that the best path keeps, its bounds less those lost; for
-        other objectives, of the best path's value. Infinite where that is 0.
+        For lost_contact, relative to the contact kept on the best path (its bounds minus the
+        contact lost); for other objectives, relative to the best path's value. Infinite where this
+        is 0.
         """
         scale = np.abs(self.values)
         if self.problem.objective.of_contact:
@@ -84,7 +85,7 @@ class DrawnPaths:
 
     @cached_property
     def _distinct(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Distinct paths by falling frequency, the index of each draw's, and their frequencies."""
+        """Distinct paths by decreasing frequency, each draw's index into them, and frequencies."""
         paths, which, counts = np.unique(
             self.paths, axis=0, return_inverse=True, return_counts=True
         )
@@ -93,7 +94,7 @@ class DrawnPaths:
 
 
 def choose_draws(params: Params, n_draws: int | None, seed: int) -> Params:
-    """Choose some draws at random, kept in order, or all, with leading axis (draw,)."""
+    """Choose `n_draws` at random, in their order, or all; leading axis (draw,)."""
     flat = params.flat()
     n = flat.leading[0]
     if n_draws is None or require_whole("n_draws", n_draws, 1) >= n:

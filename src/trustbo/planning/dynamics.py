@@ -1,4 +1,4 @@
-"""Recursion of expected trust: one linear form for every model, and its roll along a path."""
+"""Recursion of expected trust: one linear form for every model, rolled out along a path."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -16,10 +16,11 @@ class Dynamics(NamedTuple):
     """Expected trust x_k = transition x_{k-1} + drift(bound), x_0 = start; leading axes (...,).
 
     Fields: transition (..., state, state), drift (..., state, move, row, col), start (..., state)
-    and noise_sd (...,), delta_v as the mean over robots. States are the robots, and trust of the
-    team is their mean; one state, this mean, suffices where all have one beta0.
+    and noise_sd (...,), the mean of delta_v over robots. States are the robots, and the team's
+    trust is their mean; if all robots have the same beta0, this mean is the only state.
 
-    Drift is that of the bound into (row, col) by one of the eight moves, NaN where there is none.
+    The drift at (move, row, col) belongs to the bound that enters the cell by that move; NaN if
+    none.
     """
 
     transition: np.ndarray
@@ -52,10 +53,10 @@ def trust_dynamics(
         z: Awareness, shape (robot, move, row, col, feature).
         x0: Expected trust before the first bound, () or (robot,), with leading axes or not; by
             default `params.x0_mean`.
-        by_robot: Whether each robot is a state also where their mean would suffice.
+        by_robot: Whether each robot is a state even where the mean would suffice.
 
     Raises:
-        TrustboError: Parameters of other numbers of robots or features.
+        TrustboError: If the parameters have another number of robots or features.
     """
     n_robots, leading = len(z), params.leading
     start = np.asarray(params.x0_mean if x0 is None else x0, dtype=float)
@@ -75,14 +76,14 @@ def trust_dynamics(
 def drift(params: Params, awareness: np.ndarray) -> np.ndarray:
     """Increment of trust by one bound, u = sum_m beta_m z_m + b, (..., robot, move, row, col).
 
-    Effects of places are added, or those of the bounds of a path, see `Params.along`.
+    Includes the effects of places, or of the bounds of a path, see `ParameterDraws.along`.
 
     Args:
         params: Parameters of any model, with leading axes (...,).
         awareness: Shape (robot, move, row, col, feature).
 
     Raises:
-        TrustboError: Other numbers of robots, features or cells than the parameters'.
+        TrustboError: If the numbers of robots, features or cells differ from the parameters.
     """
     check_params(params, None if params.places else len(awareness), awareness.shape[-1])
     u, b = params.increments(awareness), np.asarray(params.b, dtype=float)
@@ -105,8 +106,8 @@ def roll_trust(params: Params, awareness: ArrayLike, x0: ArrayLike | None = None
     """Expected trust along a path, equations (1) and (3) without their noise.
 
     Args:
-        params: Parameters of any model, with leading axes (...,) such as (draw,). Where places have
-            effects, those of the path, `params.along(path)`.
+        params: Parameters of any model, with leading axes (...,) such as (draw,). With place
+            effects, pass `params.along(path)`.
         awareness: Shape (bound, robot, feature).
         x0: Expected trust before the first bound, shape (), (robot,) or (..., robot); by default
             `params.x0_mean`.
@@ -115,8 +116,8 @@ def roll_trust(params: Params, awareness: ArrayLike, x0: ArrayLike | None = None
         Shape (..., bound, robot).
 
     Raises:
-        TrustboError: The number of robots or features differs from that of the parameters, or
-            effects of places are of a map, not of the path's bounds.
+        TrustboError: If the number of robots or features differs from the parameters, or place
+            effects are given for a map instead of the path's bounds.
     """
     of_robots = np.swapaxes(np.asarray(awareness, dtype=float), 0, 1)
     return roll(trust_dynamics(params, of_robots[:, None, None], x0, by_robot=True))

@@ -1,20 +1,21 @@
-"""Best path where history or risk counts: label search on the unrolled graph.
+"""Best path if its cost depends on history or risk: label search on the unrolled graph.
 
 Method: labels with dominance for the resource-constrained shortest path (Martins 1984; Irnich and
 Desaulniers 2005). A label at a state has the cost so far, the sums r_m of risks -log(1 - p), and
-trust of each robot that differs (none where the cost is a sum of weights). An edge has a cost and,
-where there is trust, a loss that falls in it. A path pays besides sum_m F_m (1 - exp(-r_m)), and
-its last sum is within a limit.
+the trust of each distinct robot (none where the cost is a weighted sum). An edge has a cost and,
+where trust matters, a loss that decreases with trust. The cost of a path also includes sum_m F_m (1
+- exp(-r_m)), and its last sum must not exceed a limit.
 
-A label is dropped if another of its state costs no more, has no larger sums and as much trust of
-each robot: B0 >= 0 keeps trust in order, so that every completion of the one is as good for the
-other. Where a path may not turn back, the other must have come from the same cell, or there must
-be two that came from different cells. A label is also dropped if it cannot beat the best path
-known: what follows costs at least a sum over edges, in which trust is the most that it can be, and
-F_m (1 - exp(-r_m)) its chord over the sums that can still be best. The limit is priced by bisection
-of its Lagrange multiplier (Handler and Zang 1980).
+A label is dropped if another label of its state costs no more, has no larger sums and no less trust
+of any robot. B0 >= 0 preserves the order of trust, so every completion of the former is at least as
+good for the latter. Where a path may not turn back, the other must have come from the same cell, or
+there must be two that came from different cells. A label is also dropped if it cannot beat the best
+path
+known: the remaining cost is bounded by a sum over edges, with the largest possible trust and with
+    F_m (1 - exp(-r_m)) replaced by its chord over the sums that can still be optimal. The limit is
+    relaxed with a Lagrange multiplier, found by bisection (Handler and Zang 1980).
 
-Exact: the labels that are left include the best path, unless that is known already.
+The search is exact: the remaining labels include the best path unless it is already known.
 """
 
 import math
@@ -37,7 +38,7 @@ TINY_SD = 1e-9
 
 
 class Costs(NamedTuple):
-    """What paths cost under one draw.
+    """Costs of paths under one draw.
 
     Fields: loss, one of `LOSSES`; drift (robot, bound) and its weight in the value (left, robot);
     start, cost by the number of bounds (left,); transition (robot, robot) and x0 (robot,) of trust,
@@ -61,7 +62,7 @@ class Costs(NamedTuple):
 def best_labels(
     graph: Unrolled, costs: Costs, scale: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find the path of least cost of every draw.
+    """Find the path of least cost under every draw.
 
     Args:
         graph: Unrolled graph.
@@ -69,8 +70,8 @@ def best_labels(
         scale: Divisor of a path's cost by its number of bounds, (length,).
 
     Returns:
-        Costs (draw,), inf where no path is within the limit; lower limits on them, equal to them
-        where exact; and paths as flat cells, (draw, cell), filled with -1.
+        Costs (draw,), inf where no path is within the limit; lower limits on the costs, equal where
+        exact; and paths as flat cells, (draw, cell), filled with -1.
     """
     searches = [graph]
     divisor = scale[graph.left[graph.starts]]
@@ -126,7 +127,7 @@ def _lost_on(graph, costs, e, x, after):
 
 @kernel
 def _least_costs(graph, costs, edge_cost):
-    """Cost of each edge with the most trust that it can be taken with, (edge,)."""
+    """Cost of each edge at the largest trust with which it can be entered, (edge,)."""
     if len(costs.x0) == 0:
         return edge_cost
     cost = np.full(len(graph.head), np.inf)
@@ -166,9 +167,9 @@ class Known(NamedTuple):
 
 @kernel
 def _try_paths(graph, costs, edge_cost, to_go, known):
-    """Try the cheapest path by `to_go` from each start: the least of their costs to go.
+    """Try the cheapest path by `to_go` from each start; returns the least cost to go.
 
-    Keeps the best of them that is within the limit, and the sums of the cheapest.
+    Keeps the best path within the limit, and the sums of the cheapest path.
     """
     least, after, x = np.inf, np.empty(len(costs.x0)), np.empty(len(costs.x0))
     sums = np.empty(len(costs.failure))
@@ -195,7 +196,7 @@ def _try_paths(graph, costs, edge_cost, to_go, known):
 
 @kernel
 def _fill_priced(graph, costs, least_cost, price, to_go):
-    """Write the costs to go of edges at a price of each risk, (sum,)."""
+    """Write the costs to go with a price for each risk, (sum,)."""
     cost = least_cost.copy()
     for e in range(len(cost)):
         for m in range(len(price)):
@@ -204,7 +205,7 @@ def _fill_priced(graph, costs, least_cost, price, to_go):
 
 
 class Limits(NamedTuple):
-    """Lower limits on what the rest of a path costs, by which labels are dropped.
+    """Lower limits on the cost of the rest of a path, used to drop labels.
 
     Fields: lower limit on the cost of all paths; safest, least sums to go (state, sum); free, least
     cost to go without risk (state,); priced, with the `price` of each sum (sum,), to which the
@@ -251,10 +252,10 @@ def _limits(graph, costs, edge_cost, least_cost, known):
 
 @kernel
 def _chords(costs, low, gap):
-    """Slopes (sum,) and constant of a plane below the cost of failing of paths that can be best.
+    """Slopes (sum,) and constant of a plane below the failure cost of paths that can be optimal.
 
-    These have sums of at least `low`, and pay at most `gap` for failing, what the best path known
-    costs beyond the least cost without risk.
+    These have sums of at least `low` and a failure cost of at most `gap`, the difference between
+    the cost of the best path known and the least cost without risk.
     """
     failure, slopes, constant = costs.failure, np.zeros(len(low)), 0.0
     at_low = _failing(failure, low)
@@ -296,7 +297,7 @@ def _price_of_limit(graph, costs, edge_cost, least_cost, chord, offset, to_go, k
 
 @kernel
 def _best_path(graph, costs, most, path):
-    """Write the path of least cost within the limit; its cost, inf if none, and a lower limit."""
+    """Write the cheapest path within the limit; returns its cost (or inf) and a lower limit."""
     edge_cost, n, n_sums = np.empty(len(graph.head)), len(path), len(costs.failure)
     costs_of_sums(graph, costs.drift, costs.weight, costs.toll, edge_cost)
     known = Known(np.full(1, np.inf), np.full(n, -1), np.full(n, -1), np.zeros(n_sums))
@@ -329,7 +330,7 @@ class Labels(NamedTuple):
 
 @kernel
 def _search(graph, costs, most, edge_cost, limits, known):
-    """Label search: writes the best path; a lower limit on its cost, equal to it where exact."""
+    """Label search: writes the best path; returns a lower limit on its cost, equal where exact."""
     n_numbers = 1 + len(costs.failure) + len(costs.x0)
     made, last = np.empty((4, most), np.int64), np.full(len(graph.cell), -1)
     labels = Labels(np.empty((most, n_numbers)), made[0], made[1], made[2], made[3], last)
@@ -353,7 +354,7 @@ def _search(graph, costs, most, edge_cost, limits, known):
 
 @kernel
 def _extend(graph, costs, edge_cost, limits, known, labels, s, label, n):
-    """Make the labels that follow one of a state and can be best; the number of all labels."""
+    """Make the successors of a label that can be optimal; returns the number of all labels."""
     n_sums = len(costs.failure)
     number, after, sums = labels.number[label], np.empty(len(costs.x0)), np.empty(n_sums)
     for e in range(graph.first[s], graph.first[s + 1]):
@@ -378,7 +379,7 @@ def _extend(graph, costs, edge_cost, limits, known, labels, s, label, n):
 
 @kernel
 def _is_hopeless(costs, limits, h, cost, sums, known):
-    """Whether no path that enters a state with this cost and these sums beats the one known."""
+    """Whether no path that enters a state with this cost and these sums beats the best one."""
     if sums[-1] + limits.safest[h, -1] > costs.limit:
         return True
     at_least = cost + limits.priced[h] + limits.offset

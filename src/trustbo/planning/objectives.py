@@ -1,4 +1,4 @@
-"""Objectives: the value of a path from the team's expected trust along it, one row each."""
+"""Objectives: the value of a path, computed from the team's expected trust along it."""
 
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
@@ -27,8 +27,8 @@ class Objective(NamedTuple):
 
         (sum_k credit(K - k) x_k - tolls) / scale(K),
 
-    or, for objectives `of_contact`, minus the contact expected to be lost and the tolls. A new
-    objective is a new row: searches and tests need nothing else.
+    or, for objectives `of_contact`, minus the expected lost contact and the tolls. To add an
+    objective, add a row; searches and tests need no change.
     """
 
     name: str
@@ -50,10 +50,10 @@ MEAN = Objective("mean", scale=lambda n_bounds: np.maximum(n_bounds, 1.0))
 OBJECTIVES: Mapping[str, Objective] = {row.name: row for row in (LOST_CONTACT, TERMINAL, MEAN)}
 """Objectives by name; values are to be maximised.
 
-lost_contact: minus the contact that is expected to be lost on the way, in bounds (9 bounds with an
-expected rate of .9 lose .9), less the tolls and, where the planner has a risk, `failure_cost` times
-the chance to fail. terminal: sigma(trust at the goal - tolls), one minus the paper's cost (6)
-without tolls. mean: mean over the bounds of trust less the toll.
+lost_contact: minus the expected lost contact, in bounds (9 bounds with an expected rate of .9 lose
+.9), minus the tolls and, where the planner has a risk, `failure_cost` times the failure
+probability. terminal: sigma(trust at the goal - tolls), one minus the paper's cost (6)
+without tolls. mean: mean over the bounds of trust minus the toll.
 """
 
 
@@ -106,7 +106,7 @@ def capped(objective: Objective, family: Family, dynamics: Dynamics) -> Dynamics
     """Cap drift and start where rates are linear in trust, so that no bound gains contact.
 
     u <= 1 - B0 1 and x_0 <= 1 for each state, so that trust is at most 1 if B0 >= 0, and a loop
-    never pays. Other dynamics are returned unchanged.
+    never increases the value. Other dynamics are returned unchanged.
     """
     if not objective.of_contact or has_history(objective, family):
         return dynamics

@@ -39,9 +39,9 @@ class AdmissiblePaths:
         start: First cell.
         goal: Last cell.
         max_bounds: Limit on the number of bounds, see `Planner`.
-        turns: Whether a bound may lead back to the cell before: where `max_bounds` is a number.
-        avoided: Bounds that paths do not take though robots could, (move, row, col), or None.
-        bounds: Bounds that a path may take, (move, row, col), by the cell that they enter.
+        turns: Whether U-turns are allowed, which holds if `max_bounds` is a number.
+        avoided: Passable bounds that paths must avoid, (move, row, col), or None.
+        bounds: Bounds that a path may take, (move, row, col), indexed by the cell entered.
         bounds_to_goal: Fewest bounds from each cell to the goal, (row, col); -1 without a path.
         shortest: Fewest bounds of a path.
         longest: Most bounds of a path.
@@ -55,7 +55,7 @@ class AdmissiblePaths:
         max_bounds: int | str = "shortest+2",
         avoided: np.ndarray | None = None,
     ) -> None:
-        """Check the ends and find the fewest bounds; see `Planner` for what is refused."""
+        """Check start and goal and find the fewest bounds; see `Planner` for the errors."""
         self.workspace = require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
         self.start = workspace.locate(start, "start")
         self.goal = workspace.locate(goal, "goal")
@@ -100,7 +100,7 @@ class AdmissiblePaths:
 
     @cached_property
     def graph(self) -> Unrolled:
-        """Unrolled graph of the paths; TrustboError: it is too large to be held."""
+        """Unrolled graph of the paths; raises TrustboError if it is too large."""
         n_moves, rows, cols = self.bounds.shape
         bounds = self.bounds.reshape(n_moves, -1)
         far, near = self.bounds_to_goal.ravel(), self.bounds_from_start.ravel()
@@ -135,13 +135,13 @@ class AdmissiblePaths:
         return Unrolled(cell, left, first, head, bound, starts, self.turns)
 
     def avoiding(self, bounds: np.ndarray, risk: np.ndarray) -> "AdmissiblePaths":
-        """Restrict to paths that take none of some bounds.
+        """Restrict to paths that avoid the given bounds.
 
-        Where there is none, the bounds of least risk are admitted again one by one until there is.
+        If there is no such path, bounds of least risk are admitted again one by one until there is.
 
         Args:
             bounds: Bounds to avoid, (move, row, col).
-            risk: Chance to fail of each bound, (move, row, col).
+            risk: Failure probability of each bound, (move, row, col).
         """
         avoided = bounds & self.workspace.passable_bounds.values
         if self.avoided is not None:
@@ -159,12 +159,12 @@ class AdmissiblePaths:
         return self
 
     def to(self, cell: Cell, extra: int) -> "AdmissiblePaths":
-        """Return the paths to another cell, of up to so many bounds more than the fewest."""
+        """Return the paths to another cell, with up to `extra` bounds more than the fewest."""
         admitted = f"shortest+{extra}"
         return AdmissiblePaths(self.workspace, self.start, cell, admitted, self.avoided)
 
     def cells(self, flat: np.ndarray) -> tuple[Cell, ...]:
-        """Cells of flat indices, up to the first that is negative."""
+        """Cells of flat indices, up to the first negative index."""
         rows, cols = np.divmod(flat[flat >= 0], self.bounds.shape[-1])
         return tuple(zip(rows.tolist(), cols.tolist(), strict=True))
 
@@ -172,7 +172,7 @@ class AdmissiblePaths:
         """Return a path as a tuple of cells if every bound is possible.
 
         Raises:
-            TrustboError: It is broken, or does not lead from start to goal.
+            TrustboError: If it is broken, or does not lead from start to goal.
         """
         cells = tuple(require_on_grid(path, self.bounds.shape[1:]))
         if len(cells) < 2 or (cells[0], cells[-1]) != (self.start, self.goal):

@@ -1,4 +1,4 @@
-"""A plan: a path, its expected trust, value and exactness, and what robots are to do."""
+"""A plan: a path, its expected trust, value and exactness, and the robots' routes."""
 
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -19,8 +19,8 @@ QUANTILES = (0.05, 0.25, 0.75, 0.95)
 class Plan(Summary):
     """A path with its expected trust, value and exactness.
 
-    What robots are to do, `stops`, `posts` and `routes`, in CRS metres, is computed on demand from
-    the workspace, and None without a terrain in memory.
+    The robots' `stops`, `posts` and `routes`, in CRS metres, are computed on demand from the
+    workspace; they are None without a terrain in memory.
 
     Attributes:
         path: Cells, start first.
@@ -30,7 +30,7 @@ class Plan(Summary):
         bands: Quantiles of expected trust over draws of the parameters, shape (quantile, bound,
             robot), see `QUANTILES`; equal to `trust` where the plan is for one draw.
         value: Value of the objective, to be maximised (see `OBJECTIVES`): for lost_contact, minus
-            the contact expected to be lost, in bounds, with trust capped at 1.
+            the expected lost contact, in bounds, with trust capped at 1.
         objective: Name of the objective.
         exact: True if no admissible path is better.
         limit: Upper limit on the value of any admissible path; `value` where exact, NaN for a given
@@ -38,11 +38,11 @@ class Plan(Summary):
         revisits: Number of bounds that enter a cell again.
         seconds: Time of the search, s.
         workspace: Workspace of the path.
-        risk: Chances of the bounds to end the mission and of the path to arrive, with its band;
-            None without a hazard.
-        infeasible: Whether its chance to fail exceeds `max_failure`, as that of a given path may.
-        value_band: Ends of the 90 % band of the value over draws of the parameters, at the chance
-            to fail expected; None where the plan is for one draw. Noise of rates is not in it.
+        risk: Failure probability of each bound, and probability to arrive with its band; None
+            without a hazard.
+        infeasible: Whether the failure probability of a given path exceeds `max_failure`.
+        value_band: Ends of the 90 % band of the value over parameter draws, at the expected failure
+            probability and without noise of rates; None where the plan is for one draw.
     """
 
     path: tuple[Cell, ...]
@@ -62,7 +62,7 @@ class Plan(Summary):
     value_band: tuple[float, float] | None = None
 
     def with_draws(self, given: Self) -> Self:
-        """Return the plan with the bands of another of its path, for many draws."""
+        """Return the plan with the bands of another plan of the same path, for many draws."""
         return replace(self, bands=given.bands, value_band=given.value_band)
 
     def _rows(self) -> Rows:
@@ -87,12 +87,12 @@ class Plan(Summary):
 
     @property
     def p_fail(self) -> np.ndarray | None:
-        """Chance of each bound to end the mission, given that it is begun, shape (bound,)."""
+        """Probability that each bound ends the mission, given that it is begun, shape (bound,)."""
         return None if self.risk is None else self.risk.p_fail
 
     @property
     def p_arrive(self) -> float | None:
-        """Chance that the mission reaches the goal, the mean over draws of the risk."""
+        """Probability that the mission reaches the goal, averaged over draws of the risk."""
         return None if self.risk is None else self.risk.p_arrive
 
     @cached_property
@@ -103,7 +103,7 @@ class Plan(Summary):
 
     @cached_property
     def posts(self) -> np.ndarray | None:
-        """Posts where T2 stands before each bound, shape (bound, robot, 2)."""
+        """Overwatch positions of T2 before each bound, shape (bound, robot, 2)."""
         posts, path = self.workspace.posts, self.path
         return None if posts is None else np.stack([*map(posts.watching, path, path[1:])])
 
@@ -111,8 +111,8 @@ class Plan(Summary):
     def routes(self) -> tuple[tuple[np.ndarray | None, ...], ...] | None:
         """Routes of each bound: the lead's, then each of T2's, polylines of shape (point, 2).
 
-        T2 closes up to its posts for the next bound, at the goal around the lead. None for a robot
-        that has no route.
+        T2 moves to its posts for the next bound, or at the goal to positions around the lead. None
+        for a robot without a route.
         """
         posts, path = self.workspace.posts, self.path
         if posts is None:

@@ -1,4 +1,4 @@
-"""The planner of a user: one workspace, one start and goal, one objective."""
+"""The planner: one workspace, start, goal and objective."""
 
 import time
 from collections.abc import Sequence
@@ -31,7 +31,7 @@ from trustbo.workspace.moves import along
 
 
 class Planner(Summary):
-    """Search for the most trustworthy path of a workspace.
+    """Search for the most trustworthy path in a workspace.
 
     Attributes:
         problem: Admissible paths, objective and costs.
@@ -54,7 +54,7 @@ class Planner(Summary):
         failure_cost: float | None = None,
         family: str = "gaussian",
     ) -> None:
-        """Prepare to plan.
+        """Check the arguments and find the admissible paths.
 
         Args:
             workspace: Planning grid with awareness and passability.
@@ -65,20 +65,21 @@ class Planner(Summary):
                 `"shortest+n"`: up to n more, without U-turns (default: n = 2 for terminal and mean,
                 4 for lost_contact); paths are simple for n up to 2, and `Plan.revisits` counts
                 cells entered again for larger n. An int: walks of at most that many bounds.
-            toll: Cost of each bound apart from trust, such as its length or the time that it takes,
-                (move, row, col) with the moves of `workspace.moves.MOVES`, or an array that
-                broadcasts to it; in bounds for lost_contact, else in units of trust.
-            max_failure: Largest chance that a path fails, in [0, 1), under the risk of `with_risk`;
-                by default no limit.
-            failure_cost: Cost of a failure for lost_contact, in bounds: its value is less by this
-                times the chance to fail. By default the fewest bounds from start to goal, so that
-                a mission that fails counts as one that lost all contact.
-            family: Family of the contact rates, that of the trust model; for lost_contact.
+            toll: Cost of each bound apart from trust, such as its length or duration, (move, row,
+                col) with the moves of `workspace.moves.MOVES`, or an array that broadcasts to it;
+                in bounds for lost_contact, else in units of trust.
+            max_failure: Largest probability that a path fails, in [0, 1), under the risk of
+                `with_risk`; by default no limit.
+            failure_cost: Cost of a failure for lost_contact, in bounds: the value is reduced by
+                this times the failure probability. By default the fewest bounds from start to goal,
+                so that a failed mission counts as one without any contact.
+            family: Observation family of the trust model; used for lost_contact.
 
         Raises:
-            TrustboError: A toll of another shape; start or goal off the grid, impassable, or equal;
-                an unknown name; `max_bounds` below the fewest possible; a number out of its range.
-            NoPathError: The goal cannot be reached.
+            TrustboError: If the toll has another shape; start or goal is off the grid or
+                impassable, or they are equal; a name is unknown; `max_bounds` is below the fewest
+                possible; or a number is out of range.
+            NoPathError: If the goal cannot be reached.
         """
         row = OBJECTIVES[require_choice("objective", objective, OBJECTIVES)]
         chosen = FAMILIES[require_choice("family", family, FAMILIES)]
@@ -122,11 +123,11 @@ class Planner(Summary):
         return other
 
     def require_path(self, path: Sequence[Cell]) -> tuple[Cell, ...]:
-        """Return a path as a tuple of cells; refuse a broken one, or one between other ends."""
+        """Return a path as a tuple of cells; raises TrustboError for a broken or wrong path."""
         return self.problem.paths.require_path(path)
 
     def avoiding(self, bounds: np.ndarray, risk: np.ndarray) -> Self:
-        """Return the planner of paths without some bounds; see `AdmissiblePaths.avoiding`."""
+        """Return the planner that avoids the given bounds; see `AdmissiblePaths.avoiding`."""
         return self._with(paths=self.problem.paths.avoiding(bounds, risk))
 
     def with_risk(
@@ -135,18 +136,19 @@ class Planner(Summary):
         draws: ArrayLike | None = None,
         strata: Strata | None = None,
     ) -> Self:
-        """Return the planner with the chance of each bound to end the mission.
+        """Return the planner with the given failure probability of each bound.
 
-        Plans then have `p_arrive`, respect `max_failure`, and pay `failure_cost` in lost_contact.
+        Plans then have the attribute `p_arrive` and respect `max_failure`; for lost_contact, the
+        value includes `failure_cost`.
 
         Args:
             p_fail: Posterior mean, shape (move, row, col); NaN where there is no bound.
-            draws: Draws from its posterior, shape (draw, move, row, col), for bands of `p_arrive`.
-            strata: Chances under groups of draws, such as `BoundRisk.strata()`, by which a failure
-                is priced; by default `p_fail`, as if bounds failed independently.
+            draws: Draws from the posterior, shape (draw, move, row, col), for bands of `p_arrive`.
+            strata: Failure probabilities under groups of draws, such as `BoundRisk.strata()`, used
+                for the cost of a failure; by default `p_fail`, as if bounds failed independently.
 
         Raises:
-            TrustboError: Other shapes; a chance outside [0, 1].
+            TrustboError: If shapes differ, or a probability is outside [0, 1].
         """
         drawn = None if draws is None else np.asarray(draws, dtype=float)
         risk = Risk(np.asarray(p_fail, dtype=float), drawn, strata)
@@ -155,10 +157,10 @@ class Planner(Summary):
     def with_failure_cost(self, failure_cost: float) -> Self:
         """Return the planner with another cost of a failure, in bounds.
 
-        Objectives other than lost_contact have no such cost, and their planner is unchanged.
+        Objectives other than lost_contact have no such cost; their planner is returned unchanged.
 
         Raises:
-            TrustboError: It is negative, or not finite.
+            TrustboError: If it is negative or not finite.
         """
         return self._with(failure_cost=failure_cost) if self.problem.objective.of_contact else self
 
@@ -166,14 +168,14 @@ class Planner(Summary):
         """Find the best admissible path for given parameters, or for the mean of a posterior.
 
         Args:
-            params: Posterior of `fit`, or parameters; of several draws, the path is that of their
-                mean, and the bands are over the draws, see `evaluate`.
+            params: Posterior of `fit`, or parameters. With several draws, the path is optimal for
+                their mean, and the bands are over the draws; see `evaluate`.
             x0: Expected trust at the start, shape () or (robot,); by default `params.x0_mean`.
 
         Raises:
-            TrustboError: Parameters of other robots or features; beta0 outside the range that the
-                objective is exact for.
-            InfeasibleError: No path respects `max_failure`.
+            TrustboError: If the parameters have other robots or features, or beta0 is outside the
+                range for which the search is exact.
+            InfeasibleError: If no path respects `max_failure`.
         """
         started = time.perf_counter()
         mean = mean_of(params, self.workspace)
@@ -193,8 +195,8 @@ class Planner(Summary):
             dynamics: Recursion of expected trust without leading axes; see `Problem.dynamics`.
 
         Raises:
-            TrustboError: beta0 is outside the range the objective is exact for.
-            InfeasibleError: No path respects `max_failure`.
+            TrustboError: If beta0 is outside the range for which the search is exact.
+            InfeasibleError: If no path respects `max_failure`.
         """
         return self.problem.paths.cells(self.problem.best(dynamics)[-1][0])
 
@@ -209,8 +211,8 @@ class Planner(Summary):
             seed: Seed of the choice of draws.
 
         Raises:
-            TrustboError: beta0 of a draw is outside the range the objective is exact for.
-            InfeasibleError: No path respects `max_failure`.
+            TrustboError: If beta0 of a draw is outside the range for which the search is exact.
+            InfeasibleError: If no path respects `max_failure`.
         """
         params = choose_draws(draws_of(posterior, self.workspace), n_draws, seed)
         dynamics = self.problem.dynamics(params)
@@ -222,16 +224,16 @@ class Planner(Summary):
         """Evaluate a given path; `exact` is False and `limit` NaN.
 
         Args:
-            path: Cells from start to goal, each a neighbour of the last.
-            params: Draws of parameters, one or many, or a posterior; of many, `trust` and `value`
-                are those of mean trust, and `bands` its quantiles. For lost_contact, `value` is the
-                mean over draws. Draws of a posterior have the next mission's day of each robot, see
-                `params_of`.
+            path: Cells from start to goal, each a neighbour of the one before.
+            params: One or many parameter draws, or a posterior. With many, `trust` and `value` are
+                computed from mean trust, and `bands` are its quantiles; for lost_contact, `value`
+                is the mean over draws. Draws of a posterior include robot effects drawn for the
+                next mission, see `params_of`.
             x0: Expected trust at the start; by default `params.x0_mean`.
 
         Raises:
-            TrustboError: Parameters of other robots or features; a path that is broken, or does not
-                lead from start to goal.
+            TrustboError: If the parameters have other robots or features, or the path is broken or
+                does not lead from start to goal.
         """
         path, problem = self.require_path(path), self.problem
         draws, cells = draws_of(params, self.workspace, day=True), np.array(path)
@@ -262,19 +264,19 @@ class Planner(Summary):
         )
 
     def graph(self, params: Params | xr.DataTree) -> nx.DiGraph:
-        """Return the bounds as a graph of cells, on which any algorithm of networkx runs.
+        """Return the cells and bounds as a networkx graph.
 
         Nodes are the passable cells `(row, col)` with `x` and `y` of their centres, CRS metres.
-        Attributes of an edge, a bound: `length`, m; `drift` of the team's mean trust; `cost`, -log
-        sigma of the trust that the bound would lead to if all were like it, and its toll; `lost`,
-        the contact that it would lose then, in bounds, and its toll; and with a risk `risk`,
-        -log(1 - p_fail). Apart from the memory of trust, sums of `lost` are those of lost_contact.
+        Edges are the bounds, with attributes `length`, m; `drift` of the team's mean trust; `cost`,
+        -log sigma of the limit of trust if the bound were repeated, plus its toll; `lost`, the
+        contact lost at that limit, in bounds, plus its toll; and, with a risk, `risk`, -log(1 -
+        p_fail). Except for the memory of trust, sums of `lost` equal the objective lost_contact.
 
         Args:
             params: Posterior or parameters, whose mean is taken.
 
         Raises:
-            TrustboError: abs(beta0) >= 1, for which trust settles nowhere.
+            TrustboError: If abs(beta0) >= 1, for which trust has no limit.
         """
         problem, mean = self.problem, mean_of(params, self.workspace)
         dynamics = problem.dynamics(mean)
@@ -308,13 +310,13 @@ class Planner(Summary):
     def trust_map(
         self, params: Params | xr.DataTree, *, per_robot: bool = False, x0: ArrayLike | None = None
     ) -> xr.DataArray:
-        """Compute the largest expected trust with which each cell can be reached; NaN if none can.
+        """Compute the largest expected trust with which each cell can be reached, else NaN.
 
-        Over the paths to each cell with the fewest possible bounds, or, unless `max_bounds` is
-        "shortest", up to two more without U-turns: with the default `max_bounds`, the value of the
-        goal is the terminal trust of the `terminal` plan. Longer walks, which an int admits, are
-        excluded, for they loiter to gather trust. Shape (row, col), with `per_robot` (robot, row,
-        col), with a leading (draw,) for draws.
+        The maximum is over paths to each cell with the fewest possible bounds or, unless
+        `max_bounds` is "shortest", up to two more without U-turns. With the default `max_bounds`,
+        the value at the goal is the terminal trust of the `terminal` plan. Longer walks, allowed by
+        an int, are excluded, as they could gain trust by loitering. Shape (row, col), or (robot,
+        row, col) with `per_robot`, with a leading axis (draw,) for draws.
 
         Args:
             params: Parameters of any model; a map for every draw if they have draws.
@@ -351,7 +353,7 @@ class Planner(Summary):
     ) -> xr.DataArray:
         """Compute P(cell on the best path), (row, col), from the best path under some draws.
 
-        Where no path respects `max_failure`, that of the safest one.
+        Where no path respects `max_failure`, the safest path is used.
 
         Args:
             posterior: Posterior of `fit`, or draws with leading axis (draw,).
@@ -370,7 +372,7 @@ class Planner(Summary):
 def _toll_of(toll: ArrayLike, bounds: np.ndarray) -> np.ndarray:
     """Tolls (move, row, col), 0 where there is no bound.
 
-    TrustboError: they do not broadcast, or that of a bound is not finite.
+    Raises TrustboError if the shape does not broadcast or the toll of a bound is not finite.
     """
     given = np.asarray(toll, dtype=float)
     try:
@@ -388,7 +390,7 @@ def _toll_of(toll: ArrayLike, bounds: np.ndarray) -> np.ndarray:
 def _value_along(
     problem: Problem, cells: np.ndarray, params: Params, x0: ArrayLike | None
 ) -> tuple[np.ndarray, float, np.ndarray]:
-    """Trust along a path (draw, bound, robot), its value without failures, and that of draws."""
+    """Trust along a path (draw, bound, robot), its value without failures, and per draw."""
     z, of_path = along(problem.paths.workspace.awareness.values, cells), params.along(cells)
     z = z[:, None, None]  # a map of one row
     by_robot = trust_dynamics(of_path, z, x0, by_robot=True)

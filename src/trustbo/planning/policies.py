@@ -1,7 +1,7 @@
 """Policies: from posterior draws to the next plan.
 
 A policy is any callable `policy(rng, params, planner) -> Plan`, and may be passed in place of a
-name. Trust and value of every plan are expectations under the posterior mean, for each policy.
+name. For every policy, trust and value of the plan are expectations under the posterior mean.
 """
 
 from collections.abc import Callable, Mapping
@@ -23,7 +23,7 @@ N_DRAWS = 200
 
 
 def greedy(rng: np.random.Generator, params: Params, planner: Planner) -> Plan:
-    """Best path under the posterior mean of the parameters (the paper's)."""
+    """Best path under the posterior mean of the parameters, as in the paper."""
     return planner.plan(params.mean())
 
 
@@ -46,7 +46,7 @@ def optimistic(
 
 
 def ucb(rng: np.random.Generator, params: Params, planner: Planner, *, kappa: float = 1.0) -> Plan:
-    """Path with the highest mean plus `kappa` sd of its value, of the draws' best paths."""
+    """Best path of a draw with the highest mean plus `kappa` sd of its value over draws."""
     drawn = planner.plan_draws(params, n_draws=N_DRAWS, seed=_seed(rng))
     values = drawn.values_of(drawn.candidates)
     chosen = int(np.argmax(values.mean(0) + kappa * values.std(0)))
@@ -54,7 +54,7 @@ def ucb(rng: np.random.Generator, params: Params, planner: Planner, *, kappa: fl
 
 
 def random(rng: np.random.Generator, params: Params, planner: Planner) -> Plan:
-    """Best path under drifts of the bounds that are uniform in [0, 1], whatever was learned."""
+    """Best path under drifts drawn uniformly from [0, 1], ignoring the posterior."""
     drift = rng.uniform(size=(1, *planner.problem.paths.bounds.shape))
     dynamics = Dynamics(np.zeros((1, 1)), drift, np.zeros(1), np.full((), 0.1))
     return planner.evaluate(planner.best_path(dynamics), params.mean())
@@ -74,7 +74,7 @@ def resolve_policy(policy: str | Policy) -> Policy:
     """Return the policy of that name, or the callable itself.
 
     Raises:
-        TrustboError: It is neither.
+        TrustboError: If it is neither.
     """
     return policy if callable(policy) else POLICIES[require_choice("policy", policy, POLICIES)]
 

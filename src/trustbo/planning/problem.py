@@ -33,7 +33,7 @@ class InfeasibleError(TrustboError):
 
     Attributes:
         path: Safest admissible path.
-        p_fail: Chance that it fails, the least of all admissible paths.
+        p_fail: Failure probability of this path, the least of all admissible paths.
     """
 
     def __init__(self, message: str, path: tuple[Cell, ...], p_fail: float) -> None:
@@ -43,16 +43,16 @@ class InfeasibleError(TrustboError):
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Admissible paths, objective and costs: the data of a `Planner`, which explains them.
+    """Admissible paths, objective and costs of a `Planner`, where they are explained.
 
     Attributes:
         paths: Admissible paths.
         objective: Row of `OBJECTIVES`.
         family: Family of the contact rates.
         toll: Cost of each bound apart from trust, (move, row, col).
-        max_failure: Largest chance that a path fails, or None.
+        max_failure: Largest probability that a path fails, or None.
         failure_cost: Cost of a failure in bounds; None: the fewest bounds of a path.
-        risk: Chance of each bound to end the mission, or None.
+        risk: Probability that each bound ends the mission, or None.
     """
 
     paths: AdmissiblePaths
@@ -81,7 +81,7 @@ class Problem:
 
     @property
     def price(self) -> float:
-        """Cost of a failure, in bounds: 0 without a risk, or for objectives not of contact."""
+        """Cost of a failure, in bounds; 0 without a risk or for objectives not `of_contact`."""
         if self.risk is None or not self.objective.of_contact:
             return 0.0
         return float(self.paths.shortest) if self.failure_cost is None else self.failure_cost
@@ -95,7 +95,7 @@ class Problem:
     ) -> np.ndarray:
         """Value of a path without failures, shape (...,).
 
-        From the team's trust after each bound, (..., bound), and the sd of a rate, (...,).
+        Computed from the team's trust after each bound, (..., bound), and the sd of a rate, (...,).
         """
         objective, toll, n_bounds = self.objective, self.toll_along(path), trust.shape[-1]
         if objective.of_contact:
@@ -106,11 +106,11 @@ class Problem:
         return objective.value((trust @ credit - toll) / scale)
 
     def failure_along(self, path: Sequence[Cell] | np.ndarray) -> float:
-        """Cost of a failure times the chance that a path fails."""
+        """Cost of a failure times the probability that a path fails."""
         return self.price * self.risk.priced(path) if self.risk and self.price else 0.0
 
     def is_within_limit(self, path: Sequence[Cell] | np.ndarray) -> bool:
-        """Whether a path keeps within `max_failure`."""
+        """Whether a path respects `max_failure`."""
         if self.max_failure is None or self.risk is None:
             return True
         return 1.0 - self.risk.survival(path) <= self.max_failure + ROUNDING
@@ -123,10 +123,10 @@ class Problem:
 
     @cached_property
     def risks(self) -> "Risks | None":
-        """Risks that searches add up, None where plans do not depend on them.
+        """Risks that the searches sum along a path; None where plans do not depend on risk.
 
         Raises:
-            TrustboError: There is a limit and no risk, or the chance of a possible bound is NaN.
+            TrustboError: If there is a limit but no risk, or `p_fail` of a possible bound is NaN.
         """
         if self.risk is None and self.max_failure is not None:
             raise TrustboError(
@@ -157,12 +157,12 @@ class Problem:
         """Find the best admissible path under every draw of `dynamics`, or the only one.
 
         Returns:
-            Scores (draw,); upper limits on the score of any path, equal to them where exact; and
-            paths as flat cells, (draw, cell), filled with -1.
+            Scores (draw,); upper limits on the score of any path, equal to the scores where exact;
+            and paths as flat cells, (draw, cell), filled with -1.
 
         Raises:
-            TrustboError: beta0 outside the range for which the search is exact.
-            InfeasibleError: No path respects `max_failure`.
+            TrustboError: If beta0 is outside the range for which the search is exact.
+            InfeasibleError: If no path respects `max_failure`.
         """
         history = has_history(self.objective, self.family)
         self._require_valid(dynamics, history)
@@ -198,7 +198,7 @@ class Problem:
             )
 
     def _infeasible(self, risk: Risk) -> InfeasibleError:
-        """Error of a problem in which no path respects the limit, with the safest path."""
+        """Error for a problem in which no path respects the limit, with the safest path."""
         graph, n = self.paths.graph, self.paths.graph.longest + 1
         nothing = Weights(np.zeros((1, n, 1)), np.zeros((1, n)), np.ones(n))
         of_bounds = risk_of(risk.p_fail).ravel()
@@ -216,7 +216,7 @@ class Problem:
 
 
 class Risks(NamedTuple):
-    """Risks -log(1 - p_fail) of bounds, which a path adds up.
+    """Risks -log(1 - p_fail) of bounds, to be summed along a path.
 
     Fields: of_bounds (bound, sum), for the strata of the risk and, with a limit, for their mean;
     failure (sum,), the cost F_m of a path with sum r_m, F_m (1 - exp(-r_m)); and the limit of the
@@ -229,7 +229,7 @@ class Risks(NamedTuple):
 
 
 def risk_of(p_fail: np.ndarray) -> np.ndarray:
-    """Risk of chances to fail, of which 1 has a large one; 0 where there is no bound."""
+    """Risk -log(1 - p_fail), large but finite for p_fail = 1; 0 where there is no bound."""
     with np.errstate(divide="ignore"):
         return np.minimum(-np.log1p(-np.nan_to_num(p_fail)), _CERTAIN)
 
@@ -238,7 +238,7 @@ def draws_of(posterior: Params | xr.DataTree, workspace: Workspace, *, day: bool
     """Return parameters unchanged, or the draws of a posterior: leading axis (draw,).
 
     Features and robots of a posterior are put in the order of the workspace by their names.
-    `day`: see `params_of`. TrustboError: another object, or other features or robots.
+    `day`: see `params_of`. Raises TrustboError for other objects, features or robots.
     """
     if isinstance(posterior, xr.DataTree):
         return params_of(posterior, workspace, day=day)
@@ -246,6 +246,6 @@ def draws_of(posterior: Params | xr.DataTree, workspace: Workspace, *, day: bool
 
 
 def mean_of(params: Params | xr.DataTree, workspace: Workspace) -> Params:
-    """Return one draw of parameters unchanged, or the mean of several, or of a posterior."""
+    """Return the mean of a posterior or of several draws; one draw is returned unchanged."""
     draws = draws_of(params, workspace)
     return draws.mean() if draws.leading else draws

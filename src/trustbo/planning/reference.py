@@ -1,8 +1,8 @@
-"""The planner by networkx and by enumeration: slow, readable, and judge of the compiled searches.
+"""Reference planner by networkx and enumeration: slow and readable, to test the compiled searches.
 
-Where the value of a path is a sum over its bounds, it is the shortest path by Bellman and Ford in
-the unrolled graph; where history or risk counts, all admissible paths are written out. Neither uses
-a kernel of the package.
+Where the value of a path is a sum over its bounds, the best path is found by Bellman-Ford in the
+unrolled graph; where it depends on history or risk, all admissible paths are enumerated. Neither
+uses the package's compiled kernels.
 """
 
 from collections.abc import Iterator
@@ -25,14 +25,14 @@ from trustbo.workspace.moves import MOVES
 def plan(planner: Planner, params: Params | xr.DataTree) -> Plan:
     """Find the best admissible path for given parameters, or for the mean of a posterior.
 
-    Its value is that of `planner.plan(params)`; of several best paths it may be another one.
+    Its value equals that of `planner.plan(params)`; if several paths are best, they may differ.
 
     Args:
         planner: Planner of a small grid.
         params: Posterior or parameters, whose mean is taken.
 
     Raises:
-        InfeasibleError: No path respects `max_failure`.
+        InfeasibleError: If no path respects `max_failure`.
     """
     problem, mean = planner.problem, mean_of(params, planner.workspace)
     if problem.risks is not None or has_history(problem.objective, problem.family):
@@ -48,7 +48,7 @@ def shortest_paths(planner: Planner, dynamics: Dynamics) -> Iterator[tuple[Cell,
     """Best path of each number of bounds, by `networkx.bellman_ford_path`.
 
     In a path, a bound with j bounds left after it adds w_j . u to the sum, with the weights w_j =
-    sum_{i <= j} credit(i) view . B0^(j - i) of its drift u, and takes its toll away.
+    sum_{i <= j} credit(i) view . B0^(j - i) of its drift u, and subtracts its toll.
     """
     problem = planner.problem
     graph, n_states = problem.paths.graph, len(dynamics.start)
@@ -73,7 +73,7 @@ def shortest_paths(planner: Planner, dynamics: Dynamics) -> Iterator[tuple[Cell,
 
 
 def every_path(paths: AdmissiblePaths) -> Iterator[tuple[Cell, ...]]:
-    """All admissible paths, written out: for small grids."""
+    """Enumerate all admissible paths; for small grids."""
     onward: dict[Cell, list[Cell]] = {}
     for move, row, col in np.argwhere(paths.bounds).tolist():
         down, right = MOVES[move]

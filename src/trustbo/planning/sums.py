@@ -2,7 +2,7 @@
 
 With j bounds left after a bound, its drift u adds w_j . u to the value, whatever the length of the
 path: w_j is the sum over i <= j of credit(i) view . B0^(j - i), see `objectives.weights_of`. States
-are taken in the order of the bounds left, so that those ahead are final (Bellman 1958).
+are processed in order of the bounds left, so that successors are final (Bellman 1958).
 """
 
 import numpy as np

@@ -38,7 +38,7 @@ def cost_of(trust: xr.DataArray) -> xr.DataArray:
 
 
 def _largest(paths: AdmissiblePaths, dynamics: Dynamics, view: np.ndarray) -> np.ndarray:
-    """Largest trust view . x of every draw and cell, (draw, row, col); NaN if out of reach."""
+    """Largest trust view . x of every draw and cell, (draw, row, col); NaN if unreachable."""
     extra = min(SIMPLE_EXTRA, paths.longest - paths.shortest)
     weights = view @ dynamics.transition  # (draw, state)
     beta0 = np.divide(weights, view, out=np.zeros_like(weights), where=view > 0.0)
@@ -60,10 +60,10 @@ def _largest(paths: AdmissiblePaths, dynamics: Dynamics, view: np.ndarray) -> np
 def best_trust(
     paths: AdmissiblePaths, extra: int, drift: np.ndarray, beta0: np.ndarray, x0: np.ndarray
 ) -> np.ndarray:
-    """Largest trust with which each cell can be entered, (draw, row, col); NaN if out of reach.
+    """Largest trust with which each cell can be entered, (draw, row, col); NaN if unreachable.
 
-    One pass over the numbers of bounds. A bound may not lead back to the cell before: each cell
-    keeps the largest trust by any move and by another. Exact for beta0 >= 0.
+    One pass over the numbers of bounds. U-turns are not allowed: each cell keeps the largest trust
+    by any move, and the largest by another move. Exact for beta0 >= 0.
 
     Args:
         paths: Admissible paths.

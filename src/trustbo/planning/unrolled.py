@@ -1,9 +1,9 @@
 """The unrolled graph: the bounds of a path problem, copied for each number of bounds left.
 
-A state (cell, left) is a path in a cell with so many bounds to go. An edge is a bound; it leads to
+A state (cell, left) is a cell with `left` bounds to go. An edge is a bound; it leads to
 a state with one bound less. Every path through the graph is admissible, and every admissible path
-is in it. Kernels go through its arrays once, in the order of `left`; networkx gets the same edges
-by `to_networkx`.
+is in it. Kernels process its arrays once, in the order of `left`; `to_networkx` exports the same
+edges.
 """
 
 from collections.abc import Sequence
@@ -27,7 +27,7 @@ class Unrolled(NamedTuple):
         head: State that each edge leads to, (edge,).
         bound: Bound of each edge, move * cells + cell entered, (edge,).
         starts: State of the start for each number of bounds, from fewest to most, (length,).
-        turns: Whether a bound may lead back to the cell before.
+        turns: Whether U-turns are allowed.
     """
 
     cell: np.ndarray
@@ -44,11 +44,11 @@ class Unrolled(NamedTuple):
         return int(self.left[-1])
 
     def to_networkx(self, cost: Sequence[float] | np.ndarray) -> nx.DiGraph:
-        """Return the graph with the `cost` and the `bound` of each edge, for any algorithm.
+        """Return a networkx graph with the `cost` and the `bound` of each edge.
 
         Every path of the graph from a node `(None, start, left)` to the node `"goal"` is
-        admissible. A node is (cell before, cell, bounds left); the cell before is None where a
-        path may turn back, as it does not matter there.
+        admissible. A node is (cell before, cell, bounds left); the cell before is None where
+        U-turns are allowed, as it is not needed then.
 
         Args:
             cost: Cost of each edge, (edge,).
@@ -87,14 +87,14 @@ class ToGo(NamedTuple):
 
 @kernel
 def new_to_go(n_states: int) -> ToGo:
-    """Room for the costs to go of so many states."""
+    """Allocate the costs to go of `n_states` states."""
     edge, other = np.full(n_states, -1), np.full(n_states, -1)
     return ToGo(np.zeros(n_states), edge, np.full(n_states, np.inf), other)
 
 
 @kernel
 def fill_to_go(graph, cost, to_go) -> None:
-    """Dynamic programming from the goal: write the least sums of the cost of edges, (edge,)."""
+    """Dynamic programming from the goal: write the least costs to go for edge costs (edge,)."""
     least, edge, second, other = to_go
     cell, first, head = graph.cell, graph.first, graph.head
     for s in range(1, len(cell)):
@@ -113,7 +113,7 @@ def fill_to_go(graph, cost, to_go) -> None:
 
 @kernel
 def edges_from(graph, to_go, start, edges) -> int:
-    """Write the edges of the cheapest path from a state; their number."""
+    """Write the edges of the cheapest path from a state; returns their number."""
     s, before, n = start, -1, 0
     while s > 0:
         e = to_go.edge[s]
