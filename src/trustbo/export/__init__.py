@@ -1,4 +1,4 @@
-"""Results as files for other programs: GIS, robots, tables."""
+"""Export of results for GIS, robots and tables."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -21,7 +21,7 @@ WRITERS: dict[str, tuple[str, Callable[[Path, Result], None]]] = {
 def export_result(
     result: Result, folder: FilePath, formats: Sequence[str] = ("geotiff", "geojson")
 ) -> list[Path]:
-    """Write a result to a folder in several formats; return what was written.
+    """Write a result to a folder in several formats; return the files written.
 
     Formats are geotiff, geojson, csv and nav2.
     """

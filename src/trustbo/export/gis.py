@@ -1,4 +1,4 @@
-"""Files for GIS: maps as GeoTIFF; the path, posts and routes of a plan as GeoJSON; CSV."""
+"""GIS files: maps as GeoTIFF; the path, posts and routes of a plan as GeoJSON; tables as CSV."""
 
 import json
 from typing import Any
@@ -30,7 +30,7 @@ def write_geotiff(path: FilePath, maps: Result | xr.Dataset) -> None:
 
     Args:
         path: .tif or .tiff file to write, or to replace.
-        maps: Result, or maps of one: `Result.maps()`.
+        maps: Result, or its maps, `Result.maps()`.
 
     Raises:
         TrustboError: The maps have no CRS, or the file cannot be written.
@@ -61,13 +61,13 @@ def write_geojson(path: FilePath, plan: Plan | Result) -> None:
     """Write a path as GeoJSON (RFC 7946), longitude and latitude on WGS 84.
 
     It has a LineString from start to goal, a Point for each cell with its `bound`, `cell`, expected
-    trust of each robot and its 90 % band, and chance to fail; and on a terrain a Point for each
-    post and a LineString for each route. The property `layer` is "path", "bounds", "posts" or
-    "routes". Lines across 180 degrees are cut in two there.
+    trust of each robot with its 90 % band, and failure probability; with a terrain, also a Point
+    for each post and a LineString for each route. The property `layer` is "path", "bounds", "posts"
+    or "routes". Lines that cross longitude 180 degrees are cut there.
 
     Args:
         path: File to write, or to replace.
-        plan: Plan, or result whose recommended path is meant.
+        plan: Plan, or result whose recommended path is written.
 
     Raises:
         TrustboError: The workspace has no CRS, or the file cannot be written.
@@ -95,11 +95,11 @@ def write_geojson(path: FilePath, plan: Plan | Result) -> None:
 
 
 def write_csv(path: FilePath, result: Result) -> None:
-    """Write a table with a row for each mission, bound and robot, numbered from 1.
+    """Write a table with one row per mission, bound and robot, numbered from 1.
 
-    Columns are those of `logs.to_frame`, and `trust_mean` and `trust_sd`, latent trust under the
-    last posterior; blank for a value that was not measured, for the start cell, and for the trust
-    of a mission that the last posterior does not cover.
+    It has the columns of `logs.to_frame`, and `trust_mean` and `trust_sd` of latent trust under the
+    last posterior. Blanks are values that were not measured, the start cell, and the trust of
+    missions that are not in the last posterior.
 
     Args:
         path: File to write, or to replace.
@@ -123,12 +123,12 @@ def write_csv(path: FilePath, result: Result) -> None:
 
 
 def _of(values: Any) -> Any:
-    """Values of a plan on a terrain; none without."""
+    """Values of a plan on a terrain; empty without a terrain."""
     return () if values is None else values
 
 
 def _cells(plan: Plan) -> list[dict[str, Any]]:
-    """Properties of the cells of a path; what is not known is left out."""
+    """Properties of the cells of a path; unknown ones are omitted."""
     columns: dict[str, np.ndarray] = {}
     for i, robot in enumerate(plan.workspace.team.names):
         columns[f"trust_{robot}"] = plan.trust[:, i]
@@ -144,7 +144,7 @@ def _cells(plan: Plan) -> list[dict[str, Any]]:
 
 
 def _feature(plan: Plan, layer: str, places: np.ndarray, about: dict[str, Any]) -> dict[str, Any]:
-    """Feature at a place (2,) or along places (point, 2), CRS metres."""
+    """GeoJSON feature at a position (2,) or along positions (point, 2), CRS metres."""
     if plan.workspace.grid.crs is None:
         raise TrustboError(_NO_CRS)
     crs, xy = plan.workspace.grid.crs, np.atleast_2d(places)
@@ -159,7 +159,7 @@ def _feature(plan: Plan, layer: str, places: np.ndarray, about: dict[str, Any]) 
 
 
 def _cut(line: shapely.LineString) -> shapely.Geometry:
-    """Line of longitudes without jumps, cut at 180 degrees (RFC 7946, 3.1.9)."""
+    """Line with continuous longitudes, cut at 180 degrees (RFC 7946, 3.1.9)."""
     west, _, east, _ = line.bounds
     if -180.0 <= west and east <= 180.0:
         return line

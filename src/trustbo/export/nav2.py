@@ -1,8 +1,8 @@
 """Files for Nav2: cost map for map_server, stops for FollowWaypoints, graph for its route server.
 
-Positions are in a frame with its origin near the robots: RViz and Nav2 hold them in float32, which
-is coarse at the coordinates of a CRS. `frame.yaml` has the frame's pose in the CRS. The files are
-JSON, which is YAML.
+Positions are in a frame with its origin near the robots, because RViz and Nav2 store them in
+float32, which is too coarse for the coordinates of a CRS. `frame.yaml` has the frame's pose in the
+CRS. The files are JSON, which is YAML.
 """
 
 import json
@@ -32,12 +32,13 @@ _LEAST_COST = 1e-9
 
 
 class Frame(NamedTuple):
-    """Frame of robots: a pose in the CRS.
+    """Coordinate frame of the robots, given by its pose in the CRS.
 
     Attributes:
         origin: Position of (0, 0) of the frame, x and y in CRS metres.
-        rotation: Angle from east, the CRS's x axis, to that of the frame, rad, anticlockwise.
-        name: Name, the `frame_id` of messages.
+        rotation: Angle from east, the x axis of the CRS, to the x axis of the frame, rad,
+            anticlockwise.
+        name: Name, used as the `frame_id` of messages.
     """
 
     origin: tuple[float, float]
@@ -61,15 +62,15 @@ def write_nav2(
     """Write the cost map, each robot's waypoints, the route graph and the frame to a folder.
 
     Args:
-        folder: Folder of `cost_map.yaml` and `.pgm`, `waypoints_<robot>.yaml` (on a terrain),
+        folder: Folder for `cost_map.yaml` and `.pgm`, `waypoints_<robot>.yaml` (on a terrain),
             `route_graph.geojson` and `frame.yaml`.
         result: Result of a campaign.
         frame: Frame of all files, by default with its origin at the start of the path.
         pixel: Side of a pixel of the map, m; by default a tenth of a cell's shorter side.
 
     Raises:
-        TrustboError: A robot has no route in a bound; more cells than ids of Nav2; a map of too
-            many pixels; or a file cannot be written.
+        TrustboError: A robot has no route in a bound; there are more cells than Nav2 has ids; the
+            map has too many pixels; or a file cannot be written.
     """
     folder, workspace = Path(folder), result.workspace
     place = frame or Frame(workspace.grid.center(result.path[0]))
@@ -106,7 +107,7 @@ def write_ros_map(
         pixel: Side of a pixel, m; by default a tenth of a cell's shorter side.
 
     Raises:
-        TrustboError: A cost outside [0, 1], or a map of too many pixels.
+        TrustboError: A cost is outside [0, 1], or the map has too many pixels.
     """
     target = require_suffix(path, ".yaml", ".yml")
     values, corner, side = occupancy(cost.values, workspace, frame, pixel)
@@ -122,7 +123,7 @@ def write_ros_map(
 def occupancy(
     cost: np.ndarray, workspace: Workspace, frame: Frame, pixel: float | None = None
 ) -> tuple[np.ndarray, list[float], float]:
-    """Pixels (row, col), uint8, the southern row first; their lower left corner; their side, m."""
+    """Pixels (row, col), uint8, southern row first; their lower left corner; and pixel size, m."""
     if ((cost < 0.0) | (cost > 1.0)).any():
         raise TrustboError(
             f"cost must be in [0, 1]; got {np.nanmin(cost):g} to {np.nanmax(cost):g}."
@@ -153,8 +154,9 @@ def occupancy(
 def stops_of(plan: Plan, robot: str, frame: Frame) -> np.ndarray:
     """Poses of a robot's stops in a frame, (stop, 3): x, y and heading.
 
-    The lead's stops look at the next; a robot's posts, and its place at the goal, at the lead's
-    next stop. No robot waits for the others by the file. TrustboError: no terrain or route.
+    At each stop the lead faces its next stop. At each post, and at the goal, another robot faces
+    the lead's next stop. The files do not make robots wait for each other. TrustboError: no terrain
+    or route.
     """
     require_choice("robot", robot, (LEAD, *plan.workspace.team.names))
     if plan.stops is None or plan.posts is None or plan.routes is None:
@@ -182,10 +184,10 @@ def _pose(frame: str, x: float, y: float, turn: float) -> dict[str, Any]:
 
 
 def _graph(result: Result, frame: Frame) -> str:
-    """All bounds with the contact each loses, as GeoJSON of Nav2's route server.
+    """All bounds with the contact lost in each, as GeoJSON for Nav2's route server.
 
-    Nodes are the stops of cells, row * columns + column, and edges straight, (1 + move) * cells +
-    the cell entered. Costs are in `metadata`, for its scorer PenaltyScorer.
+    Nodes are the stops in the cells, with ids row * columns + column. Edges are straight, with ids
+    (1 + move) * cells + the cell entered. Costs are in `metadata`, for Nav2's PenaltyScorer.
     """
     workspace = result.workspace
     cols, n_cells = workspace.grid.shape[1], math.prod(workspace.grid.shape)
@@ -218,7 +220,7 @@ def _feature(kind: str, coordinates: list[Any], properties: dict[str, Any]) -> s
 
 
 def _json(value: Any) -> str:
-    """JSON of plain values, floats with a decimal point: the loader takes others as integers."""
+    """JSON of plain values; floats keep a decimal point, else the loader reads integers."""
     if isinstance(value, dict):
         return "{" + ", ".join(f"{json.dumps(k)}: {_json(v)}" for k, v in value.items()) + "}"
     if isinstance(value, list):

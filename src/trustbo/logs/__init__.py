@@ -1,4 +1,4 @@
-"""Missions in files, and logs of robots and people as missions."""
+"""Reading and writing of mission files, robot logs and trust reports."""
 
 from trustbo.logs.bag import Topics, read_bag
 from trustbo.logs.netcdf import read_missions, write_missions

@@ -8,8 +8,9 @@
     /{robot}/contact  std_msgs/Bool, or Float32 and Float64 in [0, 1], at each tick
     /{robot}/odom     Odometry, PoseStamped or PoseWithCovarianceStamped, optional; also of /lead
 
-A bound lasts from its marker to its status, else to the last contact before the next marker. Its
-contact rate is the share of a robot's ticks with contact; NaN was not measured, and is no tick.
+A bound lasts from its marker to its status or, without a status, to the last contact before the
+next marker. Its contact rate is the fraction of a robot's ticks with contact; NaN ticks are
+ignored.
 """
 
 import json
@@ -33,13 +34,13 @@ _NS = 1e9  # in a second
 
 @dataclass(frozen=True)
 class Topics:
-    """Names of topics; `{robot}` stands for the name of a robot, or of the lead.
+    """Names of topics; `{robot}` is replaced by the name of a robot or of the lead.
 
     Attributes:
-        bound: Markers of the starts of bounds.
-        status: Statuses of bounds and missions.
-        contact: Contact of each robot.
-        pose: Pose of each robot and the lead.
+        bound: Topic that marks the start of each bound.
+        status: Topic with the status of bounds and missions.
+        contact: Topic with the contact of each robot.
+        pose: Topic with the pose of each robot and of the lead.
         lead: Name of the lead.
     """
 
@@ -51,7 +52,7 @@ class Topics:
 
 
 class _Series(NamedTuple):
-    """Values and their times, ascending."""
+    """Values and their times, in ascending order."""
 
     time: np.ndarray  # (record,), ns
     value: np.ndarray  # (record, ...)
@@ -78,7 +79,7 @@ class _Marker(NamedTuple):
 
 
 class _Recording(NamedTuple):
-    """Records of a bag, in the order of the robots; poses begin with the lead's, or are empty."""
+    """Records of a bag, in the order of the robots; poses begin with the lead, or are empty."""
 
     markers: list[_Marker]
     status: _Series
@@ -91,15 +92,17 @@ def read_bag(path: FilePath, workspace: Workspace, *, topics: Topics = Topics())
 
     Args:
         path: A `.bag` file of ROS 1, or the folder of a bag of ROS 2.
-        workspace: Workspace with the robots to read, in its order.
+        workspace: Workspace whose robots are read, in its order.
         topics: Names of topics, if not the default ones.
 
     Returns:
-        Missions with the ticks of robots. Awareness is NaN, which a campaign takes from its map.
+        Missions with the ticks of robots. Awareness is NaN; campaigns use the awareness of their
+        map.
 
     Raises:
-        TrustboError: No rosbags; not a bag, or a damaged one; a missing topic; a clock that goes
-            backwards; markers out of order; or what `Mission` refuses.
+        TrustboError: rosbags is not installed; the path is not a bag, or the bag is damaged; a
+            topic is missing; a clock goes backwards; markers are out of order; or `Mission` refuses
+            the data.
     """
     robots = workspace.team.names
     found = _recording(Path(path), topics, robots)
@@ -175,7 +178,7 @@ def _messages(
 
 
 def _marker(time: int, message: Any) -> _Marker:
-    """Start of a bound in a message."""
+    """Parse a message that marks the start of a bound."""
     try:
         content = json.loads(message.data)
         path = tuple(require_pair("path", cell) for cell in content.get("path", ()))
@@ -206,7 +209,7 @@ def _pose(topic: str, message: Any) -> list[float]:
 def _mission(
     found: _Recording, markers: list[_Marker], until: int, workspace: Workspace
 ) -> Mission:
-    """Mission of its markers, the last bound of which ends at `until` at the latest."""
+    """Mission from its markers; its last bound ends at `until` at the latest."""
     start, cells = markers[0], tuple(marker.cell for marker in markers)
     if [marker.bound for marker in markers] != list(range(len(markers))):
         raise TrustboError(f"bounds are in the order {[marker.bound for marker in markers]}.")
@@ -226,7 +229,7 @@ def _mission(
 
 
 def _bound(found: _Recording, marker: _Marker, until: int, start: int, n_features: int) -> Bound:
-    """Bound from its marker to the next, at `until`, of a mission from `start`."""
+    """Bound from its marker to the next one, at time `until`; the mission begins at `start`."""
     statuses = found.status.between(marker.time, until)
     end = int(statuses.time[0]) if len(statuses.time) else until
     contacts = [series.between(marker.time, end) for series in found.contact]

@@ -1,4 +1,4 @@
-"""Tables that users give: one reader, and one parser of names, numbers and times."""
+"""Reader of user tables, with parsers of names, numbers and times."""
 
 import csv
 import gzip
@@ -25,21 +25,23 @@ _LONGEST = 7 * 86_400.0
 
 
 class Columns:
-    """Columns of a table, by name, without what spreadsheets and surveys add to it.
+    """Columns of a table by name, without the extra lines of spreadsheets and surveys.
 
-    Left out are a line `sep=`, columns without a name, empty rows, and the header rows of a survey
-    down to the one with ImportId. Columns are found in any case, with spaces or underscores.
+    These are skipped: a line `sep=`, columns without a name, empty rows, and the header rows of a
+    survey down to the one with ImportId. Column names match regardless of case, and spaces match
+    underscores.
 
     Attributes:
-        what: The table in messages, such as "the table of poses".
+        what: Name of the table in messages, such as "the table of poses".
         frame: Values; None in blank cells of text. The index is the row, 1 below the header.
     """
 
     def __init__(self, table: Any, what: str = "the table") -> None:
-        """Read a CSV file, separated by commas, semicolons or tabs; or any columns pandas takes.
+        """Read a CSV file (commas, semicolons or tabs), or any columns that pandas accepts.
 
         Raises:
-            TrustboError: No such file, or no table; a repeated column; or no rows.
+            TrustboError: The file does not exist or is not a table, a column is repeated, or there
+                are no rows.
         """
         self.what = what
         frame = _of_file(Path(table)) if isinstance(table, str | PathLike) else _of_values(table)
@@ -56,22 +58,22 @@ class Columns:
             raise TrustboError(f"{what} has no rows.")
 
     def find(self, name: str) -> str | None:
-        """Name of a column as the table has it; None without such a column."""
+        """Name of a column as spelled in the table; None if there is no such column."""
         if name in self.frame:
             return name
         alike = [other for other in self.frame if _folded(other) == _folded(name)]
         return alike[0] if len(alike) == 1 else None
 
     def require(self, names: Iterable[str], remedy: str = "") -> None:
-        """Check that columns are there; the TrustboError lists those that the table has."""
+        """Check that columns exist; the TrustboError lists the columns of the table."""
         if missing := [name for name in names if self.find(name) is None]:
             there = ", ".join(self.frame) or "no columns"
             raise TrustboError(f"{self.what} lacks {', '.join(missing)}; it has {there}.{remedy}")
 
     def texts(self, column: str, *, required: bool = True) -> list[str]:
-        """Texts of a column, "" if blank; 1.0, which pandas makes of 1 beside a blank, is 1.
+        """Texts of a column, "" if blank; 1.0 becomes 1 (pandas reads 1 as 1.0 if a cell is blank).
 
-        All are blank where the table lacks a column that is not `required`.
+        All are blank if a column that is not `required` is missing.
         """
         cells = self._cells(column, required).astype(object)
         return ["" if pd.isna(cell) else _WHOLE.sub(r"\1", str(cell)) for cell in cells]
@@ -79,11 +81,11 @@ class Columns:
     def numbers(
         self, column: str, *, blank: bool = True, whole: bool = False, required: bool = True
     ) -> np.ndarray:
-        """Numbers of a column, (row,); NaN where blank, or without a column not `required`.
+        """Numbers of a column, (row,); NaN where blank, or if an optional column is missing.
 
         Raises:
-            TrustboError: Text that is no number, infinity, a blank unless `blank`, or a fraction if
-                `whole`.
+            TrustboError: A value is not a number or is infinite, blank without `blank`, or not
+                whole with `whole`.
         """
         cells = self._cells(column, required)
         parsed = _numbers(cells)
@@ -101,7 +103,7 @@ class Columns:
         return cells.to_numpy(float, na_value=np.nan)
 
     def times(self, column: str) -> pd.Series:
-        """Times of a column: numbers, or dates, in UTC if they have a zone."""
+        """Times of a column: numbers, or dates, converted to UTC if they have a time zone."""
         cells = self._cells(column)
         is_date = cells.dtype.kind == "M"
         if not is_date and not np.isnan(_numbers(cells.dropna())).any():
@@ -125,11 +127,11 @@ class Columns:
 
 
 def seconds_of(first: Columns, second: Columns, column: str = "t") -> list[np.ndarray]:
-    """Times of two tables by one clock, each (row,), s; those of dates since the first date.
+    """Times of two tables on one clock, each (row,), s; dates are counted from the first date.
 
     Raises:
-        TrustboError: Numbers that cannot be seconds; dates in one table alone, or of which one
-            table alone has a time zone; or clocks by which no time of the second is of the first.
+        TrustboError: Numbers cannot be seconds; only one table has dates, or dates with a time
+            zone; or the times of the two tables do not overlap.
     """
     tables, given = (first, second), [table.times(column) for table in (first, second)]
     kinds = ["numbers" if t.dtype.kind != "M" else "dates with a zone" if t.dt.tz else "dates"
@@ -164,7 +166,7 @@ def seconds_of(first: Columns, second: Columns, column: str = "t") -> list[np.nd
 
 
 def require_one_spelling(what: str, names: Iterable[str]) -> None:
-    """Refuse two names that differ by case, spaces or leading zeros alone: TrustboError."""
+    """Raise TrustboError if two names differ only by case, spaces or leading zeros."""
     spelled: dict[str, str] = {}
     for name in dict.fromkeys(names):
         other = spelled.setdefault(_folded(name), name)
@@ -176,7 +178,7 @@ def require_one_spelling(what: str, names: Iterable[str]) -> None:
 
 
 def _folded(name: str) -> str:
-    """Name without case, leading zeros and kinds of spaces."""
+    """Name in lower case, without leading zeros and with uniform spaces."""
     spaced = re.sub(r"[\s_-]+", " ", name.casefold()).strip()
     return re.sub(r"(?<![\d.])0+(?=\d)", "", spaced)
 
@@ -188,12 +190,12 @@ def _cell(value: object) -> str | None:
 
 
 def _numbers(cells: pd.Series) -> np.ndarray:
-    """Numbers of cells, NaN for what is none."""
+    """Numbers of cells; NaN for a cell that is not a number."""
     return pd.Series(pd.to_numeric(cells, errors="coerce")).to_numpy(float, na_value=np.nan)
 
 
 def _of_values(table: Any) -> pd.DataFrame:
-    """Frame of a DataFrame, a mapping of columns or a structured array."""
+    """DataFrame from a DataFrame, a mapping of columns or a structured array."""
     try:
         frame = pd.DataFrame(table)
     except (TypeError, ValueError) as error:
@@ -204,7 +206,7 @@ def _of_values(table: Any) -> pd.DataFrame:
 
 
 def _of_file(file: Path) -> pd.DataFrame:
-    """Cells of a CSV file as text; commas of decimals where other signs separate columns."""
+    """Cells of a CSV file as text; decimal commas are allowed if the separator is not a comma."""
     if not file.is_file():
         raise TrustboError(f"there is no file {str(file)!r}; give a CSV file.")
     try:

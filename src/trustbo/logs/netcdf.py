@@ -1,4 +1,4 @@
-"""Missions as trees of arrays, for netCDF files: a table of them all, and the ticks of robots."""
+"""Missions in netCDF files: a table of all missions, and the ticks of the robots."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,7 +20,7 @@ def read_tree(path: FilePath) -> xr.DataTree:
     """Read a netCDF file of groups into memory.
 
     Raises:
-        TrustboError: There is no such file, it is damaged, or it is no netCDF.
+        TrustboError: The file does not exist, is damaged, or is not netCDF.
     """
     content = read_file(path)
     try:
@@ -36,7 +36,7 @@ def write_tree(path: FilePath, tree: xr.DataTree) -> None:
 
 
 def write_missions(path: FilePath, missions: Sequence[Mission]) -> None:
-    """Write missions, at least one, and their ticks to a netCDF file."""
+    """Write at least one mission, with ticks, to a netCDF file."""
     write_tree(path, missions_to_tree(missions))
 
 
@@ -44,10 +44,10 @@ def read_missions(path: FilePath) -> list[Mission]:
     """Read missions, and their ticks, from a netCDF file or from the folder of a campaign.
 
     Args:
-        path: File of missions; or folder of a campaign, whose missions are as measured.
+        path: File of missions, or folder of a campaign, whose missions are returned as measured.
 
     Raises:
-        TrustboError: There is no such file, it is damaged, or it holds no missions.
+        TrustboError: The file does not exist, is damaged, or contains no missions.
     """
     missions = []
     for file in sorted(Path(path).glob("missions/[0-9]*.nc")) or [path]:
@@ -58,9 +58,9 @@ def read_missions(path: FilePath) -> list[Mission]:
 
 
 def missions_to_tree(missions: Sequence[Mission]) -> xr.DataTree:
-    """Tree of missions, padded with NaN, with their ticks if they were recorded.
+    """Convert missions to a tree, padded with NaN, with ticks if they were recorded.
 
-    TrustboError: robots or features differ.
+    TrustboError: the missions have different robots or features.
     """
     require_same_team(missions)
     n_steps = max(max(len(mission.path), len(mission.bounds) + 1) for mission in missions)
@@ -98,7 +98,7 @@ def missions_to_tree(missions: Sequence[Mission]) -> xr.DataTree:
 
 
 def missions_from_tree(tree: xr.DataTree) -> list[Mission]:
-    """Missions of a tree of `missions_to_tree`; LookupError or ValueError if it is none."""
+    """Convert a tree of `missions_to_tree` back; LookupError or ValueError if it is not one."""
     table = {str(n): a.values for n, a in tree["missions"].to_dataset().variables.items()}
     robots, features = (tuple(map(str, table[d])) for d in ("robot", "feature"))
     ticks = _by_bound(tree["ticks"].to_dataset()) if "ticks" in tree.children else {}
@@ -148,7 +148,7 @@ def _ticks(missions: Sequence[Mission]) -> xr.Dataset | None:
 
 
 def _by_bound(ticks: xr.Dataset) -> dict[tuple[int, int], tuple[Any, Any, Any]]:
-    """Poses, contact and states, None if not recorded, of each mission and bound with ticks."""
+    """Poses, contact and states (None if not recorded) of each mission and bound with ticks."""
     of = np.column_stack([ticks["mission"].values, ticks["bound"].values])
     unknown = np.full(len(of), np.nan)
     values = [of, ticks["pose"].values, ticks["contact"].values.astype(bool)]

@@ -1,4 +1,4 @@
-"""Trust that people report, in tables with a row for each person and step."""
+"""Trust reports of people, in tables with one row per person and step."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -27,12 +27,12 @@ def read_reports(
     inputs: Sequence[str] = (),
     scale: str = "unit",
 ) -> list[Mission]:
-    """Read reports of trust from a table with a row for each person and step.
+    """Read trust reports from a table with one row per person and step.
 
-    A report is given after the outcome of its step. A first row without an outcome is the report
-    before anything was seen. Steps are taken in order; a blank report was not given. A person
-    becomes a mission without a map, a step a bound of one robot, a report a rate in [0, 1], and
-    inputs of a step become features: what the person saw since the report before.
+    Each report follows the outcome of its step. A first row without an outcome is the report before
+    the first observation. Steps are sorted; a blank means that no report was given. Each person
+    becomes a mission without a map, each step a bound of one robot, and each report a rate in [0,
+    1]. The inputs since the previous report become the features of the step.
 
     Args:
         table: Path of a CSV file with a header, separated by commas, semicolons or tabs; or a
@@ -40,20 +40,22 @@ def read_reports(
         person: Column that identifies the person.
         step: Column of the step, a number.
         report: Column of the report.
-        outcome: Column of what the robot did: 1, `true`, `yes` or `success`, or 0, `false`, `no` or
-            `failure`, or blank. It becomes the features `success` and `failure`.
-        demand: Column with the demand of what was seen, from 0, easy, to 1. It becomes the features
-            `success_demand`, success times demand, and `failure_demand`, failure times 1 - demand.
-        inputs: Columns of further features, numbers of size 1: centre and scale other units.
+        outcome: Column with the robot's outcome: 1, `true`, `yes` or `success`, or 0, `false`, `no`
+            or `failure`, or blank. It becomes the features `success` and `failure`.
+        demand: Column with the difficulty of the robot's task, from 0 (easy) to 1. It becomes the
+            features `success_demand`, success times demand, and `failure_demand`, failure times 1 -
+            demand.
+        inputs: Columns of further features, of order 1: centre and scale other units first.
         scale: `"unit"`, reports in [0, 1]; `"likert7"` (or `"ordinal7"`), whole numbers 1 to 7.
 
     Returns:
-        Missions, one for each person in the order of the table; `n_ticks` is the number of steps
-        of a scale of levels, such as 6.
+        Missions, one per person in the order of the table. For a scale of levels, `n_ticks` is the
+        number of levels minus 1, such as 6.
 
     Raises:
-        TrustboError: A missing file or column, a repeated row, a value of the wrong kind or off the
-            scale, a large input, a person without reports, or neither an outcome nor an input.
+        TrustboError: A file or column is missing, a row is repeated, a value has the wrong type or
+            is off the scale, an input is too large, a person has no reports, or there is neither an
+            outcome nor an input.
     """
     levels = levels_of(scale)
     if outcome is None and (demand is not None or not inputs):
@@ -88,7 +90,7 @@ def read_reports(
 def _seen(
     columns: Columns, outcome: str | None, demand: str | None, inputs: Sequence[str]
 ) -> dict[str, np.ndarray]:
-    """Features of what was seen, by name, each (row,)."""
+    """Features by name, each (row,)."""
     seen, rows = {}, columns.frame.index
     if outcome is not None:
         given = [text.lower() for text in columns.texts(outcome)]
@@ -118,7 +120,7 @@ def _seen(
 
 
 def _unit_of(columns: Columns, report: str, levels: int) -> np.ndarray:
-    """Reports in [0, 1], (row,), NaN where blank; TrustboError: one is not on the scale."""
+    """Reports scaled to [0, 1], (row,), NaN where blank; TrustboError: one is not on the scale."""
     y = columns.numbers(report)
     low, high = (1.0, float(levels)) if levels else (0.0, 1.0)
     off = (y < low) | (y > high) | (levels > 0) & (y > np.floor(y))

@@ -1,4 +1,4 @@
-"""Missions as a table in long form: a row for each mission, bound and robot; and back."""
+"""Missions as tables in long form, with one row per mission, bound and robot."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -21,12 +21,12 @@ COLUMNS = (*KEYS, "row", "col", *RATES, "t0", "status", "mission_status")
 def to_frame(missions: Sequence[Mission]) -> pd.DataFrame:
     """Table of missions, numbered from 1, without ticks; `to_csv(file, index=False)` writes it.
 
-    Columns are those of `read_table`. Bound 0 is the start cell, without measurements, and bounds
-    that were planned and not run are blank; a mission without a map has no row of bound 0.
+    Columns are those of `read_table`. Bound 0 is the start cell and has no measurements. Bounds
+    that were planned but not run are blank. A mission without a map has no bound 0.
 
     Raises:
-        TrustboError: Missions of different robots or features; some with a path and some without;
-            or a feature with the name of another column.
+        TrustboError: The missions have different robots or features, only some have a path, or a
+            feature has the name of another column.
     """
     require_same_team(missions)
     if taken := {*missions[0].features} & {*COLUMNS, "x", "y"}:
@@ -55,27 +55,27 @@ def to_frame(missions: Sequence[Mission]) -> pd.DataFrame:
 def read_table(
     table: Any, workspace: Workspace | None = None, *, features: Sequence[str] | None = None
 ) -> list[Mission]:
-    """Read missions from a table with a row for each mission, bound and robot.
+    """Read missions from a table with one row per mission, bound and robot.
 
     Columns are `mission`; `bound`, 0 for the start cell, which has no measurements; `robot`; the
     cell (`row`, `col`), or a position (`x`, `y`, metres of the workspace's CRS); and
     `contact_rate`. Optional are `duration` (s), `n_ticks`, `t0` (s), `status` of the bound,
-    `mission_status` and a column for each feature. A blank was not measured. Bounds after the last
-    with a measurement were planned and not run. Without cells, missions are of a log without a map.
+    `mission_status` and a column for each feature. A blank means not measured. Bounds after the
+    last one with a measurement were planned but not run. Without cells, the log has no map.
 
     Args:
         table: Path of a CSV file with a header, separated by commas, semicolons or tabs; or a
             DataFrame, or a mapping of columns.
-        workspace: Workspace with the robots and features to read, in its order.
-        features: Names of the columns of awareness; by default the workspace's, NaN for those
-            without a column, and without a workspace all columns that are left.
+        workspace: Workspace whose robots and features are read, in its order.
+        features: Names of the awareness columns. By default the workspace's features, NaN if a
+            column is missing; without a workspace, all remaining columns.
 
     Returns:
         Missions in the order of the table, without ticks.
 
     Raises:
-        TrustboError: A missing column, bound or robot; a repeated row; a value of the wrong kind;
-            rows of one bound that disagree; or what `Mission` refuses.
+        TrustboError: A column, bound or robot is missing, a row is repeated, a value has the wrong
+            type, rows of one bound disagree, or `Mission` refuses the data.
     """
     columns = Columns(table)
     at_metres = columns.find("row") is None and columns.find("x") is not None
@@ -113,7 +113,7 @@ def read_table(
 
 
 def _parsed(columns: Columns, features: Sequence[str], places: Sequence[str]) -> pd.DataFrame:
-    """Columns by their names in this module, with the right types; NaN or None where blank."""
+    """Columns with the names and types of this module; NaN or None where blank."""
     values: dict[str, Any] = {name: columns.texts(name) for name in ("mission", "robot")}
     require_one_spelling("column mission", values["mission"])
     if "" in values["mission"]:
@@ -131,7 +131,7 @@ def _parsed(columns: Columns, features: Sequence[str], places: Sequence[str]) ->
 def _mission(
     rows: pd.DataFrame, features: tuple[str, ...], robots: tuple[str, ...], is_mapped: bool
 ) -> Mission:
-    """Mission of its rows."""
+    """Make a mission from its rows."""
     of_bound = rows.groupby("bound")
     numbers = rows["bound"].to_numpy(int)
     planned = list(range(0 if is_mapped else 1, int(numbers.max()) + 1))

@@ -1,4 +1,4 @@
-"""Logs of poses and detections: who saw whom, as missions of robots that watch one of them."""
+"""Logs of poses and detections, converted to missions in which all robots watch one lead."""
 
 import warnings
 from itertools import pairwise
@@ -24,17 +24,17 @@ _FEWEST = 2
 
 
 class Tracks:
-    """Poses of robots and their detections of each other.
+    """Poses of robots, and their detections of each other.
 
     Attributes:
-        robots: Names of the robots, those with poses.
+        robots: Names of the robots with poses.
         tracks: Poses of each robot, (sample, 4): time (s), x, y (m), heading (rad from east,
             anticlockwise), times ascending.
         detections: Detections between robots, (detection, 3): time (s), indices of the watcher and
             of the robot seen.
-        landmarks: Upright cylinders that hide robots, (landmark, 3): x, y, radius (m).
-        robot_radius: Radius within which a robot hides others, m.
-        max_gap: Longest time between two poses over which they are interpolated, s.
+        landmarks: Vertical cylinders that occlude robots, (landmark, 3): x, y, radius (m).
+        robot_radius: Radius of a robot, which occludes others, m.
+        max_gap: Longest gap between two poses that is interpolated, s.
     """
 
     def __init__(
@@ -49,18 +49,18 @@ class Tracks:
         """Read two tables: paths of CSV files, DataFrames, or mappings of columns.
 
         Args:
-            poses: Columns t, robot, x, y (m) and, if known, heading (rad); by default robots face
-                in the direction of their motion. Times are seconds, or dates with times.
-            detections: Columns t, watcher, seen, by the same clock. Those of anything without
-                poses are left out.
+            poses: Columns t, robot, x, y (m) and, if known, heading (rad); by default the heading
+                is the direction of motion. Times are seconds, or dates with times.
+            detections: Columns t, watcher, seen, on the same clock. Detections of objects without
+                poses are ignored.
             landmarks: Shape (landmark, 3), see the attribute.
             robot_radius: See the attribute.
             max_gap: See the attribute.
 
         Raises:
-            TrustboError: A missing column, a value of the wrong kind, two poses of a robot at one
-                time, fewer than two robots, or no detection between robots; and times, positions or
-                headings that cannot be in seconds, metres and radians.
+            TrustboError: A column is missing, a value has the wrong type, a robot has two poses at
+                one time, there are fewer than two robots or no detections between robots, or times,
+                positions or headings cannot be in seconds, metres and radians.
         """
         self.max_gap, self.robot_radius = require_positive("max_gap", max_gap), robot_radius
         self.landmarks = as_array("landmarks", landmarks).reshape(-1, 3)
@@ -101,7 +101,7 @@ class Tracks:
         return min(t[0, 0] for t in self.tracks), max(t[-1, 0] for t in self.tracks)
 
     def at(self, times: np.ndarray) -> np.ndarray:
-        """Poses at some times, (robot, time, 3): x, y, heading; NaN in longer gaps."""
+        """Poses at given times, (robot, time, 3): x, y, heading; NaN in gaps over `max_gap`."""
         poses = np.full((len(self.robots), len(times), 3), np.nan)
         for one, track in zip(poses, self.tracks, strict=True):
             t = track[:, 0]
@@ -120,28 +120,30 @@ def missions_of(
     workspace: Workspace | None = None,
     tick: float = 1.0,
 ) -> list[Mission]:
-    """Make missions of a log: all robots watch one, the lead, bound after bound.
+    """Convert a log to missions in which all robots watch the lead, bound after bound.
 
-    A contact rate is the share of a bound's ticks in which a robot detected the lead, and `n_ticks`
-    their number. The lead is a robot of the mission too, so that all have the same: its rates are
-    not measured (NaN), its features 0. A bound in which a pose is not known in any tick is not
-    measured, and has the mean of each feature over the others of its robot. Features are the means
-    over a bound of `near`, r / (r + range) with the median range r of the log; `ahead`, whether the
-    lead is within 30 degrees of the heading; and `clear`, whether nothing hides it.
+    A contact rate is the fraction of a bound's ticks in which a robot detected the lead, and
+    `n_ticks` is the number of ticks. The lead is also listed as a robot, so that all missions have
+    the same robots. Its contact rates are NaN, because they are not measured, and its features are
+    0. A bound without any tick with known poses is not measured; its features are the means over
+    the robot's other bounds. Features are averaged over a bound: `near` is r / (r + range) with the
+    median range r of the log, `ahead` whether the lead is within 30 degrees of the heading, and
+    `clear` whether the lead is not occluded.
 
     Args:
         tracks: Poses and detections.
-        window: Length of a bound, s; not used with a workspace.
-        lead: Name of the lead; or `"each"`: missions for each robot that the others watch.
-        workspace: Map; bounds then are the lead's crossings from cell to cell, and missions end
-            where it leaves the grid or comes to a cell that is no neighbour.
+        window: Length of a bound, s; ignored if a workspace is given.
+        lead: Name of the lead; or `"each"`, to use every robot as the lead in turn.
+        workspace: Map, with which each move of the lead to another cell is a bound. A mission ends
+            where the lead leaves the grid or jumps to a cell that is not a neighbour.
         tick: Length of a tick, s.
 
     Returns:
-        Missions by lead and time, with a path where there is a workspace.
+        Missions sorted by lead and time, with a path if a workspace is given.
 
     Raises:
-        TrustboError: An unknown robot, a window below a tick, or a log too short for two bounds.
+        TrustboError: The lead is unknown, the window is shorter than a tick, or the log is too
+            short for two bounds.
     """
     require_choice("robot", lead, (*tracks.robots, EACH))
     start, end = tracks.span
@@ -165,13 +167,13 @@ def missions_of(
 
 
 def _ticks(tracks: Tracks, poses: np.ndarray, tick: float) -> np.ndarray:
-    """What each robot has of each other at each tick, (watcher, seen, tick, 2 + feature).
+    """Data of each pair of robots at each tick, shape (watcher, seen, tick, 2 + feature).
 
-    These are whether both poses are known, contact, and the features; all are 0 where a pose is
-    not known, and of a robot with itself.
+    The last axis has whether both poses are known, contact, and the features; all are 0 where a
+    pose is unknown, and on the diagonal.
 
     Raises:
-        TrustboError: Two poses are known at no tick.
+        TrustboError: There is no tick at which two poses are known.
     """
     place = poses[..., 0] + 1j * poses[..., 1]  # a point of the plane is a complex number
     across = place[None] - place[:, None]
@@ -208,9 +210,9 @@ def _mission(
     tick: float,
     path: list[Cell] | None,
 ) -> Mission:
-    """Mission of the ticks (watcher, tick, 2 + feature) of one lead.
+    """Make a mission from the ticks (watcher, tick, 2 + feature) of one lead.
 
-    Its bounds are between the edges, (bound + 1,): the first tick of each bound, and the end.
+    `edges`, shape (bound + 1,), has the first tick of each bound, and the end.
     """
     sums = np.add.reduceat(ticks[:, : edges[-1]], edges[:-1], axis=1).swapaxes(0, 1)
     n_ticks = np.where(sums[..., :1] > 0.0, sums[..., :1], np.nan)
@@ -224,7 +226,7 @@ def _mission(
 
 
 def _crossings(xy: np.ndarray, workspace: Workspace) -> list[tuple[np.ndarray, list[Cell]]]:
-    """Edges and path of each stretch of neighbouring cells that the lead, (tick, 2), entered."""
+    """Edges and path of each sequence of neighbouring cells that the lead, (tick, 2), entered."""
     cells: list[Cell] = []
     for x, y in xy:
         try:
@@ -240,7 +242,7 @@ def _crossings(xy: np.ndarray, workspace: Workspace) -> list[tuple[np.ndarray, l
 
 
 def _track(name: str, rows: np.ndarray) -> np.ndarray:
-    """Poses of one robot (sample, 4) by time, its heading unwound, or that of its motion."""
+    """Poses of one robot (sample, 4) by time, with unwrapped heading or direction of motion."""
     rows = rows[np.argsort(rows[:, 0], kind="stable")]
     t, x, y, heading = rows.T
     if len(t) < 2 or (np.diff(t) <= 0.0).any():
@@ -265,7 +267,7 @@ def _track(name: str, rows: np.ndarray) -> np.ndarray:
 
 
 def _in_degrees(heading: np.ndarray, course: np.ndarray, along: np.ndarray) -> bool:
-    """Whether headings jump as no radians do, or are the course of robots that move in degrees."""
+    """Whether headings are in degrees, by their jumps or the directions of motion."""
     if np.abs(heading).max() <= 2.0 * np.pi + 1e-6:
         return False
     fit, other = (np.cos(h - course).sum() for h in (along, np.radians(along)))

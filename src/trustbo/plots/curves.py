@@ -1,4 +1,4 @@
-"""Curves: trust along a mission, a campaign by mission, regret of studies, effects of robots."""
+"""Curves: trust along a mission, history of a campaign, effects of robots."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -40,8 +40,8 @@ def trust_curves(given: xr.DataTree | Plan, mission: int = -1, *, ax: Any = None
     """Draw the trust of each robot along a mission or a plan, with 50 % and 90 % bands.
 
     Args:
-        given: Posterior of `tb.fit`, whose dots are the measured contact rates; or a plan over a
-            posterior, such as `Result.plan`.
+        given: Posterior of `tb.fit`, drawn with the measured contact rates as dots; or a plan over
+            a posterior, such as `Result.plan`.
         mission: Index of the mission in a posterior; negative indices count from the last.
         ax: Axes to draw on, one for each robot; by default a new figure.
 
@@ -76,7 +76,7 @@ def trust_curves(given: xr.DataTree | Plan, mission: int = -1, *, ax: Any = None
 def _latent_trust(
     posterior: xr.DataTree, mission: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Sequence[str]]:
-    """Bounds, medians and quantiles of trust, measured rates and robots of a mission."""
+    """Bounds, trust medians and quantiles, measured rates and robots of a mission."""
     if "latent" not in posterior.children:
         raise TrustboError(
             "this posterior has no latent trust; give inference.complete(posterior, missions)."
@@ -97,8 +97,8 @@ def _latent_trust(
 def campaign_history(history: xr.Dataset, *, ax: Any = None) -> np.ndarray:
     """Draw the contact and the objective of each mission and, if it is known, the regret.
 
-    A filled dot marks a path that differs from the one before, a cross a mission that did not reach
-    the goal.
+    A filled dot marks a path that differs from the previous one; a cross marks a mission that did
+    not reach the goal.
 
     Args:
         history: `Result.history` or `Campaign.history`.
@@ -137,9 +137,9 @@ def campaign_history(history: xr.Dataset, *, ax: Any = None) -> np.ndarray:
 
 @styled
 def robot_effects(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
-    """Draw the effect of each robot by mission with two standard deviations, from a check.
+    """Draw the effect of each robot by mission, with bars of two standard deviations.
 
-    The band holds effects too small to change a plan; filled markers stand out.
+    The band covers effects too small to change a plan; filled markers are effects that stand out.
 
     Args:
         table: A row for each mission and robot, with the columns `mission`, `robot`, `effect`, `sd`

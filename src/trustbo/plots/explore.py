@@ -34,10 +34,10 @@ text.text = texts[n - 1]
 
 @dataclass(frozen=True)
 class Explorer:
-    """Interactive page; a notebook displays it.
+    """Interactive page, displayed in notebooks.
 
     Attributes:
-        html: The page, which needs no other file and no network.
+        html: The self-contained page, which works offline.
     """
 
     html: str
@@ -52,7 +52,7 @@ class Explorer:
 
 
 def explore(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> Explorer:
-    """Draw a map with layers, the numbers of each cell under the pointer, and missions by a slider.
+    """Draw a map with layers, the values of the cell under the pointer, and a slider over missions.
 
     Args:
         plan: Recommended plan, such as `Result.plan`.
@@ -63,7 +63,7 @@ def explore(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> Explorer:
         Page to display or save.
 
     Raises:
-        TrustboError: The history has no mission.
+        TrustboError: The history has no missions.
     """
     if not history.sizes.get("iteration"):
         raise TrustboError("there is nothing to explore: the history has no mission.")
@@ -146,7 +146,7 @@ def _layout(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> Any:
 
 
 def _layers(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> dict[str, np.ndarray]:
-    """Values of each layer (row, col), by name; those of missions by "mission 1" and so on."""
+    """Values of each layer (row, col) by name; those of missions are named "mission 1", ..."""
     free = plan.workspace.passable.values
     layers = {
         str(name).replace("_", " "): over_cells(values).transpose("row", "col").values
@@ -179,7 +179,7 @@ def _draw_plan(plot: Any, plan: Plan) -> None:
 
 
 def _cells(steps: np.ndarray) -> list[Cell]:
-    """Cells of a path of a history, which is padded with -1."""
+    """Cells of a path in a history, in which paths are padded with -1."""
     return [(int(row), int(col)) for row, col in steps if row >= 0]
 
 
@@ -190,7 +190,7 @@ def _places(path: Sequence[Cell], grid: Grid) -> dict[str, Any]:
 
 
 def _text(mission: xr.Dataset) -> str:
-    """Describe a mission in a line."""
+    """Describe a mission in one line."""
     return (
         f"<b>Mission {int(mission['iteration'])}</b>: {escape(str(mission['status'].item()))}, "
         f"contact rate {float(mission['contact_rate']):.3f}, "

@@ -1,4 +1,4 @@
-"""Planning grid of a workspace, with the names of its cells."""
+"""Planning grid of a workspace, with labelled cells."""
 
 import numpy as np
 from matplotlib import colormaps
@@ -15,7 +15,7 @@ _MOST_NAMED = 24
 
 @styled
 def grid_map(workspace: Workspace, *, ax: Axes | None = None) -> Axes:
-    """Draw the mean heights of the cells, with the cells' names, row,col.
+    """Draw the mean height of each cell, labelled with its row and column.
 
     Impassable cells are hatched; without a terrain, passable cells are blank.
 

@@ -1,4 +1,4 @@
-"""Maps of the terrain and of the planning cells, with contour lines, paths and a scale."""
+"""Maps of the terrain and of the planning cells, with contour lines, paths and a scale bar."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -40,18 +40,18 @@ def trust_maps(
     missions: Sequence[int] = MOMENTS,
     ax: Any = None,
 ) -> np.ndarray:
-    """Draw the trust map that missions were planned on, with their paths (Fig. 5 of the paper).
+    """Draw the trust maps used to plan missions, with their paths (Fig. 5 of the paper).
 
-    The last panel shows the map and the recommended path after the last mission. All maps have one
-    scale: the 2 % to 98 % quantiles of the learned maps without the start cell, whose trust is
-    assumed. A trust of 1 corresponds to unbroken contact; larger values share its colour.
+    The last panel shows the map and the recommended path after the last mission. All maps share one
+    colour scale: the 2 % to 98 % quantiles of the learned maps without the start cell, whose trust
+    is assumed. A trust of 1 corresponds to unbroken contact; larger values have the same colour.
 
     Args:
         history: Map and path of each iteration, such as `Result.history`.
         trust_map: Map after the last mission, dims (row, col), such as `Result.trust_map`.
-        path: Path recommended then, such as `Result.path`.
+        path: Path recommended after the last mission, such as `Result.path`.
         workspace: Workspace of the cells.
-        missions: Missions to draw, from 1; those that were not run are left out.
+        missions: Missions to draw, from 1; missions that were not run are skipped.
         ax: Axes to draw on, one for each panel; by default a new figure.
 
     Returns:
@@ -83,8 +83,8 @@ def trust_maps(
 def terrain_maps(workspace: Workspace, *, ax: Any = None) -> np.ndarray:
     """Draw the surface and the index of each feature (Fig. 4 of the paper).
 
-    A feature of bounds, such as line of sight, is the mean over robots and over the bounds into a
-    cell.
+    A feature of bounds, such as line of sight, is averaged over robots and over the bounds into
+    each cell.
 
     Args:
         workspace: Workspace made from a terrain.
@@ -132,11 +132,11 @@ def cell_map(
     """Draw a map of the planning cells with contour lines; impassable cells are grey.
 
     Args:
-        values: Map, dims (row, col), or (y, x) as of `Result.maps`.
+        values: Map, dims (row, col), or (y, x) as in `Result.maps`.
         workspace: Workspace of the cells.
         path: Path to draw.
-        limits: Values of the first and last colour; by default those of the map.
-        cmap: Colours, a name or a `Colormap` of matplotlib.
+        limits: Values of the first and last colour; by default the range of the map.
+        cmap: Matplotlib `Colormap` or its name.
         label: Label of the colour bar, by default the name of the map; `""` for no colour bar.
         ax: Axes to draw on; by default a new figure.
 
@@ -201,7 +201,7 @@ def draw_cells(
 
 
 def draw_ground(ax: Axes, workspace: Workspace) -> None:
-    """Draw vegetation and contour lines, or the edges of cells without a terrain."""
+    """Draw vegetation and contour lines or, without a terrain, the cell edges."""
     terrain, extent = workspace.terrain, extent_of(workspace.grid)
     ax.set(xlim=extent[:2], ylim=extent[2:], aspect="equal", xticks=[], yticks=[])
     ax.spines[:].set_visible(True)
@@ -214,7 +214,7 @@ def draw_ground(ax: Axes, workspace: Workspace) -> None:
 
 
 def draw_cell_edges(ax: Axes, grid: Grid) -> None:
-    """Draw the edges of the cells."""
+    """Draw the cell edges."""
     _, right, _, top = extent_of(grid)
     style: dict[str, Any] = {"color": "white", "linewidth": 0.3, "alpha": 0.5}
     ax.vlines(np.arange(1, grid.shape[1]) * grid.cell_width, 0.0, top, **style)
@@ -228,7 +228,7 @@ def draw_contours(ax: Axes, workspace: Workspace, colour: str, opacity: float) -
 
 
 def contours(workspace: Workspace) -> list[np.ndarray]:
-    """Contour lines of the ground, at most a dozen levels at a round number of metres.
+    """Contour lines of the ground: at most 12 levels, at multiples of a round number of metres.
 
     Returns:
         Lines, each (point, 2): x and y in metres from the map's lower left corner.
@@ -269,13 +269,13 @@ def contour_interval(relief: float) -> float | None:
 
 
 def robust_limits(values: np.ndarray) -> tuple[float, float]:
-    """Values at the ends of the colours: quantiles, so that single cells do not decide."""
+    """Limits of the colour scale: quantiles, so that they are robust to single cells."""
     low, high = np.nanquantile(values, _ROBUST).tolist()
     return (low, high) if low < high else (low - 0.5e-3, high + 0.5e-3)
 
 
 def draw_scale(ax: Axes, grid: Grid) -> None:
-    """Draw a bar of a round number of metres in the lower right corner of a map."""
+    """Draw a scale bar of a round number of metres in the lower right corner of a map."""
     left, right = ax.get_xlim()
     width = right - left
     magnitude = 10.0 ** np.floor(np.log10(0.4 * width))

@@ -1,4 +1,4 @@
-"""A plan on its terrain, bound by bound: stops of the lead, posts, sight lines and routes."""
+"""Maps of a plan, bound by bound: stops of the lead, posts, sight lines and routes."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -18,10 +18,10 @@ _DASHED = (0, (3, 1.5))
 
 @styled
 def plan_map(plan: Plan, *, bounds: Sequence[int] | None = None, ax: Any = None) -> np.ndarray:
-    """Draw what the robots do: an overview of the path, then each bound.
+    """Draw an overview of a plan's path, then each bound.
 
-    Of a bound, the lead's route between its stops, the posts of the others with their sight lines
-    to the next stop of the lead, and the routes on which they then follow to their next posts.
+    Each bound shows the lead's route between its stops, the posts of the other robots with their
+    sight lines to the lead's next stop, and the routes to their next posts.
 
     Args:
         plan: Plan on a terrain, such as `Result.plan`.
@@ -57,7 +57,7 @@ def plan_map(plan: Plan, *, bounds: Sequence[int] | None = None, ax: Any = None)
 
 
 def _draw_bound(ax: Axes, plan: Plan, k: int) -> None:
-    """Draw the bound of index k and its surroundings."""
+    """Draw bound k and its surroundings."""
     stops, posts, routes = plan.stops, plan.posts, plan.routes
     assert stops is not None and posts is not None and routes is not None  # noqa: S101, PT018
     corner = np.array(plan.workspace.grid.corner)
@@ -86,7 +86,7 @@ def _draw_bound(ax: Axes, plan: Plan, k: int) -> None:
 
 
 def _window(middle: float, half: float, low: float, high: float) -> tuple[float, float]:
-    """Ends of a window around a point, shifted into the map."""
+    """Limits of a window around a point, shifted into the map."""
     width = min(2.0 * half, high - low)
     left = float(np.clip(middle - width / 2.0, low, high - width))
     return left, left + width

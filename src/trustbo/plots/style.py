@@ -1,4 +1,4 @@
-"""Style of all figures, and the axes that they are drawn on."""
+"""Style of all figures, and their axes."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -43,13 +43,13 @@ PAGE = 7.6
 def panels(
     n: int, ax: Any, size: tuple[float, float], *, columns: int = 4, **shared: Any
 ) -> np.ndarray:
-    """Axes of n panels, row by row: those of the user, or those of a new figure.
+    """Axes of n panels, row by row: the user's axes, or axes of a new figure.
 
     Args:
         n: Number of panels.
-        ax: Axes of the user, one or an array; None for a new figure.
+        ax: The user's axes, one or an array; None for a new figure.
         size: Width and height of a panel of a new figure, inches.
-        columns: Most panels in a row.
+        columns: Maximum number of panels in a row.
         **shared: `sharex` and `sharey` of `plt.subplots`.
 
     Raises:
@@ -94,7 +94,7 @@ def add_legend(axes: np.ndarray, handles: Sequence[Any]) -> None:
 
 
 def accent() -> str:
-    """Colour of a single curve: blue that is visible on the background."""
+    """Colour of a single curve: a blue that is visible on the background."""
     red, green, blue = to_rgb(paper())
     return ROBOTS[4] if 0.3 * red + 0.6 * green + 0.1 * blue < 0.5 else ROBOTS[0]
 
@@ -110,10 +110,10 @@ def paper() -> str:
 
 
 def outlined(width: float, colour: str) -> list[patheffects.AbstractPathEffect]:
-    """Effect of an outline, `width` points with the line."""
+    """Outline effect; `width` in points includes the line."""
     return [patheffects.withStroke(linewidth=width, foreground=colour)]
 
 
 def as_text(name: object) -> str:
-    """Text of a name, whose dollar signs matplotlib would take for formulas."""
+    """Name with its dollar signs escaped, so that matplotlib does not read it as a formula."""
     return str(name).replace("$", r"\$").replace("_", " ")
