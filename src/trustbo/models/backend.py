@@ -1,12 +1,12 @@
-"""Import of numpyro with its submodules, and the JAX settings of all computations.
+"""Import of numpyro with its submodules, and JAX settings for all computations.
 
-Without ipywidgets, a kernel of Jupyter is warned of it when numpyro is imported ("IProgress not
-found"); the warning is silenced, as text bars suffice.
+In Jupyter without ipywidgets, importing numpyro warns "IProgress not found"; the warning is
+silenced, as text progress bars suffice.
 
-arviz_base leaves a lazy numpyro in `sys.modules`. A caller that then imports a submodule of it
-first, as in `import arviz; import numpyro.distributions`, gets packages without their submodules,
-and numpyro fails ("numpyro.distributions has no attribute 'distribution'"). To ask the package for
-something first avoids it; where it has happened already, the submodules are put in their places.
+arviz_base leaves a lazy numpyro in `sys.modules`. If a submodule is imported first, as in `import
+arviz; import numpyro.distributions`, packages lack their submodules and numpyro fails
+("numpyro.distributions has no attribute 'distribution'"). Accessing an attribute of the package
+first avoids this; where it has already happened, the submodules are set as attributes.
 """
 
 import sys
@@ -41,24 +41,24 @@ for _name, _module in list(sys.modules.items()):
 
 
 def namespace(x: Any) -> ModuleType:
-    """`jax.numpy` for arrays of JAX, else NumPy: formulas written once serve both."""
+    """`jax.numpy` for JAX arrays, else NumPy, so that one formula serves both."""
     return jnp if isinstance(x, jax.Array) else np
 
 
 def special_functions(x: Any) -> Any:
-    """`jax.scipy.special` for arrays of JAX, else SciPy's."""
+    """`jax.scipy.special` for JAX arrays, else `scipy.special`."""
     return jax.scipy.special if isinstance(x, jax.Array) else special
 
 
 @partial(jax.jit, static_argnums=1)
 def call(prior: Any, method: str, x: jax.Array) -> jax.Array:
-    """Call a method of a distribution as one program; else each operation in it is compiled."""
+    """Call a method of a distribution as one compiled program, not one per operation."""
     return getattr(prior, method)(x)
 
 
 @contextmanager
 def own_settings() -> Iterator[None]:
-    """Compute in float64 with one random number generator, for any JAX flags of the caller."""
+    """Compute in float64 with one random number generator, whatever the caller's JAX flags."""
     with (
         jax.enable_x64(True),
         jax.default_prng_impl("threefry2x32"),

@@ -1,4 +1,4 @@
-"""The state space as NumPyro distributions, for models of your own and the programs of ours."""
+"""The state space as a NumPyro distribution, for built-in and custom models."""
 
 from typing import Any
 
@@ -11,13 +11,12 @@ from numpyro.distributions import constraints
 
 
 class ContactRate(dist.Distribution):
-    """Contact rates of missions given the drift of trust, equations (3)-(4), trust integrated out.
+    """Contact rates given the drift of trust, equations (3)-(4), with trust integrated out.
 
     x_k = beta0 x_{k-1} + drift_k + delta_w w_k, y_k = x_k + delta_v v_k, x_0 ~ N(x0_mean, x0_sd^2)
 
-    The batch shape is (mission,), the event shape (bound, robot). A rate that is NaN was not
-    measured. `drift` may be any function of awareness and of parameters with `numpyro.sample`
-    statements of their own:
+    The batch shape is (mission,), the event shape (bound, robot). NaN marks rates that were not
+    measured. `drift` may be any function of awareness and of other sampled parameters:
 
     >>> drift = level + most * (1.0 - jnp.exp(-rise * awareness[..., 1]))
     >>> with numpyro.plate("mission", len(drift)):
@@ -37,15 +36,15 @@ class ContactRate(dist.Distribution):
         x0_mean: ArrayLike = 0.5,
         x0_sd: ArrayLike = 0.5,
     ) -> None:
-        """Take the drift and the parameters.
+        """Set the drift and the parameters.
 
         Args:
-            drift: What each bound adds to trust, shape (mission, bound, robot).
+            drift: Increment of trust in each bound, shape (mission, bound, robot).
             beta0: Autoregression, shape () or (robot,).
             delta_w: Standard deviation of the process noise, shape () or (robot,).
             delta_v: Standard deviation of the observation noise, shape () or (robot,).
             x0_mean: Mean of trust before the first bound, shape ().
-            x0_sd: Its standard deviation, shape ().
+            x0_sd: Standard deviation of trust before the first bound, shape ().
         """
         self.drift = jnp.asarray(drift)
         self.parameters = tuple(jnp.asarray(p) for p in (beta0, delta_w, delta_v, x0_mean, x0_sd))
@@ -53,7 +52,7 @@ class ContactRate(dist.Distribution):
 
     @jax.numpy_rank_promotion("allow")
     def log_prob(self, value: Array) -> Array:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Log density of each mission in nats, shape (mission,): Kalman's filter."""
+        """Log density of each mission in nats, shape (mission,), by the Kalman filter."""
         seen = ~jnp.isnan(value)
         bounds = (jnp.where(seen, value, 0.0), seen, self.drift)
         by_bound = tuple(jnp.swapaxes(a, 0, 1) for a in bounds)

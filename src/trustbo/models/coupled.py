@@ -51,7 +51,7 @@ class CoupledTrust(TrustModel):
         return named | partials
 
     def derived(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """See `TrustModel.derived`: B0, Delta_w and Delta_v of diagonals and correlations."""
+        """See `TrustModel.derived`: B0, Delta_w and Delta_v from diagonals and correlations."""
         if "B0" in values:
             B0 = values["B0"]
             return {**values, "rest": 1.0 - namespace(B0).diagonal(B0, axis1=1, axis2=2)}
@@ -77,7 +77,7 @@ class CoupledTrust(TrustModel):
     def signal(self, theta: Theta, slots: Slots, layout: Layout) -> Signal:
         """Trust of all robots at all bounds; rows are (bound, robot).
 
-        Rates' noise is Delta_v - eps 1, which robots share, and independent noise of variance eps.
+        Noise of rates is the sum of shared noise, Delta_v - eps 1, and independent noise, eps 1.
         """
         B0, K, R = theta["B0"], slots.n_bounds, slots.n_robots
         xp: Any = namespace(B0)
@@ -116,7 +116,7 @@ class CoupledTrust(TrustModel):
 
 
 def correlation_factor(r: Any, n: int) -> Any:
-    """Cholesky factors (point, n, n) of correlations, of partial ones (point, n (n - 1) / 2)."""
+    """Cholesky factors (point, n, n) from partial correlations (point, n (n - 1) / 2)."""
     xp, k, rows = namespace(r), 0, []
     for i in range(n):
         left, row = xp.ones(len(r)), []

@@ -1,4 +1,4 @@
-"""The default model of fits, campaigns, commands and studies."""
+"""The default model of `fit`, campaigns, commands and studies."""
 
 from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.effects.robot import RobotEffect
@@ -6,15 +6,15 @@ from trustbo.models.pooled import PooledTrust
 
 
 def default_model(observation: str = "gaussian", *, places: bool = True) -> PooledTrust:
-    """Make the default model: `PooledTrust` with effects of places and of robots in missions.
+    """Make the default model: `PooledTrust` with effects of places and robots.
 
     Args:
-        observation: Family of observations, see `TrustModel`.
-        places: False for effects of robots alone, as missions without a map need: effects of places
-            are of cells and of the bounds between them.
+        observation: Observation family, see `TrustModel`.
+        places: Whether to include effects of places, which belong to cells and bounds of a map; use
+            False for missions without a map.
 
     Raises:
-        TrustboError: The family is unknown.
+        TrustboError: If the family is unknown.
     """
     effects = (PlaceEffect(),) * places + (RobotEffect(),)
     return PooledTrust(observation=observation, effects=effects)

@@ -16,7 +16,8 @@ class HierarchicalTrust(PooledTrust):
     """Coefficients per robot, partially pooled: between `PooledTrust` and separate robots.
 
     beta_{i,m} ~ N(mean_beta_m, tau_beta_m^2) and b_i ~ N(mean_b, tau_b^2). The means have the
-    priors of the pooled coefficients, the spreads `Priors.tau`; memory and noises are shared.
+    priors of the pooled coefficients, the spreads have `Priors.tau`; beta0 and the noise scales are
+    common to all robots.
     """
 
     @property

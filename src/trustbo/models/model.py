@@ -41,21 +41,21 @@ MODELS: dict[str, type["TrustModel"]] = {}
 class TrustModel(Summary, ABC):
     """A trust model.
 
-    A model is a file with `weights`, `hyperpriors`, `derived`, `layout`, `signal` (the equation as
-    matrices), `rates` (the equation as a distribution) and `dims`. Inference, posteriors and plans
-    need no more.
+    A subclass defines `weights`, `hyperpriors`, `derived`, `layout`, `signal` (the equation as
+    matrices), `rates` (the equation as a distribution) and `dims`. Inference and planning need no
+    more.
 
     Attributes:
-        priors: Prior of each parameter; by default those of the family of observations and of the
-            names of the features, see `Priors.of`.
-        observation: Family of observations: `"gaussian"`, the paper's; `"censored"`, rates of 0
-            and 1 being limits; `"beta_binomial"`, ticks in contact out of `Bound.n_ticks` ticks,
-            trust being a logit.
-        effects: Effects that add to trust, such as `PlaceEffect()`, of places that awareness does
-            not explain, and `RobotEffect()`, of each robot in each mission; none in the paper.
+        priors: Prior of each parameter; the default depends on the observation family and the
+            feature names, see `Priors.of`.
+        observation: Observation family: `"gaussian"`, as in the paper; `"censored"`, with rates
+            censored at 0 and 1; or `"beta_binomial"`, for ticks in contact out of `Bound.n_ticks`
+            ticks, with trust on the logit scale.
+        effects: Effects added to trust, such as `PlaceEffect()` for places and `RobotEffect()` for
+            each robot in each mission; none in the paper.
 
     Raises:
-        TrustboError: A name is unknown, or effects are no effects, or two of one kind.
+        TrustboError: If a name is unknown, an effect is not an `Effect`, or two are of one kind.
     """
 
     priors: Priors = None  # pyright: ignore[reportAssignmentType]
@@ -89,19 +89,18 @@ class TrustModel(Summary, ABC):
 
     @abstractmethod
     def hyperpriors(self, n_robots: int, n_features: int) -> dict[str, Distribution]:
-        """Priors of the parameters that do not integrate out, numbers or vectors, by name."""
+        """Priors of the parameters that are not integrated out, scalars or vectors, by name."""
 
     @abstractmethod
     def derived(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """Hyperparameters as `signal` takes them, and `rest`, see `effects.effect.Theta`.
 
-        `values` are hyperparameters (point, ...) by the names of `hyperpriors`, or those of a
-        posterior.
+        `values` are hyperparameters (point, ...) by name, from `hyperpriors` or from a posterior.
         """
 
     @abstractmethod
     def layout(self, slots: Slots, *, contrasts: bool = True) -> Layout:
-        """The blocks that slots form; without contrasts, rows are rates of robots."""
+        """Layout of the slots in blocks; without contrasts, rows are rates of robots."""
 
     @abstractmethod
     def signal(self, theta: Theta, slots: Slots, layout: Layout) -> Signal:
@@ -110,7 +109,7 @@ class TrustModel(Summary, ABC):
     @property
     @abstractmethod
     def dims(self) -> dict[str, tuple[str, ...]]:
-        """Axes of each parameter in a posterior, but those of effects."""
+        """Axes of each parameter in a posterior, without the effects."""
 
     # --- shared by all models ---
 
@@ -135,15 +134,15 @@ class TrustModel(Summary, ABC):
         return {name: float(getattr(self.priors, name)) for name in ("x0_mean", "x0_sd")}
 
     def all_hyperpriors(self, slots: Slots) -> dict[str, Distribution]:
-        """Priors of all hyperparameters, those of effects last, by name."""
+        """Priors of all hyperparameters by name, the effects last."""
         priors = self.hyperpriors(slots.n_robots, slots.z.shape[3])
         return priors | {n: p for e in self.effects for n, p in e.hyperpriors().items()}
 
     def theta(self, values: Mapping[str, Any], resolution: float) -> dict[str, Any]:
-        """Hyperparameters as `signal` takes them, of values under `all_hyperpriors`.
+        """Convert values named as in `all_hyperpriors` to the argument of `signal`.
 
-        Rates recorded to a resolution have independent noise of that sd too: without it the density
-        of rates that fit perfectly, constant ones among them, would grow without bound.
+        The resolution of the rates adds independent noise of that sd; otherwise the density of
+        rates that fit perfectly, such as constant ones, would be unbounded.
         """
         if self.family.adds_noise:
             noise = values["delta_v"]
@@ -152,9 +151,9 @@ class TrustModel(Summary, ABC):
         return self.derived(values)
 
     def rates(self, theta: Theta, drift: Any) -> Distribution | None:
-        """Distribution of rates given the drift (mission, bound, robot); one point.
+        """Distribution of rates given the drift (mission, bound, robot), for one point.
 
-        None where no distribution integrates trust out.
+        None if trust cannot be integrated out.
         """
         return None
 
@@ -163,12 +162,12 @@ class TrustModel(Summary, ABC):
         return {name: (name, sites[name]) for name in self.dims}
 
     def slots(self, missions: Sequence[Mission], workspace: Workspace | None = None) -> Slots:
-        """Rates and features of missions, with what the model's effects need beside.
+        """Rates and features of missions, with further data that the model's effects need.
 
         Raises:
-            TrustboError: There are no missions, or they disagree on robots or features; an
-                awareness value is NaN, a measured rate lacks the number of ticks that the family
-                needs, or a path jumps or leaves the workspace.
+            TrustboError: If there are no missions, or they differ in robots or features; an
+                awareness value is NaN; a measured rate lacks the n_ticks that the family needs; or
+                a path jumps or leaves the workspace.
         """
         batch = stack_missions(missions)
         require_ticks(self.family, batch.contact_rate, batch.n_ticks)
@@ -179,7 +178,7 @@ class TrustModel(Summary, ABC):
         return slots
 
     def for_features(self, features: Sequence[str]) -> Self:
-        """The model with default priors for features of these names; custom priors stay.
+        """The model with default priors for the named features; custom priors are kept.
 
         See `Priors.of`. `fit` and campaigns call it.
         """
@@ -188,10 +187,10 @@ class TrustModel(Summary, ABC):
         return replace(self, priors=Priors.of(tuple(features), self.observation))
 
     def program(self, slots: Slots) -> None:
-        """The model as a plain NumPyro program, for any kernel: `MCMC(NUTS(model.program))`.
+        """The model as a NumPyro program, for any kernel, such as `NUTS(model.program)`.
 
-        Everything is sampled but trust, which integrates out where `rates` is a distribution. Call
-        it within `jax.enable_x64(True)`: effects need double precision.
+        Everything is sampled except trust, which is integrated out where `rates` is a distribution.
+        Call it within `jax.enable_x64(True)`: effects need double precision.
         """
         values = {
             name: numpyro.sample(name, prior.to_event(len(prior.batch_shape)))
@@ -221,7 +220,7 @@ class TrustModel(Summary, ABC):
         numpyro.factor("contact_rate", jnp.where(seen, log_p, 0.0).sum())
 
     def params(self, sites: Mapping[str, Any]) -> Params:
-        """Parameters of values by name, (draw, ...), with the axes of `dims`."""
+        """Parameters from values (draw, ...) by name, with the axes of `dims`."""
         return assemble_params(sites, self.x0, self.memory)
 
     def simulate(
@@ -235,15 +234,14 @@ class TrustModel(Summary, ABC):
 
         Args:
             key: Random key.
-            params: Parameters without leading axes; where places have effects, those of the
-                missions' bounds, `params.along(path)`.
+            params: Parameters without leading axes; with place effects, pass `params.along(path)`.
             awareness: Shape (mission, bound, robot, feature).
             n_ticks: Ticks of each bound, of shape (mission, bound, robot) or broadcast to it; the
                 beta-binomial family needs them.
 
         Raises:
-            TrustboError: Awareness has other axes; parameters with leading axes, or of other robots
-                or features; a covariance is not positive definite, or n_ticks is missing.
+            TrustboError: If awareness has other axes; the parameters have leading axes, or other
+                robots or features; a covariance is not positive definite; or n_ticks is missing.
         """
         z = np.asarray(awareness, dtype=float)
         if z.ndim != 4 or params.leading:
@@ -259,7 +257,7 @@ class TrustModel(Summary, ABC):
         return draw_missions(self.family, params, z, ticks, rng)
 
     def options(self) -> dict[str, Any]:
-        """Options to record, by name; priors, effects and the usual memory are left out."""
+        """Options to record, by name, without priors, effects and the default memory."""
         others = ("priors", "effects", *("memory",) * (self.memory == "level"))
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in others}
 

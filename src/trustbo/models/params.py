@@ -19,7 +19,7 @@ PLACES: Mapping[str, tuple[str, ...]] = {
 
 
 class ParameterDraws(Summary):
-    """Methods of parameters of every model; mixed into their tuples."""
+    """Mixin with the methods common to the parameters of all models."""
 
     __slots__ = ()
 
@@ -42,7 +42,7 @@ class ParameterDraws(Summary):
 
     @property
     def by_name(self) -> dict[str, Numbers]:
-        """Numbers by name; fields that are None left out."""
+        """Arrays by name, without fields that are None."""
         values = {name: getattr(self, name) for name in self._fields if name != "memory"}
         return {name: value for name, value in values.items() if value is not None}
 
@@ -54,7 +54,7 @@ class ParameterDraws(Summary):
 
     @property
     def n_robots(self) -> int | None:
-        """Number of robots; None where all share their parameters."""
+        """Number of robots; None if the parameters are the same for all robots."""
         return np.shape(self.b)[-1] if self.BY_ROBOT else None  # pyright: ignore
 
     @property
@@ -71,7 +71,7 @@ class ParameterDraws(Summary):
         return np.broadcast_to(beta0, (*self.leading, n_robots))[..., None] * np.eye(n_robots)
 
     def expected_transition(self, n_robots: int) -> np.ndarray:
-        """Matrix by which expected trust depends on that before: 0 where deviations last."""
+        """Transition matrix of expected trust; 0 for memory of deviations."""
         B0 = self.transition(n_robots)
         return B0 if self.memory == "level" else np.zeros_like(B0)  # pyright: ignore
 
@@ -85,12 +85,12 @@ class ParameterDraws(Summary):
 
     @property
     def places(self) -> dict[str, np.ndarray]:
-        """Effects of places in the model, place and place_bound, by name."""
+        """Place effects of the model, `place` and `place_bound`, by name."""
         effects = {name: getattr(self, name, None) for name in PLACES}
         return {name: np.asarray(value) for name, value in effects.items() if value is not None}
 
     def of_places(self, bounds: np.ndarray) -> np.ndarray:
-        """Effect of each bound, that of the cell entered included; shape (..., bound, effect).
+        """Effect of each bound, including the cell entered; shape (..., bound, effect).
 
         Bounds (bound, 3) are moves, rows and columns; the effect is 0 where the move is negative.
         """
@@ -103,10 +103,11 @@ class ParameterDraws(Summary):
         return np.swapaxes(np.where(moves < 0, 0.0, total), -1, -2)
 
     def along(self, path: Sequence[Cell] | np.ndarray) -> Self:
-        """Parameters of the bounds of a path: the effects of its places are in the intercept.
+        """Parameters for the bounds of a path, with its place effects added to the intercept.
 
-        They have no places, and b (..., 1, bound, robot), the last axis of length 1 where all
-        robots share it; without places they are the same.
+        The result has no place effects, and b (..., 1, bound, robot), with a last axis of length 1
+        where it is common to all robots. Without place effects, the parameters are returned
+        unchanged.
         """
         if not self.places:
             return self
@@ -157,7 +158,7 @@ class _Trust(NamedTuple):
 
 
 class TrustParams(ParameterDraws, _Trust):
-    """Parameters of the pooled model, equations (3)-(4); leading axes (...,) such as (draw,).
+    """Parameters of the pooled model, equations (3)-(4), with leading axes such as (draw,).
 
     Attributes:
         beta0: Autoregression, (...,).
@@ -166,12 +167,12 @@ class TrustParams(ParameterDraws, _Trust):
         delta_w: Standard deviation of the process noise, (...,).
         delta_v: Standard deviation of the observation noise, (...,).
         x0_mean: Mean of trust before the first bound, () or (...,).
-        x0_sd: Its standard deviation, () or (...,).
-        place: Effect of each cell entered, (..., effect, row, col), or None. The axis effect is of
-            robots, or of length 1 where all share them.
+        x0_sd: Standard deviation of trust before the first bound, () or (...,).
+        place: Effect of each cell entered, (..., effect, row, col), or None. The axis `effect` is
+            the robot, or has length 1 if effects are common to all robots.
         place_bound: Effect of each bound, (..., effect, move, row, col), moves as in
             `workspace.MOVES`, or None.
-        memory: What lasts between bounds, `"level"` or `"deviation"`, see `PooledTrust`.
+        memory: Quantity carried over between bounds, `"level"` or `"deviation"`, see `PooledTrust`.
     """
 
     __slots__ = ()
@@ -243,9 +244,9 @@ Params = TrustParams | RobotParams | CoupledParams
 def assemble_params(
     sites: Mapping[str, np.ndarray], x0: Mapping[str, float], memory: str = "level"
 ) -> Params:
-    """Parameters from their sites by name, with leading axis (draw,), and x0_mean and x0_sd.
+    """Build parameters from sites by name, with leading axis (draw,), and x0_mean and x0_sd.
 
-    `memory`: what lasts between bounds, see `PooledTrust`.
+    `memory`: quantity carried over between bounds, see `PooledTrust`.
     """
     if "B0" in sites:
         return CoupledParams(**{name: sites[name] for name in CoupledParams._fields[:5]}, **x0)
@@ -258,10 +259,10 @@ def assemble_params(
 
 
 def check_params(params: Params, n_robots: int | None, n_features: int) -> None:
-    """Refuse parameters that do not match the data; `n_robots` None leaves robots unchecked.
+    """Check that parameters match the data; with `n_robots` None, robots are not checked.
 
-    TrustboError: another number of robots or features, or a covariance that is not symmetric and
-    positive definite.
+    Raises TrustboError if the number of robots or features differs, or a covariance is not
+    symmetric and positive definite.
     """
     n = params.n_robots if n_robots is None else n_robots
     sizes = {"feature": {n_features}, "robot": {n}, "robot_": {n}, "effect": {1, n}}

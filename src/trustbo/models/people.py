@@ -1,4 +1,4 @@
-"""Trust that a person reports: the state space of `PooledTrust` under outcomes, of many persons."""
+"""Self-reported trust of many persons: the state space of `PooledTrust`, driven by outcomes."""
 
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -25,22 +25,21 @@ SUCCESS, FAILURE = "success", "failure"
 
 @dataclass(frozen=True, repr=False)
 class HumanTrust(PooledTrust):
-    """Self-reported trust: a base, and decaying effects of past outcomes.
+    """Self-reported trust: a base level plus decaying effects of past outcomes.
 
     x^k = base^k + d^k,  d^k = beta0 d^{k-1} + gains . inputs^k + delta_w w^k,  d^0 = 0,
 
-    base^k = b + weights . features^k + the person's level; the person's start is in d^1, own gains
-    are in d^k. Inputs are the features whose names begin with `success` or `failure`: outcomes,
-    which may be scaled by demands. A person is a mission, a step is a bound, and an asked task a
-    row of it, as a robot is. `trustbo.logs.read_reports` makes such missions.
+    base^k = b + weights . features^k + the person's level; the person's start enters d^1, and the
+    person's gains enter d^k. Inputs are the features whose names begin with `success` or `failure`:
+    outcomes, which may be scaled by demands. A person is stored as a mission, a step as a bound,
+    and a rated task as a robot. `trustbo.logs.read_reports` makes such missions.
 
     Attributes:
-        scale: `"unit"`, numbers in [0, 1], 0 and 1 being limits, or `"likert7"`, so many levels
-            with cut points halfway between them: trust plus noise lies between the two of a report.
-            Noise of levels is logistic, with sd delta_v.
+        scale: `"unit"`, numbers in [0, 1], censored at 0 and 1; or `"likert7"`, seven levels with
+            cut points halfway between them, and logistic noise with sd delta_v.
 
     Raises:
-        TrustboError: The scale is unknown, or the model has effects but `PersonEffect`.
+        TrustboError: If the scale is unknown, or there are effects other than `PersonEffect`.
     """
 
     memory: str = "deviation"
@@ -61,7 +60,7 @@ class HumanTrust(PooledTrust):
 
     @property
     def columns(self) -> tuple[Effect, ...]:
-        """See `TrustModel.columns`: those of weights, see `effects.person`."""
+        """See `TrustModel.columns`: only weights, see `effects.person`."""
         return (self.weights,)
 
     @cached_property
@@ -76,7 +75,7 @@ class HumanTrust(PooledTrust):
         return cast(PersonEffect, self.effects[0])
 
     def slots(self, missions: Any, workspace: Any = None) -> Slots:
-        """See `TrustModel.slots`; TrustboError: reports are not on the scale."""
+        """See `TrustModel.slots`; raises TrustboError if reports are not on the scale."""
         slots, levels = super().slots(missions, workspace), levels_of(self.scale)
         wanted = levels - 1.0 if levels else np.nan
         bad = ~np.isnan(slots.y) & ~np.isclose(slots.n_ticks, wanted, equal_nan=True)
@@ -89,13 +88,13 @@ class HumanTrust(PooledTrust):
         return slots
 
     def layout(self, slots: Slots, *, contrasts: bool = True) -> Layout:
-        """See `TrustModel.layout`: a block is a person, whose steps add outcomes and the base."""
+        """See `TrustModel.layout`: a block is a person, with outcomes and the base as inputs."""
         outcomes = [name.startswith((SUCCESS, FAILURE)) for name in slots.features]
         split = np.array([*outcomes, False])  # what beta0 carries on
         return Layout(slots.y.shape, joint=True, split=split, apart=True)
 
     def signal(self, theta: Theta, slots: Slots, layout: Layout) -> Signal:
-        """Trust of all bounds: inputs are what beta0 carries on, then what it does not."""
+        """Trust of all bounds: first the inputs that decay with beta0, then the others."""
         xp: Any = namespace(theta["beta0"])
         lasting = self._lasting(theta, slots)
         parts = self.parts(theta, slots)
@@ -107,12 +106,12 @@ class HumanTrust(PooledTrust):
         return Signal(m, T, S, theta["delta_v"][:, None, None])
 
     def _lasting(self, theta: Theta, slots: Slots) -> Any:
-        """What remains at each row of an input at another, (point, row, row)."""
+        """Share of the input at one row that remains at another row, (point, row, row)."""
         xp: Any = namespace(theta["beta0"])
         return xp.kron(powers(theta["beta0"], slots.n_bounds), np.eye(slots.n_robots))
 
     def parts(self, theta: Theta, slots: Slots) -> Any:
-        """Effect of a person's standardised parts on trust, (point, mission, row, part)."""
+        """Effect of a person's standardised coefficients on trust, (point, mission, row, part)."""
         carried, level = np.zeros((2, *slots.y.shape, len(PARTS)))
         carried[:, 0, :, 0] = 1.0  # start
         level[..., 1] = 1.0
@@ -127,9 +126,9 @@ class HumanTrust(PooledTrust):
     def persons(
         self, theta: Theta, off: np.ndarray, slots: Slots, rng: np.random.Generator
     ) -> np.ndarray:
-        """Draws of the parts of persons (draw, mission, part) given their trust.
+        """Draws of the persons' coefficients (draw, mission, part) given their trust.
 
-        `off` (draw, mission, row) is trust less its mean given the columns.
+        `off` (draw, mission, row) is trust minus its mean given the columns.
         """
         W, S = self.parts(theta, slots), self.signal(theta, slots, self.layout(slots)).S
         gain = np.swapaxes(np.linalg.solve(S + 1e-12 * np.eye(S.shape[-1]), W), 2, 3)
@@ -141,7 +140,7 @@ class HumanTrust(PooledTrust):
         return unit * self.effect.sds(theta)[:, None]
 
     def simulate(self, *args: Any, **options: Any) -> NoReturn:
-        """Refuse: TrustboError."""
+        """Not supported; raises TrustboError."""
         raise TrustboError(
             "HumanTrust simulates no missions for given parameters, as persons have effects: fit "
             "reports; the posterior has posterior_predictive."
@@ -154,9 +153,9 @@ class HumanTrust(PooledTrust):
 
 @cache
 def _default_priors() -> Priors:
-    """Memory that lasts, gains of some tenths, and a start that is a person's own.
+    """Default priors: long memory, gains of some tenths, and a separate start for each person.
 
-    Outcomes move a person's trust, little else does; reports slip more.
+    Trust changes mainly with outcomes, and reports are noisier than contact rates.
     """
     with own_settings():
         return Priors(

@@ -28,10 +28,10 @@ class PooledTrust(TrustModel):
     x_k = beta0 x_{k-1} + beta . z_k + b + delta_w w_k,  y_k = x_k + delta_v v_k
 
     Attributes:
-        memory: Quantity that lasts between bounds: trust, `"level"`, as in the paper, or its
-            `"deviation"` from what features and effects expect at a bound.
-        shared_noise: Whether robots share noise in a bound: delta_s s_k is added to the rates of
-            all robots, s_k standard normal.
+        memory: Quantity carried over between bounds: `"level"`, trust as in the paper, or
+            `"deviation"`, its deviation from the mean given features and effects.
+        shared_noise: Whether to add common noise delta_s s_k, s_k standard normal, to the rates of
+            all robots in a bound.
     """
 
     memory: str = "level"  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -61,9 +61,9 @@ class PooledTrust(TrustModel):
         return {**values, "rest": rest}
 
     def layout(self, slots: Slots, *, contrasts: bool = True) -> Layout:
-        """A block for each robot; with shared noise for each contrast of robots, or each mission.
+        """One block per robot; with shared noise, one per contrast of robots or per mission.
 
-        Helmert's contrasts of the robots' rates are independent where all robots are measured.
+        Helmert contrasts of the robots' rates are independent if all robots are measured.
         """
         n = slots.n_robots
         if not self.shared_noise or n == 1:
@@ -74,7 +74,7 @@ class PooledTrust(TrustModel):
         return Layout(slots.y.shape, joint=True)
 
     def signal(self, theta: Theta, slots: Slots, layout: Layout) -> Signal:
-        """Trust of all bounds at once, T = (1 - beta0 Lag)^-1 its response to the drift."""
+        """Trust of all bounds; T = (1 - beta0 Lag)^-1 is its response to the drift."""
         xp: Any = namespace(theta["beta0"])
         n, K = slots.n_robots, slots.n_bounds
         beta0, delta_w = theta["beta0"][:, None], theta["delta_w"][:, None, None]

@@ -18,18 +18,19 @@ from trustbo.models.scores import log_density
 
 
 def _built(kind: Any, *parameters: float) -> Distribution:
-    """Distribution in our precision, on demand: importing trustbo must create no JAX array."""
+    """Distribution in float64, made on demand: importing trustbo must create no JAX array."""
     with own_settings():
         return kind(*parameters)
 
 
 @dataclass(frozen=True, repr=False)
 class Priors(Summary):
-    """Prior of each parameter, a scalar numpyro distribution, and of trust before bound 1.
+    """Priors of the parameters, as scalar NumPyro distributions, and of the initial trust.
 
     The defaults are below; the second argument of a normal is a standard deviation, and the paper
-    leaves x_0 ~ N(0.5, 0.5^2) open. A model ignores parameters it does not have. Weights integrate
-    out under Normal priors; those of memory and noises need quantiles (icdf).
+    leaves x_0 ~ N(0.5, 0.5^2) open. A model ignores parameters it does not have. Weights need
+    Normal priors, as they are integrated out; beta0 and noise scales need priors with quantiles
+    (icdf).
 
     Attributes:
         beta0: Autoregression; the diagonal of B0 in the coupled model.
@@ -45,13 +46,13 @@ class Priors(Summary):
         tau: Spread of the robots' coefficients in the hierarchical model.
         concentration: Concentration of the LKJ prior of noise correlations, coupled model.
         x0_mean: Mean of trust before the first bound.
-        x0_sd: Its standard deviation; 0 fixes it.
+        x0_sd: Standard deviation of trust before the first bound; 0 fixes it at `x0_mean`.
         stationary: True if `beta` and `b` are priors of the weights and intercept of stationary
             trust, beta / (1 - beta0) and b / (1 - beta0), the limit under constant features.
 
     Raises:
-        TrustboError: A prior is no such distribution, that of a weight is not Normal, that of beta0
-            not on (0, 1), a noise or tau can be negative, or `x0_sd` is negative.
+        TrustboError: If a prior is not such a distribution, the prior of a weight is not Normal or
+            that of beta0 not on (0, 1), a noise or tau can be negative, or `x0_sd` is negative.
     """
 
     beta0: Distribution = field(default_factory=partial(_built, dist.Beta, 2.0, 2.0))
@@ -83,7 +84,7 @@ class Priors(Summary):
     @classmethod
     @cache
     def default(cls, observation: str) -> "Priors":
-        """Default priors of a family of observations, one cached object.
+        """Default priors of an observation family, as a cached object.
 
         Counts (`"beta_binomial"`) have wider ones, as trust is a logit: beta_m ~ N(0, 2),
         b ~ N(0, 1), delta_w ~ HalfNormal(0.5), x_0 ~ N(0, 1.5^2).
@@ -92,13 +93,13 @@ class Priors(Summary):
 
     @classmethod
     def of(cls, features: Sequence[str], observation: str = "gaussian") -> "Priors":
-        """Default priors for features of these names.
+        """Default priors for the named features.
 
         `line_of_sight` is a predicted contact rate: stationary trust has slope 1 in it, or in the
         mean of n of them (`line_of_sight_1`, ...), and little else. beta_los / (1 - beta0) ~
         N(1 / n, 0.3^2 / n), other weights N(0, 0.25^2), and b / (1 - beta0) ~ N(0, 0.15^2), so that
-        most rates drawn from the prior lie in [0, 1]. Counts, whose trust is a logit, have five
-        times these, for rates around one half. With no such feature, `default`.
+        most rates drawn from the prior lie in [0, 1]. For counts, where trust is a logit, these are
+        scaled by five, for rates around one half. Without such a feature, returns `default`.
         """
         is_sight = np.array([is_line_of_sight(name) for name in features])
         default, n = cls.default(observation), max(int(is_sight.sum()), 1)
@@ -115,7 +116,7 @@ class Priors(Summary):
             )
 
     def moments(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """Mean and sd of the Normal prior of that name."""
+        """Mean and sd of the Normal prior `name`."""
         prior: Any = getattr(self, name)
         return np.asarray(prior.loc, dtype=float), np.asarray(prior.scale, dtype=float)
 
@@ -128,7 +129,7 @@ class Priors(Summary):
         return mean, sd
 
     def log_density(self, name: str, values: np.ndarray, rest: np.ndarray) -> np.ndarray:
-        """Log density of the prior of that name at values of a parameter, one for each of them.
+        """Log density of the prior `name` at each value of the parameter.
 
         Args:
             name: Name of a field.
@@ -142,12 +143,12 @@ class Priors(Summary):
         return log_density(prior, values / rest) - np.log(rest)
 
     def describe(self) -> dict[str, str]:
-        """Each prior as text, for the record kept with a result."""
+        """Text of each prior, for the record of a posterior."""
         return {one.name: _as_text(getattr(self, one.name)) for one in fields(self)}
 
 
 def _wanted(name: str, prior: Any) -> str:
-    """Text of what a prior of that name must be, empty where it is."""
+    """Text of the requirement that a prior violates, or empty."""
     if not isinstance(prior, Distribution) or len(prior.shape()) > (name == "beta"):
         return "a scalar numpyro distribution, e.g. Normal(0.0, 1.0)"
     if name in ("beta", "b", "coupling"):

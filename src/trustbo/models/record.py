@@ -12,7 +12,7 @@ from trustbo.models.priors import Priors
 
 
 def model_to_record(model: TrustModel) -> dict[str, Any]:
-    """Record of class, options, effects, and priors as text.
+    """Record of a model's class, options and effects, and of its priors as text.
 
     `by_feature` states that the priors depend on the features' names.
     """
@@ -30,10 +30,10 @@ def model_to_record(model: TrustModel) -> dict[str, Any]:
 def model_from_record(
     record: dict[str, Any], given: TrustModel | None = None, features: Sequence[str] = ()
 ) -> TrustModel:
-    """Rebuild the model of a record; one with custom priors or class has to be passed again.
+    """Rebuild a model from its record; models with custom priors or class must be `given`.
 
-    `features` are those of the posterior, for default priors by feature. TrustboError: it has to be
-    passed and was not, or another was passed.
+    `features` are those of the posterior, for default priors by feature. Raises TrustboError if the
+    model is required but not given, or a different one is given.
     """
     if given is not None:
         if model_to_record(given) != record:
@@ -57,9 +57,9 @@ def model_from_record(
 
 
 def effects_from_record(record: Mapping[str, Any]) -> tuple[Effect, ...]:
-    """Effects of a model's record.
+    """Effects from a model's record.
 
-    TrustboError: one of them is of a class that this process has not imported.
+    Raises TrustboError if the class of an effect has not been imported.
     """
     return tuple(_effect_from_record(**effect) for effect in record.get("effects", ()))
 

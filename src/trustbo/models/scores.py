@@ -1,4 +1,4 @@
-"""Hyperparameters as normal scores of their priors: the coordinates that samplers move in.
+"""Hyperparameters as normal scores of their priors, the coordinates used by the samplers.
 
 A score is standard normal a priori. The two noises are the exception: with half-normal scores
 (a_w, a_v) = size (sin(angle), cos(angle)), the coordinates are log size, which the rates determine,
@@ -26,7 +26,7 @@ class Scores:
     """Scores (point, score) of hyperparameters with independent priors."""
 
     def __init__(self, priors: Mapping[str, Distribution]) -> None:
-        """Take the prior of each hyperparameter, a number or a vector, in order."""
+        """Set the prior of each hyperparameter, a scalar or a vector, in order."""
         self.priors = dict(priors)
         sizes = {name: int(np.prod(prior.batch_shape)) for name, prior in priors.items()}
         ends = np.cumsum([0, *sizes.values()])
@@ -43,7 +43,7 @@ class Scores:
 
     @property
     def sizes(self) -> slice:
-        """Scores that are logarithms of the size of the noises."""
+        """Slice of the scores that are logarithms of the size of the noises."""
         return self.at[NOISES[0]]
 
     def values(self, z: np.ndarray) -> dict[str, np.ndarray]:
@@ -72,7 +72,7 @@ class Scores:
     ) -> dict[str, np.ndarray]:
         """Draws of the hyperparameters from their priors, (draw,) or (draw, k).
 
-        Even ones are spread evenly over each prior, in random order.
+        With `even`, they are evenly spaced quantiles of each prior, in random order.
         """
         found = {}
         for name, prior in self.priors.items():
@@ -112,7 +112,7 @@ def of_size(prior: Distribution, size: np.ndarray, name: str = "") -> np.ndarray
 
 
 def log_density(prior: Distribution, x: np.ndarray) -> np.ndarray:
-    """Log density of a prior, in closed form for the usual ones: compiling takes longer."""
+    """Log density of a prior, in closed form for common priors to avoid compilation."""
     prior = _base(prior)
     if isinstance(prior, dist.HalfNormal):
         return stats.halfnorm.logpdf(x, scale=np.asarray(prior.scale))
@@ -129,7 +129,7 @@ def log_density(prior: Distribution, x: np.ndarray) -> np.ndarray:
 
 
 def _base(prior: Any) -> Any:
-    """The distribution of each of equal, independent variables."""
+    """Distribution of one variable of an independent, identically distributed vector."""
     return prior.base_dist if isinstance(prior, dist.ExpandedDistribution) else prior
 
 

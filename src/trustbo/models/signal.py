@@ -1,4 +1,4 @@
-"""What a model says, as matrices: blocks of slots, and their signals given the columns."""
+"""A model as matrices: blocks of slots, and their signals given the columns."""
 
 from typing import Any, NamedTuple
 
@@ -9,10 +9,10 @@ from trustbo.models.backend import namespace
 
 
 class Layout(NamedTuple):
-    """Blocks and rows that slots form.
+    """Layout of slots in blocks and rows.
 
     A block is a robot in a mission, its rows bounds; or, if `joint`, a mission, its rows (bound,
-    robot). With a rotation, signals of blocks are orthonormal combinations of those of the robots.
+    robot). With a rotation, signals of blocks are orthonormal combinations of the robots' signals.
     """
 
     shape: Any  # missions, bounds, robots
@@ -25,7 +25,7 @@ class Layout(NamedTuple):
 
     @property
     def label(self) -> np.ndarray:
-        """Label of each block; the first of the rotated robots differs from the others."""
+        """Label of each block; with a rotation, that of the first contrast differs."""
         n_missions, _, n_robots = self.shape
         if self.joint:
             return np.arange(n_missions) * int(self.apart)
@@ -50,7 +50,7 @@ class Layout(NamedTuple):
         return values if self.rotation is None else values @ self.rotation
 
     def columns(self, U: Any) -> Any:
-        """Columns of slots, sparse (slot, column), as those of (block * row, column)."""
+        """Columns of slots, sparse (slot, column), rearranged to (block * row, column)."""
         n, K, R = self.shape
         if self.rotation is not None:
             U = sparse.csr_array(sparse.kron(sparse.eye_array(n * K), self.rotation)) @ U
@@ -66,10 +66,10 @@ class Layout(NamedTuple):
 
 
 class Signal(NamedTuple):
-    """Trust x = m + T u + e, e ~ N(0, S), of a block at each point; u is the drift by its columns.
+    """Trust x = m + T u + e, e ~ N(0, S), of a block at each point; u is the drift by column.
 
     Rows of a block are its observations, inputs the numbers that columns add to. The second axis is
-    of labels, see `inference.engine.Blocks`; it has length 1 where all blocks are alike.
+    the label, see `inference.engine.Blocks`; it has length 1 where all blocks have equal matrices.
     """
 
     m: Any  # (point, label, row)
@@ -80,12 +80,12 @@ class Signal(NamedTuple):
 
     @property
     def covariance(self) -> Any:
-        """Covariance of trust and the noise that rows share, (point, label, row, row)."""
+        """Covariance of trust plus shared noise, (point, label, row, row)."""
         return self.S if self.noise is None else self.S + self.noise
 
 
 def each(M: Any, label: np.ndarray) -> Any:
-    """Values (point, block, ...) of blocks by their labels; one for all where all are alike."""
+    """Values (point, block, ...) of blocks by label; one block if all are equal."""
     return M if M.shape[1] == 1 else M[:, label]
 
 

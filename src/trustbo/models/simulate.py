@@ -1,4 +1,4 @@
-"""Missions drawn from a model for given parameters, in NumPy: nothing is compiled."""
+"""Missions simulated from a model for given parameters, in NumPy without compilation."""
 
 import numpy as np
 
@@ -33,9 +33,9 @@ def draw_missions(
 
 
 def _noise(params: Params, family: Family, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Factors of the covariances of w and of rates' noise that robots share, and sd of their own.
+    """Factors of the covariances of w and of shared noise of rates, and sd of independent noise.
 
-    As in `CoupledTrust.signal`, own noise is half the least eigenvalue of Delta_v.
+    As in `CoupledTrust.signal`, independent noise has half the least eigenvalue of Delta_v.
     """
     none = np.zeros((n, n))
     if not isinstance(params, CoupledParams):

@@ -20,7 +20,7 @@ UNKNOWN_RESOLUTION, COARSEST_RESOLUTION = 0.005, 0.1
 
 
 class Slots(NamedTuple):
-    """Rates and features of missions, padded to the longest one; slots are mission first."""
+    """Rates and features of missions, padded to the longest one; the first axis is the mission."""
 
     y: np.ndarray  # (mission, bound, robot), NaN where not measured
     z: np.ndarray  # (mission, bound, robot, feature), 0 in the padding
@@ -60,7 +60,7 @@ class Slots(NamedTuple):
         return float(min(np.median(steps), COARSEST_RESOLUTION))
 
     def without(self, missions: Sequence[int] | slice) -> Self:
-        """The same slots as if some missions had not been measured."""
+        """Copy in which the given missions are marked as not measured."""
         y = self.y.copy()
         y[missions] = np.nan
         return self._replace(y=y)
@@ -69,14 +69,14 @@ class Slots(NamedTuple):
 def broadcast_ticks(
     family: Family, n_ticks: ArrayLike | None, shape: tuple[int, ...]
 ) -> np.ndarray:
-    """Ticks of that shape, NaN if not given; TrustboError: the family needs them."""
+    """Broadcast ticks, NaN if not given; raises TrustboError if the family needs them."""
     if n_ticks is None and family.needs_ticks:
         raise TrustboError(NO_TICKS)
     return np.broadcast_to(np.asarray(np.nan if n_ticks is None else n_ticks, dtype=float), shape)
 
 
 def require_ticks(family: Family, y: np.ndarray, n_ticks: np.ndarray) -> None:
-    """Refuse measured rates (mission, bound, robot) without n_ticks if the family needs them."""
+    """Raise TrustboError if the family needs n_ticks and a measured rate in y lacks it."""
     without = ~np.isnan(y) & ~(n_ticks >= 1.0)
     if family.needs_ticks and without.any():
         j, k, i = np.argwhere(without)[0]

@@ -25,8 +25,8 @@ class Visited(NamedTuple):
 def bounds_of(missions: Sequence[Mission], shape: tuple[int, int] | None = None) -> np.ndarray:
     """Move, row and column of each mission's bounds, (mission, bound, 3), -1 in the padding.
 
-    `shape`, missions and bounds, is that with the padding, by default without. TrustboError: a path
-    jumps, so that it has no directed bounds, or a mission has no map.
+    `shape` (missions, bounds) includes the padding; by default none is added. Raises TrustboError
+    if a path jumps or a mission has no map.
     """
     require_map("a model with effects of places", missions)
     if shape is None:
@@ -45,7 +45,7 @@ def bounds_of(missions: Sequence[Mission], shape: tuple[int, int] | None = None)
 
 
 def has_places(missions: Sequence[Mission]) -> bool:
-    """Whether bounds of missions have places: there is a map, and no path jumps."""
+    """Whether all missions have a map and paths without jumps."""
     try:
         bounds_of(missions)
     except TrustboError:
@@ -56,8 +56,8 @@ def has_places(missions: Sequence[Mission]) -> bool:
 def visited(bounds: np.ndarray, shape: tuple[int, int] | None = None) -> Visited:
     """Index the places of bounds (mission, bound, 3), see `bounds_of`.
 
-    `shape` is that of the grid, by default up to the last row and column visited. TrustboError: a
-    cell lies outside it, or there are too many bounds for one dense factor.
+    `shape` is the shape of the grid, by default up to the last row and column visited. Raises
+    TrustboError if a cell lies outside, or there are too many bounds for one dense factor.
     """
     there = bounds[..., 0] >= 0
     found, index_of = np.unique(bounds[there], axis=0, return_inverse=True)

@@ -10,10 +10,9 @@ A label is dropped if another label of its state costs no more, has no larger su
 of any robot. B0 >= 0 preserves the order of trust, so every completion of the former is at least as
 good for the latter. Where a path may not turn back, the other must have come from the same cell, or
 there must be two that came from different cells. A label is also dropped if it cannot beat the best
-path
-known: the remaining cost is bounded by a sum over edges, with the largest possible trust and with
-    F_m (1 - exp(-r_m)) replaced by its chord over the sums that can still be optimal. The limit is
-    relaxed with a Lagrange multiplier, found by bisection (Handler and Zang 1980).
+path known: the remaining cost is bounded by a sum over edges, with the largest possible trust and
+with F_m (1 - exp(-r_m)) replaced by its chord over the sums that can still be optimal. The limit is
+relaxed with a Lagrange multiplier, found by bisection (Handler and Zang 1980).
 
 The search is exact: the remaining labels include the best path unless it is already known.
 """
