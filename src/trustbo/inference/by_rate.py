@@ -27,27 +27,27 @@ def by_rate(
     *,
     model: TrustModel | None = None,
 ) -> xr.DataTree:
-    """Flatten a posterior to one dimension of measured rates, each predicted from those before.
+    """Flatten a posterior to one dimension of rates, each predicted from the earlier ones.
 
-    A posterior's own observations are whole missions, as the rates of a mission depend on each
-    other: `loo` leaves out missions. ArviZ's functions of single observations (`loo_pit`,
-    `plot_loo_pit`, `loo_expectations`, `loo_metrics`, PIT of predictions) read this view. Its
-    likelihood is p(rate | draw, rates of the mission before), whose product over a mission is the
-    mission's; its predictions are draws from the same.
+    In a posterior, whole missions are the observations, as the rates of a mission depend on each
+    other; `loo` leaves out missions. Use this view with ArviZ functions for single observations
+    (`loo_pit`, `plot_loo_pit`, `loo_expectations`, `loo_metrics`). Its likelihood is p(rate | draw,
+    earlier rates of the mission), whose product is the likelihood of the mission; predictions are
+    drawn from this distribution.
 
     Args:
         posterior: DataTree from `fit`, or one of `Result.posteriors`.
-        missions: Missions that it was fitted to; needed where it holds no data.
-        model: Its model; needed with custom priors.
+        missions: Missions of the fit; needed if the posterior holds no data.
+        model: Model of the posterior; needed with custom priors.
 
     Returns:
         DataTree with `posterior`, `sample_stats`, `prior` and `log_prior` unchanged, and
         `observed_data`, `posterior_predictive`, `prior_predictive` and `log_likelihood` of
         `contact_rate`, over (chain, draw, rate), with the mission, bound and robot of each rate as
-        coordinates. Rates that were not measured are left out.
+        coordinates. Unmeasured rates are omitted.
 
     Raises:
-        TrustboError: Rates that are not Gaussian, or no posterior of `fit`.
+        TrustboError: If rates are not Gaussian, or the posterior is not from `fit`.
     """
     posterior = complete(require_posterior("by_rate", posterior), missions, model=model)
     fitted, draws = read_posterior(posterior, missions, model=model)
@@ -85,9 +85,9 @@ def by_rate(
 
 
 def _one_step(fitted: Posterior, draws: Draws) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and sd (draw, mission, bound, robot) of each rate given those before it in its mission.
+    """Mean and sd (draw, mission, bound, robot) of each rate given earlier ones of its mission.
 
-    The covariance of the rates of a block is factored in their order, (bound, robot).
+    The covariance of a block's rates is factored in the order (bound, robot).
     """
     model, slots = fitted.model, fitted.slots
     blocks, layout = fitted.by_robot()

@@ -1,4 +1,4 @@
-"""Diagnostics of a posterior, and the limits beyond which `fit` refuses it."""
+"""Diagnostics of a posterior, and the limits beyond which `fit` raises an error."""
 
 from collections.abc import Mapping
 
@@ -23,7 +23,7 @@ def diagnostics(posterior: xr.DataTree) -> dict[str, float]:
         hyperparameters, and the number of `divergences`.
 
     Raises:
-        TrustboError: No posterior of `fit`.
+        TrustboError: If the posterior is not from `fit`.
     """
     attrs = require_posterior("diagnostics", posterior).attrs
     names = ("k_hat", "kish") if attrs["sampler"] == "importance" else NUTS_NAMES

@@ -1,4 +1,4 @@
-"""Draws of a posterior, read by the names of its variables, features and robots."""
+"""Read the draws of a posterior by the names of its variables, features and robots."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -47,7 +47,7 @@ def sites_of(posterior: xr.DataTree) -> dict[str, np.ndarray]:
     """All draws of a posterior by name, chains joined: leading axis (draw,).
 
     Raises:
-        TrustboError: Some draws are NaN, as if masked.
+        TrustboError: If some draws are NaN, for example after masking.
     """
     draws = posterior["posterior"].to_dataset()
     sites = {str(name): joined_draws(array) for name, array in draws.items()}
@@ -62,10 +62,10 @@ def sites_of(posterior: xr.DataTree) -> dict[str, np.ndarray]:
 
 
 def joined_draws(array: xr.DataArray, axes: Sequence[Any] = (...,)) -> np.ndarray:
-    """Draws (draw, ...) with chains joined, other axes in an order, by default the given one.
+    """Draws (draw, ...) with chains joined and other axes ordered as `axes`, if given.
 
-    In one layout, whether just sampled or read from a file: sums over draws then round alike, and a
-    resumed campaign has the same bits.
+    The memory layout is the same for new draws and for draws read from a file, so that sums are
+    rounded equally and a resumed campaign is bit-identical.
     """
     values = np.ascontiguousarray(array.transpose("chain", "draw", *axes).values)
     return values.reshape(values.shape[0] * values.shape[1], *values.shape[2:])  # also of none
@@ -78,20 +78,20 @@ def params_of(
 
     Args:
         posterior: DataTree from `fit`.
-        workspace: Workspace to plan on: features and robots are put in its order, by name.
-        day: Whether each draw has effects drawn for the next mission, a bad day of a robot among
-            them, for bands and predictions of rates; by default it has the expected ones, for
-            plans. Without effects other than of places there is no difference.
+        workspace: Workspace for planning; features and robots are put in its order, by name.
+        day: Whether effects are drawn for the next mission, including a robot's bad day, for bands
+            and predictions of rates; by default they are expected effects, for plans. This matters
+            only for effects other than places.
 
     Returns:
-        `TrustParams`, `RobotParams` or `CoupledParams`, according to the model. With
-        effects other than of places, `RobotParams` of the next mission: with `RobotEffect`, weights
-        of line of sight have the effect of each robot, in which the last bad day is gone and what
-        stays fades.
+        `TrustParams`, `RobotParams` or `CoupledParams`, according to the model. With effects other
+        than places, `RobotParams` for the next mission: with `RobotEffect`, the weights of line of
+        sight include each robot's effect, without the last bad day and with the persistent part
+        decayed.
 
     Raises:
-        TrustboError: No posterior of `fit`; a variable is missing, or draws are NaN; or the
-            posterior is of other features or robots than the workspace's.
+        TrustboError: If the posterior is not from `fit`; a variable is missing, or draws are NaN;
+            or its features or robots differ from the workspace's.
     """
     if is_of_people(require_posterior("params_of", posterior)):
         raise TrustboError(
@@ -139,7 +139,7 @@ def params_of(
 
 
 def _in_order_of(workspace: Workspace, posterior: xr.DataTree) -> xr.DataTree:
-    """The posterior with features and robots in a workspace's order; TrustboError: others."""
+    """Reorder features and robots as in a workspace; raises TrustboError if they differ."""
     draws, order = posterior["posterior"].to_dataset(), {}
     data = posterior["constant_data"].to_dataset() if "constant_data" in posterior else draws
     wanted = {"feature": list(workspace.features), "robot": list(workspace.team.names)}
@@ -196,9 +196,9 @@ def theta_of(posterior: xr.DataTree, sites: Mapping[str, np.ndarray]) -> Theta:
 
 
 def model_of(posterior: xr.DataTree, model: TrustModel | None = None) -> TrustModel:
-    """Model of a posterior, with its family and priors.
+    """Return the model of a posterior, with its family and priors.
 
-    TrustboError: Its priors are its own, or its class, and `model` is not given.
+    Raises TrustboError if its priors or class are custom and `model` is not given.
     """
     data = "constant_data" if "constant_data" in posterior.children else "posterior"
     coords = posterior[data].to_dataset().coords
@@ -214,16 +214,16 @@ def read_posterior(
     *,
     model: TrustModel | None = None,
 ) -> tuple[Posterior, Draws]:
-    """The posterior of a DataTree as `fit` had it, and its draws, chains joined.
+    """Rebuild the `Posterior` of a DataTree, and its draws with chains joined.
 
     Args:
         posterior: DataTree from `fit`.
-        missions: Missions that it was fitted to; needed where it holds no data.
-        model: Its model; needed with custom priors.
+        missions: Missions of the fit; needed if the posterior holds no data.
+        model: Model of the posterior; needed with custom priors.
 
     Raises:
-        TrustboError: The posterior holds no data and no missions are given, or its model is not on
-            record.
+        TrustboError: If the posterior holds no data and no missions are given, or its model is not
+            recorded.
     """
     missions = missions_of(posterior) if missions is None else list(missions)
     model = model_of(posterior, model)
@@ -253,7 +253,7 @@ def sample_prior(
 
 
 def prior_mean(model: TrustModel, n_features: int, *, n_robots: int = 1) -> Params:
-    """Mean of the parameters under the prior, without effects; arguments as of `sample_prior`."""
+    """Mean of the parameters under the prior, without effects; see `sample_prior`."""
     prior, rng = _prior(model, n_features, n_robots), np.random.default_rng(0)
     draws = prior.draw_prior(_N_MEAN, rng, even=True)
     draws = draws._replace(c=prior.prior(draws.theta).mean)
@@ -262,7 +262,7 @@ def prior_mean(model: TrustModel, n_features: int, *, n_robots: int = 1) -> Para
 
 
 def _prior(model: TrustModel, n_features: int, n_robots: int) -> Posterior:
-    """The posterior given nothing, without effects."""
+    """The `Posterior` without data and effects."""
     sizes = {"n_features": n_features, "n_robots": n_robots}
     n_features, n_robots = (require_whole(name, n, 1) for name, n in sizes.items())
     none = np.full((1, 1, n_robots), np.nan)
@@ -272,7 +272,7 @@ def _prior(model: TrustModel, n_features: int, n_robots: int) -> Posterior:
 
 
 def missions_of(posterior: xr.DataTree) -> list[Mission]:
-    """Missions rebuilt from the data in a posterior; TrustboError: it holds parameters alone."""
+    """Rebuild missions from a posterior; raises TrustboError if it holds no data."""
     if "constant_data" not in posterior.children:
         raise TrustboError(
             "this posterior holds parameters alone: give the missions it was fitted to, of "

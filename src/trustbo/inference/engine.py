@@ -1,4 +1,4 @@
-"""The evidence of every model: blocks of jointly normal signals that share columns.
+"""Evidence of every model: blocks of jointly normal signals with common columns.
 
 A block (a robot in a mission, a mission of robots that influence each other, or a person) has trust
 and a signal
@@ -7,11 +7,11 @@ and a signal
 
 and every observation is a Gaussian site N(y; f, 1 / lam): exact for Gaussian rates, matched by
 expectation propagation for others (`ep`). With L L' = 1 + lam^1/2 (S + noise) lam^1/2 and
-W = L^-1 lam^1/2, the rates are a regression of W (y - m) on W T U with unit noise. Products of
+W = L^-1 lam^1/2, the model is a regression of W (y - m) on W T U with unit noise. Products of
 columns by pairs of rows, summed over the blocks of one kind, do not depend on theta, so that
 U' (W T)' (W T) U is one sparse product for all theta, whatever the number of missions.
 
-One source serves NumPy, where nothing compiles, and JAX, which differentiates it.
+The same code runs in NumPy, without compilation, and in JAX, with derivatives.
 """
 
 from collections.abc import Sequence
@@ -27,7 +27,7 @@ from trustbo.models.signal import Signal, each
 
 
 class Blocks(NamedTuple):
-    """Data of all blocks, which do not depend on theta."""
+    """Data of all blocks, independent of theta."""
 
     y: np.ndarray  # (block, row), 0 where not measured
     U: Any  # sparse (block * input, column)
@@ -47,14 +47,14 @@ class Blocks(NamedTuple):
         apart: bool = False,
         order: Order | None = None,
     ) -> Self:
-        """Lay blocks out; those with the same label and the same gaps are of one kind.
+        """Lay out blocks; blocks with equal labels and equal gaps are of one kind.
 
         Args:
             y: Observations (block, row), NaN where not measured.
             U: Columns, sparse (block * input, column).
             label: Index (block,) on the second axis of a `Signal`.
-            apart: Whether each block is a kind of its own, as sites that differ need it.
-            order: Order of elimination of the columns; by default all are of the core.
+            apart: Whether each block is a separate kind, as needed for sites that differ.
+            order: Order of elimination of the columns; by default all belong to the core.
         """
         n, p = len(y), U.shape[1]
         order = (
@@ -101,7 +101,7 @@ class Prior(NamedTuple):
 
     @classmethod
     def of(cls, groups: Sequence[tuple[Any, Sequence[Any]]]) -> Self:
-        """Prior of groups of columns, each a mean (point, k) or None, and its precisions."""
+        """Prior of groups of columns, each with a mean (point, k) or None, and precisions."""
         means, parts, log_det, known = [], [], 0.0, {}
         for mean, precisions in groups:
             if not precisions:
@@ -121,7 +121,7 @@ class Prior(NamedTuple):
         return cls(xp.concatenate(means, axis=1), parts, log_det)
 
     def add_to(self, A: Any, order: Order) -> Any:
-        """The precision of the columns added to entries (point, entry)."""
+        """Add the precision of the columns to entries (point, entry)."""
         start = 0
         for part in self.parts:
             i = np.arange(start, start := start + part.shape[1])
@@ -171,7 +171,7 @@ def evidence(blocks: Blocks, signal: Signal, prior: Prior, lam: Any, y: Any = No
         signal: Distribution of the signals given the columns.
         prior: Prior of the columns.
         lam: Precisions of the sites (point, kind, row), 0 where nothing was measured.
-        y: Sites (point, block, row), where these are not at the observations.
+        y: Means of the sites (point, block, row), if they differ from the observations.
     """
     W, log_sites = whiten(blocks, signal, lam)
     xp, n, b = namespace(W), len(W), blocks
@@ -209,7 +209,7 @@ def expected(blocks: Blocks, signal: Signal, c: Any) -> Any:
 
 
 def draw_columns(prior: Prior, fit: Fit, count: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Draws of the columns, so many at each point; shape (sum of count, column)."""
+    """Draws of the columns, `count` at each point; shape (sum of count, column)."""
     drawn = []
     for i, many in enumerate(count):
         one = Factor(fit.F.order, *(part[i : i + 1] for part in fit.F[1:]))
@@ -223,7 +223,7 @@ def marginals(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Mean and variance (point, block, row) of every signal given all sites.
 
-    Blocks are kinds of their own, in order.
+    Each block must be a separate kind, in order.
     """
     V, T = each(signal.covariance, blocks.label), each(signal.T, blocks.label)
     n, rows = len(V), V.shape[-1]

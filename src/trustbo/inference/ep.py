@@ -1,10 +1,10 @@
 """Expectation propagation on the engine, for observations that are not linear in the signal.
 
-Each term t(f) is replaced by a site exp(-lam f^2 / 2 + eta f). Under the sites the engine is exact;
-it gives the marginal of each signal, hence its cavity, and a family matches the site to cavity
+Each term t(f) is replaced by a site exp(-lam f^2 / 2 + eta f). Given the sites the engine is exact;
+it gives the marginal of each signal, hence its cavity, and the family matches the site to cavity
 times term. The log evidence is that of the sites plus, for every term, the log ratio of the masses
-of cavity times term and of cavity times site; it is stationary in the sites. What it leaves out is
-corrected by weights of draws, whose mean is the evidence.
+of cavity times term and of cavity times site; it is stationary in the sites. The approximation
+error is corrected by importance weights, whose mean is the evidence.
 """
 
 from typing import Any, NamedTuple
@@ -23,7 +23,7 @@ _TEMPERED = 0.6  # share of the sites' precision in the wider proposal of column
 
 
 class Terms(NamedTuple):
-    """Observations of blocks, one kind for each, and their family."""
+    """Observations of blocks, each of a separate kind, and their family."""
 
     family: Family
     y: np.ndarray  # (block, row), NaN where not measured
@@ -57,14 +57,14 @@ class Sites(NamedTuple):
         return np.where(some, self.eta / np.where(some, self.lam, 1.0), 0.0)
 
     def at(self, terms: Terms, sd: np.ndarray) -> "Sites":
-        """Sites at noises of that sd: those of linear observations are exact."""
+        """Sites at noises with this sd; sites of linear observations are exact."""
         lam = np.where(terms.linear, sd**-2.0, self.lam)
         eta = np.where(terms.linear, np.nan_to_num(terms.y) * sd**-2.0, self.eta)
         return Sites(*np.broadcast_arrays(lam, eta))
 
 
 def first_sites(terms: Terms) -> Sites:
-    """Sites to begin with, (1, block, row): matched where trust is vague."""
+    """Initial sites, (1, block, row), matched under a vague distribution of trust."""
     unit, zero = terms.family.line_of_sight
     y = terms.y
     m, v = np.full(y.shape, unit * (0.5 - zero)), np.full(y.shape, (0.3 * unit) ** 2)
@@ -85,7 +85,7 @@ def _matched(
 def log_evidence(
     joint: Joint, sites: Sites, n_sweeps: int, damp: float = 1.0
 ) -> tuple[np.ndarray, Sites]:
-    """EP's log evidence (point,) after some sweeps over all sites, and the sites."""
+    """EP's log evidence (point,) after `n_sweeps` sweeps over all sites, and the sites."""
     blocks, signal, prior, terms = joint
     seen, sd = ~np.isnan(terms.y), signal.sd
     sites = sites.at(terms, sd)
@@ -118,7 +118,8 @@ def draw(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Columns and signals at each theta with log weights, whose mean weight is the evidence.
 
-    Columns are of a mixture of two Student-t: EP's law, and that under sites of less precision.
+    Columns are drawn from a mixture of two Student-t: EP's posterior, and one with less precise
+    sites.
 
     Returns:
         Columns (point, column), signals (point, block, row) and log weights (point,).
@@ -144,12 +145,12 @@ def draw(
 def draw_signals(
     joint: Joint, at: np.ndarray, sites: Sites, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Signals given their means and the observations, row by row, each with its own term.
+    """Draw signals row by row, given their means and the observations.
 
     Args:
         joint: Columns, signals and observations.
         at: Mean of the signals given the columns (draw, block, row).
-        sites: Sites that stand for the terms of later rows.
+        sites: Sites that approximate the terms of later rows.
         rng: Random number generator.
 
     Returns:

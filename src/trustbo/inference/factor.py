@@ -1,7 +1,7 @@
-"""Cholesky factors of the precision of columns, most of which touch one mission alone.
+"""Cholesky factors of the precision of columns, most of which occur in one mission only.
 
-Columns that are independent a priori and that one mission alone has, such as bounds made once, are
-*leaves*: given all other columns, the *core*, those of different missions are independent. With
+Columns that are independent a priori and occur in one mission only, such as bounds made once, are
+*leaves*: given all other columns, the *core*, leaves of different missions are independent. With
 leaves first, the precision A and its factor F, A = F F', are
 
     A = [D  B ]    F = [G   0]    G G' = D,  X = G^-1 B,  H H' = C - X' X,
@@ -31,11 +31,11 @@ class Order(NamedTuple):
 
     @classmethod
     def of(cls, met: np.ndarray, free: np.ndarray) -> Self:
-        """Order of columns.
+        """Find the order of columns.
 
         Args:
-            met: Whether a mission has a column, (mission, column).
-            free: Whether a column is independent of all others a priori, (column,).
+            met: Whether a column occurs in a mission, (mission, column).
+            free: Whether a column is a priori independent of all others, (column,).
         """
         n_missions = len(met)
         alone = free & (met.sum(0) == 1) & (n_missions > 1)
@@ -70,7 +70,7 @@ class Order(NamedTuple):
         return sum(int(np.prod(shape)) for shape in self.shapes)
 
     def entry(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Index of entries (a, b) of the precision; -1 where that of (b, a) stands for them."""
+        """Index of entries (a, b) of the precision; -1 where entry (b, a) is stored instead."""
         (g, k, t), q = self.shapes[1], len(self.core)
         of_leaf, of_both = self.group[a] >= 0, (self.group[a] >= 0) & (self.group[b] >= 0)
         row = self.group[a] * k + self.place[a]
@@ -141,7 +141,7 @@ class Factor(NamedTuple):
         return xp.concatenate([leaf.reshape(len(h), -1), core], axis=1)
 
     def back(self, white: np.ndarray) -> np.ndarray:
-        """Vectors F'^-1 w (point, draw, column) of white ones (point, draw, ...)."""
+        """Vectors F'^-1 w (point, draw, column) of white vectors w (point, draw, ...)."""
         order, split = self.order, self.order.leaf.size
         pairs = zip(self.H, white[..., split:], strict=True)
         core = np.stack([lapack.dtrtrs(H.T, w.T, lower=0)[0].T for H, w in pairs])  # pyright: ignore[reportAttributeAccessIssue]
@@ -180,7 +180,7 @@ class Factor(NamedTuple):
 
 
 def add(A: Any, at: Any, values: Any) -> Any:
-    """Array with values added at an index: in place in NumPy, a copy in JAX."""
+    """Add values to an array at an index, in place in NumPy, as a copy in JAX."""
     if not isinstance(A, np.ndarray):
         return A.at[at].add(values)
     A[at] += values

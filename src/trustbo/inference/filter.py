@@ -1,4 +1,4 @@
-"""Trust in real time, bound by bound or tick by tick of a running mission."""
+"""Filtering of trust in real time, bound by bound or tick by tick during a mission."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
@@ -23,7 +23,7 @@ Effect = np.ndarray | float
 class Beliefs(NamedTuple):
     """Normal distribution of trust under each draw of the parameters.
 
-    A group is a set of robots whose trust or noise is dependent: all of them, or each one.
+    A group is a set of robots with dependent trust or noise: all robots, or each one alone.
     """
 
     mean: np.ndarray  # (draw, group, member)
@@ -34,15 +34,15 @@ class Beliefs(NamedTuple):
 class Dynamics:
     """One bound of the Kalman filter under many draws of the parameters, for any model.
 
-    Predicted trust x ~ N(m, V) has the signal f = x + n, n ~ N(0, noise). Rates enter one robot
-    after the other: the family matches the moments of f, exactly for Gaussian rates, and the gain
-    of x on f carries them over.
+    Predicted trust x ~ N(m, V) has the signal f = x + n, n ~ N(0, noise). Rates are processed one
+    robot at a time: the family matches the moments of f, exactly for Gaussian rates, and the gain
+    of x on f transfers them to x.
     """
 
     def __init__(
         self, params: Params, family: Family, n_robots: int, delta_s: np.ndarray | None = None
     ) -> None:
-        """Take draws (draw, ...), and the sd of noise that robots share in a bound (draw,)."""
+        """Set draws (draw, ...), and the sd of shared noise in a bound (draw,)."""
         p: Any = params
         self.family, self._params, self._coupled = family, p, isinstance(p, CoupledParams)
         n, members = len(p.b), n_robots if self._coupled or delta_s is not None else 1
@@ -79,7 +79,7 @@ class Dynamics:
         return Beliefs(mean, sd[..., None] ** 2 * np.eye(self.shape[2]), mean)
 
     def predict(self, beliefs: Beliefs, z: np.ndarray, effect: Effect = 0.0) -> Beliefs:
-        """Trust after a bound of awareness z (robot, feature), nothing measured."""
+        """Trust after a bound with awareness z (robot, feature), before its rates are known."""
         z = z.reshape(1, -1) if self._coupled else z
         drift = self._grouped(np.einsum("nim,im->ni", self._beta, z) + self._b + effect)
         before = beliefs.mean - beliefs.drift if self._deviates else beliefs.mean
@@ -88,7 +88,7 @@ class Dynamics:
         return Beliefs(mean, cov, drift)
 
     def log_densities(self, predicted: Beliefs, y: np.ndarray, n_ticks: np.ndarray) -> np.ndarray:
-        """Log density of each robot's rate alone, 0 where not measured; (draw, robot)."""
+        """Marginal log density of each robot's rate, 0 where not measured; (draw, robot)."""
         y, n_ticks = (a.reshape(self.shape[1:]) for a in (y, n_ticks))
         cov = predicted.cov if self._noise is None else predicted.cov + self._noise
         var = np.diagonal(cov, axis1=2, axis2=3)
@@ -116,7 +116,7 @@ class Dynamics:
         return Beliefs(mean[..., :members], J[..., :members, :members], drift), log_density
 
     def draw(self, beliefs: Beliefs, rng: np.random.Generator) -> Beliefs:
-        """Trust drawn, as beliefs without variance."""
+        """Draw trust, as beliefs without variance."""
         mean = beliefs.mean + _noise(beliefs.cov, rng)
         return beliefs._replace(mean=mean, cov=np.zeros_like(beliefs.cov))
 
@@ -128,7 +128,7 @@ class Dynamics:
         rng: np.random.Generator,
         effect: Effect = 0.0,
     ) -> tuple[Beliefs, np.ndarray]:
-        """Trust after a bound drawn given that before it, and rates of it, (draw, robot)."""
+        """Draw trust after a bound given trust before it, and its rates, (draw, robot)."""
         now = self.draw(self.predict(drawn, z, effect), rng)
         signal = now.mean
         if self._noise is not None:
@@ -144,7 +144,7 @@ class Dynamics:
         effects: Sequence[Effect],
         rng: np.random.Generator,
     ) -> Iterator[tuple[Beliefs, np.ndarray]]:
-        """Yield trust after each bound, nothing measured, and rates drawn for all together."""
+        """Yield predicted trust after each bound, and rates drawn jointly for all bounds."""
         x = self.draw(beliefs, rng)
         for of_bound, ticks, effect in zip(z, n_ticks, effects, strict=True):
             beliefs = self.predict(beliefs, of_bound, effect)
@@ -153,12 +153,12 @@ class Dynamics:
 
 
 def _product(A: np.ndarray, B: np.ndarray) -> np.ndarray:
-    """Matrix products; those of single numbers are many times as fast without matmul."""
+    """Matrix products; 1 x 1 matrices are much faster without matmul."""
     return A * B if A.shape[-1] == 1 else A @ B
 
 
 def _noise(cov: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Normal noise of covariances (..., member, member) that may be singular."""
+    """Normal noise with covariances (..., member, member), which may be singular."""
     root = np.linalg.cholesky(cov + 1e-12 * np.eye(cov.shape[-1]))
     return _product(root, rng.standard_normal(cov.shape[:-1])[..., None])[..., 0]
 
@@ -171,7 +171,7 @@ class TrustState(NamedTuple):
 
 
 class TrustForecast(NamedTuple):
-    """Trust and contact rates along bounds to come, averaged over parameter draws.
+    """Trust and contact rates along future bounds, averaged over parameter draws.
 
     Attributes:
         mean: Mean of trust, (bound, robot).
@@ -179,7 +179,7 @@ class TrustForecast(NamedTuple):
         rate: Mean contact rate.
         rate_low: 5 % quantile of the contact rate.
         rate_high: 95 % quantile of the contact rate.
-        draws: Contact rates drawn together for all bounds, of equal weight, (draw, bound, robot).
+        draws: Contact rates drawn jointly for all bounds, equally weighted, (draw, bound, robot).
     """
 
     mean: np.ndarray
@@ -191,21 +191,21 @@ class TrustForecast(NamedTuple):
 
 
 class TrustFilter:
-    """Follows the trust of each robot during a mission (a Rao-Blackwellised filter).
+    """Rao-Blackwellised filter of the trust of each robot during a mission.
 
-    Given a draw of the parameters, trust under Gaussian rates is Gaussian and the Kalman filter
-    exact; under other families its moments are matched after each rate (assumed-density filtering).
-    The draws are reweighted by the density with which they predicted each contact rate. After bound
-    k the filter holds p(trust, parameters | earlier missions, bounds 1..k), exactly but for the
-    number of draws and the moments.
+    Given a parameter draw and Gaussian rates, trust is Gaussian and the Kalman filter is exact; for
+    other families, moments are matched after each rate (assumed-density filtering). The draws are
+    reweighted by their predictive density of each contact rate. After bound k the filter represents
+    p(trust, parameters | earlier missions, bounds 1..k), exact up to the number of draws and moment
+    matching.
 
-    A bound is taken in when it is over, by `update`; or while it runs, by `begin_bound`,
-    `update_ticks` and `end_bound`: after any ticks trust is that if the bound ended now.
+    Use `update` after each bound, or `begin_bound`, `update_ticks` and `end_bound` during it; trust
+    after any tick is computed as if the bound ended now.
 
     Attributes:
         params: Parameter draws, leading axis (draw,).
-        weights: Their weights now, shape (draw,), sum 1.
-        n_bounds: Bounds taken in since the last `reset`.
+        weights: Current weights of the draws, shape (draw,), with sum 1.
+        n_bounds: Number of bounds since the last `reset`.
         family: Family of observations.
         dynamics: One bound of the Kalman filter under all draws.
     """
@@ -222,14 +222,14 @@ class TrustFilter:
 
         Args:
             posterior: DataTree from `fit`, or draws with leading axis (draw,).
-            n_robots: Number of robots; needed with `TrustParams`, which all robots share. A
+            n_robots: Number of robots; needed with `TrustParams`, which do not contain it. A
                 posterior records it.
-            observation: Family of observations, with draws. A posterior records it.
-            max_draws: Largest number of draws to follow; they are evenly spaced.
+            observation: Observation family, for parameter draws. A posterior records it.
+            max_draws: Maximum number of draws, evenly spaced.
 
         Raises:
-            TrustboError: Draws of another number of robots; no posterior, or `TrustParams` without
-                `n_robots`.
+            TrustboError: If the draws have another number of robots, the posterior is not from
+                `fit`, or `TrustParams` are given without `n_robots`.
         """
         delta_s, self._bounded = None, True
         if isinstance(posterior, xr.DataTree):
@@ -261,7 +261,7 @@ class TrustFilter:
         self.reset()
 
     def reset(self) -> None:
-        """Go back to before the first bound of a new mission, all draws of equal weight."""
+        """Start a new mission before its first bound, with equally weighted draws."""
         n = len(self.params.b)
         self._beliefs = self.dynamics.start()
         self._log_weight, self.weights = np.zeros(n), np.full(n, 1.0 / n)
@@ -281,7 +281,7 @@ class TrustFilter:
         *,
         n_ticks: ArrayLike | None = None,
     ) -> TrustState:
-        """Take in one bound.
+        """Update trust with the contact rates of one bound.
 
         Args:
             awareness: Shape (robot, feature).
@@ -290,13 +290,13 @@ class TrustFilter:
             n_ticks: Ticks of the bound, () or (robot,); the beta-binomial family needs them.
 
         Returns:
-            Trust after it, shapes (robot,).
+            Trust after the bound, shapes (robot,).
 
         Raises:
-            TrustboError: Another number of robots or features; awareness that is NaN, a value
-                outside [0, 1], ticks that are missing or of which the rate is no share, a bound
-                that is missing, off the grid or between cells that are no neighbours, or one that
-                is running.
+            TrustboError: If the number of robots or features differs; awareness is NaN or a value
+                is outside [0, 1]; ticks are missing or inconsistent with the rate; the bound is
+                missing, off the grid or between cells that are not neighbours; or a bound is
+                running.
         """
         self._require_running(running=False)
         predicted = self._predicted(awareness, bound)
@@ -310,23 +310,23 @@ class TrustFilter:
         return self._commit(predicted, y, broadcast_ticks(self.family, n_ticks, y.shape))
 
     def begin_bound(self, awareness: ArrayLike, bound: tuple[Cell, Cell] | None = None) -> None:
-        """Begin a bound, before its ticks; arguments and errors are those of `update`."""
+        """Begin a bound, before its ticks; see `update` for arguments and errors."""
         self._require_running(running=False)
         self._running = self._predicted(awareness, bound), np.zeros((2, self._n_robots))
 
     def update_ticks(self, n_contact: ArrayLike, n_ticks: ArrayLike) -> TrustState:
-        """Take in one or more ticks of the bound that runs.
+        """Update trust with one or more ticks of the running bound.
 
         Args:
             n_contact: Number of these ticks with contact, (robot,).
             n_ticks: Number of ticks measured, (robot,).
 
         Returns:
-            Trust after the bound if it ended now, with the rate so far; shapes (robot,).
+            Trust as if the bound ended now with the rate so far; shapes (robot,).
 
         Raises:
-            TrustboError: Another number of robots; no bound was begun, a number that is negative or
-                NaN, or more ticks with contact than ticks.
+            TrustboError: If the number of robots differs, no bound was begun, a number is negative
+                or NaN, or there are more ticks with contact than ticks.
         """
         self._require_running(running=True)
         contacts, ticks = as_array("n_contact", n_contact), as_array("n_ticks", n_ticks)
@@ -342,10 +342,10 @@ class TrustFilter:
         return _average(beliefs, _normalised(self._log_weight + gained))
 
     def end_bound(self) -> TrustState:
-        """End the bound that runs: its rate is taken in as `update` would.
+        """End the running bound and update trust with its rate, as `update` does.
 
         Raises:
-            TrustboError: No bound was begun.
+            TrustboError: If no bound was begun.
         """
         self._require_running(running=True)
         (predicted, counts), self._running = self._running, None
@@ -358,20 +358,20 @@ class TrustFilter:
         *,
         n_ticks: ArrayLike = 200,
     ) -> TrustForecast:
-        """Trust and contact rates along the bounds to come, none of them measured yet.
+        """Predict trust and contact rates along future bounds.
 
-        Rates are drawn, one for each parameter draw.
+        One rate is drawn for each parameter draw.
 
         Args:
             awareness: Shape (bound, robot, feature).
-            path: The cell where the team is and the cells to be entered; needed where places have
+            path: The current cell of the team and the cells to be entered; needed with place
                 effects.
             n_ticks: Ticks of the bounds, (), (bound,) or (bound, robot), where rates are counts.
 
         Raises:
-            TrustboError: Another number of robots, features or ticks; awareness that is NaN or
-                outside [0, 1], ticks that are no whole numbers, or a path that is missing, of
-                another length, that jumps or that leaves the grid.
+            TrustboError: If the number of robots, features or ticks differs; awareness is NaN or
+                outside [0, 1]; ticks are not whole numbers; or the path is missing, has another
+                length, jumps or leaves the grid.
         """
         given, rng = self._checked(awareness, 3), np.random.default_rng(self.n_bounds)
         ticks, effects = ticks_ahead(n_ticks, given.shape[:2]), self.effects(path, len(given))
@@ -385,7 +385,7 @@ class TrustFilter:
         return TrustForecast(mean, sd, draws.mean(0), low, high, draws)
 
     def _predicted(self, awareness: ArrayLike, bound: tuple[Cell, Cell] | None) -> Beliefs:
-        """Trust after a bound, nothing measured."""
+        """Predicted trust after a bound."""
         z, effect = self._checked(awareness, 2), self.effects(bound, 1)[0]
         return self.dynamics.predict(self._beliefs, z, effect)
 
@@ -397,7 +397,7 @@ class TrustFilter:
         return self.state
 
     def _require_running(self, *, running: bool) -> None:
-        """Refuse calls that need another state: TrustboError."""
+        """Raise TrustboError unless a bound is running, or not running, as required."""
         if running != (self._running is not None):
             raise TrustboError(
                 "no bound runs: call begin_bound(awareness) first."
@@ -451,13 +451,13 @@ class TrustFilter:
 
 
 def _rates(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rates of ticks with contact and ticks (2, robot), NaN without a tick; and the ticks."""
+    """Rates from counts of contact and ticks (2, robot), NaN without a tick; and the ticks."""
     contacts, ticks = counts
     return contacts / np.where(ticks > 0.0, ticks, np.nan), ticks
 
 
 def ticks_ahead(n_ticks: ArrayLike, shape: tuple[int, int]) -> np.ndarray:
-    """Ticks of bounds to come as (bound, robot); TrustboError if they are none."""
+    """Ticks of future bounds as (bound, robot); raises TrustboError if they are invalid."""
     given = as_array("n_ticks", n_ticks)
     given = given[:, None] if given.ndim == 1 else given
     if given.ndim > 2 or any(n not in (1, m) for n, m in zip(given.shape, shape, strict=False)):

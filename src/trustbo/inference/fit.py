@@ -1,4 +1,4 @@
-"""From missions to a posterior: sampling, checking it, and laying it out for ArviZ."""
+"""Fit a model to missions: sample, check the diagnostics, and build a DataTree for ArviZ."""
 
 import json
 import time
@@ -48,28 +48,27 @@ def fit(
     check: bool = True,
     whole: bool = True,
 ) -> xr.DataTree:
-    """Posterior of the trust model's parameters, and of latent trust, given missions.
+    """Fit the posterior of the trust model's parameters and of latent trust to missions.
 
     Args:
-        missions: All missions to learn from; contact rates that are NaN were not measured.
-        model: Trust model; by default that of campaigns, `models.default_model()`, with effects of
-            places and robots. Missions without places, which are those of no map and those whose
-            paths jump, have effects of robots alone; reports of people, as of `logs.read_reports`,
-            have `HumanTrust` of their scale.
+        missions: Missions of one team; NaN marks contact rates that were not measured.
+        model: Trust model; by default `models.default_model()`, with effects of places and robots.
+            The default omits effects of places for missions without a map or with paths that jump;
+            for reports of people, see `logs.read_reports`, it is `HumanTrust` with their scale.
         sampler: `"importance"`: independent draws by adaptive importance sampling of the
-            hyperparameters, all else integrated out; nothing is compiled. `"nuts"`: NumPyro's NUTS,
-            on the same density for Gaussian rates, else with trust sampled too.
-        workspace: Workspace of the missions. Their features and robots are then in its order, and
-            awareness that they lack, such as line of sight, is filled in, see `Workspace.fill`. A
-            model with effects of places has them over the whole grid, else up to the last row and
-            column visited.
+            hyperparameters, with all else integrated out, without compilation. `"nuts"`: NumPyro's
+            NUTS, on the same density for Gaussian rates, otherwise sampling trust as well.
+        workspace: Workspace of the missions. If given, features and robots are put in its order,
+            and missing awareness such as line of sight is filled in, see `Workspace.fill`. Effects
+            of places then cover the whole grid, otherwise the grid up to the last row and column
+            visited.
         draws: Draws kept per chain.
         chains: Number of chains; draws of importance sampling are divided among them.
         warmup: Warm-up draws per chain of NUTS, not kept.
         seed: Seed; the same seed gives the same posterior.
         progress: Whether NUTS shows a progress bar.
-        check: Refuse a posterior with bad diagnostics: k-hat > 0.7 of importance sampling; R-hat >
-            1.01, bulk ESS < 400 or a divergence of NUTS. `False` returns it unchecked.
+        check: Whether to raise an error on bad diagnostics: k-hat > 0.7 for importance sampling;
+            R-hat > 1.01, bulk ESS < 400 or a divergence for NUTS.
         whole: Whether to add latent trust, log-likelihoods and predictions at once; `complete` adds
             them later.
 
@@ -81,14 +80,14 @@ def fit(
         whole mission is one observation, so LOO leaves out missions; see `by_rate`),
         `sample_stats`, `observed_data` and
         `constant_data`. Bound k is labelled k = 1, 2, ...; short missions are padded with NaN.
-        Where all rates have an n_ticks, log-likelihoods are of the counts of ticks, on equal terms
-        for all families of observations; the attribute `log_likelihood_of` states it.
+        If all rates have n_ticks, log-likelihoods are of the tick counts, hence comparable between
+        observation families; see the attribute `log_likelihood_of`.
 
     Raises:
-        TrustboError: There are no missions, or they disagree on robots or features; an awareness
-            value is NaN, the sampler is unknown, no contact rate was measured, a path leaves the
-            workspace, or a number of draws or the seed is no whole number.
-        PosteriorError: The diagnostics are beyond their limits.
+        TrustboError: If there are no missions, or they differ in robots or features; an awareness
+            value is NaN; the sampler is unknown; no contact rate was measured; a path leaves the
+            workspace; or a number of draws or the seed is not a whole number.
+        PosteriorError: If the diagnostics are beyond their limits.
 
     Example:
         >>> posterior = tb.fit(missions, tb.models.PooledTrust())
@@ -138,7 +137,7 @@ def fit(
 def by_importance(
     posterior: Posterior, n: int, seed: int
 ) -> tuple[Draws, dict[str, np.ndarray], dict[str, Any]]:
-    """Draws by importance sampling, their statistics (draw,), and a summary; tried twice."""
+    """Draws by importance sampling, their statistics (draw,), and a summary; retries once."""
     rng = np.random.default_rng(seed)
     for size in (256, 1024):
         start = posterior.start()[None]
@@ -182,14 +181,14 @@ def _laid_out(
 
 
 def _default_of(missions: Sequence[Mission]) -> TrustModel:
-    """`HumanTrust` of reports, else the default model, without places that missions lack."""
+    """`HumanTrust` for reports, else the default model, without places if missions lack them."""
     if scale := missions[0].scale:
         return HumanTrust(scale=scale)
     return default_model(places=has_places(missions))
 
 
 def _filled(missions: Sequence[Mission], workspace: Workspace | None) -> list[Mission]:
-    """Missions of one team, with the awareness that they lack filled in from a workspace."""
+    """Missions of one team, with missing awareness filled in from a workspace."""
     require_same_team(missions)
     if workspace is None:
         return list(missions)

@@ -5,8 +5,8 @@ else (coefficients, effects, trust) is integrated out of the density and drawn g
 
 1. `find_mode` climbs from each start and fits a Gaussian by finite differences.
 2. Each round draws points from the current proposal, from the modes if there are several, and from
-   a defensive proposal, by default the prior: it finds regions that the others miss. All proposals
-   so far form one mixture q, relative to which every point is weighted by p(z) / q(z).
+   a defensive proposal, by default the prior: it covers regions that the others miss. All proposals
+   so far form one mixture q, and every point is weighted by p(z) / q(z).
 3. The moments of the weighted points give the next proposal, until k-hat and the effective number
    of points are good.
 
@@ -45,7 +45,7 @@ class Student(NamedTuple):
 
     @classmethod
     def of(cls, z: np.ndarray, weight: np.ndarray, ridge: float = 1e-3) -> Self:
-        """Take the mean and covariance of weighted points, (point, score) and (point,)."""
+        """Match the mean and covariance of weighted points, (point, score) and (point,)."""
         mean = weight @ z
         covariance = (z - mean).T * weight @ (z - mean)
         return cls(mean, np.linalg.cholesky(covariance + ridge * np.eye(z.shape[1])))
@@ -70,8 +70,8 @@ class Points(NamedTuple):
     """Weighted points of a posterior.
 
     Attributes:
-        z: Scores, shape (point, score).
-        log_p: Their log density, shape (point,).
+        z: Normal scores, shape (point, score).
+        log_p: Log density of the points, shape (point,).
         log_ratio: Log density relative to the mixture of all proposals, shape (point,).
         weight: Pareto-smoothed weights with sum 1, shape (point,).
         k_hat: Pareto shape of the weights, good below 0.5, bad beyond 0.7.
@@ -87,7 +87,7 @@ class Points(NamedTuple):
 
     @classmethod
     def of(cls, z: np.ndarray, log_p: np.ndarray, log_ratio: np.ndarray) -> Self:
-        """Smooth the weights of points with these log ratios."""
+        """Build points from log ratios by smoothing the weights."""
         return cls(z, log_p, log_ratio, *smoothed(log_ratio))
 
     @property
@@ -96,7 +96,7 @@ class Points(NamedTuple):
         return 1.0 / float((self.weight**2).sum())
 
     def fitted(self) -> Student:
-        """Student-t with the moments of the points; flattened weights where few points count."""
+        """Student-t with the moments of the points; weights are flattened if few dominate."""
         weight, least = self.weight, _PER_AXIS * self.z.shape[1]
         for _ in range(6):
             if (weight**2).sum() * least <= 1.0:
@@ -125,11 +125,11 @@ def sample(
         log_density: Log posterior density of scores.
         starts: Starts of the search for modes, shape (start, score).
         rng: Generator of random numbers.
-        size: Points of a round, a power of 2; half of them are drawn from `defensive`.
-        enough: Effective number of points that ends the rounds, if k-hat is good.
+        size: Number of points per round, a power of 2; half are drawn from `defensive`.
+        enough: Effective number of points at which sampling stops if k-hat is good.
         most: Maximum number of rounds.
         defensive: Density for regions that the given proposal may miss; by default a Student-t
-            that is somewhat wider than the prior.
+            slightly wider than the prior.
     """
     d = starts.shape[1]
     prior = Student(np.zeros(d), 1.2 * np.eye(d))
@@ -201,7 +201,7 @@ def find_mode(log_density: LogDensity, start: np.ndarray) -> Student:
 
 
 def smoothed(log_ratio: np.ndarray) -> tuple[np.ndarray, float, float]:
-    """Pareto-smooth log importance ratios (point,), some of them finite.
+    """Pareto-smooth log importance ratios (point,), of which some must be finite.
 
     Returns:
         Weights with sum 1, k-hat, and the log mean of the ratios.

@@ -1,11 +1,11 @@
-"""Leave-one-mission-out cross-validation, and comparison of models by it.
+"""Leave-one-mission-out cross-validation and model comparison.
 
 With coefficients, effects and trust integrated out, few hyperparameters theta are left, and
 
     p(y_j | y_-j) = 1 / E[ p(y_-j | theta) / p(y | theta) | y ],
 
-so that importance weights are ratios of the evidence without and with a mission. Weights of whole
-draws would not follow effects of bounds that only the mission made.
+so importance weights are ratios of the evidence without and with a mission. Weights of whole draws
+would fail for effects of bounds that only this mission made.
 """
 
 import warnings
@@ -31,23 +31,25 @@ _POINTS = 500  # distinct hyperparameters at most
 
 @one_blas_thread()
 def loo(posterior: xr.DataTree, *, model: TrustModel | None = None) -> ELPDData:
-    """Expected log predictive density of a mission left out, p(rates of it | all other missions).
+    """Expected log predictive density of a left-out mission, given all other missions.
 
-    By Pareto-smoothed weights of hyperparameters, all else integrated out; for families that are
-    not Gaussian, by expectation propagation. A mission whose weights are too uneven (k-hat above
-    0.7) is left out of a refit, and has the difference of log evidence. Missions without any rate
-    have nothing to predict and are left out of the sum.
+    Uses Pareto-smoothed weights of hyperparameters, with all else integrated out, and expectation
+    propagation for non-Gaussian families. If k-hat of a mission exceeds 0.7, the model is refitted
+    without it and the difference of log evidence is used. Missions without any measured rate are
+    excluded.
 
     Args:
         posterior: DataTree from `fit`, with its data.
-        model: Its model; needed where it has custom priors.
+        model: Model of the posterior; needed with custom priors.
 
     Returns:
         ArviZ's `ELPDData`, pointwise, for `az.compare({name: loo(posterior), ...})`. `elpd_i` and
-        `pareto_k` have a coordinate `refitted` (mission,); there `pareto_k` is that of the refit.
+        `pareto_k` have a coordinate `refitted` (mission,); for these, `pareto_k` is the k-hat of
+        the refit.
 
     Raises:
-        TrustboError: Fewer than two missions have rates, or a view `by_rate`.
+        TrustboError: If fewer than two missions have rates, or the posterior is a view from
+            `by_rate`.
     """
     posterior = require_posterior("loo", posterior)
     if "observed_data" in posterior.children and "rate" in posterior["observed_data"].dims:
@@ -102,9 +104,9 @@ def _elpd(
     refitted: np.ndarray,
     n_samples: int,
 ) -> ELPDData:
-    """ArviZ's result of log densities of missions left out.
+    """ArviZ's `ELPDData` from log densities of left-out missions.
 
-    `average` is the log density of each mission, averaged over the posterior that had it.
+    `average` is the log density of each mission, averaged over the full posterior.
     """
     coords = {"mission": measured, "refitted": ("mission", refitted)}
     elpd, n = float(density.sum()), len(density)
@@ -133,15 +135,15 @@ def compare(posteriors: Mapping[str, xr.DataTree]) -> pd.DataFrame:
     """Rank posteriors by leave-one-mission-out cross-validation, see `loo` and `arviz.compare`.
 
     Args:
-        posteriors: Two or more posteriors from `fit`, by name, each of the same missions; families
-            of observations may differ.
+        posteriors: Two or more posteriors from `fit`, by name, of the same missions; observation
+            families may differ.
 
     Returns:
-        Table of `arviz.compare`, one row a posterior, the best first: `elpd` and `elpd_diff` in
+        Table of `arviz.compare`, one row per posterior, the best first: `elpd` and `elpd_diff` in
         nats, its standard error `dse`, stacking `weight`, and `warning` where a Pareto k is high.
 
     Raises:
-        TrustboError: Fewer than two posteriors, or other missions in one of them.
+        TrustboError: If there are fewer than two posteriors, or their missions differ.
 
     Example:
         >>> tb.compare({"pooled": pooled, "hierarchical": hierarchical})

@@ -1,7 +1,7 @@
-"""Whether trust carries over from one bound to the next: the evidence with memory and without.
+"""Whether trust carries over between bounds: the evidence with and without memory.
 
-The model without memory has beta0 = 0, all other priors unchanged; its log evidence less that of
-the model is the log Bayes factor. Both are means of importance weights.
+The model without memory has beta0 = 0, all other priors unchanged; the difference of the log
+evidences is the log Bayes factor. Both are estimated by means of importance weights.
 """
 
 from collections.abc import Sequence
@@ -27,9 +27,9 @@ class Memory(NamedTuple):
     """Evidence that trust carries over from one bound to the next.
 
     Attributes:
-        log_bf: Log evidence of the model, beta0 > 0, less that of beta0 = 0.
-        beta0: Posterior mean of beta0 where it is not 0.
-        sd: Its standard deviation.
+        log_bf: Log evidence for beta0 > 0 minus log evidence for beta0 = 0.
+        beta0: Posterior mean of beta0 under beta0 > 0.
+        sd: Posterior standard deviation of beta0 under beta0 > 0.
     """
 
     log_bf: float
@@ -38,7 +38,7 @@ class Memory(NamedTuple):
 
     @property
     def p_none(self) -> float:
-        """Probability of beta0 = 0, which is .5 before the missions."""
+        """Posterior probability of beta0 = 0, with prior probability .5."""
         return float(expit(-self.log_bf))
 
     def __str__(self) -> str:
@@ -59,17 +59,17 @@ def memory(
     *,
     model: TrustModel | None = None,
 ) -> Memory:
-    """Weigh whether trust carries over from one bound to the next, against beta0 = 0.
+    """Compare the evidence that trust carries over between bounds with beta0 = 0.
 
     Args:
         posterior: Posterior of a model with one beta0, `PooledTrust`, `HierarchicalTrust` or
             `HumanTrust`, by importance sampling.
-        missions: Missions that it was fitted to; by default those it holds.
+        missions: Missions of the fit; by default the data in the posterior.
         model: Model of the posterior; needed with custom priors.
 
     Raises:
-        TrustboError: A posterior of another model or sampler, without its missions, or with custom
-            priors and no model.
+        TrustboError: If the posterior is of another model or sampler, lacks its missions, or has
+            custom priors and no model is given.
     """
     attrs = require_posterior("memory", posterior).attrs
     fitted, _ = read_posterior(posterior, missions, model=model)

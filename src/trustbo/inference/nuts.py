@@ -5,8 +5,8 @@ hyperparameters under the same evidence, differentiated by JAX. The covariance o
 sampler's points, in NumPyro's unconstrained coordinates, is the inverse mass matrix, which whitens
 the density: warm-up tunes the step size alone. Chains start at points of that sampler.
 
-Of other families that evidence is EP's approximation. There NUTS samples the plain program,
-`model.program`, coefficients and signals included.
+For other families, the evidence is only approximated by EP. NUTS then samples `model.program`,
+including coefficients and signals.
 """
 
 from collections.abc import Callable
@@ -109,9 +109,9 @@ def _kernel(
 
 
 def marginal_program(posterior: Posterior) -> Callable[[], None]:
-    """NumPyro program of the hyperparameters, the evidence being a factor.
+    """NumPyro program of the hyperparameters, with the evidence as a factor.
 
-    Rates determine the size of the two noises together and may not tell them apart. Half-normal
+    Rates determine the total size of the two noises, but may not distinguish them. Half-normal
     scores (a_w, a_v) = size (sin(angle), cos(angle)) are independent if size^2 ~ Exponential(1/2)
     and the angle is uniform, so these two are sampled, and the noises are functions of them.
     """

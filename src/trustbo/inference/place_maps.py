@@ -2,9 +2,9 @@
 
 s at the other cells by Matheron's rule: a draw of the prior over the whole grid, corrected by
 kriging at the visited cells. Prior draws are made by the fast Fourier transform of a circulant
-covariance (Dietrich and Newsam 1997), on a torus so large that the correlation is all but 0 half
-way round. e at the other bounds has its prior. Length scales are rounded to steps of 10 %, which
-changes the correlation of neighbouring cells by less than .01.
+covariance (Dietrich and Newsam 1997), on a torus so large that the correlation nearly vanishes half
+way round. e at the other bounds is drawn from its prior. Length scales are rounded to steps of 10
+%, which changes the correlation of neighbouring cells by less than .01.
 
 The random part has mean 0 over the draws, so that the mean of the maps is the posterior mean of the
 effects, without Monte Carlo error where nothing was measured.
@@ -66,15 +66,15 @@ class _Visited:
 
 
 def place_maps_of(group: xr.Dataset, sites: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Draw the effects of all cells and bounds, given those of visited places in each draw.
+    """Draw the effects of all cells and bounds, given the effects at visited places.
 
     Args:
         group: Group `places` of a posterior.
-        sites: Its hyperparameters by name, (draw,), chains joined.
+        sites: Hyperparameters by name, (draw,), with chains joined.
 
     Returns:
         place (draw, effect, row, col) and place_bound (draw, effect, move, row, col); the axis
-        effect has length 1, as robots share the effects.
+        `effect` has length 1, as effects are common to all robots.
     """
     visited, seed = _Visited(group), int(group.attrs["seed"])
     place = _cells(visited, sites, [seed, 0])
@@ -88,7 +88,7 @@ def place_maps_of(group: xr.Dataset, sites: Mapping[str, np.ndarray]) -> dict[st
 
 @one_blas_thread()
 def _cells(visited: _Visited, sites: Mapping[str, np.ndarray], seed: list[int]) -> np.ndarray:
-    """Effect s over the grid, (draw, row, col), given that of visited cells."""
+    """Effect s over the grid, (draw, row, col), given the effect at visited cells."""
     s, shape = visited.s, visited.shape
     flat = visited.cells[:, 0] * shape[1] + visited.cells[:, 1]
     centre = np.zeros((len(s), shape[0] * shape[1]))
@@ -104,10 +104,10 @@ def _cells(visited: _Visited, sites: Mapping[str, np.ndarray], seed: list[int]) 
 def _kriging(
     length_scale: np.ndarray, visited: _Visited
 ) -> Iterator[tuple[int, np.ndarray, float, np.ndarray, np.ndarray]]:
-    """Yield each step of length scales, its draws and length scale, and how s follows from cells.
+    """Yield draws, length scale and kriging terms for each step of length scales.
 
-    That is weights (cell, all) of the effects of `cells` in the mean of s over the grid, and the
-    variance (all,) that is left of a prior variance of 1.
+    The terms are weights (cell, all) of the effects at `cells` in the mean of s over the grid, and
+    the conditional variance (all,) for unit prior variance.
     """
     cells, grid = visited.cells, np.indices(visited.shape).reshape(2, -1).T
     # Beyond, all cells are nearly equal, and `_prior` would need a far larger grid in memory.
@@ -144,7 +144,7 @@ def _prior(
 
 
 def _centre(draws: np.ndarray) -> np.ndarray:
-    """Centre draws at mean 0 with unchanged variance, in place; a single one is left alone."""
+    """Centre draws at mean 0 with unchanged variance, in place; a single draw is unchanged."""
     n = len(draws)
     if n > 1:
         draws -= draws.mean(0)
@@ -155,8 +155,8 @@ def _centre(draws: np.ndarray) -> np.ndarray:
 def place_maps(posterior: xr.DataTree) -> xr.Dataset:
     """Mean and standard deviation of the effect of every cell and bound, over a posterior.
 
-    Exact given its draws at visited places: what was not visited enters by its conditional mean and
-    variance, and is not drawn.
+    Exact given the draws at visited places: unvisited places enter by their conditional mean and
+    variance instead of by draws.
 
     Args:
         posterior: DataTree from `fit` of a model with effects of places.
@@ -168,7 +168,7 @@ def place_maps(posterior: xr.DataTree) -> xr.Dataset:
         `workspace.awareness`, "n" towards row 0; NaN where a move would come from outside the grid.
 
     Raises:
-        TrustboError: No posterior of `fit`, or its model has no effects of places.
+        TrustboError: If the posterior is not from `fit`, or its model has no effects of places.
     """
     require_kind("posterior", posterior, xr.DataTree, "give one of trustbo.fit")
     if "places" not in posterior.children:

@@ -1,4 +1,4 @@
-"""A model given missions: the density that samplers take, and all else given its points."""
+"""A model given missions: the density for samplers, and draws of all else."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple, Self
@@ -29,7 +29,7 @@ _PARTICLES = 4  # signals for each of them
 
 
 class Draws(NamedTuple):
-    """Draws of hyperparameters and columns; signals where EP drew them too."""
+    """Draws of hyperparameters and columns, and of signals if drawn by EP."""
 
     theta: dict[str, np.ndarray]  # (draw, ...)
     c: np.ndarray  # (draw, column)
@@ -40,7 +40,7 @@ class Draws(NamedTuple):
     """What those weights add to the log evidence."""
 
     def at(self, index: np.ndarray) -> Self:
-        """Draws of these indices."""
+        """Select draws by index."""
         f = None if self.f is None else self.f[index]
         return self._replace(theta=at(self.theta, index), c=self.c[index], f=f)
 
@@ -89,7 +89,7 @@ class Posterior:
         return Order.of(met, free)
 
     def without(self, mission: int) -> "Posterior":
-        """The same posterior as if a mission had not been measured."""
+        """The posterior without the data of one mission."""
         other = Posterior(self.model, self.slots.without([mission]), memoryless=self.memoryless)
         if not self.exact:
             kept = ~np.isnan(other.terms.y)
@@ -97,7 +97,7 @@ class Posterior:
         return other
 
     def theta(self, z: np.ndarray) -> dict[str, np.ndarray]:
-        """Hyperparameters as the model's signal takes them, at scores (point, score)."""
+        """Hyperparameters for the model's `signal`, at scores (point, score)."""
         values = self.scores.values(z)
         if self.memoryless:
             shape = (len(z), *self.model.all_hyperpriors(self.slots)["beta0"].batch_shape)
@@ -118,7 +118,7 @@ class Posterior:
         return np.where(np.isfinite(out), out, -np.inf)
 
     def log_evidence(self, theta: Theta) -> Any:
-        """Log p(rates | theta), (point,), of EP where rates are not Gaussian; NumPy or JAX."""
+        """Log p(rates | theta), (point,), by EP if rates are not Gaussian; NumPy or JAX."""
         if namespace(theta["rest"]) is not np:
             signal, prior = self._at(theta)
             return evidence(self.blocks, signal, prior, self._lam(signal)).log_p
@@ -132,13 +132,13 @@ class Posterior:
         return found
 
     def settle(self, theta: Theta) -> None:
-        """Find the sites of EP at the mean of some points, from which those elsewhere start."""
+        """Find the EP sites at the mean of the points, used as initial sites elsewhere."""
         if not self.exact:
             center = {name: values.mean(0, keepdims=True) for name, values in theta.items()}
             self.sites = ep.log_evidence(self._joint(center), self.sites, _SETTLED, _DAMPING)[1]
 
     def start(self) -> np.ndarray:
-        """The best of four points to search the mode from, or with EP the mode; (score,)."""
+        """Best of four starts for the search of the mode, or with EP the mode; (score,)."""
         starts = np.zeros((len(_SIZES), self.n_scores))
         unit = self.model.family.line_of_sight[0]
         spread = np.log(np.clip(unit * np.nanstd(self.slots.y) / 0.2, 1e-2, 3.0))
@@ -152,7 +152,7 @@ class Posterior:
         return best
 
     def defensive(self, proposal: Student) -> Student:
-        """Fitted memory and noises, and the prior of the scores of all else."""
+        """Proposal with fitted memory and noises, and the prior for all other scores."""
         core = self.scores.core
         others = np.setdiff1d(np.arange(self.n_scores), core)
         cov = 1.5 * proposal.scale @ proposal.scale.T
@@ -167,7 +167,7 @@ class Posterior:
         Args:
             z: Scores (point, score).
             log_p: Log density at these points.
-            n: Number of draws; without correction one for each point.
+            n: Number of draws; without correction, one per point.
             rng: Random number generator.
         """
         unique, index, count = np.unique(z, axis=0, return_inverse=True, return_counts=True)
@@ -214,7 +214,7 @@ class Posterior:
         return groups
 
     def draws_of(self, groups: Mapping[str, Mapping[str, np.ndarray]]) -> Draws:
-        """Draws of variables by group and name, as `named` gives them."""
+        """Draws from variables by group and name, as returned by `named`."""
         sites, model = groups["posterior"], self.model
         theta = model.derived({n: sites[n] for n in model.dims | model.effect_dims if n in sites})
         theta = {name: v for name, v in theta.items() if name not in ("beta", "b", "B")}
@@ -260,14 +260,14 @@ class Posterior:
         return Given(trust[index[kept]], mean, sd, log_likelihood[index], predicted[index])
 
     def anew(self, draws: Draws, rng: np.random.Generator) -> np.ndarray:
-        """Rates of the same missions drawn anew, (draw, mission, bound, robot)."""
+        """Replicated rates of the missions, (draw, mission, bound, robot)."""
         rates = np.empty((len(draws.c), *self.slots.y.shape))
         for i, _, signal, mean in self.signals(draws):
             rates[i] = self._anew(signal, mean, rng)
         return rates
 
     def signals(self, draws: Draws) -> Iterator[tuple[slice, Theta, Signal, np.ndarray]]:
-        """Yield draws evaluated at once: slice, hyperparameters, signals and their means."""
+        """Yield chunks of draws: slice, hyperparameters, signals and their means."""
         for where, theta in chunks(draws.theta):
             signal = self.model.signal(theta, self.slots, self.layout)
             yield where, theta, signal, expected(self.blocks, signal, draws.c[where])
@@ -289,7 +289,7 @@ class Posterior:
     def _ep_trust(
         self, theta: Theta, signal: Signal, mean: np.ndarray, rng: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
-        """The same for other rates: by weighted particles of each block."""
+        """Trust and log likelihood for non-Gaussian rates, by weighted particles of each block."""
         joint = ep.Joint(self.blocks, signal, self.prior(theta), self.terms)
         sites = ep.log_evidence(joint, self.sites, _SWEEPS)[1]
         drawn = [ep.draw_signals(joint, mean, sites, rng) for _ in range(_PARTICLES)]
@@ -305,14 +305,14 @@ class Posterior:
         return x + (_root(S - gain @ S) @ rng.standard_normal((*x.shape, 1)))[..., 0], log_p
 
     def _anew(self, signal: Signal, mean: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Rates of the same missions drawn anew, (draw, mission, bound, robot)."""
+        """Replicated rates of the missions, (draw, mission, bound, robot)."""
         root = each(_root(signal.covariance), self.blocks.label[self.blocks.kind])
         f = self.layout.slots(mean + (root @ rng.standard_normal((*mean.shape, 1)))[..., 0])
         sd = signal.sd[..., None] if signal.sd.shape[2] == 1 else self.layout.slots(signal.sd)
         return self.model.family.sample(f, sd, self.slots.n_ticks, rng)
 
     def by_robot(self) -> tuple[Blocks, Layout]:
-        """Blocks whose rows are rates of robots, not contrasts of them, and their layout."""
+        """Blocks whose rows are rates of robots instead of contrasts, and their layout."""
         layout = self.model.layout(self.slots, contrasts=False)
         U = layout.columns(self._columns)
         return Blocks.of(layout.rows(self.slots.y), U, layout.label), layout
@@ -345,7 +345,7 @@ def _root(covariance: np.ndarray) -> np.ndarray:
 
 
 def chunks(theta: Mapping[str, Any]) -> Iterator[tuple[slice, dict[str, Any]]]:
-    """Points evaluated at once: their slice and hyperparameters."""
+    """Yield chunks of points: their slice and hyperparameters."""
     for start in range(0, len(theta["rest"]), _CHUNK):
         where = slice(start, start + _CHUNK)
         yield where, at(theta, where)

@@ -32,28 +32,29 @@ def predict_reports(
 ) -> xr.Dataset:
     """Predict each report of persons, who may be new, from their reports at earlier bounds.
 
-    Reports weigh the draws of the posterior, by which a person's start, level and gains are
-    learned; reports of one bound do not predict each other.
+    Earlier reports reweight the posterior draws, to infer a person's start, level and gains;
+    reports of one bound are not used to predict each other.
 
     Args:
         posterior: Posterior of `HumanTrust`.
-        missions: Persons; where a report is NaN it is predicted too.
+        missions: Persons as missions; NaN reports are predicted too.
         given: `"earlier"`, or `"none"`: no report of the person is known.
-        fitted: Whether the fit had the earlier reports of these persons: they then weigh no draws
-            of what all persons share a second time.
-        n_draws: Number of draws of a person's trust at most.
+        fitted: Whether the fit included the earlier reports of these persons; they are then not
+            used again to reweight the population parameters.
+        n_draws: Maximum number of draws of a person's trust.
         seed: Seed of the draws.
         model: Model of the posterior; needed with custom priors.
 
     Returns:
         Dataset over (mission, bound, robot): `report`, its `mean` and `quantile` (also over
-        `level`), on the scale that was answered, such as 1 to 7; `log_score`, nats, of the report's
-        mass (on the unit scale its density, but at 0 and 1 its mass), and with levels the
+        `level`), on the answer scale, such as 1 to 7; `log_score`, nats, the log probability of the
+        report (on the unit scale the log density, except at 0 and 1), and with levels the
         `probability` of each `answer`. Attributes: the mean absolute error `mae` of medians, the
         `mean_log_score`, and `coverage_90` of central intervals.
 
     Raises:
-        TrustboError: No posterior of `HumanTrust`; missions of other inputs, or of another scale.
+        TrustboError: If the posterior is not of `HumanTrust`, or the missions have other inputs or
+            another scale.
     """
     if not is_of_people(require_posterior("predict_reports", posterior)):
         raise TrustboError(
@@ -99,8 +100,8 @@ def _of_person(
 ) -> Iterator[tuple[tuple[int, int], np.ndarray, np.ndarray, np.ndarray]]:
     """Yield (bound, robot), weights of draws, and mean and variance of trust of each report.
 
-    The person's trust is drawn row by row given the reports so far. Runs of `alike` draws have one
-    weight in all.
+    The person's trust is drawn row by row given the reports so far. Each run of `alike` draws has
+    one common weight.
     """
     slots, family = ahead.slots, ahead.model.family
     _, n_bounds, n_robots = slots.y.shape
@@ -141,7 +142,7 @@ def _prediction(
     levels: int,
     rng: np.random.Generator,
 ) -> dict[str, Any]:
-    """Prediction of a report of which trust is N(center, var) in each draw."""
+    """Prediction of a report whose trust is N(center, var) in each draw."""
     family, sd = ahead.model.family, draws.theta["delta_v"]
     y, ticks = ahead.slots.y[slot], ahead.slots.n_ticks[slot]
     found: dict[str, Any] = {}

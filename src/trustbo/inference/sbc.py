@@ -33,29 +33,29 @@ def sbc(
 ) -> xr.Dataset:
     """Rank each true parameter among posterior draws, over data sets simulated from the prior.
 
-    If prior, likelihood and sampler fit together, ranks are uniform. The rates that the missions
-    measured are replaced by the model's own; Gaussian ones are not cut to [0, 1].
+    If prior, likelihood and sampler are consistent, ranks are uniform. Measured rates are replaced
+    by simulated ones; Gaussian rates are not clipped to [0, 1].
 
     Args:
         model: Trust model.
-        missions: Missions whose paths, awareness, ticks and gaps each data set has.
+        missions: Missions that define the paths, awareness, ticks and gaps of each data set.
         workspace: Workspace of the missions, as for `fit`.
         n_datasets: Number of data sets.
-        n_ranked: Number of draws that each truth is ranked among.
+        n_ranked: Number of posterior draws among which each true value is ranked.
         seed: Seed; the same seed gives the same ranks.
-        max_refused: Largest share of data sets that the sampler may refuse, as its weights are too
-            uneven. They are left out, and hide a departure of that share at most.
+        max_refused: Largest share of data sets whose posterior may fail the check of k-hat. They
+            are omitted, which can hide a deviation of at most this share.
         progress: Whether to show a progress bar.
 
     Returns:
         Dataset with `rank` (dataset, parameter), in 0..n_ranked, of each parameter and of the first
-        and the last number of each effect; `pit`, the ranks in (0, 1), which `az.plot_ecdf_pit`
-        draws; `p_value` (parameter) of a chi-squared test of uniformity in at most 20 bins; and
-        `coverage` (interval, parameter), the share of truths in the central interval. Its attribute
+        and last element of each effect; `pit`, the ranks in (0, 1), which `az.plot_ecdf_pit` draws;
+        `p_value` (parameter) of a chi-squared test of uniformity in at most 20 bins; and `coverage`
+        (interval, parameter), the share of true values in the central interval. Its attribute
         `n_refused` is the number of data sets left out.
 
     Raises:
-        PosteriorError: The sampler refuses more data sets than that, or all.
+        PosteriorError: If more than `max_refused` of the data sets fail, or all.
     """
     n_datasets = require_whole("n_datasets", n_datasets, 1)
     n_ranked = require_whole("n_ranked", n_ranked, 1)
@@ -81,9 +81,9 @@ def sbc(
 
 
 def _numbers(groups: dict[str, dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Draws (draw,) of every parameter, and of the first and last number of each effect.
+    """Draws (draw,) of every parameter, and of the first and last element of each effect.
 
-    Persons' own parts are left out, as are numbers that never vary.
+    Coefficients of single persons and constants are omitted.
     """
     found = {}
     for group, variables in groups.items():
@@ -121,7 +121,7 @@ def _summary(ranks: list[dict[str, int]], n_ranked: int, n_refused: int) -> xr.D
 
 
 def uniformity(ranks: np.ndarray, n_ranked: int) -> float:
-    """P-value of a chi-squared test; bins hold as many of the n_ranked + 1 ranks as they can."""
+    """P-value of a chi-squared test; bins are as equal as n_ranked + 1 ranks allow."""
     n_bins = min(20, max(2, len(ranks) // 5))  # five ranks to a bin, for the test to hold
     edges = np.linspace(0, n_ranked + 1, n_bins + 1).astype(int)
     counts, _ = np.histogram(ranks, edges - 0.5)

@@ -1,4 +1,4 @@
-"""Scores of predictions: contact rates of a mission, before it is run, against those measured."""
+"""Scores of predicted contact rates before a mission against the measured rates."""
 
 from collections.abc import Sequence
 
@@ -25,17 +25,17 @@ def score(
     workspace: Workspace | None = None,
     seed: int = 0,
 ) -> xr.Dataset:
-    """Score predictions of contact rates along the paths that missions took.
+    """Score predictions of contact rates along the paths of missions.
 
     A prediction is the marginal distribution of each rate before the first bound of its mission:
-    over parameter draws and effects of places, with the noises of trust and of rates.
+    averaged over parameter draws and effects of places, with the noise of trust and of rates.
 
     Args:
-        posterior: Posterior, which predicts all `missions`, none of which it was fitted to; or
-            those of a campaign, `Result.posteriors`, each of which predicts the next mission.
-        missions: Missions to predict; for a campaign, all of its missions in order.
-        workspace: Workspace of the missions, to fill in awareness that they lack, as for `fit`.
-        seed: Seed of the draws that rates are compared with, and of randomised PIT values.
+        posterior: Posterior that predicts all `missions`, none of which it was fitted to; or all
+            posteriors of a campaign, `Result.posteriors`, each of which predicts the next mission.
+        missions: Missions to predict; for a campaign, all missions in order.
+        workspace: Workspace of the missions, to fill in missing awareness, as for `fit`.
+        seed: Seed of the predictive draws and of randomised PIT values.
 
     Returns:
         Dataset over (mission, bound, robot), NaN where no rate was measured, in missions that were
@@ -47,8 +47,9 @@ def score(
         the squared errors of the means relative to those of the average rate; and their number `n`.
 
     Raises:
-        TrustboError: No posterior of `fit`; not as many posteriors as missions, or no mission to
-            predict; a path that leaves the grid of places with effects; or missing ticks.
+        TrustboError: If a posterior is not from `fit`; the numbers of posteriors and missions
+            differ, or there is no mission to predict; a path leaves the grid of place effects; or
+            ticks are missing.
     """
     require_whole("seed", seed, 0)
     missions = [m if workspace is None else workspace.fill(m) for m in missions]
@@ -127,7 +128,7 @@ def _summary(
 def _trees(
     posterior: xr.DataTree | Sequence[xr.DataTree], missions: Sequence[Mission]
 ) -> list[xr.DataTree]:
-    """The posterior that predicts each mission, of a campaign from the second on."""
+    """Posterior that predicts each mission; for a campaign, from the second mission on."""
     if not missions:
         raise TrustboError("score needs missions to predict; got none.")
     if isinstance(posterior, xr.DataTree) or not isinstance(posterior, Sequence):

@@ -1,4 +1,4 @@
-"""Layout of a posterior for ArviZ: named axes, no padding, the data included."""
+"""Layout of a posterior for ArviZ: named axes, no padding, with the data."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -108,7 +108,7 @@ def _data_groups(
 
 
 def parameters_alone(posterior: xr.DataTree) -> xr.DataTree:
-    """Posterior without the groups that grow with the number of missions; see `complete`."""
+    """Drop the groups that grow with the number of missions; see `complete`."""
     kept = [*_KEPT, *(effect.noun for effect in effects_of(posterior))]
     kept = [name for name in kept if name in posterior.children]
     alone = xr.DataTree.from_dict({name: posterior[name].to_dataset() for name in kept})
@@ -122,22 +122,22 @@ def complete(
     *,
     model: TrustModel | None = None,
 ) -> xr.DataTree:
-    """Add latent trust, log-likelihoods and predictions to a posterior of parameters alone.
+    """Add latent trust, log-likelihoods and predictions to a posterior.
 
-    A campaign keeps the parameters of its posteriors; these groups grow with the number of
-    missions, and are the same whenever they are computed.
+    A campaign stores only the parameters of its posteriors, as these groups grow with the number of
+    missions. They are reproducible and can be computed at any time.
 
     Args:
         posterior: DataTree from `fit`, or one of `Result.posteriors`.
-        missions: Missions that it was fitted to; needed where it holds no data.
-        model: Its model; needed with custom priors.
+        missions: Missions of the fit; needed if the posterior holds no data.
+        model: Model of the posterior; needed with custom priors.
 
     Returns:
         The posterior with the groups `latent`, `posterior_predictive`, `prior_predictive`,
-        `log_prior` and `log_likelihood`; itself, if it has them.
+        `log_prior` and `log_likelihood`; unchanged if it has them.
 
     Raises:
-        TrustboError: The posterior holds no data and no missions are given.
+        TrustboError: If the posterior holds no data and no missions are given.
     """
     if "latent" in require_posterior("complete", posterior).children:
         return posterior
@@ -186,8 +186,8 @@ def complete(
 def log_prior(model: TrustModel, sites: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Log prior density (draw,) of each parameter with an independent prior, up to a constant.
 
-    Deviations of robots from a common mean belong to the model, not to the prior: of a
-    `HierarchicalTrust` only means and spreads are here. The LKJ prior of correlations R of the
+    Deviations of robots from a common mean belong to the model, not to the prior: for
+    `HierarchicalTrust`, only means and spreads are included. The LKJ prior of correlations R of the
     coupled model has density det(R)^(concentration - 1).
 
     Args:

@@ -46,7 +46,7 @@ def optimistic(
 
 
 def ucb(rng: np.random.Generator, params: Params, planner: Planner, *, kappa: float = 1.0) -> Plan:
-    """Best path of a draw with the highest mean plus `kappa` sd of its value over draws."""
+    """Among the draws' best paths, the one with the highest mean plus `kappa` sd of value."""
     drawn = planner.plan_draws(params, n_draws=N_DRAWS, seed=_seed(rng))
     values = drawn.values_of(drawn.candidates)
     chosen = int(np.argmax(values.mean(0) + kappa * values.std(0)))
