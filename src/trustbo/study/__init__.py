@@ -1,4 +1,4 @@
-"""Studies: many campaigns as a table, on worlds whose truth is known."""
+"""Studies: grids of campaigns on worlds whose truth is known."""
 
 from trustbo.study.grid import Scene, run_grid
 from trustbo.study.summary import differences, numbers_of, summary

@@ -1,4 +1,4 @@
-"""Campaigns as one table: cases x scenes x seeds, in processes, going on where they stopped."""
+"""Grids of campaigns (cases x scenes x seeds), run in parallel processes and resumable."""
 
 import copy
 import re
@@ -23,7 +23,7 @@ from trustbo.workspace import Workspace
 
 
 class Scene(NamedTuple):
-    """Where campaigns are run: what is assumed, the true world, and a course through it."""
+    """Setting of a campaign: the assumed workspace, the true world, and a start and goal."""
 
     workspace: Workspace
     simulator: Simulator
@@ -52,33 +52,33 @@ def run_grid(
     n_missions: int = 15,
     n_jobs: int = -1,
 ) -> pd.DataFrame:
-    """Run each case on each scene with each seed, and judge the paths of each mission.
+    """Run each case on each scene with each seed, and evaluate the paths of each mission.
 
-    A run is a file in the folder, named by its case, scene, seed and number of missions; runs whose
-    files are there are not run again. Processes are those of joblib: `joblib.parallel_config`
-    chooses others, such as `backend="dask"` for a cluster. A policy with a method
-    `learn(campaign, mission)` is told of each mission, and one with `recommend(campaign)`
-    recommends a path in place of the campaign.
+    Each run writes a file named by its case, scene, seed and number of missions; runs whose files
+    exist are skipped. Runs are parallelised by joblib; `joblib.parallel_config` selects another
+    backend, such as `backend="dask"` for a cluster. If a policy has a method `learn(campaign,
+    mission)`, it is called after each mission; if it has `recommend(campaign)`, that path replaces
+    the campaign's recommendation.
 
     Args:
         cases: Cases by name.
-        scenes: Functions that make the scenes, by name; they are called in the processes.
+        scenes: Functions that make the scenes, by name; they are called in the worker processes.
         folder: Folder of the runs.
         seeds: Seeds of the campaigns.
         n_missions: Missions of a campaign.
-        n_jobs: Processes; -1 for one a core, 1 for none but this.
+        n_jobs: Number of processes; -1 for one per core, 1 to use only this process.
 
     Returns:
-        A row for each run and mission: `case`, `scene`, `seed`, labels of the scene, and `mission`;
-        0 is before the first. `regret` in % and `lost` in bounds are those of the path recommended
-        after the mission in the world of the next, see `Truth`, and `best` what the best path
-        loses there. Of the mission itself are `status`, `contact_rate` (mean), `driven` and
-        `best_driven`, which are expected to be lost on its path and on the best,
-        `failed_driven`, what is lost more than on the best path if bounds that fail or are not
-        reached keep no contact, and `seconds` of processor time.
+        One row per run and mission: `case`, `scene`, `seed`, labels of the scene, and `mission`,
+        with 0 before the first one. `regret` (%) and `lost` (bounds) describe the path recommended
+        after the mission, evaluated in the world of the next one, see `Truth`; `best` is the loss
+        of the best path there. The mission itself has `status`, mean `contact_rate`, `driven` and
+        `best_driven`, the expected losses on its path and on the best path, `failed_driven`, the
+        additional loss if bounds that fail or are not reached keep no contact, and `seconds` of
+        processor time.
 
     Raises:
-        TrustboError: Some runs failed; they are run again at the next call.
+        TrustboError: Some runs failed; the next call repeats them.
 
     Example:
         >>> cases = {"greedy": {}, "thompson": {"policy": "thompson"}}
@@ -133,7 +133,7 @@ def _run(
 
 
 def _rows(case: Case, scene: Scene, seed: int, n_missions: int) -> Iterator[dict[str, Any]]:
-    """Run a campaign: its rows, the first before any mission."""
+    """Run a campaign and return its rows; the first row is before any mission."""
     options = case(scene) if callable(case) else case
     given = {
         "workspace": scene.workspace, "start": scene.start, "goal": scene.goal, "seed": seed,
@@ -155,7 +155,7 @@ def _rows(case: Case, scene: Scene, seed: int, n_missions: int) -> Iterator[dict
 
 
 def _recommended(campaign: Campaign, scene: Scene, mission: int) -> dict[str, float]:
-    """Regret and loss of the path that is recommended for a mission."""
+    """Regret and loss of the path recommended for a mission."""
     if scene.truth is None:
         return {}
     choose = getattr(campaign.policy, "recommend", None)
@@ -167,7 +167,7 @@ def _recommended(campaign: Campaign, scene: Scene, mission: int) -> dict[str, fl
 
 
 def _driven(path: Sequence[Cell], scene: Scene, mission: int) -> dict[str, float]:
-    """Loss that was expected on the path of a mission, and on the best."""
+    """Expected loss on the path of a mission, and on the best path."""
     if scene.truth is None:
         return {}
     truth, ends = scene.truth.at(mission), (scene.start, scene.goal)

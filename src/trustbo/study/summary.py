@@ -1,4 +1,4 @@
-"""Numbers of campaigns, and paired differences of cases, with bootstrap intervals."""
+"""Summaries of campaigns and paired differences between cases, with bootstrap intervals."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -16,15 +16,15 @@ _RUN = ["case", "scene", "seed"]
 
 
 def numbers_of(table: pd.DataFrame) -> pd.DataFrame:
-    """Numbers of each run of a table of `run_grid` whose scenes have a truth.
+    """Summary numbers of each run in a table of `run_grid` whose scenes have a truth.
 
-    Columns: labels of the run; `regret after n` missions in %, and `lost after n`, contact lost
-    more than on the best path, in bounds, both in the world of the next mission; `regret now`, mean
-    over all missions; `lost while learning`, the same as `lost` for paths driven, in the world they
-    were driven in; `lost with failures`, the same where bounds that fail or are not reached keep
-    no contact; `missions to 1 %`, after which the recommended path stays within 1 %, one more
-    than were driven if it does not; shares of missions that `arrive`, of the first three and of
-    the later ones; and processor `seconds` of a mission.
+    The columns are the labels of the run; `regret after n` missions (%), and `lost after n`, the
+    contact lost in addition to the best path's loss (bounds), both in the world of the next
+    mission; `regret now`, the mean over all missions; `lost while learning`, the additional loss on
+    the paths driven, in the world in which they were driven; `lost with failures`, the same if
+    bounds that fail or are not reached keep no contact; `missions to 1 %`, after which the regret
+    stays within 1 %, or the number driven plus one if it does not; the fractions of all missions,
+    of the first three and of the later ones that `arrive`; and processor `seconds` per mission.
     """
     judged = {"mission", "regret", "lost", "best", "status", "contact_rate", "driven",
               "best_driven", "failed_driven", "seconds"}  # fmt: skip
@@ -58,12 +58,12 @@ def _numbers(run: pd.DataFrame) -> dict[str, float]:
 def summary(
     numbers: pd.DataFrame, by: str | Sequence[str] = "case", *, clusters: str = "scene"
 ) -> pd.DataFrame:
-    """Mean of each number, of regret and loss after n missions the median, with 95 % intervals.
+    """Means with 95 % intervals; medians for regret and loss after n missions.
 
     Args:
         numbers: Rows of `numbers_of`.
-        by: Columns of a row of the result.
-        clusters: Column whose equal runs enter the bootstrap together.
+        by: Columns by which runs are grouped.
+        clusters: Column of the bootstrap's clusters; runs with equal values are resampled together.
 
     Returns:
         Columns of two levels: the number, and `value`, `low` and `high`.
@@ -84,17 +84,18 @@ def summary(
 def differences(
     numbers: pd.DataFrame, ours: str, by: Sequence[str] = (), *, clusters: str = "scene"
 ) -> pd.DataFrame:
-    """Compare a case with each other one on the same scenes and seeds.
+    """Compare one case with each of the others on the same scenes and seeds.
 
     Args:
         numbers: Rows of `numbers_of`.
-        ours: Case that others are subtracted from.
-        by: Columns of a row of the result beside the other case.
-        clusters: Column whose equal pairs enter the bootstrap together.
+        ours: Case from which the others are subtracted.
+        by: Columns by which pairs are grouped, in addition to the other case.
+        clusters: Column of the bootstrap's clusters; pairs with equal values are resampled
+            together.
 
     Returns:
-        Columns as of `summary`, means of `ours` less those of the other, and the number of `pairs`;
-        intervals are NaN for one cluster.
+        Columns as in `summary`, for the difference `ours` minus the other case, and the number of
+        `pairs`; intervals are NaN if there is only one cluster.
 
     Raises:
         TrustboError: An unknown case or column.
@@ -121,9 +122,9 @@ def bootstrap(
     clusters: np.ndarray,
     middle: Callable[[np.ndarray], Any] | None = None,
 ) -> dict[tuple[str, str], float]:
-    """Value and 95 % interval of each quantity, by default a median of those after n missions.
+    """Estimate and 95 % interval of each quantity; by default medians for those after n missions.
 
-    Runs of one cluster enter the bootstrap together, and all quantities have the same draws.
+    Runs of a cluster are resampled together, and all quantities use the same resamples.
     """
     rng, (names, index) = np.random.default_rng(0), np.unique(clusters, return_inverse=True)
     members = [np.flatnonzero(index == i) for i in range(len(names))]

@@ -1,4 +1,4 @@
-"""A world: a true terrain, sight and team, what is assumed of them, and courses through it."""
+"""Benchmark worlds: true and assumed terrain, sight and team, and courses through them."""
 
 import hashlib
 from dataclasses import dataclass, field, replace
@@ -33,30 +33,30 @@ _RELIEF = 0.06
 
 
 def drawn(ground: str, what: str) -> np.random.Generator:
-    """Random numbers by rule: seeded by the SHA-256 hash of a terrain's name and a purpose."""
+    """Generator seeded by the SHA-256 hash of a terrain's name and a purpose."""
     return np.random.default_rng(list(hashlib.sha256(f"{ground} {what}".encode()).digest()))
 
 
 @dataclass(frozen=True)
 class World:
-    """A terrain with a true sight and team, what is assumed of it, and what happens.
+    """A terrain with true and assumed sight and team, and events.
 
     Attributes:
-        name: Name of the world: that of its ground, and of its case.
+        name: Name of the world: the name of its ground, followed by the name of its case.
         kind: Name of the kind, for tables.
-        ground: `"synthetic-N"`, the synthetic terrain of seed N, or `"synthetic-NAME"`, of the seed
-            that is drawn from the name; or a name in `REAL`.
+        ground: `"synthetic-N"`, the synthetic terrain with seed N; `"synthetic-NAME"`, with a seed
+            drawn from the name; or a name in `REAL`.
         sight: True model of sight.
-        assumed: Assumed model of sight; None for the true one.
+        assumed: Assumed model of sight; None for the true model.
         team: True lead and robots.
-        assumed_team: Assumed lead and robots; None for the true ones.
+        assumed_team: Assumed lead and robots; None for the true team.
         aged: Whether the assumed terrain is an old survey, see `aged`.
-        events: Events, with the missions they act in. Centres are shares of the terrain's width and
-            height from its lower left corner, in place of CRS metres.
+        events: Events, with the missions they act in. Centres are fractions of the terrain's width
+            and height from its lower left corner, instead of CRS metres.
         shape: Planning grid.
         cell: Side of a cell of a synthetic terrain, m.
-        radio: Whether contact is that of `RadioSimulator`.
-        data: Folder of the real terrains.
+        radio: Whether contact is simulated by `RadioSimulator`.
+        data: Folder with the real terrains.
     """
 
     name: str
@@ -75,12 +75,12 @@ class World:
 
     @property
     def case(self) -> str:
-        """Name without the terrain's, by default the kind."""
+        """Name without the name of the terrain; by default the kind."""
         return self.name.removeprefix(self.ground).removeprefix("-") or self.kind
 
     @property
     def is_made(self) -> bool:
-        """Whether the terrain is synthetic, and has no files."""
+        """Whether the terrain is synthetic and has no files."""
         return self.ground.startswith("synthetic")
 
     @property
@@ -91,7 +91,7 @@ class World:
     def files(self) -> list[str]:
         """Files of a real terrain.
 
-        TrustboError: they are absent, with where to put them.
+        TrustboError: the files are missing; the message says where to put them.
         """
         if self.data is None and self.is_packaged:
             return list(example_files(self.ground))
@@ -114,7 +114,7 @@ class World:
         return _made(seed, (rows * self.cell, cols * self.cell))
 
     def workspace(self, **options: Any) -> Workspace:
-        """Workspace on what is assumed, with options of `Workspace.from_terrain`."""
+        """Assumed workspace; options as in `Workspace.from_terrain`."""
         assumed = replace(
             self, name="", kind="", sight=self.assumed or self.sight, assumed=None,
             team=self.assumed_team or self.team, assumed_team=None, events=(),
@@ -123,7 +123,7 @@ class World:
         return _workspace(assumed, tuple(sorted(options.items())))
 
     def simulator(self, workspace: Workspace) -> KinematicSimulator | RadioSimulator:
-        """Simulator of the true world, with posts and routes of a workspace on the assumed one."""
+        """Simulator of the true world, with posts and routes planned on the assumed world."""
         terrain = self.true_terrain()
         if self.radio:
             return RadioSimulator(workspace, terrain=terrain)
@@ -136,7 +136,7 @@ class World:
         )
 
     def truth(self, folder: FilePath | None = None) -> Truth:
-        """Truth of the simulator, from its file in a folder where it has been found before."""
+        """Truth of the simulator, read from a file in the folder if it was computed before."""
         return Truth.of(self.simulator(self.workspace()), folder=folder)
 
     def scene(
@@ -146,9 +146,9 @@ class World:
         max_bounds: int | str = "shortest+4",
         **options: Any,
     ) -> Scene:
-        """Course through the world for `run_grid`, with the truth kept in a folder.
+        """Scene of a course through the world, for `run_grid`; the truth is cached in a folder.
 
-        Options are those of `workspace`. TrustboError: an unknown course, or absent files.
+        Options as in `workspace`. TrustboError: the course is unknown, or files are missing.
         """
         workspace = self.workspace(**options)
         paths = {"max_bounds": max_bounds}
@@ -188,10 +188,11 @@ class World:
 
 
 def aged(now: xr.Dataset, seed: int = 0) -> xr.Dataset:
-    """Terrain as an old survey has it: canopy lower, with clearings, ground off by some 0.3 m.
+    """Terrain as in an old survey: lower canopy with clearings, and ground errors of about 0.3 m.
 
-    The canopy has 0.7 times its height, and none on 15 % of the area, in patches of some 10 m that
-    have grown over since; errors of the ground have sd 0.3 m, and are alike within some 10 m.
+    The canopy has 0.7 times its true height, and is missing on 15 % of the area, in patches of
+    about 10 m that have grown over since. Ground errors have a standard deviation of 0.3 m and a
+    correlation length of about 10 m.
     """
     rng, step = np.random.default_rng(seed), abs(float(now["x"][1] - now["x"][0]))
     dem, dsm = now["dem"].values, now["dsm"].values
@@ -210,7 +211,7 @@ def aged(now: xr.Dataset, seed: int = 0) -> xr.Dataset:
 
 @lru_cache(maxsize=4)
 def _workspace(assumed: World, given: tuple[tuple[str, Any], ...]) -> Workspace:
-    """Workspace on the terrain, sight and team of a world."""
+    """Workspace with given terrain, sight and team."""
     ground = assumed.true_terrain()
     ground = aged(ground) if assumed.aged else ground
     options: dict[str, Any] = {"sight": assumed.sight, **dict(given)}

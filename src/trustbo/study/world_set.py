@@ -1,4 +1,4 @@
-"""The set of worlds of the benchmark, by kind."""
+"""Set of benchmark worlds, by kind."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -29,7 +29,7 @@ def _climbing(degrees: float) -> dict[str, Any]:
 
 
 def _team_of(degrees: float) -> Team:
-    """Three robots and a lead that stand a slope."""
+    """Team of three robots and a lead with a given slope limit."""
     robot = Robot(max_slope=float(np.deg2rad(degrees)))
     return Team(robots=(robot,) * 3, lead=robot)
 
@@ -40,7 +40,7 @@ def _limit(true: float, assumed: float) -> dict[str, Any]:
 
 
 def _is_drawn(ground: str) -> bool:
-    """Whether what happens on a terrain is drawn from its name; else it is fixed by hand."""
+    """Whether the events on a terrain are drawn from its name; else they are fixed by hand."""
     return ground not in _SYNTHETIC
 
 
@@ -55,13 +55,13 @@ def _days(ground: str) -> tuple[int, ...]:
 
 
 def _place(ground: str) -> tuple[float, float]:
-    """Centre of what happens, as shares of the terrain: in the middle, or within 20 % of it."""
+    """Centre of events, as fractions of the terrain: the middle, or within 20 % of it."""
     x, y = drawn(ground, "place").uniform(0.3, 0.7, 2) if _is_drawn(ground) else (0.5, 0.5)
     return float(x), float(y)
 
 
 def _reach(ground: str) -> float:
-    """Radius of a jammer, m: the real terrains are half as wide as the synthetic ones."""
+    """Radius of a jammer, m; real terrains are half as wide as synthetic ones."""
     return 40.0 if ground in REAL else 90.0
 
 
@@ -174,14 +174,14 @@ def _all() -> list[World]:
 
 
 def worlds(data: FilePath | None = None) -> dict[str, World]:
-    """Worlds of the benchmark by name; see docs/worlds.md.
+    """Benchmark worlds by name; see docs/worlds.md.
 
     Args:
-        data: Folder with the real terrains, `tahoe/dem.tif` and so on. Without it, their worlds are
-            listed too, but those of wellington alone, which is in the package, can be used.
+        data: Folder with the real terrains, `tahoe/dem.tif` and so on. Without it, all worlds are
+            listed, but of the real terrains only wellington, which is in the package, can be used.
 
     Returns:
-        Worlds of 6 synthetic terrains and 4 real ones.
+        Worlds on 6 synthetic and 4 real terrains.
     """
     folder = None if data is None else str(data)
     return {world.name: replace(world, data=folder) for world in _all()}

@@ -1,4 +1,4 @@
-"""Rasters of terrain and features of their pixels."""
+"""Terrain rasters and features of their pixels."""
 
 from trustbo.terrain.composite import CompositeIndex
 from trustbo.terrain.example import example

@@ -1,4 +1,4 @@
-"""Index in [0, 1] of several features, by their first principal component."""
+"""Composite index in [0, 1]: the first principal component of several features."""
 
 from collections.abc import Mapping
 from typing import Self
@@ -33,7 +33,7 @@ class CompositeIndex:
     explained_variance_ratio_: xr.DataArray
 
     def __init__(self, signs: Mapping[str, int]) -> None:
-        """Declare the features and their signs."""
+        """Set the features and their signs."""
         self.signs = dict(signs)
 
     def fit(self, features: Mapping[str, ArrayLike] | xr.Dataset) -> Self:
@@ -78,7 +78,7 @@ class CompositeIndex:
     def transform(self, features: Mapping[str, ArrayLike] | xr.Dataset) -> np.ndarray:
         """Compute the index of every sample, in [0, 1] and of the features' shape.
 
-        NaN where a feature is; 0.5 everywhere if all features were constant.
+        It is NaN where a feature is NaN, and 0.5 everywhere if all features were constant.
 
         Raises:
             TrustboError: A declared feature is missing; the index has not been fitted.

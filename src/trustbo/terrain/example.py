@@ -1,4 +1,4 @@
-"""Real terrain that comes with the package."""
+"""Example of real terrain, included in the package."""
 
 from pathlib import Path
 
@@ -13,12 +13,12 @@ EXAMPLES = ("wellington",)
 
 
 def example(name: str = "wellington") -> xr.Dataset:
-    """Read a real terrain that comes with the package.
+    """Read an example of real terrain that is included in the package.
 
-    `"wellington"` is a steep hillside under bush in the Wairarapa, New Zealand: 195 m x 278 m at
-    1 m, 211 m of relief, trees of up to 44.6 m. Copyright in this work is owned by Greater
-    Wellington Regional Council; sourced from the LINZ Data Service, CC BY 4.0. The attribute
-    `attribution` states this, and `LICENCE.md` in the folder of the files the inferred part of it.
+    `"wellington"` is a steep hillside under bush in the Wairarapa, New Zealand: 195 m x 278 m at 1
+    m, 211 m of relief, trees of up to 44.6 m. Copyright in this work is owned by Greater Wellington
+    Regional Council; sourced from the LINZ Data Service, CC BY 4.0. The attribute `attribution`
+    states this; `LICENCE.md` beside the files says which part of it is inferred.
 
     Args:
         name: Name of the terrain, one of `EXAMPLES`.

@@ -1,7 +1,7 @@
-"""Attributes of pixels that impede motion or sight.
+"""Features of pixels that impede motion or sight.
 
 A feature is a function of a terrain (Dataset of `dem` and `dsm`, dims (y, x), metres) that returns
-an array (row, col), NaN where unknown. `feature` registers one for composites:
+an array (row, col), NaN where unknown. `feature` registers such a function for composites:
 
     @tb.terrain.feature("northness", sign=+1)
     def northness(terrain):
@@ -35,7 +35,7 @@ PAPER_VISIBILITY = ("canopy_height", "canopy_cover", "openness")
 
 
 class Feature(NamedTuple):
-    """Attribute of pixels, and its sign in an index: +1 if it raises the index, -1 if not."""
+    """Feature of pixels and its sign in an index: +1 if it raises the index, -1 if it lowers it."""
 
     compute: Callable[..., np.ndarray]
     sign: int
@@ -46,7 +46,7 @@ FEATURES: dict[str, Feature] = {}
 
 
 def feature[F: Callable[..., np.ndarray]](name: str, *, sign: int) -> Callable[[F], F]:
-    """Register a feature of pixels under a new name, by a decorator.
+    """Decorator that registers a feature of pixels under a new name.
 
     TrustboError: the name is taken, or the sign is neither 1 nor -1.
     """
@@ -63,7 +63,7 @@ def feature[F: Callable[..., np.ndarray]](name: str, *, sign: int) -> Callable[[
 
 
 def pixel_features(terrain: xr.Dataset, names: Iterable[str]) -> xr.Dataset:
-    """Compute registered features, as variables of dims (y, x).
+    """Compute registered features, as variables with dims (y, x).
 
     Raises:
         TrustboError: An unknown name.
@@ -84,7 +84,7 @@ def _window(z: np.ndarray) -> dict[tuple[int, int], np.ndarray]:
 
 
 def gradient(dem: np.ndarray, pixel: tuple[float, float]) -> np.ndarray:
-    """Rise of the ground per metre to the east and to the north (Horn 1981), (2, row, col)."""
+    """Gradient of the ground to the east and to the north (Horn 1981), (2, row, col)."""
     w = _window(dem)
     east = (w[-1, 1] - w[-1, -1]) + 2.0 * (w[0, 1] - w[0, -1]) + (w[1, 1] - w[1, -1])
     south = (w[1, -1] - w[-1, -1]) + 2.0 * (w[1, 0] - w[-1, 0]) + (w[1, 1] - w[-1, 1])
@@ -114,7 +114,7 @@ def tri(terrain: xr.Dataset) -> np.ndarray:
 
 @feature("step_height", sign=-1)
 def step_height(terrain: xr.Dataset) -> np.ndarray:
-    """Largest step up or down to one of the 8 neighbours, m; to a missing one there is none."""
+    """Largest step up or down to one of the 8 neighbours, m; missing neighbours are ignored."""
     z = terrain["dem"].values
     return np.fmax.reduce([np.abs(w - z) for w in _window(z).values()])
 
@@ -127,7 +127,7 @@ def canopy_height(terrain: xr.Dataset) -> np.ndarray:
 
 @feature("canopy_cover", sign=-1)
 def canopy_cover(terrain: xr.Dataset) -> np.ndarray:
-    """Share of the square of half-width 5 m that is under canopy over 2 m high."""
+    """Fraction of a square of half-width 5 m that is covered by canopy over 2 m high."""
     return _local_mean(terrain, (canopy_height(terrain) > CANOPY_THRESHOLD).astype(float))
 
 
@@ -137,7 +137,7 @@ def vegetation_density(
 ) -> np.ndarray:
     """Share of the lowest `layer` metres of air filled by canopy, in squares of half-width 5 m.
 
-    Canopy is the layer of air from `crown_base` times its height to its top.
+    The canopy is the layer from `crown_base` times its height to its top.
     """
     height = canopy_height(terrain)
     filled = np.minimum(height, layer) - np.minimum(crown_base * height, layer)
@@ -148,10 +148,10 @@ def vegetation_density(
 def openness(
     terrain: xr.Dataset, reach: float = REACH, *, eye: float = 1.0, target: float = 1.0
 ) -> np.ndarray:
-    """Expected share of clear rays from a pixel to targets `reach` metres away all around.
+    """Expected fraction of clear rays from a pixel to targets `reach` metres away all around.
 
-    Rays run from `eye` to `target` metres above ground. Those that end off the raster do not count;
-    a pixel without others is NaN: keep `reach` below half the terrain's shorter side.
+    Rays run from `eye` to `target` metres above ground. Rays that end off the raster are ignored; a
+    pixel without other rays is NaN, so keep `reach` below half the terrain's shorter side.
     """
     maps = terrain["dem"].values, terrain["dsm"].values
     return rays.openness(*maps, pixel_size(terrain), reach, (eye, target))

@@ -1,4 +1,4 @@
-"""From the values that a raster stores to heights in metres, NaN where they are missing."""
+"""Conversion of stored raster values to heights in metres, NaN where missing."""
 
 import re
 import warnings
@@ -19,11 +19,11 @@ _PACKAGE = str(Path(__file__).parents[1])
 
 
 class Vertical(NamedTuple):
-    """Meaning of a raster's heights.
+    """Unit and vertical datum of a raster's heights.
 
     Attributes:
-        unit: Name of their unit.
-        metres: Length of the unit, negative where values are depths.
+        unit: Name of the unit.
+        metres: Length of the unit in metres, negative for depths.
         datum: Name of the vertical datum; None if nothing declares one.
     """
 
@@ -33,14 +33,14 @@ class Vertical(NamedTuple):
 
 
 class Coding(NamedTuple):
-    """How a raster stores heights: in metres, they are metres * (scale * stored + offset).
+    """Encoding of a raster's heights: in metres, they are metres * (scale * stored + offset).
 
     Attributes:
         name: Name of the raster, for messages.
-        fills: Stored values that mean missing.
+        fills: Stored values that mark missing data.
         scale: Scale.
         offset: Offset.
-        metres: Length of the unit of heights, negative for depths.
+        metres: Length of the unit of heights in metres, negative for depths.
     """
 
     name: str
@@ -58,10 +58,10 @@ def warn(message: str) -> None:
 def decoded(stored: np.ndarray, coding: Coding) -> np.ndarray:
     """Convert stored values (row, col) to heights in metres, NaN where missing.
 
-    Missing are values that are not finite, and declared fills.
+    Non-finite values and declared fill values are missing.
 
     Raises:
-        TrustboError: Values that are no real numbers, or that no height on land has: undeclared
+        TrustboError: Values are not real numbers, or are impossible as heights on land: undeclared
             fill values, fill values blended with heights, or heights in another unit.
     """
     if stored.dtype.kind not in "iuf":
@@ -84,7 +84,7 @@ def decoded(stored: np.ndarray, coding: Coding) -> np.ndarray:
 def _no_heights(
     coding: Coding, stored: np.ndarray, heights: np.ndarray, wrong: np.ndarray
 ) -> TrustboError:
-    """Error about values that are no heights, with the first of them and the likely cause."""
+    """Error about values that are not heights, with the first of them and the likely cause."""
     r, c = np.unravel_index(np.argmax(wrong), wrong.shape)
     value, height = float(stored[r, c]), heights[r, c]
     scaled = "" if value == height else f" (scaled to {height:g} m)"
@@ -104,13 +104,13 @@ def _no_heights(
 
 
 def _as_stored(value: float, dtype: np.dtype) -> float:
-    """Value rounded to the raster's type: float32 holds no -3.4e38."""
+    """Value rounded to the raster's type: float32 cannot represent -3.4e38 exactly."""
     with np.errstate(over="ignore"):
         return float(dtype.type(value)) if dtype.kind == "f" else value
 
 
 def warn_of_zeros(heights: np.ndarray, name: str) -> None:
-    """Warn of pixels at exactly 0 m apart from all other heights: a fill that nobody declared."""
+    """Warn of pixels at exactly 0 m, far from all other heights: an undeclared fill value."""
     zero, low = heights == 0.0, np.abs(heights) <= 10.0
     others = np.isfinite(heights).sum() - zero.sum()
     if zero.any() and low.sum() < 1.1 * zero.sum() < 1.1 * others:  # else the ground is level
@@ -125,11 +125,11 @@ def vertical_of(name: str, declared: object, axis: Vertical | None) -> Vertical:
 
     Args:
         name: Name of the raster.
-        declared: Unit of the band, or of each band, of which the first counts; None if unknown.
+        declared: Unit of the band, or of each band, of which the first is used; None if unknown.
         axis: Vertical axis of the CRS, if it has one.
 
     Raises:
-        TrustboError: An unknown unit, or a band and a CRS that disagree.
+        TrustboError: The unit is unknown, or band and CRS disagree.
     """
     text = str(np.ravel(np.array(declared, object))[0] or "").strip()
     if not text:

@@ -25,24 +25,26 @@ GROUND_GAP, MAX_GAP = 10.0, 3.0
 def read_lidar(
     points: FilePath | Sequence[FilePath], resolution: float = 1.0, *, crs: object = None
 ) -> xr.Dataset:
-    """Grid lidar points, ground classified, into ground (DEM) and surface (DSM).
+    """Grid classified lidar points into ground (DEM) and surface (DSM).
 
-    The ground is the triangulation of the points of class 2 at the pixel centres, missing farther
-    than 10 m from them. The surface is the highest return of a pixel; one without returns takes the
-    height above ground of the nearest with returns, up to 3 m away. Noise (classes 7 and 18) and
-    withheld points are left out. A million ground points take about 30 s and 1 GB.
+    The ground is interpolated at the pixel centres from a triangulation of the points of class 2;
+    it is missing more than 10 m away from them. The surface is the highest return in each pixel. A
+    pixel without returns has the height above ground of the nearest pixel with returns, up to 3 m
+    away. Noise (classes 7 and 18) and withheld points are ignored. A million ground points take
+    about 30 s and 1 GB.
 
     Args:
         points: A LAS or LAZ file, or the files of one survey.
-        resolution: Pixel size, m; pixel edges lie at its multiples.
+        resolution: Pixel size, m; pixel edges are at its multiples.
         crs: Coordinate reference system of files without one, e.g. `"EPSG:32633"`.
 
     Returns:
         Dataset with `dem` and `dsm` as from `read_terrain`.
 
     Raises:
-        TrustboError: No laspy; an unreadable file; no ground points, or points at heights that no
-            land has; no projected CRS, or two; no pixel with both heights.
+        TrustboError: laspy is not installed; a file is unreadable; there are no ground points, or
+            heights are impossible; there is no projected CRS, or more than one; no pixel has both
+            heights.
     """
     step, given = require_positive("resolution", resolution), crs and known_crs(crs)
     files = [points] if isinstance(points, str | PathLike) else list(points)

@@ -1,4 +1,4 @@
-"""Where on Earth a raster lies, and maps in metres with north at the top."""
+"""Georeferencing: CRS of rasters, and warping to metric maps with north at the top."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ _NORTH = 22.5  # degrees between columns and north, half the angle between two o
 
 
 def known_crs(crs: Any) -> CRS:
-    """CRS of anything that names one; TrustboError: PROJ does not know it."""
+    """CRS of anything that PROJ accepts as one; TrustboError if it does not."""
     try:
         return CRS.from_user_input(crs)
     except CRSError:
@@ -25,9 +25,9 @@ def known_crs(crs: Any) -> CRS:
 
 
 def require_map(name: str, own: object, given: CRS | None) -> CRS:
-    """CRS of a raster, in degrees or metres: its own, or the given one if it has none.
+    """CRS of a raster, in degrees or metres: its own CRS, or the given one if it has none.
 
-    TrustboError: none, another one than given, or one that is no map in degrees or metres.
+    TrustboError: there is no CRS, it differs from the given one, or it is not in degrees or metres.
     """
     if own is None and given is None:
         raise TrustboError(f"{name} has no coordinate reference system; pass crs=.")
@@ -80,7 +80,7 @@ def vertical_axis(crs: CRS) -> Vertical | None:
 
 
 def placed(heights: xr.DataArray, name: str) -> xr.DataArray:
-    """Check that a raster is somewhere on Earth; count longitudes from -180 to 180."""
+    """Check that a raster is on Earth, and shift longitudes to -180 to 180."""
     crs, (y, x) = heights.rio.crs, (heights[axis].values for axis in ("y", "x"))
     middle = 0.5 * (x[0] + x[-1])
     if crs.is_geographic:
@@ -100,9 +100,9 @@ def placed(heights: xr.DataArray, name: str) -> xr.DataArray:
 
 
 def _middle(heights: xr.DataArray, crs: str, step: float = 0.0) -> np.ndarray:
-    """Middle of a raster in another CRS, and points a step to the east and north, (xy, point).
+    """Centre of a raster in another CRS, and points one step to the east and north, (xy, point).
 
-    NaN where the middle is outside the domain of the raster's CRS.
+    NaN if the centre is outside the domain of the raster's CRS.
     """
     x, y = (0.5 * float(heights[axis][0] + heights[axis][-1]) for axis in ("x", "y"))
     try:
@@ -112,7 +112,7 @@ def _middle(heights: xr.DataArray, crs: str, step: float = 0.0) -> np.ndarray:
 
 
 def on_metric_grid(heights: xr.DataArray) -> xr.DataArray:
-    """Warp heights to a metric map with north at the top, unless they are on one."""
+    """Warp heights to a metric map with north at the top, unless they already are on one."""
     lon, lat = _middle(heights, "EPSG:4326")[:, 0].tolist()
     at = f"+lat_0={lat} +lon_0={lon} +datum=WGS84 +units=m"
     if not heights.rio.crs.is_geographic:
@@ -129,7 +129,7 @@ def on_metric_grid(heights: xr.DataArray) -> xr.DataArray:
 
 
 def same_grid(a: xr.DataArray, b: xr.DataArray) -> bool:
-    """Whether two rasters' pixels coincide to a thousandth of a pixel."""
+    """Whether the pixels of two rasters coincide within a thousandth of a pixel."""
     if a.shape != b.shape or a.rio.crs != b.rio.crs:
         return False
     steps = {axis: abs(float(a[axis][1] - a[axis][0])) for axis in ("y", "x")}

@@ -26,7 +26,7 @@ _BLOCK, _RAYS = 4, 16
 
 @_part
 def bilinear(heights, r, c):
-    """Height at a position in pixel coordinates; NaN off the raster, or of NaN."""
+    """Height at a position in pixel coordinates; NaN off the raster or for NaN coordinates."""
     rows, cols = heights.shape
     if not (0.0 <= r <= rows - 1 and 0.0 <= c <= cols - 1):
         return math.nan
@@ -52,7 +52,7 @@ def _along(raster, i, j, p, q, dp, dq):
 
 @_part
 def _share_positive(c0, c1, c2):
-    """Share of [0, 1] in which c0 + c1 t + c2 t^2 is positive."""
+    """Fraction of [0, 1] in which c0 + c1 t + c2 t^2 is positive."""
     sign = 1.0 if c0 > 0.0 else -1.0
     c0, c1, c2 = sign * c0, sign * c1, sign * c2
     square, share = c1 * c1 - 4.0 * c2 * c0, 1.0  # of the sign at 0
@@ -81,9 +81,9 @@ def _first_square(x0, dx, n):
 
 @_part
 def transmittance(ground, surface, pixel, start, end, extinction, crown_base):
-    """Share of a beam from `start` to `end`, each row, col and height (m), that passes.
+    """Transmittance of a ray from `start` to `end`, each (row, col, height in m).
 
-    0 where the ground blocks, off the raster, and where a pixel beside the ray has no data.
+    It is 0 if the ground blocks the ray, or if the ray leaves the raster or passes missing data.
     """
     (r0, c0, z0), (r1, c1, z1), (rows, cols) = start, end, ground.shape
     # Not the reverse comparisons: they are false for NaN.
@@ -126,7 +126,7 @@ def transmittance(ground, surface, pixel, start, end, extinction, crown_base):
 
 @_kernel
 def transmittances(ground, surface, pixel, ends, extinction, crown_base):
-    """Transmittance of rays (ray, 6): row, col and height of both ends; 0 where one is NaN."""
+    """Transmittance of rays (ray, 6): row, col and height of both ends; 0 if one is NaN."""
     out = np.zeros(len(ends))
     for i in range(len(ends)):
         start, end = (ends[i, 0], ends[i, 1], ends[i, 2]), (ends[i, 3], ends[i, 4], ends[i, 5])
@@ -143,11 +143,11 @@ def openness(
     heights: tuple[float, float],
     canopy: tuple[float, float] = (0.1, 0.3),
 ) -> np.ndarray:
-    """Mean transmittance to 16 points `reach` metres away all around, (row, col), in [0, 1].
+    """Mean transmittance to 16 points on a circle of radius `reach` metres, (row, col), in [0, 1].
 
-    Computed in the middle of squares of 4 x 4 pixels, all of which get its value. Eye and target
-    have `heights` above ground; the canopy has an extinction (1/m) and a crown base. Rays that end
-    off the data do not count; NaN where none does, and without ground.
+    It is computed at the centre of each square of 4 x 4 pixels and used for all of them. Eye and
+    target have `heights` above ground; the canopy has an extinction (1/m) and a crown base. Rays
+    that end outside the data are ignored; a pixel without other rays or without ground is NaN.
     """
     rows, cols = ground.shape
     coarse = np.empty((-(-rows // _BLOCK), -(-cols // _BLOCK)))

@@ -1,7 +1,7 @@
-"""Reading of a DEM and a DSM onto one metric grid.
+"""Read a DEM and a DSM onto one metric grid.
 
-Whatever is wrong with a raster is refused or put right here, where it enters: the rest of the
-package relies on heights in metres, NaN where missing, on a grid of metres with north at the top.
+Faulty rasters are rejected or corrected here: the rest of the package relies on heights in metres,
+NaN where missing, on a metric grid with north at the top.
 """
 
 import math
@@ -56,10 +56,10 @@ def read_terrain(
 ) -> xr.Dataset:
     """Read a digital elevation model (ground) and a digital surface model (canopy, roofs).
 
-    Both are put on the DEM's grid. If the DEM is in degrees, or its map is over 1 % off in lengths
-    (as web maps' EPSG:3857 is) or turned from north, it is warped to its UTM zone, or beyond the
-    zones to a transverse Mercator map of its own. The surface is raised to the ground where it is
-    below. Heights in feet, by their band or their CRS, are converted to metres, with a warning;
+    Both are resampled to the DEM's grid. The DEM is warped to its UTM zone (outside all zones, to a
+    local transverse Mercator map) if it is in degrees, or if its map is rotated from north or wrong
+    in length by over 1 %, as EPSG:3857 is. The surface is raised to the ground where it is below.
+    Heights in feet, according to the band or the CRS, are converted to metres, with a warning;
     depths become negative heights.
 
     Args:
@@ -68,12 +68,12 @@ def read_terrain(
             rioxarray. Of several bands, the one described as elevation is read, else the first.
             NaN, infinity, nodata values and pixels hidden by a mask or an alpha band are missing;
             scale and offset are applied.
-        dsm: Heights of the surface, likewise, on any grid that overlaps the DEM's. Without one,
-            the surface is the ground (a warning).
+        dsm: Heights of the surface, in the same forms, on any grid that overlaps the DEM's. Without
+            it, the surface is the ground, with a warning.
         crs: Coordinate reference system of rasters without one, e.g. `"EPSG:32633"`.
         resolution: Pixel size in metres: rasters with smaller pixels are averaged over whole
             numbers of pixels, to about this size.
-        nodata: Another stored value that means missing.
+        nodata: Another stored value that marks missing data.
 
     Returns:
         Dataset with `dem` and `dsm`, float64 in metres, dims (y, x) with north at the top, NaN
@@ -81,9 +81,9 @@ def read_terrain(
         `clipped_share` is the share of pixels whose surface was raised.
 
     Raises:
-        TrustboError: A source that is no raster of heights, has no place on Earth, or is too large
-            for the memory; values that are no heights on land; two vertical datums; no pixel with
-            both heights.
+        TrustboError: A source is not a raster of heights, is not georeferenced, or is too large for
+            the memory; values are impossible as heights on land; the vertical datums differ; no
+            pixel has both heights.
 
     Example:
         >>> terrain = tb.terrain.read_terrain("dem.tif", "dsm.tif", resolution=1.0)
@@ -110,9 +110,9 @@ def read_terrain(
 
 
 def require_terrain(terrain: xr.Dataset) -> xr.Dataset:
-    """Check a user's dataset of `dem` and `dsm` as `read_terrain` does, and return what it gives.
+    """Check a user's dataset of `dem` and `dsm` as `read_terrain` does, and return the result.
 
-    TrustboError: no `dem` or `dsm`, or what `read_terrain` refuses.
+    TrustboError: `dem` or `dsm` is missing, or `read_terrain` rejects the data.
     """
     if not isinstance(terrain, xr.Dataset) or not {"dem", "dsm"} <= set(terrain.data_vars):
         raise TrustboError(
@@ -169,9 +169,9 @@ def _heights(
 
 
 def _averaged(heights: xr.DataArray, in_degrees: bool, resolution: float | None) -> xr.DataArray:
-    """Means of squares of pixels of about a resolution, m; over half missing make one missing.
+    """Means over square blocks of about a resolution, m; NaN if over half of a block is missing.
 
-    Rows and columns at the edge that fill no such square are left out.
+    Incomplete blocks at the edge are dropped.
     """
     if resolution is None:
         return heights
@@ -190,7 +190,7 @@ def _averaged(heights: xr.DataArray, in_degrees: bool, resolution: float | None)
 
 
 def _stored(raster: RasterLike, role: str) -> xr.DataArray:
-    """Raster of any kind as it is stored, dims (y, x); its name, with `role`, is for messages."""
+    """Stored values of any kind of raster, dims (y, x); its name, with `role`, is for messages."""
     if isinstance(raster, xr.DataArray):
         name = f"{role}: DataArray" + (f" {raster.name!r}" if raster.name else "")
         check_size(raster.shape, name)
@@ -226,10 +226,10 @@ def check_size(shape: tuple[int, ...], name: str) -> None:
 
 
 def _of_file(file: DatasetReader | WarpedVRT, name: str) -> xr.DataArray:
-    """Band of heights of a GDAL dataset: that described as elevation, else the first.
+    """Height band of a GDAL dataset: the band described as elevation, else the first.
 
-    What a mask or an alpha band hides is NaN. They hide the nodata tag from GDAL's own mask, so
-    that the tag is declared, too.
+    Pixels hidden by a mask or an alpha band are NaN. With these, GDAL's own mask ignores the nodata
+    tag, so the tag is added to the declared fills.
     """
     if not file.count:
         parts = ", ".join(file.subdatasets) or "nothing"
@@ -306,7 +306,7 @@ def _declared_fills(array: xr.DataArray) -> tuple[float, ...]:
 
 
 def _even(values: np.ndarray, what: str) -> np.ndarray:
-    """Evenly spaced coordinates; TrustboError: one alone, or further from even than rounding.
+    """Evenly spaced coordinates; TrustboError if only one, or uneven by more than rounding.
 
     Coordinates that passed through float32 are rounded to 0.5 m in the north of a UTM zone.
     """
@@ -333,7 +333,7 @@ def _number(what: str, value: Any) -> float:
 
 
 def _paired(ground: xr.DataArray, surface: xr.DataArray) -> xr.Dataset:
-    """Make one dataset of two rasters on one grid: NaN in common, surface not below the ground."""
+    """Combine two rasters on one grid: common NaN, and no surface below the ground."""
     dem, dsm = ground.values, surface.values
     valid = np.isfinite(dem) & np.isfinite(dsm)
     if not valid.any():

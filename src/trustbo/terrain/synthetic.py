@@ -69,7 +69,7 @@ def synthetic_terrain(
 def _fractal(rng: np.random.Generator, shape: tuple[int, int], exponent: float) -> np.ndarray:
     """Gaussian field with spectrum f^-(2 exponent), scaled to [0, 1].
 
-    The field is synthesised on twice the size and cropped, as the Fourier method is periodic.
+    The field is synthesised at twice the size and cropped, because the Fourier method is periodic.
     """
     rows, cols = 2 * shape[0], 2 * shape[1]
     frequency = np.hypot(np.fft.fftfreq(rows)[:, None], np.fft.rfftfreq(cols)[None])
