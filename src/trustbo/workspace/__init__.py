@@ -1,4 +1,4 @@
-"""Planning grid: awareness, passability, positions, routes and sight of every cell."""
+"""Planning grid with awareness, passability, positions, routes and sight."""
 
 from trustbo.workspace.sight import Sight
 from trustbo.workspace.workspace import Workspace

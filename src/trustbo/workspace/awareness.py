@@ -1,7 +1,7 @@
 """Awareness of bounds, from the pixels of a terrain or from a user's arrays.
 
-Overwatch relates two cells, so awareness is that of a bound: a cell and the move into it. Maps of
-cells are copied to all moves.
+Overwatch relates two cells, so awareness is defined for each bound: a cell and the move into it.
+Maps of cells are copied to all moves.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -29,15 +29,15 @@ def cell_maps(
 ) -> tuple[np.ndarray, np.ndarray, xr.Dataset, dict[str, CompositeIndex]]:
     """Compute awareness and passability of the cells of a terrain.
 
-    Openness is that of the team's heights, over the range of its lidars, at most the diagonal of a
-    cell and half the terrain.
+    Openness is computed with the team's sensor and target heights over the range of its lidars, at
+    most the diagonal of a cell and half the terrain.
 
     Returns:
         Awareness (row, col, feature) in [0, 1], NaN where a cell has no data; passability (row,
-        col); maps of pixels, dims (y, x), of each feature and of passability; fitted composites.
+        col); pixel maps of each feature and of passability, dims (y, x); fitted composites.
 
     Raises:
-        TrustboError: An unknown feature, one that is used unchanged outside [0, 1], or one with
+        TrustboError: A feature is unknown, is used unchanged but has values outside [0, 1], or has
             the name of the line of sight.
     """
     remedy = "give names of pixel features by feature, e.g. {'ease': ('slope', 'tri')}"
@@ -79,7 +79,7 @@ def cell_maps(
 
 
 def _unit_values(name: str, values: np.ndarray) -> np.ndarray:
-    """Values of a feature that is used unchanged; TrustboError outside [0, 1]."""
+    """Values of a feature that is used unchanged; TrustboError for values outside [0, 1]."""
     low, high = np.nanmin(values, initial=0.0), np.nanmax(values, initial=1.0)
     if low < 0.0 or high > 1.0:
         raise TrustboError(
@@ -103,8 +103,8 @@ def with_line_of_sight(
 ) -> np.ndarray:
     """Append the line of sight to awareness of bounds (robot, move, row, col, feature).
 
-    Traversability, if it is one of the `features`, becomes the mean along the robots' tracks.
-    TrustboError: a cell without standing room for the team.
+    Traversability, if it is one of the `features`, is replaced by its mean along the robots'
+    tracks. TrustboError: a cell is too small for the team to stand in.
     """
     for row, col in np.argwhere(passable).tolist():
         posts.require_room((row, col))
@@ -144,10 +144,10 @@ def labelled(
 def unlabelled(
     awareness: ArrayLike | xr.DataArray, names: Sequence[str], features: Sequence[str]
 ) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...]]:
-    """Array of awareness in the order of axes that `of_arrays` takes, names of robots and features.
+    """Awareness with the order of axes that `of_arrays` expects, names of robots, and of features.
 
-    A DataArray is put in order by the names of its dims, and of its moves; names that are not given
-    are its labels. TrustboError: other dims, or labels that contradict the names given.
+    A DataArray is reordered by the names of its dims and moves; its labels are the default names.
+    TrustboError: it has other dims, or its labels contradict the given names.
     """
     if not isinstance(awareness, xr.DataArray):
         return as_array("awareness", awareness), tuple(names), tuple(features)
@@ -173,8 +173,8 @@ def of_arrays(awareness: ArrayLike, passable: ArrayLike | None) -> tuple[np.ndar
     Returns awareness of bounds (robot, move, row, col, feature), NaN where there is none, and
     passability (row, col).
 
-    TrustboError: other axes; a value outside [0, 1], NaN in a passable cell or in a bound between
-    two.
+    TrustboError: the axes differ, a value is outside [0, 1], or there is a NaN in a passable cell
+    or in a bound between two passable cells.
     """
     z = as_array("awareness", awareness)
     if z.ndim not in (4, 5) or (z.ndim == 5 and z.shape[1] != len(MOVES)):

@@ -1,7 +1,8 @@
-"""Difficulty of bounds: measures of their routes relative to the robots' limits.
+"""Difficulty of bounds: measures of the routes relative to the robots' limits.
 
-Each measure is 0 on easy routes and about 1 at the robots' limit; a bound has the maximum over the
-routes of the lead and of T2. T2's routes assume the next cell straight ahead.
+Each measure is 0 on easy routes and about 1 at the robots' limit. The measure of a bound is the
+maximum over the routes of the lead and of T2. T2's routes assume that the next cell is straight
+ahead.
 """
 
 import math
@@ -35,15 +36,15 @@ _cached: WeakKeyDictionary[Workspace, xr.DataArray] = WeakKeyDictionary()
 def difficulty_of(workspace: Workspace) -> xr.DataArray:
     """Compute the difficulty of a workspace's bounds; cached.
 
-    Of a way, `untraversable` is one minus the mean traversability of its pixels; `tilt` the tangent
-    of the largest pitch or roll of a robot that faces a point 1.5 m ahead on it, mean over 1 m, as
-    a share of that of its `max_slope`; `narrowness` 1 / (1 + w / 2 m) with w the least distance to
-    an impassable pixel; `tightness` log(1 + l / 1 m) / 3 with l the length of its pixels that touch
-    an impassable one.
+    For each route, `untraversable` is one minus the mean traversability of its pixels; `tilt` is
+    the tangent of the largest pitch or roll of a robot that faces a point 1.5 m ahead, averaged
+    over 1 m and divided by the tangent of `max_slope`; `narrowness` is 1 / (1 + w / 2 m) with the
+    least distance w to an impassable pixel; and `tightness` is log(1 + l / 1 m) / 3 with the length
+    l of the pixels that touch an impassable one.
 
     Returns:
-        Dims (move, row, col, measure), NaN where there is no bound; an axis `measure` of length 0
-        without a terrain in memory.
+        Dims (move, row, col, measure), NaN where there is no bound. Without a terrain in memory,
+        the axis `measure` has length 0.
     """
     if workspace not in _cached:
         exists, posts = workspace.passable_bounds, workspace.posts
@@ -82,7 +83,7 @@ def _measure(workspace: Workspace, posts: Posts, exists: np.ndarray, out: np.nda
 def _of_bound(
     posts: Posts, easy: np.ndarray, room: np.ndarray, bound: Sequence[np.ndarray | None]
 ) -> np.ndarray:
-    """Maximum of each measure over the robots' ways in a bound, with maps of pixels (row, col)."""
+    """Maximum of each measure over the robots' routes in a bound, from pixel maps (row, col)."""
     surface, team = posts.surface, posts.team
     ground = surface.gradient, surface.pixel, surface.origin
     robots = team.lead, *team.robots
@@ -106,7 +107,7 @@ def _of_bound(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _tilt(way, gradient, pixel, origin):
-    """Tangent of the largest pitch or roll along a way (point, 2), mean over a short distance."""
+    """Tangent of the largest pitch or roll along a route (point, 2), as a moving average."""
     along = np.zeros(len(way))
     for k in range(1, len(way)):
         along[k] = along[k - 1] + math.hypot(way[k, 0] - way[k - 1, 0], way[k, 1] - way[k - 1, 1])
@@ -127,7 +128,7 @@ def _tilt(way, gradient, pixel, origin):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _point(way, along, s):
-    """Position at a distance along a way, its end beyond."""
+    """Position at a distance along a route; the end of the route if it is shorter."""
     k = min(np.searchsorted(along, s, side="right"), len(way) - 1)
     length = along[k] - along[k - 1]
     share = min(1.0, (s - along[k - 1]) / length) if length > 0.0 else 1.0

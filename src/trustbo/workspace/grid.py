@@ -1,4 +1,4 @@
-"""Planning grid: cells of positions and of pixels, means over cells."""
+"""Planning grid: conversion between cells, positions and pixels, and means over cells."""
 
 import math
 import operator
@@ -27,7 +27,7 @@ MAX_MISSING = 0.5
 
 @dataclass(frozen=True, repr=False)
 class Grid(Summary):
-    """A regular grid of cells; row 0 at the top (north).
+    """A regular grid of cells; row 0 is at the top (north).
 
     Attributes:
         shape: Number of rows and columns.
@@ -47,10 +47,10 @@ class Grid(Summary):
 
     @classmethod
     def over(cls, terrain: xr.Dataset, shape: tuple[int, int]) -> "Grid":
-        """Make the grid of a given shape that covers a terrain.
+        """Make a grid of a given shape that covers a terrain.
 
         Raises:
-            TrustboError: Fewer than 2 cells, or cells smaller than 2 pixels.
+            TrustboError: There are fewer than 2 cells, or cells are smaller than 2 pixels.
         """
         rows, cols = require_pair("shape", shape)
         pixels = terrain["dem"].shape
@@ -102,12 +102,12 @@ class Grid(Summary):
 
     @property
     def x(self) -> np.ndarray:
-        """X of the columns' centres, CRS metres, shape (col,)."""
+        """X of the centre of each column, CRS metres, shape (col,)."""
         return self.left + (np.arange(self.shape[1]) + 0.5) * self.cell_width
 
     @property
     def y(self) -> np.ndarray:
-        """Y of the rows' centres, CRS metres, shape (row,)."""
+        """Y of the centre of each row, CRS metres, shape (row,)."""
         return self.top - (np.arange(self.shape[0]) + 0.5) * self.cell_height
 
     @property
@@ -120,7 +120,7 @@ class Grid(Summary):
         return f"EPSG:{code}" if code else re.findall(r'"(.*?)"', crs.to_wkt())[0]
 
     def locate(self, location: Location, what: str = "location") -> Cell:
-        """Cell of a location, by the georeference alone; it may be impassable.
+        """Cell of a location, which may be impassable.
 
         Args:
             location: Cell (row, col); or a position, `{"x": 1748000.0, "y": 5427000.0}` in metres
@@ -128,7 +128,8 @@ class Grid(Summary):
             what: Name of the location in messages.
 
         Raises:
-            TrustboError: Not a location, off the grid, or in degrees on a grid without a CRS.
+            TrustboError: The location is invalid, off the grid, or in degrees on a grid without a
+                CRS.
         """
         try:
             row, col = self._row_and_col(location)
@@ -149,7 +150,7 @@ class Grid(Summary):
         return int(row), int(col)
 
     def _row_and_col(self, location: Location) -> tuple[float, float]:
-        """Row and column of a location, fractional ones of a position; also beyond the grid."""
+        """Row and column of a location, fractional for a position; they may be off the grid."""
         if not isinstance(location, Mapping):
             row, col = (operator.index(i) for i in location)
             return row, col
@@ -162,7 +163,7 @@ class Grid(Summary):
         return (self.top - y) / self.cell_height, (x - self.left) / self.cell_width
 
     def _extent_text(self) -> str:
-        """Text of the extent in the CRS and in degrees; empty without a CRS."""
+        """Description of the extent in the CRS and in degrees; empty without a CRS."""
         if self.crs is None:
             return ""
         left, bottom, right, top = self.bounds
@@ -176,7 +177,8 @@ class Grid(Summary):
         """Longitude and latitude of a cell's centre, degrees (WGS 84).
 
         Raises:
-            TrustboError: No cell; or the grid has no CRS, or is no place on Earth in it.
+            TrustboError: There is no such cell, the grid has no CRS, or the cell is not on Earth in
+                it.
         """
         x, y = self.center(cell)
         lon, lat = _moved(self.require_crs(), WGS84, x, y)
@@ -188,7 +190,7 @@ class Grid(Summary):
         return lon, lat
 
     def place(self, maps: xr.Dataset) -> xr.Dataset:
-        """Georeference maps of the cells (row, col): dims (y, x), with the transform and CRS."""
+        """Georeference maps of the cells (row, col): dims (y, x), with transform and CRS."""
         placed = maps.drop_vars(["row", "col", "y", "x"], errors="ignore").rename(row="y", col="x")
         placed = placed.assign_coords(y=self.y, x=self.x)
         for axis in ("y", "x"):
@@ -202,7 +204,7 @@ class Grid(Summary):
         """Mean over each cell's pixels with data.
 
         Args:
-            values: Dims (y, x), on a raster that the grid covers.
+            values: Values of pixels, dims (y, x), on a raster that the grid covers.
 
         Returns:
             Shape (row, col); NaN where a cell has no data.
@@ -217,7 +219,7 @@ class Grid(Summary):
             return (total / count).reshape(self.shape)
 
     def cells_along(self, y: ArrayLike, x: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-        """Rows of the cells of pixels at `y`, and columns of those at `x`."""
+        """Row of the cell of each pixel at `y`, and column of the cell of each pixel at `x`."""
         rows, cols = self.shape
         row = ((self.top - np.asarray(y)) / self.cell_height).astype(int)
         col = ((np.asarray(x) - self.left) / self.cell_width).astype(int)
@@ -234,7 +236,7 @@ class Grid(Summary):
 
 
 def _moved(source: CRS, target: CRS, x: float, y: float) -> tuple[float, float]:
-    """Position in another CRS; infinite if it is no place on Earth in one of them."""
+    """Position in another CRS; infinite if it is not on Earth in one of them."""
     try:
         (u,), (v,) = transform_points(source, target, [x], [y])[:2]
     except Exception:  # PROJ's errors are GDAL's, without a common base

@@ -1,4 +1,4 @@
-"""Line of sight of bounds: the share of its time in which robot and lead should see each other.
+"""Line of sight of a bound: predicted fraction of time in which robot and lead see each other.
 
 A bound a -> c has two phases (docs/concepts.md, "Why bounds"). T2 stands at its posts in a and
 watches the lead drive to its stop in c; then the lead stands and watches T2 close up to posts
@@ -8,13 +8,14 @@ spread evenly over them, and weighted by their durations:
     line_of_sight_i = (T_1 mean_k p(post_i -> lead at t_k) + T_2 mean_k p(lead -> robot i at t_k))
                       / (T_1 + T_2),
 
-p the probability of detection under the assumed sight, T_1 the lead's driving time and T_2 that of
-the slowest robot; one that arrives before it is seen at its post until then. The next cell changes
-from sample to sample, over all that a path may go on to; at the goal T2 stands around the lead.
+where p is the probability of detection under the assumed sight, T_1 the lead's driving time and T_2
+the driving time of the slowest robot. A robot that arrives earlier waits at its post. The next cell
+alternates from sample to sample over all cells to which a path may continue; at the goal T2 stands
+around the lead.
 
 The lead takes the fastest route, as in the simulator. T2 is assumed to follow that route, shifted
-to its posts: its own fastest routes differ by some metres, over which sight hardly changes, and
-would take the search of some 50 routes for each bound.
+to its posts: its own fastest routes differ by a few metres, over which sight hardly changes, and
+would require a search of about 50 routes for each bound.
 """
 
 import math
@@ -40,7 +41,7 @@ _AHEAD = 0.5  # cosine of the largest turn that is expected: turns lead to other
 
 
 class Geometry(NamedTuple):
-    """Places and routes of the robots in some bounds; positions are x, y in CRS metres."""
+    """Stops, posts and routes of the robots in given bounds; positions are x, y in CRS metres."""
 
     routes: list[np.ndarray]  # of the lead, (point, 2) each
     posts: np.ndarray  # (bound, robot, 2), from which T2 watches the lead
@@ -53,10 +54,10 @@ def bound_maps(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Compute line of sight and traversability of all bounds between passable cells, (row, col).
 
-    Traversability is the mean along T2's tracks of a map of pixels, (row, col).
+    Traversability is the mean of a pixel map, (row, col), along T2's tracks.
 
     Returns:
-        Two arrays of shape (robot, move, row, col), in [0, 1]; NaN where there is no bound, or no
+        Two arrays of shape (robot, move, row, col), in [0, 1]; NaN where there is no bound or no
         data along the tracks.
     """
     exists = existing_bounds(passable)
@@ -76,7 +77,7 @@ def bound_maps(
 
 
 def geometry(posts: Posts, index: np.ndarray, passable: np.ndarray) -> Geometry:
-    """Collect bounds (bound, (move, row, col)) between cells that are `passable`, (row, col)."""
+    """Collect the bounds (bound, (move, row, col)) between `passable` cells, (row, col)."""
     left = (index[:, 1:] - np.array(MOVES)[index[:, 0]]).tolist()
     bounds = [
         ((i, j), (row, col)) for (i, j), (_, row, col) in zip(left, index.tolist(), strict=True)
@@ -94,7 +95,7 @@ def geometry(posts: Posts, index: np.ndarray, passable: np.ndarray) -> Geometry:
 
 
 def _cells_ahead(passable: np.ndarray, a: Cell, c: Cell) -> list[Cell | None]:
-    """Cells expected after the bound a -> c: without sharp turns if there are some; else None."""
+    """Cells that may follow the bound a -> c, without sharp turns if possible; else [None]."""
     (rows, cols), (down, right) = passable.shape, (c[0] - a[0], c[1] - a[1])
     onward: list[Cell | None] = []
     ahead: list[Cell | None] = []
@@ -110,7 +111,7 @@ def _cells_ahead(passable: np.ndarray, a: Cell, c: Cell) -> list[Cell | None]:
 def bound_features(
     surface: Surface, sight: Sight, team: Team, given: Geometry, traversability: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Compute line of sight and traversability of some bounds, see `bound_maps`: (bound, robot)."""
+    """Compute line of sight and traversability of bounds, see `bound_maps`: (bound, robot)."""
     lead, lead_time = _timed(surface, team.lead, given.routes)
     drives = [_timed(surface, robot, given.routes) for robot in team.robots]
     first, last = (np.stack([route[end] for route in given.routes]) for end in (0, -1))
@@ -141,13 +142,13 @@ def bound_features(
 def _timed(
     surface: Surface, robot: Robot, routes: Sequence[np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (bound, sample, 2) of a robot on routes, and their durations (bound,), s."""
+    """Positions (bound, sample, 2) of a robot along routes, and the durations (bound,), s."""
     first = np.cumsum([0, *(len(route) for route in routes)])
     return at_times(surface, robot, np.concatenate(routes), first, N_SAMPLES)
 
 
 def _mean(values: np.ndarray) -> np.ndarray:
-    """Mean over the last axis of the values that are not NaN; NaN where none is."""
+    """Mean over the last axis without NaN; NaN if all values are NaN."""
     finite = np.isfinite(values)
     with np.errstate(invalid="ignore"):
         return np.where(finite, values, 0.0).sum(-1) / finite.sum(-1)

@@ -16,7 +16,7 @@ MOVE_NAMES = ("nw", "n", "ne", "w", "e", "sw", "s", "se")
 def require_on_grid(path: Sequence[Cell] | np.ndarray, shape: tuple[int, ...]) -> list[Cell]:
     """Return the cells of a path as pairs of ints.
 
-    TrustboError: one is no pair, or is outside the grid of that shape, (row, col).
+    TrustboError: a cell is not a pair, or is outside a grid of the given shape, (row, col).
     """
     cells = [require_pair("a cell", cell) for cell in path]
     rows, cols = shape
@@ -32,7 +32,7 @@ def require_on_grid(path: Sequence[Cell] | np.ndarray, shape: tuple[int, ...]) -
 def moves_along(path: Sequence[Cell] | np.ndarray) -> np.ndarray:
     """Indices in `MOVES` of the bounds of a path, shape (bound,).
 
-    TrustboError: two successive cells are no neighbours.
+    TrustboError: two successive cells are not neighbours.
     """
     cells = np.asarray(path)
     steps = np.diff(cells, axis=0)
@@ -50,9 +50,9 @@ def bounds_along(path: Sequence[Cell] | np.ndarray) -> np.ndarray:
 
 
 def existing_bounds(passable: np.ndarray) -> np.ndarray:
-    """Whether a bound enters each cell by each move, shape (move, row, col), from (row, col).
+    """Whether a bound exists into each cell by each move, shape (move, row, col).
 
-    Both the cell entered and the cell left are passable.
+    A bound exists if the cell entered and the cell left are both passable, (row, col).
     """
     rows, cols = passable.shape
     framed = np.pad(passable, 1)

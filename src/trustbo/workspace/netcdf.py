@@ -1,4 +1,4 @@
-"""Workspaces as trees of arrays, for files."""
+"""Conversion of workspaces to trees of arrays, for files."""
 
 import json
 from dataclasses import asdict

@@ -1,19 +1,19 @@
 """Stops and posts: where the lead stops in a cell, and where T2 stands to watch it go to the next.
 
 In a bound a -> c (docs/concepts.md, "Why bounds"), T2 watches the lead's route from its posts in a;
-then the lead watches from its stop in c how T2 leaves them. In the bound before, the lead has
-watched from its stop in a how T2 closed up. Of positions p on a lattice around the stop in a, T2
-takes those with the largest
+then the lead watches from its stop in c how T2 leaves them. In the previous bound, the lead watched
+from its stop in a how T2 closed up. Among positions p on a lattice around the stop in a, the posts
+of T2 maximise
 
     1/2 mean_k s(p, lead at t_k) + 1/4 s(stop in a, p) + 1/4 s(stop in c, p),
 
-s the probability of detection under the assumed sight. Posts are within `RADIUS` of the stop, also
-beyond the edge of the cell, out of the lead's way, on ground that is well below the slope limit and
-linked to the stop over such ground. The lead stops where the routes to the stops around are seen
-best.
+where s is the probability of detection under the assumed sight. Posts are within `RADIUS` of the
+stop, also beyond the edge of the cell, out of the lead's way, on ground that is well below the
+slope limit and connected to the stop by such ground. The lead stops where the routes to the
+neighbouring stops are most visible.
 
-Maps lack things that block sight, and have things that do not. Where posts and stops are chosen,
-and nowhere else, sight is therefore doubted (`Posts._seen`); the line of sight is as predicted.
+Real obstacles may be missing from maps, and mapped ones may not block sight. The choice of posts
+and stops, and only this choice, allows for such errors (`Posts._seen`); the line of sight does not.
 """
 
 from collections.abc import Sequence
@@ -51,7 +51,7 @@ _SHARES = np.array([0.25, 0.5, 0.75, 1.0])  # of the straight line to a stop aro
 
 
 class Posts:
-    """Stops, posts and routes of a team in the cells of a grid; positions x, y in CRS metres.
+    """Stops, posts and routes of a team on a grid; positions are x, y in CRS metres.
 
     Attributes:
         grid: Planning grid.
@@ -64,7 +64,7 @@ class Posts:
     def __init__(
         self, grid: Grid, team: Team, sight: Sight, terrain: xr.Dataset, pixels: xr.Dataset
     ) -> None:
-        """Prepare the rasters; `pixels` (y, x) has `passable`, and traversability if known."""
+        """Prepare the rasters; `pixels` (y, x) contains `passable`, and traversability if known."""
         self.grid, self.team, self.sight = grid, team, sight
         self.surface = surface_of(terrain, pixels["passable"].values.astype(bool))
         self.routes = Routes(self.surface)
@@ -85,7 +85,7 @@ class Posts:
     # --- routes ---
 
     def window(self, *cells: Cell) -> Window:
-        """Window of pixels of cells and half a cell around: first and end row, then column."""
+        """Pixel window of cells plus a margin of half a cell: first and end row, then column."""
         (rows, cols), shape = self.surface.ground.shape, np.array(self.grid.shape)
         size = np.array([rows, cols]) / shape
         top, left = ((np.min(cells, axis=0) - 0.5) * size).astype(int).tolist()
@@ -93,10 +93,11 @@ class Posts:
         return max(0, top), min(rows, bottom), max(0, left), min(cols, right)
 
     def linked_bounds(self, exists: np.ndarray) -> np.ndarray:
-        """Bounds (move, row, col) that robots have a route for, of those that `exists`.
+        """Those bounds in `exists`, (move, row, col), for which the robots have a route.
 
-        T2's posts in a cell are linked to its stop within half a cell around, so that one test,
-        of the stops of both cells, holds for all robots, either way and any next cell.
+        T2's posts in a cell are connected to its stop within the cell and half a cell around it.
+        One test of the stops of both cells is therefore valid for all robots, both directions and
+        any next cell.
         """
         linked, last = np.zeros_like(exists), len(MOVES) - 1
         for m, (down, right) in enumerate(MOVES[: len(MOVES) // 2]):  # others are their reverses
@@ -112,9 +113,9 @@ class Posts:
     ) -> tuple[np.ndarray | None, ...]:
         """Routes of the bound a -> c, (point, 2) each: the lead's, then each of T2's.
 
-        The lead drives to its stop in c, then T2 from its posts in a to those from which it watches
-        the bound from c to `next_cell`; at the goal (None) it closes up around the lead. None for a
-        robot that has no route.
+        The lead drives to its stop in c; then T2 drives from its posts in a to the posts from which
+        it watches the bound from c to `next_cell`, or at the goal (None) to positions around the
+        lead. None for a robot without a route.
         """
         ends = zip(self.team.robots, self.watching(a, c), self.watching(c, next_cell), strict=True)
         window = self.window(a, c)
@@ -132,7 +133,7 @@ class Posts:
     # --- stops of the lead ---
 
     def stop(self, cell: Cell) -> np.ndarray:
-        """Stop of the lead in a cell, (2,): where the lines to the cells around are seen best."""
+        """Stop of the lead in a cell, (2,): where lines to neighbouring cells are most visible."""
         if cell not in self._stops:
             self._stops[cell] = self._seeing_stop(cell)
         return self._stops[cell]
@@ -152,7 +153,7 @@ class Posts:
         return position[np.argmax(seen - _NEARER * np.linalg.norm(position - here, axis=1))]
 
     def _central_stop(self, cell: Cell) -> np.ndarray:
-        """Easy ground near the cell's centre, (2,)."""
+        """Position on easy ground near the cell's centre, (2,)."""
         if cell not in self._central:
             row, col = self._pixels_of(cell)
             position = self._position(row, col)
@@ -166,7 +167,7 @@ class Posts:
     def watching(self, cell: Cell, next_cell: Cell | None) -> np.ndarray:
         """Posts of T2 in a cell, shape (robot, 2), from which it watches the lead's next move.
 
-        Without a next cell, T2 is around the lead at the goal.
+        Without a next cell, T2 stands around the lead at the goal.
         """
         if (cell, next_cell) not in self._posts:  # those for all neighbours cost little more
             around = [c for c in self._around(cell) if self._is_in_region(self.stop(c))]
@@ -176,7 +177,7 @@ class Posts:
         return self._posts[cell, next_cell]
 
     def _chosen(self, cell: Cell, ahead: Sequence[Cell | None]) -> np.ndarray:
-        """Best positions, robot by robot, at a least distance: (next cell, robot, 2)."""
+        """Best positions, chosen robot by robot with a minimum spacing: (next cell, robot, 2)."""
         here, robots = self.stop(cell), self.team.robots
         position, gap = self._lattice(cell, here, RADIUS), _GAP
         if len(position) < len(robots):  # little ground is safe
@@ -196,7 +197,7 @@ class Posts:
     def _scores(
         self, cell: Cell, ahead: Sequence[Cell | None], position: np.ndarray
     ) -> dict[Robot, np.ndarray]:
-        """Worth of positions as posts, (next cell, position), by robot: see the module."""
+        """Scores of positions as posts, (next cell, position), by robot; see the module."""
         here, lead = self.stop(cell), self.team.lead
         stops = np.array([here, *(here if c is None else self.stop(c) for c in ahead)])
         routes = [np.stack([here] * 2) if c is None else self.lead_line(cell, c) for c in ahead]
@@ -217,7 +218,7 @@ class Posts:
         return scores
 
     def _abreast(self, posts: np.ndarray, direction: np.ndarray) -> None:
-        """Sort equal robots from left to right, so that they keep their sides: shorter routes."""
+        """Sort identical robots from left to right, so that they keep sides and drive less."""
         robots = self.team.robots
         to_right = posts @ np.array([direction[1], -direction[0]])
         for robot in dict.fromkeys(robots):
@@ -227,10 +228,10 @@ class Posts:
     def _seen(
         self, eye: np.ndarray, target: np.ndarray, watcher: Robot, watched: Robot
     ) -> np.ndarray:
-        """Probability of detection where maps may be wrong, of targets (..., 2): (...).
+        """Probability of detection of targets (..., 2), allowing for errors of the map: (...).
 
-        Shrinks the probability of the map with distance, and adds a small chance, falling with
-        distance, to see what the map hides.
+        It shrinks the map's probability with distance, and adds a small probability, falling with
+        distance, that a hidden target is visible.
         """
         view = optics(watcher, watched)
         distance = np.linalg.norm(target - eye, axis=-1)
@@ -247,15 +248,15 @@ class Posts:
         return [c for c in near if 0 <= c[0] < rows and 0 <= c[1] < cols]
 
     def _is_in_region(self, position: np.ndarray) -> bool:
-        """Whether a position is in the region that robots can drive in."""
+        """Whether a position is in the region where robots can drive."""
         return bool(self._standable[self.surface.pixel_at(*position.tolist())])
 
     def _linked_to(
         self, position: np.ndarray, *cells: Cell, over: np.ndarray | None = None
     ) -> tuple[np.ndarray, tuple[int, int]]:
-        """Mask of the pixels of the cells' window that are linked to a position, and its corner.
+        """Mask of the pixels in the cells' window that are connected to a position, and its corner.
 
-        Over passable ground, or over another mask of pixels.
+        Pixels are connected over passable ground, or over another mask of pixels.
         """
         ground = self.surface.passable if over is None else over
         window = self.window(*cells)
@@ -263,9 +264,10 @@ class Posts:
         return linked_to(ground, window, pixel), (window[0], window[2])
 
     def _lattice(self, cell: Cell, here: np.ndarray, radius: float) -> np.ndarray:
-        """Positions around one, (position, 2), linked to it over safe ground near the cell.
+        """Lattice of positions (position, 2) around one, connected to it over safe ground.
 
-        Linked within half a cell around, which the window of every bound contains.
+        The connection lies within the cell and half a cell around it, which the window of every
+        bound contains.
         """
         steps = np.arange(-radius, radius + 1e-9, _STEP)
         offset = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
@@ -279,7 +281,7 @@ class Posts:
         return self._position(row[kept], col[kept])
 
     def _pixels_near(self, cell: Cell, here: np.ndarray) -> np.ndarray:
-        """Positions in a cell that are linked to its stop, near it where there are enough."""
+        """Positions in a cell that are connected to its stop, and near it if there are enough."""
         row, col = self._pixels_of(cell)
         region, (top, left) = self._linked_to(here, cell)
         linked = region[row - top, col - left]
@@ -293,7 +295,7 @@ class Posts:
         return position[near]
 
     def require_room(self, cell: Cell) -> None:
-        """Refuse a cell without a pixel for each robot: TrustboError that names cell and robot."""
+        """Raise TrustboError, with cell and robot, for a cell without a pixel for each robot."""
         n_pixels, names = len(self._pixels_of(cell)[0]), self.team.names
         if n_pixels <= len(names):
             raise TrustboError(
@@ -305,7 +307,7 @@ class Posts:
     def _pixels_of(self, cell: Cell) -> tuple[np.ndarray, np.ndarray]:
         """Rows and columns of a cell's passable pixels, in the largest region where possible.
 
-        All of its pixels if none is passable; no route leads there.
+        If none is passable, all of its pixels are returned; no route leads there.
         """
         top, bottom = np.searchsorted(self._cells[0], (cell[0], cell[0] + 1))
         left, right = np.searchsorted(self._cells[1], (cell[1], cell[1] + 1))

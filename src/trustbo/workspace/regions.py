@@ -1,8 +1,8 @@
-"""Regions of passable pixels: the labelling that posts, routes, planner and simulator share.
+"""Connected regions of passable pixels, used by posts, routes, planner and simulator.
 
-Two pixels are in one region if a chain of passable pixels that share edges links them. Routes pass
-neither between two impassable pixels nor round the corner of one (see `routes`), so that they link
-the same pixels: a route exists exactly within a region.
+Two pixels are in one region if a chain of passable pixels that share edges connects them. Routes do
+not pass between two impassable pixels or round the corner of one (see `routes`), so a route between
+two pixels exists if and only if they are in the same region.
 """
 
 from typing import Any
@@ -26,7 +26,7 @@ def largest_region(passable: np.ndarray) -> np.ndarray:
 
 
 def linked_to(passable: np.ndarray, window: Window, pixel: tuple[int, ...]) -> np.ndarray:
-    """Mask of the passable pixels of a window, (row, col), linked to one of them within it."""
+    """Mask of the passable pixels in a window, (row, col), connected within it to one of them."""
     top, bottom, left, right = window
     inside = passable[top:bottom, left:right]
     regions: Any = ndimage.label(inside)

@@ -21,10 +21,10 @@ _compiled = njit(cache=True, nogil=True, error_model="numpy")
 
 
 class Routes:
-    """Fastest routes over passable pixels, by A*; cached, and shared by robots of a slope limit."""
+    """Fastest routes over passable pixels by A*, cached by slope limit."""
 
     def __init__(self, surface: Surface) -> None:
-        """Prepare the slope, with which a robot's speed falls, and the pixels near obstacles."""
+        """Compute the slope, which reduces a robot's speed, and the pixels near obstacles."""
         self._surface = surface
         self._slope = np.arctan(np.hypot(*surface.gradient))
         free: Any = ndimage.distance_transform_edt(surface.passable, sampling=surface.pixel)
@@ -37,7 +37,7 @@ class Routes:
     ) -> np.ndarray | None:
         """Find the fastest route from start to goal, (x, y) in CRS metres; None if there is none.
 
-        It stays in the window of pixels. Returns positions, shape (point, 2), CRS metres.
+        It stays inside the pixel window. Returns positions, shape (point, 2), CRS metres.
         """
         ends = [self._surface.pixel_at(*p.tolist()) for p in (start, goal)]
         low, high = sorted(ends)  # the way back is the same
@@ -76,13 +76,13 @@ class Routes:
 
 @_compiled
 def speed_share(tilt, max_slope):
-    """Speed at a tilt (rad) as a share of that on level ground."""
+    """Speed at a tilt (rad) as a fraction of the speed on level ground."""
     return np.maximum(SLOWEST, 1.0 - (1.0 - SLOWEST) * tilt / max_slope)
 
 
 @_compiled
 def _a_star(pace, pixel, start, goal):
-    """Pixels of the cheapest route over paces (s/m, inf where impassable); empty if none."""
+    """Pixels of the fastest route over paces (s/m, inf where impassable); empty if none exists."""
     rows, cols = pace.shape
     best = np.full((rows, cols), np.inf)
     came = np.full((rows, cols), -1)
@@ -131,10 +131,10 @@ def _a_star(pace, pixel, start, goal):
 def at_times(
     surface: Surface, robot: Robot, flat: np.ndarray, first: np.ndarray, n: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Positions of a robot at n even times along routes, (route, time, 2), and durations, s.
+    """Positions of a robot at n evenly spaced times along each route, and the durations.
 
-    Routes follow one another in `flat` (point, 2); `first` has the index of the first point of
-    each, and the number of points.
+    The routes are concatenated in `flat` (point, 2); `first` has the index of the first point of
+    each route, and the number of points. Returns shapes (route, time, 2), and (route,) in seconds.
     """
     limits = robot.speed, robot.max_slope
     return _resampled(surface.gradient, surface.pixel, surface.origin, flat, first, limits, n)
@@ -142,7 +142,7 @@ def at_times(
 
 @_compiled
 def _resampled(gradient, pixel, origin, flat, first, limits, n_samples):
-    """Speed falls with the larger of pitch and roll, as in `simulation.motion`."""
+    """See `at_times`; speed falls with the larger of pitch and roll, as in `simulation.motion`."""
     rows, cols = gradient.shape[1:]
     n = len(first) - 1
     points, duration = np.empty((n, n_samples, 2)), np.empty(n)

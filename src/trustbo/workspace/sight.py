@@ -23,16 +23,17 @@ _JITTER = 0.7  # m
 class Sight:
     """Model of sight through terrain and canopy.
 
-    The ground blocks; the canopy, a layer from `crown_base` times its height to its top, transmits
-    exp(-extinction x metres inside). With extinction 0 only the ground blocks; with `math.inf` and
-    crown base 0, the whole surface does. On real forest the three differ by an order of magnitude.
+    The ground blocks rays; the canopy, a layer from `crown_base` times its height to its top,
+    transmits exp(-extinction x metres inside). With extinction 0 only the ground blocks; with
+    `math.inf` and crown base 0, the whole surface blocks. In real forest the three cases differ by
+    an order of magnitude.
 
     Attributes:
         extinction: Extinction coefficient of the canopy, 1/m.
-        crown_base: Lower edge of the canopy as a share of its height.
+        crown_base: Lower edge of the canopy as a fraction of its height.
 
     Raises:
-        TrustboError: A negative extinction, or a crown base outside [0, 1].
+        TrustboError: The extinction is negative, or the crown base is outside [0, 1].
     """
 
     extinction: float = 0.1
@@ -58,10 +59,10 @@ def optics(watcher: Robot, watched: Robot) -> np.ndarray:
 
 @cache
 def jittered(n: int) -> np.ndarray:
-    """Offsets of n sights from a post, (sight, 2), m: even in the disc in which a robot stops.
+    """Offsets of n viewpoints from a post, (sight, 2), m, evenly spread over the stopping disc.
 
-    It stops within half a metre, and its body tilts there with the ground, and with it the field of
-    view: sight from one exact point would be luck.
+    A robot stops within half a metre of its post, and its field of view tilts with the ground
+    there, so the view from one exact point would not be representative.
     """
     k, order = np.arange(n), np.random.default_rng(0).permutation(n)
     radius, angle = _JITTER * np.sqrt((k + 0.5) / n), 2.4 * k
@@ -73,8 +74,8 @@ def detection_probability(
 ) -> np.ndarray:
     """Probability that an ideal lidar detects each target, shape (ray,), in [0, 1].
 
-    It is the transmittance along the ray if the target is within the lidar's range and vertical
-    field of view, which tilts with the robot, and else 0. Sensors and targets have shape (ray, 2),
+    It is the transmittance along the ray if the target is within the lidar's range and its vertical
+    field of view, which tilts with the robot; otherwise 0. Sensors and targets have shape (ray, 2),
     CRS metres; see `optics`, shape (ray, 4) or (4,).
     """
     ends = _ends(
@@ -93,7 +94,7 @@ def detection_probability(
 def detection_between(
     surface: Surface, sight: Sight, eye: np.ndarray, target: np.ndarray, optics: np.ndarray
 ) -> np.ndarray:
-    """Probability of detection from eyes to targets, each (..., 2), which broadcast: (...)."""
+    """Probability of detection from eyes to targets, each (..., 2) and broadcast; shape (...)."""
     eye, target = np.broadcast_arrays(eye, target)
     rays = np.ascontiguousarray(eye).reshape(-1, 2), np.ascontiguousarray(target).reshape(-1, 2)
     return detection_probability(surface, sight, *rays, optics).reshape(eye.shape[:-1])
@@ -103,7 +104,7 @@ def detection_between(
 def _ends(ground, gradient, pixel, origin, sensor, target, optics):
     """Row, col and height of both ends of each ray, shape (ray, 6); NaN where out of view.
 
-    In a separate loop, the memory accesses of many rays overlap.
+    This is a separate loop, so that the memory accesses of many rays overlap.
     """
     n_rows, n_cols = ground.shape
     ends = np.empty((len(sensor), 6))

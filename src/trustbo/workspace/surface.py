@@ -1,4 +1,4 @@
-"""Rasters for the robots' position, motion and sight."""
+"""Rasters for positions, motion and sight of the robots."""
 
 from typing import Any, NamedTuple
 
@@ -11,7 +11,7 @@ from trustbo.terrain.read import pixel_size
 
 
 class Surface(NamedTuple):
-    """Rasters for sight and motion, and the map from positions to their pixels."""
+    """Rasters for sight and motion, and the conversion from positions to pixels."""
 
     ground: np.ndarray  # (row, col), m
     canopy: np.ndarray  # (row, col), m: the DSM
@@ -55,7 +55,7 @@ class Surface(NamedTuple):
 
 
 def surface_of(terrain: xr.Dataset, passable: np.ndarray) -> Surface:
-    """Arrays of a terrain for sight and motion; `passable` has shape (row, col) of pixels."""
+    """Surface of a terrain; `passable` has the shape (row, col) of its pixels."""
     ground, canopy = (terrain[name].values.astype(float) for name in ("dem", "dsm"))
     return Surface(
         ground=ground,
@@ -68,7 +68,7 @@ def surface_of(terrain: xr.Dataset, passable: np.ndarray) -> Surface:
 
 
 def filled(dem: np.ndarray) -> np.ndarray:
-    """Heights, missing ones replaced by the nearest: a robot may touch the edge of the data."""
+    """Heights with NaN replaced by the nearest value, as robots may touch the edge of the data."""
     nearest: Any = ndimage.distance_transform_edt(
         ~np.isfinite(dem), return_distances=False, return_indices=True
     )

@@ -1,4 +1,4 @@
-"""Workspace of planner and simulator: awareness of every bound, passability of every cell."""
+"""Workspace for planner and simulator: awareness of every bound, passability of every cell."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -47,7 +47,7 @@ class Workspace(Summary):
     """Planning grid with the situational awareness of each robot in each bound.
 
     Attributes:
-        awareness: DataArray (robot, move, row, col, feature), in [0, 1], of the bound into the cell
+        awareness: DataArray (robot, move, row, col, feature) in [0, 1], for the bound into the cell
             (row, col) by one of the eight `MOVES`; NaN where there is no such bound.
         passable: DataArray (row, col), bool.
         grid: Positions of the cells.
@@ -80,31 +80,31 @@ class Workspace(Summary):
     ) -> Self:
         """Derive traversability, visibility and line of sight from a DEM and a DSM.
 
-        Features are means of a cell's pixels, for all bounds into the cell and every robot. A cell
-        is impassable if more than half of its pixels are missing or steeper than the slope limit.
-        Openness is measured over the lidar's range, at most the diagonal of a cell: sight beyond
-        one bound does not matter to overwatch.
+        Features are averaged over a cell's pixels, and used for all bounds into the cell and all
+        robots. A cell is impassable if more than half of its pixels are missing or steeper than the
+        slope limit. Openness is measured over the lidar's range, at most the diagonal of a cell:
+        overwatch does not need sight beyond one bound.
 
         Overwatch relates two cells. Traversability is therefore averaged along the robots' tracks
-        in a bound, and the feature `line_of_sight` is added: the share of the bound's time in which
-        a robot and the lead should see each other under the assumed sight.
+        in a bound, and the feature `line_of_sight` is added: the predicted fraction of the bound's
+        time in which a robot and the lead see each other under the assumed sight.
 
         Args:
             terrain: Dataset of `read_terrain` or `synthetic_terrain`.
             shape: Rows and columns of the planning grid.
             team: Lead and robots; by default a lead and three robots.
-            features: Features of awareness by name: names of pixel features for a composite (see
-                `terrain.FEATURES`), or one name of a feature in [0, 1] that is used unchanged. By
-                default traversability and visibility, of `terrain.TRAVERSABILITY` and
+            features: Features of awareness by name: several pixel features for a composite (see
+                `terrain.FEATURES`), or one feature in [0, 1] that is used unchanged. By default
+                traversability and visibility, from `terrain.TRAVERSABILITY` and
                 `terrain.VISIBILITY`.
-            bounds: False for awareness of cells alone, as in the paper: without line of sight,
-                traversability of the cell entered, the visibility of `terrain.PAPER_VISIBILITY`.
+            bounds: False to define awareness for cells only, as in the paper: no line of sight, the
+                traversability of the cell entered, and visibility from `terrain.PAPER_VISIBILITY`.
             sight: Assumed model of sight; by default `Sight()`.
 
         Raises:
-            TrustboError: A grid too fine for the raster, a cell without standing room for the team,
-                or a dataset that is no terrain; no cell is passable, or a feature has the name of
-                the line of sight.
+            TrustboError: The dataset is not a terrain, the grid is too fine for the raster, a cell
+                is too small for the team to stand in, no cell is passable, or a feature has the
+                name of the line of sight.
 
         Example:
             >>> tb.Workspace.from_terrain(terrain, shape=(10, 10), team=tb.Team(n_robots=3))
@@ -138,17 +138,17 @@ class Workspace(Summary):
 
         Args:
             awareness: Shape (robot, row, col, feature), in [0, 1]; or (robot, move, row, col,
-                feature), of the bound into a cell by each of the eight `MOVES`. Awareness of cells
+                feature), for the bound into a cell by each of the eight `MOVES`. Awareness of cells
                 is copied to all moves.
-            passable: Shape (row, col); by default the cells without NaN in `awareness`, or with a
-                bound into them.
+            passable: Shape (row, col); by default the cells without NaN in `awareness`, or with at
+                least one bound into them.
             cell_size: Side of a cell, m.
-            team: Lead and robots; by default as many robots as `awareness` has rows.
+            team: Lead and robots; by default as many robots as on the first axis of `awareness`.
             features: Names of the features; by default traversability, visibility, z3, ...
 
         Raises:
-            TrustboError: Axes that do not fit together; a value outside [0, 1], NaN in a passable
-                cell, or no passable cell.
+            TrustboError: The axes do not match, a value is outside [0, 1] or NaN in a passable
+                cell, or no cell is passable.
         """
         known = () if team is None else Team.of(team).names
         features = as_names("features", features)
@@ -195,16 +195,16 @@ class Workspace(Summary):
 
     @property
     def sight(self) -> Sight | None:
-        """Assumed model of sight, by which posts are chosen; None without a terrain."""
+        """Assumed model of sight, used to choose posts; None without a terrain."""
         return None if self.posts is None else self.posts.sight
 
     @cached_property
     def passable_bounds(self) -> xr.DataArray:
-        """Bounds between passable cells that the robots have a route for, (move, row, col), bool.
+        """Whether a bound has passable cells and routes for the robots, (move, row, col), bool.
 
-        The bound enters the cell (row, col) by the move, one of the eight of `MOVES`. Routes are
-        searched within two cells and half a cell around; without a terrain there is one between
-        any two neighbours.
+        The bound enters the cell (row, col) by one of the eight `MOVES`. Routes are searched within
+        the two cells and half a cell around them; without a terrain, there is a route between any
+        two neighbours.
         """
         exists = existing_bounds(self.passable.values)
         if self.posts is not None:
@@ -216,22 +216,23 @@ class Workspace(Summary):
         """Awareness of the bounds of a path, shape (bound, robot, feature), in [0, 1].
 
         Args:
-            path: Cells, each a neighbour of the one before.
+            path: Cells, each a neighbour of the previous one.
 
         Raises:
-            TrustboError: A cell is off the grid or impassable, or no neighbour of the one before.
+            TrustboError: A cell is off the grid, impassable, or not a neighbour of the previous
+                one.
         """
         cells = [self.locate(cell, f"path[{k}]") for k, cell in enumerate(path)]
         return np.swapaxes(along(self.awareness.values, cells), 0, 1)
 
     def in_order(self, mission: Mission) -> Mission:
-        """Return a mission with its robots and features in the order of the workspace's.
+        """Return a mission with its robots and features in the workspace's order.
 
-        A mission need not have a line of sight, which is predicted, not measured: it is NaN then.
-        Features with default names, z3, z4, ..., take the workspace's names at the same positions.
+        Line of sight is predicted, not measured: it is NaN if the mission does not have it.
+        Features with default names, z3, z4, ..., get the workspace's names at the same positions.
 
         Raises:
-            TrustboError: It has other robots or features; it is of a log without a map.
+            TrustboError: The mission has other robots or features, or no map.
         """
         require_map("a workspace", [mission])
         unnamed = default_features(len(mission.features))
@@ -245,12 +246,12 @@ class Workspace(Summary):
         return mission.in_order(self.team.names, self.features, predicted)
 
     def fill(self, mission: Mission) -> Mission:
-        """Fill awareness that a mission did not measure (NaN) with that of its bounds.
+        """Fill awareness that a mission did not measure (NaN) with the workspace's.
 
-        A simulator measures no line of sight; a campaign fills it in by itself.
+        Simulators do not measure line of sight; campaigns fill it in automatically.
 
         Raises:
-            TrustboError: The mission's path is no path of neighbouring cells on the grid.
+            TrustboError: The mission's path is not a path of neighbouring cells on the grid.
         """
         ordered = self.in_order(mission)
         if not np.isnan(ordered.awareness).any():
@@ -266,7 +267,7 @@ class Workspace(Summary):
             what: Name of the location in messages.
 
         Raises:
-            TrustboError: Not a location, off the grid, without data, or impassable.
+            TrustboError: The location is invalid, off the grid, without data, or impassable.
         """
         cell, grid = self.grid.locate(location, what), self.grid
         if not self.passable.values[cell]:
@@ -280,7 +281,7 @@ class Workspace(Summary):
         return cell
 
     def _why_impassable(self, cell: Cell) -> str:
-        """Text of the reason why a cell is impassable; empty without a terrain."""
+        """Reason why a cell is impassable; empty without a terrain."""
         if self.terrain is None:
             return ""
         missing = self.grid.cell_means(self.terrain["dem"].isnull().astype(float))[cell]
