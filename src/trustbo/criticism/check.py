@@ -27,7 +27,7 @@ from trustbo.models.model import TrustModel
 from trustbo.models.visited import has_places
 
 SIZE, SURE = 0.1, 0.95
-"""Contact from which on an effect may change a plan, and the probability that it is that large."""
+"""Smallest effect on contact that may change a plan, and the probability required for it."""
 _SIGNED = 0.6  # prior probability of one sign from which on a weight has an expected sign
 _TOLERANCE = 0.05  # of the share of rates in 90 % intervals
 _ERRORS = 2.0  # standard errors of a difference that counts

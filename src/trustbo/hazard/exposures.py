@@ -10,7 +10,7 @@ from trustbo.errors import TrustboError, require_choice
 from trustbo.workspace.moves import bounds_along
 
 CAUSES = ("stuck", "tipped", "timeout", "collision", "lost_contact")
-"""Statuses that a bound fails with; an aborted mission has no outcome of its last bound."""
+"""Statuses of failed bounds; the last bound of an aborted mission has no outcome."""
 
 
 class LostMission(NamedTuple):

@@ -17,7 +17,7 @@ from trustbo.workspace.difficulty import difficulty_of
 from trustbo.workspace.moves import bounds_along
 
 ROUNDING = 1e-12
-"""Rounding of the risk of a path that is just within a limit."""
+"""Rounding tolerance for the risk of a path at the limit."""
 _BAND = (0.05, 0.95)
 _ENTRIES = 1 << 20  # of (draw, bound) at a time
 _SOME = 256  # number of bounds whose mean chance orders the draws
@@ -222,7 +222,7 @@ class PathRisk(NamedTuple):
     """Probability to reach the goal: the mean over draws of the product of 1 - p_fail, as failures
     are correlated; without draws, the product of the means."""
     p_arrive_band: tuple[float, float]
-    """Ends of its 90 % band over draws; NaN without draws."""
+    """Ends of the 90 % band of `p_arrive` over draws; NaN without draws."""
 
     def to_record(self) -> dict[str, Any]:
         """Convert to plain lists and numbers."""

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 MOST = 5
-"""Number of strata: labels of the path search carry a sum for each."""
+"""Default number of strata; labels of the path search hold one sum for each."""
 
 
 class Strata(NamedTuple):

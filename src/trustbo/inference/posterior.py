@@ -37,7 +37,7 @@ class Draws(NamedTuple):
     k_hat: float = 0.0
     """Pareto shape of the weights that correct EP, 0 where the evidence is exact."""
     log_correction: float = 0.0
-    """What those weights add to the log evidence."""
+    """Correction of the log evidence by these weights."""
 
     def at(self, index: np.ndarray) -> Self:
         """Select draws by index."""

@@ -24,7 +24,7 @@ class ParameterDraws(Summary):
     __slots__ = ()
 
     AXES: ClassVar[Mapping[str, tuple[str, ...]]]
-    """Axes of each field behind the leading ones; none where not listed."""
+    """Axes of each field after the leading axes; none if not listed."""
     WEIGHTS: ClassVar[str] = "beta"
     """Name of the field with the weights of features."""
     SUM: ClassVar[str]

@@ -20,7 +20,7 @@ from trustbo.models.signal import Layout, Signal, powers
 from trustbo.models.slots import Slots
 
 SUCCESS, FAILURE = "success", "failure"
-"""Beginnings of the names of features that are inputs of outcomes."""
+"""Prefixes of the names of features that are outcomes."""
 
 
 @dataclass(frozen=True, repr=False)

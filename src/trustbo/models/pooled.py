@@ -18,7 +18,7 @@ from trustbo.models.signal import Layout, Signal, powers
 from trustbo.models.slots import Slots
 
 MEMORIES = ("level", "deviation")
-"""Lasting from one bound to the next: trust, or its deviation from what effects expect."""
+"""Quantity carried over between bounds: trust, or its deviation from the expected level."""
 
 
 @dataclass(frozen=True, repr=False)

@@ -19,7 +19,7 @@ class Layout(NamedTuple):
     joint: bool = False
     rotation: np.ndarray | None = None  # (combination, robot)
     split: np.ndarray | None = None
-    """Mask of columns that are inputs of their own, before the inputs of the others."""
+    """Mask of columns with separate inputs, which precede the inputs of the others."""
     apart: bool = False
     """Whether the signals of any two blocks differ."""
 

@@ -27,11 +27,11 @@ from trustbo.planning.sums import costs_of_sums
 from trustbo.planning.unrolled import Unrolled, edges_from, fill_to_go, kernel, new_to_go
 
 MAX_LABELS = 300_000
-"""Labels of one search: beyond, it returns the best path known and a lower limit on the cost."""
+"""Maximum labels of a search, which then returns the best path known and a lower limit."""
 LOGISTIC, CLIPPED = range(2)
-"""Losses of a bound: 1 - sigma(trust); 1 - E[y], y around trust and cut to [0, 1]."""
+"""Losses of a bound: 1 - sigma(trust), or 1 - E[y] with normal y clipped to [0, 1]."""
 LOSSES = {"logistic": LOGISTIC, "clipped": CLIPPED}
-"""Loss by the expected rate of a family of observations."""
+"""Loss by `Family.expected_rate`."""
 TINY_SD = 1e-9
 """Least sd of a rate, instead of 0."""
 

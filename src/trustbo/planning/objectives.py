@@ -33,13 +33,13 @@ class Objective(NamedTuple):
 
     name: str
     credit: Callable[[Array], Array] = _ones
-    """Weight of trust after a bound by the number of bounds that are left, both (left,)."""
+    """Weight of trust after a bound as a function of the number of bounds left, both (left,)."""
     scale: Callable[[Array], Array] = _ones
-    """Divisor of the sum by the number of bounds of the path, both (length,)."""
+    """Divisor of the sum as a function of the number of bounds of the path, both (length,)."""
     value: Callable[[Array], Array] = _same
-    """Value to report for a score: an increasing function."""
+    """Increasing function from the score to the reported value."""
     of_contact: bool = False
-    """Whether contact is expected of trust by the family of the rates; a failure then loses it."""
+    """Whether the value is the expected contact given trust, which a failure reduces."""
     max_bounds: str = "shortest+2"
     """Default limit on the number of bounds."""
 
@@ -63,7 +63,7 @@ class Weights(NamedTuple):
     per_bound: Array
     """w_j by the bounds left after a bound, (draw, left, state)."""
     constant: Array
-    """Part that depends on the number of bounds alone, (draw, length)."""
+    """Term that depends only on the number of bounds, (draw, length)."""
     scale: Array
     """Divisor of a path's sum, (length,)."""
 

@@ -21,7 +21,7 @@ SIMPLE_EXTRA = 2
 STEPS = np.array(MOVES)
 """Rows and columns of each move, (move, 2)."""
 _MOST_STATES = 20_000_000
-"""Most states of the unrolled graph, whose arrays take some 3 GB."""
+"""Maximum number of states of the unrolled graph, whose arrays then need about 3 GB."""
 _SHORTEST = re.compile(r"shortest(?:\+(\d+))?")
 
 

@@ -24,7 +24,7 @@ from trustbo.workspace import Workspace
 from trustbo.workspace.moves import MOVE_NAMES, bounds_along
 
 EXACT = 1e-12
-"""Largest gap, in the unit of the score, between a path and a better one that counts as none."""
+"""Largest gap in score up to which a path is regarded as optimal."""
 _CERTAIN = 700.0  # -log(1 - p) of a bound that always fails
 
 

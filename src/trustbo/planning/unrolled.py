@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 
 kernel = njit(cache=True, nogil=True, error_model="numpy")
-"""Compiler of the kernels: cached on disk, without the interpreter's lock, 1 / 0 is inf."""
+"""Numba decorator of the kernels: cached on disk, releases the GIL, and 1 / 0 is inf."""
 
 
 class Unrolled(NamedTuple):

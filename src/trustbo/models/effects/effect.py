@@ -1,8 +1,8 @@
-"""The protocol of effects: columns that add to the drift of trust, and their weights' prior.
+"""The protocol of effects: columns added to the drift of trust, and the prior of their weights.
 
-The drift of a slot is u = U c, with coefficients c that are Gaussian given hyperparameters theta. A
-new effect is a frozen dataclass in a file of its own with the methods of `Effect`; engine,
-samplers, posteriors and plans need no more.
+The drift of a slot is u = U c, with coefficients c that are Gaussian given hyperparameters theta.
+To add an effect, write a frozen dataclass with the methods of `Effect`; inference and planning need
+no change.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,7 +29,7 @@ Values = Mapping[str, np.ndarray]
 """Variables of an effect by name, each (draw, ...)."""
 
 LEAST = 1e-4
-"""Least sd of an effect: precisions stay finite, and a smaller effect is none."""
+"""Smallest sd of an effect, which keeps precisions finite."""
 
 EFFECTS: dict[str, type["Effect"]] = {}
 """Classes of effects by name, to read models from files."""
@@ -38,21 +38,21 @@ EFFECTS: dict[str, type["Effect"]] = {}
 class Effect:
     """An effect on the drift, with the settings of its prior.
 
-    Hyperparameters are sds with half-normal priors, whose scales are the fields of these names;
-    other effects override `hyperpriors`. A class with a noun is known to files by its name.
+    By default, hyperparameters are sds with half-normal priors, whose scales are the fields of the
+    same names; otherwise override `hyperpriors`. Classes with a `noun` can be read from files.
 
     Raises:
-        TrustboError: A field of the name of a hyperparameter is not positive.
+        TrustboError: If the scale of a hyperparameter is not positive.
     """
 
     names: ClassVar[tuple[str, ...]] = ()
     """Names of the hyperparameters."""
     noun: ClassVar[str] = ""
-    """Plural of what has the effects, also the name of their group in a posterior."""
+    """Plural noun for the effect, also the name of its group in a posterior."""
     variables: ClassVar[Mapping[str, tuple[str, ...]]] = {}
-    """Axes, behind (chain, draw), of each variable of that group."""
+    """Axes after (chain, draw) of each variable of this group."""
     coords: ClassVar[Mapping[str, Sequence[Any]]] = {}
-    """Labels of axes other than those of missions, robots and features."""
+    """Labels of axes other than missions, robots and features."""
 
     def __init_subclass__(cls) -> None:
         if cls.noun:
@@ -71,23 +71,23 @@ class Effect:
         """Prior of the coefficients at each theta, in NumPy or JAX.
 
         Returns:
-            Mean (point, column), None for 0, and precisions of consecutive columns, (point, k, k)
-            or (point, k) of independent ones.
+            Mean (point, column), None for 0, and precisions of consecutive columns, (point, k, k),
+            or (point, k) if independent.
         """
         raise NotImplementedError
 
     def named(self, c: np.ndarray, theta: Theta, slots: Slots) -> Values:
-        """Variables of coefficients c (draw, column)."""
+        """Convert coefficients c (draw, column) to variables by name."""
         raise NotImplementedError
 
     def coefficients(self, values: Values, theta: Theta, slots: Slots) -> np.ndarray:
-        """Coefficients (draw, column) of variables: the inverse of `named`."""
+        """Convert variables to coefficients (draw, column), the inverse of `named`."""
         raise NotImplementedError
 
     def ahead(self, values: Values, theta: Theta, n: int, rng: Generator | None) -> np.ndarray:
-        """Slope (draw, robot) in line of sight of the drift of the mission after n, by default 0.
+        """Slope (draw, robot) of drift in line of sight for the mission after n; by default 0.
 
-        With random numbers, effects of that mission alone are drawn; else they are the expected.
+        With `rng`, effects specific to that mission are drawn; otherwise they are expectations.
         """
         return np.zeros((len(theta["rest"]), 1))
 
@@ -96,12 +96,12 @@ class Effect:
         return {name: dist.HalfNormal(getattr(self, name)) for name in self.names}
 
     def slots(self, slots: Slots, missions: Sequence[Mission], on: Workspace | None) -> Slots:
-        """Slots of missions, on a workspace if known, with all that the columns need."""
+        """Slots of missions, on a workspace if given, with all data that the columns need."""
         return slots
 
 
 def sample_columns(effects: Sequence[Effect], theta: Theta, slots: Slots) -> Any:
-    """Sample statements of all coefficients (column,); theta has one point."""
+    """Sample all coefficients (column,) in a NumPyro program; theta has one point."""
     columns = []
     for effect in effects:
         mean, parts = effect.prior(theta, slots)

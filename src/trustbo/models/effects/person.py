@@ -1,13 +1,12 @@
-"""Effects of a person: start, level to which trust returns, and gains by outcomes.
+"""Effects of a person: initial trust, level to which trust returns, and gains from outcomes.
 
-A mission is a person, whose parts last as long as the mission. They are independent, each kind with
-a separate sd,
+A mission is a person. The coefficients of a person are independent, each kind with a separate sd,
 
     start ~ N(0, tau_start^2) at the first bound,   level ~ N(0, tau_level^2) at all bounds,
     gains ~ N(0, tau_gain^2), times the inputs of success and of failure.
 
-A person has no other missions: these parts are no columns, but a term of the covariance of the
-block, see `HumanTrust.signal`.
+As a person has no other missions, the coefficients are a term in the covariance of the block
+instead of columns, see `HumanTrust.signal`.
 """
 
 from dataclasses import dataclass
@@ -21,15 +20,15 @@ PARTS = ["start", "level", "success", "failure"]
 
 @dataclass(frozen=True)
 class PersonEffect(Effect):
-    """Effects of persons, who are missions.
+    """Effects of persons, each stored as a mission.
 
     Attributes:
         tau_start: Scale of the half-normal prior of the sd of trust at the first bound.
-        tau_level: Scale of that of the level to which trust returns.
-        tau_gain: Scale of that of the gains by success and by failure.
+        tau_level: Scale of the half-normal prior of the sd of the level to which trust returns.
+        tau_gain: Scale of the half-normal prior of the sd of the gains from success and failure.
 
     Raises:
-        TrustboError: A scale is not positive.
+        TrustboError: If a scale is not positive.
     """
 
     tau_start: float = 0.3
@@ -41,6 +40,6 @@ class PersonEffect(Effect):
     coords: ClassVar = {"part": PARTS}
 
     def sds(self, theta: Theta) -> Any:
-        """Sd of each part, (point, part)."""
+        """Sd of each coefficient, (point, part)."""
         start, level, gain = (theta[name] for name in self.names)
         return namespace(start).stack([start, level, gain, gain], axis=1)

@@ -1,4 +1,4 @@
-"""Effects of places: s of the cell entered, a Gaussian process, and e of the directed bound."""
+"""Effects of places: a Gaussian process s over cells, and an effect e of each directed bound."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,20 +29,20 @@ _MOST = {
 
 @dataclass(frozen=True)
 class PlaceEffect(Effect):
-    """Effect of a place on trust that awareness does not explain, which all robots share.
+    """Effect of a place on the trust of all robots that awareness does not explain.
 
     The drift of trust by the bound from cell a to cell c is u(a -> c) = beta . z(a -> c) + b + s(c)
-    + e(a -> c). s is a Gaussian process over cells, of sd tau_s and covariance Matern 3/2 with a
+    + e(a -> c). s is a Gaussian process over cells with sd tau_s and Matern 3/2 covariance with a
     length scale in cells; e(a -> c) ~ N(0, tau_e^2), independent for each directed bound.
 
     Attributes:
         tau_s: Scale of the half-normal prior of the sd of s.
         tau_e: Scale of the half-normal prior of the sd of e.
         length_scale: Median of the log-normal prior of the length scale, in cells.
-        length_scale_sd: Its standard deviation, of the logarithm.
+        length_scale_sd: Standard deviation of the logarithm of the length scale.
 
     Raises:
-        TrustboError: A number is not positive or far too large.
+        TrustboError: If a number is not positive or far too large.
     """
 
     tau_s: float = 0.2
@@ -66,13 +66,13 @@ class PlaceEffect(Effect):
         return super().hyperpriors() | {"length_scale": length_scale}
 
     def slots(self, slots: Slots, missions: Sequence[Mission], on: Workspace | None) -> Slots:
-        """See `Effect.slots`: with the visited places."""
+        """See `Effect.slots`; adds the visited places."""
         grid = None if on is None else on.passable.shape
         bounds = bounds_of(missions, slots.y.shape[:2])
         return slots._replace(visited=visited(bounds, grid))  # pyright: ignore[reportArgumentType]
 
     def columns(self, slots: Slots) -> Any:
-        """Indicators of the cells entered, and of the bounds made."""
+        """Indicators of the cells entered and of the directed bounds."""
         places: Any = slots.visited
         at = np.broadcast_to(places.at[..., None], slots.y.shape).ravel()
         met = np.flatnonzero(at >= 0)

@@ -1,8 +1,8 @@
-"""Effects of a robot in a mission: a part that stays, and a bad day.
+"""Effects of a robot in a mission: a persistent part, and a bad day.
 
-A damaged detector stays; rain is gone tomorrow. The drift of robot i at the bounds of mission m has
-a further term l d[i, m], l its predicted line of sight, and d, in units of stationary trust,
-independent between robots with covariance over missions
+For example, a damaged detector persists, rain does not. The drift of robot i in mission m has an
+additional term l d[i, m], where l is its predicted line of sight and d, in units of stationary
+trust, is independent between robots with covariance over missions
 
     cov(d[i, m], d[i, m']) = tau_slow^2 rho^|m - m'| + tau_day^2 [m = m'].
 """
@@ -24,15 +24,15 @@ from trustbo.models.slots import Slots
 class RobotEffect(Effect):
     """Effect of a robot in a mission, proportional to its line of sight.
 
-    Without a feature that predicts line of sight, the effect is a constant of the mission.
+    Without a feature that predicts line of sight, the effect is constant during a mission.
 
     Attributes:
-        tau_slow: Scale of the half-normal prior of the sd of what stays.
-        tau_day: Scale of the half-normal prior of the sd of what is gone the next mission.
-        rho: Correlation of what stays between one mission and the next.
+        tau_slow: Scale of the half-normal prior of the sd of the persistent part.
+        tau_day: Scale of the half-normal prior of the sd of the part specific to one mission.
+        rho: Correlation of the persistent part between consecutive missions.
 
     Raises:
-        TrustboError: A scale is not positive, or rho is not between 0 and 1.
+        TrustboError: If a scale is not positive, or rho is not between 0 and 1.
     """
 
     tau_slow: float = 0.2
@@ -48,7 +48,7 @@ class RobotEffect(Effect):
             raise TrustboError(f"RobotEffect.rho must be between 0 and 1; got {self.rho!r}.")
 
     def columns(self, slots: Slots) -> Any:
-        """Line of sight of one robot in one mission, for each pair of them, the mission fastest."""
+        """Line of sight, one column per robot and mission, the mission varying fastest."""
         n_missions, n_robots = slots.n_missions, slots.n_robots
         mission, _, robot = np.indices(slots.y.shape)
         where = (robot * n_missions + mission).ravel()
@@ -58,7 +58,7 @@ class RobotEffect(Effect):
         )
 
     def prior(self, theta: Theta, slots: Slots) -> tuple[Any, list[Any]]:
-        """Robots are independent; alike, so one array, where they share `rest`."""
+        """Prior with independent robots; one array for all if they have the same `rest`."""
         rest = theta["rest"]
         Q = namespace(rest).linalg.inv(self._covariance(theta, slots.n_missions))
         if rest.ndim == 1:

@@ -1,4 +1,4 @@
-"""Weights of features and the intercept: shared by robots, drawn for each, or of coupled robots."""
+"""Weights of features and intercept: common to all robots, per robot, or of coupled robots."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -14,16 +14,16 @@ from trustbo.models.slots import Slots
 
 @dataclass(frozen=True)
 class Weights(Effect):
-    """Effect of features and of a constant, under the priors of `beta` and `b`, both Normal."""
+    """Effect of features and of a constant, with Normal priors `beta` and `b`."""
 
     priors: Priors
 
     def columns(self, slots: Slots) -> Any:
-        """Features, and 1."""
+        """Features and a constant 1."""
         return sparse.csr_array(_inputs(slots))
 
     def prior(self, theta: Theta, slots: Slots) -> tuple[Any, list[Any]]:
-        """Independent coefficients, of stationary trust if these are what the priors are of."""
+        """Independent coefficients, scaled if the priors are those of stationary trust."""
         mean, sd = self.moments(theta, slots)
         return mean, [sd**-2.0]
 
@@ -34,7 +34,7 @@ class Weights(Effect):
         return rest * mean, rest * sd
 
     def unit(self, theta: Theta) -> Any:
-        """Factor (point, [robot,] 1) of coefficients under priors of stationary trust, else 1."""
+        """Factor (point, [robot,] 1) of coefficients if priors are of stationary trust, else 1."""
         rest = theta["rest"][..., None]
         return rest if self.priors.stationary else 0.0 * rest + 1.0
 
@@ -49,16 +49,16 @@ class Weights(Effect):
 
 @dataclass(frozen=True)
 class RobotWeights(Weights):
-    """Coefficients of each robot, N(mu, tau^2), mu under the priors; theta has the spreads tau."""
+    """Coefficients of each robot, N(mu, tau^2), with priors on mu; theta contains tau."""
 
     def columns(self, slots: Slots) -> Any:
-        """Features, and 1, of one robot each, the robot fastest."""
+        """Features and 1 for each robot, the robot varying fastest."""
         values = _inputs(slots)
         mine = np.tile(np.eye(slots.n_robots), (len(values) // slots.n_robots, 1))
         return sparse.csr_array((values[..., None] * mine[:, None]).reshape(len(values), -1))
 
     def prior(self, theta: Theta, slots: Slots) -> tuple[Any, list[Any]]:
-        """Coefficients of one feature are alike, as they share its mean."""
+        """Coefficients of one feature are correlated through their common mean."""
         n, (mean, sd) = slots.n_robots, self.moments(theta, slots)
         tau = namespace(mean).maximum(_spreads(theta), LEAST)
         alike = sd**2 / (tau**2 + n * sd**2)  # (sd^2 11' + tau^2 1)^-1 in closed form
@@ -91,7 +91,7 @@ class CoupledWeights(Weights):
     """Weight of feature m at robot l in the trust of robot i, matrices B_m, and intercepts b_i."""
 
     def columns(self, slots: Slots) -> Any:
-        """Features of all robots, and 1, for each robot."""
+        """Features of all robots and 1, for each robot."""
         n = slots.n_robots
         inputs = slots.z.reshape(-1, 1, n * slots.z.shape[3])  # (mission * bound, 1, (robot, m))
         inputs = np.concatenate([inputs, np.ones((*inputs.shape[:2], 1))], axis=2)
@@ -99,7 +99,7 @@ class CoupledWeights(Weights):
         return sparse.csr_array(values.reshape(slots.y.size, -1))
 
     def prior(self, theta: Theta, slots: Slots) -> tuple[Any, list[Any]]:
-        """Weights of a robot's own features as of other models; of others', `Priors.coupling`."""
+        """Prior of weights: `Priors.coupling` for the features of other robots."""
         n, (mean, sd) = slots.n_robots, self.priors.coefficients(slots.z.shape[3])
         n_features = len(mean) - 1
         own = np.repeat(np.eye(n, dtype=bool), n_features, axis=1)

@@ -1,7 +1,7 @@
 """Families of observations: distributions of a contact rate given trust, one file each.
 
-To add one, write its file after `censored` (closed forms) or `beta_binomial` (smooth ones, by
-Gauss-Hermite nodes), and list it here.
+To add one, follow `censored` (closed forms) or `beta_binomial` (smooth densities, by Gauss-Hermite
+quadrature), and list it here.
 """
 
 from trustbo.models.families.beta_binomial import BetaBinomial

@@ -30,7 +30,7 @@ class BetaBinomial(Family):
     line_of_sight: ClassVar[tuple[float, float]] = 5.0, 0.5  # the logit's line by .5 and .92
 
     def priors(self) -> dict[str, Any]:
-        """See `Family.priors`: trust is a logit, so all are wider."""
+        """See `Family.priors`: wider, as trust is a logit."""
         with own_settings():
             return {
                 "beta": dist.Normal(0.0, 2.0),
@@ -57,7 +57,7 @@ class BetaBinomial(Family):
         return choose + library.betaln(n + a, N - n + b) - library.betaln(a, b)
 
     def _match(self, y: Array, N: Array, m: Array, v: Array, sd: Array) -> Moments:
-        """By Gauss-Hermite nodes around the mode."""
+        """See `Family._match`: by Gauss-Hermite quadrature around the mode."""
         n = np.round(y * N)
         lam = 1.0 / (1.0 / (n + 0.5) + 1.0 / (N - n + 0.5) + 0.2)  # of an empirical logit
         start = (m / v + lam * np.log((n + 0.5) / (N - n + 0.5))) / (1.0 / v + lam)
@@ -65,7 +65,7 @@ class BetaBinomial(Family):
         return match_by_nodes(lambda f: self.log_prob(y, N, f, sd), start, m, v)
 
     def _draw(self, y: Array, N: Array, m: Array, v: Array, sd: Array, rng: Generator) -> Drawn:
-        """From log-linear pieces of the density between knots."""
+        """See `Family._draw`: from a piecewise log-linear density."""
         _, mean, var = self._match(y, N, m, v, sd)
         knots = mean[..., None] + np.sqrt(var)[..., None] * _KNOTS
         y, N, m, v, sd = (a[..., None] for a in (y, N, m, v, sd))

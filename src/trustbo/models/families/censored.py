@@ -33,7 +33,7 @@ class Censored(Gaussian):
         return xp.where(y <= 0.0, log_ndtr(-trust / sd), beyond)
 
     def _match(self, y: Array, N: Array, m: Array, v: Array, sd: Array) -> Moments:
-        """Of a normal censored at a limit (Tobin 1958)."""
+        """See `Family._match`: normal censored at a limit (Tobin 1958)."""
         cut, low, high = _limits(y)
         return np.where(cut, match_interval(low, high, m, v, sd), super()._match(y, N, m, v, sd))
 
@@ -45,7 +45,7 @@ class Censored(Gaussian):
         return f, self._match(y, N, m, v, sd)[0]
 
     def mean_rate(self, trust: Array, sd: Array) -> Array:
-        """See `Family.mean_rate`: of a normal variable clipped to [0, 1]."""
+        """See `Family.mean_rate`: mean of a normal variable clipped to [0, 1]."""
         low, high = -trust / sd, (1.0 - trust) / sd
         inside = trust * (norm.cdf(high) - norm.cdf(low))
         return inside + sd * (norm.pdf(low) - norm.pdf(high)) + norm.sf(high)
@@ -56,6 +56,6 @@ class Censored(Gaussian):
 
 
 def _limits(y: Array) -> tuple[Array, Array, Array]:
-    """Whether a rate is a limit, and what the rate before clipping lay between."""
+    """Whether a rate is a limit, and the interval of the rate before clipping."""
     one = y >= 1.0
     return one | (y <= 0.0), np.where(one, 1.0, -np.inf), np.where(one, np.inf, 0.0)

@@ -1,7 +1,7 @@
 """The protocol of a family of observations: rates given a signal, and a signal given rates.
 
-A signal f is trust with the noise that rates share. A new family is a file with a subclass of
-`Family` and a row in `families/__init__`; `moments` has what its methods need.
+A signal f is trust plus noise shared between rates. To add a family, write a subclass of `Family`
+and list it in `families/__init__`; `moments` has functions for its methods.
 """
 
 from abc import ABC, abstractmethod
@@ -23,14 +23,14 @@ Drawn = tuple[Array, Array]
 class Family(ABC):
     """A family of observations.
 
-    Arguments of all methods are arrays that broadcast: rates y, their numbers of ticks N, and the
-    sd of the observation noise, delta_v. `_match` and `_draw` get measured rates of one shape.
+    Arguments of all methods are arrays that broadcast: rates y, their numbers of ticks N, and sd,
+    the observation noise delta_v. `_match` and `_draw` receive measured rates of equal shape.
     """
 
     name: ClassVar[str]
-    """Name that users give."""
+    """Name of the family in arguments."""
     gaussian: ClassVar[bool] = False
-    """Whether rates are the signal plus normal noise, so that everything integrates out exactly."""
+    """Whether rates are the signal plus normal noise, which allows exact integration."""
     needs_ticks: ClassVar[bool] = False
     """Whether each measured rate needs its number of ticks."""
     adds_noise: ClassVar[bool] = True
@@ -44,7 +44,7 @@ class Family(ABC):
 
     @abstractmethod
     def sample(self, trust: Array, sd: Array, N: Array, rng: Generator) -> Array:
-        """Rates drawn given the signal."""
+        """Draw rates given the signal."""
 
     @abstractmethod
     def log_prob(self, y: Array, N: Array, trust: Array, sd: Array) -> Array:
@@ -56,17 +56,17 @@ class Family(ABC):
 
     @abstractmethod
     def _draw(self, y: Array, N: Array, m: Array, v: Array, sd: Array, rng: Generator) -> Drawn:
-        """A draw of the signal from N(f; m, v) times the term of a rate, and its log weight.
+        """Draw the signal from N(f; m, v) times the term of a rate; returns its log weight too.
 
-        The mean weight is the mass; it does not vary where the draw is exact.
+        The mean weight is the mass; weights are constant if the draw is exact.
         """
 
     def mean_rate(self, trust: Array, sd: Array) -> Array:
-        """Mean of a rate given trust, for plans."""
+        """Mean of a rate given trust, for planning."""
         return trust
 
     def is_density(self, y: Array) -> Array:
-        """Mask of the measured rates that have a density: they are the signal plus normal noise."""
+        """Mask of the measured rates that have a density, being the signal plus normal noise."""
         return np.zeros(y.shape, dtype=bool)
 
     def priors(self) -> dict[str, Any]:
@@ -80,22 +80,22 @@ class Family(ABC):
         return np.where(seen, one, 0.0), np.where(seen, mean, m), np.where(seen, var, v)
 
     def draw(self, y: Array, N: Array, m: Array, v: Array, sd: Array, rng: Generator) -> Drawn:
-        """Draws of signals given measured rates, see `_draw`; arbitrary ones where y is NaN."""
+        """Draw signals given measured rates, see `_draw`; arbitrary where y is NaN."""
         _, (y, N, m, v, sd) = _measured(y, N, m, v, sd)
         return self._draw(y, N, m, v, sd, rng)
 
     def log_resolution(self, y: Array, N: Array) -> Array:
         """Log ratio of the probability of a count of ticks to the density of its rate.
 
-        A density covers 1/N per tick. Shape of `y`; 0 where not measured or where the rate itself
-        has a probability, NaN where the number of ticks is unknown.
+        One tick has width 1/N. The result has the shape of `y`, and is 0 where not measured or
+        where the rate itself has a probability, NaN where the number of ticks is unknown.
         """
         is_density = ~np.isnan(y) & self.is_density(y)
         return np.where(is_density, -np.log(np.where(is_density, N, 1.0)), 0.0)
 
 
 def _measured(y: Array, N: Array, *others: Array) -> tuple[Array, list[Array]]:
-    """Mask of the measured rates, and arrays of one shape with stand-ins for the other rates."""
+    """Mask of the measured rates, and arrays of equal shape with placeholders for other rates."""
     y, N, *others = np.broadcast_arrays(y, N, *others)  # pyright: ignore[reportAssignmentType]
     seen = ~np.isnan(y)
     return seen, [np.where(seen, y, 0.5), np.where(N > 0.0, N, 1.0), *others]

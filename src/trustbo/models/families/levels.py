@@ -48,7 +48,7 @@ class Levels(Family):
         return xp.log(xp.maximum(total, 1e-300))
 
     def _match(self, y: Array, N: Array, m: Array, v: Array, sd: Array) -> Moments:
-        """Of a mixture of normals between two numbers."""
+        """See `Family._match`: mixture of normals between two cut points."""
         log_p, mean, var = self._components(y, m, v, sd)
         total: Any = special.logsumexp(log_p, axis=0)
         w = np.exp(log_p - total)

@@ -1,4 +1,4 @@
-"""Moments and draws of a normal signal times the term of a rate, which families share."""
+"""Moments and draws of a normal signal times the term of a rate, used by several families."""
 
 from collections.abc import Callable
 
