@@ -1,4 +1,4 @@
-"""Simulators of bounding overwatch, and replay of recorded missions."""
+"""Simulators of bounding overwatch, including replay of recorded missions."""
 
 from trustbo.simulation.events import Degradation, Dust, Fouling, Jam, Season, Trees
 from trustbo.simulation.kinematic import KinematicSimulator

@@ -1,7 +1,7 @@
-"""Events: changes of the world in some missions, one class for each kind.
+"""Events: changes of the world in given missions, with one class for each kind.
 
-A kind of event is a frozen dataclass derived from `Event` with a method `change`, which returns a
-world with the event. Places are x and y in CRS metres.
+Each kind of event is a frozen dataclass derived from `Event` with a method `change`, which returns
+a world with the event. Positions are x and y in CRS metres.
 """
 
 import dataclasses
@@ -20,11 +20,11 @@ from trustbo.workspace.surface import Surface
 
 @dataclass(frozen=True, kw_only=True)
 class Event:
-    """Change of the world in some missions.
+    """Change of the world in given missions.
 
     Attributes:
         first: First mission with the event; missions count from 0.
-        last: Last mission with the event; None if there is no last.
+        last: Last mission with the event; None if it does not end.
     """
 
     SHARES: ClassVar[tuple[str, ...]] = ()
@@ -52,7 +52,7 @@ class Event:
 
 @dataclass(frozen=True)
 class Jam(Event):
-    """A jammer: detection from or of a robot inside a circle is 1 - `strength` times as probable.
+    """A jammer, which multiplies detection from or of robots in a circle by 1 - `strength`.
 
     Attributes:
         center: Centre of the circle.
@@ -74,7 +74,7 @@ class Jam(Event):
 
 @dataclass(frozen=True)
 class Degradation(Event):
-    """The lidar of one robot of T2 detects less.
+    """A lidar of T2 with a lower probability of detection.
 
     Attributes:
         robot: Name of the robot.
@@ -96,7 +96,7 @@ class Degradation(Event):
 
 @dataclass(frozen=True)
 class Dust(Event):
-    """Dust, rain or fog: all lidars detect less, the lead's too.
+    """Dust, rain or fog, which reduce the probability of detection of all lidars.
 
     Attributes:
         detection: Factor on the probability of detection, in [0, 1].
@@ -114,7 +114,7 @@ class Dust(Event):
 
 @dataclass(frozen=True)
 class Trees(Event):
-    """Trees in a circle that were felled or have grown; they block sight, not the way.
+    """Felled or newly grown trees in a circle; they affect sight but not motion.
 
     Attributes:
         height: Height of the canopy above the ground, m; 0 where trees were felled.
@@ -144,7 +144,7 @@ class Season(Event):
     """A denser or thinner canopy.
 
     Attributes:
-        extinction: Factor on the extinction of the true sight, positive.
+        extinction: Positive factor on the extinction of the true model of sight.
     """
 
     extinction: float
@@ -161,17 +161,18 @@ class Season(Event):
 
 @dataclass(frozen=True)
 class Fouling(Event):
-    """Lidars of T2 that foul and clear from bound to bound, also between missions.
+    """Lidars of T2 whose detection varies as they foul and clear from bound to bound.
 
     The factor on the probability of detection of a robot is f_t = worst + (1 - worst) Phi(z_t),
     where z_t = correlation z_{t-1} + sqrt(1 - correlation^2) e_t and e_t is standard normal. Time t
-    counts bounds: bound k of mission m, counted from 1 and 0, is t = m x every + k - 1. In the long
-    run f is uniform in [worst, 1], with mean (1 + worst) / 2.
+    counts bounds: t = m x every + k - 1 for bound k = 1, 2, ... of mission m = 0, 1, ... The
+    stationary distribution of f is uniform in [worst, 1], with mean (1 + worst) / 2.
 
     Attributes:
-        worst: Least factor, in [0, 1].
+        worst: Smallest factor, in [0, 1].
         correlation: Correlation of z in successive bounds, in [0, 1).
-        every: Bounds from the start of a mission to that of the next, at least those of a path.
+        every: Number of bounds between the starts of successive missions; at least the length of a
+            path.
         seed: Seed of the factors.
     """
 
@@ -187,7 +188,7 @@ class Fouling(Event):
         require_whole("every", self.every, 1)
 
     def change(self, world: World) -> World:
-        """See `Event.change`; the mean factor for the long run."""
+        """See `Event.change`; uses the mean factor for the long run."""
         if world.mission is None:
             return world._replace(detection=0.5 * (1.0 + self.worst) * world.detection)
         first = world.mission * self.every
@@ -202,7 +203,7 @@ class Fouling(Event):
 
 
 def changed(world: World, events: Iterable[Event], mission: int, long_run: bool = False) -> World:
-    """World of a mission; with `long_run`, what varies from bound to bound has its mean."""
+    """World of a mission; with `long_run`, factors that vary by bound have their mean."""
     world = world._replace(mission=None if long_run else mission)
     for event in events:
         if event.acts_in(mission):
@@ -211,7 +212,7 @@ def changed(world: World, events: Iterable[Event], mission: int, long_run: bool 
 
 
 def _circle(surface: Surface, center: tuple[float, float], radius: float) -> np.ndarray:
-    """Mask of the pixels with centres in a circle, shape (row, col); TrustboError if none."""
+    """Mask of the pixels with centres in a circle, shape (row, col); TrustboError if empty."""
     rows, cols = surface.ground.shape
     row, col = surface.to_pixel(*np.asarray(center, dtype=float))
     away = np.hypot(

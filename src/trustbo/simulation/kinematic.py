@@ -23,7 +23,7 @@ _LEAD, _T2 = slice(0, 1), slice(1, None)  # of the team's arrays
 
 
 class State(NamedTuple):
-    """Team between two bounds; positions in CRS metres, headings in rad."""
+    """State of the team between two bounds; positions in CRS metres, headings in rad."""
 
     cell: Cell
     """Cell of the lead."""
@@ -36,14 +36,14 @@ class State(NamedTuple):
 
 
 class KinematicSimulator(DescribedSimulator):
-    """Unicycle robots on a DEM and DSM, in contact while their lidar has a line of sight.
+    """Simulator of unicycle robots on a DEM and DSM, with contact by lidar line of sight.
 
-    In the first phase of a bound the lead drives to its stop in the next cell while T2 watches from
-    its posts in the last; in the second, T2 closes up to its next posts while the lead watches. The
-    contact rate of a robot of T2 is the share of ticks, of both phases, in which it is in contact
-    with the lead. Awareness of a mission is that of the workspace's maps.
+    In the first phase of a bound, the lead drives to its stop in the next cell while T2 watches
+    from its posts in the previous cell. In the second phase, T2 closes up to its next posts while
+    the lead watches. The contact rate of a robot of T2 is the fraction of ticks of both phases in
+    which it is in contact with the lead. Missions have the awareness of the workspace's maps.
 
-    A simulator with other motion derives from this class and replaces `drive`.
+    To simulate other motion, derive from this class and override `drive`.
 
     Example:
         >>> jam = tb.simulation.Jam(center=(1748000.0, 5427000.0), radius=40.0, first=3)
@@ -63,21 +63,21 @@ class KinematicSimulator(DescribedSimulator):
     ) -> None:
         """Prepare a terrain for simulation.
 
-        Robots stand and drive where the workspace planned. The true terrain, sight and team decide
-        contact, motion and failure only.
+        Stops, posts and routes are those planned by the workspace. The true terrain, sight and team
+        only affect contact, motion and failure.
 
         Args:
             workspace: A workspace made from a terrain.
-            terrain: True DEM and DSM, where they differ from the workspace's, which they cover.
+            terrain: True DEM and DSM, which must cover the workspace; by default the workspace's.
             sight: True model of sight; by default the workspace's.
-            team: True robots, of the same names; by default the workspace's.
+            team: True robots, with the same names; by default the workspace's.
             tick: Length of a tick, s.
             bound_timeout: Longest duration of a bound, s; the mission then ends as "timeout".
-            events: Changes of the world in some missions, such as `Jam` or `Dust`.
+            events: Changes of the world in given missions, such as `Jam` or `Dust`.
 
         Raises:
-            TrustboError: A workspace without terrain, a team of other robots, a value that is not
-                positive, an event that does not fit the terrain or the team.
+            TrustboError: The workspace has no terrain, the team has other robots, a value is not
+                positive, or an event does not fit the terrain or the team.
         """
         self.workspace, self.terrain = workspace, terrain
         self.sight = sight or workspace.sight or Sight()
@@ -111,7 +111,7 @@ class KinematicSimulator(DescribedSimulator):
         }
 
     def describe_world(self, mission: int) -> dict[str, object]:
-        """Return the settings of the world of a mission, which are equal in equal worlds."""
+        """Return the settings of a mission's world; equal worlds have equal settings."""
         acting = [event for event in self.events if event.acts_in(mission)]
         always = [repr(dataclasses.replace(event, first=0, last=None)) for event in acting]
         return {**self.describe(), "events": always}
@@ -124,12 +124,12 @@ class KinematicSimulator(DescribedSimulator):
         """Run a path from start to goal, or until a bound fails.
 
         Args:
-            path: Cells, each a neighbour of the last.
+            path: Cells, each a neighbour of the previous one.
             seed: Seed of slip and detections: the same seed gives the same mission.
-            mission: Number of the mission, from 0, by which events go.
+            mission: Number of the mission, from 0, which decides the active events.
 
         Raises:
-            TrustboError: A cell that is off the grid or impassable, or fewer than two cells.
+            TrustboError: A cell is off the grid or impassable, or there are fewer than two cells.
         """
         cells, seed = require_path(self.workspace, path), require_whole("seed", seed, 0)
         awareness, world = self.workspace.along(cells), self.world(mission)
@@ -148,7 +148,7 @@ class KinematicSimulator(DescribedSimulator):
         return Mission(tuple(cells), tuple(bounds), bounds[-1].status, *names)
 
     def standing(self, cell: Cell, next_cell: Cell | None) -> State:
-        """State of a team with all robots in their places in a cell, to go to the next."""
+        """State of the team with all robots at their stop and posts, before the next bound."""
         posts = self._posts
         stops = np.concatenate([posts.stop(cell)[None], posts.watching(cell, next_cell)])
         poses = np.concatenate([stops, np.zeros((len(stops), 1))], axis=1)
@@ -164,16 +164,17 @@ class KinematicSimulator(DescribedSimulator):
         max_ticks: int,
         rng: np.random.Generator,
     ) -> tuple[np.ndarray, str]:
-        """Drive robots along routes at the same time, until all arrive or one fails.
+        """Drive robots along routes simultaneously, until all arrive or one fails.
 
         Args:
             world: World of the mission.
             poses: Initial positions and headings, shape (robot, 3).
             robots: True robots.
-            routes: Points of the route of each robot, shape (point, 2); None for one without.
-            window: Pixels of the planned surface within which the routes keep: first and end row,
+            routes: Points of the route of each robot, shape (point, 2); None for a robot without a
+                route.
+            window: Pixel window of the planned surface that contains the routes: first and end row,
                 first and end column.
-            max_ticks: Ticks until the status is "timeout".
+            max_ticks: Number of ticks after which the status is "timeout".
             rng: Random numbers.
 
         Returns:
@@ -192,14 +193,14 @@ class KinematicSimulator(DescribedSimulator):
         *,
         expected: bool = False,
     ) -> list[tuple[Drive, np.ndarray, State]]:
-        """Simulate bound k of a mission, from 1, for each cell that may follow it.
+        """Simulate bound k of a mission, from 1, for each possible next cell.
 
-        Moves that alternatives share are simulated once. With `expected`, contact is the
-        probability of detection, if a scan decides by itself about contact.
+        Movements that the alternatives share are simulated once. With `expected`, contact is the
+        probability of detection, provided that contact depends on a single scan.
 
         Returns:
-            For each next cell, the movements, the contact at each tick, shape (tick, robot), and
-            the state after the bound.
+            Movements, contact at each tick, shape (tick, robot), and state after the bound, for
+            each next cell.
         """
         goals = self._posts.stop(cell)[None]
         lead = self._move(world, state, cell, _LEAD, goals, self._max_ticks, rng)
@@ -238,9 +239,9 @@ class KinematicSimulator(DescribedSimulator):
         max_ticks: int,
         rng: np.random.Generator,
     ) -> Drive:
-        """Drive part of the team to goals (robot, 2) in a cell while the others stand.
+        """Drive part of the team to goals (robot, 2) in a cell while the others stand still.
 
-        Routes start at the planned places, robots at their current poses.
+        Routes start at the planned positions, robots at their current poses.
         """
         true, planned = (
             (team.lead, *team.robots)[members] for team in (world.team, self.workspace.team)
@@ -279,7 +280,7 @@ class KinematicSimulator(DescribedSimulator):
 
 
 def _joined(drives: Sequence[Drive]) -> Drive:
-    """Movements one after the other."""
+    """Concatenate movements."""
     poses = np.concatenate([drive.poses for drive in drives])
     moves = np.concatenate([drive.lead_moves for drive in drives])
     return drives[-1]._replace(poses=poses, lead_moves=moves)

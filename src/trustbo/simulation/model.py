@@ -21,7 +21,7 @@ class ModelSimulator(DescribedSimulator):
     """Simulator that draws contact rates from a trust model, and failures from given probabilities.
 
     Posteriors and plans of a campaign can be compared with the truth: `Planner.plan(params)` is the
-    best path, and `Planner.evaluate(path, params)` has the value of another.
+    best path, and `Planner.evaluate(path, params)` evaluates any other path.
     """
 
     def __init__(
@@ -38,19 +38,19 @@ class ModelSimulator(DescribedSimulator):
 
         Args:
             workspace: Planning grid with awareness and passability.
-            params: True parameters, one draw of them.
+            params: True parameters, a single draw.
             model: Trust model with these parameters; by default `PooledTrust()`. Gaussian rates are
-                clipped to [0, 1]: where many are, the data no longer follow the model.
-            awareness: True awareness, if it differs from the workspace's, of bounds (robot, move,
-                row, col, feature); missions measure it along their path.
-            n_ticks: Ticks of each bound, for `"beta_binomial"`.
+                clipped to [0, 1]; if many are clipped, the data no longer follow the model.
+            awareness: True awareness of bounds (robot, move, row, col, feature), by default the
+                workspace's; missions measure it along their path.
+            n_ticks: Number of ticks of each bound, for `"beta_binomial"`.
             p_fail: Probability that each bound ends the mission, shape (move, row, col), such as a
-                draw of `hazard.risk.BoundRisk`; robots are "stuck" then. None for no failures.
+                draw of `hazard.risk.BoundRisk`; failed robots are "stuck". None for no failures.
 
         Raises:
-            TrustboError: Parameters or awareness of other robots or features, or of many draws; or
-                probabilities of other bounds; an `n_ticks` that is missing or not used; a
-                probability outside [0, 1].
+            TrustboError: Parameters or awareness have other robots or features, or several draws;
+                probabilities are for other bounds or outside [0, 1]; or `n_ticks` is missing or not
+                used.
         """
         require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
         require_kind("params", params, Params, "give parameters, such as TrustParams(...)")
@@ -99,7 +99,7 @@ class ModelSimulator(DescribedSimulator):
         return about
 
     def _end(self, cells: list[Cell], seed: int) -> tuple[int, str]:
-        """Number of bounds that are run, and the status that the mission ends with."""
+        """Number of bounds that are run, and the final status of the mission."""
         n = len(cells) - 1
         if self.p_fail is None:
             return n, "ok"

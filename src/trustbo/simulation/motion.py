@@ -30,12 +30,13 @@ def drive(
     max_ticks: int,
     rng: np.random.Generator,
 ) -> tuple[np.ndarray, str]:
-    """Drive along a route as a unicycle that steers for a point ahead on it (pure pursuit).
+    """Drive a unicycle along a route, steering for a point ahead on it (pure pursuit).
 
     Speed falls linearly with the larger of pitch and roll, to a tenth at the limit; a pitch beyond
-    the limit leaves the robot stuck, a roll beyond it tips it over. Wheel slip scales the speed of
-    each tick, s, by a random factor of some 5 %. The route has shape (point, 2), CRS metres; the
-    initial heading is in rad from east, anticlockwise. After `max_ticks` the status is "timeout".
+    the limit leaves the robot stuck, a roll beyond it tips it over. Wheel slip multiplies the speed
+    of each tick by a random factor with a spread of about 5 %. The route has shape (point, 2), CRS
+    metres; the initial heading is in rad from east, anticlockwise. After `max_ticks` the status is
+    "timeout".
 
     Returns poses (x, y, heading) after each tick, shape (tick, 3), and the status.
     """
@@ -63,10 +64,10 @@ def drive_together(
     max_ticks: int,
     rng: np.random.Generator,
 ) -> tuple[np.ndarray, str]:
-    """Drive several robots at the same time (see `drive`), until all arrive or one fails.
+    """Drive several robots simultaneously (see `drive`), until all arrive or one fails.
 
-    A robot without a route is stuck; initial poses (robot, 3). Returns poses after each tick, shape
-    (tick, robot, 3), and the status of the first that fails.
+    A robot without a route is stuck. Initial poses have shape (robot, 3). Returns poses after each
+    tick, shape (tick, robot, 3), and the status of the first robot that fails.
     """
     tracks, failures = [], []
     for pose, robot, route in zip(poses, robots, routes, strict=True):
@@ -89,7 +90,7 @@ def _squared(route, i, x, y):
 
 @_part
 def _within_a_turn(angle):
-    """Angle wrapped to [-pi, pi); a remainder is slow, and rarely needed."""
+    """Angle wrapped to [-pi, pi); the slow remainder is computed only if needed."""
     if -math.pi <= angle < math.pi:
         return angle
     return (angle + math.pi) % (2.0 * math.pi) - math.pi

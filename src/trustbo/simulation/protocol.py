@@ -1,4 +1,4 @@
-"""Protocol of simulators, and what those of this package share."""
+"""Protocol of simulators, and functions shared by the simulators of this package."""
 
 import hashlib
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ class Simulator(Protocol):
     """Simulator that runs a path: one of this package, a custom one, or real robots.
 
     Optional methods: `describe() -> dict` returns settings that a campaign records, and
-    `describe_world(mission) -> dict` those of the world of a mission, for `Truth`. A `Truth` also
+    `describe_world(mission) -> dict` the settings of a mission's world, for `Truth`, which also
     needs the attribute `workspace`.
     """
 
@@ -26,14 +26,14 @@ class Simulator(Protocol):
 
         Args:
             path: Cells, start first.
-            seed: Seed of all that is random.
-            mission: Number of the mission, from 0, where the world changes.
+            seed: Random seed.
+            mission: Number of the mission, from 0, for simulators whose world changes.
         """
         ...
 
 
 class DescribedSimulator(Summary):
-    """Simulator of this package, displayed by the settings that it describes."""
+    """Base class of the package's simulators, displayed by the settings from `describe`."""
 
     def describe(self) -> dict[str, object]:
         """Return the settings that decide what a mission measures."""
@@ -46,7 +46,7 @@ class DescribedSimulator(Summary):
 
 
 def require_path(workspace: Workspace, path: Sequence[Cell]) -> list[Cell]:
-    """Return the cells of a path, at least two, all passable: TrustboError if not."""
+    """Return the cells of a path; TrustboError unless there are at least two, all passable."""
     path = require_cells("path", path)
     cells = [workspace.locate(cell, f"path[{k}]") for k, cell in enumerate(path)]
     if len(cells) < 2:

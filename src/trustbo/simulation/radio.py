@@ -1,4 +1,4 @@
-"""Simulator of another physics: radio contact by a formula, without line of sight or its truth."""
+"""Simulator with different physics: radio contact by a formula, without line of sight."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -24,13 +24,13 @@ _REACH, _WINDOW, _FIELD = 60.0, 20.0, 35.0
 
 
 class RadioSimulator(DescribedSimulator):
-    """Simulator whose contact is a formula of distance, canopy cover, climb and a hidden field.
+    """Simulator with contact as a function of distance, canopy cover, climb and a hidden field.
 
     The mean contact of robot i in the bound from cell a to b is sigma(2.2 - 3.5 c^1.5 d - 0.1 h +
-    0.9 (0.3 + c) tanh(g) + q_i): d, distance of the cells' centres in 60 m; c, mean cover of canopy
-    above 1.5 m between them; h, climb in m; g, a smooth Gaussian field at b, in no map; q_i, the
-    quality of the robot's radio. Rates have Student t noise with 3 degrees of freedom and scale
-    0.06, and are clipped to [0, 1]. No bound fails.
+    0.9 (0.3 + c) tanh(g) + q_i): d is the distance between the cells' centres in units of 60 m, c
+    the mean cover of canopy above 1.5 m between them, h the climb in m, g a smooth Gaussian field
+    at b that is in no map, and q_i the quality of the robot's radio. Rates have Student t noise
+    with 3 degrees of freedom and scale 0.06, and are clipped to [0, 1]. No bound fails.
     """
 
     def __init__(
@@ -39,8 +39,8 @@ class RadioSimulator(DescribedSimulator):
         """Compute the mean contact of every bound.
 
         Args:
-            workspace: A workspace made from a terrain; TrustboError: it has none.
-            terrain: True DEM and DSM, where they differ from the workspace's.
+            workspace: A workspace made from a terrain, else TrustboError.
+            terrain: True DEM and DSM; by default the workspace's.
             seed: Seed of the field and of the radios; by default a hash of the terrain.
         """
         terrain = workspace.terrain if terrain is None else terrain
@@ -74,10 +74,10 @@ class RadioSimulator(DescribedSimulator):
 
 
 def expected_rate(mean: np.ndarray) -> np.ndarray:
-    """Expectation of a rate with its noise, clipped to [0, 1].
+    """Expectation of a noisy rate, clipped to [0, 1].
 
-    E[clip(X, 0, 1)] is the integral of P(X > x) over [0, 1]; that of the distribution function F of
-    Student's t with density f is u F(u) + (freedom + u^2) / (freedom - 1) f(u).
+    E[clip(X, 0, 1)] is the integral of P(X > x) over [0, 1]. The antiderivative of the distribution
+    function F of Student's t with density f is u F(u) + (freedom + u^2) / (freedom - 1) f(u).
     """
 
     def integral(u: np.ndarray) -> np.ndarray:
@@ -88,7 +88,7 @@ def expected_rate(mean: np.ndarray) -> np.ndarray:
 
 
 def _mean_contact(workspace: Workspace, terrain: xr.Dataset, seed: int) -> np.ndarray:
-    """Mean contact by the formula, shape (robot, move, row, col), also of absent bounds."""
+    """Mean contact by the formula, shape (robot, move, row, col), also for absent bounds."""
     grid, step, x, y = workspace.grid, pixel_size(terrain), terrain["x"].values, terrain["y"].values
     dem, dsm = terrain["dem"].values, terrain["dsm"].values
     window: Any = [max(1, round(_WINDOW / one)) for one in step]

@@ -1,8 +1,8 @@
-"""Real-time awareness of the paper: the map fused with the state of the robot that drives.
+"""Real-time awareness of the paper: the map fused with the state of the moving robot.
 
-Each feature is the first principal component of the map's value and of the robot's motion, for
-traversability, or of what its lidar sees, for visibility. The inputs are means over the ticks of a
-bound in which the robot moves.
+Each feature is the first principal component of the map's value and of the robot's motion
+(traversability) or lidar measurements (visibility). The inputs are means over the ticks of a bound
+in which the robot moves.
 """
 
 from collections.abc import Sequence
@@ -34,7 +34,7 @@ class RealtimeAwareness:
     """
 
     def __init__(self, simulator: KinematicSimulator, missions: Sequence[Mission]) -> None:
-        """Fit the indices to calibration missions of a simulator; TrustboError if they are few."""
+        """Fit the indices to calibration missions of a simulator; TrustboError if too few."""
         self._workspace, self._world = simulator.workspace, simulator.world()
         self._tick = simulator.tick
         samples = [self.inputs(bound) for mission in missions for bound in mission.bounds]
@@ -67,7 +67,7 @@ class RealtimeAwareness:
         return found
 
     def measured(self, mission: Mission) -> Mission:
-        """The mission with the features of `SIGNS` as the robots measured them."""
+        """Mission with the features of `SIGNS` as measured by the robots."""
         bounds = []
         for bound in mission.bounds:
             awareness = bound.awareness.copy()
@@ -78,9 +78,9 @@ class RealtimeAwareness:
         return replace(mission, bounds=tuple(bounds))
 
     def _lidar(self, poses: np.ndarray) -> dict[str, np.ndarray]:
-        """Mean range of returns, m, and share of clear beams, each (tick, robot).
+        """Mean range of returns, m, and fraction of clear beams, each (tick, robot).
 
-        The mean range is the integral over range of the share of beams that reach it.
+        The mean range is the integral over range of the fraction of beams that reach it.
         """
         world, robot = self._world, self._world.team.robots[0]
         low, high = np.reshape(world.surface.extent, (2, 2))

@@ -8,23 +8,24 @@ from trustbo.simulation.protocol import DescribedSimulator
 
 
 class ReplaySimulator(DescribedSimulator):
-    """Simulator that replays missions recorded by robots or by another simulator, in their order.
+    """Simulator that replays missions recorded by robots or by another simulator, in order.
 
-    A campaign with the workspace, settings and seed of the recorded one asks for the same paths.
+    A campaign with the same workspace, settings and seed as the recorded one asks for the same
+    paths.
 
     Attributes:
-        missions: All missions, in the order recorded.
+        missions: All missions, in the recorded order.
     """
 
     def __init__(self, missions: Sequence[Mission], *, any_path: bool = False) -> None:
-        """Take the missions.
+        """Store the missions.
 
         Args:
             missions: Recorded missions, such as those of `logs.read_missions`.
-            any_path: Whether to replay a mission also where another path is asked for.
+            any_path: Whether to replay a mission even if its path differs from the one asked for.
 
         Raises:
-            TrustboError: There are no missions, or they are of a log without a map.
+            TrustboError: There are no missions, or they have no map.
         """
         if isinstance(missions, Mission) or not missions:
             raise TrustboError(f"give a list of at least one mission; got {missions!r}.")
@@ -37,10 +38,10 @@ class ReplaySimulator(DescribedSimulator):
         return {"simulator": type(self).__name__, "missions": n, "any_path": self.any_path}
 
     def run(self, path: Sequence[Cell], *, seed: int, mission: int = 0) -> Mission:
-        """Return the mission of a number; `seed` is not used.
+        """Return the mission with a given number; `seed` is not used.
 
         Raises:
-            TrustboError: There is no mission of that number, or it has another path.
+            TrustboError: There is no mission with that number, or it has another path.
         """
         if mission >= len(self.missions):
             raise TrustboError(f"all {len(self.missions)} recorded missions are replayed.")

@@ -1,4 +1,4 @@
-"""Replicates of the bounds of a simulator: contact and status with each bound that can follow."""
+"""Replicates of a simulator's bounds: contact and status for each possible next bound."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
@@ -18,7 +18,7 @@ _DIMS = ("move", "row", "col", "next_move")
 
 
 class Edge(NamedTuple):
-    """A bound, and the bounds that can follow it."""
+    """A bound and its possible next bounds."""
 
     move: int
     left: Cell
@@ -34,7 +34,7 @@ type Outcomes = Iterator[tuple[Edge, list[tuple[float, str]]]]
 
 
 def table_of(contact: np.ndarray, passed: np.ndarray) -> xr.Dataset:
-    """Table as `Truth.bounds`, of arrays (move, row, col, next_move)."""
+    """Table as in `Truth.bounds`, from arrays (move, row, col, next_move)."""
     names = {"move": list(MOVE_NAMES), "next_move": [*MOVE_NAMES, "end"]}
     return xr.Dataset({"contact": (_DIMS, contact), "passed": (_DIMS, passed)}, names)
 
@@ -54,7 +54,7 @@ def edges_of(workspace: Workspace) -> list[Edge]:
 
 
 def replicated(simulator: Any, mission: int, n_replicates: int, seed: int) -> xr.Dataset:
-    """Means over replicates of all bounds."""
+    """Means over the replicates of all bounds."""
     if hasattr(simulator, "expected_contact"):
         return simulator.expected_contact()
     workspace = simulator.workspace
@@ -77,9 +77,9 @@ def replicated(simulator: Any, mission: int, n_replicates: int, seed: int) -> xr
 def _of_bounds(
     simulator: KinematicSimulator, edges: Sequence[Edge], mission: int, n: int, seed: int
 ) -> Outcomes:
-    """Replicates of bounds, which begin where bounds before them ended in the replicate before.
+    """Replicates of bounds, which begin where a preceding bound ended in the previous replicate.
 
-    A zeroth replicate, which is not counted, begins with all robots in their places.
+    A replicate 0, which is not counted, begins with all robots at their stop and posts.
     """
     world = simulator.world(mission, long_run=True)
     ends: dict[tuple[Cell, Cell | None], dict[int, State]] = {}
@@ -107,7 +107,7 @@ def _of_bounds(
 def _of_missions(
     simulator: Any, edges: Sequence[Edge], mission: int, n: int, seed: int
 ) -> Outcomes:
-    """Replicates of bounds as missions of the bound and each that can follow it."""
+    """Replicates of bounds, each as missions of the bound and each possible next bound."""
     for number in range(n):
         for edge in edges:
             outcomes = []

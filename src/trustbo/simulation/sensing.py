@@ -1,4 +1,4 @@
-"""Contact by lidar: scans, which detect a robot or not, and tracks, which outlast some misses.
+"""Contact by lidar: scans that detect a robot or not, and tracks that persist over some misses.
 
 At each tick, each standing robot scans each moving one once.
 """
@@ -28,9 +28,9 @@ class Drive(NamedTuple):
 
 
 def detections(world: World, drives: Sequence[Drive], k: int) -> list[np.ndarray]:
-    """Probability that a scan detects its target, shape (tick, robot) for each drive.
+    """Probability that a scan detects its target, shape (tick, robot), for each drive.
 
-    The drives are alternatives for bound k of a mission, 1 for the first.
+    The drives are alternatives for bound k of a mission, counted from 1.
     """
     team = world.team
     poses = np.concatenate([drive.poses[..., :2] for drive in drives])
@@ -59,11 +59,11 @@ def new_tracks(n_robots: int) -> np.ndarray:
 
 
 def contact_of(detected: np.ndarray, watchers: Sequence[Robot], tracks: np.ndarray) -> np.ndarray:
-    """Contact from scans: a track begins after some detections in a row, and ends after misses.
+    """Contact from scans: tracks begin after successive detections and end after successive misses.
 
-    `detected`, shape (tick, robot), has the outcome of each scan. The lidars of the watchers, one
-    for each robot, give the numbers of scans. The state of the tracks, shape (robot, 2), is updated
-    in place. Returns shape (tick, robot), bool.
+    `detected`, shape (tick, robot), has the outcome of each scan. The numbers of scans are
+    `acquire` and `drop` of the watchers, one for each robot. The state of the tracks, shape (robot,
+    2), is updated in place. Returns shape (tick, robot), bool.
     """
     limits = np.array([[robot.acquire, robot.drop] for robot in watchers])
     contact = np.empty(detected.shape, bool)

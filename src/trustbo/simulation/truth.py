@@ -1,8 +1,8 @@
-"""Truth of a simulator: the expected contact of every bound, the best path, and regret.
+"""Truth of a simulator: expected contact of every bound, best path, and regret.
 
-The expected contact of a bound is a function of three cells: the one left, the one entered and the
-next, as robots take posts that watch the next bound. The best path is then found by dynamic
-programming over bounds and the number of bounds that are left, which is exact.
+The expected contact of a bound depends on three cells: the cell left, the cell entered and the next
+cell, since robots choose posts from which they watch the next bound. The best path is found exactly
+by dynamic programming over bounds and the number of remaining bounds.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,15 +32,15 @@ class Truth(Summary):
     Attributes:
         workspace: Workspace of the paths.
         bounds: Dataset with dims move, row, col and next_move (the eight moves, and "end"):
-            `contact`, the expected contact rate, mean over robots, given that the bound does not
-            fail, 0 where it always did; and `passed`, the probability that it does not fail. NaN
-            where there is no such bound.
+            `contact`, the expected contact rate, averaged over robots, given that the bound does
+            not fail (0 if it failed in all replicates); and `passed`, the probability that it does
+            not fail. NaN where there is no such bound.
     """
 
     def __init__(
         self, workspace: Workspace, bounds: xr.Dataset, of: "Callable[[int], Truth] | None" = None
     ) -> None:
-        """Store the truth of bounds; `of(mission)` finds that of the world of another mission."""
+        """Store the truth of bounds; `of(mission)` computes it for another mission's world."""
         self.workspace, self.bounds, self._of = workspace, bounds, of
 
     def _rows(self) -> Rows:
@@ -58,22 +58,23 @@ class Truth(Summary):
         seed: int = 0,
         folder: FilePath | None = None,
     ) -> Self:
-        """Find the truth of a simulator by replicates of every bound with each that can follow.
+        """Compute the truth of a simulator from replicates of every bound with each next bound.
 
-        A simulator with a method `expected_contact`, which returns `bounds`, has it in closed form.
-        Of a `KinematicSimulator`, a replicate has no noise of detection, and begins where one of
-        the bounds before it ended in the replicate before. Of any other, it is a mission of the
-        bound and the next. Of `Fouling`, contact is the expectation in the long run.
+        If a simulator has a method `expected_contact`, which returns `bounds` in closed form, it is
+        used. For a `KinematicSimulator`, replicates have no detection noise, and begin where a
+        preceding bound ended in the previous replicate. For any other simulator, a replicate is a
+        mission of the bound and the next one. With `Fouling`, contact is the stationary
+        expectation.
 
         Args:
             simulator: Simulator with a `workspace`.
-            mission: Number of the mission, where the world changes.
-            n_replicates: Replicates of every bound.
+            mission: Number of the mission, for simulators whose world changes.
+            n_replicates: Number of replicates of every bound.
             seed: Seed of the replicates.
-            folder: Folder where truths are kept; by default they are not.
+            folder: Folder in which truths are cached; None for no cache.
 
         Raises:
-            TrustboError: A simulator without a workspace, or one whose contact has a memory.
+            TrustboError: The simulator has no workspace, or its contact depends on earlier scans.
         """
         workspace = getattr(simulator, "workspace", None)
         if not isinstance(workspace, Workspace):
@@ -101,23 +102,24 @@ class Truth(Summary):
         return of_mission(mission)
 
     def at(self, mission: int) -> "Truth":
-        """Truth of the world of another mission, counted from 0."""
+        """Truth of another mission's world; missions count from 0."""
         return self if self._of is None else self._of(mission)
 
     def lost(self, path: Sequence[Cell]) -> float:
         """Expected contact lost on a path, in bounds, given that no bound fails.
 
         Raises:
-            TrustboError: A cell is off the grid or impassable, or no neighbour of the last.
+            TrustboError: A cell is off the grid, impassable, or not a neighbour of the previous
+                one.
         """
         contact, _ = self._along(path)
         return float((1.0 - contact).sum())
 
     def lost_or_failed(self, path: Sequence[Cell]) -> float:
-        """Expected contact lost, where a bound that fails or is not reached keeps none.
+        """Expected contact lost if bounds that fail or are not reached keep no contact.
 
         It is sum_k (1 - S_k c_k) for the contact c_k of bound k, where S_k is the probability that
-        it and all bounds before it are completed. Raises as `lost` does.
+        it and all bounds before it are completed. Raises the errors of `lost`.
         """
         contact, passed = self._along(path)
         return float((1.0 - np.cumprod(passed) * contact).sum())
@@ -130,16 +132,16 @@ class Truth(Summary):
         *,
         failures: bool = False,
     ) -> tuple[Cell, ...]:
-        """Find the path of least `lost`, or with `failures` of least `lost_or_failed`, exactly.
+        """Find the exact path with the least `lost` or, with `failures`, `lost_or_failed`.
 
         Args:
             start: First cell, or a position in it, see `Workspace.locate`.
             goal: Last cell, or a position in it.
-            max_bounds: Longest path, as for `Planner`.
+            max_bounds: Maximum number of bounds, as in `Planner`.
             failures: Whether bounds may fail.
 
         Raises:
-            TrustboError: A cell off the grid, or impassable.
+            TrustboError: A cell is off the grid or impassable.
             NoPathError: The goal cannot be reached.
         """
         paths = AdmissiblePaths(self.workspace, start, goal, max_bounds)
@@ -149,10 +151,10 @@ class Truth(Summary):
         return _most_kept(contact, passed, *ends, paths.longest, u_turns=paths.turns)
 
     def regret(self, path: Sequence[Cell], max_bounds: int | str = "shortest+4") -> float:
-        """Regret of a path, in % of the contact that the best path between its ends keeps.
+        """Regret of a path, in % of the contact kept on the best path with the same ends.
 
-        100 (lost on the path - lost on the best) / contact kept on the best, all in bounds.
-        Negative if the path is better than the best of at most `max_bounds`.
+        100 (lost on the path - lost on the best) / contact kept on the best, all in bounds. It is
+        negative if the path is better than the best path of at most `max_bounds` bounds.
         """
         best = self.best(path[0], path[-1], max_bounds)
         least = self.lost(best)
@@ -160,7 +162,7 @@ class Truth(Summary):
         return 100.0 * (self.lost(path) - least) / kept if kept > 0.0 else np.nan
 
     def _along(self, path: Sequence[Cell]) -> tuple[np.ndarray, np.ndarray]:
-        """Contact and probability to pass of the bounds of a path, each shape (bound,)."""
+        """Contact and probability to pass for the bounds of a path, each of shape (bound,)."""
         cells = require_path(self.workspace, path)
         moves, (rows, cols) = moves_along(cells), np.array(cells)[1:].T
         where = moves, rows, cols, np.append(moves[1:], END)
@@ -168,14 +170,14 @@ class Truth(Summary):
 
 
 def _settings(simulator: Any, mission: int) -> object:
-    """Settings of the world of a mission."""
+    """Settings of a mission's world."""
     if hasattr(simulator, "describe_world"):
         return simulator.describe_world(mission)
     return getattr(simulator, "describe", lambda: type(simulator).__name__)()
 
 
 def _kept(folder: FilePath | None, world: str, make: Callable[[], xr.Dataset]) -> xr.Dataset:
-    """Table of bounds of a world from its file in a folder, which is made if it is not there."""
+    """Table of a world's bounds from its file in a folder; computed if the file does not exist."""
     if folder is None:
         return make()
     file = Path(folder) / f"truth-{digest(np.frombuffer(world.encode(), np.uint8))}.nc"
@@ -189,11 +191,11 @@ def _kept(folder: FilePath | None, world: str, make: Callable[[], xr.Dataset]) -
 def _most_kept(
     contact: np.ndarray, passed: np.ndarray, start: Cell, goal: Cell, longest: int, *, u_turns: bool
 ) -> tuple[Cell, ...]:
-    """Path of at most `longest` bounds that loses least, of tables (move, row, col, next_move).
+    """Path of at most `longest` bounds with the least loss; tables (move, row, col, next_move).
 
-    The most contact that is kept on a bound and what follows, V = max p (c + V'), is found backward
-    over the bound and the number of bounds after it, which is exact as the probability p to pass is
-    not negative. Without `u_turns` no bound leads back to the cell that the last one left.
+    The maximum contact kept from a bound on, V = max p (c + V'), is computed backwards over the
+    bound and the number of bounds after it. This is exact, since the probability p to pass is not
+    negative. Without `u_turns`, no bound leads back to the cell that the previous one left.
     """
     follows = np.ones((END, END), bool)  # (move, next move)
     if not u_turns:
@@ -224,7 +226,7 @@ def _most_kept(
 
 
 def _by_cell_left(values: np.ndarray, move: int) -> np.ndarray:
-    """Values of the cells that a move enters, (row, col), by the cell that it leaves."""
+    """Values of the cells that a move enters, (row, col), indexed by the cell that it leaves."""
     (down, right), (rows, cols) = MOVES[move], values.shape
     framed = np.pad(values, 1, constant_values=-np.inf)
     return framed[1 + down :, 1 + right :][:rows, :cols]

@@ -1,4 +1,4 @@
-"""World of a mission: the true terrain, sight and team, as the events of the mission leave them."""
+"""World of a mission: true terrain, sight and team after the mission's events."""
 
 from typing import NamedTuple
 
@@ -14,7 +14,7 @@ from trustbo.workspace.surface import Surface, surface_of
 
 
 class World(NamedTuple):
-    """What decides contact, motion and failure in a mission."""
+    """True conditions that decide contact, motion and failure in a mission."""
 
     surface: Surface
     """True terrain."""
@@ -40,11 +40,11 @@ def world_of(surface: Surface, sight: Sight, team: Team) -> World:
 
 
 def true_surface(workspace: Workspace, terrain: xr.Dataset | None) -> Surface:
-    """Surface that robots are simulated on: the workspace's, or that of another terrain.
+    """Surface used for the simulation: the workspace's, or the surface of another terrain.
 
     Raises:
-        TrustboError: The terrain does not cover the grid, or has another CRS; the workspace has no
-            terrain.
+        TrustboError: The terrain does not cover the grid or has another CRS, or the workspace has
+            no terrain.
     """
     planned = workspace.surface
     if planned is None or workspace.terrain is None:
