@@ -18,7 +18,7 @@ Cell = tuple[int, int]
 Status = Literal["ok", "stuck", "tipped", "timeout", "collision", "lost_contact", "aborted"]
 STATUSES: tuple[str, ...] = get_args(Status)
 NOWHERE: Cell = (-1, -1)
-"""Cell of a bound of a log without a map."""
+"""Cell of the bounds in a log without a map."""
 FEATURES = ("traversability", "visibility")
 """Names of the first two features, z1 and z2 of the paper."""
 LINE_OF_SIGHT = "line_of_sight"
@@ -361,7 +361,7 @@ def default_features(n_features: int) -> tuple[str, ...]:
 
 
 def require_shares(rate: np.ndarray, ticks: np.ndarray) -> None:
-    """Refuse ticks that are not whole and rates that are no multiples of 1 / ticks, (robot,)."""
+    """Refuse ticks that are not whole and rates that are not multiples of 1 / ticks."""
     if ticks.shape != rate.shape:
         raise TrustboError(f"n_ticks of a bound must be {rate.shape}; got shape {ticks.shape}.")
     for i in np.flatnonzero((ticks < 1.0) | (ticks != np.round(ticks)) & ~np.isnan(ticks)):

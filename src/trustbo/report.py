@@ -20,9 +20,9 @@ __all__ = ["write_report"]
 __dir__ = __all__.copy  # completion lists public names alone
 
 _DRAWS = 50
-"""Draws of the posterior behind the map of uncertainty."""
+"""Number of posterior draws for the map of uncertainty."""
 _SHOWN = 3
-"""Bounds of the path that are drawn in detail: those with the least trust."""
+"""Number of bounds drawn in detail, those with the least trust."""
 _ENDS = {"n_iterations": "all missions were run", "interrupted": "it was interrupted"}
 _PAGE = """<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8">

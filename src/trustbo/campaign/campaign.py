@@ -44,7 +44,7 @@ from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Location
 
 _ARRIVES = 0.9
-"""Chance to arrive of a plan below which a campaign without a price of failures warns."""
+"""Arrival probability below which a campaign without a cost of failures issues a warning."""
 _FIT = inspect.signature(fit)
 
 
@@ -389,7 +389,7 @@ class Campaign(Result):
         """Run missions in a simulator, one per step of the returned iterator.
 
         No mission is run before the iteration: `for plan, mission in campaign.run(simulator, 8)`.
-        The arguments are those of `iterate`; `n_iterations` counts earlier missions too.
+        The arguments are the same as in `iterate`; `n_iterations` includes earlier missions.
 
         Yields:
             Plan of each mission and the mission, after the posterior was updated with it.

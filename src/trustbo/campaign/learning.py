@@ -26,7 +26,7 @@ from trustbo.workspace.moves import along, moves_along, require_on_grid
 
 _N_DRAWS, _N_RISKS = 1000, 200
 _STOPPED, _RECOVERED = 2, 0.2
-"""Number of failures that makes a bound avoided, and the failure chance below which it is not."""
+"""Number of failures after which a bound is avoided, unless its failure probability is lower."""
 
 
 def known_along(path: Sequence[Cell], workspace: Workspace) -> np.ndarray:
@@ -40,7 +40,7 @@ def known_along(path: Sequence[Cell], workspace: Workspace) -> np.ndarray:
 
 
 def as_learned(mission: Mission, workspace: Workspace) -> Mission:
-    """Mission with the awareness used for learning: that of the map, which the planner uses too.
+    """Mission with the awareness used for learning: the map's, which the planner uses too.
 
     Weights fitted to measured awareness would be biased when the planner applies them to the map's
     awareness. TrustboError: see `known_along`.

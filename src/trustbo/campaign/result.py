@@ -239,7 +239,7 @@ class Result(Summary):
 
         Returns:
             Dataset over (y, x), the centres of the cells' rows and columns in CRS metres, so that
-            `isel(y=row, x=col)` is a cell; `maps.rio` has the CRS and writes rasters. It holds
+            `isel(y=row, x=col)` is a cell; `maps.rio` has the CRS and writes rasters. It contains
             `trust_mean` and `trust_sd` over the posterior, the mean `cost` 1 - sigma(trust),
             `path_probability` (that a cell is on the best path), and the awareness of each feature,
             averaged over robots, under its name, or as `awareness_<name>` if another map or a dim

@@ -13,9 +13,9 @@ from trustbo.logs.netcdf import read_tree
 from trustbo.planning import Plan
 
 TOLD, LEARNED, EXCLUDED, GIVEN_UP = "told", "learned", "excluded", "given up"
-"""States of a mission: recorded, in the posterior, left out of it, or ended without a report."""
+"""States of a mission: recorded, in the posterior, excluded, or ended without a report."""
 _STREAMS = ("policy", "fit", "mission", "prior", "awareness", "hazard")
-"""Streams of randomness; a seed depends on the position, so new names are added at the end."""
+"""Random streams; a seed depends on the position, so new names are added at the end."""
 COLUMNS = (
     "status", "state", "reason", "where", "contact_rate", "objective", "n_bounds", "path_changed",
     "path",
@@ -59,7 +59,7 @@ class Posterior:
     Attributes:
         name: Name of its file: the number of missions recorded when it was fitted, followed by the
             number of excluded missions if there are any, such as `"0003-1"`.
-        file: File that holds it; None if it is in memory only.
+        file: File that contains it; None if it is in memory only.
     """
 
     def __init__(
@@ -84,7 +84,7 @@ class Entry:
     """A recorded mission.
 
     Attributes:
-        plan: Plan that was asked for.
+        plan: Plan returned by `ask`.
         measured: Mission as measured.
         mission: Mission with the awareness used for learning, see `learning.as_learned`.
         trust_map: Trust map used for planning, dims (row, col).

@@ -6,7 +6,7 @@
     campaign.json         settings, numbers and states; counts the missions that are complete
 
 Every file is written to a temporary name, flushed to disk and renamed. A process that dies at any
-write loses nothing: missions beyond the record's count are learned from when the folder is opened.
+write loses nothing: missions beyond the record's count are processed when the folder is opened.
 """
 
 import itertools

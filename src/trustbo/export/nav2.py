@@ -28,7 +28,7 @@ _MOST_PIXELS = 1e8
 _MOST_IDS = 65_535
 """Largest id in messages of Nav2 (uint16)."""
 _LEAST_COST = 1e-9
-"""Least cost of an edge: the route server refuses 0."""
+"""Minimum cost of an edge: the route server refuses 0."""
 
 
 class Frame(NamedTuple):

@@ -17,11 +17,11 @@ from trustbo.errors import TrustboError, one_line
 
 _SEPARATORS = ",;\t"
 _BLANK = ("", "na", "n/a", "#n/a", "#na", "nan", "nat", "none", "null", "<na>")
-"""Cells without a value, in small letters, as R, Excel, pandas and SQL write them."""
+"""Markers of missing values, in lower case, as written by R, Excel, pandas and SQL."""
 _WHOLE = re.compile(r"^(-?\d+)\.0+$")
 _DECIMAL_COMMA = re.compile(r"^\s*([+-]?\d*),(\d+)\s*$")
 _LONGEST = 7 * 86_400.0
-"""Longest log, s: times that span more are in another unit, or have a stray stamp."""
+"""Longest log, s: a longer span means another unit, or an outlier."""
 
 
 class Columns:

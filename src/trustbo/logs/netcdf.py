@@ -13,7 +13,7 @@ from trustbo.files import FilePath, interpreting, read_file, write_file
 from trustbo.stacking import require_same_team
 
 STATES = ("speed_ratio", "pitch", "roll", "return_range", "visible_share")
-"""State of a robot at a tick: share of its speed on level ground; rad; rad; m; share of beams."""
+"""State of a robot at a tick, see `data.Bound.states`."""
 
 
 def read_tree(path: FilePath) -> xr.DataTree:

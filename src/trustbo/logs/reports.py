@@ -13,7 +13,7 @@ from trustbo.logs.columns import Columns, require_one_spelling
 _YES = ("1", "true", "yes", "success", "succeeded", "ok")
 _NO = ("0", "false", "no", "failure", "failed", "fail")
 _LARGEST = 10.0
-"""Largest input: the prior of its weight is that of an outcome's, which is 0 or 1."""
+"""Largest input: its weight has the same prior as the weight of an outcome, which is 0 or 1."""
 
 
 def read_reports(

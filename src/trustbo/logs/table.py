@@ -15,13 +15,13 @@ from trustbo.workspace import Workspace
 KEYS = ("mission", "bound", "robot")
 RATES = ("contact_rate", "duration", "n_ticks")
 COLUMNS = (*KEYS, "row", "col", *RATES, "t0", "status", "mission_status")
-"""Columns with a fixed meaning; of others, those of features are awareness."""
+"""Columns with a fixed meaning; other columns may be features of awareness."""
 
 
 def to_frame(missions: Sequence[Mission]) -> pd.DataFrame:
     """Table of missions, numbered from 1, without ticks; `to_csv(file, index=False)` writes it.
 
-    Columns are those of `read_table`. Bound 0 is the start cell and has no measurements. Bounds
+    It has the columns of `read_table`. Bound 0 is the start cell and has no measurements. Bounds
     that were planned but not run are blank. A mission without a map has no bound 0.
 
     Raises:

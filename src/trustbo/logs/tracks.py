@@ -18,9 +18,9 @@ _FEATURES = ("near", "ahead", "clear")
 _AHEAD = np.pi / 6.0
 """Half of the angle in which a robot is ahead, rad."""
 _CLOSE = 0.1
-"""Distance to either end of a line of sight within which nothing hides, and least extent, m."""
+"""Distance to the ends of a line of sight within which nothing occludes, and least extent, m."""
 _FEWEST = 2
-"""Bounds of a mission."""
+"""Minimum number of bounds of a mission."""
 
 
 class Tracks:

@@ -32,7 +32,7 @@ _LABELS = {
 }
 """Variables of a history that `campaign_history` draws, and the labels of their axes."""
 SMALL_EFFECT = 0.1
-"""Share of contact below which an effect of a robot changes no plan."""
+"""Size of a robot's effect, as a fraction of contact, below which no plan changes."""
 
 
 @styled

@@ -29,7 +29,7 @@ colours.high = limits[column][1]
 driven.data = paths[n - 1]
 text.text = texts[n - 1]
 """
-"""Code that the browser runs when another layer or mission is chosen."""
+"""JavaScript callback for the choice of another layer or mission."""
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from trustbo.workspace import Workspace
 
 _WIDTH = 7.0
 _MOST_NAMED = 24
-"""Rows and columns above which cells are named at the edges alone."""
+"""Number of rows or columns above which only the edges of the grid are labelled."""
 
 
 @styled

@@ -22,7 +22,7 @@ from trustbo.workspace.grid import Grid, over_cells
 MOMENTS = (1, 2, 4)
 """Missions whose maps are drawn by default, besides the map after the last one."""
 VEGETATION = (0.44, 0.56, 0.39, 0.4)
-"""Green that is partly opaque, for light and dark ground."""
+"""Semi-transparent green, for light and dark ground."""
 _GROWN = 0.5  # least height of vegetation above the ground, m
 _CONTOURS = 12  # levels of contour lines, at most
 _MOST_PIXELS = 400  # side of the raster that contour lines are traced on

@@ -27,17 +27,17 @@ RC: dict[str, Any] = {
     "image.cmap": "viridis",
     "image.interpolation": "nearest",
 }
-"""Settings of matplotlib under which every figure is drawn; colours of text and background, fonts
-and resolution stay those of the user."""
+"""Matplotlib settings of all figures; the user's fonts, resolution and colours of text and
+background are kept."""
 styled = mpl.rc_context(RC)  # pyright: ignore[reportArgumentType]
 """Decorator of a function that draws a figure."""
 ROBOTS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
 """Colours of Okabe and Ito (2008), by robot; markers distinguish robots without colour."""
 MARKERS = "osD^vPX*<>"
 GREY = "0.55"
-"""References and impassable cells, visible on light and on dark ground."""
+"""Colour of references and impassable cells, visible on light and dark backgrounds."""
 PAGE = 7.6
-"""Width of a page, inches: no new figure is wider."""
+"""Width of a page, inches, which is the maximum width of a new figure."""
 
 
 def panels(

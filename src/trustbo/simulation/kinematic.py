@@ -30,7 +30,7 @@ class State(NamedTuple):
     poses: np.ndarray
     """Position and heading of each robot, the lead first, shape (1 + robot, 3)."""
     stops: np.ndarray
-    """Planned places, from which the routes start, shape (1 + robot, 2)."""
+    """Planned positions, at which the routes start, shape (1 + robot, 2)."""
     tracks: np.ndarray
     """State of the lidars' tracks, see `sensing.new_tracks`."""
 

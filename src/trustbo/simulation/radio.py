@@ -20,7 +20,7 @@ from trustbo.workspace.moves import MOVES, moves_along
 FREEDOM, SCALE = 3.0, 0.06
 """Degrees of freedom and scale of the noise of a rate."""
 _REACH, _WINDOW, _FIELD = 60.0, 20.0, 35.0
-"""Distance that counts as one, width of the window of canopy cover, scale of the field, m."""
+"""Unit of distance, width of the window of canopy cover, and scale of the field, m."""
 
 
 class RadioSimulator(DescribedSimulator):

@@ -22,7 +22,7 @@ SIGNS = {
 }
 """Inputs of each feature, and whether they raise it: angles in rad, the range in m."""
 MIN_SAMPLES = 200
-"""Least number of robots x bounds to fit on: with fewer, the loadings are unstable."""
+"""Minimum number of robots x bounds for the fit: with fewer, the loadings are unstable."""
 _SHARES, _ANGLES = np.array([0.25, 0.5, 0.75, 1.0]), np.linspace(0.0, 2.0 * np.pi, 13)[:-1]
 
 

@@ -21,8 +21,8 @@ class ReplaySimulator(DescribedSimulator):
         """Store the missions.
 
         Args:
-            missions: Recorded missions, such as those of `logs.read_missions`.
-            any_path: Whether to replay a mission even if its path differs from the one asked for.
+            missions: Recorded missions, such as the result of `logs.read_missions`.
+            any_path: Whether to replay a mission even if `run` gets another path.
 
         Raises:
             TrustboError: There are no missions, or they have no map.

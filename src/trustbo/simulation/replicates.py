@@ -30,7 +30,7 @@ class Edge(NamedTuple):
 
 
 type Outcomes = Iterator[tuple[Edge, list[tuple[float, str]]]]
-"""Contact, mean over robots, and status of a bound with each that can follow it."""
+"""Contact, averaged over robots, and status of a bound for each possible next bound."""
 
 
 def table_of(contact: np.ndarray, passed: np.ndarray) -> xr.Dataset:

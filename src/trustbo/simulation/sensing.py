@@ -24,7 +24,7 @@ class Drive(NamedTuple):
     status: str
     """Outcome of the bound."""
     stops: np.ndarray
-    """Planned places of the robots afterwards, shape (1 + robot, 2)."""
+    """Planned positions of the robots afterwards, shape (1 + robot, 2)."""
 
 
 def detections(world: World, drives: Sequence[Drive], k: int) -> list[np.ndarray]:

@@ -74,7 +74,8 @@ class Truth(Summary):
             folder: Folder in which truths are cached; None for no cache.
 
         Raises:
-            TrustboError: The simulator has no workspace, or its contact depends on earlier scans.
+            TrustboError: The simulator has no workspace, or contact in a bound depends on all
+                earlier bounds.
         """
         workspace = getattr(simulator, "workspace", None)
         if not isinstance(workspace, Workspace):

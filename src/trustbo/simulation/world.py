@@ -23,12 +23,12 @@ class World(NamedTuple):
     team: Team
     """True lead and robots."""
     detection: np.ndarray
-    """Probability of detection by T2's lidars in clear sight, shape (bound, robot); bounds after
-    the last row are as in it."""
+    """Probability of detection by T2's lidars in clear sight, shape (bound, robot); the last
+    row also applies to later bounds."""
     lead_detection: float
-    """The same of the lead's lidar."""
+    """Probability of detection by the lead's lidar in clear sight."""
     mission: int | None = 0
-    """Number of the mission, from 0; None for the long run over missions."""
+    """Number of the mission, from 0; None for the long-run mean over missions."""
     jams: tuple[tuple[np.ndarray, float], ...] = ()
     """Mask of the pixels inside, shape (row, col), and strength of each jammer."""
 

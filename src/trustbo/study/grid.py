@@ -30,13 +30,13 @@ class Scene(NamedTuple):
     start: Cell
     goal: Cell
     truth: Truth | None = None
-    """Truth of the simulator, by which paths are judged."""
+    """Truth of the simulator, used to evaluate paths."""
     options: Mapping[str, Any] = {}
-    """Options of `Campaign` on this scene, which those of a case replace."""
+    """Options of `Campaign` in this scene; options of a case override them."""
     labels: Mapping[str, Any] = {}
     """Further columns of the table."""
     judged: Mapping[str, Any] = {}
-    """Options of `Truth.best`, such as `max_bounds`, for the path that others are compared with."""
+    """Options of `Truth.best`, such as `max_bounds`, for the reference path."""
 
 
 type Case = Mapping[str, Any] | Callable[[Scene], Mapping[str, Any]]

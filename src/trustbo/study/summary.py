@@ -11,7 +11,7 @@ from trustbo.errors import require_choice
 SHOWN = (0, 1, 3, 8, 15)
 """Numbers of missions after which regret is shown."""
 NEAR = 1.0
-"""Regret in % within which a campaign is near the best path."""
+"""Regret in % below which a recommendation counts as nearly optimal."""
 _RUN = ["case", "scene", "seed"]
 
 
@@ -122,7 +122,7 @@ def bootstrap(
     clusters: np.ndarray,
     middle: Callable[[np.ndarray], Any] | None = None,
 ) -> dict[tuple[str, str], float]:
-    """Estimate and 95 % interval of each quantity; by default medians for those after n missions.
+    """Estimate and 95 % interval of each quantity; by default medians for values after n missions.
 
     Runs of a cluster are resampled together, and all quantities use the same resamples.
     """

@@ -27,9 +27,9 @@ REAL = ("wellington", "tahoe", "bcts", "topography")
 COURSES = ("sw-ne", "nw-se", "n-s", "w-e")
 """Courses through a world: two diagonals, from north to south and from west to east."""
 _STRIP = 250
-"""Rows of a real terrain that are used, those with most data: all but bcts have not many more."""
+"""Number of rows used of a real terrain, those with most data; only bcts has many more."""
 _RELIEF = 0.06
-"""Relief of a synthetic terrain as a share of its longer side."""
+"""Relief of a synthetic terrain as a fraction of its longer side."""
 
 
 def drawn(ground: str, what: str) -> np.random.Generator:

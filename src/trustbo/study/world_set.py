@@ -16,7 +16,7 @@ from trustbo.workspace.sight import Sight
 _SYNTHETIC = tuple(f"synthetic-{seed}" for seed in range(3))
 _ALDER, _BIRCH, _CEDAR = (f"synthetic-{name}" for name in ("alder", "birch", "cedar"))
 _AFTER = 6
-"""First mission, counted from 0, after a change: the seventh to be driven."""
+"""First mission after a change, counted from 0: the seventh mission."""
 _DAYS = (1, 3, 4, 7)
 """Missions with bad weather, counted from 0."""
 

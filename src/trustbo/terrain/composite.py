@@ -12,7 +12,7 @@ from trustbo.errors import TrustboError
 from trustbo.terrain.heights import warn
 
 MAX_PIXELS = 1_000_000
-"""Most samples that an index is fitted on, spread evenly over those given."""
+"""Maximum number of samples for the fit of an index, spread evenly over the given ones."""
 _COLUMNS, _NUMBERS = ("low", "high", "mean", "sd"), ("bottom", "top")
 
 

@@ -31,7 +31,7 @@ TRAVERSABILITY = ("slope", "roughness", "tri", "step_height")
 VISIBILITY = ("vegetation_density", "openness")
 """Pixel features of visibility (z2): vegetation lowers it, openness raises it."""
 PAPER_VISIBILITY = ("canopy_height", "canopy_cover", "openness")
-"""Visibility in the paper's setting; in forest it points the wrong way."""
+"""Visibility in the paper's setting; in forest it has the wrong sign."""
 
 
 class Feature(NamedTuple):

@@ -19,7 +19,7 @@ from trustbo.terrain.read import check_size, read_terrain
 
 GROUND_CLASS, NOISE_CLASSES = 2, (7, 18)
 GROUND_GAP, MAX_GAP = 10.0, 3.0
-"""Largest distance of a pixel from a ground point, and over which a return fills pixels, m."""
+"""Maximum distances of a pixel from a ground point and from the return that fills it, m."""
 
 
 def read_lidar(

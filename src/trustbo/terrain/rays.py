@@ -21,7 +21,7 @@ from trustbo.parallel import PART, over_rows
 _kernel = njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz", "arcp"})
 _part = njit(nogil=True, error_model="numpy", fastmath={"contract", "nsz", "arcp"}, **PART)
 _BLOCK, _RAYS = 4, 16
-"""Side of the squares of pixels that share an openness, and its directions."""
+"""Side of the squares of pixels that share one value of openness, and number of directions."""
 
 
 @_part

@@ -19,10 +19,10 @@ from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError, require_pair
 
 type Location = Cell | Mapping[str, float]
-"""A cell (row, col), or a position with names, see `Grid.locate`."""
+"""A cell (row, col), or a position with named coordinates, see `Grid.locate`."""
 WGS84 = CRS.from_epsg(4326)
 MAX_MISSING = 0.5
-"""Largest share of missing or too steep pixels in a passable cell."""
+"""Maximum fraction of missing or too steep pixels in a passable cell."""
 
 
 @dataclass(frozen=True, repr=False)

@@ -36,7 +36,7 @@ from trustbo.workspace.surface import Surface
 
 _BLOCK = 256  # bounds computed at a time: they share calls, and bound the memory
 N_SAMPLES = 16
-"""Times in each phase at which sight is computed."""
+"""Number of times in each phase at which sight is computed."""
 _AHEAD = 0.5  # cosine of the largest turn that is expected: turns lead to other posts
 
 

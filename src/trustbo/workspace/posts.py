@@ -34,9 +34,9 @@ from trustbo.workspace.sight import Sight, detection_between, jittered, optics
 from trustbo.workspace.surface import surface_of
 
 TRAVERSABLE = "traversability"
-"""Name of the feature that tells easy ground, and that bounds average along their routes."""
+"""Name of the feature that identifies easy ground, and is averaged along the routes of bounds."""
 SPACING, RADIUS = 2.0, 25.0
-"""Least distance between two robots of T2, and largest distance of T2 from the lead's stop, m."""
+"""Minimum distance between robots of T2, and maximum distance of T2 from the lead's stop, m."""
 _GAP = 4.0  # m, between two posts where there is room
 _STEP, _STOP_RADIUS = 4.0, 16.0  # m: of the lattice; of the lead's stop from the cell's centre
 _SMOOTHED = 5.0  # m, over which traversability is averaged

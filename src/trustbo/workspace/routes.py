@@ -14,7 +14,7 @@ from trustbo.workspace.regions import Window
 from trustbo.workspace.surface import Surface
 
 SLOWEST = 0.1
-"""Speed at the slope limit as a share of that on level ground."""
+"""Speed at the slope limit as a fraction of the speed on level ground."""
 _CLEARANCE = 1.0  # m from obstacles, that routes keep where they can: robots drive beside them
 _CLOSE = 4.0  # cost of a metre within it
 _compiled = njit(cache=True, nogil=True, error_model="numpy")
