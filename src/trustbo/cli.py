@@ -115,13 +115,7 @@ def parser() -> argparse.ArgumentParser:
 
 def _add_campaign(add: Any, folder: str) -> None:
     """Add the flags of commands that start a campaign."""
-    add(
-        "--missions",
-        type=_count,
-        default=8,
-        metavar="N",
-        help="total number of missions (default 8)",
-    )
+    add("--missions", type=_count, default=8, metavar="N", help="total missions (default 8)")
     add("--seed", type=int, default=0, metavar="N", help="random seed (default 0)")
     add("--out", type=Path, default=Path(folder), metavar="DIR", help=f"(default {folder})")
     add("--overwrite", action="store_true", help="replace the campaign in that folder")
@@ -136,7 +130,7 @@ def _add_grid(add: Any) -> None:
 
 def _add_stop(add: Any) -> None:
     """Add the flag of the stopping rule."""
-    text = "stop when the path is within this share of the best with probability 0.9"
+    text = "stop when the path is within this fraction of the best with probability 0.9"
     add("--stop-regret", type=float, metavar="SHARE", help=text)
 
 

@@ -33,8 +33,7 @@ class Bound(Summary):
         cell: Planning cell entered, (row, col); `NOWHERE` in a log without a map.
         awareness: Situational awareness, shape (robot, feature), in [0, 1], or any finite values in
             a log without a map; NaN where not measured.
-        contact_rate: Fraction of the running time in contact, shape (robot,); NaN where not
-            measured.
+        contact_rate: Fraction of time in contact, shape (robot,); NaN where not measured.
         duration: Running time of the bound, shape (robot,), s; NaN where not recorded.
         status: Outcome of the bound, `"ok"` or the reason that ended the mission.
         t0: Start of the bound, s since the mission's start.
@@ -210,8 +209,8 @@ class Mission(Summary):
     ) -> Self:
         """Make a mission from the arrays of a log.
 
-        A mission that ended early has fewer bounds than planned, and a status: `from_arrays(path,
-        z, y, status="stuck")`. A bound that was not measured is a row of NaN.
+        A mission that ended early has fewer bounds than planned, and a status:
+        `from_arrays(path, z, y, status="stuck")`. A bound that was not measured is a row of NaN.
 
         Args:
             path: Planned cells, start first; None for a log without a map, whose missions have no
@@ -224,8 +223,7 @@ class Mission(Summary):
             n_ticks: Number of ticks over which `contact_rate` is averaged, shape (bound, robot) or
                 (bound,); None where not recorded.
             features: Names of the features; by default traversability, visibility, z3, ...; a
-                workspace with the same number of features renames z3, ... to its own names, see
-                `Workspace.in_order`.
+                workspace with as many features renames z3, ..., see `Workspace.in_order`.
             robots: Names of the robots; by default r1, r2, ...
 
         Raises:

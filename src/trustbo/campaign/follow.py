@@ -59,8 +59,7 @@ class Follower:
     def begin(self, t: float, cell: Cell | None = None) -> None:
         """Begin the next bound at time `t`, into the planned cell or another one.
 
-        After an unplanned cell, the remaining plan is dropped, and `cell` is required for each
-        bound.
+        After an unplanned cell, the plan is dropped, and each bound requires `cell`.
 
         Raises:
             TrustboError: A bound is in progress, the mission is over, no cell is planned, the cell
@@ -108,8 +107,7 @@ class Follower:
         """End the bound in progress; a status other than `"ok"` ends the mission.
 
         Raises:
-            TrustboError: No bound is in progress, the status is unknown, or the bound has no
-                duration.
+            TrustboError: No bound is in progress, the status is unknown, or the duration is zero.
         """
         self._require(running=True, t=t)
         contacts, ticks = self._counts

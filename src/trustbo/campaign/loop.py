@@ -43,8 +43,8 @@ def iterate(
             `KinematicSimulator(workspace)`.
         truth: Truth of the simulator, `simulation.Truth.of(simulator)`. If given, the history
             records the regret of each plan, in % of the contact kept on the best admissible path.
-        stop: Stopping rules, called between missions: a `RegretBound`, a callable `stop(campaign)
-            -> reason or None`, or several of them.
+        stop: Stopping rules, called between missions: a `RegretBound`, a function of the campaign
+            that returns a reason or None, or several of them.
         directory: Folder that is updated after each mission. If the process dies, `resume`
             continues from it.
         overwrite: Whether to remove another campaign from that folder first.

@@ -32,8 +32,7 @@ class RegretBound:
     Attributes:
         eps: Acceptable regret, as a fraction; 0.05 is 5 %.
         delta: Probability of a larger regret.
-        patience: Number of successive missions after which the condition must hold; `patience` + 1
-            missions are needed at least.
+        patience: Number of successive missions after which the condition must hold.
         n_draws: Number of posterior draws.
 
     Raises:

@@ -96,8 +96,7 @@ def read_bag(path: FilePath, workspace: Workspace, *, topics: Topics = Topics())
         topics: Names of topics, if not the default ones.
 
     Returns:
-        Missions with the ticks of robots. Awareness is NaN; campaigns use the awareness of their
-        map.
+        Missions with the ticks of robots. Awareness is NaN; campaigns use their map's.
 
     Raises:
         TrustboError: rosbags is not installed; the path is not a bag, or the bag is damaged; a

@@ -74,8 +74,7 @@ class Truth(Summary):
             folder: Folder in which truths are cached; None for no cache.
 
         Raises:
-            TrustboError: The simulator has no workspace, or contact in a bound depends on all
-                earlier bounds.
+            TrustboError: The simulator has no workspace, or contact depends on earlier bounds.
         """
         workspace = getattr(simulator, "workspace", None)
         if not isinstance(workspace, Workspace):

@@ -56,9 +56,9 @@ def run_grid(
 
     Each run writes a file named by its case, scene, seed and number of missions; runs whose files
     exist are skipped. Runs are parallelised by joblib; `joblib.parallel_config` selects another
-    backend, such as `backend="dask"` for a cluster. If a policy has a method `learn(campaign,
-    mission)`, it is called after each mission; if it has `recommend(campaign)`, that path replaces
-    the campaign's recommendation.
+    backend, such as `backend="dask"` for a cluster. A policy's method `learn(campaign, mission)`,
+    if any, is called after each mission; if it has `recommend(campaign)`, that path replaces the
+    campaign's recommendation.
 
     Args:
         cases: Cases by name.

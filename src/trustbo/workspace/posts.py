@@ -266,8 +266,7 @@ class Posts:
     def _lattice(self, cell: Cell, here: np.ndarray, radius: float) -> np.ndarray:
         """Lattice of positions (position, 2) around one, connected to it over safe ground.
 
-        The connection lies within the cell and half a cell around it, which the window of every
-        bound contains.
+        The connection lies within half a cell around, which the window of every bound contains.
         """
         steps = np.arange(-radius, radius + 1e-9, _STEP)
         offset = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
