@@ -57,8 +57,8 @@ def run_grid(
     Each run writes a file named by its case, scene, seed and number of missions; runs whose files
     exist are skipped. Runs are parallelised by joblib; `joblib.parallel_config` selects another
     backend, such as `backend="dask"` for a cluster. A policy's method `learn(campaign, mission)`,
-    if any, is called after each mission; if it has `recommend(campaign)`, that path replaces the
-    campaign's recommendation.
+    if any, is called after each mission; the path of its `recommend(campaign)`, if any, replaces
+    the campaign's recommendation.
 
     Args:
         cases: Cases by name.
