@@ -166,12 +166,12 @@ def test_mistakes_are_refused_before_sampling(missions):
     ids=lambda model: model.in_short(),
 )
 def test_nuts_and_importance_sampling_agree(missions, model):
-    """Means within .05 posterior sd, of which Monte Carlo error is a third."""
-    size = {"progress": False, "whole": False, "check": False}
-    ours = fit(missions, model, draws=8000, **size)["posterior"].to_dataset()
+    """Means within .05 posterior sd, or three Monte Carlo errors where points are few."""
+    size, over = {"progress": False, "whole": False, "check": False}, ("chain", "draw")
+    fitted = fit(missions, model, draws=8000, **size)
+    ours, limit = fitted["posterior"].to_dataset(), max(0.05, 3.0 / fitted.attrs["kish"] ** 0.5)
     nuts = fit(missions, model, sampler="nuts", draws=3000, **size)["posterior"].to_dataset()
-    over = ("chain", "draw")
     gap = abs(ours.mean(over) - nuts.mean(over)) / nuts.std(over)
     for name in ("beta0", "beta", "b", "B0", "B", "delta_w", "delta_v", "Delta_w", "Delta_v"):
         if name in gap:
-            assert float(gap[name].max()) < 0.05, name
+            assert float(gap[name].max()) < limit, name
