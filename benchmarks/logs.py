@@ -7,7 +7,10 @@ Halpern, Barfoot and Liu, International Journal of Robotics Research 30 (8), 201
 the user's: their terms are the producer's.
 """
 
+from dataclasses import replace
+
 import numpy as np
+import numpyro.distributions as dist
 import pandas as pd
 from common import Table, arguments, parsed
 
@@ -91,10 +94,13 @@ def memory(logs, window):
     """Log Bayes factor for trust that carries over from one bound to the next."""
     table = Table("window", "half", "for beta0 > 0", "beta0")
     for name, tracks in logs.items():
-        posterior = tb.fit(tb.logs.missions_of(tracks, window), MODELS["counts"], progress=False)
-        beta0 = float(posterior["posterior"]["beta0"].mean())
-        found = tb.inference.memory(posterior)
-        table.row(f"{window:g} s", name, f"{found.log_bf:.1f}", f"{beta0:.2f}")
+        missions, model = tb.logs.missions_of(tracks, window), MODELS["counts"]
+        model = model.for_features(missions[0].features)
+        none = replace(model, priors=replace(model.priors, beta0=dist.Beta(1.0, 1e6)))
+        carried, other = (tb.fit(missions, m, progress=False, whole=False) for m in (model, none))
+        factor = carried.attrs["log_evidence"] - other.attrs["log_evidence"]
+        beta0 = float(carried["posterior"]["beta0"].mean())
+        table.row(f"{window:g} s", name, f"{factor:.1f}", f"{beta0:.2f}")
 
 
 def main():

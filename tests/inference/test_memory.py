@@ -1,17 +1,18 @@
 """Whether trust carries over between bounds: evidence against quadrature, and simulated rates."""
 
+from dataclasses import replace
+
 import jax
 import numpy as np
+import numpyro.distributions as dist
 import pytest
 from references import dense_log_likelihood
 from scipy import stats
 
 import trustbo as tb
-from trustbo.errors import TrustboError
 from trustbo.inference.fit import by_importance
-from trustbo.inference.memory import Memory
 from trustbo.inference.posterior import Posterior
-from trustbo.models import CoupledTrust, PlaceEffect, PooledTrust, RobotEffect, TrustParams
+from trustbo.models import PlaceEffect, PooledTrust, RobotEffect, TrustParams
 
 FEATURES = ["line_of_sight", "slope"]
 
@@ -36,10 +37,16 @@ def missions_with(beta0, n=4):
     )
 
 
+def without_memory(model):
+    """The model with beta0 = 0 but for 1e-6."""
+    model = model.for_features(FEATURES)
+    return replace(model, priors=replace(model.priors, beta0=dist.Beta(1.0, 1e6)))
+
+
 def test_the_evidence_without_memory_is_that_of_quadrature():
     """Over both noises, half-normal a priori."""
-    model = PooledTrust().for_features(FEATURES)
-    posterior = Posterior(model, model.slots(missions_with(0.3, 1)), memoryless=True)
+    model = without_memory(PooledTrust())
+    posterior = Posterior(model, model.slots(missions_with(0.3, 1)))
     found = by_importance(posterior, 1000, 0)[2]["log_evidence"]
 
     p = (np.arange(80) + 0.5) / 80
@@ -60,25 +67,16 @@ def test_the_evidence_without_memory_is_that_of_quadrature():
     ids=["pooled", "robots", "censored"],
 )
 def test_memory_is_found_where_it_is_and_not_where_it_is_not(model):
-    carried, not_carried = (
-        tb.inference.memory(tb.fit(missions_with(beta0), model, whole=False))
-        for beta0 in (0.5, 0.0)
-    )
-    assert carried.log_bf > 3.0
-    assert abs(carried.beta0 - 0.5) < 0.25
-    assert not_carried.log_bf < 0.0
-    assert not_carried.p_none > 0.5
-
-
-def test_p_none_follows_from_the_bayes_factor():
-    assert Memory(0.0, 0.3, 0.1).p_none == 0.5
-    assert Memory(2000.0, 0.9, 0.1).p_none == 0.0
-
-
-def test_models_without_one_beta0_are_refused():
-    posterior = tb.fit(missions_with(0.3, 2), CoupledTrust(), whole=False, check=False)
-    with pytest.raises(TrustboError, match="beta0"):
-        tb.inference.memory(posterior)
+    models = model, without_memory(model)
+    for beta0 in (0.5, 0.0):
+        missions = missions_with(beta0)
+        fits = [tb.fit(missions, m, whole=False) for m in models]
+        with_memory, without = (fit.attrs["log_evidence"] for fit in fits)
+        if beta0:
+            assert with_memory - without > 3.0
+            assert abs(float(fits[0]["posterior"]["beta0"].mean()) - 0.5) < 0.25
+        else:
+            assert with_memory < without
 
 
 @pytest.fixture(scope="module")

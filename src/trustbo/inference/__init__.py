@@ -9,10 +9,8 @@ from trustbo.inference.draws import params_of, sample_prior
 from trustbo.inference.filter import TrustFilter
 from trustbo.inference.fit import fit
 from trustbo.inference.loo import compare, loo
-from trustbo.inference.memory import memory
 from trustbo.inference.place_maps import place_maps
 from trustbo.inference.reports import predict_reports
-from trustbo.inference.sbc import sbc
 from trustbo.inference.score import score
 from trustbo.inference.tree import complete
 
@@ -24,12 +22,10 @@ __all__ = [
     "diagnostics",
     "fit",
     "loo",
-    "memory",
     "params_of",
     "place_maps",
     "predict_reports",
     "sample_prior",
-    "sbc",
     "score",
 ]
 __dir__ = __all__.copy  # completion lists public names alone

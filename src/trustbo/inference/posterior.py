@@ -58,14 +58,11 @@ class Given(NamedTuple):
 class Posterior:
     """Posterior of a trust model's hyperparameters, coefficients and signals."""
 
-    def __init__(self, model: TrustModel, slots: Slots, *, memoryless: bool = False) -> None:
-        """Lay out the columns of missions; without memory, beta0 is fixed at 0."""
-        self.model, self.slots, self.memoryless = model, slots, memoryless
+    def __init__(self, model: TrustModel, slots: Slots) -> None:
+        """Lay out the columns of missions."""
+        self.model, self.slots = model, slots
         self.layout = model.layout(slots)
-        hyperpriors = model.all_hyperpriors(slots)
-        if memoryless:
-            del hyperpriors["beta0"]
-        self.scores = Scores(hyperpriors)
+        self.scores = Scores(model.all_hyperpriors(slots))
         self.n_scores = self.scores.n_scores
         columns = [effect.columns(slots) for effect in model.columns]
         self._ends = np.cumsum([0, *(U.shape[1] for U in columns)])
@@ -90,7 +87,7 @@ class Posterior:
 
     def without(self, mission: int) -> "Posterior":
         """The posterior without the data of one mission."""
-        other = Posterior(self.model, self.slots.without([mission]), memoryless=self.memoryless)
+        other = Posterior(self.model, self.slots.without([mission]))
         if not self.exact:
             kept = ~np.isnan(other.terms.y)
             other.sites = ep.Sites(*(np.where(kept, site, 0.0) for site in self.sites))
@@ -98,11 +95,7 @@ class Posterior:
 
     def theta(self, z: np.ndarray) -> dict[str, np.ndarray]:
         """Hyperparameters for the model's `signal`, at scores (point, score)."""
-        values = self.scores.values(z)
-        if self.memoryless:
-            shape = (len(z), *self.model.all_hyperpriors(self.slots)["beta0"].batch_shape)
-            values["beta0"] = np.zeros(shape)
-        return self.model.theta(values, self.slots.resolution)
+        return self.model.theta(self.scores.values(z), self.slots.resolution)
 
     def log_density(self, z: np.ndarray) -> np.ndarray:
         """Log posterior density of scores (point, score), up to the evidence; shape (point,)."""
@@ -226,10 +219,7 @@ class Posterior:
 
     def draw_prior(self, n: int, rng: np.random.Generator, *, even: bool = False) -> Draws:
         """Draws of hyperparameters and columns from the prior; `even` as of `Scores.draw`."""
-        values = self.scores.draw(n, rng, even=even)
-        if self.memoryless:
-            values["beta0"] = np.zeros(n)
-        theta = self.model.theta(values, self.slots.resolution)
+        theta = self.model.theta(self.scores.draw(n, rng, even=even), self.slots.resolution)
         c = [self.prior(chunk).draw(rng) for _, chunk in chunks(theta)]
         return Draws(theta, np.concatenate(c))
 
