@@ -83,8 +83,8 @@ def check(
     weight, if its sign contradicts the prior's; coverage, if the share of rates inside 90 %
     intervals one mission ahead differs from .9 by more than .05 and two standard errors over
     missions; a comparison, if another model predicts left-out missions better by two standard
-    errors. For the shape of predictions see `az.plot_loo_pit(tb.inference.by_rate(posterior))`, for
-    the sensitivity to the priors `az.psense_summary(posterior)`.
+    errors. For the shape of predictions see `pit` of `tb.inference.score`, for the sensitivity to
+    the priors `az.psense_summary(posterior)`.
 
     Args:
         posterior: DataTree from `fit`; or all posteriors of a campaign, `Result.posteriors`: the

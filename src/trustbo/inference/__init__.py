@@ -3,7 +3,6 @@
 from trustbo.models import backend as backend  # first: it loads numpyro
 
 # isort: split
-from trustbo.inference.by_rate import by_rate
 from trustbo.inference.diagnostics import diagnostics
 from trustbo.inference.draws import params_of, sample_prior
 from trustbo.inference.filter import TrustFilter
@@ -16,7 +15,6 @@ from trustbo.inference.tree import complete
 
 __all__ = [
     "TrustFilter",
-    "by_rate",
     "compare",
     "complete",
     "diagnostics",

@@ -77,10 +77,9 @@ def fit(
         delta_w, delta_v), one for each kind of effects, `latent` (trust[chain, draw, mission,
         bound, robot], and trust_mean and trust_sd over all draws), `posterior_predictive`, `prior`,
         `prior_predictive`, `log_prior`, `log_likelihood` (contact_rate[chain, draw, mission]: a
-        whole mission is one observation, so LOO leaves out missions; see `by_rate`),
-        `sample_stats`, `observed_data` and
-        `constant_data`. Bound k is labelled k = 1, 2, ...; short missions are padded with NaN.
-        If all rates have n_ticks, log-likelihoods are of the tick counts, hence comparable between
+        whole mission is one observation, so LOO leaves out missions), `sample_stats`,
+        `observed_data` and `constant_data`. Bound k is labelled k = 1, 2, ...; short missions are
+        padded with NaN. If all rates have n_ticks, log-likelihoods are of the tick counts, hence comparable between
         observation families; see the attribute `log_likelihood_of`.
 
     Raises:

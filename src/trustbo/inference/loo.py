@@ -48,12 +48,9 @@ def loo(posterior: xr.DataTree, *, model: TrustModel | None = None) -> ELPDData:
         the refit.
 
     Raises:
-        TrustboError: If fewer than two missions have rates, or the posterior is a view from
-            `by_rate`.
+        TrustboError: If fewer than two missions have rates.
     """
     posterior = require_posterior("loo", posterior)
-    if "observed_data" in posterior.children and "rate" in posterior["observed_data"].dims:
-        raise TrustboError("loo leaves out missions; of a view by rate, give the posterior itself.")
     fitted, draws = read_posterior(posterior, model=model)
     fitted.settle(draws.theta)
     measured = np.flatnonzero(~np.isnan(fitted.slots.y).all((1, 2)))

@@ -16,7 +16,7 @@ from trustbo.models.effects.effect import Theta
 from trustbo.models.model import TrustModel
 from trustbo.models.people import HumanTrust
 from trustbo.models.scores import Scores
-from trustbo.models.signal import Layout, Signal, each
+from trustbo.models.signal import Signal, each
 from trustbo.models.slots import Slots
 
 _CHUNK = 16  # points evaluated at once
@@ -66,8 +66,7 @@ class Posterior:
         self.n_scores = self.scores.n_scores
         columns = [effect.columns(slots) for effect in model.columns]
         self._ends = np.cumsum([0, *(U.shape[1] for U in columns)])
-        self._columns = sparse.hstack(columns, format="csr")
-        self._U = self.layout.columns(self._columns)
+        self._U = self.layout.columns(sparse.hstack(columns, format="csr"))
         self.exact = model.family.gaussian
         y = self.layout.rows(slots.y)
         apart, order = not self.exact, self._order()
@@ -300,12 +299,6 @@ class Posterior:
         f = self.layout.slots(mean + (root @ rng.standard_normal((*mean.shape, 1)))[..., 0])
         sd = signal.sd[..., None] if signal.sd.shape[2] == 1 else self.layout.slots(signal.sd)
         return self.model.family.sample(f, sd, self.slots.n_ticks, rng)
-
-    def by_robot(self) -> tuple[Blocks, Layout]:
-        """Blocks whose rows are rates of robots instead of contrasts, and their layout."""
-        layout = self.model.layout(self.slots, contrasts=False)
-        U = layout.columns(self._columns)
-        return Blocks.of(layout.rows(self.slots.y), U, layout.label), layout
 
     def _at(self, theta: Theta) -> tuple[Signal, Prior]:
         return self.model.signal(theta, self.slots, self.layout), self.prior(theta)
