@@ -18,11 +18,6 @@ def posterior(missions):
     return fit(missions, PooledTrust(), seed=1)
 
 
-def tick(live, seen):
-    """Take in one tick; NaN where a robot did not look."""
-    return live.update_ticks(np.nan_to_num(seen), ~np.isnan(np.asarray(seen, dtype=float)))
-
-
 def mixture(n_draws=4, seed=0):
     rng = np.random.default_rng(seed)
     draws = [random_params(rng) for _ in range(n_draws)]
@@ -109,14 +104,10 @@ def test_impossible_values_leave_the_filter_as_it_was(posterior):
     """Trust of 44 is what a filter says that takes 85 for the contact of a tick."""
     _, params = mixture()
     live, good = TrustFilter(params, n_robots=3), np.full((3, 2), 0.5)
-    for call in (live.update, live.begin_bound):
-        rates = [[0.5] * 3] if call == live.update else []
-        with pytest.raises(
-            TrustboError, match=r"awareness: \[0, 0\] = 80 is outside \[0, 1\] \(per"
-        ):
-            call(good * 160, *rates)
-        with pytest.raises(TrustboError, match="awareness must be an array of numbers; got 'high'"):
-            call("high", *rates)
+    with pytest.raises(TrustboError, match=r"awareness: \[0, 0\] = 80 is outside"):
+        live.update(good * 160, [0.5] * 3)
+    with pytest.raises(TrustboError, match="awareness must be an array of numbers"):
+        live.update("high", [0.5] * 3)
     with pytest.raises(TrustboError, match=r"awareness: \[1, 0, 0\] = -1 is outside"):
         live.predict([good, good - 1.5])
     with pytest.raises(TrustboError, match=r"n_ticks\[0\] = 0 must be a whole number"):
@@ -125,10 +116,7 @@ def test_impossible_values_leave_the_filter_as_it_was(posterior):
         live.update(good, [0.5] * 3, n_ticks=25)
     with pytest.raises(TrustboError, match="n_ticks of a bound must be"):
         live.update(good, [0.5] * 3, n_ticks=[4, 4])
-    live.begin_bound(good)
-    with pytest.raises(TrustboError, match="n_contact"):
-        tick(live, [85, 90, np.nan])
-    assert 0.0 < tick(live, [1.0, 0.0, np.nan]).mean[0] < 1.5
+    assert 0.0 < live.update(good, [1.0, 0.0, np.nan]).mean[0] < 1.5
     for most in (0, 2.5):
         with pytest.raises(TrustboError, match="max_draws must be a whole number from 1 on"):
             TrustFilter(params, 3, max_draws=most)
@@ -175,66 +163,7 @@ def test_families_are_followed_to_the_trust_of_a_grid(family):
         assert abs(live._log_weight[0] - expected) < 0.03
 
 
-@pytest.mark.parametrize("family", ["gaussian", "censored", "beta_binomial"])
-def test_ticks_add_up_to_the_bound(family):
-    p, rng = OF_FAMILY[family], np.random.default_rng(0)
-    params = constant(p, 3)._replace(b=p.b + np.array([-0.1, 0.0, 0.1]))
-    ticks, bounds = rng.uniform(size=(4, 25, 3)) < 0.8, rng.uniform(size=(4, 3, 2))
-    by_tick, by_bound = (TrustFilter(params, 3, observation=family) for _ in range(2))
-    for seen, z in zip(ticks, bounds, strict=True):
-        by_tick.begin_bound(z)
-        for one in seen:
-            running = tick(by_tick, one)
-        ended = by_tick.end_bound()
-        np.testing.assert_array_equal(running.mean, ended.mean)
-        state = by_bound.update(z, seen.mean(0), n_ticks=25)
-        np.testing.assert_allclose(ended.mean, state.mean, rtol=1e-12)
-        np.testing.assert_allclose(ended.sd, state.sd, rtol=1e-12)
-        np.testing.assert_allclose(by_tick.weights, by_bound.weights, rtol=1e-10)
-    assert by_tick.n_bounds == 4
-
-
-@pytest.mark.parametrize("family", ["gaussian", "beta_binomial"])
-def test_ticks_together_are_ticks_one_by_one(family):
-    rng = np.random.default_rng(5)
-    seen = np.where(rng.uniform(size=(40, 2)) < 0.2, np.nan, rng.uniform(size=(40, 2)) < 0.7)
-    params = constant(OF_FAMILY[family], 30)
-    one, many = (TrustFilter(params, 2, observation=family) for _ in range(2))
-    for live in (one, many):
-        live.begin_bound(np.full((2, 2), 0.5))
-    for seen_now in seen:
-        last = tick(one, seen_now)
-    for part in np.split(seen, [7, 30]):
-        state = many.update_ticks(np.nansum(part, 0), (~np.isnan(part)).sum(0))
-    np.testing.assert_array_equal(state.mean, last.mean)
-    np.testing.assert_array_equal(many.end_bound().sd, one.end_bound().sd)
-
-
-def test_counts_of_ticks_that_cannot_be_are_refused():
-    live = TrustFilter(constant(OF_FAMILY["gaussian"]), 2)
-    live.begin_bound(np.full((2, 2), 0.5))
-    for contacts, ticks in (([3, 1], [2, 1]), ([-1, 0], [2, 1]), ([np.nan, 0], [2, 1])):
-        with pytest.raises(TrustboError, match="n_contact must be from 0 to n_ticks"):
-            live.update_ticks(contacts, ticks)
-    with pytest.raises(TrustboError, match=r"n_ticks must be \(2,\); got shape \(\)"):
-        live.update_ticks([1, 1], 2)
-
-
-def test_a_robot_that_did_not_look_is_not_measured():
-    params = constant(OF_FAMILY["censored"])
-    live, other = (TrustFilter(params, 2, observation="censored") for _ in range(2))
-    live.begin_bound(np.full((2, 2), 0.5))
-    tick(live, [1.0, np.nan])
-    np.testing.assert_allclose(
-        live.end_bound().mean, other.update(np.full((2, 2), 0.5), [1.0, np.nan]).mean
-    )
-    with pytest.raises(TrustboError, match="no bound runs: call begin_bound"):
-        tick(live, [1.0, 1.0])
-    live.begin_bound(np.full((2, 2), 0.5))
-    with pytest.raises(TrustboError, match="a bound runs: call end_bound"):
-        live.update(np.full((2, 2), 0.5), [1.0, 1.0])
-    with pytest.raises(TrustboError, match="n_contact"):
-        tick(live, [1.0, 1.0, 0.0])
+def test_counts_need_their_numbers_of_ticks():
     counting = TrustFilter(constant(OF_FAMILY["beta_binomial"]), 2, observation="beta_binomial")
     with pytest.raises(TrustboError, match="The beta-binomial family counts ticks"):
         counting.update(np.full((2, 2), 0.5), [1.0, 1.0])

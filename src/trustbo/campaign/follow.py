@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from copy import copy
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -50,6 +51,8 @@ class Follower:
         self._started = self._begun = self._now = -np.inf  # of the mission, the bound, and now
         self.running = False
         self._counts = np.zeros((2, self._n_robots))  # ticks with contact, and ticks
+        self._bound: Any = None  # awareness and cells of the bound in progress
+        self._ended = self._filter  # the filter if this bound ended now
 
     @property
     def rest(self) -> tuple[Cell, ...]:
@@ -73,13 +76,13 @@ class Follower:
             raise TrustboError(f"no cell is planned after {here}; give the cell of the bound.")
         cell = planned[0] if cell is None else require_pair("cell", cell)
         (known,) = known_along((here, cell), self._campaign.workspace)
-        self._filter.begin_bound(known, (here, cell))
+        counts, bound = np.zeros((2, self._n_robots)), (known, (here, cell))
+        self.trust = self._end_with(counts, bound)  # as predicted
         if planned != (cell,):
             self.path = (*self.path[: len(self.bounds) + 1], cell)
         self._started = self._started if self.bounds else t
         self._begun = self._now = t
-        self.running, self._counts = True, np.zeros((2, self._n_robots))
-        self.trust = self._filter.update_ticks(*self._counts)  # as predicted
+        self.running, self._counts, self._bound = True, counts, bound
 
     def tick(self, t: float, in_contact: ArrayLike) -> None:
         """Add a tick to the bound in progress.
@@ -98,10 +101,9 @@ class Follower:
         measured = ~np.isnan(seen)
         if seen.shape != (self._n_robots,) or not np.isin(seen[measured], (0.0, 1.0)).all():
             raise TrustboError(f"in_contact must be 0, 1 or NaN for each robot; got {seen}.")
-        ticks = np.nan_to_num(seen), measured
-        self.trust = self._filter.update_ticks(*ticks)
-        self._counts += ticks
-        self._now = t
+        counts = self._counts + np.stack([np.nan_to_num(seen), measured])
+        self.trust = self._end_with(counts, self._bound)
+        self._counts, self._now = counts, t
 
     def end(self, t: float, status: str = "ok") -> None:
         """End the bound in progress; a status other than `"ok"` ends the mission.
@@ -110,15 +112,12 @@ class Follower:
             TrustboError: No bound is in progress, the status is unknown, or the duration is zero.
         """
         self._require(running=True, t=t)
-        contacts, ticks = self._counts
-        n_ticks = np.where(ticks > 0.0, ticks, np.nan)
+        rates, n_ticks = _rates(self._counts)
         unknown = np.full((self._n_robots, len(self._campaign.workspace.features)), np.nan)
         seconds = np.full(self._n_robots, t - self._begun)
         since = self._begun - self._started
-        bound = Bound(
-            self.rest[0], unknown, contacts / n_ticks, seconds, status, since, n_ticks=n_ticks
-        )
-        self.trust = self._filter.end_bound()
+        bound = Bound(self.rest[0], unknown, rates, seconds, status, since, n_ticks=n_ticks)
+        self._filter = self._ended
         self.running, self._now = False, t
         self.bounds = (*self.bounds, bound)
 
@@ -133,10 +132,7 @@ class Follower:
         rest = list(self.rest)
         if len(rest) < 2:
             raise TrustboError(f"no cell is planned after {rest[0]}.")
-        after = copy(self._filter)  # which replaces its arrays, and changes none of them
-        if self.running:
-            after.end_bound()
-        return after.predict(known_along(rest, self._campaign.workspace), rest)
+        return self._ended.predict(known_along(rest, self._campaign.workspace), rest)
 
     def to_mission(self) -> Mission:
         """Mission of the completed bounds; its awareness is NaN, because it is not measured.
@@ -155,6 +151,13 @@ class Follower:
             status = "aborted"
         return Mission(self.path, self.bounds, status, workspace.features, workspace.team.names)
 
+    def _end_with(self, counts: np.ndarray, bound: Any) -> TrustState:
+        """Trust if a bound ended now with these counts of ticks."""
+        rates, n_ticks = _rates(counts)
+        self._ended = copy(self._filter)  # which replaces its arrays, and changes none of them
+        known, cells = bound
+        return self._ended.update(known, rates, cells, n_ticks=n_ticks)
+
     def _require(self, *, running: bool, t: float) -> None:
         """Raise TrustboError for a call in the wrong state, or a time before the last one."""
         if running != self.running:
@@ -163,6 +166,13 @@ class Follower:
             )
         if not self._now <= t < np.inf:
             raise TrustboError(f"t = {t} s must be finite, and not before {self._now} s.")
+
+
+def _rates(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rates from counts of contact and ticks (2, robot), and the ticks; NaN without a tick."""
+    contacts, ticks = counts
+    n_ticks = np.where(ticks > 0.0, ticks, np.nan)
+    return contacts / n_ticks, n_ticks
 
 
 def _filter_of(campaign: Campaign) -> TrustFilter:

@@ -1,4 +1,4 @@
-"""Filtering of trust in real time, bound by bound or tick by tick during a mission."""
+"""Filtering of trust during a mission, bound by bound."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
@@ -199,8 +199,7 @@ class TrustFilter:
     p(trust, parameters | earlier missions, bounds 1..k), exact up to the number of draws and moment
     matching.
 
-    Use `update` after each bound, or `begin_bound`, `update_ticks` and `end_bound` during it; trust
-    after any tick is computed as if the bound ended now.
+    To follow a bound tick by tick, update a copy with the rate so far, as `tb.Follower` does.
 
     Attributes:
         params: Parameter draws, leading axis (draw,).
@@ -266,7 +265,6 @@ class TrustFilter:
         self._beliefs = self.dynamics.start()
         self._log_weight, self.weights = np.zeros(n), np.full(n, 1.0 / n)
         self.n_bounds = 0
-        self._running: Any = None  # predicted trust at its end, and its counts of ticks
 
     @property
     def state(self) -> TrustState:
@@ -295,61 +293,24 @@ class TrustFilter:
         Raises:
             TrustboError: If the number of robots or features differs; awareness is NaN or a value
                 is outside [0, 1]; ticks are missing or inconsistent with the rate; the bound is
-                missing, off the grid or between cells that are not neighbours; or a bound is
-                running.
+                missing, off the grid or between cells that are not neighbours.
         """
-        self._require_running(running=False)
-        predicted = self._predicted(awareness, bound)
+        z, effect = self._checked(awareness, 2), self.effects(bound, 1)[0]
         y = as_array("contact_rate", contact_rate)
-        self._require_shape("contact_rate", y)
+        if y.shape != (self._n_robots,):
+            raise TrustboError(f"contact_rate must be ({self._n_robots},); got shape {y.shape}.")
         require_unit_interval("contact_rate", y)
         if n_ticks is not None:
             n_ticks = as_array("n_ticks", n_ticks)
             n_ticks = n_ticks if n_ticks.ndim else np.full(y.shape, n_ticks)
             require_shares(y, n_ticks)
-        return self._commit(predicted, y, broadcast_ticks(self.family, n_ticks, y.shape))
-
-    def begin_bound(self, awareness: ArrayLike, bound: tuple[Cell, Cell] | None = None) -> None:
-        """Begin a bound, before its ticks; see `update` for arguments and errors."""
-        self._require_running(running=False)
-        self._running = self._predicted(awareness, bound), np.zeros((2, self._n_robots))
-
-    def update_ticks(self, n_contact: ArrayLike, n_ticks: ArrayLike) -> TrustState:
-        """Update trust with one or more ticks of the running bound.
-
-        Args:
-            n_contact: Number of these ticks with contact, (robot,).
-            n_ticks: Number of ticks measured, (robot,).
-
-        Returns:
-            Trust as if the bound ended now with the rate so far; shapes (robot,).
-
-        Raises:
-            TrustboError: If the number of robots differs, no bound was begun, a number is negative
-                or NaN, or there are more ticks with contact than ticks.
-        """
-        self._require_running(running=True)
-        contacts, ticks = as_array("n_contact", n_contact), as_array("n_ticks", n_ticks)
-        for name, numbers in (("n_contact", contacts), ("n_ticks", ticks)):
-            self._require_shape(name, numbers)
-        if not ((contacts >= 0.0) & (contacts <= ticks)).all():
-            raise TrustboError(
-                f"n_contact must be from 0 to n_ticks; got {contacts} of {ticks} ticks."
-            )
-        predicted, counts = self._running
-        self._running = predicted, counts + np.array([contacts, ticks])
-        beliefs, gained = self.dynamics.update(predicted, *_rates(self._running[1]))
-        return _average(beliefs, _normalised(self._log_weight + gained))
-
-    def end_bound(self) -> TrustState:
-        """End the running bound and update trust with its rate, as `update` does.
-
-        Raises:
-            TrustboError: If no bound was begun.
-        """
-        self._require_running(running=True)
-        (predicted, counts), self._running = self._running, None
-        return self._commit(predicted, *_rates(counts))
+        n_ticks = broadcast_ticks(self.family, n_ticks, y.shape)
+        predicted = self.dynamics.predict(self._beliefs, z, effect)
+        self._beliefs, gained = self.dynamics.update(predicted, y, n_ticks)
+        self._log_weight = self._log_weight + gained  # a copy of the filter keeps its own
+        self.weights = _normalised(self._log_weight)
+        self.n_bounds += 1
+        return self.state
 
     def predict(
         self,
@@ -383,27 +344,6 @@ class TrustFilter:
         mean, sd = (np.stack(column) for column in zip(*trust, strict=True))
         low, high = np.quantile(draws, (0.05, 0.95), axis=0)
         return TrustForecast(mean, sd, draws.mean(0), low, high, draws)
-
-    def _predicted(self, awareness: ArrayLike, bound: tuple[Cell, Cell] | None) -> Beliefs:
-        """Predicted trust after a bound."""
-        z, effect = self._checked(awareness, 2), self.effects(bound, 1)[0]
-        return self.dynamics.predict(self._beliefs, z, effect)
-
-    def _commit(self, predicted: Beliefs, y: np.ndarray, n_ticks: np.ndarray) -> TrustState:
-        self._beliefs, gained = self.dynamics.update(predicted, y, n_ticks)
-        self._log_weight = self._log_weight + gained  # a copy of the filter keeps its own
-        self.weights = _normalised(self._log_weight)
-        self.n_bounds += 1
-        return self.state
-
-    def _require_running(self, *, running: bool) -> None:
-        """Raise TrustboError unless a bound is running, or not running, as required."""
-        if running != (self._running is not None):
-            raise TrustboError(
-                "no bound runs: call begin_bound(awareness) first."
-                if running
-                else "a bound runs: call end_bound() first."
-            )
 
     def effects(self, path: Sequence[Cell] | None, n_bounds: int) -> Sequence[Effect]:
         """Effect of each bound's place; 0 where there are none. Checks the path's cells."""
@@ -444,16 +384,6 @@ class TrustFilter:
         if self._bounded:
             require_unit_interval("awareness", z)
         return z
-
-    def _require_shape(self, name: str, values: np.ndarray) -> None:
-        if values.shape != (self._n_robots,):
-            raise TrustboError(f"{name} must be ({self._n_robots},); got shape {values.shape}.")
-
-
-def _rates(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rates from counts of contact and ticks (2, robot), NaN without a tick; and the ticks."""
-    contacts, ticks = counts
-    return contacts / np.where(ticks > 0.0, ticks, np.nan), ticks
 
 
 def ticks_ahead(n_ticks: ArrayLike, shape: tuple[int, int]) -> np.ndarray:

@@ -79,8 +79,8 @@ def fit(
         `prior_predictive`, `log_prior`, `log_likelihood` (contact_rate[chain, draw, mission]: a
         whole mission is one observation, so LOO leaves out missions), `sample_stats`,
         `observed_data` and `constant_data`. Bound k is labelled k = 1, 2, ...; short missions are
-        padded with NaN. If all rates have n_ticks, log-likelihoods are of the tick counts, hence comparable between
-        observation families; see the attribute `log_likelihood_of`.
+        padded with NaN. If all rates have n_ticks, log-likelihoods are of the tick counts, hence
+        comparable between observation families; see the attribute `log_likelihood_of`.
 
     Raises:
         TrustboError: If there are no missions, or they differ in robots or features; an awareness
