@@ -1,11 +1,12 @@
 """Missions made for tests, and the parameters that they are drawn from."""
 
-import jax
 import numpy as np
 from hypothesis import strategies as st
 
 from trustbo.data import NOWHERE, Bound, Mission
-from trustbo.models import PooledTrust, TrustParams
+from trustbo.models import TrustParams
+from trustbo.models.families import FAMILIES
+from trustbo.models.simulate import draw_missions
 
 TRUTH = TrustParams(0.6, np.array([0.3, 0.2]), 0.05, 0.05, 0.05)
 N_TICKS = 20
@@ -16,11 +17,17 @@ OF_FAMILY = {
 }
 
 
+def draw_rates(params, awareness, *, family="gaussian", n_ticks=np.nan, seed=0):
+    """Rates (mission, bound, robot) that a model draws for given parameters."""
+    rng, ticks = np.random.default_rng([0, seed, 0x6D697373]), np.full(awareness.shape[:3], n_ticks)
+    return draw_missions(FAMILIES[family], params, awareness, ticks, rng)
+
+
 def simulate_missions(n_missions=6, seed=0, truth=TRUTH, lengths=(7, 5, 8)):
     """Missions of three robots whose rates the pooled model draws."""
     rng = np.random.default_rng(seed)
     awareness = rng.uniform(size=(n_missions, 8, 3, 2))
-    sample = PooledTrust().simulate(jax.random.key(seed), truth, awareness)
+    sample = draw_rates(truth, awareness, seed=seed)
     missions = []
     for j in range(n_missions):
         n = lengths[j % len(lengths)]
@@ -34,8 +41,7 @@ def counted_missions(family, seed=0, n=6, low=0.0):
     """Awareness, rates in shares of `N_TICKS`, one missing, and their missions of one robot."""
     rng = np.random.default_rng(seed)
     z = rng.uniform(size=(n, 5, 1, 2))
-    model = PooledTrust(observation=family)
-    y = model.simulate(jax.random.key(seed), OF_FAMILY[family], z, n_ticks=N_TICKS)
+    y = draw_rates(OF_FAMILY[family], z, family=family, n_ticks=N_TICKS, seed=seed)
     y = np.round(np.clip(y, low, 1.0 - low) * N_TICKS) / N_TICKS
     y[0, 2] = np.nan
     path = [(0, k) for k in range(6)]

@@ -5,14 +5,12 @@ import os
 import shutil
 from pathlib import Path
 
-import jax
 import numpy as np
 import xarray as xr
-from missions import TRUTH
+from missions import TRUTH, draw_rates
 
 import trustbo as tb
 from trustbo.data import Mission
-from trustbo.models import PooledTrust
 from trustbo.terrain import synthetic_terrain
 from trustbo.terrain.read import read_terrain
 from trustbo.workspace import Workspace
@@ -62,9 +60,7 @@ class ModelSimulator:
         status = "ok"
         if self.fail_at is not None:
             z, status = z[: self.fail_at], "stuck"
-        sample = PooledTrust().simulate(
-            jax.random.key(seed, impl="threefry2x32"), self.truth, z[None]
-        )
+        sample = draw_rates(self.truth, z[None], seed=seed)
         if self.blind:
             z = np.full_like(z, np.nan)
         rates = np.clip(sample[0], 0.0, 1.0)

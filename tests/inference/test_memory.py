@@ -2,10 +2,10 @@
 
 from dataclasses import replace
 
-import jax
 import numpy as np
 import numpyro.distributions as dist
 import pytest
+from missions import draw_rates
 from references import dense_log_likelihood
 from scipy import stats
 
@@ -23,8 +23,7 @@ def simulated(truth, n=4, seed=0):
     missions = []
     for _ in range(n):
         z = rng.uniform(size=(12, 3, 2))
-        key = jax.random.key(int(rng.integers(1000)))
-        y = np.clip(PooledTrust().simulate(key, truth, z[None])[0], 0.0, 1.0)
+        y = np.clip(draw_rates(truth, z[None], seed=int(rng.integers(1000)))[0], 0.0, 1.0)
         missions.append(tb.Mission.from_arrays(path, z, y, features=FEATURES))
     return missions
 

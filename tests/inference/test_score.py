@@ -1,9 +1,15 @@
 """Scores of predictions against joint normals written out, and against simulation."""
 
-import jax
 import numpy as np
 import pytest
-from missions import N_TICKS, OF_FAMILY, counted_missions, simulate_missions, walking_missions
+from missions import (
+    N_TICKS,
+    OF_FAMILY,
+    counted_missions,
+    draw_rates,
+    simulate_missions,
+    walking_missions,
+)
 from references import DenseOfPlaces, dense_joint
 from scipy import stats
 
@@ -116,7 +122,7 @@ def test_pit_of_rates_that_the_model_draws_are_uniform_with_limits_of_censored_o
     truth = OF_FAMILY["censored"]._replace(delta_w=0.4)
     z = np.random.default_rng(0).uniform(size=(60, 5, 1, 2))
     model = PooledTrust(observation="censored")
-    y = model.simulate(jax.random.key(0), truth, z)
+    y = draw_rates(truth, z, family="censored")
     assert 0.2 < np.isin(y, (0.0, 1.0)).mean() < 0.8
     path = [(0, k) for k in range(6)]
     missions = [Mission.from_arrays(path, a, b) for a, b in zip(z, y, strict=True)]

@@ -5,13 +5,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar, Self
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import numpyro
 import numpyro.distributions as dist
-from jax import Array
-from numpy.typing import ArrayLike
 from numpyro.distributions import Distribution
 from scipy import sparse
 
@@ -22,16 +19,12 @@ from trustbo.models.backend import namespace
 from trustbo.models.effects.effect import Effect, Theta, sample_columns
 from trustbo.models.effects.weights import Weights
 from trustbo.models.families import FAMILIES, Family
-from trustbo.models.params import Params, assemble_params, check_params
+from trustbo.models.params import Params, assemble_params
 from trustbo.models.priors import Priors
 from trustbo.models.signal import Layout, Signal
-from trustbo.models.simulate import draw_missions
-from trustbo.models.slots import Slots, broadcast_ticks, require_ticks
+from trustbo.models.slots import Slots, require_ticks
 from trustbo.stacking import stack_missions
 from trustbo.workspace import Workspace
-
-_STREAM = 0x6D697373  # of `simulate`, among all that a seed gives
-
 
 MODELS: dict[str, type["TrustModel"]] = {}
 """Classes of models by name, to read models from files."""
@@ -222,39 +215,6 @@ class TrustModel(Summary, ABC):
     def params(self, sites: Mapping[str, Any]) -> Params:
         """Parameters from values (draw, ...) by name, with the axes of `dims`."""
         return assemble_params(sites, self.x0, self.memory)
-
-    def simulate(
-        self,
-        key: Array,
-        params: Params,
-        awareness: ArrayLike,
-        n_ticks: ArrayLike | None = None,
-    ) -> np.ndarray:
-        """Contact rates (mission, bound, robot) drawn from the model for given parameters.
-
-        Args:
-            key: Random key.
-            params: Parameters without leading axes; with place effects, pass `params.along(path)`.
-            awareness: Shape (mission, bound, robot, feature).
-            n_ticks: Ticks of each bound, of shape (mission, bound, robot) or broadcast to it; the
-                beta-binomial family needs them.
-
-        Raises:
-            TrustboError: If awareness has other axes; the parameters have leading axes, or other
-                robots or features; a covariance is not positive definite; or n_ticks is missing.
-        """
-        z = np.asarray(awareness, dtype=float)
-        if z.ndim != 4 or params.leading:
-            raise TrustboError(
-                "awareness must be (mission, bound, robot, feature) and the parameters one draw; "
-                f"got {z.shape}, and parameters with leading axes {params.leading}."
-            )
-        check_params(params, z.shape[2], z.shape[3])
-        ticks = broadcast_ticks(self.family, n_ticks, z.shape[:3])
-        # The last number: else key 0 would give the stream of `default_rng(0)`, which awareness
-        # may well have been drawn from.
-        rng = np.random.default_rng([*np.asarray(jax.random.key_data(key)).ravel(), _STREAM])
-        return draw_missions(self.family, params, z, ticks, rng)
 
     def options(self) -> dict[str, Any]:
         """Options to record, by name, without priors, effects and the default memory."""

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cache, cached_property
-from typing import Any, NoReturn, cast
+from typing import Any, cast
 
 import numpy as np
 import numpyro.distributions as dist
@@ -138,13 +138,6 @@ class HumanTrust(PooledTrust):
         white = np.sqrt(np.maximum(values, 0.0)) * rng.standard_normal(values.shape)
         unit = center + np.einsum("djpq,djq->djp", vectors, white)
         return unit * self.effect.sds(theta)[:, None]
-
-    def simulate(self, *args: Any, **options: Any) -> NoReturn:
-        """Not supported; raises TrustboError."""
-        raise TrustboError(
-            "HumanTrust simulates no missions for given parameters, as persons have effects: fit "
-            "reports; the posterior has posterior_predictive."
-        )
 
     def _rows(self) -> Rows:
         kept = [row for row in super()._rows() if row[0] not in ("rates", "scale")]

@@ -13,7 +13,15 @@ def draw_missions(
     n_ticks: np.ndarray,
     rng: np.random.Generator,
 ) -> np.ndarray:
-    """Contact rates, see `TrustModel.simulate`: x_k = B0 x_{k-1} + u_k + w_k, y_k by the family."""
+    """Contact rates (mission, bound, robot): x_k = B0 x_{k-1} + u_k + w_k, y_k by the family.
+
+    Args:
+        family: Observation family.
+        params: One draw of the parameters; with place effects, `params.along(path)`.
+        awareness: Shape (mission, bound, robot, feature).
+        n_ticks: Ticks of each bound, (mission, bound, robot).
+        rng: Random number generator.
+    """
     n_missions, n_bounds, n_robots = shape = awareness.shape[:3]
     B0 = params.transition(n_robots)
     as_map = np.moveaxis(awareness, 2, 0)[:, None]  # (robot, 1, mission, bound, feature)

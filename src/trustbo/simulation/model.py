@@ -2,19 +2,20 @@
 
 from collections.abc import Sequence
 
-import jax
 import numpy as np
 from numpy.typing import ArrayLike
 
 from trustbo.data import Cell, Mission
 from trustbo.errors import TrustboError, require_kind, require_whole
 from trustbo.models import PooledTrust
-from trustbo.models.backend import own_settings
 from trustbo.models.model import TrustModel
 from trustbo.models.params import Params, check_params
+from trustbo.models.simulate import draw_missions
 from trustbo.simulation.protocol import DescribedSimulator, require_path
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import along, moves_along
+
+_STREAM = 0x6D697373  # among all streams of a seed
 
 
 class ModelSimulator(DescribedSimulator):
@@ -76,9 +77,11 @@ class ModelSimulator(DescribedSimulator):
         """Run a path; the same seed gives the same mission, whatever its number."""
         cells = require_path(self.workspace, path)
         z = np.swapaxes(along(self.awareness, cells), 0, 1)
-        with own_settings():  # else the caller's flags decide what is drawn
-            key = jax.random.key(require_whole("seed", seed, 0))
-        sample = self.model.simulate(key, self.params.along(cells), z[None], self.n_ticks)
+        # Without the last number, seed 0 would give the stream of `default_rng(0)`.
+        rng = np.random.default_rng([0, require_whole("seed", seed, 0), _STREAM])
+        of_bounds = np.full((1, *z.shape[:2]), np.nan if self.n_ticks is None else self.n_ticks)
+        params = self.params.along(cells)
+        sample = draw_missions(self.model.family, params, z[None], of_bounds, rng)
         rates = np.clip(sample[0], 0.0, 1.0)
         n, status = self._end(cells, seed)
         ticks = None if self.n_ticks is None else np.full(rates[:n].shape, self.n_ticks)
