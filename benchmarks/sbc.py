@@ -94,16 +94,13 @@ def rank(model, missions, n, seed, n_ranked=N_RANKED):
         posterior = Posterior(model, slots._replace(y=rates))
         drawn, _, summary = by_importance(posterior, n_ranked, int(rng.integers(2**31)))
         if summary["k_hat"] <= MAX_KHAT:
-            found, true = (numbers(posterior.named(d, rng)) for d in (drawn, truth))
+            found, true = (numbers(posterior.named(d)) for d in (drawn, truth))
             ranks.append({name: int((found[name] < true[name][0]).sum()) for name in found})
     return pd.DataFrame(ranks), n - len(ranks)
 
 
 def numbers(groups):
-    """Draws of every parameter, and of the first and last element of each effect.
-
-    Coefficients of single persons and constants are omitted.
-    """
+    """Draws of every parameter, and of the first and last element of each effect."""
     found = {}
     for group, variables in groups.items():
         for name, values in variables.items():
@@ -111,8 +108,7 @@ def numbers(groups):
             columns = range(flat.shape[1])
             if group != "posterior":
                 columns = sorted({0, flat.shape[1] - 1})
-            if name != "person":
-                found |= {label(name, values, i): flat[:, i] for i in columns}
+            found |= {label(name, values, i): flat[:, i] for i in columns}
     return {n: v for n, v in found.items() if len(v) == 1 or np.ptp(v) > 0.0}
 
 

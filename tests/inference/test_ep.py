@@ -23,8 +23,7 @@ def small(observation, y):
 def by_quadrature(posterior, theta):
     """Log p(rates | theta) by a grid over both signals, coefficients integrated out."""
     signal, prior = posterior._at(theta)
-    layout = posterior.layout
-    U = layout.columns(posterior._columns).toarray()
+    U = posterior.blocks.U.toarray()
     c_cov = np.diag(1.0 / np.concatenate([part[0] for part in prior.parts]))
     T = signal.T[0, 0]
     mean = signal.m[0, 0] + T @ U @ prior.mean[0]

@@ -75,7 +75,7 @@ def test_any_model_has_any_effects_and_is_read_back_as_it_was(name):
     missions = walking_missions(0, 3)
     posterior = fit(missions, MODELS[name], check=False, **QUIET)
     fitted, draws = read_posterior(posterior)
-    named = fitted.named(draws, np.random.default_rng(0))["posterior"]
+    named = fitted.named(draws)["posterior"]
     for site, values in named.items():
         if not site.startswith("mean_"):
             kept = posterior["posterior"][site].values

@@ -61,7 +61,7 @@ def test_every_parameter_and_the_ends_of_effects_are_ranked():
     assert ranks.max().max() <= 40
 
 
-def test_people_are_ranked_without_their_own_parts():
+def test_what_people_share_is_ranked():
     ranks, _ = rank(HumanTrust(scale="likert7"), sbc.people(4, 3), 2, 0)
     assert {"beta0", "tau_gain", "beta[1]"} <= set(ranks)
 

@@ -16,7 +16,6 @@ from trustbo.models.effects.effect import Effect, Theta
 from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.model import TrustModel
 from trustbo.models.params import Params, RobotParams, assemble_params
-from trustbo.models.people import HumanTrust
 from trustbo.models.record import effects_from_record, model_from_record
 from trustbo.models.slots import Slots
 from trustbo.workspace import Workspace
@@ -249,7 +248,7 @@ def sample_prior(
     require_kind("model", model, TrustModel, "give one such as PooledTrust()")
     n_draws, seed = require_whole("n_draws", n_draws, 1), require_whole("seed", seed, 0)
     prior, rng = _prior(model, n_features, n_robots), np.random.default_rng(seed)
-    return model.params(prior.named(prior.draw_prior(n_draws, rng), rng)["posterior"])
+    return model.params(prior.named(prior.draw_prior(n_draws, rng))["posterior"])
 
 
 def prior_mean(model: TrustModel, n_features: int, *, n_robots: int = 1) -> Params:
@@ -257,7 +256,7 @@ def prior_mean(model: TrustModel, n_features: int, *, n_robots: int = 1) -> Para
     prior, rng = _prior(model, n_features, n_robots), np.random.default_rng(0)
     draws = prior.draw_prior(_N_MEAN, rng, even=True)
     draws = draws._replace(c=prior.prior(draws.theta).mean)
-    sites = prior.named(draws, rng)["posterior"]
+    sites = prior.named(draws)["posterior"]
     return model.params({name: values.mean(0, keepdims=True) for name, values in sites.items()})
 
 
@@ -267,8 +266,7 @@ def _prior(model: TrustModel, n_features: int, n_robots: int) -> Posterior:
     n_features, n_robots = (require_whole(name, n, 1) for name, n in sizes.items())
     none = np.full((1, 1, n_robots), np.nan)
     z = np.zeros((1, 1, n_robots, n_features))
-    bare = model if isinstance(model, HumanTrust) else replace(model, effects=())
-    return Posterior(bare, Slots(none, z, none, ("",) * n_features))
+    return Posterior(replace(model, effects=()), Slots(none, z, none, ("",) * n_features))
 
 
 def missions_of(posterior: xr.DataTree) -> list[Mission]:

@@ -164,13 +164,13 @@ def _laid_out(
 ) -> xr.DataTree:
     """Draws of parameters and effects, and of the prior, as a DataTree with the data."""
     rng = np.random.default_rng([seed, 3])
-    groups = posterior.named(drawn, rng)
+    groups = posterior.named(drawn)
     groups = {
         group: {name: v.reshape(*shape, *v.shape[1:]) for name, v in values.items()}
         for group, values in groups.items()
     }
     places, model = groups.pop("places", None), posterior.model
-    before = posterior.named(posterior.draw_prior(_N_PRIOR, rng), rng)["posterior"]
+    before = posterior.named(posterior.draw_prior(_N_PRIOR, rng))["posterior"]
     groups["sample_stats"] = {name: v.reshape(*shape, *v.shape[1:]) for name, v in stats.items()}
     groups["prior"] = {name: values[None] for name, values in before.items()}
     tree = to_datatree(groups, missions, model.dims, model.effects)

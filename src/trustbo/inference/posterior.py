@@ -14,7 +14,6 @@ from trustbo.inference.importance import Student, find_mode, smoothed, systemati
 from trustbo.models.backend import namespace
 from trustbo.models.effects.effect import Theta
 from trustbo.models.model import TrustModel
-from trustbo.models.people import HumanTrust
 from trustbo.models.scores import Scores
 from trustbo.models.signal import Signal, each
 from trustbo.models.slots import Slots
@@ -190,7 +189,7 @@ class Posterior:
             drawn.append(draw_columns(prior, fit, count[where], rng))
         return np.concatenate(drawn)
 
-    def named(self, draws: Draws, rng: np.random.Generator) -> dict[str, dict[str, np.ndarray]]:
+    def named(self, draws: Draws) -> dict[str, dict[str, np.ndarray]]:
         """Variables of draws by group and name: `posterior`, and one for each effect."""
         model, theta = self.model, draws.theta
         names = model.dims.keys() | model.effect_dims.keys()
@@ -198,11 +197,6 @@ class Posterior:
         for effect, a, b in zip(model.columns, self._ends[:-1], self._ends[1:], strict=True):
             named = effect.named(draws.c[:, a:b], theta, self.slots)
             groups.setdefault(effect.noun or "posterior", {}).update(named)
-        if isinstance(model, HumanTrust) and draws.f is not None:
-            persons = np.empty((len(draws.c), self.slots.n_missions, 4))
-            for i, chunk, _, mean in self.signals(draws):
-                persons[i] = model.persons(chunk, draws.f[i] - mean, self.slots, rng)
-            groups[model.effect.noun] = {"person": persons}
         return groups
 
     def draws_of(self, groups: Mapping[str, Mapping[str, np.ndarray]]) -> Draws:

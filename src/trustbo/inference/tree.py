@@ -14,6 +14,7 @@ from trustbo.inference.draws import (
     require_posterior,
     sites_of,
 )
+from trustbo.inference.posterior import Posterior
 from trustbo.models.effects.effect import Effect
 from trustbo.models.model import TrustModel
 from trustbo.models.scores import log_density
@@ -176,14 +177,14 @@ def complete(
     index = {name: posterior["posterior"][name] for name in ("chain", "draw")}
     densities = {
         name: (("chain", "draw"), by_chain(values))
-        for name, values in log_prior(fitted.model, sites_of(posterior)).items()
+        for name, values in log_prior(fitted, sites_of(posterior)).items()
     }
     whole["log_prior"] = xr.DataTree(xr.Dataset(densities, index))
     whole.attrs = posterior.attrs | {"log_likelihood_of": "ticks" if counted else "contact_rate"}
     return whole
 
 
-def log_prior(model: TrustModel, sites: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+def log_prior(fitted: Posterior, sites: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Log prior density (draw,) of each parameter with an independent prior, up to a constant.
 
     Deviations of robots from a common mean belong to the model, not to the prior: for
@@ -191,10 +192,12 @@ def log_prior(model: TrustModel, sites: Mapping[str, np.ndarray]) -> dict[str, n
     coupled model has density det(R)^(concentration - 1).
 
     Args:
-        model: Trust model.
+        fitted: Model given missions.
         sites: Parameters of the posterior, (draw, ...).
     """
-    rest, densities = model.derived(sites)["rest"], {}
+    model, priors = fitted.model, fitted.scores.priors
+    rest = model.derived(sites)["rest"]
+    densities = {n: log_density(prior, sites[n]) for n, prior in priors.items() if n in sites}
     for name, (field, values) in model.prior_terms(sites).items():
         given = rest.reshape(*rest.shape, *(1,) * (values.ndim - rest.ndim))
         densities[name] = model.priors.log_density(field, values, given)
@@ -204,7 +207,4 @@ def log_prior(model: TrustModel, sites: Mapping[str, np.ndarray]) -> dict[str, n
             correlation = sites[noise] / (sd[..., :, None] * sd[..., None, :])
             log_det = np.linalg.slogdet(correlation)[1]
             densities[f"correlation_{noise[-1]}"] = (model.priors.concentration - 1.0) * log_det
-    for effect in model.effects:
-        for name, prior in effect.hyperpriors().items():
-            densities[name] = log_density(prior, sites[name])
     return {name: values.reshape(len(values), -1).sum(1) for name, values in densities.items()}

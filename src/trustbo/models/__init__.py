@@ -6,7 +6,6 @@ from trustbo.models import backend as backend  # first: it loads numpyro
 from trustbo.models.contact_rate import ContactRate
 from trustbo.models.coupled import CoupledTrust
 from trustbo.models.default import default_model
-from trustbo.models.effects.person import PersonEffect
 from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.effects.robot import RobotEffect
 from trustbo.models.hierarchical import HierarchicalTrust
@@ -20,7 +19,6 @@ __all__ = [
     "CoupledTrust",
     "HierarchicalTrust",
     "HumanTrust",
-    "PersonEffect",
     "PlaceEffect",
     "PooledTrust",
     "Priors",

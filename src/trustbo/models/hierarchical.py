@@ -32,10 +32,8 @@ class HierarchicalTrust(PooledTrust):
         return super().hyperpriors(n_robots, n_features) | spreads
 
     def prior_terms(self, sites: Mapping[str, np.ndarray]) -> dict[str, tuple[str, np.ndarray]]:
-        """See `TrustModel.prior_terms`: means, spreads, memory and noises."""
-        fields = {"mean_beta": "beta", "mean_b": "b", "tau_beta": "tau", "tau_b": "tau"}
-        names = [name for name in self.dims if name not in ("beta", "b")]
-        return {name: (fields.get(name, name), sites[name]) for name in names}
+        """See `TrustModel.prior_terms`: means of the robots' coefficients."""
+        return {"mean_beta": ("beta", sites["mean_beta"]), "mean_b": ("b", sites["mean_b"])}
 
     @property
     def dims(self) -> dict[str, tuple[str, ...]]:

@@ -151,8 +151,8 @@ class TrustModel(Summary, ABC):
         return None
 
     def prior_terms(self, sites: Mapping[str, np.ndarray]) -> dict[str, tuple[str, np.ndarray]]:
-        """Field of `Priors` and values of each parameter with an independent prior, by label."""
-        return {name: (name, sites[name]) for name in self.dims}
+        """Field of `Priors` and values of each parameter that is not a hyperparameter, by label."""
+        return {name: (name, sites[name]) for name in ("beta", "b")}
 
     def slots(self, missions: Sequence[Mission], workspace: Workspace | None = None) -> Slots:
         """Rates and features of missions, with further data that the model's effects need.

@@ -2,17 +2,16 @@
 
 from dataclasses import dataclass
 from functools import cache, cached_property
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import numpyro.distributions as dist
 
 from trustbo.data import levels_of
 from trustbo.display import Rows
-from trustbo.errors import TrustboError
+from trustbo.errors import TrustboError, require_positive
 from trustbo.models.backend import namespace, own_settings
-from trustbo.models.effects.effect import Effect, Theta
-from trustbo.models.effects.person import PARTS, PersonEffect
+from trustbo.models.effects.effect import Theta
 from trustbo.models.families import FAMILIES, Family, Levels
 from trustbo.models.pooled import PooledTrust
 from trustbo.models.priors import Priors
@@ -21,6 +20,8 @@ from trustbo.models.slots import Slots
 
 SUCCESS, FAILURE = "success", "failure"
 """Prefixes of the names of features that are outcomes."""
+SDS = "tau_start", "tau_level", "tau_gain"
+"""Sds of the persons' coefficients."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -30,49 +31,52 @@ class HumanTrust(PooledTrust):
     x^k = base^k + d^k,  d^k = beta0 d^{k-1} + gains . inputs^k + delta_w w^k,  d^0 = 0,
 
     base^k = b + weights . features^k + the person's level; the person's start enters d^1, and the
-    person's gains enter d^k. Inputs are the features whose names begin with `success` or `failure`:
-    outcomes, which may be scaled by demands. A person is stored as a mission, a step as a bound,
-    and a rated task as a robot. `trustbo.logs.read_reports` makes such missions.
+    person's gains enter d^k. Start, level and gains are independent with means 0 and sds tau_start,
+    tau_level and tau_gain. As a person has no other missions, they are a term in the covariance of
+    the person's trust instead of columns. Inputs are the features whose names begin with `success`
+    or `failure`: outcomes, which may be scaled by demands. A person is stored as a mission, a step
+    as a bound, and a rated task as a robot. `trustbo.logs.read_reports` makes such missions.
 
     Attributes:
         scale: `"unit"`, numbers in [0, 1], censored at 0 and 1; or `"likert7"`, seven levels with
             cut points halfway between them, and logistic noise with sd delta_v.
+        tau_start: Scale of the half-normal prior of the sd of trust at the first bound.
+        tau_level: Scale of the half-normal prior of the sd of the level to which trust returns.
+        tau_gain: Scale of the half-normal prior of the sd of the gains from success and failure.
 
     Raises:
-        TrustboError: If the scale is unknown, or there are effects other than `PersonEffect`.
+        TrustboError: If the scale is unknown, an sd is not positive, or there are effects.
     """
 
     memory: str = "deviation"
     scale: str = "unit"
+    tau_start: float = 0.3
+    tau_level: float = 0.2
+    tau_gain: float = 0.2
 
     def __post_init__(self) -> None:
         levels_of(self.scale)
         object.__setattr__(self, "observation", "censored")  # on the unit scale; see `family`
         if self.priors is None:
             object.__setattr__(self, "priors", _default_priors())
-        if not self.effects:
-            object.__setattr__(self, "effects", (PersonEffect(),))
         super().__post_init__()
-        if [type(effect) for effect in self.effects] != [PersonEffect] or self.shared_noise:
+        for name in SDS:
+            require_positive(f"HumanTrust.{name}", getattr(self, name))
+        if self.effects or self.shared_noise:
             raise TrustboError(
                 f"HumanTrust has effects of persons alone; got effects={self.effects!r}."
             )
 
-    @property
-    def columns(self) -> tuple[Effect, ...]:
-        """See `TrustModel.columns`: only weights, see `effects.person`."""
-        return (self.weights,)
+    def hyperpriors(self, n_robots: int, n_features: int) -> dict[str, dist.Distribution]:
+        """See `TrustModel.hyperpriors`; also the sds of the persons' coefficients."""
+        sds = {name: dist.HalfNormal(getattr(self, name)) for name in SDS}
+        return super().hyperpriors(n_robots, n_features) | sds
 
     @cached_property
     def family(self) -> Family:  # pyright: ignore
         """See `TrustModel.family`."""
         levels = levels_of(self.scale)
         return Levels(levels) if levels else FAMILIES["censored"]
-
-    @property
-    def effect(self) -> PersonEffect:
-        """The effects of persons."""
-        return cast(PersonEffect, self.effects[0])
 
     def slots(self, missions: Any, workspace: Any = None) -> Slots:
         """See `TrustModel.slots`; raises TrustboError if reports are not on the scale."""
@@ -111,33 +115,27 @@ class HumanTrust(PooledTrust):
         return xp.kron(powers(theta["beta0"], slots.n_bounds), np.eye(slots.n_robots))
 
     def parts(self, theta: Theta, slots: Slots) -> Any:
-        """Effect of a person's standardised coefficients on trust, (point, mission, row, part)."""
-        carried, level = np.zeros((2, *slots.y.shape, len(PARTS)))
+        """Effect of a person's standardised coefficients on trust, (point, mission, row, part).
+
+        The parts are start, level, and gains from success and from failure.
+        """
+        carried, level = np.zeros((2, *slots.y.shape, 4))
         carried[:, 0, :, 0] = 1.0  # start
         level[..., 1] = 1.0
         for i, name in ((2, SUCCESS), (3, FAILURE)):
             first = next((m for m, f in enumerate(slots.features) if f.startswith(name)), None)
             if first is not None:
                 carried[..., i] = slots.z[..., first]
-        carried, level = (a.reshape(slots.n_missions, -1, len(PARTS)) for a in (carried, level))
+        carried, level = (a.reshape(slots.n_missions, -1, 4) for a in (carried, level))
         parts = self._lasting(theta, slots)[:, None] @ carried + level
-        return parts * self.effect.sds(theta)[:, None, None]
+        start, of_level, gain = (theta[name] for name in SDS)
+        sds = namespace(start).stack([start, of_level, gain, gain], axis=1)
+        return parts * sds[:, None, None]
 
-    def persons(
-        self, theta: Theta, off: np.ndarray, slots: Slots, rng: np.random.Generator
-    ) -> np.ndarray:
-        """Draws of the persons' coefficients (draw, mission, part) given their trust.
-
-        `off` (draw, mission, row) is trust minus its mean given the columns.
-        """
-        W, S = self.parts(theta, slots), self.signal(theta, slots, self.layout(slots)).S
-        gain = np.swapaxes(np.linalg.solve(S + 1e-12 * np.eye(S.shape[-1]), W), 2, 3)
-        center = np.einsum("djpr,djr->djp", gain, off)
-        cov = np.eye(len(PARTS)) - gain @ W
-        values, vectors = np.linalg.eigh(cov)
-        white = np.sqrt(np.maximum(values, 0.0)) * rng.standard_normal(values.shape)
-        unit = center + np.einsum("djpq,djq->djp", vectors, white)
-        return unit * self.effect.sds(theta)[:, None]
+    @property
+    def dims(self) -> dict[str, tuple[str, ...]]:
+        """See `TrustModel.dims`."""
+        return super().dims | dict.fromkeys(SDS, ())
 
     def _rows(self) -> Rows:
         kept = [row for row in super()._rows() if row[0] not in ("rates", "scale")]
