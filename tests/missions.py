@@ -100,7 +100,7 @@ def random_covariance(rng, n, scale):
 def missions(draw, *, ticks=True):
     """Missions of one team, as files must keep them: with or without a map, with what is missing.
 
-    With `ticks`, some bounds have poses, contacts and states of ticks.
+    With `ticks`, some bounds have poses and contacts of ticks.
     """
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     mapped, n_features = draw(st.booleans()), draw(st.integers(1, 3))
@@ -125,8 +125,6 @@ def missions(draw, *, ticks=True):
                 n = draw(st.integers(1, 4))
                 more["poses"] = rng.normal(size=(n, 1 + len(robots), 3))
                 more["contact"] = rng.uniform(size=(n, len(robots))) < 0.5
-                if draw(st.booleans()):
-                    more["states"] = rng.normal(size=(n, len(robots), 5))
             cell, ended = path[k + 1] if mapped else NOWHERE, status if k == n_run - 1 else "ok"
             bounds.append(Bound(cell, z, rate, duration, ended, t0, n_ticks=n_ticks, **more))
             t0 = bounds[-1].t1 + float(rng.choice([0.0, 0.3]))
@@ -143,7 +141,7 @@ def assert_same_missions(found, expected, *, ticks=True):
         assert len(one.bounds) == len(other.bounds)
         for a, b in zip(one.bounds, other.bounds, strict=True):
             assert (a.cell, a.status, a.t0) == (b.cell, b.status, b.t0)
-            kept = ("poses", "contact", "states") if ticks else ()
+            kept = ("poses", "contact") if ticks else ()
             for name in ("awareness", "contact_rate", "duration", "n_ticks", *kept):
                 x, y = getattr(a, name), getattr(b, name)
                 assert (x is None) == (y is None), name

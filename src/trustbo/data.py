@@ -42,9 +42,6 @@ class Bound(Summary):
         contact: Contact of each robot at each tick, shape (tick, robot). None where not recorded.
         n_ticks: Number of ticks over which `contact_rate` is averaged, shape (robot,); NaN where
             not recorded.
-        states: Motion and sensing of each robot, shape (tick, robot, state): speed as a fraction of
-            its speed on level ground, pitch and roll (rad), mean range of returns (m), fraction of
-            clear beams. None where not recorded.
 
     Raises:
         TrustboError: The arrays disagree on the number of robots; a value outside [0, 1], a
@@ -61,7 +58,6 @@ class Bound(Summary):
     poses: np.ndarray | None = None
     contact: np.ndarray | None = None
     n_ticks: np.ndarray = None  # pyright: ignore[reportAssignmentType]
-    states: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         for name in ("awareness", "contact_rate", "duration", "n_ticks"):
@@ -284,8 +280,8 @@ class Mission(Summary):
         for b in self.bounds:
             z = np.pad(b.awareness, ((0, 0), (0, len(lacks))), constant_values=np.nan)
             per_robot = {n: getattr(b, n)[i] for n in ("contact_rate", "duration", "n_ticks")}
-            ticks = {n: getattr(b, n) for n in ("contact", "states")}
-            per_robot |= {n: values[:, i] for n, values in ticks.items() if values is not None}
+            if b.contact is not None:
+                per_robot["contact"] = b.contact[:, i]
             if b.poses is not None:
                 per_robot["poses"] = b.poses[:, [0, *(1 + j for j in i)]]
             bounds.append(replace(b, awareness=z[np.ix_(i, m)], **per_robot))

@@ -1,4 +1,4 @@
-"""Missions in netCDF files: a table of all missions, and the ticks of the robots."""
+"""Missions in netCDF files: their bounds one after the other, with the ticks of the robots."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,8 +12,8 @@ from trustbo.errors import TrustboError
 from trustbo.files import FilePath, interpreting, read_file, write_file
 from trustbo.stacking import require_same_team
 
-STATES = ("speed_ratio", "pitch", "roll", "return_range", "visible_share")
-"""State of a robot at a tick, see `data.Bound.states`."""
+_ARRAYS = {"awareness": "1", "contact_rate": "1", "duration": "s", "n_ticks": "1"}
+"""Arrays of a bound, (robot,) or (robot, feature), and their units."""
 
 
 def read_tree(path: FilePath) -> xr.DataTree:
@@ -36,7 +36,10 @@ def write_tree(path: FilePath, tree: xr.DataTree) -> None:
 
 
 def write_missions(path: FilePath, missions: Sequence[Mission]) -> None:
-    """Write at least one mission, with ticks, to a netCDF file."""
+    """Write at least one mission, with ticks, to a netCDF file.
+
+    TrustboError: the missions have different robots or features, or the file cannot be written.
+    """
     write_tree(path, missions_to_tree(missions))
 
 
@@ -58,104 +61,63 @@ def read_missions(path: FilePath) -> list[Mission]:
 
 
 def missions_to_tree(missions: Sequence[Mission]) -> xr.DataTree:
-    """Convert missions to a tree, padded with NaN, with ticks if they were recorded.
+    """Convert missions to a tree; ticks are stored of the bounds with both poses and contacts.
 
     TrustboError: the missions have different robots or features.
     """
     require_same_team(missions)
-    n_steps = max(max(len(mission.path), len(mission.bounds) + 1) for mission in missions)
-    shape = (len(missions), n_steps - 1)
-    robots, features = missions[0].robots, missions[0].features
-    path = np.full((len(missions), n_steps, 2), -1)
-    awareness = np.full((*shape, len(robots), len(features)), np.nan)
-    rates, duration, n_ticks = (np.full((*shape, len(robots)), np.nan) for _ in range(3))
-    start, status = np.full(shape, np.nan), np.full(shape, "", dtype=object)
-    for j, mission in enumerate(missions):
-        n = len(mission.bounds)
-        path[j, : len(mission.path)] = np.reshape(mission.path, (-1, 2))
-        awareness[j, :n], rates[j, :n] = mission.awareness, mission.contact_rate
-        duration[j, :n], n_ticks[j, :n] = mission.duration, mission.n_ticks
-        start[j, :n] = [bound.t0 for bound in mission.bounds]
-        status[j, :n] = [bound.status for bound in mission.bounds]
-    dims = ("mission", "bound", "robot")
-    table = xr.Dataset(
-        {
-            "path": (("mission", "step", "axis"), path),
-            "awareness": ((*dims, "feature"), awareness),
-            "contact_rate": (dims, rates),
-            "duration": (dims, duration, {"units": "s"}),
-            "n_ticks": (dims, n_ticks, {"units": "1"}),
-            "start": (dims[:2], start, {"units": "s"}),
-            "bound_status": (dims[:2], status.astype(str)),
-            "status": (dims[:1], [mission.status for mission in missions]),
-            "scale": (dims[:1], [mission.scale for mission in missions]),
-            "n_bounds": (dims[:1], [len(mission.bounds) for mission in missions]),
-        },
-        {"robot": list(robots), "feature": list(features), "axis": ["row", "col"]},
-    )
-    ticks = _ticks(missions)
-    return xr.DataTree.from_dict({"missions": table} | ({} if ticks is None else {"ticks": ticks}))
+    bounds = [bound for mission in missions for bound in mission.bounds]
+    ticks = [_ticks(bound) for bound in bounds]
+    poses, contacts = (np.concatenate(values) for values in zip(*ticks, strict=True))
+    cells = [cell for mission in missions for cell in mission.path]
+    variables: dict[str, Any] = {
+        "path": (("step", "axis"), np.reshape(cells, (-1, 2)).astype(int)),
+        "start": ("bound", [bound.t0 for bound in bounds], {"units": "s"}),
+        "bound_status": ("bound", [bound.status for bound in bounds]),
+        "recorded": ("bound", [len(pose) for pose, _ in ticks]),
+        "pose": (("tick", "member", "component"), poses),
+        "contact": (("tick", "robot"), contacts),
+        "n_bounds": ("mission", [len(mission.bounds) for mission in missions]),
+        "n_steps": ("mission", [len(mission.path) for mission in missions]),
+        "status": ("mission", [mission.status for mission in missions]),
+        "scale": ("mission", [mission.scale for mission in missions]),
+    }
+    for name, units in _ARRAYS.items():
+        values = np.stack([getattr(bound, name) for bound in bounds])
+        variables[name] = ("bound", "robot", "feature")[: values.ndim], values, {"units": units}
+    names = {"robot": list(missions[0].robots), "feature": list(missions[0].features)}
+    axes = {"axis": ["row", "col"], "component": ["x", "y", "heading"]}
+    return xr.DataTree(xr.Dataset(variables, names | axes))
 
 
 def missions_from_tree(tree: xr.DataTree) -> list[Mission]:
     """Convert a tree of `missions_to_tree` back; LookupError or ValueError if it is not one."""
-    table = {str(n): a.values for n, a in tree["missions"].to_dataset().variables.items()}
-    robots, features = (tuple(map(str, table[d])) for d in ("robot", "feature"))
-    ticks = _by_bound(tree["ticks"].to_dataset()) if "ticks" in tree.children else {}
+    table = {str(name): array.values for name, array in tree.to_dataset().variables.items()}
+
+    def parts(values: np.ndarray, counts: str) -> list[np.ndarray]:
+        """Values of each mission or bound."""
+        return np.split(values, np.cumsum(table[counts])[:-1])
+
+    robots, features = (tuple(map(str, table[name])) for name in ("robot", "feature"))
+    poses, contacts = parts(table["pose"], "recorded"), parts(table["contact"], "recorded")
+    paths, rows = parts(table["path"], "n_steps"), parts(np.arange(len(poses)), "n_bounds")
     missions = []
-    for j, n_bounds in enumerate(table["n_bounds"].tolist()):
-        path = tuple((int(r), int(c)) for r, c in table["path"][j] if r >= 0)
+    for j, of_mission in enumerate(rows):
+        path = tuple((int(row), int(col)) for row, col in paths[j])
         bounds = []
-        for k in range(n_bounds):
-            z, y, seconds, n = (
-                table[name][j, k] for name in ("awareness", "contact_rate", "duration", "n_ticks")
-            )
-            status, t0 = str(table["bound_status"][j, k]), float(table["start"][j, k])
-            poses, contact, states = ticks.get((j, k), (None, None, None))
-            cell = path[k + 1] if path else NOWHERE
-            bounds.append(Bound(cell, z, y, seconds, status, t0, poses, contact, n, states))
+        for cell, i in zip(path[1:] or [NOWHERE] * len(of_mission), of_mission, strict=False):
+            z, y, seconds, n = (table[name][i] for name in _ARRAYS)
+            status, t0 = str(table["bound_status"][i]), float(table["start"][i])
+            ticks = (poses[i], contacts[i].astype(bool)) if len(poses[i]) else (None, None)
+            bounds.append(Bound(cell, z, y, seconds, status, t0, *ticks, n))
         status, scale = str(table["status"][j]), str(table["scale"][j])
         missions.append(Mission(path, tuple(bounds), status, features, robots, scale))
     return missions
 
 
-def _ticks(missions: Sequence[Mission]) -> xr.Dataset | None:
-    """Poses, contacts and states at the recorded ticks of all bounds; None if there are none."""
-    rows: dict[str, list[Any]] = {"of": [], "pose": [], "contact": [], "states": []}
-    for j, mission in enumerate(missions):
-        for k, bound in enumerate(mission.bounds):
-            if bound.poses is None or bound.contact is None:
-                continue
-            unknown = np.full((*bound.contact.shape, len(STATES)), np.nan)
-            rows["of"].append(np.tile([j, k], (len(bound.poses), 1)))
-            rows["pose"].append(bound.poses)
-            rows["contact"].append(bound.contact)
-            rows["states"].append(unknown if bound.states is None else bound.states)
-    if not rows["of"]:
-        return None
-    of, pose, contact, states = (np.concatenate(values) for values in rows.values())
-    variables = {
-        "mission": ("tick", of[:, 0]),
-        "bound": ("tick", of[:, 1]),
-        "pose": (("tick", "member", "component"), pose),
-        "contact": (("tick", "robot"), contact),
-    }
-    coords = {"component": ["x", "y", "heading"]}
-    if not np.isnan(states).all():
-        variables["states"] = (("tick", "robot", "state"), states)
-        coords["state"] = list(STATES)
-    return xr.Dataset(variables, coords)
-
-
-def _by_bound(ticks: xr.Dataset) -> dict[tuple[int, int], tuple[Any, Any, Any]]:
-    """Poses, contact and states (None if not recorded) of each mission and bound with ticks."""
-    of = np.column_stack([ticks["mission"].values, ticks["bound"].values])
-    unknown = np.full(len(of), np.nan)
-    values = [of, ticks["pose"].values, ticks["contact"].values.astype(bool)]
-    values.append(ticks["states"].values if "states" in ticks else unknown)
-    edges = np.flatnonzero(np.diff(of, axis=0).any(axis=1)) + 1
-    parts = zip(*(np.split(array, edges) for array in values), strict=True)
-    return {
-        tuple(key[0].tolist()): (pose, contact, None if np.isnan(states).all() else states)
-        for key, pose, contact, states in parts
-    }
+def _ticks(bound: Bound) -> tuple[np.ndarray, np.ndarray]:
+    """Poses (tick, member, component) and contacts (tick, robot); no ticks if one is missing."""
+    if bound.poses is None or bound.contact is None:
+        n_robots = len(bound.contact_rate)
+        return np.empty((0, 1 + n_robots, 3)), np.empty((0, n_robots), dtype=bool)
+    return bound.poses, bound.contact
