@@ -1,25 +1,26 @@
 """Reader of user tables, with parsers of names, numbers and times."""
 
 import csv
-import gzip
 import io
 import re
 import warnings
 from collections.abc import Iterable
 from os import PathLike
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from trustbo.errors import TrustboError, one_line
+from trustbo.files import FilePath, read_file
 
 _SEPARATORS = ",;\t"
 _BLANK = ("", "na", "n/a", "#n/a", "#na", "nan", "nat", "none", "null", "<na>")
 """Markers of missing values, in lower case, as written by R, Excel, pandas and SQL."""
 _WHOLE = re.compile(r"^(-?\d+)\.0+$")
 _DECIMAL_COMMA = re.compile(r"^\s*([+-]?\d*),(\d+)\s*$")
+_ZONE = r":.*(?:Z|[+-]\d\d(?::?\d\d)?)$"
+"""End of a date with a time zone."""
 _LONGEST = 7 * 86_400.0
 """Longest log, s: a longer span means another unit, or an outlier."""
 
@@ -44,7 +45,7 @@ class Columns:
                 are no rows.
         """
         self.what = what
-        frame = _of_file(Path(table)) if isinstance(table, str | PathLike) else _of_values(table)
+        frame = _of_file(table) if isinstance(table, str | PathLike) else _of_values(table)
         frame.columns = [str(name).strip() for name in frame.columns]
         frame = frame.loc[:, [not re.fullmatch(r"(Unnamed: \d+)?", n) for n in frame.columns]]
         if not frame.columns.is_unique:
@@ -102,22 +103,28 @@ class Columns:
                 raise TrustboError(f"row {row} of {self.what}: {column} = {value} {fault}.")
         return cells.to_numpy(float, na_value=np.nan)
 
-    def times(self, column: str) -> pd.Series:
-        """Times of a column: numbers, or dates, converted to UTC if they have a time zone."""
+    def times(self, column: str) -> tuple[str, pd.Series]:
+        """Kind of a column of times, and the times: numbers, or dates, of which zones become UTC.
+
+        Raises:
+            TrustboError: A time is blank or neither a number nor a date, or only some dates have a
+                time zone.
+        """
         cells = self._cells(column)
-        is_date = cells.dtype.kind == "M"
-        if not is_date and not np.isnan(_numbers(cells.dropna())).any():
-            return pd.Series(self.numbers(column, blank=False))
+        if cells.dtype.kind != "M" and not np.isnan(_numbers(cells.dropna())).any():
+            return "numbers", pd.Series(self.numbers(column, blank=False))
+        zoned = cells.astype(str).str.contains(_ZONE)
         try:
-            dates = pd.to_datetime(cells, format="ISO8601")
-        except ValueError as error:
+            dates = pd.to_datetime(cells, format="ISO8601", utc=True)
+        except ValueError:
+            dates = pd.Series(pd.NaT, index=cells.index)
+        if (bad := dates.isna() | (zoned != zoned.iloc[0])).any():
+            row, value = bad.idxmax(), one_line(cells[bad].iloc[0])
             raise TrustboError(
-                f"{column} of {self.what} has neither seconds nor dates such as "
-                f"2026-11-24T10:00:00.5Z, all in one time zone or none: {one_line(str(error))}."
-            ) from None
-        if dates.isna().any():
-            raise TrustboError(f"{column} of {self.what} is blank in some rows.")
-        return dates
+                f"row {row} of {self.what}: {column} = {value}; give all times in seconds, or as "
+                "dates such as 2026-11-24T10:00:00.5Z, either all with a time zone or none."
+            )
+        return "dates with a time zone" if zoned.all() else "dates without a time zone", dates
 
     def _cells(self, column: str, required: bool = True) -> pd.Series:
         if not required and self.find(column) is None:
@@ -126,37 +133,33 @@ class Columns:
         return self.frame[self.find(column)]
 
 
-def seconds_of(first: Columns, second: Columns, column: str = "t") -> list[np.ndarray]:
-    """Times of two tables on one clock, each (row,), s; dates are counted from the first date.
+def seconds_of(first: Columns, second: Columns) -> list[np.ndarray]:
+    """Times `t` of two tables on one clock, each (row,), s; dates are counted from the first date.
 
     Raises:
         TrustboError: Numbers cannot be seconds; only one table has dates, or dates with a time
             zone; or the times of the two tables do not overlap.
     """
-    tables, given = (first, second), [table.times(column) for table in (first, second)]
-    kinds = ["numbers" if t.dtype.kind != "M" else "dates with a zone" if t.dt.tz else "dates"
-             for t in given]  # fmt: skip
+    kinds, given = zip(first.times("t"), second.times("t"), strict=True)
     if kinds[0] != kinds[1]:
         raise TrustboError(
-            f"{first.what} has times as {kinds[0]} and {second.what} as {kinds[1]}: clocks that "
-            "cannot be compared; write both as dates in UTC, or both in seconds."
+            f"times of {first.what} are {kinds[0]}, of {second.what} {kinds[1]}; give both as "
+            "dates in UTC, or both in seconds."
         )
     if kinds[0] != "numbers":
         given = [(t - given[0].min()).dt.total_seconds() for t in given]
     times = [t.to_numpy(float) for t in given]
-    for table, t in zip(tables, times, strict=True):
+    spans = [f"{t.min():.9g} to {t.max():.9g} s" for t in times]
+    for table, t, span in zip((first, second), times, spans, strict=True):
         if np.ptp(t) > _LONGEST or np.abs(t).max() > 1e11:
             raise TrustboError(
-                f"times of {table.what} are from {t.min():.9g} to {t.max():.9g}, which as seconds "
-                f"span {np.ptp(t) / 86_400.0:.3g} days; the unit is the second (divide "
-                "milliseconds by 1000), and a log spans a week at most."
+                f"times of {table.what} are {span}; they must be in seconds (divide milliseconds "
+                "by 1000) and span at most 7 days."
             )
-    start, end = times[0].min(), times[0].max()
-    inside = ((times[1] >= start) & (times[1] <= end)).mean()
+    inside = ((times[1] >= times[0].min()) & (times[1] <= times[0].max())).mean()
     message = (
-        f"{inside:.0%} of the times of {second.what}, {times[1].min():.9g} to "
-        f"{times[1].max():.9g} s, lie in those of {first.what}, {start:.9g} to {end:.9g} s: do "
-        "the clocks differ in zero, unit or time zone?"
+        f"{inside:.0%} of the times of {second.what}, {spans[1]}, are within those of "
+        f"{first.what}, {spans[0]}; check the zero, the unit and the time zone of both clocks."
     )
     if not inside:
         raise TrustboError(message)
@@ -169,11 +172,10 @@ def require_one_spelling(what: str, names: Iterable[str]) -> None:
     """Raise TrustboError if two names differ only by case, spaces or leading zeros."""
     spelled: dict[str, str] = {}
     for name in dict.fromkeys(names):
-        other = spelled.setdefault(_folded(name), name)
-        if other != name:
+        if (other := spelled.setdefault(_folded(name), name)) != name:
             raise TrustboError(
-                f"{what} has {other!r} and {name!r}: write what is one name alike, and let names "
-                "of two differ by more than case, spaces or zeros."
+                f"{what} has {other!r} and {name!r}: use one spelling, or names that differ by "
+                "more than case, spaces or leading zeros."
             )
 
 
@@ -205,21 +207,16 @@ def _of_values(table: Any) -> pd.DataFrame:
     return frame.reset_index() if any(frame.index.names) else frame.copy()
 
 
-def _of_file(file: Path) -> pd.DataFrame:
+def _of_file(file: FilePath) -> pd.DataFrame:
     """Cells of a CSV file as text; decimal commas are allowed if the separator is not a comma."""
-    if not file.is_file():
-        raise TrustboError(f"there is no file {str(file)!r}; give a CSV file.")
     try:
-        content = file.read_bytes()
-        content = gzip.decompress(content) if file.suffix == ".gz" else content
-        is_wide = content[:2] in (b"\xff\xfe", b"\xfe\xff")  # the byte order marks of UTF-16
-        text = content.decode("utf-16" if is_wide else "utf-8-sig")
+        text = read_file(file).decode("utf-8-sig")
         first, _, rest = text.partition("\n")
         separator = max(_SEPARATORS, key=first.count)
         if named := re.fullmatch(r'"?sep=(.)"?\s*', first, re.IGNORECASE):
             separator, text = named[1], rest
         lines = [*csv.reader(io.StringIO(text, newline=""), delimiter=separator)]
-    except (OSError, EOFError, UnicodeDecodeError, csv.Error) as error:
+    except (UnicodeDecodeError, csv.Error) as error:
         raise TrustboError(
             f"{str(file)!r} cannot be read as CSV in UTF-8: {error}. Save it as UTF-8, or give a "
             'DataFrame, such as pandas.read_csv(file, encoding="cp1252").'
@@ -231,6 +228,4 @@ def _of_file(file: Path) -> pd.DataFrame:
                 f"row {i} of {str(file)!r} has {len(row)} values, the header {len(header)}."
             )
     frame = pd.DataFrame([row[: len(header)] for row in rows], columns=header, dtype=object)
-    if separator != ",":
-        frame = frame.replace(_DECIMAL_COMMA, r"\1.\2", regex=True)
-    return frame
+    return frame if separator == "," else frame.replace(_DECIMAL_COMMA, r"\1.\2", regex=True)
