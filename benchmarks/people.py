@@ -144,11 +144,12 @@ def read_azevedo_sa(file):
     table = pd.read_csv(file)
     table["report"] = np.clip(np.round(logit(table["trust"].clip(0.01, 0.99)) + 4.0), 1, 7)
     pairs = [(table[n], table[f"asked_{n}"]) for n in ("sensing", "processing")]
-    table["demand"] = np.mean([seen >= asked for seen, asked in pairs], axis=0)
+    demand = np.mean([seen >= asked for seen, asked in pairs], axis=0)
+    table["success_demand"] = (table["success"] == 1) * demand
+    table["failure_demand"] = (table["success"] == 0) * (1.0 - demand)
     table["need"] = np.mean([asked for _, asked in pairs], axis=0)
-    return tb.logs.read_reports(
-        table, outcome="success", demand="demand", inputs=("need",), scale="likert7"
-    )
+    inputs = "success_demand", "failure_demand", "need"
+    return tb.logs.read_reports(table, outcome="success", inputs=inputs, scale="likert7")
 
 
 def median_of(probability, values):

@@ -11,7 +11,7 @@ GOOD = {
     "person": ["ann", "ann", "ann", "bob", "bob"],
     "step": [0, 1, 2, 0, 1],
     "outcome": ["", 1, 0, "", "Failure"],
-    "demand": ["", 0.25, 0.75, "", 0.5],
+    "load": [0.0, 0.25, 0.75, 0.0, 0.5],
     "report": [4, 5, "", 3, 1],
 }
 
@@ -21,18 +21,17 @@ def read(given, **options):
 
 
 def test_a_person_is_a_mission_and_outcomes_are_inputs():
-    ann, bob = read(GOOD, demand="demand")
+    ann, bob = read(GOOD, inputs=["load"])
     assert (ann.path, ann.scale) == ((), "likert7")
-    assert ann.features == ("success", "failure", "success_demand", "failure_demand")
-    np.testing.assert_allclose(ann.awareness[:, 0],
-                               [[0, 0, 0, 0], [1, 0, 0.25, 0], [0, 1, 0, 0.25]])  # fmt: skip
+    assert ann.features == ("success", "failure", "load")
+    np.testing.assert_allclose(ann.awareness[:, 0], [[0, 0, 0], [1, 0, 0.25], [0, 1, 0.75]])
     np.testing.assert_allclose(ann.contact_rate[:, 0], [0.5, 4 / 6, np.nan])
     np.testing.assert_allclose(bob.contact_rate[:, 0], [2 / 6, 0.0])
     assert (ann.n_ticks == 6.0).all()
-    other = read(pd.DataFrame(GOOD)[::-1], demand="demand")
+    other = read(pd.DataFrame(GOOD)[::-1], inputs=["load"])
     np.testing.assert_array_equal(other[1].contact_rate, ann.contact_rate)
     np.testing.assert_array_equal(other[1].awareness, ann.awareness)
-    (first, _) = read_reports(pd.DataFrame(GOOD).assign(report=0.5, load=0.3), inputs=["load"])
+    (first, _) = read_reports(pd.DataFrame(GOOD).assign(report=0.5), inputs=["load"])
     assert first.features == ("load",)
     assert np.isnan(first.n_ticks).all()
 
@@ -51,12 +50,9 @@ def test_a_person_is_a_mission_and_outcomes_are_inputs():
         ({"person": ["ann", "ann", "", "bob", "bob"]}, {}),
         ({"person": ["ann", "ann", "Ann", "bob", "bob"]}, {}),
         ({"outcome": ["", "maybe", 0, "", 1]}, {}),
-        ({"demand": ["", 3, 0, "", 1]}, {"demand": "demand"}),
-        ({"demand": ["", "", 0, "", 1]}, {"demand": "demand"}),
-        ({}, {"demand": "demand", "outcome": None}),
         ({}, {"outcome": None}),
         ({}, {"outcome": "result"}),
-        ({}, {"inputs": ["demand"]}),
+        ({"load": ["", 1, 0, 0, 1]}, {"inputs": ["load"]}),
         ({"age": [9, 9, 9, 61, 61]}, {"inputs": ["age"]}),
     ],
 )

@@ -23,7 +23,6 @@ def read_reports(
     step: str = "step",
     report: str = "report",
     outcome: str | None = None,
-    demand: str | None = None,
     inputs: Sequence[str] = (),
     scale: str = "unit",
 ) -> list[Mission]:
@@ -42,9 +41,6 @@ def read_reports(
         report: Column of the report.
         outcome: Column with the robot's outcome: 1, `true`, `yes` or `success`, or 0, `false`, `no`
             or `failure`, or blank. It becomes the features `success` and `failure`.
-        demand: Column with the difficulty of the robot's task, from 0 (easy) to 1. It becomes the
-            features `success_demand`, success times demand, and `failure_demand`, failure times 1 -
-            demand.
         inputs: Columns of further features, of order 1: centre and scale other units first.
         scale: `"unit"`, reports in [0, 1]; `"likert7"` (or `"ordinal7"`), whole numbers 1 to 7.
 
@@ -58,25 +54,23 @@ def read_reports(
             outcome nor an input.
     """
     levels = levels_of(scale)
-    if outcome is None and (demand is not None or not inputs):
+    if outcome is None and not inputs:
         raise TrustboError("reports need what was seen: give outcome=, a column, or inputs=.")
-    named = {"person": person, "step": step, "report": report, "outcome": outcome, "demand": demand}
     columns = Columns(table)
-    for argument, column in named.items():
-        if column is not None:
-            columns.require([column], f' Name its columns, such as {argument}="...".')
+    for name, column in {"person": person, "step": step, "report": report}.items():
+        columns.require([column], f' Name its columns, such as {name}="...".')
     people, steps = np.array(columns.texts(person)), columns.numbers(step, blank=False)
     require_one_spelling(f"column {person}", people.tolist())
     if "" in people:
         raise TrustboError("a person is blank; leave the row out.")
     y = _unit_of(columns, report, levels)
-    seen = _seen(columns, outcome, demand, inputs)
+    seen = _seen(columns, outcome, inputs)
     z, missions = np.column_stack([*seen.values()]), []
     for name in dict.fromkeys(people.tolist()):
         of = np.flatnonzero(people == name)
         of = of[np.argsort(steps[of])]
         if (np.diff(steps[of]) == 0.0).any():
-            raise TrustboError(f"{person} {name}: a step is there twice.")
+            raise TrustboError(f"{person} {name}: two rows have the same step.")
         if np.isnan(y[of]).all():
             raise TrustboError(f"{person} {name}: there is no report; leave out the rows.")
         made = Mission.from_arrays(
@@ -87,28 +81,18 @@ def read_reports(
     return missions
 
 
-def _seen(
-    columns: Columns, outcome: str | None, demand: str | None, inputs: Sequence[str]
-) -> dict[str, np.ndarray]:
+def _seen(columns: Columns, outcome: str | None, inputs: Sequence[str]) -> dict[str, np.ndarray]:
     """Features by name, each (row,)."""
-    seen, rows = {}, columns.frame.index
+    seen = {}
     if outcome is not None:
         given = [text.lower() for text in columns.texts(outcome)]
-        for row, text in zip(rows, given, strict=True):
+        for row, text in zip(columns.frame.index, given, strict=True):
             if text not in ("", *_YES, *_NO):
                 raise TrustboError(
-                    f"row {row}: {outcome} = {text!r} is no outcome; give 1 or 0, success or "
-                    "failure, or a blank."
+                    f"row {row}: {outcome} = {text!r} must be 1 or 0, success or failure, or blank."
                 )
-        seen["success"] = np.array([float(text in _YES) for text in given])
-        seen["failure"] = np.array([float(text in _NO) for text in given])
-    if demand is not None:
-        d = columns.numbers(demand)
-        d = np.where(np.isnan(d) & (seen["success"] + seen["failure"] == 0.0), 0.0, d)
-        if (bad := ~((d >= 0.0) & (d <= 1.0))).any():
-            raise TrustboError(f"row {rows[bad][0]}: {demand} = {d[bad][0]:g} must be in [0, 1].")
-        seen["success_demand"] = seen["success"] * d
-        seen["failure_demand"] = seen["failure"] * (1.0 - d)
+        seen["success"] = np.isin(given, _YES).astype(float)
+        seen["failure"] = np.isin(given, _NO).astype(float)
     for name in inputs:
         seen[name] = columns.numbers(name, blank=False)
         if (large := np.abs(seen[name]).max()) > _LARGEST:
