@@ -15,7 +15,7 @@ ignored.
 
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -23,13 +23,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from trustbo.data import Bound, Cell, Mission
+from trustbo.data import Bound, Cell, Mission, require_unit_interval
 from trustbo.errors import TrustboError, require_pair, require_whole
 from trustbo.files import FilePath
 from trustbo.workspace import Workspace
 
 _NEVER = np.iinfo(np.int64).max
 _NS = 1e9  # in a second
+
+type Messages = list[tuple[int, Any]]
+"""Time of recording (ns) and content of each message."""
+type Marker = tuple[int, int, Cell, tuple[Cell, ...]]
+"""Time (ns), number and cell of a bound, and the planned path, which may be empty."""
 
 
 @dataclass(frozen=True)
@@ -69,19 +74,9 @@ class _Series(NamedTuple):
         return padded[last + 1]
 
 
-class _Marker(NamedTuple):
-    """Start of a bound."""
-
-    time: int
-    bound: int
-    cell: Cell
-    path: tuple[Cell, ...]
-
-
 class _Recording(NamedTuple):
     """Records of a bag, in the order of the robots; poses begin with the lead, or are empty."""
 
-    markers: list[_Marker]
     status: _Series
     contact: list[_Series]
     poses: list[_Series]
@@ -104,56 +99,39 @@ def read_bag(path: FilePath, workspace: Workspace, *, topics: Topics = Topics())
             the data.
     """
     robots = workspace.team.names
-    found = _recording(Path(path), topics, robots)
-    starts = [i for i, marker in enumerate(found.markers) if marker.bound == 0]
+    contact = [topics.contact.replace("{robot}", robot) for robot in robots]
+    poses = [topics.pose.replace("{robot}", robot) for robot in (topics.lead, *robots)]
+    messages = _messages(Path(path), [topics.bound, *contact], [topics.status, *poses])
+    found = _Recording(
+        _series(topics.status, messages, lambda message: str(message.data)),
+        [_contacts(topic, messages) for topic in contact],
+        [_series(topic, messages, _pose) for topic in poses if all(map(messages.get, poses))],
+    )
+    markers = sorted(_marker(time, message) for time, message in messages[topics.bound])
+    starts = [i for i, (_, bound, *_) in enumerate(markers) if bound == 0]
     if not starts or starts[0] > 0:
         raise TrustboError(f"{str(path)!r} must begin with the marker of bound 0, the start cell.")
     missions = []
-    for first, end in pairwise([*starts, len(found.markers)]):
+    for first, end in pairwise([*starts, len(markers)]):
         if end - first < 2:  # nothing was driven
             continue
-        until = found.markers[end].time if end < len(found.markers) else _NEVER
+        until = markers[end][0] if end < len(markers) else _NEVER
         try:
-            missions.append(_mission(found, found.markers[first:end], until, workspace))
+            missions.append(_mission(found, markers[first:end], until, workspace))
         except TrustboError as error:
             raise TrustboError(f"{str(path)!r}, mission {len(missions) + 1}: {error}") from None
     return missions
 
 
-def _recording(path: Path, topics: Topics, robots: tuple[str, ...]) -> _Recording:
-    """Records of a bag."""
-    contact = [topics.contact.replace("{robot}", robot) for robot in robots]
-    poses = [topics.pose.replace("{robot}", robot) for robot in (topics.lead, *robots)]
-    messages = _messages(path, [topics.bound, *contact], [topics.status, *poses])
-
-    def series(topic: str, read: Callable[[str, Any], Any]) -> _Series:
-        time = np.array([t for t, _ in messages[topic]], dtype=np.int64)
-        if (np.diff(time) < 0).any():
-            raise TrustboError(f"the clock of {topic} goes backwards.")
-        return _Series(time, np.array([read(topic, message) for _, message in messages[topic]]))
-
-    markers = sorted(
-        (_marker(time, message) for time, message in messages[topics.bound]),
-        key=lambda marker: (marker.time, marker.bound),
-    )
-    moved = [series(topic, _pose) for topic in poses] if all(map(messages.get, poses)) else []
-    for track in moved:
-        track.value[:, 2] = np.unwrap(track.value[:, 2])
-    status = series(topics.status, lambda _, message: str(message.data))
-    return _Recording(markers, status, [series(topic, _contact) for topic in contact], moved)
-
-
-def _messages(
-    path: Path, needed: list[str], optional: list[str]
-) -> dict[str, list[tuple[int, Any]]]:
-    """Time of recording (ns) and content of each message, by topic."""
+def _messages(path: Path, needed: Sequence[str], optional: Sequence[str]) -> dict[str, Messages]:
+    """Messages by topic."""
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
         raise TrustboError("ROS bags need rosbags: python -m pip install rosbags") from None
 
-    messages: dict[str, list[tuple[int, Any]]] = {topic: [] for topic in (*needed, *optional)}
+    messages: dict[str, Messages] = {topic: [] for topic in (*needed, *optional)}
     there = {}
     try:
         # Bags of ROS 2 before Iron do not define their types.
@@ -176,28 +154,23 @@ def _messages(
     return messages
 
 
-def _marker(time: int, message: Any) -> _Marker:
-    """Parse a message that marks the start of a bound."""
-    try:
-        content = json.loads(message.data)
-        path = tuple(require_pair("path", cell) for cell in content.get("path", ()))
-        k = require_whole("bound", content["bound"], 0)
-        return _Marker(time, k, require_pair("cell", content["cell"]), path)
-    except (AttributeError, KeyError, TypeError, ValueError):
-        raise TrustboError(
-            "a marker must be JSON with a bound and a cell; got "
-            f"{getattr(message, 'data', message)!r:.60}."
-        ) from None
+def _series(topic: str, messages: dict[str, Messages], read: Callable[[Any], Any]) -> _Series:
+    """Values that `read` takes from the messages of a topic."""
+    time = np.array([time for time, _ in messages[topic]], dtype=np.int64)
+    if (np.diff(time) < 0).any():
+        raise TrustboError(f"the clock of {topic} goes backwards.")
+    return _Series(time, np.array([read(message) for _, message in messages[topic]]))
 
 
-def _contact(topic: str, message: Any) -> float:
-    value = float(message.data)
-    if value < 0.0 or value > 1.0:
-        raise TrustboError(f"{topic} has {value:g}, outside [0, 1]; divide percentages by 100.")
-    return value
+def _contacts(topic: str, messages: dict[str, Messages]) -> _Series:
+    """Contact at the ticks of a robot, without those that are NaN."""
+    time, value = _series(topic, messages, lambda message: float(message.data))
+    require_unit_interval(topic, value)
+    measured = ~np.isnan(value)
+    return _Series(time[measured], value[measured] > 0.5)
 
 
-def _pose(topic: str, message: Any) -> list[float]:
+def _pose(message: Any) -> list[float]:
     """Position x and y, and heading in rad from the x axis, in [-pi, pi]."""
     pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
     p, q = pose.position, pose.orientation
@@ -205,51 +178,58 @@ def _pose(topic: str, message: Any) -> list[float]:
     return [p.x, p.y, yaw]
 
 
-def _mission(
-    found: _Recording, markers: list[_Marker], until: int, workspace: Workspace
-) -> Mission:
+def _marker(time: int, message: Any) -> Marker:
+    """Parse a message that marks the start of a bound."""
+    try:
+        content = json.loads(message.data)
+        path = tuple(require_pair("path", cell) for cell in content.get("path", ()))
+        k = require_whole("bound", content["bound"], 0)
+        return time, k, require_pair("cell", content["cell"]), path
+    except (AttributeError, KeyError, TypeError, ValueError):
+        raise TrustboError(
+            "a marker must be JSON with a bound and a cell; got "
+            f"{getattr(message, 'data', message)!r:.60}."
+        ) from None
+
+
+def _mission(found: _Recording, markers: list[Marker], until: int, workspace: Workspace) -> Mission:
     """Mission from its markers; its last bound ends at `until` at the latest."""
-    start, cells = markers[0], tuple(marker.cell for marker in markers)
-    if [marker.bound for marker in markers] != list(range(len(markers))):
-        raise TrustboError(f"bounds are in the order {[marker.bound for marker in markers]}.")
-    path = start.path or cells
+    times, numbers, cells, paths = zip(*markers, strict=True)
+    if numbers != (*range(len(markers)),):
+        raise TrustboError(f"bounds are in the order {list(numbers)}.")
+    path = paths[0] or cells
     if path[0] != cells[0]:
         raise TrustboError(f"it starts in {cells[0]}, but its path in {path[0]}.")
-    ends = [*(marker.time for marker in markers[2:]), until]
-    bounds = tuple(
-        _bound(found, marker, end, start.time, len(workspace.features))
-        for marker, end in zip(markers[1:], ends, strict=True)
-    )
-    statuses = found.status.between(markers[-1].time, until).value
+    spans = zip(cells[1:], pairwise([*times[1:], until]), strict=True)
+    bounds = tuple(_bound(found, cell, *span, times[0], workspace) for cell, span in spans)
+    statuses = found.status.between(times[-1], until).value
     status = str(statuses[-1]) if len(statuses) else "ok"
     if status == "ok" and len(bounds) < len(path) - 1:
         status = "aborted"  # no record of the reason
     return Mission(path, bounds, status, workspace.features, workspace.team.names)
 
 
-def _bound(found: _Recording, marker: _Marker, until: int, start: int, n_features: int) -> Bound:
-    """Bound from its marker to the next one, at time `until`; the mission begins at `start`."""
-    statuses = found.status.between(marker.time, until)
+def _bound(
+    found: _Recording, cell: Cell, begin: int, until: int, start: int, workspace: Workspace
+) -> Bound:
+    """Bound from its marker to the next one, in a mission that begins at `start`, ns."""
+    statuses = found.status.between(begin, until)
     end = int(statuses.time[0]) if len(statuses.time) else until
-    contacts = [series.between(marker.time, end) for series in found.contact]
+    contacts = [series.between(begin, end) for series in found.contact]
     if not len(statuses.time):
-        end = max((int(c.time[-1]) for c in contacts if len(c.time)), default=marker.time)
-    looked = [~np.isnan(c.value) for c in contacts]
-    contacts = [_Series(c.time[m], c.value[m] > 0.5) for c, m in zip(contacts, looked, strict=True)]
-    n_ticks = np.array([len(c.time) for c in contacts], dtype=float)
-    ticks = contacts[int(np.argmax(n_ticks))].time
-    of_ticks = [c.value if len(c.time) == len(ticks) else
-                c.value[np.maximum(np.searchsorted(c.time, ticks, side="right") - 1, 0)]
-                for c in contacts if n_ticks.all()]  # fmt: skip
-    seconds = (end - marker.time) / _NS if end > marker.time else np.nan
+        end = max((int(c.time[-1]) for c in contacts if len(c.time)), default=begin)
+    n_ticks = np.array([len(c.time) or np.nan for c in contacts])
+    ticks = max((c.time for c in contacts), key=len)
+    poses, seen = ([series.held(ticks) for series in of] for of in (found.poses, found.contact))
+    unknown = np.full((len(contacts), len(workspace.features)), np.nan)
     return Bound(
-        marker.cell,
-        np.full((len(contacts), n_features), np.nan),
+        cell,
+        unknown,
         np.array([c.value.mean() if len(c.value) else np.nan for c in contacts]),
-        np.full(len(contacts), seconds),
+        np.full(len(contacts), (end - begin) / _NS if end > begin else np.nan),
         str(statuses.value[0]) if len(statuses.time) else "ok",
-        (marker.time - start) / _NS,
-        np.stack([series.held(ticks) for series in found.poses], axis=1) if found.poses else None,
-        np.stack(of_ticks, axis=1) if of_ticks else None,
-        np.where(n_ticks > 0, n_ticks, np.nan),
+        (begin - start) / _NS,
+        np.stack(poses, axis=1) if poses else None,
+        np.stack(seen, axis=1) > 0.5 if not np.isnan(n_ticks).any() else None,
+        n_ticks,
     )
