@@ -26,15 +26,13 @@ MODELS = {
 
 
 def read_mrclam(run):
-    """Tables of poses and detections, and landmarks, of a run of the five robots.
+    """Tables of poses and detections of a run of the five robots.
 
-    `run` has Robot1_Groundtruth.dat, Robot1_Measurement.dat, ..., Landmark_Groundtruth.dat and
-    Barcodes.dat; or poses.csv and detections.csv.
+    `run` has Robot1_Groundtruth.dat, Robot1_Measurement.dat, ... and Barcodes.dat; or poses.csv and
+    detections.csv.
     """
     if not (run / "Barcodes.dat").exists():
-        tables = [next(run.glob(f"{name}.csv*")) for name in ("poses", "detections", "landmarks")]
-        poses, detections, landmarks = map(pd.read_csv, tables)
-        return poses, detections, landmarks[["x", "y"]].assign(radius=0.06).to_numpy()
+        return [pd.read_csv(next(run.glob(f"{name}.csv*"))) for name in ("poses", "detections")]
     subject = {int(code): int(n) for n, code in np.loadtxt(run / "Barcodes.dat")[:, :2]}
     poses, detections = [], []
     for i in range(1, 6):
@@ -47,20 +45,16 @@ def read_mrclam(run):
                 detections.append((t, i, subject[int(code)]))
     table, start = pd.concat(poses), min(one["t"].iloc[0] for one in poses)
     seen = pd.DataFrame(detections, columns=["t", "watcher", "seen"])
-    tubes = np.loadtxt(run / "Landmark_Groundtruth.dat")[:, 1:3]
-    landmarks = np.column_stack([tubes, np.full(len(tubes), 0.06)])
-    return table.assign(t=table["t"] - start), seen.assign(t=seen["t"] - start), landmarks
+    return table.assign(t=table["t"] - start), seen.assign(t=seen["t"] - start)
 
 
-def halves(poses, detections, landmarks):
-    """Tracks of both halves of a log."""
+def halves(poses, detections):
+    """Tables of both halves of a log."""
     middle = poses["t"].max() // 40.0 * 20.0
     return {
-        name: tb.logs.Tracks(*(table[(table["t"] >= a) & (table["t"] <= b)]
-                               for table in (poses, detections)),
-                             landmarks=landmarks, robot_radius=0.17)
+        name: [table[(table["t"] >= a) & (table["t"] <= b)] for table in (poses, detections)]
         for name, a, b in (("first", 0.0, middle), ("second", middle, np.inf))
-    }  # fmt: skip
+    }
 
 
 def made_up():
@@ -75,14 +69,14 @@ def made_up():
         away = np.linalg.norm(xy[:, None] - xy[None], axis=-1)
         chance = rng.random((4, 4)) < 0.8 - 0.05 * away
         seen += [(t[k], i, j) for i, j in np.argwhere(chance) if i != j]
-    return pd.concat(rows), pd.DataFrame(seen, columns=["t", "watcher", "seen"]), np.empty((0, 3))
+    return pd.concat(rows), pd.DataFrame(seen, columns=["t", "watcher", "seen"])
 
 
 def score(logs, window):
     """Log score of each model on the half that it was not fitted to."""
     table = Table("window", "fitted to", "model", "log score", "n")
     for learned, other in (("first", "second"), ("second", "first")):
-        train, test = (tb.logs.missions_of(logs[name], window) for name in (learned, other))
+        train, test = (tb.logs.read_tracks(*logs[name], window=window) for name in (learned, other))
         for name, model in MODELS.items():
             posterior = tb.fit(train, model, progress=False)
             found = tb.inference.score(posterior, test)
@@ -93,8 +87,8 @@ def score(logs, window):
 def memory(logs, window):
     """Log Bayes factor for trust that carries over from one bound to the next."""
     table = Table("window", "half", "for beta0 > 0", "beta0")
-    for name, tracks in logs.items():
-        missions, model = tb.logs.missions_of(tracks, window), MODELS["counts"]
+    for name, tables in logs.items():
+        missions, model = tb.logs.read_tracks(*tables, window=window), MODELS["counts"]
         model = model.for_features(missions[0].features)
         none = replace(model, priors=replace(model.priors, beta0=dist.Beta(1.0, 1e6)))
         carried, other = (tb.fit(missions, m, progress=False, whole=False) for m in (model, none))

@@ -164,7 +164,7 @@ def seconds_of(first: Columns, second: Columns) -> list[np.ndarray]:
     if not inside:
         raise TrustboError(message)
     if inside < 0.5:
-        warnings.warn(message, stacklevel=3)
+        warnings.warn(message, stacklevel=4)
     return times
 
 
