@@ -18,7 +18,7 @@ def workspace_to_tree(workspace: Workspace) -> xr.DataTree:
     """Convert a workspace to a tree."""
     cells = xr.Dataset({"awareness": workspace.awareness, "passable": workspace.passable})
     tree = {"cells": cells}
-    tree |= {f"composites/{n}": index.to_dataset() for n, index in workspace.composites.items()}
+    tree |= {f"composites/{n}": index.fitted for n, index in workspace.composites.items()}
     if workspace.terrain is not None and workspace.pixels is not None:
         pixels = workspace.pixels.drop_vars("spatial_ref", errors="ignore")  # the terrain's
         tree |= {"terrain": workspace.terrain, "pixels": pixels}
@@ -49,16 +49,11 @@ def workspace_from_tree(tree: xr.DataTree) -> Workspace:
                 array.encoding["grid_mapping"] = array.attrs.pop("grid_mapping")
         pixels = tree["pixels"].to_dataset().assign_coords(spatial_ref=terrain["spatial_ref"])
         posts = Posts(grid, team, Sight(**json.loads(tree.attrs["sight"])), terrain, pixels)
+    nodes = tree["composites"].children if "composites" in tree else {}
+    composites = {
+        name: CompositeIndex(node["sign"].to_series().to_dict(), node.to_dataset())
+        for name, node in nodes.items()
+    }
     return Workspace(
-        cells["awareness"],
-        cells["passable"],
-        grid,
-        team,
-        terrain,
-        pixels,
-        {
-            name: CompositeIndex.from_dataset(node.to_dataset())
-            for name, node in (tree["composites"].children if "composites" in tree else {}).items()
-        },
-        posts,
+        cells["awareness"], cells["passable"], grid, team, terrain, pixels, composites, posts
     )
