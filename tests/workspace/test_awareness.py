@@ -6,7 +6,7 @@ import xarray as xr
 
 from trustbo.errors import TrustboError
 from trustbo.terrain import synthetic_terrain
-from trustbo.terrain.features import pixel_features
+from trustbo.terrain.features import canopy_cover
 from trustbo.workspace import Workspace
 
 
@@ -23,7 +23,7 @@ def test_features_are_composites_or_used_unchanged(terrain):
     workspace = Workspace.from_terrain(terrain, (4, 3), features=features)
     assert workspace.features == ("traversability", "cover", "line_of_sight")
     assert set(workspace.composites) == {"traversability"}
-    cover = workspace.grid.cell_means(pixel_features(terrain, ["canopy_cover"])["canopy_cover"])
+    cover = workspace.grid.cell_means(terrain["dem"].copy(data=canopy_cover(terrain)))
     of_r1 = workspace.awareness.sel(robot="r1", feature="cover").mean("move")
     np.testing.assert_allclose(of_r1, cover, atol=1e-6)
 

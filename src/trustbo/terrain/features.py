@@ -9,23 +9,18 @@ an array (row, col), NaN where unknown. `feature` registers such a function for 
         return -north / np.hypot(east, north)
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
 from scipy import ndimage
 
-from trustbo.errors import TrustboError, require_choice
+from trustbo.errors import TrustboError
+from trustbo.parallel import over_rows
 from trustbo.terrain import rays
 from trustbo.terrain.read import pixel_size
 
-CANOPY_THRESHOLD = 2.0
-"""Vegetation at least this high (m) counts as canopy."""
-COVER_RADIUS = 5.0
-"""Half-width of the squares over which canopy is averaged, m."""
-REACH = 50.0
-"""Length of the rays of openness, m."""
 TRAVERSABILITY = ("slope", "roughness", "tri", "step_height")
 """Pixel features of traversability (z1); each lowers it."""
 VISIBILITY = ("vegetation_density", "openness")
@@ -60,17 +55,6 @@ def feature[F: Callable[..., np.ndarray]](name: str, *, sign: int) -> Callable[[
         return compute
 
     return register
-
-
-def pixel_features(terrain: xr.Dataset, names: Iterable[str]) -> xr.Dataset:
-    """Compute registered features, as variables with dims (y, x).
-
-    Raises:
-        TrustboError: An unknown name.
-    """
-    like = terrain["dem"].drop_attrs(deep=False)
-    chosen = {name: FEATURES[require_choice("feature", name, FEATURES)] for name in names}
-    return xr.Dataset({name: like.copy(data=f.compute(terrain)) for name, f in chosen.items()})
 
 
 def _window(z: np.ndarray) -> dict[tuple[int, int], np.ndarray]:
@@ -128,7 +112,7 @@ def canopy_height(terrain: xr.Dataset) -> np.ndarray:
 @feature("canopy_cover", sign=-1)
 def canopy_cover(terrain: xr.Dataset) -> np.ndarray:
     """Fraction of a square of half-width 5 m that is covered by canopy over 2 m high."""
-    return _local_mean(terrain, (canopy_height(terrain) > CANOPY_THRESHOLD).astype(float))
+    return _local_mean(terrain, (canopy_height(terrain) > 2.0).astype(float))
 
 
 @feature("vegetation_density", sign=-1)
@@ -146,20 +130,30 @@ def vegetation_density(
 
 @feature("openness", sign=+1)
 def openness(
-    terrain: xr.Dataset, reach: float = REACH, *, eye: float = 1.0, target: float = 1.0
+    terrain: xr.Dataset, reach: float = 50.0, *, eye: float = 1.0, target: float = 1.0
 ) -> np.ndarray:
     """Expected fraction of clear rays from a pixel to targets `reach` metres away all around.
 
     Rays run from `eye` to `target` metres above ground. Rays that end off the raster are ignored; a
-    pixel without other rays is NaN, so keep `reach` below half the terrain's shorter side.
+    pixel without other rays is NaN, so keep `reach` below half the terrain's shorter side. Pixels
+    of a 4 x 4 square share the value of its centre.
     """
-    maps = terrain["dem"].values, terrain["dsm"].values
-    return rays.openness(*maps, pixel_size(terrain), reach, (eye, target))
+    ground, surface = terrain["dem"].values, terrain["dsm"].values
+    rows, cols = ground.shape
+    coarse = np.empty((-(-rows // rays.BLOCK), -(-cols // rays.BLOCK)))
+
+    def work(first: int, last: int) -> None:
+        maps = ground, surface, pixel_size(terrain)
+        rays.openness(*maps, reach, (eye, target), (0.1, 0.3), coarse, first, last)
+
+    over_rows(work, len(coarse))
+    whole = coarse.repeat(rays.BLOCK, axis=0).repeat(rays.BLOCK, axis=1)[:rows, :cols]
+    return np.where(np.isfinite(ground), whole, np.nan)
 
 
 def _local_mean(terrain: xr.Dataset, values: np.ndarray) -> np.ndarray:
     """Mean of the valid pixels in squares of half-width 5 m, in [0, 1]; NaN without ground."""
-    size = [2 * max(1, round(COVER_RADIUS / step)) + 1 for step in pixel_size(terrain)]
+    size = [2 * max(1, round(5.0 / step)) + 1 for step in pixel_size(terrain)]
     has_ground, valid = np.isfinite(terrain["dem"].values), np.isfinite(values)
     total, weight = (
         np.asarray(ndimage.uniform_filter(a, size, mode="nearest"))  # pyright: ignore[reportArgumentType]

@@ -16,11 +16,11 @@ import math
 import numpy as np
 from numba import njit
 
-from trustbo.parallel import PART, over_rows
+from trustbo.parallel import PART
 
 _kernel = njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz", "arcp"})
 _part = njit(nogil=True, error_model="numpy", fastmath={"contract", "nsz", "arcp"}, **PART)
-_BLOCK, _RAYS = 4, 16
+BLOCK, _RAYS = 4, 16
 """Side of the squares of pixels that share one value of openness, and number of directions."""
 
 
@@ -135,38 +135,19 @@ def transmittances(ground, surface, pixel, ends, extinction, crown_base):
     return out
 
 
-def openness(
-    ground: np.ndarray,
-    surface: np.ndarray,
-    pixel: tuple[float, float],
-    reach: float,
-    heights: tuple[float, float],
-    canopy: tuple[float, float] = (0.1, 0.3),
-) -> np.ndarray:
-    """Mean transmittance to 16 points on a circle of radius `reach` metres, (row, col), in [0, 1].
-
-    It is computed at the centre of each square of 4 x 4 pixels and used for all of them. Eye and
-    target have `heights` above ground; the canopy has an extinction (1/m) and a crown base. Rays
-    that end outside the data are ignored; a pixel without other rays or without ground is NaN.
-    """
-    rows, cols = ground.shape
-    coarse = np.empty((-(-rows // _BLOCK), -(-cols // _BLOCK)))
-
-    def work(first: int, last: int) -> None:
-        _openness(ground, surface, pixel, reach, heights, canopy, coarse, first, last)
-
-    over_rows(work, len(coarse))
-    whole = coarse.repeat(_BLOCK, axis=0).repeat(_BLOCK, axis=1)[:rows, :cols]
-    return np.where(np.isfinite(ground), whole, np.nan)
-
-
 @_kernel
-def _openness(ground, surface, pixel, reach, heights, canopy, coarse, first, last):
-    middle = 0.5 * (_BLOCK - 1)
+def openness(ground, surface, pixel, reach, heights, canopy, coarse, first, last):
+    """Mean transmittance to 16 points on a circle of radius `reach` metres.
+
+    It is written to `coarse`, one value for each square of BLOCK x BLOCK pixels, for the rows of
+    squares from `first` to `last`. Eye and target have `heights` above ground; `canopy` is the
+    extinction (1/m) and the crown base. Rays that end outside the data are ignored.
+    """
+    middle = 0.5 * (BLOCK - 1)
     for i in range(first, last):
         for j in range(coarse.shape[1]):
-            r = min(_BLOCK * i + middle, ground.shape[0] - 1.0)
-            c = min(_BLOCK * j + middle, ground.shape[1] - 1.0)
+            r = min(BLOCK * i + middle, ground.shape[0] - 1.0)
+            c = min(BLOCK * j + middle, ground.shape[1] - 1.0)
             z, total, n = bilinear(ground, r, c), 0.0, 0
             for k in range(_RAYS):
                 angle = 2.0 * math.pi * k / _RAYS
