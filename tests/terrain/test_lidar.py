@@ -109,15 +109,6 @@ def test_a_point_on_an_edge_belongs_to_the_pixel_east_or_south(tmp_path):
     np.testing.assert_array_equal(column, top)
 
 
-def test_the_lowest_of_ground_points_in_one_place_counts(tmp_path):
-    x, y, z = lattice()
-    path = write_las(tmp_path / "twice.las", *stack((x, y, z + 1.0, 2), (x, y, z, 2)))
-    terrain = read_lidar(path)
-    inside = terrain["dem"].isel(x=slice(1, -1), y=slice(1, -1))
-    np.testing.assert_allclose(inside, plane_of(inside), atol=1e-9)
-    np.testing.assert_allclose((terrain["dsm"] - terrain["dem"]).max(), 1.0)
-
-
 def test_noise_and_withheld_points_are_left_out(tmp_path):
     x, y, z = lattice()
     clean = read_lidar(write_las(tmp_path / "clean.las", x, y, z))
