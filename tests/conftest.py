@@ -7,7 +7,7 @@ import jax
 import matplotlib as mpl
 import pytest
 
-from trustbo.terrain.example import EXAMPLES, example_files
+from trustbo.terrain.example import EXAMPLE_FILES
 
 mpl.use("Agg")
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -39,8 +39,8 @@ def real_terrain(request):
     """Paths of a real DEM and DSM by name; that of the package needs no other data."""
 
     def paths(name):
-        if name in EXAMPLES:
-            return example_files(name)
+        if name == "wellington":
+            return EXAMPLE_FILES
         folder = request.getfixturevalue("real_data") / name
         return folder / "dem.tif", folder / "dsm.tif"
 

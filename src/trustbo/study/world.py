@@ -18,7 +18,7 @@ from trustbo.simulation import KinematicSimulator, RadioSimulator, Truth
 from trustbo.simulation.events import Event
 from trustbo.study.grid import Scene
 from trustbo.team import Team
-from trustbo.terrain.example import EXAMPLES, example_files
+from trustbo.terrain.example import EXAMPLE_FILES
 from trustbo.workspace import Workspace
 from trustbo.workspace.sight import Sight
 
@@ -86,7 +86,7 @@ class World:
     @property
     def is_packaged(self) -> bool:
         """Whether the terrain comes with the package."""
-        return self.is_made or self.ground in EXAMPLES
+        return self.is_made or self.ground == "wellington"
 
     def files(self) -> list[str]:
         """Files of a real terrain.
@@ -94,7 +94,7 @@ class World:
         TrustboError: the files are missing; the message says where to put them.
         """
         if self.data is None and self.is_packaged:
-            return list(example_files(self.ground))
+            return list(EXAMPLE_FILES)
         folder = "" if self.data is None else Path(self.data).absolute()
         files = [Path(folder, self.ground, f"{name}.tif") for name in ("dem", "dsm")]
         if absent := [str(f) for f in files if self.data is None or not f.is_file()]:
