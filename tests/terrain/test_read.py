@@ -35,7 +35,7 @@ def plane(hole=None, dtype="float32", shape=(8, 10)):
 
 
 def write(path, *bands, crs=UTM, transform=CORNER, mask=None, colours=None, **profile):
-    names, unit = profile.pop("descriptions", None), profile.pop("unit", None)
+    unit = profile.pop("unit", None)
     scale, gcps = profile.pop("scale", None), profile.pop("gcps", None)
     height, width = bands[0].shape
     with rasterio.open(
@@ -48,8 +48,6 @@ def write(path, *bands, crs=UTM, transform=CORNER, mask=None, colours=None, **pr
             sink.write_mask(mask)
         if colours is not None:
             sink.colorinterp = colours
-        if names is not None:
-            sink.descriptions = names
         if unit is not None:
             sink.units = [unit] * len(bands)
         if scale is not None:
@@ -94,9 +92,9 @@ def test_a_pair_comes_out_aligned_north_up_and_in_metres(tmp_path):
     xr.testing.assert_identical(again, terrain)
 
 
-def test_paths_datasets_and_arrays_are_read_alike(tif):
-    with rasterio.open(tif) as dataset, rioxarray.open_rasterio(tif) as opened:
-        for source in (tif, str(tif), dataset, opened, opened[0], array(plane(np.nan))):
+def test_paths_and_arrays_are_read_alike(tif):
+    with rioxarray.open_rasterio(tif) as opened:
+        for source in (tif, str(tif), opened, opened[0], array(plane(np.nan))):
             assert_is_the_plane(read_terrain(source, source))
 
 
@@ -194,14 +192,11 @@ def test_zeros_apart_from_all_heights_are_warned_of_and_a_coast_is_not():
     read_terrain(coast, coast)  # warnings are errors
 
 
-def test_pictures_are_refused_and_bands_of_elevation_are_found(tmp_path):
+def test_pictures_are_refused_and_several_bands_are_warned_of(tmp_path):
     byte = plane(dtype="uint8")
     picture = write(tmp_path / "rgb.tif", byte, byte, byte, photometric="RGB")
     with pytest.raises(TrustboError, match="red"):
         read_terrain(picture)
-    named = {"descriptions": ("red", "green", "blue", "Elevation (m)")}
-    four = write(tmp_path / "four.tif", *[0 * plane()] * 3, plane(np.nan), **named)
-    assert_is_the_plane(read_terrain(four, four))
     two = write(tmp_path / "two.tif", plane(np.nan), plane())
     with pytest.warns(UserWarning, match="2 bands"):
         assert_is_the_plane(read_terrain(two, two))
@@ -251,8 +246,7 @@ def test_a_surface_below_the_ground_is_raised_and_counted():
     with pytest.warns(UserWarning, match=r"20\.0%"):
         terrain = read_terrain(array(plane()), array(surface))
     assert float((terrain["dsm"] - terrain["dem"]).min()) == 0.0
-    assert terrain.attrs["clipped_share"] == pytest.approx(0.2)
-    assert require_terrain(terrain).attrs["clipped_share"] == pytest.approx(0.2)
+    require_terrain(terrain)  # without another warning
 
 
 def test_without_a_surface_it_is_the_ground(tif):
@@ -299,7 +293,7 @@ def test_crs_is_for_rasters_without_one(tmp_path):
         read_terrain(path, crs="nonsense")
     other = write(tmp_path / "other.tif", plane())
     read_terrain(other, other, crs=UTM)
-    with pytest.raises(TrustboError, match="zone 33N"):
+    with pytest.raises(TrustboError, match="EPSG:32633"):
         read_terrain(other, crs="EPSG:32632")
 
 
@@ -415,8 +409,6 @@ def test_what_is_no_raster_of_heights_is_refused(tmp_path, tif):
     for wrong in (both["dem"], both.drop_vars("dsm"), both.drop_vars("spatial_ref")):
         with pytest.raises(TrustboError):
             require_terrain(wrong)
-    with pytest.raises(TrustboError, match="nodata"):
-        read_terrain(tif, nodata="none")
 
 
 def test_resolution_averages_whole_numbers_of_pixels(tmp_path, monkeypatch):
@@ -435,7 +427,7 @@ def test_resolution_averages_whole_numbers_of_pixels(tmp_path, monkeypatch):
     )
     for wrong in (0.0, 200.0):
         with pytest.raises(TrustboError, match="resolution"):
-            read_terrain(path, resolution=wrong)
+            read_terrain(path, path, resolution=wrong)
     monkeypatch.setattr("trustbo.terrain.read._MOST_PIXELS", 1000.0)
     for large in (path, stripped):
         with pytest.raises(TrustboError, match="memory"):

@@ -2,6 +2,7 @@
 
 import re
 import warnings
+from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -32,81 +33,61 @@ class Vertical(NamedTuple):
     datum: str | None = None
 
 
-class Coding(NamedTuple):
-    """Encoding of a raster's heights: in metres, they are metres * (scale * stored + offset).
-
-    Attributes:
-        name: Name of the raster, for messages.
-        fills: Stored values that mark missing data.
-        scale: Scale.
-        offset: Offset.
-        metres: Length of the unit of heights in metres, negative for depths.
-    """
-
-    name: str
-    fills: tuple[float, ...] = ()
-    scale: float = 1.0
-    offset: float = 0.0
-    metres: float = 1.0
-
-
 def warn(message: str) -> None:
     """Issue a warning that points to the caller of the package."""
     warnings.warn(message, skip_file_prefixes=(_PACKAGE,), stacklevel=2)
 
 
-def decoded(stored: np.ndarray, coding: Coding) -> np.ndarray:
-    """Convert stored values (row, col) to heights in metres, NaN where missing.
+def decoded(
+    stored: np.ndarray,
+    name: str,
+    fills: Iterable[float],
+    linear: tuple[float, float],
+    metres: float,
+) -> np.ndarray:
+    """Convert stored values to heights in metres, metres * (scale * stored + offset).
 
-    Non-finite values and declared fill values are missing.
+    Args:
+        stored: Values (row, col).
+        name: Name of the raster, for messages.
+        fills: Stored values that mark missing data, as non-finite ones do; they become NaN.
+        linear: Scale and offset.
+        metres: Length of the unit of heights in metres, negative for depths.
 
     Raises:
         TrustboError: Values are not real numbers, or are impossible as heights on land: undeclared
             fill values, fill values blended with heights, or heights in another unit.
     """
     if stored.dtype.kind not in "iuf":
-        raise TrustboError(
-            f"{coding.name} holds {stored.dtype}, which are no heights; give real numbers."
-        )
+        raise TrustboError(f"{name} holds {stored.dtype}, not heights; give real numbers.")
     values = stored.astype(float)
     missing = ~np.isfinite(values)
-    for fill in coding.fills:
-        missing |= values == _as_stored(fill, stored.dtype)
-    suspicious = np.isin(values, _FILLS if coding.scale != 1.0 else (*_FILLS, -999.0))
-    heights = coding.metres * (coding.scale * values + coding.offset)
+    with np.errstate(over="ignore"):
+        for fill in fills:  # rounded to the raster's type: float32 has no exact -3.4e38
+            missing |= stored == fill
+    scale, offset = linear
+    suspicious = np.isin(values, _FILLS if scale != 1.0 else (*_FILLS, -999.0))
+    heights = metres * (scale * values + offset)
     heights[missing] = np.nan
     wrong = ~missing & (suspicious | (heights < LOWEST) | (heights > HIGHEST))
-    if wrong.any():
-        raise _no_heights(coding, stored, heights, wrong)
-    return heights
-
-
-def _no_heights(
-    coding: Coding, stored: np.ndarray, heights: np.ndarray, wrong: np.ndarray
-) -> TrustboError:
-    """Error about values that are not heights, with the first of them and the likely cause."""
+    if not wrong.any():
+        return heights
     r, c = np.unravel_index(np.argmax(wrong), wrong.shape)
     value, height = float(stored[r, c]), heights[r, c]
     scaled = "" if value == height else f" (scaled to {height:g} m)"
-    where = f"{coding.name} holds {value!r}{scaled} at row {r}, column {c}"
+    where = f"{name} holds {value!r}{scaled} at row {r}, column {c}"
     share = wrong.sum() / np.isfinite(heights).sum()
     if share > 0.5:
-        return TrustboError(
+        raise TrustboError(
             f"{where}, and {share:.0%} of its heights lie outside {LOWEST:g} to {HIGHEST:g} m: "
             "they may be in another unit, such as centimetres; convert them, or declare their "
             "scale, e.g. with gdal_edit.py -scale 0.01."
         )
-    return TrustboError(
-        f"{where}, no height on land: a fill value that no tag declares, or one that resampling "
-        f"has blended with heights. Pass nodata={value!r}, or resample the raster again with its "
-        "fill value declared."
+    raise TrustboError(
+        f"{where}, which is no height on land: it is a fill value that no tag declares, or one "
+        f"that resampling has blended with heights. Pass nodata={value!r}, or resample the raster "
+        "again with its fill value declared."
     )
-
-
-def _as_stored(value: float, dtype: np.dtype) -> float:
-    """Value rounded to the raster's type: float32 cannot represent -3.4e38 exactly."""
-    with np.errstate(over="ignore"):
-        return float(dtype.type(value)) if dtype.kind == "f" else value
 
 
 def warn_of_zeros(heights: np.ndarray, name: str) -> None:

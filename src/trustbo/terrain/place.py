@@ -35,22 +35,17 @@ def require_map(name: str, own: object, given: CRS | None) -> CRS:
     flat = horizontal(crs)
     if given is not None and flat != horizontal(given):
         raise TrustboError(
-            f"{name} is in {name_of(crs)!r}, but crs= is {name_of(given)!r}; leave crs= out, or "
+            f"{name} is in {crs.to_string()}, but crs= is {given.to_string()}; leave crs= out, or "
             "correct the raster's own CRS, e.g. with gdal_edit.py -a_srs."
         )
     if not flat.is_geographic and not flat.is_projected:
-        raise TrustboError(f"{name} is in {name_of(crs)!r}, no map of the Earth; reproject it.")
+        raise TrustboError(f"{name} is in {crs.to_string()}, not a map of the Earth; reproject it.")
     if flat.is_projected and abs(flat.linear_units_factor[1] - 1.0) > 1e-9:
         raise TrustboError(
             f"{name} has a map in {flat.linear_units_factor[0]}, not metres; warp it, e.g. with "
             "gdalwarp -t_srs EPSG:32633."
         )
     return crs
-
-
-def name_of(crs: CRS) -> str:
-    """Name of a CRS, for messages."""
-    return crs.to_dict(projjson=True)["name"]
 
 
 def horizontal(crs: CRS) -> CRS:
@@ -82,20 +77,15 @@ def vertical_axis(crs: CRS) -> Vertical | None:
 def placed(heights: xr.DataArray, name: str) -> xr.DataArray:
     """Check that a raster is on Earth, and shift longitudes to -180 to 180."""
     crs, (y, x) = heights.rio.crs, (heights[axis].values for axis in ("y", "x"))
-    middle = 0.5 * (x[0] + x[-1])
+    middle, side = 0.5 * (x[0] + x[-1]), min(abs(x[1] - x[0]), abs(y[1] - y[0]))
     if crs.is_geographic:
         if max(abs(y[0]), abs(y[-1])) <= 90.0 and abs(middle) <= 540.0:
             return heights.assign_coords(x=x - 360.0 * round(middle / 360.0))
-    elif min(abs(x[1] - x[0]), abs(y[1] - y[0])) < 0.01:
-        raise TrustboError(
-            f"{name} has pixels of {abs(x[1] - x[0]):.2g} m in {crs.to_string()}: its coordinates "
-            "look like degrees; correct its CRS."
-        )
-    elif np.isfinite(_middle(heights, "EPSG:4326")).all():
+    elif side >= 0.01 and np.isfinite(_middle(heights, "EPSG:4326")).all():  # m: not degrees
         return heights
     raise TrustboError(
-        f"{name} has coordinates around ({middle:.8g}, {y[len(y) // 2]:.8g}), no place on Earth in "
-        f"its CRS, {crs.to_string()}; correct the CRS."
+        f"{name} has coordinates around ({middle:.8g}, {y[len(y) // 2]:.8g}) and pixels of "
+        f"{side:.2g}, which is impossible in its CRS, {crs.to_string()}; correct the CRS."
     )
 
 

@@ -5,11 +5,8 @@ NaN where missing, on a metric grid with north at the top.
 """
 
 import math
-import os
-import re
 import warnings
-from contextlib import nullcontext
-from os import PathLike
+from os import PathLike, fspath
 from typing import Any
 
 import numpy as np
@@ -20,12 +17,11 @@ from rasterio.crs import CRS
 from rasterio.enums import ColorInterp, Resampling
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
 from rasterio.io import DatasetReader
-from rasterio.vrt import WarpedVRT
 from rioxarray.exceptions import MissingSpatialDimensionError
 
 from trustbo.errors import TrustboError, require_positive
 from trustbo.files import FilePath
-from trustbo.terrain.heights import Coding, decoded, vertical_of, warn, warn_of_zeros
+from trustbo.terrain.heights import decoded, vertical_of, warn, warn_of_zeros
 from trustbo.terrain.place import (
     horizontal,
     known_crs,
@@ -36,19 +32,15 @@ from trustbo.terrain.place import (
     vertical_axis,
 )
 
-type RasterLike = FilePath | DatasetReader | WarpedVRT | xr.DataArray
-
 _MOST_PIXELS = 1e8  # of a raster: some 3 GB while it is read
 _CLIPPED = 0.02  # share of pixels with the surface below the ground, above which a warning is due
 _TALL, _RAISED = 60.0, 20.0  # m: unlikely medians and 5 % quantiles of canopy heights
-_DEGREE = 111_195.0  # of latitude, m
 _FILL_NAMES = ("_FillValue", "missing_value", "fill_value", "nodata")
-_HEIGHT_BANDS = re.compile(r"elev|height|altitude|\b(dem|dsm|dtm)\b", re.IGNORECASE)
 
 
 def read_terrain(
-    dem: RasterLike,
-    dsm: RasterLike | None = None,
+    dem: FilePath | xr.DataArray,
+    dsm: FilePath | xr.DataArray | None = None,
     *,
     crs: object = None,
     resolution: float | None = None,
@@ -63,22 +55,20 @@ def read_terrain(
     depths become negative heights.
 
     Args:
-        dem: Heights: a path or an address of a raster that GDAL reads (`/vsizip/...`,
-            `https://...`), an open rasterio dataset, or a DataArray with coordinates and a CRS of
-            rioxarray. Of several bands, the one described as elevation is read, else the first.
-            NaN, infinity, nodata values and pixels hidden by a mask or an alpha band are missing;
-            scale and offset are applied.
+        dem: Heights: the path or address of a raster that GDAL reads (`/vsizip/...`,
+            `https://...`), or a DataArray with coordinates and a CRS set by rioxarray. The first
+            band is read. NaN, infinity, nodata values and pixels hidden by a mask or an alpha band
+            are missing; scale and offset are applied.
         dsm: Heights of the surface, in the same forms, on any grid that overlaps the DEM's. Without
             it, the surface is the ground, with a warning.
         crs: Coordinate reference system of rasters without one, e.g. `"EPSG:32633"`.
-        resolution: Pixel size in metres: rasters with smaller pixels are averaged over whole
-            numbers of pixels, to about this size.
+        resolution: Pixel size in metres: smaller pixels are averaged over whole numbers of pixels,
+            to about this size.
         nodata: Another stored value that marks missing data.
 
     Returns:
         Dataset with `dem` and `dsm`, float64 in metres, dims (y, x) with north at the top, NaN
-        where one of the two has no data; the CRS is in `spatial_ref`. The attribute
-        `clipped_share` is the share of pixels whose surface was raised.
+        where one of the two has no data; the CRS is in `spatial_ref`.
 
     Raises:
         TrustboError: A source is not a raster of heights, is not georeferenced, or is too large for
@@ -89,24 +79,26 @@ def read_terrain(
         >>> terrain = tb.terrain.read_terrain("dem.tif", "dsm.tif", resolution=1.0)
     """
     given = None if crs is None else known_crs(crs)
-    ground = _heights(dem, "dem", given, resolution, nodata)
-    heights = on_metric_grid(ground)
+    ground = surface = _heights(dem, "dem", given, nodata)
     if dsm is None:
         warn("no surface (DSM) is given, so no canopy is known: only the ground blocks sight.")
-        return _paired(heights, heights)
-    surface = _heights(dsm, "dsm", given, resolution, nodata)
+    else:
+        surface = _heights(dsm, "dsm", given, nodata)
     datums = [heights.attrs["datum"] for heights in (ground, surface)]
     if all(datums) and datums[0] != datums[1]:
         raise TrustboError(
             f"{ground.name} has heights above {datums[0]!r}, but {surface.name} above "
             f"{datums[1]!r}; transform one of them, e.g. with gdalwarp -t_srs."
         )
-    if same_grid(surface, ground):
-        surface = on_metric_grid(surface)  # exactly as the ground was
-    if not same_grid(heights, surface):
+    alike = same_grid(ground, surface)
+    ground = on_metric_grid(ground)
+    if alike:
+        surface = on_metric_grid(surface)
+    else:
         how = Resampling.bilinear
-        surface = surface.rio.reproject_match(heights, resampling=how, nodata=np.nan)
-    return _paired(heights, surface)
+        surface = surface.rio.reproject_match(ground, resampling=how, nodata=np.nan)
+    terrain = _averaged(_paired(ground, surface), resolution).rio.write_crs(ground.rio.crs)
+    return terrain.rio.write_transform(terrain.rio.transform(recalc=True))
 
 
 def require_terrain(terrain: xr.Dataset) -> xr.Dataset:
@@ -120,100 +112,13 @@ def require_terrain(terrain: xr.Dataset) -> xr.Dataset:
             f"{type(terrain).__name__}."
         )
     read = read_terrain(terrain["dem"], terrain["dsm"], crs=terrain.rio.crs)
-    clipped = max(read.attrs["clipped_share"], terrain.attrs.get("clipped_share", 0.0))
-    return read.assign_attrs(terrain.attrs, clipped_share=clipped)
+    return read.assign_attrs(terrain.attrs)
 
 
 def pixel_size(terrain: xr.Dataset) -> tuple[float, float]:
     """Pixel height and width in metres."""
     y, x = (terrain.variables[axis].values for axis in ("y", "x"))
     return abs(float(y[-1] - y[0])) / (len(y) - 1), abs(float(x[-1] - x[0])) / (len(x) - 1)
-
-
-# --- one raster ---
-
-
-def _heights(
-    raster: RasterLike,
-    role: str,
-    given: CRS | None,
-    resolution: float | None,
-    nodata: float | None,
-) -> xr.DataArray:
-    """Heights of one raster, dem or dsm, in metres with north up, averaged to a resolution.
-
-    The attribute `datum` is the vertical datum, None if nothing declares one.
-    """
-    array = _stored(raster, role)
-    name = str(array.name)
-    crs = require_map(name, array.rio.crs, given)
-    vertical = vertical_of(name, array.attrs.get("units"), vertical_axis(crs))
-    if abs(vertical.metres) != 1.0:
-        warn(f"{name} has heights in {vertical.unit!r}; they are converted to metres.")
-
-    def note(default: float, *names: str) -> float:
-        found = [array.attrs[one] for one in names if one in array.attrs]
-        return _number(names[0], np.ravel(found[0])[0]) if found else default
-
-    fills = _declared_fills(array)
-    if nodata is not None:
-        fills = *fills, _number("nodata", nodata)
-    scale, offset = note(1.0, "scale_factor", "scales"), note(0.0, "add_offset", "offsets")
-    coding = Coding(name, fills, scale, offset, vertical.metres)
-    coords = {axis: array[axis].values for axis in ("y", "x")}
-    heights = xr.DataArray(decoded(array.to_numpy(), coding), coords, name=name)
-    heights = _averaged(heights, crs.is_geographic, resolution)
-    warn_of_zeros(heights.values, name)
-    heights = heights.sortby("y", ascending=False).sortby("x").assign_attrs(datum=vertical.datum)
-    return placed(heights.rio.write_crs(horizontal(crs)), name)
-
-
-def _averaged(heights: xr.DataArray, in_degrees: bool, resolution: float | None) -> xr.DataArray:
-    """Means over square blocks of about a resolution, m; NaN if over half of a block is missing.
-
-    Incomplete blocks at the edge are dropped.
-    """
-    if resolution is None:
-        return heights
-    side = abs(float(heights["y"][1] - heights["y"][0])) * (_DEGREE if in_degrees else 1.0)
-    factor = max(1, round(require_positive("resolution", resolution) / side))
-    if min(heights.shape) < 2 * factor:
-        raise TrustboError(
-            f"{heights.name} has {heights.shape} pixels, too few to average {factor} x {factor}; "
-            "lower resolution=."
-        )
-    squares: Any = heights.coarsen(y=factor, x=factor, boundary="trim")
-    return squares.mean().where(2 * squares.count() >= factor**2)
-
-
-# --- what is stored ---
-
-
-def _stored(raster: RasterLike, role: str) -> xr.DataArray:
-    """Stored values of any kind of raster, dims (y, x); its name, with `role`, is for messages."""
-    if isinstance(raster, xr.DataArray):
-        name = f"{role}: DataArray" + (f" {raster.name!r}" if raster.name else "")
-        check_size(raster.shape, name)
-        return _of_array(raster, name)
-    if isinstance(raster, str | PathLike):
-        name = f"{role}: {os.fspath(raster)!r}"
-    elif isinstance(raster, DatasetReader | WarpedVRT):
-        name = f"{role}: {raster.name!r}"
-    else:
-        raise TrustboError(
-            f"{role} must be a path, an open rasterio dataset or an xarray.DataArray; got "
-            f"{type(raster).__name__}."
-        )
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            is_open = isinstance(raster, DatasetReader | WarpedVRT)
-            opened = nullcontext(raster) if is_open else rasterio.open(raster)
-        with opened as file:
-            check_size(file.shape, name)
-            return _of_array(_of_file(file, name), name)
-    except RasterioError as error:
-        raise TrustboError(f"{name} cannot be read by GDAL: {error}.") from None
 
 
 def check_size(shape: tuple[int, ...], name: str) -> None:
@@ -225,15 +130,58 @@ def check_size(shape: tuple[int, ...], name: str) -> None:
         )
 
 
-def _of_file(file: DatasetReader | WarpedVRT, name: str) -> xr.DataArray:
-    """Height band of a GDAL dataset: the band described as elevation, else the first.
+def _heights(
+    raster: FilePath | xr.DataArray, role: str, given: CRS | None, nodata: float | None
+) -> xr.DataArray:
+    """Heights of one raster, dem or dsm, in metres with north at the top.
 
-    Pixels hidden by a mask or an alpha band are NaN. With these, GDAL's own mask ignores the nodata
-    tag, so the tag is added to the declared fills.
+    The attribute `datum` is the vertical datum, None if nothing declares one.
+    """
+    array = _stored(raster, role)
+    name = str(array.name)
+    crs = require_map(name, array.rio.crs, given)
+    vertical = vertical_of(name, array.attrs.get("units"), vertical_axis(crs))
+    if abs(vertical.metres) != 1.0:
+        warn(f"{name} has heights in {vertical.unit!r}; they are converted to metres.")
+    tags = [nodata, *(array.attrs.get(key) for key in _FILL_NAMES)]
+    fills = [float(fill) for tag in tags if tag is not None for fill in np.ravel(tag)]
+    scale, offset = array.attrs.get("scale_factor", 1.0), array.attrs.get("add_offset", 0.0)
+    values = decoded(array.to_numpy(), name, fills, (scale, offset), vertical.metres)
+    warn_of_zeros(values, name)
+    coords = {axis: array[axis].values for axis in ("y", "x")}
+    heights = xr.DataArray(values, coords, name=name, attrs={"datum": vertical.datum})
+    heights = heights.sortby("y", ascending=False).sortby("x")
+    return placed(heights.rio.write_crs(horizontal(crs)), name)
+
+
+def _stored(raster: FilePath | xr.DataArray, role: str) -> xr.DataArray:
+    """Stored values of a file or an array, dims (y, x); its name, with `role`, is for messages."""
+    if isinstance(raster, xr.DataArray):
+        name = f"{role}: DataArray" + (f" {raster.name!r}" if raster.name else "")
+        return _of_array(raster, name)
+    if not isinstance(raster, str | PathLike):
+        kind = type(raster).__name__
+        raise TrustboError(f"{role} must be a path or an xarray.DataArray; got {kind}.")
+    name = f"{role}: {fspath(raster)!r}"
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)
+            with rasterio.open(raster) as file:
+                return _of_array(_of_file(file, name), name)
+    except RasterioError as error:
+        raise TrustboError(f"{name} cannot be read by GDAL: {error}.") from None
+
+
+def _of_file(file: DatasetReader, name: str) -> xr.DataArray:
+    """First band of a GDAL dataset, NaN where a mask or an alpha band hides a pixel.
+
+    With a mask or an alpha band, GDAL's own mask ignores the nodata tag, so the tag is added to the
+    declared fill values.
     """
     if not file.count:
         parts = ", ".join(file.subdatasets) or "nothing"
         raise TrustboError(f"{name} has no band of its own; give one of its parts: {parts}.")
+    check_size(file.shape, name)
     t = file.transform
     # Less than a thousandth of a pixel over the whole raster is rounding.
     turned = abs(t.b) * file.height > 1e-3 * abs(t.a) or abs(t.d) * file.width > 1e-3 * abs(t.e)
@@ -243,29 +191,24 @@ def _of_file(file: DatasetReader | WarpedVRT, name: str) -> xr.DataArray:
             "map, e.g. with gdalwarp -t_srs EPSG:32633, or declare its corners, e.g. with "
             "gdal_edit.py -a_ullr."
         )
-    colours = dict(enumerate(file.colorinterp, 1))
-    alpha = [k for k, colour in colours.items() if colour == ColorInterp.alpha]
-    bands = [k for k in colours if k not in alpha] or [1]
-    named = [k for k in bands if _HEIGHT_BANDS.search(file.descriptions[k - 1] or "")]
-    band = named[0] if len(named) == 1 else bands[0]
-    if colours[band] not in (ColorInterp.undefined, ColorInterp.gray):
+    first, *others = file.colorinterp
+    if first not in (ColorInterp.undefined, ColorInterp.gray):
         raise TrustboError(
-            f"{name} is a picture: band {band} has the colour {colours[band].name!r}; give a "
-            "raster of heights."
+            f"{name} is a picture: its first band has the colour {first.name!r}; give a raster of "
+            "heights, e.g. one band of it with gdal_translate -b."
         )
-    if len(named) != 1:
-        _warn_of_bands(len(bands), name)
-    if file.dtypes[band - 1].startswith("complex"):
-        raise TrustboError(f"{name} holds complex numbers, no heights; give real numbers.")
-    stored = file.read(band, masked=True)
+    if file.dtypes[0].startswith("complex"):
+        raise TrustboError(f"{name} holds complex numbers, not heights; give real numbers.")
+    stored = file.read(1, masked=True)
     values = stored.astype(np.result_type(stored, np.float32)).filled(np.nan)
-    for k in alpha:  # GDAL's mask knows no alpha band of floats
+    alpha = [k for k, colour in enumerate(others, 2) if colour == ColorInterp.alpha]
+    for k in alpha:  # GDAL does not mask by an alpha band of floats
         values[file.read(k) == 0] = np.nan
-    names = {
-        "_FillValue": file.nodatavals, "scale_factor": file.scales, "add_offset": file.offsets,
-        "units": file.units,
+    _warn_of_bands(file.count - len(alpha), name)
+    attrs = {
+        "_FillValue": file.nodata, "scale_factor": file.scales[0], "add_offset": file.offsets[0],
+        "units": file.units[0],
     }  # fmt: skip
-    attrs = {key: of_bands[band - 1] for key, of_bands in names.items()}
     rows, cols = np.arange(file.height) + 0.5, np.arange(file.width) + 0.5
     coords = {"y": t.f + rows * t.e, "x": t.c + cols * t.a}
     array = xr.DataArray(values, coords, ("y", "x"), attrs=attrs)
@@ -279,6 +222,7 @@ def _warn_of_bands(n: int, name: str) -> None:
 
 def _of_array(array: xr.DataArray, name: str) -> xr.DataArray:
     """Array of dims (y, x), evenly spaced; of several bands, the first."""
+    check_size(array.shape, name)
     try:
         y, x = array.rio.y_dim, array.rio.x_dim
     except MissingSpatialDimensionError:
@@ -293,16 +237,6 @@ def _of_array(array: xr.DataArray, name: str) -> xr.DataArray:
     array = array.isel(dict.fromkeys(bands, 0)).transpose(y, x)
     rows, cols = (_even(array[axis].values, f"{name}'s {axis}") for axis in (y, x))
     return array.rename({y: "y", x: "x"}).assign_coords(y=rows, x=cols).rename(name)
-
-
-def _declared_fills(array: xr.DataArray) -> tuple[float, ...]:
-    """Values declared missing by attributes, and by an encoding without a scale."""
-    notes = [array.attrs]
-    # An encoding has been applied: with a scale, its fill value is no height.
-    if not {"scale_factor", "add_offset", "scales", "offsets"} & set(array.encoding):
-        notes.append(array.encoding)
-    tags = [tag for note in notes for key in _FILL_NAMES for tag in np.ravel(note.get(key, []))]
-    return tuple(_number("nodata", tag) for tag in tags if tag is not None)
 
 
 def _even(values: np.ndarray, what: str) -> np.ndarray:
@@ -322,16 +256,6 @@ def _even(values: np.ndarray, what: str) -> np.ndarray:
     return given if off <= 1e-6 * step else even
 
 
-def _number(what: str, value: Any) -> float:
-    try:
-        return float(value)
-    except (TypeError, ValueError):
-        raise TrustboError(f"{what} must be a number; got {value!r}.") from None
-
-
-# --- the pair ---
-
-
 def _paired(ground: xr.DataArray, surface: xr.DataArray) -> xr.Dataset:
     """Combine two rasters on one grid: common NaN, and no surface below the ground."""
     dem, dsm = ground.values, surface.values
@@ -342,11 +266,10 @@ def _paired(ground: xr.DataArray, surface: xr.DataArray) -> xr.Dataset:
             "all nodata where they overlap."
         )
     canopy = (dsm - dem)[valid]
-    clipped = float((canopy < 0.0).mean())
-    if clipped > _CLIPPED:
+    if (share := (canopy < 0.0).mean()) > _CLIPPED:
         warn(
-            f"the DSM lies below the DEM on {clipped:.1%} of pixels; it is raised to the DEM "
-            "there. Check that both share one vertical datum."
+            f"the DSM lies below the DEM on {share:.1%} of pixels; it is raised to the DEM there. "
+            "Check that both share one vertical datum."
         )
     low, middle = np.quantile(canopy, [0.05, 0.5])
     if low > _RAISED or middle > _TALL:
@@ -359,6 +282,21 @@ def _paired(ground: xr.DataArray, surface: xr.DataArray) -> xr.Dataset:
         name: (("y", "x"), np.where(valid, z, np.nan), {"long_name": long_name, "units": "m"})
         for name, (long_name, z) in heights.items()
     }
-    coords = {axis: ground[axis].values for axis in ("y", "x")}
-    terrain = xr.Dataset(maps, coords, {"clipped_share": clipped}).rio.write_crs(ground.rio.crs)
-    return terrain.rio.write_transform(terrain.rio.transform(recalc=True))
+    return xr.Dataset(maps, {axis: ground[axis].values for axis in ("y", "x")})
+
+
+def _averaged(terrain: xr.Dataset, resolution: float | None) -> xr.Dataset:
+    """Means over square blocks of about a resolution, m; NaN if over half of a block is missing.
+
+    Incomplete blocks at the edge are dropped.
+    """
+    if resolution is None:
+        return terrain
+    factor = max(1, round(require_positive("resolution", resolution) / pixel_size(terrain)[0]))
+    shape = terrain["dem"].shape
+    if min(shape) < 2 * factor:
+        raise TrustboError(
+            f"{shape} pixels are too few to average {factor} x {factor}; lower resolution=."
+        )
+    squares: Any = terrain.coarsen(y=factor, x=factor, boundary="trim")
+    return squares.mean().where(2 * squares.count() >= factor**2)
