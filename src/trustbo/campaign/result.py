@@ -17,7 +17,7 @@ from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError
 from trustbo.files import FilePath
 from trustbo.hazard.risk import BoundRisk
-from trustbo.inference import complete, params_of, place_maps, sample_prior
+from trustbo.inference import complete, params_of, sample_prior
 from trustbo.inference.diagnostics import MAX_RHAT
 from trustbo.inference.draws import prior_mean
 from trustbo.inference.importance import GOOD_KHAT
@@ -245,8 +245,7 @@ class Result(Summary):
             averaged over robots, under its name, or as `awareness_<name>` if another map or a dim
             has that name. Values are NaN where no robot can go. For models with place effects, it
             also contains `place_mean` and `place_sd` of the effect of each cell, and
-            `place_bounds_mean`, the mean effect of the bounds into it (see `inference.place_maps`),
-            averaged over robots where the effects differ by robot.
+            `place_bounds_mean`, the mean effect of the bounds into it.
         """
         if n_draws is None:
             dynamics = self.planner.problem.dynamics(self.belief.mean())
@@ -271,16 +270,19 @@ class Result(Summary):
 
     def _places(self) -> xr.Dataset:
         """Maps of the place effects, (row, col), if the model has them."""
-        if "places" not in self.posterior.children:
-            return xr.Dataset()
-        effects = place_maps(self.posterior)
-        if "place_bound_mean" in effects:
-            into = effects["place_bound_mean"].where(self.workspace.passable_bounds).mean("move")
-            label = "mean effect on trust of the bounds into a cell"
-            into.attrs = {"long_name": label, "units": "1"}
-            effects["place_bounds_mean"] = into
-        maps = effects.drop_vars(["place_bound_mean", "place_bound_sd", "move"], errors="ignore")
-        return maps.mean("robot", keep_attrs=True) if "robot" in maps.dims else maps
+        maps = xr.Dataset()
+        if self.state.last is None or not (places := self.belief.places):
+            return maps
+        cells = places["place"].mean(1)  # (draw, row, col)
+        bounds = xr.DataArray(places["place_bound"].mean((0, 1)), dims=("move", "row", "col"))
+        into = bounds.where(self.workspace.passable_bounds.drop_vars("move")).mean("move")
+        for name, text, values in (
+            ("place_mean", "mean effect of the cell on trust", cells.mean(0)),
+            ("place_sd", "standard deviation of the effect of the cell on trust", cells.std(0)),
+            ("place_bounds_mean", "mean effect on trust of the bounds into a cell", into.values),
+        ):
+            maps[name] = ("row", "col"), values, {"long_name": text, "units": "1"}
+        return maps
 
     def plot_maps(self, **options: Any) -> np.ndarray:
         """Draw trust maps and paths of four missions; options and Axes as in `plots.trust_maps`."""

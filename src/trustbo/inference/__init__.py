@@ -8,7 +8,6 @@ from trustbo.inference.draws import params_of, sample_prior
 from trustbo.inference.filter import TrustFilter
 from trustbo.inference.fit import fit
 from trustbo.inference.loo import compare, loo
-from trustbo.inference.place_maps import place_maps
 from trustbo.inference.reports import predict_reports
 from trustbo.inference.score import score
 from trustbo.inference.tree import complete
@@ -21,7 +20,6 @@ __all__ = [
     "fit",
     "loo",
     "params_of",
-    "place_maps",
     "predict_reports",
     "sample_prior",
     "score",

@@ -17,17 +17,15 @@ import xarray as xr
 from scipy import fft
 from scipy.linalg import cho_factor, cho_solve
 
-from trustbo.errors import TrustboError, require_kind
 from trustbo.models.effects.place import matern
 from trustbo.models.visited import Visited
 from trustbo.parallel import one_blas_thread
-from trustbo.workspace.moves import MOVE_NAMES, existing_bounds
+from trustbo.workspace.moves import MOVE_NAMES
 
 _STEP = 0.1  # of the logarithm of length scales
 _LARGEST = 4.0  # length scale in units of the grid's longer side
 _REACH = 5.0  # length scales at which the correlation is .002
 _JITTER = 1e-9
-_MOMENTS = "mean", "standard deviation of the"
 _MAP = "row", "col"
 
 
@@ -93,7 +91,7 @@ def _cells(visited: _Visited, sites: Mapping[str, np.ndarray], seed: list[int]) 
     flat = visited.cells[:, 0] * shape[1] + visited.cells[:, 1]
     centre = np.zeros((len(s), shape[0] * shape[1]))
     off = np.empty(centre.shape)
-    for step, rows, scale, weights, _ in _kriging(sites["length_scale"], visited):
+    for step, rows, scale, weights in _kriging(sites["length_scale"], visited):
         rng = np.random.default_rng([*seed, step + 1000])
         free = _prior(shape, scale, int(rows.sum()), rng) * sites["tau_s"][rows, None]
         centre[rows] = s[rows] @ weights
@@ -103,11 +101,10 @@ def _cells(visited: _Visited, sites: Mapping[str, np.ndarray], seed: list[int]) 
 
 def _kriging(
     length_scale: np.ndarray, visited: _Visited
-) -> Iterator[tuple[int, np.ndarray, float, np.ndarray, np.ndarray]]:
-    """Yield draws, length scale and kriging terms for each step of length scales.
+) -> Iterator[tuple[int, np.ndarray, float, np.ndarray]]:
+    """Yield draws, length scale and kriging weights for each step of length scales.
 
-    The terms are weights (cell, all) of the effects at `cells` in the mean of s over the grid, and
-    the conditional variance (all,) for unit prior variance.
+    Weights (cell, all) are those of the effects at visited cells in the mean of s over the grid.
     """
     cells, grid = visited.cells, np.indices(visited.shape).reshape(2, -1).T
     # Beyond, all cells are nearly equal, and `_prior` would need a far larger grid in memory.
@@ -119,8 +116,7 @@ def _kriging(
         if len(cells):
             K = _correlation(cells, cells, scale) + _JITTER * np.eye(len(cells))
             weights = cho_solve(cho_factor(K), cross)
-        left = np.maximum(1.0 - (weights * cross).sum(0), 0.0)
-        yield int(step), steps == step, scale, weights, left
+        yield int(step), steps == step, scale, weights
 
 
 def _correlation(cells: np.ndarray, others: np.ndarray, length_scale: float) -> np.ndarray:
@@ -150,57 +146,3 @@ def _centre(draws: np.ndarray) -> np.ndarray:
         draws -= draws.mean(0)
         draws *= np.sqrt(n / (n - 1.0))
     return draws
-
-
-def place_maps(posterior: xr.DataTree) -> xr.Dataset:
-    """Mean and standard deviation of the effect of every cell and bound, over a posterior.
-
-    Exact given the draws at visited places: unvisited places enter by their conditional mean and
-    variance instead of by draws.
-
-    Args:
-        posterior: DataTree from `fit` of a model with effects of places.
-
-    Returns:
-        place_mean and place_sd (row, col) of s, the effect of entering a cell, and place_bound_mean
-        and place_bound_sd (move, row, col) of e, the further effect of entering it by that move.
-        Effects are added to trust at each such bound. Moves have the names of
-        `workspace.awareness`, "n" towards row 0; NaN where a move would come from outside the grid.
-
-    Raises:
-        TrustboError: If the posterior is not from `fit`, or its model has no effects of places.
-    """
-    require_kind("posterior", posterior, xr.DataTree, "give one of trustbo.fit")
-    if "places" not in posterior.children:
-        raise TrustboError(
-            f"a posterior of {posterior.attrs.get('model', 'a model')} without effects of places "
-            "has no maps of them; fit a model with effects=PlaceEffect()."
-        )
-    visited = _Visited(posterior["places"].to_dataset())
-    draws = posterior["posterior"].to_dataset()
-    sites = {name: draws[name].values.ravel() for name in ("tau_s", "length_scale", "tau_e")}
-    of_bounds = np.zeros((2, len(MOVE_NAMES), *visited.shape))
-    of_bounds[1] = np.sqrt((sites["tau_e"] ** 2).mean())
-    of_bounds[:, *visited.bounds] = visited.e.mean(0), visited.e.std(0)
-    of_bounds[..., ~existing_bounds(np.ones(visited.shape, bool))] = np.nan
-    maps, (rows, cols) = xr.Dataset(), visited.shape
-    for name, text, axes, moments in (
-        ("place", "cell", _MAP, _moments_of_cells(visited, sites)),
-        ("place_bound", "bound by a move", ("move", *_MAP), of_bounds),
-    ):
-        for kind, long, values in zip(("mean", "sd"), _MOMENTS, moments, strict=True):
-            attrs = {"long_name": f"{long} effect of the {text} on trust", "units": "1"}
-            maps[f"{name}_{kind}"] = axes, values, attrs
-    return maps.assign_coords(move=list(MOVE_NAMES), row=np.arange(rows), col=np.arange(cols))
-
-
-@one_blas_thread()
-def _moments_of_cells(visited: _Visited, sites: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Mean and standard deviation of s over the grid, (2, row, col)."""
-    s, shape = visited.s, visited.shape
-    centre = np.zeros((len(s), shape[0] * shape[1]))
-    variance = np.zeros(shape[0] * shape[1])
-    for _, rows, _, weights, left in _kriging(sites["length_scale"], visited):
-        centre[rows] = s[rows] @ weights
-        variance += (sites["tau_s"][rows] ** 2).sum() * left / len(s)
-    return np.stack([centre.mean(0), np.sqrt(centre.var(0) + variance)]).reshape(2, *shape)
