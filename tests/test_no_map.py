@@ -77,7 +77,7 @@ def test_a_robot_that_stands_out_is_found_without_places():
         y[:, 1] -= 0.5 * z[:, 1, 0] * (j >= 3)  # robot 2, index 1, from mission 3 on
         given = z, np.clip(y, 0.0, 1.0)
         missions.append(Mission.from_arrays(None, *given, features=["line_of_sight"]))
-    found = tb.check(tb.fit(missions, PooledTrust(effects=RobotEffect())), compare=False)
+    found = tb.check(tb.fit(missions, PooledTrust(effects=RobotEffect())))
     assert found.table.loc["robots", "stands_out"]
     assert found.table.loc["robots", "label"] == "r2"
     odd = found.robots[found.robots["stands_out"]]

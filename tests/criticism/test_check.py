@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 import trustbo as tb
-from trustbo.criticism.check import variants
 from trustbo.models import PlaceEffect, PooledTrust, RobotEffect
 
 MODEL = PooledTrust(effects=(PlaceEffect(), RobotEffect()))
@@ -24,8 +23,8 @@ def drawn(seed=0, *, robot=0.0, place=0.0, slope=0.8, n_missions=8):
     return missions
 
 
-def checked(missions, model=MODEL, **options):
-    return tb.check(tb.fit(missions, model, progress=False), compare=False, **options)
+def checked(missions, model=MODEL):
+    return tb.check(tb.fit(missions, model, progress=False))
 
 
 def test_nothing_stands_out_where_nothing_is_wrong():
@@ -33,7 +32,6 @@ def test_nothing_stands_out_where_nothing_is_wrong():
 
     assert not found.table["stands_out"].any()
     assert not found.robots["stands_out"].any()
-    assert len(found.loo) == 0
 
 
 def test_a_robot_that_degrades_stands_out_from_then_on():
@@ -71,29 +69,8 @@ def test_intervals_of_a_campaign_that_are_too_narrow_stand_out():
     ]
     posteriors = [tb.fit(quiet, PooledTrust(), progress=False)] * 6
 
-    assert not tb.check(posteriors, quiet, compare=False).table.loc["coverage", "stands_out"]
-    assert tb.check(posteriors, noisy, compare=False).table.loc["coverage", "stands_out"]
-
-
-def test_a_model_without_a_planted_effect_loses_the_comparison():
-    posterior = tb.fit(drawn(place=-0.35, n_missions=5), PooledTrust(), progress=False)
-    found = tb.check(posterior)
-
-    assert found.loo.index[0] == "with effects of places"
-    assert found.table.loc["comparison", "size"] < 0.0
-
-
-def test_variants_leave_out_each_effect_and_add_each_that_is_absent():
-    missions = drawn(n_missions=1)
-
-    assert list(variants(MODEL, missions)) == [
-        "without effects of places",
-        "without effects of robots",
-    ]
-    assert list(variants(PooledTrust(), missions)) == [
-        "with effects of places",
-        "with effects of robots",
-    ]
+    assert not tb.check(posteriors, quiet).table.loc["coverage", "stands_out"]
+    assert tb.check(posteriors, noisy).table.loc["coverage", "stands_out"]
 
 
 def test_what_is_no_posterior_of_contact_is_refused():

@@ -1,7 +1,7 @@
-"""Check of a fitted model: problems indicated by its posterior, predictions and LOO."""
+"""Check of a fitted model: problems indicated by its posterior and predictions."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 
 import numpy as np
 import pandas as pd
@@ -10,28 +10,15 @@ import xarray as xr
 from trustbo.data import Mission
 from trustbo.display import Rows, Summary, joined
 from trustbo.errors import TrustboError
-from trustbo.inference.draws import (
-    is_of_people,
-    joined_draws,
-    missions_of,
-    model_of,
-    require_posterior,
-)
-from trustbo.inference.fit import fit
-from trustbo.inference.loo import compare as ranked
+from trustbo.inference.draws import is_of_people, joined_draws, missions_of, require_posterior
 from trustbo.inference.score import score
-from trustbo.models.effects.place import PlaceEffect
-from trustbo.models.effects.robot import RobotEffect
 from trustbo.models.families import FAMILIES
-from trustbo.models.model import TrustModel
-from trustbo.models.visited import has_places
 
 SIZE, SURE = 0.1, 0.95
 """Smallest effect on contact that may change a plan, and the probability required for it."""
 _SIGNED = 0.6  # prior probability of one sign from which on a weight has an expected sign
 _TOLERANCE = 0.05  # of the share of rates in 90 % intervals
 _ERRORS = 2.0  # standard errors of a difference that counts
-_GIVEN = "the model"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -44,14 +31,11 @@ class Check(Summary):
             finding, its probability, whether it `stands_out`, and the finding in words.
         robots: One row per mission and robot: its effect as a share of line of sight minus the
             team's median, the sd, the probability that it exceeds .1, and whether it `stands_out`.
-        loo: Table of `compare` for the model and its variants with one effect removed or added;
-            empty without `compare`.
     """
 
     verdict: str
     table: pd.DataFrame
     robots: pd.DataFrame
-    loo: pd.DataFrame
 
     def _rows(self) -> Rows:
         rows = [(str(name), str(row["finding"])) for name, row in self.table.iterrows()]
@@ -72,9 +56,6 @@ class Finding:
 def check(
     posterior: xr.DataTree | Sequence[xr.DataTree],
     missions: Sequence[Mission] | None = None,
-    *,
-    compare: bool = True,
-    model: TrustModel | None = None,
 ) -> Check:
     """Check a fitted model of contact rates.
 
@@ -82,16 +63,13 @@ def check(
     team's median with a probability above .95; a place, if its effect exceeds .1 of contact; a
     weight, if its sign contradicts the prior's; coverage, if the share of rates inside 90 %
     intervals one mission ahead differs from .9 by more than .05 and two standard errors over
-    missions; a comparison, if another model predicts left-out missions better by two standard
-    errors. For the shape of predictions see `pit` of `tb.inference.score`, for the sensitivity to
-    the priors `az.psense_summary(posterior)`.
+    missions. For the shape of predictions see `pit` of `tb.inference.score`, for the sensitivity to
+    the priors `az.psense_summary(posterior)`, for other models `tb.compare`.
 
     Args:
         posterior: DataTree from `fit`; or all posteriors of a campaign, `Result.posteriors`: the
             last is checked, and the predictions of each for the next mission are scored.
-        missions: Missions of the fit, needed where the posterior holds no data; or of the campaign.
-        compare: Whether to compare with other models by LOO; each of them is fitted.
-        model: Model of the posterior, needed if its priors are custom.
+        missions: All missions of the campaign; by default those that the last posterior holds.
 
     Raises:
         TrustboError: If the posterior is not from `fit`, is of people's reports, or holds no data
@@ -101,8 +79,6 @@ def check(
     tree = require_posterior("check", trees[-1])
     if is_of_people(tree):
         raise TrustboError("check is of robots' contact; this posterior is of people's reports.")
-    missions = missions_of(tree) if missions is None else missions
-
     robots = effects_of_robots(tree)
     findings = {
         "robots": _check_robots(robots),
@@ -110,13 +86,10 @@ def check(
         "weights": _check_weights(tree),
         "coverage": _check_coverage(trees, missions),
     }
-    loo = _compare(tree, missions, model) if compare else pd.DataFrame()
-    if len(loo):
-        findings["comparison"] = _check_comparison(loo)
     rows = {name: asdict(finding) for name, finding in findings.items()}
     table = pd.DataFrame.from_dict(rows, orient="index").rename_axis("check")
     odd = [finding.finding for finding in findings.values() if finding.stands_out]
-    return Check(("; ".join(odd) or "nothing stands out") + ".", table, robots, loo)
+    return Check(("; ".join(odd) or "nothing stands out") + ".", table, robots)
 
 
 def effects_of_robots(posterior: xr.DataTree) -> pd.DataFrame:
@@ -157,15 +130,13 @@ def _check_robots(robots: pd.DataFrame) -> Finding:
 def _check_places(posterior: xr.DataTree) -> Finding:
     if "places" not in posterior.children:
         return Finding("not tested: the model has no effects of places")
-    places, total = posterior["places"].to_dataset(), np.zeros(1)
+    places = posterior["places"].to_dataset()
     cells, where = (
         list(zip(places[f"{kind}_row"].values, places[f"{kind}_col"].values, strict=True))
-        for kind in ("cell", "bound" if "place_bound" in places else "cell")
+        for kind in ("cell", "bound")
     )
-    if "place_bound" in places:
-        total = joined_draws(places["place_bound"])
-    if "place" in places:
-        total = total + joined_draws(places["place"])[:, [cells.index(cell) for cell in where]]
+    of_cells = joined_draws(places["place"])[:, [cells.index(cell) for cell in where]]
+    total = joined_draws(places["place_bound"]) + of_cells
     beta0 = joined_draws(posterior["posterior"].to_dataset()["beta0"])
     draws = total / (1.0 - beta0[:, None])  # stationary trust
     effect = draws.mean(0)
@@ -198,48 +169,13 @@ def _check_weights(posterior: xr.DataTree) -> Finding:
     return Finding(words, bool(odd), str(features[most]), size, p)
 
 
-def _check_coverage(trees: Sequence[xr.DataTree], missions: Sequence[Mission]) -> Finding:
+def _check_coverage(trees: list[xr.DataTree], missions: Sequence[Mission] | None) -> Finding:
     if len(trees) < 2:
         return Finding("not tested: give all posteriors of a campaign")
-    pit = score(trees, missions)["pit"]
+    pit = score(trees, missions_of(trees[-1]) if missions is None else missions)["pit"]
     within = (abs(pit - 0.5) <= 0.45).where(pit.notnull()).mean(("bound", "robot")).values
     within = within[np.isfinite(within)]
     off = float(within.mean() - 0.9)
     error = within.std(ddof=1) / np.sqrt(len(within)) if len(within) > 1 else np.inf
     words = f"90 % intervals one mission ahead hold {within.mean():.0%} of the rates"
     return Finding(words, bool(abs(off) > max(_TOLERANCE, _ERRORS * error)), "90 %", off)
-
-
-def _compare(
-    posterior: xr.DataTree, missions: Sequence[Mission], model: TrustModel | None
-) -> pd.DataFrame:
-    """Table of `compare` of the model and its variants."""
-    others = {
-        name: fit(missions, other, seed=int(posterior.attrs["seed"]), progress=False)
-        for name, other in variants(model_of(posterior, model), missions).items()
-    }
-    return ranked({_GIVEN: posterior, **others}) if others else pd.DataFrame()
-
-
-def variants(model: TrustModel, missions: Sequence[Mission]) -> dict[str, TrustModel]:
-    """Variants of the model with one effect removed or added, by name."""
-    named: dict[str, TrustModel] = {}
-    for effect in model.effects:
-        others = tuple(other for other in model.effects if other is not effect)
-        named[f"without effects of {effect.noun}"] = replace(model, effects=others)
-    kinds = (PlaceEffect, RobotEffect) if has_places(missions) else (RobotEffect,)
-    for kind in kinds:
-        if not any(isinstance(effect, kind) for effect in model.effects):
-            effects = (*model.effects, kind())
-            named[f"with effects of {kind.noun}"] = replace(model, effects=effects)
-    return named
-
-
-def _check_comparison(loo: pd.DataFrame) -> Finding:
-    best = str(loo.index[0])
-    if best == _GIVEN:
-        return Finding("no other model predicts missions left out better")
-    given = loo.index.get_loc(_GIVEN)
-    difference, error = (float(loo[name].to_numpy()[given]) for name in ("elpd_diff", "dse"))
-    words = f"{best} it predicts missions left out better by {abs(difference):.1f} nats"
-    return Finding(words, abs(difference) > _ERRORS * error, best, difference)
