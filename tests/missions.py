@@ -6,7 +6,6 @@ from hypothesis import strategies as st
 from trustbo.data import NOWHERE, Bound, Mission
 from trustbo.models import TrustParams
 from trustbo.models.families import FAMILIES
-from trustbo.models.simulate import draw_missions
 
 TRUTH = TrustParams(0.6, np.array([0.3, 0.2]), 0.05, 0.05, 0.05)
 N_TICKS = 20
@@ -18,9 +17,20 @@ OF_FAMILY = {
 
 
 def draw_rates(params, awareness, *, family="gaussian", n_ticks=np.nan, seed=0):
-    """Rates (mission, bound, robot) that a model draws for given parameters."""
-    rng, ticks = np.random.default_rng([0, seed, 0x6D697373]), np.full(awareness.shape[:3], n_ticks)
-    return draw_missions(FAMILIES[family], params, awareness, ticks, rng)
+    """Rates (mission, bound, robot) of the pooled model for given parameters."""
+    rng, n_robots = np.random.default_rng([0, seed, 0x6D697373]), awareness.shape[2]
+    as_map = np.moveaxis(awareness, 2, 0)[:, None]  # (robot, 1, mission, bound, feature)
+    u = np.moveaxis(params.increments(as_map)[:, 0], 0, -1) + params.b
+    if params.memory == "deviation":  # x - u lasts
+        first = np.full_like(u[:, :1], params.x0_mean)
+        u = u - params.beta0 * np.concatenate([first, u[:, :-1]], axis=1)
+    w, _ = rng.standard_normal((2, awareness.shape[1], len(awareness), n_robots))
+    x = params.x0_mean + params.x0_sd * rng.standard_normal((len(awareness), n_robots))
+    rates = np.empty(awareness.shape[:3])
+    for k in range(rates.shape[1]):
+        x = params.beta0 * x + u[:, k] + params.delta_w * w[k]
+        rates[:, k] = FAMILIES[family].sample(x, params.delta_v, n_ticks, rng)
+    return rates
 
 
 def simulate_missions(n_missions=6, seed=0, truth=TRUTH, lengths=(7, 5, 8)):

@@ -64,7 +64,7 @@ def test_a_posterior_completed_later_is_the_same(posterior, missions):
 MODELS = {
     "places and robots": PooledTrust(effects=(PlaceEffect(), RobotEffect())),
     "by robot": HierarchicalTrust(effects=(PlaceEffect(),)),
-    "coupled": CoupledTrust(effects=(RobotEffect(),)),
+    "coupled": CoupledTrust(effects=(PlaceEffect(), RobotEffect())),
     "censored": PooledTrust(effects=(RobotEffect(),), observation="censored"),
     "shared noise": PooledTrust(shared_noise=True, memory="deviation"),
 }
@@ -82,6 +82,7 @@ def test_any_model_has_any_effects_and_is_read_back_as_it_was(name):
             np.testing.assert_allclose(values, kept.reshape(values.shape), rtol=1e-9, atol=1e-12)
     params = params_of(posterior)
     assert params.leading == (400,)
+    assert bool(params.places) == ("places" in posterior.children)
     assert np.isfinite(posterior["log_likelihood"]["contact_rate"]).all()
 
 

@@ -10,7 +10,14 @@ import xarray as xr
 from trustbo.data import Mission
 from trustbo.display import Rows, Summary, joined
 from trustbo.errors import TrustboError
-from trustbo.inference.draws import is_of_people, joined_draws, missions_of, require_posterior
+from trustbo.inference.draws import (
+    is_of_people,
+    joined_draws,
+    missions_of,
+    require_posterior,
+    sites_of,
+    theta_of,
+)
 from trustbo.inference.score import score
 from trustbo.models.families import FAMILIES
 
@@ -137,8 +144,8 @@ def _check_places(posterior: xr.DataTree) -> Finding:
     )
     of_cells = joined_draws(places["place"])[:, [cells.index(cell) for cell in where]]
     total = joined_draws(places["place_bound"]) + of_cells
-    beta0 = joined_draws(posterior["posterior"].to_dataset()["beta0"])
-    draws = total / (1.0 - beta0[:, None])  # stationary trust
+    rest = theta_of(posterior, sites_of(posterior))["rest"]
+    draws = total / rest.reshape(len(total), -1).mean(1, keepdims=True)  # stationary trust
     effect = draws.mean(0)
     sure = (draws * np.sign(effect) > 0.0).mean(0)
     odd = (sure > SURE) & (np.abs(effect) > SIZE)

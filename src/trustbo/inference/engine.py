@@ -44,8 +44,8 @@ class Blocks(NamedTuple):
         U: Any,
         label: np.ndarray,
         *,
+        order: Order,
         apart: bool = False,
-        order: Order | None = None,
     ) -> Self:
         """Lay out blocks; blocks with equal labels and equal gaps are of one kind.
 
@@ -53,15 +53,10 @@ class Blocks(NamedTuple):
             y: Observations (block, row), NaN where not measured.
             U: Columns, sparse (block * input, column).
             label: Index (block,) on the second axis of a `Signal`.
+            order: Order of elimination of the columns.
             apart: Whether each block is a separate kind, as needed for sites that differ.
-            order: Order of elimination of the columns; by default all belong to the core.
         """
         n, p = len(y), U.shape[1]
-        order = (
-            Order.of(np.ones((1, p), dtype=bool), np.zeros(p, dtype=bool))
-            if order is None
-            else order
-        )
         inputs, U = U.shape[0] // n, sparse.csr_array(U)
         seen = ~np.isnan(y)
         kinds = np.column_stack([np.arange(n) if apart else np.zeros(n, dtype=int), label, seen])

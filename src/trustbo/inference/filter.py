@@ -16,6 +16,7 @@ from trustbo.models.params import CoupledParams, Params, check_params
 from trustbo.models.slots import broadcast_ticks
 from trustbo.workspace.moves import bounds_along, moves_along, require_on_grid
 
+_TICKS = 200.0  # of a future bound
 Effect = np.ndarray | float
 """Effect of a bound's place, (draw, robot or 1)."""
 
@@ -312,30 +313,22 @@ class TrustFilter:
         self.n_bounds += 1
         return self.state
 
-    def predict(
-        self,
-        awareness: ArrayLike,
-        path: Sequence[Cell] | None = None,
-        *,
-        n_ticks: ArrayLike = 200,
-    ) -> TrustForecast:
+    def predict(self, awareness: ArrayLike, path: Sequence[Cell] | None = None) -> TrustForecast:
         """Predict trust and contact rates along future bounds.
 
-        One rate is drawn for each parameter draw.
+        One rate is drawn for each parameter draw, of 200 ticks where rates are counts.
 
         Args:
             awareness: Shape (bound, robot, feature).
             path: The current cell of the team and the cells to be entered; needed with place
                 effects.
-            n_ticks: Ticks of the bounds, (), (bound,) or (bound, robot), where rates are counts.
 
         Raises:
-            TrustboError: If the number of robots, features or ticks differs; awareness is NaN or
-                outside [0, 1]; ticks are not whole numbers; or the path is missing, has another
-                length, jumps or leaves the grid.
+            TrustboError: If the number of robots or features differs; awareness is NaN or outside
+                [0, 1]; or the path is missing, has another length, jumps or leaves the grid.
         """
         given, rng = self._checked(awareness, 3), np.random.default_rng(self.n_bounds)
-        ticks, effects = ticks_ahead(n_ticks, given.shape[:2]), self.effects(path, len(given))
+        ticks, effects = np.full(given.shape[:2], _TICKS), self.effects(path, len(given))
         trust, rates = [], []
         for beliefs, drawn in self.dynamics.ahead(self._beliefs, given, ticks, effects, rng):
             trust.append(_average(beliefs, self.weights))
@@ -384,17 +377,6 @@ class TrustFilter:
         if self._bounded:
             require_unit_interval("awareness", z)
         return z
-
-
-def ticks_ahead(n_ticks: ArrayLike, shape: tuple[int, int]) -> np.ndarray:
-    """Ticks of future bounds as (bound, robot); raises TrustboError if they are invalid."""
-    given = as_array("n_ticks", n_ticks)
-    given = given[:, None] if given.ndim == 1 else given
-    if given.ndim > 2 or any(n not in (1, m) for n, m in zip(given.shape, shape, strict=False)):
-        raise TrustboError(f"n_ticks must be (), (bound,) or {shape}; got shape {given.shape}.")
-    if not ((given >= 1.0) & (given == np.round(given))).all():
-        raise TrustboError(f"n_ticks must be whole numbers of ticks from 1; got {given.min():g}.")
-    return np.broadcast_to(given, shape)
 
 
 def _average(beliefs: Beliefs, weights: np.ndarray) -> TrustState:

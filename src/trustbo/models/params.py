@@ -208,13 +208,16 @@ class _Coupled(NamedTuple):
     Delta_v: Numbers
     x0_mean: Numbers = 0.5
     x0_sd: Numbers = 0.5
+    place: Numbers | None = None
+    place_bound: Numbers | None = None
 
 
 class CoupledParams(ParameterDraws, _Coupled):
     """Parameters of the coupled model, equations (1)-(2).
 
     Fields: B0 (..., robot, robot'), B (..., feature, robot, robot'), b (..., robot), the
-    covariances Delta_w and Delta_v (..., robot, robot'), and x0_mean and x0_sd, () or (...,).
+    covariances Delta_w and Delta_v (..., robot, robot'), x0_mean and x0_sd, () or (...,), and place
+    and place_bound as in `TrustParams`.
     """
 
     __slots__ = ()
@@ -226,6 +229,7 @@ class CoupledParams(ParameterDraws, _Coupled):
         "B": ("feature", "robot", "robot_"),
         "b": ("robot",),
         **dict.fromkeys(("B0", "Delta_w", "Delta_v"), ("robot", "robot_")),
+        **PLACES,
     }
 
     @property

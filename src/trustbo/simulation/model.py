@@ -7,13 +7,13 @@ from numpy.typing import ArrayLike
 
 from trustbo.data import Cell, Mission
 from trustbo.errors import TrustboError, require_kind, require_whole
+from trustbo.inference.filter import Dynamics
 from trustbo.models import PooledTrust
 from trustbo.models.model import TrustModel
 from trustbo.models.params import Params, check_params
-from trustbo.models.simulate import draw_missions
 from trustbo.simulation.protocol import DescribedSimulator, require_path
 from trustbo.workspace import Workspace
-from trustbo.workspace.moves import along, moves_along
+from trustbo.workspace.moves import along, bounds_along, moves_along
 
 _STREAM = 0x6D697373  # among all streams of a seed
 
@@ -79,10 +79,13 @@ class ModelSimulator(DescribedSimulator):
         z = np.swapaxes(along(self.awareness, cells), 0, 1)
         # Without the last number, seed 0 would give the stream of `default_rng(0)`.
         rng = np.random.default_rng([0, require_whole("seed", seed, 0), _STREAM])
-        of_bounds = np.full((1, *z.shape[:2]), np.nan if self.n_ticks is None else self.n_ticks)
-        params = self.params.along(cells)
-        sample = draw_missions(self.model.family, params, z[None], of_bounds, rng)
-        rates = np.clip(sample[0], 0.0, 1.0)
+        of_bounds = np.full(z.shape[:2], np.nan if self.n_ticks is None else self.n_ticks)
+        effects, params = [0.0] * len(z), self.params.flat()
+        if params.places:
+            effects = list(np.moveaxis(params.of_places(bounds_along(cells)), -2, 0))
+        dynamics = Dynamics(params, self.model.family, z.shape[1])
+        drawn = dynamics.ahead(dynamics.start(), z, of_bounds, effects, rng)
+        rates = np.clip([of_bound[0] for _, of_bound in drawn], 0.0, 1.0)
         n, status = self._end(cells, seed)
         ticks = None if self.n_ticks is None else np.full(rates[:n].shape, self.n_ticks)
         return Mission.from_arrays(
