@@ -1,4 +1,4 @@
-"""Clean executed notebooks before they are committed: no run times, no bars, smaller figures.
+"""Clean executed notebooks before they are committed: no run times, no progress, smaller figures.
 
 Figures get a palette of 256 colours where hardly a pixel changes.
 
@@ -32,10 +32,10 @@ def smaller(png: str) -> str:
     return found if len(found) < len(png) else png
 
 
-def is_bar(output: dict) -> bool:
-    """Whether an output is of progress bars of text alone, of which none is left at the end."""
+def is_progress(output: dict) -> bool:
+    """Whether an output only has progress bars, or the line about the compilation of kernels."""
     text = "".join(output.get("text", []))
-    return bool(re.fullmatch(r"(\r[^\n]*)+", text))
+    return bool(re.fullmatch(r"(\r[^\n]*)+|compiling kernels.*\n", text))
 
 
 def clean(path: Path) -> None:
@@ -44,7 +44,7 @@ def clean(path: Path) -> None:
     for cell in notebook["cells"]:
         cell["metadata"].pop("execution", None)
         if "outputs" in cell:
-            cell["outputs"] = [output for output in cell["outputs"] if not is_bar(output)]
+            cell["outputs"] = [output for output in cell["outputs"] if not is_progress(output)]
         for output in cell.get("outputs", []):
             data = output.get("data", {})
             if "image/png" in data:

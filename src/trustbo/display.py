@@ -65,12 +65,12 @@ def say(line: str) -> None:
 @contextmanager
 def compiling() -> Iterator[None]:
     """Print a line when kernels are compiled, which happens once on a machine."""
-    with event.install_listener("numba:compile", _Announcement()):
+    with event.install_listener("numba:compile", _ANNOUNCEMENT):
         yield
 
 
 class _Announcement(event.Listener):
-    """Listener that announces the first compilation."""
+    """Listener that announces the first compilation of a process."""
 
     def __init__(self) -> None:
         self._announced = False
@@ -82,3 +82,6 @@ class _Announcement(event.Listener):
 
     def on_end(self, event: event.Event) -> None:
         pass
+
+
+_ANNOUNCEMENT = _Announcement()

@@ -17,15 +17,15 @@ import jax.numpy as jnp
 import numpy as np
 import numpyro
 import numpyro.distributions as dist
-from jax.scipy.special import erf, erfinv
-from numpyro.distributions import Distribution, biject_to
+from numpyro.distributions import biject_to
 from numpyro.infer import MCMC, NUTS, init_to_value
+from scipy.special import log_ndtr
 
 from trustbo.inference import importance
 from trustbo.inference.diagnostics import complaints_of
 from trustbo.inference.posterior import Draws, Posterior
 from trustbo.models.backend import own_settings
-from trustbo.models.scores import NOISES
+from trustbo.models.scores import NOISES, Scores, of_size
 
 _POINTS = 2000  # resampled points that the covariance is taken of
 _TARGET = 0.9
@@ -60,9 +60,9 @@ def sample_by_nuts(
     points = importance.sample(
         posterior.log_density, posterior.start()[None], rng, defensive=posterior.defensive
     )
-    values = posterior.scores.values(points.z[points.resample(_POINTS, rng)])
+    z = points.z[points.resample(_POINTS, rng)]
     with own_settings():
-        kernel, starts = _kernel(posterior, values, chains, rng)
+        kernel, starts = _kernel(posterior, z, chains, rng)
         mcmc = MCMC(
             kernel, num_warmup=warmup, num_samples=draws, num_chains=chains,
             chain_method="vectorized", progress_bar=progress,
@@ -85,9 +85,10 @@ def sample_by_nuts(
 
 
 def _kernel(
-    posterior: Posterior, values: dict[str, np.ndarray], chains: int, rng: np.random.Generator
+    posterior: Posterior, z: np.ndarray, chains: int, rng: np.random.Generator
 ) -> tuple[NUTS, dict[str, jax.Array] | None]:
-    """Kernel, and starts of the chains, given hyperparameters at points of the posterior."""
+    """Kernel, and starts of the chains, given scores (point, score) from the posterior."""
+    values = posterior.scores.values(z)
     if not posterior.exact:
         center = {name: jnp.asarray(np.median(v, axis=0)) for name, v in values.items()}
         strategy = init_to_value(values=center)
@@ -96,7 +97,7 @@ def _kernel(
             posterior.model.program(posterior.slots)
 
         return NUTS(program, init_strategy=strategy, target_accept_prob=_TARGET), None
-    free = _unconstrained(posterior, values)
+    free = _unconstrained(posterior.scores, z, values)
     flat = np.column_stack([np.asarray(free[name]).reshape(_POINTS, -1) for name in sorted(free)])
     finite = np.flatnonzero(np.isfinite(flat).all(1))
     inverse_mass = np.atleast_2d(np.cov(flat[finite].T)) + 1e-6 * np.eye(flat.shape[1])
@@ -128,7 +129,7 @@ def marginal_program(posterior: Posterior) -> Callable[[], None]:
         angle = numpyro.sample("noise_angle", dist.Uniform(0.0, 1.0).expand(shape).to_event())
         angle, size = 0.5 * jnp.pi * jnp.asarray(angle), jnp.sqrt(jnp.asarray(square))
         for name, share in zip(NOISES, (jnp.sin(angle), jnp.cos(angle)), strict=True):
-            values[name] = numpyro.deterministic(name, _of_size(priors[name], size * share))
+            values[name] = numpyro.deterministic(name, of_size(priors[name], size * share, name))
         values = {name: jnp.asarray(value)[None] for name, value in values.items()}
         theta = posterior.model.theta(values, posterior.slots.resolution)
         numpyro.factor("contact_rate", posterior.log_evidence(theta)[0])
@@ -136,32 +137,16 @@ def marginal_program(posterior: Posterior) -> Callable[[], None]:
     return program
 
 
-def _unconstrained(posterior: Posterior, values: dict[str, np.ndarray]) -> dict[str, jax.Array]:
+def _unconstrained(
+    scores: Scores, z: np.ndarray, values: dict[str, np.ndarray]
+) -> dict[str, jax.Array]:
     """Unconstrained coordinates (point, ...) of the sites of `marginal_program`."""
-    priors = posterior.scores.priors
     sites = {
         name: biject_to(prior.support).inv(jnp.asarray(values[name]))
-        for name, prior in priors.items()
+        for name, prior in scores.priors.items()
         if name not in NOISES
     }
-    w, v = (_half_normal_score(priors[name], values[name]) for name in NOISES)
-    angle = np.arctan2(w, v)
-    sites["noise_square"] = jnp.log(w**2 + v**2)
-    sites["noise_angle"] = jnp.log(angle / (0.5 * np.pi - angle))
+    size, angle = (z[:, scores.at[name]].reshape(values[name].shape) for name in NOISES)
+    sites["noise_square"] = jnp.asarray(2.0 * size)  # a logarithm, as the score is
+    sites["noise_angle"] = jnp.asarray(log_ndtr(angle) - log_ndtr(-angle))
     return sites
-
-
-def _of_size(prior: Distribution, score: jax.Array) -> jax.Array:
-    """Quantile of a prior at P(|N(0, 1)| < score)."""
-    base = prior.base_dist if isinstance(prior, dist.ExpandedDistribution) else prior
-    if isinstance(base, dist.HalfNormal):
-        return jnp.asarray(base.scale * score)
-    return jnp.asarray(prior.icdf(erf(score / np.sqrt(2.0))))
-
-
-def _half_normal_score(prior: Distribution, value: np.ndarray) -> np.ndarray:
-    """Inverse of `_of_size`."""
-    base = prior.base_dist if isinstance(prior, dist.ExpandedDistribution) else prior
-    if isinstance(base, dist.HalfNormal):
-        return np.asarray(value) / np.asarray(base.scale)
-    return np.sqrt(2.0) * np.asarray(erfinv(prior.cdf(jnp.asarray(value))))

@@ -16,7 +16,7 @@ from numpyro.distributions import Distribution
 from scipy import special, stats
 
 from trustbo.errors import TrustboError
-from trustbo.models.backend import call, own_settings
+from trustbo.models.backend import call, namespace, own_settings
 
 NOISES = "delta_w", "delta_v"
 _LOG_ROOT_2PI = 0.5 * np.log(2.0 * np.pi)
@@ -103,11 +103,13 @@ def quantile(prior: Distribution, score: np.ndarray, name: str = "") -> np.ndarr
     return _by_numpyro(prior, special.ndtr(score), name)
 
 
-def of_size(prior: Distribution, size: np.ndarray, name: str = "") -> np.ndarray:
-    """Quantile of a prior at P(|N(0, 1)| < size)."""
+def of_size(prior: Distribution, size: Any, name: str = "") -> Any:
+    """Quantile of a prior at P(|N(0, 1)| < size), in NumPy or JAX as `size` is."""
     prior = _base(prior)
     if isinstance(prior, dist.HalfNormal):
         return np.asarray(prior.scale) * size
+    if namespace(size) is not np:
+        return prior.icdf(jax.scipy.special.erf(size / np.sqrt(2.0)))
     return _by_numpyro(prior, special.erf(size / np.sqrt(2.0)), name)
 
 
