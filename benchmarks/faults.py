@@ -87,7 +87,7 @@ FAULTS = (
     Fault("strata count alike in the price of a failure", "planning/problem.py",
           "Risks(np.ascontiguousarray(of_bounds), self.price * shares, limit)",
           "Risks(np.ascontiguousarray(of_bounds), self.price * np.full_like(shares, 0.2), limit)"),
-    Fault("of equally good paths the longest is planned", "planning/search/layers.py",
+    Fault("of equally good paths the longest is planned", "planning/sums.py",
           "if score > scores[d]:", "if score >= scores[d]:"),
     Fault("a bound has the awareness of the cell that it leaves", "workspace/moves.py",
           "np.column_stack([moves_along(path), np.asarray(path)[1:]])",

@@ -154,3 +154,10 @@ def test_objectives_of_contact_need_memory_that_is_not_negative(workspace):
         with pytest.raises(TrustboError, match="beta0"):
             Planner(workspace, *ENDS, family=family).plan(forgetful)
     assert Planner(workspace, *ENDS, "mean").plan(forgetful).exact
+
+
+@pytest.mark.parametrize("objective", OBJECTIVES)
+def test_of_equally_good_paths_a_shortest_is_planned(workspace, objective):
+    params = TrustParams(0.0, np.zeros(2), 1.0, 0.1, 0.1)  # the same trust after every bound
+    planner = Planner(workspace, *ENDS, objective=objective, max_bounds="shortest+3")
+    assert len(planner.plan(params).path) == 4
