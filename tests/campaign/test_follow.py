@@ -190,8 +190,8 @@ def test_robots_that_leave_the_path_are_followed_where_they_go():
 @pytest.mark.parametrize(
     ("act", "named"),
     [
-        (lambda f: f.begin(5.0), "a bound runs"),
-        (lambda f: f.to_mission(), "a bound runs"),
+        (lambda f: f.begin(5.0), "a bound is"),
+        (lambda f: f.to_mission(), "a bound is"),
         (lambda f: f.tick(6.0, [1, 0]), "in_contact"),
         (lambda f: f.tick(6.0, [1, 0, 0.5]), "in_contact"),
         (lambda f: f.tick(6.0, [1, 0, 2]), "in_contact"),

@@ -120,7 +120,7 @@ class Campaign(Result):
         model = default_model() if model is None else model
         require_kind("model", model, TrustModel, "give one such as PooledTrust()")
         if isinstance(model, HumanTrust):
-            raise TrustboError("model: HumanTrust is for reports of people, and plans no paths.")
+            raise TrustboError("model: HumanTrust describes reports of people; it plans no paths.")
         self.policy = resolve_policy(policy)
         settings = {
             "policy": policy if isinstance(policy, str) else _name_of(policy),
@@ -230,8 +230,8 @@ class Campaign(Result):
             return
         self._warned_of_risk = True
         warnings.warn(
-            f"the plan arrives with a chance of {p_arrive:.2f} only, and a failure has no price "
-            'until one was recorded; give planner={"max_failure": ...} or {"failure_cost": ...}, '
+            f"the plan arrives with probability {p_arrive:.2f} only, and failures have no cost "
+            'until one is recorded; pass planner={"max_failure": ...} or {"failure_cost": ...}, '
             "or lower max_slope of the team's robots.",
             stacklevel=4,
         )
@@ -325,9 +325,9 @@ class Campaign(Result):
             TrustboError: There is no such mission, or it is already excluded.
         """
         if not 1 <= require_whole("n", n, 1) <= (n_told := len(self.state.entries)):
-            raise TrustboError(f"there is no mission {n} to exclude; {n_told} were told.")
+            raise TrustboError(f"there is no mission {n} to exclude; {n_told} are recorded.")
         if (entry := self.state.entries[n - 1]).state == EXCLUDED:
-            raise TrustboError(f"mission {n} is excluded already: {entry.row['reason']}")
+            raise TrustboError(f"mission {n} is already excluded: {entry.row['reason']}")
         entry.become(EXCLUDED, str(reason))
         self._renew()
         self._learn(self.state.seed_of("fit"))

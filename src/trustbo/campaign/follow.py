@@ -135,7 +135,7 @@ class Follower:
         return self._ended.predict(known_along(rest, self._campaign.workspace), rest)
 
     def to_mission(self) -> Mission:
-        """Mission of the completed bounds; its awareness is NaN, because it is not measured.
+        """Return the completed bounds as a mission; its awareness is not measured, hence NaN.
 
         Its status is the status of the last bound, or `"aborted"` if that bound is `"ok"` but did
         not reach the goal.
@@ -152,7 +152,7 @@ class Follower:
         return Mission(self.path, self.bounds, status, workspace.features, workspace.team.names)
 
     def _end_with(self, counts: np.ndarray, bound: Any) -> TrustState:
-        """Trust if a bound ended now with these counts of ticks."""
+        """Update trust as if a bound ended now with these counts of ticks."""
         rates, n_ticks = _rates(counts)
         self._ended = copy(self._filter)  # which replaces its arrays, and changes none of them
         known, cells = bound
@@ -161,22 +161,21 @@ class Follower:
     def _require(self, *, running: bool, t: float) -> None:
         """Raise TrustboError for a call in the wrong state, or a time before the last one."""
         if running != self.running:
-            raise TrustboError(
-                "no bound runs: begin one first." if running else "a bound runs: end it first."
-            )
+            some, first = ("no", "begin") if running else ("a", "end")
+            raise TrustboError(f"{some} bound is in progress; call {first} first.")
         if not self._now <= t < np.inf:
             raise TrustboError(f"t = {t} s must be finite, and not before {self._now} s.")
 
 
 def _rates(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rates from counts of contact and ticks (2, robot), and the ticks; NaN without a tick."""
+    """Return rates from counts of contact and ticks (2, robot), and the ticks; NaN if none."""
     contacts, ticks = counts
     n_ticks = np.where(ticks > 0.0, ticks, np.nan)
     return contacts / n_ticks, n_ticks
 
 
 def _filter_of(campaign: Campaign) -> TrustFilter:
-    """Filter with a campaign's last posterior, or with the prior if there is none yet."""
+    """Make a filter with a campaign's last posterior, or with the prior if there is none yet."""
     if campaign.state.last is not None:
         return TrustFilter(campaign.state.last())
     names, n_robots = campaign.workspace.features, campaign.workspace.team.n_robots

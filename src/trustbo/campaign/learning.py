@@ -1,4 +1,4 @@
-"""From missions to the basis of the next plan: posterior, hazard and planner."""
+"""Learning from missions: the posterior, the hazard, and the planner of the next path."""
 
 import warnings
 from collections.abc import Mapping, Sequence
@@ -30,7 +30,7 @@ _STOPPED, _RECOVERED = 2, 0.2
 
 
 def known_along(path: Sequence[Cell], workspace: Workspace) -> np.ndarray:
-    """Awareness of the map in the bounds of a path, shape (bound, robot, feature).
+    """Return the map's awareness in the bounds of a path, shape (bound, robot, feature).
 
     TrustboError: a cell is off the grid, or is not a neighbour of the previous one.
     """
@@ -40,7 +40,7 @@ def known_along(path: Sequence[Cell], workspace: Workspace) -> np.ndarray:
 
 
 def as_learned(mission: Mission, workspace: Workspace) -> Mission:
-    """Mission with the awareness used for learning: the map's, which the planner uses too.
+    """Replace measured awareness by the awareness of the map, which the planner also uses.
 
     Weights fitted to measured awareness would be biased when the planner applies them to the map's
     awareness. TrustboError: see `known_along`.
@@ -49,7 +49,7 @@ def as_learned(mission: Mission, workspace: Workspace) -> Mission:
 
 
 def why_never_learned(mission: Mission) -> str:
-    """Reason why a mission can never be used for learning, or an empty string."""
+    """Return why a mission can never be used for learning, or an empty string."""
     if not np.isfinite(mission.contact_rate).any():
         return "no contact rate was measured."
     if np.isnan(mission.awareness).any():
@@ -65,7 +65,7 @@ def why_never_learned(mission: Mission) -> str:
 def learn(
     state: State, model: TrustModel, workspace: Workspace, seed: int, progress: bool
 ) -> xr.DataTree | None:
-    """Posterior of the parameters given all missions that are not excluded.
+    """Fit the posterior of the parameters to all missions that are not excluded.
 
     Its attribute `missions` lists their indices. If the diagnostics fail, sampling is repeated with
     twice the draws. If they fail again, None is returned with a warning, and the states of the
@@ -106,7 +106,7 @@ def learn(
     for j in waiting:
         state.entries[j].become(TOLD, reason)
     warnings.warn(
-        f"mission {len(state.entries)} is recorded, but cannot be learned from yet: "
+        f"mission {len(state.entries)} is recorded but cannot be used for learning yet: "
         f"{reason.rstrip('.')}. The campaign continues with the "
         f"{'prior' if state.last is None else 'previous posterior'}, and tries again with the next "
         "mission.",
@@ -116,7 +116,7 @@ def learn(
 
 
 def learn_hazard(state: State, workspace: Workspace) -> xr.Dataset:
-    """Posterior of the probability that a bound fails, given all missions; see `fit_hazard`.
+    """Fit the failure probabilities of bounds to all missions; see `fit_hazard`.
 
     A mission that was excluded because it measured no contact rate still shows where it failed. If
     the diagnostics fail, the previous posterior is returned with a warning.
@@ -138,7 +138,7 @@ def learn_hazard(state: State, workspace: Workspace) -> xr.Dataset:
 
 
 def base_planner(workspace: Workspace, settings: Mapping[str, Any]) -> Planner:
-    """Planner with the settings of a campaign, before any failures are known."""
+    """Make the planner of a campaign before any failures are known."""
     return Planner(
         workspace, settings["start"], settings["goal"], settings["objective"],
         family=settings["observation"], **settings["planner"],
@@ -146,7 +146,7 @@ def base_planner(workspace: Workspace, settings: Mapping[str, Any]) -> Planner:
 
 
 def informed_planner(planner: Planner, risk: BoundRisk) -> Planner:
-    """Planner given the failure probabilities of bounds.
+    """Make the planner given the failure probabilities of bounds.
 
     A bound that failed twice is avoided unless there is no other path, or its failure probability
     fell below 0.2. The user's slope limit is trusted until a failure contradicts it: before the
@@ -165,6 +165,6 @@ def informed_planner(planner: Planner, risk: BoundRisk) -> Planner:
 
 
 def to_avoid(risk: BoundRisk) -> np.ndarray:
-    """Bounds with two failures whose failure probability is still high, (move, row, col)."""
+    """Find bounds that failed twice and are still likely to fail, (move, row, col)."""
     with np.errstate(invalid="ignore"):
         return (risk.stopped >= _STOPPED - 1e-9) & ~(risk.mean < _RECOVERED)

@@ -105,8 +105,8 @@ class Result(Summary):
         """
         if self.state.last is None:
             raise TrustboError(
-                f"there is no posterior: none of {len(self.missions)} missions could be learned "
-                "from yet. They are recorded; table() has the reasons."
+                f"there is no posterior: none of {len(self.missions)} missions can be used for "
+                "learning yet. They are recorded; table() has the reasons."
             )
         stored = self.state.last()
         numbers = np.atleast_1d(stored.attrs["missions"]).astype(int).tolist()
@@ -205,7 +205,7 @@ class Result(Summary):
         return xr.Dataset(variables, coords | dict(first.coords))
 
     def table(self) -> pd.DataFrame:
-        """Table with one row per mission, labelled by its number, from 1.
+        """Return a table with one row per mission, labelled by its number, from 1.
 
         Columns are the `status`, the `state` with its `reason`, or the reason of a failure, the
         cell `where` the mission failed, the mean `contact_rate`, the plan's `objective`, the number
@@ -349,7 +349,7 @@ def load_result(directory: FilePath) -> Result:
 
 
 def evidence_of(state: State) -> Rows:
-    """Row with the diagnostics of the last posterior, if there is one."""
+    """Return a row with the diagnostics of the last posterior, if there is one."""
     last = state.entries[-1].row if state.entries else {}
     if np.isfinite(last.get("k_hat", np.nan)):
         khat = f"k-hat {last['k_hat']:.2f} (good below {GOOD_KHAT:g})"

@@ -41,7 +41,7 @@ class Failure(NamedTuple):
     reported: bool = False
 
     def row(self) -> dict[str, Any]:
-        """Row of the table of missions, for a mission without a report."""
+        """Return the row of the table of missions, for a mission without a report."""
         return {
             "status": self.reason if self.path else "aborted",
             "state": GIVEN_UP,
@@ -68,7 +68,7 @@ class Posterior:
         self.name, self.file, self._tree = name, file, tree
 
     def __call__(self) -> xr.DataTree:
-        """Posterior, read from its file if necessary; TrustboError if the file cannot be read."""
+        """Return the posterior; TrustboError if its file cannot be read."""
         if self._tree is None:
             self._tree = read_tree(self.file or "")
         return self._tree
@@ -140,11 +140,11 @@ class State:
         return self.entries[-1].posterior if self.entries else None
 
     def numbers(self, *states: str) -> list[int]:
-        """Indices of the missions in one of these states."""
+        """Return the indices of the missions in one of these states."""
         return [j for j, entry in enumerate(self.entries) if entry.state in states]
 
     def seed_of(self, stream: str) -> int:
-        """Seed of one random stream for the next mission."""
+        """Return the seed of one random stream for the next mission."""
         n = len(self.entries)
         entropy = [self.settings["seed"], _STREAMS.index(stream), n]
         if n_failures := sum(failure.after == n for failure in self.failures):
@@ -152,7 +152,7 @@ class State:
         return int(np.random.SeedSequence(entropy).generate_state(1)[0])
 
     def row_of(self, plan: Plan, mission: Mission, extra: dict[str, float]) -> dict[str, Any]:
-        """Row of a new mission; TrustboError if an extra has the name of a column."""
+        """Make the row of a new mission; TrustboError if an extra has the name of a column."""
         before = self.entries[-1].plan if self.entries else plan
         rates = mission.contact_rate
         contact = float(np.nanmean(rates)) if np.isfinite(rates).any() else np.nan

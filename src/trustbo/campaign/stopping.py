@@ -54,7 +54,7 @@ class RegretBound:
             require_whole(f"RegretBound.{name}", getattr(self, name), 1)
 
     def __call__(self, campaign: "Campaign") -> str | None:
-        """Reason to stop, or None."""
+        """Return the reason to stop, or None."""
         n = len(campaign.state.entries)
         if n <= self.patience:
             return None
@@ -67,7 +67,7 @@ class RegretBound:
         return f"regret_bound: P(regret <= {self.eps:g}) = {sure[0]:.3f} >= {1.0 - self.delta:g}"
 
     def probability(self, campaign: "Campaign", n_missions: int) -> float:
-        """P(regret of the recommended path <= eps) after the first `n_missions`."""
+        """Compute P(regret of the recommended path <= eps) after the first `n_missions`."""
         posterior = campaign.state.entries[n_missions - 1].posterior
         if posterior is None:
             return 0.0

@@ -57,8 +57,8 @@ class Storage:
             _require_campaign(self.path)
         elif not overwrite and any((self.path / n).exists() for n in (RECORD, MISSIONS)):
             raise TrustboError(
-                f"{str(directory)!r} holds a campaign: continue it by Campaign.load or resume, "
-                "give another folder, or replace it with overwrite=True."
+                f"{str(directory)!r} contains a campaign: continue it with Campaign.load or "
+                "resume, give another folder, or replace it with overwrite=True."
             )
         try:
             self.path.mkdir(parents=True, exist_ok=True)
@@ -173,4 +173,4 @@ def read_campaign(
 
 def _require_campaign(folder: Path) -> None:
     if not (folder / RECORD).exists():
-        raise TrustboError(f"{str(folder)!r} holds no campaign; give the folder of one.")
+        raise TrustboError(f"{str(folder)!r} contains no campaign.")
