@@ -1,6 +1,7 @@
 """Robots, bounds and missions: refused early, with the value and the remedy."""
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from trustbo.data import Bound, Mission
@@ -109,6 +110,20 @@ def test_a_missing_duration_does_not_stop_the_clock():
     z, y = arrays(n_robots=2)
     mission = Mission.from_arrays(PATH, z, y, duration=[[10.0, np.nan], [20.0, 5.0]])
     assert [(b.t0, b.t1) for b in mission.bounds] == [(0.0, 10.0), (10.0, 30.0)]
+
+
+def test_masked_rates_and_rates_that_pandas_calls_missing_are_not_measured():
+    z, y = arrays()
+    missing = np.zeros(y.shape, bool)
+    missing[1, 0] = True
+    masked = np.ma.masked_array(
+        np.where(missing, 0.0, y), missing
+    )  # rasterio and netCDF4 make them
+    frame = pd.DataFrame(y).rename(columns=str).astype("Float64").mask(missing)
+    frame.columns = [f"r{i + 1}" for i in range(y.shape[1])]
+    for rates in (masked, frame):
+        found = Mission.from_arrays(PATH, z, rates).contact_rate
+        np.testing.assert_array_equal(found, np.where(missing, np.nan, y))
 
 
 def test_missing_awareness_is_filled_from_a_map():

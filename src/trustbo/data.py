@@ -368,8 +368,10 @@ def require_shares(rate: np.ndarray, ticks: np.ndarray) -> None:
 
 
 def as_array(what: str, values: ArrayLike) -> np.ndarray:
-    """Return an array of floats; TrustboError if the values are not numbers."""
+    """Return an array of floats, NaN where masked; TrustboError if the values are not numbers."""
     try:
+        if np.ma.isMaskedArray(values):
+            return np.ma.filled(np.ma.asarray(values, dtype=float), np.nan)
         return np.asarray(values, dtype=float)
     except (TypeError, ValueError):
         raise TrustboError(f"{what} must be an array of numbers; got {values!r:.60}.") from None
@@ -404,7 +406,8 @@ def _labelled(what: str, values: Any, dims: Sequence[str], **names: Sequence[str
     last dim, if they are strings. TrustboError: the labels are not the given names.
     """
     if isinstance(values, pd.DataFrame) and all(isinstance(name, str) for name in values):
-        values = xr.DataArray(values.to_numpy(), dims=dims, coords={dims[-1]: list(values)})
+        numbers = values.astype(object).where(values.notna(), np.nan)  # also pd.NA
+        values = xr.DataArray(numbers.to_numpy(), dims=dims, coords={dims[-1]: list(values)})
     if not isinstance(values, xr.DataArray):
         return values
     if {*values.dims} != {*dims}:

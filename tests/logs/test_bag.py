@@ -76,3 +76,17 @@ def test_markers_out_of_order_are_refused(markers, workspace, tmp_path):
         read_bag(log.save(tmp_path / "bag"), workspace)
     with pytest.raises(TrustboError):
         read_bag(tmp_path / "none.bag", workspace)
+
+
+def test_orientations_that_no_driver_has_set_are_refused(workspace, tmp_path):
+    log = Log()
+    for seconds, *marker in ((1.0, 0, 2, 0), (1.0, 1, 1, 1)):
+        log.bound(seconds, *marker)
+    for robot in ("r1", "r2"):
+        log.contact(robot, (2.0, True), (3.0, True))
+    for robot in ("lead", "r1", "r2"):
+        for seconds in (1.0, 2.0, 3.0):
+            log.odometry(seconds, robot, seconds, 0.0, quaternion=(0.0, 0.0, 0.0, 0.0))
+    log.messages.sort(key=lambda message: message[0])
+    with pytest.raises(TrustboError, match="orientation"):
+        read_bag(log.save(tmp_path / "bag"), workspace)

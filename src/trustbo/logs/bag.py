@@ -174,6 +174,11 @@ def _pose(message: Any) -> list[float]:
     """Position x and y, and heading in rad from the x axis, in [-pi, pi]."""
     pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
     p, q = pose.position, pose.orientation
+    if q.x**2 + q.y**2 + q.z**2 + q.w**2 < 0.5:  # all 0 where a driver never sets it
+        raise TrustboError(
+            f"a pose has the orientation ({q.x:g}, {q.y:g}, {q.z:g}, {q.w:g}), which is not a unit "
+            "quaternion; record the poses with their headings."
+        )
     yaw = math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y**2 + q.z**2))
     return [p.x, p.y, yaw]
 
