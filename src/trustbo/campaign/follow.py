@@ -144,7 +144,7 @@ class Follower:
             TrustboError: A bound is in progress, or none was run (use `Campaign.fail`).
         """
         if self.running or not self.bounds:
-            state = "a bound runs: end it first" if self.running else "no bound was run"
+            state = "a bound is in progress" if self.running else "no bound was run"
             raise TrustboError(f"there is no mission yet: {state}.")
         status, workspace = self.bounds[-1].status, self._campaign.workspace
         if status == "ok" and self.rest != (self._goal,):

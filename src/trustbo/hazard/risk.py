@@ -20,7 +20,7 @@ ROUNDING = 1e-12
 """Rounding tolerance for the risk of a path at the limit."""
 _BAND = (0.05, 0.95)
 _ENTRIES = 1 << 20  # of (draw, bound) at a time
-_SOME = 256  # number of bounds whose mean chance orders the draws
+_SOME = 256  # number of bounds whose mean probability orders the draws
 
 
 class BoundRisk:
@@ -205,7 +205,7 @@ class Risk:
         drawn = self.draws[:, *index]
         low, high = np.quantile(np.prod(1.0 - drawn, axis=1), _BAND).tolist()
         # Bounds are likelier to be passed together than if they were independent. The ratio of the
-        # two chances has none of the error that few draws make in each p_fail.
+        # two probabilities is free of the error that few draws make in each p_fail.
         together = np.cumprod(1.0 - drawn, axis=1).mean(0)
         apart = np.cumprod((1.0 - drawn).mean(0))
         ratio = np.divide(together, apart, out=np.ones_like(apart), where=apart > 0.0)

@@ -48,19 +48,19 @@ class DrawnPaths:
         return values
 
     def values_of(self, paths: Sequence[Sequence[Cell]]) -> np.ndarray:
-        """Value of each given path under every draw, shape (draw, path)."""
+        """Return the value of each given path under every draw, shape (draw, path)."""
         return np.stack([self._value(self.dynamics, path) for path in paths], axis=1)
 
     def regret(self, path: Sequence[Cell]) -> np.ndarray:
-        """Value of each draw's best path minus the value of a given path, shape (draw,), >= 0."""
+        """Return each draw's best value minus the value of a given path, shape (draw,), >= 0."""
         return np.maximum(0.0, self.values - self.values_of([path])[:, 0])
 
     def relative_regret(self, path: Sequence[Cell]) -> np.ndarray:
-        """Regret of a path as a share of the value of each draw's best path, shape (draw,).
+        """Return the regret of a path relative to each draw's best value, shape (draw,).
 
-        For lost_contact, relative to the contact kept on the best path (its bounds minus the
-        contact lost); for other objectives, relative to the best path's value. Infinite where this
-        is 0.
+        For lost_contact, it is relative to the contact kept on the best path (its bounds minus the
+        contact lost); for other objectives, to the best path's value. It is infinite where the
+        denominator is 0.
         """
         scale = np.abs(self.values)
         if self.problem.objective.of_contact:
@@ -71,7 +71,7 @@ class DrawnPaths:
         return np.divide(regret, scale, out=nothing, where=scale > 0.0)
 
     def share(self) -> np.ndarray:
-        """Share of the paths that enter each cell, shape (row, col)."""
+        """Return the share of the paths that enter each cell, shape (row, col)."""
         count = np.zeros(self.problem.paths.bounds.shape[1:])
         for path, n in zip(self.candidates, self.counts, strict=True):
             count[tuple(np.array(path).T)] += n  # a cell entered twice counts once
@@ -85,7 +85,7 @@ class DrawnPaths:
 
     @cached_property
     def _distinct(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Distinct paths by decreasing frequency, each draw's index into them, and frequencies."""
+        """Find distinct paths by decreasing frequency, each draw's index, and the frequencies."""
         paths, which, counts = np.unique(
             self.paths, axis=0, return_inverse=True, return_counts=True
         )

@@ -29,7 +29,7 @@ class Dynamics(NamedTuple):
     noise_sd: np.ndarray
 
     def flat(self) -> "Dynamics":
-        """Return the dynamics with a leading axis (draw,), of length 1 where there was none."""
+        """Return the dynamics with a leading axis (draw,), of length 1 if there was none."""
         return self if self.start.ndim > 1 else Dynamics(*(value[None] for value in self))
 
     def along(self, path: Sequence[Cell] | np.ndarray) -> "Dynamics":
@@ -38,7 +38,7 @@ class Dynamics(NamedTuple):
         return self._replace(drift=self.drift[..., moves, rows, cols][..., None, None, :])
 
     def settled(self) -> np.ndarray:
-        """Limit of the team's trust if a bound were repeated, (..., move, row, col)."""
+        """Return the limit of the team's trust if a bound were repeated, (..., move, row, col)."""
         gain = np.linalg.inv(np.eye(self.start.shape[-1]) - self.transition)
         return np.einsum("...st,...tmrc->...mrc", gain, self.drift) / self.start.shape[-1]
 
@@ -74,9 +74,9 @@ def trust_dynamics(
 
 
 def drift(params: Params, awareness: np.ndarray) -> np.ndarray:
-    """Increment of trust by one bound, u = sum_m beta_m z_m + b, (..., robot, move, row, col).
+    """Compute the drift u = sum_m beta_m z_m + b of each bound, (..., robot, move, row, col).
 
-    Includes the effects of places, or of the bounds of a path, see `ParameterDraws.along`.
+    It includes the effects of places, or of the bounds of a path, see `ParameterDraws.along`.
 
     Args:
         params: Parameters of any model, with leading axes (...,).
@@ -95,7 +95,7 @@ def drift(params: Params, awareness: np.ndarray) -> np.ndarray:
     for name, effect in params.places.items():
         if effect.shape[-2:] != u.shape[-2:]:
             raise TrustboError(
-                f"params.{name} is of {effect.shape[-2:]} cells, the awareness of {u.shape[-2:]}. "
+                f"params.{name} has {effect.shape[-2:]} cells, the awareness of {u.shape[-2:]}. "
                 "With the awareness of a path's bounds, give params.along(path)."
             )
         u = u + (effect[..., None, :, :] if name == "place" else effect)
@@ -103,7 +103,7 @@ def drift(params: Params, awareness: np.ndarray) -> np.ndarray:
 
 
 def roll_trust(params: Params, awareness: ArrayLike, x0: ArrayLike | None = None) -> np.ndarray:
-    """Expected trust along a path, equations (1) and (3) without their noise.
+    """Compute expected trust along a path, equations (1) and (3) without their noise.
 
     Args:
         params: Parameters of any model, with leading axes (...,) such as (draw,). With place

@@ -1,4 +1,4 @@
-"""Best path if its cost depends on history or risk: label search on the unrolled graph.
+"""Label search on the unrolled graph, for paths whose cost depends on history or risk.
 
 Method: labels with dominance for the resource-constrained shortest path (Martins 1984; Irnich and
 Desaulniers 2005). A label at a state has the cost so far, the sums r_m of risks -log(1 - p), and
@@ -27,7 +27,7 @@ from trustbo.planning.sums import costs_of_sums
 from trustbo.planning.unrolled import Unrolled, edges_from, fill_to_go, kernel, new_to_go
 
 MAX_LABELS = 300_000
-"""Maximum labels of a search, which then returns the best path known and a lower limit."""
+"""Maximum number of labels; a search then returns the best path found and a lower limit."""
 LOGISTIC, CLIPPED = range(2)
 """Losses of a bound: 1 - sigma(trust), or 1 - E[y] with normal y clipped to [0, 1]."""
 LOSSES = {"logistic": LOGISTIC, "clipped": CLIPPED}
@@ -101,7 +101,7 @@ def _best_labels(graph, costs, most, cost, lower, paths, begin, end):
 
 @kernel
 def _lost(loss, x, sd):
-    """Expected contact lost in a bound that leaves trust x."""
+    """Compute the expected contact lost in a bound that leaves trust x."""
     if loss == LOGISTIC:
         return 1.0 / (1.0 + math.exp(min(x, 700.0)))
     low, high, root = -x / sd, (1.0 - x) / sd, math.sqrt(0.5)
@@ -112,7 +112,7 @@ def _lost(loss, x, sd):
 
 @kernel
 def _lost_on(graph, costs, e, x, after):
-    """Contact lost on an edge that is entered with trust x; writes the trust after it."""
+    """Compute the contact lost on an edge entered with trust x; writes the trust after it."""
     mean, n = 0.0, len(costs.x0)
     if n == 0:
         return 0.0
@@ -126,7 +126,7 @@ def _lost_on(graph, costs, e, x, after):
 
 @kernel
 def _least_costs(graph, costs, edge_cost):
-    """Cost of each edge at the largest trust with which it can be entered, (edge,)."""
+    """Compute the cost of each edge at the largest trust with which it can be entered, (edge,)."""
     if len(costs.x0) == 0:
         return edge_cost
     cost = np.full(len(graph.head), np.inf)
@@ -144,7 +144,7 @@ def _least_costs(graph, costs, edge_cost):
 
 @kernel
 def _failing(failure, r):
-    """Cost of failing with sums r (sum,)."""
+    """Compute the cost of failing with sums r (sum,)."""
     total = 0.0
     for m in range(len(r)):
         total -= failure[m] * math.expm1(-r[m])
@@ -251,7 +251,7 @@ def _limits(graph, costs, edge_cost, least_cost, known):
 
 @kernel
 def _chords(costs, low, gap):
-    """Slopes (sum,) and constant of a plane below the failure cost of paths that can be optimal.
+    """Find a plane below the failure cost of paths that can be optimal: slopes (sum,), constant.
 
     These have sums of at least `low` and a failure cost of at most `gap`, the difference between
     the cost of the best path known and the least cost without risk.
@@ -274,7 +274,7 @@ def _chords(costs, low, gap):
 
 @kernel
 def _price_of_limit(graph, costs, edge_cost, least_cost, chord, offset, to_go, known):
-    """Best lower limit on the cost of all paths, and the price of the limited sum that gives it.
+    """Find the price of the limited sum with the best lower limit on the cost of all paths.
 
     The dual is concave in the price; its slope is the excess of the cheapest path's sum.
     """
@@ -329,7 +329,7 @@ class Labels(NamedTuple):
 
 @kernel
 def _search(graph, costs, most, edge_cost, limits, known):
-    """Label search: writes the best path; returns a lower limit on its cost, equal where exact."""
+    """Search for the best path; returns a lower limit on its cost, equal where exact."""
     n_numbers = 1 + len(costs.failure) + len(costs.x0)
     made, last = np.empty((4, most), np.int64), np.full(len(graph.cell), -1)
     labels = Labels(np.empty((most, n_numbers)), made[0], made[1], made[2], made[3], last)
@@ -378,7 +378,7 @@ def _extend(graph, costs, edge_cost, limits, known, labels, s, label, n):
 
 @kernel
 def _is_hopeless(costs, limits, h, cost, sums, known):
-    """Whether no path that enters a state with this cost and these sums beats the best one."""
+    """Check whether no path that enters a state with this cost and these sums can be best."""
     if sums[-1] + limits.safest[h, -1] > costs.limit:
         return True
     at_least = cost + limits.priced[h] + limits.offset
@@ -403,7 +403,7 @@ def _write_edges(graph, labels, label, edges):
 
 @kernel
 def _is_dominated(graph, labels, label, other, n_sums):
-    """Whether labels of one state have all the completions of one, at no higher cost."""
+    """Check whether other labels of a state have all completions of a label at no higher cost."""
     number, by = labels.number[label], -2
     while other >= 0:
         covers, equal = other != label, True

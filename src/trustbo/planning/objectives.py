@@ -95,9 +95,9 @@ def weights_of(objective: Objective, dynamics: Dynamics, view: Array, longest: i
 
 
 def has_history(objective: Objective, family: Family) -> bool:
-    """Whether the loss of a bound depends on the trust with which it is entered.
+    """Return whether the loss of a bound depends on the trust with which it is entered.
 
-    Otherwise the score is a sum of weights of drifts. Needs B0 >= 0.
+    Otherwise the score is a weighted sum of drifts. B0 must be >= 0.
     """
     return objective.of_contact and family.expected_rate != "identity"
 

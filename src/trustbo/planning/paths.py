@@ -164,7 +164,7 @@ class AdmissiblePaths:
         return AdmissiblePaths(self.workspace, self.start, cell, admitted, self.avoided)
 
     def cells(self, flat: np.ndarray) -> tuple[Cell, ...]:
-        """Cells of flat indices, up to the first negative index."""
+        """Convert flat indices to cells, up to the first negative index."""
         rows, cols = np.divmod(flat[flat >= 0], self.bounds.shape[-1])
         return tuple(zip(rows.tolist(), cols.tolist(), strict=True))
 
@@ -191,7 +191,7 @@ class AdmissiblePaths:
 
 
 def fewest_bounds(bounds: np.ndarray, cell: Cell, *, back: bool = False) -> np.ndarray:
-    """Fewest bounds from a cell to every other, shape (row, col); -1 where there is no path.
+    """Count the fewest bounds from a cell to every other, (row, col); -1 where there is no path.
 
     Args:
         bounds: Bounds that may be taken, (move, row, col).

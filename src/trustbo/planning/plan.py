@@ -80,7 +80,7 @@ class Plan(Summary):
         ]
         if self.p_arrive is not None:
             beyond = "; fails beyond max_failure" if self.infeasible else ""
-            rows.append(("chance to arrive", f"{self.p_arrive:.3g}{beyond}"))
+            rows.append(("arrival probability", f"{self.p_arrive:.3g}{beyond}"))
         if not np.isnan(self.limit):
             rows.append(("search", f"{1e3 * self.seconds:.1f} ms"))
         return rows

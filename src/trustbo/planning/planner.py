@@ -370,7 +370,7 @@ class Planner(Summary):
 
 
 def _toll_of(toll: ArrayLike, bounds: np.ndarray) -> np.ndarray:
-    """Tolls (move, row, col), 0 where there is no bound.
+    """Return the tolls (move, row, col), 0 where there is no bound.
 
     Raises TrustboError if the shape does not broadcast or the toll of a bound is not finite.
     """
@@ -390,7 +390,7 @@ def _toll_of(toll: ArrayLike, bounds: np.ndarray) -> np.ndarray:
 def _value_along(
     problem: Problem, cells: np.ndarray, params: Params, x0: ArrayLike | None
 ) -> tuple[np.ndarray, float, np.ndarray]:
-    """Trust along a path (draw, bound, robot), its value without failures, and per draw."""
+    """Compute trust along a path (draw, bound, robot), its value without failures, and per draw."""
     z, of_path = along(problem.paths.workspace.awareness.values, cells), params.along(cells)
     z = z[:, None, None]  # a map of one row
     by_robot = trust_dynamics(of_path, z, x0, by_robot=True)

@@ -23,12 +23,12 @@ N_DRAWS = 200
 
 
 def greedy(rng: np.random.Generator, params: Params, planner: Planner) -> Plan:
-    """Best path under the posterior mean of the parameters, as in the paper."""
+    """Plan the best path under the posterior mean of the parameters, as in the paper."""
     return planner.plan(params.mean())
 
 
 def thompson(rng: np.random.Generator, params: Params, planner: Planner) -> Plan:
-    """Best path under one posterior draw taken at random (probability matching)."""
+    """Plan the best path under one random posterior draw (probability matching)."""
     plan = planner.plan(params.draw(int(rng.integers(params.leading[0]))))
     return planner.evaluate(plan.path, params.mean())
 
@@ -36,7 +36,7 @@ def thompson(rng: np.random.Generator, params: Params, planner: Planner) -> Plan
 def optimistic(
     rng: np.random.Generator, params: Params, planner: Planner, *, quantile: float = 0.9
 ) -> Plan:
-    """Best path under the upper quantile over draws of each bound's drift u."""
+    """Plan the best path under the upper quantile over draws of each bound's drift u."""
     some = choose_draws(params, 1000, _seed(rng))
     transition, drift, start, sd = planner.problem.dynamics(some)
     best = Dynamics(
@@ -46,7 +46,7 @@ def optimistic(
 
 
 def ucb(rng: np.random.Generator, params: Params, planner: Planner, *, kappa: float = 1.0) -> Plan:
-    """Among the draws' best paths, the one with the highest mean plus `kappa` sd of value."""
+    """Choose the draws' best path with the highest mean plus `kappa` sd of the value."""
     drawn = planner.plan_draws(params, n_draws=N_DRAWS, seed=_seed(rng))
     values = drawn.values_of(drawn.candidates)
     chosen = int(np.argmax(values.mean(0) + kappa * values.std(0)))
@@ -54,7 +54,7 @@ def ucb(rng: np.random.Generator, params: Params, planner: Planner, *, kappa: fl
 
 
 def random(rng: np.random.Generator, params: Params, planner: Planner) -> Plan:
-    """Best path under drifts drawn uniformly from [0, 1], ignoring the posterior."""
+    """Plan the best path under drifts drawn uniformly from [0, 1], ignoring the posterior."""
     drift = rng.uniform(size=(1, *planner.problem.paths.bounds.shape))
     dynamics = Dynamics(np.zeros((1, 1)), drift, np.zeros(1), np.full((), 0.1))
     return planner.evaluate(planner.best_path(dynamics), params.mean())

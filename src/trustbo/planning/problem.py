@@ -87,13 +87,13 @@ class Problem:
         return float(self.paths.shortest) if self.failure_cost is None else self.failure_cost
 
     def toll_along(self, path: Sequence[Cell] | np.ndarray) -> float:
-        """Toll of a path."""
+        """Sum the tolls of a path."""
         return float(self.toll[*bounds_along(path).T].sum())
 
     def value_along(
         self, path: Sequence[Cell] | np.ndarray, trust: np.ndarray, noise_sd: np.ndarray
     ) -> np.ndarray:
-        """Value of a path without failures, shape (...,).
+        """Compute the value of a path without failures, shape (...,).
 
         Computed from the team's trust after each bound, (..., bound), and the sd of a rate, (...,).
         """
@@ -106,7 +106,7 @@ class Problem:
         return objective.value((trust @ credit - toll) / scale)
 
     def failure_along(self, path: Sequence[Cell] | np.ndarray) -> float:
-        """Cost of a failure times the probability that a path fails."""
+        """Compute the cost of a failure times the probability that a path fails."""
         return self.price * self.risk.priced(path) if self.risk and self.price else 0.0
 
     def is_within_limit(self, path: Sequence[Cell] | np.ndarray) -> bool:
@@ -130,8 +130,8 @@ class Problem:
         """
         if self.risk is None and self.max_failure is not None:
             raise TrustboError(
-                f"max_failure = {self.max_failure:g} needs the chance of each bound to fail; use "
-                "planner.with_risk(p_fail)."
+                f"max_failure = {self.max_failure:g} needs the failure probability "
+                "of each bound; use planner.with_risk(p_fail)."
             )
         if self.risk is None or (self.max_failure is None and self.price == 0.0):
             return None
@@ -148,7 +148,7 @@ class Problem:
             move, row, col = np.argwhere(missing)[0].tolist()
             raise TrustboError(
                 f"p_fail of the bound into {(row, col)} by move {MOVE_NAMES[move]!r} is NaN; give "
-                "a chance to every possible bound."
+                "a probability for every possible bound."
             )
         of_bounds = risk_of(p_fail).reshape(len(p_fail), -1).T
         return Risks(np.ascontiguousarray(of_bounds), self.price * shares, limit)
@@ -198,7 +198,7 @@ class Problem:
             )
 
     def _infeasible(self, risk: Risk) -> InfeasibleError:
-        """Error for a problem in which no path respects the limit, with the safest path."""
+        """Make the error for a problem without a path within the limit, with the safest path."""
         graph, n = self.paths.graph, self.paths.graph.longest + 1
         nothing = Weights(np.zeros((1, n, 1)), np.zeros((1, n)), np.ones(n))
         of_bounds = risk_of(risk.p_fail).ravel()
@@ -206,7 +206,7 @@ class Problem:
         path = self.paths.cells(paths[0])
         p_fail = 1.0 - risk.survival(path)
         return InfeasibleError(
-            f"no admissible path from {path[0]} to {path[-1]} fails with a chance of at most "
+            f"no admissible path from {path[0]} to {path[-1]} fails with a probability of at most "
             f"max_failure = {self.max_failure:g}; the least is {p_fail:.4g}, on the path {path}. "
             "Raise max_failure, admit more paths by max_bounds, or take the safest, the "
             "attribute path of this error.",
@@ -229,7 +229,7 @@ class Risks(NamedTuple):
 
 
 def risk_of(p_fail: np.ndarray) -> np.ndarray:
-    """Risk -log(1 - p_fail), large but finite for p_fail = 1; 0 where there is no bound."""
+    """Compute the risk -log(1 - p_fail), finite for p_fail = 1; 0 where there is no bound."""
     with np.errstate(divide="ignore"):
         return np.minimum(-np.log1p(-np.nan_to_num(p_fail)), _CERTAIN)
 

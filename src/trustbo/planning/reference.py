@@ -1,4 +1,4 @@
-"""Reference planner by networkx and enumeration: slow and readable, to test the compiled searches.
+"""Slow, readable reference planner by networkx and enumeration, to test the compiled searches.
 
 Where the value of a path is a sum over its bounds, the best path is found by Bellman-Ford in the
 unrolled graph; where it depends on history or risk, all admissible paths are enumerated. Neither
@@ -45,7 +45,7 @@ def plan(planner: Planner, params: Params | xr.DataTree) -> Plan:
 
 
 def shortest_paths(planner: Planner, dynamics: Dynamics) -> Iterator[tuple[Cell, ...]]:
-    """Best path of each number of bounds, by `networkx.bellman_ford_path`.
+    """Find the best path of each number of bounds by `networkx.bellman_ford_path`.
 
     In a path, a bound with j bounds left after it adds w_j . u to the sum, with the weights w_j =
     sum_{i <= j} credit(i) view . B0^(j - i) of its drift u, and subtracts its toll.
@@ -73,7 +73,7 @@ def shortest_paths(planner: Planner, dynamics: Dynamics) -> Iterator[tuple[Cell,
 
 
 def every_path(paths: AdmissiblePaths) -> Iterator[tuple[Cell, ...]]:
-    """Enumerate all admissible paths; for small grids."""
+    """Enumerate all admissible paths; feasible only for small grids."""
     onward: dict[Cell, list[Cell]] = {}
     for move, row, col in np.argwhere(paths.bounds).tolist():
         down, right = MOVES[move]

@@ -1,4 +1,4 @@
-"""Best path where its value is a sum over its bounds: dynamic programming on the unrolled graph.
+"""Dynamic programming on the unrolled graph, for objectives that are sums over the bounds.
 
 With j bounds left after a bound, its drift u adds w_j . u to the value, whatever the length of the
 path: w_j is the sum over i <= j of credit(i) view . B0^(j - i), see `objectives.weights_of`. States

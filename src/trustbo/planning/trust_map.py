@@ -1,4 +1,4 @@
-"""Trust map: largest expected trust with which each cell can be reached, per draw and robot."""
+"""Trust map: the largest expected trust with which each cell can be reached."""
 
 import numpy as np
 import xarray as xr
@@ -38,7 +38,7 @@ def cost_of(trust: xr.DataArray) -> xr.DataArray:
 
 
 def _largest(paths: AdmissiblePaths, dynamics: Dynamics, view: np.ndarray) -> np.ndarray:
-    """Largest trust view . x of every draw and cell, (draw, row, col); NaN if unreachable."""
+    """Compute the largest trust view . x by draw and cell, (draw, row, col); NaN if unreachable."""
     extra = min(SIMPLE_EXTRA, paths.longest - paths.shortest)
     weights = view @ dynamics.transition  # (draw, state)
     beta0 = np.divide(weights, view, out=np.zeros_like(weights), where=view > 0.0)
@@ -60,10 +60,10 @@ def _largest(paths: AdmissiblePaths, dynamics: Dynamics, view: np.ndarray) -> np
 def best_trust(
     paths: AdmissiblePaths, extra: int, drift: np.ndarray, beta0: np.ndarray, x0: np.ndarray
 ) -> np.ndarray:
-    """Largest trust with which each cell can be entered, (draw, row, col); NaN if unreachable.
+    """Find the largest trust with which each cell can be entered; NaN where unreachable.
 
-    One pass over the numbers of bounds. U-turns are not allowed: each cell keeps the largest trust
-    by any move, and the largest by another move. Exact for beta0 >= 0.
+    This is one pass over the numbers of bounds. U-turns are not allowed: each cell keeps the
+    largest trust by any move, and the largest by another move. The result is exact for beta0 >= 0.
 
     Args:
         paths: Admissible paths.
@@ -71,6 +71,9 @@ def best_trust(
         drift: Drift of bounds, (draw, move, row, col), NaN where there is none.
         beta0: Autoregression, (draw,).
         x0: Trust at the start, (draw,).
+
+    Returns:
+        Shape (draw, row, col).
     """
     start, fewest = paths.start, paths.bounds_from_start
     margin = ((0, 0), (0, 0), (1, 1), (1, 1))

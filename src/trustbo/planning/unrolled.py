@@ -94,7 +94,7 @@ def new_to_go(n_states: int) -> ToGo:
 
 @kernel
 def fill_to_go(graph, cost, to_go) -> None:
-    """Dynamic programming from the goal: write the least costs to go for edge costs (edge,)."""
+    """Write the least costs to go for edge costs (edge,), by dynamic programming from the goal."""
     least, edge, second, other = to_go
     cell, first, head = graph.cell, graph.first, graph.head
     for s in range(1, len(cell)):
