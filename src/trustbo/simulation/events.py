@@ -52,7 +52,7 @@ class Event:
 
 @dataclass(frozen=True)
 class Jam(Event):
-    """A jammer, which multiplies detection from or of robots in a circle by 1 - `strength`.
+    """Jammer, which multiplies detection from or of robots in a circle by 1 - `strength`.
 
     Attributes:
         center: Centre of the circle.
@@ -74,7 +74,7 @@ class Jam(Event):
 
 @dataclass(frozen=True)
 class Degradation(Event):
-    """A lidar of T2 with a lower probability of detection.
+    """Degraded lidar of T2, with a lower probability of detection.
 
     Attributes:
         robot: Name of the robot.
@@ -114,7 +114,7 @@ class Dust(Event):
 
 @dataclass(frozen=True)
 class Trees(Event):
-    """Felled or newly grown trees in a circle; they affect sight but not motion.
+    """Trees felled or newly grown in a circle; they affect sight but not motion.
 
     Attributes:
         height: Height of the canopy above the ground, m; 0 where trees were felled.
@@ -141,7 +141,7 @@ class Trees(Event):
 
 @dataclass(frozen=True)
 class Season(Event):
-    """A denser or thinner canopy.
+    """Change of season, which makes the canopy denser or thinner.
 
     Attributes:
         extinction: Positive factor on the extinction of the true model of sight.
@@ -161,7 +161,7 @@ class Season(Event):
 
 @dataclass(frozen=True)
 class Fouling(Event):
-    """Lidars of T2 whose detection varies as they foul and clear from bound to bound.
+    """Fouling and clearing of T2's lidars, by which detection varies from bound to bound.
 
     The factor on the probability of detection of a robot is f_t = worst + (1 - worst) Phi(z_t),
     where z_t = correlation z_{t-1} + sqrt(1 - correlation^2) e_t and e_t is standard normal. Time t
@@ -203,7 +203,7 @@ class Fouling(Event):
 
 
 def changed(world: World, events: Iterable[Event], mission: int, long_run: bool = False) -> World:
-    """World of a mission; with `long_run`, factors that vary by bound have their mean."""
+    """Return the world of a mission; with `long_run`, the factors of bounds have their means."""
     world = world._replace(mission=None if long_run else mission)
     for event in events:
         if event.acts_in(mission):
@@ -212,7 +212,7 @@ def changed(world: World, events: Iterable[Event], mission: int, long_run: bool 
 
 
 def _circle(surface: Surface, center: tuple[float, float], radius: float) -> np.ndarray:
-    """Mask of the pixels with centres in a circle, shape (row, col); TrustboError if empty."""
+    """Return a mask of the pixels with centres in a circle, (row, col); TrustboError if empty."""
     rows, cols = surface.ground.shape
     row, col = surface.to_pixel(*np.asarray(center, dtype=float))
     away = np.hypot(

@@ -85,7 +85,7 @@ class KinematicSimulator(DescribedSimulator):
         if self.team.names != workspace.team.names:
             raise TrustboError(
                 f"the true team has robots {self.team.names}, the workspace's "
-                f"{workspace.team.names}; give as many, by the same names."
+                f"{workspace.team.names}; the names must be the same."
             )
         surface = true_surface(workspace, terrain)
         self.tick = require_positive("tick", tick)
@@ -117,7 +117,7 @@ class KinematicSimulator(DescribedSimulator):
         return {**self.describe(), "events": always}
 
     def world(self, mission: int = 0, *, long_run: bool = False) -> World:
-        """World of a mission; with `long_run`, what varies from bound to bound has its mean."""
+        """Return the world of a mission; with `long_run`, factors of bounds have their means."""
         return changed(self._usual, self.events, require_whole("mission", mission, 0), long_run)
 
     def run(self, path: Sequence[Cell], *, seed: int, mission: int = 0) -> Mission:
@@ -148,7 +148,7 @@ class KinematicSimulator(DescribedSimulator):
         return Mission(tuple(cells), tuple(bounds), bounds[-1].status, *names)
 
     def standing(self, cell: Cell, next_cell: Cell | None) -> State:
-        """State of the team with all robots at their stop and posts, before the next bound."""
+        """Return the team's state with all robots at stop and posts, before the next bound."""
         posts = self._posts
         stops = np.concatenate([posts.stop(cell)[None], posts.watching(cell, next_cell)])
         poses = np.concatenate([stops, np.zeros((len(stops), 1))], axis=1)
@@ -269,7 +269,7 @@ class KinematicSimulator(DescribedSimulator):
         probability: np.ndarray,
         rng: np.random.Generator,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Contact at each tick, (tick, robot), and the tracks after it."""
+        """Compute the contact at each tick, (tick, robot), and the tracks after it."""
         detected = rng.random(probability.shape) < probability
         contact, tracks = np.empty(detected.shape, bool), tracks.copy()
         watchers = world.team.robots, (world.team.lead,) * world.team.n_robots

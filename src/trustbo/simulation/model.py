@@ -105,7 +105,7 @@ class ModelSimulator(DescribedSimulator):
         return about
 
     def _end(self, cells: list[Cell], seed: int) -> tuple[int, str]:
-        """Number of bounds that are run, and the final status of the mission."""
+        """Count the bounds that are run, and find the final status of the mission."""
         n = len(cells) - 1
         if self.p_fail is None:
             return n, "ok"
@@ -116,7 +116,7 @@ class ModelSimulator(DescribedSimulator):
 
 
 def _require_probabilities(p_fail: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
-    """Probabilities of failure, NaN where there is no bound, as an array (move, row, col)."""
+    """Return failure probabilities (move, row, col), NaN where there is no bound."""
     p = np.asarray(p_fail, dtype=float)
     if p.shape != shape:
         raise TrustboError(f"p_fail must be (move, row, col) = {shape}; got {p.shape}.")

@@ -90,7 +90,7 @@ def _squared(route, i, x, y):
 
 @_part
 def _within_a_turn(angle):
-    """Angle wrapped to [-pi, pi); the slow remainder is computed only if needed."""
+    """Wrap an angle to [-pi, pi); the slow remainder is computed only if needed."""
     if -math.pi <= angle < math.pi:
         return angle
     return (angle + math.pi) % (2.0 * math.pi) - math.pi

@@ -55,7 +55,7 @@ def require_path(workspace: Workspace, path: Sequence[Cell]) -> list[Cell]:
 
 
 def digest(*arrays: ArrayLike) -> str:
-    """Hash of the values of arrays."""
+    """Hash the values of arrays."""
     found = hashlib.sha256()
     for array in arrays:
         found.update(np.ascontiguousarray(array).tobytes())

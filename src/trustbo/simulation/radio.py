@@ -24,7 +24,7 @@ _REACH, _WINDOW, _FIELD = 60.0, 20.0, 35.0
 
 
 class RadioSimulator(DescribedSimulator):
-    """Simulator with contact as a function of distance, canopy cover, climb and a hidden field.
+    """Simulator whose contact depends on distance, canopy cover, climb and a hidden field.
 
     The mean contact of robot i in the bound from cell a to b is sigma(2.2 - 3.5 c^1.5 d - 0.1 h +
     0.9 (0.3 + c) tanh(g) + q_i): d is the distance between the cells' centres in units of 60 m, c
@@ -39,9 +39,12 @@ class RadioSimulator(DescribedSimulator):
         """Compute the mean contact of every bound.
 
         Args:
-            workspace: A workspace made from a terrain, else TrustboError.
+            workspace: A workspace made from a terrain.
             terrain: True DEM and DSM; by default the workspace's.
             seed: Seed of the field and of the radios; by default a hash of the terrain.
+
+        Raises:
+            TrustboError: The workspace was not made from a terrain.
         """
         terrain = workspace.terrain if terrain is None else terrain
         if terrain is None:
@@ -74,7 +77,7 @@ class RadioSimulator(DescribedSimulator):
 
 
 def expected_rate(mean: np.ndarray) -> np.ndarray:
-    """Expectation of a noisy rate, clipped to [0, 1].
+    """Compute the expectation of a noisy rate that is clipped to [0, 1].
 
     E[clip(X, 0, 1)] is the integral of P(X > x) over [0, 1]. The antiderivative of the distribution
     function F of Student's t with density f is u F(u) + (freedom + u^2) / (freedom - 1) f(u).
@@ -88,7 +91,7 @@ def expected_rate(mean: np.ndarray) -> np.ndarray:
 
 
 def _mean_contact(workspace: Workspace, terrain: xr.Dataset, seed: int) -> np.ndarray:
-    """Mean contact by the formula, shape (robot, move, row, col), also for absent bounds."""
+    """Compute mean contact by the formula, (robot, move, row, col), also for absent bounds."""
     grid, step, x, y = workspace.grid, pixel_size(terrain), terrain["x"].values, terrain["y"].values
     dem, dsm = terrain["dem"].values, terrain["dsm"].values
     window: Any = [max(1, round(_WINDOW / one)) for one in step]

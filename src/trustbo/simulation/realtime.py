@@ -22,12 +22,12 @@ SIGNS = {
 }
 """Inputs of each feature, and whether they raise it: angles in rad, the range in m."""
 MIN_SAMPLES = 200
-"""Minimum number of robots x bounds for the fit: with fewer, the loadings are unstable."""
+"""Minimum number of robots x bounds for the fit, since few samples make loadings unstable."""
 _SHARES, _ANGLES = np.array([0.25, 0.5, 0.75, 1.0]), np.linspace(0.0, 2.0 * np.pi, 13)[:-1]
 
 
 class RealtimeAwareness:
-    """Awareness as robots measure it in a bound.
+    """Awareness measured by the robots during a bound.
 
     Attributes:
         indices: Fitted `CompositeIndex` by feature.
@@ -46,7 +46,7 @@ class RealtimeAwareness:
             self.indices[feature] = CompositeIndex(signs).fit(of_all)
 
     def inputs(self, bound: Bound) -> dict[str, dict[str, np.ndarray]]:
-        """Inputs of each feature, see `SIGNS`, arrays (robot,)."""
+        """Compute the inputs of each feature, see `SIGNS`, arrays (robot,)."""
         world, workspace, poses = self._world, self._workspace, bound.poses[:, 1:]  # pyright: ignore[reportOptionalSubscript]
         way = np.diff(poses[..., :2], axis=0, prepend=poses[:1, :, :2])
         speed = np.hypot(way[..., 0], way[..., 1]) / self._tick
@@ -67,7 +67,7 @@ class RealtimeAwareness:
         return found
 
     def measured(self, mission: Mission) -> Mission:
-        """Mission with the features of `SIGNS` as measured by the robots."""
+        """Return the mission with the features of `SIGNS` as measured by the robots."""
         bounds = []
         for bound in mission.bounds:
             awareness = bound.awareness.copy()
@@ -78,7 +78,7 @@ class RealtimeAwareness:
         return replace(mission, bounds=tuple(bounds))
 
     def _lidar(self, poses: np.ndarray) -> dict[str, np.ndarray]:
-        """Mean range of returns, m, and fraction of clear beams, each (tick, robot).
+        """Compute mean range of returns, m, and fraction of clear beams, each (tick, robot).
 
         The mean range is the integral over range of the fraction of beams that reach it.
         """

@@ -34,13 +34,13 @@ type Outcomes = Iterator[tuple[Edge, list[tuple[float, str]]]]
 
 
 def table_of(contact: np.ndarray, passed: np.ndarray) -> xr.Dataset:
-    """Table as in `Truth.bounds`, from arrays (move, row, col, next_move)."""
+    """Make a table as in `Truth.bounds` from arrays (move, row, col, next_move)."""
     names = {"move": list(MOVE_NAMES), "next_move": [*MOVE_NAMES, "end"]}
     return xr.Dataset({"contact": (_DIMS, contact), "passed": (_DIMS, passed)}, names)
 
 
 def edges_of(workspace: Workspace) -> list[Edge]:
-    """All bounds of a workspace for which its robots have a route."""
+    """List all bounds of a workspace for which its robots have a route."""
     exists = workspace.passable_bounds.values
     around = np.pad(exists, ((0, 0), (1, 1), (1, 1)))
     edges = []
@@ -54,7 +54,7 @@ def edges_of(workspace: Workspace) -> list[Edge]:
 
 
 def replicated(simulator: Any, mission: int, n_replicates: int, seed: int) -> xr.Dataset:
-    """Means over the replicates of all bounds."""
+    """Average over the replicates of all bounds."""
     if hasattr(simulator, "expected_contact"):
         return simulator.expected_contact()
     workspace = simulator.workspace
@@ -77,7 +77,7 @@ def replicated(simulator: Any, mission: int, n_replicates: int, seed: int) -> xr
 def _of_bounds(
     simulator: KinematicSimulator, edges: Sequence[Edge], mission: int, n: int, seed: int
 ) -> Outcomes:
-    """Replicates of bounds, which begin where a preceding bound ended in the previous replicate.
+    """Replicate bounds, each from where a preceding bound ended in the previous replicate.
 
     A replicate 0, which is not counted, begins with all robots at their stop and posts.
     """
@@ -107,7 +107,7 @@ def _of_bounds(
 def _of_missions(
     simulator: Any, edges: Sequence[Edge], mission: int, n: int, seed: int
 ) -> Outcomes:
-    """Replicates of bounds, each as missions of the bound and each possible next bound."""
+    """Replicate bounds by missions of the bound and each possible next bound."""
     for number in range(n):
         for edge in edges:
             outcomes = []

@@ -28,7 +28,7 @@ class Drive(NamedTuple):
 
 
 def detections(world: World, drives: Sequence[Drive], k: int) -> list[np.ndarray]:
-    """Probability that a scan detects its target, shape (tick, robot), for each drive.
+    """Compute the probability that a scan detects its target, (tick, robot), for each drive.
 
     The drives are alternatives for bound k of a mission, counted from 1.
     """
@@ -54,12 +54,12 @@ def detections(world: World, drives: Sequence[Drive], k: int) -> list[np.ndarray
 
 
 def new_tracks(n_robots: int) -> np.ndarray:
-    """Tracks without a target: (phase, robot, (tracked, run of contrary scans))."""
+    """Make tracks without a target: (phase, robot, (tracked, run of contrary scans))."""
     return np.zeros((2, n_robots, 2), np.int64)
 
 
 def contact_of(detected: np.ndarray, watchers: Sequence[Robot], tracks: np.ndarray) -> np.ndarray:
-    """Contact from scans: tracks begin after successive detections and end after successive misses.
+    """Track targets in scans: tracks begin after successive detections and end after misses.
 
     `detected`, shape (tick, robot), has the outcome of each scan. The numbers of scans are
     `acquire` and `drop` of the watchers, one for each robot. The state of the tracks, shape (robot,

@@ -102,11 +102,11 @@ class Truth(Summary):
         return of_mission(mission)
 
     def at(self, mission: int) -> "Truth":
-        """Truth of another mission's world; missions count from 0."""
+        """Compute the truth of another mission's world; missions count from 0."""
         return self if self._of is None else self._of(mission)
 
     def lost(self, path: Sequence[Cell]) -> float:
-        """Expected contact lost on a path, in bounds, given that no bound fails.
+        """Compute the expected contact lost on a path, in bounds, given that no bound fails.
 
         Raises:
             TrustboError: A cell is off the grid, impassable, or not a neighbour of the previous
@@ -116,7 +116,7 @@ class Truth(Summary):
         return float((1.0 - contact).sum())
 
     def lost_or_failed(self, path: Sequence[Cell]) -> float:
-        """Expected contact lost if bounds that fail or are not reached keep no contact.
+        """Compute the expected contact lost if failed and unreached bounds keep no contact.
 
         It is sum_k (1 - S_k c_k) for the contact c_k of bound k, where S_k is the probability that
         it and all bounds before it are completed. Raises the errors of `lost`.
@@ -151,10 +151,10 @@ class Truth(Summary):
         return _most_kept(contact, passed, *ends, paths.longest, u_turns=paths.turns)
 
     def regret(self, path: Sequence[Cell], max_bounds: int | str = "shortest+4") -> float:
-        """Regret of a path, in % of the contact kept on the best path with the same ends.
+        """Compute the regret of a path, in % of the contact kept on the best path between its ends.
 
-        100 (lost on the path - lost on the best) / contact kept on the best, all in bounds. It is
-        negative if the path is better than the best path of at most `max_bounds` bounds.
+        It is 100 (lost on the path - lost on the best) / contact kept on the best, all in bounds,
+        and negative if the path is better than the best path of at most `max_bounds` bounds.
         """
         best = self.best(path[0], path[-1], max_bounds)
         least = self.lost(best)
@@ -162,7 +162,7 @@ class Truth(Summary):
         return 100.0 * (self.lost(path) - least) / kept if kept > 0.0 else np.nan
 
     def _along(self, path: Sequence[Cell]) -> tuple[np.ndarray, np.ndarray]:
-        """Contact and probability to pass for the bounds of a path, each of shape (bound,)."""
+        """Return contact and probability to pass for the bounds of a path, each (bound,)."""
         cells = require_path(self.workspace, path)
         moves, (rows, cols) = moves_along(cells), np.array(cells)[1:].T
         where = moves, rows, cols, np.append(moves[1:], END)
@@ -170,14 +170,14 @@ class Truth(Summary):
 
 
 def _settings(simulator: Any, mission: int) -> object:
-    """Settings of a mission's world."""
+    """Return the settings of a mission's world."""
     if hasattr(simulator, "describe_world"):
         return simulator.describe_world(mission)
     return getattr(simulator, "describe", lambda: type(simulator).__name__)()
 
 
 def _kept(folder: FilePath | None, world: str, make: Callable[[], xr.Dataset]) -> xr.Dataset:
-    """Table of a world's bounds from its file in a folder; computed if the file does not exist."""
+    """Read the table of a world's bounds from its file; compute it if the file does not exist."""
     if folder is None:
         return make()
     file = Path(folder) / f"truth-{digest(np.frombuffer(world.encode(), np.uint8))}.nc"
@@ -191,7 +191,7 @@ def _kept(folder: FilePath | None, world: str, make: Callable[[], xr.Dataset]) -
 def _most_kept(
     contact: np.ndarray, passed: np.ndarray, start: Cell, goal: Cell, longest: int, *, u_turns: bool
 ) -> tuple[Cell, ...]:
-    """Path of at most `longest` bounds with the least loss; tables (move, row, col, next_move).
+    """Find the path of at most `longest` bounds with the least loss.
 
     The maximum contact kept from a bound on, V = max p (c + V'), is computed backwards over the
     bound and the number of bounds after it. This is exact, since the probability p to pass is not
@@ -226,7 +226,7 @@ def _most_kept(
 
 
 def _by_cell_left(values: np.ndarray, move: int) -> np.ndarray:
-    """Values of the cells that a move enters, (row, col), indexed by the cell that it leaves."""
+    """Index the values of the cells that a move enters by the cell that it leaves."""
     (down, right), (rows, cols) = MOVES[move], values.shape
     framed = np.pad(values, 1, constant_values=-np.inf)
     return framed[1 + down :, 1 + right :][:rows, :cols]

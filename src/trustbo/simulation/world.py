@@ -34,13 +34,13 @@ class World(NamedTuple):
 
 
 def world_of(surface: Surface, sight: Sight, team: Team) -> World:
-    """World without events."""
+    """Make a world without events."""
     detection = np.array([[robot.detection for robot in team.robots]])
     return World(surface, sight, team, detection, team.lead.detection)
 
 
 def true_surface(workspace: Workspace, terrain: xr.Dataset | None) -> Surface:
-    """Surface used for the simulation: the workspace's, or the surface of another terrain.
+    """Return the surface used for the simulation: the workspace's or another terrain's.
 
     Raises:
         TrustboError: The terrain does not cover the grid or has another CRS, or the workspace has

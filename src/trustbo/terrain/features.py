@@ -41,7 +41,7 @@ FEATURES: dict[str, Feature] = {}
 
 
 def feature[F: Callable[..., np.ndarray]](name: str, *, sign: int) -> Callable[[F], F]:
-    """Decorator that registers a feature of pixels under a new name.
+    """Register a function as a feature of pixels under a new name (decorator).
 
     TrustboError: the name is taken, or the sign is neither 1 nor -1.
     """
@@ -58,7 +58,7 @@ def feature[F: Callable[..., np.ndarray]](name: str, *, sign: int) -> Callable[[
 
 
 def _window(z: np.ndarray) -> dict[tuple[int, int], np.ndarray]:
-    """The nine heights of each pixel's 3 x 3 window, by steps (down, right).
+    """Return the nine heights of each pixel's 3 x 3 window, by steps (down, right).
 
     Beyond the raster's edge the ground is level.
     """
@@ -68,7 +68,7 @@ def _window(z: np.ndarray) -> dict[tuple[int, int], np.ndarray]:
 
 
 def gradient(dem: np.ndarray, pixel: tuple[float, float]) -> np.ndarray:
-    """Gradient of the ground to the east and to the north (Horn 1981), (2, row, col)."""
+    """Compute the gradient of the ground to the east and north (Horn 1981), (2, row, col)."""
     w = _window(dem)
     east = (w[-1, 1] - w[-1, -1]) + 2.0 * (w[0, 1] - w[0, -1]) + (w[1, 1] - w[1, -1])
     south = (w[1, -1] - w[-1, -1]) + 2.0 * (w[1, 0] - w[-1, 0]) + (w[1, 1] - w[-1, 1])
@@ -77,41 +77,41 @@ def gradient(dem: np.ndarray, pixel: tuple[float, float]) -> np.ndarray:
 
 @feature("slope", sign=-1)
 def slope(terrain: xr.Dataset) -> np.ndarray:
-    """Slope of the ground, rad (Horn 1981)."""
+    """Compute the slope of the ground, rad (Horn 1981)."""
     z = terrain["dem"].values
     return np.arctan(np.hypot(*gradient(z, pixel_size(terrain)))) + (z - z)  # missing stays missing
 
 
 @feature("roughness", sign=-1)
 def roughness(terrain: xr.Dataset) -> np.ndarray:
-    """Highest minus lowest ground in the 3 x 3 window, m (Wilson et al. 2007)."""
+    """Compute highest minus lowest ground in the 3 x 3 window, m (Wilson et al. 2007)."""
     window = np.stack(list(_window(terrain["dem"].values).values()))
     return window.max(0) - window.min(0)
 
 
 @feature("tri", sign=-1)
 def tri(terrain: xr.Dataset) -> np.ndarray:
-    """Terrain ruggedness index, m: root sum of squared steps to the 8 neighbours (Riley 1999)."""
+    """Compute the terrain ruggedness index, m: root sum of squared steps (Riley 1999)."""
     z = terrain["dem"].values
     return np.sqrt(sum(((w - z) ** 2 for w in _window(z).values()), np.zeros_like(z)))
 
 
 @feature("step_height", sign=-1)
 def step_height(terrain: xr.Dataset) -> np.ndarray:
-    """Largest step up or down to one of the 8 neighbours, m; missing neighbours are ignored."""
+    """Compute the largest step to one of the 8 neighbours, m; missing neighbours are ignored."""
     z = terrain["dem"].values
     return np.fmax.reduce([np.abs(w - z) for w in _window(z).values()])
 
 
 @feature("canopy_height", sign=-1)
 def canopy_height(terrain: xr.Dataset) -> np.ndarray:
-    """Surface minus ground, m."""
+    """Compute the surface minus the ground, m."""
     return terrain["dsm"].values - terrain["dem"].values
 
 
 @feature("canopy_cover", sign=-1)
 def canopy_cover(terrain: xr.Dataset) -> np.ndarray:
-    """Fraction of a square of half-width 5 m that is covered by canopy over 2 m high."""
+    """Compute the fraction of a square of half-width 5 m covered by canopy over 2 m high."""
     return _local_mean(terrain, (canopy_height(terrain) > 2.0).astype(float))
 
 
@@ -119,9 +119,10 @@ def canopy_cover(terrain: xr.Dataset) -> np.ndarray:
 def vegetation_density(
     terrain: xr.Dataset, *, layer: float = 3.0, crown_base: float = 0.3
 ) -> np.ndarray:
-    """Share of the lowest `layer` metres of air filled by canopy, in squares of half-width 5 m.
+    """Compute the share of the lowest `layer` metres of air that canopy fills.
 
-    The canopy is the layer from `crown_base` times its height to its top.
+    It is averaged over squares of half-width 5 m. The canopy is the layer from `crown_base` times
+    its height to its top.
     """
     height = canopy_height(terrain)
     filled = np.minimum(height, layer) - np.minimum(crown_base * height, layer)
@@ -132,11 +133,11 @@ def vegetation_density(
 def openness(
     terrain: xr.Dataset, reach: float = 50.0, *, eye: float = 1.0, target: float = 1.0
 ) -> np.ndarray:
-    """Expected fraction of clear rays from a pixel to targets `reach` metres away all around.
+    """Compute the expected fraction of clear rays from a pixel to targets all around.
 
-    Rays run from `eye` to `target` metres above ground. Rays that end off the raster are ignored; a
-    pixel without other rays is NaN, so keep `reach` below half the terrain's shorter side. Pixels
-    of a 4 x 4 square share the value of its centre.
+    Rays are `reach` metres long and run from `eye` to `target` metres above ground. Rays that end
+    off the raster are ignored; a pixel without other rays is NaN, so keep `reach` below half the
+    terrain's shorter side. Pixels of a 4 x 4 square share the value of its centre.
     """
     ground, surface = terrain["dem"].values, terrain["dsm"].values
     rows, cols = ground.shape
@@ -152,7 +153,7 @@ def openness(
 
 
 def _local_mean(terrain: xr.Dataset, values: np.ndarray) -> np.ndarray:
-    """Mean of the valid pixels in squares of half-width 5 m, in [0, 1]; NaN without ground."""
+    """Average valid pixels in squares of half-width 5 m, in [0, 1]; NaN without ground."""
     size = [2 * max(1, round(5.0 / step)) + 1 for step in pixel_size(terrain)]
     has_ground, valid = np.isfinite(terrain["dem"].values), np.isfinite(values)
     total, weight = (

@@ -82,7 +82,7 @@ def read_lidar(
 
 
 def _read_tile(path: str, given: CRS | None) -> tuple[np.ndarray, np.ndarray, CRS]:
-    """Positions (point, 3) of a file's usable points, whether each is ground, and the CRS."""
+    """Read positions (point, 3) of a file's usable points, whether each is ground, and the CRS."""
     try:
         import laspy
     except ImportError:

@@ -17,7 +17,7 @@ _NORTH = 22.5  # degrees between columns and north, half the angle between two o
 
 
 def known_crs(crs: Any) -> CRS:
-    """CRS of anything that PROJ accepts as one; TrustboError if it does not."""
+    """Convert anything that PROJ accepts to a CRS; TrustboError if PROJ does not know it."""
     try:
         return CRS.from_user_input(crs)
     except CRSError:
@@ -25,7 +25,7 @@ def known_crs(crs: Any) -> CRS:
 
 
 def require_map(name: str, own: object, given: CRS | None) -> CRS:
-    """CRS of a raster, in degrees or metres: its own CRS, or the given one if it has none.
+    """Return a raster's CRS, in degrees or metres: its own, or the given one if it has none.
 
     TrustboError: there is no CRS, it differs from the given one, or it is not in degrees or metres.
     """
@@ -49,7 +49,7 @@ def require_map(name: str, own: object, given: CRS | None) -> CRS:
 
 
 def horizontal(crs: CRS) -> CRS:
-    """CRS without its vertical axis."""
+    """Return the CRS without its vertical axis."""
     whole = crs.to_dict(projjson=True)
     if whole["type"] == "CompoundCRS":
         return CRS.from_dict(whole["components"][0])
@@ -61,7 +61,7 @@ def horizontal(crs: CRS) -> CRS:
 
 
 def vertical_axis(crs: CRS) -> Vertical | None:
-    """Unit, direction and datum of a CRS's vertical axis, if it has one."""
+    """Return unit, direction and datum of a CRS's vertical axis, or None if it has none."""
     whole = crs.to_dict(projjson=True)
     part = whole.get("components", [whole])[-1]
     part = part.get("source_crs", part)
@@ -90,7 +90,7 @@ def placed(heights: xr.DataArray, name: str) -> xr.DataArray:
 
 
 def _middle(heights: xr.DataArray, crs: str, step: float = 0.0) -> np.ndarray:
-    """Centre of a raster in another CRS, and points one step to the east and north, (xy, point).
+    """Convert a raster's centre, and points one step east and north of it, to another CRS.
 
     NaN if the centre is outside the domain of the raster's CRS.
     """
@@ -119,7 +119,7 @@ def on_metric_grid(heights: xr.DataArray) -> xr.DataArray:
 
 
 def same_grid(a: xr.DataArray, b: xr.DataArray) -> bool:
-    """Whether the pixels of two rasters coincide within a thousandth of a pixel."""
+    """Return whether the pixels of two rasters coincide within a thousandth of a pixel."""
     if a.shape != b.shape or a.rio.crs != b.rio.crs:
         return False
     steps = {axis: abs(float(a[axis][1] - a[axis][0])) for axis in ("y", "x")}

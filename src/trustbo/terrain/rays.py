@@ -26,7 +26,7 @@ BLOCK, _RAYS = 4, 16
 
 @_part
 def bilinear(heights, r, c):
-    """Height at a position in pixel coordinates; NaN off the raster or for NaN coordinates."""
+    """Interpolate a height in pixel coordinates; NaN off the raster or for NaN coordinates."""
     rows, cols = heights.shape
     if not (0.0 <= r <= rows - 1 and 0.0 <= c <= cols - 1):
         return math.nan
@@ -42,7 +42,7 @@ def bilinear(heights, r, c):
 
 @_part
 def _along(raster, i, j, p, q, dp, dq):
-    """Coefficients of the height along a line in a square, from (p, q) to (p + dp, q + dq)."""
+    """Compute coefficients of the height along a line in a square, (p, q) to (p + dp, q + dq)."""
     corner = raster[i, j]
     down, right = raster[i + 1, j] - corner, raster[i, j + 1] - corner
     both = raster[i + 1, j + 1] - raster[i, j + 1] - down
@@ -52,7 +52,7 @@ def _along(raster, i, j, p, q, dp, dq):
 
 @_part
 def _share_positive(c0, c1, c2):
-    """Fraction of [0, 1] in which c0 + c1 t + c2 t^2 is positive."""
+    """Compute the fraction of [0, 1] in which c0 + c1 t + c2 t^2 is positive."""
     sign = 1.0 if c0 > 0.0 else -1.0
     c0, c1, c2 = sign * c0, sign * c1, sign * c2
     square, share = c1 * c1 - 4.0 * c2 * c0, 1.0  # of the sign at 0
@@ -66,7 +66,7 @@ def _share_positive(c0, c1, c2):
 
 @_part
 def _first_square(x0, dx, n):
-    """First of n - 1 squares along an axis, step to the next, and where on the ray squares end.
+    """Find the first of n - 1 squares along an axis, the step to the next, and the crossings.
 
     The last two are the position of the first crossing, and its distance from the next.
     """
@@ -81,7 +81,7 @@ def _first_square(x0, dx, n):
 
 @_part
 def transmittance(ground, surface, pixel, start, end, extinction, crown_base):
-    """Transmittance of a ray from `start` to `end`, each (row, col, height in m).
+    """Compute the transmittance of a ray from `start` to `end`, each (row, col, height in m).
 
     It is 0 if the ground blocks the ray, or if the ray leaves the raster or passes missing data.
     """
@@ -126,7 +126,7 @@ def transmittance(ground, surface, pixel, start, end, extinction, crown_base):
 
 @_kernel
 def transmittances(ground, surface, pixel, ends, extinction, crown_base):
-    """Transmittance of rays (ray, 6): row, col and height of both ends; 0 if one is NaN."""
+    """Compute transmittances of rays (ray, 6): row, col, height of both ends; 0 if NaN."""
     out = np.zeros(len(ends))
     for i in range(len(ends)):
         start, end = (ends[i, 0], ends[i, 1], ends[i, 2]), (ends[i, 3], ends[i, 4], ends[i, 5])
@@ -137,7 +137,7 @@ def transmittances(ground, surface, pixel, ends, extinction, crown_base):
 
 @_kernel
 def openness(ground, surface, pixel, reach, heights, canopy, coarse, first, last):
-    """Mean transmittance to 16 points on a circle of radius `reach` metres.
+    """Compute the mean transmittance to 16 points on a circle of radius `reach` metres.
 
     It is written to `coarse`, one value for each square of BLOCK x BLOCK pixels, for the rows of
     squares from `first` to `last`. Eye and target have `heights` above ground; `canopy` is the

@@ -116,7 +116,7 @@ def require_terrain(terrain: xr.Dataset) -> xr.Dataset:
 
 
 def pixel_size(terrain: xr.Dataset) -> tuple[float, float]:
-    """Pixel height and width in metres."""
+    """Return pixel height and width in metres."""
     y, x = (terrain.variables[axis].values for axis in ("y", "x"))
     return abs(float(y[-1] - y[0])) / (len(y) - 1), abs(float(x[-1] - x[0])) / (len(x) - 1)
 
@@ -133,7 +133,7 @@ def check_size(shape: tuple[int, ...], name: str) -> None:
 def _heights(
     raster: FilePath | xr.DataArray, role: str, given: CRS | None, nodata: float | None
 ) -> xr.DataArray:
-    """Heights of one raster, dem or dsm, in metres with north at the top.
+    """Read the heights of one raster, dem or dsm, in metres with north at the top.
 
     The attribute `datum` is the vertical datum, None if nothing declares one.
     """
@@ -155,7 +155,7 @@ def _heights(
 
 
 def _stored(raster: FilePath | xr.DataArray, role: str) -> xr.DataArray:
-    """Stored values of a file or an array, dims (y, x); its name, with `role`, is for messages."""
+    """Read stored values of a file or an array, dims (y, x), named with `role` for messages."""
     if isinstance(raster, xr.DataArray):
         name = f"{role}: DataArray" + (f" {raster.name!r}" if raster.name else "")
         return _of_array(raster, name)
@@ -173,7 +173,7 @@ def _stored(raster: FilePath | xr.DataArray, role: str) -> xr.DataArray:
 
 
 def _of_file(file: DatasetReader, name: str) -> xr.DataArray:
-    """First band of a GDAL dataset, NaN where a mask or an alpha band hides a pixel.
+    """Read the first band of a GDAL dataset, NaN where a mask or an alpha band hides a pixel.
 
     With a mask or an alpha band, GDAL's own mask ignores the nodata tag, so the tag is added to the
     declared fill values.
@@ -221,7 +221,7 @@ def _warn_of_bands(n: int, name: str) -> None:
 
 
 def _of_array(array: xr.DataArray, name: str) -> xr.DataArray:
-    """Array of dims (y, x), evenly spaced; of several bands, the first."""
+    """Reduce an array to dims (y, x), evenly spaced, and to the first of several bands."""
     check_size(array.shape, name)
     try:
         y, x = array.rio.y_dim, array.rio.x_dim
@@ -240,7 +240,7 @@ def _of_array(array: xr.DataArray, name: str) -> xr.DataArray:
 
 
 def _even(values: np.ndarray, what: str) -> np.ndarray:
-    """Evenly spaced coordinates; TrustboError if only one, or uneven by more than rounding.
+    """Return evenly spaced coordinates; TrustboError if only one, or uneven beyond rounding.
 
     Coordinates that passed through float32 are rounded to 0.5 m in the north of a UTM zone.
     """
@@ -286,7 +286,7 @@ def _paired(ground: xr.DataArray, surface: xr.DataArray) -> xr.Dataset:
 
 
 def _averaged(terrain: xr.Dataset, resolution: float | None) -> xr.Dataset:
-    """Means over square blocks of about a resolution, m; NaN if over half of a block is missing.
+    """Average square blocks of about a resolution, m; NaN if over half of a block is missing.
 
     Incomplete blocks at the edge are dropped.
     """

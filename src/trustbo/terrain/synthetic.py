@@ -62,7 +62,7 @@ def synthetic_terrain(
 
 
 def _fractal(rng: np.random.Generator, shape: tuple[int, int], exponent: float) -> np.ndarray:
-    """Gaussian field with spectrum f^-(2 exponent), scaled to [0, 1].
+    """Draw a Gaussian field with spectrum f^-(2 exponent), scaled to [0, 1].
 
     The field is synthesised at twice the size and cropped, because the Fourier method is periodic.
     """

@@ -43,7 +43,7 @@ def cell_maps(
     remedy = "give names of pixel features by feature, e.g. {'ease': ('slope', 'tri')}"
     for name in require_kind("features", features, Mapping, remedy):
         if is_line_of_sight(name):
-            raise TrustboError(f"{name!r} is the name of a feature of bounds; give yours another.")
+            raise TrustboError(f"{name!r} is the name of a computed feature; choose another name.")
     sides = [n * step for n, step in zip(terrain["dem"].shape, pixel_size(terrain), strict=True)]
     diagonal = float(np.hypot(grid.cell_height, grid.cell_width))
     ranges = [robot.lidar_range for robot in team.robots]
@@ -79,7 +79,7 @@ def cell_maps(
 
 
 def _unit_values(name: str, values: np.ndarray) -> np.ndarray:
-    """Values of a feature that is used unchanged; TrustboError for values outside [0, 1]."""
+    """Return the values of a feature used unchanged; TrustboError if outside [0, 1]."""
     low, high = np.nanmin(values, initial=0.0), np.nanmax(values, initial=1.0)
     if low < 0.0 or high > 1.0:
         raise TrustboError(
@@ -144,7 +144,7 @@ def labelled(
 def unlabelled(
     awareness: ArrayLike | xr.DataArray, names: Sequence[str], features: Sequence[str]
 ) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...]]:
-    """Awareness with the order of axes that `of_arrays` expects, names of robots, and of features.
+    """Return awareness in the axis order of `of_arrays`, and the names of robots and features.
 
     A DataArray is reordered by the names of its dims and moves; its labels are the default names.
     TrustboError: it has other dims, or its labels contradict the given names.

@@ -83,7 +83,7 @@ def _measure(workspace: Workspace, posts: Posts, exists: np.ndarray, out: np.nda
 def _of_bound(
     posts: Posts, easy: np.ndarray, room: np.ndarray, bound: Sequence[np.ndarray | None]
 ) -> np.ndarray:
-    """Maximum of each measure over the robots' routes in a bound, from pixel maps (row, col)."""
+    """Compute the maximum of each measure over the robots' routes in a bound, from pixel maps."""
     surface, team = posts.surface, posts.team
     ground = surface.gradient, surface.pixel, surface.origin
     robots = team.lead, *team.robots
@@ -107,7 +107,7 @@ def _of_bound(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _tilt(way, gradient, pixel, origin):
-    """Tangent of the largest pitch or roll along a route (point, 2), as a moving average."""
+    """Compute tangents of the largest pitch or roll on a route (point, 2), smoothed over 1 m."""
     along = np.zeros(len(way))
     for k in range(1, len(way)):
         along[k] = along[k - 1] + math.hypot(way[k, 0] - way[k - 1, 0], way[k, 1] - way[k - 1, 1])
@@ -128,7 +128,7 @@ def _tilt(way, gradient, pixel, origin):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _point(way, along, s):
-    """Position at a distance along a route; the end of the route if it is shorter."""
+    """Find the position at a distance along a route, or the end of the route if it is shorter."""
     k = min(np.searchsorted(along, s, side="right"), len(way) - 1)
     length = along[k] - along[k - 1]
     share = min(1.0, (s - along[k - 1]) / length) if length > 0.0 else 1.0

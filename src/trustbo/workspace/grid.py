@@ -84,7 +84,7 @@ class Grid(Summary):
         return rows
 
     def center(self, cell: Cell) -> tuple[float, float]:
-        """X and y of a cell's centre, CRS metres."""
+        """Return x and y of a cell's centre, CRS metres."""
         row, col = require_pair("cell", cell)
         x = self.left + (col + 0.5) * self.cell_width
         return x, self.top - (row + 0.5) * self.cell_height
@@ -120,7 +120,7 @@ class Grid(Summary):
         return f"EPSG:{code}" if code else re.findall(r'"(.*?)"', crs.to_wkt())[0]
 
     def locate(self, location: Location, what: str = "location") -> Cell:
-        """Cell of a location, which may be impassable.
+        """Find the cell of a location, which may be impassable.
 
         Args:
             location: Cell (row, col); or a position, `{"x": 1748000.0, "y": 5427000.0}` in metres
@@ -150,7 +150,7 @@ class Grid(Summary):
         return int(row), int(col)
 
     def _row_and_col(self, location: Location) -> tuple[float, float]:
-        """Row and column of a location, fractional for a position; they may be off the grid."""
+        """Return the row and column of a location, fractional for a position, even off the grid."""
         if not isinstance(location, Mapping):
             row, col = (operator.index(i) for i in location)
             return row, col
@@ -163,7 +163,7 @@ class Grid(Summary):
         return (self.top - y) / self.cell_height, (x - self.left) / self.cell_width
 
     def _extent_text(self) -> str:
-        """Description of the extent in the CRS and in degrees; empty without a CRS."""
+        """Describe the extent in the CRS and in degrees; empty without a CRS."""
         if self.crs is None:
             return ""
         left, bottom, right, top = self.bounds
@@ -174,7 +174,7 @@ class Grid(Summary):
         )
 
     def lonlat(self, cell: Cell) -> tuple[float, float]:
-        """Longitude and latitude of a cell's centre, degrees (WGS 84).
+        """Return the longitude and latitude of a cell's centre, degrees (WGS 84).
 
         Raises:
             TrustboError: There is no such cell, the grid has no CRS, or the cell is not on Earth in
@@ -184,7 +184,7 @@ class Grid(Summary):
         lon, lat = _moved(self.require_crs(), WGS84, x, y)
         if not math.isfinite(lon + lat):
             raise TrustboError(
-                f"({x:.10g}, {y:.10g}) is no place on Earth in {self.crs_name}; give the terrain "
+                f"({x:.10g}, {y:.10g}) is not on Earth in {self.crs_name}; give the terrain "
                 "the CRS that its coordinates are in."
             )
         return lon, lat
@@ -201,7 +201,7 @@ class Grid(Summary):
         return placed.rio.write_transform(from_origin(self.left, self.top, *step))
 
     def cell_means(self, values: xr.DataArray) -> np.ndarray:
-        """Mean over each cell's pixels with data.
+        """Average over each cell's pixels with data.
 
         Args:
             values: Values of pixels, dims (y, x), on a raster that the grid covers.
@@ -219,14 +219,14 @@ class Grid(Summary):
             return (total / count).reshape(self.shape)
 
     def cells_along(self, y: ArrayLike, x: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-        """Row of the cell of each pixel at `y`, and column of the cell of each pixel at `x`."""
+        """Find the row of the cell of each pixel at `y`, and the column for each pixel at `x`."""
         rows, cols = self.shape
         row = ((self.top - np.asarray(y)) / self.cell_height).astype(int)
         col = ((np.asarray(x) - self.left) / self.cell_width).astype(int)
         return np.clip(row, 0, rows - 1), np.clip(col, 0, cols - 1)
 
     def require_crs(self) -> CRS:
-        """CRS of the grid; TrustboError without one."""
+        """Return the CRS of the grid; TrustboError if it has none."""
         if self.crs is None:
             raise TrustboError(
                 "this grid has no coordinate reference system: its workspace was not made from a "
@@ -236,7 +236,7 @@ class Grid(Summary):
 
 
 def _moved(source: CRS, target: CRS, x: float, y: float) -> tuple[float, float]:
-    """Position in another CRS; infinite if it is not on Earth in one of them."""
+    """Convert a position to another CRS; infinite if it is not on Earth in one of them."""
     try:
         (u,), (v,) = transform_points(source, target, [x], [y])[:2]
     except Exception:  # PROJ's errors are GDAL's, without a common base

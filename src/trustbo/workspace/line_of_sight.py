@@ -95,7 +95,7 @@ def geometry(posts: Posts, index: np.ndarray, passable: np.ndarray) -> Geometry:
 
 
 def _cells_ahead(passable: np.ndarray, a: Cell, c: Cell) -> list[Cell | None]:
-    """Cells that may follow the bound a -> c, without sharp turns if possible; else [None]."""
+    """Find the cells that may follow the bound a -> c, without sharp turns if possible."""
     (rows, cols), (down, right) = passable.shape, (c[0] - a[0], c[1] - a[1])
     onward: list[Cell | None] = []
     ahead: list[Cell | None] = []
@@ -142,13 +142,13 @@ def bound_features(
 def _timed(
     surface: Surface, robot: Robot, routes: Sequence[np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (bound, sample, 2) of a robot along routes, and the durations (bound,), s."""
+    """Return positions (bound, sample, 2) of a robot on routes, and the durations (bound,), s."""
     first = np.cumsum([0, *(len(route) for route in routes)])
     return at_times(surface, robot, np.concatenate(routes), first, N_SAMPLES)
 
 
 def _mean(values: np.ndarray) -> np.ndarray:
-    """Mean over the last axis without NaN; NaN if all values are NaN."""
+    """Average over the last axis without NaN; NaN if all values are NaN."""
     finite = np.isfinite(values)
     with np.errstate(invalid="ignore"):
         return np.where(finite, values, 0.0).sum(-1) / finite.sum(-1)

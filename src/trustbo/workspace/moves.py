@@ -30,7 +30,7 @@ def require_on_grid(path: Sequence[Cell] | np.ndarray, shape: tuple[int, ...]) -
 
 
 def moves_along(path: Sequence[Cell] | np.ndarray) -> np.ndarray:
-    """Indices in `MOVES` of the bounds of a path, shape (bound,).
+    """Return the indices in `MOVES` of the bounds of a path, shape (bound,).
 
     TrustboError: two successive cells are not neighbours.
     """
@@ -39,18 +39,18 @@ def moves_along(path: Sequence[Cell] | np.ndarray) -> np.ndarray:
     if (far := np.abs(steps).max(1) != 1).any():
         k = int(np.argmax(far))
         a, c = (tuple(cells[i].tolist()) for i in (k, k + 1))
-        raise TrustboError(f"no bound leads from {a} to {c}: the cells are no neighbours.")
+        raise TrustboError(f"no bound leads from {a} to {c}: the cells are not neighbours.")
     index = 3 * (steps[:, 0] + 1) + steps[:, 1] + 1  # 0..8, the middle one being no move
     return index - (index > 4)
 
 
 def bounds_along(path: Sequence[Cell] | np.ndarray) -> np.ndarray:
-    """Move, row and column of the bounds of a path, shape (bound, 3); see `moves_along`."""
+    """Return move, row and column of the bounds of a path, (bound, 3); see `moves_along`."""
     return np.column_stack([moves_along(path), np.asarray(path)[1:]])
 
 
 def existing_bounds(passable: np.ndarray) -> np.ndarray:
-    """Whether a bound exists into each cell by each move, shape (move, row, col).
+    """Return whether a bound exists into each cell by each move, shape (move, row, col).
 
     A bound exists if the cell entered and the cell left are both passable, (row, col).
     """
@@ -61,9 +61,9 @@ def existing_bounds(passable: np.ndarray) -> np.ndarray:
 
 
 def along(maps: np.ndarray, path: Sequence[Cell] | np.ndarray) -> np.ndarray:
-    """Values of the bounds of a path, shape (..., bound, feature).
+    """Select the values of the bounds of a path, shape (..., bound, feature).
 
-    From maps (..., move, row, col, feature).
+    The maps have shape (..., move, row, col, feature).
     """
     moves, rows, cols = bounds_along(path).T
     return maps[..., moves, rows, cols, :]

@@ -85,7 +85,7 @@ class Posts:
     # --- routes ---
 
     def window(self, *cells: Cell) -> Window:
-        """Pixel window of cells plus a margin of half a cell: first and end row, then column."""
+        """Return the pixel window of cells plus a margin of half a cell: rows, then columns."""
         (rows, cols), shape = self.surface.ground.shape, np.array(self.grid.shape)
         size = np.array([rows, cols]) / shape
         top, left = ((np.min(cells, axis=0) - 0.5) * size).astype(int).tolist()
@@ -93,7 +93,7 @@ class Posts:
         return max(0, top), min(rows, bottom), max(0, left), min(cols, right)
 
     def linked_bounds(self, exists: np.ndarray) -> np.ndarray:
-        """Those bounds in `exists`, (move, row, col), for which the robots have a route.
+        """Return those bounds in `exists`, (move, row, col), for which the robots have a route.
 
         T2's posts in a cell are connected to its stop within the cell and half a cell around it.
         One test of the stops of both cells is therefore valid for all robots, both directions and
@@ -111,7 +111,7 @@ class Posts:
     def bound_routes(
         self, a: Cell, c: Cell, next_cell: Cell | None
     ) -> tuple[np.ndarray | None, ...]:
-        """Routes of the bound a -> c, (point, 2) each: the lead's, then each of T2's.
+        """Find the routes of the bound a -> c, (point, 2) each: the lead's, then each of T2's.
 
         The lead drives to its stop in c; then T2 drives from its posts in a to the posts from which
         it watches the bound from c to `next_cell`, or at the goal (None) to positions around the
@@ -122,18 +122,18 @@ class Posts:
         return self._lead_route(a, c), *(self.routes.find(*each, window) for each in ends)
 
     def _lead_route(self, a: Cell, c: Cell) -> np.ndarray | None:
-        """Route of the lead from stop to stop, (point, 2); None if there is none."""
+        """Find the route of the lead from stop to stop, (point, 2); None if there is none."""
         return self.routes.find(self.team.lead, self.stop(a), self.stop(c), self.window(a, c))
 
     def lead_line(self, a: Cell, c: Cell) -> np.ndarray:
-        """Route of the lead, or the straight line where there is none, (point, 2)."""
+        """Return the route of the lead, or a straight line where there is none, (point, 2)."""
         route = self._lead_route(a, c)
         return np.stack([self.stop(a), self.stop(c)]) if route is None else route
 
     # --- stops of the lead ---
 
     def stop(self, cell: Cell) -> np.ndarray:
-        """Stop of the lead in a cell, (2,): where lines to neighbouring cells are most visible."""
+        """Find the lead's stop in a cell, (2,), where routes to other stops are most visible."""
         if cell not in self._stops:
             self._stops[cell] = self._seeing_stop(cell)
         return self._stops[cell]
@@ -153,7 +153,7 @@ class Posts:
         return position[np.argmax(seen - _NEARER * np.linalg.norm(position - here, axis=1))]
 
     def _central_stop(self, cell: Cell) -> np.ndarray:
-        """Position on easy ground near the cell's centre, (2,)."""
+        """Find a position on easy ground near the cell's centre, (2,)."""
         if cell not in self._central:
             row, col = self._pixels_of(cell)
             position = self._position(row, col)
@@ -165,7 +165,7 @@ class Posts:
     # --- posts of T2 ---
 
     def watching(self, cell: Cell, next_cell: Cell | None) -> np.ndarray:
-        """Posts of T2 in a cell, shape (robot, 2), from which it watches the lead's next move.
+        """Find the posts of T2 in a cell from which it watches the lead's next move, (robot, 2).
 
         Without a next cell, T2 stands around the lead at the goal.
         """
@@ -177,7 +177,7 @@ class Posts:
         return self._posts[cell, next_cell]
 
     def _chosen(self, cell: Cell, ahead: Sequence[Cell | None]) -> np.ndarray:
-        """Best positions, chosen robot by robot with a minimum spacing: (next cell, robot, 2)."""
+        """Choose the best positions, one robot after the other: (next cell, robot, 2)."""
         here, robots = self.stop(cell), self.team.robots
         position, gap = self._lattice(cell, here, RADIUS), _GAP
         if len(position) < len(robots):  # little ground is safe
@@ -197,7 +197,7 @@ class Posts:
     def _scores(
         self, cell: Cell, ahead: Sequence[Cell | None], position: np.ndarray
     ) -> dict[Robot, np.ndarray]:
-        """Scores of positions as posts, (next cell, position), by robot; see the module."""
+        """Score positions as posts, (next cell, position), by robot; see the module."""
         here, lead = self.stop(cell), self.team.lead
         stops = np.array([here, *(here if c is None else self.stop(c) for c in ahead)])
         routes = [np.stack([here] * 2) if c is None else self.lead_line(cell, c) for c in ahead]
@@ -228,7 +228,7 @@ class Posts:
     def _seen(
         self, eye: np.ndarray, target: np.ndarray, watcher: Robot, watched: Robot
     ) -> np.ndarray:
-        """Probability of detection of targets (..., 2), allowing for errors of the map: (...).
+        """Compute the detection probability of targets (..., 2), allowing for errors of the map.
 
         It shrinks the map's probability with distance, and adds a small probability, falling with
         distance, that a hidden target is visible.
@@ -242,19 +242,19 @@ class Posts:
     # --- pixels ---
 
     def _around(self, cell: Cell) -> list[Cell]:
-        """Neighbours on the grid."""
+        """Return the neighbours on the grid."""
         rows, cols = self.grid.shape
         near = [(cell[0] + down, cell[1] + right) for down, right in MOVES]
         return [c for c in near if 0 <= c[0] < rows and 0 <= c[1] < cols]
 
     def _is_in_region(self, position: np.ndarray) -> bool:
-        """Whether a position is in the region where robots can drive."""
+        """Return whether a position is in the region where robots can drive."""
         return bool(self._standable[self.surface.pixel_at(*position.tolist())])
 
     def _linked_to(
         self, position: np.ndarray, *cells: Cell, over: np.ndarray | None = None
     ) -> tuple[np.ndarray, tuple[int, int]]:
-        """Mask of the pixels in the cells' window that are connected to a position, and its corner.
+        """Return a mask of the window's pixels that are connected to a position, and its corner.
 
         Pixels are connected over passable ground, or over another mask of pixels.
         """
@@ -264,7 +264,7 @@ class Posts:
         return linked_to(ground, window, pixel), (window[0], window[2])
 
     def _lattice(self, cell: Cell, here: np.ndarray, radius: float) -> np.ndarray:
-        """Lattice of positions (position, 2) around one, connected to it over safe ground.
+        """Lay a lattice of positions (position, 2) around one, connected to it over safe ground.
 
         The connection lies within half a cell around, which the window of every bound contains.
         """
@@ -280,7 +280,7 @@ class Posts:
         return self._position(row[kept], col[kept])
 
     def _pixels_near(self, cell: Cell, here: np.ndarray) -> np.ndarray:
-        """Positions in a cell that are connected to its stop, and near it if there are enough."""
+        """Find positions in a cell that are connected to its stop, near it if there are enough."""
         row, col = self._pixels_of(cell)
         region, (top, left) = self._linked_to(here, cell)
         linked = region[row - top, col - left]
@@ -304,7 +304,7 @@ class Posts:
             )
 
     def _pixels_of(self, cell: Cell) -> tuple[np.ndarray, np.ndarray]:
-        """Rows and columns of a cell's passable pixels, in the largest region where possible.
+        """Find rows and columns of a cell's passable pixels, in the largest region where possible.
 
         If none is passable, all of its pixels are returned; no route leads there.
         """
@@ -318,6 +318,6 @@ class Posts:
         return row + top, col + left
 
     def _position(self, row: np.ndarray, col: np.ndarray) -> np.ndarray:
-        """Positions of pixels, (pixel, 2)."""
+        """Return the positions of pixels, (pixel, 2)."""
         y, x = self.surface.axes
         return np.stack([x[col], y[row]], axis=-1)

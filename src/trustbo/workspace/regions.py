@@ -15,7 +15,7 @@ Window = tuple[int, int, int, int]
 
 
 def largest_region(passable: np.ndarray) -> np.ndarray:
-    """Mask of the largest region of passable pixels, (row, col); no route leaves it."""
+    """Return a mask of the largest region of passable pixels, (row, col)."""
     regions: Any = ndimage.label(passable)
     labels, n_regions = regions
     if n_regions == 0:
@@ -26,7 +26,7 @@ def largest_region(passable: np.ndarray) -> np.ndarray:
 
 
 def linked_to(passable: np.ndarray, window: Window, pixel: tuple[int, ...]) -> np.ndarray:
-    """Mask of the passable pixels in a window, (row, col), connected within it to one of them."""
+    """Return a mask of a window's passable pixels that are connected within it to one of them."""
     top, bottom, left, right = window
     inside = passable[top:bottom, left:right]
     regions: Any = ndimage.label(inside)

@@ -37,7 +37,7 @@ class Routes:
     ) -> np.ndarray | None:
         """Find the fastest route from start to goal, (x, y) in CRS metres; None if there is none.
 
-        It stays inside the pixel window. Returns positions, shape (point, 2), CRS metres.
+        The route stays inside the pixel window; it has shape (point, 2), in CRS metres.
         """
         ends = [self._surface.pixel_at(*p.tolist()) for p in (start, goal)]
         low, high = sorted(ends)  # the way back is the same
@@ -56,7 +56,7 @@ class Routes:
     def _search(
         self, start: tuple[int, int], goal: tuple[int, int], window: Window, max_slope: float
     ) -> np.ndarray:
-        """Positions of the pixels from start to goal; empty if there is no route."""
+        """Find the positions of the pixels from start to goal; empty if there is no route."""
         surface = self._surface
         if max_slope not in self._paces:
             pace = 1.0 / speed_share(self._slope, max_slope)
@@ -76,13 +76,13 @@ class Routes:
 
 @_compiled
 def speed_share(tilt, max_slope):
-    """Speed at a tilt (rad) as a fraction of the speed on level ground."""
+    """Compute the speed at a tilt (rad) as a fraction of the speed on level ground."""
     return np.maximum(SLOWEST, 1.0 - (1.0 - SLOWEST) * tilt / max_slope)
 
 
 @_compiled
 def _a_star(pace, pixel, start, goal):
-    """Pixels of the fastest route over paces (s/m, inf where impassable); empty if none exists."""
+    """Find the fastest route over pixels with paces (s/m, inf where impassable); may be empty."""
     rows, cols = pace.shape
     best = np.full((rows, cols), np.inf)
     came = np.full((rows, cols), -1)
@@ -131,7 +131,7 @@ def _a_star(pace, pixel, start, goal):
 def at_times(
     surface: Surface, robot: Robot, flat: np.ndarray, first: np.ndarray, n: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Positions of a robot at n evenly spaced times along each route, and the durations.
+    """Find a robot's positions at n evenly spaced times along each route, and the durations.
 
     The routes are concatenated in `flat` (point, 2); `first` has the index of the first point of
     each route, and the number of points. Returns shapes (route, time, 2), and (route,) in seconds.
@@ -142,7 +142,7 @@ def at_times(
 
 @_compiled
 def _resampled(gradient, pixel, origin, flat, first, limits, n_samples):
-    """See `at_times`; speed falls with the larger of pitch and roll, as in `simulation.motion`."""
+    """Compute `at_times`; speed falls with the larger of pitch and roll."""
     rows, cols = gradient.shape[1:]
     n = len(first) - 1
     points, duration = np.empty((n, n_samples, 2)), np.empty(n)

@@ -48,7 +48,7 @@ class Sight:
 
 
 def optics(watcher: Robot, watched: Robot) -> np.ndarray:
-    """Sensor height (m), target height (m), range (m) and sine of the field of view, shape (4,)."""
+    """Return sensor and target height (m), range (m) and sine of the field of view, shape (4,)."""
     return np.array([
         watcher.sensor_height,
         watched.target_height,
@@ -59,7 +59,7 @@ def optics(watcher: Robot, watched: Robot) -> np.ndarray:
 
 @cache
 def jittered(n: int) -> np.ndarray:
-    """Offsets of n viewpoints from a post, (sight, 2), m, evenly spread over the stopping disc.
+    """Return offsets of n viewpoints from a post, (viewpoint, 2), m, evenly over the stopping disc.
 
     A robot stops within half a metre of its post, and its field of view tilts with the ground
     there, so the view from one exact point would not be representative.
@@ -72,7 +72,7 @@ def jittered(n: int) -> np.ndarray:
 def detection_probability(
     surface: Surface, sight: Sight, sensor: np.ndarray, target: np.ndarray, optics: np.ndarray
 ) -> np.ndarray:
-    """Probability that an ideal lidar detects each target, shape (ray,), in [0, 1].
+    """Compute the probability that an ideal lidar detects each target, (ray,), in [0, 1].
 
     It is the transmittance along the ray if the target is within the lidar's range and its vertical
     field of view, which tilts with the robot; otherwise 0. Sensors and targets have shape (ray, 2),
@@ -94,7 +94,7 @@ def detection_probability(
 def detection_between(
     surface: Surface, sight: Sight, eye: np.ndarray, target: np.ndarray, optics: np.ndarray
 ) -> np.ndarray:
-    """Probability of detection from eyes to targets, each (..., 2) and broadcast; shape (...)."""
+    """Compute the detection probability from eyes to targets, (..., 2), broadcast; (...)."""
     eye, target = np.broadcast_arrays(eye, target)
     rays = np.ascontiguousarray(eye).reshape(-1, 2), np.ascontiguousarray(target).reshape(-1, 2)
     return detection_probability(surface, sight, *rays, optics).reshape(eye.shape[:-1])
@@ -102,7 +102,7 @@ def detection_between(
 
 @_compiled
 def _ends(ground, gradient, pixel, origin, sensor, target, optics):
-    """Row, col and height of both ends of each ray, shape (ray, 6); NaN where out of view.
+    """Compute row, col and height of both ends of each ray, (ray, 6); NaN where out of view.
 
     This is a separate loop, so that the memory accesses of many rays overlap.
     """

@@ -35,11 +35,11 @@ class Surface(NamedTuple):
         return float(x[0] - wide), float(y[-1] - high), float(x[-1] + wide), float(y[0] + high)
 
     def to_pixel(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Fractional row and column of positions in CRS metres."""
+        """Convert positions in CRS metres to fractional rows and columns."""
         return (self.origin[1] - y) / self.pixel[0], (x - self.origin[0]) / self.pixel[1]
 
     def nearest(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Row and column of the pixels at positions."""
+        """Return the row and column of the pixels at positions."""
         row, col = self.to_pixel(np.asarray(x), np.asarray(y))
         rows, cols = self.ground.shape
         return (
@@ -48,14 +48,14 @@ class Surface(NamedTuple):
         )
 
     def pixel_at(self, x: float, y: float) -> tuple[int, int]:
-        """Row and column of the pixel at one position."""
+        """Return the row and column of the pixel at one position."""
         rows, cols = self.ground.shape
         row, col = round((self.origin[1] - y) / self.pixel[0]), (x - self.origin[0])
         return min(max(row, 0), rows - 1), min(max(round(col / self.pixel[1]), 0), cols - 1)
 
 
 def surface_of(terrain: xr.Dataset, passable: np.ndarray) -> Surface:
-    """Surface of a terrain; `passable` has the shape (row, col) of its pixels."""
+    """Make the surface of a terrain; `passable` has the shape (row, col) of its pixels."""
     ground, canopy = (terrain[name].values.astype(float) for name in ("dem", "dsm"))
     return Surface(
         ground=ground,
@@ -68,7 +68,7 @@ def surface_of(terrain: xr.Dataset, passable: np.ndarray) -> Surface:
 
 
 def filled(dem: np.ndarray) -> np.ndarray:
-    """Heights with NaN replaced by the nearest value, as robots may touch the edge of the data."""
+    """Replace missing heights by the nearest value, as robots may touch the edge of the data."""
     nearest: Any = ndimage.distance_transform_edt(
         ~np.isfinite(dem), return_distances=False, return_indices=True
     )

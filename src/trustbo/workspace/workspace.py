@@ -1,4 +1,4 @@
-"""Workspace for planner and simulator: awareness of every bound, passability of every cell."""
+"""Workspace: the awareness of every bound and the passability of every cell."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -156,7 +156,8 @@ class Workspace(Summary):
         z, free = of_arrays(z, passable)
         team = Team(len(z), names=robots) if team is None else Team.of(team)
         if len(team.robots) != len(z):
-            raise TrustboError(f"awareness has {len(z)} robots, the team {len(team.robots)}.")
+            n = len(team.robots)
+            raise TrustboError(f"awareness has {len(z)} robots, but the team has {n}.")
         names = features or default_features(z.shape[-1])
         if len(names) != z.shape[-1]:
             raise TrustboError(f"features must be {z.shape[-1]} names; got {names}.")
@@ -213,7 +214,7 @@ class Workspace(Summary):
         return like.copy(data=exists).rename("passable_bounds")
 
     def along(self, path: Sequence[Cell]) -> np.ndarray:
-        """Awareness of the bounds of a path, shape (bound, robot, feature), in [0, 1].
+        """Return the awareness of the bounds of a path, shape (bound, robot, feature), in [0, 1].
 
         Args:
             path: Cells, each a neighbour of the previous one.
@@ -259,7 +260,7 @@ class Workspace(Summary):
         return fill_awareness(ordered, self.along(ordered.path))
 
     def locate(self, location: Location, what: str = "location") -> Cell:
-        """Cell of a location, which must be passable.
+        """Find the cell of a location, which must be passable.
 
         Args:
             location: Cell (row, col); or a position, `{"x": 1748000.0, "y": 5427000.0}` in metres
@@ -281,7 +282,7 @@ class Workspace(Summary):
         return cell
 
     def _why_impassable(self, cell: Cell) -> str:
-        """Reason why a cell is impassable; empty without a terrain."""
+        """Say why a cell is impassable; empty without a terrain."""
         if self.terrain is None:
             return ""
         missing = self.grid.cell_means(self.terrain["dem"].isnull().astype(float))[cell]
