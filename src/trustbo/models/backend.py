@@ -41,12 +41,12 @@ for _name, _module in list(sys.modules.items()):
 
 
 def namespace(x: Any) -> ModuleType:
-    """`jax.numpy` for JAX arrays, else NumPy, so that one formula serves both."""
+    """Return `jax.numpy` for JAX arrays, else NumPy, so that one formula serves both."""
     return jnp if isinstance(x, jax.Array) else np
 
 
 def special_functions(x: Any) -> Any:
-    """`jax.scipy.special` for JAX arrays, else `scipy.special`."""
+    """Return `jax.scipy.special` for JAX arrays, else `scipy.special`."""
     return jax.scipy.special if isinstance(x, jax.Array) else special
 
 

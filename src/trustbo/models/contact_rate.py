@@ -52,7 +52,7 @@ class ContactRate(dist.Distribution):
 
     @jax.numpy_rank_promotion("allow")
     def log_prob(self, value: Array) -> Array:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Log density of each mission in nats, shape (mission,), by the Kalman filter."""
+        """Compute the log density of each mission, shape (mission,), by the Kalman filter."""
         seen = ~jnp.isnan(value)
         bounds = (jnp.where(seen, value, 0.0), seen, self.drift)
         by_bound = tuple(jnp.swapaxes(a, 0, 1) for a in bounds)
@@ -62,7 +62,7 @@ class ContactRate(dist.Distribution):
         return lax.scan(self._filter, start, by_bound)[1].sum(0)
 
     def _filter(self, state: Any, inputs: Any) -> Any:
-        """One bound: trust after it, and the log density of its rates (mission,)."""
+        """Filter one bound: trust after it, and the log density of its rates (mission,)."""
         (m, P), (y, seen, u), (beta0, delta_w, delta_v, *_) = state, inputs, self.parameters
         m, P = beta0 * m + u, beta0**2 * P + delta_w**2  # predict
         F = P + delta_v**2
@@ -74,7 +74,7 @@ class ContactRate(dist.Distribution):
     def sample(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, key: Array, sample_shape: tuple[int, ...] = ()
     ) -> Array:
-        """Contact rates, shape `(*sample_shape, mission, bound, robot)`."""
+        """Draw contact rates, shape `(*sample_shape, mission, bound, robot)`."""
         beta0, delta_w, delta_v, x0_mean, x0_sd = self.parameters
         shape = *sample_shape, *self.drift.shape
         w, v, e = (random.normal(k, shape) for k in random.split(key, 3))

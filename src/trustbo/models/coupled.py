@@ -75,7 +75,7 @@ class CoupledTrust(TrustModel):
         return Layout(slots.y.shape, joint=True)
 
     def signal(self, theta: Theta, slots: Slots, layout: Layout) -> Signal:
-        """Trust of all robots at all bounds; rows are (bound, robot).
+        """Compute the trust of all robots at all bounds; rows are (bound, robot).
 
         Noise of rates is the sum of shared noise, Delta_v - eps 1, and independent noise, eps 1.
         """
@@ -116,7 +116,7 @@ class CoupledTrust(TrustModel):
 
 
 def correlation_factor(r: Any, n: int) -> Any:
-    """Cholesky factors (point, n, n) from partial correlations (point, n (n - 1) / 2)."""
+    """Compute Cholesky factors (point, n, n) from partial correlations."""
     xp, k, rows = namespace(r), 0, []
     for i in range(n):
         left, row = xp.ones(len(r)), []
@@ -130,6 +130,6 @@ def correlation_factor(r: Any, n: int) -> Any:
 
 
 def _kron(A: np.ndarray, Q: Any) -> Any:
-    """Kronecker products of a matrix (k, k) and matrices (point, n, n)."""
+    """Compute Kronecker products of a matrix (k, k) and matrices (point, n, n)."""
     blocks = A[None, :, None, :, None] * Q[:, None, :, None, :]
     return blocks.reshape(len(Q), *(len(A) * Q.shape[1],) * 2)

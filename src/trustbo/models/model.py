@@ -68,7 +68,9 @@ class TrustModel(Summary, ABC):
         given: Any = self.effects
         effects = (given,) if isinstance(given, Effect) else tuple(given)
         if unknown := [effect for effect in effects if not isinstance(effect, Effect)]:
-            raise TrustboError(f"effects must be such as PlaceEffect(); got {unknown[0]!r}.")
+            raise TrustboError(
+                f"effects must be objects such as PlaceEffect(); got {unknown[0]!r}."
+            )
         if len({type(effect) for effect in effects}) < len(effects):
             raise TrustboError(f"effects must be of different kinds; got {effects!r}.")
         object.__setattr__(self, "effects", effects)
@@ -82,27 +84,27 @@ class TrustModel(Summary, ABC):
 
     @abstractmethod
     def hyperpriors(self, n_robots: int, n_features: int) -> dict[str, Distribution]:
-        """Priors of the parameters that are not integrated out, scalars or vectors, by name."""
+        """Return the priors of the parameters that are not integrated out, by name."""
 
     @abstractmethod
     def derived(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Hyperparameters as `signal` takes them, and `rest`, see `effects.effect.Theta`.
+        """Convert hyperparameters to the form that `signal` takes, with `rest`, see `Theta`.
 
         `values` are hyperparameters (point, ...) by name, from `hyperpriors` or from a posterior.
         """
 
     @abstractmethod
     def layout(self, slots: Slots, *, contrasts: bool = True) -> Layout:
-        """Layout of the slots in blocks; without contrasts, rows are rates of robots."""
+        """Lay out the slots in blocks; without contrasts, rows are rates of robots."""
 
     @abstractmethod
     def signal(self, theta: Theta, slots: Slots, layout: Layout) -> Signal:
-        """The equation of the model: trust along all bounds, in NumPy or JAX."""
+        """Compute trust along all bounds by the model's equation, in NumPy or JAX."""
 
     @property
     @abstractmethod
     def dims(self) -> dict[str, tuple[str, ...]]:
-        """Axes of each parameter in a posterior, without the effects."""
+        """Return the axes of each parameter in a posterior, without the effects."""
 
     # --- shared by all models ---
 
@@ -127,7 +129,7 @@ class TrustModel(Summary, ABC):
         return {name: float(getattr(self.priors, name)) for name in ("x0_mean", "x0_sd")}
 
     def all_hyperpriors(self, slots: Slots) -> dict[str, Distribution]:
-        """Priors of all hyperparameters by name, the effects last."""
+        """Return the priors of all hyperparameters by name, the effects last."""
         priors = self.hyperpriors(slots.n_robots, slots.z.shape[3])
         return priors | {n: p for e in self.effects for n, p in e.hyperpriors().items()}
 
@@ -144,18 +146,18 @@ class TrustModel(Summary, ABC):
         return self.derived(values)
 
     def rates(self, theta: Theta, drift: Any) -> Distribution | None:
-        """Distribution of rates given the drift (mission, bound, robot), for one point.
+        """Return the distribution of rates given the drift (mission, bound, robot), for one point.
 
-        None if trust cannot be integrated out.
+        It is None if trust cannot be integrated out.
         """
         return None
 
     def prior_terms(self, sites: Mapping[str, np.ndarray]) -> dict[str, tuple[str, np.ndarray]]:
-        """Field of `Priors` and values of each parameter that is not a hyperparameter, by label."""
+        """Return the field of `Priors` and the values of each other parameter, by label."""
         return {name: (name, sites[name]) for name in ("beta", "b")}
 
     def slots(self, missions: Sequence[Mission], workspace: Workspace | None = None) -> Slots:
-        """Rates and features of missions, with further data that the model's effects need.
+        """Collect rates and features of missions, with further data that the effects need.
 
         Raises:
             TrustboError: If there are no missions, or they differ in robots or features; an
@@ -171,7 +173,7 @@ class TrustModel(Summary, ABC):
         return slots
 
     def for_features(self, features: Sequence[str]) -> Self:
-        """The model with default priors for the named features; custom priors are kept.
+        """Return the model with default priors for the named features; keep custom priors.
 
         See `Priors.of`. `fit` and campaigns call it.
         """
@@ -180,7 +182,7 @@ class TrustModel(Summary, ABC):
         return replace(self, priors=Priors.of(tuple(features), self.observation))
 
     def program(self, slots: Slots) -> None:
-        """The model as a NumPyro program, for any kernel, such as `NUTS(model.program)`.
+        """Run the model as a NumPyro program, for any kernel, such as `NUTS(model.program)`.
 
         Everything is sampled except trust, which is integrated out where `rates` is a distribution.
         Call it within `jax.enable_x64(True)`: effects need double precision.
@@ -213,11 +215,11 @@ class TrustModel(Summary, ABC):
         numpyro.factor("contact_rate", jnp.where(seen, log_p, 0.0).sum())
 
     def params(self, sites: Mapping[str, Any]) -> Params:
-        """Parameters from values (draw, ...) by name, with the axes of `dims`."""
+        """Build parameters from values (draw, ...) by name, with the axes of `dims`."""
         return assemble_params(sites, self.x0, self.memory)
 
     def options(self) -> dict[str, Any]:
-        """Options to record, by name, without priors, effects and the default memory."""
+        """Return the options to record, without priors, effects and the default memory."""
         others = ("priors", "effects", *("memory",) * (self.memory == "level"))
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in others}
 

@@ -42,7 +42,7 @@ class ParameterDraws(Summary):
 
     @property
     def by_name(self) -> dict[str, Numbers]:
-        """Arrays by name, without fields that are None."""
+        """Return the arrays by name, without fields that are None."""
         values = {name: getattr(self, name) for name in self._fields if name != "memory"}
         return {name: value for name, value in values.items() if value is not None}
 
@@ -76,7 +76,7 @@ class ParameterDraws(Summary):
         return B0 if self.memory == "level" else np.zeros_like(B0)  # pyright: ignore
 
     def increments(self, awareness: np.ndarray) -> np.ndarray:
-        """Drift without intercept, (..., robot, move, row, col).
+        """Compute the drift without intercept, (..., robot, move, row, col).
 
         Awareness is (robot, move, row, col, feature).
         """
@@ -90,7 +90,7 @@ class ParameterDraws(Summary):
         return {name: np.asarray(value) for name, value in effects.items() if value is not None}
 
     def of_places(self, bounds: np.ndarray) -> np.ndarray:
-        """Effect of each bound, including the cell entered; shape (..., bound, effect).
+        """Return the effect of each bound and the cell it enters; shape (..., bound, effect).
 
         Bounds (bound, 3) are moves, rows and columns; the effect is 0 where the move is negative.
         """
@@ -103,7 +103,7 @@ class ParameterDraws(Summary):
         return np.swapaxes(np.where(moves < 0, 0.0, total), -1, -2)
 
     def along(self, path: Sequence[Cell] | np.ndarray) -> Self:
-        """Parameters for the bounds of a path, with its place effects added to the intercept.
+        """Return the parameters for the bounds of a path, with its place effects in the intercept.
 
         The result has no place effects, and b (..., 1, bound, robot), with a last axis of length 1
         where it is common to all robots. Without place effects, the parameters are returned
@@ -117,15 +117,15 @@ class ParameterDraws(Summary):
         return self._replace(b=b, place=None, place_bound=None)  # pyright: ignore[reportAttributeAccessIssue]
 
     def draw(self, index: int) -> Self:
-        """One draw out of many, with its leading axis dropped."""
+        """Select one draw, with its leading axis dropped."""
         return self.map(lambda value, n: np.asarray(value)[index] if np.ndim(value) > n else value)
 
     def mean(self) -> Self:
-        """Mean over all leading axes."""
+        """Average over all leading axes."""
         return self.flat().map(lambda value, _: value.mean(0))
 
     def flat(self) -> Self:
-        """Every field with exactly one leading axis (draw,), float64."""
+        """Return every field with exactly one leading axis (draw,), float64."""
         leading = self.leading
 
         def expand(value: Numbers, n: int) -> np.ndarray:
@@ -290,7 +290,7 @@ def check_params(params: Params, n_robots: int | None, n_features: int) -> None:
 
 
 def _written(draws: np.ndarray) -> str:
-    """Text of the mean and sd over draws (draw, ...) of a field."""
+    """Write the mean and sd over draws (draw, ...) of a field."""
     mean, sd = draws.mean(0), draws.std(0)
     if mean.size > 6:
         return f"{mean.shape}, {mean.min():.3g} to {mean.max():.3g}"

@@ -64,7 +64,7 @@ class HumanTrust(PooledTrust):
             require_positive(f"HumanTrust.{name}", getattr(self, name))
         if self.effects or self.shared_noise:
             raise TrustboError(
-                f"HumanTrust has effects of persons alone; got effects={self.effects!r}."
+                f"HumanTrust supports no further effects; got effects={self.effects!r}."
             )
 
     def hyperpriors(self, n_robots: int, n_features: int) -> dict[str, dist.Distribution]:
@@ -98,7 +98,7 @@ class HumanTrust(PooledTrust):
         return Layout(slots.y.shape, joint=True, split=split, apart=True)
 
     def signal(self, theta: Theta, slots: Slots, layout: Layout) -> Signal:
-        """Trust of all bounds: first the inputs that decay with beta0, then the others."""
+        """Compute trust: first the inputs that decay with beta0, then the others."""
         xp: Any = namespace(theta["beta0"])
         lasting = self._lasting(theta, slots)
         parts = self.parts(theta, slots)
@@ -110,12 +110,12 @@ class HumanTrust(PooledTrust):
         return Signal(m, T, S, theta["delta_v"][:, None, None])
 
     def _lasting(self, theta: Theta, slots: Slots) -> Any:
-        """Share of the input at one row that remains at another row, (point, row, row)."""
+        """Compute the share of the input at one row that remains at another, (point, row, row)."""
         xp: Any = namespace(theta["beta0"])
         return xp.kron(powers(theta["beta0"], slots.n_bounds), np.eye(slots.n_robots))
 
     def parts(self, theta: Theta, slots: Slots) -> Any:
-        """Effect of a person's standardised coefficients on trust, (point, mission, row, part).
+        """Compute the effect of standardised personal coefficients, (point, mission, row, part).
 
         The parts are start, level, and gains from success and from failure.
         """
@@ -144,7 +144,7 @@ class HumanTrust(PooledTrust):
 
 @cache
 def _default_priors() -> Priors:
-    """Default priors: long memory, gains of some tenths, and a separate start for each person.
+    """Make default priors: long memory, gains of some tenths, and a start for each person.
 
     Trust changes mainly with outcomes, and reports are noisier than contact rates.
     """

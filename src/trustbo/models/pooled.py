@@ -61,7 +61,7 @@ class PooledTrust(TrustModel):
         return {**values, "rest": rest}
 
     def layout(self, slots: Slots, *, contrasts: bool = True) -> Layout:
-        """One block per robot; with shared noise, one per contrast of robots or per mission.
+        """Lay out one block per robot; with shared noise, per contrast of robots or per mission.
 
         Helmert contrasts of the robots' rates are independent if all robots are measured.
         """
@@ -74,7 +74,7 @@ class PooledTrust(TrustModel):
         return Layout(slots.y.shape, joint=True)
 
     def signal(self, theta: Theta, slots: Slots, layout: Layout) -> Signal:
-        """Trust of all bounds; T = (1 - beta0 Lag)^-1 is its response to the drift."""
+        """Compute the trust of all bounds; T = (1 - beta0 Lag)^-1 is its response to the drift."""
         xp: Any = namespace(theta["beta0"])
         n, K = slots.n_robots, slots.n_bounds
         beta0, delta_w = theta["beta0"][:, None], theta["delta_w"][:, None, None]

@@ -18,7 +18,7 @@ from trustbo.models.scores import log_density
 
 
 def _built(kind: Any, *parameters: float) -> Distribution:
-    """Distribution in float64, made on demand: importing trustbo must create no JAX array."""
+    """Make a distribution in float64 on demand: importing trustbo must create no JAX array."""
     with own_settings():
         return kind(*parameters)
 
@@ -84,16 +84,16 @@ class Priors(Summary):
     @classmethod
     @cache
     def default(cls, observation: str) -> "Priors":
-        """Default priors of an observation family, as a cached object.
+        """Return the default priors of an observation family, as a cached object.
 
-        Counts (`"beta_binomial"`) have wider ones, as trust is a logit: beta_m ~ N(0, 2),
+        Counts (`"beta_binomial"`) have wider priors, as trust is a logit: beta_m ~ N(0, 2),
         b ~ N(0, 1), delta_w ~ HalfNormal(0.5), x_0 ~ N(0, 1.5^2).
         """
         return cls(**FAMILIES[observation].priors())
 
     @classmethod
     def of(cls, features: Sequence[str], observation: str = "gaussian") -> "Priors":
-        """Default priors for the named features.
+        """Return the default priors for the named features.
 
         `line_of_sight` is a predicted contact rate: stationary trust has slope 1 in it, or in the
         mean of n of them (`line_of_sight_1`, ...), and little else. beta_los / (1 - beta0) ~
@@ -116,12 +116,12 @@ class Priors(Summary):
             )
 
     def moments(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """Mean and sd of the Normal prior `name`."""
+        """Return the mean and sd of the Normal prior `name`."""
         prior: Any = getattr(self, name)
         return np.asarray(prior.loc, dtype=float), np.asarray(prior.scale, dtype=float)
 
     def coefficients(self, n_features: int) -> tuple[np.ndarray, np.ndarray]:
-        """Means and sds of the weights and, last, the intercept, each (feature + 1,)."""
+        """Return means and sds of the weights and, last, the intercept, each (feature + 1,)."""
         mean, sd = (
             np.append(np.broadcast_to(of_beta, n_features), of_b)
             for of_beta, of_b in zip(self.moments("beta"), self.moments("b"), strict=True)
@@ -129,7 +129,7 @@ class Priors(Summary):
         return mean, sd
 
     def log_density(self, name: str, values: np.ndarray, rest: np.ndarray) -> np.ndarray:
-        """Log density of the prior `name` at each value of the parameter.
+        """Compute the log density of the prior `name` at each value of the parameter.
 
         Args:
             name: Name of a field.
@@ -143,12 +143,12 @@ class Priors(Summary):
         return log_density(prior, values / rest) - np.log(rest)
 
     def describe(self) -> dict[str, str]:
-        """Text of each prior, for the record of a posterior."""
+        """Write each prior as text, for the record of a posterior."""
         return {one.name: _as_text(getattr(self, one.name)) for one in fields(self)}
 
 
 def _wanted(name: str, prior: Any) -> str:
-    """Text of the requirement that a prior violates, or empty."""
+    """Return the requirement that a prior violates, or an empty text."""
     if not isinstance(prior, Distribution) or len(prior.shape()) > (name == "beta"):
         return "a scalar numpyro distribution, e.g. Normal(0.0, 1.0)"
     if name in ("beta", "b", "coupling"):
@@ -163,7 +163,7 @@ def _wanted(name: str, prior: Any) -> str:
 
 
 def _as_text(prior: Distribution | float) -> str:
-    """Distribution or number as text."""
+    """Write a distribution or a number as text."""
     if isinstance(prior, bool):
         return "yes" if prior else "no"
     if not isinstance(prior, Distribution):

@@ -57,7 +57,7 @@ def model_from_record(
 
 
 def effects_from_record(record: Mapping[str, Any]) -> tuple[Effect, ...]:
-    """Effects from a model's record.
+    """Rebuild the effects of a model from its record.
 
     Raises TrustboError if the class of an effect has not been imported.
     """

@@ -47,7 +47,7 @@ class Scores:
         return self.at[NOISES[0]]
 
     def values(self, z: np.ndarray) -> dict[str, np.ndarray]:
-        """Hyperparameters at scores (point, score), by name, each (point,) or (point, k)."""
+        """Convert scores (point, score) to hyperparameters by name, each (point,) or (point, k)."""
         size, angle = np.exp(z[:, self.at["delta_w"]]), z[:, self.at["delta_v"]]
         found = {}
         for name, prior in self.priors.items():
@@ -61,7 +61,7 @@ class Scores:
         return found
 
     def log_prior(self, z: np.ndarray) -> np.ndarray:
-        """Log prior density of scores, (point,)."""
+        """Compute the log prior density of scores, (point,)."""
         size = z[:, self.sizes]
         others = np.delete(z, np.arange(self.n_scores)[self.sizes], axis=1)
         normal = -0.5 * (others**2).sum(1) - others.shape[1] * _LOG_ROOT_2PI
@@ -70,7 +70,7 @@ class Scores:
     def draw(
         self, n: int, rng: np.random.Generator, *, even: bool = False
     ) -> dict[str, np.ndarray]:
-        """Draws of the hyperparameters from their priors, (draw,) or (draw, k).
+        """Draw hyperparameters from their priors, (draw,) or (draw, k).
 
         With `even`, they are evenly spaced quantiles of each prior, in random order.
         """
@@ -85,7 +85,7 @@ class Scores:
 
 
 def quantile(prior: Distribution, score: np.ndarray, name: str = "") -> np.ndarray:
-    """Quantile of a prior at Phi(score), accurate in both tails."""
+    """Compute the quantile of a prior at Phi(score), accurate in both tails."""
     prior = _base(prior)
     if isinstance(prior, dist.Normal):
         return np.asarray(prior.loc) + np.asarray(prior.scale) * score
@@ -104,7 +104,7 @@ def quantile(prior: Distribution, score: np.ndarray, name: str = "") -> np.ndarr
 
 
 def of_size(prior: Distribution, size: Any, name: str = "") -> Any:
-    """Quantile of a prior at P(|N(0, 1)| < size), in NumPy or JAX as `size` is."""
+    """Compute the quantile of a prior at P(|N(0, 1)| < size)."""
     prior = _base(prior)
     if isinstance(prior, dist.HalfNormal):
         return np.asarray(prior.scale) * size
@@ -114,7 +114,7 @@ def of_size(prior: Distribution, size: Any, name: str = "") -> Any:
 
 
 def log_density(prior: Distribution, x: np.ndarray) -> np.ndarray:
-    """Log density of a prior, in closed form for common priors to avoid compilation."""
+    """Compute the log density of a prior, in closed form for common priors."""
     prior = _base(prior)
     if isinstance(prior, dist.HalfNormal):
         return stats.halfnorm.logpdf(x, scale=np.asarray(prior.scale))
@@ -131,7 +131,7 @@ def log_density(prior: Distribution, x: np.ndarray) -> np.ndarray:
 
 
 def _base(prior: Any) -> Any:
-    """Distribution of one variable of an independent, identically distributed vector."""
+    """Return the distribution of one variable of a vector of independent, identical variables."""
     return prior.base_dist if isinstance(prior, dist.ExpandedDistribution) else prior
 
 

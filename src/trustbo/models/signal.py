@@ -33,7 +33,7 @@ class Layout(NamedTuple):
         return np.tile(others.astype(int), n_missions)
 
     def rows(self, values: np.ndarray) -> np.ndarray:
-        """Values (..., mission, bound, robot) as (..., block, row)."""
+        """Rearrange values (..., mission, bound, robot) as (..., block, row)."""
         if self.rotation is not None:
             values = values @ self.rotation.T
         if not self.joint:
@@ -42,7 +42,7 @@ class Layout(NamedTuple):
         return values.reshape(*leading, n, a * b) if self.joint else values.reshape(*leading, -1, b)
 
     def slots(self, values: np.ndarray) -> np.ndarray:
-        """Values (..., block, row) as (..., mission, bound, robot)."""
+        """Rearrange values (..., block, row) as (..., mission, bound, robot)."""
         n, K, R = self.shape
         if self.joint:
             return values.reshape(*values.shape[:-2], n, K, R)
@@ -50,7 +50,7 @@ class Layout(NamedTuple):
         return values if self.rotation is None else values @ self.rotation
 
     def columns(self, U: Any) -> Any:
-        """Columns of slots, sparse (slot, column), rearranged to (block * row, column)."""
+        """Rearrange columns of slots, sparse (slot, column), to (block * row, column)."""
         n, K, R = self.shape
         if self.rotation is not None:
             U = sparse.csr_array(sparse.kron(sparse.eye_array(n * K), self.rotation)) @ U
@@ -85,12 +85,12 @@ class Signal(NamedTuple):
 
 
 def each(M: Any, label: np.ndarray) -> Any:
-    """Values (point, block, ...) of blocks by label; one block if all are equal."""
+    """Return values (point, block, ...) of blocks by label; one block if all are equal."""
     return M if M.shape[1] == 1 else M[:, label]
 
 
 def powers(beta0: Any, n: int) -> Any:
-    """Lower triangular matrices (..., n, n) with entries beta0^(k - j), (1 - beta0 Lag)^-1."""
+    """Compute (1 - beta0 Lag)^-1, lower triangular (..., n, n) with entries beta0^(k - j)."""
     xp = namespace(beta0)
     lag = np.subtract.outer(np.arange(n), np.arange(n))
     return xp.where(lag >= 0, beta0[..., None, None] ** np.maximum(lag, 0), 0.0)

@@ -60,7 +60,7 @@ class Slots(NamedTuple):
         return float(min(np.median(steps), COARSEST_RESOLUTION))
 
     def without(self, missions: Sequence[int] | slice) -> Self:
-        """Copy in which the given missions are marked as not measured."""
+        """Return a copy in which the given missions are marked as not measured."""
         y = self.y.copy()
         y[missions] = np.nan
         return self._replace(y=y)

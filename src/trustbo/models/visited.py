@@ -23,7 +23,7 @@ class Visited(NamedTuple):
 
 
 def bounds_of(missions: Sequence[Mission], shape: tuple[int, int] | None = None) -> np.ndarray:
-    """Move, row and column of each mission's bounds, (mission, bound, 3), -1 in the padding.
+    """Return move, row and column of each bound, (mission, bound, 3), -1 in the padding.
 
     `shape` (missions, bounds) includes the padding; by default none is added. Raises TrustboError
     if a path jumps or a mission has no map.
@@ -45,7 +45,7 @@ def bounds_of(missions: Sequence[Mission], shape: tuple[int, int] | None = None)
 
 
 def has_places(missions: Sequence[Mission]) -> bool:
-    """Whether all missions have a map and paths without jumps."""
+    """Return whether all missions have a map and paths without jumps."""
     try:
         bounds_of(missions)
     except TrustboError:
@@ -73,7 +73,7 @@ def visited(bounds: np.ndarray, shape: tuple[int, int] | None = None) -> Visited
         )
     if len(found) > _MOST:
         raise TrustboError(
-            f"{len(found)} visited bounds are more than {_MOST}, the most that one dense factor "
+            f"{len(found)} visited bounds exceed the limit of {_MOST} that one dense factor "
             "takes. Give coarser cells, or leave PlaceEffect() out."
         )
     cells, cell_of = np.unique(found[:, 1:], axis=0, return_inverse=True)

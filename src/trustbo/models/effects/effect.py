@@ -64,11 +64,11 @@ class Effect:
                 require_positive(f"{type(self).__name__}.{name}", value)
 
     def columns(self, slots: Slots) -> Any:
-        """Sparse matrix (slot, column); slots are (mission, bound, robot), raveled."""
+        """Return a sparse matrix (slot, column); slots are (mission, bound, robot), raveled."""
         raise NotImplementedError
 
     def prior(self, theta: Theta, slots: Slots) -> tuple[Any, list[Any]]:
-        """Prior of the coefficients at each theta, in NumPy or JAX.
+        """Return the prior of the coefficients at each theta, in NumPy or JAX.
 
         Returns:
             Mean (point, column), None for 0, and precisions of consecutive columns, (point, k, k),
@@ -85,18 +85,18 @@ class Effect:
         raise NotImplementedError
 
     def ahead(self, values: Values, theta: Theta, n: int, rng: Generator | None) -> np.ndarray:
-        """Slope (draw, robot) of drift in line of sight for the mission after n; by default 0.
+        """Return the slope (draw, robot) of drift in line of sight after mission n; 0 by default.
 
         With `rng`, effects specific to that mission are drawn; otherwise they are expectations.
         """
         return np.zeros((len(theta["rest"]), 1))
 
     def hyperpriors(self) -> dict[str, Distribution]:
-        """Priors of the hyperparameters, by name."""
+        """Return the priors of the hyperparameters, by name."""
         return {name: dist.HalfNormal(getattr(self, name)) for name in self.names}
 
     def slots(self, slots: Slots, missions: Sequence[Mission], on: Workspace | None) -> Slots:
-        """Slots of missions, on a workspace if given, with all data that the columns need."""
+        """Add the data that the columns need to slots of missions, on a workspace if given."""
         return slots
 
 

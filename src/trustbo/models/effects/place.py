@@ -72,7 +72,7 @@ class PlaceEffect(Effect):
         return slots._replace(visited=visited(bounds, grid))  # pyright: ignore[reportArgumentType]
 
     def columns(self, slots: Slots) -> Any:
-        """Indicators of the cells entered and of the directed bounds."""
+        """Return indicators of the cells entered and of the directed bounds."""
         places: Any = slots.visited
         at = np.broadcast_to(places.at[..., None], slots.y.shape).ravel()
         met = np.flatnonzero(at >= 0)
@@ -84,7 +84,7 @@ class PlaceEffect(Effect):
         )
 
     def prior(self, theta: Theta, slots: Slots) -> tuple[Any, list[Any]]:
-        """A Gaussian process over the visited cells, and independent bounds."""
+        """Return a Gaussian process prior of the visited cells, and independent bounds."""
         xp: Any = namespace(theta["tau_e"])
         places: Any = slots.visited
         of_bound = xp.maximum(theta["tau_e"], LEAST) ** -2.0
@@ -92,7 +92,7 @@ class PlaceEffect(Effect):
         return None, [self._cells(theta, places.cells), of_bounds]
 
     def _cells(self, theta: Theta, cells: np.ndarray) -> Any:
-        """Precision (point, cell, cell) of s at cells (cell, 2)."""
+        """Compute the precision (point, cell, cell) of s at cells (cell, 2)."""
         xp: Any = namespace(theta["tau_s"])
         gap = cells[:, None].astype(float) - cells[None]
         square, pair = np.unique((gap**2).sum(-1), return_inverse=True)
@@ -102,7 +102,7 @@ class PlaceEffect(Effect):
         return xp.linalg.inv(tau**2 * (K + _JITTER * np.eye(len(cells))))
 
     def named(self, c: np.ndarray, theta: Theta, slots: Slots) -> Values:
-        """Effects of visited cells, place (draw, cell), and bounds, place_bound (draw, bound)."""
+        """Return effects of visited cells, `place`, and bounds, `place_bound`, each (draw, ...)."""
         places: Any = slots.visited
         n = len(places.cells)
         return {"place": c[:, :n], "place_bound": c[:, n:]}
@@ -113,7 +113,7 @@ class PlaceEffect(Effect):
 
 
 def matern(distance: ArrayLike, length_scale: ArrayLike) -> Any:
-    """Matern 3/2 correlation at a distance, both in cells."""
+    """Compute the Matern 3/2 correlation at a distance, both in cells."""
     xp: Any = namespace(length_scale)
     h = np.sqrt(3.0) * xp.asarray(distance) / xp.asarray(length_scale)
     return (1.0 + h) * xp.exp(-h)

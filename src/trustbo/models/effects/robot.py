@@ -48,7 +48,7 @@ class RobotEffect(Effect):
             raise TrustboError(f"RobotEffect.rho must be between 0 and 1; got {self.rho!r}.")
 
     def columns(self, slots: Slots) -> Any:
-        """Line of sight, one column per robot and mission, the mission varying fastest."""
+        """Return line of sight, one column per robot and mission, the mission varying fastest."""
         n_missions, n_robots = slots.n_missions, slots.n_robots
         mission, _, robot = np.indices(slots.y.shape)
         where = (robot * n_missions + mission).ravel()
@@ -58,7 +58,7 @@ class RobotEffect(Effect):
         )
 
     def prior(self, theta: Theta, slots: Slots) -> tuple[Any, list[Any]]:
-        """Prior with independent robots; one array for all if they have the same `rest`."""
+        """Return the prior of independent robots; one array for all if `rest` is common."""
         rest = theta["rest"]
         Q = namespace(rest).linalg.inv(self._covariance(theta, slots.n_missions))
         if rest.ndim == 1:
@@ -66,7 +66,7 @@ class RobotEffect(Effect):
         return None, [Q / of_robot[:, None, None] ** 2 for of_robot in rest.T]
 
     def named(self, c: np.ndarray, theta: Theta, slots: Slots) -> Values:
-        """Effects d on stationary trust, robot_effect (draw, mission, robot)."""
+        """Return the effects d on stationary trust, robot_effect (draw, mission, robot)."""
         d = c.reshape(len(c), slots.n_robots, slots.n_missions) / _rest(theta)
         return {"robot_effect": np.swapaxes(d, 1, 2)}
 
@@ -83,7 +83,7 @@ class RobotEffect(Effect):
         return _rest(theta)[..., 0] * d
 
     def next_mission(self, effect: np.ndarray, theta: Theta) -> tuple[np.ndarray, np.ndarray]:
-        """Mean (draw, robot) and sd (draw,) of the next d, given d (draw, mission, robot)."""
+        """Predict the next d given d (draw, mission, robot): mean (draw, robot), sd (draw,)."""
         n = effect.shape[1]
         C, slow = self._covariance(theta, n), np.maximum(theta["tau_slow"], LEAST) ** 2
         k = slow[:, None] * self.rho ** np.arange(n, 0, -1)
@@ -92,7 +92,7 @@ class RobotEffect(Effect):
         return np.einsum("nm,nmi->ni", gain, effect), np.sqrt(left)
 
     def _covariance(self, theta: Theta, n: int) -> Any:
-        """Covariance (point, mission, mission) of d of one robot."""
+        """Compute the covariance (point, mission, mission) of d of one robot."""
         xp, i = namespace(theta["tau_slow"]), np.arange(n)
         slow, day = (xp.maximum(theta[name], LEAST)[:, None, None] ** 2 for name in self.names)
         fading = self.rho ** np.abs(i[:, None] - i)
@@ -100,6 +100,6 @@ class RobotEffect(Effect):
 
 
 def _rest(theta: Theta) -> np.ndarray:
-    """Drift (draw, robot or 1, 1) by which stationary trust rises by 1."""
+    """Return the drift (draw, robot or 1, 1) by which stationary trust rises by 1."""
     rest = theta["rest"]
     return rest.reshape(len(rest), -1, 1)

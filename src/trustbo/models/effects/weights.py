@@ -14,32 +14,32 @@ from trustbo.models.slots import Slots
 
 @dataclass(frozen=True)
 class Weights(Effect):
-    """Effect of features and of a constant, with Normal priors `beta` and `b`."""
+    """Weights of features and an intercept, with Normal priors `beta` and `b`."""
 
     priors: Priors
 
     def columns(self, slots: Slots) -> Any:
-        """Features and a constant 1."""
+        """Return the features and a constant 1."""
         return sparse.csr_array(_inputs(slots))
 
     def prior(self, theta: Theta, slots: Slots) -> tuple[Any, list[Any]]:
-        """Independent coefficients, scaled if the priors are those of stationary trust."""
+        """Return independent coefficients, scaled if the priors are on stationary trust."""
         mean, sd = self.moments(theta, slots)
         return mean, [sd**-2.0]
 
     def moments(self, theta: Theta, slots: Slots) -> tuple[Any, Any]:
-        """Means and sds of the coefficients, (point, column)."""
+        """Return means and sds of the coefficients, (point, column)."""
         mean, sd = self.priors.coefficients(slots.z.shape[3])
         rest = self.unit(theta)
         return rest * mean, rest * sd
 
     def unit(self, theta: Theta) -> Any:
-        """Factor (point, [robot,] 1) of coefficients if priors are of stationary trust, else 1."""
+        """Return the factor (point, [robot,] 1) of coefficients with priors on stationary trust."""
         rest = theta["rest"][..., None]
         return rest if self.priors.stationary else 0.0 * rest + 1.0
 
     def named(self, c: np.ndarray, theta: Theta, slots: Slots) -> Values:
-        """Weights beta (draw, feature) and intercept b (draw,)."""
+        """Return weights beta (draw, feature) and intercept b (draw,)."""
         return {"beta": c[:, :-1], "b": c[:, -1]}
 
     def coefficients(self, values: Values, theta: Theta, slots: Slots) -> np.ndarray:
@@ -52,13 +52,13 @@ class RobotWeights(Weights):
     """Coefficients of each robot, N(mu, tau^2), with priors on mu; theta contains tau."""
 
     def columns(self, slots: Slots) -> Any:
-        """Features and 1 for each robot, the robot varying fastest."""
+        """Return the features and 1 for each robot, the robot varying fastest."""
         values = _inputs(slots)
         mine = np.tile(np.eye(slots.n_robots), (len(values) // slots.n_robots, 1))
         return sparse.csr_array((values[..., None] * mine[:, None]).reshape(len(values), -1))
 
     def prior(self, theta: Theta, slots: Slots) -> tuple[Any, list[Any]]:
-        """Coefficients of one feature are correlated through their common mean."""
+        """Return coefficients that are correlated through their common mean."""
         n, (mean, sd) = slots.n_robots, self.moments(theta, slots)
         tau = namespace(mean).maximum(_spreads(theta), LEAST)
         alike = sd**2 / (tau**2 + n * sd**2)  # (sd^2 11' + tau^2 1)^-1 in closed form
@@ -69,7 +69,7 @@ class RobotWeights(Weights):
         return namespace(mean).repeat(mean, n, axis=1), parts
 
     def named(self, c: np.ndarray, theta: Theta, slots: Slots) -> Values:
-        """Weights beta (draw, robot, feature), intercepts b (draw, robot), and their means.
+        """Return weights beta (draw, robot, feature), intercepts b (draw, robot), and their means.
 
         `mean_beta` and `mean_b` are expectations given the coefficients.
         """
@@ -91,7 +91,7 @@ class CoupledWeights(Weights):
     """Weight of feature m at robot l in the trust of robot i, matrices B_m, and intercepts b_i."""
 
     def columns(self, slots: Slots) -> Any:
-        """Features of all robots and 1, for each robot."""
+        """Return the features of all robots and 1, for each robot."""
         n = slots.n_robots
         inputs = slots.z.reshape(-1, 1, n * slots.z.shape[3])  # (mission * bound, 1, (robot, m))
         inputs = np.concatenate([inputs, np.ones((*inputs.shape[:2], 1))], axis=2)
@@ -99,7 +99,7 @@ class CoupledWeights(Weights):
         return sparse.csr_array(values.reshape(slots.y.size, -1))
 
     def prior(self, theta: Theta, slots: Slots) -> tuple[Any, list[Any]]:
-        """Prior of weights: `Priors.coupling` for the features of other robots."""
+        """Return the prior of weights: `Priors.coupling` for features of other robots."""
         n, (mean, sd) = slots.n_robots, self.priors.coefficients(slots.z.shape[3])
         n_features = len(mean) - 1
         own = np.repeat(np.eye(n, dtype=bool), n_features, axis=1)
@@ -112,7 +112,7 @@ class CoupledWeights(Weights):
         return means.reshape(len(means), -1), [sds.reshape(len(sds), -1) ** -2.0]
 
     def named(self, c: np.ndarray, theta: Theta, slots: Slots) -> Values:
-        """Matrices B (draw, feature, robot, robot') and intercepts b (draw, robot)."""
+        """Return matrices B (draw, feature, robot, robot') and intercepts b (draw, robot)."""
         n = slots.n_robots
         c = c.reshape(len(c), n, -1)
         B = c[..., :-1].reshape(len(c), n, n, -1)
@@ -126,7 +126,7 @@ class CoupledWeights(Weights):
 
 
 def _inputs(slots: Slots) -> np.ndarray:
-    """Features and 1, (slot, feature + 1)."""
+    """Return the features and 1, (slot, feature + 1)."""
     z = slots.z.reshape(-1, slots.z.shape[3])
     return np.column_stack([z, np.ones(len(z))])
 

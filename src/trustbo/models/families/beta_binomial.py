@@ -82,5 +82,5 @@ class BetaBinomial(Family):
 
 
 def _concentration(sd: Any) -> Any:
-    """Concentration of the beta distribution, at most 1e6: counts are then binomial."""
+    """Return the concentration of the beta distribution, at most 1e6 (binomial)."""
     return 1.0 / (sd**2 + 1e-6)

@@ -56,6 +56,6 @@ class Censored(Gaussian):
 
 
 def _limits(y: Array) -> tuple[Array, Array, Array]:
-    """Whether a rate is a limit, and the interval of the rate before clipping."""
+    """Return whether a rate is a limit, and the interval of the rate before clipping."""
     one = y >= 1.0
     return one | (y <= 0.0), np.where(one, 1.0, -np.inf), np.where(one, np.inf, 0.0)

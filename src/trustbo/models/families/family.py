@@ -48,11 +48,11 @@ class Family(ABC):
 
     @abstractmethod
     def log_prob(self, y: Array, N: Array, trust: Array, sd: Array) -> Array:
-        """Log density or probability of measured rates given the signal, in NumPy or JAX."""
+        """Compute the log density or probability of measured rates given the signal."""
 
     @abstractmethod
     def _match(self, y: Array, N: Array, m: Array, v: Array, sd: Array) -> Moments:
-        """Log mass, mean and variance of N(f; m, v) times the term of a rate."""
+        """Compute log mass, mean and variance of N(f; m, v) times the term of a rate."""
 
     @abstractmethod
     def _draw(self, y: Array, N: Array, m: Array, v: Array, sd: Array, rng: Generator) -> Drawn:
@@ -62,19 +62,19 @@ class Family(ABC):
         """
 
     def mean_rate(self, trust: Array, sd: Array) -> Array:
-        """Mean of a rate given trust, for planning."""
+        """Compute the mean of a rate given trust, for planning."""
         return trust
 
     def is_density(self, y: Array) -> Array:
-        """Mask of the measured rates that have a density, being the signal plus normal noise."""
+        """Return a mask of the rates with a density, being the signal plus normal noise."""
         return np.zeros(y.shape, dtype=bool)
 
     def priors(self) -> dict[str, Any]:
-        """Default priors that differ from those of `Priors()`, by name."""
+        """Return the default priors that differ from those of `Priors()`, by name."""
         return {}
 
     def match(self, y: Array, N: Array, m: Array, v: Array, sd: Array) -> Moments:
-        """Moments of N(f; m, v) times the term of a rate; 0, m and v where y is NaN."""
+        """Compute moments of N(f; m, v) times the term of a rate; 0, m and v where y is NaN."""
         seen, arrays = _measured(y, N, m, v, sd)
         one, mean, var = self._match(*arrays)
         return np.where(seen, one, 0.0), np.where(seen, mean, m), np.where(seen, var, v)
@@ -85,7 +85,7 @@ class Family(ABC):
         return self._draw(y, N, m, v, sd, rng)
 
     def log_resolution(self, y: Array, N: Array) -> Array:
-        """Log ratio of the probability of a count of ticks to the density of its rate.
+        """Compute the log ratio of a count's probability to the density of its rate.
 
         One tick has width 1/N. The result has the shape of `y`, and is 0 where not measured or
         where the rate itself has a probability, NaN where the number of ticks is unknown.
@@ -95,7 +95,7 @@ class Family(ABC):
 
 
 def _measured(y: Array, N: Array, *others: Array) -> tuple[Array, list[Array]]:
-    """Mask of the measured rates, and arrays of equal shape with placeholders for other rates."""
+    """Return a mask of the measured rates, and arrays with placeholders for other rates."""
     y, N, *others = np.broadcast_arrays(y, N, *others)  # pyright: ignore[reportAssignmentType]
     seen = ~np.isnan(y)
     return seen, [np.where(seen, y, 0.5), np.where(N > 0.0, N, 1.0), *others]

@@ -26,7 +26,7 @@ class Levels(Family):
     adds_noise: ClassVar[bool] = False
 
     def cuts(self, y: Array) -> tuple[Array, Array]:
-        """Cut points below and above reports."""
+        """Return the cut points below and above reports."""
         xp, n = namespace(y), self.levels - 1
         level = xp.round(y * n)
         low = xp.where(level < 0.5, -np.inf, (level - 0.5) / n)
@@ -66,7 +66,7 @@ class Levels(Family):
         return f, special.logsumexp(log_p, axis=0)
 
     def _components(self, y: Array, m: Array, v: Array, sd: Array) -> Moments:
-        """Moments (component, ...) of each normal of the mixture, log shares in the first."""
+        """Compute moments (component, ...) of each normal of the mixture, after log shares."""
         parts = [match_interval(*self.cuts(y), m, v, of_one * sd) for of_one in _SDS]
         log_p, mean, var = (np.stack(moments) for moments in zip(*parts, strict=True))
         return log_p + np.log(_SHARES).reshape(-1, *(1,) * np.ndim(y)), mean, var

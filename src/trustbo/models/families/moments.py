@@ -16,12 +16,12 @@ _STEP = 0.05  # of differences in a search for the mode
 
 
 def log_normal(e: Array, variance: Array) -> Array:
-    """Log density of N(0, variance) at e."""
+    """Compute the log density of N(0, variance) at e."""
     return -0.5 * (e**2 / variance + namespace(variance).log(2.0 * np.pi * variance))
 
 
 def match_interval(low: ndarray, high: ndarray, m: ndarray, v: ndarray, noise: ndarray) -> Moments:
-    """Moments of N(f; m, v) where f plus normal noise lies between two numbers."""
+    """Compute moments of N(f; m, v) where f plus normal noise is between two numbers."""
     total = v + noise**2
     sd = np.sqrt(total)
     log_p, e, spread = truncated(*((end - m) / sd for end in (low, high)))
@@ -29,7 +29,7 @@ def match_interval(low: ndarray, high: ndarray, m: ndarray, v: ndarray, noise: n
 
 
 def truncated(a: ndarray, b: ndarray) -> Moments:
-    """Log probability, mean and variance of a standard normal between a and b."""
+    """Compute log probability, mean and variance of a standard normal between a and b."""
     mirror = a > -b  # the lower tail is the accurate one
     a, b = np.where(mirror, -b, a), np.where(mirror, -a, b)
     log_p = log_between(a, b)
@@ -41,7 +41,7 @@ def truncated(a: ndarray, b: ndarray) -> Moments:
 
 
 def log_between(a: ndarray, b: ndarray) -> ndarray:
-    """Log of Phi(b) - Phi(a), for a + b <= 0."""
+    """Compute the log of Phi(b) - Phi(a), for a + b <= 0."""
     with np.errstate(divide="ignore"):
         log_b = special.log_ndtr(b)
         gap = np.minimum(special.log_ndtr(a) - log_b, -1e-300)
@@ -49,7 +49,7 @@ def log_between(a: ndarray, b: ndarray) -> ndarray:
 
 
 def draw_between(a: ndarray, b: ndarray, rng: Generator) -> ndarray:
-    """Standard normal draws between a and b."""
+    """Draw standard normal variables between a and b."""
     mirror = a > -b
     a, b = np.where(mirror, -b, a), np.where(mirror, -a, b)
     with np.errstate(divide="ignore"):
@@ -62,7 +62,7 @@ def draw_between(a: ndarray, b: ndarray, rng: Generator) -> ndarray:
 
 
 def draw_between_knots(knots: ndarray, log_f: ndarray, rng: Generator) -> Drawn:
-    """Draws from a density that is log-linear between knots (..., knot), and their log density."""
+    """Draw from a log-linear density between knots (..., knot); also return its log."""
     width, rise = np.diff(knots), np.diff(log_f)
     rise = np.where(np.abs(rise) < 1e-9, 1e-9, rise)
     log_mass = log_f[..., :-1] + np.log(width) + np.log(np.expm1(rise) / rise)
@@ -78,7 +78,7 @@ def draw_between_knots(knots: ndarray, log_f: ndarray, rng: Generator) -> Drawn:
 def match_by_nodes(
     log_prob: Callable[[ndarray], ndarray], start: ndarray, m: ndarray, v: ndarray
 ) -> Moments:
-    """Moments of N(f; m, v) times a term, by Gauss-Hermite nodes around the mode.
+    """Compute moments of N(f; m, v) times a term, by Gauss-Hermite nodes at the mode.
 
     `log_prob` is the log of the term at nodes (..., node); the mode is searched from `start`.
     """
