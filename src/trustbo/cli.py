@@ -58,7 +58,7 @@ def _exit(message: str, code: int) -> NoReturn:
 
 
 def parser() -> argparse.ArgumentParser:
-    """Parser of all commands; `run` of the parsed arguments is the function that executes them."""
+    """Make the parser of all commands; `run` of the parsed arguments executes the command."""
     top = argparse.ArgumentParser(
         prog="trustbo",
         description="Learn how trustworthy robots are on a terrain, and plan their best path.",
@@ -211,7 +211,7 @@ def _run(args: argparse.Namespace, workspace: "Workspace", **options: Any) -> No
 
 
 def _stop(args: argparse.Namespace) -> Any:
-    """Stopping rule given by the flag `--stop-regret`; None without the flag."""
+    """Make the stopping rule given by the flag `--stop-regret`; None without the flag."""
     from trustbo import RegretBound
 
     return None if args.stop_regret is None else RegretBound(eps=args.stop_regret)

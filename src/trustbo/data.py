@@ -144,7 +144,7 @@ class Mission(Summary):
             object.__setattr__(self, name, labels)
 
     def _require_path(self) -> None:
-        """Refuse bounds that do not match the path, or that enter cells when there is no path."""
+        """Reject bounds that do not match the path, or that enter cells if there is no path."""
         n_run, n_planned = len(self.bounds), len(self.path) - 1
         if not n_run or (self.path and n_run > n_planned):
             raise TrustboError(
@@ -254,7 +254,7 @@ class Mission(Summary):
     def in_order(
         self, robots: Sequence[str], features: Sequence[str], unmeasured: Sequence[str] = ()
     ) -> Self:
-        """The mission with its robots and features in the order of these names.
+        """Return the mission with its robots and features in the order of these names.
 
         Args:
             robots: Names of the robots.
@@ -316,15 +316,15 @@ class Mission(Summary):
 
 
 def levels_of(scale: object) -> int:
-    """Number of levels of a scale; 0 for "unit".
+    """Return the number of levels of a scale; 0 for "unit".
 
     TrustboError: the name is not "unit", "likertN" or "ordinalN" with a number N of at least 2.
     """
     found = re.fullmatch(r"(likert|ordinal)(\d*)", scale) if isinstance(scale, str) else None
     if scale != "unit" and found is None:
         raise TrustboError(
-            f'scale must be "unit", "likert7" or "ordinal7", the number being that of levels; '
-            f"got {scale!r}."
+            f'scale must be "unit" or, with the number of levels, "likert7" or "ordinal7"; got '
+            f"{scale!r}."
         )
     return 0 if found is None else require_whole("levels of a scale", int(found[2] or 7), 2)
 
@@ -350,12 +350,12 @@ def is_line_of_sight(feature: str) -> bool:
 
 
 def default_features(n_features: int) -> tuple[str, ...]:
-    """Default names of features: traversability, visibility, z3, z4, ..."""
+    """Return default names of features: traversability, visibility, z3, z4, ..."""
     return (*FEATURES, *(f"z{m + 1}" for m in range(2, n_features)))[:n_features]
 
 
 def require_shares(rate: np.ndarray, ticks: np.ndarray) -> None:
-    """Refuse ticks that are not whole and rates that are not multiples of 1 / ticks."""
+    """Reject ticks that are not whole and rates that are not multiples of 1 / ticks."""
     if ticks.shape != rate.shape:
         raise TrustboError(f"n_ticks of a bound must be {rate.shape}; got shape {ticks.shape}.")
     for i in np.flatnonzero((ticks < 1.0) | (ticks != np.round(ticks)) & ~np.isnan(ticks)):
@@ -363,7 +363,7 @@ def require_shares(rate: np.ndarray, ticks: np.ndarray) -> None:
     off = np.abs(rate * ticks - np.round(rate * ticks)) > 1e-6 * ticks
     for i in np.flatnonzero(off):
         raise TrustboError(
-            f"contact_rate[{i}] = {rate[i]:g} is no share of {ticks[i]:g} ticks (n_ticks)."
+            f"contact_rate[{i}] = {rate[i]:g} is not a multiple of 1 / {ticks[i]:g} (n_ticks)."
         )
 
 
@@ -378,7 +378,7 @@ def as_array(what: str, values: ArrayLike) -> np.ndarray:
 
 
 def as_names(what: str, given: Iterable[str]) -> tuple[str, ...]:
-    """Names as a tuple; TrustboError if one is not a string or is repeated."""
+    """Return names as a tuple; TrustboError if one is not a string or is repeated."""
     listed = isinstance(given, Iterable) and not isinstance(given, str)
     names = tuple(given) if listed else ()
     if not listed or not all(isinstance(name, str) for name in names):
@@ -400,7 +400,7 @@ def require_unit_interval(what: str, values: np.ndarray) -> None:
 
 
 def _labelled(what: str, values: Any, dims: Sequence[str], **names: Sequence[str]) -> Any:
-    """Labelled values, reordered to the given dims and to the given names along some of them.
+    """Reorder labelled values to the given dims, and to the given names along some of them.
 
     Labels are the dims and coordinates of a DataArray, or the column names of a DataFrame for the
     last dim, if they are strings. TrustboError: the labels are not the given names.
@@ -422,7 +422,7 @@ def _labelled(what: str, values: Any, dims: Sequence[str], **names: Sequence[str
 
 
 def _per_robot(what: str, values: np.ndarray, rates: np.ndarray) -> np.ndarray:
-    """Values broadcast to shape (bound, robot); they may have one value for each bound."""
+    """Broadcast values, one for each bound or for each robot in it, to (bound, robot)."""
     try:
         return np.broadcast_to(values[:, None] if values.ndim == 1 else values, rates.shape)
     except ValueError:

@@ -24,7 +24,7 @@ class Summary:
     __slots__ = ()
 
     def _rows(self) -> Rows:
-        """Names and values to display."""
+        """Return names and values to display."""
         raise NotImplementedError
 
     def __repr__(self) -> str:
@@ -53,7 +53,7 @@ def joined(names: Sequence[str]) -> str:
 
 
 def progress_bar(show: bool, **options: Any) -> tqdm:
-    """Bar in a terminal or a notebook, hidden unless `show`; `options` are passed to tqdm."""
+    """Make a progress bar, hidden unless `show`; `options` are passed to tqdm."""
     return tqdm(disable=not show, **options)
 
 

@@ -71,7 +71,7 @@ def interpreting(path: FilePath) -> Iterator[None]:
     ) as error:  # fmt: skip
         message = " ".join(str(error).split())[:200]
         raise TrustboError(
-            f"{str(path)!r} is damaged: it does not hold what it should ({message})."
+            f"{str(path)!r} is damaged or has unexpected contents ({message})."
         ) from error
 
 

@@ -23,7 +23,7 @@ They are not cached on disk; their compiled callers are.
 
 
 def plain(values: np.ndarray) -> np.ndarray:
-    """Contiguous, writable array; a copy if necessary.
+    """Return a contiguous, writable array; a copy if necessary.
 
     Kernels are compiled for each memory layout of their arguments, which takes seconds, so all
     arguments have the same layout.
@@ -44,7 +44,7 @@ def over_rows(work: Callable[[int, int], None], n_rows: int) -> None:
 
 
 def in_order[T, R](work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
-    """Results in the order of the items; at most as many are in memory as there are cores."""
+    """Yield results in the order of the items; at most as many are in memory as cores."""
 
     def alone(item: T) -> R:
         _here.is_worker = True
@@ -73,10 +73,10 @@ def one_blas_thread() -> Iterator[None]:
 
 @cache
 def _blas() -> ThreadpoolController:
-    """Loaded BLAS libraries; cached, as the search takes a fifth of the time of exact sampling."""
+    """Return the loaded BLAS libraries; cached, as the search is slow."""
     return ThreadpoolController()
 
 
 def n_cores() -> int:
-    """Number of cores that this process may use, which may be fewer than the machine has."""
+    """Return the number of cores that this process may use, at most all of the machine."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -67,7 +67,7 @@ def write_report(path: FilePath, result: Result) -> None:
 
 
 def _facts(result: Result) -> str:
-    """Table of the facts that decide whether to follow the path."""
+    """Make the table of the facts that decide whether to follow the path."""
     plan, trust = result.plan, np.minimum(result.plan.trust, 1.0).mean(1)
     worst = int(np.argmin(trust))
     cells = " → ".join(f"{row},{col}" for row, col in plan.path)
@@ -90,7 +90,7 @@ def _facts(result: Result) -> str:
 
 
 def _path(plan: Plan) -> list[str]:
-    """Recommended path with its posts on the terrain, and its bounds."""
+    """Draw the recommended path with its posts on the terrain, and its bounds."""
     content = [_heading("Recommended path")]
     if plan.stops is not None:
         weakest = sorted((np.argsort(plan.trust.mean(1))[:_SHOWN] + 1).tolist())

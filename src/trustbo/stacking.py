@@ -56,7 +56,7 @@ def require_same_team(missions: Sequence[Mission]) -> None:
     first = missions[0]
     for j, mission in enumerate(missions):
         if not isinstance(mission, Mission):
-            raise TrustboError(f"mission {j} is no Mission; got {one_line(mission)}.")
+            raise TrustboError(f"mission {j} is not a Mission; got {one_line(mission)}.")
         if (mission.robots, mission.features) != (first.robots, first.features):
             raise TrustboError(
                 f"mission {j} has robots {mission.robots} and features {mission.features}, mission "

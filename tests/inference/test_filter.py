@@ -112,7 +112,7 @@ def test_impossible_values_leave_the_filter_as_it_was(posterior):
         live.predict([good, good - 1.5])
     with pytest.raises(TrustboError, match=r"n_ticks\[0\] = 0 must be a whole number"):
         live.update(good, [0.5] * 3, n_ticks=0)
-    with pytest.raises(TrustboError, match="is no share of 25 ticks"):
+    with pytest.raises(TrustboError, match="contact_rate"):
         live.update(good, [0.5] * 3, n_ticks=25)
     with pytest.raises(TrustboError, match="n_ticks of a bound must be"):
         live.update(good, [0.5] * 3, n_ticks=[4, 4])

@@ -100,7 +100,7 @@ def check(
 
 
 def effects_of_robots(posterior: xr.DataTree) -> pd.DataFrame:
-    """One row per mission and robot, see `Check.robots`; empty without robot effects."""
+    """Tabulate missions and robots, see `Check.robots`; empty without robot effects."""
     if "robots" not in posterior.children:
         return pd.DataFrame()
     group = posterior["robots"].to_dataset()

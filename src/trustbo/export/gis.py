@@ -123,12 +123,12 @@ def write_csv(path: FilePath, result: Result) -> None:
 
 
 def _of(values: Any) -> Any:
-    """Values of a plan on a terrain; empty without a terrain."""
+    """Return values of a plan on a terrain; empty without a terrain."""
     return () if values is None else values
 
 
 def _cells(plan: Plan) -> list[dict[str, Any]]:
-    """Properties of the cells of a path; unknown ones are omitted."""
+    """Return the properties of the cells of a path; unknown ones are omitted."""
     columns: dict[str, np.ndarray] = {}
     for i, robot in enumerate(plan.workspace.team.names):
         columns[f"trust_{robot}"] = plan.trust[:, i]
@@ -144,7 +144,7 @@ def _cells(plan: Plan) -> list[dict[str, Any]]:
 
 
 def _feature(plan: Plan, layer: str, places: np.ndarray, about: dict[str, Any]) -> dict[str, Any]:
-    """GeoJSON feature at a position (2,) or along positions (point, 2), CRS metres."""
+    """Make a GeoJSON feature at a position (2,) or along positions (point, 2), CRS metres."""
     if plan.workspace.grid.crs is None:
         raise TrustboError(_NO_CRS)
     crs, xy = plan.workspace.grid.crs, np.atleast_2d(places)
@@ -159,7 +159,7 @@ def _feature(plan: Plan, layer: str, places: np.ndarray, about: dict[str, Any]) 
 
 
 def _cut(line: shapely.LineString) -> shapely.Geometry:
-    """Line with continuous longitudes, cut at 180 degrees (RFC 7946, 3.1.9)."""
+    """Cut a line with continuous longitudes at 180 degrees (RFC 7946, 3.1.9)."""
     west, _, east, _ = line.bounds
     if -180.0 <= west and east <= 180.0:
         return line

@@ -46,12 +46,12 @@ class Frame(NamedTuple):
     name: str = "map"
 
     def of_crs(self, xy: Any) -> np.ndarray:
-        """Positions in the frame of positions in the CRS, (..., 2), m."""
+        """Convert positions in the CRS, (..., 2), m, to the frame."""
         c, s = math.cos(self.rotation), math.sin(self.rotation)
         return (np.asarray(xy, dtype=float) - self.origin) @ np.array([[c, -s], [s, c]])
 
     def to_crs(self, xy: Any) -> np.ndarray:
-        """Positions in the CRS of positions in the frame, (..., 2), m."""
+        """Convert positions in the frame, (..., 2), m, to the CRS."""
         c, s = math.cos(self.rotation), math.sin(self.rotation)
         return np.asarray(xy, dtype=float) @ np.array([[c, s], [-s, c]]) + self.origin
 
@@ -123,7 +123,7 @@ def write_ros_map(
 def occupancy(
     cost: np.ndarray, workspace: Workspace, frame: Frame, pixel: float | None = None
 ) -> tuple[np.ndarray, list[float], float]:
-    """Pixels (row, col), uint8, southern row first; their lower left corner; and pixel size, m."""
+    """Draw the map: pixels (row, col), southern row first; their corner; and their size, m."""
     if ((cost < 0.0) | (cost > 1.0)).any():
         raise TrustboError(
             f"cost must be in [0, 1]; got {np.nanmin(cost):g} to {np.nanmax(cost):g}."
@@ -152,7 +152,7 @@ def occupancy(
 
 
 def stops_of(plan: Plan, robot: str, frame: Frame) -> np.ndarray:
-    """Poses of a robot's stops in a frame, (stop, 3): x, y and heading.
+    """Return the poses of a robot's stops in a frame, (stop, 3): x, y and heading.
 
     At each stop the lead faces its next stop. At each post, and at the goal, another robot faces
     the lead's next stop. The files do not make robots wait for each other. TrustboError: no terrain
@@ -184,7 +184,7 @@ def _pose(frame: str, x: float, y: float, turn: float) -> dict[str, Any]:
 
 
 def _graph(result: Result, frame: Frame) -> str:
-    """All bounds with the contact lost in each, as GeoJSON for Nav2's route server.
+    """Return all bounds with the contact lost in each, as GeoJSON for Nav2's route server.
 
     Nodes are the stops in the cells, with ids row * columns + column. Edges are straight, with ids
     (1 + move) * cells + the cell entered. Costs are in `metadata`, for Nav2's PenaltyScorer.
@@ -193,8 +193,8 @@ def _graph(result: Result, frame: Frame) -> str:
     cols, n_cells = workspace.grid.shape[1], math.prod(workspace.grid.shape)
     if (1 + len(MOVES)) * n_cells - 1 > _MOST_IDS:
         raise TrustboError(
-            f"a route graph of {n_cells} cells has ids beyond {_MOST_IDS}, which messages of Nav2 "
-            "hold; take larger cells."
+            f"a route graph of {n_cells} cells has ids beyond {_MOST_IDS}, the limit of Nav2; "
+            "use larger cells."
         )
     posts = workspace.posts
     graph = result.planner.graph(mean_of(result.posterior, result.workspace))
@@ -220,7 +220,7 @@ def _feature(kind: str, coordinates: list[Any], properties: dict[str, Any]) -> s
 
 
 def _json(value: Any) -> str:
-    """JSON of plain values; floats keep a decimal point, else the loader reads integers."""
+    """Write plain values as JSON; floats keep a decimal point, else the loader reads integers."""
     if isinstance(value, dict):
         return "{" + ", ".join(f"{json.dumps(k)}: {_json(v)}" for k, v in value.items()) + "}"
     if isinstance(value, list):

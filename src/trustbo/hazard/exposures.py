@@ -76,7 +76,7 @@ class Exposures(NamedTuple):
 
 
 def _reported(mission: Mission) -> tuple[Sequence[Cell], str | None]:
-    """Path up to the last bound with an outcome, and the cause if that bound failed."""
+    """Return the path up to the last known outcome, and the cause if that bound failed."""
     n, cause = len(mission.bounds), mission.status if mission.status in CAUSES else None
     return mission.path[: n + (cause is not None or mission.status == "ok")], cause
 

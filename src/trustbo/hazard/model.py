@@ -91,13 +91,13 @@ def fit_hazard(
 def sample(
     prior: BoundPrior, exposures: Exposures, rng: np.random.Generator
 ) -> tuple[importance.Points, np.ndarray]:
-    """Weighted points, and the index of the bound where each lost mission failed at each point."""
+    """Draw weighted points, and the bound where each lost mission failed at each point."""
     n, failed, paths = exposures.n, exposures.failed, exposures.lost
     counts, kind = np.unique(n, return_inverse=True)
     times, bad = np.bincount(kind, minlength=len(counts)), failed > 0.0
 
     def log_any_fails(alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
-        """Log probability that all lost missions fail if they are independent."""
+        """Compute the log probability that all lost missions fail, if independent."""
         if not paths:
             return np.zeros(len(alpha))
         a, b = alpha + failed, beta + n - failed
@@ -129,7 +129,7 @@ def sample(
 
 
 def _log_rising(x: np.ndarray, k: np.ndarray) -> np.ndarray:
-    """Log of Gamma(x + k) / Gamma(x)."""
+    """Compute the log of Gamma(x + k) / Gamma(x)."""
     return special.gammaln(x + k) - special.gammaln(x)
 
 
@@ -170,7 +170,7 @@ def impute(
 def _lookahead(
     path: np.ndarray, later: Sequence[np.ndarray], a: np.ndarray, b: np.ndarray
 ) -> np.ndarray:
-    """Factor by which a failure at each bound of a path raises the probability of later ones.
+    """Compute how much a failure at each bound of a path makes later failures more likely.
 
     Shape (point, bound). Without it, the rare points that attribute several failures to one bound
     would have large weights.
@@ -194,7 +194,7 @@ def _to_dataset(
     difficulty: xr.DataArray,
     seed: int,
 ) -> xr.Dataset:
-    """The group `hazard` without the maps of failure probabilities."""
+    """Make the group `hazard` without the maps of failure probabilities."""
     rng = np.random.default_rng([seed, 2])
     chosen = rng.permutation(points.resample(_N_DRAWS, rng))
     weights, limit, strength = prior.values(points.z[chosen])

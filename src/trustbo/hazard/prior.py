@@ -69,7 +69,7 @@ class Hazard:
     def of_bounds(
         self, difficulty: np.ndarray, measures: Sequence[str], max_slope: float
     ) -> "BoundPrior":
-        """Prior of bounds with difficulties (bound, measure); `max_slope` is the limit in rad."""
+        """Make the prior of bounds with difficulties (bound, measure) and a slope limit in rad."""
         weighted = [m for m, name in enumerate(measures) if name != TILT]
         normals, steepness = [self.intercept, *[self.coefficient] * len(weighted)], None
         if TILT in measures:
@@ -93,7 +93,7 @@ class BoundPrior(NamedTuple):
     doubt: tuple[float, float]
 
     def values(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Parameters at scores (point, parameter).
+        """Compute the parameters at scores (point, parameter).
 
         Returns:
             Intercept and coefficients (point, 1 + measure); margin and width of the limit (point,
@@ -110,7 +110,7 @@ class BoundPrior(NamedTuple):
         return values[:, :n], values[:, n:-1], values[:, -1]
 
     def betas(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Alpha and beta of the Beta priors at scores (point, parameter), each (point, bound)."""
+        """Compute alpha and beta, each (point, bound), at scores (point, parameter)."""
         return prior_betas(*self.values(z), self.difficulty, self.steepness)
 
 
@@ -135,12 +135,12 @@ def prior_betas(
 
 
 def steepness_of(tilt: np.ndarray, max_slope: float) -> np.ndarray:
-    """Degrees beyond the limit, in rad, of a tilt as a share of the limit's tangent."""
+    """Convert a tilt, as a share of the limit's tangent, to degrees beyond the limit (rad)."""
     return np.rad2deg(np.arctan(tilt * np.tan(max_slope)) - max_slope)
 
 
 def mixture_quantile(z: np.ndarray, narrow: float, share: float, wide: float) -> np.ndarray:
-    """Value x(z) with Phi(z) = (1 - share) Phi(x / narrow) + share Phi(x / wide).
+    """Solve Phi(z) = (1 - share) Phi(x / narrow) + share Phi(x / wide) for x.
 
     Interpolated to 1e-5 of `narrow`; linear in the far tails, with the larger sd as its slope.
     """
@@ -152,7 +152,7 @@ def mixture_quantile(z: np.ndarray, narrow: float, share: float, wide: float) ->
 
 @cache
 def _quantile_curve(narrow: float, share: float, wide: float) -> PchipInterpolator:
-    """The quantile for z >= 0; the mixture is symmetric."""
+    """Compute the quantile for z >= 0; the mixture is symmetric."""
     largest = _FARTHEST * max(narrow, wide)
     x = narrow * np.sinh(np.linspace(0.0, np.arcsinh(largest / narrow), 4000))
     # Upper tails by their logs, as 1 - F rounds to 0 from 38 sds on.

@@ -79,7 +79,7 @@ class BoundRisk:
         return counts
 
     def draw(self, n: int, seed: int = 0) -> np.ndarray:
-        """Draws of the failure probabilities, shape (draw, move, row, col).
+        """Draw the failure probabilities, shape (draw, move, row, col).
 
         Args:
             n: Number of draws. Hyperparameter draws are evenly spaced from the mildest to the most
@@ -95,7 +95,7 @@ class BoundRisk:
         return out
 
     def strata(self, n: int = MOST) -> Strata:
-        """Failure probabilities under at most `n` groups of draws, mild to severe; see `Strata`.
+        """Average the failure probabilities over at most `n` groups of draws; see `Strata`.
 
         Their mean, weighted by the shares, equals the mean over all draws.
         """
@@ -126,7 +126,7 @@ class BoundRisk:
             yield bounds, *self._betas_of(bounds, draws)
 
     def _betas_of(self, bounds: np.ndarray, draws: Any = slice(None)) -> tuple[np.ndarray, ...]:
-        """Alpha and beta of the posterior Beta distributions of bounds, each (draw, bound)."""
+        """Return alpha and beta of the posterior Beta distributions of bounds: (draw, bound)."""
         where = np.unravel_index(bounds, self.exists.shape)
         steepness = None if self.steepness is None else self.steepness[where]
         drawn = self._weights[draws], self._limit[draws], self._strength[draws]
@@ -181,14 +181,14 @@ class Risk:
                 raise TrustboError(f"{name} must be in [0, 1]; got {p[bad][0]:g}.")
 
     def survival(self, path: Sequence[Cell] | np.ndarray) -> float:
-        """Product of 1 - p_fail along a path, used for the limit `max_failure`.
+        """Compute the product of 1 - p_fail along a path, used for the limit `max_failure`.
 
         The probability to arrive is larger if failures are correlated under the draws; see `along`.
         """
         return float(np.prod(1.0 - self.p_fail[*bounds_along(path).T]))
 
     def priced(self, path: Sequence[Cell] | np.ndarray) -> float:
-        """Probability that a path fails, averaged over the strata, for the cost of a failure."""
+        """Compute the probability that a path fails, averaged over strata, for the failure cost."""
         if self.strata is None:
             return 1.0 - self.survival(path)
         p_fail, shares = self.strata

@@ -27,7 +27,7 @@ class Strata(NamedTuple):
 
 
 def partition(values: np.ndarray, n: int) -> np.ndarray:
-    """Ends of at most `n` groups of sorted values (value,) with the least squares within groups.
+    """Split sorted values (value,) into at most `n` groups with the least squared deviations.
 
     The optimal partition in one dimension, by dynamic programming (Fisher 1958). Group k is
     values[ends[k - 1] : ends[k]]; quantiles would mix the few severe draws with mild ones. Time and

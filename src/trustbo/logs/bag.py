@@ -63,12 +63,12 @@ class _Series(NamedTuple):
     value: np.ndarray  # (record, ...)
 
     def between(self, after: int, until: int) -> "_Series":
-        """Records later than `after`, up to and including `until`."""
+        """Return records later than `after`, up to and including `until`."""
         first, last = np.searchsorted(self.time, (after, until), side="right")
         return _Series(self.time[first:last], self.value[first:last])
 
     def held(self, ticks: np.ndarray) -> np.ndarray:
-        """Latest value at each tick, (tick, ...); NaN before the first."""
+        """Return the latest value at each tick, (tick, ...); NaN before the first."""
         last = np.searchsorted(self.time, ticks, side="right") - 1
         padded = np.concatenate([np.full((1, *self.value.shape[1:]), np.nan), self.value])
         return padded[last + 1]
@@ -124,7 +124,7 @@ def read_bag(path: FilePath, workspace: Workspace, *, topics: Topics = Topics())
 
 
 def _messages(path: Path, needed: Sequence[str], optional: Sequence[str]) -> dict[str, Messages]:
-    """Messages by topic."""
+    """Read messages by topic."""
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
@@ -155,7 +155,7 @@ def _messages(path: Path, needed: Sequence[str], optional: Sequence[str]) -> dic
 
 
 def _series(topic: str, messages: dict[str, Messages], read: Callable[[Any], Any]) -> _Series:
-    """Values that `read` takes from the messages of a topic."""
+    """Collect the values that `read` takes from the messages of a topic."""
     time = np.array([time for time, _ in messages[topic]], dtype=np.int64)
     if (np.diff(time) < 0).any():
         raise TrustboError(f"the clock of {topic} goes backwards.")
@@ -163,7 +163,7 @@ def _series(topic: str, messages: dict[str, Messages], read: Callable[[Any], Any
 
 
 def _contacts(topic: str, messages: dict[str, Messages]) -> _Series:
-    """Contact at the ticks of a robot, without those that are NaN."""
+    """Return contact at the ticks of a robot, without those that are NaN."""
     time, value = _series(topic, messages, lambda message: float(message.data))
     require_unit_interval(topic, value)
     measured = ~np.isnan(value)
@@ -171,7 +171,7 @@ def _contacts(topic: str, messages: dict[str, Messages]) -> _Series:
 
 
 def _pose(message: Any) -> list[float]:
-    """Position x and y, and heading in rad from the x axis, in [-pi, pi]."""
+    """Return position x and y, and heading in rad from the x axis, in [-pi, pi]."""
     pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
     p, q = pose.position, pose.orientation
     if q.x**2 + q.y**2 + q.z**2 + q.w**2 < 0.5:  # all 0 where a driver never sets it
@@ -198,7 +198,7 @@ def _marker(time: int, message: Any) -> Marker:
 
 
 def _mission(found: _Recording, markers: list[Marker], until: int, workspace: Workspace) -> Mission:
-    """Mission from its markers; its last bound ends at `until` at the latest."""
+    """Make a mission from its markers; its last bound ends at `until` at the latest."""
     times, numbers, cells, paths = zip(*markers, strict=True)
     if numbers != (*range(len(markers)),):
         raise TrustboError(f"bounds are in the order {list(numbers)}.")
@@ -217,7 +217,7 @@ def _mission(found: _Recording, markers: list[Marker], until: int, workspace: Wo
 def _bound(
     found: _Recording, cell: Cell, begin: int, until: int, start: int, workspace: Workspace
 ) -> Bound:
-    """Bound from its marker to the next one, in a mission that begins at `start`, ns."""
+    """Make a bound from its marker to the next one, in a mission that begins at `start`, ns."""
     statuses = found.status.between(begin, until)
     end = int(statuses.time[0]) if len(statuses.time) else until
     contacts = [series.between(begin, end) for series in found.contact]

@@ -72,7 +72,7 @@ class Columns:
             raise TrustboError(f"{self.what} lacks {', '.join(missing)}; it has {there}.{remedy}")
 
     def texts(self, column: str, *, required: bool = True) -> list[str]:
-        """Texts of a column, "" if blank; 1.0 becomes 1 (pandas reads 1 as 1.0 if a cell is blank).
+        """Return a column as text, "" if blank; 1.0 becomes 1, as pandas reads 1 beside blanks.
 
         All are blank if a column that is not `required` is missing.
         """
@@ -82,7 +82,7 @@ class Columns:
     def numbers(
         self, column: str, *, blank: bool = True, whole: bool = False, required: bool = True
     ) -> np.ndarray:
-        """Numbers of a column, (row,); NaN where blank, or if an optional column is missing.
+        """Return a column as numbers, (row,); NaN where blank, or if an optional column is missing.
 
         Raises:
             TrustboError: A value is not a number or is infinite, blank without `blank`, or not
@@ -104,7 +104,7 @@ class Columns:
         return cells.to_numpy(float, na_value=np.nan)
 
     def times(self, column: str) -> tuple[str, pd.Series]:
-        """Kind of a column of times, and the times: numbers, or dates, of which zones become UTC.
+        """Return the kind of a column of times, and the times as numbers, or as dates in UTC.
 
         Raises:
             TrustboError: A time is blank or neither a number nor a date, or only some dates have a
@@ -134,7 +134,7 @@ class Columns:
 
 
 def seconds_of(first: Columns, second: Columns) -> list[np.ndarray]:
-    """Times `t` of two tables on one clock, each (row,), s; dates are counted from the first date.
+    """Return times `t` of two tables on one clock, each (row,), s, from the first date if dates.
 
     Raises:
         TrustboError: Numbers cannot be seconds; only one table has dates, or dates with a time
@@ -186,18 +186,18 @@ def _folded(name: str) -> str:
 
 
 def _cell(value: object) -> str | None:
-    """Text of a cell, None if blank."""
+    """Return the text of a cell, None if blank."""
     text = str(value).strip()
     return None if text.lower() in _BLANK else text
 
 
 def _numbers(cells: pd.Series) -> np.ndarray:
-    """Numbers of cells; NaN for a cell that is not a number."""
+    """Convert cells to numbers; NaN for a cell that is not a number."""
     return pd.Series(pd.to_numeric(cells, errors="coerce")).to_numpy(float, na_value=np.nan)
 
 
 def _of_values(table: Any) -> pd.DataFrame:
-    """DataFrame from a DataFrame, a mapping of columns or a structured array."""
+    """Make a DataFrame from a DataFrame, a mapping of columns or a structured array."""
     try:
         frame = pd.DataFrame(table)
     except (TypeError, ValueError) as error:
@@ -208,7 +208,7 @@ def _of_values(table: Any) -> pd.DataFrame:
 
 
 def _of_file(file: FilePath) -> pd.DataFrame:
-    """Cells of a CSV file as text; decimal commas are allowed if the separator is not a comma."""
+    """Read the cells of a CSV file as text; decimal commas need a separator other than a comma."""
     try:
         text = read_file(file).decode("utf-8-sig")
         first, _, rest = text.partition("\n")

@@ -27,7 +27,7 @@ def read_tree(path: FilePath) -> xr.DataTree:
         with xr.open_datatree(content, engine="netcdf4") as tree:
             return tree.load()
     except Exception:  # the library raises many kinds for bytes that are no netCDF
-        raise TrustboError(f"{str(path)!r} is damaged, or no netCDF file.") from None
+        raise TrustboError(f"{str(path)!r} is damaged or not a netCDF file.") from None
 
 
 def write_tree(path: FilePath, tree: xr.DataTree) -> None:
@@ -95,7 +95,7 @@ def missions_from_tree(tree: xr.DataTree) -> list[Mission]:
     table = {str(name): array.values for name, array in tree.to_dataset().variables.items()}
 
     def parts(values: np.ndarray, counts: str) -> list[np.ndarray]:
-        """Values of each mission or bound."""
+        """Return the values of each mission or bound."""
         return np.split(values, np.cumsum(table[counts])[:-1])
 
     robots, features = (tuple(map(str, table[name])) for name in ("robot", "feature"))
@@ -116,7 +116,7 @@ def missions_from_tree(tree: xr.DataTree) -> list[Mission]:
 
 
 def _ticks(bound: Bound) -> tuple[np.ndarray, np.ndarray]:
-    """Poses (tick, member, component) and contacts (tick, robot); no ticks if one is missing."""
+    """Return poses (tick, member, component) and contacts (tick, robot), if both are stored."""
     if bound.poses is None or bound.contact is None:
         n_robots = len(bound.contact_rate)
         return np.empty((0, 1 + n_robots, 3)), np.empty((0, n_robots), dtype=bool)

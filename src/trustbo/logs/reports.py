@@ -55,7 +55,7 @@ def read_reports(
     """
     levels = levels_of(scale)
     if outcome is None and not inputs:
-        raise TrustboError("reports need what was seen: give outcome=, a column, or inputs=.")
+        raise TrustboError("give the column of outcomes, outcome=, or other columns, inputs=.")
     columns = Columns(table)
     for name, column in {"person": person, "step": step, "report": report}.items():
         columns.require([column], f' Name its columns, such as {name}="...".')
@@ -82,7 +82,7 @@ def read_reports(
 
 
 def _seen(columns: Columns, outcome: str | None, inputs: Sequence[str]) -> dict[str, np.ndarray]:
-    """Features by name, each (row,)."""
+    """Return the features by name, each (row,)."""
     seen = {}
     if outcome is not None:
         given = [text.lower() for text in columns.texts(outcome)]
@@ -104,7 +104,7 @@ def _seen(columns: Columns, outcome: str | None, inputs: Sequence[str]) -> dict[
 
 
 def _unit_of(columns: Columns, report: str, levels: int) -> np.ndarray:
-    """Reports scaled to [0, 1], (row,), NaN where blank; TrustboError: one is not on the scale."""
+    """Scale reports to [0, 1], (row,), NaN where blank; TrustboError: one is not on the scale."""
     y = columns.numbers(report)
     low, high = (1.0, float(levels)) if levels else (0.0, 1.0)
     off = (y < low) | (y > high) | (levels > 0) & (y > np.floor(y))

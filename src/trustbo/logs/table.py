@@ -19,10 +19,11 @@ COLUMNS = (*KEYS, "row", "col", *RATES, "status")
 
 
 def to_frame(missions: Sequence[Mission]) -> pd.DataFrame:
-    """Table of missions, numbered from 1, without ticks; `to_csv(file, index=False)` writes it.
+    """Return a table of missions, numbered from 1, without ticks.
 
-    It has the columns of `read_table`. Bound 0 is the start cell and has no measurements. Bounds
-    that were planned but not run are blank. A mission without a map has no bound 0.
+    It has the columns of `read_table`; `to_csv(file, index=False)` writes it. Bound 0 is the start
+    cell and has no measurements. Bounds that were planned but not run are blank. A mission without
+    a map has no bound 0.
 
     Raises:
         TrustboError: The missions have different robots or features, only some have a path, or a
@@ -113,7 +114,7 @@ def read_table(
 
 
 def _parsed(columns: Columns, features: Sequence[str], places: Sequence[str]) -> pd.DataFrame:
-    """Columns with the names and types of this module; NaN or None where blank."""
+    """Return the columns with the names and types of this module; NaN or None where blank."""
     values: dict[str, Any] = {name: columns.texts(name) for name in ("mission", "robot")}
     require_one_spelling("column mission", values["mission"])
     if "" in values["mission"]:

@@ -96,12 +96,12 @@ def read_tracks(
         missions += [_mission(ticks[of_team, i], edges, tick, path, team, workspace)
                      for edges, path in stretches if len(edges) > _FEWEST]  # fmt: skip
     if not missions:
-        raise TrustboError(f"the log of {n * tick:g} s has no two bounds; give a shorter window.")
+        raise TrustboError(f"the log of {n * tick:g} s is too short; give a shorter window.")
     return missions
 
 
 def _read(poses: Any, detections: Any) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Poses of each robot, (sample, 4), and detections, (detection, 3).
+    """Read the poses of each robot, (sample, 4), and detections, (detection, 3).
 
     A pose is a time (s), x, y (m) and heading (rad), times ascending; a detection is a time and the
     indices of the watcher and of the robot seen.
@@ -138,7 +138,7 @@ def _read(poses: Any, detections: Any) -> tuple[dict[str, np.ndarray], np.ndarra
 
 
 def _track(name: str, rows: np.ndarray) -> np.ndarray:
-    """Poses of one robot (sample, 4) by time, with unwrapped heading or direction of motion."""
+    """Sort the poses of one robot (sample, 4) by time, with unwrapped heading."""
     rows = rows[np.argsort(rows[:, 0], kind="stable")]
     t, x, y, heading = rows.T
     if len(t) < 2 or (np.diff(t) <= 0.0).any():
@@ -171,7 +171,7 @@ def _in_degrees(heading: np.ndarray, course: np.ndarray, along: np.ndarray) -> b
 
 
 def _at(track: np.ndarray, times: np.ndarray, max_gap: float) -> np.ndarray:
-    """Poses of a robot at given times, (time, 3): x, y, heading; NaN in gaps over `max_gap`."""
+    """Interpolate the poses of a robot, (time, 3): x, y, heading; NaN in gaps over `max_gap`."""
     t = track[:, 0]
     gap = np.diff(t)[np.clip(np.searchsorted(t, times), 1, len(t) - 1) - 1]
     known = (times >= t[0]) & (times <= t[-1]) & (gap <= max_gap)
@@ -180,7 +180,7 @@ def _at(track: np.ndarray, times: np.ndarray, max_gap: float) -> np.ndarray:
 
 
 def _ticks(poses: np.ndarray, looks: np.ndarray) -> np.ndarray:
-    """Data of each pair of robots at each tick, shape (watcher, seen, tick, 2 + feature).
+    """Return data of each pair of robots at each tick, (watcher, seen, tick, 2 + feature).
 
     The last axis has whether both poses are known, contact, and the features; all are 0 where a
     pose is unknown, and on the diagonal. `looks` are tick, watcher and robot seen, (detection, 3).
@@ -235,7 +235,7 @@ def _mission(
 
 
 def _crossings(xy: np.ndarray, workspace: Workspace) -> list[tuple[np.ndarray, list[Cell]]]:
-    """Edges and path of each sequence of neighbouring cells that the lead, (tick, 2), entered."""
+    """Find edges and path of each sequence of neighbouring cells that the lead entered."""
     cells: list[Cell] = []
     for x, y in xy:
         try:

@@ -76,7 +76,7 @@ def trust_curves(given: xr.DataTree | Plan, mission: int = -1, *, ax: Any = None
 def _latent_trust(
     posterior: xr.DataTree, mission: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Sequence[str]]:
-    """Bounds, trust medians and quantiles, measured rates and robots of a mission."""
+    """Return bounds, trust medians and quantiles, measured rates and robots of a mission."""
     if "latent" not in posterior.children:
         raise TrustboError(
             "this posterior has no latent trust; give inference.complete(posterior, missions)."

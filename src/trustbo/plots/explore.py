@@ -76,7 +76,7 @@ def explore(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> Explorer:
 
 
 def _layout(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> Any:
-    """Column of the controls, the map, and the text of the mission."""
+    """Lay out the controls, the map, and the text of the mission."""
     from bokeh import models
     from bokeh.layouts import column
     from bokeh.plotting import figure
@@ -146,7 +146,7 @@ def _layout(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> Any:
 
 
 def _layers(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> dict[str, np.ndarray]:
-    """Values of each layer (row, col) by name; those of missions are named "mission 1", ..."""
+    """Return the values of each layer (row, col) by name; of missions as "mission 1", ..."""
     free = plan.workspace.passable.values
     layers = {
         str(name).replace("_", " "): over_cells(values).transpose("row", "col").values
@@ -179,12 +179,12 @@ def _draw_plan(plot: Any, plan: Plan) -> None:
 
 
 def _cells(steps: np.ndarray) -> list[Cell]:
-    """Cells of a path in a history, in which paths are padded with -1."""
+    """Return the cells of a path in a history, in which paths are padded with -1."""
     return [(int(row), int(col)) for row, col in steps if row >= 0]
 
 
 def _places(path: Sequence[Cell], grid: Grid) -> dict[str, Any]:
-    """Positions of a path, metres from the lower left corner of the grid."""
+    """Return the positions of a path, metres from the lower left corner of the grid."""
     x, y = (np.array([grid.center(cell) for cell in path]) - grid.corner).T
     return {"x": x.tolist(), "y": y.tolist()}
 

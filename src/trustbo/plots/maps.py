@@ -163,7 +163,7 @@ def draw_path(ax: Axes, path: Sequence[Cell], grid: Grid) -> None:
 
 
 def map_panels(grid: Grid, n: int, ax: Any) -> np.ndarray:
-    """Axes of n maps in metres from the lower left corner of the grid, see `panels`."""
+    """Return the axes of n maps in metres from the lower left corner of the grid."""
     left, right, bottom, top = extent_of(grid)
     tall = float(np.clip((top - bottom) / (right - left), 0.3, 3.0))
     width = 3.0 if n > 1 else 4.0
@@ -228,7 +228,7 @@ def draw_contours(ax: Axes, workspace: Workspace, colour: str, opacity: float) -
 
 
 def contours(workspace: Workspace) -> list[np.ndarray]:
-    """Contour lines of the ground: at most 12 levels, at multiples of a round number of metres.
+    """Draw contour lines of the ground: at most 12 levels, at multiples of a round number.
 
     Returns:
         Lines, each (point, 2): x and y in metres from the map's lower left corner.
@@ -260,7 +260,7 @@ def contours(workspace: Workspace) -> list[np.ndarray]:
 
 
 def contour_interval(relief: float) -> float | None:
-    """Round number of metres between contour lines; None on level ground."""
+    """Choose a round number of metres between contour lines; None on level ground."""
     if not relief > 0.05:
         return None
     magnitude = 10.0 ** np.floor(np.log10(relief / _CONTOURS))
@@ -269,7 +269,7 @@ def contour_interval(relief: float) -> float | None:
 
 
 def robust_limits(values: np.ndarray) -> tuple[float, float]:
-    """Limits of the colour scale: quantiles, so that they are robust to single cells."""
+    """Return limits of the colour scale: quantiles, so that they are robust to outliers."""
     low, high = np.nanquantile(values, _ROBUST).tolist()
     return (low, high) if low < high else (low - 0.5e-3, high + 0.5e-3)
 
@@ -289,5 +289,5 @@ def draw_scale(ax: Axes, grid: Grid) -> None:
 
 
 def extent_of(grid: Grid) -> tuple[float, float, float, float]:
-    """Left, right, bottom and top of a map, metres from its lower left corner."""
+    """Return left, right, bottom and top of a map, metres from its lower left corner."""
     return (0.0, grid.shape[1] * grid.cell_width, 0.0, grid.shape[0] * grid.cell_height)

@@ -86,7 +86,7 @@ def _draw_bound(ax: Axes, plan: Plan, k: int) -> None:
 
 
 def _window(middle: float, half: float, low: float, high: float) -> tuple[float, float]:
-    """Limits of a window around a point, shifted into the map."""
+    """Return the limits of a window around a point, shifted into the map."""
     width = min(2.0 * half, high - low)
     left = float(np.clip(middle - width / 2.0, low, high - width))
     return left, left + width

@@ -43,7 +43,7 @@ PAGE = 7.6
 def panels(
     n: int, ax: Any, size: tuple[float, float], *, columns: int = 4, **shared: Any
 ) -> np.ndarray:
-    """Axes of n panels, row by row: the user's axes, or axes of a new figure.
+    """Return the axes of n panels, row by row: the user's axes, or axes of a new figure.
 
     Args:
         n: Number of panels.
@@ -77,7 +77,7 @@ def panels(
 
 
 def figure_of(axes: Sequence[Axes] | np.ndarray) -> Figure:
-    """Top-level figure of some axes."""
+    """Return the top-level figure of some axes."""
     figure = axes[0].get_figure(root=True)
     assert isinstance(figure, Figure)  # noqa: S101
     return figure
@@ -94,23 +94,23 @@ def add_legend(axes: np.ndarray, handles: Sequence[Any]) -> None:
 
 
 def accent() -> str:
-    """Colour of a single curve: a blue that is visible on the background."""
+    """Return the colour of a single curve: a blue that is visible on the background."""
     red, green, blue = to_rgb(paper())
     return ROBOTS[4] if 0.3 * red + 0.6 * green + 0.1 * blue < 0.5 else ROBOTS[0]
 
 
 def ink() -> str:
-    """Colour of text."""
+    """Return the colour of text."""
     return mpl.rcParams["text.color"]
 
 
 def paper() -> str:
-    """Colour of the background."""
+    """Return the colour of the background."""
     return mpl.rcParams["axes.facecolor"]
 
 
 def outlined(width: float, colour: str) -> list[patheffects.AbstractPathEffect]:
-    """Outline effect; `width` in points includes the line."""
+    """Return an outline effect; `width` in points includes the line."""
     return [patheffects.withStroke(linewidth=width, foreground=colour)]
 
 

@@ -155,7 +155,7 @@ def _rows(case: Case, scene: Scene, seed: int, n_missions: int) -> Iterator[dict
 
 
 def _recommended(campaign: Campaign, scene: Scene, mission: int) -> dict[str, float]:
-    """Regret and loss of the path recommended for a mission."""
+    """Compute regret and loss of the path recommended for a mission."""
     if scene.truth is None:
         return {}
     choose = getattr(campaign.policy, "recommend", None)
@@ -167,7 +167,7 @@ def _recommended(campaign: Campaign, scene: Scene, mission: int) -> dict[str, fl
 
 
 def _driven(path: Sequence[Cell], scene: Scene, mission: int) -> dict[str, float]:
-    """Expected loss on the path of a mission, and on the best path."""
+    """Compute the expected loss on the path of a mission, and on the best path."""
     if scene.truth is None:
         return {}
     truth, ends = scene.truth.at(mission), (scene.start, scene.goal)

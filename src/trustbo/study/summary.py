@@ -16,7 +16,7 @@ _RUN = ["case", "scene", "seed"]
 
 
 def numbers_of(table: pd.DataFrame) -> pd.DataFrame:
-    """Summary numbers of each run in a table of `run_grid` whose scenes have a truth.
+    """Summarise each run in a table of `run_grid` whose scenes have a truth.
 
     The columns are the labels of the run; `regret after n` missions (%), and `lost after n`, the
     contact lost in addition to the best path's loss (bounds), both in the world of the next
@@ -35,7 +35,7 @@ def numbers_of(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def _numbers(run: pd.DataFrame) -> dict[str, float]:
-    """Numbers of one run, rows of missions 0, 1, ..."""
+    """Summarise one run, rows of missions 0, 1, ..."""
     run = run.sort_values("mission")
     driven, regret = run.iloc[1:], run["regret"].to_numpy()
     after = [n for n in SHOWN if n < len(run)]
@@ -58,7 +58,7 @@ def _numbers(run: pd.DataFrame) -> dict[str, float]:
 def summary(
     numbers: pd.DataFrame, by: str | Sequence[str] = "case", *, clusters: str = "scene"
 ) -> pd.DataFrame:
-    """Means with 95 % intervals; medians for regret and loss after n missions.
+    """Compute means with 95 % intervals; medians for regret and loss after n missions.
 
     Args:
         numbers: Rows of `numbers_of`.
@@ -122,7 +122,7 @@ def bootstrap(
     clusters: np.ndarray,
     middle: Callable[[np.ndarray], Any] | None = None,
 ) -> dict[tuple[str, str], float]:
-    """Estimate and 95 % interval of each quantity; by default medians for values after n missions.
+    """Estimate each quantity with a 95 % interval; by default medians after n missions.
 
     Runs of a cluster are resampled together, and all quantities use the same resamples.
     """
@@ -144,7 +144,7 @@ def bootstrap(
 
 
 def _values(numbers: pd.DataFrame) -> dict[str, np.ndarray]:
-    """Columns of numbers, by name."""
+    """Return columns of numbers, by name."""
     first = numbers.columns.get_loc("regret after 0")
     return {name: numbers[name].to_numpy(float) for name in numbers.columns[first:]}
 

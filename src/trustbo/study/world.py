@@ -33,7 +33,7 @@ _RELIEF = 0.06
 
 
 def drawn(ground: str, what: str) -> np.random.Generator:
-    """Generator seeded by the SHA-256 hash of a terrain's name and a purpose."""
+    """Make a generator seeded by the SHA-256 hash of a terrain's name and a purpose."""
     return np.random.default_rng(list(hashlib.sha256(f"{ground} {what}".encode()).digest()))
 
 
@@ -89,7 +89,7 @@ class World:
         return self.is_made or self.ground == "wellington"
 
     def files(self) -> list[str]:
-        """Files of a real terrain.
+        """Return the files of a real terrain.
 
         TrustboError: the files are missing; the message says where to put them.
         """
@@ -105,7 +105,7 @@ class World:
         return [str(file) for file in files]
 
     def true_terrain(self) -> xr.Dataset:
-        """True DEM and DSM."""
+        """Return the true DEM and DSM."""
         if not self.is_made:
             return _read(*self.files())
         name = self.ground.partition("-")[2]
@@ -114,7 +114,7 @@ class World:
         return _made(seed, (rows * self.cell, cols * self.cell))
 
     def workspace(self, **options: Any) -> Workspace:
-        """Assumed workspace; options as in `Workspace.from_terrain`."""
+        """Make the assumed workspace; options as in `Workspace.from_terrain`."""
         assumed = replace(
             self, name="", kind="", sight=self.assumed or self.sight, assumed=None,
             team=self.assumed_team or self.team, assumed_team=None, events=(),
@@ -123,7 +123,7 @@ class World:
         return _workspace(assumed, tuple(sorted(options.items())))
 
     def simulator(self, workspace: Workspace) -> KinematicSimulator | RadioSimulator:
-        """Simulator of the true world, with posts and routes planned on the assumed world."""
+        """Make a simulator of the true world; posts and routes are planned on the assumed one."""
         terrain = self.true_terrain()
         if self.radio:
             return RadioSimulator(workspace, terrain=terrain)
@@ -136,7 +136,7 @@ class World:
         )
 
     def truth(self, folder: FilePath | None = None) -> Truth:
-        """Truth of the simulator, read from a file in the folder if it was computed before."""
+        """Return the truth of the simulator, from a file in the folder if already computed."""
         return Truth.of(self.simulator(self.workspace()), folder=folder)
 
     def scene(
@@ -146,7 +146,7 @@ class World:
         max_bounds: int | str = "shortest+4",
         **options: Any,
     ) -> Scene:
-        """Scene of a course through the world, for `run_grid`; the truth is cached in a folder.
+        """Make the scene of a course through the world, for `run_grid`; the truth is cached.
 
         Options as in `workspace`. TrustboError: the course is unknown, or files are missing.
         """
@@ -158,7 +158,7 @@ class World:
         return Scene(workspace, simulator, *ends, truth, options, labels, paths)
 
     def _events(self, terrain: xr.Dataset) -> list[Event]:
-        """Events with their centres in CRS metres."""
+        """Return the events with their centres in CRS metres."""
         left, bottom, right, top = terrain.rio.bounds(recalc=True)
         corner, size = np.array([left, bottom]), np.array([right - left, top - bottom])
         placed = []
@@ -188,7 +188,7 @@ class World:
 
 
 def aged(now: xr.Dataset, seed: int = 0) -> xr.Dataset:
-    """Terrain as in an old survey: lower canopy with clearings, and ground errors of about 0.3 m.
+    """Age a terrain like an old survey: lower canopy with clearings, and ground errors of 0.3 m.
 
     The canopy has 0.7 times its true height, and is missing on 15 % of the area, in patches of
     about 10 m that have grown over since. Ground errors have a standard deviation of 0.3 m and a
@@ -211,7 +211,7 @@ def aged(now: xr.Dataset, seed: int = 0) -> xr.Dataset:
 
 @lru_cache(maxsize=4)
 def _workspace(assumed: World, given: tuple[tuple[str, Any], ...]) -> Workspace:
-    """Workspace with given terrain, sight and team."""
+    """Make the workspace with given terrain, sight and team."""
     ground = assumed.true_terrain()
     ground = aged(ground) if assumed.aged else ground
     options: dict[str, Any] = {"sight": assumed.sight, **dict(given)}

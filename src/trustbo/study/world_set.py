@@ -29,13 +29,13 @@ def _climbing(degrees: float) -> dict[str, Any]:
 
 
 def _team_of(degrees: float) -> Team:
-    """Team of three robots and a lead with a given slope limit."""
+    """Make a team of three robots and a lead with a given slope limit."""
     robot = Robot(max_slope=float(np.deg2rad(degrees)))
     return Team(robots=(robot,) * 3, lead=robot)
 
 
 def _limit(true: float, assumed: float) -> dict[str, Any]:
-    """True and assumed slope limits, degrees."""
+    """Return the true and assumed slope limits, degrees."""
     return {"team": _team_of(true), "assumed_team": _team_of(assumed)}
 
 
@@ -49,19 +49,19 @@ def _one_robot(ground: str) -> int:
 
 
 def _days(ground: str) -> tuple[int, ...]:
-    """Missions with bad weather: four of the first nine."""
+    """Return the missions with bad weather: four of the first nine."""
     days = drawn(ground, "days").permutation(9)[:4] if _is_drawn(ground) else _DAYS
     return tuple(sorted(int(day) for day in days))
 
 
 def _place(ground: str) -> tuple[float, float]:
-    """Centre of events, as fractions of the terrain: the middle, or within 20 % of it."""
+    """Choose the centre of events, as fractions of the terrain: within 20 % of the middle."""
     x, y = drawn(ground, "place").uniform(0.3, 0.7, 2) if _is_drawn(ground) else (0.5, 0.5)
     return float(x), float(y)
 
 
 def _reach(ground: str) -> float:
-    """Radius of a jammer, m; real terrains are half as wide as synthetic ones."""
+    """Return the radius of a jammer, m; real terrains are half as wide as synthetic ones."""
     return 40.0 if ground in REAL else 90.0
 
 
@@ -174,7 +174,7 @@ def _all() -> list[World]:
 
 
 def worlds(data: FilePath | None = None) -> dict[str, World]:
-    """Benchmark worlds by name; see docs/worlds.md.
+    """Return benchmark worlds by name; see docs/worlds.md.
 
     Args:
         data: Folder with the real terrains, `tahoe/dem.tif` and so on. Without it, all worlds are
