@@ -47,7 +47,7 @@ def main() -> None:
 
     mpl.use("agg")
     # The hillside is nearly as steep as the limit of the robots, which is right in the simulator.
-    warnings.filterwarnings("ignore", "the plan arrives with a chance")
+    warnings.filterwarnings("ignore", "the plan arrives with probability")
     workspace = tb.Workspace.from_terrain(tb.terrain.example(), shape=(10, 10))
     with tb.Campaign(workspace, START, GOAL, directory=given.out, overwrite=True) as campaign:
         path = campaign.ask().path

@@ -96,17 +96,17 @@ def _layout(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> Any:
     )
 
     left, right, bottom, top = extent_of(grid)
-    height = int(np.clip(760 * (top - bottom) / (right - left), 250, 900))
+    height = int(np.clip(600 * (top - bottom) / (right - left), 250, 700))
     plot = figure(
-        width=800, height=height, sizing_mode="scale_width", match_aspect=True,
-        tools="pan,wheel_zoom,reset,save", active_drag=None,
+        height=height + 200, sizing_mode="stretch_width", match_aspect=True,
+        tools="pan,wheel_zoom,reset,save", active_drag=None, toolbar_location="above",
         x_axis_label="east (m)", y_axis_label="north (m)",
     )  # fmt: skip
     plot.grid.visible = False
     size: dict[str, Any] = {"width": grid.cell_width, "height": grid.cell_height}
     fill: Any = {"field": "value", "transform": colours}
     drawn = plot.rect("x", "y", source=cells, fill_color=fill, line_color=None, **size)
-    plot.add_layout(models.ColorBar(color_mapper=colours), "right")
+    plot.add_layout(models.ColorBar(color_mapper=colours, height=12), "below")
     tips = [("cell", "@cell_row,@cell_col"), *((n, f"@{{{n}}}{{0.000}}") for n in names)]
     plot.add_tools(models.HoverTool(renderers=[drawn], tooltips=tips))
     lines = contours(plan.workspace)
@@ -121,11 +121,11 @@ def _layout(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> Any:
     driven = models.ColumnDataSource(paths[-1])
     plot.line(
         "x", "y", source=driven, color="#d55e00", line_width=4, line_dash="dashed",
-        legend_label="path of the mission",
+        legend_label="mission",
     )  # fmt: skip
     _draw_plan(plot, plan)
     plot.legend.click_policy = "hide"
-    plot.legend.update(orientation="horizontal", ncols=2)
+    plot.legend.update(orientation="horizontal", ncols=2, location="left", spacing=8, margin=0)
     plot.add_layout(plot.legend[0], "below")
 
     layer = models.Select(title="Layer", value=names[0], options=[*names, _PLANNED_ON])
@@ -155,15 +155,21 @@ def _layers(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> dict[str, np.n
     }
     trust = history["trust_map"].transpose("iteration", "row", "col").values
     layers |= {f"mission {i + 1}": values for i, values in enumerate(trust)}
-    return {name: np.where(free, values, np.nan) for name, values in layers.items()}
+    learned = free.copy()
+    learned[plan.path[0]] = False  # trust is assumed at the start
+    about_trust = "trust", "cost", "mission"
+    return {
+        name: np.where(learned if name.startswith(about_trust) else free, values, np.nan)
+        for name, values in layers.items()
+    }
 
 
 def _draw_plan(plot: Any, plan: Plan) -> None:
     """Draw the recommended path and, on a terrain, the posts and routes of the robots."""
     grid = plan.workspace.grid
     corner, path = np.array(grid.corner), _places(plan.path, grid)
-    plot.line(path["x"], path["y"], color="black", line_width=5, legend_label="recommended path")
-    plot.line(path["x"], path["y"], color="white", line_width=3, legend_label="recommended path")
+    plot.line(path["x"], path["y"], color="black", line_width=5, legend_label="recommended")
+    plot.line(path["x"], path["y"], color="white", line_width=3, legend_label="recommended")
     for k, marker in ((0, "circle"), (-1, "star")):
         end = [path["x"][k]], [path["y"][k]]
         plot.scatter(*end, marker=marker, size=14, color="white", line_color="black")
@@ -171,7 +177,7 @@ def _draw_plan(plot: Any, plan: Plan) -> None:
         return
     for i, name in enumerate(plan.workspace.team.names):
         x, y = (plan.posts[:, i] - corner).T
-        look = {"color": ROBOTS[i % len(ROBOTS)], "legend_label": f"{name}: posts, routes"}
+        look = {"color": ROBOTS[i % len(ROBOTS)], "legend_label": f"posts of {name}"}
         marker = _MARKERS[i % len(_MARKERS)]
         plot.scatter(x, y, marker=marker, size=8, line_color="white", **look)
         routes = [bound[i + 1] - corner for bound in plan.routes if bound[i + 1] is not None]

@@ -43,8 +43,8 @@ def trust_maps(
     """Draw the trust maps used to plan missions, with their paths (Fig. 5 of the paper).
 
     The last panel shows the map and the recommended path after the last mission. All maps share one
-    colour scale: the 2 % to 98 % quantiles of the learned maps without the start cell, whose trust
-    is assumed. A trust of 1 corresponds to unbroken contact; larger values have the same colour.
+    colour scale: the 2 % to 98 % quantiles of the learned maps. The start is grey, because its
+    trust is assumed. A trust of 1 corresponds to unbroken contact; larger values have this colour.
 
     Args:
         history: Map and path of each iteration, such as `Result.history`.
@@ -70,8 +70,8 @@ def trust_maps(
     norm = Normalize(low, min(high, 1.0) if low < 1.0 else high)
 
     axes = map_panels(workspace.grid, len(maps), ax)
-    for one, trust, cells, n in zip(axes, maps, paths, learned, strict=True):
-        draw_cells(one, trust, workspace, norm)
+    for one, trust, cells, n in zip(axes, values, paths, learned, strict=True):
+        draw_cells(one, maps[0].copy(data=trust), workspace, norm)
         draw_path(one, cells, workspace.grid)
         one.set_title("prior" if n == 0 else f"after {n} mission{'s' * (n > 1)}")
     draw_scale(axes[0], workspace.grid)
@@ -113,7 +113,7 @@ def terrain_maps(workspace: Workspace, *, ax: Any = None) -> np.ndarray:
         draw_contours(one, workspace, "black", 0.25)
         draw_cell_edges(one, grid)
     draw_scale(surface, grid)
-    colour_bar(axes, heights, "height (m)")
+    colour_bar(axes, heights, "height (m)", location="bottom", aspect=40)
     colour_bar(axes, ScalarMappable(Normalize(0.0, 1.0)), "index (0 worst, 1 best)")
     return axes
 
