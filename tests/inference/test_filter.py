@@ -81,7 +81,7 @@ def test_bad_input_is_named():
     _, params = mixture()
     with pytest.raises(TrustboError, match="got None"):
         TrustFilter(None)
-    with pytest.raises(TrustboError, match="say how many robots"):
+    with pytest.raises(TrustboError, match="n_robots"):
         TrustFilter(params)
     live = TrustFilter(params, n_robots=3)
     good = np.full((3, 2), 0.5)
@@ -132,11 +132,11 @@ def test_bounds_that_cannot_be_are_named():
         ((0.0, 0.5), (1, 0)): r"a cell must be two whole numbers \(row, col\); got \(0.0, 0.5\)",
         ((0, 0), (2, 0)): "no bound leads from",
         (2, 0): r"two whole numbers \(row, col\); got 2",
-        ((0, 0),): "say which 2 cells the 1 bounds lead over",
+        ((0, 0),): "need 2 cells",
     }.items():
         with pytest.raises(TrustboError, match=message):
             live.update(z, y, bound)
-    with pytest.raises(TrustboError, match="say which 3 cells the 2 bounds lead over"):
+    with pytest.raises(TrustboError, match="need 3 cells"):
         live.predict([z, z], [(0, 0), (0, 1)])
     assert live.n_bounds == 0
     np.testing.assert_array_equal(live.predict([z], np.array([(4, 4), (4, 5)])).mean.shape, (1, 3))

@@ -85,7 +85,9 @@ def check(
     trees = list(posterior) if isinstance(posterior, Sequence) else [posterior]
     tree = require_posterior("check", trees[-1])
     if is_of_people(tree):
-        raise TrustboError("check is of robots' contact; this posterior is of people's reports.")
+        raise TrustboError(
+            "check is for contact rates of robots; this posterior is of reports of people."
+        )
     robots = effects_of_robots(tree)
     findings = {
         "robots": _check_robots(robots),

@@ -15,7 +15,7 @@ NUTS_NAMES = "r_hat", "ess_bulk", "divergences"
 
 
 def diagnostics(posterior: xr.DataTree) -> dict[str, float]:
-    """Diagnostics of the sampler.
+    """Return the diagnostics of the sampler.
 
     Returns:
         For importance sampling, whose draws are nearly independent, `k_hat` (good below 0.5) and
@@ -33,7 +33,7 @@ def diagnostics(posterior: xr.DataTree) -> dict[str, float]:
 def complaints_of(
     draws: Mapping[str, np.ndarray], diverging: np.ndarray
 ) -> tuple[dict[str, float], list[str]]:
-    """Diagnostics of draws (chain, draw, ...) of NUTS by name, and complaints about bad ones."""
+    """Return NUTS diagnostics of draws (chain, draw, ...) by name, and complaints."""
     flat = {name: values.reshape(*values.shape[:2], -1) for name, values in draws.items()}
     # Constants of the model do not count.
     free = {name: v[:, :, np.ptp(v, axis=(0, 1)) > 0.0] for name, v in flat.items()}

@@ -43,7 +43,7 @@ def require_posterior(who: str, value: object) -> xr.DataTree:
 
 
 def sites_of(posterior: xr.DataTree) -> dict[str, np.ndarray]:
-    """All draws of a posterior by name, chains joined: leading axis (draw,).
+    """Return all draws of a posterior by name, chains joined: leading axis (draw,).
 
     Raises:
         TrustboError: If some draws are NaN, for example after masking.
@@ -61,7 +61,7 @@ def sites_of(posterior: xr.DataTree) -> dict[str, np.ndarray]:
 
 
 def joined_draws(array: xr.DataArray, axes: Sequence[Any] = (...,)) -> np.ndarray:
-    """Draws (draw, ...) with chains joined and other axes ordered as `axes`, if given.
+    """Return draws (draw, ...) with chains joined and other axes ordered as `axes`.
 
     The memory layout is the same for new draws and for draws read from a file, so that sums are
     rounded equally and a resumed campaign is bit-identical.
@@ -73,7 +73,7 @@ def joined_draws(array: xr.DataArray, axes: Sequence[Any] = (...,)) -> np.ndarra
 def params_of(
     posterior: xr.DataTree, workspace: Workspace | None = None, *, day: bool = False
 ) -> Params:
-    """All draws of a posterior as parameters, chains joined: leading axis (draw,).
+    """Return all draws of a posterior as parameters, chains joined: leading axis (draw,).
 
     Args:
         posterior: DataTree from `fit`.
@@ -94,7 +94,7 @@ def params_of(
     """
     if is_of_people(require_posterior("params_of", posterior)):
         raise TrustboError(
-            "a posterior of HumanTrust has no parameters of paths: for reports use "
+            "a posterior of HumanTrust cannot be used for planning; to predict reports, use "
             "trustbo.inference.predict_reports."
         )
     if workspace is not None:
@@ -170,24 +170,24 @@ def _in_order_of(workspace: Workspace, posterior: xr.DataTree) -> xr.DataTree:
 
 
 def effects_of(posterior: xr.DataTree) -> tuple[Effect, ...]:
-    """Effects in the model of a posterior."""
+    """Return the effects in the model of a posterior."""
     return effects_from_record(json.loads(posterior.attrs["model_record"]))
 
 
 def is_of_people(posterior: xr.DataTree) -> bool:
-    """Whether a posterior is of `HumanTrust`."""
+    """Return whether a posterior is of `HumanTrust`."""
     return posterior.attrs.get("model") == "HumanTrust"
 
 
 def values_of(posterior: xr.DataTree, effect: Effect) -> dict[str, np.ndarray]:
-    """Variables of an effect by name, chains joined: leading axis (draw,)."""
+    """Return the variables of an effect by name, chains joined: leading axis (draw,)."""
     group = posterior[effect.noun].to_dataset()
     axes = {name: axes or (...,) for name, axes in effect.variables.items() if name in group}
     return {name: joined_draws(group[name], of_name) for name, of_name in axes.items()}
 
 
 def theta_of(posterior: xr.DataTree, sites: Mapping[str, np.ndarray]) -> Theta:
-    """Hyperparameters and `rest` of draws by name."""
+    """Return the hyperparameters and `rest` of draws by name."""
     if "B0" in sites:
         return {**sites, "rest": 1.0 - np.diagonal(sites["B0"], axis1=1, axis2=2)}
     level = posterior.attrs.get("memory", "level") == "level"
@@ -236,7 +236,7 @@ def read_posterior(
 def sample_prior(
     model: TrustModel, n_features: int, n_draws: int, seed: int, *, n_robots: int = 1
 ) -> Params:
-    """Draws of the parameters from the prior, without effects; leading axis (draw,).
+    """Draw parameters from the prior, without effects; leading axis (draw,).
 
     Args:
         model: Trust model.
@@ -252,7 +252,7 @@ def sample_prior(
 
 
 def prior_mean(model: TrustModel, n_features: int, *, n_robots: int = 1) -> Params:
-    """Mean of the parameters under the prior, without effects; see `sample_prior`."""
+    """Compute the prior mean of the parameters, without effects; see `sample_prior`."""
     prior, rng = _prior(model, n_features, n_robots), np.random.default_rng(0)
     draws = prior.draw_prior(_N_MEAN, rng, even=True)
     draws = draws._replace(c=prior.prior(draws.theta).mean)
@@ -261,7 +261,7 @@ def prior_mean(model: TrustModel, n_features: int, *, n_robots: int = 1) -> Para
 
 
 def _prior(model: TrustModel, n_features: int, n_robots: int) -> Posterior:
-    """The `Posterior` without data and effects."""
+    """Make the `Posterior` without data and effects."""
     sizes = {"n_features": n_features, "n_robots": n_robots}
     n_features, n_robots = (require_whole(name, n, 1) for name, n in sizes.items())
     none = np.full((1, 1, n_robots), np.nan)
@@ -273,8 +273,8 @@ def missions_of(posterior: xr.DataTree) -> list[Mission]:
     """Rebuild missions from a posterior; raises TrustboError if it holds no data."""
     if "constant_data" not in posterior.children:
         raise TrustboError(
-            "this posterior holds parameters alone: give the missions it was fitted to, of "
-            "result.posteriors[j] those of result.missions[: j + 1]."
+            "this posterior contains only parameters; give missions=, the missions of the fit, "
+            "which are result.missions[: j + 1] for result.posteriors[j]."
         )
     data = posterior["constant_data"].to_dataset()
     data = data.assign(contact_rate=posterior["observed_data"].to_dataset()["contact_rate"])

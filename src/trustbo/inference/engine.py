@@ -96,7 +96,7 @@ class Prior(NamedTuple):
 
     @classmethod
     def of(cls, groups: Sequence[tuple[Any, Sequence[Any]]]) -> Self:
-        """Prior of groups of columns, each with a mean (point, k) or None, and precisions."""
+        """Make the prior of groups of columns, with means (point, k) or None, and precisions."""
         means, parts, log_det, known = [], [], 0.0, {}
         for mean, precisions in groups:
             if not precisions:
@@ -128,7 +128,7 @@ class Prior(NamedTuple):
         return A
 
     def log_density(self, c: np.ndarray) -> np.ndarray:
-        """Log density of columns (point, column), shape (point,)."""
+        """Compute the log density of columns (point, column), shape (point,)."""
         start, off, square = 0, c - self.mean, 0.0
         for part in self.parts:
             x = off[:, start : (start := start + part.shape[1])]
@@ -137,7 +137,7 @@ class Prior(NamedTuple):
         return 0.5 * (self.log_det - c.shape[1] * np.log(2.0 * np.pi) - square)
 
     def draw(self, rng: np.random.Generator) -> np.ndarray:
-        """One draw of the columns at each point, (point, column)."""
+        """Draw the columns once at each point, (point, column)."""
         drawn = []
         for part in self.parts:
             e = rng.standard_normal(part.shape[:2])
@@ -159,7 +159,7 @@ class Fit(NamedTuple):
 
 
 def evidence(blocks: Blocks, signal: Signal, prior: Prior, lam: Any, y: Any = None) -> Fit:
-    """Log p(y | theta) at all points, with signals and columns integrated out.
+    """Compute log p(y | theta) at all points, with signals and columns integrated out.
 
     Args:
         blocks: Data of all blocks.
@@ -185,7 +185,7 @@ def evidence(blocks: Blocks, signal: Signal, prior: Prior, lam: Any, y: Any = No
 
 
 def whiten(blocks: Blocks, signal: Signal, lam: Any) -> tuple[Any, Any]:
-    """Matrices W (point, kind, row, row), and log densities of residuals of 0 (point, kind)."""
+    """Return matrices W (point, kind, row, row), and log densities of residuals of 0."""
     V = each(signal.covariance, blocks.label)
     xp, some = namespace(V), lam > 0.0
     d = xp.where(some, xp.where(some, lam, 1.0) ** 0.5, 0.0)  # the root's slope at 0 is infinite
@@ -195,7 +195,7 @@ def whiten(blocks: Blocks, signal: Signal, lam: Any) -> tuple[Any, Any]:
 
 
 def expected(blocks: Blocks, signal: Signal, c: Any) -> Any:
-    """Mean of the signals (point, block, row) given columns (point, column)."""
+    """Compute the mean of the signals (point, block, row) given columns (point, column)."""
     drift = times(blocks.U, c).reshape(len(c), len(blocks.y), -1)
     xp, label = namespace(drift), blocks.label[blocks.kind]
     if signal.T.shape[1] == 1:
@@ -204,7 +204,7 @@ def expected(blocks: Blocks, signal: Signal, c: Any) -> Any:
 
 
 def draw_columns(prior: Prior, fit: Fit, count: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Draws of the columns, `count` at each point; shape (sum of count, column)."""
+    """Draw the columns, `count` times at each point; shape (sum of count, column)."""
     drawn = []
     for i, many in enumerate(count):
         one = Factor(fit.F.order, *(part[i : i + 1] for part in fit.F[1:]))
@@ -216,7 +216,7 @@ def draw_columns(prior: Prior, fit: Fit, count: np.ndarray, rng: np.random.Gener
 def marginals(
     blocks: Blocks, signal: Signal, prior: Prior, fit: Fit, y: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and variance (point, block, row) of every signal given all sites.
+    """Compute mean and variance (point, block, row) of every signal given all sites.
 
     Each block must be a separate kind, in order.
     """
@@ -236,7 +236,7 @@ def marginals(
 
 
 def times(M: Any, x: Any) -> Any:
-    """Products (point, row) of a sparse matrix with vectors x (point, column)."""
+    """Multiply a sparse matrix by vectors x (point, column); shape (point, row)."""
     if isinstance(x, np.ndarray):
         return np.ascontiguousarray((M @ x.T).T)
     M = M.tocoo()

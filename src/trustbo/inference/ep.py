@@ -57,14 +57,14 @@ class Sites(NamedTuple):
         return np.where(some, self.eta / np.where(some, self.lam, 1.0), 0.0)
 
     def at(self, terms: Terms, sd: np.ndarray) -> "Sites":
-        """Sites at noises with this sd; sites of linear observations are exact."""
+        """Return the sites at noises with this sd; sites of linear observations are exact."""
         lam = np.where(terms.linear, sd**-2.0, self.lam)
         eta = np.where(terms.linear, np.nan_to_num(terms.y) * sd**-2.0, self.eta)
         return Sites(*np.broadcast_arrays(lam, eta))
 
 
 def first_sites(terms: Terms) -> Sites:
-    """Initial sites, (1, block, row), matched under a vague distribution of trust."""
+    """Make initial sites, (1, block, row), matched under a vague distribution of trust."""
     unit, zero = terms.family.line_of_sight
     y = terms.y
     m, v = np.full(y.shape, unit * (0.5 - zero)), np.full(y.shape, (0.3 * unit) ** 2)
@@ -76,7 +76,7 @@ def first_sites(terms: Terms) -> Sites:
 def _matched(
     terms: Terms, rest: np.ndarray, slope: np.ndarray, mean: np.ndarray, var: np.ndarray
 ) -> Sites:
-    """Sites that turn cavities of precision `rest` and mean slope / rest into given moments."""
+    """Find sites that turn cavities of precision `rest` and mean slope / rest into moments."""
     seen = ~np.isnan(terms.y)
     lam = np.where(seen, np.maximum(1.0 / var - rest, _LEAST), 0.0)
     return Sites(lam, np.where(seen, mean * (lam + rest) - slope, 0.0))
@@ -85,7 +85,7 @@ def _matched(
 def log_evidence(
     joint: Joint, sites: Sites, n_sweeps: int, damp: float = 1.0
 ) -> tuple[np.ndarray, Sites]:
-    """EP's log evidence (point,) after `n_sweeps` sweeps over all sites, and the sites."""
+    """Compute EP's log evidence (point,) after `n_sweeps` sweeps, and the sites."""
     blocks, signal, prior, terms = joint
     seen, sd = ~np.isnan(terms.y), signal.sd
     sites = sites.at(terms, sd)
@@ -107,7 +107,7 @@ def log_evidence(
 
 
 def _overlap(y: np.ndarray, lam: np.ndarray, m: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Log mass of N(f; m, v) times the site N(y; f, 1 / lam); 0 where there is no site."""
+    """Compute the log mass of N(f; m, v) times the site N(y; f, 1 / lam); 0 without a site."""
     some = lam > 0.0
     total = v + 1.0 / np.where(some, lam, 1.0)
     return np.where(some, log_normal(y - m, total), 0.0)
@@ -116,7 +116,7 @@ def _overlap(y: np.ndarray, lam: np.ndarray, m: np.ndarray, v: np.ndarray) -> np
 def draw(
     joint: Joint, sites: Sites, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Columns and signals at each theta with log weights, whose mean weight is the evidence.
+    """Draw columns and signals at each theta with log weights, whose mean weight is the evidence.
 
     Columns are drawn from a mixture of two Student-t: EP's posterior, and one with less precise
     sites.
@@ -185,7 +185,7 @@ def draw_signals(
 
 
 def _log_student(c: np.ndarray, center: np.ndarray, F: Factor, nu: float) -> np.ndarray:
-    """Log density of a multivariate Student-t; F is the factor of its precision."""
+    """Compute the log density of a Student-t; F is the factor of its precision."""
     p, z = c.shape[1], F.whitened(c - center)
     constant: Any = special.gammaln(0.5 * (nu + p)) - special.gammaln(0.5 * nu)
     constant = constant - 0.5 * p * np.log(nu * np.pi)

@@ -70,7 +70,7 @@ class Order(NamedTuple):
         return sum(int(np.prod(shape)) for shape in self.shapes)
 
     def entry(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Index of entries (a, b) of the precision; -1 where entry (b, a) is stored instead."""
+        """Return the index of entries (a, b) of the precision; -1 where (b, a) is stored."""
         (g, k, t), q = self.shapes[1], len(self.core)
         of_leaf, of_both = self.group[a] >= 0, (self.group[a] >= 0) & (self.group[b] >= 0)
         row = self.group[a] * k + self.place[a]
@@ -81,7 +81,7 @@ class Order(NamedTuple):
         return np.where(other | (~of_leaf & (self.group[b] >= 0)), -1, index)
 
     def parts(self, A: Any) -> tuple[Any, Any, Any]:
-        """D, B and C, (point, ...), of vectors (point, entry)."""
+        """Return D, B and C, (point, ...), of vectors (point, entry)."""
         ends = np.cumsum([0, *(int(np.prod(shape)) for shape in self.shapes)])
         D, B, C = (
             A[:, i:j].reshape(len(A), *shape)
@@ -123,7 +123,7 @@ class Factor(NamedTuple):
         return log_diagonal(self.H) - log_diagonal(self.inverse).sum(1)
 
     def forward(self, h: Any) -> Any:
-        """White vectors F^-1 h of vectors h (point, column)."""
+        """Compute white vectors F^-1 h of vectors h (point, column)."""
         xp, order = namespace(h), self.order
         h = xp.concatenate([h, xp.zeros((len(h), 1))], axis=1)
         leaf = (self.inverse @ h[:, order.leaf][..., None])[..., 0]
@@ -141,7 +141,7 @@ class Factor(NamedTuple):
         return xp.concatenate([leaf.reshape(len(h), -1), core], axis=1)
 
     def back(self, white: np.ndarray) -> np.ndarray:
-        """Vectors F'^-1 w (point, draw, column) of white vectors w (point, draw, ...)."""
+        """Compute vectors F'^-1 w (point, draw, column) of white vectors w (point, draw, ...)."""
         order, split = self.order, self.order.leaf.size
         pairs = zip(self.H, white[..., split:], strict=True)
         core = np.stack([lapack.dtrtrs(H.T, w.T, lower=0)[0].T for H, w in pairs])  # pyright: ignore[reportAttributeAccessIssue]
@@ -154,7 +154,7 @@ class Factor(NamedTuple):
         return found[..., :-1]
 
     def whitened(self, c: np.ndarray) -> np.ndarray:
-        """White vectors F' c of vectors c (point, column)."""
+        """Compute white vectors F' c of vectors c (point, column)."""
         order = self.order
         c = np.column_stack([c, np.zeros(len(c))])
         leaf, core = c[:, order.leaf], c[:, order.core]
@@ -165,7 +165,7 @@ class Factor(NamedTuple):
         return np.concatenate([leaf.reshape(len(c), -1), core], axis=1)
 
     def covariance(self) -> np.ndarray:
-        """Entries of A^-1 in the layout of A, diagonals halved, as sums over pairs need them."""
+        """Compute the entries of A^-1 in the layout of A, diagonals halved for sums over pairs."""
         C = np.stack([np.tril(lapack.dpotri(H.T, lower=0)[0].T) for H in self.H])  # pyright: ignore[reportAttributeAccessIssue]
         q = np.arange(C.shape[1])
         whole = C + np.swapaxes(np.tril(C, -1), 1, 2)
@@ -188,13 +188,13 @@ def add(A: Any, at: Any, values: Any) -> Any:
 
 
 def log_diagonal(L: Any) -> Any:
-    """Log determinant of triangular matrices."""
+    """Compute the log determinant of triangular matrices."""
     xp = namespace(L)
     return xp.log(xp.diagonal(L, axis1=-2, axis2=-1)).sum(-1)
 
 
 def cholesky(A: Any) -> Any:
-    """Lower factors, from the lower triangles; NaN where a matrix is not positive definite."""
+    """Factor lower triangles; NaN where a matrix is not positive definite."""
     if not isinstance(A, np.ndarray):
         return jax.lax.linalg.cholesky(A, symmetrize_input=False)
     try:

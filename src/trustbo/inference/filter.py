@@ -67,12 +67,12 @@ class Dynamics:
         self._beta = p.beta if p.beta.ndim == 3 else p.beta[:, None]
 
     def _grouped(self, values: np.ndarray) -> np.ndarray:
-        """Values (draw,) or (draw, robot) as (draw, group, member)."""
+        """Rearrange values (draw,) or (draw, robot) as (draw, group, member)."""
         n, groups, members = self.shape
         return np.broadcast_to(values.reshape(n, -1), (n, groups * members)).reshape(self.shape)
 
     def start(self) -> Beliefs:
-        """Trust before the first bound."""
+        """Return trust before the first bound."""
         mean, sd = (
             self._grouped(np.broadcast_to(getattr(self._params, name), self.shape[:1]))
             for name in ("x0_mean", "x0_sd")
@@ -80,7 +80,7 @@ class Dynamics:
         return Beliefs(mean, sd[..., None] ** 2 * np.eye(self.shape[2]), mean)
 
     def predict(self, beliefs: Beliefs, z: np.ndarray, effect: Effect = 0.0) -> Beliefs:
-        """Trust after a bound with awareness z (robot, feature), before its rates are known."""
+        """Predict trust after a bound with awareness z (robot, feature)."""
         z = z.reshape(1, -1) if self._coupled else z
         drift = self._grouped(np.einsum("nim,im->ni", self._beta, z) + self._b + effect)
         before = beliefs.mean - beliefs.drift if self._deviates else beliefs.mean
@@ -89,7 +89,7 @@ class Dynamics:
         return Beliefs(mean, cov, drift)
 
     def log_densities(self, predicted: Beliefs, y: np.ndarray, n_ticks: np.ndarray) -> np.ndarray:
-        """Marginal log density of each robot's rate, 0 where not measured; (draw, robot)."""
+        """Compute the marginal log density of each robot's rate, (draw, robot); 0 if NaN."""
         y, n_ticks = (a.reshape(self.shape[1:]) for a in (y, n_ticks))
         cov = predicted.cov if self._noise is None else predicted.cov + self._noise
         var = np.diagonal(cov, axis1=2, axis2=3)
@@ -99,7 +99,7 @@ class Dynamics:
     def update(
         self, predicted: Beliefs, y: np.ndarray, n_ticks: np.ndarray
     ) -> tuple[Beliefs, np.ndarray]:
-        """Trust given rates (robot,), NaN where not measured, and their log density (draw,)."""
+        """Update trust with rates (robot,), NaN where not measured; also their log density."""
         y, n_ticks = (a.reshape(self.shape[1:]) for a in (y, n_ticks))
         members, (mean, J, drift), first = self.shape[2], predicted, 0
         if self._noise is not None:  # signals differ from trust, and follow it in the joint normal
@@ -154,12 +154,12 @@ class Dynamics:
 
 
 def _product(A: np.ndarray, B: np.ndarray) -> np.ndarray:
-    """Matrix products; 1 x 1 matrices are much faster without matmul."""
+    """Multiply matrices; 1 x 1 matrices are much faster without matmul."""
     return A * B if A.shape[-1] == 1 else A @ B
 
 
 def _noise(cov: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Normal noise with covariances (..., member, member), which may be singular."""
+    """Draw normal noise with covariances (..., member, member), which may be singular."""
     root = np.linalg.cholesky(cov + 1e-12 * np.eye(cov.shape[-1]))
     return _product(root, rng.standard_normal(cov.shape[:-1])[..., None])[..., 0]
 
@@ -241,13 +241,15 @@ class TrustFilter:
             posterior = params_of(posterior, day=True)
         elif not isinstance(posterior, Params):
             raise TrustboError(
-                "a filter follows a posterior of fit, or draws of parameters; got "
-                f"{one_line(posterior)}. Before its first mission a campaign has no posterior: "
-                "take its `belief`."
+                "a filter needs a posterior of fit, or draws of parameters; got "
+                f"{one_line(posterior)}. Before its first mission, a campaign has no posterior; "
+                "use its `belief`."
             )
         n_robots = posterior.n_robots if n_robots is None else n_robots
         if n_robots is None:
-            raise TrustboError("with draws of the parameters, say how many robots: n_robots=.")
+            raise TrustboError(
+                "draws of TrustParams do not contain the number of robots; give n_robots=."
+            )
         self._n_robots = require_whole("n_robots", n_robots, 1)
         self._n_features = posterior.n_features
         check_params(posterior, self._n_robots, self._n_features)
@@ -339,15 +341,15 @@ class TrustFilter:
         return TrustForecast(mean, sd, draws.mean(0), low, high, draws)
 
     def effects(self, path: Sequence[Cell] | None, n_bounds: int) -> Sequence[Effect]:
-        """Effect of each bound's place; 0 where there are none. Checks the path's cells."""
+        """Return the effect of each bound's place, 0 if none; checks the path's cells."""
         cells = []
         if path is not None:
             path = list(path) if isinstance(path, Iterable) else []
             cells = [require_pair("a cell", cell) for cell in path]
             if len(cells) != n_bounds + 1:
                 raise TrustboError(
-                    f"say which {n_bounds + 1} cells the {n_bounds} bounds lead over, the cell "
-                    f"left first; got {path!r}."
+                    f"need {n_bounds + 1} cells for {n_bounds} bounds, the current cell first; got "
+                    f"{path!r}."
                 )
             for grid in {np.shape(value)[-2:] for value in self.params.places.values()}:
                 require_on_grid(cells, grid)
@@ -356,8 +358,8 @@ class TrustFilter:
             return [0.0] * n_bounds
         if not cells:
             raise TrustboError(
-                f"places have effects: say which {n_bounds + 1} cells the bounds lead over, the "
-                "cell left first."
+                f"with place effects, give the {n_bounds + 1} cells of the path, the current one "
+                "first."
             )
         return list(np.moveaxis(self.params.of_places(bounds_along(cells)), -2, 0))
 
@@ -380,7 +382,7 @@ class TrustFilter:
 
 
 def _average(beliefs: Beliefs, weights: np.ndarray) -> TrustState:
-    """Mean and sd of the mixture over draws."""
+    """Compute mean and sd of the mixture over draws."""
     mean = beliefs.mean.reshape(len(weights), -1)
     var = np.diagonal(beliefs.cov, axis1=2, axis2=3).reshape(mean.shape)
     center = weights @ mean

@@ -103,9 +103,7 @@ def fit(
     model = model.for_features(missions[0].features)
     slots = model.slots(missions, workspace)
     if np.isnan(slots.y).all():
-        raise TrustboError(
-            "every contact rate is NaN: nothing was measured. Give one rate at least."
-        )
+        raise TrustboError("every contact rate is NaN; give at least one measured rate.")
     posterior = Posterior(model, slots)
     with one_blas_thread():
         if sampler == "importance":
@@ -123,9 +121,9 @@ def fit(
     tree.attrs |= _record(model, posterior) | summary | {"sampler": sampler, "seed": seed}
     if check and complaints:
         raise PosteriorError(
-            f"posterior refused: {'; '.join(complaints)}.",
+            f"posterior rejected: {'; '.join(complaints)}.",
             tree,
-            "Give more missions or firmer priors, or pass check=False to have it as it is.",
+            "Give more missions or firmer priors, or pass check=False to return it nevertheless.",
         )
     if whole:
         tree = complete(tree, missions, model=model)
@@ -136,7 +134,7 @@ def fit(
 def by_importance(
     posterior: Posterior, n: int, seed: int
 ) -> tuple[Draws, dict[str, np.ndarray], dict[str, Any]]:
-    """Draws by importance sampling, their statistics (draw,), and a summary; retries once."""
+    """Draw by importance sampling; returns draws, statistics (draw,), a summary."""
     rng = np.random.default_rng(seed)
     for size in (256, 1024):
         start = posterior.start()[None]
@@ -162,7 +160,7 @@ def _laid_out(
     missions: Sequence[Mission],
     seed: int,
 ) -> xr.DataTree:
-    """Draws of parameters and effects, and of the prior, as a DataTree with the data."""
+    """Lay out draws of parameters and effects, and of the prior, as a DataTree with the data."""
     rng = np.random.default_rng([seed, 3])
     groups = posterior.named(drawn)
     groups = {
@@ -180,14 +178,14 @@ def _laid_out(
 
 
 def _default_of(missions: Sequence[Mission]) -> TrustModel:
-    """`HumanTrust` for reports, else the default model, without places if missions lack them."""
+    """Return `HumanTrust` for reports, else the default model, without places if no map."""
     if scale := missions[0].scale:
         return HumanTrust(scale=scale)
     return default_model(places=has_places(missions))
 
 
 def _filled(missions: Sequence[Mission], workspace: Workspace | None) -> list[Mission]:
-    """Missions of one team, with missing awareness filled in from a workspace."""
+    """Check missions of one team, and fill in missing awareness from a workspace."""
     require_same_team(missions)
     if workspace is None:
         return list(missions)
@@ -196,7 +194,7 @@ def _filled(missions: Sequence[Mission], workspace: Workspace | None) -> list[Mi
 
 
 def _record(model: TrustModel, posterior: Posterior) -> dict[str, Any]:
-    """Attributes of a posterior: its model and data."""
+    """Make the attributes of a posterior: its model and data."""
     slots = posterior.slots
     options = {name: int(v) if isinstance(v, bool) else v for name, v in model.options().items()}
     return {

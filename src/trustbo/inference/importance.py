@@ -58,7 +58,7 @@ class Student(NamedTuple):
         return self.center + special.ndtri(uniform[:, :d]) / np.sqrt(chi2) @ self.scale.T
 
     def log_density(self, z: np.ndarray) -> np.ndarray:
-        """Log density of points (point, score), shape (point,)."""
+        """Compute the log density of points (point, score), shape (point,)."""
         nu, d = _DEGREES, len(self.center)
         white = solve_triangular(self.scale, (z - self.center).T, lower=True)
         constant = special.gammaln(0.5 * (nu + d)) - special.gammaln(0.5 * nu)
@@ -96,7 +96,7 @@ class Points(NamedTuple):
         return 1.0 / float((self.weight**2).sum())
 
     def fitted(self) -> Student:
-        """Student-t with the moments of the points; weights are flattened if few dominate."""
+        """Fit a Student-t to the moments of the points; weights are flattened if few dominate."""
         weight, least = self.weight, _PER_AXIS * self.z.shape[1]
         for _ in range(6):
             if (weight**2).sum() * least <= 1.0:
@@ -158,7 +158,7 @@ def sample(
 
 
 def find_modes(log_density: LogDensity, starts: np.ndarray) -> list[Student]:
-    """Gaussian fits at the distinct modes that are reached from the starts, the highest first."""
+    """Fit Gaussians at the distinct modes reached from the starts, the highest first."""
     found: list[tuple[float, Student]] = []
     for start in starts:
         mode = find_mode(log_density, start)
@@ -174,7 +174,7 @@ def find_modes(log_density: LogDensity, starts: np.ndarray) -> list[Student]:
 
 
 def find_mode(log_density: LogDensity, start: np.ndarray) -> Student:
-    """Gaussian fit at the mode: L-BFGS by forward differences, curvature by central ones."""
+    """Fit a Gaussian at the mode by L-BFGS, with curvature by central differences."""
     d = len(start)
     axes = np.eye(d)
 
@@ -201,7 +201,7 @@ def find_mode(log_density: LogDensity, start: np.ndarray) -> Student:
 
 
 def smoothed(log_ratio: np.ndarray) -> tuple[np.ndarray, float, float]:
-    """Pareto-smooth log importance ratios (point,), of which some must be finite.
+    """Smooth log importance ratios (point,) by a Pareto tail; some must be finite.
 
     Returns:
         Weights with sum 1, k-hat, and the log mean of the ratios.
@@ -216,6 +216,6 @@ def smoothed(log_ratio: np.ndarray) -> tuple[np.ndarray, float, float]:
 
 
 def systematic(weight: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:
-    """Indices of `n` equally weighted draws, sorted, by systematic resampling."""
+    """Return indices of `n` equally weighted draws, sorted, by systematic resampling."""
     points = (rng.random() + np.arange(n)) / n
     return np.searchsorted(np.cumsum(weight)[:-1] / weight.sum(), points)

@@ -31,7 +31,7 @@ _POINTS = 500  # distinct hyperparameters at most
 
 @one_blas_thread()
 def loo(posterior: xr.DataTree, *, model: TrustModel | None = None) -> ELPDData:
-    """Expected log predictive density of a left-out mission, given all other missions.
+    """Estimate the log predictive density of each mission given all other missions.
 
     Uses Pareto-smoothed weights of hyperparameters, with all else integrated out, and expectation
     propagation for non-Gaussian families. If k-hat of a mission exceeds 0.7, the model is refitted
@@ -56,8 +56,7 @@ def loo(posterior: xr.DataTree, *, model: TrustModel | None = None) -> ELPDData:
     measured = np.flatnonzero(~np.isnan(fitted.slots.y).all((1, 2)))
     if len(measured) < 2:
         raise TrustboError(
-            f"LOO leaves out one of several missions; {len(measured)} of {fitted.slots.n_missions} "
-            "have rates. Give a posterior of two at least."
+            f"LOO needs at least two missions with rates; this posterior has {len(measured)}."
         )
 
     rows = np.column_stack([v.reshape(len(draws.c), -1) for v in draws.theta.values()])
@@ -88,7 +87,7 @@ def loo(posterior: xr.DataTree, *, model: TrustModel | None = None) -> ELPDData:
 
 
 def _log_evidence(posterior: Posterior, seed: int) -> tuple[float, float]:
-    """Log evidence of a posterior, and the k-hat of its weights."""
+    """Compute the log evidence of a posterior, and the k-hat of its weights."""
     summary = by_importance(posterior, 1000, seed)[2]
     return summary["log_evidence"], summary["k_hat"]
 
@@ -101,7 +100,7 @@ def _elpd(
     refitted: np.ndarray,
     n_samples: int,
 ) -> ELPDData:
-    """ArviZ's `ELPDData` from log densities of left-out missions.
+    """Make ArviZ's `ELPDData` from log densities of left-out missions.
 
     `average` is the log density of each mission, averaged over the full posterior.
     """
@@ -162,7 +161,7 @@ def compare(posteriors: Mapping[str, xr.DataTree]) -> pd.DataFrame:
 
 
 def _rates(posterior: xr.DataTree) -> np.ndarray:
-    """Rates as measured, (mission, bound, robot)."""
+    """Return the rates as measured, (mission, bound, robot)."""
     if "observed_data" not in posterior.children:
-        raise TrustboError("compare needs the group observed_data; give posteriors of fit, whole.")
+        raise TrustboError("compare needs the group observed_data; give whole posteriors of fit.")
     return posterior["observed_data"].to_dataset()["contact_rate"].values

@@ -87,7 +87,7 @@ def sample_by_nuts(
 def _kernel(
     posterior: Posterior, z: np.ndarray, chains: int, rng: np.random.Generator
 ) -> tuple[NUTS, dict[str, jax.Array] | None]:
-    """Kernel, and starts of the chains, given scores (point, score) from the posterior."""
+    """Make the kernel, and starts of the chains, given scores (point, score) of the posterior."""
     values = posterior.scores.values(z)
     if not posterior.exact:
         center = {name: jnp.asarray(np.median(v, axis=0)) for name, v in values.items()}
@@ -110,7 +110,7 @@ def _kernel(
 
 
 def marginal_program(posterior: Posterior) -> Callable[[], None]:
-    """NumPyro program of the hyperparameters, with the evidence as a factor.
+    """Run the hyperparameters as a NumPyro program, with the evidence as a factor.
 
     Rates determine the total size of the two noises, but may not distinguish them. Half-normal
     scores (a_w, a_v) = size (sin(angle), cos(angle)) are independent if size^2 ~ Exponential(1/2)
@@ -140,7 +140,7 @@ def marginal_program(posterior: Posterior) -> Callable[[], None]:
 def _unconstrained(
     scores: Scores, z: np.ndarray, values: dict[str, np.ndarray]
 ) -> dict[str, jax.Array]:
-    """Unconstrained coordinates (point, ...) of the sites of `marginal_program`."""
+    """Return unconstrained coordinates (point, ...) of the sites of `marginal_program`."""
     sites = {
         name: biject_to(prior.support).inv(jnp.asarray(values[name]))
         for name, prior in scores.priors.items()

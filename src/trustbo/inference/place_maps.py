@@ -86,7 +86,7 @@ def place_maps_of(group: xr.Dataset, sites: Mapping[str, np.ndarray]) -> dict[st
 
 @one_blas_thread()
 def _cells(visited: _Visited, sites: Mapping[str, np.ndarray], seed: list[int]) -> np.ndarray:
-    """Effect s over the grid, (draw, row, col), given the effect at visited cells."""
+    """Draw the effect s over the grid, (draw, row, col), given the effect at visited cells."""
     s, shape = visited.s, visited.shape
     flat = visited.cells[:, 0] * shape[1] + visited.cells[:, 1]
     centre = np.zeros((len(s), shape[0] * shape[1]))
@@ -120,7 +120,7 @@ def _kriging(
 
 
 def _correlation(cells: np.ndarray, others: np.ndarray, length_scale: float) -> np.ndarray:
-    """Correlation of s between cells (cell, 2) and others (other, 2)."""
+    """Compute the correlation of s between cells (cell, 2) and others (other, 2)."""
     gap = cells[:, None].astype(float) - others[None]
     return matern(np.hypot(gap[..., 0], gap[..., 1]), length_scale)
 
@@ -128,7 +128,7 @@ def _correlation(cells: np.ndarray, others: np.ndarray, length_scale: float) -> 
 def _prior(
     shape: tuple[int, int], length_scale: float, n: int, rng: np.random.Generator
 ) -> np.ndarray:
-    """Draws of unit variance over the grid, (n, cell)."""
+    """Draw fields of unit variance over the grid, (n, cell)."""
     reach = int(_REACH * length_scale)
     torus = [int(fft.next_fast_len(max(2 * m, m + reach), real=True) or 2 * m) for m in shape]
     down, right = (np.minimum(np.arange(m), m - np.arange(m)) for m in torus)

@@ -84,7 +84,7 @@ class Posterior:
         return Order.of(met, free)
 
     def without(self, mission: int) -> "Posterior":
-        """The posterior without the data of one mission."""
+        """Return the posterior without the data of one mission."""
         other = Posterior(self.model, self.slots.without([mission]))
         if not self.exact:
             kept = ~np.isnan(other.terms.y)
@@ -92,11 +92,11 @@ class Posterior:
         return other
 
     def theta(self, z: np.ndarray) -> dict[str, np.ndarray]:
-        """Hyperparameters for the model's `signal`, at scores (point, score)."""
+        """Convert scores (point, score) to hyperparameters for the model's `signal`."""
         return self.model.theta(self.scores.values(z), self.slots.resolution)
 
     def log_density(self, z: np.ndarray) -> np.ndarray:
-        """Log posterior density of scores (point, score), up to the evidence; shape (point,)."""
+        """Compute the log posterior density of scores, up to the evidence; (point,)."""
         out = np.full(len(z), -np.inf)
         with np.errstate(all="ignore"):  # far out, scores over- and underflow: no density there
             theta, log_prior = self.theta(z), self.scores.log_prior(z)
@@ -109,7 +109,7 @@ class Posterior:
         return np.where(np.isfinite(out), out, -np.inf)
 
     def log_evidence(self, theta: Theta) -> Any:
-        """Log p(rates | theta), (point,), by EP if rates are not Gaussian; NumPy or JAX."""
+        """Compute log p(rates | theta), (point,), by EP if rates are not Gaussian."""
         if namespace(theta["rest"]) is not np:
             signal, prior = self._at(theta)
             return evidence(self.blocks, signal, prior, self._lam(signal)).log_p
@@ -129,7 +129,7 @@ class Posterior:
             self.sites = ep.log_evidence(self._joint(center), self.sites, _SETTLED, _DAMPING)[1]
 
     def start(self) -> np.ndarray:
-        """Best of four starts for the search of the mode, or with EP the mode; (score,)."""
+        """Find the best of four starts for the search of the mode, or with EP the mode."""
         starts = np.zeros((len(_SIZES), self.n_scores))
         unit = self.model.family.line_of_sight[0]
         spread = np.log(np.clip(unit * np.nanstd(self.slots.y) / 0.2, 1e-2, 3.0))
@@ -143,7 +143,7 @@ class Posterior:
         return best
 
     def defensive(self, proposal: Student) -> Student:
-        """Proposal with fitted memory and noises, and the prior for all other scores."""
+        """Make a proposal with fitted memory and noises, and the prior for all other scores."""
         core = self.scores.core
         others = np.setdiff1d(np.arange(self.n_scores), core)
         cov = 1.5 * proposal.scale @ proposal.scale.T
@@ -153,7 +153,7 @@ class Posterior:
         return Student(center, np.linalg.cholesky(cov))
 
     def draw(self, z: np.ndarray, log_p: np.ndarray, n: int, rng: np.random.Generator) -> Draws:
-        """Draws of all else given equally weighted points, sorted as `Points.resample` does.
+        """Draw all else given equally weighted points, sorted as by `Points.resample`.
 
         Args:
             z: Scores (point, score).
@@ -181,7 +181,7 @@ class Posterior:
     def draw_columns(
         self, theta: Theta, rng: np.random.Generator, count: np.ndarray | None = None
     ) -> np.ndarray:
-        """Draws of the columns at each point given Gaussian rates, one or `count` of each."""
+        """Draw the columns at each point given Gaussian rates, once or `count` times."""
         count, drawn = np.ones(len(theta["rest"]), dtype=int) if count is None else count, []
         for where, chunk in chunks(theta):
             signal, prior = self._at(chunk)
@@ -190,7 +190,7 @@ class Posterior:
         return np.concatenate(drawn)
 
     def named(self, draws: Draws) -> dict[str, dict[str, np.ndarray]]:
-        """Variables of draws by group and name: `posterior`, and one for each effect."""
+        """Return variables of draws by group and name: `posterior`, and one per effect."""
         model, theta = self.model, draws.theta
         names = model.dims.keys() | model.effect_dims.keys()
         groups = {"posterior": {n: values for n, values in theta.items() if n in names}}
@@ -200,7 +200,7 @@ class Posterior:
         return groups
 
     def draws_of(self, groups: Mapping[str, Mapping[str, np.ndarray]]) -> Draws:
-        """Draws from variables by group and name, as returned by `named`."""
+        """Make draws from variables by group and name, as returned by `named`."""
         sites, model = groups["posterior"], self.model
         theta = model.derived({n: sites[n] for n in model.dims | model.effect_dims if n in sites})
         theta = {name: v for name, v in theta.items() if name not in ("beta", "b", "B")}
@@ -211,13 +211,13 @@ class Posterior:
         return Draws(theta, np.column_stack(c))
 
     def draw_prior(self, n: int, rng: np.random.Generator, *, even: bool = False) -> Draws:
-        """Draws of hyperparameters and columns from the prior; `even` as of `Scores.draw`."""
+        """Draw hyperparameters and columns from the prior; see `Scores.draw`."""
         theta = self.model.theta(self.scores.draw(n, rng, even=even), self.slots.resolution)
         c = [self.prior(chunk).draw(rng) for _, chunk in chunks(theta)]
         return Draws(theta, np.concatenate(c))
 
     def given(self, draws: Draws, kept: np.ndarray, rng: np.random.Generator) -> Given:
-        """Trust, likelihoods and predictions under draws.
+        """Compute trust, likelihoods and predictions under draws.
 
         Args:
             draws: Draws of hyperparameters and columns.
@@ -243,7 +243,7 @@ class Posterior:
         return Given(trust[index[kept]], mean, sd, log_likelihood[index], predicted[index])
 
     def anew(self, draws: Draws, rng: np.random.Generator) -> np.ndarray:
-        """Replicated rates of the missions, (draw, mission, bound, robot)."""
+        """Draw replicated rates of the missions, (draw, mission, bound, robot)."""
         rates = np.empty((len(draws.c), *self.slots.y.shape))
         for i, _, signal, mean in self.signals(draws):
             rates[i] = self._anew(signal, mean, rng)
@@ -258,7 +258,7 @@ class Posterior:
     def _exact_trust(
         self, theta: Theta, signal: Signal, mean: np.ndarray, rng: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Trust (draw, block, row) given Gaussian rates, and their log likelihood (draw, block)."""
+        """Draw trust (draw, block, row) given Gaussian rates; also their log likelihood."""
         b, S = self.blocks, each(signal.S, self.blocks.label)
         W, log_sites = whiten(b, signal, self._lam(signal))
         off = b.y - mean
@@ -272,7 +272,7 @@ class Posterior:
     def _ep_trust(
         self, theta: Theta, signal: Signal, mean: np.ndarray, rng: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Trust and log likelihood for non-Gaussian rates, by weighted particles of each block."""
+        """Draw trust for non-Gaussian rates by weighted particles of each block."""
         joint = ep.Joint(self.blocks, signal, self.prior(theta), self.terms)
         sites = ep.log_evidence(joint, self.sites, _SWEEPS)[1]
         drawn = [ep.draw_signals(joint, mean, sites, rng) for _ in range(_PARTICLES)]
@@ -288,7 +288,7 @@ class Posterior:
         return x + (_root(S - gain @ S) @ rng.standard_normal((*x.shape, 1)))[..., 0], log_p
 
     def _anew(self, signal: Signal, mean: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Replicated rates of the missions, (draw, mission, bound, robot)."""
+        """Draw replicated rates of the missions, (draw, mission, bound, robot)."""
         root = each(_root(signal.covariance), self.blocks.label[self.blocks.kind])
         f = self.layout.slots(mean + (root @ rng.standard_normal((*mean.shape, 1)))[..., 0])
         sd = signal.sd[..., None] if signal.sd.shape[2] == 1 else self.layout.slots(signal.sd)
@@ -298,7 +298,7 @@ class Posterior:
         return self.model.signal(theta, self.slots, self.layout), self.prior(theta)
 
     def prior(self, theta: Theta) -> Prior:
-        """Prior of all columns at each theta."""
+        """Return the prior of all columns at each theta."""
         return Prior.of([effect.prior(theta, self.slots) for effect in self.model.columns])
 
     def _lam(self, signal: Signal) -> Any:
@@ -314,7 +314,7 @@ def at(theta: Mapping[str, Any], index: Any) -> dict[str, Any]:
 
 
 def _root(covariance: np.ndarray) -> np.ndarray:
-    """Lower factors of covariances (..., row, row) that rounding may have made singular."""
+    """Compute lower factors of covariances (..., row, row) that may be singular by rounding."""
     n = covariance.shape[-1]
     even = 0.5 * (covariance + np.swapaxes(covariance, -1, -2))
     scale = np.trace(even, axis1=-2, axis2=-1)[..., None, None] / n

@@ -142,7 +142,7 @@ def _prediction(
     levels: int,
     rng: np.random.Generator,
 ) -> dict[str, Any]:
-    """Prediction of a report whose trust is N(center, var) in each draw."""
+    """Predict a report whose trust is N(center, var) in each draw."""
     family, sd = ahead.model.family, draws.theta["delta_v"]
     y, ticks = ahead.slots.y[slot], ahead.slots.n_ticks[slot]
     found: dict[str, Any] = {}
@@ -168,7 +168,7 @@ def _prediction(
 def _dataset(
     report: np.ndarray, out: dict[str, np.ndarray], levels: int, robots: Sequence[str]
 ) -> xr.Dataset:
-    """Predictions by name, with their summaries as attributes."""
+    """Collect predictions by name, with their summaries as attributes."""
     axes = {"quantile": ("level",), "probability": ("answer",)}
     dims = ("mission", "bound", "robot")
     variables = {"report": (dims, report)}
@@ -192,5 +192,5 @@ def _dataset(
 
 
 def _answer_of(report: Any, levels: int) -> Any:
-    """Answers on a scale of levels, 1 to their number, of reports in [0, 1]; or these."""
+    """Convert reports in [0, 1] to answers on a scale of levels, if there is one."""
     return np.round(report * (levels - 1.0) * 1e6) / 1e6 + 1.0 if levels else report

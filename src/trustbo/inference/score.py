@@ -89,14 +89,14 @@ def score(
 
 
 def _follow(posterior: xr.DataTree) -> TrustFilter:
-    """Filter of all draws."""
+    """Make the filter of all draws."""
     return TrustFilter(posterior, max_draws=posterior["posterior"]["b"].size)
 
 
 def _predict(
     trust: TrustFilter, mission: Mission, batch: MissionBatch, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Log density of each rate (bound, robot), and draws of rates (draw, bound, robot)."""
+    """Return log densities of rates (bound, robot), and draws of rates (draw, bound, robot)."""
     log_scores, drawn, (z, y, ticks) = np.full(batch.contact_rate.shape, np.nan), [], batch
     path = mission.path[: len(z) + 1] if trust.params.places and mission.has_map else None
     effects, start = trust.effects(path, len(z)), trust.dynamics.start()
@@ -110,7 +110,7 @@ def _predict(
 def _summary(
     contact_rate: np.ndarray, mean: np.ndarray, pit: np.ndarray, log_score: np.ndarray
 ) -> dict[str, float]:
-    """Coverage, mean log score, R2 and number of rates, NaN where not measured."""
+    """Compute coverage, mean log score, R2 and number of rates, NaN where not measured."""
     kept = np.isfinite(contact_rate)
     y, n = contact_rate[kept], int(kept.sum())
     if not n:
@@ -128,7 +128,7 @@ def _summary(
 def _trees(
     posterior: xr.DataTree | Sequence[xr.DataTree], missions: Sequence[Mission]
 ) -> list[xr.DataTree]:
-    """Posterior that predicts each mission; for a campaign, from the second mission on."""
+    """List the posterior that predicts each mission; in a campaign, from the second one on."""
     if not missions:
         raise TrustboError("score needs missions to predict; got none.")
     if isinstance(posterior, xr.DataTree) or not isinstance(posterior, Sequence):
@@ -140,12 +140,12 @@ def _trees(
             "mission, as Result.posteriors."
         )
     if len(missions) == 1:
-        raise TrustboError("one mission leaves none to predict; give more missions.")
+        raise TrustboError("a campaign of one mission has none to predict; give more missions.")
     return trees[: len(missions) - 1]
 
 
 def _pit(drawn: np.ndarray, y: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Randomised PIT of rates (bound, robot) among draws (draw, bound, robot)."""
+    """Compute the randomised PIT of rates (bound, robot) among draws (draw, bound, robot)."""
     below, equal = (drawn < y).sum(0), (drawn == y).sum(0)
     pit = (below + rng.random(y.shape) * (equal + 1.0)) / (len(drawn) + 1.0)
     return np.where(np.isnan(y), np.nan, pit)

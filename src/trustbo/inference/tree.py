@@ -185,7 +185,7 @@ def complete(
 
 
 def log_prior(fitted: Posterior, sites: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Log prior density (draw,) of each parameter with an independent prior, up to a constant.
+    """Compute the log prior density (draw,) of each parameter with an independent prior.
 
     Deviations of robots from a common mean belong to the model, not to the prior: for
     `HierarchicalTrust`, only means and spreads are included. The LKJ prior of correlations R of the

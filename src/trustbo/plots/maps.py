@@ -228,7 +228,7 @@ def draw_contours(ax: Axes, workspace: Workspace, colour: str, opacity: float) -
 
 
 def contours(workspace: Workspace) -> list[np.ndarray]:
-    """Draw contour lines of the ground: at most 12 levels, at multiples of a round number.
+    """Compute contour lines of the ground: at most 12 levels, at multiples of a round number.
 
     Returns:
         Lines, each (point, 2): x and y in metres from the map's lower left corner.
