@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from copy import copy
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -42,17 +41,15 @@ class Follower:
         """
         cells = campaign.ask().path if path is None else path
         self.path: tuple[Cell, ...] = tuple(require_cells("path", cells))
-        known_along(self.path, campaign.workspace)  # refuses a path that cannot be
-        self._campaign, self._goal = campaign, self.path[-1]
-        self._n_robots = campaign.workspace.team.n_robots
-        self._filter = _filter_of(campaign)
+        self._workspace, self._goal = campaign.workspace, self.path[-1]
+        known_along(self.path, self._workspace)  # refuses a path that cannot be
         self.bounds: tuple[Bound, ...] = ()
-        self.trust: TrustState = self._filter.state
-        self._started = self._begun = self._now = -np.inf  # of the mission, the bound, and now
         self.running = False
-        self._counts = np.zeros((2, self._n_robots))  # ticks with contact, and ticks
-        self._bound: Any = None  # awareness and cells of the bound in progress
-        self._ended = self._filter  # the filter if this bound ended now
+        # After the bounds that have ended, and if the one in progress ended now.
+        self._before = self._now = _filter_of(campaign)
+        self.trust: TrustState = self._now.state
+        self._started = self._begun = self._last = -np.inf  # times of mission, bound and tick
+        self._counts = np.zeros((2, self._workspace.team.n_robots))  # ticks with contact, and ticks
 
     @property
     def rest(self) -> tuple[Cell, ...]:
@@ -71,18 +68,15 @@ class Follower:
         self._require(running=False, t=t)
         if self.bounds and self.bounds[-1].status != "ok":
             raise TrustboError(f"the mission is over: {self.bounds[-1].status}.")
-        here, planned = self.rest[0], self.rest[1:2]
+        here, *planned = self.rest
         if cell is None and not planned:
             raise TrustboError(f"no cell is planned after {here}; give the cell of the bound.")
         cell = planned[0] if cell is None else require_pair("cell", cell)
-        (known,) = known_along((here, cell), self._campaign.workspace)
-        counts, bound = np.zeros((2, self._n_robots)), (known, (here, cell))
-        self.trust = self._end_with(counts, bound)  # as predicted
-        if planned != (cell,):
+        self._count(t, np.zeros_like(self._counts), (here, cell))
+        if planned[:1] != [cell]:
             self.path = (*self.path[: len(self.bounds) + 1], cell)
         self._started = self._started if self.bounds else t
-        self._begun = self._now = t
-        self.running, self._counts, self._bound = True, counts, bound
+        self._begun, self.running = t, True
 
     def tick(self, t: float, in_contact: ArrayLike) -> None:
         """Add a tick to the bound in progress.
@@ -99,11 +93,10 @@ class Follower:
         self._require(running=True, t=t)
         seen = as_array("in_contact", in_contact)
         measured = ~np.isnan(seen)
-        if seen.shape != (self._n_robots,) or not np.isin(seen[measured], (0.0, 1.0)).all():
+        if measured.shape != self._counts[0].shape or not np.isin(seen[measured], (0, 1)).all():
             raise TrustboError(f"in_contact must be 0, 1 or NaN for each robot; got {seen}.")
-        counts = self._counts + np.stack([np.nan_to_num(seen), measured])
-        self.trust = self._end_with(counts, self._bound)
-        self._counts, self._now = counts, t
+        here, cell = self.path[len(self.bounds) :][:2]
+        self._count(t, self._counts + np.stack([np.nan_to_num(seen), measured]), (here, cell))
 
     def end(self, t: float, status: str = "ok") -> None:
         """End the bound in progress; a status other than `"ok"` ends the mission.
@@ -112,14 +105,12 @@ class Follower:
             TrustboError: No bound is in progress, the status is unknown, or the duration is zero.
         """
         self._require(running=True, t=t)
+        unknown = np.full((self._counts.shape[1], len(self._workspace.features)), np.nan)
+        seconds, since = np.full(len(unknown), t - self._begun), self._begun - self._started
         rates, n_ticks = _rates(self._counts)
-        unknown = np.full((self._n_robots, len(self._campaign.workspace.features)), np.nan)
-        seconds = np.full(self._n_robots, t - self._begun)
-        since = self._begun - self._started
         bound = Bound(self.rest[0], unknown, rates, seconds, status, since, n_ticks=n_ticks)
-        self._filter = self._ended
-        self.running, self._now = False, t
         self.bounds = (*self.bounds, bound)
+        self.running, self._last, self._before = False, t, self._now
 
     def ahead(self) -> TrustForecast:
         """Predict trust and contact rates in the bounds of `rest`, shapes (bound, robot).
@@ -132,7 +123,7 @@ class Follower:
         rest = list(self.rest)
         if len(rest) < 2:
             raise TrustboError(f"no cell is planned after {rest[0]}.")
-        return self._ended.predict(known_along(rest, self._campaign.workspace), rest)
+        return self._now.predict(known_along(rest, self._workspace), rest)
 
     def to_mission(self) -> Mission:
         """Return the completed bounds as a mission; its awareness is not measured, hence NaN.
@@ -146,25 +137,26 @@ class Follower:
         if self.running or not self.bounds:
             state = "a bound is in progress" if self.running else "no bound was run"
             raise TrustboError(f"there is no mission yet: {state}.")
-        status, workspace = self.bounds[-1].status, self._campaign.workspace
+        status, workspace = self.bounds[-1].status, self._workspace
         if status == "ok" and self.rest != (self._goal,):
             status = "aborted"
         return Mission(self.path, self.bounds, status, workspace.features, workspace.team.names)
 
-    def _end_with(self, counts: np.ndarray, bound: Any) -> TrustState:
-        """Update trust as if a bound ended now with these counts of ticks."""
+    def _count(self, t: float, counts: np.ndarray, bound: tuple[Cell, Cell]) -> None:
+        """Set the counts of ticks, (2, robot), of a bound, and the trust if it ended now."""
+        now = copy(self._before)  # which replaces its arrays, and changes none of them
+        (known,) = known_along(bound, self._workspace)
         rates, n_ticks = _rates(counts)
-        self._ended = copy(self._filter)  # which replaces its arrays, and changes none of them
-        known, cells = bound
-        return self._ended.update(known, rates, cells, n_ticks=n_ticks)
+        self.trust = now.update(known, rates, bound, n_ticks=n_ticks)
+        self._now, self._counts, self._last = now, counts, t
 
     def _require(self, *, running: bool, t: float) -> None:
         """Raise TrustboError for a call in the wrong state, or a time before the last one."""
         if running != self.running:
             some, first = ("no", "begin") if running else ("a", "end")
             raise TrustboError(f"{some} bound is in progress; call {first} first.")
-        if not self._now <= t < np.inf:
-            raise TrustboError(f"t = {t} s must be finite, and not before {self._now} s.")
+        if not self._last <= t < np.inf:
+            raise TrustboError(f"t = {t} s must be finite, and not before {self._last} s.")
 
 
 def _rates(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
