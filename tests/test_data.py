@@ -6,7 +6,7 @@ import pytest
 
 from trustbo.data import Bound, Mission
 from trustbo.errors import TrustboError
-from trustbo.stacking import fill_awareness
+from trustbo.stacking import replace_awareness
 from trustbo.team import Robot, Team
 
 PATH = [(2, 0), (1, 1), (0, 2)]
@@ -126,13 +126,13 @@ def test_masked_rates_and_rates_that_pandas_calls_missing_are_not_measured():
         np.testing.assert_array_equal(found, np.where(missing, np.nan, y))
 
 
-def test_missing_awareness_is_filled_from_a_map():
+def test_awareness_is_replaced_where_other_values_are_known():
     z, y = arrays()
-    z[0, 1] = np.nan
-    known = np.random.default_rng(0).uniform(size=(2, 3, 2))
-    filled = fill_awareness(Mission.from_arrays(PATH, z, y), known)
-    np.testing.assert_array_equal(filled.awareness[0, 1], known[0, 1])
-    np.testing.assert_array_equal(filled.awareness[1], z[1])
+    known = np.random.default_rng(0).uniform(size=(3, 3, 2))  # of a planned bound too
+    known[0, 1] = np.nan
+    replaced = replace_awareness(Mission.from_arrays(PATH, z, y), known)
+    np.testing.assert_array_equal(replaced.awareness[0, 1], z[0, 1])
+    np.testing.assert_array_equal(replaced.awareness[1], known[1])
 
 
 def test_robots_and_teams_are_checked():

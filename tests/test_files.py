@@ -27,7 +27,7 @@ def test_refusal_of_the_system_names_the_file(tmp_path):
 
 @pytest.mark.parametrize("content", [b"", b"{", b"[1]", b"\xff", b"[" * 100000])
 def test_damaged_record_is_named(tmp_path, content):
-    with pytest.raises(TrustboError, match="missing"):
+    with pytest.raises(TrustboError, match="cannot be read"):
         read_record(tmp_path / "a.json")
     (tmp_path / "a.json").write_bytes(content)
     with pytest.raises(TrustboError, match=r"a\.json"):

@@ -25,8 +25,8 @@ LINE_OF_SIGHT = "line_of_sight"
 """Name of the predicted contact rate; `line_of_sight_1`, `_2`, ... where several are assumed."""
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Bound(Summary):
+@dataclass(frozen=True, eq=False)
+class Bound:
     """Measurements of one bound, one row per overwatching robot.
 
     Attributes:
@@ -90,15 +90,6 @@ class Bound(Summary):
     def t1(self) -> float:
         """End of the bound, s since the mission's start."""
         return self.t0 + float(np.nanmax(self.duration, initial=0.0))
-
-    def _rows(self) -> Rows:
-        return [
-            ("cell", str(self.cell) if self.cell != NOWHERE else "none: no map"),
-            ("status", self.status),
-            ("contact rate", np.array2string(self.contact_rate, precision=2)),
-            ("duration", f"{np.array2string(self.duration, precision=1)} s"),
-            ("begins", number(self.t0, "s", 4)),
-        ]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -167,27 +158,19 @@ class Mission(Summary):
         return bool(self.path)
 
     def _rows(self) -> Rows:
-        rates = self.contact_rate
-        n_measured = np.isfinite(rates).sum(0)
-        if self.scale:
-            return [
-                ("trust reported", f"{n_measured.sum()} times, scale {self.scale}"),
-                ("steps", str(len(self.bounds))),
-                ("tasks", joined(self.robots)),
-                ("inputs", joined(self.features)),
-            ]
-        ends = f"{path_text(self.path[:1])} to {path_text(self.path[-1:])}"
-        planned = f"{ends}, {len(self.path) - 1} bounds planned" if self.path else "none: no map"
-        with np.errstate(invalid="ignore"):
-            means = np.nansum(rates, axis=0) / n_measured
-            mean = np.nansum(rates) / n_measured.sum()
-        took = self.bounds[-1].t1
+        rates, took = self.contact_rate, self.bounds[-1].t1
+        planned = f"{path_text(self.path[:1])} to {path_text(self.path[-1:])}"
+        by_robot = zip(self.robots, pd.DataFrame(rates).mean(), strict=True)
         return [
-            ("path", planned),
+            ("path", planned if self.path else "none: no map"),
             ("outcome", f"{self.status}, {len(self.bounds)} bounds run"),
-            ("contact rate", f"{mean:.3f} on average; {np.isnan(rates).sum()} missing"),
-            *((f"  {name}", f"{rate:.3f}") for name, rate in zip(self.robots, means, strict=True)),
-            ("takes", number(took, "s", 4) if took > 0.0 else "not measured"),
+            (
+                "trust reported" if self.scale else "contact rate",
+                f"{np.isnan(rates).sum()} missing",
+            ),
+            *((f"  {name}", f"{rate:.3f}") for name, rate in by_robot),
+            ("features", joined(self.features)),
+            ("takes", number(took, "s", 4) if took else "not measured"),
         ]
 
     @classmethod

@@ -1,6 +1,5 @@
 """Parallel work in threads, which use all cores because compiled code releases the GIL."""
 
-import os
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
@@ -10,6 +9,7 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+from joblib import cpu_count
 from threadpoolctl import ThreadpoolController
 
 _BLOCK = 64  # rows per call: few enough for the caches
@@ -39,7 +39,7 @@ def over_rows(work: Callable[[int, int], None], n_rows: int) -> None:
         for block in blocks:
             work(*block)
         return
-    with ThreadPoolExecutor(n_cores()) as pool:
+    with ThreadPoolExecutor(cpu_count()) as pool:
         list(pool.map(lambda block: work(*block), blocks))
 
 
@@ -51,11 +51,11 @@ def in_order[T, R](work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
         return work(item)
 
     pending: deque[Future[R]] = deque()
-    with ThreadPoolExecutor(n_cores()) as pool:
+    with ThreadPoolExecutor(cpu_count()) as pool:
         for item in items:
             pending.append(pool.submit(alone, item))
             del item
-            if len(pending) >= n_cores():
+            if len(pending) >= cpu_count():
                 yield pending.popleft().result()
         while pending:
             yield pending.popleft().result()
@@ -75,8 +75,3 @@ def one_blas_thread() -> Iterator[None]:
 def _blas() -> ThreadpoolController:
     """Return the loaded BLAS libraries; cached, as the search is slow."""
     return ThreadpoolController()
-
-
-def n_cores() -> int:
-    """Return the number of cores that this process may use, at most all of the machine."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -64,20 +64,12 @@ def require_same_team(missions: Sequence[Mission]) -> None:
             )
 
 
-def fill_awareness(mission: Mission, awareness: np.ndarray) -> Mission:
-    """Replace awareness that a mission did not measure (NaN) with given values.
-
-    `awareness` has shape (bound, robot, feature).
-    """
-    missing = np.isnan(mission.awareness)
-    filled = np.where(missing, awareness[: len(missing)], mission.awareness)
-    return replace_awareness(mission, filled) if missing.any() else mission
-
-
 def replace_awareness(mission: Mission, awareness: np.ndarray) -> Mission:
-    """Replace a mission's awareness by given values, (bound, robot, feature), that are not NaN."""
-    bounds = tuple(
-        replace(b, awareness=np.where(np.isnan(awareness[k]), b.awareness, awareness[k]))
-        for k, b in enumerate(mission.bounds)
-    )
-    return replace(mission, bounds=bounds)
+    """Replace a mission's awareness by given values, (bound, robot, feature), that are not NaN.
+
+    Values of planned bounds that were not run are ignored.
+    """
+    given = awareness[: len(mission.bounds)]
+    values = np.where(np.isnan(given), mission.awareness, given)
+    bounds = zip(mission.bounds, values, strict=True)
+    return replace(mission, bounds=tuple(replace(bound, awareness=z) for bound, z in bounds))

@@ -6,7 +6,7 @@ from typing import Self
 
 import numpy as np
 
-from trustbo.display import Rows, Summary, number
+from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError, require_kind, require_positive, require_whole
 
 
@@ -59,19 +59,15 @@ class Robot(Summary):
                 )
 
     def _rows(self) -> Rows:
-        field_of_view, max_slope = (
-            number(float(np.rad2deg(angle)), "degrees")
-            for angle in (2.0 * self.vertical_fov, self.max_slope)
+        vertical, slope = (
+            f"{np.rad2deg(a):.3g} degrees" for a in (self.vertical_fov, self.max_slope)
         )
         return [
-            ("speed", f"{number(self.speed, 'm/s')}, turns {number(self.turn_rate, 'rad/s')}"),
-            ("slope limit", max_slope),
-            ("lidar", f"range {number(self.lidar_range, 'm')}, {field_of_view} vertically"),
-            ("sensor", f"{number(self.sensor_height, 'm')} high, aims {self.target_height:g} m"),
-            (
-                "looks",
-                f"{self.detection:.0%} found; {self.acquire} to acquire, {self.drop} to drop",
-            ),
+            ("speed", f"{self.speed:g} m/s, turns {self.turn_rate:g} rad/s"),
+            ("slope limit", slope),
+            ("lidar", f"range {self.lidar_range:g} m, {vertical} up and down"),
+            ("sensor", f"{self.sensor_height:g} m high, aims {self.target_height:g} m"),
+            ("detection", f"{self.detection:.0%}; {self.acquire} to acquire, {self.drop} to drop"),
         ]
 
 
@@ -124,6 +120,6 @@ class Team(Summary):
 
     def _rows(self) -> Rows:
         members = {"lead": self.lead} | dict(zip(self.names, self.robots, strict=True))
-        limit = number(float(np.rad2deg(self.max_slope)), "degrees")
+        limit = f"{np.rad2deg(self.max_slope):.3g} degrees"
         alike = "all alike" if len(set(members.values())) == 1 else "not all alike"
         return [("robots", f"{', '.join(self.names)} ({alike})"), ("slope limit", limit)]

@@ -22,7 +22,7 @@ from trustbo.data import (
 )
 from trustbo.display import Rows, Summary, compiling
 from trustbo.errors import TrustboError, require_positive
-from trustbo.stacking import fill_awareness
+from trustbo.stacking import replace_awareness
 from trustbo.team import Team
 from trustbo.terrain.composite import CompositeIndex
 from trustbo.terrain.features import PAPER_VISIBILITY, TRAVERSABILITY, VISIBILITY
@@ -255,9 +255,11 @@ class Workspace(Summary):
             TrustboError: The mission's path is not a path of neighbouring cells on the grid.
         """
         ordered = self.in_order(mission)
-        if not np.isnan(ordered.awareness).any():
+        missing = np.isnan(ordered.awareness)
+        if not missing.any():
             return ordered
-        return fill_awareness(ordered, self.along(ordered.path))
+        known = self.along(ordered.path)[: len(missing)]
+        return replace_awareness(ordered, np.where(missing, known, np.nan))
 
     def locate(self, location: Location, what: str = "location") -> Cell:
         """Find the cell of a location, which must be passable.
