@@ -156,13 +156,11 @@ def test_mission_on_an_impossible_path_is_refused_and_not_recorded(workspace, tm
         assert not (tmp_path / "missions").exists()
 
 
-def test_mission_of_another_team_or_with_a_reserved_number_is_refused(workspace):
+def test_mission_of_another_team_is_refused(workspace):
     campaign = begin(workspace)
     other = Mission.from_arrays(DIAGONAL[:2], np.full((1, 2, 2), 0.5), np.full((1, 2), 0.5))
     with pytest.raises(tb.TrustboError, match="robots"):
         campaign.tell(other)
-    with pytest.raises(tb.TrustboError, match="status"):
-        campaign.tell(rates(workspace, DIAGONAL), status=1.0)
     with pytest.raises(tb.TrustboError, match="mission"):
         campaign.tell([rates(workspace, DIAGONAL)])
     assert campaign.missions == []

@@ -268,4 +268,4 @@ def test_progress_is_a_line(workspace, capsys):
     run(workspace, n_iterations=1)
     assert capsys.readouterr() == ("", "")
     run(workspace, n_iterations=1, progress=True)
-    assert "k-hat" in capsys.readouterr().err
+    assert "k_hat" in capsys.readouterr().err

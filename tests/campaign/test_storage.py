@@ -24,15 +24,14 @@ def workspace():
 
 
 def numbers(result):
-    """All numbers of a result but the seconds, by name."""
+    """All numbers of a result by name."""
     found = {
         "path": np.array(result.path),
         "trust": result.plan.trust,
         "map": result.trust_map.values,
     }
     for name, column in result.history.data_vars.items():
-        if not str(name).startswith("seconds"):
-            found[name] = column.values
+        found[name] = column.values
     for j, tree in enumerate(result.posteriors):
         for group in {"posterior", "places", "robots", "hazard"} & {
             *(tree.children if tree else ())
@@ -56,7 +55,7 @@ def drive(campaign):
     """Run a campaign of four missions, of which one fails, one is given up, one is excluded."""
     state, simulator = campaign.state, ModelSimulator(campaign.workspace, blind=True)
     if not state.entries:
-        campaign.tell(simulator.run(campaign.ask().path, seed=state.seed_of("mission")), fuel=1.5)
+        campaign.tell(simulator.run(campaign.ask().path, seed=state.seed_of("mission")))
     if len(state.entries) == 1 and not state.failures:
         campaign.ask()
         campaign.fail("stuck", where=campaign.ask().path[1])
@@ -139,7 +138,7 @@ def test_campaign_that_dies_while_it_learns_learns_when_it_is_loaded(
         with monkeypatch.context() as patch:
             patch.setattr("trustbo.campaign.learning.fit", die)
             with pytest.raises(Dead):
-                campaign.tell(mission, fuel=1.5)
+                campaign.tell(mission)
     with tb.Campaign.load(tmp_path) as again:
         assert again.state.numbers("learned") == [0]
         same(drive(again), tb.load_result(folder))

@@ -2,7 +2,6 @@
 
 import inspect
 import json
-import time
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
@@ -12,10 +11,9 @@ import numpy as np
 import xarray as xr
 
 from trustbo.campaign.learning import as_learned, base_planner, learn, why_never_learned
-from trustbo.campaign.result import Result, evidence_of
+from trustbo.campaign.result import Result, in_a_line
 from trustbo.campaign.state import (
     EXCLUDED,
-    GIVEN_UP,
     LEARNED,
     TOLD,
     Entry,
@@ -26,7 +24,7 @@ from trustbo.campaign.state import (
 from trustbo.campaign.stopping import Stop
 from trustbo.campaign.storage import Storage, read_campaign
 from trustbo.data import Cell, Mission
-from trustbo.display import Rows, compiling, progress_bar
+from trustbo.display import compiling, progress_bar
 from trustbo.errors import TrustboError, require_choice, require_kind, require_pair, require_whole
 from trustbo.files import FilePath, to_json
 from trustbo.hazard import Hazard
@@ -37,7 +35,7 @@ from trustbo.models import HumanTrust, default_model
 from trustbo.models.model import TrustModel
 from trustbo.models.record import model_from_record, model_to_record
 from trustbo.planning import InfeasibleError, Plan
-from trustbo.planning.policies import Policy, resolve_policy
+from trustbo.planning.policies import POLICIES, Policy, resolve_policy
 from trustbo.simulation import KinematicSimulator, Truth
 from trustbo.simulation.protocol import Simulator
 from trustbo.workspace import Workspace
@@ -45,6 +43,8 @@ from trustbo.workspace.grid import Location
 
 _ARRIVES = 0.9
 """Arrival probability below which a campaign without a cost of failures issues a warning."""
+_OPTIONS = ("objective", "sampler", "seed", "initial", "planner", "fit")
+"""Settings that are arguments of `Campaign`, unchanged."""
 _FIT = inspect.signature(fit)
 
 
@@ -123,8 +123,7 @@ class Campaign(Result):
             raise TrustboError("model: HumanTrust describes reports of people; it plans no paths.")
         self.policy = resolve_policy(policy)
         settings = {
-            "policy": policy if isinstance(policy, str) else _name_of(policy),
-            "own_policy": not isinstance(policy, str),
+            "policy": policy if isinstance(policy, str) else f"{_name_of(policy)} (custom)",
             "objective": objective,
             "sampler": sampler,
             "seed": require_whole("seed", seed, 0),
@@ -144,7 +143,6 @@ class Campaign(Result):
         }
         state = State(json.loads(to_json(settings)))  # as a file returns them
         super().__init__(workspace, state, model, base)
-        self._seconds_plan = 0.0
         self._warned_of_risk = False
         self.progress = True
         self.storage: Storage | None = None
@@ -157,19 +155,6 @@ class Campaign(Result):
             delattr(self, name)
         self._maps.clear()
 
-    def _rows(self) -> Rows:
-        settings, state = self.state.settings, self.state
-        counts = {name: len(state.numbers(name)) for name in (LEARNED, TOLD, EXCLUDED)}
-        counts[GIVEN_UP] = len(state.failures)
-        shown = [f"{number} {name}" for name, number in counts.items() if number]
-        rows = [
-            ("course", f"{tuple(settings['start'])} to {tuple(settings['goal'])}"),
-            ("missions", ", ".join(shown) or "none yet"),
-            ("model", self.model.in_short()),
-            ("policy", f"{settings['policy']}, objective {settings['objective']}"),
-        ]
-        return rows + evidence_of(state)
-
     # --- ask and tell ---
 
     def ask(self) -> Plan:
@@ -180,7 +165,7 @@ class Campaign(Result):
         """
         if self.state.asked is not None:
             return self.state.asked
-        started, name = time.perf_counter(), f"policy {self.state.settings['policy']!r}"
+        name = f"policy {self.state.settings['policy']!r}"
         rng = np.random.default_rng(self.state.seed_of("policy"))
         try:
             plan = self.policy(rng, self.belief, self.planner)
@@ -191,7 +176,7 @@ class Campaign(Result):
             self.planner.require_path(plan.path)
         except TrustboError as error:
             raise TrustboError(f"{name}: {error}") from None
-        return self._accept(plan, started)
+        return self._accept(plan)
 
     def suggest(self, path: Sequence[Cell]) -> Plan:
         """Set the next path manually; `ask` then returns it.
@@ -202,30 +187,26 @@ class Campaign(Result):
         Raises:
             TrustboError: The path is invalid, or does not lead from start to goal.
         """
-        started = time.perf_counter()
-        return self._accept(self.planner.evaluate(path, self.belief.mean()), started)
+        return self._accept(self.planner.evaluate(path, self.belief.mean()))
 
-    def _accept(self, plan: Plan, started: float) -> Plan:
+    def _accept(self, plan: Plan) -> Plan:
         """Store a plan, with bands over the posterior, as the next one to run."""
         given = self.planner.evaluate(plan.path, self.belief)
-        self._seconds_plan = time.perf_counter() - started
-        self._warn_of_risk(plan, given)
+        self._warn_of_risk(plan, 1.0 if given.p_arrive is None else given.p_arrive)
         self.state.asked = accepted = plan.with_draws(given)
         self._write()
         return accepted
 
-    def _warn_of_risk(self, plan: Plan, given: Plan) -> None:
+    def _warn_of_risk(self, plan: Plan, p_arrive: float) -> None:
         """Warn of a plan that exceeds `max_failure`; or, once, of a likely failure at no cost."""
         options = self.state.settings["planner"]
-        if plan.infeasible and plan.p_fail is not None:
-            p_fail = 1.0 - np.prod(1.0 - plan.p_fail)  # by which max_failure goes
+        if plan.infeasible:
             warnings.warn(
-                f"the plan fails with probability {p_fail:.3g} if bounds fail independently, more "
-                f"than max_failure = {options['max_failure']:g}: no safer path was found.",
+                f"the plan exceeds max_failure = {options['max_failure']:g}: it arrives with "
+                f"probability {p_arrive:.3g}.",
                 stacklevel=4,
             )
         limited = any(options.get(name) is not None for name in ("max_failure", "failure_cost"))
-        p_arrive = 1.0 if given.p_arrive is None else given.p_arrive
         if limited or self._warned_of_risk or self.risk.has_failures or p_arrive >= _ARRIVES:
             return
         self._warned_of_risk = True
@@ -236,7 +217,7 @@ class Campaign(Result):
             stacklevel=4,
         )
 
-    def tell(self, mission: Mission, **extra: float) -> xr.DataTree | None:
+    def tell(self, mission: Mission) -> xr.DataTree | None:
         """Record a mission and learn from it.
 
         Learning uses the awareness of the map. Robots and features may be in any order, and the
@@ -244,32 +225,30 @@ class Campaign(Result):
 
         Args:
             mission: Mission as measured, whether or not it reached the goal.
-            **extra: Additional numbers for the mission's row of the history, such as its regret.
 
         Returns:
             Posterior of the parameters given all usable missions. If this mission cannot be used,
             or not yet, the previous posterior or None is returned with a warning.
 
         Raises:
-            TrustboError: Robots or features differ from the workspace's; the path leaves the grid,
-                jumps, or begins in a different cell than the plan; or an extra has the name of a
-                column. The mission is then not stored.
+            TrustboError: Robots or features differ from the workspace's; or the path leaves the
+                grid, jumps, or begins in a different cell than the plan. The mission is then not
+                stored.
         """
-        require_kind("mission", mission, Mission, "tell one trustbo.Mission at a time")
-        mission = self.workspace.in_order(mission)
-        if mission.path[0] != (first := self.ask().path[0]):
-            raise TrustboError(
-                f"the mission starts at {mission.path[0]}, not at {first}; cells are (row, col)."
-            )
-        self._take(mission, extra)
-        return None if self.state.last is None else self.state.last()
+        self._take(mission, {})
+        return self.state.posterior
 
     def _take(self, mission: Mission, extra: dict[str, float]) -> None:
-        """Write a mission to disk, then learn from it."""
-        state, plan, seed = self.state, self.ask(), self.state.seed_of("fit")
-        learned, row = as_learned(mission, self.workspace), state.row_of(plan, mission, extra)
-        started = time.perf_counter()
-        row["seconds_plan"] = self._seconds_plan
+        """Write a mission, and more numbers of its row, to disk; then learn from it."""
+        require_kind("mission", mission, Mission, "tell one trustbo.Mission at a time")
+        mission, state, plan = self.workspace.in_order(mission), self.state, self.ask()
+        if mission.path[0] != plan.path[0]:
+            raise TrustboError(
+                f"the mission starts at {mission.path[0]}, not at {plan.path[0]}; cells are (row, "
+                "col)."
+            )
+        learned, row = as_learned(mission, self.workspace), state.row_of(plan, mission) | extra
+        seed = state.seed_of("fit")
         entry = Entry(plan, mission, learned, self.trust_map, row, state.last)
         state.entries.append(entry)
         self._renew()
@@ -280,7 +259,6 @@ class Campaign(Result):
             warnings.warn(f"mission {len(state.entries)} is excluded: {reason}", stacklevel=4)
         else:
             self._learn(seed)
-        row["seconds_fit"] = time.perf_counter() - started
         self._continue()
 
     def _learn(self, seed: int) -> None:
@@ -332,7 +310,7 @@ class Campaign(Result):
         self._renew()
         self._learn(self.state.seed_of("fit"))
         self._continue()
-        return None if self.state.last is None else self.state.last()
+        return self.state.posterior
 
     def fail(
         self, reason: str, mission: Mission | None = None, *, where: Cell | None = None
@@ -403,12 +381,9 @@ class Campaign(Result):
             raise TrustboError(
                 f"simulator must have run(path, *, seed, mission) -> Mission; got {runner!r}."
             )
-        if truth is not None:
-            require_kind("truth", truth, Truth, "give Truth.of(simulator)")
-        rules: list[Any] = [] if stop is None else [stop] if callable(stop) else list(stop)
-        for rule in rules:
-            if not callable(rule):
-                raise TrustboError(f"stop must be stop(campaign) -> reason or None; got {rule!r}.")
+        rules: list[Stop] = [] if stop is None else [stop] if callable(stop) else list(stop)
+        if not all(map(callable, rules)) or not isinstance(truth, Truth | None):
+            raise TrustboError(f"stop and truth: got {stop!r}, {truth!r}; see `iterate`.")
         describe = getattr(runner, "describe", lambda: {"simulator": type(runner).__name__})
         self.state.simulation = json.loads(to_json({**describe(), "n_iterations": n_iterations}))
         self.progress = progress
@@ -432,8 +407,8 @@ class Campaign(Result):
                 if truth is not None:
                     longest = self.planner.max_bounds
                     extra["regret"] = truth.at(n).regret(plan.path, max_bounds=longest)
-                self.tell(mission, **extra)
-                bar.set_postfix_str(_in_a_line(state.entries[-1].row), refresh=False)
+                self._take(mission, extra)
+                bar.set_postfix_str(in_a_line(state.entries[-1].row), refresh=False)
                 bar.update()
                 yield plan, mission
         state.stop_reason = reason
@@ -492,7 +467,7 @@ class Campaign(Result):
         try:
             state, workspace, pending = read_campaign(storage.path)
             given = state.settings
-            if given["own_policy"] and policy is None:
+            if given["policy"] not in POLICIES and policy is None:
                 raise TrustboError(
                     f"the campaign's policy {given['policy']!r} was your own: give policy=."
                 )
@@ -500,9 +475,7 @@ class Campaign(Result):
                 workspace, given["start"], given["goal"],
                 model=model_from_record(given["model_record"], model),
                 policy=given["policy"] if policy is None else policy,
-                objective=given["objective"], sampler=given["sampler"], seed=given["seed"],
-                initial=given["initial"], hazard=Hazard(**given["hazard"]),
-                planner=given["planner"], fit=given["fit"],
+                hazard=Hazard(**given["hazard"]), **{name: given[name] for name in _OPTIONS},
             )  # fmt: skip
             campaign.state, campaign.storage = state, storage
             campaign._renew()
@@ -524,11 +497,3 @@ class Campaign(Result):
 
 def _name_of(function: object) -> str:
     return getattr(function, "__name__", type(function).__name__)
-
-
-def _in_a_line(row: dict[str, Any]) -> str:
-    """Describe a mission in one line."""
-    regret = f", regret {row['regret']:.1f} %" if "regret" in row else ""
-    name, label = ("r_hat", "R-hat") if "r_hat" in row else ("k_hat", "k-hat")
-    learned = f"{label} {row[name]:.3f}" if row["state"] == LEARNED else row["state"]
-    return f"objective {row['objective']:.3f}{regret}, {learned}, {row['status']}"

@@ -75,9 +75,8 @@ def learn(
     missions = [state.entries[j].mission for j in numbers]
     sampler, options = state.settings["sampler"], state.settings["fit"]
     # Draws of importance sampling are independent, and effects of places make them large.
-    few = sampler == "importance" and any(
-        isinstance(effect, PlaceEffect) for effect in model.effects
-    )
+    has_places = any(isinstance(effect, PlaceEffect) for effect in model.effects)
+    few = sampler == "importance" and has_places
     usual = options.get("draws", _N_DRAWS // 4 if few else _N_DRAWS)
     reason = ""
     for shift, draws in enumerate((usual, 2 * usual)):
@@ -107,9 +106,7 @@ def learn(
         state.entries[j].become(TOLD, reason)
     warnings.warn(
         f"mission {len(state.entries)} is recorded but cannot be used for learning yet: "
-        f"{reason.rstrip('.')}. The campaign continues with the "
-        f"{'prior' if state.last is None else 'previous posterior'}, and tries again with the next "
-        "mission.",
+        f"{reason.rstrip('.')}. The campaign tries again with the next mission.",
         stacklevel=5,
     )
     return None

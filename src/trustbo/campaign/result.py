@@ -1,7 +1,7 @@
 """Result of a campaign: posterior, maps, history and recommended path."""
 
 from functools import cached_property
-from operator import itemgetter
+from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,7 +10,7 @@ import rioxarray  # noqa: F401  (registers the .rio accessor)
 import xarray as xr
 
 from trustbo.campaign.learning import base_planner, informed_planner, learn_hazard
-from trustbo.campaign.state import COLUMNS, State
+from trustbo.campaign.state import COLUMNS, EXCLUDED, GIVEN_UP, LEARNED, TOLD, State
 from trustbo.campaign.storage import Storage, read_campaign
 from trustbo.data import Cell, Mission, path_text
 from trustbo.display import Rows, Summary
@@ -18,9 +18,7 @@ from trustbo.errors import TrustboError
 from trustbo.files import FilePath
 from trustbo.hazard.risk import BoundRisk
 from trustbo.inference import complete, params_of, sample_prior
-from trustbo.inference.diagnostics import MAX_RHAT
 from trustbo.inference.draws import prior_mean
-from trustbo.inference.importance import GOOD_KHAT
 from trustbo.models.backend import VERSIONS
 from trustbo.models.model import TrustModel
 from trustbo.models.params import Params
@@ -60,15 +58,22 @@ class Result(Summary):
         return {name: vars(self)[name] for name in cached if name in vars(self)}
 
     def _rows(self) -> Rows:
-        n, row = len(self.missions), self.state.entries[-1].row
+        settings, state = self.state.settings, self.state
+        counts = {name: len(state.numbers(name)) for name in (LEARNED, TOLD, EXCLUDED)}
+        counts[GIVEN_UP] = len(state.failures)
+        shown = [f"{number} {name}" for name, number in counts.items() if number]
         rows = [
-            ("missions", f"{n}; stopped: {self.stop_reason}"),
-            ("recommended", f"{self.path[0]} to {self.path[-1]}, {len(self.path) - 1} bounds"),
-            ("value", f"{self.plan.value:.3g} ({self.settings['objective']})"),
-            ("contact rate", f"{row['contact_rate']:.3f} on the last mission"),
-            ("outcomes", ", ".join(mission.status for mission in self.missions)),
+            ("course", f"{tuple(settings['start'])} to {tuple(settings['goal'])}"),
+            ("missions", ", ".join(shown) or "none yet"),
+            ("model", settings["model"]),
+            ("policy", f"{settings['policy']}, objective {settings['objective']}"),
         ]
-        return rows + evidence_of(self.state)
+        if state.last is not None:
+            rows.append(
+                ("recommended", f"{len(self.path) - 1} bounds, value {self.plan.value:.3g}")
+            )
+            rows.append(("last mission", in_a_line(state.entries[-1].row)))
+        return rows
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -103,12 +108,11 @@ class Result(Summary):
         Raises:
             TrustboError: Nothing could be learned yet.
         """
-        if self.state.last is None:
+        if (stored := self.state.posterior) is None:
             raise TrustboError(
                 f"there is no posterior: none of {len(self.missions)} missions can be used for "
                 "learning yet. They are recorded; table() has the reasons."
             )
-        stored = self.state.last()
         numbers = np.atleast_1d(stored.attrs["missions"]).astype(int).tolist()
         # The model is needed for `log_prior` if its priors are not the default.
         whole = complete(stored, [self.missions[j] for j in numbers], model=self.model)
@@ -123,8 +127,8 @@ class Result(Summary):
     @cached_property
     def belief(self) -> Params:
         """Parameter draws of the last posterior, or of `initial` before the first posterior."""
-        if self.state.last is not None:
-            return params_of(self.state.last())
+        if self.state.posterior is not None:
+            return params_of(self.state.posterior)
         features, n_robots = self.workspace.features, self.workspace.team.n_robots
         model, n_features = self.model.for_features(features), len(features)
         if self.state.settings["initial"] == "prior_mean":
@@ -164,7 +168,7 @@ class Result(Summary):
     def plan(self) -> Plan:
         """Recommended plan, the best under the posterior mean, with posterior credible bands."""
         best = self.recommend()
-        draws = self.belief if self.state.last is None else self.state.last()
+        draws = self.state.posterior or self.belief  # of which it draws effects of the next mission
         return best.with_draws(self.planner.evaluate(best.path, draws))
 
     @property
@@ -185,24 +189,21 @@ class Result(Summary):
         `objective` when it was planned, whether it differs from the previous plan (`path_changed`)
         and the `trust_map` used for planning; the mean `contact_rate` of the mission, the
         `contact_lost` in bounds (bounds that were not run lose all contact), its `status`, its
-        `state` (`"told"`, not used yet; `"learned"`; `"excluded"`) with the `reason`, diagnostics
-        of the posterior (see `inference.diagnostics`), and the seconds of planning and fitting.
+        `state` (`"told"`, not used yet; `"learned"`; `"excluded"`) with the `reason`, and the
+        diagnostics of the posterior (see `inference.diagnostics`).
         """
         entries = self.state.entries
-        plans, first = [entry.plan for entry in entries], entries[0].trust_map
-        steps = np.full((len(plans), max(len(plan.path) for plan in plans), 2), -1)
-        for i, plan in enumerate(plans):
-            steps[i, : len(plan.path)] = plan.path
-        rows = pd.DataFrame([entry.row for entry in entries])
-        maps = np.stack([entry.trust_map.values for entry in entries])
-        variables: dict[str, Any] = {
-            name: ("iteration", rows[name].tolist(), {"units": "%"} if name == "regret" else {})
-            for name in rows
-        }
-        variables["path"] = ("iteration", "step", "axis"), steps
-        variables["trust_map"] = ("iteration", "row", "col"), maps, first.attrs
-        coords = {"iteration": np.arange(1, len(rows) + 1), "axis": ["row", "col"]}
-        return xr.Dataset(variables, coords | dict(first.coords))
+        paths = [entry.plan.path for entry in entries]
+        steps = np.full((len(paths), max(map(len, paths)), 2), -1)
+        for row, path in zip(steps, paths, strict=True):
+            row[: len(path)] = path
+        numbers = pd.RangeIndex(1, len(paths) + 1, name="iteration")
+        history = pd.DataFrame([entry.row for entry in entries], numbers).to_xarray()
+        if "regret" in history:
+            history["regret"].attrs["units"] = "%"
+        history["path"] = ("iteration", "step", "axis"), steps
+        history["trust_map"] = xr.concat([entry.trust_map for entry in entries], numbers)
+        return history.assign_coords(axis=["row", "col"])
 
     def table(self) -> pd.DataFrame:
         """Return a table with one row per mission, labelled by its number, from 1.
@@ -214,21 +215,23 @@ class Result(Summary):
         see `Campaign.fail`, has no number and the state "given up".
         """
         reasons = {f.after: f.reason for f in self.state.failures if f.reported}
-        rows = []
+        rows: list[dict[str, Any]] = []
         for n, entry in enumerate(self.state.entries, start=1):
             mission = entry.measured
-            told = {
+            rows.append(entry.row | {
+                "mission": n,
                 "reason": entry.row["reason"] or reasons.get(n, ""),
                 "where": path_text([mission.bounds[-1].cell]) if mission.status != "ok" else "",
                 "n_bounds": len(mission.bounds),
                 "path": path_text(entry.plan.path),
-            }
-            rows.append((n, n, {**entry.row, **told}))
-        rows += [(f.after, None, f.row()) for f in self.state.failures if not f.reported]
-        rows.sort(key=itemgetter(0))  # stable: those given up follow the mission before them
-        index = pd.Index([number for _, number, _ in rows], dtype="Int64", name="mission")
-        names = dict.fromkeys([*COLUMNS, *(name for *_, row in rows for name in row)])
-        return pd.DataFrame([row for *_, row in rows], index, list(names))
+            })  # fmt: skip
+        given_up = [failure for failure in self.state.failures if not failure.reported]
+        for i, failure in enumerate(given_up):  # each follows the mission before it
+            rows.insert(failure.after + i, failure.row())
+        table = pd.DataFrame(
+            rows, columns=list(dict.fromkeys(["mission", *COLUMNS, *chain(*rows)]))
+        )
+        return table.astype({"mission": "Int64"}).set_index("mission")
 
     def maps(self, *, n_draws: int | None = None) -> xr.Dataset:
         """Compute every map of the planning cells after the last mission, for GIS and figures.
@@ -269,19 +272,13 @@ class Result(Summary):
         return self.workspace.grid.place(maps.where(self.workspace.passable))
 
     def _places(self) -> xr.Dataset:
-        """Maps of the place effects, (row, col), if the model has them."""
-        maps = xr.Dataset()
+        """Maps of the effects of cells, (row, col), if the model has them."""
         if self.state.last is None or not (places := self.belief.places):
-            return maps
-        cells = places["place"].mean(1)  # (draw, row, col)
-        bounds = xr.DataArray(places["place_bound"].mean((0, 1)), dims=("move", "row", "col"))
-        into = bounds.where(self.workspace.passable_bounds.drop_vars("move")).mean("move")
-        for name, text, values in (
-            ("place_mean", "mean effect of the cell on trust", cells.mean(0)),
-            ("place_sd", "standard deviation of the effect of the cell on trust", cells.std(0)),
-            ("place_bounds_mean", "mean effect on trust of the bounds into a cell", into.values),
-        ):
-            maps[name] = ("row", "col"), values, {"long_name": text, "units": "1"}
+            return xr.Dataset()
+        cells = xr.DataArray(places["place"].mean(1), dims=("draw", "row", "col"))
+        maps = xr.Dataset({"place_mean": cells.mean("draw"), "place_sd": cells.std("draw")})
+        for what, values in zip(("mean", "standard deviation"), maps.values(), strict=True):
+            values.attrs = {"long_name": f"{what} of the effect of the cell on trust", "units": "1"}
         return maps
 
     def plot_maps(self, **options: Any) -> np.ndarray:
@@ -348,14 +345,8 @@ def load_result(directory: FilePath) -> Result:
     return Result(workspace, state, model)
 
 
-def evidence_of(state: State) -> Rows:
-    """Return a row with the diagnostics of the last posterior, if there is one."""
-    last = state.entries[-1].row if state.entries else {}
-    if np.isfinite(last.get("k_hat", np.nan)):
-        khat = f"k-hat {last['k_hat']:.2f} (good below {GOOD_KHAT:g})"
-        return [("posterior", f"{khat}, Kish size {last['kish']:.0f}")]
-    if np.isfinite(last.get("r_hat", np.nan)):
-        rhat = f"R-hat {last['r_hat']:.3f} (good up to {MAX_RHAT:g})"
-        ess = f"bulk ESS {last['ess_bulk']:.0f}, divergences {last['divergences']:.0f}"
-        return [("posterior", f"{rhat}, {ess}")]
-    return []
+def in_a_line(row: dict[str, Any]) -> str:
+    """Describe a mission in one line: its status, value and regret, and the posterior after it."""
+    names = ("objective", "contact_rate", "regret", "k_hat", "kish", "r_hat", "ess_bulk")
+    numbers = [f"{name} {row[name]:.3g}" for name in names if name in row]
+    return ", ".join([row["status"], row["state"], *numbers])

@@ -8,7 +8,6 @@ import numpy as np
 import xarray as xr
 
 from trustbo.data import Cell, Mission, path_text
-from trustbo.errors import TrustboError
 from trustbo.logs.netcdf import read_tree
 from trustbo.planning import Plan
 
@@ -139,6 +138,11 @@ class State:
         """Posterior after the last mission."""
         return self.entries[-1].posterior if self.entries else None
 
+    @property
+    def posterior(self) -> xr.DataTree | None:
+        """Parameters given the missions so far; None if nothing was learned."""
+        return None if self.last is None else self.last()
+
     def numbers(self, *states: str) -> list[int]:
         """Return the indices of the missions in one of these states."""
         return [j for j, entry in enumerate(self.entries) if entry.state in states]
@@ -151,22 +155,17 @@ class State:
             entropy.append(n_failures)  # another attempt may choose another path
         return int(np.random.SeedSequence(entropy).generate_state(1)[0])
 
-    def row_of(self, plan: Plan, mission: Mission, extra: dict[str, float]) -> dict[str, Any]:
-        """Make the row of a new mission; TrustboError if an extra has the name of a column."""
+    def row_of(self, plan: Plan, mission: Mission) -> dict[str, Any]:
+        """Make the row of a new mission."""
         before = self.entries[-1].plan if self.entries else plan
         rates = mission.contact_rate
         contact = float(np.nanmean(rates)) if np.isfinite(rates).any() else np.nan
-        n_run = len(mission.bounds)
-        row: dict[str, Any] = {
+        return {
             "objective": plan.value,
             "path_changed": plan.path != before.path,
             "contact_rate": contact,
-            "contact_lost": len(mission.path) - 1 - n_run * contact,
+            "contact_lost": len(mission.path) - 1 - len(mission.bounds) * contact,
             "status": mission.status,
             "state": TOLD,
             "reason": "",
         }
-        for name in extra:
-            if name in {*row, *COLUMNS, "mission", "iteration", "trust_map"}:
-                raise TrustboError(f"{name!r} is a column of the history; give it another name.")
-        return row | {name: float(value) for name, value in extra.items()}

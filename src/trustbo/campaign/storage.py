@@ -93,7 +93,7 @@ class Storage:
         self.write_record(state)
 
     def add_mission(self, n: int, entry: Entry, extra: dict[str, float]) -> None:
-        """Write mission n, from 1, as measured, with its plan and the extra numbers of `tell`."""
+        """Write mission n, from 1, as measured, with its plan and the extra numbers of its row."""
         planned = xr.Dataset({"trust_map": entry.trust_map})
         planned.attrs = {"plan": to_json(plan_to_record(entry.plan)), "extra": to_json(extra)}
         tree = missions_to_tree([entry.measured])
@@ -131,7 +131,7 @@ def read_campaign(
 
     Returns:
         State; workspace; and the missions not yet counted in the record, each with the extra
-        numbers passed to `tell`.
+        numbers of its row.
 
     Raises:
         TrustboError: The folder contains no campaign, or a file is missing or damaged.
