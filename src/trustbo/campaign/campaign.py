@@ -153,7 +153,6 @@ class Campaign(Result):
         """Clear what was computed from the missions and failures, which have changed."""
         for name in self._computed():
             delattr(self, name)
-        self._maps.clear()
 
     # --- ask and tell ---
 

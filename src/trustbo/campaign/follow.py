@@ -10,7 +10,7 @@ from trustbo.campaign.campaign import Campaign
 from trustbo.campaign.learning import known_along
 from trustbo.data import Bound, Cell, Mission, as_array
 from trustbo.errors import TrustboError, require_cells, require_pair
-from trustbo.inference import TrustFilter, sample_prior
+from trustbo.inference import TrustFilter
 from trustbo.inference.filter import TrustForecast, TrustState
 
 
@@ -168,11 +168,7 @@ def _rates(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _filter_of(campaign: Campaign) -> TrustFilter:
     """Make a filter with a campaign's last posterior, or with the prior if there is none yet."""
-    if campaign.state.last is not None:
-        return TrustFilter(campaign.state.last())
-    names, n_robots = campaign.workspace.features, campaign.workspace.team.n_robots
-    model = campaign.model.for_features(names)
-    draws = sample_prior(
-        model, len(names), 1000, campaign.state.seed_of("prior"), n_robots=n_robots
-    )
-    return TrustFilter(draws, n_robots, observation=model.observation)
+    if campaign.state.posterior is not None:
+        return TrustFilter(campaign.state.posterior)
+    n_robots, family = campaign.workspace.team.n_robots, campaign.model.observation
+    return TrustFilter(campaign.draw_prior(1000), n_robots, observation=family)

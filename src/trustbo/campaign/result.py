@@ -50,7 +50,6 @@ class Result(Summary):
         self.workspace, self.state = workspace, state
         self.model: Any = model
         self._base = base_planner(workspace, state.settings) if base is None else base
-        self._maps: dict[int, xr.Dataset] = {}  # by number of draws
 
     def _computed(self) -> dict[str, Any]:
         """Cached properties by name."""
@@ -129,12 +128,17 @@ class Result(Summary):
         """Parameter draws of the last posterior, or of `initial` before the first posterior."""
         if self.state.posterior is not None:
             return params_of(self.state.posterior)
+        if self.state.settings["initial"] == "prior_draw":
+            return self.draw_prior(1)
         features, n_robots = self.workspace.features, self.workspace.team.n_robots
-        model, n_features = self.model.for_features(features), len(features)
-        if self.state.settings["initial"] == "prior_mean":
-            return prior_mean(model, n_features, n_robots=n_robots).flat()
-        seed = State(self.state.settings).seed_of("prior")
-        return sample_prior(model, n_features, 1, seed, n_robots=n_robots).flat()
+        model = self.model.for_features(features)
+        return prior_mean(model, len(features), n_robots=n_robots).flat()
+
+    def draw_prior(self, n_draws: int) -> Params:
+        """Draws of the parameters from the prior, leading axis (draw,)."""
+        features, n_robots = self.workspace.features, self.workspace.team.n_robots
+        seed, model = State(self.settings).seed_of("prior"), self.model.for_features(features)
+        return sample_prior(model, len(features), n_draws, seed, n_robots=n_robots).flat()
 
     @cached_property
     def hazard(self) -> xr.Dataset:
@@ -247,17 +251,11 @@ class Result(Summary):
             `path_probability` (that a cell is on the best path), and the awareness of each feature,
             averaged over robots, under its name, or as `awareness_<name>` if another map or a dim
             has that name. Values are NaN where no robot can go. For models with place effects, it
-            also contains `place_mean` and `place_sd` of the effect of each cell, and
-            `place_bounds_mean`, the mean effect of the bounds into it.
+            also contains `place_mean` and `place_sd` of the effect of each cell.
         """
         if n_draws is None:
             dynamics = self.planner.problem.dynamics(self.belief.mean())
             n_draws = 1000 if len(dynamics.start) == 1 else 100
-        if n_draws not in self._maps:
-            self._maps[n_draws] = self._compute_maps(n_draws)
-        return self._maps[n_draws].copy(deep=True)  # the caller may write into it
-
-    def _compute_maps(self, n_draws: int) -> xr.Dataset:
         summary = self.planner.trust_summary(self.posterior, n_draws=n_draws)
         maps = summary.rename(mean="trust_mean", sd="trust_sd")
         share = self.planner.path_posterior(self.posterior, n_draws=n_draws)

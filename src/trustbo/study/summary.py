@@ -55,15 +55,12 @@ def _numbers(run: pd.DataFrame) -> dict[str, float]:
     }
 
 
-def summary(
-    numbers: pd.DataFrame, by: str | Sequence[str] = "case", *, clusters: str = "scene"
-) -> pd.DataFrame:
-    """Compute means with 95 % intervals; medians for regret and loss after n missions.
+def summary(numbers: pd.DataFrame, by: str | Sequence[str] = "case") -> pd.DataFrame:
+    """Compute means with 95 % intervals over scenes; medians for regret and loss after n missions.
 
     Args:
         numbers: Rows of `numbers_of`.
         by: Columns by which runs are grouped.
-        clusters: Column of the bootstrap's clusters; runs with equal values are resampled together.
 
     Returns:
         Columns of two levels: the number, and `value`, `low` and `high`.
@@ -75,27 +72,23 @@ def summary(
         require_choice("column", n, numbers.columns) for n in ([by] if isinstance(by, str) else by)
     ]
     rows = {
-        key if len(by) > 1 else key[0]: bootstrap(_values(rows), rows[clusters].to_numpy())  # pyright: ignore[reportIndexIssue]
+        key if len(by) > 1 else key[0]: bootstrap(_values(rows), rows["scene"].to_numpy())  # pyright: ignore[reportIndexIssue]
         for key, rows in numbers.groupby(by, sort=False)
     }
     return _table(rows, by)
 
 
-def differences(
-    numbers: pd.DataFrame, ours: str, by: Sequence[str] = (), *, clusters: str = "scene"
-) -> pd.DataFrame:
+def differences(numbers: pd.DataFrame, ours: str, by: Sequence[str] = ()) -> pd.DataFrame:
     """Compare one case with each of the others on the same scenes and seeds.
 
     Args:
         numbers: Rows of `numbers_of`.
         ours: Case from which the others are subtracted.
         by: Columns by which pairs are grouped, in addition to the other case.
-        clusters: Column of the bootstrap's clusters; pairs with equal values are resampled
-            together.
 
     Returns:
         Columns as in `summary`, for the difference `ours` minus the other case, and the number of
-        `pairs`; intervals are NaN if there is only one cluster.
+        `pairs`; intervals are over scenes, and NaN if there is only one.
 
     Raises:
         TrustboError: An unknown case or column.
@@ -109,7 +102,7 @@ def differences(
     names = [name for name in _values(numbers) if not name.startswith("lost after")]
     for key, some in pairs.groupby([*by, "case 2"], sort=False):
         less = {name: (some[name] - some[f"{name} 2"]).to_numpy() for name in names}
-        apart = some[clusters].to_numpy()
+        apart = some["scene"].to_numpy()
         row = bootstrap(less, apart, np.nanmean)
         if len(set(apart)) == 1:
             row |= {(name, end): np.nan for name in names for end in ("low", "high")}
