@@ -66,8 +66,8 @@ class Bound:
             object.__setattr__(self, name, as_array(name, values))
         if self.awareness.ndim != 2 or not self.awareness.size:
             raise TrustboError(
-                "awareness of a bound must be (robot, feature), of one robot and one feature at "
-                f"least; got shape {self.awareness.shape}. Without features, give one that is 0."
+                "awareness of a bound must be (robot, feature), with at least one robot and one "
+                f"feature; got shape {self.awareness.shape}. Without features, give one that is 0."
             )
         per_robot = self.awareness.shape[:1]
         for name in ("contact_rate", "duration"):
@@ -138,14 +138,15 @@ class Mission(Summary):
         """Reject bounds that do not match the path, or that enter cells if there is no path."""
         n_run, n_planned = len(self.bounds), len(self.path) - 1
         if not n_run or (self.path and n_run > n_planned):
+            most = f" and, on its path, at most {n_planned}" if self.path else ""
             raise TrustboError(
-                f"a path of {len(self.path)} cells has {max(n_planned, 0)} bounds, and a mission "
-                f"at least one; got {n_run}. Before a first bound, there is `Campaign.fail`."
+                f"a mission has at least one bound{most}; got {n_run}. If no bound was run, use "
+                "`Campaign.fail`."
             )
         if self.status == "ok" and n_run < n_planned:
             raise TrustboError(
-                f'status "ok" says the goal was reached, but only {n_run} of {n_planned} bounds '
-                "were run; give the status it ended with."
+                f'status "ok" means that the goal was reached, but only {n_run} of {n_planned} '
+                "bounds were run; give the status of the last one."
             )
         for k, bound in enumerate(self.bounds, start=1):
             if bound.cell != (expected := self.path[k] if self.path else NOWHERE):
@@ -317,8 +318,8 @@ def require_map(what: str, missions: Iterable[Mission]) -> None:
     for j, mission in enumerate(missions):
         if not mission.has_map:
             raise TrustboError(
-                f"{what} needs the cells of a map, and mission {j} is of a log without one "
-                "(path=None); such missions have fits without effects of places, and scores."
+                f"{what} needs the cells of a map, but mission {j} has none (path=None); missions "
+                "without a map can only be fitted, without effects of places, and scored."
             )
 
 

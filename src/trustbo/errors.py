@@ -38,7 +38,7 @@ def require_whole(what: str, value: object, minimum: int) -> int:
     except TypeError:
         number = None
     if number is None or isinstance(value, bool) or number < minimum:
-        raise TrustboError(f"{what} must be a whole number from {minimum} on; got {value!r}.")
+        raise TrustboError(f"{what} must be a whole number of at least {minimum}; got {value!r}.")
     return number
 
 

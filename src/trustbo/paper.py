@@ -25,7 +25,7 @@ WORKSPACE: Mapping[str, Any] = MappingProxyType(
         "bounds": False,
     }
 )
-"""Keywords of `Workspace.from_terrain`: awareness z of (1) and (3) is of the cell entered. Its
+"""Keywords of `Workspace.from_terrain`: awareness z of (1) and (3) describes the cell entered. Its
 features are two composites, each the first principal component of features of pixels."""
 
 CAMPAIGN: Mapping[str, Any] = MappingProxyType(

@@ -98,8 +98,8 @@ class Team(Summary):
             isinstance(robot, Robot) for robot in self.robots
         ):
             raise TrustboError(
-                "Team.robots must be a sequence of Robot; for a number of equal ones give "
-                f"n_robots=; got {type(self.robots).__name__}."
+                f"Team.robots must be a sequence of Robot; got {type(self.robots).__name__}. For "
+                "identical robots, give n_robots=."
             )
         robots = tuple(self.robots) or (Robot(),) * require_whole("n_robots", self.n_robots, 1)
         names = tuple(self.names) or tuple(f"r{i + 1}" for i in range(len(robots)))

@@ -368,7 +368,7 @@ def test_wrong_input_is_named():
         fit_hazard([mission(ROW)], workspace(2))
     with pytest.raises(TrustboError, match="sd of intercept must be positive"):
         Hazard(intercept=(0.0, 0.0))
-    with pytest.raises(TrustboError, match="share of doubt"):
+    with pytest.raises(TrustboError, match="doubt"):
         Hazard(doubt=(1.0, 4.0))
     with pytest.raises(TrustboError, match="sd of doubt"):
         Hazard(doubt=(0.1, 0.0))

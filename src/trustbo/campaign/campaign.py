@@ -94,7 +94,7 @@ class Campaign(Result):
                 returns a Plan.
             objective: Objective of the paths, see `planning.Planner`.
             sampler: Sampler of the posterior, see `trustbo.fit`.
-            seed: Seed of everything random.
+            seed: Seed of all random numbers.
             directory: Folder that is updated after each mission. It is locked until the end of
                 `with campaign:`, or of the process.
             overwrite: Whether to remove an existing campaign from that folder first.
@@ -468,7 +468,7 @@ class Campaign(Result):
             given = state.settings
             if given["policy"] not in POLICIES and policy is None:
                 raise TrustboError(
-                    f"the campaign's policy {given['policy']!r} was your own: give policy=."
+                    f"the campaign's policy {given['policy']!r} is a custom function; give policy=."
                 )
             campaign = cls(
                 workspace, given["start"], given["goal"],

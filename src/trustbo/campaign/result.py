@@ -212,11 +212,11 @@ class Result(Summary):
     def table(self) -> pd.DataFrame:
         """Return a table with one row per mission, labelled by its number, from 1.
 
-        Columns are the `status`, the `state` with its `reason`, or the reason of a failure, the
-        cell `where` the mission failed, the mean `contact_rate`, the plan's `objective`, the number
-        `n_bounds` of bounds run, including a failed one, `path_changed` and the `path` as text,
-        "9,0 8,1"; then the other quantities of `history`. A mission that failed without a report,
-        see `Campaign.fail`, has no number and the state "given up".
+        The first columns are `status`, `state`, the `reason` for the state or the failure, the cell
+        `where` the mission failed, the mean `contact_rate`, the plan's `objective`, the number
+        `n_bounds` of bounds run, `path_changed`, and the `path` as text, "9,0 8,1". The other
+        quantities of `history` follow. A mission that failed without a report, see `Campaign.fail`,
+        has no number and the state "given up".
         """
         reasons = {f.after: f.reason for f in self.state.failures if f.reported}
         rows: list[dict[str, Any]] = []

@@ -61,9 +61,9 @@ class Hazard:
             mean, sd = getattr(self, name)
             object.__setattr__(self, name, (float(mean), require_positive(f"sd of {name}", sd)))
         share, sd = self.doubt
-        share = require_positive("share of doubt", share, or_zero=True)
+        share = require_positive("the probability of doubt", share, or_zero=True)
         if share >= 1.0:
-            raise TrustboError(f"share of doubt must be in [0, 1); got {share!r}.")
+            raise TrustboError(f"the probability of doubt must be in [0, 1); got {share!r}.")
         object.__setattr__(self, "doubt", (share, require_positive("sd of doubt", sd)))
 
     def of_bounds(

@@ -36,8 +36,8 @@ def require_posterior(who: str, value: object) -> xr.DataTree:
     missing += [name for name in _ATTRIBUTES if name not in value.attrs]
     if missing:
         raise TrustboError(
-            f"{who} takes a posterior from fit; this DataTree has no {missing[0]!r}. Give one of "
-            "trustbo.fit, whole."
+            f"{who} takes a posterior from fit; this DataTree has no {missing[0]!r}. Give the "
+            "whole result of trustbo.fit."
         )
     return value
 
@@ -104,8 +104,8 @@ def params_of(
     needed = ("B0", "B") if "B0" in sites else ("beta0", "beta", "b", "delta_w", "delta_v")
     if missing := [name for name in needed if name not in sites]:
         raise TrustboError(
-            f"the posterior has no variable {missing[0]!r}; it has {', '.join(sites)}. Give one "
-            "of trustbo.fit with its own names."
+            f"the posterior has no variable {missing[0]!r}; it has {', '.join(sites)}. Give a "
+            "posterior of trustbo.fit with unchanged names."
         )
     x0 = {name: attrs[name] for name in ("x0_mean", "x0_sd")}
     params = assemble_params(sites, x0, attrs.get("memory", "level"))
@@ -152,7 +152,7 @@ def _in_order_of(workspace: Workspace, posterior: xr.DataTree) -> xr.DataTree:
             continue
         if sorted(have) != sorted(names):
             raise TrustboError(
-                f"the posterior is of the {axis}s {', '.join(have)}, the workspace has "
+                f"the posterior has the {axis}s {', '.join(have)}, but the workspace has "
                 f"{', '.join(names)}; fit missions of this workspace."
             )
         order[axis] = names

@@ -309,7 +309,7 @@ class Posterior:
 
 
 def at(theta: Mapping[str, Any], index: Any) -> dict[str, Any]:
-    """Hyperparameters at some points."""
+    """Select the hyperparameters at some points."""
     return {name: values[index] for name, values in theta.items()}
 
 

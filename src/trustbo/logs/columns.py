@@ -49,7 +49,7 @@ class Columns:
         frame.columns = [str(name).strip() for name in frame.columns]
         frame = frame.loc[:, [not re.fullmatch(r"(Unnamed: \d+)?", n) for n in frame.columns]]
         if not frame.columns.is_unique:
-            raise TrustboError(f"{what} has two columns of one name: {', '.join(frame.columns)}.")
+            raise TrustboError(f"{what} repeats a column name: {', '.join(frame.columns)}.")
         frame.index = pd.RangeIndex(1, len(frame) + 1)
         text = [name for name in frame if frame[name].dtype.kind not in "biufM"]
         frame = frame.assign(**{n: frame[n].astype(object).map(_cell).astype(object) for n in text})

@@ -41,7 +41,7 @@ def read_reports(
         report: Column of the report.
         outcome: Column with the robot's outcome: 1, `true`, `yes` or `success`, or 0, `false`, `no`
             or `failure`, or blank. It becomes the features `success` and `failure`.
-        inputs: Columns of further features, of order 1: centre and scale other units first.
+        inputs: Columns of further features; standardise columns whose values are not of order 1.
         scale: `"unit"`, reports in [0, 1]; `"likert7"` (or `"ordinal7"`), whole numbers 1 to 7.
 
     Returns:
@@ -97,8 +97,8 @@ def _seen(columns: Columns, outcome: str | None, inputs: Sequence[str]) -> dict[
         seen[name] = columns.numbers(name, blank=False)
         if (large := np.abs(seen[name]).max()) > _LARGEST:
             raise TrustboError(
-                f"{name} has values up to {large:g}; inputs are of size 1: centre and scale the "
-                "column, such as (column - column.mean()) / column.std()."
+                f"{name} has values up to {large:g}, but inputs must be of order 1; standardise "
+                "the column: (column - column.mean()) / column.std()."
             )
     return seen
 
@@ -111,8 +111,8 @@ def _unit_of(columns: Columns, report: str, levels: int) -> np.ndarray:
     if off.any():
         kind = "whole number" if levels else "number"
         raise TrustboError(
-            f"row {columns.frame.index[off][0]}: {report} = {y[off][0]:g} is no {kind} from "
-            f'{low:g} to {high:g}; name the scale, such as scale="likert7", divide percentages by '
-            "100, and leave out what was not answered."
+            f"row {columns.frame.index[off][0]}: {report} = {y[off][0]:g} is not a {kind} from "
+            f'{low:g} to {high:g}; give the scale, such as scale="likert7", divide percentages by '
+            "100, and leave missing answers blank."
         )
     return (y - low) / (high - low)

@@ -112,7 +112,7 @@ def _read(poses: Any, detections: Any) -> tuple[dict[str, np.ndarray], np.ndarra
     names, pairs = where.texts("robot"), [seen.texts(end) for end in ("watcher", "seen")]
     robots = tuple(dict.fromkeys(names))
     if len(robots) < 2 or "" in robots:
-        raise TrustboError(f"poses must be of at least two named robots; got {robots}.")
+        raise TrustboError(f"poses must include at least two named robots; got {robots}.")
     require_one_spelling("the names in poses and detections", [*names, *pairs[0], *pairs[1]])
     xy = [where.numbers(name, blank=False) for name in ("x", "y")]
     if max(np.ptp(xy[0]), np.ptp(xy[1])) < _EXTENT:
@@ -126,12 +126,12 @@ def _read(poses: Any, detections: Any) -> tuple[dict[str, np.ndarray], np.ndarra
              if a in index and b in index and a != b]  # fmt: skip
     if not looks:
         raise TrustboError(
-            f"no detection is of one of {robots} by another; the first is of {pairs[1][0]!r} by "
-            f"{pairs[0][0]!r}."
+            f"in no detection does one of {robots} detect another; in the first, "
+            f"{pairs[0][0]!r} detects {pairs[1][0]!r}."
         )
     if silent := {*robots} - {robots[i] for look in looks for i in look[1:]}:
         warnings.warn(
-            f"no detection names {', '.join(sorted(silent))}: contact of such a robot is 0.",
+            f"no detection names {', '.join(sorted(silent))}; the contact of such a robot is 0.",
             stacklevel=3,
         )
     return {name: _track(name, rows[of == name]) for name in robots}, np.array(looks, dtype=float)
@@ -156,8 +156,8 @@ def _track(name: str, rows: np.ndarray) -> np.ndarray:
         raise TrustboError(f"headings of robot {name!r} are blank in some poses; give all or none.")
     elif _in_degrees(heading, course[moves], heading[moves]):
         raise TrustboError(
-            f"headings of robot {name!r} are up to {np.abs(heading).max():g}, in degrees; "
-            "give rad from east, anticlockwise: radians(90 - compass heading)."
+            f"headings of robot {name!r} are up to {np.abs(heading).max():g}, so they seem to be "
+            "in degrees; give rad from east, anticlockwise: radians(90 - compass heading)."
         )
     return np.column_stack([t, x, y, np.unwrap(heading)])
 

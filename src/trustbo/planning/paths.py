@@ -44,7 +44,7 @@ class AdmissiblePaths:
         bounds: Bounds that a path may take, (move, row, col), indexed by the cell entered.
         bounds_to_goal: Fewest bounds from each cell to the goal, (row, col); -1 without a path.
         shortest: Fewest bounds of a path.
-        longest: Most bounds of a path.
+        longest: Largest number of bounds of a path.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class AdmissiblePaths:
         self.start = workspace.locate(start, "start")
         self.goal = workspace.locate(goal, "goal")
         if self.start == self.goal:
-            raise TrustboError(f"start and goal are the same cell {self.start}; choose two.")
+            raise TrustboError(f"start and goal are the same cell {self.start}; choose two cells.")
         self.avoided = avoided
         self.bounds = workspace.passable_bounds.values
         if avoided is not None:
@@ -73,8 +73,8 @@ class AdmissiblePaths:
             n_goal = int((self.bounds_to_goal >= 0).sum())
             raise NoPathError(
                 f"no path from {self.start} to {self.goal}: {n_reached} of {n_cells} passable "
-                f"cells can be reached from the start, and the goal from {n_goal}. Choose "
-                "ends in one part, or a team with a larger max_slope."
+                f"cells can be reached from the start, and the goal from {n_goal}. Choose another "
+                "start or goal, or a team with a larger max_slope."
             )
         self.turns = not isinstance(max_bounds, str)
         self.max_bounds = max_bounds
@@ -110,7 +110,7 @@ class AdmissiblePaths:
         if (n_states := int(n_left.sum())) > _MOST_STATES:
             raise TrustboError(
                 f"max_bounds = {self.max_bounds!r} admits paths of up to {self.longest} bounds, "
-                f"whose search has {n_states:.3g} states, more than {_MOST_STATES:.3g}; give less."
+                f"whose search has {n_states:.3g} states, more than {_MOST_STATES:.3g}; reduce it."
             )
         cell = np.repeat(np.arange(rows * cols, dtype=np.int32), n_left)
         base = np.concatenate([[0], np.cumsum(n_left)])

@@ -51,7 +51,7 @@ class Problem:
         family: Family of the contact rates.
         toll: Cost of each bound apart from trust, (move, row, col).
         max_failure: Largest probability that a path fails, or None.
-        failure_cost: Cost of a failure in bounds; None: the fewest bounds of a path.
+        failure_cost: Cost of a failure in bounds; by default the fewest bounds of a path.
         risk: Probability that each bound ends the mission, or None.
     """
 
@@ -72,8 +72,8 @@ class Problem:
             require_positive("failure_cost", self.failure_cost, or_zero=True)
             if not self.objective.of_contact:
                 raise TrustboError(
-                    f"failure_cost is a loss of contact, which {self.objective.name!r} does not "
-                    "count; use max_failure."
+                    f"failure_cost is a loss of contact, which the objective "
+                    f"{self.objective.name!r} does not include; use max_failure."
                 )
         shape = self.paths.bounds.shape
         if self.risk is not None and self.risk.p_fail.shape != shape:

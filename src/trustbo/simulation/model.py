@@ -66,10 +66,8 @@ class ModelSimulator(DescribedSimulator):
         check_params(params, shape[0], shape[-1])
         self.n_ticks = None if n_ticks is None else require_whole("n_ticks", n_ticks, 1)
         if (self.n_ticks is not None) != self.model.family.needs_ticks:
-            raise TrustboError(
-                f"n_ticks is for families that count ticks, and {self.model.family.name} "
-                f"{'does' if self.model.family.needs_ticks else 'does not'}; got {n_ticks}."
-            )
+            needs = "needs" if self.model.family.needs_ticks else "does not use"
+            raise TrustboError(f"the family {self.model.family.name} {needs} n_ticks.")
         bounds = shape[1:4]
         self.p_fail = None if p_fail is None else _require_probabilities(p_fail, bounds)
 

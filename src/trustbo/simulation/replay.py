@@ -48,7 +48,7 @@ class ReplaySimulator(DescribedSimulator):
         recorded, asked = self.missions[mission], require_cells("path", path)
         if recorded.path != asked and not self.any_path:
             raise TrustboError(
-                f"mission {mission} was recorded on {path_text(recorded.path)}, and the path asked "
-                f"for is {path_text(asked)}; to replay it nevertheless, set any_path=True."
+                f"mission {mission} was recorded on {path_text(recorded.path)}, not on "
+                f"{path_text(asked)}; to replay it nevertheless, set any_path=True."
             )
         return recorded

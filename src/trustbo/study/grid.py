@@ -99,7 +99,7 @@ def run_grid(
     )
     if failed := [error for error in errors if error]:
         raise TrustboError(
-            f"{len(failed)} of {len(runs)} runs failed, and are run again at the next call: "
+            f"{len(failed)} of {len(runs)} runs failed; the next call repeats them: "
             f"{'; '.join(failed[:3])}"
         )
     return pd.concat([pd.read_csv(file) for file in files.values()], ignore_index=True)

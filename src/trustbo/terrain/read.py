@@ -50,7 +50,7 @@ def read_terrain(
 
     Both are resampled to the DEM's grid. The DEM is warped to its UTM zone (outside all zones, to a
     local transverse Mercator map) if it is in degrees, or if its map is rotated from north or wrong
-    in length by over 1 %, as EPSG:3857 is. The surface is raised to the ground where it is below.
+    in length by over 1 %, as EPSG:3857 is. Where the surface is below the ground, it is raised.
     Heights in feet, according to the band or the CRS, are converted to metres, with a warning;
     depths become negative heights.
 
@@ -180,7 +180,7 @@ def _of_file(file: DatasetReader, name: str) -> xr.DataArray:
     """
     if not file.count:
         parts = ", ".join(file.subdatasets) or "nothing"
-        raise TrustboError(f"{name} has no band of its own; give one of its parts: {parts}.")
+        raise TrustboError(f"{name} has no band; give one of its subdatasets: {parts}.")
     check_size(file.shape, name)
     t = file.transform
     # Less than a thousandth of a pixel over the whole raster is rounding.

@@ -127,7 +127,7 @@ def labelled(
     if not passable.any():
         raise TrustboError(
             "no cell is passable: more than half of every cell is missing or too steep. Use "
-            "other cells, or a team with a larger max_slope."
+            "another shape, or a team with a larger max_slope."
         )
     cells = {
         **{axis: np.arange(n) for axis, n in zip(("row", "col"), grid.shape, strict=True)},
@@ -160,7 +160,7 @@ def unlabelled(
     for axis, given in (("robot", names), ("feature", features)):
         labels = awareness[axis].values.astype(str).tolist() if axis in awareness.coords else []
         if labels and given and set(labels) != set(given):
-            raise TrustboError(f"awareness has labels {labels} of {axis}; got {list(given)}.")
+            raise TrustboError(f"awareness has the {axis} labels {labels}, not {list(given)}.")
         if labels and given:
             awareness = awareness.sel({axis: list(given)})
         chosen.append(tuple(given or labels))

@@ -62,7 +62,7 @@ def draw_between(a: ndarray, b: ndarray, rng: Generator) -> ndarray:
 
 
 def draw_between_knots(knots: ndarray, log_f: ndarray, rng: Generator) -> Drawn:
-    """Draw from a log-linear density between knots (..., knot); also return its log."""
+    """Draw from a density that is log-linear between knots (..., knot); return its log, too."""
     width, rise = np.diff(knots), np.diff(log_f)
     rise = np.where(np.abs(rise) < 1e-9, 1e-9, rise)
     log_mass = log_f[..., :-1] + np.log(width) + np.log(np.expm1(rise) / rise)
