@@ -54,15 +54,15 @@ def openblas(core: str) -> Setting:
     """The setting of a core type, which is tried in a process of its own, as it may crash."""
     code = (
         "import numpy as np, scipy.linalg, threadpoolctl\n"
-        "a = np.random.default_rng(0).random((200, 200))\n"
-        "scipy.linalg.cholesky(a @ a.T + np.eye(200)) @ a[0]\n"
+        "a = np.random.default_rng(0).random((500, 500))\n"
+        "scipy.linalg.cholesky(a @ a.T + np.eye(500)) @ (a @ a)\n"
         "print({pool.get('architecture') for pool in threadpoolctl.threadpool_info()})\n"
     )
     command, environment = [sys.executable, "-c", code], os.environ | {"OPENBLAS_CORETYPE": core}
     tried = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     lacking = ""
     if tried.returncode != 0:
-        lacking = "this processor lacks its instructions"
+        lacking = "a product of matrices crashes under it here"
     elif (taken := tried.stdout.strip()) != str({core}):
         lacking = f"this build of OpenBLAS takes {taken} for it"
     return Setting("OPENBLAS_CORETYPE", core, lacking)
