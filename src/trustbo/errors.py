@@ -1,4 +1,4 @@
-"""Errors that trustbo raises for input it refuses; each is also a ValueError."""
+"""Errors that trustbo raises for invalid input; each is also a ValueError."""
 
 import math
 import operator
@@ -7,14 +7,14 @@ from typing import Any
 
 
 class TrustboError(ValueError):
-    """Input that trustbo refuses; the message names the value and the remedy."""
+    """Error for invalid input; the message names the value and the remedy."""
 
 
 class PosteriorError(TrustboError):
     """A posterior whose diagnostics exceed their limits.
 
     Attributes:
-        posterior: Refused posterior (ArviZ DataTree), for inspection.
+        posterior: Rejected posterior (ArviZ DataTree), for inspection.
         reason: Message without the remedy.
     """
 

@@ -414,7 +414,7 @@ class Campaign(Result):
         self._write()
 
     def _reason_to_end(self, n_iterations: int, rules: Sequence[Stop]) -> str | None:
-        """Reason given by the first stopping rule that applies, by default its name; else None."""
+        """Return the reason of the first stopping rule that applies, else None."""
         n = len(self.state.entries)
         for rule in rules if n else ():
             if verdict := rule(self):

@@ -52,7 +52,7 @@ class Result(Summary):
         self._base = base_planner(workspace, state.settings) if base is None else base
 
     def _computed(self) -> dict[str, Any]:
-        """Cached properties by name."""
+        """Collect the cached properties by name."""
         cached = (name for name, of in vars(Result).items() if isinstance(of, cached_property))
         return {name: vars(self)[name] for name in cached if name in vars(self)}
 
@@ -135,7 +135,7 @@ class Result(Summary):
         return prior_mean(model, len(features), n_robots=n_robots).flat()
 
     def draw_prior(self, n_draws: int) -> Params:
-        """Draws of the parameters from the prior, leading axis (draw,)."""
+        """Draw parameters from the prior, leading axis (draw,)."""
         features, n_robots = self.workspace.features, self.workspace.team.n_robots
         seed, model = State(self.settings).seed_of("prior"), self.model.for_features(features)
         return sample_prior(model, len(features), n_draws, seed, n_robots=n_robots).flat()
@@ -270,7 +270,7 @@ class Result(Summary):
         return self.workspace.grid.place(maps.where(self.workspace.passable))
 
     def _places(self) -> xr.Dataset:
-        """Maps of the effects of cells, (row, col), if the model has them."""
+        """Make maps of the effects of cells, (row, col), if the model has them."""
         if self.state.last is None or not (places := self.belief.places):
             return xr.Dataset()
         cells = xr.DataArray(places["place"].mean(1), dims=("draw", "row", "col"))

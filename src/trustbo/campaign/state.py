@@ -129,7 +129,7 @@ class State:
     stop_reason: str = "interrupted"
 
     def copy(self) -> Self:
-        """Copy that later missions do not change."""
+        """Return a copy that later missions do not change."""
         entries = [replace(entry, row=dict(entry.row)) for entry in self.entries]
         return replace(self, entries=entries, failures=list(self.failures))
 

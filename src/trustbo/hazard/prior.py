@@ -142,7 +142,7 @@ def steepness_of(tilt: np.ndarray, max_slope: float) -> np.ndarray:
 def mixture_quantile(z: np.ndarray, narrow: float, share: float, wide: float) -> np.ndarray:
     """Solve Phi(z) = (1 - share) Phi(x / narrow) + share Phi(x / wide) for x.
 
-    Interpolated to 1e-5 of `narrow`; linear in the far tails, with the larger sd as its slope.
+    The value is interpolated to 1e-5 of `narrow`, and linear in the far tails, with the larger sd.
     """
     curve = _quantile_curve(float(narrow), share, wide)
     end = curve.x[-1]

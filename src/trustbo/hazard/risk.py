@@ -38,7 +38,7 @@ class BoundRisk:
     """
 
     def __init__(self, hazard: xr.Dataset, workspace: Workspace) -> None:
-        """Take the group `hazard` of a posterior, see `fit_hazard`, and the workspace."""
+        """Set the group `hazard` of a posterior, see `fit_hazard`, and the workspace."""
         self.exists = workspace.passable_bounds.values
         self.exposures, self.failures = hazard["exposures"].values, hazard["failures"].values
         difficulty = difficulty_of(workspace)

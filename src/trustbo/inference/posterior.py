@@ -75,7 +75,7 @@ class Posterior:
             self.sites = ep.first_sites(self.terms)
 
     def _order(self) -> Order:
-        """Order of elimination: independent columns of one mission alone are leaves."""
+        """Find the order of elimination: independent columns of one mission alone are leaves."""
         n, (rows, p) = self.slots.n_missions, self._U.shape
         parts = self.prior(self.theta(np.zeros((1, self.n_scores)))).parts
         free = np.concatenate([np.full(part.shape[1], part.ndim == 2) for part in parts])

@@ -59,7 +59,7 @@ class Columns:
             raise TrustboError(f"{what} has no rows.")
 
     def find(self, name: str) -> str | None:
-        """Name of a column as spelled in the table; None if there is no such column."""
+        """Return the name of a column as spelled in the table; None if there is no such column."""
         if name in self.frame:
             return name
         alike = [other for other in self.frame if _folded(other) == _folded(name)]
@@ -180,7 +180,7 @@ def require_one_spelling(what: str, names: Iterable[str]) -> None:
 
 
 def _folded(name: str) -> str:
-    """Name in lower case, without leading zeros and with uniform spaces."""
+    """Return a name in lower case, without leading zeros and with uniform spaces."""
     spaced = re.sub(r"[\s_-]+", " ", name.casefold()).strip()
     return re.sub(r"(?<![\d.])0+(?=\d)", "", spaced)
 

@@ -134,7 +134,9 @@ def _mission(
     """Make a mission from its rows."""
     first, numbers = 0 if is_mapped else 1, sorted(rows["bound"].unique().tolist())
     if numbers != (planned := list(range(first, numbers[-1] + 1))):
-        raise TrustboError(f"bounds must be {planned}, from the start cell; got {numbers}.")
+        raise TrustboError(
+            f"bounds must be numbered {planned}, 0 being the start cell; got {numbers}."
+        )
     path = None
     if is_mapped:
         cells = rows[["bound", "row", "col"]].drop_duplicates().sort_values("bound")

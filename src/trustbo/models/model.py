@@ -72,7 +72,7 @@ class TrustModel(Summary, ABC):
                 f"effects must be objects such as PlaceEffect(); got {unknown[0]!r}."
             )
         if len({type(effect) for effect in effects}) < len(effects):
-            raise TrustboError(f"effects must be of different kinds; got {effects!r}.")
+            raise TrustboError(f"effects must not repeat a kind; got {effects!r}.")
         object.__setattr__(self, "effects", effects)
 
     # --- defined by each model ---
@@ -231,7 +231,7 @@ class TrustModel(Summary, ABC):
         ]
 
     def in_short(self) -> str:
-        """Name, effects, family, and the options that differ from their defaults."""
+        """Write the name, effects, family, and the options that differ from their defaults."""
         usual = {f.name: f.default for f in fields(self)}
         others = [
             f"{name} {value}"

@@ -64,14 +64,14 @@ class ParameterDraws(Summary):
         return np.shape(getattr(self, self.WEIGHTS))[axes.index("feature") - len(axes)]
 
     def transition(self, n_robots: int) -> np.ndarray:
-        """B0 of equation (1), shape (..., robot, robot); diagonal where robots do not interact."""
+        """Return B0 of equation (1), (..., robot, robot), diagonal if uncoupled."""
         beta0 = np.asarray(self.beta0, dtype=float)  # pyright: ignore
         if not self.BY_ROBOT:
             beta0 = beta0[..., None]
         return np.broadcast_to(beta0, (*self.leading, n_robots))[..., None] * np.eye(n_robots)
 
     def expected_transition(self, n_robots: int) -> np.ndarray:
-        """Transition matrix of expected trust; 0 for memory of deviations."""
+        """Return the transition matrix of expected trust; 0 for memory of deviations."""
         B0 = self.transition(n_robots)
         return B0 if self.memory == "level" else np.zeros_like(B0)  # pyright: ignore
 

@@ -12,7 +12,7 @@ from trustbo.models.priors import Priors
 
 
 def model_to_record(model: TrustModel) -> dict[str, Any]:
-    """Record of a model's class, options and effects, and of its priors as text.
+    """Write a model's class, options, effects and, as text, priors to a record.
 
     `by_feature` states that the priors depend on the features' names.
     """

@@ -18,7 +18,7 @@ kernel = njit(cache=True, nogil=True, error_model="numpy")
 
 
 class Unrolled(NamedTuple):
-    """States in the order of the bounds left, the goal first; edges in the order of their tails.
+    """Graph of states, ordered by the bounds left from the goal on, and of edges by their tails.
 
     Fields:
         cell: Flat index of the cell of each state, (state,).

@@ -115,5 +115,5 @@ def outlined(width: float, colour: str) -> list[patheffects.AbstractPathEffect]:
 
 
 def as_text(name: object) -> str:
-    """Name with its dollar signs escaped, so that matplotlib does not read it as a formula."""
+    """Escape the dollar signs of a name, so that matplotlib does not read it as a formula."""
     return str(name).replace("$", r"\$").replace("_", " ")

@@ -129,7 +129,7 @@ class Trees(Event):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not 0.0 <= self.height < np.inf:
-            raise TrustboError(f"height must be 0 or positive, m; got {self.height!r}.")
+            raise TrustboError(f"height (m) must not be negative; got {self.height!r}.")
 
     def change(self, world: World) -> World:
         """See `Event.change`."""

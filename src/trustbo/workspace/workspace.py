@@ -284,7 +284,7 @@ class Workspace(Summary):
         return cell
 
     def _why_impassable(self, cell: Cell) -> str:
-        """Say why a cell is impassable; empty without a terrain."""
+        """Explain why a cell is impassable; empty without a terrain."""
         if self.terrain is None:
             return ""
         missing = self.grid.cell_means(self.terrain["dem"].isnull().astype(float))[cell]
