@@ -25,8 +25,8 @@ from groups import KINDS, OURS, report_groups, rows_of
 from joblib import Parallel, delayed
 
 import trustbo as tb
-from trustbo.study import World, differences, numbers_of, run_grid, summary, worlds
-from trustbo.study.world import COURSES
+from trustbo.study import differences, numbers_of, run_grid, summary, worlds
+from trustbo.study.world import COURSES, World
 
 SET = (
     "synthetic-0", "synthetic-1", "synthetic-2", "wellington", "synthetic-0-aged",

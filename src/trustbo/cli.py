@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from trustbo.errors import PosteriorError, TrustboError
+from trustbo.errors import TrustboError
 
 if TYPE_CHECKING:
     from trustbo.campaign.result import Result
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 POLICIES = ("greedy", "optimistic", "thompson", "ucb", "random")
 OBJECTIVES = ("lost_contact", "terminal", "mean")
 FORMATS = ("geotiff", "geojson", "csv", "nav2")
-BAD_INPUT, REFUSED, INTERRUPTED = 2, 3, 130
-EPILOG = "exit codes: 0 done; 2 bad input; 3 the posterior failed its diagnostics; 130 interrupted"
+BAD_INPUT, INTERRUPTED = 2, 130
+EPILOG = "exit codes: 0 done; 2 bad input; 130 interrupted"
 PLACE = "ROW,COL, with row 0 in the north; or x=...,y=... in metres of the CRS; or lon=...,lat=..."
 _COLUMNS = ("status", "contact_rate", "objective", "k_hat", "r_hat", "path_changed")
 """Columns of the table that a finished campaign prints."""
@@ -36,7 +36,6 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     """
     args = parser().parse_args(arguments)
     folder = getattr(args, "folder", getattr(args, "out", None))
-    resume_later = f"continue with: trustbo resume {folder}"
     warnings.showwarning = lambda message, *_, **__: print(f"warning: {message}", file=sys.stderr)
     for stream in (sys.stdout, sys.stderr):  # a terminal may lack letters of a path
         if isinstance(stream, io.TextIOWrapper):
@@ -44,9 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     try:
         args.run(args)
     except KeyboardInterrupt:
-        _exit(f"interrupted; {resume_later}", INTERRUPTED)
-    except PosteriorError as error:
-        _exit(f"error: {error}\nThe missions so far are kept; {resume_later}", REFUSED)
+        _exit(f"interrupted; continue with: trustbo resume {folder}", INTERRUPTED)
     except (TrustboError, OSError) as error:
         _exit(f"error: {error}", BAD_INPUT)
     sys.exit(0)

@@ -127,13 +127,8 @@ class World:
         terrain = self.true_terrain()
         if self.radio:
             return RadioSimulator(workspace, terrain=terrain)
-        return KinematicSimulator(
-            workspace,
-            terrain=terrain,
-            sight=self.sight,
-            team=self.team,
-            events=self._events(terrain),
-        )
+        given = {"terrain": terrain, "sight": self.sight, "team": self.team}
+        return KinematicSimulator(workspace, events=self._events(terrain), **given)
 
     def truth(self, folder: FilePath | None = None) -> Truth:
         """Return the truth of the simulator, from a file in the folder if already computed."""
