@@ -34,7 +34,8 @@ class Blocks(NamedTuple):
     kind: np.ndarray  # (block,): blocks of one kind share their factors
     label: np.ndarray  # (kind,): index on the second axis of a `Signal`
     seen: np.ndarray  # (kind, row)
-    sums: Any  # sparse (entry, kind * pair of inputs), entries of the precision, see `Order`
+    sums: Any  # sparse (entry, kind * pair of inputs), of the entries of the precision in `at`
+    at: np.ndarray  # (entry,), where the precision has products of columns, see `Order`
     order: Order
 
     @classmethod
@@ -65,21 +66,22 @@ class Blocks(NamedTuple):
         upper = np.triu_indices(inputs)
         pair = np.zeros((inputs, inputs), dtype=int)
         pair[upper] = pair.T[upper] = np.arange(len(upper[0]))
-        at, where, values = [], [], []
+        entries, where, values = [], [], []
         for g in range(len(kinds)):
             rows = (np.flatnonzero(kind == g)[:, None] * inputs + np.arange(inputs)).ravel()
             X = sparse.csr_array(U[rows].reshape(len(rows) // inputs, inputs * p))
             products = (X.T @ X).tocoo()
             (k, a), (j, b) = np.divmod(products.row, p), np.divmod(products.col, p)
             entry = order.entry(a, b)
-            at.append(entry[entry >= 0])
+            entries.append(entry[entry >= 0])
             where.append((g * len(upper[0]) + pair[k, j])[entry >= 0])
             values.append(products.data[entry >= 0])
-        entries = np.concatenate(at), np.concatenate(where)
-        shape = order.size, len(kinds) * len(upper[0])
-        sums = sparse.csr_array((np.concatenate(values), entries), shape=shape)
+        at, row = np.unique(np.concatenate(entries), return_inverse=True)
+        shape = len(at), len(kinds) * len(upper[0])
+        index = row, np.concatenate(where)
+        sums = sparse.csr_array((np.concatenate(values), index), shape=shape)
         seen_by_kind = kinds[:, 2:].astype(bool)
-        return cls(np.where(seen, y, 0.0), U, kind, kinds[:, 1], seen_by_kind, sums, order)
+        return cls(np.where(seen, y, 0.0), U, kind, kinds[:, 1], seen_by_kind, sums, at, order)
 
     @property
     def n_columns(self) -> int:
@@ -122,7 +124,7 @@ class Prior(NamedTuple):
             i = np.arange(start, start := start + part.shape[1])
             a = b = np.arange(len(i))
             if part.ndim == 3:
-                a, b = np.tril_indices(len(i))
+                a, b = np.triu_indices(len(i))
             values = part if part.ndim == 2 else part[:, a, b]
             A = add(A, (slice(None), order.entry(i[a], i[b])), values)
         return A
@@ -176,8 +178,9 @@ def evidence(blocks: Blocks, signal: Signal, prior: Prior, lam: Any, y: Any = No
     back = (xp.swapaxes(C, 2, 3)[:, b.kind] @ w[..., None])[..., 0]
     h = times(b.U.T, back.reshape(n, -1))
     pairs = (xp.swapaxes(C, 2, 3) @ C)[:, :, *np.triu_indices(C.shape[3])]
-    A = prior.add_to(times(b.sums, pairs.reshape(n, -1)), b.order)
-    F = Factor.of(b.order, A)
+    products = times(b.sums, pairs.reshape(n, -1))
+    A = add(xp.zeros((n, b.order.size)), (slice(None), b.at), products)
+    F = Factor.of(b.order, prior.add_to(A, b.order))
     half = F.forward(h)
     many = np.bincount(b.kind, minlength=len(b.seen)).astype(float)
     log_p = log_sites @ many + 0.5 * (prior.log_det - (w**2).sum((1, 2)) + (half**2).sum(1))
@@ -229,7 +232,9 @@ def marginals(
     mean = at + np.einsum("nbij,nbj->nbi", gain, y - at)
     k, j = np.triu_indices(T.shape[3])
     M = np.zeros((n, len(blocks.y), T.shape[3], T.shape[3]))  # U cov U' of each block
-    M[..., k, j] = times(blocks.sums.T, fit.F.covariance()).reshape(n, len(blocks.y), -1)
+    M[..., k, j] = times(blocks.sums.T, fit.F.covariance()[:, blocks.at]).reshape(
+        n, len(blocks.y), -1
+    )
     M = M + np.swapaxes(M, 2, 3)
     var = np.diagonal(V - gain @ V, axis1=2, axis2=3) + ((G @ M) * G).sum(3)
     return mean, np.broadcast_to(var, (n, len(blocks.y), rows))

@@ -4,10 +4,11 @@ Columns that are independent a priori and occur in one mission only, such as bou
 *leaves*: given all other columns, the *core*, leaves of different missions are independent. With
 leaves first, the precision A and its factor F, A = F F', are
 
-    A = [D  B ]    F = [G   0]    G G' = D,  X = G^-1 B,  H H' = C - X' X,
-        [B' C ]        [X'  H]
+    A = [D  B ]    F = [G   0 ]    G G' = D,  X = G^-1 B,  H' H = C - X' X,
+        [B' C ]        [X'  H']
 
-with D and G block diagonal, a block for each mission. Only H is a large dense factor.
+with D and G block diagonal, a block for each mission. Only H is a large dense factor, kept as an
+upper triangle: LAPACK factors it in place, and fastest, as a lower one in its order of axes.
 """
 
 from typing import Any, NamedTuple, Self
@@ -77,7 +78,8 @@ class Order(NamedTuple):
         number = self.number[self.group[a], b] if g else 0
         index = np.where(of_both, row * k + self.place[b], g * k * k + row * t + number)
         index = np.where(of_leaf, index, g * k * (k + t) + self.place[a] * q + self.place[b])
-        other = (of_leaf == (self.group[b] >= 0)) & (self.place[a] < self.place[b])
+        above = np.where(of_both, self.place[a] < self.place[b], self.place[a] > self.place[b])
+        other = (of_leaf == (self.group[b] >= 0)) & above
         return np.where(other | (~of_leaf & (self.group[b] >= 0)), -1, index)
 
     def parts(self, A: Any) -> tuple[Any, Any, Any]:
@@ -97,20 +99,20 @@ class Factor(NamedTuple):
     order: Order
     inverse: Any  # (point, mission, place, place), G^-1
     X: Any  # (point, mission, place, touched), 0 elsewhere in the core
-    H: Any  # (point, core, core)
+    H: Any  # (point, core, core), upper triangles, with anything below
 
     @classmethod
     def of(cls, order: Order, A: Any) -> Self:
-        """Factor precisions whose lower triangles are in vectors (point, entry)."""
+        """Factor precisions in vectors (point, entry), which NumPy overwrites."""
         D, B, C = order.parts(A)
         xp = namespace(A)
         inverse = xp.linalg.inv(cholesky(D))
         X = inverse @ B
-        square, q = xp.swapaxes(X, 2, 3) @ X, len(order.core)
-        C = xp.pad(C, ((0, 0), (0, 1), (0, 1)))  # padding of what is touched
-        for g, i in enumerate(order.touched):
-            C = add(C, (slice(None), i[:, None], i), -square[:, g])
-        return cls(order, inverse, X, cholesky(C[:, :q, :q]))
+        square = xp.swapaxes(X, 2, 3) @ X
+        for g, touched in enumerate(order.touched):
+            i = touched[touched < len(order.core)]  # without the padding
+            C = add(C, (slice(None), i[:, None], i), -square[:, g, : len(i), : len(i)])
+        return cls(order, inverse, X, upper_factor(C))
 
     @property
     def size(self) -> int:
@@ -133,10 +135,10 @@ class Factor(NamedTuple):
         rest = rest[:, :-1]
         if isinstance(rest, np.ndarray):
             pairs = zip(self.H, rest, strict=True)
-            core = np.stack([lapack.dtrtrs(H.T, x, lower=0, trans=1)[0] for H, x in pairs])  # pyright: ignore[reportAttributeAccessIssue]
+            core = np.stack([lapack.dtrtrs(H.T, x, lower=1)[0] for H, x in pairs])  # pyright: ignore[reportAttributeAccessIssue]
         else:
             core = jax.lax.linalg.triangular_solve(
-                self.H, rest[..., None], left_side=True, lower=True
+                self.H, rest[..., None], left_side=True, lower=False, transpose_a=True
             )[..., 0]
         return xp.concatenate([leaf.reshape(len(h), -1), core], axis=1)
 
@@ -144,7 +146,7 @@ class Factor(NamedTuple):
         """Compute vectors F'^-1 w (point, draw, column) of white vectors w (point, draw, ...)."""
         order, split = self.order, self.order.leaf.size
         pairs = zip(self.H, white[..., split:], strict=True)
-        core = np.stack([lapack.dtrtrs(H.T, w.T, lower=0)[0].T for H, w in pairs])  # pyright: ignore[reportAttributeAccessIssue]
+        core = np.stack([lapack.dtrtrs(H.T, w.T, lower=1, trans=1)[0].T for H, w in pairs])  # pyright: ignore[reportAttributeAccessIssue]
         leaf = white[..., :split].reshape(*white.shape[:2], *order.leaf.shape)
         padded = np.concatenate([core, np.zeros((*core.shape[:2], 1))], axis=2)
         leaf = leaf - np.einsum("ngkt,ndgt->ndgk", self.X, padded[..., order.touched])
@@ -161,14 +163,14 @@ class Factor(NamedTuple):
         leaf = np.linalg.solve(np.swapaxes(self.inverse, 2, 3), leaf[..., None])[..., 0]
         padded = np.column_stack([core, np.zeros(len(core))])
         leaf = leaf + np.einsum("ngkt,ngt->ngk", self.X, padded[:, order.touched])
-        core = np.einsum("nij,ni->nj", self.H, core)
+        core = np.einsum("nij,nj->ni", np.triu(self.H), core)
         return np.concatenate([leaf.reshape(len(c), -1), core], axis=1)
 
     def covariance(self) -> np.ndarray:
         """Compute the entries of A^-1 in the layout of A, diagonals halved for sums over pairs."""
-        C = np.stack([np.tril(lapack.dpotri(H.T, lower=0)[0].T) for H in self.H])  # pyright: ignore[reportAttributeAccessIssue]
+        C = np.stack([np.triu(lapack.dpotri(H.T, lower=1)[0].T) for H in self.H])  # pyright: ignore[reportAttributeAccessIssue]
         q = np.arange(C.shape[1])
-        whole = C + np.swapaxes(np.tril(C, -1), 1, 2)
+        whole = C + np.swapaxes(np.triu(C, 1), 1, 2)
         turned, i = np.swapaxes(self.inverse, 2, 3), self.order.touched
         whole = np.pad(whole, ((0, 0), (0, 1), (0, 1)))[:, i[..., None], i[:, None]]
         B = -turned @ self.X @ whole
@@ -191,6 +193,17 @@ def log_diagonal(L: Any) -> Any:
     """Compute the log determinant of triangular matrices."""
     xp = namespace(L)
     return xp.log(xp.diagonal(L, axis1=-2, axis2=-1)).sum(-1)
+
+
+def upper_factor(A: Any) -> Any:
+    """Upper factors, from the upper triangles, in place in NumPy; anything below; NaN if none."""
+    if not isinstance(A, np.ndarray):
+        lower = jax.lax.linalg.cholesky(A.mT, symmetrize_input=False)
+        return lower.mT
+    for one in A:
+        if lapack.dpotrf(one.T, lower=1, clean=0, overwrite_a=1)[1]:  # pyright: ignore[reportAttributeAccessIssue]
+            one[:] = np.nan
+    return A
 
 
 def cholesky(A: Any) -> Any:
