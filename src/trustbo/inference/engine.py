@@ -17,11 +17,10 @@ The same code runs in NumPy, without compilation, and in JAX, with derivatives.
 from collections.abc import Sequence
 from typing import Any, NamedTuple, Self
 
-import jax
 import numpy as np
 from scipy import sparse
 
-from trustbo.inference.factor import Factor, Order, add, cholesky, log_diagonal
+from trustbo.inference.factor import Factor, Order, add, cholesky, log_diagonal, times
 from trustbo.models.backend import namespace
 from trustbo.models.signal import Signal, each
 
@@ -110,7 +109,7 @@ class Prior(NamedTuple):
                     xp = namespace(part)
                     one_axis = part.ndim == 2
                     known[id(part)] = (
-                        xp.log(part).sum(1) if one_axis else xp.linalg.slogdet(part)[1]
+                        xp.log(part).sum(1) if one_axis else 2.0 * log_diagonal(cholesky(part))
                     )
                 log_det = log_det + known[id(part)]
             parts.extend(precisions)
@@ -238,13 +237,3 @@ def marginals(
     M = M + np.swapaxes(M, 2, 3)
     var = np.diagonal(V - gain @ V, axis1=2, axis2=3) + ((G @ M) * G).sum(3)
     return mean, np.broadcast_to(var, (n, len(blocks.y), rows))
-
-
-def times(M: Any, x: Any) -> Any:
-    """Multiply a sparse matrix by vectors x (point, column); shape (point, row)."""
-    if isinstance(x, np.ndarray):
-        return np.ascontiguousarray((M @ x.T).T)
-    M = M.tocoo()
-    order = np.argsort(M.row, kind="stable")
-    terms = M.data[order, None] * x.T[M.col[order]]
-    return jax.ops.segment_sum(terms, M.row[order], M.shape[0], indices_are_sorted=True).T

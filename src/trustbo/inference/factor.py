@@ -15,6 +15,7 @@ from typing import Any, NamedTuple, Self
 
 import jax
 import numpy as np
+from scipy import sparse
 from scipy.linalg import lapack
 
 from trustbo.models.backend import namespace
@@ -29,6 +30,9 @@ class Order(NamedTuple):
     place: np.ndarray  # (column,), among the leaves of the mission, or in the core
     touched: np.ndarray  # (mission, number), places of core columns of a mission with leaves
     number: np.ndarray  # (mission, column), where in `touched`
+    spread: Any  # sparse (core, mission * touched), to sum what missions add to a vector
+    pairs: Any  # sparse (pair, mission * touched * touched), to sum what they add to C
+    pair: np.ndarray  # (pair,), where in C
 
     @classmethod
     def of(cls, met: np.ndarray, free: np.ndarray) -> Self:
@@ -57,7 +61,14 @@ class Order(NamedTuple):
         for g, places in enumerate(of_mission[1:]):
             touched[g, : len(places)] = places
             number[g, groups[0][places]] = np.arange(len(places))
-        return cls(leaf, groups[0], group, place, touched, number)
+        q, flat = len(groups[0]), touched.ravel()
+        spread = _summing(flat, np.flatnonzero(flat < q), q)
+        a, b = np.broadcast_arrays(touched[:, :, None], touched[:, None])
+        at, kept = (a * q + b).ravel(), np.flatnonzero((a <= b) & (b < q))
+        pair, row = np.unique(at[kept], return_inverse=True)
+        at[kept] = row
+        pairs = _summing(at, kept, len(pair))
+        return cls(leaf, groups[0], group, place, touched, number, spread, pairs, pair)
 
     @property
     def shapes(self) -> tuple[tuple[int, ...], ...]:
@@ -108,10 +119,8 @@ class Factor(NamedTuple):
         xp = namespace(A)
         inverse = xp.linalg.inv(cholesky(D))
         X = inverse @ B
-        square = xp.swapaxes(X, 2, 3) @ X
-        for g, touched in enumerate(order.touched):
-            i = touched[touched < len(order.core)]  # without the padding
-            C = add(C, (slice(None), i[:, None], i), -square[:, g, : len(i), : len(i)])
+        squares = times(order.pairs, (xp.swapaxes(X, 2, 3) @ X).reshape(len(A), -1))
+        C = add(C.reshape(len(A), -1), (slice(None), order.pair), -squares).reshape(C.shape)
         return cls(order, inverse, X, upper_factor(C))
 
     @property
@@ -129,10 +138,8 @@ class Factor(NamedTuple):
         xp, order = namespace(h), self.order
         h = xp.concatenate([h, xp.zeros((len(h), 1))], axis=1)
         leaf = (self.inverse @ h[:, order.leaf][..., None])[..., 0]
-        rest, back = h[:, np.append(order.core, -1)], xp.einsum("ngkt,ngk->ngt", self.X, leaf)
-        for g, i in enumerate(order.touched):
-            rest = add(rest, (slice(None), i), -back[:, g])
-        rest = rest[:, :-1]
+        back = xp.einsum("ngkt,ngk->ngt", self.X, leaf).reshape(len(h), -1)
+        rest = h[:, order.core] - times(order.spread, back)
         if isinstance(rest, np.ndarray):
             pairs = zip(self.H, rest, strict=True)
             core = np.stack([lapack.dtrtrs(H.T, x, lower=1)[0] for H, x in pairs])  # pyright: ignore[reportAttributeAccessIssue]
@@ -179,6 +186,22 @@ class Factor(NamedTuple):
         C[:, q, q] *= 0.5
         D[:, :, k, k] *= 0.5
         return np.concatenate([part.reshape(len(C), -1) for part in (D, B, C)], axis=1)
+
+
+def _summing(row: np.ndarray, kept: np.ndarray, n: int) -> Any:
+    """Sparse matrix (n, value) that adds each kept value to its row."""
+    shape = n, len(row)
+    return sparse.csr_array((np.ones(len(kept)), (row[kept], kept)), shape=shape)
+
+
+def times(M: Any, x: Any) -> Any:
+    """Multiply a sparse matrix by vectors x (point, column); shape (point, row)."""
+    if isinstance(x, np.ndarray):
+        return np.ascontiguousarray((M @ x.T).T)
+    M = M.tocoo()
+    order = np.argsort(M.row, kind="stable")
+    terms = M.data[order, None] * x.T[M.col[order]]
+    return jax.ops.segment_sum(terms, M.row[order], M.shape[0], indices_are_sorted=True).T
 
 
 def add(A: Any, at: Any, values: Any) -> Any:

@@ -22,6 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy import special
+from scipy.linalg import lapack
 
 with warnings.catch_warnings():
     warnings.filterwarnings("ignore", "IProgress not found")
@@ -48,6 +49,18 @@ def namespace(x: Any) -> ModuleType:
 def special_functions(x: Any) -> Any:
     """Return `jax.scipy.special` for JAX arrays, else `scipy.special`."""
     return jax.scipy.special if isinstance(x, jax.Array) else special
+
+
+def inverse(A: Any) -> Any:
+    """Inverses of positive definite matrices (point, n, n), NaN where one is not."""
+    if isinstance(A, jax.Array):
+        return jnp.linalg.inv(A)
+    half = A.copy()
+    for one in half:  # symmetric, so its transpose, in LAPACK's order of axes, is the same matrix
+        if lapack.dpotrf(one.T, lower=1, overwrite_a=1)[1]:  # pyright: ignore[reportAttributeAccessIssue]
+            one[:] = np.nan
+        lapack.dpotri(one.T, lower=1, overwrite_c=1)  # pyright: ignore[reportAttributeAccessIssue]
+    return half + np.swapaxes(np.triu(half, 1), 1, 2)
 
 
 @partial(jax.jit, static_argnums=1)

@@ -11,7 +11,7 @@ from scipy import sparse
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError, require_positive
-from trustbo.models.backend import namespace
+from trustbo.models.backend import inverse, namespace
 from trustbo.models.effects.effect import LEAST, Effect, Theta, Values
 from trustbo.models.slots import Slots
 from trustbo.models.visited import bounds_of, visited
@@ -99,7 +99,7 @@ class PlaceEffect(Effect):
         scale = xp.clip(theta["length_scale"], *_LENGTH_SCALES)
         K = matern(np.sqrt(square), scale[:, None])[:, pair.reshape(gap.shape[:2])]
         tau = xp.maximum(theta["tau_s"], LEAST)[:, None, None]
-        return xp.linalg.inv(tau**2 * (K + _JITTER * np.eye(len(cells))))
+        return inverse(tau**2 * (K + _JITTER * np.eye(len(cells))))
 
     def named(self, c: np.ndarray, theta: Theta, slots: Slots) -> Values:
         """Return effects of visited cells, `place`, and bounds, `place_bound`, each (draw, ...)."""

@@ -50,19 +50,27 @@ class BetaBinomial(Family):
 
     def log_prob(self, y: Array, N: Array, trust: Array, sd: Array) -> Array:
         """See `Family.log_prob`."""
+        xp, library, phi = namespace(trust), special_functions(trust), _concentration(sd)
+        choose = -library.betaln(xp.round(y * N) + 1.0, N - xp.round(y * N) + 1.0) - xp.log(N + 1.0)
+        scale = library.gammaln(phi) - library.gammaln(phi + N)
+        return choose + scale + self._of_trust(y, N, trust, phi)
+
+    def _of_trust(self, y: Array, N: Array, trust: Array, phi: Array) -> Array:
+        """The terms of the log probability that depend on trust."""
         xp, library = namespace(trust), special_functions(trust)
-        phi, p = _concentration(sd), library.expit(trust)
-        n, a, b = xp.round(y * N), phi * p, phi * (1.0 - p)
-        choose = -library.betaln(n + 1.0, N - n + 1.0) - xp.log(N + 1.0)
-        return choose + library.betaln(n + a, N - n + b) - library.betaln(a, b)
+        n, a = xp.round(y * N), phi * library.expit(trust)
+        b, log_gamma = phi * library.expit(-trust), library.gammaln
+        return log_gamma(n + a) - log_gamma(a) + log_gamma(N - n + b) - log_gamma(b)
 
     def _match(self, y: Array, N: Array, m: Array, v: Array, sd: Array) -> Moments:
         """See `Family._match`: by Gauss-Hermite quadrature around the mode."""
         n = np.round(y * N)
         lam = 1.0 / (1.0 / (n + 0.5) + 1.0 / (N - n + 0.5) + 0.2)  # of an empirical logit
         start = (m / v + lam * np.log((n + 0.5) / (N - n + 0.5))) / (1.0 / v + lam)
-        y, N, sd = (a[..., None] for a in (y, N, sd))
-        return match_by_nodes(lambda f: self.log_prob(y, N, f, sd), start, m, v)
+        constant = self.log_prob(y, N, start, sd) - self._of_trust(y, N, start, _concentration(sd))
+        y, N, phi = y[..., None], N[..., None], _concentration(sd)[..., None]
+        log_mass, mean, var = match_by_nodes(lambda f: self._of_trust(y, N, f, phi), start, m, v)
+        return log_mass + constant, mean, var
 
     def _draw(self, y: Array, N: Array, m: Array, v: Array, sd: Array, rng: Generator) -> Drawn:
         """See `Family._draw`: from a piecewise log-linear density."""
