@@ -235,5 +235,5 @@ def marginals(
         n, len(blocks.y), -1
     )
     M = M + np.swapaxes(M, 2, 3)
-    var = np.diagonal(V - gain @ V, axis1=2, axis2=3) + ((G @ M) * G).sum(3)
+    var = np.diagonal(V, axis1=2, axis2=3) - (gain * V).sum(3) + ((G @ M) * G).sum(3)
     return mean, np.broadcast_to(var, (n, len(blocks.y), rows))

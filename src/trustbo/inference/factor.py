@@ -93,15 +93,13 @@ class Order(NamedTuple):
         other = (of_leaf == (self.group[b] >= 0)) & above
         return np.where(other | (~of_leaf & (self.group[b] >= 0)), -1, index)
 
-    def parts(self, A: Any) -> tuple[Any, Any, Any]:
-        """Return D, B and C, (point, ...), of vectors (point, entry)."""
+    def views(self, A: Any) -> Any:
+        """Return views of D, B and C, (point, ...), in vectors (point, entry)."""
         ends = np.cumsum([0, *(int(np.prod(shape)) for shape in self.shapes)])
-        D, B, C = (
+        return tuple(
             A[:, i:j].reshape(len(A), *shape)
             for i, j, shape in zip(ends[:-1], ends[1:], self.shapes, strict=True)
         )
-        padding = (self.leaf == len(self.place))[..., None] * np.eye(self.leaf.shape[1])
-        return D + padding, B, C
 
 
 class Factor(NamedTuple):
@@ -115,9 +113,10 @@ class Factor(NamedTuple):
     @classmethod
     def of(cls, order: Order, A: Any) -> Self:
         """Factor precisions in vectors (point, entry), which NumPy overwrites."""
-        D, B, C = order.parts(A)
+        D, B, C = order.views(A)
         xp = namespace(A)
-        inverse = xp.linalg.inv(cholesky(D))
+        padding = (order.leaf == len(order.place))[..., None] * np.eye(order.leaf.shape[1])
+        inverse = xp.linalg.inv(cholesky(D + padding))
         X = inverse @ B
         squares = times(order.pairs, (xp.swapaxes(X, 2, 3) @ X).reshape(len(A), -1))
         C = add(C.reshape(len(A), -1), (slice(None), order.pair), -squares).reshape(C.shape)
@@ -175,17 +174,18 @@ class Factor(NamedTuple):
 
     def covariance(self) -> np.ndarray:
         """Compute the entries of A^-1 in the layout of A, diagonals halved for sums over pairs."""
-        C = np.stack([np.triu(lapack.dpotri(H.T, lower=1)[0].T) for H in self.H])  # pyright: ignore[reportAttributeAccessIssue]
-        q = np.arange(C.shape[1])
-        whole = C + np.swapaxes(np.triu(C, 1), 1, 2)
-        turned, i = np.swapaxes(self.inverse, 2, 3), self.order.touched
-        whole = np.pad(whole, ((0, 0), (0, 1), (0, 1)))[:, i[..., None], i[:, None]]
-        B = -turned @ self.X @ whole
-        D = np.tril(turned @ self.inverse - B @ np.swapaxes(turned @ self.X, 2, 3))
-        k = np.arange(D.shape[2])
+        entries = np.empty((len(self.H), self.order.size))
+        D, B, C = self.order.views(entries)
+        for H, found in zip(self.H, C, strict=True):
+            upper = np.triu(lapack.dpotri(H.T, lower=1)[0].T)  # pyright: ignore[reportAttributeAccessIssue]
+            found[:] = upper + np.triu(upper, 1).T
+        turned, q = np.swapaxes(self.inverse, 2, 3), np.arange(C.shape[1])
+        i, k = np.minimum(self.order.touched, q[-1]), np.arange(D.shape[2])
+        B[:] = -turned @ self.X @ C[:, i[..., None], i[:, None]]  # of padding, X is 0
+        D[:] = turned @ self.inverse - B @ np.swapaxes(turned @ self.X, 2, 3)
         C[:, q, q] *= 0.5
         D[:, :, k, k] *= 0.5
-        return np.concatenate([part.reshape(len(C), -1) for part in (D, B, C)], axis=1)
+        return entries
 
 
 def _summing(row: np.ndarray, kept: np.ndarray, n: int) -> Any:
