@@ -189,7 +189,7 @@ class Factor(NamedTuple):
 
 
 def _summing(row: np.ndarray, kept: np.ndarray, n: int) -> Any:
-    """Sparse matrix (n, value) that adds each kept value to its row."""
+    """Build the sparse matrix (n, value) that adds each kept value to its row."""
     shape = n, len(row)
     return sparse.csr_array((np.ones(len(kept)), (row[kept], kept)), shape=shape)
 
@@ -219,7 +219,7 @@ def log_diagonal(L: Any) -> Any:
 
 
 def upper_factor(A: Any) -> Any:
-    """Upper factors, from the upper triangles, in place in NumPy; anything below; NaN if none."""
+    """Factor upper triangles, in NumPy in place and with anything below; NaN as in `cholesky`."""
     if not isinstance(A, np.ndarray):
         lower = jax.lax.linalg.cholesky(A.mT, symmetrize_input=False)
         return lower.mT

@@ -52,7 +52,7 @@ def special_functions(x: Any) -> Any:
 
 
 def inverse(A: Any) -> Any:
-    """Inverses of positive definite matrices (point, n, n), NaN where one is not."""
+    """Invert positive definite matrices (point, n, n); NaN where one is not."""
     if isinstance(A, jax.Array):
         return jnp.linalg.inv(A)
     half = A.copy()

@@ -56,7 +56,7 @@ class BetaBinomial(Family):
         return choose + scale + self._of_trust(y, N, trust, phi)
 
     def _of_trust(self, y: Array, N: Array, trust: Array, phi: Array) -> Array:
-        """The terms of the log probability that depend on trust."""
+        """Compute the terms of the log probability that depend on trust."""
         xp, library = namespace(trust), special_functions(trust)
         n, a = xp.round(y * N), phi * library.expit(trust)
         b, log_gamma = phi * library.expit(-trust), library.gammaln
