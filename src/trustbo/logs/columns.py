@@ -113,13 +113,13 @@ class Columns:
         cells = self._cells(column)
         if cells.dtype.kind != "M" and not np.isnan(_numbers(cells.dropna())).any():
             return "numbers", pd.Series(self.numbers(column, blank=False))
-        zoned = cells.astype(str).str.contains(_ZONE)
+        zoned = cells.astype(str).str.contains(_ZONE).to_numpy(bool)
         try:
             dates = pd.to_datetime(cells, format="ISO8601", utc=True)
         except ValueError:
             dates = pd.Series(pd.NaT, index=cells.index)
-        if (bad := dates.isna() | (zoned != zoned.iloc[0])).any():
-            row, value = bad.idxmax(), one_line(cells[bad].iloc[0])
+        for i in np.flatnonzero(dates.isna().to_numpy() | (zoned != zoned[0])):
+            row, value = self.frame.index[i], one_line(cells.iloc[i])
             raise TrustboError(
                 f"row {row} of {self.what}: {column} = {value}; give all times in seconds, or as "
                 "dates such as 2026-11-24T10:00:00.5Z, either all with a time zone or none."
@@ -140,15 +140,16 @@ def seconds_of(first: Columns, second: Columns) -> list[np.ndarray]:
         TrustboError: Numbers cannot be seconds; only one table has dates, or dates with a time
             zone; or the times of the two tables do not overlap.
     """
-    kinds, given = zip(first.times("t"), second.times("t"), strict=True)
-    if kinds[0] != kinds[1]:
+    (kind, ours), (other, theirs) = first.times("t"), second.times("t")
+    if kind != other:
         raise TrustboError(
-            f"times of {first.what} are {kinds[0]}, of {second.what} {kinds[1]}; give both as "
-            "dates in UTC, or both in seconds."
+            f"times of {first.what} are {kind}, of {second.what} {other}; give both as dates in "
+            "UTC, or both in seconds."
         )
-    if kinds[0] != "numbers":
-        given = [(t - given[0].min()).dt.total_seconds() for t in given]
-    times = [t.to_numpy(float) for t in given]
+    if kind != "numbers":
+        start = ours.min()
+        ours, theirs = ((t - start).dt.total_seconds() for t in (ours, theirs))
+    times = [ours.to_numpy(float), theirs.to_numpy(float)]
     spans = [f"{t.min():.9g} to {t.max():.9g} s" for t in times]
     for table, t, span in zip((first, second), times, spans, strict=True):
         if np.ptp(t) > _LONGEST or np.abs(t).max() > 1e11:

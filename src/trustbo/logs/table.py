@@ -139,18 +139,20 @@ def _mission(
         )
     path = None
     if is_mapped:
-        cells = rows[["bound", "row", "col"]].drop_duplicates().sort_values("bound")
-        if cells["bound"].duplicated().any():
+        cells = sorted({*map(tuple, rows[["bound", "row", "col"]].to_numpy(int).tolist())})
+        if len(cells) > len(planned):
             raise TrustboError("rows of one bound disagree on its cell, row and col.")
-        path = [(int(row), int(col)) for row, col in cells[["row", "col"]].to_numpy()]
-    measured = rows.loc[rows[[*RATES, "status", *features]].notna().any(axis=1), "bound"]
-    if measured.empty or measured.min() < 1:
+        path = [(row, col) for _, row, col in cells]
+    bound, status = rows["bound"].to_numpy(int), "ok"
+    measured = bound[rows[[*RATES, "status", *features]].notna().to_numpy().any(axis=1)]
+    if not len(measured) or measured.min() < 1:
         raise TrustboError("bounds with a measurement must be numbered from 1; got none, or 0.")
     n_run = int(measured.max())
-    ended = rows[rows["status"].notna() & (rows["status"] != "ok")]
-    status, *more = ended["status"].unique().tolist() or ["ok"]
-    if more or (ended["bound"] < n_run).any():
-        raise TrustboError("only the last bound that was run may have a status other than ok.")
+    for k, ended in zip(bound, rows["status"], strict=True):
+        if isinstance(ended, str) and ended != "ok":
+            if k < n_run or status not in ("ok", ended):
+                raise TrustboError("only the last bound that was run may have a status but ok.")
+            status = ended
     expected = pd.MultiIndex.from_product([range(1, n_run + 1), robots])
     of_robot = rows.set_index(["bound", "robot"])
     if missing := [pair for pair in expected if pair not in of_robot.index]:
