@@ -12,15 +12,7 @@ import xarray as xr
 
 from trustbo.campaign.learning import as_learned, base_planner, learn, why_never_learned
 from trustbo.campaign.result import Result, in_a_line
-from trustbo.campaign.state import (
-    EXCLUDED,
-    LEARNED,
-    TOLD,
-    Entry,
-    Failure,
-    Posterior,
-    State,
-)
+from trustbo.campaign.state import EXCLUDED, LEARNED, TOLD, Entry, Failure, Posterior, State
 from trustbo.campaign.stopping import Stop
 from trustbo.campaign.storage import Storage, read_campaign
 from trustbo.data import Cell, Mission
@@ -382,7 +374,7 @@ class Campaign(Result):
             )
         rules: list[Stop] = [] if stop is None else [stop] if callable(stop) else list(stop)
         if not all(map(callable, rules)) or not isinstance(truth, Truth | None):
-            raise TrustboError(f"stop and truth: got {stop!r}, {truth!r}; see `iterate`.")
+            raise TrustboError(f"stop={stop!r} or truth={truth!r} is invalid; see tb.iterate.")
         describe = getattr(runner, "describe", lambda: {"simulator": type(runner).__name__})
         self.state.simulation = json.loads(to_json({**describe(), "n_iterations": n_iterations}))
         self.progress = progress
@@ -443,11 +435,7 @@ class Campaign(Result):
 
     @classmethod
     def load(
-        cls,
-        directory: FilePath,
-        *,
-        model: TrustModel | None = None,
-        policy: Policy | None = None,
+        cls, directory: FilePath, *, model: TrustModel | None = None, policy: Policy | None = None
     ) -> Self:
         """Continue a campaign where it stopped, in the same folder.
 

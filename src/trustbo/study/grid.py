@@ -110,11 +110,7 @@ def _plain(name: str) -> str:
 
 
 def _run(
-    case: Case,
-    scene: Callable[[], Scene],
-    names: tuple[str, str, int],
-    n_missions: int,
-    file: Path,
+    case: Case, scene: Callable[[], Scene], names: tuple[str, str, int], n_missions: int, file: Path
 ) -> str:
     """Run a campaign and write its rows to a file; return the error, if any."""
     labels = dict(zip(("case", "scene", "seed"), names, strict=True))
