@@ -144,20 +144,6 @@ def test_ground_is_missing_beyond_10_m_from_ground_points(tmp_path):
     np.testing.assert_array_equal(np.flatnonzero(~known), np.arange(11, 29))
 
 
-def test_tiles_of_one_survey_are_gridded_together(tmp_path):
-    x, y, z = lattice()
-    west = x < 10
-    tiles = [
-        write_las(tmp_path / f"{k}.las", x[part], y[part], z[part])
-        for k, part in enumerate((west, ~west))
-    ]
-    whole = read_lidar(write_las(tmp_path / "whole.las", x, y, z))
-    xr.testing.assert_allclose(read_lidar(tiles), whole)
-    other = write_las(tmp_path / "other.las", x, y, z, crs="EPSG:32632")
-    with pytest.raises(TrustboError, match="CRS"):
-        read_lidar([tiles[0], other])
-
-
 def test_points_that_make_no_terrain_are_refused(tmp_path):
     x, y, z = lattice()
     label = np.full(len(x), 5)
@@ -172,7 +158,7 @@ def test_points_that_make_no_terrain_are_refused(tmp_path):
         write_las(tmp_path / "stray.las", x, y, stray, np.where(z == stray, 2, 1)),
         write_las(tmp_path / "degrees.las", x, y, z, crs="EPSG:4326"),
         write_las(tmp_path / "nowhere.las", x, y, z, crs=None),
-        cut, tmp_path / "text.las", tmp_path / "absent.las", [],
+        cut, tmp_path / "text.las", tmp_path / "absent.las",
     ):  # fmt: skip
         with pytest.raises(TrustboError):
             read_lidar(wrong)

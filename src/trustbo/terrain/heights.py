@@ -4,7 +4,6 @@ import re
 import warnings
 from collections.abc import Iterable
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -17,20 +16,6 @@ _METRE = {"m", "metre", "metres", "meter", "meters"}
 _FOOT = {"ft", "foot", "feet", "ftus", "usft"}
 _US = {"us", "survey", "ftus", "usft"}
 _PACKAGE = str(Path(__file__).parents[1])
-
-
-class Vertical(NamedTuple):
-    """Unit and vertical datum of a raster's heights.
-
-    Attributes:
-        unit: Name of the unit.
-        metres: Length of the unit in metres, negative for depths.
-        datum: Name of the vertical datum; None if nothing declares one.
-    """
-
-    unit: str = "m"
-    metres: float = 1.0
-    datum: str | None = None
 
 
 def warn(message: str) -> None:
@@ -101,33 +86,29 @@ def warn_of_zeros(heights: np.ndarray, name: str) -> None:
         )
 
 
-def vertical_of(name: str, declared: object, axis: Vertical | None) -> Vertical:
-    """Find the unit and datum of heights; metres if nothing declares a unit.
+def metres_of(name: str, declared: object, axis: float | None) -> float:
+    """Return the length of the unit of heights in metres, negative for depths.
 
     Args:
         name: Name of the raster.
         declared: Unit of the band, or of each band, of which the first is used; None if unknown.
-        axis: Vertical axis of the CRS, if it has one.
+        axis: Length of the unit of the CRS's vertical axis, m, if there is one.
 
     Raises:
         TrustboError: The unit is unknown, or band and CRS disagree.
     """
     text = str(np.ravel(np.array(declared, object))[0] or "").strip()
-    if not text:
-        return axis or Vertical()
     words = set(re.findall(r"[a-z]+", text.lower()))
-    if words & _METRE and not words & _FOOT:
-        unit, length = "m", 1.0
-    elif words & _FOOT and not words & _METRE:
-        unit, length = text, 1200.0 / 3937.0 if words & _US else 0.3048
-    else:
+    in_metres, in_feet = bool(words & _METRE), bool(words & _FOOT)
+    if text and in_metres == in_feet:
         raise TrustboError(
             f"{name} has heights in {text!r}; metres and feet are known: convert them, or declare "
             "the true unit, e.g. with gdal_edit.py -units m."
         )
-    if axis and abs(length / abs(axis.metres) - 1.0) > 1e-5:
+    length = 1.0 if not in_feet else 1200.0 / 3937.0 if words & _US else 0.3048
+    if text and axis and abs(length / abs(axis) - 1.0) > 1e-5:
         raise TrustboError(
-            f"{name} has heights in {text!r} by its band, but in {axis.unit!r} by its CRS; declare "
-            "the true unit, e.g. with gdal_edit.py -units m, or the true CRS, with -a_srs."
+            f"{name} has heights in {text!r} by its band, but in units of {abs(axis):.6g} m by its "
+            "CRS; declare the true unit, e.g. with gdal_edit.py -units m, or CRS, with -a_srs."
         )
-    return axis._replace(unit=unit) if axis else Vertical(unit, length)
+    return axis or length

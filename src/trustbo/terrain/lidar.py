@@ -1,7 +1,6 @@
 """DEM and DSM on one grid from classified lidar points."""
 
-from collections.abc import Sequence
-from os import PathLike, fspath
+from os import fspath
 from typing import Any
 
 import numpy as np
@@ -14,16 +13,14 @@ from scipy.spatial import QhullError
 from trustbo.errors import TrustboError, require_positive
 from trustbo.files import FilePath
 from trustbo.terrain.heights import HIGHEST, LOWEST
-from trustbo.terrain.place import known_crs, require_map
+from trustbo.terrain.place import require_map
 from trustbo.terrain.read import check_size, read_terrain
 
 GROUND_GAP, MAX_GAP = 10.0, 3.0
 """Maximum distances of a pixel from one with ground points and from the one that fills it, m."""
 
 
-def read_lidar(
-    points: FilePath | Sequence[FilePath], resolution: float = 1.0, *, crs: object = None
-) -> xr.Dataset:
+def read_lidar(points: FilePath, resolution: float = 1.0, *, crs: object = None) -> xr.Dataset:
     """Grid classified lidar points into ground (DEM) and surface (DSM).
 
     The ground is interpolated at the pixel centres from a triangulation of the points of class 2;
@@ -32,24 +29,19 @@ def read_lidar(
     with returns, up to 3 m away. Noise (classes 7 and 18) and withheld points are ignored.
 
     Args:
-        points: A LAS or LAZ file, or the files of one survey.
+        points: A LAS or LAZ file.
         resolution: Pixel size, m; pixel edges are at its multiples.
-        crs: Coordinate reference system of files without one, e.g. `"EPSG:32633"`.
+        crs: Coordinate reference system of a file without one, e.g. `"EPSG:32633"`.
 
     Returns:
         Dataset with `dem` and `dsm` as from `read_terrain`.
 
     Raises:
-        TrustboError: laspy is not installed; a file is unreadable; there are no ground points, or
-            heights are impossible; there is no projected CRS, or more than one; no pixel has both
-            heights.
+        TrustboError: laspy is not installed; the file is unreadable or has no projected CRS; there
+            are no ground points; heights are impossible; no pixel has both heights.
     """
-    step, given = require_positive("resolution", resolution), crs and known_crs(crs)
-    files = [points] if isinstance(points, str | PathLike) else list(points)
-    tiles = [_read_tile(fspath(file), given) for file in files]
-    if not tiles or len({tile[2].to_wkt() for tile in tiles}) > 1:
-        raise TrustboError("give one LAS or LAZ file or more, all in one CRS.")
-    xyz, is_ground = (np.concatenate([tile[k] for tile in tiles]) for k in (0, 1))  # pyright: ignore[reportArgumentType, reportCallIssue]
+    step = require_positive("resolution", resolution)
+    xyz, is_ground, own = _read_points(fspath(points), crs)
     # Pixels count from the upper left corner; a point on an edge is in the pixel south or east.
     place = np.array([[1.0, -1.0]]) * xyz[:, :2] / step
     corner = np.floor(place.min(0) + 1e-6)
@@ -73,15 +65,12 @@ def read_lidar(
     canopy = np.maximum(highest - dem, 0.0)
     nearest: Any = distance_transform_edt(np.isnan(canopy), step, return_indices=True)
     canopy = np.where(nearest[0] <= MAX_GAP, canopy[tuple(nearest[1])], np.nan)
-    coords = {
-        "y": -(corner[1] + centres[:, 0, 1]) * step,
-        "x": (corner[0] + centres[0, :, 0]) * step,
-    }
-    maps = (xr.DataArray(z, coords, ("y", "x")) for z in (dem, dem + canopy))
-    return read_terrain(*(z.rio.write_crs(tiles[0][2]) for z in maps))
+    x, y = (corner[0] + centres[0, :, 0]) * step, -(corner[1] + centres[:, 0, 1]) * step
+    maps = (xr.DataArray(z, {"y": y, "x": x}, ("y", "x")) for z in (dem, dem + canopy))
+    return read_terrain(*(z.rio.write_crs(own) for z in maps))
 
 
-def _read_tile(path: str, given: CRS | None) -> tuple[np.ndarray, np.ndarray, CRS]:
+def _read_points(path: str, given: object) -> tuple[np.ndarray, np.ndarray, CRS]:
     """Read positions (point, 3) of a file's usable points, whether each is ground, and the CRS."""
     try:
         import laspy

@@ -11,32 +11,28 @@ from rasterio.errors import CRSError
 from rasterio.warp import transform
 
 from trustbo.errors import TrustboError
-from trustbo.terrain.heights import Vertical
 
 _NORTH = 22.5  # degrees between columns and north, half the angle between two of the eight moves
 
 
-def known_crs(crs: Any) -> CRS:
-    """Convert anything that PROJ accepts to a CRS; TrustboError if PROJ does not know it."""
-    try:
-        return CRS.from_user_input(crs)
-    except CRSError:
-        raise TrustboError(f"crs {crs!r} is not one PROJ knows; give e.g. 'EPSG:32633'.") from None
-
-
-def require_map(name: str, own: object, given: CRS | None) -> CRS:
+def require_map(name: str, own: Any, given: Any) -> CRS:
     """Return a raster's CRS, in degrees or metres: its own, or the given one if it has none.
 
     TrustboError: there is no CRS, it differs from the given one, or it is not in degrees or metres.
     """
     if own is None and given is None:
         raise TrustboError(f"{name} has no coordinate reference system; pass crs=.")
-    crs = known_crs(given if own is None else own)
-    flat = horizontal(crs)
-    if given is not None and flat != horizontal(given):
+    try:
+        crs, *other = [CRS.from_user_input(one) for one in (own, given) if one is not None]
+    except CRSError:
         raise TrustboError(
-            f"{name} is in {crs.to_string()}, but crs= is {given.to_string()}; leave crs= out, or "
-            "correct the raster's own CRS, e.g. with gdal_edit.py -a_srs."
+            f"crs {given!r} is not one PROJ knows; give e.g. 'EPSG:32633'."
+        ) from None
+    flat = horizontal(crs)
+    if other and flat != horizontal(other[0]):
+        raise TrustboError(
+            f"{name} is in {crs.to_string()}, but crs= is {given}; leave crs= out, or correct the "
+            "raster's own CRS, e.g. with gdal_edit.py -a_srs."
         )
     if not flat.is_geographic and not flat.is_projected:
         raise TrustboError(f"{name} is in {crs.to_string()}, not a map of the Earth; reproject it.")
@@ -60,18 +56,17 @@ def horizontal(crs: CRS) -> CRS:
     return CRS.from_dict({key: value for key, value in flat.items() if key != "id"})
 
 
-def vertical_axis(crs: CRS) -> Vertical | None:
-    """Return unit, direction and datum of a CRS's vertical axis, or None if it has none."""
+def vertical_axis(crs: CRS) -> tuple[float | None, str | None]:
+    """Return the unit of a CRS's vertical axis in metres, negative for depths, and its datum."""
     whole = crs.to_dict(projjson=True)
     part = whole.get("components", [whole])[-1]
     part = part.get("source_crs", part)
     axis = part.get("coordinate_system", {"axis": [{}]})["axis"][-1]
     if axis.get("direction") not in ("up", "down"):
-        return None
-    unit = axis["unit"]
-    unit, length = ("m", 1.0) if unit == "metre" else (unit["name"], unit["conversion_factor"])
+        return None, None
+    length = 1.0 if axis["unit"] == "metre" else axis["unit"]["conversion_factor"]
     datum = part.get("datum", part)["name"] if part["type"] == "VerticalCRS" else "the ellipsoid"
-    return Vertical(unit, length if axis["direction"] == "up" else -length, datum)
+    return length if axis["direction"] == "up" else -length, datum
 
 
 def placed(heights: xr.DataArray, name: str) -> xr.DataArray:

@@ -13,7 +13,6 @@ import numpy as np
 import rasterio
 import rioxarray  # noqa: F401  # the accessor `rio`
 import xarray as xr
-from rasterio.crs import CRS
 from rasterio.enums import ColorInterp, Resampling
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
 from rasterio.io import DatasetReader
@@ -21,10 +20,9 @@ from rioxarray.exceptions import MissingSpatialDimensionError
 
 from trustbo.errors import TrustboError, require_positive
 from trustbo.files import FilePath
-from trustbo.terrain.heights import decoded, vertical_of, warn, warn_of_zeros
+from trustbo.terrain.heights import decoded, metres_of, warn, warn_of_zeros
 from trustbo.terrain.place import (
     horizontal,
-    known_crs,
     on_metric_grid,
     placed,
     require_map,
@@ -78,12 +76,11 @@ def read_terrain(
     Example:
         >>> terrain = tb.terrain.read_terrain("dem.tif", "dsm.tif", resolution=1.0)
     """
-    given = None if crs is None else known_crs(crs)
-    ground = surface = _heights(dem, "dem", given, nodata)
+    ground = surface = _heights(dem, "dem", crs, nodata)
     if dsm is None:
         warn("no surface (DSM) is given, so no canopy is known: only the ground blocks sight.")
     else:
-        surface = _heights(dsm, "dsm", given, nodata)
+        surface = _heights(dsm, "dsm", crs, nodata)
     datums = [heights.attrs["datum"] for heights in (ground, surface)]
     if all(datums) and datums[0] != datums[1]:
         raise TrustboError(
@@ -131,7 +128,7 @@ def check_size(shape: tuple[int, ...], name: str) -> None:
 
 
 def _heights(
-    raster: FilePath | xr.DataArray, role: str, given: CRS | None, nodata: float | None
+    raster: FilePath | xr.DataArray, role: str, given: object, nodata: float | None
 ) -> xr.DataArray:
     """Read the heights of one raster, dem or dsm, in metres with north at the top.
 
@@ -140,16 +137,17 @@ def _heights(
     array = _stored(raster, role)
     name = str(array.name)
     crs = require_map(name, array.rio.crs, given)
-    vertical = vertical_of(name, array.attrs.get("units"), vertical_axis(crs))
-    if abs(vertical.metres) != 1.0:
-        warn(f"{name} has heights in {vertical.unit!r}; they are converted to metres.")
+    axis, datum = vertical_axis(crs)
+    metres = metres_of(name, array.attrs.get("units"), axis)
+    if abs(metres) != 1.0:
+        warn(f"{name} has heights in units of {abs(metres):.6g} m; they are converted to metres.")
     tags = [nodata, *(array.attrs.get(key) for key in _FILL_NAMES)]
     fills = [float(fill) for tag in tags if tag is not None for fill in np.ravel(tag)]
     scale, offset = array.attrs.get("scale_factor", 1.0), array.attrs.get("add_offset", 0.0)
-    values = decoded(array.to_numpy(), name, fills, (scale, offset), vertical.metres)
+    values = decoded(array.to_numpy(), name, fills, (scale, offset), metres)
     warn_of_zeros(values, name)
     coords = {axis: array[axis].values for axis in ("y", "x")}
-    heights = xr.DataArray(values, coords, name=name, attrs={"datum": vertical.datum})
+    heights = xr.DataArray(values, coords, name=name, attrs={"datum": datum})
     heights = heights.sortby("y", ascending=False).sortby("x")
     return placed(heights.rio.write_crs(horizontal(crs)), name)
 
