@@ -1,4 +1,4 @@
-"""Robots and teams of them."""
+"""Robots and teams."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field

@@ -30,7 +30,7 @@ _ERRORS = 2.0  # standard errors of a difference that counts
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Check(Summary):
-    """Check of a fitted model.
+    """Result of the check of a fitted model.
 
     Attributes:
         verdict: The findings that stand out, in words.

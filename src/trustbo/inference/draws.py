@@ -78,15 +78,14 @@ def params_of(
     Args:
         posterior: DataTree from `fit`.
         workspace: Workspace for planning; features and robots are put in its order, by name.
-        day: Whether effects are drawn for the next mission, including a robot's bad day, for bands
-            and predictions of rates; by default they are expected effects, for plans. This matters
-            only for effects other than places.
+        day: Whether effects are drawn for the next mission, including the part specific to it, for
+            bands and predictions of rates; by default they are expected effects, for plans. This
+            matters only for effects other than places.
 
     Returns:
         `TrustParams`, `RobotParams` or `CoupledParams`, according to the model. With effects other
         than places, `RobotParams` for the next mission: with `RobotEffect`, the weights of line of
-        sight include each robot's effect, without the last bad day and with the persistent part
-        decayed.
+        sight include the persistent part of each robot's effect, decayed by one mission.
 
     Raises:
         TrustboError: If the posterior is not from `fit`; a variable is missing, or draws are NaN;

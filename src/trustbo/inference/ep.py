@@ -85,7 +85,7 @@ def _matched(
 def log_evidence(
     joint: Joint, sites: Sites, n_sweeps: int, damp: float = 1.0
 ) -> tuple[np.ndarray, Sites]:
-    """Compute EP's log evidence (point,) after `n_sweeps` sweeps, and the sites."""
+    """Compute EP's log evidence (point,), and the sites, after `n_sweeps` sweeps."""
     blocks, signal, prior, terms = joint
     seen, sd = ~np.isnan(terms.y), signal.sd
     sites = sites.at(terms, sd)

@@ -99,7 +99,7 @@ class Dynamics:
     def update(
         self, predicted: Beliefs, y: np.ndarray, n_ticks: np.ndarray
     ) -> tuple[Beliefs, np.ndarray]:
-        """Update trust with rates (robot,), NaN where not measured; also their log density."""
+        """Update trust with rates (robot,), NaN where not measured; return their density, too."""
         y, n_ticks = (a.reshape(self.shape[1:]) for a in (y, n_ticks))
         members, (mean, J, drift), first = self.shape[2], predicted, 0
         if self._noise is not None:  # signals differ from trust, and follow it in the joint normal

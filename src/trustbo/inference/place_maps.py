@@ -1,4 +1,4 @@
-"""Effects of places over a whole grid: draws given those at visited places.
+"""Effects of places over a whole grid, drawn given the effects at visited places.
 
 s at the other cells by Matheron's rule: a draw of the prior over the whole grid, corrected by
 kriging at the visited cells. Prior draws are made by the fast Fourier transform of a circulant

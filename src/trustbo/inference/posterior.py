@@ -1,4 +1,4 @@
-"""A model given missions: the density for samplers, and draws of all else."""
+"""A model given missions: the density for samplers, and draws of all other variables."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple, Self
@@ -153,7 +153,7 @@ class Posterior:
         return Student(center, np.linalg.cholesky(cov))
 
     def draw(self, z: np.ndarray, log_p: np.ndarray, n: int, rng: np.random.Generator) -> Draws:
-        """Draw all else given equally weighted points, sorted as by `Points.resample`.
+        """Draw columns and signals given equally weighted points, sorted by point.
 
         Args:
             z: Scores (point, score).

@@ -91,7 +91,7 @@ def read_bag(path: FilePath, workspace: Workspace, *, topics: Topics = Topics())
         topics: Names of topics, if not the default ones.
 
     Returns:
-        Missions with the ticks of robots. Awareness is NaN; campaigns use their map's.
+        Missions with the ticks of robots. Awareness is NaN; campaigns use the map's awareness.
 
     Raises:
         TrustboError: rosbags is not installed; the path is not a bag, or the bag is damaged; a

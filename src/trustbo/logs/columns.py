@@ -72,7 +72,7 @@ class Columns:
             raise TrustboError(f"{self.what} lacks {', '.join(missing)}; it has {there}.{remedy}")
 
     def texts(self, column: str, *, required: bool = True) -> list[str]:
-        """Return a column as text, "" if blank; 1.0 becomes 1, as pandas reads 1 beside blanks.
+        """Return a column as text, "" if blank; floats such as 1.0 become 1.
 
         All are blank if a column that is not `required` is missing.
         """

@@ -312,7 +312,7 @@ def _best_path(graph, costs, most, path):
 
 
 class Labels(NamedTuple):
-    """Labels: cost, sums and trust of each (label, number), and where it came from.
+    """Table of labels: cost, sums and trust of each (label, number), and its predecessor.
 
     Fields: number; edge by which it came, the cell that this left, its parent and the label of its
     state that was made before it, (label,), -1 where there is none; and last, that of each state

@@ -43,7 +43,7 @@ class InfeasibleError(TrustboError):
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Admissible paths, objective and costs of a `Planner`, where they are explained.
+    """Admissible paths, objective and costs of a `Planner`; see there for the arguments.
 
     Attributes:
         paths: Admissible paths.

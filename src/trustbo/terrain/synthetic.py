@@ -37,7 +37,9 @@ def synthetic_terrain(
     shape = (round(height / step), round(width / step))
     check_size(shape, f"size {size} m at {resolution} m")
     if min(shape) < 4:
-        raise TrustboError(f"size {size} m at {resolution} m is {shape} pixels; need 4 x 4.")
+        raise TrustboError(
+            f"size {size} m at {resolution} m is {shape} pixels; at least 4 x 4 are needed."
+        )
     relief = require_positive("relief", relief, or_zero=True)
     rng = np.random.default_rng(require_whole("seed", seed, 0))
     ground = _fractal(rng, shape, exponent=1.9)

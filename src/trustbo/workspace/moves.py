@@ -52,7 +52,7 @@ def bounds_along(path: Sequence[Cell] | np.ndarray) -> np.ndarray:
 def existing_bounds(passable: np.ndarray) -> np.ndarray:
     """Return whether a bound exists into each cell by each move, shape (move, row, col).
 
-    A bound exists if the cell entered and the cell left are both passable, (row, col).
+    A bound exists if the cell entered and the cell left are both in `passable`, (row, col).
     """
     rows, cols = passable.shape
     framed = np.pad(passable, 1)

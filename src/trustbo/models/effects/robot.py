@@ -1,4 +1,4 @@
-"""Effects of a robot in a mission: a persistent part, and a bad day.
+"""Effects of a robot in a mission: a persistent part, and a part specific to the mission.
 
 For example, a damaged detector persists, rain does not. The drift of robot i in mission m has an
 additional term l d[i, m], where l is its predicted line of sight and d, in units of stationary
