@@ -106,7 +106,7 @@ FAULTS = (
     Fault("the truth's best path ends on the last bound but one", "simulation/truth.py",
           "last = (passed * contact)[:, *goal, END]", "last = (passed * contact)[:, *goal, 0]"),
     Fault("a fit takes the seeds of the policy", "campaign/campaign.py",
-          'self.ask(), self.state.seed_of("fit")', 'self.ask(), self.state.seed_of("policy")'),
+          'seed = state.seed_of("fit")', 'seed = state.seed_of("policy")'),
     Fault("a mission is learned from before it is on disk", "campaign/campaign.py",
           MEASURED + LEARNED, LEARNED + MEASURED),
     Fault("the y axis of a map for ROS is flipped", "export/nav2.py",
