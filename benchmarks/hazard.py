@@ -46,7 +46,7 @@ def simulate(seed):
     bounds = np.column_stack(
         [np.zeros(N_BOUNDS, int), np.arange(N_BOUNDS), np.zeros(N_BOUNDS, int)]
     )
-    return difficulty, Exposures(bounds, n, failed, tuple(lost), np.zeros(5))
+    return difficulty, Exposures(bounds, n, failed, tuple(lost))
 
 
 def log_likelihood(prior, exposures, z):

@@ -41,7 +41,7 @@ def exposures(n, failed, lost=()):
     n = np.array(n, dtype=float)
     bounds = np.column_stack([np.zeros(len(n), int), np.arange(len(n)), np.zeros(len(n), int)])
     paths = tuple(np.array(path) for path in lost)
-    return Exposures(bounds, n, np.array(failed, dtype=float), paths, np.zeros(5))
+    return Exposures(bounds, n, np.array(failed, dtype=float), paths)
 
 
 def law(difficulty):
@@ -264,14 +264,13 @@ def test_missions_count_as_exposures_up_to_where_they_end():
     path = ((0, 0), (0, 1), (0, 2), (1, 2))
     counted = Exposures.of(
         [mission(path), mission(path, "stuck", 2), mission(path, "aborted", 2)],
-        [LostMission(path, "tipped", (0, 1)), LostMission(path, "timeout")],
+        [LostMission(path, (0, 1)), LostMission(path)],
     )
     east, south = 4, 6
     assert counted.bounds.tolist() == [[east, 0, 1], [east, 0, 2], [south, 1, 2]]
     assert counted.n.tolist() == [4, 2, 1]
     assert counted.failed.tolist() == [1, 1, 0]
     assert counted.lost[0].tolist() == [0, 1, 2]
-    assert counted.causes.tolist() == [1, 1, 1, 0, 0]
 
 
 def test_a_failed_bound_has_a_higher_risk_and_a_completed_one_a_lower():
@@ -290,7 +289,7 @@ def test_a_failed_bound_has_a_higher_risk_and_a_completed_one_a_lower():
 
 def test_draws_of_chances_have_the_means_of_the_map():
     ws = workspace()
-    lost = [LostMission(ROW, "stuck"), LostMission(((0, 0), (0, 1), (1, 1)), "stuck")]
+    lost = [LostMission(ROW), LostMission(((0, 0), (0, 1), (1, 1)))]
     risk = BoundRisk(fit_hazard([mission(ROW), mission(ROW, "stuck", 2)], ws, lost=lost), ws)
     draws = risk.draw(20_000, seed=1)
     exists = ws.passable_bounds.values
@@ -317,7 +316,7 @@ def test_one_failure_on_steep_ground_teaches_all_that_is_as_steep(hilly):
     move, row, col = np.unravel_index(steepest, tilt.shape)
     cells = [(row[0] - MOVES[move[0]][0], col[0] - MOVES[move[0]][1]), (row[0], col[0])]
     path = [tuple(int(i) for i in cell) for cell in cells]
-    prior, gone = prior_risk(hilly), fit_hazard([], hilly, lost=[LostMission(path, "tipped")])
+    prior, gone = prior_risk(hilly), fit_hazard([], hilly, lost=[LostMission(path)])
     after = BoundRisk(gone, hilly)
     others = move[1:], row[1:], col[1:]
     assert (after.mean[others] > prior.mean[others] + 0.1).all()
@@ -341,7 +340,7 @@ def test_few_draws_have_the_mean_chance_to_arrive_of_many(hilly):
 
 def test_the_same_seed_gives_the_same_hazard():
     ws, told = workspace(), [mission(ROW, "stuck", 1)]
-    lost = [LostMission(ROW, "stuck")]
+    lost = [LostMission(ROW)]
     one, other = (fit_hazard(told, ws, lost=lost, seed=3) for _ in range(2))
     assert one.drop_attrs().identical(other.drop_attrs())
     assert not one["p_fail"].equals(fit_hazard(told, ws, lost=lost, seed=4)["p_fail"])
@@ -361,9 +360,7 @@ def test_a_bad_proposal_is_refused(monkeypatch):
 def test_wrong_input_is_named():
     ws = workspace()
     with pytest.raises(TrustboError, match=r"never enters where = \(2, 2\)"):
-        fit_hazard([], ws, lost=[LostMission(ROW, "stuck", (2, 2))])
-    with pytest.raises(TrustboError, match="unknown cause 'tired'"):
-        fit_hazard([], ws, lost=[LostMission(ROW, "tired")])
+        fit_hazard([], ws, lost=[LostMission(ROW, (2, 2))])
     with pytest.raises(TrustboError, match=r"a mission enters \(0, 2\), outside"):
         fit_hazard([mission(ROW)], workspace(2))
     with pytest.raises(TrustboError, match="sd of intercept must be positive"):

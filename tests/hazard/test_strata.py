@@ -42,7 +42,7 @@ def risk():
     team = tb.Team(robots=(robot,), lead=robot)
     workspace = tb.Workspace.from_terrain(terrain, (5, 5), team, bounds=False)
     path = [(4, 0), (3, 1), (2, 2), (1, 3), (0, 4)]
-    lost = [LostMission(((4, 0), (3, 0), (2, 0)), "tipped")]
+    lost = [LostMission(((4, 0), (3, 0), (2, 0)))]
     return BoundRisk(fit_hazard([], workspace, lost=lost), workspace), path
 
 

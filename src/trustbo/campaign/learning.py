@@ -123,7 +123,7 @@ def learn_hazard(state: State, workspace: Workspace) -> xr.Dataset:
         for entry in state.entries
         if entry.state != EXCLUDED or why_never_learned(entry.mission)
     ]
-    lost = [LostMission(f.path, f.reason, f.where) for f in state.failures if f.path]
+    lost = [LostMission(f.path, f.where) for f in state.failures if f.path]
     prior = Hazard(**state.settings["hazard"])
     try:
         return fit_hazard(measured, workspace, prior, lost=lost, seed=state.seed_of("hazard"))

@@ -6,7 +6,7 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from trustbo.data import Cell, Mission
-from trustbo.errors import TrustboError, require_choice
+from trustbo.errors import TrustboError
 from trustbo.workspace.moves import bounds_along
 
 CAUSES = ("stuck", "tipped", "timeout", "collision", "lost_contact")
@@ -18,13 +18,11 @@ class LostMission(NamedTuple):
 
     Attributes:
         path: Planned cells, start first.
-        cause: Cause of the failure, one of `CAUSES`.
         where: Cell that the team failed to enter, at its first occurrence in the path; None if
             unknown.
     """
 
     path: tuple[Cell, ...]
-    cause: str
     where: Cell | None = None
 
 
@@ -37,14 +35,12 @@ class Exposures(NamedTuple):
         n: Number of exposures with a known outcome, shape (bound,).
         failed: Number of these exposures that failed, shape (bound,).
         lost: Planned bounds of each mission lost at an unknown place, as indices into `bounds`.
-        causes: Number of failures by cause, shape (cause,).
     """
 
     bounds: np.ndarray
     n: np.ndarray
     failed: np.ndarray
     lost: tuple[np.ndarray, ...]
-    causes: np.ndarray
 
     @classmethod
     def of(cls, missions: Sequence[Mission], lost: Sequence[LostMission] = ()) -> Self:
@@ -53,36 +49,32 @@ class Exposures(NamedTuple):
         The last bound of a mission that failed is a failure; an aborted bound is not counted.
 
         Raises:
-            TrustboError: If a path jumps or does not enter `where`, or a cause is unknown.
+            TrustboError: If a path jumps or does not enter `where`.
         """
         known = [_reported(mission) for mission in missions]
         known += [_located(mission) for mission in lost if mission.where is not None]
-        unknown = [(mission.path, mission.cause) for mission in lost if mission.where is None]
+        unknown = [mission.path for mission in lost if mission.where is None]
 
-        met = [bounds_along(path) for path, _ in (*known, *unknown)]
+        met = [bounds_along(path) for path in (*(path for path, _ in known), *unknown)]
         rows = np.concatenate([np.empty((0, 3), int), *met])
         bounds, index = np.unique(rows, axis=0, return_inverse=True)
         paths = np.split(index, np.cumsum([len(part) for part in met])[:-1]) if met else []
 
-        n, failed, causes = np.zeros(len(bounds)), np.zeros(len(bounds)), np.zeros(len(CAUSES))
-        for path, (_, cause) in zip(paths, known, strict=False):
+        n, failed = np.zeros((2, len(bounds)))
+        for path, (_, fails) in zip(paths, known, strict=False):
             np.add.at(n, path, 1.0)
-            if cause is not None:
-                failed[path[-1]] += 1.0
-                causes[CAUSES.index(cause)] += 1.0
-        for _, cause in unknown:
-            causes[CAUSES.index(require_choice("cause", cause, CAUSES))] += 1.0
-        return cls(bounds, n, failed, tuple(paths[len(known) :]), causes)
+            failed[path[-1:]] += fails
+        return cls(bounds, n, failed, tuple(paths[len(known) :]))
 
 
-def _reported(mission: Mission) -> tuple[Sequence[Cell], str | None]:
-    """Return the path up to the last known outcome, and the cause if that bound failed."""
-    n, cause = len(mission.bounds), mission.status if mission.status in CAUSES else None
-    return mission.path[: n + (cause is not None or mission.status == "ok")], cause
+def _reported(mission: Mission) -> tuple[Sequence[Cell], bool]:
+    """Return the path up to the last known outcome, and whether that bound failed."""
+    n, fails = len(mission.bounds), mission.status in CAUSES
+    return mission.path[: n + (fails or mission.status == "ok")], fails
 
 
-def _located(mission: LostMission) -> tuple[Sequence[Cell], str | None]:
+def _located(mission: LostMission) -> tuple[Sequence[Cell], bool]:
     if mission.where not in mission.path[1:]:
         raise TrustboError(f"the path {mission.path} never enters where = {mission.where}.")
     n = mission.path.index(mission.where, 1)
-    return mission.path[: n + 1], require_choice("cause", mission.cause, CAUSES)
+    return mission.path[: n + 1], True

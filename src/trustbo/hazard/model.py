@@ -23,7 +23,7 @@ from scipy import special, stats
 
 from trustbo.data import Mission
 from trustbo.errors import PosteriorError, TrustboError, require_whole
-from trustbo.hazard.exposures import CAUSES, Exposures, LostMission
+from trustbo.hazard.exposures import Exposures, LostMission
 from trustbo.hazard.prior import FLOOR, LIMIT_NAMES, REFERENCE, TILT, BoundPrior, Hazard
 from trustbo.hazard.risk import BoundRisk, add_lost
 from trustbo.inference import importance
@@ -59,10 +59,10 @@ def fit_hazard(
         `strength` (draw), and `place` (draw, lost), the bound, counted from 1, at which each
         mission lost at an unknown place failed; `p_fail` (move, row, col), posterior mean of the
         failure probability, NaN where there is no bound; `exposures` and `failures` (move, row,
-        col), counts of known outcomes; `failures_by_cause` (cause). `BoundRisk` draws from it.
+        col), counts of known outcomes. `BoundRisk` draws from it.
 
     Raises:
-        TrustboError: If a mission's path jumps or leaves the grid, or a cause is unknown.
+        TrustboError: If a mission's path jumps or leaves the grid.
         PosteriorError: If k-hat > 0.7.
     """
     started, hazard = time.perf_counter(), hazard or Hazard()
@@ -216,12 +216,10 @@ def _to_dataset(
             "lost_bound": (("lost", "bound", "axis"), lost),
             "exposures": (_MAPS, n),
             "failures": (_MAPS, failed),
-            "failures_by_cause": ("cause", exposures.causes),
         },
         {
             "draw": np.arange(_N_DRAWS),
             "measure": [m for m in difficulty["measure"].values.tolist() if m != TILT],
-            "cause": list(CAUSES),
             "axis": list(_MAPS),
             "move": list(MOVE_NAMES),
         },

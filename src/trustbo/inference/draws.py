@@ -247,7 +247,8 @@ def sample_prior(
     require_kind("model", model, TrustModel, "give one such as PooledTrust()")
     n_draws, seed = require_whole("n_draws", n_draws, 1), require_whole("seed", seed, 0)
     prior, rng = _prior(model, n_features, n_robots), np.random.default_rng(seed)
-    return model.params(prior.named(prior.draw_prior(n_draws, rng))["posterior"])
+    sites = prior.named(prior.draw_prior(n_draws, rng))["posterior"]
+    return assemble_params(sites, model.x0, model.memory)
 
 
 def prior_mean(model: TrustModel, n_features: int, *, n_robots: int = 1) -> Params:
@@ -256,7 +257,8 @@ def prior_mean(model: TrustModel, n_features: int, *, n_robots: int = 1) -> Para
     draws = prior.draw_prior(_N_MEAN, rng, even=True)
     draws = draws._replace(c=prior.prior(draws.theta).mean)
     sites = prior.named(draws)["posterior"]
-    return model.params({name: values.mean(0, keepdims=True) for name, values in sites.items()})
+    sites = {name: values.mean(0, keepdims=True) for name, values in sites.items()}
+    return assemble_params(sites, model.x0, model.memory)
 
 
 def _prior(model: TrustModel, n_features: int, n_robots: int) -> Posterior:

@@ -19,7 +19,6 @@ from trustbo.models.backend import namespace
 from trustbo.models.effects.effect import Effect, Theta, sample_columns
 from trustbo.models.effects.weights import Weights
 from trustbo.models.families import FAMILIES, Family
-from trustbo.models.params import Params, assemble_params
 from trustbo.models.priors import Priors
 from trustbo.models.signal import Layout, Signal
 from trustbo.models.slots import Slots, require_ticks
@@ -213,10 +212,6 @@ class TrustModel(Summary, ABC):
         some, N = np.where(seen, y, 0.5), np.where(ticks > 0.0, ticks, 1.0)
         log_p = self.family.log_prob(some, N, f, signal.sd[0])
         numpyro.factor("contact_rate", jnp.where(seen, log_p, 0.0).sum())
-
-    def params(self, sites: Mapping[str, Any]) -> Params:
-        """Build parameters from values (draw, ...) by name, with the axes of `dims`."""
-        return assemble_params(sites, self.x0, self.memory)
 
     def options(self) -> dict[str, Any]:
         """Return the options to record, without priors, effects and the default memory."""

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from scipy import sparse
 
 from trustbo.data import Mission
-from trustbo.errors import TrustboError, require_positive
+from trustbo.errors import require_positive
 from trustbo.models.backend import inverse, namespace
 from trustbo.models.effects.effect import LEAST, Effect, Theta, Values
 from trustbo.models.slots import Slots
@@ -19,12 +19,6 @@ from trustbo.workspace import Workspace
 
 _JITTER = 1e-8  # of a correlation of cells
 _LENGTH_SCALES = 1e-6, 1e6  # cells: outside, cells are independent, or equal
-_MOST = {
-    "tau_s": (100.0, "trust, which is between 0 and 1"),
-    "tau_e": (100.0, "trust, which is between 0 and 1"),
-    "length_scale": (1000.0, "cells, not metres"),
-    "length_scale_sd": (3.0, "the logarithm of a length scale"),
-}
 
 
 @dataclass(frozen=True)
@@ -42,7 +36,7 @@ class PlaceEffect(Effect):
         length_scale_sd: Standard deviation of the logarithm of the length scale.
 
     Raises:
-        TrustboError: If a number is not positive or far too large.
+        TrustboError: If a number is not positive.
     """
 
     tau_s: float = 0.2
@@ -54,11 +48,8 @@ class PlaceEffect(Effect):
     variables: ClassVar = {"place": (), "place_bound": ()}  # laid out by `place_maps.place_group`
 
     def __post_init__(self) -> None:
-        for name, (most, scale) in _MOST.items():
-            if (value := require_positive(f"PlaceEffect.{name}", getattr(self, name))) > most:
-                raise TrustboError(
-                    f"PlaceEffect.{name} = {value:g} exceeds {most:g}: it is of {scale}."
-                )
+        super().__post_init__()
+        require_positive("PlaceEffect.length_scale_sd", self.length_scale_sd)
 
     def hyperpriors(self) -> dict[str, dist.Distribution]:
         """See `Effect.hyperpriors`."""
