@@ -24,7 +24,7 @@ from scipy import special, stats
 from trustbo.data import Mission
 from trustbo.errors import PosteriorError, TrustboError, require_whole
 from trustbo.hazard.exposures import Exposures, LostMission
-from trustbo.hazard.prior import FLOOR, LIMIT_NAMES, REFERENCE, TILT, BoundPrior, Hazard
+from trustbo.hazard.prior import FLOOR, LIMIT_NAMES, TILT, BoundPrior, Hazard
 from trustbo.hazard.risk import BoundRisk, add_lost
 from trustbo.inference import importance
 from trustbo.workspace import Workspace
@@ -227,6 +227,5 @@ def _to_dataset(
             "k_hat": float(np.clip(points.k_hat, -1.0, 1e3)),
             "kish": points.kish,
             "seed": seed,
-            "reference": REFERENCE,
         },
     )

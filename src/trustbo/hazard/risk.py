@@ -10,7 +10,7 @@ import xarray as xr
 
 from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_whole
-from trustbo.hazard.prior import LIMIT_NAMES, TILT, prior_betas, steepness_of
+from trustbo.hazard.prior import LIMIT_NAMES, REFERENCE, TILT, prior_betas, steepness_of
 from trustbo.hazard.strata import MOST, Strata, partition
 from trustbo.workspace import Workspace
 from trustbo.workspace.difficulty import difficulty_of
@@ -43,7 +43,7 @@ class BoundRisk:
         self.exposures, self.failures = hazard["exposures"].values, hazard["failures"].values
         difficulty = difficulty_of(workspace)
         measures, limit = hazard["measure"].values.tolist(), [n for n in LIMIT_NAMES if n in hazard]
-        self._difficulty = difficulty.sel(measure=measures).values - hazard.attrs["reference"]
+        self._difficulty = difficulty.sel(measure=measures).values - REFERENCE
         self.steepness = None
         if limit:
             tilt = difficulty.sel(measure=TILT).values

@@ -82,11 +82,6 @@ class Blocks(NamedTuple):
         seen_by_kind = kinds[:, 2:].astype(bool)
         return cls(np.where(seen, y, 0.0), U, kind, kinds[:, 1], seen_by_kind, sums, at, order)
 
-    @property
-    def n_columns(self) -> int:
-        """Number of columns."""
-        return self.U.shape[1]
-
 
 class Prior(NamedTuple):
     """Prior of the columns at each theta."""

@@ -125,7 +125,7 @@ def draw(
         Columns (point, column), signals (point, block, row) and log weights (point,).
     """
     blocks, signal, prior, terms = joint
-    n, p = len(signal.sd), blocks.n_columns
+    n, p = len(signal.sd), blocks.U.shape[1]
     nu = max(8.0, 2.0 * p)
     laws = []
     for share in (1.0, _TEMPERED):

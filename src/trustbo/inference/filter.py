@@ -342,25 +342,21 @@ class TrustFilter:
 
     def effects(self, path: Sequence[Cell] | None, n_bounds: int) -> Sequence[Effect]:
         """Return the effect of each bound's place, 0 if none; checks the path's cells."""
-        cells = []
-        if path is not None:
-            path = list(path) if isinstance(path, Iterable) else []
-            cells = [require_pair("a cell", cell) for cell in path]
-            if len(cells) != n_bounds + 1:
-                raise TrustboError(
-                    f"need {n_bounds + 1} cells for {n_bounds} bounds, the current cell first; got "
-                    f"{path!r}."
-                )
-            for grid in {np.shape(value)[-2:] for value in self.params.places.values()}:
-                require_on_grid(cells, grid)
-            moves_along(cells)
-        if not self.params.places:
+        places = self.params.places
+        if path is None and not places:
             return [0.0] * n_bounds
-        if not cells:
+        given = path if isinstance(path, Iterable) else []
+        cells = [require_pair("a cell", cell) for cell in given]
+        if len(cells) != n_bounds + 1:
             raise TrustboError(
-                f"with place effects, give the {n_bounds + 1} cells of the path, the current one "
-                "first."
+                f"need {n_bounds + 1} cells for {n_bounds} bounds, the current cell first; got "
+                f"{path!r}."
             )
+        for grid in {np.shape(value)[-2:] for value in places.values()}:
+            require_on_grid(cells, grid)
+        moves_along(cells)
+        if not places:
+            return [0.0] * n_bounds
         return list(np.moveaxis(self.params.of_places(bounds_along(cells)), -2, 0))
 
     def _checked(self, awareness: ArrayLike, n_axes: int) -> np.ndarray:

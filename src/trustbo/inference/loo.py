@@ -19,12 +19,13 @@ from arviz_stats.utils import ELPDData
 from scipy.special import logsumexp
 
 from trustbo.errors import TrustboError, one_line
-from trustbo.inference.draws import read_posterior, require_posterior
+from trustbo.inference.draws import missions_of, read_posterior, require_posterior
 from trustbo.inference.fit import by_importance
 from trustbo.inference.importance import MAX_KHAT, smoothed
 from trustbo.inference.posterior import Posterior, at
 from trustbo.models.model import TrustModel
 from trustbo.parallel import one_blas_thread
+from trustbo.stacking import stack_missions
 
 _POINTS = 500  # distinct hyperparameters at most
 
@@ -150,7 +151,9 @@ def compare(posteriors: Mapping[str, xr.DataTree]) -> pd.DataFrame:
             f"{one_line(posteriors)}."
         )
     trees = {name: require_posterior("compare", tree) for name, tree in posteriors.items()}
-    (first, reference), *others = ((name, _rates(tree)) for name, tree in trees.items())
+    (first, reference), *others = (
+        (name, stack_missions(missions_of(tree)).contact_rate) for name, tree in trees.items()
+    )
     for name, rates in others:
         if not np.array_equal(reference, rates, equal_nan=True):
             raise TrustboError(
@@ -158,10 +161,3 @@ def compare(posteriors: Mapping[str, xr.DataTree]) -> pd.DataFrame:
                 f"{rates.shape} and {reference.shape}; fit both to the same."
             )
     return ranked({name: loo(tree) for name, tree in trees.items()})
-
-
-def _rates(posterior: xr.DataTree) -> np.ndarray:
-    """Return the rates as measured, (mission, bound, robot)."""
-    if "observed_data" not in posterior.children:
-        raise TrustboError("compare needs the group observed_data; give whole posteriors of fit.")
-    return posterior["observed_data"].to_dataset()["contact_rate"].values
