@@ -133,7 +133,7 @@ def _missions(result: Result) -> list[str]:
         _image(result.plot_history, "contact and objective by mission"),
         _table(shown),
         _note(
-            "The objective is that of the plan before the mission, under the posterior of the "
+            "The objective is the value of the plan before the mission, under the posterior of the "
             f"missions before it: {result.settings['objective'].replace('_', ' ')}."
         ),
     ]

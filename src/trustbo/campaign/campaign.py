@@ -422,7 +422,7 @@ class Campaign(Result):
             TrustboError: There is no mission yet.
         """
         if not self.state.entries:
-            raise TrustboError("the campaign has no mission yet; tell it one first.")
+            raise TrustboError("the campaign has no mission yet; call tell or run first.")
         result = Result(self.workspace, self.state.copy(), self.model, self._base)
         vars(result).update(self._computed())
         return result

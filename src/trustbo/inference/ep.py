@@ -2,7 +2,7 @@
 
 Each term t(f) is replaced by a site exp(-lam f^2 / 2 + eta f). Given the sites the engine is exact;
 it gives the marginal of each signal, hence its cavity, and the family matches the site to cavity
-times term. The log evidence is that of the sites plus, for every term, the log ratio of the masses
+times term. The log evidence is the sites' plus, for every term, the log ratio of the masses
 of cavity times term and of cavity times site; it is stationary in the sites. The approximation
 error is corrected by importance weights, whose mean is the evidence.
 """

@@ -42,7 +42,7 @@ _FIELDS = {
 def sample_by_nuts(
     posterior: Posterior, *, chains: int, draws: int, warmup: int, seed: int, progress: bool = True
 ) -> tuple[Draws, dict[str, np.ndarray], dict[str, Any], list[str]]:
-    """Sample a posterior with NumPyro's `MCMC(NUTS)`, the chains vectorised.
+    """Sample a posterior with NumPyro's `MCMC(NUTS)`, with vectorised chains.
 
     Args:
         posterior: Model given missions.

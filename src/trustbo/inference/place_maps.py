@@ -104,7 +104,7 @@ def _kriging(
 ) -> Iterator[tuple[int, np.ndarray, float, np.ndarray]]:
     """Yield draws, length scale and kriging weights for each step of length scales.
 
-    Weights (cell, all) are those of the effects at visited cells in the mean of s over the grid.
+    Weights (cell, all) give the mean of s over the grid from the effects at visited cells.
     """
     cells, grid = visited.cells, np.indices(visited.shape).reshape(2, -1).T
     # Beyond, all cells are nearly equal, and `_prior` would need a far larger grid in memory.

@@ -44,7 +44,7 @@ def score(
         nats, of counts of ticks where every rate has an n_ticks (attribute `log_score_of`), else of
         densities, and probabilities at limits of censored rates. Over all rates: `coverage_50` and
         `coverage_90`, the shares of rates in the central intervals; `mean_log_score`; `r2`, 1 less
-        the squared errors of the means relative to those of the average rate; and their number `n`.
+        the ratio of squared errors of the means and of the average rate; and their number `n`.
 
     Raises:
         TrustboError: If a posterior is not from `fit`; the numbers of posteriors and missions

@@ -92,7 +92,7 @@ class Columns:
         parsed = _numbers(cells)
         there = cells.notna().to_numpy()
         faults = {
-            "is no finite number; write decimals with a point, and map words to numbers, such as "
+            "is not a finite number; write decimals with a point, and map words to numbers: "
             "frame[column].map({'agree': 6})": np.isinf(parsed) | np.isnan(parsed) & there,
             "is blank": np.isnan(parsed) & (not blank),
             "must be a whole number": whole & (parsed > np.floor(parsed)),
@@ -226,7 +226,7 @@ def _of_file(file: FilePath) -> pd.DataFrame:
     for i, row in enumerate(rows, start=1):
         if len(row) < len(header) or any(cell.strip() for cell in row[len(header) :]):
             raise TrustboError(
-                f"row {i} of {str(file)!r} has {len(row)} values, the header {len(header)}."
+                f"row {i} of {str(file)!r} has {len(row)} values, but the header has {len(header)}."
             )
     frame = pd.DataFrame([row[: len(header)] for row in rows], columns=header, dtype=object)
     return frame if separator == "," else frame.replace(_DECIMAL_COMMA, r"\1.\2", regex=True)

@@ -60,7 +60,7 @@ def read_table(
     Columns are `mission`; `bound`, 0 for the start cell, which has no measurements; `robot`; the
     cell (`row`, `col`), or a position (`x`, `y`, metres of the workspace's CRS); and
     `contact_rate`. Optional are `duration` (s), `n_ticks`, `status`, and a column for each feature.
-    The status of the last bound is that of the mission. A blank means not measured, or the status
+    The status of the last bound is the mission's. A blank means "not measured", or the status
     "ok". Bounds after the last one with a measurement were planned but not run. Without cells, the
     log has no map.
 

@@ -51,8 +51,8 @@ class Priors(Summary):
             trust, beta / (1 - beta0) and b / (1 - beta0), the limit under constant features.
 
     Raises:
-        TrustboError: If a prior is not such a distribution, the prior of a weight is not Normal or
-            that of beta0 not on (0, 1), a noise or tau can be negative, or `x0_sd` is negative.
+        TrustboError: If a prior is not such a distribution, a weight's prior is not Normal or
+            beta0's prior not on (0, 1), a noise or tau can be negative, or `x0_sd` is negative.
     """
 
     beta0: Distribution = field(default_factory=partial(_built, dist.Beta, 2.0, 2.0))

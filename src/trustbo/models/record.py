@@ -32,8 +32,8 @@ def model_from_record(
 ) -> TrustModel:
     """Rebuild a model from its record; models with custom priors or class must be `given`.
 
-    `features` are those of the posterior, for default priors by feature. Raises TrustboError if the
-    model is required but not given, or a different one is given.
+    `features` are the posterior's features, for default priors by feature. Raises TrustboError if
+    the model is required but not given, or a different one is given.
     """
     if given is not None:
         if model_to_record(given) != record:

@@ -25,7 +25,7 @@ class Layout(NamedTuple):
 
     @property
     def label(self) -> np.ndarray:
-        """Label of each block; with a rotation, that of the first contrast differs."""
+        """Label of each block; with a rotation, the first contrast has a different label."""
         n_missions, _, n_robots = self.shape
         if self.joint:
             return np.arange(n_missions) * int(self.apart)
@@ -85,7 +85,7 @@ class Signal(NamedTuple):
 
 
 def each(M: Any, label: np.ndarray) -> Any:
-    """Return values (point, block, ...) of blocks by label; one block if all are equal."""
+    """Return values (point, block, ...) by the label of each block; one block if all are equal."""
     return M if M.shape[1] == 1 else M[:, label]
 
 

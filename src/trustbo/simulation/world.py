@@ -57,7 +57,7 @@ def true_surface(workspace: Workspace, terrain: xr.Dataset | None) -> Surface:
     terrain = require_terrain(terrain)
     if terrain.rio.crs != workspace.terrain.rio.crs:
         raise TrustboError(
-            f"the true terrain has CRS {terrain.rio.crs}, the workspace "
+            f"the true terrain has CRS {terrain.rio.crs}, but the workspace has "
             f"{workspace.terrain.rio.crs}; reproject the terrain."
         )
     surface = surface_of(terrain, np.isfinite(terrain["dem"].values))

@@ -69,7 +69,7 @@ def decoded(
             "scale, e.g. with gdal_edit.py -scale 0.01."
         )
     raise TrustboError(
-        f"{where}, which is no height on land: it is a fill value that no tag declares, or one "
+        f"{where}, which is not a height on land: a fill value that no tag declares, or one "
         f"that resampling has blended with heights. Pass nodata={value!r}, or resample the raster "
         "again with its fill value declared."
     )
@@ -91,7 +91,7 @@ def metres_of(name: str, declared: object, axis: float | None) -> float:
 
     Args:
         name: Name of the raster.
-        declared: Unit of the band, or of each band, of which the first is used; None if unknown.
+        declared: Unit of the band, or units of all bands; the first one is used. None if unknown.
         axis: Length of the unit of the CRS's vertical axis, m, if there is one.
 
     Raises:
