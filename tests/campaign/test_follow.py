@@ -116,7 +116,9 @@ def test_trust_within_a_bound_and_what_is_ahead_are_as_if_it_ended_now():
 @pytest.mark.parametrize("path", [None, DETOUR])
 def test_a_mission_that_was_followed_is_the_mission_made_at_once(path):
     campaign = begun()
-    follower = tb.Follower(campaign, path)
+    if path is not None:
+        campaign.suggest(path)
+    follower = tb.Follower(campaign)
     seen = looks(len(follower.path) - 1)
     for _ in follow(follower, seen):
         pass
@@ -224,7 +226,7 @@ def test_before_and_after_its_bounds_a_mission_takes_nothing():
         lambda: follower.to_mission(),
         lambda: follower.begin(0.0, (0, 3)),  # not a neighbour
         lambda: follower.begin(np.inf),
-        lambda: tb.Follower(campaign, [(3, 0), (4, 0)]),  # off the grid
+        lambda: follower.begin(0.0, (4, 0)),  # off the grid
     ):
         with pytest.raises(tb.TrustboError):
             act()

@@ -1,6 +1,5 @@
 """Online estimates of each robot's trust during a mission."""
 
-from collections.abc import Sequence
 from copy import copy
 
 import numpy as np
@@ -9,7 +8,7 @@ from numpy.typing import ArrayLike
 from trustbo.campaign.campaign import Campaign
 from trustbo.campaign.learning import known_along
 from trustbo.data import Bound, Cell, Mission, as_array
-from trustbo.errors import TrustboError, require_cells, require_pair
+from trustbo.errors import TrustboError, require_pair
 from trustbo.inference import TrustFilter
 from trustbo.inference.filter import TrustForecast, TrustState
 
@@ -29,20 +28,10 @@ class Follower:
         running: Whether a bound is in progress.
     """
 
-    def __init__(self, campaign: Campaign, path: Sequence[Cell] | None = None) -> None:
-        """Start before the first bound.
-
-        Args:
-            campaign: Campaign whose mission is followed.
-            path: Planned cells, start first; by default the path of `campaign.ask()`.
-
-        Raises:
-            TrustboError: Cells are off the grid, or successive cells are not neighbours.
-        """
-        cells = campaign.ask().path if path is None else path
-        self.path: tuple[Cell, ...] = tuple(require_cells("path", cells))
+    def __init__(self, campaign: Campaign) -> None:
+        """Start before the first bound of the path that `campaign.ask()` returns."""
+        self.path: tuple[Cell, ...] = tuple(campaign.ask().path)
         self._workspace, self._goal = campaign.workspace, self.path[-1]
-        known_along(self.path, self._workspace)  # refuses a path that cannot be
         self.bounds: tuple[Bound, ...] = ()
         self.running = False
         # After the bounds that have ended, and if the one in progress ended now.
