@@ -201,7 +201,7 @@ def test_next_try_may_take_another_path(workspace):
     campaign, paths = begin(workspace, policy="random"), set()
     for _ in range(7):
         paths.add(campaign.ask().path)
-        assert campaign.fail("the lead lost its map") is None
+        campaign.fail("the lead lost its map")
     assert campaign.missions == []
     assert len(paths) > 1
 
@@ -213,29 +213,24 @@ def test_table_has_a_row_for_each_mission_given_up(workspace):
     campaign.tell(simulator.run(campaign.ask().path, seed=0))
     simulator.fail_at = 2
     part = simulator.run(campaign.ask().path, seed=1)
-    campaign.fail("the wheel broke", part)
-    campaign.ask()
+    campaign.tell(part)
     campaign.fail("rain")
     table = campaign.table()
     assert table.index.isna().tolist() == [True, False, False, True]
     where = [f"{row},{col}" for row, col in (path[2], part.path[2])]
     assert table["where"].tolist() == [where[0], "", where[1], ""]
-    assert table["reason"].tolist() == ["stuck", "", "the wheel broke", "rain"]
+    assert table["reason"].tolist() == ["stuck", "", "", "rain"]
     assert table["state"].tolist() == ["given up", "learned", "learned", "given up"]
     assert table["status"].tolist() == ["stuck", "ok", part.status, "aborted"]
     assert table["n_bounds"].tolist()[:3] == [2, len(campaign.missions[0].bounds), 2]
-    assert campaign.state.failures[1] == (2, "the wheel broke", (), None, True)
 
 
 def test_contradictory_reports_of_failures_are_refused(workspace):
     campaign = begin(workspace)
     path = campaign.ask().path
-    arrived = ModelSimulator(workspace).run(path, seed=0)
     for arguments, named in (
         ({"reason": ""}, "reason"),
         ({"reason": None}, "reason"),
-        ({"reason": "stuck", "mission": arrived}, "mission"),
-        ({"reason": "rain", "mission": arrived, "where": path[1]}, "mission"),
         ({"reason": "stuck", "where": path[0]}, "where"),
         ({"reason": "rain", "where": path[1]}, "where"),
     ):

@@ -303,48 +303,32 @@ class Campaign(Result):
         self._continue()
         return self.state.posterior
 
-    def fail(
-        self, reason: str, mission: Mission | None = None, *, where: Cell | None = None
-    ) -> xr.DataTree | None:
-        """Report that the planned mission failed; the next plan takes the failure into account.
+    def fail(self, reason: str, *, where: Cell | None = None) -> None:
+        """Report that no bound of the planned mission was measured; `ask` then plans again.
+
+        If bounds were run, `tell` a mission with these bounds and its status instead.
 
         Args:
             reason: Reason, for the record. One of `hazard.CAUSES`, such as "stuck", means that a
                 bound of the plan failed; the failure then updates the hazard model.
-            mission: Bounds that were run, to learn from; None if there are none.
-            where: Cell that the team failed to enter, if known and no mission is given.
-
-        Returns:
-            Posterior of the parameters; None if there are no data.
+            where: Cell that the team failed to enter, if known.
 
         Raises:
-            TrustboError: `tell` would refuse the mission, or it reached the goal although a cause
-                is given; the reason is empty; or `where` is not on the plan, or is given with a
-                mission or a reason that is not a cause.
+            TrustboError: The reason is empty; or `where` is not on the plan, or is given with a
+                reason that is not a cause.
         """
         if not isinstance(reason, str) or not reason.strip():
             raise TrustboError(f"reason must be text, such as {CAUSES[0]!r}; got {reason!r}.")
-        posterior, path = None, ()
-        if mission is not None:
-            if where is not None or (reason in CAUSES and mission.status == "ok"):
-                raise TrustboError(
-                    f"mission ends with status {mission.status!r}, which contradicts reason = "
-                    f"{reason!r}, where = {where}; give its bounds with the status of the last."
-                )
-            posterior = self.tell(mission)
-        elif where is not None or reason in CAUSES:
-            path = self.ask().path
-            where = None if where is None else require_pair("where", where)
-            if where is not None and (reason not in CAUSES or where not in path[1:]):
-                raise TrustboError(
-                    f"where = {where} must be a cell that the plan enters, {path[1:]}, and reason "
-                    f"one of {', '.join(CAUSES)}; got {reason!r}."
-                )
-        n = len(self.state.entries)
-        self.state.failures.append(Failure(n, reason, tuple(path), where, mission is not None))
+        path = self.ask().path if reason in CAUSES or where is not None else ()
+        where = None if where is None else require_pair("where", where)
+        if where is not None and (reason not in CAUSES or where not in path[1:]):
+            raise TrustboError(
+                f"where = {where} must be a cell that the plan enters, {path[1:]}, and reason one "
+                f"of {', '.join(CAUSES)}; got {reason!r}."
+            )
+        self.state.failures.append(Failure(len(self.state.entries), reason, tuple(path), where))
         self._renew()
         self._continue()
-        return posterior
 
     def run(
         self,

@@ -215,26 +215,22 @@ class Result(Summary):
         The first columns are `status`, `state`, the `reason` for the state or the failure, the cell
         `where` the mission failed, the mean `contact_rate`, the plan's `objective`, the number
         `n_bounds` of bounds run, `path_changed`, and the `path` as text, "9,0 8,1". The other
-        quantities of `history` follow. A mission that failed without a report, see `Campaign.fail`,
-        has no number and the state "given up".
+        quantities of `history` follow. A mission that was given up, see `Campaign.fail`, has no
+        number and the state "given up".
         """
-        reasons = {f.after: f.reason for f in self.state.failures if f.reported}
         rows: list[dict[str, Any]] = []
         for n, entry in enumerate(self.state.entries, start=1):
             mission = entry.measured
             rows.append(entry.row | {
                 "mission": n,
-                "reason": entry.row["reason"] or reasons.get(n, ""),
                 "where": path_text([mission.bounds[-1].cell]) if mission.status != "ok" else "",
                 "n_bounds": len(mission.bounds),
                 "path": path_text(entry.plan.path),
             })  # fmt: skip
-        given_up = [failure for failure in self.state.failures if not failure.reported]
-        for i, failure in enumerate(given_up):  # each follows the mission before it
+        for i, failure in enumerate(self.state.failures):  # each follows the mission before it
             rows.insert(failure.after + i, failure.row())
-        table = pd.DataFrame(
-            rows, columns=list(dict.fromkeys(["mission", *COLUMNS, *chain(*rows)]))
-        )
+        names = dict.fromkeys(["mission", *COLUMNS, *chain(*rows)])
+        table = pd.DataFrame(rows, columns=list(names))
         return table.astype({"mission": "Int64"}).set_index("mission")
 
     def maps(self, *, n_draws: int | None = None) -> xr.Dataset:

@@ -23,24 +23,22 @@ COLUMNS = (
 
 
 class Failure(NamedTuple):
-    """A mission that failed.
+    """A mission that was given up, without measurements.
 
     Attributes:
         after: Number of missions recorded before it.
         reason: Reason, one of `hazard.CAUSES` if a bound failed.
         path: Planned path, start first; empty if no bound caused the failure.
         where: Cell that the team failed to enter, if known.
-        reported: Whether the completed bounds are recorded as a mission.
     """
 
     after: int
     reason: str
     path: tuple[Cell, ...] = ()
     where: Cell | None = None
-    reported: bool = False
 
     def row(self) -> dict[str, Any]:
-        """Return the row of the table of missions, for a mission without a report."""
+        """Return the row of the table of missions."""
         return {
             "status": self.reason if self.path else "aborted",
             "state": GIVEN_UP,

@@ -144,8 +144,8 @@ def read_campaign(
     with interpreting(folder / RECORD):
         asked = record["asked"] and plan_from_record(record["asked"], workspace)
         failures = [
-            Failure(after, reason, tuple(map(tuple, path)), where and tuple(where), reported)
-            for after, reason, path, where, reported in record["failures"]
+            Failure(after, reason, tuple(map(tuple, path)), where and tuple(where))
+            for after, reason, path, where in record["failures"]
         ]
         reason = str(record["stop_reason"])
         state = State(record["settings"], [], failures, asked, record["simulation"], reason)
