@@ -6,7 +6,7 @@ import xarray as xr
 
 import trustbo as tb
 from trustbo.inference import TrustFilter, diagnostics, fit, params_of
-from trustbo.models import PlaceEffect, PooledTrust, Priors
+from trustbo.models import PooledTrust, Priors
 from trustbo.planning import Planner
 
 ENDS = (5, 0), (0, 5)
@@ -46,7 +46,6 @@ MISTAKES = {
     "start is goal": (lambda w: Planner(w, (5, 0), (5, 0)), "start"),
     "an unknown objective": (lambda w: Planner(w, *ENDS, "trust"), "objective"),
     "a number for a prior": (lambda w: Priors(beta0=0.5), "beta0"),
-    "an effect beyond trust": (lambda w: PlaceEffect(tau_s=1e300), "tau_s"),
     "awareness without robots": (lambda w: tb.Workspace.from_awareness(Z), "awareness"),
     "a number for a team": (lambda w: tb.Workspace.from_awareness(Z[None], team=3), "team"),
     "robots=3": (lambda w: tb.Team(robots=3), "robots"),
