@@ -329,7 +329,7 @@ def path_text(path: Iterable[Cell]) -> str:
 
 
 def is_line_of_sight(feature: str) -> bool:
-    """Whether a feature is a predicted contact rate."""
+    """Return whether a feature is a predicted contact rate."""
     return feature.startswith(LINE_OF_SIGHT)
 
 

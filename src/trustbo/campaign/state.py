@@ -85,7 +85,7 @@ class Entry:
         measured: Mission as measured.
         mission: Mission with the awareness used for learning, see `learning.as_learned`.
         trust_map: Trust map used for planning, dims (row, col).
-        row: Numbers of the mission by name, among them its `state` and the `reason` for that.
+        row: Numbers of the mission by name, with its `state` and the `reason` for this state.
         posterior: Posterior after this mission; None if there is none yet.
     """
 

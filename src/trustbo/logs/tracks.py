@@ -149,7 +149,7 @@ def _track(name: str, rows: np.ndarray) -> np.ndarray:
         if not moves.any():
             raise TrustboError(
                 f"robot {name!r} has no heading, and moves by less than 1 mm/s: are times in "
-                "seconds and positions in metres? Else give its heading."
+                "seconds and positions in metres? If so, give its heading."
             )
         heading = pd.Series(np.where(moves, course, np.nan)).ffill().bfill().to_numpy()
     elif np.isnan(heading).any():
@@ -163,7 +163,7 @@ def _track(name: str, rows: np.ndarray) -> np.ndarray:
 
 
 def _in_degrees(heading: np.ndarray, course: np.ndarray, along: np.ndarray) -> bool:
-    """Whether headings are in degrees, by their jumps or the directions of motion."""
+    """Return whether headings are in degrees, by their jumps or the directions of motion."""
     if np.abs(heading).max() <= 2.0 * np.pi + 1e-6:
         return False
     fit, other = (np.cos(h - course).sum() for h in (along, np.radians(along)))

@@ -38,8 +38,8 @@ class Priors(Summary):
             distribution of batch shape (feature,) gives each feature a separate prior.
         b: Intercept.
         delta_w: Standard deviation of the process noise.
-        delta_v: Standard deviation of the observation noise, to which the resolution of the rates
-            adds as independent noise; in the beta-binomial family, the square root of the ratio of
+        delta_v: Standard deviation of the observation noise, without the noise that is due to the
+            resolution of the rates; in the beta-binomial family, the square root of the ratio of
             excess to binomial variance (concentration delta_v^-2).
         delta_s: Standard deviation of the noise that robots share in a bound.
         coupling: Influence of robots on each other: off-diagonals of B0 and B_m.

@@ -76,7 +76,7 @@ def weights_of(objective: Objective, dynamics: Dynamics, view: Array, longest: i
     adds sum_k credit(K - k) view . B0^k x_0 to the sum of a path of K bounds.
 
     Args:
-        objective: Row of `OBJECTIVES`; contact is taken to be trust.
+        objective: Row of `OBJECTIVES`; contact is assumed to equal trust.
         dynamics: Recursion of trust with leading axis (draw,).
         view: Weights of the states in the team's trust, (state,).
         longest: Largest number of bounds.

@@ -110,7 +110,7 @@ class Problem:
         return self.price * self.risk.priced(path) if self.risk and self.price else 0.0
 
     def is_within_limit(self, path: Sequence[Cell] | np.ndarray) -> bool:
-        """Whether a path respects `max_failure`."""
+        """Return whether a path respects `max_failure`."""
         if self.max_failure is None or self.risk is None:
             return True
         return 1.0 - self.risk.survival(path) <= self.max_failure + ROUNDING

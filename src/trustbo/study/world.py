@@ -99,8 +99,8 @@ class World:
         files = [Path(folder, self.ground, f"{name}.tif") for name in ("dem", "dsm")]
         if absent := [str(f) for f in files if self.data is None or not f.is_file()]:
             raise TrustboError(
-                f"world {self.name!r} lacks {' and '.join(absent)}: name the folder that holds "
-                f"{self.ground}/ by data=, or leave the world out."
+                f"world {self.name!r} lacks {' and '.join(absent)}; give data=, the folder that "
+                f"contains {self.ground}/, or leave the world out."
             )
         return [str(file) for file in files]
 
