@@ -82,12 +82,10 @@ def expected_rate(mean: np.ndarray) -> np.ndarray:
     E[clip(X, 0, 1)] is the integral of P(X > x) over [0, 1]. The antiderivative of the distribution
     function F of Student's t with density f is u F(u) + (freedom + u^2) / (freedom - 1) f(u).
     """
-
-    def integral(u: np.ndarray) -> np.ndarray:
-        tail = (FREEDOM + u**2) / (FREEDOM - 1.0) * student.pdf(u, FREEDOM)
-        return u * student.cdf(u, FREEDOM) + tail
-
-    return 1.0 - SCALE * (integral((1.0 - mean) / SCALE) - integral(-mean / SCALE))
+    u = np.stack([-mean, 1.0 - mean]) / SCALE
+    tail = (FREEDOM + u**2) / (FREEDOM - 1.0) * student.pdf(u, FREEDOM)
+    below, above = u * student.cdf(u, FREEDOM) + tail
+    return 1.0 - SCALE * (above - below)
 
 
 def _mean_contact(workspace: Workspace, terrain: xr.Dataset, seed: int) -> np.ndarray:
