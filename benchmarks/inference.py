@@ -19,7 +19,8 @@ from arviz_stats import sampling_diagnostics
 from numpyro.infer import MCMC, NUTS
 
 import trustbo as tb
-from trustbo.inference import TrustFilter, diagnostics, sample_prior
+from trustbo.inference import TrustFilter, sample_prior
+from trustbo.inference.diagnostics import diagnostics
 from trustbo.models import PlaceEffect, PooledTrust, RobotEffect
 from trustbo.models.backend import own_settings
 

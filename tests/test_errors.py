@@ -5,7 +5,8 @@ import pytest
 import xarray as xr
 
 import trustbo as tb
-from trustbo.inference import TrustFilter, diagnostics, fit, params_of
+from trustbo.inference import TrustFilter, fit, params_of
+from trustbo.inference.diagnostics import diagnostics
 from trustbo.models import PooledTrust, Priors
 from trustbo.planning import Planner
 

@@ -12,7 +12,8 @@ from missions import walking_missions
 
 import trustbo as tb
 from trustbo.errors import TrustboError
-from trustbo.inference import complete, diagnostics, fit, importance, params_of, sample_prior
+from trustbo.inference import complete, fit, importance, params_of, sample_prior
+from trustbo.inference.diagnostics import diagnostics
 from trustbo.inference.draws import prior_mean, read_posterior
 from trustbo.inference.tree import parameters_alone
 from trustbo.models import (

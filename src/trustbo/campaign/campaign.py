@@ -21,7 +21,8 @@ from trustbo.errors import TrustboError, require_choice, require_kind, require_p
 from trustbo.files import FilePath, to_json
 from trustbo.hazard import Hazard
 from trustbo.hazard.exposures import CAUSES
-from trustbo.inference import diagnostics, fit
+from trustbo.inference import fit
+from trustbo.inference.diagnostics import diagnostics
 from trustbo.inference.fit import SAMPLERS
 from trustbo.models import HumanTrust, default_model
 from trustbo.models.model import TrustModel

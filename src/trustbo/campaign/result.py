@@ -194,7 +194,7 @@ class Result(Summary):
         and the `trust_map` used for planning; the mean `contact_rate` of the mission, the
         `contact_lost` in bounds (bounds that were not run lose all contact), its `status`, its
         `state` (`"told"`, not used yet; `"learned"`; `"excluded"`) with the `reason`, and the
-        diagnostics of the posterior (see `inference.diagnostics`).
+        diagnostics of the posterior (see `fit`).
         """
         entries = self.state.entries
         paths = [entry.plan.path for entry in entries]

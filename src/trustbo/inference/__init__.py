@@ -3,7 +3,6 @@
 from trustbo.models import backend as backend  # first: it loads numpyro
 
 # isort: split
-from trustbo.inference.diagnostics import diagnostics
 from trustbo.inference.draws import params_of, sample_prior
 from trustbo.inference.filter import TrustFilter
 from trustbo.inference.fit import fit
@@ -16,7 +15,6 @@ __all__ = [
     "TrustFilter",
     "compare",
     "complete",
-    "diagnostics",
     "fit",
     "loo",
     "params_of",
