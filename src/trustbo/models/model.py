@@ -71,7 +71,7 @@ class TrustModel(Summary, ABC):
                 f"effects must be objects such as PlaceEffect(); got {unknown[0]!r}."
             )
         if len({type(effect) for effect in effects}) < len(effects):
-            raise TrustboError(f"give at most one effect of each kind; got {effects!r}.")
+            raise TrustboError(f"effects must be of different kinds; got {effects!r}.")
         object.__setattr__(self, "effects", effects)
 
     # --- defined by each model ---
