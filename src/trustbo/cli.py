@@ -78,16 +78,16 @@ def parser() -> argparse.ArgumentParser:
 
     add = command(info, "Describe and draw the planning grid of a terrain.", "dem.tif")
     add("dem", type=Path, metavar="DEM", help="heights of the ground, such as a GeoTIFF")
-    add("dsm", type=Path, nargs="?", metavar="DSM", help="heights of the canopy")
+    add("dsm", type=Path, nargs="?", metavar="DSM", help="heights of the surface, with trees")
     _add_grid(add)
     add("--out", type=Path, default=Path("grid.png"), metavar="FILE", help="image of the grid")
 
     example = "--dem dem.tif --dsm dsm.tif --start 9,0 --goal 0,9"
     add = command(run, "Run a simulated campaign on a given terrain.", example)
     add("--dem", type=Path, required=True, metavar="FILE", help="heights of the ground")
-    add("--dsm", type=Path, metavar="FILE", help="heights of the canopy (default: no canopy)")
-    add("--start", type=_place, required=True, metavar="PLACE", help=PLACE)
-    add("--goal", type=_place, required=True, metavar="PLACE", help="as for --start")
+    add("--dsm", type=Path, metavar="FILE", help="heights of the surface, with trees")
+    add("--start", type=place, required=True, metavar="PLACE", help=PLACE)
+    add("--goal", type=place, required=True, metavar="PLACE", help="as for --start")
     _add_grid(add)
     add("--robots", type=_count, default=3, metavar="N", help="overwatching robots (default 3)")
     add("--max-slope", type=float, default=45.0, metavar="DEG", help="slope limit (default 45)")
@@ -121,7 +121,7 @@ def _add_campaign(add: Any, folder: str) -> None:
 
 def _add_grid(add: Any) -> None:
     """Add the flags of the planning grid."""
-    add("--shape", type=_shape, default=(10, 10), metavar="ROWS,COLS", help="(default 10,10)")
+    add("--shape", type=shape, default=(10, 10), metavar="ROWS,COLS", help="(default 10,10)")
     add("--resolution", type=float, metavar="M", help="average the rasters to pixels of M m")
 
 
@@ -138,16 +138,16 @@ def _count(text: str) -> int:
     return int(text)
 
 
-def _shape(text: str) -> tuple[int, int]:
+def shape(text: str) -> tuple[int, int]:
     """Parse two whole numbers, such as "10,12"."""
     rows, cols = map(int, text.split(","))
     return rows, cols
 
 
-def _place(text: str) -> tuple[int, int] | dict[str, float]:
+def place(text: str) -> tuple[int, int] | dict[str, float]:
     """Parse a cell, such as "9,0", or a position, such as "x=1748000,y=5427000"."""
     if "=" not in text:
-        return _shape(text)
+        return shape(text)
     pairs = (part.split("=") for part in text.split(","))
     return {name.strip(): float(value) for name, value in pairs}
 
@@ -238,7 +238,8 @@ def _finish(result: "Result", folder: Path, quiet: bool) -> None:
     if not quiet:
         table = result.table()
         print(table[[name for name in _COLUMNS if name in table]].to_string(float_format="%.3f"))
-    print(f"stopped: {result.stop_reason}")
+    done = f"all {len(result.missions)} missions are done; for more, resume with --missions"
+    print(f"stopped: {done if result.stop_reason == 'n_iterations' else result.stop_reason}")
     print(f"recommended: {' '.join(f'{row},{col}' for row, col in result.path)}")
     print(f"results are in {folder}; open {folder / 'report.html'}")
 

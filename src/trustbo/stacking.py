@@ -34,7 +34,7 @@ def stack_missions(missions: Sequence[Mission]) -> MissionBatch:
             k, i, m = np.argwhere(np.isnan(mission.awareness))[0]
             raise TrustboError(
                 f"awareness of mission {j}, bound {k + 1}, robot {first.robots[i]}, feature "
-                f"{first.features[m]} is NaN; fill it from the awareness map or drop the bound."
+                f"{first.features[m]} is NaN; pass workspace= to fill it, or drop the bound."
             )
     n_bounds = max(len(mission.bounds) for mission in missions)
     shape = (len(missions), n_bounds, len(first.robots), len(first.features))

@@ -69,6 +69,35 @@ def test_crossings_of_the_lead_are_bounds_of_a_map():
         read_tracks(poses, SEEN, tb.Workspace.from_awareness(z), lead="a")
 
 
+def test_cells_whose_corner_is_cut_are_no_bounds_of_a_planned_path():
+    workspace = tb.Workspace.from_awareness(np.full((1, 3, 3, 2), 0.5), cell_size=10.0,
+                                            team=tb.Team(1, names=("b",)))  # fmt: skip
+    t = np.arange(30.0)
+    lead = {
+        "t": t,
+        "robot": "a",
+        "x": 0.5 + t,
+        "y": t + 0.2 * (t > 5),
+    }  # enters (1, 0) before (1, 1)
+    poses = pd.concat([pd.DataFrame(lead), pd.DataFrame(lead | {"robot": "b", "y": 1.0})])
+    seen = {"t": t, "watcher": ["b"] * 30, "seen": ["a"] * 30}
+    (cut,) = read_tracks(poses, seen, workspace)  # the lead is the robot that is not in the team
+    assert len(cut.path) > 3
+    planned = ((2, 0), (1, 1), (0, 2))
+    (one,) = read_tracks(poses, seen, workspace, path=planned)
+    assert (one.path, len(one.bounds), one.status) == (planned, 2, "ok")
+    (one,) = read_tracks(
+        poses[poses.t < 20], {n: v[:19] for n, v in seen.items()}, workspace, path=planned
+    )
+    assert (one.path, len(one.bounds), one.status) == (planned, 1, "aborted")
+    with pytest.warns(UserWarning, match="pass tick=2"):
+        read_tracks(poses, {n: v[::2] for n, v in seen.items()}, workspace)
+    more = pd.concat([poses, poses[poses.robot == "b"].assign(robot="c")])
+    seen |= {"t": np.repeat(t[:15], 2), "watcher": [*"bc"] * 15}
+    with pytest.raises(TrustboError, match="lead"):
+        read_tracks(more, seen, workspace)
+
+
 @pytest.mark.parametrize(
     ("poses", "seen"),
     [

@@ -175,8 +175,8 @@ def require_one_spelling(what: str, names: Iterable[str]) -> None:
     for name in dict.fromkeys(names):
         if (other := spelled.setdefault(_folded(name), name)) != name:
             raise TrustboError(
-                f"{what} has {other!r} and {name!r}: use one spelling, or names that differ by "
-                "more than case, spaces or leading zeros."
+                f"{what}: {other!r} and {name!r} look alike: use one spelling, or names that "
+                "differ by more than case, spaces or leading zeros."
             )
 
 

@@ -20,7 +20,7 @@ _AHEAD = np.pi / 6.0
 _EXTENT = 0.1
 """Least extent of a log, m."""
 _FEWEST = 2
-"""Minimum number of bounds of a mission."""
+"""Minimum number of bounds of a mission without a planned path."""
 
 
 def read_tracks(
@@ -28,6 +28,7 @@ def read_tracks(
     detections: Any,
     workspace: Workspace | None = None,
     *,
+    path: Sequence[Cell] | None = None,
     lead: str = EACH,
     window: float = 20.0,
     tick: float = 1.0,
@@ -40,7 +41,9 @@ def read_tracks(
 
     With a workspace, each move of the lead to another cell is a bound, and missions have the robots
     and features of the workspace, for `Campaign.tell`; awareness is NaN. A mission ends where the
-    lead leaves the grid or jumps to a cell that is not a neighbour.
+    lead leaves the grid or jumps to a cell that is not a neighbour. With the planned `path`, a
+    bound begins where the lead enters the next cell of the path, so that cells whose corners it
+    cuts are not bounds; if it does not reach the last cell, the status is `"aborted"`.
 
     Without a workspace, bounds are windows of time. The lead is also listed as a robot, so that all
     missions have the same robots; its contact rates are NaN, because they are not measured, and its
@@ -56,7 +59,9 @@ def read_tracks(
         detections: Columns t, watcher, seen, on the same clock. Detections of objects without poses
             are ignored.
         workspace: Map of the cells that the lead enters.
-        lead: Name of the lead; or `"each"`, to use every robot as the lead in turn.
+        path: Path that was planned, such as `campaign.ask().path`, if there is a workspace.
+        lead: Name of the lead. By default the robot that is not in the workspace's team; without a
+            workspace, every robot is used as the lead in turn.
         window: Length of a bound without a workspace, s.
         tick: Length of a tick, s.
         max_gap: Longest gap between two poses that is interpolated, s.
@@ -70,21 +75,27 @@ def read_tracks(
             positions or headings cannot be in seconds, metres and radians, the lead is unknown, or
             the log is too short for two bounds.
     """
-    tracks, looks = _read(poses, detections)
+    tracks, looks = _read(poses, detections, require_positive("tick", tick))
     robots = tuple(tracks)
     require_choice("lead", lead, (*robots, EACH))
     team = robots if workspace is None else workspace.team.names
     for name in team:
-        require_choice("robot of the workspace", name, robots)
+        if name not in robots:
+            raise TrustboError(f"the poses have no robot {name!r} of the team; they have {robots}.")
+    if workspace is not None and lead == EACH:
+        others = [name for name in robots if name not in team]
+        if len(others) != 1:
+            raise TrustboError(f"lead must be one of {others or robots}, to read a log with a map.")
+        lead = others[0]
     start = min(track[0, 0] for track in tracks.values())
     end = max(track[-1, 0] for track in tracks.values())
-    n = int(np.floor((end - start) / require_positive("tick", tick) + 1e-9))
+    n = int(np.floor((end - start) / tick + 1e-9))
     times, gap = start + (np.arange(n) + 0.5) * tick, require_positive("max_gap", max_gap)
     places = np.stack([_at(track, times, gap) for track in tracks.values()])
     looks[:, 0] = np.floor((looks[:, 0] - start) / tick + 1e-9)
     ticks = _ticks(places, looks[(looks[:, 0] >= 0) & (looks[:, 0] < n)].astype(int))
     of_team = [robots.index(name) for name in team]
-    missions = []
+    missions, fewest = [], _FEWEST if path is None else 1
     for i, name in enumerate(robots):
         if lead not in (name, EACH):
             continue
@@ -92,15 +103,15 @@ def read_tracks(
             step = max(round(require_positive("window", window) / tick), 1)
             stretches = [(np.arange(0, n + 1, step), None)]
         else:
-            stretches = _crossings(places[i, :, :2], workspace)
-        missions += [_mission(ticks[of_team, i], edges, tick, path, team, workspace)
-                     for edges, path in stretches if len(edges) > _FEWEST]  # fmt: skip
+            stretches = _crossings(places[i, :, :2], workspace, path)
+        missions += [_mission(ticks[of_team, i], edges, tick, cells, team, workspace)
+                     for edges, cells in stretches if len(edges) > fewest]  # fmt: skip
     if not missions:
         raise TrustboError(f"the log of {n * tick:g} s is too short; give a shorter window.")
     return missions
 
 
-def _read(poses: Any, detections: Any) -> tuple[dict[str, np.ndarray], np.ndarray]:
+def _read(poses: Any, detections: Any, tick: float) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Read the poses of each robot, (sample, 4), and detections, (detection, 3).
 
     A pose is a time (s), x, y (m) and heading (rad), times ascending; a detection is a time and the
@@ -128,6 +139,15 @@ def _read(poses: Any, detections: Any) -> tuple[dict[str, np.ndarray], np.ndarra
         raise TrustboError(
             f"in no detection does one of {robots} detect another; in the first, "
             f"{pairs[0][0]!r} detects {pairs[1][0]!r}."
+        )
+    gaps = [np.diff(sorted({s for s, *ends in looks if ends == [*pair]}))
+            for pair in {(a, b) for _, a, b in looks}]  # fmt: skip
+    apart = float(np.quantile(np.concatenate(gaps), 0.05)) if any(map(len, gaps)) else 0.0
+    if apart > 1.5 * tick:
+        warnings.warn(
+            f"two detections of a robot by another are at least {apart:g} s apart, and ticks of "
+            f"{tick:g} s without detections count as lost contact; pass tick={apart:g}.",
+            stacklevel=3,
         )
     if silent := {*robots} - {robots[i] for look in looks for i in look[1:]}:
         warnings.warn(
@@ -228,13 +248,16 @@ def _mission(
     if workspace is not None:
         features = workspace.features
         z = np.full((*n_ticks.shape[:2], len(features)), np.nan)
+    status = "ok" if path is None or len(edges) == len(path) else "aborted"
     return Mission.from_arrays(
         path, z, means[..., 0], np.diff(edges) * tick,
-        n_ticks=n_ticks[..., 0], features=features, robots=robots,
+        n_ticks=n_ticks[..., 0], features=features, robots=robots, status=status,
     )  # fmt: skip
 
 
-def _crossings(xy: np.ndarray, workspace: Workspace) -> list[tuple[np.ndarray, list[Cell]]]:
+def _crossings(
+    xy: np.ndarray, workspace: Workspace, planned: Sequence[Cell] | None
+) -> list[tuple[np.ndarray, list[Cell]]]:
     """Find edges and path of each sequence of neighbouring cells that the lead entered."""
     cells: list[Cell] = []
     for x, y in xy:
@@ -242,6 +265,12 @@ def _crossings(xy: np.ndarray, workspace: Workspace) -> list[tuple[np.ndarray, l
             cells.append(workspace.grid.locate({"x": x, "y": y}, "position"))
         except TrustboError:  # off the grid, or not known
             cells.append(NOWHERE)
+    if planned is not None:
+        path, edges = [(int(row), int(col)) for row, col in planned], []
+        for k, cell in enumerate(cells):
+            if len(edges) < len(path) and cell == path[len(edges)]:
+                edges.append(k)
+        return [(np.array([*edges[1:], len(cells)]), path)]
     entered = [k for k, cell in enumerate(cells) if k == 0 or cell != cells[k - 1]]
     path, edges = [cells[k] for k in entered], np.array([*entered, len(cells)])
     ends = [i for i, (a, b) in enumerate(pairwise(path), start=1)

@@ -267,7 +267,7 @@ def _paired(ground: xr.DataArray, surface: xr.DataArray) -> xr.Dataset:
     if (share := (canopy < 0.0).mean()) > _CLIPPED:
         warn(
             f"the DSM lies below the DEM on {share:.1%} of pixels; it is raised to the DEM there. "
-            "Check that both share one vertical datum."
+            "Check that both have the same vertical datum, and are not swapped."
         )
     low, middle = np.quantile(canopy, [0.05, 0.5])
     if low > _RAISED or middle > _TALL:

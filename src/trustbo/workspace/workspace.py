@@ -181,6 +181,7 @@ class Workspace(Summary):
         rows = [
             ("cells", f"{grid.shape[0]} x {grid.shape[1]}, {free.mean():.0%} passable"),
             ("cell", f"{grid.cell_height:.4g} m x {grid.cell_width:.4g} m"),
+            ("CRS", grid.crs_name),
             ("team", f"a lead and {', '.join(team.names)}"),
             ("awareness", "of the middle 80 % of bounds"),
             *spread,
