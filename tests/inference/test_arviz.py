@@ -6,7 +6,7 @@ import numpyro.distributions as dist
 import pytest
 
 import trustbo as tb
-from trustbo.models import PooledTrust, Priors
+from trustbo.models import CoupledTrust, HierarchicalTrust, PooledTrust, Priors
 
 FEATURES = ("traversability", "line_of_sight")
 
@@ -54,3 +54,13 @@ def test_every_draw_has_predictions(posterior):
     for group in ("posterior_predictive", "log_likelihood", "log_prior"):
         assert posterior[group].sizes["draw"] == sizes["draw"]
         assert posterior[group].sizes["chain"] == sizes["chain"]
+
+
+@pytest.mark.parametrize("model", [HierarchicalTrust(), CoupledTrust()])
+def test_a_summary_of_all_variables_labels_them_as_one_of_each_does(missions, model):
+    posterior = tb.fit(missions, model, draws=50, whole=False, check=False)
+    together = az.summary(posterior, kind="stats", round_to="none")["mean"]
+    for name, values in posterior["posterior"].data_vars.items():
+        alone = az.summary(posterior, var_names=[name], kind="stats", round_to="none")["mean"]
+        assert values.ndim == 2 or len(alone) > 1
+        np.testing.assert_allclose(together[alone.index], alone, rtol=1e-9)

@@ -72,7 +72,9 @@ def to_datatree(
         index = {"chain": np.arange(shape[0]), "draw": np.arange(shape[1])}
         index = index if draw is None else index | {"draw": draw}
         labelled = {name: labels for name, labels in (coords | index).items() if name in used}
-        tree[group] = xr.Dataset(variables, labelled)
+        # ArviZ labels all variables by the dims of the first, so those with most dims come first.
+        ordered = dict(sorted(variables.items(), key=lambda item: -len(item[1][0])))
+        tree[group] = xr.Dataset(ordered, labelled)
     tree["observed_data"], tree["constant_data"] = _data_groups(observed, missions, coords)
     return xr.DataTree.from_dict(tree)
 
