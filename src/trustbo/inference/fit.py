@@ -123,7 +123,8 @@ def fit(
         raise PosteriorError(
             f"posterior rejected: {'; '.join(complaints)}.",
             tree,
-            "Give more missions or firmer priors, or pass check=False to return it nevertheless.",
+            "Give more missions, firmer priors or, for NUTS, larger draws and warmup; or pass "
+            "check=False to return it nevertheless.",
         )
     if whole:
         tree = complete(tree, missions, model=model)

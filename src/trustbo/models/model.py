@@ -34,8 +34,8 @@ class TrustModel(Summary, ABC):
     """A trust model.
 
     A subclass defines `weights`, `hyperpriors`, `derived`, `layout`, `signal` (the equation as
-    matrices), `rates` (the equation as a distribution) and `dims`. Inference and planning need no
-    more.
+    matrices), `rates` (the equation as a distribution) and `dims`. The hyperparameters include
+    `delta_w` and `delta_v`, and `dims` has every parameter that plans need; see `PooledTrust`.
 
     Attributes:
         priors: Prior of each parameter; the default depends on the observation family and the
