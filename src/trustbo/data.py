@@ -368,7 +368,7 @@ def as_names(what: str, given: Iterable[str]) -> tuple[str, ...]:
     if not listed or not all(isinstance(name, str) for name in names):
         raise TrustboError(f"{what} must be a list of names; got {given!r:.60}.")
     if len(set(names)) < len(names):
-        raise TrustboError(f"{what} must be distinct names; got {names}.")
+        raise TrustboError(f"{what} must be different names; got {names}.")
     return names
 
 

@@ -104,7 +104,7 @@ class Team(Summary):
         robots = tuple(self.robots) or (Robot(),) * require_whole("n_robots", self.n_robots, 1)
         names = tuple(self.names) or tuple(f"r{i + 1}" for i in range(len(robots)))
         if not len(set(names)) == len(names) == len(robots):
-            raise TrustboError(f"names must be {len(robots)} distinct names; got {names}.")
+            raise TrustboError(f"names must be {len(robots)} different names; got {names}.")
         for name, value in (("n_robots", len(robots)), ("robots", robots), ("names", names)):
             object.__setattr__(self, name, value)
 

@@ -34,8 +34,8 @@ class Hazard:
         intercept: Prior of the logit of the mean failure probability at medium difficulty.
         coefficient: Prior of the weight of each measure of difficulty, which ranges from easy (0)
             to the robots' limit (1). Tilt has no weight; it enters through the slope limit.
-        margin: Prior of the degrees by which the team's true slope limit is below the stated limit,
-            if the stated limit is right. All bounds share the margin, so a failure on one makes
+        margin: Prior of how far, in degrees, the team's true slope limit is below the stated one,
+            if the stated one is about right. All bounds share the margin, so a failure on one makes
             failures on equally steep bounds more probable.
         doubt: Probability that the stated limit is wrong, and the sd of the margin in that case,
             degrees; the prior of the margin is a mixture of two normals with the same mean. Use a

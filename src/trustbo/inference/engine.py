@@ -124,7 +124,7 @@ class Prior(NamedTuple):
         return A
 
     def log_density(self, c: np.ndarray) -> np.ndarray:
-        """Compute the log density of columns (point, column), shape (point,)."""
+        """Compute the log density (point,) of each row of columns (point, column)."""
         start, off, square = 0, c - self.mean, 0.0
         for part in self.parts:
             x = off[:, start : (start := start + part.shape[1])]
@@ -215,7 +215,7 @@ def marginals(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Compute mean and variance (point, block, row) of every signal given all sites.
 
-    Each block must be a separate kind, in order.
+    The blocks must be of different kinds, in the order of the kinds.
     """
     V, T = each(signal.covariance, blocks.label), each(signal.T, blocks.label)
     n, rows = len(V), V.shape[-1]

@@ -47,7 +47,7 @@ class Scores:
         return self.at[NOISES[0]]
 
     def values(self, z: np.ndarray) -> dict[str, np.ndarray]:
-        """Convert scores (point, score) to hyperparameters by name, each (point,) or (point, k)."""
+        """Return hyperparameters by name, (point,) or (point, k), given scores (point, score)."""
         size, angle = np.exp(z[:, self.at["delta_w"]]), z[:, self.at["delta_v"]]
         found = {}
         for name, prior in self.priors.items():

@@ -276,12 +276,12 @@ class Planner(Summary):
             params: Posterior or parameters, whose mean is taken.
 
         Raises:
-            TrustboError: If abs(beta0) >= 1, for which trust has no limit.
+            TrustboError: If abs(beta0) >= 1, because trust then grows without limit.
         """
         problem, mean = self.problem, mean_of(params, self.workspace)
         dynamics = problem.dynamics(mean)
         if (radius := np.abs(np.linalg.eigvals(dynamics.transition)).max()) >= 1.0:
-            raise TrustboError(f"a graph of settled trust needs abs(beta0) < 1; got {radius:g}.")
+            raise TrustboError(f"trust settles only if abs(beta0) < 1; got {radius:g}.")
         contact = capped(LOST_CONTACT, problem.family, dynamics)
         grid, bounds = self.workspace.grid, problem.paths.bounds
         length = np.hypot(*(STEPS * (grid.cell_height, grid.cell_width)).T)  # (move,)
