@@ -146,9 +146,9 @@ def test_robots_and_teams_are_checked():
         Team(n_robots=0)
     with pytest.raises(TrustboError, match="must be a sequence of Robot"):
         Team(robots=Robot())
-    with pytest.raises(TrustboError, match="3 distinct names"):
+    with pytest.raises(TrustboError, match="3 different names"):
         Team(n_robots=3, names=("a", "b", "c", "a"))
-    with pytest.raises(TrustboError, match="2 distinct names"):
+    with pytest.raises(TrustboError, match="2 different names"):
         Team(n_robots=2, names=("a", "a"))
 
 

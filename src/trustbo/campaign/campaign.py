@@ -113,7 +113,7 @@ class Campaign(Result):
         model = default_model() if model is None else model
         require_kind("model", model, TrustModel, "give one such as PooledTrust()")
         if isinstance(model, HumanTrust):
-            raise TrustboError("model: HumanTrust describes reports of people, and cannot be used to plan paths.")
+            raise TrustboError("model: HumanTrust describes reports of people, not paths.")
         self.policy = resolve_policy(policy)
         settings = {
             "policy": policy if isinstance(policy, str) else f"{_name_of(policy)} (custom)",

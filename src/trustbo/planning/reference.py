@@ -1,4 +1,4 @@
-"""Slow, readable reference planner that uses networkx and enumeration, to test the compiled searches.
+"""Reference planner that uses networkx and enumeration, to test the compiled searches.
 
 Where the value of a path is a sum over its bounds, the best path is found by Bellman-Ford in the
 unrolled graph; where it depends on history or risk, all admissible paths are enumerated. Neither
