@@ -22,9 +22,8 @@ POLICIES = ("greedy", "optimistic", "thompson", "ucb", "random")
 OBJECTIVES = ("lost_contact", "terminal", "mean")
 FORMATS = ("geotiff", "geojson", "csv", "nav2")
 BAD_INPUT, INTERRUPTED = 2, 130
-EPILOG = "exit codes: 0 done; 2 bad input; 130 interrupted"
 PLACE = "ROW,COL, with row 0 in the north; or x=...,y=... in metres of the CRS; or lon=...,lat=..."
-_COLUMNS = ("status", "contact_rate", "objective", "k_hat", "r_hat", "path_changed")
+_COLUMNS = ["status", "contact_rate", "objective", "k_hat", "r_hat", "path_changed"]
 """Columns of the table that a finished campaign prints."""
 
 
@@ -35,7 +34,6 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
         arguments: Words after `trustbo`; by default the arguments of this process.
     """
     args = parser().parse_args(arguments)
-    folder = getattr(args, "folder", getattr(args, "out", None))
     warnings.showwarning = lambda message, *_, **__: print(f"warning: {message}", file=sys.stderr)
     for stream in (sys.stdout, sys.stderr):  # a terminal may lack letters of a path
         if isinstance(stream, io.TextIOWrapper):
@@ -43,6 +41,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     try:
         args.run(args)
     except KeyboardInterrupt:
+        folder = getattr(args, "folder", getattr(args, "out", None))
         _exit(f"interrupted; continue with: trustbo resume {folder}", INTERRUPTED)
     except (TrustboError, OSError) as error:
         _exit(f"error: {error}", BAD_INPUT)
@@ -59,7 +58,7 @@ def parser() -> argparse.ArgumentParser:
     top = argparse.ArgumentParser(
         prog="trustbo",
         description="Learn how trustworthy robots are on a terrain, and plan their best path.",
-        epilog=EPILOG,
+        epilog="exit codes: 0 done; 2 bad input; 130 interrupted",
     )
     version = f"trustbo {importlib.metadata.version('trustbo')}"
     top.add_argument("--version", action="version", version=version)
@@ -67,9 +66,8 @@ def parser() -> argparse.ArgumentParser:
     commands = top.add_subparsers(metavar="COMMAND")
 
     def command(run: Callable[..., None], text: str, example: str) -> Any:
-        name = run.__name__
-        example = f"example: trustbo {name} {example}"
-        made = commands.add_parser(name, help=text, description=text, epilog=example)
+        example = f"example: trustbo {run.__name__} {example}"
+        made = commands.add_parser(run.__name__, help=text, description=text, epilog=example)
         made.set_defaults(run=run)
         return made.add_argument
 
@@ -236,9 +234,8 @@ def _finish(result: "Result", folder: Path, quiet: bool) -> None:
     if result.workspace.terrain is not None:
         export_result(result, folder, ("geotiff", "geojson"))
     if not quiet:
-        table = result.table()
-        print(table[[name for name in _COLUMNS if name in table]].to_string(float_format="%.3f"))
-    done = f"all {len(result.missions)} missions are done; for more, resume with --missions"
+        print(result.table().filter(_COLUMNS).to_string(float_format="%.3f"))
+    done = "all missions are done; resume with --missions for more"
     print(f"stopped: {done if result.stop_reason == 'n_iterations' else result.stop_reason}")
     print(f"recommended: {' '.join(f'{row},{col}' for row, col in result.path)}")
     print(f"results are in {folder}; open {folder / 'report.html'}")
