@@ -33,9 +33,10 @@ def smaller(png: str) -> str:
 
 
 def is_progress(output: dict) -> bool:
-    """Whether an output only has progress bars, or the line about the compilation of kernels."""
+    """Whether an output only has progress bars, or a line about them or about compilation."""
     text = "".join(output.get("text", []))
-    return bool(re.fullmatch(r"(\r[^\n]*)+|compiling kernels.*\n", text))
+    about = text.startswith("compiling kernels") or "TqdmWarning" in text
+    return about or bool(re.fullmatch(r"(\r[^\n]*)+", text))
 
 
 def clean(path: Path) -> None:
@@ -46,6 +47,10 @@ def clean(path: Path) -> None:
         if "outputs" in cell:
             cell["outputs"] = [output for output in cell["outputs"] if not is_progress(output)]
         for output in cell.get("outputs", []):
+            if "text" in output:  # no path of a machine
+                text = "".join(output["text"])
+                text = re.sub(r"/\S+/(src/trustbo/|site-packages/|\d+\.py:)", r"\1", text)
+                output["text"] = text.splitlines(keepends=True)
             data = output.get("data", {})
             if "image/png" in data:
                 data["image/png"] = smaller("".join(data["image/png"]).strip())
