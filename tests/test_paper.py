@@ -24,6 +24,7 @@ def test_awareness_is_of_cells_and_of_the_paper_s_two_composites(workspace):
     }
 
 
+@pytest.mark.slow
 def test_a_campaign_learns_equations_3_and_4_by_nuts_and_plans_by_equation_6(workspace):
     result = tb.iterate(
         workspace, (2, 0), (0, 2), n_iterations=1, progress=False,

@@ -54,6 +54,7 @@ def test_gains_are_found_and_failures_weigh_more(posterior):
     assert (beta[:, 1] < -beta[:, 0]).mean() > 0.9
 
 
+@pytest.mark.slow
 def test_persons_left_out_have_even_weights(posterior):
     assert (loo(posterior).pareto_k < 0.7).all()
 

@@ -66,6 +66,7 @@ def test_what_people_share_is_ranked():
     assert {"beta0", "tau_gain", "beta[1]"} <= set(ranks)
 
 
+@pytest.mark.slow
 def test_a_posterior_of_another_prior_is_found_out(monkeypatch):
     draw = sbc.by_importance
 
