@@ -390,8 +390,8 @@ def _labelled(what: str, values: Any, dims: Sequence[str], **names: Sequence[str
     last dim, if they are strings. TrustboError: the labels are not the given names.
     """
     if isinstance(values, pd.DataFrame) and all(isinstance(name, str) for name in values):
-        numbers = values.astype(object).where(values.notna(), np.nan)  # also pd.NA
-        values = xr.DataArray(numbers.to_numpy(), dims=dims, coords={dims[-1]: list(values)})
+        numbers = values.to_numpy(dtype=object, na_value=np.nan)  # also pd.NA
+        values = xr.DataArray(numbers, dims=dims, coords={dims[-1]: list(values)})
     if not isinstance(values, xr.DataArray):
         return values
     if {*values.dims} != {*dims}:

@@ -92,6 +92,9 @@ def test_cells_whose_corner_is_cut_are_no_bounds_of_a_planned_path():
     assert (one.path, len(one.bounds), one.status) == (planned, 1, "aborted")
     with pytest.warns(UserWarning, match="pass tick=2"):
         read_tracks(poses, {n: v[::2] for n, v in seen.items()}, workspace)
+    for where, path in ((None, planned), (workspace, ((2, 0, 0),))):
+        with pytest.raises(TrustboError, match="path"):
+            read_tracks(poses, seen, where, path=path, lead="a")
     more = pd.concat([poses, poses[poses.robot == "b"].assign(robot="c")])
     seen |= {"t": np.repeat(t[:15], 2), "watcher": [*"bc"] * 15}
     with pytest.raises(TrustboError, match="lead"):

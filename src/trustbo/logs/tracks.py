@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from trustbo.data import NOWHERE, Cell, Mission
-from trustbo.errors import TrustboError, require_choice, require_positive
+from trustbo.errors import TrustboError, require_cells, require_choice, require_positive
 from trustbo.logs.columns import Columns, require_one_spelling, seconds_of
 from trustbo.workspace import Workspace
 
@@ -95,7 +95,10 @@ def read_tracks(
     looks[:, 0] = np.floor((looks[:, 0] - start) / tick + 1e-9)
     ticks = _ticks(places, looks[(looks[:, 0] >= 0) & (looks[:, 0] < n)].astype(int))
     of_team = [robots.index(name) for name in team]
-    missions, fewest = [], _FEWEST if path is None else 1
+    planned = None if path is None else require_cells("path", path)
+    if planned and workspace is None:
+        raise TrustboError("path= needs the workspace of its cells.")
+    missions, fewest = [], _FEWEST if planned is None else 1
     for i, name in enumerate(robots):
         if lead not in (name, EACH):
             continue
@@ -103,7 +106,7 @@ def read_tracks(
             step = max(round(require_positive("window", window) / tick), 1)
             stretches = [(np.arange(0, n + 1, step), None)]
         else:
-            stretches = _crossings(places[i, :, :2], workspace, path)
+            stretches = _crossings(places[i, :, :2], workspace, planned)
         missions += [_mission(ticks[of_team, i], edges, tick, cells, team, workspace)
                      for edges, cells in stretches if len(edges) > fewest]  # fmt: skip
     if not missions:
@@ -140,9 +143,10 @@ def _read(poses: Any, detections: Any, tick: float) -> tuple[dict[str, np.ndarra
             f"in no detection does one of {robots} detect another; in the first, "
             f"{pairs[0][0]!r} detects {pairs[1][0]!r}."
         )
-    gaps = [np.diff(sorted({s for s, *ends in looks if ends == [*pair]}))
-            for pair in {(a, b) for _, a, b in looks}]  # fmt: skip
-    apart = float(np.quantile(np.concatenate(gaps), 0.05)) if any(map(len, gaps)) else 0.0
+    readings = pd.DataFrame(looks, columns=["t", "watcher", "seen"]).drop_duplicates()
+    gaps = np.asarray(readings.sort_values("t").groupby(["watcher", "seen"])["t"].diff())
+    gaps = gaps[~np.isnan(gaps)]  # none before the first detection of a pair
+    apart = float(np.quantile(gaps, 0.05)) if len(gaps) else 0.0
     if apart > 1.5 * tick:
         warnings.warn(
             f"two detections of a robot by another are at least {apart:g} s apart, and ticks of "
@@ -266,11 +270,11 @@ def _crossings(
         except TrustboError:  # off the grid, or not known
             cells.append(NOWHERE)
     if planned is not None:
-        path, edges = [(int(row), int(col)) for row, col in planned], []
+        edges = []
         for k, cell in enumerate(cells):
-            if len(edges) < len(path) and cell == path[len(edges)]:
+            if len(edges) < len(planned) and cell == planned[len(edges)]:
                 edges.append(k)
-        return [(np.array([*edges[1:], len(cells)]), path)]
+        return [(np.array([*edges[1:], len(cells)]), [*planned])]
     entered = [k for k, cell in enumerate(cells) if k == 0 or cell != cells[k - 1]]
     path, edges = [cells[k] for k in entered], np.array([*entered, len(cells)])
     ends = [i for i, (a, b) in enumerate(pairwise(path), start=1)
