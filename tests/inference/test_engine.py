@@ -99,13 +99,16 @@ def test_drawn_columns_have_the_moments_of_the_joint_normal(name):
     np.testing.assert_allclose(drawn.std(0), sd, rtol=0.04)
 
 
-@pytest.mark.parametrize("name", ["pooled", "deviation", "hierarchical"])
+@pytest.mark.parametrize(
+    "name", ["pooled", "deviation", "places and robots", "hierarchical", "coupled"]
+)
 def test_the_plain_program_has_the_density_of_the_equations(name):
     """Given coefficients: signals by the program's filter, and by the matrices of `signal`."""
     posterior, theta = posterior_of(name, gaps=True)
     model, slots, rng = posterior.model, posterior.slots, np.random.default_rng(2)
     values = posterior.scores.draw(20, rng)
     theta = model.theta(values, slots.resolution)
+    density = log_density_of_rates(model, slots)
     with own_settings():
         for i in range(20):
             given = {n: jax.numpy.asarray(v[i]) for n, v in values.items()}
@@ -120,9 +123,7 @@ def test_the_plain_program_has_the_density_of_the_equations(name):
                     )
                     given[f"{effect.noun or 'weights'}_{k}"] = jax.numpy.asarray(of_part)
                     start = stop
-            program = handlers.trace(handlers.substitute(handlers.seed(model.program, 0), given))
-            site = program.get_trace(slots)["contact_rate"]
-            found = float(site["fn"].log_prob(site["value"]).sum())
+            found = float(density(given))
             signal = model.signal(at(theta, slice(i, i + 1)), slots, posterior.layout)
             at_ = engine.expected(posterior.blocks, signal, c[None])
             W, log_sites = engine.whiten(
@@ -131,6 +132,34 @@ def test_the_plain_program_has_the_density_of_the_equations(name):
             w = W[:, posterior.blocks.kind] @ (posterior.blocks.y - at_)[..., None]
             wanted = log_sites[:, posterior.blocks.kind].sum() - 0.5 * (w**2).sum()
             np.testing.assert_allclose(found, wanted, rtol=1e-9)
+
+
+def log_density_of_rates(model, slots):
+    """By the program; noise that it samples is integrated out, as its log-density is quadratic."""
+
+    def sites(given):
+        program = handlers.substitute(handlers.seed(model.program, 0), given)
+        return handlers.trace(program).get_trace(slots)
+
+    def density(given):
+        found = sites(given)
+        if "trust_noise" not in found:
+            rates = found["contact_rate"]
+            return rates["fn"].log_prob(rates["value"]).sum()
+        prior = found["trust_noise"]["fn"]
+
+        def log_joint(e):
+            noise = e.reshape(prior.event_shape)
+            rates = sites({**given, "trust_noise": noise})["contact_rate"]
+            return prior.log_prob(noise) + rates["fn"].log_factor
+
+        zero = jax.numpy.zeros(prior.event_shape).ravel()
+        slope, precision = jax.grad(log_joint)(zero), -jax.hessian(log_joint)(zero)
+        gain = slope @ jax.numpy.linalg.solve(precision, slope)
+        size = zero.size * np.log(2 * np.pi) - jax.numpy.linalg.slogdet(precision)[1]
+        return log_joint(zero) + 0.5 * (gain + size)
+
+    return jax.jit(density)
 
 
 @pytest.mark.parametrize("name", ["places and robots", "coupled"])

@@ -203,7 +203,7 @@ class TrustModel(Summary, ABC):
         u = (layout.columns(U).toarray() @ c).reshape(len(layout.label), -1)
         signal = self.signal(theta, slots, layout)
         y, ticks = layout.rows(slots.y), layout.rows(slots.n_ticks)
-        root = jnp.linalg.cholesky(signal.covariance[0] + 1e-10 * jnp.eye(y.shape[1]))
+        root = jnp.linalg.cholesky(signal.covariance[0] + 1e-13 * jnp.eye(y.shape[1]))
         white = dist.Normal(0.0, 1.0).expand(y.shape).to_event(2)
         e = numpyro.sample("trust_noise", white)
         f = signal.m[0] + (signal.T[0] @ u[..., None])[..., 0] + (root @ e[..., None])[..., 0]  # pyright: ignore[reportArgumentType, reportCallIssue, reportIndexIssue]
