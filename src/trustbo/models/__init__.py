@@ -1,6 +1,6 @@
-"""Trust models: their parameters, priors and effects, and the state space that they share."""
+"""Trust models, with their parameters, priors, effects and common state-space form."""
 
-from trustbo.models import backend as backend  # first: it loads numpyro
+from trustbo.models import backend as backend  # imported first because it loads numpyro
 
 # isort: split
 from trustbo.models.contact_rate import ContactRate
@@ -26,4 +26,4 @@ __all__ = [
     "TrustParams",
     "default_model",
 ]
-__dir__ = __all__.copy  # completion lists public names alone
+__dir__ = __all__.copy  # tab completion lists only public names

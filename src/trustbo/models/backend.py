@@ -1,12 +1,12 @@
-"""Import of numpyro with its submodules, and JAX settings for all computations.
+"""Import numpyro with its submodules, and define the JAX settings for all computations.
 
-In Jupyter without ipywidgets, importing numpyro warns "IProgress not found"; the warning is
-silenced, as text progress bars suffice.
+In Jupyter without ipywidgets, importing numpyro raises the warning "IProgress not found". The
+warning is silenced because text progress bars suffice.
 
-arviz_base leaves a lazy numpyro in `sys.modules`. If a submodule is imported first, as in `import
-arviz; import numpyro.distributions`, packages lack their submodules and numpyro fails
-("numpyro.distributions has no attribute 'distribution'"). Accessing an attribute of the package
-first avoids this; where it has already happened, the submodules are set as attributes.
+arviz_base leaves a lazily loaded numpyro in `sys.modules`. If a submodule is imported first, as in
+`import arviz; import numpyro.distributions`, packages lack their submodules and numpyro fails
+("numpyro.distributions has no attribute 'distribution'"). Accessing an attribute of numpyro first
+avoids the error. Submodules that are already missing are set as attributes.
 """
 
 import sys
@@ -33,7 +33,7 @@ VERSIONS: dict[str, str] = {
     "numpyro": numpyro.__version__,
     "jax": jax.__version__,
 }
-"""Versions recorded in posteriors; cached, as each lookup takes 4 ms."""
+"""Versions recorded in posteriors, cached because each lookup takes 4 ms."""
 
 for _name, _module in list(sys.modules.items()):
     _package, _, _child = _name.rpartition(".")
@@ -42,21 +42,21 @@ for _name, _module in list(sys.modules.items()):
 
 
 def namespace(x: Any) -> ModuleType:
-    """Return `jax.numpy` for JAX arrays, else NumPy, so that one formula serves both."""
+    """Return `jax.numpy` for a JAX array, otherwise NumPy, so that one formula works for both."""
     return jnp if isinstance(x, jax.Array) else np
 
 
 def special_functions(x: Any) -> Any:
-    """Return `jax.scipy.special` for JAX arrays, else `scipy.special`."""
+    """Return `jax.scipy.special` for a JAX array, otherwise `scipy.special`."""
     return jax.scipy.special if isinstance(x, jax.Array) else special
 
 
 def inverse(A: Any) -> Any:
-    """Invert positive definite matrices (point, n, n); NaN where one is not."""
+    """Invert positive definite matrices (point, n, n); in NumPy, other matrices give NaN."""
     if isinstance(A, jax.Array):
         return jnp.linalg.inv(A)
     half = A.copy()
-    for one in half:  # symmetric, so its transpose, in LAPACK's order of axes, is the same matrix
+    for one in half:  # symmetric, so the transpose, in LAPACK's memory order, is equal
         if lapack.dpotrf(one.T, lower=1, overwrite_a=1)[1]:  # pyright: ignore[reportAttributeAccessIssue]
             one[:] = np.nan
         lapack.dpotri(one.T, lower=1, overwrite_c=1)  # pyright: ignore[reportAttributeAccessIssue]
@@ -65,13 +65,13 @@ def inverse(A: Any) -> Any:
 
 @partial(jax.jit, static_argnums=1)
 def call(prior: Any, method: str, x: jax.Array) -> jax.Array:
-    """Call a method of a distribution as one compiled program, not one per operation."""
+    """Call a method of a distribution as one compiled program instead of one per operation."""
     return getattr(prior, method)(x)
 
 
 @contextmanager
 def own_settings() -> Iterator[None]:
-    """Compute in float64 with one random number generator, whatever the caller's JAX flags."""
+    """Use float64 and the threefry generator, whatever JAX flags the caller has set."""
     with (
         jax.enable_x64(True),
         jax.default_prng_impl("threefry2x32"),

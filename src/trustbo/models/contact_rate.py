@@ -1,4 +1,4 @@
-"""The state space as a NumPyro distribution, for built-in and custom models."""
+"""The state-space model as a NumPyro distribution, for built-in and custom models."""
 
 from typing import Any
 
@@ -11,12 +11,12 @@ from numpyro.distributions import constraints
 
 
 class ContactRate(dist.Distribution):
-    """Contact rates given the drift of trust, equations (3)-(4), with trust integrated out.
+    """Distribution of contact rates given the drift, equations (3)-(4), with trust integrated out.
 
     x_k = beta0 x_{k-1} + drift_k + delta_w w_k, y_k = x_k + delta_v v_k, x_0 ~ N(x0_mean, x0_sd^2)
 
-    The batch shape is (mission,), the event shape (bound, robot). NaN marks rates that were not
-    measured. `drift` may be any function of awareness and of other sampled parameters:
+    The batch shape is (mission,) and the event shape is (bound, robot). NaN marks unmeasured rates.
+    `drift` may be any function of awareness and other sampled parameters:
 
     >>> drift = level + most * (1.0 - jnp.exp(-rise * awareness[..., 1]))
     >>> with numpyro.plate("mission", len(drift)):
@@ -39,8 +39,8 @@ class ContactRate(dist.Distribution):
         """Set the drift and the parameters.
 
         Args:
-            drift: Increment of trust in each bound, shape (mission, bound, robot).
-            beta0: Autoregression, shape () or (robot,).
+            drift: Drift of trust in each bound, shape (mission, bound, robot).
+            beta0: Autoregression coefficient, shape () or (robot,).
             delta_w: Standard deviation of the process noise, shape () or (robot,).
             delta_v: Standard deviation of the observation noise, shape () or (robot,).
             x0_mean: Mean of trust before the first bound, shape ().
@@ -52,7 +52,7 @@ class ContactRate(dist.Distribution):
 
     @jax.numpy_rank_promotion("allow")
     def log_prob(self, value: Array) -> Array:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Compute the log density of each mission, shape (mission,), by the Kalman filter."""
+        """Compute the log density (mission,) of each mission with the Kalman filter."""
         seen = ~jnp.isnan(value)
         bounds = (jnp.where(seen, value, 0.0), seen, self.drift)
         by_bound = tuple(jnp.swapaxes(a, 0, 1) for a in bounds)
@@ -62,7 +62,7 @@ class ContactRate(dist.Distribution):
         return lax.scan(self._filter, start, by_bound)[1].sum(0)
 
     def _filter(self, state: Any, inputs: Any) -> Any:
-        """Filter one bound: trust after it, and the log density of its rates (mission,)."""
+        """Filter one bound; return trust afterwards and the log density (mission,) of the rates."""
         (m, P), (y, seen, u), (beta0, delta_w, delta_v, *_) = state, inputs, self.parameters
         m, P = beta0 * m + u, beta0**2 * P + delta_w**2  # predict
         F = P + delta_v**2
@@ -74,7 +74,7 @@ class ContactRate(dist.Distribution):
     def sample(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, key: Array, sample_shape: tuple[int, ...] = ()
     ) -> Array:
-        """Draw contact rates, shape `(*sample_shape, mission, bound, robot)`."""
+        """Draw contact rates with shape `(*sample_shape, mission, bound, robot)`."""
         beta0, delta_w, delta_v, x0_mean, x0_sd = self.parameters
         shape = *sample_shape, *self.drift.shape
         w, v, e = (random.normal(k, shape) for k in random.split(key, 3))

@@ -1,4 +1,4 @@
-"""The paper's coupled form (1)-(2): robots that influence each other."""
+"""The paper's coupled trust model, equations (1)-(2)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -21,13 +21,13 @@ _DIAGONALS = {"beta0", "coupling", "delta_w", "delta_v", "partial_w", "partial_v
 
 @dataclass(frozen=True, repr=False)
 class CoupledTrust(TrustModel):
-    """Robots that influence each other, with separate parameters, equations (1)-(2).
+    """Model in which robots influence each other and have separate parameters, equations (1)-(2).
 
     x_k = B0 x_{k-1} + sum_m B_m z_{k,m} + b + w_k,  y_k = x_k + v_k,  w ~ N(0, Delta_w),
     v ~ N(0, Delta_v)
 
-    B0 and B_m are shrunk towards their diagonals by `Priors.coupling`; the covariances are
-    diag(sd) LKJ diag(sd).
+    `Priors.coupling` is the prior on the off-diagonal entries of B0 and B_m. The covariances are
+    diag(sd) R diag(sd), with an LKJ prior on the correlations R.
     """
 
     @property
@@ -36,7 +36,7 @@ class CoupledTrust(TrustModel):
         return CoupledWeights(self.priors)
 
     def hyperpriors(self, n_robots: int, n_features: int) -> dict[str, Distribution]:
-        """See `TrustModel.hyperpriors`: correlations by canonical partial correlations."""
+        """See `TrustModel.hyperpriors`; correlations are parametrised by partial correlations."""
         n, priors = n_robots, self.priors
         names = ("beta0", "delta_w", "delta_v")
         named = {name: getattr(priors, name).expand((n,)) for name in names}
@@ -51,7 +51,7 @@ class CoupledTrust(TrustModel):
         return named | partials
 
     def derived(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """See `TrustModel.derived`: B0, Delta_w and Delta_v from diagonals and correlations."""
+        """See `TrustModel.derived`; builds the matrices B0, Delta_w and Delta_v."""
         if "B0" in values:
             B0 = values["B0"]
             return {**values, "rest": 1.0 - namespace(B0).diagonal(B0, axis1=1, axis2=2)}
@@ -59,7 +59,7 @@ class CoupledTrust(TrustModel):
         n = beta0.shape[1]
         B0 = beta0[:, :, None] * np.eye(n)
         if n > 1:
-            place = np.eye(n * n)[~np.eye(n, dtype=bool).ravel()]  # of each off-diagonal
+            place = np.eye(n * n)[~np.eye(n, dtype=bool).ravel()]  # of each off-diagonal entry
             B0 = B0 + (values["coupling"] @ place).reshape(-1, n, n)
         derived: dict[str, Any] = {"B0": B0, "rest": 1.0 - beta0}
         for noise in ("w", "v"):
@@ -71,13 +71,13 @@ class CoupledTrust(TrustModel):
         return derived | {name: values[name] for name in values.keys() - _DIAGONALS}
 
     def layout(self, slots: Slots, *, contrasts: bool = True) -> Layout:
-        """See `TrustModel.layout`: a block is a mission."""
+        """See `TrustModel.layout`; each block is a mission."""
         return Layout(slots.y.shape, joint=True)
 
     def signal(self, theta: Theta, slots: Slots, layout: Layout) -> Signal:
-        """Compute the trust of all robots at all bounds; rows are (bound, robot).
+        """Compute the trust of all robots at all bounds, with rows ordered as (bound, robot).
 
-        Noise of rates is the sum of shared noise, Delta_v - eps 1, and independent noise, eps 1.
+        Observation noise is split into shared noise, Delta_v - eps I, and independent noise, eps I.
         """
         B0, K, R = theta["B0"], slots.n_bounds, slots.n_robots
         xp: Any = namespace(B0)
@@ -94,7 +94,7 @@ class CoupledTrust(TrustModel):
         return Signal(m, T[:, None], S[:, None], xp.sqrt(eps)[:, None, None], noise[:, None])
 
     def prior_terms(self, sites: Mapping[str, np.ndarray]) -> dict[str, tuple[str, np.ndarray]]:
-        """See `TrustModel.prior_terms`: diagonals, off-diagonals and noises."""
+        """See `TrustModel.prior_terms`; diagonal and off-diagonal entries are separate terms."""
         off = ~np.eye(sites["b"].shape[-1], dtype=bool)
         diagonal = {
             name: np.einsum("...ii->...i", sites[name]) for name in self.dims if name != "b"
@@ -116,7 +116,7 @@ class CoupledTrust(TrustModel):
 
 
 def correlation_factor(r: Any, n: int) -> Any:
-    """Compute Cholesky factors (point, n, n) from partial correlations."""
+    """Compute Cholesky factors (point, n, n) of correlations from partial correlations."""
     xp, k, rows = namespace(r), 0, []
     for i in range(n):
         left, row = xp.ones(len(r)), []
@@ -130,6 +130,6 @@ def correlation_factor(r: Any, n: int) -> Any:
 
 
 def _kron(A: np.ndarray, Q: Any) -> Any:
-    """Compute Kronecker products of a matrix (k, k) and matrices (point, n, n)."""
+    """Compute the Kronecker product of a matrix (k, k) with each of the matrices (point, n, n)."""
     blocks = A[None, :, None, :, None] * Q[:, None, :, None, :]
     return blocks.reshape(len(Q), *(len(A) * Q.shape[1],) * 2)

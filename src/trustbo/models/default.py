@@ -1,4 +1,4 @@
-"""The default model of `fit`, campaigns, commands and studies."""
+"""The default model of `fit`, campaigns, studies and the command line."""
 
 from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.effects.robot import RobotEffect
@@ -6,10 +6,9 @@ from trustbo.models.pooled import PooledTrust
 
 
 def default_model(*, places: bool = True) -> PooledTrust:
-    """Make the default model: `PooledTrust` with effects of places and robots.
+    """Make the default model, which is `PooledTrust` with place and robot effects.
 
     Args:
-        places: Whether to include effects of places, which belong to cells and bounds of a map; use
-            False for missions without a map.
+        places: Whether to include place effects, which need missions with a map.
     """
     return PooledTrust(effects=(PlaceEffect(),) * places + (RobotEffect(),))

@@ -13,11 +13,11 @@ from trustbo.models.pooled import PooledTrust
 
 @dataclass(frozen=True, repr=False)
 class HierarchicalTrust(PooledTrust):
-    """Coefficients per robot, partially pooled: between `PooledTrust` and separate robots.
+    """Model with separate coefficients for each robot, partially pooled towards a common mean.
 
-    beta_{i,m} ~ N(mean_beta_m, tau_beta_m^2) and b_i ~ N(mean_b, tau_b^2). The means have the
-    priors of the pooled coefficients, the spreads have `Priors.tau`; beta0 and the noise scales are
-    common to all robots.
+    beta_{i,m} ~ N(mean_beta_m, tau_beta_m^2) and b_i ~ N(mean_b, tau_b^2). The means have the same
+    priors as pooled coefficients, and the standard deviations tau have the prior `Priors.tau`. All
+    robots share beta0 and the noise scales.
     """
 
     @property
@@ -32,7 +32,7 @@ class HierarchicalTrust(PooledTrust):
         return super().hyperpriors(n_robots, n_features) | spreads
 
     def prior_terms(self, sites: Mapping[str, np.ndarray]) -> dict[str, tuple[str, np.ndarray]]:
-        """See `TrustModel.prior_terms`: means of the robots' coefficients."""
+        """See `TrustModel.prior_terms`; includes only the means of the robots' coefficients."""
         return {"mean_beta": ("beta", sites["mean_beta"]), "mean_b": ("b", sites["mean_b"])}
 
     @property

@@ -1,4 +1,4 @@
-"""The protocol of trust models: an equation as matrices, its priors, and a NumPyro program."""
+"""The protocol of trust models: an equation in matrix form, priors, and a NumPyro program."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -26,28 +26,29 @@ from trustbo.stacking import stack_missions
 from trustbo.workspace import Workspace
 
 MODELS: dict[str, type["TrustModel"]] = {}
-"""Classes of models by name, to read models from files."""
+"""Model classes by name, to read models from files."""
 
 
 @dataclass(frozen=True, repr=False)
 class TrustModel(Summary, ABC):
-    """A trust model.
+    """Base class of trust models.
 
-    A subclass defines `weights`, `hyperpriors`, `derived`, `layout`, `signal` (the equation as
-    matrices), `rates` (the equation as a distribution) and `dims`. The hyperparameters include
-    `delta_w` and `delta_v`, and `dims` has every parameter that plans need; see `PooledTrust`.
+    A subclass defines `weights`, `hyperpriors`, `derived`, `layout`, `signal` (the equation in
+    matrix form), `rates` (the equation as a distribution) and `dims`. Hyperparameters must include
+    `delta_w` and `delta_v`, and `dims` every parameter needed for planning. See `PooledTrust`.
 
     Attributes:
-        priors: Prior of each parameter; the default depends on the observation family and the
-            feature names, see `Priors.of`.
-        observation: Observation family: `"gaussian"`, as in the paper; `"censored"`, with rates
-            censored at 0 and 1; or `"beta_binomial"`, for ticks in contact out of `Bound.n_ticks`
-            ticks, with trust on the logit scale.
-        effects: Effects added to trust, such as `PlaceEffect()` for places and `RobotEffect()` for
-            each robot in each mission; none in the paper.
+        priors: Prior on each parameter. The default depends on the observation family and the
+            feature names; see `Priors.of`.
+        observation: Observation family: `"gaussian"` as in the paper, `"censored"` for rates that
+            are censored at 0 and 1, or `"beta_binomial"` for ticks in contact out of
+            `Bound.n_ticks`, with trust on the logit scale.
+        effects: Effects on the drift, such as `PlaceEffect()` for places and `RobotEffect()` for
+            each robot in each mission. The paper's models have none.
 
     Raises:
-        TrustboError: If a name is unknown, an effect is not an `Effect`, or two are of one kind.
+        TrustboError: If `observation` is unknown, or `effects` has a wrong type or a repeated
+            class.
     """
 
     priors: Priors = None  # pyright: ignore[reportAssignmentType]
@@ -68,10 +69,10 @@ class TrustModel(Summary, ABC):
         effects = (given,) if isinstance(given, Effect) else tuple(given)
         if unknown := [effect for effect in effects if not isinstance(effect, Effect)]:
             raise TrustboError(
-                f"effects must be objects such as PlaceEffect(); got {unknown[0]!r}."
+                f"effects must contain objects such as PlaceEffect(); got {unknown[0]!r}."
             )
         if len({type(effect) for effect in effects}) < len(effects):
-            raise TrustboError(f"effects must be of different kinds; got {effects!r}.")
+            raise TrustboError(f"effects must have different classes; got {effects!r}.")
         object.__setattr__(self, "effects", effects)
 
     # --- defined by each model ---
@@ -79,47 +80,47 @@ class TrustModel(Summary, ABC):
     @property
     @abstractmethod
     def weights(self) -> Weights:
-        """The columns of features and of the intercept."""
+        """The effect with the feature weights and the intercept."""
 
     @abstractmethod
     def hyperpriors(self, n_robots: int, n_features: int) -> dict[str, Distribution]:
-        """Return the priors of the parameters that are not integrated out, by name."""
+        """Return the priors on the parameters that are not integrated out, by name."""
 
     @abstractmethod
     def derived(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Convert hyperparameters to the form that `signal` takes, with `rest`, see `Theta`.
+        """Convert hyperparameters to the form that `signal` takes, and add `rest`; see `Theta`.
 
         `values` are hyperparameters (point, ...) by name, from `hyperpriors` or from a posterior.
         """
 
     @abstractmethod
     def layout(self, slots: Slots, *, contrasts: bool = True) -> Layout:
-        """Lay out the slots in blocks; without contrasts, rows are rates of robots."""
+        """Arrange the slots in blocks; without contrasts, each row is the rate of one robot."""
 
     @abstractmethod
     def signal(self, theta: Theta, slots: Slots, layout: Layout) -> Signal:
-        """Compute trust along all bounds by the model's equation, in NumPy or JAX."""
+        """Compute trust at all bounds from the model's equation, in NumPy or JAX."""
 
     @property
     @abstractmethod
     def dims(self) -> dict[str, tuple[str, ...]]:
-        """Return the axes of each parameter in a posterior, without the effects."""
+        """Axes of each parameter in a posterior, excluding effects."""
 
     # --- shared by all models ---
 
     @property
     def columns(self) -> tuple[Effect, ...]:
-        """Weights and effects, whose columns the blocks share."""
+        """Feature weights and effects, in the order of their columns."""
         return self.weights, *self.effects
 
     @property
     def effect_dims(self) -> dict[str, tuple[str, ...]]:
-        """Axes of the hyperparameters of effects."""
+        """Axes of the effects' hyperparameters."""
         return {name: () for effect in self.effects for name in effect.names}
 
     @property
     def family(self) -> Family:
-        """The family of observations."""
+        """The observation family."""
         return FAMILIES[self.observation]
 
     @property
@@ -128,15 +129,15 @@ class TrustModel(Summary, ABC):
         return {name: float(getattr(self.priors, name)) for name in ("x0_mean", "x0_sd")}
 
     def all_hyperpriors(self, slots: Slots) -> dict[str, Distribution]:
-        """Return the priors of all hyperparameters by name, the effects last."""
+        """Return the priors on all hyperparameters by name, with those of effects last."""
         priors = self.hyperpriors(slots.n_robots, slots.z.shape[3])
         return priors | {n: p for e in self.effects for n, p in e.hyperpriors().items()}
 
     def theta(self, values: Mapping[str, Any], resolution: float) -> dict[str, Any]:
-        """Convert values named as in `all_hyperpriors` to the argument of `signal`.
+        """Convert hyperparameters, named as in `all_hyperpriors`, to the argument of `signal`.
 
-        The resolution of the rates adds independent noise of that sd; otherwise the density of
-        rates that fit perfectly, such as constant ones, would be unbounded.
+        Noise with standard deviation `resolution` is added to `delta_v` in quadrature. Without this
+        noise, the density of rates that fit perfectly, such as constant rates, would be unbounded.
         """
         if self.family.adds_noise:
             noise = values["delta_v"]
@@ -145,21 +146,21 @@ class TrustModel(Summary, ABC):
         return self.derived(values)
 
     def rates(self, theta: Theta, drift: Any) -> Distribution | None:
-        """Return the distribution of rates given the drift (mission, bound, robot), for one point.
+        """Return the distribution of rates at one point, given the drift (mission, bound, robot).
 
-        It is None if trust cannot be integrated out.
+        The result is None if trust cannot be integrated out.
         """
         return None
 
     def prior_terms(self, sites: Mapping[str, np.ndarray]) -> dict[str, tuple[str, np.ndarray]]:
-        """Return the field of `Priors` and the values of each other parameter, by label."""
+        """Return the `Priors` field and the values of further terms of the log prior, by label."""
         return {name: (name, sites[name]) for name in ("beta", "b")}
 
     def slots(self, missions: Sequence[Mission], workspace: Workspace | None = None) -> Slots:
-        """Collect rates and features of missions, with further data that the effects need.
+        """Collect the rates and features of missions, and the data that the effects need.
 
         Raises:
-            TrustboError: If there are no missions, or they differ in robots or features; an
+            TrustboError: If there are no missions; robots or features differ between missions; an
                 awareness value is NaN; a measured rate lacks the n_ticks that the family needs; or
                 a path jumps or leaves the workspace.
         """
@@ -172,19 +173,19 @@ class TrustModel(Summary, ABC):
         return slots
 
     def for_features(self, features: Sequence[str]) -> Self:
-        """Return the model with default priors for the named features; keep custom priors.
+        """Return the model with default priors for these features; custom priors are kept.
 
-        See `Priors.of`. `fit` and campaigns call it.
+        `fit` and campaigns call this method; see `Priors.of`.
         """
         if self.priors is not Priors.default(self.observation):
             return self
         return replace(self, priors=Priors.of(tuple(features), self.observation))
 
     def program(self, slots: Slots) -> None:
-        """Run the model as a NumPyro program, for any kernel, such as `NUTS(model.program)`.
+        """Run the model as a NumPyro program, for a kernel such as `NUTS(model.program)`.
 
-        Everything is sampled except trust, which is integrated out where `rates` is a distribution.
-        Call it within `jax.enable_x64(True)`: effects need double precision.
+        All variables are sampled, except that trust is integrated out if `rates` is a distribution.
+        Call this method within `jax.enable_x64(True)`, because effects need double precision.
         """
         values = {
             name: numpyro.sample(name, prior.to_event(len(prior.batch_shape)))
@@ -214,7 +215,7 @@ class TrustModel(Summary, ABC):
         numpyro.factor("contact_rate", jnp.where(seen, log_p, 0.0).sum())
 
     def options(self) -> dict[str, Any]:
-        """Return the options to record, without priors, effects and the default memory."""
+        """Return the options to record, except priors, effects and the default memory."""
         others = ("priors", "effects", *("memory",) * (self.memory == "level"))
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in others}
 
@@ -226,7 +227,7 @@ class TrustModel(Summary, ABC):
         ]
 
     def in_short(self) -> str:
-        """Write the name, effects, family, and the options that differ from their defaults."""
+        """Return a short text with the class, effects, family and non-default options."""
         usual = {f.name: f.default for f in fields(self)}
         others = [
             f"{name} {value}"

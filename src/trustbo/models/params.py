@@ -1,4 +1,4 @@
-"""Parameters of the trust models as tuples of arrays, with leading axes such as (draw,)."""
+"""Parameters of the trust models, as tuples of arrays with leading axes such as (draw,)."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple, Self
@@ -19,18 +19,18 @@ PLACES: Mapping[str, tuple[str, ...]] = {
 
 
 class ParameterDraws(Summary):
-    """Mixin with the methods common to the parameters of all models."""
+    """Mixin with methods common to the parameters of all models."""
 
     __slots__ = ()
 
     AXES: ClassVar[Mapping[str, tuple[str, ...]]]
-    """Axes of each field after the leading axes; none if not listed."""
+    """Axes of each field after the leading axes; fields that are not listed have none."""
     WEIGHTS: ClassVar[str] = "beta"
-    """Name of the field with the weights of features."""
+    """Name of the field that contains the feature weights."""
     SUM: ClassVar[str]
-    """Subscripts of `np.einsum` for the sum of weights times awareness."""
+    """Subscripts of the `np.einsum` call that sums weights times awareness."""
     BY_ROBOT: ClassVar[bool] = False
-    """Whether coefficients differ by robot; b then has the axis (robot,)."""
+    """Whether coefficients differ between robots, so that b has the axis (robot,)."""
     _fields: ClassVar[tuple[str, ...]]
 
     def _rows(self) -> Rows:
@@ -42,13 +42,13 @@ class ParameterDraws(Summary):
 
     @property
     def by_name(self) -> dict[str, Numbers]:
-        """Return the arrays by name, without fields that are None."""
+        """Arrays by name, without fields that are None."""
         values = {name: getattr(self, name) for name in self._fields if name != "memory"}
         return {name: value for name, value in values.items() if value is not None}
 
     @property
     def leading(self) -> tuple[int, ...]:
-        """The leading axes, (draw,) or none."""
+        """Shape of the leading axes, such as (draw,)."""
         shape = np.shape(getattr(self, self.WEIGHTS))
         return shape[: len(shape) - len(self.AXES[self.WEIGHTS])]
 
@@ -64,35 +64,35 @@ class ParameterDraws(Summary):
         return np.shape(getattr(self, self.WEIGHTS))[axes.index("feature") - len(axes)]
 
     def transition(self, n_robots: int) -> np.ndarray:
-        """Return B0 of equation (1), (..., robot, robot), diagonal if uncoupled."""
+        """Return B0 (..., robot, robot) of equation (1), which is diagonal for uncoupled robots."""
         beta0 = np.asarray(self.beta0, dtype=float)  # pyright: ignore
         if not self.BY_ROBOT:
             beta0 = beta0[..., None]
         return np.broadcast_to(beta0, (*self.leading, n_robots))[..., None] * np.eye(n_robots)
 
     def expected_transition(self, n_robots: int) -> np.ndarray:
-        """Return the transition matrix of expected trust; 0 for memory of deviations."""
+        """Return the transition matrix of expected trust, which is 0 if `memory` is "deviation"."""
         B0 = self.transition(n_robots)
         return B0 if self.memory == "level" else np.zeros_like(B0)  # pyright: ignore
 
     def increments(self, awareness: np.ndarray) -> np.ndarray:
-        """Compute the drift without intercept, (..., robot, move, row, col).
+        """Compute the drift (..., robot, move, row, col) without the intercept.
 
-        Awareness is (robot, move, row, col, feature).
+        `awareness` has the shape (robot, move, row, col, feature).
         """
         weights = np.asarray(getattr(self, self.WEIGHTS), dtype=float)
         return np.einsum(self.SUM, weights, awareness)
 
     @property
     def places(self) -> dict[str, np.ndarray]:
-        """Place effects of the model, `place` and `place_bound`, by name."""
+        """Place effects `place` and `place_bound` by name, if the model has them."""
         effects = {name: getattr(self, name, None) for name in PLACES}
         return {name: np.asarray(value) for name, value in effects.items() if value is not None}
 
     def of_places(self, bounds: np.ndarray) -> np.ndarray:
-        """Return the effect of each bound and the cell it enters; shape (..., bound, effect).
+        """Return the sum (..., bound, effect) of the effects of each bound and of the entered cell.
 
-        Bounds (bound, 3) are moves, rows and columns; the effect is 0 where the move is negative.
+        `bounds` (bound, 3) contains moves, rows and columns; the effect of a negative move is 0.
         """
         moves, rows, cols = np.asarray(bounds).T
         total: Any = 0.0
@@ -103,11 +103,11 @@ class ParameterDraws(Summary):
         return np.swapaxes(np.where(moves < 0, 0.0, total), -1, -2)
 
     def along(self, path: Sequence[Cell] | np.ndarray) -> Self:
-        """Return the parameters for the bounds of a path, with its place effects in the intercept.
+        """Return the parameters for the bounds of a path, with place effects in the intercept.
 
-        The result has no place effects, and b (..., 1, bound, robot), with a last axis of length 1
-        where it is common to all robots. Without place effects, the parameters are returned
-        unchanged.
+        Without place effects, the parameters are returned unchanged. Otherwise, the result has no
+        place effects, and b has the shape (..., 1, bound, robot), where the last axis has length 1
+        if b is common to all robots.
         """
         if not self.places:
             return self
@@ -117,7 +117,7 @@ class ParameterDraws(Summary):
         return self._replace(b=b, place=None, place_bound=None)  # pyright: ignore[reportAttributeAccessIssue]
 
     def draw(self, index: int) -> Self:
-        """Select one draw, with its leading axis dropped."""
+        """Select one draw, and drop the leading axis."""
         return self.map(lambda value, n: np.asarray(value)[index] if np.ndim(value) > n else value)
 
     def mean(self) -> Self:
@@ -125,7 +125,7 @@ class ParameterDraws(Summary):
         return self.flat().map(lambda value, _: value.mean(0))
 
     def flat(self) -> Self:
-        """Return every field with exactly one leading axis (draw,), float64."""
+        """Return every field in float64 with exactly one leading axis (draw,)."""
         leading = self.leading
 
         def expand(value: Numbers, n: int) -> np.ndarray:
@@ -136,7 +136,7 @@ class ParameterDraws(Summary):
         return self.map(expand)
 
     def map(self, function: Callable[[Numbers, int], Numbers]) -> Self:
-        """Apply a function to each field and the number of its trailing axes."""
+        """Apply a function of a field and of the number of trailing axes to every field."""
         values = {
             name: function(value, len(self.AXES.get(name, ())))
             for name, value in self.by_name.items()
@@ -161,18 +161,18 @@ class TrustParams(ParameterDraws, _Trust):
     """Parameters of the pooled model, equations (3)-(4), with leading axes such as (draw,).
 
     Attributes:
-        beta0: Autoregression, (...,).
-        beta: Weights, (..., feature).
-        b: Intercept, (...,).
-        delta_w: Standard deviation of the process noise, (...,).
-        delta_v: Standard deviation of the observation noise, (...,).
-        x0_mean: Mean of trust before the first bound, () or (...,).
-        x0_sd: Standard deviation of trust before the first bound, () or (...,).
-        place: Effect of each cell entered, (..., effect, row, col), or None. The axis `effect` is
-            the robot, or has length 1 if effects are common to all robots.
-        place_bound: Effect of each bound, (..., effect, move, row, col), moves as in
-            `workspace.MOVES`, or None.
-        memory: Quantity carried over between bounds, `"level"` or `"deviation"`, see `PooledTrust`.
+        beta0: Autoregression coefficient, shape (...,).
+        beta: Feature weights, shape (..., feature).
+        b: Intercept, shape (...,).
+        delta_w: Standard deviation of the process noise, shape (...,).
+        delta_v: Standard deviation of the observation noise, shape (...,).
+        x0_mean: Mean of trust before the first bound, shape () or (...,).
+        x0_sd: Standard deviation of trust before the first bound, shape () or (...,).
+        place: Effects of entered cells, shape (..., effect, row, col), or None. The axis `effect`
+            is the robot, or has length 1 if effects are common to all robots.
+        place_bound: Effects of bounds, shape (..., effect, move, row, col), or None. Moves are
+            ordered as in `workspace.MOVES`.
+        memory: Quantity carried over between bounds, `"level"` or `"deviation"`; see `PooledTrust`.
     """
 
     __slots__ = ()
@@ -186,8 +186,8 @@ class TrustParams(ParameterDraws, _Trust):
 class RobotParams(ParameterDraws, _Trust):
     """Parameters of robots with separate coefficients and no influence on each other.
 
-    The fields are those of `TrustParams`, with beta (..., robot, feature), and beta0, b, delta_w
-    and delta_v (..., robot).
+    The fields are those of `TrustParams`, but beta has the shape (..., robot, feature), and beta0,
+    b, delta_w and delta_v have the shape (..., robot).
     """
 
     __slots__ = ()
@@ -215,9 +215,9 @@ class _Coupled(NamedTuple):
 class CoupledParams(ParameterDraws, _Coupled):
     """Parameters of the coupled model, equations (1)-(2).
 
-    Fields: B0 (..., robot, robot'), B (..., feature, robot, robot'), b (..., robot), the
-    covariances Delta_w and Delta_v (..., robot, robot'), x0_mean and x0_sd, () or (...,), and place
-    and place_bound as in `TrustParams`.
+    The fields are B0 (..., robot, robot'), B (..., feature, robot, robot'), b (..., robot), and the
+    covariances Delta_w and Delta_v (..., robot, robot'). The fields x0_mean, x0_sd, place and
+    place_bound are the same as in `TrustParams`.
     """
 
     __slots__ = ()
@@ -234,7 +234,7 @@ class CoupledParams(ParameterDraws, _Coupled):
 
     @property
     def delta_v(self) -> np.ndarray:
-        """Standard deviation of each robot's observation noise, (..., robot)."""
+        """Standard deviation (..., robot) of each robot's observation noise."""
         return np.sqrt(np.diagonal(self.Delta_v, axis1=-2, axis2=-1))
 
     def transition(self, n_robots: int) -> np.ndarray:
@@ -248,22 +248,22 @@ Params = TrustParams | RobotParams | CoupledParams
 def assemble_params(
     sites: Mapping[str, np.ndarray], x0: Mapping[str, float], memory: str = "level"
 ) -> Params:
-    """Build parameters from sites by name, with leading axis (draw,), and x0_mean and x0_sd.
+    """Build parameters from sites (draw, ...) by name and from x0_mean and x0_sd.
 
-    `memory`: quantity carried over between bounds, see `PooledTrust`.
+    `memory` is the quantity carried over between bounds; see `PooledTrust`.
     """
     if "B0" in sites:
         return CoupledParams(**{name: sites[name] for name in CoupledParams._fields[:5]}, **x0)
     values = {name: sites[name] for name in TrustParams._fields[:5]}
     if sites["b"].ndim == 1:
         return TrustParams(**values, **x0, memory=memory)
-    for name in ("beta0", "delta_w", "delta_v"):  # the hierarchical model's are shared
+    for name in ("beta0", "delta_w", "delta_v"):  # robots share these in the hierarchical model
         values[name] = np.broadcast_to(values[name][:, None], sites["b"].shape)
     return RobotParams(**values, **x0, memory=memory)
 
 
 def check_params(params: Params, n_robots: int | None, n_features: int) -> None:
-    """Check that parameters match the data; with `n_robots` None, robots are not checked.
+    """Check that parameters match the number of features and, unless it is None, of robots.
 
     Raises TrustboError if the number of robots or features differs, or a covariance is not
     symmetric and positive definite.
@@ -278,8 +278,8 @@ def check_params(params: Params, n_robots: int | None, n_features: int) -> None:
         wrong = [axis for axis, size in ends.items() if size not in sizes.get(axis, {size})]
         if len(ends) < len(axes) or (wrong and (n is not None or "feature" in wrong)):
             raise TrustboError(
-                f"params.{field} must end in the axes {axes}, of {n_features} features and "
-                f"{n or 'any'} robots; got shape {value.shape}."
+                f"params.{field} must end in the axes {axes}, with {n_features} features "
+                f"and {n or 'any number of'} robots; got the shape {value.shape}."
             )
         if field.startswith("Delta"):
             same = np.allclose(value, np.swapaxes(value, -1, -2), rtol=1e-8, atol=1e-12)
@@ -290,7 +290,7 @@ def check_params(params: Params, n_robots: int | None, n_features: int) -> None:
 
 
 def _written(draws: np.ndarray) -> str:
-    """Write the mean and sd over draws (draw, ...) of a field."""
+    """Format the mean and standard deviation of a field (draw, ...) over draws."""
     mean, sd = draws.mean(0), draws.std(0)
     if mean.size > 6:
         return f"{mean.shape}, {mean.min():.3g} to {mean.max():.3g}"

@@ -1,4 +1,4 @@
-"""Self-reported trust of many persons: the state space of `PooledTrust`, driven by outcomes."""
+"""Self-reported trust of people, modelled as in `PooledTrust` with outcomes as inputs."""
 
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -19,33 +19,33 @@ from trustbo.models.signal import Layout, Signal, powers
 from trustbo.models.slots import Slots
 
 SUCCESS, FAILURE = "success", "failure"
-"""Prefixes of the names of features that are outcomes."""
+"""Prefixes of the names of outcome features."""
 SDS = "tau_start", "tau_level", "tau_gain"
-"""Sds of the persons' coefficients."""
+"""Standard deviations of the personal coefficients."""
 
 
 @dataclass(frozen=True, repr=False)
 class HumanTrust(PooledTrust):
-    """Self-reported trust: a base level plus decaying effects of past outcomes.
+    """Model of self-reported trust as a base level plus decaying effects of past outcomes.
 
     x^k = base^k + d^k,  d^k = beta0 d^{k-1} + gains . inputs^k + delta_w w^k,  d^0 = 0,
 
-    base^k = b + weights . features^k + the person's level; the person's start enters d^1, and the
-    person's gains enter d^k. Start, level and gains are independent with means 0 and sds tau_start,
-    tau_level and tau_gain. As a person has no other missions, they are a term in the covariance of
-    the person's trust instead of columns. Inputs are the features whose names begin with `success`
-    or `failure`: outcomes, which may be scaled by demands. A person is stored as a mission, a step
-    as a bound, and a rated task as a robot. `trustbo.logs.read_reports` makes such missions.
+    base^k = b + weights . features^k + personal level. The personal start enters d^1, and personal
+    gains enter d^k. Start, level and gains are independent, with mean 0 and standard deviations
+    tau_start, tau_level and tau_gain. Because a person has only one mission, these coefficients are
+    a term in the covariance of trust instead of columns. Inputs are outcomes: features whose names
+    begin with `success` or `failure`, possibly scaled by task demands. A person is stored as a
+    mission, a step as a bound, and a rated task as a robot, as in `trustbo.logs.read_reports`.
 
     Attributes:
-        scale: `"unit"`, numbers in [0, 1], censored at 0 and 1; or `"likert7"`, seven levels with
-            cut points halfway between them, and logistic noise with sd delta_v.
-        tau_start: Scale of the half-normal prior of the sd of trust at the first bound.
-        tau_level: Scale of the half-normal prior of the sd of the level to which trust returns.
-        tau_gain: Scale of the half-normal prior of the sd of the gains from success and failure.
+        scale: `"unit"` for numbers in [0, 1], censored at 0 and 1; or `"likert7"` for seven levels,
+            with cut points halfway between levels and logistic noise with sd delta_v.
+        tau_start: Scale of the half-normal prior on the standard deviation of personal starts.
+        tau_level: Scale of the half-normal prior on the standard deviation of personal levels.
+        tau_gain: Scale of the half-normal prior on the standard deviation of personal gains.
 
     Raises:
-        TrustboError: If the scale is unknown, an sd is not positive, or there are effects.
+        TrustboError: If the scale is unknown, a tau is not positive, or an effect is given.
     """
 
     memory: str = "deviation"
@@ -64,11 +64,11 @@ class HumanTrust(PooledTrust):
             require_positive(f"HumanTrust.{name}", getattr(self, name))
         if self.effects or self.shared_noise:
             raise TrustboError(
-                f"HumanTrust supports no further effects; got effects={self.effects!r}."
+                f"HumanTrust supports no effects and no shared_noise; got effects={self.effects!r}."
             )
 
     def hyperpriors(self, n_robots: int, n_features: int) -> dict[str, dist.Distribution]:
-        """See `TrustModel.hyperpriors`; also the sds of the persons' coefficients."""
+        """See `TrustModel.hyperpriors`; also includes the sds of the personal coefficients."""
         sds = {name: dist.HalfNormal(getattr(self, name)) for name in SDS}
         return super().hyperpriors(n_robots, n_features) | sds
 
@@ -79,26 +79,26 @@ class HumanTrust(PooledTrust):
         return Levels(levels) if levels else FAMILIES["censored"]
 
     def slots(self, missions: Any, workspace: Any = None) -> Slots:
-        """See `TrustModel.slots`; raises TrustboError if reports are not on the scale."""
+        """See `TrustModel.slots`; raises TrustboError if the reports have another scale."""
         slots, levels = super().slots(missions, workspace), levels_of(self.scale)
         wanted = levels - 1.0 if levels else np.nan
         bad = ~np.isnan(slots.y) & ~np.isclose(slots.n_ticks, wanted, equal_nan=True)
         if bad.any():
             raise TrustboError(
                 f"HumanTrust(scale={self.scale!r}) needs reports with n_ticks = {wanted:g} (levels "
-                f"less 1), but some have {slots.n_ticks[bad][0]:g}: give the same scale to "
-                "read_reports and to HumanTrust."
+                f"minus 1), but some have n_ticks = {slots.n_ticks[bad][0]:g}. Give the same scale "
+                "to read_reports and HumanTrust."
             )
         return slots
 
     def layout(self, slots: Slots, *, contrasts: bool = True) -> Layout:
-        """See `TrustModel.layout`: a block is a person, with outcomes and the base as inputs."""
+        """See `TrustModel.layout`; each block is a person, with outcomes and base as inputs."""
         outcomes = [name.startswith((SUCCESS, FAILURE)) for name in slots.features]
-        split = np.array([*outcomes, False])  # what beta0 carries on
+        split = np.array([*outcomes, False])  # inputs that decay with beta0
         return Layout(slots.y.shape, joint=True, split=split, apart=True)
 
     def signal(self, theta: Theta, slots: Slots, layout: Layout) -> Signal:
-        """Compute trust: first the inputs that decay with beta0, then the others."""
+        """Compute trust, with the inputs that decay with beta0 before the other inputs."""
         xp: Any = namespace(theta["beta0"])
         lasting = self._lasting(theta, slots)
         parts = self.parts(theta, slots)
@@ -110,14 +110,14 @@ class HumanTrust(PooledTrust):
         return Signal(m, T, S, theta["delta_v"][:, None, None])
 
     def _lasting(self, theta: Theta, slots: Slots) -> Any:
-        """Compute the share of the input at one row that remains at another, (point, row, row)."""
+        """Compute the share (point, row, row) of an input at one row that remains at another."""
         xp: Any = namespace(theta["beta0"])
         return xp.kron(powers(theta["beta0"], slots.n_bounds), np.eye(slots.n_robots))
 
     def parts(self, theta: Theta, slots: Slots) -> Any:
-        """Compute the effect of standardised personal coefficients, (point, mission, row, part).
+        """Compute the effects (point, mission, row, part) of standardised personal coefficients.
 
-        The parts are start, level, and gains from success and from failure.
+        The parts are the start, the level, and the gains from success and from failure.
         """
         carried, level = np.zeros((2, *slots.y.shape, 4))
         carried[:, 0, :, 0] = 1.0  # start
@@ -144,9 +144,9 @@ class HumanTrust(PooledTrust):
 
 @cache
 def _default_priors() -> Priors:
-    """Make default priors: long memory, gains of some tenths, and a start for each person.
+    """Make default priors with long memory and gains of a few tenths.
 
-    Trust changes mainly with outcomes, and reports are noisier than contact rates.
+    Trust changes mainly with outcomes, and `tau_start` replaces the prior on x_0.
     """
     with own_settings():
         return Priors(

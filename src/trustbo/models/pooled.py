@@ -23,15 +23,15 @@ MEMORIES = ("level", "deviation")
 
 @dataclass(frozen=True, repr=False)
 class PooledTrust(TrustModel):
-    """One set of parameters for all robots, equations (3)-(4).
+    """Model with one set of parameters for all robots, equations (3)-(4).
 
     x_k = beta0 x_{k-1} + beta . z_k + b + delta_w w_k,  y_k = x_k + delta_v v_k
 
     Attributes:
-        memory: Quantity carried over between bounds: `"level"`, trust as in the paper, or
-            `"deviation"`, its deviation from the mean given features and effects.
-        shared_noise: Whether to add common noise delta_s s_k, s_k standard normal, to the rates of
-            all robots in a bound.
+        memory: Quantity carried over between bounds: `"level"` for trust, as in the paper, or
+            `"deviation"` for the deviation of trust from the mean given features and effects.
+        shared_noise: Whether the rates of all robots in a bound share the noise delta_s s_k, where
+            s_k is standard normal.
     """
 
     memory: str = "level"  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -61,7 +61,7 @@ class PooledTrust(TrustModel):
         return {**values, "rest": rest}
 
     def layout(self, slots: Slots, *, contrasts: bool = True) -> Layout:
-        """Lay out one block per robot; with shared noise, per contrast of robots or per mission.
+        """Make one block per robot or, with shared noise, per contrast of robots or per mission.
 
         Helmert contrasts of the robots' rates are independent if all robots are measured.
         """
@@ -74,7 +74,7 @@ class PooledTrust(TrustModel):
         return Layout(slots.y.shape, joint=True)
 
     def signal(self, theta: Theta, slots: Slots, layout: Layout) -> Signal:
-        """Compute the trust of all bounds; T = (1 - beta0 Lag)^-1 is its response to the drift."""
+        """Compute trust at all bounds, with the response T = (1 - beta0 Lag)^-1 to the drift."""
         xp: Any = namespace(theta["beta0"])
         n, K = slots.n_robots, slots.n_bounds
         beta0, delta_w = theta["beta0"][:, None], theta["delta_w"][:, None, None]
@@ -83,7 +83,7 @@ class PooledTrust(TrustModel):
         S = delta_w**2 * (T @ xp.swapaxes(T, 1, 2))
         S = S + self.x0["x0_sd"] ** 2 * start[:, :, None] * start[:, None, :]
         m = self.x0["x0_mean"] * start
-        if self.memory == "deviation":  # x - u lasts, and is 0 on average at first
+        if self.memory == "deviation":  # x - u is carried over, with mean 0 at first
             m, T = 0.0 * m, xp.broadcast_to(xp.eye(K), T.shape)
         m, T, S = m[:, None], T[:, None], S[:, None]
         sd = theta["delta_v"][:, None, None]
@@ -95,7 +95,7 @@ class PooledTrust(TrustModel):
             return Signal(m, T, S, sd, xp.kron(noise, np.ones((n, n))))
         if n == 1:
             return Signal(m, T, S, sd, noise)
-        first = np.array([1.0, 0.0])[:, None]  # the mean of the robots has it, contrasts have not
+        first = np.array([1.0, 0.0])[:, None]  # only the robots' mean has m and shared noise
         return Signal(np.sqrt(n) * first * m, T, S, sd, n * first[..., None] * noise)
 
     def rates(self, theta: Theta, drift: Any) -> ContactRate | None:

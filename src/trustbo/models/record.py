@@ -1,4 +1,4 @@
-"""JSON record of a model's settings, and the model rebuilt from it."""
+"""Write a model's settings to a JSON record, and rebuild the model from the record."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -12,9 +12,9 @@ from trustbo.models.priors import Priors
 
 
 def model_to_record(model: TrustModel) -> dict[str, Any]:
-    """Write a model's class, options, effects and, as text, priors to a record.
+    """Record a model's class, options and effects, and the priors as text.
 
-    `by_feature` states that the priors depend on the features' names.
+    `by_feature` is true if the priors depend on the feature names.
     """
     effects: Any = model.effects
     record = {
@@ -24,21 +24,21 @@ def model_to_record(model: TrustModel) -> dict[str, Any]:
         "effects": [{"kind": type(effect).__name__, **asdict(effect)} for effect in effects],
         "by_feature": model.priors is Priors.default(model.observation),
     }
-    return json.loads(json.dumps(record))  # a tuple is a list
+    return json.loads(json.dumps(record))  # tuples become lists, as in a file
 
 
 def model_from_record(
     record: dict[str, Any], given: TrustModel | None = None, features: Sequence[str] = ()
 ) -> TrustModel:
-    """Rebuild a model from its record; models with custom priors or class must be `given`.
+    """Rebuild a model from its record; a model with custom priors or class must be `given`.
 
-    `features` are the posterior's features, for default priors by feature. Raises TrustboError if
-    the model is required but not given, or a different one is given.
+    `features` are the posterior's features, on which default priors depend. Raises TrustboError if
+    a custom model is not given, or if the given model differs from the record.
     """
     if given is not None:
         if model_to_record(given) != record:
             raise TrustboError(
-                f"the campaign's model is {record}; the one given is {model_to_record(given)}."
+                f"the model must match the record {record}; got {model_to_record(given)}."
             )
         return given
     if (kind := MODELS.get(record["class"])) is not None:
@@ -51,8 +51,8 @@ def model_from_record(
             if model_to_record(model) == record:
                 return model
     raise TrustboError(
-        f"the campaign's model {record['class']} has priors of its own, or is your own; give it "
-        f"again with model=. Its priors: {record['priors']}."
+        f"the model {record['class']} has custom priors or a custom class; give the model with "
+        f"model=. The priors are {record['priors']}."
     )
 
 
@@ -67,7 +67,7 @@ def effects_from_record(record: Mapping[str, Any]) -> tuple[Effect, ...]:
 def _effect_from_record(kind: str, **settings: Any) -> Effect:
     if kind not in EFFECTS:
         raise TrustboError(
-            f"the model has an effect {kind!r}, which this process does not have; import the "
-            f"module that defines it. There are {', '.join(sorted(EFFECTS))}."
+            f"unknown effect {kind!r} in the model; import the module that defines this class. "
+            f"Known effects are {', '.join(sorted(EFFECTS))}."
         )
     return EFFECTS[kind](**{n: tuple(v) if isinstance(v, list) else v for n, v in settings.items()})

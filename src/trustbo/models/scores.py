@@ -1,8 +1,8 @@
-"""Hyperparameters as normal scores of their priors, the coordinates used by the samplers.
+"""Hyperparameters as normal scores, the coordinates that the samplers use.
 
-A score is standard normal a priori. The two noises are the exception: with half-normal scores
-(a_w, a_v) = size (sin(angle), cos(angle)), the coordinates are log size, which the rates determine,
-and a normal score of the angle, which they may not.
+A score is standard normal a priori, except for the two noises. The noises have half-normal scores
+(a_w, a_v) = size (sin(angle), cos(angle)), and the coordinates are log size and a normal score of
+the angle. The rates determine the size, but may not determine the angle.
 """
 
 from collections.abc import Mapping
@@ -23,31 +23,31 @@ _LOG_ROOT_2PI = 0.5 * np.log(2.0 * np.pi)
 
 
 class Scores:
-    """Scores (point, score) of hyperparameters with independent priors."""
+    """Conversion between scores (point, score) and hyperparameters with independent priors."""
 
     def __init__(self, priors: Mapping[str, Distribution]) -> None:
-        """Set the prior of each hyperparameter, a scalar or a vector, in order."""
+        """Set the scalar or vector priors on the hyperparameters, in the order of the scores."""
         self.priors = dict(priors)
         sizes = {name: int(np.prod(prior.batch_shape)) for name, prior in priors.items()}
         ends = np.cumsum([0, *sizes.values()])
         self.at = {n: slice(a, b) for n, a, b in zip(sizes, ends[:-1], ends[1:], strict=True)}
         self.n_scores = int(ends[-1])
         for name, prior in self.priors.items():
-            quantile(prior, np.zeros(sizes[name]), name)  # refuses one without quantiles
+            quantile(prior, np.zeros(sizes[name]), name)  # fails if there are no quantiles
 
     @property
     def core(self) -> np.ndarray:
-        """Indices of the scores of memory and noises, which the rates determine."""
+        """Indices of the scores of beta0 and the noises, which the rates determine."""
         names = ("beta0", *NOISES)
         return np.concatenate([np.arange(self.n_scores)[self.at[n]] for n in names if n in self.at])
 
     @property
     def sizes(self) -> slice:
-        """Slice of the scores that are logarithms of the size of the noises."""
+        """Slice of the scores that are the log size of the noises."""
         return self.at[NOISES[0]]
 
     def values(self, z: np.ndarray) -> dict[str, np.ndarray]:
-        """Return hyperparameters by name, (point,) or (point, k), given scores (point, score)."""
+        """Convert scores (point, score) to hyperparameters (point,) or (point, k) by name."""
         size, angle = np.exp(z[:, self.at["delta_w"]]), z[:, self.at["delta_v"]]
         found = {}
         for name, prior in self.priors.items():
@@ -61,7 +61,7 @@ class Scores:
         return found
 
     def log_prior(self, z: np.ndarray) -> np.ndarray:
-        """Compute the log prior density of scores, (point,)."""
+        """Compute the log prior density (point,) of scores (point, score)."""
         size = z[:, self.sizes]
         others = np.delete(z, np.arange(self.n_scores)[self.sizes], axis=1)
         normal = -0.5 * (others**2).sum(1) - others.shape[1] * _LOG_ROOT_2PI
@@ -70,9 +70,9 @@ class Scores:
     def draw(
         self, n: int, rng: np.random.Generator, *, even: bool = False
     ) -> dict[str, np.ndarray]:
-        """Draw hyperparameters from their priors, (draw,) or (draw, k).
+        """Draw hyperparameters (draw,) or (draw, k) from their priors.
 
-        With `even`, they are evenly spaced quantiles of each prior, in random order.
+        With `even`, the draws are evenly spaced quantiles of each prior in random order.
         """
         found = {}
         for name, prior in self.priors.items():
@@ -104,7 +104,7 @@ def quantile(prior: Distribution, score: np.ndarray, name: str = "") -> np.ndarr
 
 
 def of_size(prior: Distribution, size: Any, name: str = "") -> Any:
-    """Compute the quantile of a prior at P(|N(0, 1)| < size)."""
+    """Compute the quantile of a prior at the probability P(|N(0, 1)| < size)."""
     prior = _base(prior)
     if isinstance(prior, dist.HalfNormal):
         return np.asarray(prior.scale) * size
@@ -131,7 +131,7 @@ def log_density(prior: Distribution, x: np.ndarray) -> np.ndarray:
 
 
 def _base(prior: Any) -> Any:
-    """Return the distribution of one variable of a vector of independent, identical variables."""
+    """Return the distribution of one element of a vector of i.i.d. variables."""
     return prior.base_dist if isinstance(prior, dist.ExpandedDistribution) else prior
 
 
@@ -140,8 +140,8 @@ def _by_numpyro(prior: Distribution, p: np.ndarray, name: str) -> np.ndarray:
         with own_settings():
             share = jax.numpy.asarray(np.clip(p, 1e-300, 1.0 - 1e-16))
             return np.asarray(call(prior, "icdf", share), dtype=float)
-    except (NotImplementedError, ImportError):  # quantiles of a few need another package
+    except (NotImplementedError, ImportError):  # some quantiles need another package
         raise TrustboError(
-            f"the prior of {name} must have quantiles (icdf); {prior!r} has none. Give another, or "
-            "sample model.program with a kernel of NumPyro."
+            f"the prior on {name} must have quantiles (icdf), but {prior!r} has none. Give another "
+            "prior, or sample model.program with a NumPyro kernel."
         ) from None

@@ -1,4 +1,4 @@
-"""A model as matrices: blocks of slots, and their signals given the columns."""
+"""The matrix form of a model: blocks of slots, and the signals of the blocks."""
 
 from typing import Any, NamedTuple
 
@@ -11,21 +11,21 @@ from trustbo.models.backend import namespace
 class Layout(NamedTuple):
     """Layout of slots in blocks and rows.
 
-    A block is a robot in a mission, its rows bounds; or, if `joint`, a mission, its rows (bound,
-    robot). With a rotation, signals of blocks are orthonormal combinations of the robots' signals.
+    A block is a robot in a mission, with one row per bound. If `joint`, a block is a mission, with
+    rows (bound, robot). With a rotation, a block is an orthonormal combination of robots' signals.
     """
 
-    shape: Any  # missions, bounds, robots
+    shape: Any  # numbers of missions, bounds and robots
     joint: bool = False
     rotation: np.ndarray | None = None  # (combination, robot)
     split: np.ndarray | None = None
-    """Mask of columns with separate inputs, which precede the inputs of the others."""
+    """Mask of columns whose inputs are separate and precede the inputs of other columns."""
     apart: bool = False
-    """Whether the signals of any two blocks differ."""
+    """Whether all blocks have different signal matrices."""
 
     @property
     def label(self) -> np.ndarray:
-        """Label of each block; with a rotation, the first contrast has a different label."""
+        """Label of each block; with a rotation, the first combination has a separate label."""
         n_missions, _, n_robots = self.shape
         if self.joint:
             return np.arange(n_missions) * int(self.apart)
@@ -50,7 +50,7 @@ class Layout(NamedTuple):
         return values if self.rotation is None else values @ self.rotation
 
     def columns(self, U: Any) -> Any:
-        """Rearrange columns of slots, sparse (slot, column), to (block * row, column)."""
+        """Rearrange a sparse matrix (slot, column) to (block * input, column)."""
         n, K, R = self.shape
         if self.rotation is not None:
             U = sparse.csr_array(sparse.kron(sparse.eye_array(n * K), self.rotation)) @ U
@@ -66,31 +66,31 @@ class Layout(NamedTuple):
 
 
 class Signal(NamedTuple):
-    """Trust x = m + T u + e, e ~ N(0, S), of a block at each point; u is the drift by column.
+    """Trust x = m + T u + e of each block at each point, with e ~ N(0, S) and inputs u = U c.
 
-    Rows of a block are its observations, inputs the numbers that columns add to. The second axis is
-    the label, see `inference.engine.Blocks`; it has length 1 where all blocks have equal matrices.
+    Each row of a block is an observation. The second axis is the label (see
+    `inference.engine.Blocks`); the axis has length 1 if all blocks have equal matrices.
     """
 
     m: Any  # (point, label, row)
     T: Any  # (point, label, row, input)
     S: Any  # (point, label, row, row)
-    sd: Any  # (point, 1, 1 or row), sd of the independent noise of observations
-    noise: Any = None  # (point, label, row, row), covariance of noise that rows share, or None
+    sd: Any  # (point, 1, 1 or row), sd of independent observation noise
+    noise: Any = None  # (point, label, row, row), covariance of shared noise, or None
 
     @property
     def covariance(self) -> Any:
-        """Covariance of trust plus shared noise, (point, label, row, row)."""
+        """Covariance (point, label, row, row) of trust plus shared noise."""
         return self.S if self.noise is None else self.S + self.noise
 
 
 def each(M: Any, label: np.ndarray) -> Any:
-    """Return values (point, block, ...) by the label of each block; one block if all are equal."""
+    """Select values (point, block, ...) by block label, or one block if all blocks are equal."""
     return M if M.shape[1] == 1 else M[:, label]
 
 
 def powers(beta0: Any, n: int) -> Any:
-    """Compute (1 - beta0 Lag)^-1, lower triangular (..., n, n) with entries beta0^(k - j)."""
+    """Compute (1 - beta0 Lag)^-1 (..., n, n), a lower triangular matrix of powers beta0^(k - j)."""
     xp = namespace(beta0)
     lag = np.subtract.outer(np.arange(n), np.arange(n))
     return xp.where(lag >= 0, beta0[..., None, None] ** np.maximum(lag, 0), 0.0)

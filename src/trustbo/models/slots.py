@@ -1,4 +1,4 @@
-"""Rates and features of missions by slot: one bound of one robot in one mission."""
+"""Rates and features of missions by slot, which is one bound of one robot in one mission."""
 
 from collections.abc import Sequence
 from typing import NamedTuple, Self
@@ -12,19 +12,19 @@ from trustbo.models.families import Family
 from trustbo.models.visited import Visited
 
 NO_TICKS = (
-    "The beta-binomial family counts ticks: give n_ticks, the number of ticks of each bound "
-    '(Mission.from_arrays(..., n_ticks=...)), or use observation "censored".'
+    "The beta-binomial family counts ticks. Give the tick count n_ticks of each bound in "
+    'Mission.from_arrays(..., n_ticks=...), or use observation="censored".'
 )
 UNKNOWN_RESOLUTION, COARSEST_RESOLUTION = 0.005, 0.1
-"""Resolution of a rate with an unknown number of ticks, and the coarsest resolution."""
+"""Resolution of a rate whose tick count is unknown, and the coarsest resolution."""
 
 
 class Slots(NamedTuple):
-    """Rates and features of missions, padded to the longest one; the first axis is the mission."""
+    """Rates and features of missions, padded to the number of bounds in the longest mission."""
 
     y: np.ndarray  # (mission, bound, robot), NaN where not measured
     z: np.ndarray  # (mission, bound, robot, feature), 0 in the padding
-    n_ticks: np.ndarray  # (mission, bound, robot), NaN where not known
+    n_ticks: np.ndarray  # (mission, bound, robot), NaN where unknown
     features: tuple[str, ...] = ()
     visited: Visited | None = None
 
@@ -45,7 +45,7 @@ class Slots(NamedTuple):
 
     @property
     def line_of_sight(self) -> np.ndarray:
-        """Predicted contact (mission, bound, robot), 1 where no feature predicts it."""
+        """Mean (mission, bound, robot) of the line-of-sight features, or 1 if there are none."""
         sight = [m for m, name in enumerate(self.features) if is_line_of_sight(name)]
         return self.z[..., sight].mean(-1) if sight else np.ones(self.y.shape)
 
@@ -60,7 +60,7 @@ class Slots(NamedTuple):
         return float(min(np.median(steps), COARSEST_RESOLUTION))
 
     def without(self, missions: Sequence[int] | slice) -> Self:
-        """Return a copy in which the given missions are marked as not measured."""
+        """Return a copy in which all rates of the given missions are NaN."""
         y = self.y.copy()
         y[missions] = np.nan
         return self._replace(y=y)
@@ -69,7 +69,7 @@ class Slots(NamedTuple):
 def broadcast_ticks(
     family: Family, n_ticks: ArrayLike | None, shape: tuple[int, ...]
 ) -> np.ndarray:
-    """Broadcast ticks, NaN if not given; raises TrustboError if the family needs them."""
+    """Broadcast tick counts, or NaN if None; raises TrustboError if the family needs counts."""
     if n_ticks is None and family.needs_ticks:
         raise TrustboError(NO_TICKS)
     return np.broadcast_to(np.asarray(np.nan if n_ticks is None else n_ticks, dtype=float), shape)
@@ -81,5 +81,5 @@ def require_ticks(family: Family, y: np.ndarray, n_ticks: np.ndarray) -> None:
     if family.needs_ticks and without.any():
         j, k, i = np.argwhere(without)[0]
         raise TrustboError(
-            f"mission {j}, bound {k + 1}, robot {i} has a contact rate but no n_ticks. {NO_TICKS}"
+            f"robot {i} has a rate but no n_ticks in bound {k + 1} of mission {j}. {NO_TICKS}"
         )

@@ -1,4 +1,4 @@
-"""The index of the places that missions visited."""
+"""Index of the places visited by missions."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -9,11 +9,11 @@ from trustbo.data import Mission, require_map
 from trustbo.errors import TrustboError
 from trustbo.workspace.moves import bounds_along
 
-_MOST = 4000  # visited bounds: the effort grows with the cube of their number
+_MOST = 4000  # visited bounds; the cost grows with the cube of this number
 
 
 class Visited(NamedTuple):
-    """Cells entered and directed bounds made by some missions, each in order."""
+    """Cells entered and directed bounds made by missions, sorted and without duplicates."""
 
     shape: tuple[int, int]  # rows and columns of the grid
     cells: np.ndarray  # (cell, 2): row, col
@@ -23,23 +23,23 @@ class Visited(NamedTuple):
 
 
 def bounds_of(missions: Sequence[Mission], shape: tuple[int, int] | None = None) -> np.ndarray:
-    """Return move, row and column of each bound, (mission, bound, 3), -1 in the padding.
+    """Return an array (mission, bound, 3) of moves, rows and columns, with -1 in the padding.
 
-    `shape` (missions, bounds) includes the padding; by default none is added. Raises TrustboError
-    if a path jumps or a mission has no map.
+    `shape` is the number of missions and bounds, by default those of `missions`. Raises
+    TrustboError if a path jumps or a mission has no map.
     """
-    require_map("a model with effects of places", missions)
+    require_map("a model with place effects", missions)
     if shape is None:
         shape = len(missions), max(len(mission.bounds) for mission in missions)
     bounds = np.full((*shape, 3), -1)
     for j, mission in enumerate(missions):
-        path = mission.path[: len(mission.bounds) + 1]  # a failed mission did not run the rest
+        path = mission.path[: len(mission.bounds) + 1]  # failed missions do not complete the path
         try:
             bounds[j, : len(mission.bounds)] = bounds_along(path)
         except TrustboError as error:
             raise TrustboError(
-                f"mission {j}: {error} A model with place effects needs whole paths; leave "
-                "PlaceEffect() out, or split the mission there."
+                f"mission {j}: {error} A model with place effects needs paths without jumps; omit "
+                "PlaceEffect(), or split the mission at the jump."
             ) from None
     return bounds
 
@@ -54,10 +54,10 @@ def has_places(missions: Sequence[Mission]) -> bool:
 
 
 def visited(bounds: np.ndarray, shape: tuple[int, int] | None = None) -> Visited:
-    """Index the places of bounds (mission, bound, 3), see `bounds_of`.
+    """Index the places of bounds (mission, bound, 3); see `bounds_of`.
 
-    `shape` is the shape of the grid, by default up to the last row and column visited. Raises
-    TrustboError if a cell lies outside, or there are too many bounds for one dense factor.
+    `shape` is the shape of the grid, by default ending at the last row and column visited. Raises
+    TrustboError if a cell is outside the grid, or there are too many bounds for a dense factor.
     """
     there = bounds[..., 0] >= 0
     found, index_of = np.unique(bounds[there], axis=0, return_inverse=True)
@@ -68,13 +68,13 @@ def visited(bounds: np.ndarray, shape: tuple[int, int] | None = None) -> Visited
     if outside.any():
         j, k = np.argwhere(outside)[0]
         raise TrustboError(
-            f"mission {j} enters the cell {tuple(bounds[j, k, 1:].tolist())}, outside the grid of "
-            f"{shape[0]} rows and {shape[1]} columns; give the workspace the missions were run on."
+            f"mission {j} enters cell {tuple(bounds[j, k, 1:].tolist())}, outside the grid of "
+            f"{shape[0]} rows and {shape[1]} columns; give the workspace of the missions."
         )
     if len(found) > _MOST:
         raise TrustboError(
-            f"{len(found)} visited bounds exceed the limit of {_MOST} that one dense factor "
-            "takes. Give coarser cells, or leave PlaceEffect() out."
+            f"the missions visited {len(found)} bounds, but place effects support at most {_MOST}. "
+            "Use larger cells, or omit PlaceEffect()."
         )
     cells, cell_of = np.unique(found[:, 1:], axis=0, return_inverse=True)
     at = np.full(there.shape, -1)

@@ -1,1 +1,1 @@
-"""Effects on the drift of trust: groups of columns with Gaussian coefficients."""
+"""Effects on the drift of trust, as groups of columns with Gaussian coefficients."""

@@ -1,8 +1,8 @@
-"""The protocol of effects: columns added to the drift of trust, and the prior of their weights.
+"""The protocol of effects, which add columns with Gaussian coefficients to the drift of trust.
 
-The drift of a slot is u = U c, with coefficients c that are Gaussian given hyperparameters theta.
-To add an effect, write a frozen dataclass with the methods of `Effect`; inference and planning need
-no change.
+The drift of all slots is u = U c, where the coefficients c are Gaussian given the hyperparameters
+theta. To add an effect, write a frozen dataclass with the methods of `Effect`. Inference and
+planning need no change.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,37 +22,38 @@ from trustbo.models.slots import Slots
 from trustbo.workspace import Workspace
 
 Theta = Mapping[str, Any]
-"""Hyperparameters by name, each (point, ...), and `rest`, the drift by which stationary trust rises
-by 1: 1 - beta0 where trust itself lasts; (point,), or (point, robot)."""
+"""Hyperparameters (point, ...) by name. `rest`, with shape (point,) or (point, robot), is the drift
+that raises stationary trust by 1. It equals 1 - beta0 if `memory` is "level"."""
 
 Values = Mapping[str, np.ndarray]
-"""Variables of an effect by name, each (draw, ...)."""
+"""Variables (draw, ...) of an effect by name."""
 
 LEAST = 1e-4
-"""Smallest sd of an effect, which keeps precisions finite."""
+"""Smallest standard deviation of an effect, so that precisions stay finite."""
 
 EFFECTS: dict[str, type["Effect"]] = {}
-"""Classes of effects by name, to read models from files."""
+"""Effect classes by name, to read models from files."""
 
 
 class Effect:
-    """An effect on the drift, with the settings of its prior.
+    """Base class of an effect on the drift, with the settings of its prior.
 
-    By default, hyperparameters are sds with half-normal priors, whose scales are the fields of the
-    same names; otherwise override `hyperpriors`. Classes with a `noun` can be read from files.
+    By default, hyperparameters are standard deviations with half-normal priors, and fields of the
+    same names are the prior scales. Override `hyperpriors` for other priors. Classes with a `noun`
+    can be read from files.
 
     Raises:
-        TrustboError: If the scale of a hyperparameter is not positive.
+        TrustboError: If a prior scale is not positive.
     """
 
     names: ClassVar[tuple[str, ...]] = ()
     """Names of the hyperparameters."""
     noun: ClassVar[str] = ""
-    """Plural noun for the effect, also the name of its group in a posterior."""
+    """Plural noun for the effect, which is also the name of its group in a posterior."""
     variables: ClassVar[Mapping[str, tuple[str, ...]]] = {}
-    """Axes after (chain, draw) of each variable of this group."""
+    """Axes of each variable of the effect, after (chain, draw)."""
     coords: ClassVar[Mapping[str, Sequence[Any]]] = {}
-    """Labels of axes other than missions, robots and features."""
+    """Labels of axes other than mission, bound, robot and feature."""
 
     def __init_subclass__(cls) -> None:
         if cls.noun:
@@ -64,15 +65,15 @@ class Effect:
                 require_positive(f"{type(self).__name__}.{name}", value)
 
     def columns(self, slots: Slots) -> Any:
-        """Return a sparse matrix (slot, column); slots are (mission, bound, robot), raveled."""
+        """Return a sparse matrix (slot, column), with slots (mission, bound, robot) flattened."""
         raise NotImplementedError
 
     def prior(self, theta: Theta, slots: Slots) -> tuple[Any, list[Any]]:
-        """Return the prior of the coefficients at each theta, in NumPy or JAX.
+        """Return the prior on the coefficients at each theta, in NumPy or JAX.
 
         Returns:
-            Mean (point, column), None for 0, and precisions of consecutive columns, (point, k, k),
-            or (point, k) if independent.
+            The mean (point, column), or None if it is 0, and the precisions of consecutive groups
+            of columns, each (point, k, k), or (point, k) if independent.
         """
         raise NotImplementedError
 
@@ -81,27 +82,27 @@ class Effect:
         raise NotImplementedError
 
     def coefficients(self, values: Values, theta: Theta, slots: Slots) -> np.ndarray:
-        """Convert variables to coefficients (draw, column), the inverse of `named`."""
+        """Convert variables back to coefficients (draw, column), as the inverse of `named`."""
         raise NotImplementedError
 
     def ahead(self, values: Values, theta: Theta, n: int, rng: Generator | None) -> np.ndarray:
-        """Return the slope (draw, robot) of drift in line of sight after mission n; 0 by default.
+        """Return the slope (draw, robot) of the drift in line of sight after n missions; default 0.
 
-        With `rng`, effects specific to that mission are drawn; otherwise they are expectations.
+        With `rng`, mission-specific effects are drawn; otherwise, expected effects are used.
         """
         return np.zeros((len(theta["rest"]), 1))
 
     def hyperpriors(self) -> dict[str, Distribution]:
-        """Return the priors of the hyperparameters, by name."""
+        """Return the priors on the hyperparameters by name."""
         return {name: dist.HalfNormal(getattr(self, name)) for name in self.names}
 
     def slots(self, slots: Slots, missions: Sequence[Mission], on: Workspace | None) -> Slots:
-        """Add the data that the columns need to slots of missions, on a workspace if given."""
+        """Add the data that the columns need to the slots; `on` is the workspace, if known."""
         return slots
 
 
 def sample_columns(effects: Sequence[Effect], theta: Theta, slots: Slots) -> Any:
-    """Sample all coefficients (column,) in a NumPyro program; theta has one point."""
+    """Sample all coefficients (column,) at one point theta within a NumPyro program."""
     columns = []
     for effect in effects:
         mean, parts = effect.prior(theta, slots)

@@ -1,4 +1,4 @@
-"""Effects of places: a Gaussian process s over cells, and an effect e of each directed bound."""
+"""Place effects: a Gaussian process s over cells, and an effect e of each directed bound."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,26 +17,26 @@ from trustbo.models.slots import Slots
 from trustbo.models.visited import bounds_of, visited
 from trustbo.workspace import Workspace
 
-_JITTER = 1e-8  # of a correlation of cells
-_LENGTH_SCALES = 1e-6, 1e6  # cells: outside, cells are independent, or equal
+_JITTER = 1e-8  # added to the correlation matrix of cells
+_LENGTH_SCALES = 1e-6, 1e6  # in cells; beyond these, cells are independent or equal
 
 
 @dataclass(frozen=True)
 class PlaceEffect(Effect):
-    """Effect of a place on the trust of all robots that awareness does not explain.
+    """Effect of a place on the trust of all robots, beyond what awareness explains.
 
-    The drift of trust by the bound from cell a to cell c is u(a -> c) = beta . z(a -> c) + b + s(c)
-    + e(a -> c). s is a Gaussian process over cells with sd tau_s and Matern 3/2 covariance with a
-    length scale in cells; e(a -> c) ~ N(0, tau_e^2), independent for each directed bound.
+    The bound from cell a to c has the drift u(a -> c) = beta . z(a -> c) + b + s(c) + e(a -> c).
+    Here s is a Gaussian process over cells with standard deviation tau_s and a Matern 3/2
+    covariance. The effects e(a -> c) ~ N(0, tau_e^2) of directed bounds are independent.
 
     Attributes:
-        tau_s: Scale of the half-normal prior of the sd of s.
-        tau_e: Scale of the half-normal prior of the sd of e.
-        length_scale: Median of the log-normal prior of the length scale, in cells.
-        length_scale_sd: Standard deviation of the logarithm of the length scale.
+        tau_s: Scale of the half-normal prior on the standard deviation of s.
+        tau_e: Scale of the half-normal prior on the standard deviation of e.
+        length_scale: Median of the log-normal prior on the length scale of s, in cells.
+        length_scale_sd: Prior standard deviation of the log length scale.
 
     Raises:
-        TrustboError: If a number is not positive.
+        TrustboError: If a setting is not positive.
     """
 
     tau_s: float = 0.2
@@ -63,7 +63,7 @@ class PlaceEffect(Effect):
         return slots._replace(visited=visited(bounds, grid))  # pyright: ignore[reportArgumentType]
 
     def columns(self, slots: Slots) -> Any:
-        """Return indicators of the cells entered and of the directed bounds."""
+        """Return indicator columns of the cells entered and of the directed bounds."""
         places: Any = slots.visited
         at = np.broadcast_to(places.at[..., None], slots.y.shape).ravel()
         met = np.flatnonzero(at >= 0)
@@ -75,7 +75,7 @@ class PlaceEffect(Effect):
         )
 
     def prior(self, theta: Theta, slots: Slots) -> tuple[Any, list[Any]]:
-        """Return a Gaussian process prior of the visited cells, and independent bounds."""
+        """Return a Gaussian-process prior on cell effects and independent priors on bounds."""
         xp: Any = namespace(theta["tau_e"])
         places: Any = slots.visited
         of_bound = xp.maximum(theta["tau_e"], LEAST) ** -2.0
@@ -93,7 +93,7 @@ class PlaceEffect(Effect):
         return inverse(tau**2 * (K + _JITTER * np.eye(len(cells))))
 
     def named(self, c: np.ndarray, theta: Theta, slots: Slots) -> Values:
-        """Return effects of visited cells, `place`, and bounds, `place_bound`, each (draw, ...)."""
+        """Return cell effects `place` (draw, cell), bound effects `place_bound` (draw, bound)."""
         places: Any = slots.visited
         n = len(places.cells)
         return {"place": c[:, :n], "place_bound": c[:, n:]}
@@ -104,7 +104,7 @@ class PlaceEffect(Effect):
 
 
 def matern(distance: ArrayLike, length_scale: ArrayLike) -> Any:
-    """Compute the Matern 3/2 correlation at a distance, both in cells."""
+    """Compute the Matern 3/2 correlation; the distance and the length scale are in cells."""
     xp: Any = namespace(length_scale)
     h = np.sqrt(3.0) * xp.asarray(distance) / xp.asarray(length_scale)
     return (1.0 + h) * xp.exp(-h)

@@ -1,8 +1,8 @@
-"""Effects of a robot in a mission: a persistent part, and a part specific to the mission.
+"""Effect of a robot in a mission, with a persistent part and a mission-specific part.
 
-For example, a damaged detector persists, rain does not. The drift of robot i in mission m has an
-additional term l d[i, m], where l is its predicted line of sight and d, in units of stationary
-trust, is independent between robots with covariance over missions
+For example, a damaged detector has a lasting effect, but rain does not. The stationary trust of
+robot i in mission m has the additional term l d[i, m], where l is the predicted line of sight. The
+effect d is independent between robots and has the following covariance over missions:
 
     cov(d[i, m], d[i, m']) = tau_slow^2 rho^|m - m'| + tau_day^2 [m = m'].
 """
@@ -22,13 +22,13 @@ from trustbo.models.slots import Slots
 
 @dataclass(frozen=True)
 class RobotEffect(Effect):
-    """Effect of a robot in a mission, proportional to its line of sight.
+    """Effect of a robot in a mission, proportional to the predicted line of sight.
 
     Without a feature that predicts line of sight, the effect is constant during a mission.
 
     Attributes:
-        tau_slow: Scale of the half-normal prior of the sd of the persistent part.
-        tau_day: Scale of the half-normal prior of the sd of the part specific to one mission.
+        tau_slow: Scale of the half-normal prior on the standard deviation of the persistent part.
+        tau_day: Scale of the half-normal prior on the sd of the mission-specific part.
         rho: Correlation of the persistent part between consecutive missions.
 
     Raises:
@@ -48,7 +48,7 @@ class RobotEffect(Effect):
             raise TrustboError(f"RobotEffect.rho must be between 0 and 1; got {self.rho!r}.")
 
     def columns(self, slots: Slots) -> Any:
-        """Return line of sight, one column per robot and mission, the mission varying fastest."""
+        """Return line of sight in one column per robot and mission; the mission varies fastest."""
         n_missions, n_robots = slots.n_missions, slots.n_robots
         mission, _, robot = np.indices(slots.y.shape)
         where = (robot * n_missions + mission).ravel()
@@ -58,7 +58,7 @@ class RobotEffect(Effect):
         )
 
     def prior(self, theta: Theta, slots: Slots) -> tuple[Any, list[Any]]:
-        """Return the prior of independent robots; one array for all if `rest` is common."""
+        """Return independent priors for the robots, in one shared array if `rest` is common."""
         rest = theta["rest"]
         Q = namespace(rest).linalg.inv(self._covariance(theta, slots.n_missions))
         if rest.ndim == 1:
@@ -66,7 +66,7 @@ class RobotEffect(Effect):
         return None, [Q / of_robot[:, None, None] ** 2 for of_robot in rest.T]
 
     def named(self, c: np.ndarray, theta: Theta, slots: Slots) -> Values:
-        """Return the effects d on stationary trust, robot_effect (draw, mission, robot)."""
+        """Return `robot_effect` (draw, mission, robot), the effects d on stationary trust."""
         d = c.reshape(len(c), slots.n_robots, slots.n_missions) / _rest(theta)
         return {"robot_effect": np.swapaxes(d, 1, 2)}
 
@@ -83,7 +83,7 @@ class RobotEffect(Effect):
         return _rest(theta)[..., 0] * d
 
     def next_mission(self, effect: np.ndarray, theta: Theta) -> tuple[np.ndarray, np.ndarray]:
-        """Predict the next d given d (draw, mission, robot): mean (draw, robot), sd (draw,)."""
+        """Predict mean (draw, robot) and sd (draw,) of the next d from d (draw, mission, robot)."""
         n = effect.shape[1]
         C, slow = self._covariance(theta, n), np.maximum(theta["tau_slow"], LEAST) ** 2
         k = slow[:, None] * self.rho ** np.arange(n, 0, -1)
@@ -92,7 +92,7 @@ class RobotEffect(Effect):
         return np.einsum("nm,nmi->ni", gain, effect), np.sqrt(left)
 
     def _covariance(self, theta: Theta, n: int) -> Any:
-        """Compute the covariance (point, mission, mission) of d of one robot."""
+        """Compute the covariance (point, mission, mission) of one robot's effects d."""
         xp, i = namespace(theta["tau_slow"]), np.arange(n)
         slow, day = (xp.maximum(theta[name], LEAST)[:, None, None] ** 2 for name in self.names)
         fading = self.rho ** np.abs(i[:, None] - i)
@@ -100,6 +100,6 @@ class RobotEffect(Effect):
 
 
 def _rest(theta: Theta) -> np.ndarray:
-    """Return the drift (draw, robot or 1, 1) by which stationary trust rises by 1."""
+    """Return the drift (draw, robot or 1, 1) that raises stationary trust by 1."""
     rest = theta["rest"]
     return rest.reshape(len(rest), -1, 1)

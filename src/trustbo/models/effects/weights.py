@@ -1,4 +1,4 @@
-"""Weights of features and intercept: common to all robots, per robot, or of coupled robots."""
+"""Feature weights and intercepts: common to all robots, separate for each robot, or coupled."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -14,32 +14,32 @@ from trustbo.models.slots import Slots
 
 @dataclass(frozen=True)
 class Weights(Effect):
-    """Weights of features and an intercept, with Normal priors `beta` and `b`."""
+    """Feature weights and an intercept, with the Normal priors `beta` and `b`."""
 
     priors: Priors
 
     def columns(self, slots: Slots) -> Any:
-        """Return the features and a constant 1."""
+        """Return the features and a column of ones."""
         return sparse.csr_array(_inputs(slots))
 
     def prior(self, theta: Theta, slots: Slots) -> tuple[Any, list[Any]]:
-        """Return independent coefficients, scaled if the priors are on stationary trust."""
+        """Return independent priors on the coefficients, scaled if `Priors.stationary` is true."""
         mean, sd = self.moments(theta, slots)
         return mean, [sd**-2.0]
 
     def moments(self, theta: Theta, slots: Slots) -> tuple[Any, Any]:
-        """Return means and sds of the coefficients, (point, column)."""
+        """Return the prior means and standard deviations (point, column) of the coefficients."""
         mean, sd = self.priors.coefficients(slots.z.shape[3])
         rest = self.unit(theta)
         return rest * mean, rest * sd
 
     def unit(self, theta: Theta) -> Any:
-        """Return the factor (point, [robot,] 1) of coefficients with priors on stationary trust."""
+        """Return the factor (point, [robot,] 1) by which the priors on coefficients are scaled."""
         rest = theta["rest"][..., None]
         return rest if self.priors.stationary else 0.0 * rest + 1.0
 
     def named(self, c: np.ndarray, theta: Theta, slots: Slots) -> Values:
-        """Return weights beta (draw, feature) and intercept b (draw,)."""
+        """Return the weights `beta` (draw, feature) and the intercept `b` (draw,)."""
         return {"beta": c[:, :-1], "b": c[:, -1]}
 
     def coefficients(self, values: Values, theta: Theta, slots: Slots) -> np.ndarray:
@@ -49,16 +49,16 @@ class Weights(Effect):
 
 @dataclass(frozen=True)
 class RobotWeights(Weights):
-    """Coefficients of each robot, N(mu, tau^2), with priors on mu; theta contains tau."""
+    """Separate coefficients N(mu, tau^2) for each robot; mu has a prior, and tau is in theta."""
 
     def columns(self, slots: Slots) -> Any:
-        """Return the features and 1 for each robot, the robot varying fastest."""
+        """Return the features and a constant 1 for each robot; the robot varies fastest."""
         values = _inputs(slots)
         mine = np.tile(np.eye(slots.n_robots), (len(values) // slots.n_robots, 1))
         return sparse.csr_array((values[..., None] * mine[:, None]).reshape(len(values), -1))
 
     def prior(self, theta: Theta, slots: Slots) -> tuple[Any, list[Any]]:
-        """Return coefficients that are correlated through their common mean."""
+        """Return a prior that correlates the robots' coefficients through a common mean."""
         n, (mean, sd) = slots.n_robots, self.moments(theta, slots)
         tau = namespace(mean).maximum(_spreads(theta), LEAST)
         alike = sd**2 / (tau**2 + n * sd**2)  # (sd^2 11' + tau^2 1)^-1 in closed form
@@ -69,9 +69,9 @@ class RobotWeights(Weights):
         return namespace(mean).repeat(mean, n, axis=1), parts
 
     def named(self, c: np.ndarray, theta: Theta, slots: Slots) -> Values:
-        """Return weights beta (draw, robot, feature), intercepts b (draw, robot), and their means.
+        """Return the weights `beta` (draw, robot, feature), intercepts `b` (draw, robot) and means.
 
-        `mean_beta` and `mean_b` are expectations given the coefficients.
+        The means `mean_beta` and `mean_b` are expected values given the coefficients.
         """
         c = np.swapaxes(c.reshape(len(c), -1, slots.n_robots), 1, 2)
         mean, sd = self.moments(theta, slots)
@@ -88,10 +88,10 @@ class RobotWeights(Weights):
 
 @dataclass(frozen=True)
 class CoupledWeights(Weights):
-    """Weight of feature m at robot l in the trust of robot i, matrices B_m, and intercepts b_i."""
+    """Matrices B_m that weight feature m of robot l in the trust of robot i, and intercepts b_i."""
 
     def columns(self, slots: Slots) -> Any:
-        """Return the features of all robots and 1, for each robot."""
+        """Return the features of all robots and a constant 1, for each robot."""
         n = slots.n_robots
         inputs = slots.z.reshape(-1, 1, n * slots.z.shape[3])  # (mission * bound, 1, (robot, m))
         inputs = np.concatenate([inputs, np.ones((*inputs.shape[:2], 1))], axis=2)
@@ -99,7 +99,7 @@ class CoupledWeights(Weights):
         return sparse.csr_array(values.reshape(slots.y.size, -1))
 
     def prior(self, theta: Theta, slots: Slots) -> tuple[Any, list[Any]]:
-        """Return the prior of weights: `Priors.coupling` for features of other robots."""
+        """Return the prior on the weights, with `Priors.coupling` for features of other robots."""
         n, (mean, sd) = slots.n_robots, self.priors.coefficients(slots.z.shape[3])
         n_features = len(mean) - 1
         own = np.repeat(np.eye(n, dtype=bool), n_features, axis=1)
@@ -112,7 +112,7 @@ class CoupledWeights(Weights):
         return means.reshape(len(means), -1), [sds.reshape(len(sds), -1) ** -2.0]
 
     def named(self, c: np.ndarray, theta: Theta, slots: Slots) -> Values:
-        """Return matrices B (draw, feature, robot, robot') and intercepts b (draw, robot)."""
+        """Return matrices `B` (draw, feature, robot, robot') and intercepts `b` (draw, robot)."""
         n = slots.n_robots
         c = c.reshape(len(c), n, -1)
         B = c[..., :-1].reshape(len(c), n, n, -1)
@@ -126,7 +126,7 @@ class CoupledWeights(Weights):
 
 
 def _inputs(slots: Slots) -> np.ndarray:
-    """Return the features and 1, (slot, feature + 1)."""
+    """Return an array (slot, feature + 1) of the features and a column of ones."""
     z = slots.z.reshape(-1, slots.z.shape[3])
     return np.column_stack([z, np.ones(len(z))])
 

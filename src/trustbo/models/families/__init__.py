@@ -1,7 +1,7 @@
-"""Families of observations: distributions of a contact rate given trust, one file each.
+"""Observation families, which are distributions of a contact rate given trust.
 
-To add one, follow `censored` (closed forms) or `beta_binomial` (smooth densities, by Gauss-Hermite
-quadrature), and list it here.
+To add a family, start from `censored` (moments in closed form) or `beta_binomial` (moments by
+Gauss-Hermite quadrature), and add it to `FAMILIES`.
 """
 
 from trustbo.models.families.beta_binomial import BetaBinomial

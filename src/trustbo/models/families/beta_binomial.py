@@ -1,7 +1,6 @@
-"""Counts of ticks: n in contact out of N, n ~ BetaBinomial(N, sigma(x)), concentration delta_v^-2.
+"""Tick counts n ~ BetaBinomial(N, sigma(x)) out of N ticks, with concentration delta_v^-2.
 
-Trust is a logit. The ticks of a bound are not independent: delta_v^2 is the ratio of the excess to
-the binomial variance.
+Trust is a logit. Any two ticks of a bound have the correlation delta_v^2 / (1 + delta_v^2).
 """
 
 from dataclasses import dataclass
@@ -16,21 +15,21 @@ from trustbo.models.backend import namespace, own_settings, special_functions
 from trustbo.models.families.family import Array, Drawn, Family, Moments
 from trustbo.models.families.moments import draw_between_knots, log_normal, match_by_nodes
 
-_KNOTS = np.linspace(-5.0, 5.0, 21)  # of a draw, in sds from the mean
+_KNOTS = np.linspace(-5.0, 5.0, 21)  # of the density to draw from, in sds from the mean
 
 
 @dataclass(frozen=True)
 class BetaBinomial(Family):
-    """Ticks in contact out of all ticks of a bound."""
+    """Number of ticks in contact out of all ticks of a bound."""
 
     name: ClassVar[str] = "beta_binomial"
     needs_ticks: ClassVar[bool] = True
     adds_noise: ClassVar[bool] = False
     expected_rate: ClassVar[str] = "logistic"
-    line_of_sight: ClassVar[tuple[float, float]] = 5.0, 0.5  # the logit's line by .5 and .92
+    line_of_sight: ClassVar[tuple[float, float]] = 5.0, 0.5  # rate 0.5 at 0.5, 0.92 at 1
 
     def priors(self) -> dict[str, Any]:
-        """See `Family.priors`: wider, as trust is a logit."""
+        """See `Family.priors`; wider than the defaults because trust is a logit."""
         with own_settings():
             return {
                 "beta": dist.Normal(0.0, 2.0),
@@ -63,9 +62,9 @@ class BetaBinomial(Family):
         return log_gamma(n + a) - log_gamma(a) + log_gamma(N - n + b) - log_gamma(b)
 
     def _match(self, y: Array, N: Array, m: Array, v: Array, sd: Array) -> Moments:
-        """See `Family._match`: by Gauss-Hermite quadrature around the mode."""
+        """See `Family._match`; uses Gauss-Hermite quadrature around the mode."""
         n = np.round(y * N)
-        lam = 1.0 / (1.0 / (n + 0.5) + 1.0 / (N - n + 0.5) + 0.2)  # of an empirical logit
+        lam = 1.0 / (1.0 / (n + 0.5) + 1.0 / (N - n + 0.5) + 0.2)  # empirical logit
         start = (m / v + lam * np.log((n + 0.5) / (N - n + 0.5))) / (1.0 / v + lam)
         constant = self.log_prob(y, N, start, sd) - self._of_trust(y, N, start, _concentration(sd))
         y, N, phi = y[..., None], N[..., None], _concentration(sd)[..., None]
@@ -73,7 +72,7 @@ class BetaBinomial(Family):
         return log_mass + constant, mean, var
 
     def _draw(self, y: Array, N: Array, m: Array, v: Array, sd: Array, rng: Generator) -> Drawn:
-        """See `Family._draw`: from a piecewise log-linear density."""
+        """See `Family._draw`; draws from a piecewise log-linear approximation of the density."""
         _, mean, var = self._match(y, N, m, v, sd)
         knots = mean[..., None] + np.sqrt(var)[..., None] * _KNOTS
         y, N, m, v, sd = (a[..., None] for a in (y, N, m, v, sd))
@@ -90,5 +89,5 @@ class BetaBinomial(Family):
 
 
 def _concentration(sd: Any) -> Any:
-    """Return the concentration of the beta distribution, at most 1e6 (binomial)."""
+    """Return the concentration of the beta distribution, limited to 1e6 (nearly binomial)."""
     return 1.0 / (sd**2 + 1e-6)

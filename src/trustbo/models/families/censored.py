@@ -1,4 +1,4 @@
-"""Censored rates (Tobit): y = x + v clipped to [0, 1], so rates of 0 and 1 are only limits."""
+"""Censored (Tobit) rates: y is trust plus noise, x + v, clipped to [0, 1]."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -33,29 +33,29 @@ class Censored(Gaussian):
         return xp.where(y <= 0.0, log_ndtr(-trust / sd), beyond)
 
     def _match(self, y: Array, N: Array, m: Array, v: Array, sd: Array) -> Moments:
-        """See `Family._match`: normal censored at a limit (Tobin 1958)."""
+        """See `Family._match`; a rate of 0 or 1 only bounds the unclipped rate (Tobin 1958)."""
         cut, low, high = _limits(y)
         return np.where(cut, match_interval(low, high, m, v, sd), super()._match(y, N, m, v, sd))
 
     def _draw(self, y: Array, N: Array, m: Array, v: Array, sd: Array, rng: Generator) -> Drawn:
-        """Draw the rate before clipping, then the signal given it; exact."""
+        """Draw the rate before clipping, and then the signal given that rate, both exactly."""
         (cut, low, high), total = _limits(y), np.sqrt(v + sd**2)
         e = draw_between((low - m) / total, (high - m) / total, rng)
         f, _ = super()._draw(np.where(cut, m + total * e, y), N, m, v, sd, rng)
         return f, self._match(y, N, m, v, sd)[0]
 
     def mean_rate(self, trust: Array, sd: Array) -> Array:
-        """See `Family.mean_rate`: mean of a normal variable clipped to [0, 1]."""
+        """See `Family.mean_rate`; the mean of a normal variable clipped to [0, 1]."""
         low, high = -trust / sd, (1.0 - trust) / sd
         inside = trust * (norm.cdf(high) - norm.cdf(low))
         return inside + sd * (norm.pdf(low) - norm.pdf(high)) + norm.sf(high)
 
     def is_density(self, y: Array) -> Array:
-        """See `Family.is_density`: rates of 0 and 1 have a probability."""
+        """See `Family.is_density`; rates of 0 and 1 have a probability instead."""
         return (y > 0.0) & (y < 1.0)
 
 
 def _limits(y: Array) -> tuple[Array, Array, Array]:
-    """Return whether a rate is a limit, and the interval of the rate before clipping."""
+    """Return whether each rate is 0 or 1, and the interval of the rate before clipping."""
     one = y >= 1.0
     return one | (y <= 0.0), np.where(one, 1.0, -np.inf), np.where(one, np.inf, 0.0)

@@ -1,7 +1,7 @@
-"""The protocol of a family of observations: rates given a signal, and a signal given rates.
+"""The protocol of observation families: rates given signals, and signals given rates.
 
-A signal f is trust plus noise shared between rates. To add a family, write a subclass of `Family`
-and list it in `families/__init__`; `moments` has functions for its methods.
+A signal f is trust plus noise shared between rates. To add a family, write a subclass of `Family`,
+with functions from `moments` where they apply, and add it to `families.FAMILIES`.
 """
 
 from abc import ABC, abstractmethod
@@ -12,35 +12,35 @@ import numpy as np
 from numpy.random import Generator
 
 Array = Any
-"""An array of NumPy; in `log_prob` also of JAX."""
+"""A NumPy array; `log_prob` also accepts JAX arrays."""
 Moments = Any
-"""Log mass, mean and variance, each an array."""
+"""Arrays of the log mass, the mean and the variance."""
 Drawn = tuple[Array, Array]
 """Draws of the signal, and their log weights."""
 
 
 @dataclass(frozen=True)
 class Family(ABC):
-    """A family of observations.
+    """Base class of observation families.
 
-    Arguments of all methods are arrays that broadcast: rates y, their numbers of ticks N, and sd,
-    the observation noise delta_v. `_match` and `_draw` receive measured rates of equal shape.
+    All methods take arrays that broadcast: rates y, tick counts N, and the noise sd (delta_v).
+    `_match` and `_draw` receive only measured rates, in arrays of equal shape.
     """
 
     name: ClassVar[str]
-    """Name of the family in arguments."""
+    """Name of the family, as given in the argument `observation`."""
     gaussian: ClassVar[bool] = False
     """Whether rates are the signal plus normal noise, which allows exact integration."""
     needs_ticks: ClassVar[bool] = False
-    """Whether each measured rate needs its number of ticks."""
+    """Whether every measured rate needs a tick count."""
     adds_noise: ClassVar[bool] = True
-    """Whether a rate is the signal plus noise of sd delta_v, to which the resolution of its ticks
-    adds, and which may be correlated between robots."""
+    """Whether a rate is the signal plus noise with sd delta_v. The tick resolution then adds to
+    this noise, which may be correlated between robots."""
     expected_rate: ClassVar[str] = "identity"
     """Form of `mean_rate` in compiled planning: `"identity"` (trust itself), `"logistic"`, or
-    `"clipped"` (of a normal with sd delta_v, cut to [0, 1])."""
+    `"clipped"` (a normal variable with sd delta_v, clipped to [0, 1])."""
     line_of_sight: ClassVar[tuple[float, float]] = 1.0, 0.0
-    """Slope and zero of the map from line of sight to trust: trust = slope (sight - zero)."""
+    """Slope and zero in trust = slope (sight - zero), which converts line of sight to trust."""
 
     @abstractmethod
     def sample(self, trust: Array, sd: Array, N: Array, rng: Generator) -> Array:
@@ -52,21 +52,21 @@ class Family(ABC):
 
     @abstractmethod
     def _match(self, y: Array, N: Array, m: Array, v: Array, sd: Array) -> Moments:
-        """Compute log mass, mean and variance of N(f; m, v) times the term of a rate."""
+        """Compute log mass, mean and variance of N(f; m, v) times the likelihood of a rate."""
 
     @abstractmethod
     def _draw(self, y: Array, N: Array, m: Array, v: Array, sd: Array, rng: Generator) -> Drawn:
-        """Draw the signal from N(f; m, v) times the term of a rate; returns its log weight too.
+        """Draw the signal from N(f; m, v) times the likelihood of a rate; also return a log weight.
 
-        The mean weight is the mass; weights are constant if the draw is exact.
+        The mean weight is the mass of the product, and weights are constant if draws are exact.
         """
 
     def mean_rate(self, trust: Array, sd: Array) -> Array:
-        """Compute the mean of a rate given trust, for planning."""
+        """Compute the mean rate given trust, for planning."""
         return trust
 
     def is_density(self, y: Array) -> Array:
-        """Return a mask of the rates with a density, being the signal plus normal noise."""
+        """Return a mask of the rates with a density, which are the signal plus normal noise."""
         return np.zeros(y.shape, dtype=bool)
 
     def priors(self) -> dict[str, Any]:
@@ -74,28 +74,28 @@ class Family(ABC):
         return {}
 
     def match(self, y: Array, N: Array, m: Array, v: Array, sd: Array) -> Moments:
-        """Compute moments of N(f; m, v) times the term of a rate; 0, m and v where y is NaN."""
+        """Compute moments of N(f; m, v) times the likelihood of y, or 0, m and v where y is NaN."""
         seen, arrays = _measured(y, N, m, v, sd)
         one, mean, var = self._match(*arrays)
         return np.where(seen, one, 0.0), np.where(seen, mean, m), np.where(seen, var, v)
 
     def draw(self, y: Array, N: Array, m: Array, v: Array, sd: Array, rng: Generator) -> Drawn:
-        """Draw signals given measured rates, see `_draw`; arbitrary where y is NaN."""
+        """Draw signals given rates as in `_draw`; the draws are arbitrary where y is NaN."""
         _, (y, N, m, v, sd) = _measured(y, N, m, v, sd)
         return self._draw(y, N, m, v, sd, rng)
 
     def log_resolution(self, y: Array, N: Array) -> Array:
-        """Compute the log ratio of a count's probability to the density of its rate.
+        """Compute the log ratio of a tick count's probability to the density of its rate.
 
-        One tick has width 1/N. The result has the shape of `y`, and is 0 where not measured or
-        where the rate itself has a probability, NaN where the number of ticks is unknown.
+        One tick has the width 1/N. The result has the shape of `y`. It is 0 for unmeasured rates
+        and for rates that have a probability, and NaN where the tick count is unknown.
         """
         is_density = ~np.isnan(y) & self.is_density(y)
         return np.where(is_density, -np.log(np.where(is_density, N, 1.0)), 0.0)
 
 
 def _measured(y: Array, N: Array, *others: Array) -> tuple[Array, list[Array]]:
-    """Return a mask of the measured rates, and arrays with placeholders for other rates."""
+    """Return a mask of the measured rates, and the arrays with placeholders elsewhere."""
     y, N, *others = np.broadcast_arrays(y, N, *others)  # pyright: ignore[reportAssignmentType]
     seen = ~np.isnan(y)
     return seen, [np.where(seen, y, 0.5), np.where(N > 0.0, N, 1.0), *others]

@@ -18,7 +18,7 @@ class Gaussian(Family):
     gaussian: ClassVar[bool] = True
 
     def sample(self, trust: Array, sd: Array, N: Array, rng: Generator) -> Array:
-        """See `Family.sample`: rates may leave [0, 1]."""
+        """See `Family.sample`; rates may lie outside [0, 1]."""
         return trust + sd * rng.standard_normal(np.broadcast(trust, sd, N).shape)
 
     def log_prob(self, y: Array, N: Array, trust: Array, sd: Array) -> Array:
@@ -34,5 +34,5 @@ class Gaussian(Family):
         return mean + np.sqrt(var) * rng.standard_normal(mean.shape), log_p
 
     def is_density(self, y: Array) -> Array:
-        """See `Family.is_density`: every rate."""
+        """See `Family.is_density`; true for every rate."""
         return np.ones(y.shape, dtype=bool)

@@ -1,4 +1,4 @@
-"""Reports on a scale of levels: trust plus logistic noise lies between two cut points."""
+"""Reports on an ordinal scale: trust plus logistic noise lies between two cut points."""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -13,20 +13,20 @@ from trustbo.models.families.moments import draw_between, match_interval
 
 _SHARES = np.array([0.252201, 0.585225, 0.162574])
 _SDS = np.sqrt(3.0) / np.pi / np.array([0.90793, 0.577787, 0.364038])
-"""Weights and sds of a mixture of normals within 1e-3 of a logistic of sd 1, whose tails hold slips
-(Monahan and Stefanski 1992)."""
+"""Weights and sds of a normal mixture within 1e-3 of a logistic distribution with sd 1, whose heavy
+tails allow for mistaken reports (Monahan and Stefanski 1992)."""
 
 
 @dataclass(frozen=True)
 class Levels(Family):
-    """Reports of level j of n, as rates j / (n - 1); cut points lie halfway between the levels."""
+    """Reports of level j out of n as rates j / (n - 1), with cut points halfway between levels."""
 
     levels: int = 7
     name: ClassVar[str] = "levels"
     adds_noise: ClassVar[bool] = False
 
     def cuts(self, y: Array) -> tuple[Array, Array]:
-        """Return the cut points below and above reports."""
+        """Return the cut points below and above each report."""
         xp, n = namespace(y), self.levels - 1
         level = xp.round(y * n)
         low = xp.where(level < 0.5, -np.inf, (level - 0.5) / n)
@@ -48,7 +48,7 @@ class Levels(Family):
         return xp.log(xp.maximum(total, 1e-300))
 
     def _match(self, y: Array, N: Array, m: Array, v: Array, sd: Array) -> Moments:
-        """See `Family._match`: mixture of normals between two cut points."""
+        """See `Family._match`; a mixture of normals between two cut points."""
         log_p, mean, var = self._components(y, m, v, sd)
         total: Any = special.logsumexp(log_p, axis=0)
         w = np.exp(log_p - total)
@@ -56,7 +56,7 @@ class Levels(Family):
         return total, center, (w * (var + (mean - center) ** 2)).sum(0)
 
     def _draw(self, y: Array, N: Array, m: Array, v: Array, sd: Array, rng: Generator) -> Drawn:
-        """Draw the component, the number before rounding, and the signal; exact."""
+        """Draw the mixture component, the report before rounding, and the signal, all exactly."""
         log_p = self._components(y, m, v, sd)[0]
         noise = _SDS[np.argmax(log_p + rng.gumbel(size=log_p.shape), axis=0)] * sd
         total, (low, high) = np.sqrt(v + noise**2), self.cuts(y)
@@ -66,7 +66,7 @@ class Levels(Family):
         return f, special.logsumexp(log_p, axis=0)
 
     def _components(self, y: Array, m: Array, v: Array, sd: Array) -> Moments:
-        """Compute moments (component, ...) of each normal of the mixture, after log shares."""
+        """Compute the moments (component, ...) of each mixture component, weighted by its share."""
         parts = [match_interval(*self.cuts(y), m, v, of_one * sd) for of_one in _SDS]
         log_p, mean, var = (np.stack(moments) for moments in zip(*parts, strict=True))
         return log_p + np.log(_SHARES).reshape(-1, *(1,) * np.ndim(y)), mean, var

@@ -1,4 +1,4 @@
-"""Moments and draws of a normal signal times the term of a rate, used by several families."""
+"""Moments and draws of a normal signal times the likelihood of a rate."""
 
 from collections.abc import Callable
 
@@ -12,7 +12,7 @@ from trustbo.models.families.family import Array, Drawn, Moments
 
 _NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(9)
 _LOG_WEIGHTS = np.log(_WEIGHTS / _WEIGHTS.sum())
-_STEP = 0.05  # of differences in a search for the mode
+_STEP = 0.05  # step of finite differences in the search for the mode
 
 
 def log_normal(e: Array, variance: Array) -> Array:
@@ -21,7 +21,7 @@ def log_normal(e: Array, variance: Array) -> Array:
 
 
 def match_interval(low: ndarray, high: ndarray, m: ndarray, v: ndarray, noise: ndarray) -> Moments:
-    """Compute moments of N(f; m, v) where f plus normal noise is between two numbers."""
+    """Compute moments of N(f; m, v) given that f plus normal noise lies between two numbers."""
     total = v + noise**2
     sd = np.sqrt(total)
     log_p, e, spread = truncated(*((end - m) / sd for end in (low, high)))
@@ -29,8 +29,8 @@ def match_interval(low: ndarray, high: ndarray, m: ndarray, v: ndarray, noise: n
 
 
 def truncated(a: ndarray, b: ndarray) -> Moments:
-    """Compute log probability, mean and variance of a standard normal between a and b."""
-    mirror = a > -b  # the lower tail is the accurate one
+    """Compute the log probability, mean and variance of a standard normal between a and b."""
+    mirror = a > -b  # use the lower tail, which is more accurate
     a, b = np.where(mirror, -b, a), np.where(mirror, -a, b)
     log_p = log_between(a, b)
     with np.errstate(invalid="ignore"):
@@ -41,7 +41,7 @@ def truncated(a: ndarray, b: ndarray) -> Moments:
 
 
 def log_between(a: ndarray, b: ndarray) -> ndarray:
-    """Compute the log of Phi(b) - Phi(a), for a + b <= 0."""
+    """Compute log(Phi(b) - Phi(a)) for a + b <= 0."""
     with np.errstate(divide="ignore"):
         log_b = special.log_ndtr(b)
         gap = np.minimum(special.log_ndtr(a) - log_b, -1e-300)
@@ -49,7 +49,7 @@ def log_between(a: ndarray, b: ndarray) -> ndarray:
 
 
 def draw_between(a: ndarray, b: ndarray, rng: Generator) -> ndarray:
-    """Draw standard normal variables between a and b."""
+    """Draw standard normal variables truncated to the interval from a to b."""
     mirror = a > -b
     a, b = np.where(mirror, -b, a), np.where(mirror, -a, b)
     with np.errstate(divide="ignore"):
@@ -62,7 +62,7 @@ def draw_between(a: ndarray, b: ndarray, rng: Generator) -> ndarray:
 
 
 def draw_between_knots(knots: ndarray, log_f: ndarray, rng: Generator) -> Drawn:
-    """Draw from a density that is log-linear between knots (..., knot); return its log, too."""
+    """Draw from a density that is log-linear between knots (..., knot); also return its log."""
     width, rise = np.diff(knots), np.diff(log_f)
     rise = np.where(np.abs(rise) < 1e-9, 1e-9, rise)
     log_mass = log_f[..., :-1] + np.log(width) + np.log(np.expm1(rise) / rise)
@@ -78,9 +78,9 @@ def draw_between_knots(knots: ndarray, log_f: ndarray, rng: Generator) -> Drawn:
 def match_by_nodes(
     log_prob: Callable[[ndarray], ndarray], start: ndarray, m: ndarray, v: ndarray
 ) -> Moments:
-    """Compute moments of N(f; m, v) times a term, by Gauss-Hermite nodes at the mode.
+    """Compute moments of N(f; m, v) times a likelihood by Gauss-Hermite quadrature at the mode.
 
-    `log_prob` is the log of the term at nodes (..., node); the mode is searched from `start`.
+    `log_prob` returns log likelihoods at nodes (..., node); the mode search begins at `start`.
     """
     x, q = np.array(start), 1.0 / v
     for _ in range(3):
