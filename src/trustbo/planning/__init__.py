@@ -1,4 +1,4 @@
-"""Planning: from a posterior to the most trustworthy path."""
+"""Planning of the most trustworthy path under a posterior of the trust model."""
 
 from trustbo.planning import policies, reference
 from trustbo.planning.dynamics import roll_trust
@@ -13,4 +13,4 @@ __all__ = [
     "OBJECTIVES", "POLICIES", "InfeasibleError", "NoPathError", "Plan", "Planner",
     "policies", "reference", "roll_trust",
 ]  # fmt: skip
-__dir__ = __all__.copy  # completion lists public names alone
+__dir__ = __all__.copy  # completion lists only public names

@@ -1,4 +1,4 @@
-"""Best paths under every draw of a posterior: their values, regrets and frequencies."""
+"""Best paths for each draw of a posterior, with their values, regrets and frequencies."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,12 +16,12 @@ from trustbo.planning.problem import EXACT, Problem
 
 @dataclass(frozen=True, eq=False)
 class DrawnPaths:
-    """Best path of a planning problem under each parameter draw.
+    """Best path of a planning problem for each parameter draw.
 
     Attributes:
         problem: Planning problem.
-        dynamics: Recursion of expected trust with leading axis (draw,).
-        paths: Flat indices of cells, shape (draw, length), filled with -1.
+        dynamics: Recursion for expected trust, with leading axis (draw,).
+        paths: Flat indices of the cells on each path, shape (draw, cell), padded with -1.
     """
 
     problem: Problem
@@ -30,7 +30,7 @@ class DrawnPaths:
 
     @cached_property
     def candidates(self) -> list[tuple[Cell, ...]]:
-        """Distinct best paths, the most frequent first."""
+        """Distinct best paths, starting with the most frequent one."""
         return [self.problem.paths.cells(path) for path in self._distinct[0]]
 
     @property
@@ -52,15 +52,15 @@ class DrawnPaths:
         return np.stack([self._value(self.dynamics, path) for path in paths], axis=1)
 
     def regret(self, path: Sequence[Cell]) -> np.ndarray:
-        """Return each draw's best value minus the value of a given path, shape (draw,), >= 0."""
+        """Return the regret of a path, shape (draw,): each draw's best value minus the path's."""
         return np.maximum(0.0, self.values - self.values_of([path])[:, 0])
 
     def relative_regret(self, path: Sequence[Cell]) -> np.ndarray:
         """Return the regret of a path relative to each draw's best value, shape (draw,).
 
-        For lost_contact, it is relative to the contact kept on the best path (its bounds minus the
-        contact lost); for other objectives, to the best path's value. It is infinite where the
-        denominator is 0.
+        For lost_contact, the regret is divided by the contact kept on the best path, which is its
+        number of bounds minus the contact lost. For other objectives, the divisor is the absolute
+        value of the best path. If the divisor is 0, a positive regret becomes infinite.
         """
         scale = np.abs(self.values)
         if self.problem.objective.of_contact:
@@ -71,7 +71,7 @@ class DrawnPaths:
         return np.divide(regret, scale, out=nothing, where=scale > 0.0)
 
     def share(self) -> np.ndarray:
-        """Return the share of the paths that enter each cell, shape (row, col)."""
+        """Return the fraction of the paths that enter each cell, shape (row, col)."""
         count = np.zeros(self.problem.paths.bounds.shape[1:])
         for path, n in zip(self.candidates, self.counts, strict=True):
             count[tuple(np.array(path).T)] += n  # a cell entered twice counts once
@@ -85,7 +85,7 @@ class DrawnPaths:
 
     @cached_property
     def _distinct(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Find distinct paths by decreasing frequency, each draw's index, and the frequencies."""
+        """Find the distinct paths by decreasing frequency, each draw's index, and the counts."""
         paths, which, counts = np.unique(
             self.paths, axis=0, return_inverse=True, return_counts=True
         )
@@ -94,7 +94,7 @@ class DrawnPaths:
 
 
 def choose_draws(params: Params, n_draws: int | None, seed: int) -> Params:
-    """Choose `n_draws` at random, in their order, or all; leading axis (draw,)."""
+    """Choose `n_draws` draws at random, or all if None; the result has leading axis (draw,)."""
     flat = params.flat()
     n = flat.leading[0]
     if n_draws is None or require_whole("n_draws", n_draws, 1) >= n:

@@ -1,4 +1,4 @@
-"""Recursion of expected trust: one linear form for every model, rolled out along a path."""
+"""The linear recursion for expected trust, which all models share, and its values along a path."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -13,14 +13,13 @@ from trustbo.workspace.moves import bounds_along
 
 
 class Dynamics(NamedTuple):
-    """Expected trust x_k = transition x_{k-1} + drift(bound), x_0 = start; leading axes (...,).
+    """Recursion x_k = transition x_{k-1} + drift(bound) for expected trust, with x_0 = start.
 
-    Fields: transition (..., state, state), drift (..., state, move, row, col), start (..., state)
-    and noise_sd (...,), the mean of delta_v over robots. States are the robots, and the team's
-    trust is their mean; if all robots have the same beta0, this mean is the only state.
-
-    The drift at (move, row, col) belongs to the bound that enters the cell by that move; NaN if
-    none.
+    The shapes are transition (..., state, state), drift (..., state, move, row, col), start
+    (..., state) and noise_sd (...,), where noise_sd is the mean of delta_v over robots. Each robot
+    is a state, and the team's trust is the mean of the states. If all robots have the same beta0,
+    the mean trust is the only state. The drift at (move, row, col) is that of the bound that enters
+    the cell by that move, and NaN if there is no such bound.
     """
 
     transition: np.ndarray
@@ -33,12 +32,12 @@ class Dynamics(NamedTuple):
         return self if self.start.ndim > 1 else Dynamics(*(value[None] for value in self))
 
     def along(self, path: Sequence[Cell] | np.ndarray) -> "Dynamics":
-        """Select the bounds of a path: drift (..., state, 1, 1, bound)."""
+        """Select the drift of the bounds of a path, shape (..., state, 1, 1, bound)."""
         moves, rows, cols = bounds_along(path).T
         return self._replace(drift=self.drift[..., moves, rows, cols][..., None, None, :])
 
     def settled(self) -> np.ndarray:
-        """Return the limit of the team's trust if a bound were repeated, (..., move, row, col)."""
+        """Return the team's trust (..., move, row, col) in the limit if a bound were repeated."""
         gain = np.linalg.inv(np.eye(self.start.shape[-1]) - self.transition)
         return np.einsum("...st,...tmrc->...mrc", gain, self.drift) / self.start.shape[-1]
 
@@ -46,17 +45,17 @@ class Dynamics(NamedTuple):
 def trust_dynamics(
     params: Params, z: np.ndarray, x0: ArrayLike | None = None, *, by_robot: bool = False
 ) -> Dynamics:
-    """Build the recursion of expected trust under parameters with leading axes (...,).
+    """Build the recursion for expected trust from parameters with leading axes (...,).
 
     Args:
         params: Parameters of any model.
         z: Awareness, shape (robot, move, row, col, feature).
-        x0: Expected trust before the first bound, () or (robot,), with leading axes or not; by
-            default `params.x0_mean`.
-        by_robot: Whether each robot is a state even where the mean would suffice.
+        x0: Expected trust before the first bound, shape () or (robot,), with or without the leading
+            axes; by default `params.x0_mean`.
+        by_robot: Whether each robot is a state even if the team's mean would suffice.
 
     Raises:
-        TrustboError: If the parameters have another number of robots or features.
+        TrustboError: If the number of robots or features does not match the parameters.
     """
     n_robots, leading = len(z), params.leading
     start = np.asarray(params.x0_mean if x0 is None else x0, dtype=float)
@@ -69,62 +68,62 @@ def trust_dynamics(
         return Dynamics(params.expected_transition(n_robots), drift(params, z), start, sd)
     # The mean over robots obeys the same equation.
     z = z.mean(0, keepdims=True) if n_robots > 1 else z
-    u = drift(params, z).mean(-4, keepdims=True)  # robots may differ in effects of places
+    u = drift(params, z).mean(-4, keepdims=True)  # place effects may differ by robot
     return Dynamics(params.expected_transition(1), u, start.mean(-1, keepdims=True), sd)
 
 
 def drift(params: Params, awareness: np.ndarray) -> np.ndarray:
     """Compute the drift u = sum_m beta_m z_m + b of each bound, (..., robot, move, row, col).
 
-    It includes the effects of places, or of the bounds of a path, see `ParameterDraws.along`.
+    It includes the place effects, or those along a path (see `ParameterDraws.along`).
 
     Args:
         params: Parameters of any model, with leading axes (...,).
-        awareness: Shape (robot, move, row, col, feature).
+        awareness: Situational awareness, shape (robot, move, row, col, feature).
 
     Raises:
-        TrustboError: If the numbers of robots, features or cells differ from the parameters.
+        TrustboError: If the number of robots, features or cells does not match the parameters.
     """
     check_params(params, None if params.places else len(awareness), awareness.shape[-1])
     u, b = params.increments(awareness), np.asarray(params.b, dtype=float)
     if not params.BY_ROBOT and b.ndim <= len(params.leading):
         b = b[..., None]
-    if b.ndim == len(params.leading) + 3:  # (..., 1, bound, robot): of the bounds of a path
+    if b.ndim == len(params.leading) + 3:  # (..., 1, bound, robot), along a path
         return u + np.swapaxes(b[..., 0, :, :], -1, -2)[..., None, None, :]
-    u += b[..., None, None, None]  # in place: over many draws and cells this is large
+    u += b[..., None, None, None]  # in place, because the array can be large
     for name, effect in params.places.items():
         if effect.shape[-2:] != u.shape[-2:]:
             raise TrustboError(
-                f"params.{name} has {effect.shape[-2:]} cells, the awareness of {u.shape[-2:]}. "
-                "With the awareness of a path's bounds, give params.along(path)."
+                f"params.{name} has the grid shape {effect.shape[-2:]}, but the awareness has "
+                f"{u.shape[-2:]}. For the awareness along a path, use params.along(path)."
             )
         u = u + (effect[..., None, :, :] if name == "place" else effect)
     return u
 
 
 def roll_trust(params: Params, awareness: ArrayLike, x0: ArrayLike | None = None) -> np.ndarray:
-    """Compute expected trust along a path, equations (1) and (3) without their noise.
+    """Compute expected trust along a path from equations (1) and (3) without noise.
 
     Args:
         params: Parameters of any model, with leading axes (...,) such as (draw,). With place
             effects, pass `params.along(path)`.
-        awareness: Shape (bound, robot, feature).
+        awareness: Situational awareness along the path, shape (bound, robot, feature).
         x0: Expected trust before the first bound, shape (), (robot,) or (..., robot); by default
             `params.x0_mean`.
 
     Returns:
-        Shape (..., bound, robot).
+        Expected trust after each bound, shape (..., bound, robot).
 
     Raises:
-        TrustboError: If the number of robots or features differs from the parameters, or place
-            effects are given for a map instead of the path's bounds.
+        TrustboError: If the number of robots or features does not match the parameters, or place
+            effects are given on the grid instead of along the path.
     """
     of_robots = np.swapaxes(np.asarray(awareness, dtype=float), 0, 1)
     return roll(trust_dynamics(params, of_robots[:, None, None], x0, by_robot=True))
 
 
 def roll(along: Dynamics) -> np.ndarray:
-    """Roll the recursion along the bounds of a path (see `Dynamics.along`), (..., bound, state)."""
+    """Compute trust (..., bound, state) after each bound of a path (see `Dynamics.along`)."""
     drift = np.moveaxis(along.drift[..., 0, 0, :], -1, 0)  # (bound, ..., state)
     trust = [along.start]
     for u in drift:

@@ -1,4 +1,4 @@
-"""A plan: a path, its expected trust, value and exactness, and the robots' routes."""
+"""Plans: a path with its expected trust and value, and the robots' routes along the path."""
 
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -12,37 +12,37 @@ from trustbo.hazard.risk import PathRisk
 from trustbo.workspace import Workspace
 
 QUANTILES = (0.05, 0.25, 0.75, 0.95)
-"""Quantiles of `Plan.bands`: ends of the 90 % and of the 50 % band."""
+"""Quantiles in `Plan.bands`: the ends of the 90 % and the 50 % bands."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Plan(Summary):
-    """A path with its expected trust, value and exactness.
+    """A path, its expected trust and value, and whether it is provably optimal.
 
-    The robots' `stops`, `posts` and `routes`, in CRS metres, are computed on demand from the
-    workspace; they are None without a terrain in memory.
+    The properties `stops`, `posts` and `routes` are computed on demand, in CRS metres. They are
+    None if the workspace holds no terrain in memory.
 
     Attributes:
-        path: Cells, start first.
-        positions: Centres of the cells, shape (cell, 2), x and y in CRS metres.
-        length: Length from centre to centre, m.
+        path: Cells from start to goal.
+        positions: CRS coordinates x and y of the cell centres, shape (cell, 2), in metres.
+        length: Length of the line through the cell centres, in metres.
         trust: Expected trust after each bound, shape (bound, robot).
-        bands: Quantiles of expected trust over draws of the parameters, shape (quantile, bound,
-            robot), see `QUANTILES`; equal to `trust` where the plan is for one draw.
-        value: Value of the objective, to be maximised (see `OBJECTIVES`): for lost_contact, minus
-            the expected lost contact, in bounds, with trust capped at 1.
+        bands: Quantiles of expected trust over the parameter draws, shape (quantile, bound, robot),
+            for the levels in `QUANTILES`. They equal `trust` if there is only one draw.
+        value: Value of the objective (see `OBJECTIVES`); larger values are better. For
+            lost_contact, it is minus the expected lost contact in bounds, with trust capped at 1.
         objective: Name of the objective.
-        exact: True if no admissible path is better.
-        limit: Upper limit on the value of any admissible path; `value` where exact, NaN for a given
-            path.
-        revisits: Number of bounds that enter a cell again.
-        seconds: Time of the search, s.
+        exact: Whether the search proved that no admissible path is better.
+        limit: Upper limit on the value of any admissible path. It equals `value` if `exact`, and
+            is NaN for a given path.
+        revisits: Number of bounds that enter a cell for a second or later time.
+        seconds: Duration of the search in seconds.
         workspace: Workspace of the path.
-        risk: Failure probability of each bound, and probability to arrive with its band; None
-            without a hazard.
+        risk: Failure probability of each bound, and the arrival probability with its 90 % band;
+            None without a hazard.
         infeasible: Whether the failure probability of a given path exceeds `max_failure`.
-        value_band: Ends of the 90 % band of the value over parameter draws, at the expected failure
-            probability and without noise of rates; None where the plan is for one draw.
+        value_band: Ends of the 90 % band of the value over the parameter draws, without observation
+            noise and with the mean failure probability. None if there is only one draw.
     """
 
     path: tuple[Cell, ...]
@@ -62,13 +62,13 @@ class Plan(Summary):
     value_band: tuple[float, float] | None = None
 
     def with_draws(self, given: Self) -> Self:
-        """Return the plan with the bands of another plan of the same path, for many draws."""
+        """Return this plan with the bands of `given`, a plan of the same path for many draws."""
         return replace(self, bands=given.bands, value_band=given.value_band)
 
     def _rows(self) -> Rows:
-        best = "no path is better" if self.exact else f"at most {self.limit:.3g} can be had"
+        best = "no path is better" if self.exact else f"no path exceeds {self.limit:.3g}"
         if np.isnan(self.limit):
-            best = "given, or a policy's choice: value and trust are the means"
+            best = "not known: the path was given or chosen by a policy"
         within = ""
         if self.value_band is not None:
             within = ", {:.3g} to {:.3g} in 90 % of the draws".format(*self.value_band)
@@ -79,7 +79,7 @@ class Plan(Summary):
             ("trust at the goal", f"{self.trust[-1].mean():.3f}, mean of the robots"),
         ]
         if self.p_arrive is not None:
-            beyond = "; fails beyond max_failure" if self.infeasible else ""
+            beyond = "; the failure probability exceeds max_failure" if self.infeasible else ""
             rows.append(("arrival probability", f"{self.p_arrive:.3g}{beyond}"))
         if not np.isnan(self.limit):
             rows.append(("search", f"{1e3 * self.seconds:.1f} ms"))
@@ -87,17 +87,17 @@ class Plan(Summary):
 
     @property
     def p_fail(self) -> np.ndarray | None:
-        """Probability that each bound ends the mission, given that it is begun, shape (bound,)."""
+        """Probability that each bound, once begun, ends the mission, shape (bound,)."""
         return None if self.risk is None else self.risk.p_fail
 
     @property
     def p_arrive(self) -> float | None:
-        """Probability that the mission reaches the goal, averaged over draws of the risk."""
+        """Probability that the mission reaches the goal, averaged over the draws of the risk."""
         return None if self.risk is None else self.risk.p_arrive
 
     @cached_property
     def stops(self) -> np.ndarray | None:
-        """Stops of the lead in the cells of the path, shape (bound + 1, 2)."""
+        """Position at which the lead stops in each cell of the path, shape (bound + 1, 2)."""
         posts = self.workspace.posts
         return None if posts is None else np.stack([posts.stop(cell) for cell in self.path])
 
@@ -109,10 +109,10 @@ class Plan(Summary):
 
     @cached_property
     def routes(self) -> tuple[tuple[np.ndarray | None, ...], ...] | None:
-        """Routes of each bound: the lead's, then each of T2's, polylines of shape (point, 2).
+        """Routes during each bound, of the lead and then of each T2 robot, with shape (point, 2).
 
-        T2 moves to its posts for the next bound, or at the goal to positions around the lead. None
-        for a robot without a route.
+        T2 moves to its posts for the next bound or, at the goal, to positions around the lead. If
+        a robot has no route, None replaces it.
         """
         posts, path = self.workspace.posts, self.path
         if posts is None:
@@ -128,7 +128,7 @@ def plan_to_record(plan: Plan) -> dict[str, Any]:
 
 
 def plan_from_record(record: dict[str, Any], workspace: Workspace) -> Plan:
-    """Convert the record of `plan_to_record` to a plan of a workspace."""
+    """Restore a plan in its workspace from the record of `plan_to_record`."""
     values: dict[str, Any] = {**record, "workspace": workspace}
     for name in ("positions", "trust", "bands"):
         values[name] = np.array(record[name])

@@ -1,4 +1,4 @@
-"""The planner: one workspace, start, goal and objective."""
+"""The planner, for one workspace, start, goal and objective."""
 
 import time
 from collections.abc import Sequence
@@ -58,28 +58,27 @@ class Planner(Summary):
 
         Args:
             workspace: Planning grid with awareness and passability.
-            start: First cell, or a position in it; see `Workspace.locate`.
-            goal: Last cell, or a position in it.
-            objective: `"lost_contact"`, `"terminal"` or `"mean"`; see `OBJECTIVES`.
-            max_bounds: Limit on the number of bounds. `"shortest"`: the fewest possible;
-                `"shortest+n"`: up to n more, without U-turns (default: n = 2 for terminal and mean,
-                4 for lost_contact); paths are simple for n up to 2, and `Plan.revisits` counts
-                cells entered again for larger n. An int: walks of at most that many bounds.
-            toll: Cost of each bound apart from trust, such as its length or duration, (move, row,
-                col) with the moves of `workspace.moves.MOVES`, or an array that broadcasts to it;
-                in bounds for lost_contact, else in units of trust.
-            max_failure: Largest probability that a path fails, in [0, 1), under the risk of
-                `with_risk`; by default no limit.
-            failure_cost: Cost of a failure for lost_contact, in bounds: the value is reduced by
-                this times the failure probability. By default the fewest bounds from start to goal,
-                so that a failed mission counts as one without any contact.
-            family: Observation family of the trust model; used for lost_contact.
+            start: First cell, or a position inside this cell (see `Workspace.locate`).
+            goal: Last cell, or a position inside this cell.
+            objective: `"lost_contact"`, `"terminal"` or `"mean"` (see `OBJECTIVES`).
+            max_bounds: Limit on the number of bounds. `"shortest"` admits only paths with the
+                fewest bounds; `"shortest+n"` admits up to n more, without U-turns; an int admits
+                walks of at most that many bounds. By default, n is 4 for lost_contact and 2 for the
+                other objectives. With n > 2, a path may enter a cell twice (see `Plan.revisits`).
+            toll: Additional cost of each bound, such as its length or duration. The array must
+                broadcast to (move, row, col), with the moves of `workspace.moves.MOVES`. The unit
+                is bounds for lost_contact and that of trust for the other objectives.
+            max_failure: Largest failure probability of a path, in [0, 1); by default, no limit.
+            failure_cost: Cost of a failure in bounds, for lost_contact. The value is reduced by
+                this cost times the failure probability. By default, the smallest number of bounds
+                from start to goal, so a failed mission counts as one without contact.
+            family: Observation family of the trust model, used only for lost_contact.
 
         Raises:
-            TrustboError: If the toll has another shape; start or goal is off the grid or
-                impassable, or they are equal; a name is unknown; `max_bounds` is below the fewest
-                possible; or a number is out of range.
-            NoPathError: If the goal cannot be reached.
+            TrustboError: If the start or goal is off the grid or impassable, both are the same
+                cell, `max_bounds` is too small, the toll has the wrong shape, a name is unknown, or
+                a number is out of range.
+            NoPathError: If the goal cannot be reached from the start.
         """
         row = OBJECTIVES[require_choice("objective", objective, OBJECTIVES)]
         chosen = FAMILIES[require_choice("family", family, FAMILIES)]
@@ -94,12 +93,12 @@ class Planner(Summary):
             ("objective", problem.objective.name),
             ("paths", f"{paths.shortest} to {paths.longest} bounds ({paths.max_bounds})"),
             ("rates", problem.family.name),
-            ("risk", "of each bound" if problem.risk is not None else "not known"),
+            ("risk", "given for each bound" if problem.risk is not None else "not given"),
         ]
 
     @property
     def workspace(self) -> Workspace:
-        """Workspace of the paths."""
+        """Workspace in which the planner searches."""
         return self.problem.paths.workspace
 
     @property
@@ -123,11 +122,11 @@ class Planner(Summary):
         return other
 
     def require_path(self, path: Sequence[Cell]) -> tuple[Cell, ...]:
-        """Return a path as a tuple of cells; raises TrustboError for a broken or wrong path."""
+        """Check that a path leads from start to goal and return it as a tuple of cells."""
         return self.problem.paths.require_path(path)
 
     def avoiding(self, bounds: np.ndarray, risk: np.ndarray) -> Self:
-        """Return the planner that avoids the given bounds; see `AdmissiblePaths.avoiding`."""
+        """Return a planner that avoids the given bounds (see `AdmissiblePaths.avoiding`)."""
         return self._with(paths=self.problem.paths.avoiding(bounds, risk))
 
     def with_risk(
@@ -136,31 +135,31 @@ class Planner(Summary):
         draws: ArrayLike | None = None,
         strata: Strata | None = None,
     ) -> Self:
-        """Return the planner with the given failure probability of each bound.
+        """Return a planner with the given failure probability of each bound.
 
-        Plans then have the attribute `p_arrive` and respect `max_failure`; for lost_contact, the
-        value includes `failure_cost`.
+        Its plans respect `max_failure` and have an arrival probability `p_arrive`. For
+        lost_contact, their value includes the expected cost of failure.
 
         Args:
             p_fail: Posterior mean, shape (move, row, col); NaN where there is no bound.
-            draws: Draws from the posterior, shape (draw, move, row, col), for bands of `p_arrive`.
-            strata: Failure probabilities under groups of draws, such as `BoundRisk.strata()`, used
-                for the cost of a failure; by default `p_fail`, as if bounds failed independently.
+            draws: Posterior draws, shape (draw, move, row, col), for `p_arrive` and its 90 % band.
+            strata: Mean failure probabilities of groups of draws, such as `BoundRisk.strata()`, for
+                the expected cost of failure. By default, bounds fail independently with `p_fail`.
 
         Raises:
-            TrustboError: If shapes differ, or a probability is outside [0, 1].
+            TrustboError: If the shapes do not match, or a probability is outside [0, 1].
         """
         drawn = None if draws is None else np.asarray(draws, dtype=float)
         risk = Risk(np.asarray(p_fail, dtype=float), drawn, strata)
         return self._with(risk=risk)
 
     def with_failure_cost(self, failure_cost: float) -> Self:
-        """Return the planner with another cost of a failure, in bounds.
+        """Return a planner with another failure cost, in bounds.
 
-        Objectives other than lost_contact have no such cost; their planner is returned unchanged.
+        If the objective is not lost_contact, the planner is returned unchanged.
 
         Raises:
-            TrustboError: If it is negative or not finite.
+            TrustboError: If the failure cost is negative or not finite.
         """
         return self._with(failure_cost=failure_cost) if self.problem.objective.of_contact else self
 
@@ -168,13 +167,13 @@ class Planner(Summary):
         """Find the best admissible path for given parameters, or for the mean of a posterior.
 
         Args:
-            params: Posterior of `fit`, or parameters. With several draws, the path is optimal for
-                their mean, and the bands are over the draws; see `evaluate`.
+            params: Posterior from `fit`, or parameters. With several draws, the path is optimal for
+                their mean, and the bands are quantiles over the draws (see `evaluate`).
             x0: Expected trust at the start, shape () or (robot,); by default `params.x0_mean`.
 
         Raises:
-            TrustboError: If the parameters have other robots or features, or beta0 is outside the
-                range for which the search is exact.
+            TrustboError: If the parameters are for other robots or features than the workspace, or
+                beta0 is outside the range in which the search is exact.
             InfeasibleError: If no path respects `max_failure`.
         """
         started = time.perf_counter()
@@ -189,13 +188,13 @@ class Planner(Summary):
         return replace(plan, exact=exact, limit=limit, seconds=time.perf_counter() - started)
 
     def best_path(self, dynamics: Dynamics) -> tuple[Cell, ...]:
-        """Find the best admissible path under other dynamics, such as an optimistic drift.
+        """Find the best admissible path for given dynamics, such as an optimistic drift.
 
         Args:
-            dynamics: Recursion of expected trust without leading axes; see `Problem.dynamics`.
+            dynamics: Recursion for expected trust, without leading axes (see `Problem.dynamics`).
 
         Raises:
-            TrustboError: If beta0 is outside the range for which the search is exact.
+            TrustboError: If beta0 is outside the range in which the search is exact.
             InfeasibleError: If no path respects `max_failure`.
         """
         return self.problem.paths.cells(self.problem.best(dynamics)[-1][0])
@@ -203,15 +202,15 @@ class Planner(Summary):
     def plan_draws(
         self, posterior: Params | xr.DataTree, *, n_draws: int | None = None, seed: int = 0
     ) -> DrawnPaths:
-        """Find the best path under every draw.
+        """Find the best path for each draw of a posterior.
 
         Args:
-            posterior: Posterior of `fit`, or draws with leading axis (draw,).
-            n_draws: Number of draws, taken at random without replacement; by default all.
-            seed: Seed of the choice of draws.
+            posterior: Posterior from `fit`, or parameters with leading axis (draw,).
+            n_draws: Number of draws, chosen at random without replacement; by default all.
+            seed: Seed for choosing the draws.
 
         Raises:
-            TrustboError: If beta0 of a draw is outside the range for which the search is exact.
+            TrustboError: If any draw has beta0 outside the range in which the search is exact.
             InfeasibleError: If no path respects `max_failure`.
         """
         params = choose_draws(draws_of(posterior, self.workspace), n_draws, seed)
@@ -221,19 +220,19 @@ class Planner(Summary):
     def evaluate(
         self, path: Sequence[Cell], params: Params | xr.DataTree, *, x0: ArrayLike | None = None
     ) -> Plan:
-        """Evaluate a given path; `exact` is False and `limit` NaN.
+        """Evaluate a given path; in the plan, `exact` is False and `limit` is NaN.
 
         Args:
-            path: Cells from start to goal, each a neighbour of the one before.
-            params: One or many parameter draws, or a posterior. With many, `trust` and `value` are
-                computed from mean trust, and `bands` are its quantiles; for lost_contact, `value`
-                is the mean over draws. Draws of a posterior include robot effects drawn for the
-                next mission, see `params_of`.
+            path: Cells from start to goal, each adjacent to the previous one.
+            params: Posterior from `fit`, or parameters. With several draws, `trust` is their mean,
+                `bands` are their quantiles, and `value` is computed from the mean trust or, for
+                lost_contact, averaged over the draws. The draws of a posterior include robot
+                effects drawn for the next mission (see `params_of`).
             x0: Expected trust at the start; by default `params.x0_mean`.
 
         Raises:
-            TrustboError: If the parameters have other robots or features, or the path is broken or
-                does not lead from start to goal.
+            TrustboError: If the parameters are for other robots or features than the workspace, or
+                the path is not connected or does not lead from start to goal.
         """
         path, problem = self.require_path(path), self.problem
         draws, cells = draws_of(params, self.workspace, day=True), np.array(path)
@@ -266,22 +265,23 @@ class Planner(Summary):
     def graph(self, params: Params | xr.DataTree) -> nx.DiGraph:
         """Return the cells and bounds as a networkx graph.
 
-        Nodes are the passable cells `(row, col)` with `x` and `y` of their centres, CRS metres.
-        Edges are the bounds, with attributes `length`, m; `drift` of the team's mean trust; `cost`,
-        -log sigma of the limit of trust if the bound were repeated, plus its toll; `lost`, the
-        contact lost at that limit, in bounds, plus its toll; and, with a risk, `risk`, -log(1 -
-        p_fail). Except for the memory of trust, sums of `lost` equal the objective lost_contact.
+        Nodes are the passable cells `(row, col)`, with the CRS coordinates `x` and `y` of their
+        centres in metres. Edges are the bounds, with their `length` in metres, the `drift` of the
+        team's mean trust and, given a risk, `risk` = -log(1 - p_fail). With x the limit of trust if
+        a bound were repeated, `cost` is -log sigma(x) plus the toll, and `lost` is the contact lost
+        at trust x, in bounds, plus the toll. If trust had no memory, the sum of `lost` along a path
+        would be minus its value for lost_contact without failures.
 
         Args:
-            params: Posterior or parameters, whose mean is taken.
+            params: Posterior from `fit`, or parameters. Several draws are replaced by their mean.
 
         Raises:
-            TrustboError: If abs(beta0) >= 1, because trust then grows without limit.
+            TrustboError: If abs(beta0) >= 1, because trust would then grow without limit.
         """
         problem, mean = self.problem, mean_of(params, self.workspace)
         dynamics = problem.dynamics(mean)
         if (radius := np.abs(np.linalg.eigvals(dynamics.transition)).max()) >= 1.0:
-            raise TrustboError(f"trust settles only if abs(beta0) < 1; got {radius:g}.")
+            raise TrustboError(f"trust converges only if abs(beta0) < 1; got {radius:g}.")
         contact = capped(LOST_CONTACT, problem.family, dynamics)
         grid, bounds = self.workspace.grid, problem.paths.bounds
         length = np.hypot(*(STEPS * (grid.cell_height, grid.cell_width)).T)  # (move,)
@@ -310,17 +310,17 @@ class Planner(Summary):
     def trust_map(
         self, params: Params | xr.DataTree, *, per_robot: bool = False, x0: ArrayLike | None = None
     ) -> xr.DataArray:
-        """Compute the largest expected trust with which each cell can be reached, else NaN.
+        """Compute the largest expected trust with which each cell can be reached; NaN if it cannot.
 
-        The maximum is over paths to each cell with the fewest possible bounds or, unless
-        `max_bounds` is "shortest", up to two more without U-turns. With the default `max_bounds`,
-        the value at the goal is the terminal trust of the `terminal` plan. Longer walks, allowed by
-        an int, are excluded, as they could gain trust by loitering. Shape (row, col), or (robot,
-        row, col) with `per_robot`, with a leading axis (draw,) for draws.
+        The maximum is over paths to each cell without U-turns that have at most two bounds more
+        than the fewest, if `max_bounds` permits. The map at the goal equals the terminal trust of
+        the `terminal` plan with its default `max_bounds`. Longer walks are excluded because they
+        could gain trust by loitering. The map has the shape (row, col), or (robot, row, col) with
+        `per_robot`. If there are several draws, it has a leading axis (draw,).
 
         Args:
-            params: Parameters of any model; a map for every draw if they have draws.
-            per_robot: True for one map per robot instead of the team's.
+            params: Posterior from `fit`, or parameters of any model.
+            per_robot: Whether to compute one map per robot instead of one for the team.
             x0: Expected trust at the start, shape () or (robot,); by default `params.x0_mean`.
         """
         return trust_map(self.problem, draws_of(params, self.workspace), per_robot=per_robot, x0=x0)
@@ -328,18 +328,18 @@ class Planner(Summary):
     def cost_map(
         self, params: Params | xr.DataTree, *, per_robot: bool = False, x0: ArrayLike | None = None
     ) -> xr.DataArray:
-        """Compute the cost f = 1 - sigma(trust map) of each cell, equation (6); see `trust_map`."""
+        """Compute the cost f = 1 - sigma(trust) of each cell, equation (6), from `trust_map`."""
         return cost_of(self.trust_map(params, per_robot=per_robot, x0=x0))
 
     def trust_summary(
         self, posterior: Params | xr.DataTree, *, n_draws: int = 200, seed: int = 0
     ) -> xr.Dataset:
-        """Compute `mean` and `sd` of the trust map over draws, (row, col), and the mean `cost`.
+        """Compute the `mean` and `sd` of the trust map and the mean `cost`, each (row, col).
 
         Args:
-            posterior: Posterior of `fit`, or draws with leading axis (draw,).
-            n_draws: Number of draws, taken at random without replacement.
-            seed: Seed of the choice of draws.
+            posterior: Posterior from `fit`, or parameters with leading axis (draw,).
+            n_draws: Number of draws, chosen at random without replacement.
+            seed: Seed for choosing the draws.
         """
         params = choose_draws(draws_of(posterior, self.workspace), n_draws, seed)
         trust = trust_map(self.problem, params)
@@ -351,14 +351,14 @@ class Planner(Summary):
     def path_posterior(
         self, posterior: Params | xr.DataTree, *, n_draws: int | None = 1000, seed: int = 0
     ) -> xr.DataArray:
-        """Compute P(cell on the best path), (row, col), from the best path under some draws.
+        """Estimate the probability (row, col) that each cell lies on the best path.
 
-        Where no path respects `max_failure`, the safest path is used.
+        The best path is found for each draw. If no path respects `max_failure`, the safest is used.
 
         Args:
-            posterior: Posterior of `fit`, or draws with leading axis (draw,).
-            n_draws: Number of draws, taken at random without replacement.
-            seed: Seed of the choice of draws.
+            posterior: Posterior from `fit`, or parameters with leading axis (draw,).
+            n_draws: Number of draws, chosen at random without replacement.
+            seed: Seed for choosing the draws.
         """
         try:
             share = self.plan_draws(posterior, n_draws=n_draws, seed=seed).share()
@@ -370,7 +370,7 @@ class Planner(Summary):
 
 
 def _toll_of(toll: ArrayLike, bounds: np.ndarray) -> np.ndarray:
-    """Return the tolls (move, row, col), 0 where there is no bound.
+    """Return the tolls (move, row, col), which are 0 where there is no bound.
 
     Raises TrustboError if the shape does not broadcast or the toll of a bound is not finite.
     """
@@ -379,20 +379,20 @@ def _toll_of(toll: ArrayLike, bounds: np.ndarray) -> np.ndarray:
         tolls = np.where(bounds, np.broadcast_to(given, bounds.shape), 0.0)
     except ValueError:
         raise TrustboError(
-            f"toll must be (move, row, col), {bounds.shape}; got {given.shape}."
+            f"toll must broadcast to (move, row, col) = {bounds.shape}; got shape {given.shape}."
         ) from None
     if not np.isfinite(tolls).all():
         move, row, col = np.argwhere(~np.isfinite(tolls))[0].tolist()
-        raise TrustboError(f"toll[{move}, {row}, {col}] = {tolls[move, row, col]} must be finite.")
+        raise TrustboError(f"toll[{move}, {row}, {col}] = {tolls[move, row, col]} is not finite.")
     return tolls
 
 
 def _value_along(
     problem: Problem, cells: np.ndarray, params: Params, x0: ArrayLike | None
 ) -> tuple[np.ndarray, float, np.ndarray]:
-    """Compute trust along a path (draw, bound, robot), its value without failures, and per draw."""
+    """Compute trust (draw, bound, robot) and the value, overall and per draw, if no bound fails."""
     z, of_path = along(problem.paths.workspace.awareness.values, cells), params.along(cells)
-    z = z[:, None, None]  # a map of one row
+    z = z[:, None, None]  # as a map with one row
     by_robot = trust_dynamics(of_path, z, x0, by_robot=True)
     trust = roll(by_robot)
     trust = trust.reshape(-1, *trust.shape[-2:])
@@ -400,8 +400,8 @@ def _value_along(
     if not problem.objective.of_contact:
         value = problem.value_along(cells, trust.mean((0, -1)), by_robot.noise_sd)
         return trust, float(value), values
-    # Trust capped draw by draw is biased, so that the band is of trust as it is; but no path loses
-    # less than nothing.
+    # Capping trust in each draw causes bias, so the band uses uncapped trust. But no path loses
+    # less than 0 bounds of contact.
     team = capped(problem.objective, problem.family, trust_dynamics(of_path, z, x0))
     mean = problem.value_along(cells, roll(team).mean(-1), team.noise_sd).mean()
     return trust, float(mean), np.minimum(values, -problem.toll_along(cells))

@@ -1,7 +1,7 @@
-"""Policies: from posterior draws to the next plan.
+"""Policies, which choose the next plan based on posterior draws.
 
-A policy is any callable `policy(rng, params, planner) -> Plan`, and may be passed in place of a
-name. For every policy, trust and value of the plan are expectations under the posterior mean.
+A policy is any callable `policy(rng, params, planner) -> Plan`, which can be passed instead of a
+name. The policies below compute the trust and value of a plan from the posterior mean.
 """
 
 from collections.abc import Callable, Mapping
@@ -16,10 +16,10 @@ from trustbo.planning.plan import Plan
 from trustbo.planning.planner import Planner
 
 Policy = Callable[[np.random.Generator, Params, Planner], Plan]
-"""Function from a generator, draws with leading axis (draw,) and a planner to the next plan."""
+"""Function that maps a generator, draws with leading axis (draw,) and a planner to a plan."""
 
 N_DRAWS = 200
-"""Number of draws under which `ucb` plans to compare paths."""
+"""Number of draws for which `ucb` finds the best path."""
 
 
 def greedy(rng: np.random.Generator, params: Params, planner: Planner) -> Plan:
@@ -36,7 +36,7 @@ def thompson(rng: np.random.Generator, params: Params, planner: Planner) -> Plan
 def optimistic(
     rng: np.random.Generator, params: Params, planner: Planner, *, quantile: float = 0.9
 ) -> Plan:
-    """Plan the best path under the upper quantile over draws of each bound's drift u."""
+    """Plan the best path with the drift u of each bound at an upper quantile over the draws."""
     some = choose_draws(params, 1000, _seed(rng))
     transition, drift, start, sd = planner.problem.dynamics(some)
     best = Dynamics(
@@ -46,7 +46,7 @@ def optimistic(
 
 
 def ucb(rng: np.random.Generator, params: Params, planner: Planner, *, kappa: float = 1.0) -> Plan:
-    """Choose the draws' best path with the highest mean plus `kappa` sd of the value."""
+    """Choose, among the draws' best paths, the one with the largest mean + `kappa` sd of value."""
     drawn = planner.plan_draws(params, n_draws=N_DRAWS, seed=_seed(rng))
     values = drawn.values_of(drawn.candidates)
     chosen = int(np.argmax(values.mean(0) + kappa * values.std(0)))
@@ -71,14 +71,14 @@ POLICIES: Mapping[str, Policy] = {
 
 
 def resolve_policy(policy: str | Policy) -> Policy:
-    """Return the policy of that name, or the callable itself.
+    """Return the policy with the given name, or a given callable unchanged.
 
     Raises:
-        TrustboError: If it is neither.
+        TrustboError: If `policy` is neither a known name nor a callable.
     """
     return policy if callable(policy) else POLICIES[require_choice("policy", policy, POLICIES)]
 
 
 def _seed(rng: np.random.Generator) -> int:
-    """Draw a seed."""
+    """Draw a random seed."""
     return int(rng.integers(2**63))

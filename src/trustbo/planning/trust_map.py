@@ -32,17 +32,17 @@ def trust_map(
 
 
 def cost_of(trust: xr.DataArray) -> xr.DataArray:
-    """Compute the paper's cost f = 1 - sigma(trust) of a trust map."""
+    """Compute the cost f = 1 - sigma(trust) of the paper from a trust map."""
     cost = trust.copy(data=1.0 - expit(trust.values)).rename("cost")
     return cost.assign_attrs(long_name="cost 1 - sigma(trust)")
 
 
 def _largest(paths: AdmissiblePaths, dynamics: Dynamics, view: np.ndarray) -> np.ndarray:
-    """Compute the largest trust view . x by draw and cell, (draw, row, col); NaN if unreachable."""
+    """Compute the largest trust view . x in each cell, (draw, row, col); NaN if unreachable."""
     extra = min(SIMPLE_EXTRA, paths.longest - paths.shortest)
     weights = view @ dynamics.transition  # (draw, state)
     beta0 = np.divide(weights, view, out=np.zeros_like(weights), where=view > 0.0)
-    if (weights == beta0.max(-1, keepdims=True) * view).all():  # view . x depends on itself alone
+    if (weights == beta0.max(-1, keepdims=True) * view).all():  # view . x has its own recursion
         drift = np.einsum("s,dsmrc->dmrc", view, dynamics.drift)
         drift = np.where(paths.bounds, drift, np.nan)
         return best_trust(paths, extra, drift, beta0.max(-1), dynamics.start @ view)
@@ -60,20 +60,20 @@ def _largest(paths: AdmissiblePaths, dynamics: Dynamics, view: np.ndarray) -> np
 def best_trust(
     paths: AdmissiblePaths, extra: int, drift: np.ndarray, beta0: np.ndarray, x0: np.ndarray
 ) -> np.ndarray:
-    """Find the largest trust with which each cell can be entered; NaN where unreachable.
+    """Find the largest trust with which each cell can be entered; NaN if it is unreachable.
 
-    This is one pass over the numbers of bounds. U-turns are not allowed: each cell keeps the
-    largest trust by any move, and the largest by another move. The result is exact for beta0 >= 0.
+    Paths grow by one bound per iteration. To exclude U-turns, each cell stores the largest trust
+    with the move that attains it, and the largest over the other moves. Exact for beta0 >= 0.
 
     Args:
         paths: Admissible paths.
-        extra: Bounds beyond the fewest that a path to a cell may have.
-        drift: Drift of bounds, (draw, move, row, col), NaN where there is none.
-        beta0: Autoregression, (draw,).
-        x0: Trust at the start, (draw,).
+        extra: Number of bounds beyond the fewest that a path to a cell may have.
+        drift: Drift of each bound, shape (draw, move, row, col); NaN where there is no bound.
+        beta0: Autoregressive coefficient, shape (draw,).
+        x0: Trust at the start, shape (draw,).
 
     Returns:
-        Shape (draw, row, col).
+        Largest trust, shape (draw, row, col).
     """
     start, fewest = paths.start, paths.bounds_from_start
     margin = ((0, 0), (0, 0), (1, 1), (1, 1))
@@ -87,7 +87,7 @@ def best_trust(
     for k in range(1, int(fewest.max()) + extra + 1):
         for m, step in enumerate(STEPS):
             before = np.where(by == n_moves - 1 - m, second, top)  # the reverse move is forbidden
-            before = np.roll(before, step, axis=(1, 2))  # the margin is closed
+            before = np.roll(before, step, axis=(1, 2))  # wraps only the margin
             carried = np.where(np.isneginf(before), before, beta0[:, None, None] * before)
             entered[m] = carried + u[:, m]
         entered[:, :, k > reach] = -np.inf
