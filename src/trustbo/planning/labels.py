@@ -1,20 +1,20 @@
 """Label search on the unrolled graph, for paths whose cost depends on history or risk.
 
-Method: labels with dominance for the resource-constrained shortest path (Martins 1984; Irnich and
-Desaulniers 2005). A label at a state has the cost so far, the sums r_m of risks -log(1 - p), and
-the trust of each distinct robot (none where the cost is a weighted sum). An edge has a cost and,
-where trust matters, a loss that decreases with trust. The cost of a path also includes sum_m F_m (1
-- exp(-r_m)), and its last sum must not exceed a limit.
+The method is a label-setting algorithm with dominance for the resource-constrained shortest path
+(Martins 1984; Irnich and Desaulniers 2005). A label at a state contains the cost so far, the sums
+r_m of the risks -log(1 - p), and trust, if the loss depends on it. An edge has a cost and possibly
+a loss, which decreases with trust. The cost of a path also includes sum_m F_m (1 - exp(-r_m)), and
+the last of the sums must not exceed a limit.
 
-A label is dropped if another label of its state costs no more, has no larger sums and no less trust
-of any robot. B0 >= 0 preserves the order of trust, so every completion of the former is at least as
-good for the latter. Where a path may not turn back, the other must have come from the same cell, or
-there must be two that came from different cells. A label is also dropped if it cannot beat the best
-path known: the remaining cost is bounded by a sum over edges, with the largest possible trust and
-with F_m (1 - exp(-r_m)) replaced by its chord over the sums that can still be optimal. The limit is
-relaxed with a Lagrange multiplier, found by bisection (Handler and Zang 1980).
+A label is dropped if another label of its state has no higher cost, no larger sums and no lower
+trust. As B0 >= 0 preserves the order of trust, any path to the goal is then at least as good from
+the other label. If U-turns are forbidden, the other label must come from the same cell, or there
+must be two such labels from different cells. A label is also dropped if it cannot beat the best
+path found so far. The remaining cost is bounded by a sum over edges, which uses the largest
+possible trust and the chord of F_m (1 - exp(-r_m)) over the sums that can still be optimal. The
+limit is relaxed with a Lagrange multiplier, found by bisection (Handler and Zang 1980).
 
-The search is exact: the remaining labels include the best path unless it is already known.
+The search is exact, because the dropped labels do not lead to a better path than the one returned.
 """
 
 import math
@@ -27,22 +27,23 @@ from trustbo.planning.sums import costs_of_sums
 from trustbo.planning.unrolled import Unrolled, edges_from, fill_to_go, kernel, new_to_go
 
 MAX_LABELS = 300_000
-"""Maximum number of labels; a search then returns the best path found and a lower limit."""
+"""Maximum number of labels. Beyond it, a search returns the best path found and a lower limit."""
 LOGISTIC, CLIPPED = range(2)
-"""Losses of a bound: 1 - sigma(trust), or 1 - E[y] with normal y clipped to [0, 1]."""
+"""Loss of a bound: 1 - sigma(trust), or 1 - E[y] for a normal y clipped to [0, 1]."""
 LOSSES = {"logistic": LOGISTIC, "clipped": CLIPPED}
-"""Loss by `Family.expected_rate`."""
+"""Loss for each nonlinear `Family.expected_rate`."""
 TINY_SD = 1e-9
-"""Least sd of a rate, instead of 0."""
+"""Smallest standard deviation of a rate, used instead of 0."""
 
 
 class Costs(NamedTuple):
-    """Costs of paths under one draw.
+    """Costs of paths for one draw.
 
-    Fields: loss, one of `LOSSES`; drift (robot, bound) and its weight in the value (left, robot);
-    start, cost by the number of bounds (left,); transition (robot, robot) and x0 (robot,) of trust,
-    without robots where no loss depends on it; sd of a rate; toll (bound,); risk (bound, sum);
-    failure, the cost F_m of each sum (sum,); and the limit of the last sum.
+    `loss` is one of `LOSSES`. `weight` (left, robot) times `drift` (robot, bound) reduces the cost.
+    `start` (left,) is a constant for each number of bounds. `transition` (robot, robot) and `x0`
+    (robot,) define trust, or are empty if the loss is not needed. `sd` is that of a rate. Bounds
+    have a `toll` (bound,) and `risk` (bound, sum). `failure` (sum,) holds the factors F_m, and
+    `limit` is the largest value of the last sum.
     """
 
     loss: int
@@ -61,16 +62,16 @@ class Costs(NamedTuple):
 def best_labels(
     graph: Unrolled, costs: Costs, scale: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find the path of least cost under every draw.
+    """Find the path of least cost for each draw.
 
     Args:
         graph: Unrolled graph.
-        costs: Costs with a leading axis (draw,) of drift, weight, start, transition, x0 and sd.
-        scale: Divisor of a path's cost by its number of bounds, (length,).
+        costs: Costs; drift, weight, start, transition, x0 and sd have a leading axis (draw,).
+        scale: Divisor of the cost for each number of bounds of a path, shape (length,).
 
     Returns:
-        Costs (draw,), inf where no path is within the limit; lower limits on the costs, equal where
-        exact; and paths as flat cells, (draw, cell), filled with -1.
+        Costs (draw,), which are inf if no path is within the limit; lower limits on the costs
+        (draw,), which equal them if exact; and paths (draw, cell) as flat cells, padded with -1.
     """
     searches = [graph]
     divisor = scale[graph.left[graph.starts]]
@@ -101,7 +102,7 @@ def _best_labels(graph, costs, most, cost, lower, paths, begin, end):
 
 @kernel
 def _lost(loss, x, sd):
-    """Compute the expected contact lost in a bound that leaves trust x."""
+    """Compute the expected contact lost in a bound after which trust is x."""
     if loss == LOGISTIC:
         return 1.0 / (1.0 + math.exp(min(x, 700.0)))
     low, high, root = -x / sd, (1.0 - x) / sd, math.sqrt(0.5)
@@ -112,7 +113,7 @@ def _lost(loss, x, sd):
 
 @kernel
 def _lost_on(graph, costs, e, x, after):
-    """Compute the contact lost on an edge entered with trust x; writes the trust after it."""
+    """Compute the contact lost on an edge entered with trust x, and write the new trust."""
     mean, n = 0.0, len(costs.x0)
     if n == 0:
         return 0.0
@@ -126,7 +127,7 @@ def _lost_on(graph, costs, e, x, after):
 
 @kernel
 def _least_costs(graph, costs, edge_cost):
-    """Compute the cost of each edge at the largest trust with which it can be entered, (edge,)."""
+    """Compute the cost (edge,) of each edge if it is entered with the largest possible trust."""
     if len(costs.x0) == 0:
         return edge_cost
     cost = np.full(len(graph.head), np.inf)
@@ -134,7 +135,7 @@ def _least_costs(graph, costs, edge_cost):
     for s in graph.starts:
         most[s] = costs.x0
     for s in range(len(graph.cell) - 1, 0, -1):
-        if most[s, 0] == -np.inf:  # only beyond the goal
+        if most[s, 0] == -np.inf:  # reachable only via the goal
             continue
         for e in range(graph.first[s], graph.first[s + 1]):
             cost[e] = edge_cost[e] + _lost_on(graph, costs, e, most[s], after)
@@ -144,7 +145,7 @@ def _least_costs(graph, costs, edge_cost):
 
 @kernel
 def _failing(failure, r):
-    """Compute the cost of failing with sums r (sum,)."""
+    """Compute the expected cost of failure, given the sums r (sum,)."""
     total = 0.0
     for m in range(len(r)):
         total -= failure[m] * math.expm1(-r[m])
@@ -152,10 +153,10 @@ def _failing(failure, r):
 
 
 class Known(NamedTuple):
-    """Best path known and its cost, and the path tried last.
+    """Best path found so far and the path tried last.
 
-    Fields: cost (1,); edges of the path (bound,), -1 beyond its end; those of the path tried
-    (bound,), and its sums (sum,).
+    The best path has `cost` (1,) and `edges` (bound,), padded with -1. The last path has the edges
+    `trial` (bound,). `sums` (sum,) are those of the cheapest path in the last call of `_try_paths`.
     """
 
     cost: np.ndarray
@@ -166,9 +167,9 @@ class Known(NamedTuple):
 
 @kernel
 def _try_paths(graph, costs, edge_cost, to_go, known):
-    """Try the cheapest path by `to_go` from each start; returns the least cost to go.
+    """Try the cheapest path according to `to_go` from each start, and return the least cost.
 
-    Keeps the best path within the limit, and the sums of the cheapest path.
+    Store the best path within the limit and the sums of the cheapest path in `known`.
     """
     least, after, x = np.inf, np.empty(len(costs.x0)), np.empty(len(costs.x0))
     sums = np.empty(len(costs.failure))
@@ -195,7 +196,7 @@ def _try_paths(graph, costs, edge_cost, to_go, known):
 
 @kernel
 def _fill_priced(graph, costs, least_cost, price, to_go):
-    """Write the costs to go with a price for each risk, (sum,)."""
+    """Fill `to_go` for edge costs that include the risks at the given price (sum,)."""
     cost = least_cost.copy()
     for e in range(len(cost)):
         for m in range(len(price)):
@@ -206,9 +207,9 @@ def _fill_priced(graph, costs, least_cost, price, to_go):
 class Limits(NamedTuple):
     """Lower limits on the cost of the rest of a path, used to drop labels.
 
-    Fields: lower limit on the cost of all paths; safest, least sums to go (state, sum); free, least
-    cost to go without risk (state,); priced, with the `price` of each sum (sum,), to which the
-    offset is to be added.
+    `lower` is a lower limit on the cost of all paths. From each state, `safest` (state, sum) is the
+    smallest remaining sum, and `free` (state,) is the least remaining cost without risk. `priced`
+    (state,) plus `offset` is a lower limit on the remaining cost with `price` (sum,) for each sum.
     """
 
     lower: float
@@ -221,20 +222,20 @@ class Limits(NamedTuple):
 
 @kernel
 def _limits(graph, costs, edge_cost, least_cost, known):
-    """Find good paths and lower limits; the search is over where their costs are equal."""
+    """Find good paths and lower limits. If their costs are equal, no search is needed."""
     to_go, n_sums = new_to_go(len(graph.cell)), len(costs.failure)
     safest, low = np.empty((len(graph.cell), n_sums)), np.empty(n_sums)
     for m in range(n_sums):
         _fill_priced(graph, costs, np.zeros(len(graph.head)), np.eye(n_sums)[m], to_go)
         safest[:, m] = to_go.least
         low[m] = to_go.least[graph.starts].min()
-    _try_paths(graph, costs, edge_cost, to_go, known)  # the safest by the sum that is limited
+    _try_paths(graph, costs, edge_cost, to_go, known)  # safest with respect to the limited sum
     fill_to_go(graph, least_cost, to_go)
     free, price = to_go.least.copy(), np.zeros(n_sums)
     least = _try_paths(graph, costs, edge_cost, to_go, known)
     if known.cost[0] == np.inf:
         return Limits(np.inf, safest, free, free, price, 0.0)
-    for _ in range(8):  # tangents of the concave cost of failing give good paths
+    for _ in range(8):  # tangents to the concave failure cost give good paths
         before, price = price, costs.failure * np.exp(-known.sums)
         if np.abs(price - before).max() <= 1e-9 * costs.failure.max():
             break
@@ -251,10 +252,10 @@ def _limits(graph, costs, edge_cost, least_cost, known):
 
 @kernel
 def _chords(costs, low, gap):
-    """Find a plane below the failure cost of paths that can be optimal: slopes (sum,), constant.
+    """Find the slopes (sum,) and the constant of a plane below the failure cost of optimal paths.
 
-    These have sums of at least `low` and a failure cost of at most `gap`, the difference between
-    the cost of the best path known and the least cost without risk.
+    An optimal path has sums of at least `low` and a failure cost of at most `gap`, which is the
+    cost of the best path found so far minus the least cost without risk.
     """
     failure, slopes, constant = costs.failure, np.zeros(len(low)), 0.0
     at_low = _failing(failure, low)
@@ -274,9 +275,9 @@ def _chords(costs, low, gap):
 
 @kernel
 def _price_of_limit(graph, costs, edge_cost, least_cost, chord, offset, to_go, known):
-    """Find the price of the limited sum with the best lower limit on the cost of all paths.
+    """Find the price of the limited sum that gives the best lower limit on the cost of all paths.
 
-    The dual is concave in the price; its slope is the excess of the cheapest path's sum.
+    The dual is concave in the price. Its slope is the sum of the cheapest path minus the limit.
     """
     limit, price = costs.limit, chord.copy()
     lower, chosen, extra, under, over = -np.inf, 0.0, 0.0, 0.0, np.inf
@@ -296,7 +297,7 @@ def _price_of_limit(graph, costs, edge_cost, least_cost, chord, offset, to_go, k
 
 @kernel
 def _best_path(graph, costs, most, path):
-    """Write the cheapest path within the limit; returns its cost (or inf) and a lower limit."""
+    """Write the cheapest path within the limit, and return its cost (or inf) and a lower limit."""
     edge_cost, n, n_sums = np.empty(len(graph.head)), len(path), len(costs.failure)
     costs_of_sums(graph, costs.drift, costs.weight, costs.toll, edge_cost)
     known = Known(np.full(1, np.inf), np.full(n, -1), np.full(n, -1), np.zeros(n_sums))
@@ -312,11 +313,11 @@ def _best_path(graph, costs, most, path):
 
 
 class Labels(NamedTuple):
-    """Table of labels: cost, sums and trust of each (label, number), and its predecessor.
+    """Table of labels, with the cost, sums and trust of each in `number` (label, number).
 
-    Fields: number; edge by which it came, the cell that this left, its parent and the label of its
-    state that was made before it, (label,), -1 where there is none; and last, that of each state
-    (state,).
+    With shape (label,), `edge` is the edge that led to a label, `left` the cell before this edge,
+    `parent` the previous label of the path, and `before` the previous label of the same state.
+    `last` (state,) is the newest label of each state. Missing entries are -1.
     """
 
     number: np.ndarray
@@ -329,7 +330,7 @@ class Labels(NamedTuple):
 
 @kernel
 def _search(graph, costs, most, edge_cost, limits, known):
-    """Search for the best path; returns a lower limit on its cost, equal where exact."""
+    """Search for the best path, and return a lower limit on its cost, which is equal if exact."""
     n_numbers = 1 + len(costs.failure) + len(costs.x0)
     made, last = np.empty((4, most), np.int64), np.full(len(graph.cell), -1)
     labels = Labels(np.empty((most, n_numbers)), made[0], made[1], made[2], made[3], last)
@@ -353,7 +354,7 @@ def _search(graph, costs, most, edge_cost, limits, known):
 
 @kernel
 def _extend(graph, costs, edge_cost, limits, known, labels, s, label, n):
-    """Make the successors of a label that can be optimal; returns the number of all labels."""
+    """Make the successors of a label that can be optimal, and return the number of all labels."""
     n_sums = len(costs.failure)
     number, after, sums = labels.number[label], np.empty(len(costs.x0)), np.empty(n_sums)
     for e in range(graph.first[s], graph.first[s + 1]):
@@ -378,7 +379,7 @@ def _extend(graph, costs, edge_cost, limits, known, labels, s, label, n):
 
 @kernel
 def _is_hopeless(costs, limits, h, cost, sums, known):
-    """Check whether no path that enters a state with this cost and these sums can be best."""
+    """Check whether no path that enters a state with this cost and these sums can be optimal."""
     if sums[-1] + limits.safest[h, -1] > costs.limit:
         return True
     at_least = cost + limits.priced[h] + limits.offset
@@ -391,7 +392,7 @@ def _is_hopeless(costs, limits, h, cost, sums, known):
 
 @kernel
 def _write_edges(graph, labels, label, edges):
-    """Write the edges of the path of a label."""
+    """Write the edges of the path to a label."""
     n, k = label, 0
     while labels.parent[n] >= 0:
         n, k = labels.parent[n], k + 1
@@ -403,7 +404,7 @@ def _write_edges(graph, labels, label, edges):
 
 @kernel
 def _is_dominated(graph, labels, label, other, n_sums):
-    """Check whether other labels of a state have all completions of a label at no higher cost."""
+    """Check whether other labels of the same state make a label unnecessary."""
     number, by = labels.number[label], -2
     while other >= 0:
         covers, equal = other != label, True

@@ -21,25 +21,25 @@ def _same(score: Array) -> Array:
 
 
 class Objective(NamedTuple):
-    """A row of `OBJECTIVES`: how trust along a path and its tolls become its value.
+    """Definition of a path's value in terms of the trust along the path and its tolls.
 
     The score of a path of K bounds, with trust x_k after bound k, is
 
         (sum_k credit(K - k) x_k - tolls) / scale(K),
 
-    or, for objectives `of_contact`, minus the expected lost contact and the tolls. To add an
-    objective, add a row; searches and tests need no change.
+    or, for objectives `of_contact`, minus the sum of the expected lost contact and the tolls. To
+    add an objective, add an entry to `OBJECTIVES`; the searches need no change.
     """
 
     name: str
     credit: Callable[[Array], Array] = _ones
-    """Weight of trust after a bound as a function of the number of bounds left, both (left,)."""
+    """Weight of trust after a bound, (left,), as a function of the number of bounds left."""
     scale: Callable[[Array], Array] = _ones
-    """Divisor of the sum as a function of the number of bounds of the path, both (length,)."""
+    """Divisor of the sum, (length,), as a function of the number of bounds of the path."""
     value: Callable[[Array], Array] = _same
-    """Increasing function from the score to the reported value."""
+    """Increasing function that maps the score to the reported value."""
     of_contact: bool = False
-    """Whether the value is the expected contact given trust, which a failure reduces."""
+    """Whether the value measures expected contact, which a failure reduces."""
     max_bounds: str = "shortest+2"
     """Default limit on the number of bounds."""
 
@@ -48,38 +48,38 @@ LOST_CONTACT = Objective("lost_contact", of_contact=True, max_bounds="shortest+4
 TERMINAL = Objective("terminal", credit=lambda left: np.where(left == 0, 1.0, 0.0), value=expit)
 MEAN = Objective("mean", scale=lambda n_bounds: np.maximum(n_bounds, 1.0))
 OBJECTIVES: Mapping[str, Objective] = {row.name: row for row in (LOST_CONTACT, TERMINAL, MEAN)}
-"""Objectives by name; values are to be maximised.
+"""Objectives by name; larger values are better.
 
-lost_contact: minus the expected lost contact, in bounds (9 bounds with an expected rate of .9 lose
-.9), minus the tolls and, where the planner has a risk, `failure_cost` times the failure
-probability. terminal: sigma(trust at the goal - tolls), one minus the paper's cost (6)
-without tolls. mean: mean over the bounds of trust minus the toll.
+lost_contact: minus the sum of the expected lost contact in bounds, the tolls and, if the planner
+has a risk, `failure_cost` times the failure probability. (At an expected contact rate of .9, the
+loss on 9 bounds is .9.) terminal: sigma(trust at the goal - tolls), which without tolls is one
+minus the cost (6) of the paper. mean: the mean over bounds of trust minus toll.
 """
 
 
 class Weights(NamedTuple):
-    """Weights of the drift in a score that is a sum; leading axis (draw,)."""
+    """Weights of the drift in a score that is a sum over bounds."""
 
     per_bound: Array
-    """w_j by the bounds left after a bound, (draw, left, state)."""
+    """Weight w_j of a bound with j bounds left after it, shape (draw, left, state)."""
     constant: Array
-    """Term that depends only on the number of bounds, (draw, length)."""
+    """Term that depends only on the number of bounds, shape (draw, length)."""
     scale: Array
-    """Divisor of a path's sum, (length,)."""
+    """Divisor of the sum over the bounds of a path, shape (length,)."""
 
 
 def weights_of(objective: Objective, dynamics: Dynamics, view: Array, longest: int) -> Weights:
     """Compute the weights of the drift for paths of up to `longest` bounds.
 
-    Unrolled, x_k = B0^k x_0 + sum_{i <= k} B0^(k - i) u_i. The team's trust is view . x, so that a
-    bound with j bounds left after it has w_j = sum_{i <= j} credit(i) view . B0^(j - i), and x_0
-    adds sum_k credit(K - k) view . B0^k x_0 to the sum of a path of K bounds.
+    The recursion unrolls to x_k = B0^k x_0 + sum_{i <= k} B0^(k - i) u_i, and the team's trust is
+    view . x. Therefore, w_j = sum_{i <= j} credit(i) view . B0^(j - i) for a bound with j bounds
+    left after it, and x_0 adds sum_k credit(K - k) view . B0^k x_0 for a path of K bounds.
 
     Args:
-        objective: Row of `OBJECTIVES`; contact is assumed to equal trust.
-        dynamics: Recursion of trust with leading axis (draw,).
-        view: Weights of the states in the team's trust, (state,).
-        longest: Largest number of bounds.
+        objective: One of the objectives in `OBJECTIVES`; contact is assumed to equal trust.
+        dynamics: Recursion for trust, with leading axis (draw,).
+        view: Weights of the states in the team's trust, shape (state,).
+        longest: Largest number of bounds of a path.
     """
     n = np.arange(longest + 1)
     credit = objective.credit(n)
@@ -88,7 +88,7 @@ def weights_of(objective: Objective, dynamics: Dynamics, view: Array, longest: i
     for k in range(longest):
         powers[:, k + 1] = np.einsum("ds,dst->dt", powers[:, k], dynamics.transition)
     of_start = np.einsum("dks,ds->dk", powers, dynamics.start)
-    of_start[:, 0] = 0.0  # trust counts after bounds
+    of_start[:, 0] = 0.0  # trust counts only after a bound
     lags = np.tril(credit[n[:, None] - n])  # (left, lag): credit(left - lag)
     constant = of_start @ lags.T - (n if objective.of_contact else 0.0)
     return Weights(lags @ powers, constant, objective.scale(n.astype(float)))
@@ -97,16 +97,16 @@ def weights_of(objective: Objective, dynamics: Dynamics, view: Array, longest: i
 def has_history(objective: Objective, family: Family) -> bool:
     """Return whether the loss of a bound depends on the trust with which it is entered.
 
-    Otherwise the score is a weighted sum of drifts. B0 must be >= 0.
+    The search then requires B0 >= 0. Otherwise, the score is a weighted sum of drifts.
     """
     return objective.of_contact and family.expected_rate != "identity"
 
 
 def capped(objective: Objective, family: Family, dynamics: Dynamics) -> Dynamics:
-    """Cap drift and start where rates are linear in trust, so that no bound gains contact.
+    """Cap the drift and start if rates are linear in trust, so that no bound gains contact.
 
-    u <= 1 - B0 1 and x_0 <= 1 for each state, so that trust is at most 1 if B0 >= 0, and a loop
-    never increases the value. Other dynamics are returned unchanged.
+    With u <= 1 - B0 1 and x_0 <= 1 in every state, trust is at most 1 if B0 >= 0. A loop then never
+    increases the value. In all other cases, the dynamics are returned unchanged.
     """
     if not objective.of_contact or has_history(objective, family):
         return dynamics

@@ -1,4 +1,4 @@
-"""Admissible paths from one start to one goal."""
+"""Admissible paths from a start to a goal."""
 
 import re
 from collections.abc import Sequence
@@ -17,11 +17,11 @@ from trustbo.workspace.grid import Location
 from trustbo.workspace.moves import MOVES, moves_along, require_on_grid
 
 SIMPLE_EXTRA = 2
-"""Bounds beyond the fewest possible up to which a path without U-turns enters no cell twice."""
+"""Number of bounds beyond the fewest at which a path without U-turns still enters no cell twice."""
 STEPS = np.array(MOVES)
-"""Rows and columns of each move, (move, 2)."""
+"""Row and column step of each move, shape (move, 2)."""
 _MOST_STATES = 20_000_000
-"""Maximum number of states of the unrolled graph, whose arrays then need about 3 GB."""
+"""Maximum number of states of the unrolled graph; its arrays then need about 3 GB."""
 _SHORTEST = re.compile(r"shortest(?:\+(\d+))?")
 
 
@@ -32,18 +32,18 @@ class NoPathError(TrustboError, nx.NetworkXNoPath):
 class AdmissiblePaths:
     """Start, goal and the admissible paths between them.
 
-    A path ends on entering the goal, and has `shortest` to `longest` bounds.
+    A path ends when it enters the goal, and has at least `shortest` and at most `longest` bounds.
 
     Attributes:
         workspace: Workspace of the paths.
         start: First cell.
         goal: Last cell.
-        max_bounds: Limit on the number of bounds, see `Planner`.
-        turns: Whether U-turns are allowed, which holds if `max_bounds` is a number.
-        avoided: Passable bounds that paths must avoid, (move, row, col), or None.
-        bounds: Bounds that a path may take, (move, row, col), indexed by the cell entered.
-        bounds_to_goal: Fewest bounds from each cell to the goal, (row, col); -1 without a path.
-        shortest: Fewest bounds of a path.
+        max_bounds: Limit on the number of bounds (see `Planner`).
+        turns: Whether U-turns are allowed; true if `max_bounds` is a number.
+        avoided: Mask of bounds that paths must avoid, shape (move, row, col), or None.
+        bounds: Mask of bounds that a path may take, shape (move, row, col), by the cell entered.
+        bounds_to_goal: Fewest bounds from each cell to the goal, (row, col); -1 if unreachable.
+        shortest: Smallest number of bounds of a path.
         longest: Largest number of bounds of a path.
     """
 
@@ -55,12 +55,12 @@ class AdmissiblePaths:
         max_bounds: int | str = "shortest+2",
         avoided: np.ndarray | None = None,
     ) -> None:
-        """Check start and goal and find the fewest bounds; see `Planner` for the errors."""
+        """Check the start and goal and count the fewest bounds; see `Planner` for the errors."""
         self.workspace = require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
         self.start = workspace.locate(start, "start")
         self.goal = workspace.locate(goal, "goal")
         if self.start == self.goal:
-            raise TrustboError(f"start and goal are the same cell {self.start}; choose two cells.")
+            raise TrustboError(f"start and goal are the same cell, {self.start}; choose two cells.")
         self.avoided = avoided
         self.bounds = workspace.passable_bounds.values
         if avoided is not None:
@@ -72,9 +72,9 @@ class AdmissiblePaths:
             n_reached = int((self.bounds_from_start >= 0).sum())
             n_goal = int((self.bounds_to_goal >= 0).sum())
             raise NoPathError(
-                f"no path from {self.start} to {self.goal}: {n_reached} of {n_cells} passable "
-                f"cells can be reached from the start, and the goal from {n_goal}. Choose another "
-                "start or goal, or a team with a larger max_slope."
+                f"no path leads from {self.start} to {self.goal}. Of {n_cells} passable cells, "
+                f"{n_reached} can be reached from the start, and {n_goal} are connected to the "
+                "goal. Choose another start or goal, or a team with a larger max_slope."
             )
         self.turns = not isinstance(max_bounds, str)
         self.max_bounds = max_bounds
@@ -84,18 +84,18 @@ class AdmissiblePaths:
             self.longest = self.shortest + int(named[1] or 0)
         else:
             raise TrustboError(
-                f"unknown max_bounds {max_bounds!r}; choose shortest, shortest+n for n bounds more "
-                "without U-turns, such as shortest+2, or a number of bounds."
+                f"unknown max_bounds {max_bounds!r}; give 'shortest', 'shortest+n' for up to n "
+                "more bounds without U-turns, such as 'shortest+2', or an int."
             )
         if self.longest < self.shortest:
             raise TrustboError(
-                f"max_bounds = {self.longest} is below the fewest possible from {self.start} to "
-                f"{self.goal}, which is {self.shortest}."
+                f"max_bounds = {self.longest} is too small: a path from {self.start} to "
+                f"{self.goal} needs at least {self.shortest} bounds."
             )
 
     @cached_property
     def bounds_from_start(self) -> np.ndarray:
-        """Fewest bounds from the start to each cell, (row, col); -1 where there is no path."""
+        """Fewest bounds from the start to each cell, shape (row, col); -1 if there is no path."""
         return fewest_bounds(self.bounds, self.start)
 
     @cached_property
@@ -104,13 +104,13 @@ class AdmissiblePaths:
         n_moves, rows, cols = self.bounds.shape
         bounds = self.bounds.reshape(n_moves, -1)
         far, near = self.bounds_to_goal.ravel(), self.bounds_from_start.ravel()
-        # How many numbers of bounds can be left in each cell: `far` and more, one in the goal.
+        # Count the possible numbers of bounds left in each cell: `far` or more, but 0 at the goal.
         n_left = np.maximum(np.where(far == 0, 1, self.longest - near - far + 1), 0)
         n_left[(far < 0) | (near < 0)] = 0
         if (n_states := int(n_left.sum())) > _MOST_STATES:
             raise TrustboError(
-                f"max_bounds = {self.max_bounds!r} admits paths of up to {self.longest} bounds, "
-                f"whose search has {n_states:.3g} states, more than {_MOST_STATES:.3g}; reduce it."
+                f"max_bounds = {self.max_bounds!r} (up to {self.longest} bounds) is too large: the "
+                f"search has {n_states:.3g} states, but at most {_MOST_STATES:.3g} are possible."
             )
         cell = np.repeat(np.arange(rows * cols, dtype=np.int32), n_left)
         base = np.concatenate([[0], np.cumsum(n_left)])
@@ -123,7 +123,7 @@ class AdmissiblePaths:
         for m, step in enumerate(STEPS @ (cols, 1)):  # no bound enters a cell across a border
             tail = np.flatnonzero((cell + step >= 0) & (cell + step < rows * cols) & (left > 0))
             other = cell[tail] + step
-            more = left[tail] - 1 - far[other]  # of the bounds left there, beyond the fewest
+            more = left[tail] - 1 - far[other]  # bounds left after the move, beyond the fewest
             fits = bounds[m, other] & (more >= 0) & (more < n_left[other])
             head[tail[fits], m] = rank[base[other[fits]] + more[fits]]
         tail, move = np.nonzero(head >= 0)
@@ -135,13 +135,13 @@ class AdmissiblePaths:
         return Unrolled(cell, left, first, head, bound, starts, self.turns)
 
     def avoiding(self, bounds: np.ndarray, risk: np.ndarray) -> "AdmissiblePaths":
-        """Restrict to paths that avoid the given bounds.
+        """Return the paths that avoid the given bounds.
 
-        If there is no such path, bounds of least risk are admitted again one by one until there is.
+        If no such path exists, bounds are admitted again in order of risk, the safest first.
 
         Args:
-            bounds: Bounds to avoid, (move, row, col).
-            risk: Failure probability of each bound, (move, row, col).
+            bounds: Mask of the bounds to avoid, shape (move, row, col).
+            risk: Failure probability of each bound, shape (move, row, col).
         """
         avoided = bounds & self.workspace.passable_bounds.values
         if self.avoided is not None:
@@ -154,31 +154,31 @@ class AdmissiblePaths:
                 avoided[*least] = False
             try:
                 return AdmissiblePaths(*ends, avoided.copy())
-            except TrustboError:  # the goal is out of reach, or of the bounds that are allowed
+            except TrustboError:  # the goal cannot be reached, or not within max_bounds
                 continue
         return self
 
     def to(self, cell: Cell, extra: int) -> "AdmissiblePaths":
-        """Return the paths to another cell, with up to `extra` bounds more than the fewest."""
+        """Return the paths to another cell that have at most `extra` bounds beyond the fewest."""
         admitted = f"shortest+{extra}"
         return AdmissiblePaths(self.workspace, self.start, cell, admitted, self.avoided)
 
     def cells(self, flat: np.ndarray) -> tuple[Cell, ...]:
-        """Convert flat indices to cells, up to the first negative index."""
+        """Convert flat indices to cells, without the negative indices used for padding."""
         rows, cols = np.divmod(flat[flat >= 0], self.bounds.shape[-1])
         return tuple(zip(rows.tolist(), cols.tolist(), strict=True))
 
     def require_path(self, path: Sequence[Cell]) -> tuple[Cell, ...]:
-        """Return a path as a tuple of cells if every bound is possible.
+        """Check that a path leads from start to goal and return it as a tuple of cells.
 
         Raises:
-            TrustboError: If it is broken, or does not lead from start to goal.
+            TrustboError: If a bound of the path is impossible, or the path has other ends.
         """
         cells = tuple(require_on_grid(path, self.bounds.shape[1:]))
         if len(cells) < 2 or (cells[0], cells[-1]) != (self.start, self.goal):
             raise TrustboError(
                 f"a path must lead from {self.start} to {self.goal}; got {len(cells)} cells, "
-                f"{cells[:1]} to {cells[-1:]}."
+                f"from {cells[:1]} to {cells[-1:]}."
             )
         entered = np.array(cells[1:]).T
         broken = ~self.workspace.passable_bounds.values[moves_along(cells), *entered]
@@ -191,12 +191,12 @@ class AdmissiblePaths:
 
 
 def fewest_bounds(bounds: np.ndarray, cell: Cell, *, back: bool = False) -> np.ndarray:
-    """Count the fewest bounds from a cell to every other, (row, col); -1 where there is no path.
+    """Count the fewest bounds from one cell to each cell, (row, col); -1 if there is no path.
 
     Args:
-        bounds: Bounds that may be taken, (move, row, col).
+        bounds: Mask of the bounds that may be taken, shape (move, row, col).
         cell: First cell.
-        back: Whether to count from every other cell to this one instead.
+        back: Whether to count the bounds from each cell to `cell` instead.
     """
     rows, cols = bounds.shape[1:]
     move, entered = np.nonzero(bounds.reshape(len(bounds), -1))

@@ -1,4 +1,4 @@
-"""The planning problem: admissible paths, objective and costs, and its best paths."""
+"""The planning problem: its admissible paths, objective and costs, and its best paths."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,16 +24,16 @@ from trustbo.workspace import Workspace
 from trustbo.workspace.moves import MOVE_NAMES, bounds_along
 
 EXACT = 1e-12
-"""Largest gap in score up to which a path is regarded as optimal."""
-_CERTAIN = 700.0  # -log(1 - p) of a bound that always fails
+"""Largest difference from the upper limit on the score at which a path counts as optimal."""
+_CERTAIN = 700.0  # replaces -log(1 - p) = inf for a bound that always fails
 
 
 class InfeasibleError(TrustboError):
     """No admissible path respects `max_failure`.
 
     Attributes:
-        path: Safest admissible path.
-        p_fail: Failure probability of this path, the least of all admissible paths.
+        path: The safest admissible path.
+        p_fail: Failure probability of the safest path.
     """
 
     def __init__(self, message: str, path: tuple[Cell, ...], p_fail: float) -> None:
@@ -43,16 +43,16 @@ class InfeasibleError(TrustboError):
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Admissible paths, objective and costs of a `Planner`; see there for the arguments.
+    """Admissible paths, objective and costs of a planner (see the arguments of `Planner`).
 
     Attributes:
         paths: Admissible paths.
-        objective: Row of `OBJECTIVES`.
-        family: Family of the contact rates.
-        toll: Cost of each bound apart from trust, (move, row, col).
-        max_failure: Largest probability that a path fails, or None.
-        failure_cost: Cost of a failure in bounds; by default the fewest bounds of a path.
-        risk: Probability that each bound ends the mission, or None.
+        objective: One of the objectives in `OBJECTIVES`.
+        family: Observation family of the contact rates.
+        toll: Additional cost of each bound, shape (move, row, col).
+        max_failure: Largest failure probability allowed for a path, or None for no limit.
+        failure_cost: Cost of a failure in bounds; None for the smallest number of bounds of a path.
+        risk: Failure probability of each bound, or None if the planner has no risk.
     """
 
     paths: AdmissiblePaths
@@ -72,30 +72,30 @@ class Problem:
             require_positive("failure_cost", self.failure_cost, or_zero=True)
             if not self.objective.of_contact:
                 raise TrustboError(
-                    f"failure_cost is a loss of contact, which the objective "
-                    f"{self.objective.name!r} does not include; use max_failure."
+                    f"failure_cost is a loss of contact, but the objective "
+                    f"{self.objective.name!r} does not measure contact; use max_failure instead."
                 )
         shape = self.paths.bounds.shape
         if self.risk is not None and self.risk.p_fail.shape != shape:
-            raise TrustboError(f"p_fail must have shape {shape}; got {self.risk.p_fail.shape}.")
+            raise TrustboError(f"p_fail must have the shape {shape}; got {self.risk.p_fail.shape}.")
 
     @property
     def price(self) -> float:
-        """Cost of a failure, in bounds; 0 without a risk or for objectives not `of_contact`."""
+        """Cost of a failure in bounds; 0 without a risk or if the objective is not `of_contact`."""
         if self.risk is None or not self.objective.of_contact:
             return 0.0
         return float(self.paths.shortest) if self.failure_cost is None else self.failure_cost
 
     def toll_along(self, path: Sequence[Cell] | np.ndarray) -> float:
-        """Sum the tolls of a path."""
+        """Sum the tolls along a path."""
         return float(self.toll[*bounds_along(path).T].sum())
 
     def value_along(
         self, path: Sequence[Cell] | np.ndarray, trust: np.ndarray, noise_sd: np.ndarray
     ) -> np.ndarray:
-        """Compute the value of a path without failures, shape (...,).
+        """Compute the value of a path, shape (...,), under the assumption that no bound fails.
 
-        Computed from the team's trust after each bound, (..., bound), and the sd of a rate, (...,).
+        `trust` (..., bound) is the team's trust after each bound; `noise_sd` (...,) is a rate's sd.
         """
         objective, toll, n_bounds = self.objective, self.toll_along(path), trust.shape[-1]
         if objective.of_contact:
@@ -106,7 +106,7 @@ class Problem:
         return objective.value((trust @ credit - toll) / scale)
 
     def failure_along(self, path: Sequence[Cell] | np.ndarray) -> float:
-        """Compute the cost of a failure times the probability that a path fails."""
+        """Compute the expected cost of failure: `price` times a path's failure probability."""
         return self.price * self.risk.priced(path) if self.risk and self.price else 0.0
 
     def is_within_limit(self, path: Sequence[Cell] | np.ndarray) -> bool:
@@ -118,15 +118,15 @@ class Problem:
     def dynamics(
         self, params: Params, x0: ArrayLike | None = None, *, by_robot: bool = False
     ) -> Dynamics:
-        """Build the recursion of expected trust; see `trust_dynamics`."""
+        """Build the recursion for expected trust (see `trust_dynamics`)."""
         return trust_dynamics(params, self.paths.workspace.awareness.values, x0, by_robot=by_robot)
 
     @cached_property
     def risks(self) -> "Risks | None":
-        """Risks that the searches sum along a path; None where plans do not depend on risk.
+        """Risks that the search sums along a path, or None if plans do not depend on risk.
 
         Raises:
-            TrustboError: If there is a limit but no risk, or `p_fail` of a possible bound is NaN.
+            TrustboError: If `max_failure` is set without a risk, or a possible bound has NaN risk.
         """
         if self.risk is None and self.max_failure is not None:
             raise TrustboError(
@@ -141,27 +141,27 @@ class Problem:
         limit = np.inf
         if self.max_failure is not None:
             limit = -np.log1p(-self.max_failure) + ROUNDING
-            if len(shares) > 1:  # the mean of the strata has the last sum
+            if len(shares) > 1:  # the last sum is for the mean of the strata
                 p_fail = np.concatenate([p_fail, self.risk.p_fail[None]])
                 shares = np.append(shares, 0.0)
         if (missing := np.isnan(p_fail).any(0) & self.paths.bounds).any():
             move, row, col = np.argwhere(missing)[0].tolist()
             raise TrustboError(
-                f"p_fail of the bound into {(row, col)} by move {MOVE_NAMES[move]!r} is NaN; give "
-                "a probability for every possible bound."
+                f"p_fail is NaN for the bound that enters {(row, col)} by the move "
+                f"{MOVE_NAMES[move]!r}; give a probability for every possible bound."
             )
         of_bounds = risk_of(p_fail).reshape(len(p_fail), -1).T
         return Risks(np.ascontiguousarray(of_bounds), self.price * shares, limit)
 
     def best(self, dynamics: Dynamics) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Find the best admissible path under every draw of `dynamics`, or the only one.
+        """Find the best admissible path for each draw of `dynamics`, which may be a single draw.
 
         Returns:
-            Scores (draw,); upper limits on the score of any path, equal to the scores where exact;
-            and paths as flat cells, (draw, cell), filled with -1.
+            Scores (draw,), upper limits on the score of any path (draw,), and paths (draw, cell) as
+            flat cell indices, padded with -1. The limits equal the scores if the search is exact.
 
         Raises:
-            TrustboError: If beta0 is outside the range for which the search is exact.
+            TrustboError: If beta0 is outside the range in which the search is exact.
             InfeasibleError: If no path respects `max_failure`.
         """
         history = has_history(self.objective, self.family)
@@ -175,7 +175,7 @@ class Problem:
             score, paths = best_sums(graph, drift, weights, toll)
             return score, score, paths
         n_trust, loss = 0, LOGISTIC
-        if history:  # the cost is a loss of trust, and no sum of weights
+        if history:  # the cost depends on trust itself and is not a weighted sum of drifts
             n_trust, loss = n_states, LOSSES[self.family.expected_rate]
             weights = Weights(0.0 * weights.per_bound, 0.0 * weights.constant, weights.scale)
         transition, x0 = dynamics.transition[:, :n_trust, :n_trust], dynamics.start[:, :n_trust]
@@ -193,12 +193,13 @@ class Problem:
         beta0 = np.diagonal(dynamics.transition, axis1=-2, axis2=-1)
         if beta0.min() < 0.0 or (history and dynamics.transition.min() < 0.0):
             raise TrustboError(
-                f"objective {self.objective.name!r} needs beta0 >= 0, and B0 >= 0 where rates are "
-                f"not linear in trust; got {dynamics.transition.min():g}. Use 'terminal' or 'mean'."
+                f"the objective {self.objective.name!r} requires beta0 >= 0, and B0 >= 0 if rates "
+                f"are nonlinear in trust; got {dynamics.transition.min():g}. Use 'terminal' or "
+                "'mean' instead."
             )
 
     def _infeasible(self, risk: Risk) -> InfeasibleError:
-        """Make the error for a problem without a path within the limit, with the safest path."""
+        """Make the error that reports the safest path if no path respects `max_failure`."""
         graph, n = self.paths.graph, self.paths.graph.longest + 1
         nothing = Weights(np.zeros((1, n, 1)), np.zeros((1, n)), np.ones(n))
         of_bounds = risk_of(risk.p_fail).ravel()
@@ -206,21 +207,20 @@ class Problem:
         path = self.paths.cells(paths[0])
         p_fail = 1.0 - risk.survival(path)
         return InfeasibleError(
-            f"no admissible path from {path[0]} to {path[-1]} fails with a probability of at most "
-            f"max_failure = {self.max_failure:g}; the least is {p_fail:.4g}, on the path {path}. "
-            "Raise max_failure, admit more paths by max_bounds, or take the safest, the "
-            "attribute path of this error.",
+            f"no admissible path from {path[0]} to {path[-1]} has a failure probability of at most "
+            f"max_failure = {self.max_failure:g}. The smallest is {p_fail:.4g} on the path {path}. "
+            "Increase max_failure or max_bounds, or use this path (attribute `path` of the error).",
             path,
             p_fail,
         )
 
 
 class Risks(NamedTuple):
-    """Risks -log(1 - p_fail) of bounds, to be summed along a path.
+    """Risks -log(1 - p_fail) of the bounds, which are summed along a path.
 
-    Fields: of_bounds (bound, sum), for the strata of the risk and, with a limit, for their mean;
-    failure (sum,), the cost F_m of a path with sum r_m, F_m (1 - exp(-r_m)); and the limit of the
-    last sum.
+    `of_bounds` (bound, sum) has one sum per stratum of the risk and, with a limit, one for the mean
+    of the strata. A path with the sums r_m has the expected failure cost sum_m F_m (1 - exp(-r_m)),
+    where `failure` (sum,) holds the F_m. `limit` is the largest value allowed for the last sum.
     """
 
     of_bounds: np.ndarray
@@ -229,23 +229,23 @@ class Risks(NamedTuple):
 
 
 def risk_of(p_fail: np.ndarray) -> np.ndarray:
-    """Compute the risk -log(1 - p_fail), finite for p_fail = 1; 0 where there is no bound."""
+    """Compute the risk -log(1 - p_fail), which is finite for p_fail = 1 and 0 without a bound."""
     with np.errstate(divide="ignore"):
         return np.minimum(-np.log1p(-np.nan_to_num(p_fail)), _CERTAIN)
 
 
 def draws_of(posterior: Params | xr.DataTree, workspace: Workspace, *, day: bool = False) -> Params:
-    """Return parameters unchanged, or the draws of a posterior: leading axis (draw,).
+    """Return the draws of a posterior, with leading axis (draw,), or given parameters unchanged.
 
-    Features and robots of a posterior are put in the order of the workspace by their names.
-    `day`: see `params_of`. Raises TrustboError for other objects, features or robots.
+    The features and robots of a posterior are reordered by name to match the workspace. For `day`,
+    see `params_of`. Raises TrustboError if the type, the features or the robots are wrong.
     """
     if isinstance(posterior, xr.DataTree):
         return params_of(posterior, workspace, day=day)
-    return require_kind("posterior", posterior, Params, "give one of fit, or draws of parameters")
+    return require_kind("posterior", posterior, Params, "give a posterior from fit, or parameters")
 
 
 def mean_of(params: Params | xr.DataTree, workspace: Workspace) -> Params:
-    """Return the mean of a posterior or of several draws; one draw is returned unchanged."""
+    """Return the mean of a posterior or of several draws; a single draw is returned unchanged."""
     draws = draws_of(params, workspace)
     return draws.mean() if draws.leading else draws

@@ -1,8 +1,8 @@
-"""Reference planner that uses networkx and enumeration, to test the compiled searches.
+"""Reference planner, based on networkx and enumeration, for testing the compiled searches.
 
-Where the value of a path is a sum over its bounds, the best path is found by Bellman-Ford in the
-unrolled graph; where it depends on history or risk, all admissible paths are enumerated. Neither
-uses the package's compiled kernels.
+If the value of a path is a sum over its bounds, the Bellman-Ford algorithm finds the best path in
+the unrolled graph. If the value depends on history or risk, all admissible paths are enumerated.
+Neither method uses the compiled kernels.
 """
 
 from collections.abc import Iterator
@@ -25,11 +25,11 @@ from trustbo.workspace.moves import MOVES
 def plan(planner: Planner, params: Params | xr.DataTree) -> Plan:
     """Find the best admissible path for given parameters, or for the mean of a posterior.
 
-    Its value equals that of `planner.plan(params)`; if several paths are best, they may differ.
+    The value equals that of `planner.plan(params)`. The paths may differ if several are optimal.
 
     Args:
-        planner: Planner of a small grid.
-        params: Posterior or parameters, whose mean is taken.
+        planner: Planner for a small grid.
+        params: Posterior from `fit`, or parameters. Several draws are replaced by their mean.
 
     Raises:
         InfeasibleError: If no path respects `max_failure`.
@@ -45,10 +45,10 @@ def plan(planner: Planner, params: Params | xr.DataTree) -> Plan:
 
 
 def shortest_paths(planner: Planner, dynamics: Dynamics) -> Iterator[tuple[Cell, ...]]:
-    """Find the best path of each number of bounds by `networkx.bellman_ford_path`.
+    """Find the best path for each number of bounds with `networkx.bellman_ford_path`.
 
-    In a path, a bound with j bounds left after it adds w_j . u to the sum, with the weights w_j =
-    sum_{i <= j} credit(i) view . B0^(j - i) of its drift u, and subtracts its toll.
+    A bound with drift u and j bounds left after it adds w_j . u minus its toll to the value, where
+    w_j = sum_{i <= j} credit(i) view . B0^(j - i).
     """
     problem = planner.problem
     graph, n_states = problem.paths.graph, len(dynamics.start)
@@ -59,14 +59,14 @@ def shortest_paths(planner: Planner, dynamics: Dynamics) -> Iterator[tuple[Cell,
         carried = carried @ dynamics.transition + credit[j] * view
         weights.append(carried)
     drift, toll = dynamics.drift.reshape(n_states, -1), problem.toll.ravel()
-    left = graph.left[graph.head]  # after each edge
+    left = graph.left[graph.head]  # number of bounds left after each edge
     cost = [toll[b] - weights[j] @ drift[:, b] for b, j in zip(graph.bound, left, strict=True)]
     network = graph.to_networkx(cost)
     for s in graph.starts:
         start = None, int(graph.cell[s]), int(graph.left[s])
         try:
             nodes = nx.bellman_ford_path(network, start, "goal", weight="cost")
-        except (nx.NetworkXNoPath, nx.NodeNotFound):  # none without a U-turn
+        except (nx.NetworkXNoPath, nx.NodeNotFound):  # every path has a U-turn
             continue
         cells = np.array([node[1] for node in nodes[:-1]])
         yield (*problem.paths.cells(cells), planner.goal)

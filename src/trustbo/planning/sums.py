@@ -1,8 +1,8 @@
 """Dynamic programming on the unrolled graph, for objectives that are sums over the bounds.
 
-With j bounds left after a bound, its drift u adds w_j . u to the value, whatever the length of the
-path: w_j is the sum over i <= j of credit(i) view . B0^(j - i), see `objectives.weights_of`. States
-are processed in order of the bounds left, so that successors are final (Bellman 1958).
+A bound with drift u and j bounds left after it adds w_j . u to the value, for any path length. The
+weight w_j is the sum of credit(i) view . B0^(j - i) over i <= j (see `objectives.weights_of`).
+States are processed in order of bounds left, so their successors are final (Bellman 1958).
 """
 
 import numpy as np
@@ -15,16 +15,16 @@ from trustbo.planning.unrolled import Unrolled, edges_from, fill_to_go, kernel, 
 def best_sums(
     graph: Unrolled, drift: np.ndarray, weights: Weights, toll: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find the best path of every draw: the largest (constant + sum of w_j . u - tolls) / scale.
+    """Find the path with the largest (constant + sum of w_j . u - tolls) / scale for each draw.
 
     Args:
         graph: Unrolled graph.
-        drift: Drift of trust, (draw, state of trust, bound).
+        drift: Drift of each state of trust, shape (draw, state, bound).
         weights: Weights of the drift.
-        toll: Further cost of each bound, (bound,).
+        toll: Additional cost of each bound, shape (bound,).
 
     Returns:
-        Scores (draw,), and paths as flat cells, (draw, cell), filled with -1.
+        Scores (draw,), and paths (draw, cell) as flat cell indices, padded with -1.
     """
     n = len(drift)
     scores, paths = np.full(n, -np.inf), np.full((n, graph.longest + 1), -1, np.int32)
@@ -57,7 +57,7 @@ def _best_sums(graph, drift, per_bound, constant, scale, toll, scores, paths, be
 
 @kernel
 def costs_of_sums(graph, drift, per_bound, toll, cost) -> None:
-    """Write the cost of each edge under one draw: its toll less w_j . u."""
+    """Write the cost of each edge for one draw, which is the toll minus w_j . u, to `cost`."""
     for e in range(len(graph.head)):
         left, b = graph.left[graph.head[e]], graph.bound[e]
         cost[e] = toll[b]

@@ -1,9 +1,9 @@
-"""The unrolled graph: the bounds of a path problem, copied for each number of bounds left.
+"""The unrolled graph, which repeats the bounds of a path problem for each number of bounds left.
 
-A state (cell, left) is a cell with `left` bounds to go. An edge is a bound; it leads to
-a state with one bound less. Every path through the graph is admissible, and every admissible path
-is in it. Kernels process its arrays once, in the order of `left`; `to_networkx` exports the same
-edges.
+A state (cell, left) is a cell from which exactly `left` bounds remain. An edge is a bound and leads
+to a state with one bound fewer left. The paths through the graph are the admissible paths, except
+that U-turns must be excluded if they are forbidden. Kernels process the arrays once, in the order
+of `left`, and `to_networkx` exports the same edges.
 """
 
 from collections.abc import Sequence
@@ -14,19 +14,19 @@ import numpy as np
 from numba import njit
 
 kernel = njit(cache=True, nogil=True, error_model="numpy")
-"""Numba decorator of the kernels: cached on disk, releases the GIL, and 1 / 0 is inf."""
+"""Numba decorator that caches kernels on disk, releases the GIL, and lets 1 / 0 return inf."""
 
 
 class Unrolled(NamedTuple):
-    """Graph of states, ordered by the bounds left from the goal on, and of edges by their tails.
+    """Graph whose states are sorted by the bounds left, and whose edges are sorted by their tails.
 
     Fields:
-        cell: Flat index of the cell of each state, (state,).
-        left: Bounds left in each state, (state,).
-        first: Edges first[s] to first[s + 1] - 1 leave state s, (state + 1,).
-        head: State that each edge leads to, (edge,).
-        bound: Bound of each edge, move * cells + cell entered, (edge,).
-        starts: State of the start for each number of bounds, from fewest to most, (length,).
+        cell: Flat index of the cell of each state, shape (state,).
+        left: Number of bounds left in each state, shape (state,); 0 for the first, the goal.
+        first: Index of the first edge that leaves each state, shape (state + 1,).
+        head: State to which each edge leads, shape (edge,).
+        bound: Flat index move * cells + cell of the bound of each edge, shape (edge,).
+        starts: State of the start cell for each number of bounds, ascending, shape (length,).
         turns: Whether U-turns are allowed.
     """
 
@@ -46,12 +46,12 @@ class Unrolled(NamedTuple):
     def to_networkx(self, cost: Sequence[float] | np.ndarray) -> nx.DiGraph:
         """Return a networkx graph with the `cost` and the `bound` of each edge.
 
-        Every path of the graph from a node `(None, start, left)` to the node `"goal"` is
-        admissible. A node is (cell before, cell, bounds left); the cell before is None where
-        U-turns are allowed, as it is not needed then.
+        Every path from a node `(None, start, left)` to the node `"goal"` is admissible. Each other
+        node is a tuple (previous cell, cell, bounds left). If U-turns are allowed, the previous
+        cell is not needed and is None.
 
         Args:
-            cost: Cost of each edge, (edge,).
+            cost: Cost of each edge, shape (edge,).
         """
         graph = nx.DiGraph()
         nodes: list[tuple[int | None, int]] = [(None, s) for s in self.starts.tolist()]
@@ -73,10 +73,10 @@ class Unrolled(NamedTuple):
 
 
 class ToGo(NamedTuple):
-    """Least cost from each state to the goal, (state,), its first edge, and the second best.
+    """Least cost from each state to the goal (state,), its first edge, and the second-best of both.
 
-    The second best begins with another edge: where a path may not turn back, at most one first
-    edge is forbidden, so that these two suffice.
+    The second-best path begins with another edge. Two alternatives suffice even without U-turns,
+    because a U-turn rule excludes at most one first edge.
     """
 
     least: np.ndarray
@@ -87,14 +87,14 @@ class ToGo(NamedTuple):
 
 @kernel
 def new_to_go(n_states: int) -> ToGo:
-    """Allocate the costs to go of `n_states` states."""
+    """Allocate the costs to the goal for `n_states` states."""
     edge, other = np.full(n_states, -1), np.full(n_states, -1)
     return ToGo(np.zeros(n_states), edge, np.full(n_states, np.inf), other)
 
 
 @kernel
 def fill_to_go(graph, cost, to_go) -> None:
-    """Write the least costs to go for edge costs (edge,), by dynamic programming from the goal."""
+    """Fill `to_go` for the edge costs (edge,) by dynamic programming, starting at the goal."""
     least, edge, second, other = to_go
     cell, first, head = graph.cell, graph.first, graph.head
     for s in range(1, len(cell)):
@@ -113,7 +113,7 @@ def fill_to_go(graph, cost, to_go) -> None:
 
 @kernel
 def edges_from(graph, to_go, start, edges) -> int:
-    """Write the edges of the cheapest path from a state; returns their number."""
+    """Write the edges of the cheapest path from a state to `edges`, and return their number."""
     s, before, n = start, -1, 0
     while s > 0:
         e = to_go.edge[s]
