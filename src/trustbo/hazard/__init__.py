@@ -1,6 +1,6 @@
-"""Hazard: the probability that a bound ends the mission, learned from failed missions."""
+"""Hazard: the probability that a bound ends the mission, inferred from past missions."""
 
 from trustbo.hazard.prior import Hazard
 
 __all__ = ["Hazard"]
-__dir__ = __all__.copy  # completion lists public names alone
+__dir__ = __all__.copy  # completion lists only public names

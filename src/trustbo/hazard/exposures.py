@@ -1,4 +1,4 @@
-"""Exposures of bounds: how often each was begun, and how often it ended a mission."""
+"""Exposures of bounds: how often each bound was begun and how often it ended a mission."""
 
 from collections.abc import Sequence
 from typing import NamedTuple, Self
@@ -10,16 +10,16 @@ from trustbo.errors import TrustboError
 from trustbo.workspace.moves import bounds_along
 
 CAUSES = ("stuck", "tipped", "timeout", "collision", "lost_contact")
-"""Statuses of failed bounds; the last bound of an aborted mission has no outcome."""
+"""Mission statuses after a failed bound. In an aborted mission, the last bound has no outcome."""
 
 
 class LostMission(NamedTuple):
-    """A mission that failed and did not report.
+    """A failed mission without any measurements.
 
     Attributes:
-        path: Planned cells, start first.
-        where: Cell that the team failed to enter, at its first occurrence in the path; None if
-            unknown.
+        path: Planned cells, beginning with the start.
+        where: Cell that the team failed to enter, or None if unknown. If the path enters the cell
+            more than once, the first time is meant.
     """
 
     path: tuple[Cell, ...]
@@ -27,13 +27,13 @@ class LostMission(NamedTuple):
 
 
 class Exposures(NamedTuple):
-    """Exposures of the bounds that missions attempted, the sufficient statistics of the hazard.
+    """Exposure counts of attempted bounds, which are sufficient statistics of the hazard model.
 
     Attributes:
-        bounds: Distinct bounds in lexicographic order, shape (bound, 3): index of the move in
-            `MOVES`, row and column of the cell entered.
+        bounds: Distinct bounds in lexicographic order, shape (bound, 3). The columns are the index
+            of the move in `MOVES` and the row and column of the cell entered.
         n: Number of exposures with a known outcome, shape (bound,).
-        failed: Number of these exposures that failed, shape (bound,).
+        failed: Number of failures among the exposures in `n`, shape (bound,).
         lost: Planned bounds of each mission lost at an unknown place, as indices into `bounds`.
     """
 
@@ -44,12 +44,12 @@ class Exposures(NamedTuple):
 
     @classmethod
     def of(cls, missions: Sequence[Mission], lost: Sequence[LostMission] = ()) -> Self:
-        """Count the exposures of missions that reported and of missions that were lost.
+        """Count the exposures in measured missions and in lost missions.
 
-        The last bound of a mission that failed is a failure; an aborted bound is not counted.
+        The last bound of a failed mission counts as a failure. An aborted bound is not counted.
 
         Raises:
-            TrustboError: If a path jumps or does not enter `where`.
+            TrustboError: If a path skips cells or does not enter `where`.
         """
         known = [_reported(mission) for mission in missions]
         known += [_located(mission) for mission in lost if mission.where is not None]
@@ -68,7 +68,7 @@ class Exposures(NamedTuple):
 
 
 def _reported(mission: Mission) -> tuple[Sequence[Cell], bool]:
-    """Return the path up to the last known outcome, and whether that bound failed."""
+    """Return the path up to the last bound with a known outcome, and whether that bound failed."""
     n, fails = len(mission.bounds), mission.status in CAUSES
     return mission.path[: n + (fails or mission.status == "ok")], fails
 

@@ -1,16 +1,16 @@
-"""Hazard of bounds: the probability that a bound ends the mission, learned from missions.
+"""Hazard model: the probability that a bound ends the mission, inferred from missions.
 
-Bound e, from one cell to the next, fails with probability p_e ~ Beta(s m_e, s (1 - m_e)). Its prior
-mean depends on the difficulty of the route and on t_e, the degrees by which it exceeds the slope
-limit,
+Bound e fails with probability p_e ~ Beta(s m_e, s (1 - m_e)). The prior mean m_e depends on the
+difficulties of the bound's route and on t_e, the number of degrees by which the tilt of the route
+exceeds the slope limit:
 
     1 - m_e = sigma(-logit_e) sigma(-(t_e + margin) / width),
     logit_e = intercept + sum_j coefficient_j (difficulty_ej - 1/2).
 
-The p_e are integrated out, and the few parameters are drawn by importance sampling of their normal
-scores. While the proposals adapt, missions lost at unknown places are treated as independent. Then
-the places where they failed are imputed at every point (sequential imputation; Kong, Liu and Wong
-1994), and the weights are corrected, so that the draws follow the joint posterior.
+The p_e are integrated out, and the other parameters are drawn by importance sampling of their
+normal scores. During adaptation of the proposals, missions lost at unknown places are treated as
+independent. Then their places of failure are imputed at every point (sequential imputation; Kong,
+Liu and Wong 1994). The weights are corrected, so that the draws follow the joint posterior.
 """
 
 import time
@@ -50,19 +50,19 @@ def fit_hazard(
         workspace: Workspace of the missions; its terrain determines the difficulty of bounds.
             Without a terrain, all bounds have the same prior mean.
         hazard: Priors; by default `Hazard()`.
-        lost: Missions that failed and did not report.
-        seed: Seed; the same seed gives the same posterior.
+        lost: Failed missions without measurements.
+        seed: Random seed; the same seed gives the same posterior.
 
     Returns:
-        The group `hazard` of a posterior: `intercept` (draw), `coefficient` (draw, measure),
-        `margin` and `width` of the slope limit (draw), in degrees, where there is a terrain,
-        `strength` (draw), and `place` (draw, lost), the bound, counted from 1, at which each
-        mission lost at an unknown place failed; `p_fail` (move, row, col), posterior mean of the
-        failure probability, NaN where there is no bound; `exposures` and `failures` (move, row,
-        col), counts of known outcomes. `BoundRisk` draws from it.
+        The group `hazard` of a posterior. The posterior draws are `intercept` (draw),
+        `coefficient` (draw, measure), `strength` (draw) and, with a terrain, `margin` and `width`
+        (draw) of the slope limit in degrees. `place` (draw, lost) is the bound, counted from 1, at
+        which each mission lost at an unknown place failed. `p_fail` (move, row, col) is the
+        posterior mean failure probability, and NaN where there is no bound. `exposures` and
+        `failures` (move, row, col) count known outcomes. `BoundRisk` draws from the group.
 
     Raises:
-        TrustboError: If a mission's path jumps or leaves the grid.
+        TrustboError: If the path of a mission skips cells or leaves the grid.
         PosteriorError: If k-hat > 0.7.
     """
     started, hazard = time.perf_counter(), hazard or Hazard()
@@ -70,9 +70,9 @@ def fit_hazard(
     shape, cells = difficulty.shape[1:3], exposures.bounds[:, 1:]
     for cell in cells[((cells < 0) | (cells >= shape)).any(1)]:
         name = tuple(cell.tolist())
-        raise TrustboError(f"a mission enters {name}, outside the grid of {shape} rows and cols.")
+        raise TrustboError(f"a mission enters {name}, outside the grid of shape {shape}.")
 
-    # A driven bound that does not exist on the map gets the largest difficulty.
+    # A bound that was driven but does not exist on the map has the largest difficulty.
     met = np.nan_to_num(difficulty.values[*exposures.bounds.T], nan=1.0)
     measures = difficulty["measure"].values.tolist()
     prior = hazard.of_bounds(met, measures, workspace.team.max_slope)
@@ -83,21 +83,21 @@ def fit_hazard(
     group = group.assign(p_fail=(_MAPS, BoundRisk(group, workspace).mean))
     group.attrs["seconds"] = time.perf_counter() - started
     if not points.k_hat <= importance.MAX_KHAT:
-        reason = f"hazard refused: k-hat = {points.k_hat:.2f} > {importance.MAX_KHAT:g}."
-        raise PosteriorError(reason, group, "Give firmer priors, Hazard(...).")
+        reason = f"hazard posterior rejected: k-hat = {points.k_hat:.2f} > {importance.MAX_KHAT:g}."
+        raise PosteriorError(reason, group, "Use more informative priors in Hazard(...).")
     return group
 
 
 def sample(
     prior: BoundPrior, exposures: Exposures, rng: np.random.Generator
 ) -> tuple[importance.Points, np.ndarray]:
-    """Draw weighted points, and the bound where each lost mission failed at each point."""
+    """Draw weighted points and, for each point, the bound at which each lost mission failed."""
     n, failed, paths = exposures.n, exposures.failed, exposures.lost
     counts, kind = np.unique(n, return_inverse=True)
     times, bad = np.bincount(kind, minlength=len(counts)), failed > 0.0
 
     def log_any_fails(alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
-        """Compute the log probability that all lost missions fail, if independent."""
+        """Compute the log probability that all lost missions fail, as if independent."""
         if not paths:
             return np.zeros(len(alpha))
         a, b = alpha + failed, beta + n - failed
@@ -113,8 +113,8 @@ def sample(
         return total - _log_rising(strength, counts) @ times
 
     starts = np.zeros((3, len(prior.center)))
-    starts[1:, -1] = -1.5, 1.5  # modes of the strength: certain outcomes, equal bounds
-    for more in (1, 8):  # a second time with more points, should the weights be uneven
+    starts[1:, -1] = -1.5, 1.5  # low and high strength, as its posterior may have two modes
+    for more in (1, 8):  # repeat with more points if the weights are uneven
         size, enough = more * _ROUND, more * _ENOUGH
         points = importance.sample(log_density, starts, rng, size=size, enough=enough)
         places = np.zeros((len(points.z), len(paths)), int)
@@ -136,17 +136,17 @@ def _log_rising(x: np.ndarray, k: np.ndarray) -> np.ndarray:
 def impute(
     a: np.ndarray, b: np.ndarray, paths: Sequence[np.ndarray], rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draw where lost missions failed, one after the other.
+    """Draw the bounds at which lost missions failed, one mission after the other.
 
     Args:
         a: Alpha of each bound's Beta distribution without the lost missions, shape (point, bound).
         b: Beta of the same distributions, shape (point, bound).
-        paths: Bounds of each lost mission.
-        rng: Generator of random numbers.
+        paths: Bound indices of each lost mission.
+        rng: Random number generator.
 
     Returns:
-        Places (point, mission), as indices into the missions' paths; and log weights (point,). The
-        weights have the probability that all missions fail as their mean.
+        Places (point, mission), as indices into the paths, and log weights (point,). The mean of
+        the weights is the probability that all missions fail.
     """
     a, b, uniform = a.copy(), b.copy(), rng.random((len(a), len(paths)))
     places, log_weight = np.zeros(uniform.shape, int), np.zeros(len(a))
@@ -170,10 +170,10 @@ def impute(
 def _lookahead(
     path: np.ndarray, later: Sequence[np.ndarray], a: np.ndarray, b: np.ndarray
 ) -> np.ndarray:
-    """Compute how much a failure at each bound of a path makes later failures more likely.
+    """Compute how much a failure at each bound (point, bound) makes later failures more likely.
 
-    Shape (point, bound). Without it, the rare points that attribute several failures to one bound
-    would have large weights.
+    Without this factor, the rare points that attribute several failures to one bound would have
+    large weights.
     """
     favour = np.ones((len(a), len(path)))
     for other in later:
@@ -194,7 +194,7 @@ def _to_dataset(
     difficulty: xr.DataArray,
     seed: int,
 ) -> xr.Dataset:
-    """Make the group `hazard` without the maps of failure probabilities."""
+    """Make the group `hazard` without `p_fail`."""
     rng = np.random.default_rng([seed, 2])
     chosen = rng.permutation(points.resample(_N_DRAWS, rng))
     weights, limit, strength = prior.values(points.z[chosen])

@@ -1,4 +1,4 @@
-"""Prior of the probability that a bound fails, as a function of normal scores."""
+"""Prior on the probability that a bound fails, as a function of normal scores."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,39 +14,39 @@ from trustbo.errors import TrustboError, require_positive
 REFERENCE = 0.5
 """Difficulty at which the intercept is the logit of the prior mean."""
 TILT = "tilt"
-"""Measure of difficulty to which the slope limit applies."""
+"""Difficulty measure to which the slope limit applies."""
 LIMIT_NAMES = ("margin", "width")
-"""Parameters of the robots' slope limit, degrees."""
+"""Parameters of the robots' slope limit, in degrees."""
 FLOOR = 1e-12
-"""Least alpha and beta of a prior Beta: the logistic of a mean may round to 0 or 1."""
+"""Smallest alpha and beta of a Beta prior, needed because the prior mean may round to 0 or 1."""
 _LARGEST_LOG = 50.0
-_FARTHEST = 40.0  # sds of the wide normal up to which the margin's quantile is tabulated
+_FARTHEST = 40.0  # largest tabulated margin, in sds of the wide normal
 
 
 @dataclass(frozen=True)
 class Hazard:
-    """Priors of the probability that a bound ends the mission; normal priors are (mean, sd).
+    """Priors on the probability that a bound ends the mission; normal priors are (mean, sd) pairs.
 
-    By default, the stated slope limit is correct to half a degree with probability .9, and off by
-    about 4 degrees with probability .1.
+    By default, the stated slope limit is accurate to half a degree with probability .9, and wrong
+    by about 4 degrees with probability .1.
 
     Attributes:
-        intercept: Prior of the logit of the mean failure probability at medium difficulty.
-        coefficient: Prior of the weight of each measure of difficulty, which ranges from easy (0)
-            to the robots' limit (1). Tilt has no weight; it enters through the slope limit.
-        margin: Prior of how far, in degrees, the team's true slope limit is below the stated one,
-            if the stated one is about right. All bounds share the margin, so a failure on one makes
-            failures on equally steep bounds more probable.
-        doubt: Probability that the stated limit is wrong, and the sd of the margin in that case,
-            degrees; the prior of the margin is a mixture of two normals with the same mean. Use a
-            probability of 0 for a measured limit.
-        log_width: Prior of the log of the width of the limit in degrees: the failure probability
-            rises from .1 to .9 within 4.4 widths of tilt.
-        log_strength: Prior of the log of the strength s: the weight of the prior mean in units of
-            observations, small if each bound fails either always or never.
+        intercept: Prior on the logit of the mean failure probability at medium difficulty.
+        coefficient: Prior on the weight of each difficulty measure, which is 0 for an easy route
+            and 1 at the robots' limit. Tilt has no weight, but enters through the slope limit.
+        margin: Prior on the number of degrees by which the true slope limit is below the stated
+            limit, if the stated limit is about right. All bounds share the margin, so a failure on
+            one bound makes failures on equally steep bounds more probable.
+        doubt: Probability that the stated limit is wrong, and the sd of the margin in that case, in
+            degrees. The prior on the margin is a mixture of two normals with the same mean. For a
+            measured limit, use the probability 0.
+        log_width: Prior on the log of the limit's width in degrees. The failure probability
+            increases from .1 to .9 if the tilt increases by 4.4 widths.
+        log_strength: Prior on the log of the strength s, which is the weight of the prior mean in
+            units of observations. The strength is small if each bound either always or never fails.
 
     Raises:
-        TrustboError: If an sd is not positive, or the probability of `doubt` is outside [0, 1).
+        TrustboError: If an sd is not positive, or the probability in `doubt` is outside [0, 1).
     """
 
     intercept: tuple[float, float] = (-7.5, 1.5)
@@ -69,7 +69,7 @@ class Hazard:
     def of_bounds(
         self, difficulty: np.ndarray, measures: Sequence[str], max_slope: float
     ) -> "BoundPrior":
-        """Make the prior of bounds with difficulties (bound, measure) and a slope limit in rad."""
+        """Make the prior for bounds with the given difficulty (bound, measure) and limit in rad."""
         weighted = [m for m, name in enumerate(measures) if name != TILT]
         normals, steepness = [self.intercept, *[self.coefficient] * len(weighted)], None
         if TILT in measures:
@@ -80,24 +80,24 @@ class Hazard:
 
 
 class BoundPrior(NamedTuple):
-    """Beta priors of the failure probabilities of bounds, as functions of normal scores.
+    """Beta priors on the failure probabilities of bounds, as functions of normal scores z.
 
-    A parameter is center + scale z, on the log scale for width and strength; the margin is the
-    quantile of its mixture.
+    Each parameter is center + scale z, on the log scale for the width and strength. The margin is
+    the corresponding quantile of its mixture prior.
     """
 
     center: np.ndarray  # (parameter,)
     scale: np.ndarray  # (parameter,)
-    difficulty: np.ndarray  # (bound, measure), less the reference
-    steepness: np.ndarray | None  # (bound,), degrees beyond the stated limit; None: no limit
+    difficulty: np.ndarray  # (bound, measure), minus REFERENCE
+    steepness: np.ndarray | None  # (bound,), degrees beyond the stated limit; None without a limit
     doubt: tuple[float, float]
 
     def values(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Compute the parameters at scores (point, parameter).
+        """Compute the parameters at normal scores (point, parameter).
 
         Returns:
-            Intercept and coefficients (point, 1 + measure); margin and width of the limit (point,
-            2), or (point, 0) without one; strength (point,).
+            Intercept and coefficients (point, 1 + measure), margin and width (point, 2), and
+            strength (point,). Without a slope limit, the second array has shape (point, 0).
         """
         values = self.center + self.scale * z
         n = 1 + self.difficulty.shape[1]
@@ -110,7 +110,7 @@ class BoundPrior(NamedTuple):
         return values[:, :n], values[:, n:-1], values[:, -1]
 
     def betas(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Compute alpha and beta, each (point, bound), at scores (point, parameter)."""
+        """Compute alpha and beta, each (point, bound), at normal scores (point, parameter)."""
         return prior_betas(*self.values(z), self.difficulty, self.steepness)
 
 
@@ -121,10 +121,10 @@ def prior_betas(
     difficulty: np.ndarray,
     steepness: np.ndarray | None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Compute alpha and beta of the prior Beta of each bound, each (point, bound).
+    """Compute alpha and beta of the Beta prior on each bound, both (point, bound).
 
-    A bound is passed if neither its difficulty nor the limit stops the robots: 1 - m is the product
-    of sigma(-logit) and sigma(-(steepness + margin) / width).
+    A bound is passed if neither its difficulty nor the slope limit stops the robots. Therefore,
+    1 - m is the product of sigma(-logit) and sigma(-(steepness + margin) / width).
     """
     logit = weights[:, :1] + weights[:, 1:] @ difficulty.T
     fails, passes = special.expit(logit), special.expit(-logit)
@@ -135,14 +135,14 @@ def prior_betas(
 
 
 def steepness_of(tilt: np.ndarray, max_slope: float) -> np.ndarray:
-    """Convert a tilt, as a share of the limit's tangent, to degrees beyond the limit (rad)."""
+    """Convert a tilt, relative to the tangent of the limit (rad), to degrees beyond the limit."""
     return np.rad2deg(np.arctan(tilt * np.tan(max_slope)) - max_slope)
 
 
 def mixture_quantile(z: np.ndarray, narrow: float, share: float, wide: float) -> np.ndarray:
     """Solve Phi(z) = (1 - share) Phi(x / narrow) + share Phi(x / wide) for x.
 
-    The value is interpolated to 1e-5 of `narrow`, and linear in the far tails, with the larger sd.
+    Interpolation is accurate to 1e-5 `narrow`. In the far tails, the slope is the larger sd.
     """
     curve = _quantile_curve(float(narrow), share, wide)
     end = curve.x[-1]
@@ -152,10 +152,10 @@ def mixture_quantile(z: np.ndarray, narrow: float, share: float, wide: float) ->
 
 @cache
 def _quantile_curve(narrow: float, share: float, wide: float) -> PchipInterpolator:
-    """Compute the quantile for z >= 0; the mixture is symmetric."""
+    """Compute the quantile function for z >= 0, which suffices as the mixture is symmetric."""
     largest = _FARTHEST * max(narrow, wide)
     x = narrow * np.sinh(np.linspace(0.0, np.arcsinh(largest / narrow), 4000))
-    # Upper tails by their logs, as 1 - F rounds to 0 from 38 sds on.
+    # Use the logs of the upper tails, because 1 - F rounds to 0 beyond 38 sds.
     tails = (
         np.log1p(-share) + special.log_ndtr(-x / narrow),
         np.log(share) + special.log_ndtr(-x / wide),

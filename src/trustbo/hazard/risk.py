@@ -17,28 +17,28 @@ from trustbo.workspace.difficulty import difficulty_of
 from trustbo.workspace.moves import bounds_along
 
 ROUNDING = 1e-12
-"""Rounding tolerance for the risk of a path at the limit."""
+"""Tolerance for rounding errors when the risk of a path is compared with its limit."""
 _BAND = (0.05, 0.95)
-_ENTRIES = 1 << 20  # of (draw, bound) at a time
-_SOME = 256  # number of bounds whose mean probability orders the draws
+_ENTRIES = 1 << 20  # maximum size of an array (draw, bound)
+_SOME = 256  # approximate number of bounds whose mean probability orders the draws
 
 
 class BoundRisk:
     """Posterior of the probability that each bound of a workspace ends the mission.
 
-    Maps have shape (move, row, col), the move (see `MOVES`) and the cell entered by each bound; NaN
-    where there is no bound.
+    The maps have shape (move, row, col), where (row, col) is the cell that a bound enters by a move
+    of `MOVES`. Probabilities are NaN where there is no bound.
 
     Attributes:
-        exists: Whether the bound exists, (move, row, col).
-        exposures: Known exposures, (move, row, col).
-        failures: Known failures, (move, row, col).
-        steepness: Degrees by which bounds exceed the stated slope limit, (move, row, col), or None
-            without a limit.
+        exists: Whether each bound exists, shape (move, row, col).
+        exposures: Number of exposures with a known outcome, shape (move, row, col).
+        failures: Number of failures at a known bound, shape (move, row, col).
+        steepness: Degrees by which each bound exceeds the stated slope limit, shape (move, row,
+            col), or None without a limit.
     """
 
     def __init__(self, hazard: xr.Dataset, workspace: Workspace) -> None:
-        """Set the group `hazard` of a posterior, see `fit_hazard`, and the workspace."""
+        """Read the group `hazard` of a posterior (see `fit_hazard`) for a workspace."""
         self.exists = workspace.passable_bounds.values
         self.exposures, self.failures = hazard["exposures"].values, hazard["failures"].values
         difficulty = difficulty_of(workspace)
@@ -71,7 +71,7 @@ class BoundRisk:
 
     @cached_property
     def stopped(self) -> np.ndarray:
-        """Posterior expected number of past failures, shape (move, row, col)."""
+        """Posterior mean number of past failures on each bound, shape (move, row, col)."""
         counts = self.failures.copy()
         for j, path in enumerate(self._lost):
             for k, bound in enumerate(path, start=1):
@@ -82,9 +82,9 @@ class BoundRisk:
         """Draw the failure probabilities, shape (draw, move, row, col).
 
         Args:
-            n: Number of draws. Hyperparameter draws are evenly spaced from the mildest to the most
-                severe, so that few draws suffice for the mean probability to arrive.
-            seed: Seed of the draws from the Beta distributions.
+            n: Number of draws. Their hyperparameters are evenly spaced from the mildest to the most
+                severe draw, so that few draws suffice to estimate the arrival probability.
+            seed: Random seed.
         """
         rng, order = np.random.default_rng(seed), np.argsort(self._severity)
         steps = (np.arange(require_whole("n", n, 1)) + 0.5) / n
@@ -95,9 +95,9 @@ class BoundRisk:
         return out
 
     def strata(self, n: int = MOST) -> Strata:
-        """Average the failure probabilities over at most `n` groups of draws; see `Strata`.
+        """Average the failure probabilities within at most `n` groups of draws (see `Strata`).
 
-        Their mean, weighted by the shares, equals the mean over all draws.
+        The mean of the groups, weighted by their shares, equals the mean over all draws.
         """
         order = np.argsort(self._severity)
         ends = partition(self._severity[order], require_whole("n", n, 1))
@@ -112,13 +112,13 @@ class BoundRisk:
 
     @cached_property
     def _severity(self) -> np.ndarray:
-        """Mean failure probability of some bounds under each hyperparameter draw, (draw,)."""
+        """Mean failure probability (draw,) over a subset of bounds for each hyperparameter draw."""
         some = np.flatnonzero(self.exists)
         a, b = self._betas_of(some[:: 1 + len(some) // _SOME])
         return (a / (a + b)).mean(1)
 
     def _betas(self, draws: Any = slice(None)) -> Iterator[tuple[np.ndarray, ...]]:
-        """Yield existing bounds in chunks: flat indices, and alpha and beta (draw, bound)."""
+        """Yield chunks of existing bounds: flat indices, and alpha and beta (draw, bound)."""
         every, n_draws = np.flatnonzero(self.exists), len(self._strength[draws])
         step = max(1, _ENTRIES // n_draws)
         for start in range(0, len(every), step):
@@ -126,7 +126,7 @@ class BoundRisk:
             yield bounds, *self._betas_of(bounds, draws)
 
     def _betas_of(self, bounds: np.ndarray, draws: Any = slice(None)) -> tuple[np.ndarray, ...]:
-        """Return alpha and beta of the posterior Beta distributions of bounds: (draw, bound)."""
+        """Return alpha and beta (draw, bound) of the posterior Beta distributions of bounds."""
         where = np.unravel_index(bounds, self.exists.shape)
         steepness = None if self.steepness is None else self.steepness[where]
         drawn = self._weights[draws], self._limit[draws], self._strength[draws]
@@ -141,9 +141,9 @@ class BoundRisk:
 
 
 def add_lost(path: np.ndarray, place: np.ndarray, a: np.ndarray, b: np.ndarray) -> None:
-    """Add a mission that failed at `place` (point,) of its path to Betas a, b (point, bound).
+    """Update a and b (point, bound) with a mission that failed at index `place` (point,) of `path`.
 
-    Negative indices in the path are bounds that are not among these.
+    Negative indices in the path mean bounds that are not in `a` and `b`.
     """
     for k, e in enumerate(path):
         if e >= 0:
@@ -156,14 +156,14 @@ class Risk:
     """Probability that each bound of a workspace ends the mission.
 
     Attributes:
-        p_fail: Posterior mean, shape (move, row, col) with the moves of `MOVES`; NaN where there
+        p_fail: Posterior mean, shape (move, row, col), with the moves of `MOVES`. NaN where there
             is no bound.
-        draws: Draws from the posterior, shape (draw, move, row, col), or None.
-        strata: Failure probabilities under groups of draws, used for the cost of a failure; if
-            None, `p_fail` is used, as if bounds were independent.
+        draws: Posterior draws, shape (draw, move, row, col), or None.
+        strata: Mean failure probabilities of groups of draws, used for the expected cost of
+            failure. If None, bounds fail independently with `p_fail`.
 
     Raises:
-        TrustboError: If a shape differs, or a probability is outside [0, 1].
+        TrustboError: If the shapes do not match, or a probability is outside [0, 1].
     """
 
     p_fail: np.ndarray
@@ -176,19 +176,19 @@ class Risk:
             if p is None:
                 continue
             if p.ndim != 4 or p.shape[1:] != self.p_fail.shape:
-                raise TrustboError(f"{name} must be (..., move, row, col); got shape {p.shape}.")
+                raise TrustboError(f"{name} has the shape {p.shape}, not (..., move, row, col).")
             if (bad := (p < 0.0) | (p > 1.0)).any():
                 raise TrustboError(f"{name} must be in [0, 1]; got {p[bad][0]:g}.")
 
     def survival(self, path: Sequence[Cell] | np.ndarray) -> float:
-        """Compute the product of 1 - p_fail along a path, used for the limit `max_failure`.
+        """Compute the product of 1 - p_fail along a path, which is used to check `max_failure`.
 
-        The probability to arrive is larger if failures are correlated under the draws; see `along`.
+        The arrival probability is larger if failures are correlated (see `along`).
         """
         return float(np.prod(1.0 - self.p_fail[*bounds_along(path).T]))
 
     def priced(self, path: Sequence[Cell] | np.ndarray) -> float:
-        """Compute the probability that a path fails, averaged over strata, for the failure cost."""
+        """Compute the failure probability of a path as the mean over strata, for `failure_cost`."""
         if self.strata is None:
             return 1.0 - self.survival(path)
         p_fail, shares = self.strata
@@ -196,7 +196,7 @@ class Risk:
         return float(shares @ (1.0 - np.prod(1.0 - p, axis=1)))
 
     def along(self, path: Sequence[Cell] | np.ndarray) -> "PathRisk":
-        """Select the bounds of a path."""
+        """Compute the risk along a path."""
         index = tuple(bounds_along(path).T)
         p = self.p_fail[index]
         reach = np.cumprod(1.0 - p)
@@ -204,8 +204,8 @@ class Risk:
             return PathRisk(p, float(reach[-1]), (np.nan, np.nan))
         drawn = self.draws[:, *index]
         low, high = np.quantile(np.prod(1.0 - drawn, axis=1), _BAND).tolist()
-        # Bounds are likelier to be passed together than if they were independent. The ratio of the
-        # two probabilities is free of the error that few draws make in each p_fail.
+        # Passing all bounds is more probable than if they were independent. The ratio of the two
+        # probabilities is not affected by the sampling error of each mean p_fail.
         together = np.cumprod(1.0 - drawn, axis=1).mean(0)
         apart = np.cumprod((1.0 - drawn).mean(0))
         ratio = np.divide(together, apart, out=np.ones_like(apart), where=apart > 0.0)
@@ -214,22 +214,22 @@ class Risk:
 
 
 class PathRisk(NamedTuple):
-    """Probability that each bound of a path ends the mission, given that it is begun."""
+    """Failure probabilities of the bounds of a path, and the arrival probability."""
 
     p_fail: np.ndarray
-    """Posterior mean, shape (bound,)."""
+    """Posterior mean probability that each bound, once begun, ends the mission, shape (bound,)."""
     p_arrive: float
-    """Probability to reach the goal: the mean over draws of the product of 1 - p_fail, as failures
-    are correlated; without draws, the product of the means."""
+    """Probability of reaching the goal. Given draws, it is the mean over draws of the product of
+    1 - p_fail, since failures are correlated; otherwise, it is the product of the means."""
     p_arrive_band: tuple[float, float]
-    """Ends of the 90 % band of `p_arrive` over draws; NaN without draws."""
+    """Ends of the 90 % band of `p_arrive` over the draws, or NaN without draws."""
 
     def to_record(self) -> dict[str, Any]:
-        """Convert to plain lists and numbers."""
+        """Convert the risk to plain lists and numbers."""
         return {**self._asdict(), "p_fail": self.p_fail.tolist()}
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> Self:
-        """Convert the record of `to_record` back."""
+        """Restore the risk from the record of `to_record`."""
         low, high = record["p_arrive_band"]
         return cls(np.array(record["p_fail"]), record["p_arrive"], (low, high))

@@ -1,12 +1,12 @@
-"""Strata: the posterior failure probabilities as a small mixture, for the cost of a failure.
+"""Strata: a small mixture of failure probabilities that replaces the posterior in path searches.
 
-Bounds fail together where they share an uncertain slope limit. Given the hyperparameters, they fail
-independently, so that a path fails with probability
+Failures of bounds are correlated because the bounds share an uncertain slope limit. Given the
+hyperparameters, bounds fail independently, so a path fails with probability
 
     E[1 - prod_k (1 - p_k)] = mean over draws of 1 - prod_k (1 - E[p_k | draw]).
 
-Strata are groups of draws, from mild to severe, each treated as one draw with the mean
-probabilities of its members, so that a search needs only a sum over a few strata.
+Strata are groups of draws, ordered from mild to severe. Each group is treated as one draw with the
+mean probabilities of its members, so a search needs only one sum per stratum.
 """
 
 from typing import NamedTuple
@@ -14,24 +14,24 @@ from typing import NamedTuple
 import numpy as np
 
 MOST = 5
-"""Default number of strata; labels of the path search hold one sum for each."""
+"""Default maximum number of strata; a label of the path search has one sum per stratum."""
 
 
 class Strata(NamedTuple):
-    """Failure probabilities under each group of draws."""
+    """Failure probabilities in each group of draws."""
 
     p_fail: np.ndarray
-    """Mean failure probability, (stratum, move, row, col), NaN where there is no bound."""
+    """Mean failure probability, shape (stratum, move, row, col); NaN where there is no bound."""
     shares: np.ndarray
-    """Share of the draws, (stratum,); they add up to 1."""
+    """Share of the draws in each stratum, shape (stratum,); the shares sum to 1."""
 
 
 def partition(values: np.ndarray, n: int) -> np.ndarray:
-    """Split sorted values (value,) into at most `n` groups with the least squared deviations.
+    """Split sorted values (value,) into at most `n` groups with the smallest squared deviations.
 
-    The optimal partition in one dimension, by dynamic programming (Fisher 1958). Group k is
-    values[ends[k - 1] : ends[k]]; quantiles would mix the few severe draws with mild ones. Time and
-    memory grow with the square of the number of values.
+    Dynamic programming minimises the squared deviations from the group means (Fisher 1958). Group k
+    is values[ends[k - 1] : ends[k]], where `ends` is the result. Groups of equal size would mix the
+    few severe draws with mild ones. Time and memory grow with the square of the number of values.
     """
     size = len(values)
     total, squares = (np.concatenate([[0.0], np.cumsum(v)]) for v in (values, values**2))
@@ -39,7 +39,7 @@ def partition(values: np.ndarray, n: int) -> np.ndarray:
     count = np.maximum(last - first, 1)
     within = squares[last] - squares[first] - (total[last] - total[first]) ** 2 / count
     within[first >= last] = np.inf
-    # least[j]: of values[:j] in the groups so far; cut[k, j]: where the last of them begins.
+    # least[j] is the optimum for values[:j] in the groups so far; the last begins at cuts[-1][j].
     least, cuts = within[0], []
     for _ in range(min(n, len(np.unique(values))) - 1):
         with_one_more = least[:, None] + within
