@@ -1,6 +1,6 @@
-"""Criticism: what may be wrong with a fitted trust model."""
+"""Criticism: a check of a fitted trust model for possible problems."""
 
 from trustbo.criticism.check import check
 
 __all__ = ["check"]
-__dir__ = __all__.copy  # completion lists public names alone
+__dir__ = __all__.copy  # completion lists only public names

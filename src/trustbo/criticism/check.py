@@ -1,4 +1,4 @@
-"""Check of a fitted model: problems indicated by its posterior and predictions."""
+"""Check of a fitted model for problems in its posterior and predictions."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -22,10 +22,10 @@ from trustbo.inference.score import score
 from trustbo.models.families import FAMILIES
 
 SIZE, SURE = 0.1, 0.95
-"""Smallest effect on contact that may change a plan, and the probability required for it."""
-_SIGNED = 0.6  # prior probability of one sign from which on a weight has an expected sign
-_TOLERANCE = 0.05  # of the share of rates in 90 % intervals
-_ERRORS = 2.0  # standard errors of a difference that counts
+"""Smallest effect on contact that may change a plan, and the probability required to report it."""
+_SIGNED = 0.6  # a weight has an expected sign if the sign's prior probability exceeds this
+_TOLERANCE = 0.05  # tolerated error of the coverage of 90 % intervals
+_ERRORS = 2.0  # number of standard errors from which a difference is significant
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -33,11 +33,11 @@ class Check(Summary):
     """Result of the check of a fitted model.
 
     Attributes:
-        verdict: The findings that stand out, in words.
-        table: One row per check (index `check`): the label that is most affected, the size of the
-            finding, its probability, whether it `stands_out`, and the finding in words.
-        robots: One row per mission and robot: its effect as a share of line of sight minus the
-            team's median, the sd, the probability that it exceeds .1, and whether it `stands_out`.
+        verdict: Text with the findings that stand out.
+        table: One row per check (index `check`). The columns are the text of the `finding`, whether
+            it `stands_out`, the most affected `label`, and the `size` and `probability`.
+        robots: One row per mission and robot: its `effect` as a fraction of line of sight minus the
+            median, the `sd`, the `probability` that it exceeds +-.1, and whether it `stands_out`.
     """
 
     verdict: str
@@ -51,7 +51,7 @@ class Check(Summary):
 
 @dataclass(frozen=True)
 class Finding:
-    """A row of the table of a check."""
+    """One row of `Check.table`."""
 
     finding: str
     stands_out: bool = False
@@ -64,29 +64,29 @@ def check(
     posterior: xr.DataTree | Sequence[xr.DataTree],
     missions: Sequence[Mission] | None = None,
 ) -> Check:
-    """Check a fitted model of contact rates.
+    """Check a fitted model of contact rates for possible problems.
 
-    A robot stands out in a mission if its share of line of sight differs by more than .1 from the
-    team's median with a probability above .95; a place, if its effect exceeds .1 of contact; a
-    weight, if its sign contradicts the prior's; coverage, if the share of rates inside 90 %
-    intervals one mission ahead differs from .9 by more than .05 and two standard errors over
-    missions. For the shape of predictions see `pit` of `tb.inference.score`, for the sensitivity to
-    the priors `az.psense_summary(posterior)`, for other models `tb.compare`.
+    A robot stands out in a mission if its effect differs from the team's median by more than .1 of
+    line of sight, with a probability above .95. A place stands out if its effect exceeds .1 of
+    contact, and a weight if its sign contradicts its prior. The coverage of 90 % intervals one
+    mission ahead stands out if it differs from .9 by more than .05 and two standard errors over
+    missions. See also `pit` of `tb.inference.score` for the shape of predictions, `tb.compare` for
+    other models, and `az.psense_summary(posterior)` for the sensitivity to the priors.
 
     Args:
-        posterior: DataTree from `fit`; or all posteriors of a campaign, `Result.posteriors`: the
-            last is checked, and the predictions of each for the next mission are scored.
-        missions: All missions of the campaign; by default those that the last posterior holds.
+        posterior: Posterior from `fit`, or all posteriors of a campaign (`Result.posteriors`). In
+            the latter case, the last is checked, and all predictions of a next mission are scored.
+        missions: All missions of the campaign; by default, the missions in the last posterior.
 
     Raises:
-        TrustboError: If the posterior is not from `fit`, is of people's reports, or holds no data
-            and no missions are given.
+        TrustboError: If the posterior is not from `fit`, was fitted to people's reports, or
+            contains no data if `missions` is not given.
     """
     trees = list(posterior) if isinstance(posterior, Sequence) else [posterior]
     tree = require_posterior("check", trees[-1])
     if is_of_people(tree):
         raise TrustboError(
-            "check is for contact rates of robots; this posterior is of reports of people."
+            "check needs a posterior fitted to contact rates; got one fitted to people's reports."
         )
     robots = effects_of_robots(tree)
     findings = {
@@ -102,12 +102,12 @@ def check(
 
 
 def effects_of_robots(posterior: xr.DataTree) -> pd.DataFrame:
-    """Tabulate missions and robots, see `Check.robots`; empty without robot effects."""
+    """Tabulate the robot effects (see `Check.robots`); empty if the model has none."""
     if "robots" not in posterior.children:
         return pd.DataFrame()
     group = posterior["robots"].to_dataset()
     draws = joined_draws(group["robot_effect"])
-    # The weight of line of sight fits the level of all effects.
+    # The weight of line of sight already accounts for the common level of all effects.
     draws = draws - np.median(draws, axis=(1, 2), keepdims=True)
     draws = draws / FAMILIES[posterior.attrs["observation"]].line_of_sight[0]
     probability = np.maximum((draws < -SIZE).mean(0), (draws > SIZE).mean(0))
@@ -120,7 +120,7 @@ def effects_of_robots(posterior: xr.DataTree) -> pd.DataFrame:
 
 def _check_robots(robots: pd.DataFrame) -> Finding:
     if not len(robots):
-        return Finding("not tested: the model has no effects of robots")
+        return Finding("not tested: the model has no robot effects")
     effect, odd = robots["effect"].to_numpy(), robots["stands_out"].to_numpy()
     if not odd.any():
         return Finding("no robot stands out", size=float(np.abs(effect).max()))
@@ -130,7 +130,7 @@ def _check_robots(robots: pd.DataFrame) -> Finding:
         rows = odd & (robot == name)
         when = f"mission {joined(mission[rows].astype(str).tolist())}"
         when = "all missions" if rows.sum() == (robot == name).sum() else when
-        words.append(f"{name} has {effect[rows].mean():+.2f} contact in full sight in {when}")
+        words.append(f"{name} has {effect[rows].mean():+.2f} contact at full sight in {when}")
     most = int(np.argmax(np.abs(effect) * odd))
     size, p = float(effect[most]), float(robots["probability"].to_numpy()[most])
     return Finding(joined(words), True, str(robot[most]), size, p)
@@ -138,7 +138,7 @@ def _check_robots(robots: pd.DataFrame) -> Finding:
 
 def _check_places(posterior: xr.DataTree) -> Finding:
     if "places" not in posterior.children:
-        return Finding("not tested: the model has no effects of places")
+        return Finding("not tested: the model has no place effects")
     places = posterior["places"].to_dataset()
     cells, where = (
         list(zip(places[f"{kind}_row"].values, places[f"{kind}_col"].values, strict=True))
@@ -153,7 +153,7 @@ def _check_places(posterior: xr.DataTree) -> Finding:
     odd = (sure > SURE) & (np.abs(effect) > SIZE)
     most = int(np.argmax(np.abs(effect) * (odd if odd.any() else 1.0)))
     row, col = (int(i) for i in where[most])
-    words = f"{odd.sum()} of {len(odd)} places stand out, the largest effect is {effect[most]:+.2f}"
+    words = f"{odd.sum()} of {len(odd)} places stand out; the largest effect is {effect[most]:+.2f}"
     size, p = float(effect[most]), float(sure[most])
     return Finding(words, bool(odd.any()), f"({row}, {col})", size, p)
 
@@ -161,7 +161,7 @@ def _check_places(posterior: xr.DataTree) -> Finding:
 def _check_weights(posterior: xr.DataTree) -> Finding:
     name = "beta" if "beta" in posterior["posterior"] else "B"
     if "prior" not in posterior.children or name not in posterior["prior"]:
-        return Finding("not tested: the posterior holds no draws of the prior")
+        return Finding("not tested: the posterior contains no prior draws")
     features = posterior["posterior"].to_dataset()["feature"].values
     prior, draws = (
         joined_draws(posterior[group].to_dataset()[name]).reshape(-1, len(features))
@@ -171,20 +171,20 @@ def _check_weights(posterior: xr.DataTree) -> Finding:
     expected = (prior * sign > 0.0).mean(0) > _SIGNED
     wrong = (draws * sign < 0.0).mean(0) * expected
     most, odd = int(wrong.argmax()), [str(feature) for feature in features[wrong > SURE]]
-    words = "every weight agrees with its prior"
+    words = "the sign of every weight agrees with its prior"
     if odd:
-        words = f"the weight of {joined(odd)} has another sign than the prior expects"
+        words = f"the sign of the weight contradicts the prior for {joined(odd)}"
     size, p = float(draws[:, most].mean()), float(wrong[most])
     return Finding(words, bool(odd), str(features[most]), size, p)
 
 
 def _check_coverage(trees: list[xr.DataTree], missions: Sequence[Mission] | None) -> Finding:
     if len(trees) < 2:
-        return Finding("not tested: give all posteriors of a campaign")
+        return Finding("not tested: this check needs all posteriors of a campaign")
     pit = score(trees, missions_of(trees[-1]) if missions is None else missions)["pit"]
     within = (abs(pit - 0.5) <= 0.45).where(pit.notnull()).mean(("bound", "robot")).values
     within = within[np.isfinite(within)]
     off = float(within.mean() - 0.9)
     error = within.std(ddof=1) / np.sqrt(len(within)) if len(within) > 1 else np.inf
-    words = f"90 % intervals one mission ahead hold {within.mean():.0%} of the rates"
+    words = f"90 % intervals one mission ahead contain {within.mean():.0%} of the rates"
     return Finding(words, bool(abs(off) > max(_TOLERANCE, _ERRORS * error)), "90 %", off)
