@@ -1,4 +1,4 @@
-"""Grids of campaigns (cases x scenes x seeds), run in parallel processes and resumable."""
+"""Grids of campaigns (cases x scenes x seeds), which run in parallel and can be resumed."""
 
 import copy
 import re
@@ -23,7 +23,7 @@ from trustbo.workspace import Workspace
 
 
 class Scene(NamedTuple):
-    """Setting of a campaign: the assumed workspace, the true world, and a start and goal."""
+    """Setting of a campaign: the assumed workspace, a simulator, the start and the goal."""
 
     workspace: Workspace
     simulator: Simulator
@@ -32,15 +32,15 @@ class Scene(NamedTuple):
     truth: Truth | None = None
     """Truth of the simulator, used to evaluate paths."""
     options: Mapping[str, Any] = {}
-    """Options of `Campaign` in this scene; options of a case override them."""
+    """Options of `Campaign` in this scene; the options of a case override them."""
     labels: Mapping[str, Any] = {}
-    """Further columns of the table."""
+    """Additional columns of the table."""
     judged: Mapping[str, Any] = {}
-    """Options of `Truth.best`, such as `max_bounds`, for the reference path."""
+    """Options of `Truth.best` for the reference path, such as `max_bounds`."""
 
 
 type Case = Mapping[str, Any] | Callable[[Scene], Mapping[str, Any]]
-"""Options of `Campaign`, or a function that makes them for a scene."""
+"""Options of `Campaign`, or a function that returns the options for a scene."""
 
 
 def run_grid(
@@ -52,33 +52,33 @@ def run_grid(
     n_missions: int = 15,
     n_jobs: int = -1,
 ) -> pd.DataFrame:
-    """Run each case on each scene with each seed, and evaluate the paths of each mission.
+    """Run each case in each scene with each seed, and evaluate the paths of each mission.
 
-    Each run writes a file named by its case, scene, seed and number of missions; runs whose files
-    exist are skipped. Runs are parallelised by joblib; `joblib.parallel_config` selects another
-    backend, such as `backend="dask"` for a cluster. A policy's method `learn(campaign, mission)`,
-    if any, is called after each mission; the path of its `recommend(campaign)`, if any, replaces
-    the campaign's recommendation.
+    Each run writes a file whose name contains the case, scene, seed and number of missions. A run
+    is skipped if its file exists. Runs are parallelised with joblib; `joblib.parallel_config`
+    selects another backend, such as `backend="dask"` for a cluster. If the policy has a method
+    `learn(campaign, mission)`, it is called after each mission. If it has `recommend(campaign)`,
+    the returned path replaces the campaign's recommendation.
 
     Args:
         cases: Cases by name.
-        scenes: Functions that make the scenes, by name; they are called in the worker processes.
-        folder: Folder of the runs.
+        scenes: Functions that make the scenes, by name. They are called in the worker processes.
+        folder: Folder for the files of the runs.
         seeds: Seeds of the campaigns.
-        n_missions: Missions of a campaign.
+        n_missions: Number of missions per campaign.
         n_jobs: Number of processes; -1 for one per core, 1 to use only this process.
 
     Returns:
-        One row per run and mission: `case`, `scene`, `seed`, labels of the scene, and `mission`,
-        with 0 before the first one. `regret` (%) and `lost` (bounds) describe the path recommended
-        after the mission, evaluated in the world of the next one, see `Truth`; `best` is the loss
-        of the best path there. The mission itself has `status`, mean `contact_rate`, `driven` and
-        `best_driven`, the expected losses on its path and on the best path, `failed_driven`, the
-        additional loss if bounds that fail or are not reached keep no contact, and `seconds` of
-        processor time.
+        One row per run and mission, with `case`, `scene`, `seed`, the labels of the scene, and
+        `mission`, which is 0 before the first mission. `regret` (%) and `lost` (bounds) are for the
+        path recommended after the mission, and `best` is the loss on the best path. All three are
+        evaluated in the world of the next mission (see `Truth`). The mission itself has a `status`
+        and a mean `contact_rate`. `driven` and `best_driven` are the expected losses on the path
+        of the mission and on the best path. `failed_driven` is the loss beyond that on the best
+        path if bounds that fail or are not reached have no contact. `seconds` is the CPU time.
 
     Raises:
-        TrustboError: Some runs failed; the next call repeats them.
+        TrustboError: If some runs failed. The next call repeats these runs.
 
     Example:
         >>> cases = {"greedy": {}, "thompson": {"policy": "thompson"}}
@@ -91,7 +91,7 @@ def run_grid(
         for seed, scene, case in runs
     }
     if len(set(files.values())) < len(runs):
-        raise TrustboError("names of cases and scenes must differ in their letters and digits.")
+        raise TrustboError("the names of cases and scenes must differ in more than punctuation.")
     errors = Parallel(n_jobs=n_jobs)(
         delayed(_run)(cases[case], scenes[scene], (case, scene, seed), n_missions, file)
         for (seed, scene, case), file in files.items()
@@ -99,8 +99,8 @@ def run_grid(
     )
     if failed := [error for error in errors if error]:
         raise TrustboError(
-            f"{len(failed)} of {len(runs)} runs failed; the next call repeats them: "
-            f"{'; '.join(failed[:3])}"
+            f"{len(failed)} of {len(runs)} runs failed; call run_grid again to repeat them. The "
+            f"first errors are: {'; '.join(failed[:3])}"
         )
     return pd.concat([pd.read_csv(file) for file in files.values()], ignore_index=True)
 
@@ -123,13 +123,13 @@ def _run(
                 for row in _rows(case, where, names[2], n_missions)
             ]
         write_file(file, lambda path: pd.DataFrame(rows).to_csv(path, index=False))
-    except Exception as error:  # of one run, which does not stop the others
+    except Exception as error:  # an error in one run does not stop the others
         return f"{', '.join(map(str, names))}: {type(error).__name__}: {error}"
     return ""
 
 
 def _rows(case: Case, scene: Scene, seed: int, n_missions: int) -> Iterator[dict[str, Any]]:
-    """Run a campaign and return its rows; the first row is before any mission."""
+    """Run a campaign and yield its rows; the first row describes the state before any mission."""
     options = case(scene) if callable(case) else case
     given = {
         "workspace": scene.workspace, "start": scene.start, "goal": scene.goal, "seed": seed,
@@ -151,7 +151,7 @@ def _rows(case: Case, scene: Scene, seed: int, n_missions: int) -> Iterator[dict
 
 
 def _recommended(campaign: Campaign, scene: Scene, mission: int) -> dict[str, float]:
-    """Compute regret and loss of the path recommended for a mission."""
+    """Compute the regret and the loss of the path recommended for a mission."""
     if scene.truth is None:
         return {}
     choose = getattr(campaign.policy, "recommend", None)
@@ -163,7 +163,7 @@ def _recommended(campaign: Campaign, scene: Scene, mission: int) -> dict[str, fl
 
 
 def _driven(path: Sequence[Cell], scene: Scene, mission: int) -> dict[str, float]:
-    """Compute the expected loss on the path of a mission, and on the best path."""
+    """Compute the expected losses on the path of a mission and on the best path."""
     if scene.truth is None:
         return {}
     truth, ends = scene.truth.at(mission), (scene.start, scene.goal)

@@ -9,7 +9,7 @@ import pandas as pd
 from trustbo.errors import require_choice
 
 SHOWN = (0, 1, 3, 8, 15)
-"""Numbers of missions after which regret is shown."""
+"""Numbers of missions after which the regret is reported."""
 NEAR = 1.0
 """Regret in % below which a recommendation counts as nearly optimal."""
 _RUN = ["case", "scene", "seed"]
@@ -18,13 +18,13 @@ _RUN = ["case", "scene", "seed"]
 def numbers_of(table: pd.DataFrame) -> pd.DataFrame:
     """Summarise each run in a table of `run_grid` whose scenes have a truth.
 
-    The columns are the labels of the run; `regret after n` missions (%), and `lost after n`, the
-    contact lost in addition to the best path's loss (bounds), both in the world of the next
-    mission; `regret now`, the mean over all missions; `lost while learning`, the additional loss on
-    the paths driven, in the world in which they were driven; `lost with failures`, the same if
-    bounds that fail or are not reached keep no contact; `missions to 1 %`, after which the regret
-    stays within 1 %, or the number driven plus one if it does not; the fractions of all missions,
-    of the first three and of the later ones that `arrive`; and processor `seconds` per mission.
+    In addition to the labels of the run, the table has these columns. `regret after n` missions (%)
+    and `lost after n`, the loss beyond that on the best path (bounds), refer to the world of the
+    next mission. `regret now` is the mean regret. `lost while learning` is the mean loss of the
+    missions beyond that on the best path. `lost with failures` is the same if bounds that fail or
+    are not reached have no contact. After `missions to 1 %`, the regret stays within 1 %; this is
+    the number driven plus one if it does not. `arrive` is the fraction of missions that reach the
+    goal, also for the first three and the later ones. `seconds` is the CPU time per mission.
     """
     judged = {"mission", "regret", "lost", "best", "status", "contact_rate", "driven",
               "best_driven", "failed_driven", "seconds"}  # fmt: skip
@@ -35,7 +35,7 @@ def numbers_of(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def _numbers(run: pd.DataFrame) -> dict[str, float]:
-    """Summarise one run, rows of missions 0, 1, ..."""
+    """Summarise one run, given its rows for missions 0, 1, ..."""
     run = run.sort_values("mission")
     driven, regret = run.iloc[1:], run["regret"].to_numpy()
     after = [n for n in SHOWN if n < len(run)]
@@ -56,17 +56,17 @@ def _numbers(run: pd.DataFrame) -> dict[str, float]:
 
 
 def summary(numbers: pd.DataFrame, by: str | Sequence[str] = "case") -> pd.DataFrame:
-    """Compute means with 95 % intervals over scenes; medians for regret and loss after n missions.
+    """Compute means, or medians after n missions, with 95 % intervals over scenes.
 
     Args:
         numbers: Rows of `numbers_of`.
         by: Columns by which runs are grouped.
 
     Returns:
-        Columns of two levels: the number, and `value`, `low` and `high`.
+        Table with two levels of columns: the quantity, and `value`, `low` and `high`.
 
     Raises:
-        TrustboError: An unknown column.
+        TrustboError: If a column is unknown.
     """
     by = [
         require_choice("column", n, numbers.columns) for n in ([by] if isinstance(by, str) else by)
@@ -79,19 +79,19 @@ def summary(numbers: pd.DataFrame, by: str | Sequence[str] = "case") -> pd.DataF
 
 
 def differences(numbers: pd.DataFrame, ours: str, by: Sequence[str] = ()) -> pd.DataFrame:
-    """Compare one case with each of the others on the same scenes and seeds.
+    """Compare one case with every other case on the same scenes and seeds.
 
     Args:
         numbers: Rows of `numbers_of`.
-        ours: Case from which the others are subtracted.
+        ours: Case from which the other cases are subtracted.
         by: Columns by which pairs are grouped, in addition to the other case.
 
     Returns:
-        Columns as in `summary`, for the difference `ours` minus the other case, and the number of
-        `pairs`; intervals are over scenes, and NaN if there is only one.
+        Table as from `summary`, for the difference `ours` minus the other case, with the number of
+        `pairs`. The intervals are over scenes, and NaN if there is only one scene.
 
     Raises:
-        TrustboError: An unknown case or column.
+        TrustboError: If a case or column is unknown.
     """
     require_choice("case", ours, list(numbers["case"]))
     for name in by:
@@ -115,9 +115,9 @@ def bootstrap(
     clusters: np.ndarray,
     middle: Callable[[np.ndarray], Any] | None = None,
 ) -> dict[tuple[str, str], float]:
-    """Estimate each quantity with a 95 % interval; by default medians after n missions.
+    """Estimate each quantity by `middle`, by default as in `summary`, with a 95 % interval.
 
-    Runs of a cluster are resampled together, and all quantities use the same resamples.
+    The runs of a cluster are resampled together, and all quantities use the same resamples.
     """
     rng, (names, index) = np.random.default_rng(0), np.unique(clusters, return_inverse=True)
     members = [np.flatnonzero(index == i) for i in range(len(names))]
@@ -127,7 +127,7 @@ def bootstrap(
     ]
     row = {}
     for name, values in numbers.items():
-        if np.isnan(values).all():  # such as arrivals of later missions where there are none
+        if np.isnan(values).all():  # such as arrivals in later missions if there are none
             row |= {(name, what): np.nan for what in ("value", "low", "high")}
             continue
         usual = middle or (np.nanmedian if " after " in name else np.nanmean)
@@ -137,7 +137,7 @@ def bootstrap(
 
 
 def _values(numbers: pd.DataFrame) -> dict[str, np.ndarray]:
-    """Return columns of numbers, by name."""
+    """Return the numeric columns by name."""
     first = numbers.columns.get_loc("regret after 0")
     return {name: numbers[name].to_numpy(float) for name in numbers.columns[first:]}
 

@@ -1,4 +1,4 @@
-"""Benchmark worlds: true and assumed terrain, sight and team, and courses through them."""
+"""Benchmark worlds, which have a true and an assumed terrain, sight and team, and four courses."""
 
 import hashlib
 from dataclasses import dataclass, field, replace
@@ -23,38 +23,38 @@ from trustbo.workspace import Workspace
 from trustbo.workspace.sight import Sight
 
 REAL = ("wellington", "tahoe", "bcts", "topography")
-"""Real terrains by the names of their folders, each with a dem.tif and a dsm.tif."""
+"""Folder names of the real terrains; each folder contains dem.tif and dsm.tif."""
 COURSES = ("sw-ne", "nw-se", "n-s", "w-e")
-"""Courses through a world: two diagonals, from north to south and from west to east."""
+"""Courses through a world: along both diagonals, from north to south, and from west to east."""
 _STRIP = 250
-"""Number of rows used of a real terrain, those with most data; only bcts has many more."""
+"""Extent in y, in metres, to which real terrains of more than twice this extent are cropped."""
 _RELIEF = 0.06
 """Relief of a synthetic terrain as a fraction of its longer side."""
 
 
 def drawn(ground: str, what: str) -> np.random.Generator:
-    """Make a generator seeded by the SHA-256 hash of a terrain's name and a purpose."""
+    """Make a generator seeded with the SHA-256 hash of a terrain's name and a purpose."""
     return np.random.default_rng(list(hashlib.sha256(f"{ground} {what}".encode()).digest()))
 
 
 @dataclass(frozen=True)
 class World:
-    """A terrain with true and assumed sight and team, and events.
+    """A terrain with events, and the true and assumed sight and team.
 
     Attributes:
-        name: Name of the world: the name of its ground, followed by the name of its case.
-        kind: Name of the kind, for tables.
-        ground: `"synthetic-N"`, the synthetic terrain with seed N; `"synthetic-NAME"`, with a seed
-            drawn from the name; or a name in `REAL`.
-        sight: True model of sight.
-        assumed: Assumed model of sight; None for the true model.
+        name: Name of the terrain, followed by the name of the case.
+        kind: Kind of the world, a label for tables.
+        ground: Name of the terrain: `"synthetic-N"` for a synthetic terrain with seed N,
+            `"synthetic-NAME"` for one whose seed is drawn from the name, or a name in `REAL`.
+        sight: True sight model.
+        assumed: Assumed sight model; None for the true model.
         team: True lead and robots.
         assumed_team: Assumed lead and robots; None for the true team.
-        aged: Whether the assumed terrain is an old survey, see `aged`.
-        events: Events, with the missions they act in. Centres are fractions of the terrain's width
-            and height from its lower left corner, instead of CRS metres.
-        shape: Planning grid.
-        cell: Side of a cell of a synthetic terrain, m.
+        aged: Whether the assumed terrain is an outdated survey (see `aged`).
+        events: Events in the true world. Their centres are fractions of the terrain's width and
+            height, measured from its lower left corner, instead of CRS metres.
+        shape: Shape of the planning grid, (row, col).
+        cell: Side length of the planning cells on a synthetic terrain, in metres.
         radio: Whether contact is simulated by `RadioSimulator`.
         data: Folder with the real terrains.
     """
@@ -75,7 +75,7 @@ class World:
 
     @property
     def case(self) -> str:
-        """Name without the name of the terrain; by default the kind."""
+        """Name of the case, which is the kind if the name contains only the terrain."""
         return self.name.removeprefix(self.ground).removeprefix("-") or self.kind
 
     @property
@@ -91,7 +91,7 @@ class World:
     def files(self) -> list[str]:
         """Return the files of a real terrain.
 
-        TrustboError: the files are missing; the message says where to put them.
+        Raises TrustboError if files are missing; the message names the folder that is needed.
         """
         if self.data is None and self.is_packaged:
             return list(EXAMPLE_FILES)
@@ -99,8 +99,8 @@ class World:
         files = [Path(folder, self.ground, f"{name}.tif") for name in ("dem", "dsm")]
         if absent := [str(f) for f in files if self.data is None or not f.is_file()]:
             raise TrustboError(
-                f"world {self.name!r} lacks {' and '.join(absent)}; give data=, the folder that "
-                f"contains {self.ground}/, or leave the world out."
+                f"world {self.name!r} needs {' and '.join(absent)}. Set data= to the folder that "
+                f"contains {self.ground}/, or leave this world out."
             )
         return [str(file) for file in files]
 
@@ -114,7 +114,7 @@ class World:
         return _made(seed, (rows * self.cell, cols * self.cell))
 
     def workspace(self, **options: Any) -> Workspace:
-        """Make the assumed workspace; options as in `Workspace.from_terrain`."""
+        """Make the assumed workspace; `options` are passed to `Workspace.from_terrain`."""
         assumed = replace(
             self, name="", kind="", sight=self.assumed or self.sight, assumed=None,
             team=self.assumed_team or self.team, assumed_team=None, events=(),
@@ -123,7 +123,7 @@ class World:
         return _workspace(assumed, tuple(sorted(options.items())))
 
     def simulator(self, workspace: Workspace) -> KinematicSimulator | RadioSimulator:
-        """Make a simulator of the true world; posts and routes are planned on the assumed one."""
+        """Make a simulator of the true world with posts and routes from the assumed workspace."""
         terrain = self.true_terrain()
         if self.radio:
             return RadioSimulator(workspace, terrain=terrain)
@@ -131,7 +131,7 @@ class World:
         return KinematicSimulator(workspace, events=self._events(terrain), **given)
 
     def truth(self, folder: FilePath | None = None) -> Truth:
-        """Return the truth of the simulator, from a file in the folder if already computed."""
+        """Return the truth of the simulator, which is read from `folder` if already computed."""
         return Truth.of(self.simulator(self.workspace()), folder=folder)
 
     def scene(
@@ -141,9 +141,9 @@ class World:
         max_bounds: int | str = "shortest+4",
         **options: Any,
     ) -> Scene:
-        """Make the scene of a course through the world, for `run_grid`; the truth is cached.
+        """Make the scene of a course through the world for `run_grid`, and cache the truth.
 
-        Options as in `workspace`. TrustboError: the course is unknown, or files are missing.
+        For `options`, see `workspace`. Raises TrustboError for unknown courses or missing files.
         """
         workspace = self.workspace(**options)
         paths = {"max_bounds": max_bounds}
@@ -165,7 +165,7 @@ class World:
         return placed
 
     def ends(self, course: str) -> tuple[Cell, Cell]:
-        """Start and goal of a course: the nearest cells from which most others can be reached."""
+        """Return the start and goal of a course, moved to the largest connected region of cells."""
         rows, cols = (n - 1 for n in self.shape)
         start, goal = {
             "sw-ne": ((rows, 0), (0, cols)),
@@ -183,11 +183,11 @@ class World:
 
 
 def aged(now: xr.Dataset, seed: int = 0) -> xr.Dataset:
-    """Age a terrain like an old survey: lower canopy with clearings, and ground errors of 0.3 m.
+    """Imitate an outdated survey of a terrain, with errors of the canopy and the ground.
 
     The canopy has 0.7 times its true height, and is missing on 15 % of the area, in patches of
-    about 10 m that have grown over since. Ground errors have a standard deviation of 0.3 m and a
-    correlation length of about 10 m.
+    about 10 m. The ground errors have a standard deviation of 0.3 m and a correlation length of
+    about 10 m.
     """
     rng, step = np.random.default_rng(seed), abs(float(now["x"][1] - now["x"][0]))
     dem, dsm = now["dem"].values, now["dsm"].values
@@ -206,7 +206,7 @@ def aged(now: xr.Dataset, seed: int = 0) -> xr.Dataset:
 
 @lru_cache(maxsize=4)
 def _workspace(assumed: World, given: tuple[tuple[str, Any], ...]) -> Workspace:
-    """Make the workspace with given terrain, sight and team."""
+    """Make the workspace with the assumed terrain, sight and team."""
     ground = assumed.true_terrain()
     ground = aged(ground) if assumed.aged else ground
     options: dict[str, Any] = {"sight": assumed.sight, **dict(given)}

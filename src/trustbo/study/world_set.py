@@ -1,4 +1,4 @@
-"""Set of benchmark worlds, by kind."""
+"""The set of benchmark worlds."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -16,12 +16,12 @@ from trustbo.workspace.sight import Sight
 _SYNTHETIC = tuple(f"synthetic-{seed}" for seed in range(3))
 _ALDER, _BIRCH, _CEDAR = (f"synthetic-{name}" for name in ("alder", "birch", "cedar"))
 _AFTER = 6
-"""First mission after a change, counted from 0: the seventh mission."""
+"""Index of the first mission after a change, which is the seventh mission."""
 _DAYS = (1, 3, 4, 7)
-"""Missions with bad weather, counted from 0."""
+"""Indices of the missions with bad weather."""
 
 type _Case = tuple[str, str, tuple[str, ...], Mapping[str, Any] | Callable[[str], dict[str, Any]]]
-"""Kind, case, names of the terrains, and settings of `World`, or a function of the terrain."""
+"""Kind, case, terrain names, and settings of `World` or a function that returns the settings."""
 
 
 def _climbing(degrees: float) -> dict[str, Any]:
@@ -29,18 +29,18 @@ def _climbing(degrees: float) -> dict[str, Any]:
 
 
 def _team_of(degrees: float) -> Team:
-    """Make a team of three robots and a lead with a given slope limit."""
+    """Make a team of a lead and three robots with the given slope limit in degrees."""
     robot = Robot(max_slope=float(np.deg2rad(degrees)))
     return Team(robots=(robot,) * 3, lead=robot)
 
 
 def _limit(true: float, assumed: float) -> dict[str, Any]:
-    """Return the true and assumed slope limits, degrees."""
+    """Return settings with the given true and assumed slope limits in degrees."""
     return {"team": _team_of(true), "assumed_team": _team_of(assumed)}
 
 
 def _is_drawn(ground: str) -> bool:
-    """Whether the events on a terrain are drawn from its name; else they are fixed by hand."""
+    """Return whether the events on a terrain are drawn from its name instead of set by hand."""
     return ground not in _SYNTHETIC
 
 
@@ -49,19 +49,19 @@ def _one_robot(ground: str) -> int:
 
 
 def _days(ground: str) -> tuple[int, ...]:
-    """Return the missions with bad weather: four of the first nine."""
+    """Return the four missions with bad weather among the first nine missions."""
     days = drawn(ground, "days").permutation(9)[:4] if _is_drawn(ground) else _DAYS
     return tuple(sorted(int(day) for day in days))
 
 
 def _place(ground: str) -> tuple[float, float]:
-    """Choose the centre of events, as fractions of the terrain: within 20 % of the middle."""
+    """Choose the centre of events within 20 % of the terrain's middle, as fractions of its size."""
     x, y = drawn(ground, "place").uniform(0.3, 0.7, 2) if _is_drawn(ground) else (0.5, 0.5)
     return float(x), float(y)
 
 
 def _reach(ground: str) -> float:
-    """Return the radius of a jammer, m; real terrains are half as wide as synthetic ones."""
+    """Return the radius of a jammer in metres; real terrains are half as wide as synthetic ones."""
     return 40.0 if ground in REAL else 90.0
 
 
@@ -116,11 +116,11 @@ def _season(factor: float) -> dict[str, Any]:
     return {"events": (Season(factor, first=_AFTER),)}
 
 
-# Slope limits assumed too high (kind "limit"): the true limit is the lowest of 14, 18, 22 and 26
-# degrees under which, with 4 degrees more assumed, an admissible path arrives on both diagonal
-# courses while at least 5 % of bounds fail. No such limit is found for wellington, and on
-# synthetic-2 only 4 % of bounds fail: both are out. With 1 degree more assumed, the limits are 17
-# of the 18 of kind "slopes", and on wellington 44 of the 45 of usual robots.
+# In the kind "limit", the assumed slope limit is too high. The case "limit-4" assumes 4 degrees
+# more than the true limit. The latter is the lowest of 14, 18, 22 and 26 degrees at which some path
+# arrives on both diagonal courses, and at least 5 % of the bounds fail. Wellington has no such
+# limit, and on synthetic-2 only 4 % of the bounds fail, so both are left out. In "limit-1", the
+# assumed limit is 18 degrees as in the kind "slopes", and the default 45 degrees on wellington.
 _CASES: tuple[_Case, ...] = (
     ("right", "", (*_SYNTHETIC, *REAL), {}),
     ("wall", "wall", ("synthetic-0", "synthetic-1", "tahoe"), {"sight": Sight(math.inf, 0.0)}),
@@ -174,11 +174,11 @@ def _all() -> list[World]:
 
 
 def worlds(data: FilePath | None = None) -> dict[str, World]:
-    """Return benchmark worlds by name; see docs/worlds.md.
+    """Return the benchmark worlds by name (see docs/worlds.md).
 
     Args:
-        data: Folder with the real terrains, `tahoe/dem.tif` and so on. Without it, all worlds are
-            listed, but of the real terrains only wellington, which is in the package, can be used.
+        data: Folder with the real terrains, such as `tahoe/dem.tif`. Without this folder, the only
+            real terrain whose worlds can be used is wellington, which is part of the package.
 
     Returns:
         Worlds on 6 synthetic and 4 real terrains.
