@@ -1,6 +1,6 @@
-"""Inference of trust models: posteriors, predictions, comparison, and filters."""
+"""Inference for trust models: posteriors, predictions, model comparison and filters."""
 
-from trustbo.models import backend as backend  # first: it loads numpyro
+from trustbo.models import backend as backend  # imported first because it loads numpyro
 
 # isort: split
 from trustbo.inference.draws import params_of, sample_prior
@@ -22,4 +22,4 @@ __all__ = [
     "sample_prior",
     "score",
 ]
-__dir__ = __all__.copy  # completion lists public names alone
+__dir__ = __all__.copy  # tab completion lists only public names

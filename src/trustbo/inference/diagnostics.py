@@ -10,7 +10,7 @@ from arviz_stats import sampling_diagnostics
 from trustbo.inference.draws import require_posterior
 
 MAX_RHAT, MIN_ESS = 1.01, 400.0
-"""Largest rank-normalised R-hat, and least bulk effective sample size, of NUTS."""
+"""Largest rank-normalised R-hat and smallest bulk effective sample size accepted from NUTS."""
 NUTS_NAMES = "r_hat", "ess_bulk", "divergences"
 
 
@@ -18,9 +18,9 @@ def diagnostics(posterior: xr.DataTree) -> dict[str, float]:
     """Return the diagnostics of the sampler.
 
     Returns:
-        For importance sampling, whose draws are nearly independent, `k_hat` (good below 0.5) and
-        `kish`, the effective number of points. For NUTS `r_hat` and `ess_bulk`, the worst over all
-        hyperparameters, and the number of `divergences`.
+        Importance sampling has `k_hat`, which is good below 0.5, and `kish`, the effective number
+        of points. NUTS has the worst `r_hat` and `ess_bulk` over all hyperparameters, and the
+        number of `divergences`.
 
     Raises:
         TrustboError: If the posterior is not from `fit`.
@@ -33,9 +33,9 @@ def diagnostics(posterior: xr.DataTree) -> dict[str, float]:
 def complaints_of(
     draws: Mapping[str, np.ndarray], diverging: np.ndarray
 ) -> tuple[dict[str, float], list[str]]:
-    """Return NUTS diagnostics of draws (chain, draw, ...) by name, and complaints."""
+    """Return the NUTS diagnostics of draws (chain, draw, ...), and a list of failed checks."""
     flat = {name: values.reshape(*values.shape[:2], -1) for name, values in draws.items()}
-    # Constants of the model do not count.
+    # Parameters that are constant in the model have no diagnostics.
     free = {name: v[:, :, np.ptp(v, axis=(0, 1)) > 0.0] for name, v in flat.items()}
     tree = arviz_base.from_dict({"posterior": {n: v for n, v in free.items() if v.size}})
     sites = tree["posterior"].to_dataset()
@@ -43,10 +43,10 @@ def complaints_of(
     worst = max(float(a.max()) for a in r_hat.data_vars.values())
     least = min(float(a.min()) for a in ess.data_vars.values())
     divergences, complaints = int(diverging.sum()), []
-    if not worst <= MAX_RHAT:  # NaN is a complaint too
-        complaints.append(f"R-hat is {worst:.3f} (at most {MAX_RHAT})")
+    if not worst <= MAX_RHAT:  # also true for NaN
+        complaints.append(f"R-hat is {worst:.3f} (limit {MAX_RHAT})")
     if not least >= MIN_ESS:
-        complaints.append(f"bulk ESS is {least:.0f} (at least {MIN_ESS:.0f})")
+        complaints.append(f"bulk ESS is {least:.0f} (minimum {MIN_ESS:.0f})")
     if divergences:
-        complaints.append(f"{divergences} divergences")
+        complaints.append(f"the number of divergences is {divergences} (limit 0)")
     return dict(zip(NUTS_NAMES, (worst, least, divergences), strict=True)), complaints

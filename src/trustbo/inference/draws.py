@@ -1,4 +1,4 @@
-"""Read the draws of a posterior by the names of its variables, features and robots."""
+"""Read parameters, missions and models from a posterior."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -20,30 +20,30 @@ from trustbo.models.record import effects_from_record, model_from_record
 from trustbo.models.slots import Slots
 from trustbo.workspace import Workspace
 
-_DAYS = 20261123  # seed of the next mission's effects: the same posterior has the same bands
-_N_MEAN = 4096  # draws of a prior mean
+_DAYS = 20261123  # seed of the next mission's effects, for reproducible bands
+_N_MEAN = 4096  # draws that are averaged to a prior mean
 _ATTRIBUTES = "observation", "x0_mean", "x0_sd", "model_record"
 
 
 def require_posterior(who: str, value: object) -> xr.DataTree:
-    """Return `value` if it is a posterior from `fit`, else raise TrustboError for `who`."""
+    """Return `value` if it is a posterior from `fit`, otherwise raise TrustboError naming `who`."""
     if not isinstance(value, xr.DataTree):
-        remedy = " Give its .posterior." if hasattr(value, "posterior") else ""
+        remedy = " Give the attribute .posterior." if hasattr(value, "posterior") else ""
         raise TrustboError(
-            f"{who} takes a posterior from fit; got a {type(value).__name__}.{remedy}"
+            f"{who} needs a posterior from fit; got a {type(value).__name__}.{remedy}"
         )
     missing = [] if "posterior" in value.children else ["posterior"]
     missing += [name for name in _ATTRIBUTES if name not in value.attrs]
     if missing:
         raise TrustboError(
-            f"{who} takes a posterior from fit; this DataTree has no {missing[0]!r}. Give the "
-            "whole result of trustbo.fit."
+            f"{who} needs a posterior from fit, but this DataTree has no {missing[0]!r}. Give the "
+            "complete result of trustbo.fit."
         )
     return value
 
 
 def sites_of(posterior: xr.DataTree) -> dict[str, np.ndarray]:
-    """Return all draws of a posterior by name, chains joined: leading axis (draw,).
+    """Return all draws of a posterior by name, with chains joined in a leading axis (draw,).
 
     Raises:
         TrustboError: If some draws are NaN, for example after masking.
@@ -54,42 +54,42 @@ def sites_of(posterior: xr.DataTree) -> dict[str, np.ndarray]:
         bad = np.isnan(values.reshape(len(values), -1)).any(1).sum()
         if bad:
             raise TrustboError(
-                f"{bad} of {len(values)} draws of {name!r} are NaN; drop them with "
-                "posterior.isel(draw=...) instead of masking them."
+                f"{bad} of {len(values)} draws of {name!r} are NaN; drop these "
+                "draws with posterior.isel(draw=...) instead of masking them."
             )
     return sites
 
 
 def joined_draws(array: xr.DataArray, axes: Sequence[Any] = (...,)) -> np.ndarray:
-    """Return draws (draw, ...) with chains joined and other axes ordered as `axes`.
+    """Return draws (draw, ...) with chains joined and with the other axes in the order `axes`.
 
-    The memory layout is the same for new draws and for draws read from a file, so that sums are
-    rounded equally and a resumed campaign is bit-identical.
+    New draws and draws read from a file get the same memory layout, so that sums have the same
+    rounding errors and a resumed campaign is bit-identical.
     """
     values = np.ascontiguousarray(array.transpose("chain", "draw", *axes).values)
-    return values.reshape(values.shape[0] * values.shape[1], *values.shape[2:])  # also of none
+    return values.reshape(values.shape[0] * values.shape[1], *values.shape[2:])  # also for 0 draws
 
 
 def params_of(
     posterior: xr.DataTree, workspace: Workspace | None = None, *, day: bool = False
 ) -> Params:
-    """Return all draws of a posterior as parameters, chains joined: leading axis (draw,).
+    """Return all draws of a posterior as parameters, with chains joined in a leading axis (draw,).
 
     Args:
         posterior: DataTree from `fit`.
-        workspace: Workspace for planning; features and robots are put in its order, by name.
-        day: Whether effects are drawn for the next mission, including the part specific to it, for
-            bands and predictions of rates; by default they are expected effects, for plans. This
-            matters only for effects other than places.
+        workspace: Workspace for planning; features and robots are reordered to match the workspace.
+        day: Whether to draw the mission-specific effects of the next mission, for bands and
+            predicted rates. By default, expected effects are used, as needed for planning. Place
+            effects do not depend on this option.
 
     Returns:
-        `TrustParams`, `RobotParams` or `CoupledParams`, according to the model. With effects other
-        than places, `RobotParams` for the next mission: with `RobotEffect`, the weights of line of
-        sight include the persistent part of each robot's effect, decayed by one mission.
+        `TrustParams`, `RobotParams` or `CoupledParams`, depending on the model. A pooled model with
+        robot effects gives `RobotParams` for the next mission, in which the line-of-sight weights
+        include each robot's persistent effect, decayed by one mission.
 
     Raises:
-        TrustboError: If the posterior is not from `fit`; a variable is missing, or draws are NaN;
-            or its features or robots differ from the workspace's.
+        TrustboError: If the posterior is not from `fit`; a variable is missing or has NaN draws; or
+            features or robots differ from those of the workspace.
     """
     if is_of_people(require_posterior("params_of", posterior)):
         raise TrustboError(
@@ -103,8 +103,8 @@ def params_of(
     needed = ("B0", "B") if "B0" in sites else ("beta0", "beta", "b", "delta_w", "delta_v")
     if missing := [name for name in needed if name not in sites]:
         raise TrustboError(
-            f"the posterior has no variable {missing[0]!r}; it has {', '.join(sites)}. Give a "
-            "posterior of trustbo.fit with unchanged names."
+            f"the posterior has no variable {missing[0]!r}, only {', '.join(sites)}. Give a "
+            "posterior from trustbo.fit with unchanged names."
         )
     x0 = {name: attrs[name] for name in ("x0_mean", "x0_sd")}
     params = assemble_params(sites, x0, attrs.get("memory", "level"))
@@ -137,7 +137,7 @@ def params_of(
 
 
 def _in_order_of(workspace: Workspace, posterior: xr.DataTree) -> xr.DataTree:
-    """Reorder features and robots as in a workspace; raises TrustboError if they differ."""
+    """Reorder features and robots to match a workspace; raises TrustboError if names differ."""
     draws, order = posterior["posterior"].to_dataset(), {}
     data = posterior["constant_data"].to_dataset() if "constant_data" in posterior else draws
     wanted = {"feature": list(workspace.features), "robot": list(workspace.team.names)}
@@ -147,12 +147,12 @@ def _in_order_of(workspace: Workspace, posterior: xr.DataTree) -> xr.DataTree:
             continue
         have = [str(name) for name in with_axis[axis].values]
         of_all = axis == "robot" and axis not in draws.dims and "robots" not in posterior.children
-        if of_all:  # parameters that all robots share are for any team
+        if of_all:  # parameters shared by all robots apply to any team
             continue
         if sorted(have) != sorted(names):
             raise TrustboError(
                 f"the posterior has the {axis}s {', '.join(have)}, but the workspace has "
-                f"{', '.join(names)}; fit missions of this workspace."
+                f"{', '.join(names)}; fit missions in this workspace."
             )
         order[axis] = names
     if "robot" in order:
@@ -174,19 +174,19 @@ def effects_of(posterior: xr.DataTree) -> tuple[Effect, ...]:
 
 
 def is_of_people(posterior: xr.DataTree) -> bool:
-    """Return whether a posterior is of `HumanTrust`."""
+    """Return whether the model of a posterior is `HumanTrust`."""
     return posterior.attrs.get("model") == "HumanTrust"
 
 
 def values_of(posterior: xr.DataTree, effect: Effect) -> dict[str, np.ndarray]:
-    """Return the variables of an effect by name, chains joined: leading axis (draw,)."""
+    """Return the variables of an effect by name, with chains joined in a leading axis (draw,)."""
     group = posterior[effect.noun].to_dataset()
     axes = {name: axes or (...,) for name, axes in effect.variables.items() if name in group}
     return {name: joined_draws(group[name], of_name) for name, of_name in axes.items()}
 
 
 def theta_of(posterior: xr.DataTree, sites: Mapping[str, np.ndarray]) -> Theta:
-    """Return the hyperparameters and `rest` of draws by name."""
+    """Return the hyperparameters of draws by name, including `rest`; see `Theta`."""
     if "B0" in sites:
         return {**sites, "rest": 1.0 - np.diagonal(sites["B0"], axis1=1, axis2=2)}
     level = posterior.attrs.get("memory", "level") == "level"
@@ -196,7 +196,7 @@ def theta_of(posterior: xr.DataTree, sites: Mapping[str, np.ndarray]) -> Theta:
 def model_of(posterior: xr.DataTree, model: TrustModel | None = None) -> TrustModel:
     """Return the model of a posterior, with its family and priors.
 
-    Raises TrustboError if its priors or class are custom and `model` is not given.
+    Raises TrustboError if the model has custom priors or a custom class and is not given.
     """
     data = "constant_data" if "constant_data" in posterior.children else "posterior"
     coords = posterior[data].to_dataset().coords
@@ -212,16 +212,16 @@ def read_posterior(
     *,
     model: TrustModel | None = None,
 ) -> tuple[Posterior, Draws]:
-    """Rebuild the `Posterior` of a DataTree, and its draws with chains joined.
+    """Rebuild the `Posterior` and the draws of a DataTree, with chains joined.
 
     Args:
         posterior: DataTree from `fit`.
-        missions: Missions of the fit; needed if the posterior holds no data.
-        model: Model of the posterior; needed with custom priors.
+        missions: Fitted missions; needed if the posterior contains no data.
+        model: Model of the posterior; needed if the priors are custom.
 
     Raises:
-        TrustboError: If the posterior holds no data and no missions are given, or its model is not
-            recorded.
+        TrustboError: If the posterior contains no data and no missions are given, or a custom model
+            is not given.
     """
     missions = missions_of(posterior) if missions is None else list(missions)
     model = model_of(posterior, model)
@@ -235,16 +235,16 @@ def read_posterior(
 def sample_prior(
     model: TrustModel, n_features: int, n_draws: int, seed: int, *, n_robots: int = 1
 ) -> Params:
-    """Draw parameters from the prior, without effects; leading axis (draw,).
+    """Draw parameters (draw, ...) from the prior, without effects.
 
     Args:
         model: Trust model.
         n_features: Number of features.
         n_draws: Number of draws.
-        seed: Seed; the same seed gives the same draws.
+        seed: Random seed; the same seed gives the same draws.
         n_robots: Number of robots, for models with separate parameters for each robot.
     """
-    require_kind("model", model, TrustModel, "give one such as PooledTrust()")
+    require_kind("model", model, TrustModel, "give a model such as PooledTrust()")
     n_draws, seed = require_whole("n_draws", n_draws, 1), require_whole("seed", seed, 0)
     prior, rng = _prior(model, n_features, n_robots), np.random.default_rng(seed)
     sites = prior.named(prior.draw_prior(n_draws, rng))["posterior"]
@@ -252,7 +252,7 @@ def sample_prior(
 
 
 def prior_mean(model: TrustModel, n_features: int, *, n_robots: int = 1) -> Params:
-    """Compute the prior mean of the parameters, without effects; see `sample_prior`."""
+    """Compute the prior mean of the parameters without effects; see `sample_prior`."""
     prior, rng = _prior(model, n_features, n_robots), np.random.default_rng(0)
     draws = prior.draw_prior(_N_MEAN, rng, even=True)
     draws = draws._replace(c=prior.prior(draws.theta).mean)
@@ -262,7 +262,7 @@ def prior_mean(model: TrustModel, n_features: int, *, n_robots: int = 1) -> Para
 
 
 def _prior(model: TrustModel, n_features: int, n_robots: int) -> Posterior:
-    """Make the `Posterior` without data and effects."""
+    """Make a `Posterior` without data or effects."""
     sizes = {"n_features": n_features, "n_robots": n_robots}
     n_features, n_robots = (require_whole(name, n, 1) for name, n in sizes.items())
     none = np.full((1, 1, n_robots), np.nan)
@@ -271,11 +271,11 @@ def _prior(model: TrustModel, n_features: int, n_robots: int) -> Posterior:
 
 
 def missions_of(posterior: xr.DataTree) -> list[Mission]:
-    """Rebuild missions from a posterior; raises TrustboError if it holds no data."""
+    """Rebuild missions from the data of a posterior; raises TrustboError if there are no data."""
     if "constant_data" not in posterior.children:
         raise TrustboError(
-            "this posterior contains only parameters; give missions=, the missions of the fit, "
-            "which are result.missions[: j + 1] for result.posteriors[j]."
+            "this posterior contains only parameters; give the fitted missions with missions=. "
+            "For result.posteriors[j], they are result.missions[: j + 1]."
         )
     data = posterior["constant_data"].to_dataset()
     data = data.assign(contact_rate=posterior["observed_data"].to_dataset()["contact_rate"])

@@ -1,17 +1,17 @@
-"""Evidence of every model: blocks of jointly normal signals with common columns.
+"""Evidence of a model with blocks of jointly normal signals that share columns.
 
-A block (a robot in a mission, a mission of robots that influence each other, or a person) has trust
-and a signal
+A block is a robot in a mission, a mission of dependent robots, or a person. Each block has trust x
+and a signal f,
 
     x = m + T U c + e,    f = x + n,    e ~ N(0, S),  n ~ N(0, noise),  c ~ N(mean, precision^-1),
 
-and every observation is a Gaussian site N(y; f, 1 / lam): exact for Gaussian rates, matched by
-expectation propagation for others (`ep`). With L L' = 1 + lam^1/2 (S + noise) lam^1/2 and
-W = L^-1 lam^1/2, the model is a regression of W (y - m) on W T U with unit noise. Products of
-columns by pairs of rows, summed over the blocks of one kind, do not depend on theta, so that
+where every observation is a Gaussian site N(y; f, 1 / lam). Sites are exact for Gaussian rates, and
+matched by expectation propagation (`ep`) for other families. With L L' = 1 + lam^1/2 (S + noise)
+lam^1/2 and W = L^-1 lam^1/2, the model is a regression of W (y - m) on W T U with unit noise.
+Products of columns for pairs of inputs, summed over blocks of one kind, do not depend on theta. So
 U' (W T)' (W T) U is one sparse product for all theta, whatever the number of missions.
 
-The same code runs in NumPy, without compilation, and in JAX, with derivatives.
+The same code runs in NumPy without compilation and in JAX with derivatives.
 """
 
 from collections.abc import Sequence
@@ -26,15 +26,15 @@ from trustbo.models.signal import Signal, each
 
 
 class Blocks(NamedTuple):
-    """Data of all blocks, independent of theta."""
+    """Data of all blocks, which do not depend on theta."""
 
     y: np.ndarray  # (block, row), 0 where not measured
     U: Any  # sparse (block * input, column)
-    kind: np.ndarray  # (block,): blocks of one kind share their factors
-    label: np.ndarray  # (kind,): index on the second axis of a `Signal`
+    kind: np.ndarray  # (block,), kind of each block; blocks of one kind share factors
+    label: np.ndarray  # (kind,), index on the second axis of a `Signal`
     seen: np.ndarray  # (kind, row)
-    sums: Any  # sparse (entry, kind * pair of inputs), of the entries of the precision in `at`
-    at: np.ndarray  # (entry,), where the precision has products of columns, see `Order`
+    sums: Any  # sparse (entry, kind * pair of inputs), for the precision entries in `at`
+    at: np.ndarray  # (entry,), precision entries with products of columns; see `Order`
     order: Order
 
     @classmethod
@@ -47,14 +47,14 @@ class Blocks(NamedTuple):
         order: Order,
         apart: bool = False,
     ) -> Self:
-        """Lay out blocks; blocks with equal labels and equal gaps are of one kind.
+        """Arrange blocks; blocks with equal labels and equal missing rows are of one kind.
 
         Args:
             y: Observations (block, row), NaN where not measured.
-            U: Columns, sparse (block * input, column).
-            label: Index (block,) on the second axis of a `Signal`.
-            order: Order of elimination of the columns.
-            apart: Whether each block is a separate kind, as needed for sites that differ.
+            U: Columns as a sparse matrix (block * input, column).
+            label: Index (block,) of each block on the second axis of a `Signal`.
+            order: Order in which the columns are eliminated.
+            apart: Whether each block is a separate kind, as needed if sites differ between blocks.
         """
         n, p = len(y), U.shape[1]
         inputs, U = U.shape[0] // n, sparse.csr_array(U)
@@ -84,15 +84,15 @@ class Blocks(NamedTuple):
 
 
 class Prior(NamedTuple):
-    """Prior of the columns at each theta."""
+    """Prior on the coefficients of the columns at each theta."""
 
     mean: Any  # (point, column)
     parts: Sequence[Any]  # precisions (point, k, k), or (point, k) of independent columns, in order
-    log_det: Any  # (point,), of the whole precision
+    log_det: Any  # (point,), of the full precision
 
     @classmethod
     def of(cls, groups: Sequence[tuple[Any, Sequence[Any]]]) -> Self:
-        """Make the prior of groups of columns, with means (point, k) or None, and precisions."""
+        """Combine groups of columns, each with a mean (point, k) or None and with precisions."""
         means, parts, log_det, known = [], [], 0.0, {}
         for mean, precisions in groups:
             if not precisions:
@@ -112,7 +112,7 @@ class Prior(NamedTuple):
         return cls(xp.concatenate(means, axis=1), parts, log_det)
 
     def add_to(self, A: Any, order: Order) -> Any:
-        """Add the precision of the columns to entries (point, entry)."""
+        """Add the prior precision to the entries (point, entry) of A."""
         start = 0
         for part in self.parts:
             i = np.arange(start, start := start + part.shape[1])
@@ -124,7 +124,7 @@ class Prior(NamedTuple):
         return A
 
     def log_density(self, c: np.ndarray) -> np.ndarray:
-        """Compute the log density (point,) of each row of columns (point, column)."""
+        """Compute the log density (point,) of coefficients (point, column)."""
         start, off, square = 0, c - self.mean, 0.0
         for part in self.parts:
             x = off[:, start : (start := start + part.shape[1])]
@@ -133,7 +133,7 @@ class Prior(NamedTuple):
         return 0.5 * (self.log_det - c.shape[1] * np.log(2.0 * np.pi) - square)
 
     def draw(self, rng: np.random.Generator) -> np.ndarray:
-        """Draw the columns once at each point, (point, column)."""
+        """Draw coefficients (point, column), once at each point."""
         drawn = []
         for part in self.parts:
             e = rng.standard_normal(part.shape[:2])
@@ -146,23 +146,23 @@ class Prior(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """Evidence and factors at each theta; the columns are mean + F'^-1 (half + white noise)."""
+    """Evidence and factors at each theta; coefficients are mean + F'^-1 (half + white noise)."""
 
     log_p: Any  # (point,)
-    F: Factor  # of the precision of the columns
-    half: Any  # (point, column), a white vector
+    F: Factor  # of the posterior precision of the coefficients
+    half: Any  # (point, column), a whitened vector
     W: Any  # (point, kind, row, row)
 
 
 def evidence(blocks: Blocks, signal: Signal, prior: Prior, lam: Any, y: Any = None) -> Fit:
-    """Compute log p(y | theta) at all points, with signals and columns integrated out.
+    """Compute log p(y | theta) at all points, with signals and coefficients integrated out.
 
     Args:
         blocks: Data of all blocks.
-        signal: Distribution of the signals given the columns.
-        prior: Prior of the columns.
-        lam: Precisions of the sites (point, kind, row), 0 where nothing was measured.
-        y: Means of the sites (point, block, row), if they differ from the observations.
+        signal: Distribution of the signals given the coefficients.
+        prior: Prior on the coefficients.
+        lam: Site precisions (point, kind, row), 0 where nothing was measured.
+        y: Site means (point, block, row), if different from the observations.
     """
     W, log_sites = whiten(blocks, signal, lam)
     xp, n, b = namespace(W), len(W), blocks
@@ -182,17 +182,17 @@ def evidence(blocks: Blocks, signal: Signal, prior: Prior, lam: Any, y: Any = No
 
 
 def whiten(blocks: Blocks, signal: Signal, lam: Any) -> tuple[Any, Any]:
-    """Return matrices W (point, kind, row, row), and log densities of residuals of 0."""
+    """Return whitening matrices W (point, kind, row, row) and log densities at zero residual."""
     V = each(signal.covariance, blocks.label)
     xp, some = namespace(V), lam > 0.0
-    d = xp.where(some, xp.where(some, lam, 1.0) ** 0.5, 0.0)  # the root's slope at 0 is infinite
+    d = xp.where(some, xp.where(some, lam, 1.0) ** 0.5, 0.0)  # avoids the infinite slope at 0
     L = cholesky(np.eye(V.shape[-1]) + d[..., :, None] * V * d[..., None, :])
     log_sites = 0.5 * xp.log(xp.where(some, lam, 2.0 * np.pi) / (2.0 * np.pi)).sum(-1)
     return xp.linalg.inv(L) * d[..., None, :], log_sites - log_diagonal(L)
 
 
 def expected(blocks: Blocks, signal: Signal, c: Any) -> Any:
-    """Compute the mean of the signals (point, block, row) given columns (point, column)."""
+    """Compute the mean signals (point, block, row) given coefficients (point, column)."""
     drift = times(blocks.U, c).reshape(len(c), len(blocks.y), -1)
     xp, label = namespace(drift), blocks.label[blocks.kind]
     if signal.T.shape[1] == 1:
@@ -201,7 +201,7 @@ def expected(blocks: Blocks, signal: Signal, c: Any) -> Any:
 
 
 def draw_columns(prior: Prior, fit: Fit, count: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Draw the columns, `count` times at each point; shape (sum of count, column)."""
+    """Draw coefficients (sum of count, column), `count` times at each point."""
     drawn = []
     for i, many in enumerate(count):
         one = Factor(fit.F.order, *(part[i : i + 1] for part in fit.F[1:]))
@@ -213,9 +213,9 @@ def draw_columns(prior: Prior, fit: Fit, count: np.ndarray, rng: np.random.Gener
 def marginals(
     blocks: Blocks, signal: Signal, prior: Prior, fit: Fit, y: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Compute mean and variance (point, block, row) of every signal given all sites.
+    """Compute the mean and variance (point, block, row) of every signal given all sites.
 
-    The blocks must be of different kinds, in the order of the kinds.
+    Each block must be a separate kind (`apart` in `Blocks.of`), so that kind i is block i.
     """
     V, T = each(signal.covariance, blocks.label), each(signal.T, blocks.label)
     n, rows = len(V), V.shape[-1]
@@ -225,7 +225,7 @@ def marginals(
     at = expected(blocks, signal, c)
     mean = at + np.einsum("nbij,nbj->nbi", gain, y - at)
     k, j = np.triu_indices(T.shape[3])
-    M = np.zeros((n, len(blocks.y), T.shape[3], T.shape[3]))  # U cov U' of each block
+    M = np.zeros((n, len(blocks.y), T.shape[3], T.shape[3]))  # U cov U' for each block
     M[..., k, j] = times(blocks.sums.T, fit.F.covariance()[:, blocks.at]).reshape(
         n, len(blocks.y), -1
     )

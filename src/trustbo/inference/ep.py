@@ -1,10 +1,10 @@
-"""Expectation propagation on the engine, for observations that are not linear in the signal.
+"""Expectation propagation (EP) for observations that are not linear in the signal.
 
-Each term t(f) is replaced by a site exp(-lam f^2 / 2 + eta f). Given the sites the engine is exact;
-it gives the marginal of each signal, hence its cavity, and the family matches the site to cavity
-times term. The log evidence is the sites' plus, for every term, the log ratio of the masses
-of cavity times term and of cavity times site; it is stationary in the sites. The approximation
-error is corrected by importance weights, whose mean is the evidence.
+Each likelihood term t(f) is replaced by a site exp(-lam f^2 / 2 + eta f). Given the sites, `engine`
+computes the marginals of the signals exactly. Dividing a marginal by its site gives the cavity, and
+the family matches the site to the moments of cavity times term. The log evidence is that of the
+sites plus, for every term, the log ratio of the masses of cavity times term and cavity times site.
+The approximation is stationary in the sites and is corrected by importance weights.
 """
 
 from typing import Any, NamedTuple
@@ -18,12 +18,12 @@ from trustbo.models.families import Family
 from trustbo.models.families.moments import log_normal
 from trustbo.models.signal import Signal, each
 
-_LEAST = 1e-9  # precision of a cavity or a site
-_TEMPERED = 0.6  # share of the sites' precision in the wider proposal of columns
+_LEAST = 1e-9  # smallest precision of a cavity or a site
+_TEMPERED = 0.6  # share of the site precisions in the wider proposal
 
 
 class Terms(NamedTuple):
-    """Observations of blocks, each of a separate kind, and their family."""
+    """Observations of blocks, each of a separate kind, and the observation family."""
 
     family: Family
     y: np.ndarray  # (block, row), NaN where not measured
@@ -31,12 +31,12 @@ class Terms(NamedTuple):
 
     @property
     def linear(self) -> np.ndarray:
-        """Observations whose sites are exact, (block, row)."""
+        """Mask (block, row) of the observations whose sites are exact."""
         return ~np.isnan(self.y) & self.family.is_density(self.y)
 
 
 class Joint(NamedTuple):
-    """Columns, signals and observations of all blocks at each theta."""
+    """Blocks, signals, prior and observations at each theta."""
 
     blocks: Blocks
     signal: Signal
@@ -45,26 +45,26 @@ class Joint(NamedTuple):
 
 
 class Sites(NamedTuple):
-    """Sites (point, block, row): precision, and precision times mean."""
+    """Sites (point, block, row) with precision lam and precision-weighted mean eta."""
 
     lam: np.ndarray
     eta: np.ndarray
 
     @property
     def y(self) -> np.ndarray:
-        """Means of the sites, 0 where there is none."""
+        """Means of the sites, 0 where there is no site."""
         some = self.lam != 0.0
         return np.where(some, self.eta / np.where(some, self.lam, 1.0), 0.0)
 
     def at(self, terms: Terms, sd: np.ndarray) -> "Sites":
-        """Return the sites at noises with this sd; sites of linear observations are exact."""
+        """Return the sites, with exact values for linear observations given the noise sd."""
         lam = np.where(terms.linear, sd**-2.0, self.lam)
         eta = np.where(terms.linear, np.nan_to_num(terms.y) * sd**-2.0, self.eta)
         return Sites(*np.broadcast_arrays(lam, eta))
 
 
 def first_sites(terms: Terms) -> Sites:
-    """Make initial sites, (1, block, row), matched under a vague distribution of trust."""
+    """Make initial sites (1, block, row), matched under a vague distribution of trust."""
     unit, zero = terms.family.line_of_sight
     y = terms.y
     m, v = np.full(y.shape, unit * (0.5 - zero)), np.full(y.shape, (0.3 * unit) ** 2)
@@ -76,7 +76,7 @@ def first_sites(terms: Terms) -> Sites:
 def _matched(
     terms: Terms, rest: np.ndarray, slope: np.ndarray, mean: np.ndarray, var: np.ndarray
 ) -> Sites:
-    """Find sites that turn cavities of precision `rest` and mean slope / rest into moments."""
+    """Find sites whose products with cavities N(slope / rest, 1 / rest) have these moments."""
     seen = ~np.isnan(terms.y)
     lam = np.where(seen, np.maximum(1.0 / var - rest, _LEAST), 0.0)
     return Sites(lam, np.where(seen, mean * (lam + rest) - slope, 0.0))
@@ -85,7 +85,7 @@ def _matched(
 def log_evidence(
     joint: Joint, sites: Sites, n_sweeps: int, damp: float = 1.0
 ) -> tuple[np.ndarray, Sites]:
-    """Compute EP's log evidence (point,), and the sites, after `n_sweeps` sweeps."""
+    """Compute the EP log evidence (point,) and the sites after `n_sweeps` sweeps."""
     blocks, signal, prior, terms = joint
     seen, sd = ~np.isnan(terms.y), signal.sd
     sites = sites.at(terms, sd)
@@ -94,7 +94,7 @@ def log_evidence(
         lam, eta, y = *sites, sites.y
         fit = evidence(blocks, signal, prior, lam, y)
         mean, var = marginals(blocks, signal, prior, fit, y)
-        rest = np.maximum(1.0 / var - lam, _LEAST)  # of the cavities
+        rest = np.maximum(1.0 / var - lam, _LEAST)  # precision of the cavities
         slope = mean / var - eta
         m, v = slope / rest, 1.0 / rest
         log_mass, mean, var = terms.family.match(terms.y, terms.n_ticks, m, v, sd)
@@ -116,13 +116,13 @@ def _overlap(y: np.ndarray, lam: np.ndarray, m: np.ndarray, v: np.ndarray) -> np
 def draw(
     joint: Joint, sites: Sites, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Draw columns and signals at each theta with log weights, whose mean weight is the evidence.
+    """Draw coefficients and signals at each theta, with weights whose mean is the evidence.
 
-    Columns are drawn from a mixture of two Student-t: EP's posterior, and one with less precise
-    sites.
+    Coefficients are drawn from a mixture of two Student-t distributions, which are centred on the
+    EP posterior and on a posterior with less precise sites.
 
     Returns:
-        Columns (point, column), signals (point, block, row) and log weights (point,).
+        Coefficients (point, column), signals (point, block, row) and log weights (point,).
     """
     blocks, signal, prior, terms = joint
     n, p = len(signal.sd), blocks.U.shape[1]
@@ -145,17 +145,17 @@ def draw(
 def draw_signals(
     joint: Joint, at: np.ndarray, sites: Sites, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draw signals row by row, given their means and the observations.
+    """Draw signals row by row, given the means and the observations.
 
     Args:
-        joint: Columns, signals and observations.
-        at: Mean of the signals given the columns (draw, block, row).
-        sites: Sites that approximate the terms of later rows.
+        joint: Blocks, signals, prior and observations.
+        at: Mean signals (draw, block, row) given the coefficients.
+        sites: Sites that approximate the likelihood of later rows.
         rng: Random number generator.
 
     Returns:
-        Signals (draw, block, row) and log weights (draw, block), whose mean weight is the
-        likelihood of a block given the columns.
+        Signals (draw, block, row) and log weights (draw, block). The mean weight is the likelihood
+        of a block given the coefficients.
     """
     blocks, signal, _, terms = joint
     lam, eta, y = *sites, sites.y
@@ -185,7 +185,7 @@ def draw_signals(
 
 
 def _log_student(c: np.ndarray, center: np.ndarray, F: Factor, nu: float) -> np.ndarray:
-    """Compute the log density of a Student-t; F is the factor of its precision."""
+    """Compute the log density of a Student-t distribution; F factors the precision matrix."""
     p, z = c.shape[1], F.whitened(c - center)
     constant: Any = special.gammaln(0.5 * (nu + p)) - special.gammaln(0.5 * nu)
     constant = constant - 0.5 * p * np.log(nu * np.pi)

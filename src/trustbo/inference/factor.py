@@ -1,14 +1,14 @@
-"""Cholesky factors of the precision of columns, most of which occur in one mission only.
+"""Cholesky factors of a precision matrix whose columns mostly belong to one mission.
 
-Columns that are independent a priori and occur in one mission only, such as bounds made once, are
-*leaves*: given all other columns, the *core*, leaves of different missions are independent. With
-leaves first, the precision A and its factor F, A = F F', are
+Columns that are independent a priori and occur in only one mission, such as bounds visited once,
+are *leaves*. All other columns are the *core*. Given the core, leaves of different missions are
+independent. If leaves come first, the precision A = F F' and its factor F are
 
     A = [D  B ]    F = [G   0 ]    G G' = D,  X = G^-1 B,  H' H = C - X' X,
         [B' C ]        [X'  H']
 
-with D and G block diagonal, a block for each mission. Only H is a large dense factor, kept as an
-upper triangle: LAPACK factors it in place, and fastest, as a lower one in its order of axes.
+where D and G are block diagonal, with one block per mission. Only H is a large dense factor. LAPACK
+factors upper triangles fastest and in place, because its memory order is transposed.
 """
 
 from typing import Any, NamedTuple, Self
@@ -24,23 +24,23 @@ from trustbo.models.backend import namespace
 class Order(NamedTuple):
     """Order in which columns are eliminated, and the layout of D, B and C in one vector."""
 
-    leaf: np.ndarray  # (mission, place), columns, padded with the number of columns
-    core: np.ndarray  # columns
-    group: np.ndarray  # (column,), mission of a leaf, -1 of the core
-    place: np.ndarray  # (column,), among the leaves of the mission, or in the core
-    touched: np.ndarray  # (mission, number), places of core columns of a mission with leaves
-    number: np.ndarray  # (mission, column), where in `touched`
-    spread: Any  # sparse (core, mission * touched), to sum what missions add to a vector
-    pairs: Any  # sparse (pair, mission * touched * touched), to sum what they add to C
-    pair: np.ndarray  # (pair,), where in C
+    leaf: np.ndarray  # (mission, place), leaf columns, padded with the number of columns
+    core: np.ndarray  # core columns
+    group: np.ndarray  # (column,), mission of a leaf, -1 for the core
+    place: np.ndarray  # (column,), index among the leaves of the mission, or in the core
+    touched: np.ndarray  # (mission, number), places of core columns in a mission with leaves
+    number: np.ndarray  # (mission, column), index in `touched`
+    spread: Any  # sparse (core, mission * touched), sums the missions' terms of a vector
+    pairs: Any  # sparse (pair, mission * touched * touched), sums the missions' terms of C
+    pair: np.ndarray  # (pair,), flat index in C
 
     @classmethod
     def of(cls, met: np.ndarray, free: np.ndarray) -> Self:
-        """Find the order of columns.
+        """Find the elimination order of the columns.
 
         Args:
-            met: Whether a column occurs in a mission, (mission, column).
-            free: Whether a column is a priori independent of all others, (column,).
+            met: Mask (mission, column) of the columns that occur in each mission.
+            free: Mask (column,) of the columns that are independent of all others a priori.
         """
         n_missions = len(met)
         alone = free & (met.sum(0) == 1) & (n_missions > 1)
@@ -72,17 +72,17 @@ class Order(NamedTuple):
 
     @property
     def shapes(self) -> tuple[tuple[int, ...], ...]:
-        """Shapes of D, B and C at a point."""
+        """Shapes of D, B and C at one point."""
         (g, k), q = self.leaf.shape, len(self.core)
         return (g, k, k), (g, k, self.touched.shape[1]), (q, q)
 
     @property
     def size(self) -> int:
-        """Length of the vector."""
+        """Length of the vector that contains D, B and C."""
         return sum(int(np.prod(shape)) for shape in self.shapes)
 
     def entry(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Return the index of entries (a, b) of the precision; -1 where (b, a) is stored."""
+        """Return the index of precision entries (a, b), or -1 where (b, a) is stored instead."""
         (g, k, t), q = self.shapes[1], len(self.core)
         of_leaf, of_both = self.group[a] >= 0, (self.group[a] >= 0) & (self.group[b] >= 0)
         row = self.group[a] * k + self.place[a]
@@ -94,7 +94,7 @@ class Order(NamedTuple):
         return np.where(other | (~of_leaf & (self.group[b] >= 0)), -1, index)
 
     def views(self, A: Any) -> Any:
-        """Return views of D, B and C, (point, ...), in vectors (point, entry)."""
+        """Return views (point, ...) of D, B and C in vectors (point, entry)."""
         ends = np.cumsum([0, *(int(np.prod(shape)) for shape in self.shapes)])
         return tuple(
             A[:, i:j].reshape(len(A), *shape)
@@ -103,16 +103,16 @@ class Order(NamedTuple):
 
 
 class Factor(NamedTuple):
-    """Factor F at each point; white vectors have leaves first, their padding included."""
+    """Factor F at each point; whitened vectors begin with the leaves, including padding."""
 
     order: Order
     inverse: Any  # (point, mission, place, place), G^-1
-    X: Any  # (point, mission, place, touched), 0 elsewhere in the core
-    H: Any  # (point, core, core), upper triangles, with anything below
+    X: Any  # (point, mission, place, touched), 0 for other core columns
+    H: Any  # (point, core, core), upper triangles; entries below are arbitrary
 
     @classmethod
     def of(cls, order: Order, A: Any) -> Self:
-        """Factor precisions in vectors (point, entry), which NumPy overwrites."""
+        """Factor precisions stored in vectors (point, entry), which NumPy overwrites."""
         D, B, C = order.views(A)
         xp = namespace(A)
         padding = (order.leaf == len(order.place))[..., None] * np.eye(order.leaf.shape[1])
@@ -124,16 +124,16 @@ class Factor(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Length of a white vector."""
+        """Length of a whitened vector."""
         return self.order.leaf.size + len(self.order.core)
 
     @property
     def log_det(self) -> Any:
-        """Log determinant of F, (point,)."""
+        """Log determinant (point,) of F."""
         return log_diagonal(self.H) - log_diagonal(self.inverse).sum(1)
 
     def forward(self, h: Any) -> Any:
-        """Compute white vectors F^-1 h of vectors h (point, column)."""
+        """Compute whitened vectors F^-1 h from vectors h (point, column)."""
         xp, order = namespace(h), self.order
         h = xp.concatenate([h, xp.zeros((len(h), 1))], axis=1)
         leaf = (self.inverse @ h[:, order.leaf][..., None])[..., 0]
@@ -149,7 +149,7 @@ class Factor(NamedTuple):
         return xp.concatenate([leaf.reshape(len(h), -1), core], axis=1)
 
     def back(self, white: np.ndarray) -> np.ndarray:
-        """Compute vectors F'^-1 w (point, draw, column) of white vectors w (point, draw, ...)."""
+        """Compute vectors F'^-1 w (point, draw, column) from whitened w (point, draw, ...)."""
         order, split = self.order, self.order.leaf.size
         pairs = zip(self.H, white[..., split:], strict=True)
         core = np.stack([lapack.dtrtrs(H.T, w.T, lower=1, trans=1)[0].T for H, w in pairs])  # pyright: ignore[reportAttributeAccessIssue]
@@ -162,7 +162,7 @@ class Factor(NamedTuple):
         return found[..., :-1]
 
     def whitened(self, c: np.ndarray) -> np.ndarray:
-        """Compute white vectors F' c of vectors c (point, column)."""
+        """Compute whitened vectors F' c from vectors c (point, column)."""
         order = self.order
         c = np.column_stack([c, np.zeros(len(c))])
         leaf, core = c[:, order.leaf], c[:, order.core]
@@ -173,7 +173,7 @@ class Factor(NamedTuple):
         return np.concatenate([leaf.reshape(len(c), -1), core], axis=1)
 
     def covariance(self) -> np.ndarray:
-        """Compute the entries of A^-1 in the layout of A, diagonals halved for sums over pairs."""
+        """Compute A^-1 in the layout of A, with halved diagonals for sums over pairs."""
         entries = np.empty((len(self.H), self.order.size))
         D, B, C = self.order.views(entries)
         for H, found in zip(self.H, C, strict=True):
@@ -181,7 +181,7 @@ class Factor(NamedTuple):
             found[:] = upper + np.triu(upper, 1).T
         turned, q = np.swapaxes(self.inverse, 2, 3), np.arange(C.shape[1])
         i, k = np.minimum(self.order.touched, q[-1]), np.arange(D.shape[2])
-        B[:] = -turned @ self.X @ C[:, i[..., None], i[:, None]]  # of padding, X is 0
+        B[:] = -turned @ self.X @ C[:, i[..., None], i[:, None]]  # X is 0 in the padding
         D[:] = turned @ self.inverse - B @ np.swapaxes(turned @ self.X, 2, 3)
         C[:, q, q] *= 0.5
         D[:, :, k, k] *= 0.5
@@ -195,7 +195,7 @@ def _summing(row: np.ndarray, kept: np.ndarray, n: int) -> Any:
 
 
 def times(M: Any, x: Any) -> Any:
-    """Multiply a sparse matrix by vectors x (point, column); shape (point, row)."""
+    """Multiply a sparse matrix by vectors x (point, column); returns vectors (point, row)."""
     if isinstance(x, np.ndarray):
         return np.ascontiguousarray((M @ x.T).T)
     M = M.tocoo()
@@ -205,7 +205,7 @@ def times(M: Any, x: Any) -> Any:
 
 
 def add(A: Any, at: Any, values: Any) -> Any:
-    """Add values to an array at an index, in place in NumPy, as a copy in JAX."""
+    """Add values to an array at an index, in place in NumPy and to a copy in JAX."""
     if not isinstance(A, np.ndarray):
         return A.at[at].add(values)
     A[at] += values
@@ -213,13 +213,13 @@ def add(A: Any, at: Any, values: Any) -> Any:
 
 
 def log_diagonal(L: Any) -> Any:
-    """Compute the log determinant of triangular matrices."""
+    """Compute the log determinants of triangular matrices."""
     xp = namespace(L)
     return xp.log(xp.diagonal(L, axis1=-2, axis2=-1)).sum(-1)
 
 
 def upper_factor(A: Any) -> Any:
-    """Factor upper triangles, in NumPy in place and with anything below; NaN as in `cholesky`."""
+    """Factor A = H' H with upper H, in place in NumPy; failures are NaN as in `cholesky`."""
     if not isinstance(A, np.ndarray):
         lower = jax.lax.linalg.cholesky(A.mT, symmetrize_input=False)
         return lower.mT
@@ -230,12 +230,12 @@ def upper_factor(A: Any) -> Any:
 
 
 def cholesky(A: Any) -> Any:
-    """Factor lower triangles; NaN where a matrix is not positive definite."""
+    """Compute lower Cholesky factors, with NaN where a matrix is not positive definite."""
     if not isinstance(A, np.ndarray):
         return jax.lax.linalg.cholesky(A, symmetrize_input=False)
     try:
         return np.linalg.cholesky(A)
-    except np.linalg.LinAlgError:  # one bad point must not cost the others
+    except np.linalg.LinAlgError:  # one bad point must not invalidate the others
         if A.ndim == 2:
             return np.full(A.shape, np.nan)
         return np.stack([cholesky(one) for one in A])

@@ -16,34 +16,34 @@ from trustbo.models.params import CoupledParams, Params, check_params
 from trustbo.models.slots import broadcast_ticks
 from trustbo.workspace.moves import bounds_along, moves_along, require_on_grid
 
-_TICKS = 200.0  # of a future bound
+_TICKS = 200.0  # assumed for a future bound
 Effect = np.ndarray | float
-"""Effect of a bound's place, (draw, robot or 1)."""
+"""Place effect of a bound, an array (draw, robot or 1) or a number."""
 
 
 class Beliefs(NamedTuple):
     """Normal distribution of trust under each draw of the parameters.
 
-    A group is a set of robots with dependent trust or noise: all robots, or each one alone.
+    A group is a set of robots with dependent trust or noise: either all robots or a single one.
     """
 
     mean: np.ndarray  # (draw, group, member)
     cov: np.ndarray  # (draw, group, member, member)
-    drift: np.ndarray  # (draw, group, member), of the bound before
+    drift: np.ndarray  # (draw, group, member), drift of the last bound
 
 
 class Dynamics:
-    """One bound of the Kalman filter under many draws of the parameters, for any model.
+    """Kalman filter step for one bound and many parameter draws, for any model.
 
-    Predicted trust x ~ N(m, V) has the signal f = x + n, n ~ N(0, noise). Rates are processed one
-    robot at a time: the family matches the moments of f, exactly for Gaussian rates, and the gain
-    of x on f transfers them to x.
+    Predicted trust x ~ N(m, V) gives the signal f = x + n, n ~ N(0, noise). Rates are processed one
+    robot at a time. The family matches the moments of f, exactly for Gaussian rates, and the gain
+    of x on f transfers the update from f to x.
     """
 
     def __init__(
         self, params: Params, family: Family, n_robots: int, delta_s: np.ndarray | None = None
     ) -> None:
-        """Set draws (draw, ...), and the sd of shared noise in a bound (draw,)."""
+        """Set parameter draws (draw, ...) and the sd (draw,) of the noise that robots share."""
         p: Any = params
         self.family, self._params, self._coupled = family, p, isinstance(p, CoupledParams)
         n, members = len(p.b), n_robots if self._coupled or delta_s is not None else 1
@@ -89,7 +89,7 @@ class Dynamics:
         return Beliefs(mean, cov, drift)
 
     def log_densities(self, predicted: Beliefs, y: np.ndarray, n_ticks: np.ndarray) -> np.ndarray:
-        """Compute the marginal log density of each robot's rate, (draw, robot); 0 if NaN."""
+        """Compute the marginal log density (draw, robot) of each rate, 0 for NaN rates."""
         y, n_ticks = (a.reshape(self.shape[1:]) for a in (y, n_ticks))
         cov = predicted.cov if self._noise is None else predicted.cov + self._noise
         var = np.diagonal(cov, axis1=2, axis2=3)
@@ -99,10 +99,10 @@ class Dynamics:
     def update(
         self, predicted: Beliefs, y: np.ndarray, n_ticks: np.ndarray
     ) -> tuple[Beliefs, np.ndarray]:
-        """Update trust with rates (robot,), NaN where not measured; return their density, too."""
+        """Update trust with rates (robot,), NaN where unmeasured; also return the log density."""
         y, n_ticks = (a.reshape(self.shape[1:]) for a in (y, n_ticks))
         members, (mean, J, drift), first = self.shape[2], predicted, 0
-        if self._noise is not None:  # signals differ from trust, and follow it in the joint normal
+        if self._noise is not None:  # the joint normal has trust first, then signals
             mean, first = np.concatenate([mean, mean], axis=2), members
             J = np.block([[J, J], [J, J + self._noise]])
         log_density = np.zeros(self.shape[0])
@@ -117,7 +117,7 @@ class Dynamics:
         return Beliefs(mean[..., :members], J[..., :members, :members], drift), log_density
 
     def draw(self, beliefs: Beliefs, rng: np.random.Generator) -> Beliefs:
-        """Draw trust, as beliefs without variance."""
+        """Draw trust, and return the draws as beliefs with zero variance."""
         mean = beliefs.mean + _noise(beliefs.cov, rng)
         return beliefs._replace(mean=mean, cov=np.zeros_like(beliefs.cov))
 
@@ -129,7 +129,7 @@ class Dynamics:
         rng: np.random.Generator,
         effect: Effect = 0.0,
     ) -> tuple[Beliefs, np.ndarray]:
-        """Draw trust after a bound given trust before it, and its rates, (draw, robot)."""
+        """Draw trust after a bound given earlier trust, and rates (draw, robot) in the bound."""
         now = self.draw(self.predict(drawn, z, effect), rng)
         signal = now.mean
         if self._noise is not None:
@@ -154,7 +154,7 @@ class Dynamics:
 
 
 def _product(A: np.ndarray, B: np.ndarray) -> np.ndarray:
-    """Multiply matrices; 1 x 1 matrices are much faster without matmul."""
+    """Multiply matrices; avoiding matmul is much faster for 1 x 1 matrices."""
     return A * B if A.shape[-1] == 1 else A @ B
 
 
@@ -165,7 +165,7 @@ def _noise(cov: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 class TrustState(NamedTuple):
-    """Mean and sd of trust, averaged over parameter draws; shape (robot,)."""
+    """Mean and standard deviation (robot,) of trust, averaged over parameter draws."""
 
     mean: np.ndarray
     sd: np.ndarray
@@ -175,12 +175,12 @@ class TrustForecast(NamedTuple):
     """Trust and contact rates along future bounds, averaged over parameter draws.
 
     Attributes:
-        mean: Mean of trust, (bound, robot).
+        mean: Mean of trust, shape (bound, robot).
         sd: Standard deviation of trust.
         rate: Mean contact rate.
         rate_low: 5 % quantile of the contact rate.
         rate_high: 95 % quantile of the contact rate.
-        draws: Contact rates drawn jointly for all bounds, equally weighted, (draw, bound, robot).
+        draws: Equally weighted joint draws (draw, bound, robot) of the contact rates of all bounds.
     """
 
     mean: np.ndarray
@@ -192,22 +192,22 @@ class TrustForecast(NamedTuple):
 
 
 class TrustFilter:
-    """Rao-Blackwellised filter of the trust of each robot during a mission.
+    """Rao-Blackwellised filter for the trust of each robot during a mission.
 
-    Given a parameter draw and Gaussian rates, trust is Gaussian and the Kalman filter is exact; for
+    Given a parameter draw and Gaussian rates, trust is Gaussian and the Kalman filter is exact. For
     other families, moments are matched after each rate (assumed-density filtering). The draws are
-    reweighted by their predictive density of each contact rate. After bound k the filter represents
-    p(trust, parameters | earlier missions, bounds 1..k), exact up to the number of draws and moment
-    matching.
+    reweighted by the predictive density of the rates. After bound k, the filter represents p(trust,
+    parameters | earlier missions, bounds 1..k), up to Monte Carlo error and moment matching.
 
-    To follow a bound tick by tick, update a copy with the rate so far, as `tb.Follower` does.
+    To follow a bound tick by tick, update a copy of the filter with the rate so far, as in
+    `tb.Follower`.
 
     Attributes:
-        params: Parameter draws, leading axis (draw,).
-        weights: Current weights of the draws, shape (draw,), with sum 1.
+        params: Parameter draws with the leading axis (draw,).
+        weights: Current weights (draw,) of the draws, which sum to 1.
         n_bounds: Number of bounds since the last `reset`.
-        family: Family of observations.
-        dynamics: One bound of the Kalman filter under all draws.
+        family: Observation family.
+        dynamics: Kalman filter step for one bound and all draws.
     """
 
     def __init__(
@@ -218,38 +218,35 @@ class TrustFilter:
         observation: str = "gaussian",
         max_draws: int = 1000,
     ) -> None:
-        """Start before the first bound of a mission.
+        """Start the filter before the first bound of a mission.
 
         Args:
-            posterior: DataTree from `fit`, or draws with leading axis (draw,).
-            n_robots: Number of robots; needed with `TrustParams`, which do not contain it. A
-                posterior records it.
-            observation: Observation family, for parameter draws. A posterior records it.
-            max_draws: Maximum number of draws, evenly spaced.
+            posterior: DataTree from `fit`, or parameter draws with the leading axis (draw,).
+            n_robots: Number of robots; needed only with `TrustParams`.
+            observation: Observation family of parameter draws; ignored for a DataTree.
+            max_draws: Maximum number of draws; if there are more, evenly spaced draws are selected.
 
         Raises:
-            TrustboError: If the draws have another number of robots, the posterior is not from
-                `fit`, or `TrustParams` are given without `n_robots`.
+            TrustboError: If the number of robots does not match the draws, the posterior is not
+                from `fit`, or `TrustParams` are given without `n_robots`.
         """
         delta_s, self._bounded = None, True
         if isinstance(posterior, xr.DataTree):
             require_posterior("TrustFilter", posterior)
-            if "constant_data" in posterior.children:  # logs without a map have any awareness
+            if "constant_data" in posterior.children:  # without a map, awareness is unbounded
                 self._bounded = bool((posterior["constant_data"]["row"] >= 0).any())
             n_robots, observation = posterior.attrs["n_robots"], posterior.attrs["observation"]
             delta_s = sites_of(posterior).get("delta_s")
             posterior = params_of(posterior, day=True)
         elif not isinstance(posterior, Params):
             raise TrustboError(
-                "a filter needs a posterior of fit, or draws of parameters; got "
-                f"{one_line(posterior)}. Before its first mission, a campaign has no posterior; "
-                "use its `belief`."
+                "TrustFilter needs a posterior from fit or parameter draws; got "
+                f"{one_line(posterior)}. A campaign has no posterior before the first mission; "
+                "use the `belief` of the campaign instead."
             )
         n_robots = posterior.n_robots if n_robots is None else n_robots
         if n_robots is None:
-            raise TrustboError(
-                "draws of TrustParams do not contain the number of robots; give n_robots=."
-            )
+            raise TrustboError("TrustParams do not contain the number of robots; give n_robots=.")
         self._n_robots = require_whole("n_robots", n_robots, 1)
         self._n_features = posterior.n_features
         check_params(posterior, self._n_robots, self._n_features)
@@ -263,7 +260,7 @@ class TrustFilter:
         self.reset()
 
     def reset(self) -> None:
-        """Start a new mission before its first bound, with equally weighted draws."""
+        """Start a new mission with equally weighted draws."""
         n = len(self.params.b)
         self._beliefs = self.dynamics.start()
         self._log_weight, self.weights = np.zeros(n), np.full(n, 1.0 / n)
@@ -271,7 +268,7 @@ class TrustFilter:
 
     @property
     def state(self) -> TrustState:
-        """Trust after the bounds so far, shapes (robot,)."""
+        """Trust of each robot after the bounds so far."""
         return _average(self._beliefs, self.weights)
 
     def update(
@@ -285,23 +282,25 @@ class TrustFilter:
         """Update trust with the contact rates of one bound.
 
         Args:
-            awareness: Shape (robot, feature).
-            contact_rate: Shape (robot,); NaN where not measured.
-            bound: Cell left and cell entered; needed where places have effects.
-            n_ticks: Ticks of the bound, () or (robot,); the beta-binomial family needs them.
+            awareness: Awareness in the bound, shape (robot, feature).
+            contact_rate: Contact rates, shape (robot,); NaN where not measured.
+            bound: Cell left and cell entered; needed if the model has place effects.
+            n_ticks: Tick counts, shape () or (robot,); needed for the beta-binomial family.
 
         Returns:
-            Trust after the bound, shapes (robot,).
+            Mean and standard deviation of trust after the bound.
 
         Raises:
-            TrustboError: If the number of robots or features differs; awareness is NaN or a value
-                is outside [0, 1]; ticks are missing or inconsistent with the rate; the bound is
+            TrustboError: If the number of robots or features is wrong; awareness is NaN or outside
+                [0, 1]; tick counts are missing or inconsistent with the rates; or the bound is
                 missing, off the grid or between cells that are not neighbours.
         """
         z, effect = self._checked(awareness, 2), self.effects(bound, 1)[0]
         y = as_array("contact_rate", contact_rate)
         if y.shape != (self._n_robots,):
-            raise TrustboError(f"contact_rate must be ({self._n_robots},); got shape {y.shape}.")
+            raise TrustboError(
+                f"the shape of contact_rate must be ({self._n_robots},); got shape {y.shape}."
+            )
         require_unit_interval("contact_rate", y)
         if n_ticks is not None:
             n_ticks = as_array("n_ticks", n_ticks)
@@ -310,7 +309,7 @@ class TrustFilter:
         n_ticks = broadcast_ticks(self.family, n_ticks, y.shape)
         predicted = self.dynamics.predict(self._beliefs, z, effect)
         self._beliefs, gained = self.dynamics.update(predicted, y, n_ticks)
-        self._log_weight = self._log_weight + gained  # a copy of the filter keeps its own
+        self._log_weight = self._log_weight + gained  # a new array, as copies share the old one
         self.weights = _normalised(self._log_weight)
         self.n_bounds += 1
         return self.state
@@ -318,16 +317,15 @@ class TrustFilter:
     def predict(self, awareness: ArrayLike, path: Sequence[Cell] | None = None) -> TrustForecast:
         """Predict trust and contact rates along future bounds.
 
-        One rate is drawn for each parameter draw, of 200 ticks where rates are counts.
+        One rate is drawn for each parameter draw. For tick counts, 200 ticks per bound are assumed.
 
         Args:
-            awareness: Shape (bound, robot, feature).
-            path: The current cell of the team and the cells to be entered; needed with place
-                effects.
+            awareness: Awareness along the path, shape (bound, robot, feature).
+            path: Current cell of the team and the cells to be entered; needed with place effects.
 
         Raises:
-            TrustboError: If the number of robots or features differs; awareness is NaN or outside
-                [0, 1]; or the path is missing, has another length, jumps or leaves the grid.
+            TrustboError: If the number of robots or features is wrong; awareness is NaN or outside
+                [0, 1]; or the path is missing, has the wrong length, jumps or leaves the grid.
         """
         given, rng = self._checked(awareness, 3), np.random.default_rng(self.n_bounds)
         ticks, effects = np.full(given.shape[:2], _TICKS), self.effects(path, len(given))
@@ -341,7 +339,7 @@ class TrustFilter:
         return TrustForecast(mean, sd, draws.mean(0), low, high, draws)
 
     def effects(self, path: Sequence[Cell] | None, n_bounds: int) -> Sequence[Effect]:
-        """Return the effect of each bound's place, 0 if none; checks the path's cells."""
+        """Check the cells of a path, and return the place effect of each bound, 0 by default."""
         places = self.params.places
         if path is None and not places:
             return [0.0] * n_bounds
@@ -349,7 +347,7 @@ class TrustFilter:
         cells = [require_pair("a cell", cell) for cell in given]
         if len(cells) != n_bounds + 1:
             raise TrustboError(
-                f"need {n_bounds + 1} cells for {n_bounds} bounds, the current cell first; got "
+                f"need {n_bounds + 1} cells, beginning with the current cell of the team; got "
                 f"{path!r}."
             )
         for grid in {np.shape(value)[-2:] for value in places.values()}:
@@ -364,13 +362,13 @@ class TrustFilter:
         expected = (self._n_robots, self._n_features)
         if z.ndim != n_axes or z.shape[-2:] != expected or not len(z):
             raise TrustboError(
-                f"awareness must be {'(bound, ' if n_axes == 3 else '('}{expected[0]} robots, "
-                f"{expected[1]} features); got shape {z.shape}."
+                f"the shape of awareness must be {'(bound, ' if n_axes == 3 else '('}"
+                f"{expected[0]} robots, {expected[1]} features); got shape {z.shape}."
             )
         if np.isnan(z).any():
             raise TrustboError(
-                "awareness must not be NaN; take unmeasured values from the map: "
-                "workspace.along(path), (bound, robot, feature)."
+                "awareness must not be NaN; replace unmeasured values by those of the map, "
+                "workspace.along(path), with shape (bound, robot, feature)."
             )
         if self._bounded:
             require_unit_interval("awareness", z)
@@ -378,7 +376,7 @@ class TrustFilter:
 
 
 def _average(beliefs: Beliefs, weights: np.ndarray) -> TrustState:
-    """Compute mean and sd of the mixture over draws."""
+    """Compute the mean and standard deviation of the mixture over draws."""
     mean = beliefs.mean.reshape(len(weights), -1)
     var = np.diagonal(beliefs.cov, axis1=2, axis2=3).reshape(mean.shape)
     center = weights @ mean

@@ -48,45 +48,45 @@ def fit(
     check: bool = True,
     whole: bool = True,
 ) -> xr.DataTree:
-    """Fit the posterior of the trust model's parameters and of latent trust to missions.
+    """Fit a trust model to missions, and return the posterior of parameters and latent trust.
 
     Args:
         missions: Missions of one team; NaN marks contact rates that were not measured.
-        model: Trust model; by default `models.default_model()`, with effects of places and robots.
-            The default omits effects of places for missions without a map or with paths that jump;
-            for reports of people, see `logs.read_reports`, it is `HumanTrust` with their scale.
-        sampler: `"importance"`: independent draws by adaptive importance sampling of the
-            hyperparameters, with all else integrated out, without compilation. `"nuts"`: NumPyro's
-            NUTS, on the same density for Gaussian rates, otherwise sampling trust as well.
-        workspace: Workspace of the missions. If given, features and robots are put in its order,
-            and missing awareness such as line of sight is filled in, see `Workspace.fill`. Effects
-            of places then cover the whole grid, otherwise the grid up to the last row and column
-            visited.
-        draws: Draws kept per chain.
-        chains: Number of chains; draws of importance sampling are divided among them.
-        warmup: Warm-up draws per chain of NUTS, not kept.
-        seed: Seed; the same seed gives the same posterior.
+        model: Trust model, by default `models.default_model()` with place and robot effects. Place
+            effects are omitted if a mission has no map or a path jumps. For reports of people (see
+            `logs.read_reports`), the default is `HumanTrust` with the scale of the reports.
+        sampler: `"importance"` takes independent draws by adaptive importance sampling without
+            compilation, and integrates out all variables except hyperparameters. `"nuts"` uses
+            NumPyro's NUTS, which also samples trust unless rates are Gaussian.
+        workspace: Workspace of the missions. If given, features and robots are reordered to match
+            the workspace, missing awareness such as line of sight is filled in (see
+            `Workspace.fill`), and place effects cover the whole grid. Otherwise, place effects end
+            at the last row and column visited.
+        draws: Number of draws per chain.
+        chains: Number of chains, among which the draws of importance sampling are divided.
+        warmup: Number of warm-up draws per chain of NUTS, which are discarded.
+        seed: Random seed; the same seed gives the same posterior.
         progress: Whether NUTS shows a progress bar.
-        check: Whether to raise an error on bad diagnostics: k-hat > 0.7 for importance sampling;
-            R-hat > 1.01, bulk ESS < 400 or a divergence for NUTS.
-        whole: Whether to add latent trust, log-likelihoods and predictions at once; `complete` adds
-            them later.
+        check: Whether to raise an error if diagnostics are bad: k-hat > 0.7 for importance
+            sampling; R-hat > 1.01, bulk ESS < 400 or any divergence for NUTS.
+        whole: Whether to add latent trust, log-likelihoods and predictions, as `complete` does.
 
     Returns:
-        An ArviZ DataTree with the groups `posterior` (for `PooledTrust` beta0, beta[feature], b,
-        delta_w, delta_v), one for each kind of effects, `latent` (trust[chain, draw, mission,
-        bound, robot], and trust_mean and trust_sd over all draws), `posterior_predictive`, `prior`,
-        `prior_predictive`, `log_prior`, `log_likelihood` (contact_rate[chain, draw, mission]: a
-        whole mission is one observation, so LOO leaves out missions), `sample_stats`,
-        `observed_data` and `constant_data`. Bound k is labelled k = 1, 2, ...; short missions are
-        padded with NaN. If all rates have n_ticks, log-likelihoods are of the tick counts, hence
-        comparable between observation families; see the attribute `log_likelihood_of`.
+        An ArviZ DataTree. `posterior` contains the parameters (for `PooledTrust` beta0,
+        beta[feature], b, delta_w and delta_v), and each effect has a separate group. `latent`
+        contains trust[chain, draw, mission, bound, robot], and trust_mean and trust_sd over all
+        draws. `log_likelihood` contains contact_rate[chain, draw, mission], so that LOO leaves out
+        whole missions. If all rates have n_ticks, the log-likelihoods are those of tick counts
+        (attribute `log_likelihood_of`) and comparable between observation families. Other groups
+        are `posterior_predictive`, `prior`, `prior_predictive`, `log_prior`, `sample_stats`,
+        `observed_data` and `constant_data`. Bounds are labelled from 1, and short missions are
+        padded with NaN.
 
     Raises:
-        TrustboError: If there are no missions, or they differ in robots or features; an awareness
-            value is NaN; the sampler is unknown; no contact rate was measured; a path leaves the
-            workspace; or a number of draws or the seed is not a whole number.
-        PosteriorError: If the diagnostics are beyond their limits.
+        TrustboError: If there are no missions; robots or features differ between missions; an
+            awareness value is NaN; the sampler is unknown; no contact rate was measured; a path
+            leaves the workspace; or a number of draws or the seed is not a whole number.
+        PosteriorError: If `check` is true and the diagnostics are bad.
 
     Example:
         >>> posterior = tb.fit(missions, tb.models.PooledTrust())
@@ -95,7 +95,7 @@ def fit(
     started = time.perf_counter()
     missions = _filled(missions, workspace)
     model = _default_of(missions) if model is None else model
-    require_kind("model", model, TrustModel, "give one such as PooledTrust()")
+    require_kind("model", model, TrustModel, "give a model such as PooledTrust()")
     require_choice("sampler", sampler, SAMPLERS)
     sizes = {"draws": draws, "chains": chains, "warmup": warmup}
     draws, chains, warmup = (require_whole(name, n, 1) for name, n in sizes.items())
@@ -121,10 +121,10 @@ def fit(
     tree.attrs |= _record(model, posterior) | summary | {"sampler": sampler, "seed": seed}
     if check and complaints:
         raise PosteriorError(
-            f"posterior rejected: {'; '.join(complaints)}.",
+            f"the diagnostics of the posterior are bad: {'; '.join(complaints)}.",
             tree,
-            "Give more missions, firmer priors or, for NUTS, larger draws and warmup; or pass "
-            "check=False to return it nevertheless.",
+            "Give more missions, narrower priors or, for NUTS, larger draws and warmup; or pass "
+            "check=False to get the posterior anyway.",
         )
     if whole:
         tree = complete(tree, missions, model=model)
@@ -135,7 +135,7 @@ def fit(
 def by_importance(
     posterior: Posterior, n: int, seed: int
 ) -> tuple[Draws, dict[str, np.ndarray], dict[str, Any]]:
-    """Draw by importance sampling; returns draws, statistics (draw,), a summary."""
+    """Draw by importance sampling, and return draws, statistics (draw,) and a summary."""
     rng = np.random.default_rng(seed)
     for size in (256, 1024):
         start = posterior.start()[None]
@@ -161,7 +161,7 @@ def _laid_out(
     missions: Sequence[Mission],
     seed: int,
 ) -> xr.DataTree:
-    """Lay out draws of parameters and effects, and of the prior, as a DataTree with the data."""
+    """Build a DataTree from the data, and from posterior and prior draws."""
     rng = np.random.default_rng([seed, 3])
     groups = posterior.named(drawn)
     groups = {
@@ -179,23 +179,23 @@ def _laid_out(
 
 
 def _default_of(missions: Sequence[Mission]) -> TrustModel:
-    """Return `HumanTrust` for reports, else the default model, without places if no map."""
+    """Return `HumanTrust` for reports, otherwise the default model for the missions."""
     if scale := missions[0].scale:
         return HumanTrust(scale=scale)
     return default_model(places=has_places(missions))
 
 
 def _filled(missions: Sequence[Mission], workspace: Workspace | None) -> list[Mission]:
-    """Check missions of one team, and fill in missing awareness from a workspace."""
+    """Check that missions have one team, and fill in missing awareness from a workspace."""
     require_same_team(missions)
     if workspace is None:
         return list(missions)
-    require_kind("workspace", workspace, Workspace, "give the one the missions were run on")
+    require_kind("workspace", workspace, Workspace, "give the workspace of the missions")
     return [workspace.fill(mission) for mission in missions]
 
 
 def _record(model: TrustModel, posterior: Posterior) -> dict[str, Any]:
-    """Make the attributes of a posterior: its model and data."""
+    """Make the attributes that describe the model and the data of a posterior."""
     slots = posterior.slots
     options = {name: int(v) if isinstance(v, bool) else v for name, v in model.options().items()}
     return {

@@ -1,17 +1,17 @@
 """Adaptive importance sampling of normal scores, for any log density.
 
-Hyperparameters are sampled as *scores* z, coordinates whose prior is a standard normal. Everything
-else (coefficients, effects, trust) is integrated out of the density and drawn given the scores.
+Hyperparameters are sampled as *scores* z, which are standard normal a priori. All other variables
+(coefficients, effects, trust) are integrated out of the density and drawn given the scores.
 
-1. `find_mode` climbs from each start and fits a Gaussian by finite differences.
-2. Each round draws points from the current proposal, from the modes if there are several, and from
-   a defensive proposal, by default the prior: it covers regions that the others miss. All proposals
-   so far form one mixture q, and every point is weighted by p(z) / q(z).
-3. The moments of the weighted points give the next proposal, until k-hat and the effective number
-   of points are good.
+1. `find_mode` searches for a mode from each start and fits a Gaussian by finite differences.
+2. Each round draws points from the current proposal, from the fits at the modes if there are
+   several modes, and from a defensive proposal, which covers regions that other proposals miss. All
+   proposals so far form a mixture q, and every point has the weight p(z) / q(z).
+3. The moments of the weighted points give the next proposal. Sampling stops when k-hat and the
+   effective number of points are good.
 
-The weights are Pareto-smoothed (Vehtari, Simpson, Gelman, Yao and Gabry 2024). Their mean, before
-smoothing, estimates the evidence.
+The weights are Pareto-smoothed (Vehtari, Simpson, Gelman, Yao and Gabry 2024). The mean weight
+before smoothing is an estimate of the evidence.
 """
 
 from collections.abc import Callable
@@ -25,40 +25,40 @@ from scipy.linalg import solve_triangular
 from trustbo.parallel import one_blas_thread
 
 GOOD_KHAT, MAX_KHAT = 0.5, 0.7
-"""Pareto shape of the weights: rounds end below the first, results beyond the second are bad."""
+"""Limits on the Pareto shape k-hat of the weights, for stopping and for acceptable results."""
 _DEGREES = 8.0  # degrees of freedom of the proposals
 _WIDER = 1.15  # scale of a proposal relative to the points that it is fitted to
-_PER_AXIS = 4.0  # effective points for each score that moments need
+_PER_AXIS = 4.0  # effective points needed per score to estimate moments
 _SLOPE_STEP, _CURVATURE_STEP = 1e-3, 3e-2
-_LEAST_CURVATURE = 0.3  # of minus the log density; that of the prior is 1
-_FARTHEST = 7.0  # limit of the scores of a mode
+_LEAST_CURVATURE = 0.3  # of minus the log density; 1 for the prior
+_FARTHEST = 7.0  # largest absolute score of a mode
 
 LogDensity = Callable[[np.ndarray], np.ndarray]
-"""Log density of scores (point, score), up to a constant; shape (point,), -inf where it is 0."""
+"""Log density (point,) of scores (point, score) up to a constant; -inf for zero density."""
 
 
 class Student(NamedTuple):
-    """Multivariate Student-t density."""
+    """Multivariate Student-t distribution."""
 
     center: np.ndarray  # (score,)
     scale: np.ndarray  # (score, score), lower triangular
 
     @classmethod
     def of(cls, z: np.ndarray, weight: np.ndarray, ridge: float = 1e-3) -> Self:
-        """Match the mean and covariance of weighted points, (point, score) and (point,)."""
+        """Fit to the mean and covariance of points z (point, score) with weights (point,)."""
         mean = weight @ z
         covariance = (z - mean).T * weight @ (z - mean)
         return cls(mean, np.linalg.cholesky(covariance + ridge * np.eye(z.shape[1])))
 
     def draw(self, n: int, rng: np.random.Generator) -> np.ndarray:
-        """Draw points of a scrambled Sobol sequence, shape (n, score); n is a power of 2."""
+        """Draw points (n, score) from a scrambled Sobol sequence; n must be a power of 2."""
         d = len(self.center)
         uniform = np.clip(stats.qmc.Sobol(d + 1, rng=rng).random(n), 1e-12, 1.0 - 1e-12)
         chi2 = 2.0 * special.gammaincinv(0.5 * _DEGREES, uniform[:, d:]) / _DEGREES
         return self.center + special.ndtri(uniform[:, :d]) / np.sqrt(chi2) @ self.scale.T
 
     def log_density(self, z: np.ndarray) -> np.ndarray:
-        """Compute the log density of points (point, score), shape (point,)."""
+        """Compute the log density (point,) of points (point, score)."""
         nu, d = _DEGREES, len(self.center)
         white = solve_triangular(self.scale, (z - self.center).T, lower=True)
         constant = special.gammaln(0.5 * (nu + d)) - special.gammaln(0.5 * nu)
@@ -74,7 +74,7 @@ class Points(NamedTuple):
         log_p: Log density of the points, shape (point,).
         log_ratio: Log density relative to the mixture of all proposals, shape (point,).
         weight: Pareto-smoothed weights with sum 1, shape (point,).
-        k_hat: Pareto shape of the weights, good below 0.5, bad beyond 0.7.
+        k_hat: Pareto shape of the weights, which is good below 0.5 and bad above 0.7.
         log_evidence: Log of the integral of the density.
     """
 
@@ -87,16 +87,16 @@ class Points(NamedTuple):
 
     @classmethod
     def of(cls, z: np.ndarray, log_p: np.ndarray, log_ratio: np.ndarray) -> Self:
-        """Build points from log ratios by smoothing the weights."""
+        """Build weighted points by smoothing the importance weights."""
         return cls(z, log_p, log_ratio, *smoothed(log_ratio))
 
     @property
     def kish(self) -> float:
-        """Effective number of points, 1 / sum of squared weights."""
+        """Effective number of points, which is 1 / sum of squared weights."""
         return 1.0 / float((self.weight**2).sum())
 
     def fitted(self) -> Student:
-        """Fit a Student-t to the moments of the points; weights are flattened if few dominate."""
+        """Fit a Student-t to the points' moments, with flattened weights if few points dominate."""
         weight, least = self.weight, _PER_AXIS * self.z.shape[1]
         for _ in range(6):
             if (weight**2).sum() * least <= 1.0:
@@ -105,7 +105,7 @@ class Points(NamedTuple):
         return Student.of(self.z, weight)
 
     def resample(self, n: int, rng: np.random.Generator) -> np.ndarray:
-        """Draw indices of `n` equally weighted points, sorted."""
+        """Draw sorted indices of `n` equally weighted points."""
         return systematic(self.weight, n, rng)
 
 
@@ -119,17 +119,17 @@ def sample(
     most: int = 8,
     defensive: Callable[[Student], Student] | None = None,
 ) -> Points:
-    """Sample a posterior of scores; the caller checks `k_hat`.
+    """Sample a posterior of scores; the caller must check `k_hat`.
 
     Args:
         log_density: Log posterior density of scores.
-        starts: Starts of the search for modes, shape (start, score).
-        rng: Generator of random numbers.
-        size: Number of points per round, a power of 2; half are drawn from `defensive`.
+        starts: Starting points of the search for modes, shape (start, score).
+        rng: Random number generator.
+        size: Number of points per round, a power of 2; half of them are drawn from `defensive`.
         enough: Effective number of points at which sampling stops if k-hat is good.
         most: Maximum number of rounds.
-        defensive: Density for regions that the given proposal may miss; by default a Student-t
-            slightly wider than the prior.
+        defensive: Function that returns a proposal for regions that the current proposal may miss;
+            by default a Student-t slightly wider than the prior.
     """
     d = starts.shape[1]
     prior = Student(np.zeros(d), 1.2 * np.eye(d))
@@ -158,7 +158,7 @@ def sample(
 
 
 def find_modes(log_density: LogDensity, starts: np.ndarray) -> list[Student]:
-    """Fit Gaussians at the distinct modes reached from the starts, the highest first."""
+    """Fit Gaussians at the distinct modes reached from the starts, with the highest mode first."""
     found: list[tuple[float, Student]] = []
     for start in starts:
         mode = find_mode(log_density, start)
@@ -174,7 +174,7 @@ def find_modes(log_density: LogDensity, starts: np.ndarray) -> list[Student]:
 
 
 def find_mode(log_density: LogDensity, start: np.ndarray) -> Student:
-    """Fit a Gaussian at the mode by L-BFGS, with curvature by central differences."""
+    """Find a mode by L-BFGS, and fit a Gaussian with the curvature from finite differences."""
     d = len(start)
     axes = np.eye(d)
 
@@ -201,10 +201,10 @@ def find_mode(log_density: LogDensity, start: np.ndarray) -> Student:
 
 
 def smoothed(log_ratio: np.ndarray) -> tuple[np.ndarray, float, float]:
-    """Smooth log importance ratios (point,) by a Pareto tail; some must be finite.
+    """Smooth log importance ratios (point,) with a Pareto tail; at least one must be finite.
 
     Returns:
-        Weights with sum 1, k-hat, and the log mean of the ratios.
+        Weights that sum to 1, k-hat, and the log of the mean ratio.
     """
     finite = np.isfinite(log_ratio)
     log_mean = float(special.logsumexp(log_ratio) - np.log(len(log_ratio)))
@@ -216,6 +216,6 @@ def smoothed(log_ratio: np.ndarray) -> tuple[np.ndarray, float, float]:
 
 
 def systematic(weight: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:
-    """Return indices of `n` equally weighted draws, sorted, by systematic resampling."""
+    """Return sorted indices of `n` equally weighted draws by systematic resampling."""
     points = (rng.random() + np.arange(n)) / n
     return np.searchsorted(np.cumsum(weight)[:-1] / weight.sum(), points)

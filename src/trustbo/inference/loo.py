@@ -1,11 +1,11 @@
 """Leave-one-mission-out cross-validation and model comparison.
 
-With coefficients, effects and trust integrated out, few hyperparameters theta are left, and
+With coefficients, effects and trust integrated out, only the hyperparameters theta are left, and
 
     p(y_j | y_-j) = 1 / E[ p(y_-j | theta) / p(y | theta) | y ],
 
-so importance weights are ratios of the evidence without and with a mission. Weights of whole draws
-would fail for effects of bounds that only this mission made.
+so the importance weights are ratios of the evidence without and with mission j. Weights of full
+draws would fail for the effects of bounds that occur only in mission j.
 """
 
 import warnings
@@ -27,29 +27,29 @@ from trustbo.models.model import TrustModel
 from trustbo.parallel import one_blas_thread
 from trustbo.stacking import stack_missions
 
-_POINTS = 500  # distinct hyperparameters at most
+_POINTS = 500  # maximum number of distinct hyperparameter values
 
 
 @one_blas_thread()
 def loo(posterior: xr.DataTree, *, model: TrustModel | None = None) -> ELPDData:
     """Estimate the log predictive density of each mission given all other missions.
 
-    Uses Pareto-smoothed weights of hyperparameters, with all else integrated out, and expectation
-    propagation for non-Gaussian families. If k-hat of a mission exceeds 0.7, the model is refitted
-    without it and the difference of log evidence is used. Missions without any measured rate are
-    excluded.
+    Hyperparameter draws get Pareto-smoothed weights. All other variables are integrated out, by
+    expectation propagation if rates are not Gaussian. If k-hat of a mission exceeds 0.7, the model
+    is refitted without that mission and the difference in log evidence is used. Missions without
+    measured rates are excluded.
 
     Args:
-        posterior: DataTree from `fit`, with its data.
-        model: Model of the posterior; needed with custom priors.
+        posterior: DataTree from `fit` that includes the data.
+        model: Model of the posterior; needed if the priors are custom.
 
     Returns:
-        ArviZ's `ELPDData`, pointwise, for `az.compare({name: loo(posterior), ...})`. `elpd_i` and
-        `pareto_k` have a coordinate `refitted` (mission,); for these, `pareto_k` is the k-hat of
-        the refit.
+        Pointwise `ELPDData` of ArviZ for `az.compare({name: loo(posterior), ...})`. The coordinate
+        `refitted` (mission,) of `elpd_i` and `pareto_k` marks refitted missions, for which
+        `pareto_k` is the k-hat of the refit.
 
     Raises:
-        TrustboError: If fewer than two missions have rates.
+        TrustboError: If fewer than two missions have measured rates.
     """
     posterior = require_posterior("loo", posterior)
     fitted, draws = read_posterior(posterior, model=model)
@@ -57,7 +57,7 @@ def loo(posterior: xr.DataTree, *, model: TrustModel | None = None) -> ELPDData:
     measured = np.flatnonzero(~np.isnan(fitted.slots.y).all((1, 2)))
     if len(measured) < 2:
         raise TrustboError(
-            f"LOO needs at least two missions with rates; this posterior has {len(measured)}."
+            f"LOO needs at least two missions with measured rates; got {len(measured)}."
         )
 
     rows = np.column_stack([v.reshape(len(draws.c), -1) for v in draws.theta.values()])
@@ -103,7 +103,7 @@ def _elpd(
 ) -> ELPDData:
     """Make ArviZ's `ELPDData` from log densities of left-out missions.
 
-    `average` is the log density of each mission, averaged over the full posterior.
+    `average` is the log of each mission's mean density under the full posterior.
     """
     coords = {"mission": measured, "refitted": ("mission", refitted)}
     elpd, n = float(density.sum()), len(density)
@@ -111,7 +111,7 @@ def _elpd(
     if bad.any():
         warnings.warn(
             f"Estimated shape parameter of Pareto distribution is greater than {MAX_KHAT:.2f} for "
-            f"missions {measured[bad].tolist()}: their densities may be off.",
+            f"missions {measured[bad].tolist()}; the results may be inaccurate.",
             stacklevel=3,
         )
     return ELPDData(
@@ -129,15 +129,16 @@ def _elpd(
 
 
 def compare(posteriors: Mapping[str, xr.DataTree]) -> pd.DataFrame:
-    """Rank posteriors by leave-one-mission-out cross-validation, see `loo` and `arviz.compare`.
+    """Rank posteriors by leave-one-mission-out cross-validation; see `loo` and `arviz.compare`.
 
     Args:
-        posteriors: Two or more posteriors from `fit`, by name, of the same missions; observation
-            families may differ.
+        posteriors: Two or more posteriors from `fit` by name, fitted to the same missions. The
+            observation families may differ.
 
     Returns:
-        Table of `arviz.compare`, one row per posterior, the best first: `elpd` and `elpd_diff` in
-        nats, its standard error `dse`, stacking `weight`, and `warning` where a Pareto k is high.
+        Table from `arviz.compare` with one row per posterior, the best first. The columns include
+        `elpd`, `elpd_diff` and its standard error `dse` in nats, the stacking `weight`, and
+        `warning`, which is true if a Pareto k is high.
 
     Raises:
         TrustboError: If there are fewer than two posteriors, or their missions differ.
@@ -147,8 +148,7 @@ def compare(posteriors: Mapping[str, xr.DataTree]) -> pd.DataFrame:
     """
     if not isinstance(posteriors, Mapping) or len(posteriors) < 2:
         raise TrustboError(
-            "compare takes two or more posteriors by name, {'pooled': one, 'apart': other}; got "
-            f"{one_line(posteriors)}."
+            f"compare needs a dict of two or more posteriors by name; got {one_line(posteriors)}."
         )
     trees = {name: require_posterior("compare", tree) for name, tree in posteriors.items()}
     (first, reference), *others = (
@@ -157,7 +157,7 @@ def compare(posteriors: Mapping[str, xr.DataTree]) -> pd.DataFrame:
     for name, rates in others:
         if not np.array_equal(reference, rates, equal_nan=True):
             raise TrustboError(
-                f"{name!r} and {first!r} are posteriors of different missions, with rates "
-                f"{rates.shape} and {reference.shape}; fit both to the same."
+                f"{name!r} and {first!r} were fitted to different missions, with rates of shape "
+                f"{rates.shape} and {reference.shape}; fit both to the same missions."
             )
     return ranked({name: loo(tree) for name, tree in trees.items()})

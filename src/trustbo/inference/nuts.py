@@ -1,12 +1,12 @@
-"""NumPyro's NUTS: on the density of the importance sampler, or on a model's plain program.
+"""Sampling with NumPyro's NUTS, on the marginal density or on the full program of a model.
 
-Where rates are Gaussian, coefficients and signals integrate out, and NUTS samples the few
-hyperparameters under the same evidence, differentiated by JAX. The covariance of the importance
-sampler's points, in NumPyro's unconstrained coordinates, is the inverse mass matrix, which whitens
-the density: warm-up tunes the step size alone. Chains start at points of that sampler.
+For Gaussian rates, coefficients and signals are integrated out, and NUTS samples only the
+hyperparameters, with gradients of the evidence from JAX. The inverse mass matrix is the covariance
+of the importance sampler's points in NumPyro's unconstrained coordinates, so warm-up tunes only the
+step size. Chains start at points of the importance sampler.
 
-For other families, the evidence is only approximated by EP. NUTS then samples `model.program`,
-including coefficients and signals.
+For other families, EP only approximates the evidence, so NUTS samples `model.program`, including
+coefficients and signals.
 """
 
 from collections.abc import Callable
@@ -27,7 +27,7 @@ from trustbo.inference.posterior import Draws, Posterior
 from trustbo.models.backend import own_settings
 from trustbo.models.scores import NOISES, Scores, of_size
 
-_POINTS = 2000  # resampled points that the covariance is taken of
+_POINTS = 2000  # resampled points used for the covariance
 _TARGET = 0.9
 _FIELDS = {
     "num_steps": "n_steps",
@@ -36,25 +36,25 @@ _FIELDS = {
     "energy": "energy",
     "potential_energy": "lp",
 }
-"""Names of NumPyro's statistics in ArviZ."""
+"""ArviZ names of NumPyro's sampling statistics."""
 
 
 def sample_by_nuts(
     posterior: Posterior, *, chains: int, draws: int, warmup: int, seed: int, progress: bool = True
 ) -> tuple[Draws, dict[str, np.ndarray], dict[str, Any], list[str]]:
-    """Sample a posterior with NumPyro's `MCMC(NUTS)`, with vectorised chains.
+    """Sample a posterior with NumPyro's NUTS in vectorised chains.
 
     Args:
-        posterior: Model given missions.
+        posterior: Posterior of a model given missions.
         chains: Number of chains.
-        draws: Draws of each chain that are kept.
-        warmup: Draws of each chain that tune the sampler.
-        seed: Seed.
+        draws: Number of draws per chain.
+        warmup: Number of warm-up draws per chain.
+        seed: Random seed.
         progress: Whether to show a progress bar.
 
     Returns:
-        Draws, one chain after the other; statistics (draw,) by name; a summary; and complaints
-        about the convergence.
+        Draws with chains joined, statistics (draw,) by name, diagnostics and a list of failed
+        checks.
     """
     rng = np.random.default_rng([seed, 1])
     points = importance.sample(
@@ -87,7 +87,7 @@ def sample_by_nuts(
 def _kernel(
     posterior: Posterior, z: np.ndarray, chains: int, rng: np.random.Generator
 ) -> tuple[NUTS, dict[str, jax.Array] | None]:
-    """Make the kernel, and starts of the chains, given scores (point, score) of the posterior."""
+    """Make the kernel and the chains' starting points from posterior scores (point, score)."""
     values = posterior.scores.values(z)
     if not posterior.exact:
         center = {name: jnp.asarray(np.median(v, axis=0)) for name, v in values.items()}
@@ -110,11 +110,11 @@ def _kernel(
 
 
 def marginal_program(posterior: Posterior) -> Callable[[], None]:
-    """Run the hyperparameters as a NumPyro program, with the evidence as a factor.
+    """Return a NumPyro program of the hyperparameters, with the evidence as a factor.
 
-    Rates determine the total size of the two noises, but may not distinguish them. Half-normal
-    scores (a_w, a_v) = size (sin(angle), cos(angle)) are independent if size^2 ~ Exponential(1/2)
-    and the angle is uniform, so these two are sampled, and the noises are functions of them.
+    The rates determine the total size of the two noises, but may not distinguish the two.
+    Half-normal scores (a_w, a_v) = size (sin(angle), cos(angle)) are independent if size^2 ~
+    Exponential(1/2) and the angle is uniform, so size^2 and the angle are sampled.
     """
     priors = posterior.scores.priors
     shape = priors["delta_w"].batch_shape
@@ -147,6 +147,6 @@ def _unconstrained(
         if name not in NOISES
     }
     size, angle = (z[:, scores.at[name]].reshape(values[name].shape) for name in NOISES)
-    sites["noise_square"] = jnp.asarray(2.0 * size)  # a logarithm, as the score is
+    sites["noise_square"] = jnp.asarray(2.0 * size)  # a logarithm, like the score
     sites["noise_angle"] = jnp.asarray(log_ndtr(angle) - log_ndtr(-angle))
     return sites

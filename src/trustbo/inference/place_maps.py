@@ -1,12 +1,12 @@
-"""Effects of places over a whole grid, drawn given the effects at visited places.
+"""Place effects over a whole grid, drawn given the effects at visited places.
 
-s at the other cells by Matheron's rule: a draw of the prior over the whole grid, corrected by
-kriging at the visited cells. Prior draws are made by the fast Fourier transform of a circulant
-covariance (Dietrich and Newsam 1997), on a torus so large that the correlation nearly vanishes half
-way round. e at the other bounds is drawn from its prior. Length scales are rounded to steps of 10
-%, which changes the correlation of neighbouring cells by less than .01.
+Effects s of unvisited cells are drawn by Matheron's rule: a prior draw over the whole grid is
+corrected by kriging at the visited cells. Prior draws use the fast Fourier transform of a circulant
+covariance (Dietrich and Newsam 1997) on a torus large enough for correlations to nearly vanish.
+Effects e of unvisited bounds are drawn from the prior. Rounding length scales to steps of 10 %
+changes the correlation of neighbouring cells by less than 0.01.
 
-The random part has mean 0 over the draws, so that the mean of the maps is the posterior mean of the
+The random part is centred over the draws, so that the mean map is the posterior mean of the
 effects, without Monte Carlo error where nothing was measured.
 """
 
@@ -22,20 +22,20 @@ from trustbo.models.visited import Visited
 from trustbo.parallel import one_blas_thread
 from trustbo.workspace.moves import MOVE_NAMES
 
-_STEP = 0.1  # of the logarithm of length scales
-_LARGEST = 4.0  # length scale in units of the grid's longer side
-_REACH = 5.0  # length scales at which the correlation is .002
+_STEP = 0.1  # step of log length scales
+_LARGEST = 4.0  # largest length scale, in units of the grid's longer side
+_REACH = 5.0  # distance in length scales at which the correlation is 0.002
 _JITTER = 1e-9
 _MAP = "row", "col"
 
 
 def place_group(draws: Mapping[str, np.ndarray], places: Visited, seed: int) -> xr.Dataset:
-    """Lay out the draws at visited places as a group of a posterior.
+    """Build the posterior group with the draws at visited places.
 
     Args:
-        draws: place (chain, draw, cell) and place_bound (chain, draw, bound).
+        draws: Arrays place (chain, draw, cell) and place_bound (chain, draw, bound).
         places: Visited places.
-        seed: Seed of the maps that `params_of` draws.
+        seed: Random seed for the maps that `params_of` draws.
     """
     variables = {"place": (("chain", "draw", "cell"), draws["place"])}
     variables["place_bound"] = ("chain", "draw", "bound"), draws["place_bound"]
@@ -67,12 +67,12 @@ def place_maps_of(group: xr.Dataset, sites: Mapping[str, np.ndarray]) -> dict[st
     """Draw the effects of all cells and bounds, given the effects at visited places.
 
     Args:
-        group: Group `places` of a posterior.
-        sites: Hyperparameters by name, (draw,), with chains joined.
+        group: Posterior group `places`.
+        sites: Hyperparameters (draw,) by name, with chains joined.
 
     Returns:
-        place (draw, effect, row, col) and place_bound (draw, effect, move, row, col); the axis
-        `effect` has length 1, as effects are common to all robots.
+        Arrays place (draw, effect, row, col) and place_bound (draw, effect, move, row, col). The
+        axis `effect` has length 1 because effects are common to all robots.
     """
     visited, seed = _Visited(group), int(group.attrs["seed"])
     place = _cells(visited, sites, [seed, 0])
@@ -86,7 +86,7 @@ def place_maps_of(group: xr.Dataset, sites: Mapping[str, np.ndarray]) -> dict[st
 
 @one_blas_thread()
 def _cells(visited: _Visited, sites: Mapping[str, np.ndarray], seed: list[int]) -> np.ndarray:
-    """Draw the effect s over the grid, (draw, row, col), given the effect at visited cells."""
+    """Draw the effect s (draw, row, col) over the grid, given the effect at visited cells."""
     s, shape = visited.s, visited.shape
     flat = visited.cells[:, 0] * shape[1] + visited.cells[:, 1]
     centre = np.zeros((len(s), shape[0] * shape[1]))
@@ -102,12 +102,12 @@ def _cells(visited: _Visited, sites: Mapping[str, np.ndarray], seed: list[int]) 
 def _kriging(
     length_scale: np.ndarray, visited: _Visited
 ) -> Iterator[tuple[int, np.ndarray, float, np.ndarray]]:
-    """Yield draws, length scale and kriging weights for each step of length scales.
+    """Yield the index, draws, length scale and kriging weights of each length-scale step.
 
-    Weights (cell, all) give the mean of s over the grid from the effects at visited cells.
+    The weights (visited cell, grid cell) convert s at visited cells to the mean of s everywhere.
     """
     cells, grid = visited.cells, np.indices(visited.shape).reshape(2, -1).T
-    # Beyond, all cells are nearly equal, and `_prior` would need a far larger grid in memory.
+    # For larger scales, cells are nearly equal, and `_prior` would need a far larger grid.
     length_scale = np.minimum(length_scale, _LARGEST * max(visited.shape))
     steps = np.round(np.log(length_scale) / _STEP).astype(int)
     for step in np.unique(steps):
@@ -128,7 +128,7 @@ def _correlation(cells: np.ndarray, others: np.ndarray, length_scale: float) -> 
 def _prior(
     shape: tuple[int, int], length_scale: float, n: int, rng: np.random.Generator
 ) -> np.ndarray:
-    """Draw fields of unit variance over the grid, (n, cell)."""
+    """Draw n random fields (n, cell) with unit variance over the grid."""
     reach = int(_REACH * length_scale)
     torus = [int(fft.next_fast_len(max(2 * m, m + reach), real=True) or 2 * m) for m in shape]
     down, right = (np.minimum(np.arange(m), m - np.arange(m)) for m in torus)
@@ -140,7 +140,7 @@ def _prior(
 
 
 def _centre(draws: np.ndarray) -> np.ndarray:
-    """Centre draws at mean 0 with unchanged variance, in place; a single draw is unchanged."""
+    """Centre draws at 0 in place without changing the variance; a single draw is unchanged."""
     n = len(draws)
     if n > 1:
         draws -= draws.mean(0)

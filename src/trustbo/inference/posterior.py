@@ -1,4 +1,4 @@
-"""A model given missions: the density for samplers, and draws of all other variables."""
+"""The posterior of a model: a density for samplers, and draws of all other variables."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple, Self
@@ -19,24 +19,24 @@ from trustbo.models.signal import Signal, each
 from trustbo.models.slots import Slots
 
 _CHUNK = 16  # points evaluated at once
-_SIZES = (0.3, 1.0, 1.8, 2.6)  # logs by which starts of the noises fall below the rates' spread
+_SIZES = (0.3, 1.0, 1.8, 2.6)  # log ratios of the rates' spread to starting noises
 _LARGEST_NOISE, _LEAST_NOISE = 50.0, 1e-6
-_SWEEPS = 1  # of EP at each point, from the sites of the mode
-_SETTLED, _DAMPING = 12, 0.7  # sweeps to find those
-_WEIGHTED = 512  # draws that correct EP
-_PARTICLES = 4  # signals for each of them
+_SWEEPS = 1  # EP sweeps at each point, from the sites at the mode
+_SETTLED, _DAMPING = 12, 0.7  # to find the sites at the mode
+_WEIGHTED = 512  # weighted draws that correct EP
+_PARTICLES = 4  # signals for each draw
 
 
 class Draws(NamedTuple):
-    """Draws of hyperparameters and columns, and of signals if drawn by EP."""
+    """Draws of hyperparameters and coefficients, and of signals if drawn with EP."""
 
     theta: dict[str, np.ndarray]  # (draw, ...)
     c: np.ndarray  # (draw, column)
     f: np.ndarray | None = None  # (draw, block, row)
     k_hat: float = 0.0
-    """Pareto shape of the weights that correct EP, 0 where the evidence is exact."""
+    """Pareto shape of the weights that correct EP, 0 if the evidence is exact."""
     log_correction: float = 0.0
-    """Correction of the log evidence by these weights."""
+    """Correction of the log evidence by the weights that correct EP."""
 
     def at(self, index: np.ndarray) -> Self:
         """Select draws by index."""
@@ -45,20 +45,20 @@ class Draws(NamedTuple):
 
 
 class Given(NamedTuple):
-    """Trust, likelihoods and predictions under draws."""
+    """Trust, likelihoods and predictions for given draws."""
 
     trust: np.ndarray  # (kept draw, mission, bound, robot)
     mean: np.ndarray  # (mission, bound, robot), over all draws
     sd: np.ndarray
     log_likelihood: np.ndarray  # (draw, mission)
-    predicted: np.ndarray  # (draw, mission, bound, robot), rates drawn anew
+    predicted: np.ndarray  # (draw, mission, bound, robot), replicated rates
 
 
 class Posterior:
     """Posterior of a trust model's hyperparameters, coefficients and signals."""
 
     def __init__(self, model: TrustModel, slots: Slots) -> None:
-        """Lay out the columns of missions."""
+        """Build the columns and blocks of the missions."""
         self.model, self.slots = model, slots
         self.layout = model.layout(slots)
         self.scores = Scores(model.all_hyperpriors(slots))
@@ -75,7 +75,7 @@ class Posterior:
             self.sites = ep.first_sites(self.terms)
 
     def _order(self) -> Order:
-        """Find the order of elimination: independent columns of one mission alone are leaves."""
+        """Find the elimination order; independent columns that occur in one mission are leaves."""
         n, (rows, p) = self.slots.n_missions, self._U.shape
         parts = self.prior(self.theta(np.zeros((1, self.n_scores)))).parts
         free = np.concatenate([np.full(part.shape[1], part.ndim == 2) for part in parts])
@@ -96,9 +96,9 @@ class Posterior:
         return self.model.theta(self.scores.values(z), self.slots.resolution)
 
     def log_density(self, z: np.ndarray) -> np.ndarray:
-        """Compute the log posterior density of scores, up to the evidence; (point,)."""
+        """Compute the unnormalised log posterior density (point,) of scores (point, score)."""
         out = np.full(len(z), -np.inf)
-        with np.errstate(all="ignore"):  # far out, scores over- and underflow: no density there
+        with np.errstate(all="ignore"):  # extreme scores overflow and get no density
             theta, log_prior = self.theta(z), self.scores.log_prior(z)
             size = np.exp(z[:, self.scores.sizes])
             flat = [np.asarray(values).reshape(len(z), -1) for values in theta.values()]
@@ -109,7 +109,7 @@ class Posterior:
         return np.where(np.isfinite(out), out, -np.inf)
 
     def log_evidence(self, theta: Theta) -> Any:
-        """Compute log p(rates | theta), (point,), by EP if rates are not Gaussian."""
+        """Compute log p(rates | theta) at each point, with EP if rates are not Gaussian."""
         if namespace(theta["rest"]) is not np:
             signal, prior = self._at(theta)
             return evidence(self.blocks, signal, prior, self._lam(signal)).log_p
@@ -123,13 +123,13 @@ class Posterior:
         return found
 
     def settle(self, theta: Theta) -> None:
-        """Find the EP sites at the mean of the points, used as initial sites elsewhere."""
+        """Find the EP sites at the mean of the points, for use as initial sites at other points."""
         if not self.exact:
             center = {name: values.mean(0, keepdims=True) for name, values in theta.items()}
             self.sites = ep.log_evidence(self._joint(center), self.sites, _SETTLED, _DAMPING)[1]
 
     def start(self) -> np.ndarray:
-        """Find the best of four starts for the search of the mode, or with EP the mode."""
+        """Return the best of four starts of the mode search or, with EP, the mode."""
         starts = np.zeros((len(_SIZES), self.n_scores))
         unit = self.model.family.line_of_sight[0]
         spread = np.log(np.clip(unit * np.nanstd(self.slots.y) / 0.2, 1e-2, 3.0))
@@ -143,7 +143,7 @@ class Posterior:
         return best
 
     def defensive(self, proposal: Student) -> Student:
-        """Make a proposal with fitted memory and noises, and the prior for all other scores."""
+        """Make a proposal that is fitted for beta0 and noises, and near the prior elsewhere."""
         core = self.scores.core
         others = np.setdiff1d(np.arange(self.n_scores), core)
         cov = 1.5 * proposal.scale @ proposal.scale.T
@@ -153,12 +153,12 @@ class Posterior:
         return Student(center, np.linalg.cholesky(cov))
 
     def draw(self, z: np.ndarray, log_p: np.ndarray, n: int, rng: np.random.Generator) -> Draws:
-        """Draw columns and signals given equally weighted points, sorted by point.
+        """Draw coefficients and signals at equally weighted points, sorted by point.
 
         Args:
             z: Scores (point, score).
-            log_p: Log density at these points.
-            n: Number of draws; without correction, one per point.
+            log_p: Log density (point,) of the scores.
+            n: Number of draws; for Gaussian rates, one draw per point is returned instead.
             rng: Random number generator.
         """
         unique, index, count = np.unique(z, axis=0, return_inverse=True, return_counts=True)
@@ -181,7 +181,7 @@ class Posterior:
     def draw_columns(
         self, theta: Theta, rng: np.random.Generator, count: np.ndarray | None = None
     ) -> np.ndarray:
-        """Draw the columns at each point given Gaussian rates, once or `count` times."""
+        """Draw the coefficients at each point given Gaussian rates, once or `count` times."""
         count, drawn = np.ones(len(theta["rest"]), dtype=int) if count is None else count, []
         for where, chunk in chunks(theta):
             signal, prior = self._at(chunk)
@@ -190,7 +190,7 @@ class Posterior:
         return np.concatenate(drawn)
 
     def named(self, draws: Draws) -> dict[str, dict[str, np.ndarray]]:
-        """Return variables of draws by group and name: `posterior`, and one per effect."""
+        """Return the variables of draws by group (`posterior` and one per effect) and name."""
         model, theta = self.model, draws.theta
         names = model.dims.keys() | model.effect_dims.keys()
         groups = {"posterior": {n: values for n, values in theta.items() if n in names}}
@@ -211,21 +211,21 @@ class Posterior:
         return Draws(theta, np.column_stack(c))
 
     def draw_prior(self, n: int, rng: np.random.Generator, *, even: bool = False) -> Draws:
-        """Draw hyperparameters and columns from the prior; see `Scores.draw`."""
+        """Draw hyperparameters and coefficients from the prior; see `Scores.draw`."""
         theta = self.model.theta(self.scores.draw(n, rng, even=even), self.slots.resolution)
         c = [self.prior(chunk).draw(rng) for _, chunk in chunks(theta)]
         return Draws(theta, np.concatenate(c))
 
     def given(self, draws: Draws, kept: np.ndarray, rng: np.random.Generator) -> Given:
-        """Compute trust, likelihoods and predictions under draws.
+        """Compute trust, likelihoods and predictions for given draws.
 
         Args:
-            draws: Draws of hyperparameters and columns.
+            draws: Draws of hyperparameters and coefficients.
             kept: Indices of the draws whose trust is kept.
             rng: Random number generator.
         """
         rows = [v.reshape(len(draws.c), -1) for v in draws.theta.values()]
-        _, some, index = np.unique(  # under EP draws repeat: each is evaluated once
+        _, some, index = np.unique(  # EP draws repeat; evaluate each once
             np.column_stack([*rows, draws.c]), axis=0, return_index=True, return_inverse=True
         )
         index, draws = index.ravel(), draws.at(some)
@@ -243,14 +243,14 @@ class Posterior:
         return Given(trust[index[kept]], mean, sd, log_likelihood[index], predicted[index])
 
     def anew(self, draws: Draws, rng: np.random.Generator) -> np.ndarray:
-        """Draw replicated rates of the missions, (draw, mission, bound, robot)."""
+        """Draw replicated rates (draw, mission, bound, robot) of the missions."""
         rates = np.empty((len(draws.c), *self.slots.y.shape))
         for i, _, signal, mean in self.signals(draws):
             rates[i] = self._anew(signal, mean, rng)
         return rates
 
     def signals(self, draws: Draws) -> Iterator[tuple[slice, Theta, Signal, np.ndarray]]:
-        """Yield chunks of draws: slice, hyperparameters, signals and their means."""
+        """Yield the slice, hyperparameters, signals and mean signals of each chunk of draws."""
         for where, theta in chunks(draws.theta):
             signal = self.model.signal(theta, self.slots, self.layout)
             yield where, theta, signal, expected(self.blocks, signal, draws.c[where])
@@ -258,7 +258,7 @@ class Posterior:
     def _exact_trust(
         self, theta: Theta, signal: Signal, mean: np.ndarray, rng: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Draw trust (draw, block, row) given Gaussian rates; also their log likelihood."""
+        """Draw trust (draw, block, row) given Gaussian rates; also return log-likelihoods."""
         b, S = self.blocks, each(signal.S, self.blocks.label)
         W, log_sites = whiten(b, signal, self._lam(signal))
         off = b.y - mean
@@ -272,7 +272,7 @@ class Posterior:
     def _ep_trust(
         self, theta: Theta, signal: Signal, mean: np.ndarray, rng: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Draw trust for non-Gaussian rates by weighted particles of each block."""
+        """Draw trust for non-Gaussian rates with weighted particles for each block."""
         joint = ep.Joint(self.blocks, signal, self.prior(theta), self.terms)
         sites = ep.log_evidence(joint, self.sites, _SWEEPS)[1]
         drawn = [ep.draw_signals(joint, mean, sites, rng) for _ in range(_PARTICLES)]
@@ -288,7 +288,7 @@ class Posterior:
         return x + (_root(S - gain @ S) @ rng.standard_normal((*x.shape, 1)))[..., 0], log_p
 
     def _anew(self, signal: Signal, mean: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Draw replicated rates of the missions, (draw, mission, bound, robot)."""
+        """Draw replicated rates (draw, mission, bound, robot) of the missions."""
         root = each(_root(signal.covariance), self.blocks.label[self.blocks.kind])
         f = self.layout.slots(mean + (root @ rng.standard_normal((*mean.shape, 1)))[..., 0])
         sd = signal.sd[..., None] if signal.sd.shape[2] == 1 else self.layout.slots(signal.sd)
@@ -298,7 +298,7 @@ class Posterior:
         return self.model.signal(theta, self.slots, self.layout), self.prior(theta)
 
     def prior(self, theta: Theta) -> Prior:
-        """Return the prior of all columns at each theta."""
+        """Return the prior on all coefficients at each theta."""
         return Prior.of([effect.prior(theta, self.slots) for effect in self.model.columns])
 
     def _lam(self, signal: Signal) -> Any:
@@ -309,12 +309,12 @@ class Posterior:
 
 
 def at(theta: Mapping[str, Any], index: Any) -> dict[str, Any]:
-    """Select the hyperparameters at some points."""
+    """Select the hyperparameters at the given points."""
     return {name: values[index] for name, values in theta.items()}
 
 
 def _root(covariance: np.ndarray) -> np.ndarray:
-    """Compute lower factors of covariances (..., row, row) that may be singular by rounding."""
+    """Compute Cholesky factors of covariances (..., row, row) that may be nearly singular."""
     n = covariance.shape[-1]
     even = 0.5 * (covariance + np.swapaxes(covariance, -1, -2))
     scale = np.trace(even, axis1=-2, axis2=-1)[..., None, None] / n
@@ -322,7 +322,7 @@ def _root(covariance: np.ndarray) -> np.ndarray:
 
 
 def chunks(theta: Mapping[str, Any]) -> Iterator[tuple[slice, dict[str, Any]]]:
-    """Yield chunks of points: their slice and hyperparameters."""
+    """Yield the slice and the hyperparameters of each chunk of points."""
     for start in range(0, len(theta["rest"]), _CHUNK):
         where = slice(start, start + _CHUNK)
         yield where, at(theta, where)

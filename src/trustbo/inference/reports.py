@@ -1,4 +1,4 @@
-"""Predictions of people's reports under a posterior of `HumanTrust`."""
+"""Predictions of people's reports from a posterior of `HumanTrust`."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -16,7 +16,7 @@ from trustbo.parallel import one_blas_thread
 
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 GIVEN = ("earlier", "none")
-_ALIKE = 16  # draws of a person's trust for each draw of what persons share
+_ALIKE = 16  # draws of personal trust for each draw of the population parameters
 
 
 @one_blas_thread()
@@ -30,44 +30,44 @@ def predict_reports(
     seed: int = 0,
     model: TrustModel | None = None,
 ) -> xr.Dataset:
-    """Predict each report of persons, who may be new, from their reports at earlier bounds.
+    """Predict each report of a person, who may be new, from the person's earlier reports.
 
-    Earlier reports reweight the posterior draws, to infer a person's start, level and gains;
-    reports of one bound are not used to predict each other.
+    Earlier reports reweight the posterior draws, to infer a person's start, level and gains.
+    Reports at the same bound are not used to predict each other.
 
     Args:
         posterior: Posterior of `HumanTrust`.
-        missions: Persons as missions; NaN reports are predicted too.
-        given: `"earlier"`, or `"none"`: no report of the person is known.
-        fitted: Whether the fit included the earlier reports of these persons; they are then not
-            used again to reweight the population parameters.
+        missions: One mission per person; NaN reports are also predicted.
+        given: `"earlier"` to use earlier reports of the person, or `"none"` to use no reports.
+        fitted: Whether the fit included the earlier reports of these persons. If so, these reports
+            do not reweight the population parameters again.
         n_draws: Maximum number of draws of a person's trust.
-        seed: Seed of the draws.
-        model: Model of the posterior; needed with custom priors.
+        seed: Random seed.
+        model: Model of the posterior; needed if the priors are custom.
 
     Returns:
-        Dataset over (mission, bound, robot): `report`, its `mean` and `quantile` (also over
-        `level`), on the answer scale, such as 1 to 7; `log_score`, nats, the log probability of the
-        report (on the unit scale the log density, except at 0 and 1), and with levels the
-        `probability` of each `answer`. Attributes: the mean absolute error `mae` of medians, the
-        `mean_log_score`, and `coverage_90` of central intervals.
+        Dataset over (mission, bound, robot). `report` and the predicted `mean` and `quantile` (also
+        over `level`) are on the answer scale, such as 1 to 7. `log_score` is the log probability of
+        the report in nats (on the unit scale, the log density except at 0 and 1). With levels,
+        `probability` is the probability of each `answer`. Attributes are the mean absolute error
+        `mae` of medians, `mean_log_score`, and `coverage_90`, the coverage of central intervals.
 
     Raises:
-        TrustboError: If the posterior is not of `HumanTrust`, or the missions have other inputs or
-            another scale.
+        TrustboError: If the posterior is not of `HumanTrust`, or the missions have different inputs
+            or a different scale.
     """
     if not is_of_people(require_posterior("predict_reports", posterior)):
         raise TrustboError(
-            "predict_reports takes a posterior of HumanTrust; got one of "
-            f"{posterior.attrs.get('model')}. Use trustbo.inference.score."
+            "predict_reports needs a posterior of HumanTrust; got a posterior of "
+            f"{posterior.attrs.get('model')}. Use trustbo.inference.score instead."
         )
     require_choice("given", given, GIVEN)
     seed, n = require_whole("seed", seed, 0), require_whole("n_draws", n_draws, 1)
     of_fit, draws = read_posterior(posterior, model=model)
     if missions[0].features != of_fit.slots.features:
         raise TrustboError(
-            f"the posterior has inputs {of_fit.slots.features}, the missions "
-            f"{missions[0].features}; give missions of the same."
+            f"the posterior has the inputs {of_fit.slots.features}, but the missions have "
+            f"{missions[0].features}; the inputs must match."
         )
     levels = levels_of(posterior.attrs["scale"])
     ahead = Posterior(of_fit.model, of_fit.model.slots(missions))
@@ -98,10 +98,10 @@ def predict_reports(
 def _of_person(
     ahead: Posterior, draws: Draws, j: int, earlier: bool, alike: int, rng: np.random.Generator
 ) -> Iterator[tuple[tuple[int, int], np.ndarray, np.ndarray, np.ndarray]]:
-    """Yield (bound, robot), weights of draws, and mean and variance of trust of each report.
+    """Yield (bound, robot), draw weights, and mean and variance of trust for each report.
 
     The person's trust is drawn row by row given the reports so far. Each run of `alike` draws has
-    one common weight.
+    the same total weight.
     """
     slots, family = ahead.slots, ahead.model.family
     _, n_bounds, n_robots = slots.y.shape
@@ -123,7 +123,7 @@ def _of_person(
             var = (root[:, r, known : r + 1] ** 2).sum(1)
             yield (k, i), weight / len(runs), center, var
 
-            # Trust given the report, and those before: rows of one bound tell of each other here.
+            # Draw trust given all reports so far, including reports at the same bound.
             a = mean[:, r] + (root[:, r, :r] * white[:, :r]).sum(1)
             d = root[:, r, r]
             white[:, r] = rng.standard_normal(len(mean))
@@ -168,7 +168,7 @@ def _prediction(
 def _dataset(
     report: np.ndarray, out: dict[str, np.ndarray], levels: int, robots: Sequence[str]
 ) -> xr.Dataset:
-    """Collect predictions by name, with their summaries as attributes."""
+    """Collect predictions in a dataset, with summaries as attributes."""
     axes = {"quantile": ("level",), "probability": ("answer",)}
     dims = ("mission", "bound", "robot")
     variables = {"report": (dims, report)}
@@ -192,5 +192,5 @@ def _dataset(
 
 
 def _answer_of(report: Any, levels: int) -> Any:
-    """Convert reports in [0, 1] to answers on a scale of levels, if there is one."""
+    """Convert reports in [0, 1] to answers from 1 to `levels`, if there are levels."""
     return np.round(report * (levels - 1.0) * 1e6) / 1e6 + 1.0 if levels else report

@@ -1,4 +1,4 @@
-"""Scores of predicted contact rates before a mission against the measured rates."""
+"""Scores of contact rates that were predicted before a mission."""
 
 from collections.abc import Sequence
 
@@ -25,31 +25,31 @@ def score(
     workspace: Workspace | None = None,
     seed: int = 0,
 ) -> xr.Dataset:
-    """Score predictions of contact rates along the paths of missions.
+    """Score predicted contact rates along the paths of missions.
 
-    A prediction is the marginal distribution of each rate before the first bound of its mission:
-    averaged over parameter draws and effects of places, with the noise of trust and of rates.
+    A prediction is the marginal distribution of a rate before the mission starts. The distribution
+    is averaged over parameter draws and place effects, and includes process and observation noise.
 
     Args:
-        posterior: Posterior that predicts all `missions`, none of which it was fitted to; or all
-            posteriors of a campaign, `Result.posteriors`, each of which predicts the next mission.
+        posterior: Posterior that predicts all `missions` and was fitted to none of these; or all
+            posteriors of a campaign (`Result.posteriors`), each of which predicts the next mission.
         missions: Missions to predict; for a campaign, all missions in order.
-        workspace: Workspace of the missions, to fill in missing awareness, as for `fit`.
-        seed: Seed of the predictive draws and of randomised PIT values.
+        workspace: Workspace of the missions, used to fill in missing awareness as in `fit`.
+        seed: Random seed for predictive draws and randomised PIT values.
 
     Returns:
-        Dataset over (mission, bound, robot), NaN where no rate was measured, in missions that were
-        predicted: `contact_rate`, its `mean`, `quantile` (also over `level`), `pit`, the
-        probability integral transform, randomised where rates have point masses, and `log_score`,
-        nats, of counts of ticks where every rate has an n_ticks (attribute `log_score_of`), else of
-        densities, and probabilities at limits of censored rates. Over all rates: `coverage_50` and
-        `coverage_90`, the shares of rates in the central intervals; `mean_log_score`; `r2`, 1 less
-        the ratio of squared errors of the means and of the average rate; and their number `n`.
+        Dataset over (mission, bound, robot) for the predicted missions, NaN where no rate was
+        measured. The variables are `contact_rate`, the predicted `mean` and `quantile` (also over
+        `level`), `pit` (the probability integral transform, randomised at point masses), and
+        `log_score` in nats. Log scores apply to tick counts if every rate has n_ticks, otherwise to
+        rates (see the attribute `log_score_of`). Summaries over all `n` rates are the shares
+        `coverage_50` and `coverage_90` of rates in central intervals, `mean_log_score`, and `r2` of
+        the predicted means.
 
     Raises:
-        TrustboError: If a posterior is not from `fit`; the numbers of posteriors and missions
-            differ, or there is no mission to predict; a path leaves the grid of place effects; or
-            ticks are missing.
+        TrustboError: If a posterior is not from `fit`; the numbers of posteriors and missions do
+            not match; there is no mission to predict; a path leaves the grid of place effects; or
+            tick counts are missing.
     """
     require_whole("seed", seed, 0)
     missions = [m if workspace is None else workspace.fill(m) for m in missions]
@@ -89,14 +89,14 @@ def score(
 
 
 def _follow(posterior: xr.DataTree) -> TrustFilter:
-    """Make the filter of all draws."""
+    """Make a filter from all draws of a posterior."""
     return TrustFilter(posterior, max_draws=posterior["posterior"]["b"].size)
 
 
 def _predict(
     trust: TrustFilter, mission: Mission, batch: MissionBatch, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return log densities of rates (bound, robot), and draws of rates (draw, bound, robot)."""
+    """Return log densities (bound, robot) and draws (draw, bound, robot) of the rates."""
     log_scores, drawn, (z, y, ticks) = np.full(batch.contact_rate.shape, np.nan), [], batch
     path = mission.path[: len(z) + 1] if trust.params.places and mission.has_map else None
     effects, start = trust.effects(path, len(z)), trust.dynamics.start()
@@ -110,7 +110,7 @@ def _predict(
 def _summary(
     contact_rate: np.ndarray, mean: np.ndarray, pit: np.ndarray, log_score: np.ndarray
 ) -> dict[str, float]:
-    """Compute coverage, mean log score, R2 and number of rates, NaN where not measured."""
+    """Compute the coverage, the mean log score, R2 and the number of measured rates."""
     kept = np.isfinite(contact_rate)
     y, n = contact_rate[kept], int(kept.sum())
     if not n:
@@ -128,7 +128,7 @@ def _summary(
 def _trees(
     posterior: xr.DataTree | Sequence[xr.DataTree], missions: Sequence[Mission]
 ) -> list[xr.DataTree]:
-    """List the posterior that predicts each mission; in a campaign, from the second one on."""
+    """List the posterior that predicts each mission, in a campaign from the second mission on."""
     if not missions:
         raise TrustboError("score needs missions to predict; got none.")
     if isinstance(posterior, xr.DataTree) or not isinstance(posterior, Sequence):
@@ -136,11 +136,11 @@ def _trees(
     trees = [require_posterior("score", tree) for tree in posterior]
     if not len(missions) - 1 <= len(trees) <= len(missions):
         raise TrustboError(
-            f"{len(trees)} posteriors and {len(missions)} missions: give one posterior after each "
-            "mission, as Result.posteriors."
+            f"got {len(trees)} posteriors and {len(missions)} missions; give one posterior per "
+            "mission, as in Result.posteriors."
         )
     if len(missions) == 1:
-        raise TrustboError("a campaign of one mission has none to predict; give more missions.")
+        raise TrustboError("a campaign needs at least two missions to be scored; got one.")
     return trees[: len(missions) - 1]
 
 

@@ -1,4 +1,4 @@
-"""Layout of a posterior for ArviZ: named axes, no padding, with the data."""
+"""Build the ArviZ DataTree of a posterior from arrays and missions."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -22,7 +22,7 @@ from trustbo.stacking import MissionBatch, stack_missions
 
 _OF_RATES = ("mission", "bound", "robot")
 _DIMS = dict.fromkeys(("trust", "trust_mean", "trust_sd", "contact_rate"), _OF_RATES)
-_N_TRAJECTORIES = 200  # draws, spread evenly over the chains, that latent trust is kept of
+_N_TRAJECTORIES = 200  # kept draws of latent trust, evenly spaced in the chains
 _N_PRIOR = 500
 _KEPT = ("posterior", "sample_stats", "prior", "hazard")
 
@@ -36,10 +36,10 @@ def to_datatree(
     """Name the axes, remove the padding, and set values after a mission's end to NaN.
 
     Args:
-        groups: Arrays by group and name, with leading axes (chain, draw) except moments.
+        groups: Arrays by group and name, with leading axes (chain, draw) except for moments.
         missions: Missions of the posterior.
         site_dims: Axes of the model's parameters.
-        effects: Effects of the model, whose variables are in some groups.
+        effects: Effects of the model, whose variables may be in the groups.
     """
     observed = stack_missions(missions)
     n_missions, n_bounds = observed.contact_rate.shape[:2]
@@ -72,7 +72,7 @@ def to_datatree(
         index = {"chain": np.arange(shape[0]), "draw": np.arange(shape[1])}
         index = index if draw is None else index | {"draw": draw}
         labelled = {name: labels for name, labels in (coords | index).items() if name in used}
-        # ArviZ labels all variables by the dims of the first, so those with most dims come first.
+        # ArviZ labels variables by the dims of the first one, so those with most dims come first.
         ordered = dict(sorted(variables.items(), key=lambda item: -len(item[1][0])))
         tree[group] = xr.Dataset(ordered, labelled)
     tree["observed_data"], tree["constant_data"] = _data_groups(observed, missions, coords)
@@ -88,7 +88,7 @@ def _data_groups(
         duration[j, : len(mission.bounds)] = mission.duration
         cell[j, : len(mission.bounds)] = [bound.cell for bound in mission.bounds]
     starts = [mission.path[0] if mission.has_map else NOWHERE for mission in missions]
-    # Cells tell how many bounds a mission has, but where there are none.
+    # The cells give the number of bounds, except for missions without a map.
     n_bounds = [len(mission.bounds) for mission in missions]
     counted = {} if all(m.has_map for m in missions) else {"n_bounds": (("mission",), n_bounds)}
     dims, labelled = _OF_RATES, {name: coords[name] for name in _OF_RATES}
@@ -127,20 +127,20 @@ def complete(
 ) -> xr.DataTree:
     """Add latent trust, log-likelihoods and predictions to a posterior.
 
-    A campaign stores only the parameters of its posteriors, as these groups grow with the number of
-    missions. They are reproducible and can be computed at any time.
+    A campaign stores only the parameters of its posteriors because the other groups grow with the
+    number of missions. The other groups are reproducible and can be computed at any time.
 
     Args:
         posterior: DataTree from `fit`, or one of `Result.posteriors`.
-        missions: Missions of the fit; needed if the posterior holds no data.
-        model: Model of the posterior; needed with custom priors.
+        missions: Fitted missions; needed if the posterior contains no data.
+        model: Model of the posterior; needed if the priors are custom.
 
     Returns:
         The posterior with the groups `latent`, `posterior_predictive`, `prior_predictive`,
-        `log_prior` and `log_likelihood`; unchanged if it has them.
+        `log_prior` and `log_likelihood`, or the unchanged posterior if `latent` already exists.
 
     Raises:
-        TrustboError: If the posterior holds no data and no missions are given.
+        TrustboError: If the posterior contains no data and no missions are given.
     """
     if "latent" in require_posterior("complete", posterior).children:
         return posterior
@@ -189,13 +189,13 @@ def complete(
 def log_prior(fitted: Posterior, sites: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Compute the log prior density (draw,) of each parameter with an independent prior.
 
-    Deviations of robots from a common mean belong to the model, not to the prior: for
-    `HierarchicalTrust`, only means and spreads are included. The LKJ prior of correlations R of the
-    coupled model has density det(R)^(concentration - 1).
+    Deviations of robots from a common mean belong to the model and not to the prior, so only means
+    and standard deviations are included for `HierarchicalTrust`. In the coupled model, the LKJ
+    prior on correlations R has the density det(R)^(concentration - 1), up to a constant.
 
     Args:
-        fitted: Model given missions.
-        sites: Parameters of the posterior, (draw, ...).
+        fitted: Posterior of the model given missions.
+        sites: Draws (draw, ...) of the parameters by name.
     """
     model, priors = fitted.model, fitted.scores.priors
     rest = model.derived(sites)["rest"]

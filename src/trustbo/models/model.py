@@ -47,8 +47,7 @@ class TrustModel(Summary, ABC):
             each robot in each mission. The paper's models have none.
 
     Raises:
-        TrustboError: If `observation` is unknown, or `effects` has a wrong type or a repeated
-            class.
+        TrustboError: If `observation` is unknown, or `effects` has a wrong or a repeated class.
     """
 
     priors: Priors = None  # pyright: ignore[reportAssignmentType]
@@ -125,7 +124,7 @@ class TrustModel(Summary, ABC):
 
     @property
     def x0(self) -> dict[str, float]:
-        """Mean and sd of trust before the first bound, by name."""
+        """Mean and standard deviation of trust before the first bound, by name."""
         return {name: float(getattr(self.priors, name)) for name in ("x0_mean", "x0_sd")}
 
     def all_hyperpriors(self, slots: Slots) -> dict[str, Distribution]:
@@ -153,7 +152,7 @@ class TrustModel(Summary, ABC):
         return None
 
     def prior_terms(self, sites: Mapping[str, np.ndarray]) -> dict[str, tuple[str, np.ndarray]]:
-        """Return the `Priors` field and the values of further terms of the log prior, by label."""
+        """Return the `Priors` field and the values of each further log-prior term, by label."""
         return {name: (name, sites[name]) for name in ("beta", "b")}
 
     def slots(self, missions: Sequence[Mission], workspace: Workspace | None = None) -> Slots:

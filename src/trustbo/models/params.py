@@ -105,9 +105,9 @@ class ParameterDraws(Summary):
     def along(self, path: Sequence[Cell] | np.ndarray) -> Self:
         """Return the parameters for the bounds of a path, with place effects in the intercept.
 
-        Without place effects, the parameters are returned unchanged. Otherwise, the result has no
-        place effects, and b has the shape (..., 1, bound, robot), where the last axis has length 1
-        if b is common to all robots.
+        Without place effects, the parameters are returned unchanged. Otherwise, place effects are
+        removed, and b has the shape (..., 1, bound, robot). The last axis of b has length 1 if b is
+        common to all robots.
         """
         if not self.places:
             return self

@@ -32,8 +32,8 @@ class HumanTrust(PooledTrust):
 
     base^k = b + weights . features^k + personal level. The personal start enters d^1, and personal
     gains enter d^k. Start, level and gains are independent, with mean 0 and standard deviations
-    tau_start, tau_level and tau_gain. Because a person has only one mission, these coefficients are
-    a term in the covariance of trust instead of columns. Inputs are outcomes: features whose names
+    tau_start, tau_level and tau_gain. Because a person has only one mission, these coefficients
+    enter the covariance of trust instead of the columns. Inputs are outcomes: features whose names
     begin with `success` or `failure`, possibly scaled by task demands. A person is stored as a
     mission, a step as a bound, and a rated task as a robot, as in `trustbo.logs.read_reports`.
 
@@ -64,7 +64,7 @@ class HumanTrust(PooledTrust):
             require_positive(f"HumanTrust.{name}", getattr(self, name))
         if self.effects or self.shared_noise:
             raise TrustboError(
-                f"HumanTrust supports no effects and no shared_noise; got effects={self.effects!r}."
+                f"HumanTrust allows neither effects nor shared_noise; got effects={self.effects!r}."
             )
 
     def hyperpriors(self, n_robots: int, n_features: int) -> dict[str, dist.Distribution]:
@@ -92,7 +92,7 @@ class HumanTrust(PooledTrust):
         return slots
 
     def layout(self, slots: Slots, *, contrasts: bool = True) -> Layout:
-        """See `TrustModel.layout`; each block is a person, with outcomes and base as inputs."""
+        """See `TrustModel.layout`; a block is a person, with outcomes and base level as inputs."""
         outcomes = [name.startswith((SUCCESS, FAILURE)) for name in slots.features]
         split = np.array([*outcomes, False])  # inputs that decay with beta0
         return Layout(slots.y.shape, joint=True, split=split, apart=True)

@@ -40,7 +40,7 @@ class Priors(Summary):
         delta_v: Standard deviation of the observation noise, excluding the noise that is due to the
             resolution of the rates. In the beta-binomial family, the concentration is delta_v^-2.
         delta_s: Standard deviation of the noise that all robots share in a bound.
-        coupling: Influence of robots on each other, the off-diagonal entries of B0 and B_m.
+        coupling: Off-diagonal entries of B0 and B_m, through which robots influence each other.
         tau: Standard deviation of coefficients between robots in the hierarchical model.
         concentration: Concentration of the LKJ prior on noise correlations in the coupled model.
         x0_mean: Mean of trust before the first bound.
@@ -82,10 +82,10 @@ class Priors(Summary):
     @classmethod
     @cache
     def default(cls, observation: str) -> "Priors":
-        """Return the default priors for an observation family, always as the same object.
+        """Return the default priors for an observation family, as the same object in every call.
 
-        Tick counts (`"beta_binomial"`) have wider priors because trust is a logit: beta_m ~ N(0,
-        2^2), b ~ N(0, 1), delta_w ~ HalfNormal(0.5) and x_0 ~ N(0, 1.5^2).
+        The family `"beta_binomial"` has wider priors because trust is a logit: beta_m ~ N(0, 2^2),
+        b ~ N(0, 1), delta_w ~ HalfNormal(0.5) and x_0 ~ N(0, 1.5^2).
         """
         return cls(**FAMILIES[observation].priors())
 
@@ -96,8 +96,8 @@ class Priors(Summary):
         The feature `line_of_sight` predicts the contact rate, so stationary trust has prior slope 1
         in this feature or in the mean of n such features (`line_of_sight_1`, ...). With beta_los /
         (1 - beta0) ~ N(1 / n, 0.3^2 / n), other weights ~ N(0, 0.25^2), and b / (1 - beta0) ~ N(0,
-        0.15^2), most rates are in [0, 1]. For tick counts, the priors are scaled by 5 and centred
-        on a rate of 0.5. Without such a feature, returns `default`.
+        0.15^2), most rates drawn from the prior are in [0, 1]. For tick counts, the priors are
+        scaled by 5 and centred on a rate of 0.5. Without such a feature, `default` is returned.
         """
         is_sight = np.array([is_line_of_sight(name) for name in features])
         default, n = cls.default(observation), max(int(is_sight.sum()), 1)
@@ -131,9 +131,9 @@ class Priors(Summary):
 
         Args:
             name: Name of a field.
-            values: Values with shape (...), or (..., feature) for `beta`.
-            rest: Drift that raises stationary trust by 1, used if `stationary` is true. Its shape
-                must broadcast to the shape of the values.
+            values: Parameter values with shape (...), or (..., feature) for `beta`.
+            rest: Drift that raises stationary trust by 1, with a shape that broadcasts to the
+                values; used only if `stationary` is true.
         """
         prior = getattr(self, name)
         if not self.stationary or name not in ("beta", "b"):

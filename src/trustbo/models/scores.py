@@ -1,4 +1,4 @@
-"""Hyperparameters as normal scores, the coordinates that the samplers use.
+"""Normal scores of hyperparameters, which are the coordinates that the samplers use.
 
 A score is standard normal a priori, except for the two noises. The noises have half-normal scores
 (a_w, a_v) = size (sin(angle), cos(angle)), and the coordinates are log size and a normal score of
@@ -43,7 +43,7 @@ class Scores:
 
     @property
     def sizes(self) -> slice:
-        """Slice of the scores that are the log size of the noises."""
+        """Slice of the scores that contain the log size of the noises."""
         return self.at[NOISES[0]]
 
     def values(self, z: np.ndarray) -> dict[str, np.ndarray]:

@@ -90,7 +90,7 @@ def each(M: Any, label: np.ndarray) -> Any:
 
 
 def powers(beta0: Any, n: int) -> Any:
-    """Compute (1 - beta0 Lag)^-1 (..., n, n), a lower triangular matrix of powers beta0^(k - j)."""
+    """Compute lower triangular matrices (1 - beta0 Lag)^-1 (..., n, n) of powers beta0^(k - j)."""
     xp = namespace(beta0)
     lag = np.subtract.outer(np.arange(n), np.arange(n))
     return xp.where(lag >= 0, beta0[..., None, None] ** np.maximum(lag, 0), 0.0)

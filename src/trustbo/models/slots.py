@@ -1,4 +1,4 @@
-"""Rates and features of missions by slot, which is one bound of one robot in one mission."""
+"""Rates and features of missions by slot; a slot is one bound of one robot in one mission."""
 
 from collections.abc import Sequence
 from typing import NamedTuple, Self
@@ -35,7 +35,7 @@ class Slots(NamedTuple):
 
     @property
     def n_bounds(self) -> int:
-        """Number of bounds of the longest mission."""
+        """Number of bounds in the longest mission."""
         return self.y.shape[1]
 
     @property

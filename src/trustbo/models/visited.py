@@ -25,7 +25,7 @@ class Visited(NamedTuple):
 def bounds_of(missions: Sequence[Mission], shape: tuple[int, int] | None = None) -> np.ndarray:
     """Return an array (mission, bound, 3) of moves, rows and columns, with -1 in the padding.
 
-    `shape` is the number of missions and bounds, by default those of `missions`. Raises
+    `shape` contains the numbers of missions and bounds, by default those in `missions`. Raises
     TrustboError if a path jumps or a mission has no map.
     """
     require_map("a model with place effects", missions)

@@ -38,9 +38,9 @@ EFFECTS: dict[str, type["Effect"]] = {}
 class Effect:
     """Base class of an effect on the drift, with the settings of its prior.
 
-    By default, hyperparameters are standard deviations with half-normal priors, and fields of the
-    same names are the prior scales. Override `hyperpriors` for other priors. Classes with a `noun`
-    can be read from files.
+    By default, hyperparameters are standard deviations with half-normal priors, whose scales are
+    given by the fields of the same names. Override `hyperpriors` for other priors. Classes with a
+    `noun` can be read from files.
 
     Raises:
         TrustboError: If a prior scale is not positive.
@@ -65,7 +65,7 @@ class Effect:
                 require_positive(f"{type(self).__name__}.{name}", value)
 
     def columns(self, slots: Slots) -> Any:
-        """Return a sparse matrix (slot, column), with slots (mission, bound, robot) flattened."""
+        """Return a sparse matrix (slot, column), with flattened slots (mission, bound, robot)."""
         raise NotImplementedError
 
     def prior(self, theta: Theta, slots: Slots) -> tuple[Any, list[Any]]:
@@ -86,7 +86,7 @@ class Effect:
         raise NotImplementedError
 
     def ahead(self, values: Values, theta: Theta, n: int, rng: Generator | None) -> np.ndarray:
-        """Return the slope (draw, robot) of the drift in line of sight after n missions; default 0.
+        """Return the slope (draw, robot) of drift in line of sight after n missions, 0 by default.
 
         With `rng`, mission-specific effects are drawn; otherwise, expected effects are used.
         """

@@ -75,7 +75,7 @@ class PlaceEffect(Effect):
         )
 
     def prior(self, theta: Theta, slots: Slots) -> tuple[Any, list[Any]]:
-        """Return a Gaussian-process prior on cell effects and independent priors on bounds."""
+        """Return a Gaussian-process prior on cells and independent priors on bounds."""
         xp: Any = namespace(theta["tau_e"])
         places: Any = slots.visited
         of_bound = xp.maximum(theta["tau_e"], LEAST) ** -2.0
@@ -93,7 +93,7 @@ class PlaceEffect(Effect):
         return inverse(tau**2 * (K + _JITTER * np.eye(len(cells))))
 
     def named(self, c: np.ndarray, theta: Theta, slots: Slots) -> Values:
-        """Return cell effects `place` (draw, cell), bound effects `place_bound` (draw, bound)."""
+        """Return cell effects place (draw, cell) and bound effects place_bound (draw, bound)."""
         places: Any = slots.visited
         n = len(places.cells)
         return {"place": c[:, :n], "place_bound": c[:, n:]}
