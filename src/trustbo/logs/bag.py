@@ -14,14 +14,14 @@ ignored.
 """
 
 import json
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 
 from trustbo.data import Bound, Cell, Mission, require_unit_interval
 from trustbo.errors import TrustboError, require_pair, require_whole
@@ -31,8 +31,6 @@ from trustbo.workspace import Workspace
 _NEVER = np.iinfo(np.int64).max
 _NS = 1e9  # in a second
 
-type Messages = list[tuple[int, Any]]
-"""Time of recording (ns) and content of each message."""
 type Marker = tuple[int, int, Cell, tuple[Cell, ...]]
 """Time (ns), number and cell of a bound, and the planned path, which may be empty."""
 
@@ -56,30 +54,12 @@ class Topics:
     lead: str = "lead"
 
 
-class _Series(NamedTuple):
-    """Values and their times, in ascending order."""
-
-    time: np.ndarray  # (record,), ns
-    value: np.ndarray  # (record, ...)
-
-    def between(self, after: int, until: int) -> "_Series":
-        """Return records later than `after`, up to and including `until`."""
-        first, last = np.searchsorted(self.time, (after, until), side="right")
-        return _Series(self.time[first:last], self.value[first:last])
-
-    def held(self, ticks: np.ndarray) -> np.ndarray:
-        """Return the latest value at each tick, (tick, ...); NaN before the first."""
-        last = np.searchsorted(self.time, ticks, side="right") - 1
-        padded = np.concatenate([np.full((1, *self.value.shape[1:]), np.nan), self.value])
-        return padded[last + 1]
-
-
 class _Recording(NamedTuple):
-    """Records of a bag, in the order of the robots; poses begin with the lead, or are empty."""
+    """Records of a bag by time, ns, in the order of the robots; poses begin with the lead."""
 
-    status: _Series
-    contact: list[_Series]
-    poses: list[_Series]
+    status: pd.Series
+    contact: list[pd.Series]  # 1 with contact, else 0
+    poses: list[pd.DataFrame]  # x, y, heading; empty if a robot has none
 
 
 def read_bag(path: FilePath, workspace: Workspace, *, topics: Topics = Topics()) -> list[Mission]:
@@ -95,19 +75,20 @@ def read_bag(path: FilePath, workspace: Workspace, *, topics: Topics = Topics())
 
     Raises:
         TrustboError: rosbags is not installed; the path is not a bag, or the bag is damaged; a
-            topic is missing; a clock goes backwards; markers are out of order; or `Mission` refuses
-            the data.
+            topic is missing; markers are out of order; or `Mission` refuses the data.
     """
     robots = workspace.team.names
     contact = [topics.contact.replace("{robot}", robot) for robot in robots]
     poses = [topics.pose.replace("{robot}", robot) for robot in (topics.lead, *robots)]
     messages = _messages(Path(path), [topics.bound, *contact], [topics.status, *poses])
+    if not all(len(messages[topic]) for topic in poses):
+        poses = []
     found = _Recording(
-        _series(topics.status, messages, lambda message: str(message.data)),
-        [_contacts(topic, messages) for topic in contact],
-        [_series(topic, messages, _pose) for topic in poses if all(map(messages.get, poses))],
+        messages[topics.status].map(lambda message: str(message.data)),
+        [_contacts(topic, messages[topic]) for topic in contact],
+        [_poses(topic, messages[topic]) for topic in poses],
     )
-    markers = sorted(_marker(time, message) for time, message in messages[topics.bound])
+    markers = sorted(_marker(time, message) for time, message in messages[topics.bound].items())
     starts = [i for i, (_, bound, *_) in enumerate(markers) if bound == 0]
     if not starts or starts[0] > 0:
         raise TrustboError(f"{str(path)!r} must begin with the marker of bound 0, the start cell.")
@@ -123,15 +104,16 @@ def read_bag(path: FilePath, workspace: Workspace, *, topics: Topics = Topics())
     return missions
 
 
-def _messages(path: Path, needed: Sequence[str], optional: Sequence[str]) -> dict[str, Messages]:
-    """Read messages by topic."""
+def _messages(path: Path, needed: Sequence[str], optional: Sequence[str]) -> dict[str, pd.Series]:
+    """Read the messages of each topic by their time of recording, ns."""
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
         raise TrustboError("ROS bags need rosbags: python -m pip install rosbags") from None
 
-    messages: dict[str, Messages] = {topic: [] for topic in (*needed, *optional)}
+    messages: dict[str, list[Any]] = {topic: [] for topic in (*needed, *optional)}
+    times: dict[str, list[int]] = {topic: [] for topic in messages}
     there = {}
     try:
         # Bags of ROS 2 before Iron do not define their types.
@@ -139,7 +121,8 @@ def _messages(path: Path, needed: Sequence[str], optional: Sequence[str]) -> dic
             there = {c.topic: c.msgtype for c in reader.connections}
             chosen = [c for c in reader.connections if c.topic in messages]
             for c, time, raw in reader.messages(connections=chosen) if chosen else ():
-                messages[c.topic].append((time, reader.deserialize(raw, c.msgtype)))
+                times[c.topic].append(time)
+                messages[c.topic].append(reader.deserialize(raw, c.msgtype))
     except Exception as error:  # rosbags raises many kinds for a file that is damaged or no bag
         raise TrustboError(
             f"{str(path)!r} cannot be read as a ROS bag ({error or type(error).__name__}); give a "
@@ -151,39 +134,33 @@ def _messages(path: Path, needed: Sequence[str], optional: Sequence[str]) -> dic
             f"{str(path)!r} lacks {', '.join(missing)}; it has {found or 'no topics'}. "
             "Topics with other names: topics=Topics(...)."
         )
-    return messages
+    series = {t: pd.Series(m, pd.Index(times[t], dtype=int), object) for t, m in messages.items()}
+    return {topic: one.sort_index(kind="stable") for topic, one in series.items()}
 
 
-def _series(topic: str, messages: dict[str, Messages], read: Callable[[Any], Any]) -> _Series:
-    """Collect the values that `read` takes from the messages of a topic."""
-    time = np.array([time for time, _ in messages[topic]], dtype=np.int64)
-    if (np.diff(time) < 0).any():
-        raise TrustboError(f"the clock of {topic} goes backwards.")
-    return _Series(time, np.array([read(message) for _, message in messages[topic]]))
+def _contacts(topic: str, messages: pd.Series) -> pd.Series:
+    """Return contact at the ticks of a robot, 1 or 0, without those that are NaN."""
+    value = messages.map(lambda message: float(message.data)).astype(float)
+    require_unit_interval(topic, value.to_numpy())
+    return (value.dropna() > 0.5).astype(float)
 
 
-def _contacts(topic: str, messages: dict[str, Messages]) -> _Series:
-    """Return contact at the ticks of a robot, without those that are NaN."""
-    time, value = _series(topic, messages, lambda message: float(message.data))
-    require_unit_interval(topic, value)
-    measured = ~np.isnan(value)
-    return _Series(time[measured], value[measured] > 0.5)
-
-
-def _pose(message: Any) -> list[float]:
+def _poses(topic: str, messages: pd.Series) -> pd.DataFrame:
     """Return position x and y, and heading in rad from the x axis, in [-pi, pi]."""
-    pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
-    p, q = pose.position, pose.orientation
-    if q.x**2 + q.y**2 + q.z**2 + q.w**2 < 0.5:  # all 0 where a driver never sets it
+    stamped = [getattr(message.pose, "pose", message.pose) for message in messages]
+    rows = [(p.position.x, p.position.y, *(getattr(p.orientation, i) for i in "xyzw"))
+            for p in stamped]  # fmt: skip
+    east, north, x, y, z, w = np.array(rows).T
+    if (x**2 + y**2 + z**2 + w**2 < 0.5).any():  # all 0 where a driver never sets it
         raise TrustboError(
-            f"a pose has the orientation ({q.x:g}, {q.y:g}, {q.z:g}, {q.w:g}), which is not a unit "
-            "quaternion; record the poses with their headings."
+            f"{topic} has poses whose orientation is not a unit quaternion, such as 0, 0, 0, 0; "
+            "record the poses with their headings."
         )
-    yaw = math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y**2 + q.z**2))
-    return [p.x, p.y, yaw]
+    yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y**2 + z**2))
+    return pd.DataFrame({"x": east, "y": north, "heading": yaw}, messages.index)
 
 
-def _marker(time: int, message: Any) -> Marker:
+def _marker(time: Any, message: Any) -> Marker:
     """Parse a message that marks the start of a bound."""
     try:
         content = json.loads(message.data)
@@ -207,8 +184,8 @@ def _mission(found: _Recording, markers: list[Marker], until: int, workspace: Wo
         raise TrustboError(f"it starts in {cells[0]}, but its path in {path[0]}.")
     spans = zip(cells[1:], pairwise([*times[1:], until]), strict=True)
     bounds = tuple(_bound(found, cell, *span, times[0], workspace) for cell, span in spans)
-    statuses = found.status.between(times[-1], until).value
-    status = str(statuses[-1]) if len(statuses) else "ok"
+    statuses = found.status.loc[times[-1] + 1 : until]
+    status = statuses.iloc[-1] if len(statuses) else "ok"
     if status == "ok" and len(bounds) < len(path) - 1:
         status = "aborted"  # no record of the reason
     return Mission(path, bounds, status, workspace.features, workspace.team.names)
@@ -218,21 +195,23 @@ def _bound(
     found: _Recording, cell: Cell, begin: int, until: int, start: int, workspace: Workspace
 ) -> Bound:
     """Make a bound from its marker to the next one, in a mission that begins at `start`, ns."""
-    statuses = found.status.between(begin, until)
-    end = int(statuses.time[0]) if len(statuses.time) else until
-    contacts = [series.between(begin, end) for series in found.contact]
-    if not len(statuses.time):
-        end = max((int(c.time[-1]) for c in contacts if len(c.time)), default=begin)
-    n_ticks = np.array([len(c.time) or np.nan for c in contacts])
-    ticks = max((c.time for c in contacts), key=len)
-    poses, seen = ([series.held(ticks) for series in of] for of in (found.poses, found.contact))
-    unknown = np.full((len(contacts), len(workspace.features)), np.nan)
+    statuses = found.status.loc[begin + 1 : until]
+    contacts = [contact.loc[begin + 1 : until] for contact in found.contact]
+    end = max((int(contact.index[-1]) for contact in contacts if len(contact)), default=begin)
+    if len(statuses):
+        end = int(statuses.index[0])
+        contacts = [contact.loc[:end] for contact in contacts]
+    n_ticks = np.array([len(contact) or np.nan for contact in contacts])
+    ticks = max(contacts, key=len).index
+    poses, seen = (
+        [np.asarray(one.asof(ticks)) for one in of] for of in (found.poses, found.contact)
+    )
     return Bound(
         cell,
-        unknown,
-        np.array([c.value.mean() if len(c.value) else np.nan for c in contacts]),
+        np.full((len(contacts), len(workspace.features)), np.nan),
+        np.array([contact.mean() for contact in contacts]),
         np.full(len(contacts), (end - begin) / _NS if end > begin else np.nan),
-        str(statuses.value[0]) if len(statuses.time) else "ok",
+        statuses.iloc[0] if len(statuses) else "ok",
         (begin - start) / _NS,
         np.stack(poses, axis=1) if poses else None,
         np.stack(seen, axis=1) > 0.5 if not np.isnan(n_ticks).any() else None,
