@@ -45,7 +45,7 @@ class Student(NamedTuple):
 
     @classmethod
     def of(cls, z: np.ndarray, weight: np.ndarray, ridge: float = 1e-3) -> Self:
-        """Fit to the mean and covariance of points z (point, score) with weights (point,)."""
+        """Match the mean and covariance of points z (point, score) with weights (point,)."""
         mean = weight @ z
         covariance = (z - mean).T * weight @ (z - mean)
         return cls(mean, np.linalg.cholesky(covariance + ridge * np.eye(z.shape[1])))

@@ -77,7 +77,7 @@ class CoupledTrust(TrustModel):
     def signal(self, theta: Theta, slots: Slots, layout: Layout) -> Signal:
         """Compute the trust of all robots at all bounds, with rows ordered as (bound, robot).
 
-        Observation noise is split into shared noise, Delta_v - eps I, and independent noise, eps I.
+        Observation noise is the sum of shared (Delta_v - eps I) and independent noise (eps I).
         """
         B0, K, R = theta["B0"], slots.n_bounds, slots.n_robots
         xp: Any = namespace(B0)

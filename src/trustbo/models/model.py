@@ -35,7 +35,7 @@ class TrustModel(Summary, ABC):
 
     A subclass defines `weights`, `hyperpriors`, `derived`, `layout`, `signal` (the equation in
     matrix form), `rates` (the equation as a distribution) and `dims`. Hyperparameters must include
-    `delta_w` and `delta_v`, and `dims` every parameter needed for planning. See `PooledTrust`.
+    `delta_w` and `delta_v`, and `dims` must list every parameter that planning needs.
 
     Attributes:
         priors: Prior on each parameter. The default depends on the observation family and the
@@ -44,10 +44,10 @@ class TrustModel(Summary, ABC):
             are censored at 0 and 1, or `"beta_binomial"` for ticks in contact out of
             `Bound.n_ticks`, with trust on the logit scale.
         effects: Effects on the drift, such as `PlaceEffect()` for places and `RobotEffect()` for
-            each robot in each mission. The paper's models have none.
+            each robot in each mission. The paper's models have no effects.
 
     Raises:
-        TrustboError: If `observation` is unknown, or `effects` has a wrong or a repeated class.
+        TrustboError: If `observation` is unknown, or `effects` contains a wrong or repeated class.
     """
 
     priors: Priors = None  # pyright: ignore[reportAssignmentType]
@@ -183,8 +183,8 @@ class TrustModel(Summary, ABC):
     def program(self, slots: Slots) -> None:
         """Run the model as a NumPyro program, for a kernel such as `NUTS(model.program)`.
 
-        All variables are sampled, except that trust is integrated out if `rates` is a distribution.
-        Call this method within `jax.enable_x64(True)`, because effects need double precision.
+        All variables are sampled except trust, which is integrated out if `rates` is a
+        distribution. Call this method within `jax.enable_x64(True)`; effects need float64.
         """
         values = {
             name: numpyro.sample(name, prior.to_event(len(prior.batch_shape)))

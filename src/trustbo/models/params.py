@@ -136,7 +136,7 @@ class ParameterDraws(Summary):
         return self.map(expand)
 
     def map(self, function: Callable[[Numbers, int], Numbers]) -> Self:
-        """Apply a function of a field and of the number of trailing axes to every field."""
+        """Apply `function(field, number of trailing axes)` to every field."""
         values = {
             name: function(value, len(self.AXES.get(name, ())))
             for name, value in self.by_name.items()
@@ -169,7 +169,7 @@ class TrustParams(ParameterDraws, _Trust):
         x0_mean: Mean of trust before the first bound, shape () or (...,).
         x0_sd: Standard deviation of trust before the first bound, shape () or (...,).
         place: Effects of entered cells, shape (..., effect, row, col), or None. The axis `effect`
-            is the robot, or has length 1 if effects are common to all robots.
+            runs over robots, or has length 1 if effects are common to all robots.
         place_bound: Effects of bounds, shape (..., effect, move, row, col), or None. Moves are
             ordered as in `workspace.MOVES`.
         memory: Quantity carried over between bounds, `"level"` or `"deviation"`; see `PooledTrust`.
@@ -263,7 +263,7 @@ def assemble_params(
 
 
 def check_params(params: Params, n_robots: int | None, n_features: int) -> None:
-    """Check that parameters match the number of features and, unless it is None, of robots.
+    """Check that parameters match `n_features` and, unless it is None, `n_robots`.
 
     Raises TrustboError if the number of robots or features differs, or a covariance is not
     symmetric and positive definite.

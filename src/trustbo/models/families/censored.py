@@ -1,4 +1,4 @@
-"""Censored (Tobit) rates: y is trust plus noise, x + v, clipped to [0, 1]."""
+"""Censored (Tobit) rates: trust plus noise, clipped to [0, 1]."""
 
 from dataclasses import dataclass
 from typing import ClassVar

@@ -87,8 +87,8 @@ class Family(ABC):
     def log_resolution(self, y: Array, N: Array) -> Array:
         """Compute the log ratio of a tick count's probability to the density of its rate.
 
-        One tick has the width 1/N. The result has the shape of `y`. It is 0 for unmeasured rates
-        and for rates that have a probability, and NaN where the tick count is unknown.
+        One tick has the width 1/N. The result, in the shape of `y`, is 0 for unmeasured rates and
+        for rates with a probability, and NaN where the tick count is unknown.
         """
         is_density = ~np.isnan(y) & self.is_density(y)
         return np.where(is_density, -np.log(np.where(is_density, N, 1.0)), 0.0)
