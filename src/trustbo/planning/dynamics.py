@@ -37,7 +37,7 @@ class Dynamics(NamedTuple):
         return self._replace(drift=self.drift[..., moves, rows, cols][..., None, None, :])
 
     def settled(self) -> np.ndarray:
-        """Return the team's trust (..., move, row, col) in the limit if a bound were repeated."""
+        """Return the limit of the team's trust (..., move, row, col) if a bound were repeated."""
         gain = np.linalg.inv(np.eye(self.start.shape[-1]) - self.transition)
         return np.einsum("...st,...tmrc->...mrc", gain, self.drift) / self.start.shape[-1]
 
@@ -75,7 +75,7 @@ def trust_dynamics(
 def drift(params: Params, awareness: np.ndarray) -> np.ndarray:
     """Compute the drift u = sum_m beta_m z_m + b of each bound, (..., robot, move, row, col).
 
-    It includes the place effects, or those along a path (see `ParameterDraws.along`).
+    The drift includes any place effects, which `ParameterDraws.along` selects for a path.
 
     Args:
         params: Parameters of any model, with leading axes (...,).

@@ -41,9 +41,9 @@ class Costs(NamedTuple):
 
     `loss` is one of `LOSSES`. `weight` (left, robot) times `drift` (robot, bound) reduces the cost.
     `start` (left,) is a constant for each number of bounds. `transition` (robot, robot) and `x0`
-    (robot,) define trust, or are empty if the loss is not needed. `sd` is that of a rate. Bounds
-    have a `toll` (bound,) and `risk` (bound, sum). `failure` (sum,) holds the factors F_m, and
-    `limit` is the largest value of the last sum.
+    (robot,) define trust, or are empty if no loss depends on trust. `sd` is the sd of a rate.
+    Bounds have a `toll` (bound,) and `risk` (bound, sum). `failure` (sum,) holds the factors F_m,
+    and `limit` is the largest value of the last sum.
     """
 
     loss: int
@@ -70,8 +70,8 @@ def best_labels(
         scale: Divisor of the cost for each number of bounds of a path, shape (length,).
 
     Returns:
-        Costs (draw,), which are inf if no path is within the limit; lower limits on the costs
-        (draw,), which equal them if exact; and paths (draw, cell) as flat cells, padded with -1.
+        Costs (draw,), lower limits on the costs (draw,), and paths (draw, cell) as flat cell
+        indices, padded with -1. A cost is inf if no path is within the limit.
     """
     searches = [graph]
     divisor = scale[graph.left[graph.starts]]
@@ -277,7 +277,7 @@ def _chords(costs, low, gap):
 def _price_of_limit(graph, costs, edge_cost, least_cost, chord, offset, to_go, known):
     """Find the price of the limited sum that gives the best lower limit on the cost of all paths.
 
-    The dual is concave in the price. Its slope is the sum of the cheapest path minus the limit.
+    The dual is concave in the price. The slope is the sum of the cheapest path minus the limit.
     """
     limit, price = costs.limit, chord.copy()
     lower, chosen, extra, under, over = -np.inf, 0.0, 0.0, 0.0, np.inf

@@ -40,8 +40,8 @@ class AdmissiblePaths:
         goal: Last cell.
         max_bounds: Limit on the number of bounds (see `Planner`).
         turns: Whether U-turns are allowed; true if `max_bounds` is a number.
-        avoided: Mask of bounds that paths must avoid, shape (move, row, col), or None.
-        bounds: Mask of bounds that a path may take, shape (move, row, col), by the cell entered.
+        avoided: Mask (move, row, col) of bounds that paths must avoid, or None.
+        bounds: Mask (move, row, col) of bounds that a path may take, indexed by the cell entered.
         bounds_to_goal: Fewest bounds from each cell to the goal, (row, col); -1 if unreachable.
         shortest: Smallest number of bounds of a path.
         longest: Largest number of bounds of a path.
@@ -137,7 +137,7 @@ class AdmissiblePaths:
     def avoiding(self, bounds: np.ndarray, risk: np.ndarray) -> "AdmissiblePaths":
         """Return the paths that avoid the given bounds.
 
-        If no such path exists, bounds are admitted again in order of risk, the safest first.
+        If no such path exists, the safest bounds are admitted again until there is one.
 
         Args:
             bounds: Mask of the bounds to avoid, shape (move, row, col).
@@ -172,7 +172,7 @@ class AdmissiblePaths:
         """Check that a path leads from start to goal and return it as a tuple of cells.
 
         Raises:
-            TrustboError: If a bound of the path is impossible, or the path has other ends.
+            TrustboError: If a bound is impossible, or the path does not lead from start to goal.
         """
         cells = tuple(require_on_grid(path, self.bounds.shape[1:]))
         if len(cells) < 2 or (cells[0], cells[-1]) != (self.start, self.goal):

@@ -19,8 +19,8 @@ QUANTILES = (0.05, 0.25, 0.75, 0.95)
 class Plan(Summary):
     """A path, its expected trust and value, and whether it is provably optimal.
 
-    The properties `stops`, `posts` and `routes` are computed on demand, in CRS metres. They are
-    None if the workspace holds no terrain in memory.
+    The properties `stops`, `posts` and `routes` are computed on demand, in CRS metres.
+    Without a terrain in memory, these properties are None.
 
     Attributes:
         path: Cells from start to goal.
@@ -28,21 +28,21 @@ class Plan(Summary):
         length: Length of the line through the cell centres, in metres.
         trust: Expected trust after each bound, shape (bound, robot).
         bands: Quantiles of expected trust over the parameter draws, shape (quantile, bound, robot),
-            for the levels in `QUANTILES`. They equal `trust` if there is only one draw.
+            for the levels in `QUANTILES`. With one draw, the bands equal `trust`.
         value: Value of the objective (see `OBJECTIVES`); larger values are better. For
-            lost_contact, it is minus the expected lost contact in bounds, with trust capped at 1.
+            lost_contact, the value is minus the expected lost contact, with trust capped at 1.
         objective: Name of the objective.
         exact: Whether the search proved that no admissible path is better.
-        limit: Upper limit on the value of any admissible path. It equals `value` if `exact`, and
-            is NaN for a given path.
-        revisits: Number of bounds that enter a cell for a second or later time.
+        limit: Upper limit on the value of any admissible path. The limit equals `value` if `exact`
+            is True, and is NaN for a given path.
+        revisits: Number of bounds that enter a cell visited before.
         seconds: Duration of the search in seconds.
         workspace: Workspace of the path.
         risk: Failure probability of each bound, and the arrival probability with its 90 % band;
             None without a hazard.
         infeasible: Whether the failure probability of a given path exceeds `max_failure`.
         value_band: Ends of the 90 % band of the value over the parameter draws, without observation
-            noise and with the mean failure probability. None if there is only one draw.
+            noise and with the mean failure probability; None with one draw.
     """
 
     path: tuple[Cell, ...]
@@ -109,10 +109,10 @@ class Plan(Summary):
 
     @cached_property
     def routes(self) -> tuple[tuple[np.ndarray | None, ...], ...] | None:
-        """Routes during each bound, of the lead and then of each T2 robot, with shape (point, 2).
+        """Routes of the lead and then of each T2 robot for each bound, with shape (point, 2).
 
-        T2 moves to its posts for the next bound or, at the goal, to positions around the lead. If
-        a robot has no route, None replaces it.
+        T2 moves to its posts for the next bound or, at the goal, to positions around the lead. The
+        entry of a robot without a route is None.
         """
         posts, path = self.workspace.posts, self.path
         if posts is None:

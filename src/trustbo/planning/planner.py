@@ -1,4 +1,4 @@
-"""The planner, for one workspace, start, goal and objective."""
+"""The planner, which searches for paths from a start to a goal in a workspace."""
 
 import time
 from collections.abc import Sequence
@@ -62,16 +62,16 @@ class Planner(Summary):
             goal: Last cell, or a position inside this cell.
             objective: `"lost_contact"`, `"terminal"` or `"mean"` (see `OBJECTIVES`).
             max_bounds: Limit on the number of bounds. `"shortest"` admits only paths with the
-                fewest bounds; `"shortest+n"` admits up to n more, without U-turns; an int admits
-                walks of at most that many bounds. By default, n is 4 for lost_contact and 2 for the
-                other objectives. With n > 2, a path may enter a cell twice (see `Plan.revisits`).
+                fewest bounds. `"shortest+n"` admits up to n more bounds, but no U-turns. An int
+                admits any walk of up to that many bounds. By default, n is 4 for lost_contact and
+                2 otherwise. With n > 2, a path may enter a cell twice (see `Plan.revisits`).
             toll: Additional cost of each bound, such as its length or duration. The array must
                 broadcast to (move, row, col), with the moves of `workspace.moves.MOVES`. The unit
-                is bounds for lost_contact and that of trust for the other objectives.
+                is bounds for lost_contact and trust for the other objectives.
             max_failure: Largest failure probability of a path, in [0, 1); by default, no limit.
             failure_cost: Cost of a failure in bounds, for lost_contact. The value is reduced by
-                this cost times the failure probability. By default, the smallest number of bounds
-                from start to goal, so a failed mission counts as one without contact.
+                this cost times the failure probability. The default is the smallest number of
+                bounds of a path, so a failed mission counts as a mission without contact.
             family: Observation family of the trust model, used only for lost_contact.
 
         Raises:
@@ -137,14 +137,14 @@ class Planner(Summary):
     ) -> Self:
         """Return a planner with the given failure probability of each bound.
 
-        Its plans respect `max_failure` and have an arrival probability `p_arrive`. For
-        lost_contact, their value includes the expected cost of failure.
+        With a risk, plans respect `max_failure` and have an arrival probability `p_arrive`. For
+        lost_contact, the value of a plan includes the expected cost of failure.
 
         Args:
             p_fail: Posterior mean, shape (move, row, col); NaN where there is no bound.
             draws: Posterior draws, shape (draw, move, row, col), for `p_arrive` and its 90 % band.
             strata: Mean failure probabilities of groups of draws, such as `BoundRisk.strata()`, for
-                the expected cost of failure. By default, bounds fail independently with `p_fail`.
+                the expected cost of failure; by default, `p_fail` with independent failures.
 
         Raises:
             TrustboError: If the shapes do not match, or a probability is outside [0, 1].
@@ -172,8 +172,8 @@ class Planner(Summary):
             x0: Expected trust at the start, shape () or (robot,); by default `params.x0_mean`.
 
         Raises:
-            TrustboError: If the parameters are for other robots or features than the workspace, or
-                beta0 is outside the range in which the search is exact.
+            TrustboError: If the robots or features of the parameters are not those of the
+                workspace, or beta0 is outside the range in which the search is exact.
             InfeasibleError: If no path respects `max_failure`.
         """
         started = time.perf_counter()
@@ -224,15 +224,15 @@ class Planner(Summary):
 
         Args:
             path: Cells from start to goal, each adjacent to the previous one.
-            params: Posterior from `fit`, or parameters. With several draws, `trust` is their mean,
-                `bands` are their quantiles, and `value` is computed from the mean trust or, for
+            params: Posterior from `fit`, or parameters. With several draws, `trust` is their mean
+                and `bands` are their quantiles. `value` is computed from the mean trust or, for
                 lost_contact, averaged over the draws. The draws of a posterior include robot
                 effects drawn for the next mission (see `params_of`).
             x0: Expected trust at the start; by default `params.x0_mean`.
 
         Raises:
-            TrustboError: If the parameters are for other robots or features than the workspace, or
-                the path is not connected or does not lead from start to goal.
+            TrustboError: If the robots or features of the parameters are not those of the
+                workspace, or the path is broken or does not lead from start to goal.
         """
         path, problem = self.require_path(path), self.problem
         draws, cells = draws_of(params, self.workspace, day=True), np.array(path)
@@ -267,10 +267,10 @@ class Planner(Summary):
 
         Nodes are the passable cells `(row, col)`, with the CRS coordinates `x` and `y` of their
         centres in metres. Edges are the bounds, with their `length` in metres, the `drift` of the
-        team's mean trust and, given a risk, `risk` = -log(1 - p_fail). With x the limit of trust if
-        a bound were repeated, `cost` is -log sigma(x) plus the toll, and `lost` is the contact lost
-        at trust x, in bounds, plus the toll. If trust had no memory, the sum of `lost` along a path
-        would be minus its value for lost_contact without failures.
+        team's mean trust and, given a risk, `risk` = -log(1 - p_fail). If repeating a bound leads
+        to trust x, `cost` is -log sigma(x) plus the toll, and `lost` is the contact lost at trust
+        x, in bounds, plus the toll. If trust had no memory, the sum of `lost` along a path would be
+        minus the value of the path for lost_contact without failures.
 
         Args:
             params: Posterior from `fit`, or parameters. Several draws are replaced by their mean.
@@ -312,11 +312,11 @@ class Planner(Summary):
     ) -> xr.DataArray:
         """Compute the largest expected trust with which each cell can be reached; NaN if it cannot.
 
-        The maximum is over paths to each cell without U-turns that have at most two bounds more
-        than the fewest, if `max_bounds` permits. The map at the goal equals the terminal trust of
-        the `terminal` plan with its default `max_bounds`. Longer walks are excluded because they
-        could gain trust by loitering. The map has the shape (row, col), or (robot, row, col) with
-        `per_robot`. If there are several draws, it has a leading axis (draw,).
+        The maximum is over paths without U-turns that have at most two bounds more than the fewest,
+        or fewer if `max_bounds` is tighter. Longer walks are excluded because they could gain trust
+        by loitering. With the default `max_bounds`, the map at the goal equals the terminal trust
+        of the `terminal` plan. The map has the shape (row, col), or (robot, row, col) with
+        `per_robot`; several draws add a leading axis (draw,).
 
         Args:
             params: Posterior from `fit`, or parameters of any model.
@@ -353,7 +353,7 @@ class Planner(Summary):
     ) -> xr.DataArray:
         """Estimate the probability (row, col) that each cell lies on the best path.
 
-        The best path is found for each draw. If no path respects `max_failure`, the safest is used.
+        The best path is found for each draw. If none respects `max_failure`, the safest is used.
 
         Args:
             posterior: Posterior from `fit`, or parameters with leading axis (draw,).

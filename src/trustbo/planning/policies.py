@@ -46,7 +46,7 @@ def optimistic(
 
 
 def ucb(rng: np.random.Generator, params: Params, planner: Planner, *, kappa: float = 1.0) -> Plan:
-    """Choose, among the draws' best paths, the one with the largest mean + `kappa` sd of value."""
+    """Choose the path with the largest mean plus `kappa` sd of the value among the draws' best."""
     drawn = planner.plan_draws(params, n_draws=N_DRAWS, seed=_seed(rng))
     values = drawn.values_of(drawn.candidates)
     chosen = int(np.argmax(values.mean(0) + kappa * values.std(0)))

@@ -95,7 +95,7 @@ class Problem:
     ) -> np.ndarray:
         """Compute the value of a path, shape (...,), under the assumption that no bound fails.
 
-        `trust` (..., bound) is the team's trust after each bound; `noise_sd` (...,) is a rate's sd.
+        The team's `trust` after each bound has shape (..., bound), and `noise_sd` has shape (...,).
         """
         objective, toll, n_bounds = self.objective, self.toll_along(path), trust.shape[-1]
         if objective.of_contact:
@@ -126,7 +126,7 @@ class Problem:
         """Risks that the search sums along a path, or None if plans do not depend on risk.
 
         Raises:
-            TrustboError: If `max_failure` is set without a risk, or a possible bound has NaN risk.
+            TrustboError: If `max_failure` is set without a risk, or `p_fail` of a bound is NaN.
         """
         if self.risk is None and self.max_failure is not None:
             raise TrustboError(

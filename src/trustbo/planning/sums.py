@@ -2,7 +2,7 @@
 
 A bound with drift u and j bounds left after it adds w_j . u to the value, for any path length. The
 weight w_j is the sum of credit(i) view . B0^(j - i) over i <= j (see `objectives.weights_of`).
-States are processed in order of bounds left, so their successors are final (Bellman 1958).
+States are processed in order of bounds left, so successors are final (Bellman 1958).
 """
 
 import numpy as np

@@ -63,7 +63,7 @@ def best_trust(
     """Find the largest trust with which each cell can be entered; NaN if it is unreachable.
 
     Paths grow by one bound per iteration. To exclude U-turns, each cell stores the largest trust
-    with the move that attains it, and the largest over the other moves. Exact for beta0 >= 0.
+    and its move, and the largest trust by another move. The result is exact for beta0 >= 0.
 
     Args:
         paths: Admissible paths.

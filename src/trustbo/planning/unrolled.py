@@ -1,7 +1,7 @@
 """The unrolled graph, which repeats the bounds of a path problem for each number of bounds left.
 
-A state (cell, left) is a cell from which exactly `left` bounds remain. An edge is a bound and leads
-to a state with one bound fewer left. The paths through the graph are the admissible paths, except
+A state (cell, left) is a cell from which exactly `left` bounds remain. Each edge is a bound and
+leads to a state with one bound less. The paths through the graph are the admissible paths, except
 that U-turns must be excluded if they are forbidden. Kernels process the arrays once, in the order
 of `left`, and `to_networkx` exports the same edges.
 """
@@ -22,11 +22,11 @@ class Unrolled(NamedTuple):
 
     Fields:
         cell: Flat index of the cell of each state, shape (state,).
-        left: Number of bounds left in each state, shape (state,); 0 for the first, the goal.
+        left: Number of bounds left in each state, shape (state,); the first is the goal.
         first: Index of the first edge that leaves each state, shape (state + 1,).
         head: State to which each edge leads, shape (edge,).
         bound: Flat index move * cells + cell of the bound of each edge, shape (edge,).
-        starts: State of the start cell for each number of bounds, ascending, shape (length,).
+        starts: State at the start for each number of bounds in ascending order, shape (length,).
         turns: Whether U-turns are allowed.
     """
 
@@ -75,8 +75,8 @@ class Unrolled(NamedTuple):
 class ToGo(NamedTuple):
     """Least cost from each state to the goal (state,), its first edge, and the second-best of both.
 
-    The second-best path begins with another edge. Two alternatives suffice even without U-turns,
-    because a U-turn rule excludes at most one first edge.
+    The second-best path begins with another edge. These two paths suffice, because forbidding
+    U-turns excludes at most one first edge.
     """
 
     least: np.ndarray
