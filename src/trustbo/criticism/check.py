@@ -36,8 +36,8 @@ class Check(Summary):
         verdict: Text with the findings that stand out.
         table: One row per check (index `check`). The columns are the text of the `finding`, whether
             it `stands_out`, the most affected `label`, and the `size` and `probability`.
-        robots: One row per mission and robot: its `effect` as a fraction of line of sight minus the
-            median, the `sd`, the `probability` that it exceeds +-.1, and whether it `stands_out`.
+        robots: One row per mission and robot, with the `effect` (share of line of sight minus the
+            median), its `sd`, the `probability` that it exceeds .1 in size, and `stands_out`.
     """
 
     verdict: str
@@ -74,13 +74,13 @@ def check(
     other models, and `az.psense_summary(posterior)` for the sensitivity to the priors.
 
     Args:
-        posterior: Posterior from `fit`, or all posteriors of a campaign (`Result.posteriors`). In
-            the latter case, the last is checked, and all predictions of a next mission are scored.
+        posterior: Posterior from `fit`, or all posteriors of a campaign (`Result.posteriors`). Of
+            several, the last is checked, and the prediction of each for the next mission is scored.
         missions: All missions of the campaign; by default, the missions in the last posterior.
 
     Raises:
         TrustboError: If the posterior is not from `fit`, was fitted to people's reports, or
-            contains no data if `missions` is not given.
+            contains no data although `missions` is None.
     """
     trees = list(posterior) if isinstance(posterior, Sequence) else [posterior]
     tree = require_posterior("check", trees[-1])

@@ -18,8 +18,8 @@ class LostMission(NamedTuple):
 
     Attributes:
         path: Planned cells, beginning with the start.
-        where: Cell that the team failed to enter, or None if unknown. If the path enters the cell
-            more than once, the first time is meant.
+        where: Cell that the team failed to enter, or None if unknown. If the path enters this
+            cell more than once, the failure is at its first entry.
     """
 
     path: tuple[Cell, ...]

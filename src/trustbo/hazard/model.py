@@ -9,8 +9,8 @@ exceeds the slope limit:
 
 The p_e are integrated out, and the other parameters are drawn by importance sampling of their
 normal scores. During adaptation of the proposals, missions lost at unknown places are treated as
-independent. Then their places of failure are imputed at every point (sequential imputation; Kong,
-Liu and Wong 1994). The weights are corrected, so that the draws follow the joint posterior.
+independent. Then the place of each of these failures is imputed at every point (sequential
+imputation; Kong, Liu and Wong 1994), and the weights are corrected for the joint posterior.
 """
 
 import time
@@ -59,11 +59,11 @@ def fit_hazard(
         (draw) of the slope limit in degrees. `place` (draw, lost) is the bound, counted from 1, at
         which each mission lost at an unknown place failed. `p_fail` (move, row, col) is the
         posterior mean failure probability, and NaN where there is no bound. `exposures` and
-        `failures` (move, row, col) count known outcomes. `BoundRisk` draws from the group.
+        `failures` (move, row, col) count known outcomes. Use `BoundRisk` to draw from it.
 
     Raises:
         TrustboError: If the path of a mission skips cells or leaves the grid.
-        PosteriorError: If k-hat > 0.7.
+        PosteriorError: If the k-hat of the importance weights exceeds 0.7.
     """
     started, hazard = time.perf_counter(), hazard or Hazard()
     exposures, difficulty = Exposures.of(missions, lost), difficulty_of(workspace)

@@ -38,8 +38,8 @@ class Hazard:
             limit, if the stated limit is about right. All bounds share the margin, so a failure on
             one bound makes failures on equally steep bounds more probable.
         doubt: Probability that the stated limit is wrong, and the sd of the margin in that case, in
-            degrees. The prior on the margin is a mixture of two normals with the same mean. For a
-            measured limit, use the probability 0.
+            degrees. The prior on the margin is a mixture of two normals with the same mean. Use a
+            probability of 0 if the limit was measured.
         log_width: Prior on the log of the limit's width in degrees. The failure probability
             increases from .1 to .9 if the tilt increases by 4.4 widths.
         log_strength: Prior on the log of the strength s, which is the weight of the prior mean in
@@ -142,7 +142,7 @@ def steepness_of(tilt: np.ndarray, max_slope: float) -> np.ndarray:
 def mixture_quantile(z: np.ndarray, narrow: float, share: float, wide: float) -> np.ndarray:
     """Solve Phi(z) = (1 - share) Phi(x / narrow) + share Phi(x / wide) for x.
 
-    Interpolation is accurate to 1e-5 `narrow`. In the far tails, the slope is the larger sd.
+    The interpolation error is about 1e-5 `narrow`. In the far tails, the slope is the larger sd.
     """
     curve = _quantile_curve(float(narrow), share, wide)
     end = curve.x[-1]

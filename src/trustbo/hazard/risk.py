@@ -26,8 +26,8 @@ _SOME = 256  # approximate number of bounds whose mean probability orders the dr
 class BoundRisk:
     """Posterior of the probability that each bound of a workspace ends the mission.
 
-    The maps have shape (move, row, col), where (row, col) is the cell that a bound enters by a move
-    of `MOVES`. Probabilities are NaN where there is no bound.
+    Maps have shape (move, row, col), where (row, col) is the cell that a bound enters and the moves
+    are those of `MOVES`. Failure probabilities are NaN where there is no bound.
 
     Attributes:
         exists: Whether each bound exists, shape (move, row, col).
@@ -71,7 +71,7 @@ class BoundRisk:
 
     @cached_property
     def stopped(self) -> np.ndarray:
-        """Posterior mean number of past failures on each bound, shape (move, row, col)."""
+        """Posterior mean of the number of past failures on each bound, shape (move, row, col)."""
         counts = self.failures.copy()
         for j, path in enumerate(self._lost):
             for k, bound in enumerate(path, start=1):
@@ -82,8 +82,8 @@ class BoundRisk:
         """Draw the failure probabilities, shape (draw, move, row, col).
 
         Args:
-            n: Number of draws. Their hyperparameters are evenly spaced from the mildest to the most
-                severe draw, so that few draws suffice to estimate the arrival probability.
+            n: Number of draws. The hyperparameter draws are evenly spaced in order of severity, so
+                few draws suffice to estimate the mean arrival probability.
             seed: Random seed.
         """
         rng, order = np.random.default_rng(seed), np.argsort(self._severity)
@@ -143,7 +143,7 @@ class BoundRisk:
 def add_lost(path: np.ndarray, place: np.ndarray, a: np.ndarray, b: np.ndarray) -> None:
     """Update a and b (point, bound) with a mission that failed at index `place` (point,) of `path`.
 
-    Negative indices in the path mean bounds that are not in `a` and `b`.
+    Negative indices in `path` stand for bounds that are not in `a` and `b`.
     """
     for k, e in enumerate(path):
         if e >= 0:
@@ -160,7 +160,7 @@ class Risk:
             is no bound.
         draws: Posterior draws, shape (draw, move, row, col), or None.
         strata: Mean failure probabilities of groups of draws, used for the expected cost of
-            failure. If None, bounds fail independently with `p_fail`.
+            failure. If None, bounds are assumed to fail independently with probability `p_fail`.
 
     Raises:
         TrustboError: If the shapes do not match, or a probability is outside [0, 1].
@@ -188,7 +188,7 @@ class Risk:
         return float(np.prod(1.0 - self.p_fail[*bounds_along(path).T]))
 
     def priced(self, path: Sequence[Cell] | np.ndarray) -> float:
-        """Compute the failure probability of a path as the mean over strata, for `failure_cost`."""
+        """Compute the failure probability of a path, averaged over strata, for `failure_cost`."""
         if self.strata is None:
             return 1.0 - self.survival(path)
         p_fail, shares = self.strata

@@ -27,11 +27,11 @@ class Strata(NamedTuple):
 
 
 def partition(values: np.ndarray, n: int) -> np.ndarray:
-    """Split sorted values (value,) into at most `n` groups with the smallest squared deviations.
+    """Split sorted values (value,) into at most `n` groups of similar values.
 
-    Dynamic programming minimises the squared deviations from the group means (Fisher 1958). Group k
-    is values[ends[k - 1] : ends[k]], where `ends` is the result. Groups of equal size would mix the
-    few severe draws with mild ones. Time and memory grow with the square of the number of values.
+    Dynamic programming minimises the sum of squared deviations from the group means (Fisher 1958).
+    Group k is values[ends[k - 1] : ends[k]], where `ends` is the result. Groups of equal size would
+    mix the few severe draws with mild ones. Time and memory are quadratic in the number of values.
     """
     size = len(values)
     total, squares = (np.concatenate([[0.0], np.cumsum(v)]) for v in (values, values**2))

@@ -57,12 +57,12 @@ def run_grid(
     Each run writes a file whose name contains the case, scene, seed and number of missions. A run
     is skipped if its file exists. Runs are parallelised with joblib; `joblib.parallel_config`
     selects another backend, such as `backend="dask"` for a cluster. If the policy has a method
-    `learn(campaign, mission)`, it is called after each mission. If it has `recommend(campaign)`,
-    the returned path replaces the campaign's recommendation.
+    `learn(campaign, mission)`, it is called after each mission. If the policy has a method
+    `recommend(campaign)`, its path replaces the campaign's recommendation.
 
     Args:
         cases: Cases by name.
-        scenes: Functions that make the scenes, by name. They are called in the worker processes.
+        scenes: Functions that make the scenes in the worker processes, by name.
         folder: Folder for the files of the runs.
         seeds: Seeds of the campaigns.
         n_missions: Number of missions per campaign.
@@ -74,11 +74,11 @@ def run_grid(
         path recommended after the mission, and `best` is the loss on the best path. All three are
         evaluated in the world of the next mission (see `Truth`). The mission itself has a `status`
         and a mean `contact_rate`. `driven` and `best_driven` are the expected losses on the path
-        of the mission and on the best path. `failed_driven` is the loss beyond that on the best
-        path if bounds that fail or are not reached have no contact. `seconds` is the CPU time.
+        of the mission and on the best path. `failed_driven` is the difference to the best path
+        if bounds that fail or are not reached have no contact. `seconds` is the CPU time.
 
     Raises:
-        TrustboError: If some runs failed. The next call repeats these runs.
+        TrustboError: If a run failed. The next call repeats failed runs.
 
     Example:
         >>> cases = {"greedy": {}, "thompson": {"policy": "thompson"}}

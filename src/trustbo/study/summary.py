@@ -18,13 +18,13 @@ _RUN = ["case", "scene", "seed"]
 def numbers_of(table: pd.DataFrame) -> pd.DataFrame:
     """Summarise each run in a table of `run_grid` whose scenes have a truth.
 
-    In addition to the labels of the run, the table has these columns. `regret after n` missions (%)
-    and `lost after n`, the loss beyond that on the best path (bounds), refer to the world of the
-    next mission. `regret now` is the mean regret. `lost while learning` is the mean loss of the
-    missions beyond that on the best path. `lost with failures` is the same if bounds that fail or
-    are not reached have no contact. After `missions to 1 %`, the regret stays within 1 %; this is
-    the number driven plus one if it does not. `arrive` is the fraction of missions that reach the
-    goal, also for the first three and the later ones. `seconds` is the CPU time per mission.
+    `regret after n` (%) and `lost after n` (the loss minus the best path's, in bounds) describe the
+    path recommended after n missions, in the world of the next mission. `regret now` is the mean
+    regret. `lost while learning` is the mean loss in the missions minus that on the best path.
+    `lost with failures` is the same if bounds that fail or are not reached have no contact. After
+    `missions to 1 %`, the regret stays within 1 %. If it never does, the value is the number of
+    missions plus one. `arrive` is the fraction of missions that reach the goal, also given for the
+    first three and the later missions. `seconds` is the mean CPU time of a mission.
     """
     judged = {"mission", "regret", "lost", "best", "status", "contact_rate", "driven",
               "best_driven", "failed_driven", "seconds"}  # fmt: skip
@@ -56,14 +56,14 @@ def _numbers(run: pd.DataFrame) -> dict[str, float]:
 
 
 def summary(numbers: pd.DataFrame, by: str | Sequence[str] = "case") -> pd.DataFrame:
-    """Compute means, or medians after n missions, with 95 % intervals over scenes.
+    """Compute means (medians for quantities after n missions) with 95 % intervals over scenes.
 
     Args:
         numbers: Rows of `numbers_of`.
         by: Columns by which runs are grouped.
 
     Returns:
-        Table with two levels of columns: the quantity, and `value`, `low` and `high`.
+        Table with two column levels: the quantity, and its `value`, `low` and `high`.
 
     Raises:
         TrustboError: If a column is unknown.
@@ -87,8 +87,8 @@ def differences(numbers: pd.DataFrame, ours: str, by: Sequence[str] = ()) -> pd.
         by: Columns by which pairs are grouped, in addition to the other case.
 
     Returns:
-        Table as from `summary`, for the difference `ours` minus the other case, with the number of
-        `pairs`. The intervals are over scenes, and NaN if there is only one scene.
+        Table like that of `summary`, for `ours` minus the other case, with the number of `pairs`.
+        The intervals are over scenes, and NaN if there is only one scene.
 
     Raises:
         TrustboError: If a case or column is unknown.

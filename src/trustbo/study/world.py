@@ -43,16 +43,16 @@ class World:
 
     Attributes:
         name: Name of the terrain, followed by the name of the case.
-        kind: Kind of the world, a label for tables.
-        ground: Name of the terrain: `"synthetic-N"` for a synthetic terrain with seed N,
+        kind: Kind of the world, used as a label in tables.
+        ground: Name of the terrain, `"synthetic-N"` for a synthetic terrain with seed N,
             `"synthetic-NAME"` for one whose seed is drawn from the name, or a name in `REAL`.
         sight: True sight model.
         assumed: Assumed sight model; None for the true model.
         team: True lead and robots.
         assumed_team: Assumed lead and robots; None for the true team.
         aged: Whether the assumed terrain is an outdated survey (see `aged`).
-        events: Events in the true world. Their centres are fractions of the terrain's width and
-            height, measured from its lower left corner, instead of CRS metres.
+        events: Events in the true world. The centre of an event is given in fractions of the
+            terrain's width and height from the lower left corner, not in CRS metres.
         shape: Shape of the planning grid, (row, col).
         cell: Side length of the planning cells on a synthetic terrain, in metres.
         radio: Whether contact is simulated by `RadioSimulator`.
@@ -143,7 +143,7 @@ class World:
     ) -> Scene:
         """Make the scene of a course through the world for `run_grid`, and cache the truth.
 
-        For `options`, see `workspace`. Raises TrustboError for unknown courses or missing files.
+        See `workspace` for `options`. Raises TrustboError for an unknown course or missing files.
         """
         workspace = self.workspace(**options)
         paths = {"max_bounds": max_bounds}
