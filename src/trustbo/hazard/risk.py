@@ -176,7 +176,7 @@ class Risk:
             if p is None:
                 continue
             if p.ndim != 4 or p.shape[1:] != self.p_fail.shape:
-                raise TrustboError(f"{name} has the shape {p.shape}, not (..., move, row, col).")
+                raise TrustboError(f"{name} must have shape (..., move, row, col); got {p.shape}.")
             if (bad := (p < 0.0) | (p > 1.0)).any():
                 raise TrustboError(f"{name} must be in [0, 1]; got {p[bad][0]:g}.")
 

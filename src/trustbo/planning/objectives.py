@@ -97,7 +97,7 @@ def weights_of(objective: Objective, dynamics: Dynamics, view: Array, longest: i
 def has_history(objective: Objective, family: Family) -> bool:
     """Return whether the loss of a bound depends on the trust with which it is entered.
 
-    If it does, the search requires B0 >= 0. If not, the score is a weighted sum of drifts.
+    With history, the search requires B0 >= 0. Otherwise, the score is a weighted sum of drifts.
     """
     return objective.of_contact and family.expected_rate != "identity"
 

@@ -60,7 +60,7 @@ class AdmissiblePaths:
         self.start = workspace.locate(start, "start")
         self.goal = workspace.locate(goal, "goal")
         if self.start == self.goal:
-            raise TrustboError(f"start and goal are the same cell, {self.start}; choose two cells.")
+            raise TrustboError(f"start and goal are both the cell {self.start}; choose two cells.")
         self.avoided = avoided
         self.bounds = workspace.passable_bounds.values
         if avoided is not None:
@@ -110,7 +110,7 @@ class AdmissiblePaths:
         if (n_states := int(n_left.sum())) > _MOST_STATES:
             raise TrustboError(
                 f"max_bounds = {self.max_bounds!r} (up to {self.longest} bounds) is too large: the "
-                f"search has {n_states:.3g} states, but at most {_MOST_STATES:.3g} are possible."
+                f"search has {n_states:.3g} states, but at most {_MOST_STATES:.3g} are allowed."
             )
         cell = np.repeat(np.arange(rows * cols, dtype=np.int32), n_left)
         base = np.concatenate([[0], np.cumsum(n_left)])

@@ -334,7 +334,7 @@ class Planner(Summary):
     def trust_summary(
         self, posterior: Params | xr.DataTree, *, n_draws: int = 200, seed: int = 0
     ) -> xr.Dataset:
-        """Compute the `mean` and `sd` of the trust map and the mean `cost`, each (row, col).
+        """Compute the `mean` and `sd` of the trust map and the mean `cost`, of shape (row, col).
 
         Args:
             posterior: Posterior from `fit`, or parameters with leading axis (draw,).
@@ -353,7 +353,7 @@ class Planner(Summary):
     ) -> xr.DataArray:
         """Estimate the probability (row, col) that each cell lies on the best path.
 
-        The best path is found for each draw. If none respects `max_failure`, the safest is used.
+        The best path is found for each draw, or the safest path if none respects `max_failure`.
 
         Args:
             posterior: Posterior from `fit`, or parameters with leading axis (draw,).

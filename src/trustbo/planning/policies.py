@@ -36,7 +36,7 @@ def thompson(rng: np.random.Generator, params: Params, planner: Planner) -> Plan
 def optimistic(
     rng: np.random.Generator, params: Params, planner: Planner, *, quantile: float = 0.9
 ) -> Plan:
-    """Plan the best path with the drift u of each bound at an upper quantile over the draws."""
+    """Plan the best path with the drift u of each bound set to a high quantile over the draws."""
     some = choose_draws(params, 1000, _seed(rng))
     transition, drift, start, sd = planner.problem.dynamics(some)
     best = Dynamics(

@@ -24,7 +24,7 @@ def best_sums(
         toll: Additional cost of each bound, shape (bound,).
 
     Returns:
-        Scores (draw,), and paths (draw, cell) as flat cell indices, padded with -1.
+        Scores (draw,) and paths (draw, cell), given as flat cell indices and padded with -1.
     """
     n = len(drift)
     scores, paths = np.full(n, -np.inf), np.full((n, graph.longest + 1), -1, np.int32)

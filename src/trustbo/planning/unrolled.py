@@ -73,7 +73,7 @@ class Unrolled(NamedTuple):
 
 
 class ToGo(NamedTuple):
-    """Least cost from each state to the goal (state,), its first edge, and the second-best of both.
+    """Costs (state,) and first edges (state,) of the best and second-best paths to the goal.
 
     The second-best path begins with another edge. These two paths suffice, because forbidding
     U-turns excludes at most one first edge.

@@ -71,11 +71,11 @@ def run_grid(
     Returns:
         One row per run and mission, with `case`, `scene`, `seed`, the labels of the scene, and
         `mission`, which is 0 before the first mission. `regret` (%) and `lost` (bounds) are for the
-        path recommended after the mission, and `best` is the loss on the best path. All three are
-        evaluated in the world of the next mission (see `Truth`). The mission itself has a `status`
-        and a mean `contact_rate`. `driven` and `best_driven` are the expected losses on the path
-        of the mission and on the best path. `failed_driven` is the difference to the best path
-        if bounds that fail or are not reached have no contact. `seconds` is the CPU time.
+        path recommended after the mission, and `best` is the loss on the best path, evaluated in
+        the world of the next mission (see `Truth`). The mission itself has a `status` and a mean
+        `contact_rate`. `driven` and `best_driven` are the expected losses on the driven path and on
+        the best path. `failed_driven` is the loss on the driven path minus that on the best path if
+        bounds that fail or are not reached have no contact. `seconds` is the CPU time.
 
     Raises:
         TrustboError: If a run failed. The next call repeats failed runs.

@@ -87,8 +87,8 @@ def differences(numbers: pd.DataFrame, ours: str, by: Sequence[str] = ()) -> pd.
         by: Columns by which pairs are grouped, in addition to the other case.
 
     Returns:
-        Table like that of `summary`, for `ours` minus the other case, with the number of `pairs`.
-        The intervals are over scenes, and NaN if there is only one scene.
+        Table of differences, `ours` minus the other case, as in `summary`, with the number of
+        `pairs`. The intervals are over scenes, and NaN if there is only one scene.
 
     Raises:
         TrustboError: If a case or column is unknown.
