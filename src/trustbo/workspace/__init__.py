@@ -1,7 +1,7 @@
-"""Planning grid with awareness, passability, positions, routes and sight."""
+"""Planning grid: awareness and passability of cells, posts, routes and line of sight."""
 
 from trustbo.workspace.sight import Sight
 from trustbo.workspace.workspace import Workspace
 
 __all__ = ["Sight", "Workspace"]
-__dir__ = __all__.copy  # completion lists public names alone
+__dir__ = __all__.copy  # tab completion lists only public names

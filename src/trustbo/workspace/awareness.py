@@ -1,7 +1,7 @@
 """Awareness of bounds, from the pixels of a terrain or from a user's arrays.
 
-Overwatch relates two cells, so awareness is defined for each bound: a cell and the move into it.
-Maps of cells are copied to all moves.
+Overwatch involves two cells, so awareness is defined for each bound, that is, for a cell and a move
+into the cell. Maps of cells are copied to all moves.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -27,23 +27,23 @@ _AXES = "(robot, row, col, feature) or (robot, move, row, col, feature) with 8 m
 def cell_maps(
     terrain: xr.Dataset, grid: Grid, features: Mapping[str, object], team: Team
 ) -> tuple[np.ndarray, np.ndarray, xr.Dataset, dict[str, CompositeIndex]]:
-    """Compute awareness and passability of the cells of a terrain.
+    """Compute the awareness and the passability of a terrain's cells.
 
-    Openness is computed with the team's sensor and target heights over the range of its lidars, at
-    most the diagonal of a cell and half the terrain.
+    Openness is computed for the team's sensor and target heights, up to the team's largest lidar
+    range but at most over the diagonal of a cell and half the terrain.
 
     Returns:
         Awareness (row, col, feature) in [0, 1], NaN where a cell has no data; passability (row,
-        col); pixel maps of each feature and of passability, dims (y, x); fitted composites.
+        col); a dataset (y, x) of each feature and of passability; and the fitted composites.
 
     Raises:
-        TrustboError: A feature is unknown, is used unchanged but has values outside [0, 1], or has
-            the name of the line of sight.
+        TrustboError: A feature is unknown, has the reserved name of the line of sight, or is used
+            unchanged but has values outside [0, 1].
     """
-    remedy = "give names of pixel features by feature, e.g. {'ease': ('slope', 'tri')}"
+    remedy = "map each feature to its pixel features, such as {'ease': ('slope', 'tri')}"
     for name in require_kind("features", features, Mapping, remedy):
         if is_line_of_sight(name):
-            raise TrustboError(f"{name!r} is the name of a computed feature; choose another name.")
+            raise TrustboError(f"the name {name!r} is reserved; choose another name.")
     sides = [n * step for n, step in zip(terrain["dem"].shape, pixel_size(terrain), strict=True)]
     diagonal = float(np.hypot(grid.cell_height, grid.cell_width))
     ranges = [robot.lidar_range for robot in team.robots]
@@ -79,20 +79,20 @@ def cell_maps(
 
 
 def _unit_values(name: str, values: np.ndarray) -> np.ndarray:
-    """Return the values of a feature used unchanged; TrustboError if outside [0, 1]."""
+    """Return the values of an unchanged feature; TrustboError if a value is outside [0, 1]."""
     low, high = np.nanmin(values, initial=0.0), np.nanmax(values, initial=1.0)
     if low < 0.0 or high > 1.0:
         raise TrustboError(
-            f"feature {name!r} is used unchanged and must lie in [0, 1]; it has {low:g} to "
-            f"{high:g}. Make it a composite of one: {{{name!r}: [...]}}."
+            f"feature {name!r} is used unchanged and must be in [0, 1]; its values are {low:g} to "
+            f"{high:g}. Make it a composite index to scale it: {{{name!r}: [...]}}."
         )
     return values
 
 
 def of_moves(cells: np.ndarray, passable: np.ndarray) -> np.ndarray:
-    """Copy maps (..., row, col, feature) to all bounds into a cell, (..., move, row, col, feature).
+    """Copy maps (..., row, col, feature) to all moves, shape (..., move, row, col, feature).
 
-    NaN where there is no bound between two passable cells, (row, col).
+    Values are NaN where a move is not a bound between two passable cells.
     """
     exists = existing_bounds(passable)[..., None]
     return np.where(exists, cells[..., None, :, :, :], np.nan)
@@ -101,10 +101,10 @@ def of_moves(cells: np.ndarray, passable: np.ndarray) -> np.ndarray:
 def with_line_of_sight(
     z: np.ndarray, features: Sequence[str], passable: np.ndarray, posts: Posts, pixels: xr.Dataset
 ) -> np.ndarray:
-    """Append the line of sight to awareness of bounds (robot, move, row, col, feature).
+    """Append line of sight to the awareness of bounds (robot, move, row, col, feature).
 
-    Traversability, if it is one of the `features`, is replaced by its mean along the robots'
-    tracks. TrustboError: a cell is too small for the team to stand in.
+    If traversability is one of the `features`, it is replaced with its mean along the robots'
+    tracks. Raises TrustboError if a cell is too small for the team.
     """
     for row, col in np.argwhere(passable).tolist():
         posts.require_room((row, col))
@@ -122,12 +122,12 @@ def labelled(
 ) -> tuple[xr.DataArray, xr.DataArray]:
     """Label awareness (robot, move, row, col, feature) and passability (row, col) of a grid.
 
-    TrustboError: no cell is passable.
+    Raises TrustboError if no cell is passable.
     """
     if not passable.any():
         raise TrustboError(
-            "no cell is passable: more than half of every cell is missing or too steep. Use "
-            "another shape, or a team with a larger max_slope."
+            "no cell is passable: more than half of every cell has no data or is too steep. Use a "
+            "grid of another shape, or a team with a larger max_slope."
         )
     cells = {
         **{axis: np.arange(n) for axis, n in zip(("row", "col"), grid.shape, strict=True)},
@@ -146,21 +146,21 @@ def unlabelled(
 ) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...]]:
     """Return awareness in the axis order of `of_arrays`, and the names of robots and features.
 
-    A DataArray is reordered by the names of its dims and moves; its labels are the default names.
-    TrustboError: it has other dims, or its labels contradict the given names.
+    A DataArray is reordered by its dimensions and labels; the labels are also the default names.
+    Raises TrustboError if the DataArray has other dimensions or labels than expected.
     """
     if not isinstance(awareness, xr.DataArray):
         return as_array("awareness", awareness), tuple(names), tuple(features)
     axes = [axis for axis in _DIMS if axis != "move" or "move" in awareness.dims]
     if set(awareness.dims) != set(axes):
-        raise TrustboError(f"awareness must have dims {_AXES}; got {awareness.dims}.")
+        raise TrustboError(f"awareness must have the dims {_AXES}; got {awareness.dims}.")
     if "move" in awareness.coords:
         awareness = awareness.sel(move=list(MOVE_NAMES))
     chosen = []
     for axis, given in (("robot", names), ("feature", features)):
         labels = awareness[axis].values.astype(str).tolist() if axis in awareness.coords else []
         if labels and given and set(labels) != set(given):
-            raise TrustboError(f"awareness has the {axis} labels {labels}, not {list(given)}.")
+            raise TrustboError(f"awareness has {axis} labels {labels}; expected {list(given)}.")
         if labels and given:
             awareness = awareness.sel({axis: list(given)})
         chosen.append(tuple(given or labels))
@@ -170,19 +170,19 @@ def unlabelled(
 def of_arrays(awareness: ArrayLike, passable: ArrayLike | None) -> tuple[np.ndarray, np.ndarray]:
     """Check the arrays of `Workspace.from_awareness`.
 
-    Returns awareness of bounds (robot, move, row, col, feature), NaN where there is none, and
-    passability (row, col).
+    Returns the awareness of bounds (robot, move, row, col, feature), NaN where there is no bound,
+    and the passability (row, col).
 
-    TrustboError: the axes differ, a value is outside [0, 1], or there is a NaN in a passable cell
-    or in a bound between two passable cells.
+    Raises TrustboError if the axes do not match, a value is outside [0, 1], or a passable cell or a
+    bound between passable cells has a NaN.
     """
     z = as_array("awareness", awareness)
     if z.ndim not in (4, 5) or (z.ndim == 5 and z.shape[1] != len(MOVES)):
-        raise TrustboError(f"awareness must be {_AXES}; got shape {z.shape}.")
+        raise TrustboError(f"awareness must have the shape {_AXES}; got shape {z.shape}.")
     if not z.size:
         raise TrustboError(
-            f"awareness has an axis of length 0; got shape {z.shape}. Without features, give one "
-            "that is 0 everywhere."
+            f"awareness has an axis of length 0: its shape is {z.shape}. If you have no features, "
+            "give one feature that is 0 everywhere."
         )
     if (bad := (z < 0.0) | (z > 1.0)).any():
         index = tuple(int(i) for i in np.argwhere(bad)[0])
@@ -191,11 +191,12 @@ def of_arrays(awareness: ArrayLike, passable: ArrayLike | None) -> tuple[np.ndar
     reached = finite if z.ndim == 4 else finite.any(0)
     free = reached if passable is None else np.asarray(passable, dtype=bool)
     if free.shape != z.shape[-3:-1]:
-        raise TrustboError(f"passable must be (row, col) = {z.shape[-3:-1]}; got {free.shape}.")
+        shape = z.shape[-3:-1]
+        raise TrustboError(f"the shape of passable must be (row, col) = {shape}; got {free.shape}.")
     if (free & ~reached).any():
         cell = tuple(int(i) for i in np.argwhere(free & ~reached)[0])
         raise TrustboError(
-            f"awareness of the passable cell {cell} is NaN; fill it, or mark it impassable."
+            f"awareness of the passable cell {cell} is NaN; give a value or mark it impassable."
         )
     if z.ndim == 4:
         return of_moves(z, free), free
@@ -204,7 +205,7 @@ def of_arrays(awareness: ArrayLike, passable: ArrayLike | None) -> tuple[np.ndar
         m, row, col = (int(i) for i in np.argwhere(missing)[0])
         down, right = MOVES[m]
         raise TrustboError(
-            f"awareness of the bound {(row - down, col - right)} -> {(row, col)} is NaN; fill it, "
-            "or mark one of the cells impassable."
+            f"awareness of the bound {(row - down, col - right)} -> {(row, col)} is NaN; give a "
+            "value or mark one of the cells impassable."
         )
     return np.where(exists[..., None], z, np.nan), free

@@ -1,8 +1,8 @@
-"""Difficulty of bounds: measures of the routes relative to the robots' limits.
+"""Difficulty of bounds, measured on the robots' routes relative to the robots' limits.
 
 Each measure is 0 on easy routes and about 1 at the robots' limit. The measure of a bound is the
-maximum over the routes of the lead and of T2. T2's routes assume that the next cell is straight
-ahead.
+maximum over the routes of the lead and of T2. T2's routes assume that the next bound has the same
+direction.
 """
 
 import math
@@ -21,30 +21,30 @@ from trustbo.workspace.moves import MOVES
 from trustbo.workspace.posts import TRAVERSABLE, Posts
 
 MEASURES = ("untraversable", "tilt", "narrowness", "tightness")
-"""Measures of difficulty, see `difficulty_of`."""
-_AHEAD = 1.5  # m along its way to the point that a robot faces
-_STEP, _SUSTAINED = 0.25, 4  # m between samples of a way, and samples that a tilt is the mean of
-_WIDTH = 2.0  # m of room on either side that count as half narrow
-_MOST = 2.0  # a cliff is no worse than twice the limit
-_TIGHT = 3.0  # log(1 + m) along impassable ground that count as 1: 19 m
-_BLOCK = 16  # bounds for each call of a thread
+"""Measures of difficulty; see `difficulty_of`."""
+_AHEAD = 1.5  # distance to the point of the route that a robot faces, m
+_STEP, _SUSTAINED = 0.25, 4  # distance between samples, m, and samples in a mean of tilts
+_WIDTH = 2.0  # distance to an impassable pixel at which narrowness is 1/2, m
+_MOST = 2.0  # maximum tilt, as a multiple of the limit
+_TIGHT = 3.0  # log(1 + length in m) at which tightness is 1: 19 m
+_BLOCK = 16  # bounds per task of a thread
 
 
 _cached: WeakKeyDictionary[Workspace, xr.DataArray] = WeakKeyDictionary()
 
 
 def difficulty_of(workspace: Workspace) -> xr.DataArray:
-    """Compute the difficulty of a workspace's bounds; cached.
+    """Compute the difficulty of a workspace's bounds; the result is cached.
 
-    For each route, `untraversable` is one minus the mean traversability of its pixels; `tilt` is
-    the tangent of the largest pitch or roll of a robot that faces a point 1.5 m ahead, averaged
-    over 1 m and divided by the tangent of `max_slope`; `narrowness` is 1 / (1 + w / 2 m) with the
-    least distance w to an impassable pixel; and `tightness` is log(1 + l / 1 m) / 3 with the length
-    l of the pixels that touch an impassable one.
+    `untraversable` is one minus the mean traversability of a route's pixels. `tilt` is the largest
+    mean, over 1 m of a route, of the tangent of pitch or roll of a robot that faces a point 1.5 m
+    ahead; it is divided by the tangent of `max_slope`. `narrowness` is 1 / (1 + w / 2 m), where w
+    is the smallest distance to an impassable pixel. `tightness` is log(1 + l / 1 m) / 3, where l is
+    the length of the route beside impassable pixels.
 
     Returns:
-        Dims (move, row, col, measure), NaN where there is no bound. Without a terrain in memory,
-        the axis `measure` has length 0.
+        DataArray (move, row, col, measure), NaN where there is no bound. Without a terrain, the
+        dimension `measure` has length 0.
     """
     if workspace not in _cached:
         exists, posts = workspace.passable_bounds, workspace.posts
@@ -59,7 +59,7 @@ def difficulty_of(workspace: Workspace) -> xr.DataArray:
 
 
 def _measure(workspace: Workspace, posts: Posts, exists: np.ndarray, out: np.ndarray) -> None:
-    """Write the measures of bounds that exist, (move, row, col, measure)."""
+    """Write the measures of existing bounds to `out`, shape (move, row, col, measure)."""
     surface, pixels = posts.surface, workspace.pixels
     room = np.full(surface.ground.shape, np.inf)  # distance to the nearest impassable pixel, m
     if not surface.passable.all():
@@ -83,14 +83,14 @@ def _measure(workspace: Workspace, posts: Posts, exists: np.ndarray, out: np.nda
 def _of_bound(
     posts: Posts, easy: np.ndarray, room: np.ndarray, bound: Sequence[np.ndarray | None]
 ) -> np.ndarray:
-    """Compute the maximum of each measure over the robots' routes in a bound, from pixel maps."""
+    """Compute the maximum of each measure over the robots' routes in a bound, shape (measure,)."""
     surface, team = posts.surface, posts.team
     ground = surface.gradient, surface.pixel, surface.origin
     robots = team.lead, *team.robots
     worst = np.zeros(len(MEASURES))
     for robot, way in zip(robots, bound, strict=True):
         if way is None:
-            continue  # two posts may be in one pixel, with a route of length 0
+            continue  # the robot has no route
         pixels = surface.nearest(*way.T)
         of_way, gaps = easy[pixels], room[pixels]
         of_way = of_way[np.isfinite(of_way)]
@@ -107,7 +107,7 @@ def _of_bound(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _tilt(way, gradient, pixel, origin):
-    """Compute tangents of the largest pitch or roll on a route (point, 2), smoothed over 1 m."""
+    """Compute the largest tangent of pitch or roll on a route (point, 2), averaged over 1 m."""
     along = np.zeros(len(way))
     for k in range(1, len(way)):
         along[k] = along[k - 1] + math.hypot(way[k, 0] - way[k - 1, 0], way[k, 1] - way[k - 1, 1])
@@ -128,7 +128,7 @@ def _tilt(way, gradient, pixel, origin):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _point(way, along, s):
-    """Find the position at a distance along a route, or the end of the route if it is shorter."""
+    """Return the position at distance s along a route, or the end of a shorter route."""
     k = min(np.searchsorted(along, s, side="right"), len(way) - 1)
     length = along[k] - along[k - 1]
     share = min(1.0, (s - along[k - 1]) / length) if length > 0.0 else 1.0

@@ -19,10 +19,10 @@ from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError, require_pair
 
 type Location = Cell | Mapping[str, float]
-"""A cell (row, col), or a position with named coordinates, see `Grid.locate`."""
+"""A cell (row, col), or a position with named coordinates; see `Grid.locate`."""
 WGS84 = CRS.from_epsg(4326)
 MAX_MISSING = 0.5
-"""Maximum fraction of missing or too steep pixels in a passable cell."""
+"""Maximum fraction of a passable cell's pixels that are missing or too steep."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -31,11 +31,11 @@ class Grid(Summary):
 
     Attributes:
         shape: Number of rows and columns.
-        left: x of the left edge, CRS metres.
-        top: y of the top edge, CRS metres.
-        cell_height: North-south size of a cell, m.
-        cell_width: East-west size of a cell, m.
-        crs: Coordinate reference system, as WKT; None without a terrain.
+        left: x coordinate of the left edge, in CRS metres.
+        top: y coordinate of the top edge, in CRS metres.
+        cell_height: North-south size of a cell, in metres.
+        cell_width: East-west size of a cell, in metres.
+        crs: Coordinate reference system as WKT; None without a terrain.
     """
 
     shape: tuple[int, int]
@@ -47,10 +47,10 @@ class Grid(Summary):
 
     @classmethod
     def over(cls, terrain: xr.Dataset, shape: tuple[int, int]) -> "Grid":
-        """Make a grid of a given shape that covers a terrain.
+        """Make a grid of the given shape that covers a terrain.
 
         Raises:
-            TrustboError: There are fewer than 2 cells, or cells are smaller than 2 pixels.
+            TrustboError: The grid has fewer than 2 cells, or cells smaller than 2 x 2 pixels.
         """
         rows, cols = require_pair("shape", shape)
         pixels = terrain["dem"].shape
@@ -58,9 +58,8 @@ class Grid(Summary):
             raise TrustboError(f"shape must be (rows, cols) with at least two cells; got {shape}.")
         if pixels[0] < 2 * rows or pixels[1] < 2 * cols:
             raise TrustboError(
-                f"a grid of {rows} x {cols} cells needs at least 2 x 2 pixels per cell; the "
-                f"terrain has {pixels[0]} x {pixels[1]} pixels. Take a smaller shape or a finer "
-                "raster."
+                f"a grid of {rows} x {cols} cells needs at least 2 x 2 pixels per cell, but the "
+                f"terrain has {pixels[0]} x {pixels[1]} pixels. Use fewer cells or a finer raster."
             )
         left, bottom, right, top = terrain.rio.bounds(recalc=True)
         crs = terrain.rio.crs
@@ -84,30 +83,30 @@ class Grid(Summary):
         return rows
 
     def center(self, cell: Cell) -> tuple[float, float]:
-        """Return x and y of a cell's centre, CRS metres."""
+        """Return x and y of a cell's centre, in CRS metres."""
         row, col = require_pair("cell", cell)
         x = self.left + (col + 0.5) * self.cell_width
         return x, self.top - (row + 0.5) * self.cell_height
 
     @property
     def corner(self) -> tuple[float, float]:
-        """X and y of the lower left corner, CRS metres."""
+        """X and y of the lower left corner, in CRS metres."""
         return self.left, self.top - self.shape[0] * self.cell_height
 
     @property
     def bounds(self) -> tuple[float, float, float, float]:
-        """Left, bottom, right and top, CRS metres."""
+        """Left, bottom, right and top edges, in CRS metres."""
         left, bottom = self.corner
         return left, bottom, left + self.shape[1] * self.cell_width, self.top
 
     @property
     def x(self) -> np.ndarray:
-        """X of the centre of each column, CRS metres, shape (col,)."""
+        """X of the centre of each column, shape (col,), in CRS metres."""
         return self.left + (np.arange(self.shape[1]) + 0.5) * self.cell_width
 
     @property
     def y(self) -> np.ndarray:
-        """Y of the centre of each row, CRS metres, shape (row,)."""
+        """Y of the centre of each row, shape (row,), in CRS metres."""
         return self.top - (np.arange(self.shape[0]) + 0.5) * self.cell_height
 
     @property
@@ -120,12 +119,12 @@ class Grid(Summary):
         return f"EPSG:{code}" if code else re.findall(r'"(.*?)"', crs.to_wkt())[0]
 
     def locate(self, location: Location, what: str = "location") -> Cell:
-        """Find the cell of a location, which may be impassable.
+        """Find the cell at a location, whether or not it is passable.
 
         Args:
-            location: Cell (row, col); or a position, `{"x": 1748000.0, "y": 5427000.0}` in metres
-                of the CRS, or `{"lon": 174.7, "lat": -41.3}` in degrees (WGS 84).
-            what: Name of the location in messages.
+            location: Cell (row, col), or a position such as `{"x": 1748000.0, "y": 5427000.0}` in
+                CRS metres or `{"lon": 174.7, "lat": -41.3}` in degrees (WGS 84).
+            what: Name of the location in error messages.
 
         Raises:
             TrustboError: The location is invalid, off the grid, or in degrees on a grid without a
@@ -137,20 +136,20 @@ class Grid(Summary):
             raise
         except (TypeError, ValueError, KeyError, OverflowError):
             raise TrustboError(
-                f"{what} must be a cell (row, col), whole numbers; or a position, "
+                f"{what} must be a cell (row, col) of whole numbers, or a position "
                 '{"x": ..., "y": ...} in metres or {"lon": ..., "lat": ...} in degrees; '
                 f"got {location!r}."
             ) from None
         rows, cols = self.shape
         if not (0 <= row < rows and 0 <= col < cols):
             raise TrustboError(
-                f"{what} {location!r} is outside the grid of {rows} rows and {cols} columns; rows "
-                f"are 0..{rows - 1} from the top, columns 0..{cols - 1}{self._extent_text()}."
+                f"{what} {location!r} is outside the grid, which covers rows 0 (top) to {rows - 1} "
+                f"and columns 0 to {cols - 1}{self._extent_text()}."
             )
         return int(row), int(col)
 
     def _row_and_col(self, location: Location) -> tuple[float, float]:
-        """Return the row and column of a location, fractional for a position, even off the grid."""
+        """Convert a location, even off the grid, to a row and column, fractional for positions."""
         if not isinstance(location, Mapping):
             row, col = (operator.index(i) for i in location)
             return row, col
@@ -169,28 +168,29 @@ class Grid(Summary):
         left, bottom, right, top = self.bounds
         west, south, east, north = transform_bounds(self.require_crs(), WGS84, *self.bounds)
         return (
-            f", x {left:.1f} to {right:.1f} and y {bottom:.1f} to {top:.1f} m in {self.crs_name}, "
-            f"longitude {west:.5f} to {east:.5f} and latitude {south:.5f} to {north:.5f}"
+            f" (x {left:.1f} to {right:.1f} m and y {bottom:.1f} to {top:.1f} m in "
+            f"{self.crs_name}; longitude {west:.5f} to {east:.5f}, latitude {south:.5f} to "
+            f"{north:.5f})"
         )
 
     def lonlat(self, cell: Cell) -> tuple[float, float]:
-        """Return the longitude and latitude of a cell's centre, degrees (WGS 84).
+        """Return the longitude and latitude of a cell's centre, in degrees (WGS 84).
 
         Raises:
-            TrustboError: There is no such cell, the grid has no CRS, or the cell is not on Earth in
-                it.
+            TrustboError: The cell is not a pair of whole numbers, the grid has no CRS, or the CRS
+                is not valid at the cell.
         """
         x, y = self.center(cell)
         lon, lat = _moved(self.require_crs(), WGS84, x, y)
         if not math.isfinite(lon + lat):
             raise TrustboError(
-                f"({x:.10g}, {y:.10g}) is not on Earth in {self.crs_name}; give the terrain "
-                "the CRS that its coordinates are in."
+                f"({x:.10g}, {y:.10g}) is not a point on Earth in {self.crs_name}; correct the "
+                "CRS of the terrain."
             )
         return lon, lat
 
     def place(self, maps: xr.Dataset) -> xr.Dataset:
-        """Georeference maps of the cells (row, col): dims (y, x), with transform and CRS."""
+        """Georeference maps of the cells: rename (row, col) to (y, x); set transform and CRS."""
         placed = maps.drop_vars(["row", "col", "y", "x"], errors="ignore").rename(row="y", col="x")
         placed = placed.assign_coords(y=self.y, x=self.x)
         for axis in ("y", "x"):
@@ -201,13 +201,13 @@ class Grid(Summary):
         return placed.rio.write_transform(from_origin(self.left, self.top, *step))
 
     def cell_means(self, values: xr.DataArray) -> np.ndarray:
-        """Average over each cell's pixels with data.
+        """Average the valid pixels of each cell.
 
         Args:
-            values: Values of pixels, dims (y, x), on a raster that the grid covers.
+            values: Pixel values, dims (y, x), on a raster that the grid covers.
 
         Returns:
-            Shape (row, col); NaN where a cell has no data.
+            Means, shape (row, col); NaN where a cell has no valid pixel.
         """
         row, col = self.cells_along(values["y"].values, values["x"].values)
         cell, z = row[:, None] * self.shape[1] + col, values.transpose("y", "x").values
@@ -219,24 +219,24 @@ class Grid(Summary):
             return (total / count).reshape(self.shape)
 
     def cells_along(self, y: ArrayLike, x: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-        """Find the row of the cell of each pixel at `y`, and the column for each pixel at `x`."""
+        """Return the row of the cell at each `y` and the column of the cell at each `x`."""
         rows, cols = self.shape
         row = ((self.top - np.asarray(y)) / self.cell_height).astype(int)
         col = ((np.asarray(x) - self.left) / self.cell_width).astype(int)
         return np.clip(row, 0, rows - 1), np.clip(col, 0, cols - 1)
 
     def require_crs(self) -> CRS:
-        """Return the CRS of the grid; TrustboError if it has none."""
+        """Return the CRS; TrustboError if the grid has none."""
         if self.crs is None:
             raise TrustboError(
-                "this grid has no coordinate reference system: its workspace was not made from a "
-                "terrain. Give positions as x and y, in metres."
+                "the grid has no coordinate reference system, because the workspace was not made "
+                "from a terrain; give positions as x and y in metres."
             )
         return CRS.from_user_input(self.crs)
 
 
 def _moved(source: CRS, target: CRS, x: float, y: float) -> tuple[float, float]:
-    """Convert a position to another CRS; infinite if it is not on Earth in one of them."""
+    """Convert a position to another CRS; return infinities if that is impossible."""
     try:
         (u,), (v,) = transform_points(source, target, [x], [y])[:2]
     except Exception:  # PROJ's errors are GDAL's, without a common base
@@ -245,7 +245,7 @@ def _moved(source: CRS, target: CRS, x: float, y: float) -> tuple[float, float]:
 
 
 def over_cells[Map: (xr.Dataset, xr.DataArray)](maps: Map) -> Map:
-    """Rename the dimensions (y, x) of `Result.maps` to (row, col)."""
+    """Rename the dimensions (y, x) of maps such as `Result.maps()` to (row, col)."""
     if not {"y", "x"} <= set(maps.dims):
         return maps
     return maps.drop_vars(["y", "x"], errors="ignore").rename(y="row", x="col")

@@ -1,21 +1,20 @@
-"""Line of sight of a bound: predicted fraction of time in which robot and lead see each other.
+"""Line of sight in a bound: predicted fraction of time in which robot and lead see each other.
 
-A bound a -> c has two phases (docs/concepts.md, "Why bounds"). T2 stands at its posts in a and
-watches the lead drive to its stop in c; then the lead stands and watches T2 close up to posts
-in c, from which each of the admissible next cells can be watched. Both phases are sampled at times
-spread evenly over them, and weighted by their durations:
+A bound a -> c has two phases (docs/concepts.md, "Why bounds"). First, T2 watches from its posts
+in a while the lead drives to its stop in c. Then the lead watches from this stop while T2 closes up
+to its posts in c, which depend on the next cell. Sight is computed at evenly spaced times in each
+phase, and the phases are weighted by their durations:
 
     line_of_sight_i = (T_1 mean_k p(post_i -> lead at t_k) + T_2 mean_k p(lead -> robot i at t_k))
                       / (T_1 + T_2),
 
-where p is the probability of detection under the assumed sight, T_1 the lead's driving time and T_2
-the driving time of the slowest robot. A robot that arrives earlier waits at its post. The next cell
-alternates from sample to sample over all cells to which a path may continue; at the goal T2 stands
-around the lead.
+where p is the detection probability under the assumed model of sight, T_1 is the lead's driving
+time and T_2 is the driving time of the slowest robot. A robot that arrives earlier waits at its
+post. The samples alternate between the next cells to which a path may continue.
 
 The lead takes the fastest route, as in the simulator. T2 is assumed to follow that route, shifted
-to its posts: its own fastest routes differ by a few metres, over which sight hardly changes, and
-would require a search of about 50 routes for each bound.
+to T2's posts. T2's own fastest routes would need about 50 searches for each bound. They differ from
+the assumed routes by a few metres, over which sight hardly changes.
 """
 
 import math
@@ -34,14 +33,14 @@ from trustbo.workspace.routes import at_times
 from trustbo.workspace.sight import Sight, detection_between, jittered, optics
 from trustbo.workspace.surface import Surface
 
-_BLOCK = 256  # bounds computed at a time: they share calls, and bound the memory
+_BLOCK = 256  # bounds computed together, which limits the memory
 N_SAMPLES = 16
 """Number of times in each phase at which sight is computed."""
-_AHEAD = 0.5  # cosine of the largest turn that is expected: turns lead to other posts
+_AHEAD = 0.5  # cosine of the largest expected turn of a path
 
 
 class Geometry(NamedTuple):
-    """Stops, posts and routes of the robots in given bounds; positions are x, y in CRS metres."""
+    """Stops, posts and routes of the robots in given bounds, x and y in CRS metres."""
 
     routes: list[np.ndarray]  # of the lead, (point, 2) each
     posts: np.ndarray  # (bound, robot, 2), from which T2 watches the lead
@@ -52,9 +51,9 @@ class Geometry(NamedTuple):
 def bound_maps(
     posts: Posts, passable: np.ndarray, traversability: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Compute line of sight and traversability of all bounds between passable cells, (row, col).
+    """Compute the line of sight and the traversability of all bounds between passable cells.
 
-    Traversability is the mean of a pixel map, (row, col), along T2's tracks.
+    The traversability of a bound is the mean of a pixel map, shape (row, col), along T2's tracks.
 
     Returns:
         Two arrays of shape (robot, move, row, col), in [0, 1]; NaN where there is no bound or no
@@ -77,7 +76,7 @@ def bound_maps(
 
 
 def geometry(posts: Posts, index: np.ndarray, passable: np.ndarray) -> Geometry:
-    """Collect the bounds (bound, (move, row, col)) between `passable` cells, (row, col)."""
+    """Collect the geometry of bounds, which `index` lists by (move, row, col)."""
     left = (index[:, 1:] - np.array(MOVES)[index[:, 0]]).tolist()
     bounds = [
         ((i, j), (row, col)) for (i, j), (_, row, col) in zip(left, index.tolist(), strict=True)
@@ -95,7 +94,7 @@ def geometry(posts: Posts, index: np.ndarray, passable: np.ndarray) -> Geometry:
 
 
 def _cells_ahead(passable: np.ndarray, a: Cell, c: Cell) -> list[Cell | None]:
-    """Find the cells that may follow the bound a -> c, without sharp turns if possible."""
+    """Return the cells that may follow the bound a -> c, without sharp turns if possible."""
     (rows, cols), (down, right) = passable.shape, (c[0] - a[0], c[1] - a[1])
     onward: list[Cell | None] = []
     ahead: list[Cell | None] = []
@@ -111,7 +110,7 @@ def _cells_ahead(passable: np.ndarray, a: Cell, c: Cell) -> list[Cell | None]:
 def bound_features(
     surface: Surface, sight: Sight, team: Team, given: Geometry, traversability: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Compute line of sight and traversability of bounds, see `bound_maps`: (bound, robot)."""
+    """Compute line of sight and traversability, each (bound, robot); see `bound_maps`."""
     lead, lead_time = _timed(surface, team.lead, given.routes)
     drives = [_timed(surface, robot, given.routes) for robot in team.robots]
     first, last = (np.stack([route[end] for route in given.routes]) for end in (0, -1))
@@ -142,13 +141,13 @@ def bound_features(
 def _timed(
     surface: Surface, robot: Robot, routes: Sequence[np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions (bound, sample, 2) of a robot on routes, and the durations (bound,), s."""
+    """Return a robot's positions (bound, sample, 2) on routes, and the durations (bound,) in s."""
     first = np.cumsum([0, *(len(route) for route in routes)])
     return at_times(surface, robot, np.concatenate(routes), first, N_SAMPLES)
 
 
 def _mean(values: np.ndarray) -> np.ndarray:
-    """Average over the last axis without NaN; NaN if all values are NaN."""
+    """Average over the last axis, ignoring NaN; NaN if all values are NaN."""
     finite = np.isfinite(values)
     with np.errstate(invalid="ignore"):
         return np.where(finite, values, 0.0).sum(-1) / finite.sum(-1)

@@ -8,31 +8,31 @@ from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_pair
 
 MOVES = ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1))
-"""Steps (down, right) to the neighbouring cells; the reverse of move m is the m-th from last."""
+"""Steps (down, right) to the neighbouring cells; the reverse of move m is move 7 - m."""
 MOVE_NAMES = ("nw", "n", "ne", "w", "e", "sw", "s", "se")
-"""Labels of the moves of `MOVES`; row 0 is in the north."""
+"""Compass directions of `MOVES`, with row 0 in the north."""
 
 
 def require_on_grid(path: Sequence[Cell] | np.ndarray, shape: tuple[int, ...]) -> list[Cell]:
     """Return the cells of a path as pairs of ints.
 
-    TrustboError: a cell is not a pair, or is outside a grid of the given shape, (row, col).
+    Raises TrustboError if a cell is not a pair or is outside a grid with the shape (row, col).
     """
     cells = [require_pair("a cell", cell) for cell in path]
     rows, cols = shape
     for row, col in cells:
         if not (0 <= row < rows and 0 <= col < cols):
             raise TrustboError(
-                f"{(row, col)} is outside the grid of {rows} rows and {cols} columns; cells are "
-                "(row, col) from 0, row 0 at the top."
+                f"cell {(row, col)} is outside the grid of {rows} rows and {cols} columns; rows "
+                "and columns are counted from 0, with row 0 at the top."
             )
     return cells
 
 
 def moves_along(path: Sequence[Cell] | np.ndarray) -> np.ndarray:
-    """Return the indices in `MOVES` of the bounds of a path, shape (bound,).
+    """Return the index in `MOVES` of each bound of a path, shape (bound,).
 
-    TrustboError: two successive cells are not neighbours.
+    Raises TrustboError if two successive cells are not neighbours.
     """
     cells = np.asarray(path)
     steps = np.diff(cells, axis=0)
@@ -40,19 +40,19 @@ def moves_along(path: Sequence[Cell] | np.ndarray) -> np.ndarray:
         k = int(np.argmax(far))
         a, c = (tuple(cells[i].tolist()) for i in (k, k + 1))
         raise TrustboError(f"no bound leads from {a} to {c}: the cells are not neighbours.")
-    index = 3 * (steps[:, 0] + 1) + steps[:, 1] + 1  # 0..8, the middle one being no move
+    index = 3 * (steps[:, 0] + 1) + steps[:, 1] + 1  # 0..8, where 4 is no move
     return index - (index > 4)
 
 
 def bounds_along(path: Sequence[Cell] | np.ndarray) -> np.ndarray:
-    """Return move, row and column of the bounds of a path, (bound, 3); see `moves_along`."""
+    """Return the move, row and column of each bound of a path, (bound, 3); see `moves_along`."""
     return np.column_stack([moves_along(path), np.asarray(path)[1:]])
 
 
 def existing_bounds(passable: np.ndarray) -> np.ndarray:
-    """Return whether a bound exists into each cell by each move, shape (move, row, col).
+    """Return whether each move into each cell is a bound, shape (move, row, col).
 
-    A bound exists if the cell entered and the cell left are both in `passable`, (row, col).
+    A bound leads from one passable cell to another; `passable` has the shape (row, col).
     """
     rows, cols = passable.shape
     framed = np.pad(passable, 1)
@@ -61,9 +61,9 @@ def existing_bounds(passable: np.ndarray) -> np.ndarray:
 
 
 def along(maps: np.ndarray, path: Sequence[Cell] | np.ndarray) -> np.ndarray:
-    """Select the values of the bounds of a path, shape (..., bound, feature).
+    """Select the values for the bounds of a path, shape (..., bound, feature).
 
-    The maps have shape (..., move, row, col, feature).
+    The maps have the shape (..., move, row, col, feature).
     """
     moves, rows, cols = bounds_along(path).T
     return maps[..., moves, rows, cols, :]

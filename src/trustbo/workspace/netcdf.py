@@ -1,4 +1,4 @@
-"""Conversion of workspaces to trees of arrays, for files."""
+"""Conversion between workspaces and data trees, which are stored in files."""
 
 import json
 from dataclasses import asdict
@@ -15,12 +15,12 @@ from trustbo.workspace.workspace import Workspace
 
 
 def workspace_to_tree(workspace: Workspace) -> xr.DataTree:
-    """Convert a workspace to a tree."""
+    """Convert a workspace to a data tree."""
     cells = xr.Dataset({"awareness": workspace.awareness, "passable": workspace.passable})
     tree = {"cells": cells}
     tree |= {f"composites/{n}": index.fitted for n, index in workspace.composites.items()}
     if workspace.terrain is not None and workspace.pixels is not None:
-        pixels = workspace.pixels.drop_vars("spatial_ref", errors="ignore")  # the terrain's
+        pixels = workspace.pixels.drop_vars("spatial_ref", errors="ignore")  # kept in the terrain
         tree |= {"terrain": workspace.terrain, "pixels": pixels}
     result = xr.DataTree.from_dict(tree)
     result.attrs = {
@@ -32,7 +32,7 @@ def workspace_to_tree(workspace: Workspace) -> xr.DataTree:
 
 
 def workspace_from_tree(tree: xr.DataTree) -> Workspace:
-    """Convert a tree of `workspace_to_tree` back."""
+    """Convert a data tree from `workspace_to_tree` to a workspace."""
     cells = tree["cells"].to_dataset()
     grid, team = json.loads(tree.attrs["grid"]), json.loads(tree.attrs["team"])
     grid = Grid(**grid | {"shape": tuple(grid["shape"])})
@@ -44,7 +44,7 @@ def workspace_from_tree(tree: xr.DataTree) -> Workspace:
     terrain = pixels = posts = None
     if "terrain" in tree:
         terrain = tree["terrain"].to_dataset().set_coords("spatial_ref")
-        for array in terrain.data_vars.values():  # rioxarray's place for it
+        for array in terrain.data_vars.values():  # where rioxarray expects it
             if "grid_mapping" in array.attrs:
                 array.encoding["grid_mapping"] = array.attrs.pop("grid_mapping")
         pixels = tree["pixels"].to_dataset().assign_coords(spatial_ref=terrain["spatial_ref"])

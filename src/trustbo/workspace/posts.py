@@ -1,19 +1,19 @@
-"""Stops and posts: where the lead stops in a cell, and where T2 stands to watch it go to the next.
+"""Choice of stops, where the lead halts, and of posts, from which T2 watches the lead's next move.
 
-In a bound a -> c (docs/concepts.md, "Why bounds"), T2 watches the lead's route from its posts in a;
-then the lead watches from its stop in c how T2 leaves them. In the previous bound, the lead watched
-from its stop in a how T2 closed up. Among positions p on a lattice around the stop in a, the posts
-of T2 maximise
+In a bound a -> c (docs/concepts.md, "Why bounds"), T2 watches the lead's route from posts in a.
+Then the lead watches from its stop in c while T2 leaves these posts. In the previous bound, the
+lead watched from its stop in a while T2 drove to these posts. Among positions p on a lattice around
+the stop in a, the posts of T2 maximise
 
     1/2 mean_k s(p, lead at t_k) + 1/4 s(stop in a, p) + 1/4 s(stop in c, p),
 
-where s is the probability of detection under the assumed sight. Posts are within `RADIUS` of the
-stop, also beyond the edge of the cell, out of the lead's way, on ground that is well below the
-slope limit and connected to the stop by such ground. The lead stops where the routes to the
-neighbouring stops are most visible.
+where s is the detection probability under the assumed model of sight. Posts are within `RADIUS` of
+the stop, even beyond the edge of the cell, and away from the lead's route. Their ground is well
+below the slope limit, and connected to the stop by such ground. The lead stops where the routes to
+the neighbouring stops are most visible.
 
-Real obstacles may be missing from maps, and mapped ones may not block sight. The choice of posts
-and stops, and only this choice, allows for such errors (`Posts._seen`); the line of sight does not.
+Real obstacles may be missing from maps, and mapped obstacles may not block sight. The choice of
+posts and stops allows for such errors (`Posts._seen`); the feature `line_of_sight` does not.
 """
 
 from collections.abc import Sequence
@@ -34,28 +34,28 @@ from trustbo.workspace.sight import Sight, detection_between, jittered, optics
 from trustbo.workspace.surface import surface_of
 
 TRAVERSABLE = "traversability"
-"""Name of the feature that identifies easy ground, and is averaged along the routes of bounds."""
+"""Name of the feature that measures how easy the ground is, averaged along the routes of bounds."""
 SPACING, RADIUS = 2.0, 25.0
-"""Minimum distance between robots of T2, and maximum distance of T2 from the lead's stop, m."""
-_GAP = 4.0  # m, between two posts where there is room
-_STEP, _STOP_RADIUS = 4.0, 16.0  # m: of the lattice; of the lead's stop from the cell's centre
-_SMOOTHED = 5.0  # m, over which traversability is averaged
-_SAFE = 0.7  # steepest ground of posts and of the ground around, as a share of the slope limit
-_DISCOUNT = 0.005  # 1/m, rate at which sight is taken to fall with distance
-_DOUBT, _DOUBT_REACH = 0.1, 40.0  # share of the unexpected that is seen at 0 m; its reach, m
-_NEARER = 1e-3  # sight that a post one metre nearer is worth
-_IN_THE_WAY, _TOO_CLOSE = 5.0, 10.0  # penalties, larger than any sight
-_N_WATCHED = 30  # positions, best seen from the stops, from which the lead's route is looked at
-_N_AIMS = 6  # times on the lead's route at which it is aimed at
-_SHARES = np.array([0.25, 0.5, 0.75, 1.0])  # of the straight line to a stop around
+"""Minimum distance in m between T2's robots, and maximum distance of T2 from the lead's stop."""
+_GAP = 4.0  # preferred minimum distance between two posts, m
+_STEP, _STOP_RADIUS = 4.0, 16.0  # lattice spacing, and search radius for the lead's stop, m
+_SMOOTHED = 5.0  # width of the moving average of traversability, m
+_SAFE = 0.7  # steepest ground for posts, as a fraction of the slope limit
+_DISCOUNT = 0.005  # assumed rate at which detection falls with distance, 1/m
+_DOUBT, _DOUBT_REACH = 0.1, 40.0  # probability at 0 m of an unexpected detection; its decay, m
+_NEARER = 1e-3  # penalty on the score per metre from the stop
+_IN_THE_WAY, _TOO_CLOSE = 5.0, 10.0  # penalties, larger than any probability
+_N_WATCHED = 30  # positions best seen from the stops, for which sight of the route is computed
+_N_AIMS = 6  # times on the lead's route at which sight is computed
+_SHARES = np.array([0.25, 0.5, 0.75, 1.0])  # of the straight line to a neighbouring stop
 
 
 class Posts:
-    """Stops, posts and routes of a team on a grid; positions are x, y in CRS metres.
+    """Stops, posts and routes of a team on a grid; positions are x and y in CRS metres.
 
     Attributes:
         grid: Planning grid.
-        team: Lead and robots.
+        team: Lead and overwatching robots.
         sight: Assumed model of sight.
         surface: Rasters of the terrain.
         routes: Fastest routes over the surface.
@@ -64,7 +64,7 @@ class Posts:
     def __init__(
         self, grid: Grid, team: Team, sight: Sight, terrain: xr.Dataset, pixels: xr.Dataset
     ) -> None:
-        """Prepare the rasters; `pixels` (y, x) contains `passable`, and traversability if known."""
+        """Prepare the rasters; `pixels` (y, x) has passability and, if known, traversability."""
         self.grid, self.team, self.sight = grid, team, sight
         self.surface = surface_of(terrain, pixels["passable"].values.astype(bool))
         self.routes = Routes(self.surface)
@@ -85,7 +85,7 @@ class Posts:
     # --- routes ---
 
     def window(self, *cells: Cell) -> Window:
-        """Return the pixel window of cells plus a margin of half a cell: rows, then columns."""
+        """Return the pixel window (rows, then columns) of cells with a margin of half a cell."""
         (rows, cols), shape = self.surface.ground.shape, np.array(self.grid.shape)
         size = np.array([rows, cols]) / shape
         top, left = ((np.min(cells, axis=0) - 0.5) * size).astype(int).tolist()
@@ -93,14 +93,14 @@ class Posts:
         return max(0, top), min(rows, bottom), max(0, left), min(cols, right)
 
     def linked_bounds(self, exists: np.ndarray) -> np.ndarray:
-        """Return those bounds in `exists`, (move, row, col), for which the robots have a route.
+        """Return which bounds in `exists`, shape (move, row, col), have routes for all robots.
 
-        T2's posts in a cell are connected to its stop within the cell and half a cell around it.
-        One test of the stops of both cells is therefore valid for all robots, both directions and
-        any next cell.
+        T2's posts in a cell are connected to the cell's stop within the cell and half a cell around
+        the cell. If the stops of two cells are connected, all robots therefore have routes in both
+        directions, whatever the next cell is.
         """
         linked, last = np.zeros_like(exists), len(MOVES) - 1
-        for m, (down, right) in enumerate(MOVES[: len(MOVES) // 2]):  # others are their reverses
+        for m, (down, right) in enumerate(MOVES[: len(MOVES) // 2]):  # the others are reverse moves
             for row, col in np.argwhere(exists[m]).tolist():
                 a, c = (row - down, col - right), (row, col)
                 region, (top, left) = self._linked_to(self.stop(a), a, c)
@@ -111,29 +111,29 @@ class Posts:
     def bound_routes(
         self, a: Cell, c: Cell, next_cell: Cell | None
     ) -> tuple[np.ndarray | None, ...]:
-        """Find the routes of the bound a -> c, (point, 2) each: the lead's, then each of T2's.
+        """Find the robots' routes in the bound a -> c, the lead's route first, each (point, 2).
 
-        The lead drives to its stop in c; then T2 drives from its posts in a to the posts from which
-        it watches the bound from c to `next_cell`, or at the goal (None) to positions around the
-        lead. None for a robot without a route.
+        The lead drives to its stop in c. T2 then drives from its posts in a to its posts for the
+        bound from c to `next_cell` or, if `next_cell` is None, to positions around the lead. A
+        route is None if it does not exist.
         """
         ends = zip(self.team.robots, self.watching(a, c), self.watching(c, next_cell), strict=True)
         window = self.window(a, c)
         return self._lead_route(a, c), *(self.routes.find(*each, window) for each in ends)
 
     def _lead_route(self, a: Cell, c: Cell) -> np.ndarray | None:
-        """Find the route of the lead from stop to stop, (point, 2); None if there is none."""
+        """Find the lead's route between its stops in a and c, (point, 2); None if there is none."""
         return self.routes.find(self.team.lead, self.stop(a), self.stop(c), self.window(a, c))
 
     def lead_line(self, a: Cell, c: Cell) -> np.ndarray:
-        """Return the route of the lead, or a straight line where there is none, (point, 2)."""
+        """Return the lead's route, or a straight line if there is no route, (point, 2)."""
         route = self._lead_route(a, c)
         return np.stack([self.stop(a), self.stop(c)]) if route is None else route
 
     # --- stops of the lead ---
 
     def stop(self, cell: Cell) -> np.ndarray:
-        """Find the lead's stop in a cell, (2,), where routes to other stops are most visible."""
+        """Find the position in a cell, (2,), from which routes to other stops are most visible."""
         if cell not in self._stops:
             self._stops[cell] = self._seeing_stop(cell)
         return self._stops[cell]
@@ -165,11 +165,11 @@ class Posts:
     # --- posts of T2 ---
 
     def watching(self, cell: Cell, next_cell: Cell | None) -> np.ndarray:
-        """Find the posts of T2 in a cell from which it watches the lead's next move, (robot, 2).
+        """Find the posts in a cell from which T2 watches the lead's next move, shape (robot, 2).
 
         Without a next cell, T2 stands around the lead at the goal.
         """
-        if (cell, next_cell) not in self._posts:  # those for all neighbours cost little more
+        if (cell, next_cell) not in self._posts:  # all neighbours take little more time
             around = [c for c in self._around(cell) if self._is_in_region(self.stop(c))]
             ahead = list(dict.fromkeys([None, *around, next_cell]))
             for c, posts in zip(ahead, self._chosen(cell, ahead), strict=True):
@@ -177,10 +177,10 @@ class Posts:
         return self._posts[cell, next_cell]
 
     def _chosen(self, cell: Cell, ahead: Sequence[Cell | None]) -> np.ndarray:
-        """Choose the best positions, one robot after the other: (next cell, robot, 2)."""
+        """Choose the best positions for one robot after another, shape (next cell, robot, 2)."""
         here, robots = self.stop(cell), self.team.robots
         position, gap = self._lattice(cell, here, RADIUS), _GAP
-        if len(position) < len(robots):  # little ground is safe
+        if len(position) < len(robots):  # too little safe ground
             position, gap = self._pixels_near(cell, here), SPACING
         scores = self._scores(cell, ahead, position)
         posts = np.empty((len(ahead), len(robots), 2))
@@ -197,7 +197,7 @@ class Posts:
     def _scores(
         self, cell: Cell, ahead: Sequence[Cell | None], position: np.ndarray
     ) -> dict[Robot, np.ndarray]:
-        """Score positions as posts, (next cell, position), by robot; see the module."""
+        """Score positions as posts of each robot, shape (next cell, position); see the module."""
         here, lead = self.stop(cell), self.team.lead
         stops = np.array([here, *(here if c is None else self.stop(c) for c in ahead)])
         routes = [np.stack([here] * 2) if c is None else self.lead_line(cell, c) for c in ahead]
@@ -212,7 +212,7 @@ class Posts:
             best = np.argsort(nearer - seen, axis=1, kind="stable")[:, :_N_WATCHED]
             eyes = position[best][:, :, None] + jittered(_N_AIMS)
             watched = 0.5 * self._seen(eyes, aims[:, None], robot, lead).mean(-1)
-            score = seen - 1.0  # of positions from which the route was not looked at
+            score = seen - 1.0  # for positions without computed sight of the route
             np.put_along_axis(score, best, np.take_along_axis(seen, best, 1) + watched, 1)
             scores[robot] = score - _IN_THE_WAY * blocking - nearer
         return scores
@@ -228,10 +228,10 @@ class Posts:
     def _seen(
         self, eye: np.ndarray, target: np.ndarray, watcher: Robot, watched: Robot
     ) -> np.ndarray:
-        """Compute the detection probability of targets (..., 2), allowing for errors of the map.
+        """Compute the detection probability of targets (..., 2), allowing for map errors.
 
-        It shrinks the map's probability with distance, and adds a small probability, falling with
-        distance, that a hidden target is visible.
+        The probability from the map is reduced with distance. A small probability that a hidden
+        target is visible, which also falls with distance, is added.
         """
         view = optics(watcher, watched)
         distance = np.linalg.norm(target - eye, axis=-1)
@@ -242,21 +242,21 @@ class Posts:
     # --- pixels ---
 
     def _around(self, cell: Cell) -> list[Cell]:
-        """Return the neighbours on the grid."""
+        """Return the neighbours of a cell on the grid."""
         rows, cols = self.grid.shape
         near = [(cell[0] + down, cell[1] + right) for down, right in MOVES]
         return [c for c in near if 0 <= c[0] < rows and 0 <= c[1] < cols]
 
     def _is_in_region(self, position: np.ndarray) -> bool:
-        """Return whether a position is in the region where robots can drive."""
+        """Return whether a position is in the largest passable region."""
         return bool(self._standable[self.surface.pixel_at(*position.tolist())])
 
     def _linked_to(
         self, position: np.ndarray, *cells: Cell, over: np.ndarray | None = None
     ) -> tuple[np.ndarray, tuple[int, int]]:
-        """Return a mask of the window's pixels that are connected to a position, and its corner.
+        """Return a mask of the pixels around cells that are linked to a position, and its corner.
 
-        Pixels are connected over passable ground, or over another mask of pixels.
+        The pixels are connected over passable ground or, if given, over the mask `over`.
         """
         ground = self.surface.passable if over is None else over
         window = self.window(*cells)
@@ -264,9 +264,9 @@ class Posts:
         return linked_to(ground, window, pixel), (window[0], window[2])
 
     def _lattice(self, cell: Cell, here: np.ndarray, radius: float) -> np.ndarray:
-        """Lay a lattice of positions (position, 2) around one, connected to it over safe ground.
+        """Return lattice positions (position, 2) that safe ground connects to the position `here`.
 
-        The connection lies within half a cell around, which the window of every bound contains.
+        The connection is within half a cell around the cell, and so in the window of each bound.
         """
         steps = np.arange(-radius, radius + 1e-9, _STEP)
         offset = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
@@ -280,7 +280,7 @@ class Posts:
         return self._position(row[kept], col[kept])
 
     def _pixels_near(self, cell: Cell, here: np.ndarray) -> np.ndarray:
-        """Find positions in a cell that are connected to its stop, near it if there are enough."""
+        """Find positions in a cell that are connected to the stop, near the stop if possible."""
         row, col = self._pixels_of(cell)
         region, (top, left) = self._linked_to(here, cell)
         linked = region[row - top, col - left]
@@ -294,19 +294,19 @@ class Posts:
         return position[near]
 
     def require_room(self, cell: Cell) -> None:
-        """Raise TrustboError, with cell and robot, for a cell without a pixel for each robot."""
+        """Raise TrustboError if a cell has too few passable pixels for the robots."""
         n_pixels, names = len(self._pixels_of(cell)[0]), self.team.names
         if n_pixels <= len(names):
             raise TrustboError(
                 f"cell {cell} has {n_pixels} passable pixels, on which robot "
-                f"{names[max(0, n_pixels - 1)]!r} finds no post beside the lead; take larger "
+                f"{names[max(0, n_pixels - 1)]!r} finds no post beside the lead; use larger "
                 "cells, a finer raster or fewer robots."
             )
 
     def _pixels_of(self, cell: Cell) -> tuple[np.ndarray, np.ndarray]:
-        """Find rows and columns of a cell's passable pixels, in the largest region where possible.
+        """Return rows and columns of a cell's passable pixels, in the largest region if possible.
 
-        If none is passable, all of its pixels are returned; no route leads there.
+        If the cell has no passable pixel, all its pixels are returned; no route leads to them.
         """
         top, bottom = np.searchsorted(self._cells[0], (cell[0], cell[0] + 1))
         left, right = np.searchsorted(self._cells[1], (cell[1], cell[1] + 1))
@@ -318,6 +318,6 @@ class Posts:
         return row + top, col + left
 
     def _position(self, row: np.ndarray, col: np.ndarray) -> np.ndarray:
-        """Return the positions of pixels, (pixel, 2)."""
+        """Return the positions of pixels, shape (pixel, 2)."""
         y, x = self.surface.axes
         return np.stack([x[col], y[row]], axis=-1)

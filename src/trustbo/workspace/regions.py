@@ -1,8 +1,8 @@
-"""Connected regions of passable pixels, used by posts, routes, planner and simulator.
+"""Connected regions of passable pixels, for posts, routes, the planner and the simulator.
 
-Two pixels are in one region if a chain of passable pixels that share edges connects them. Routes do
-not pass between two impassable pixels or round the corner of one (see `routes`), so a route between
-two pixels exists if and only if they are in the same region.
+Two pixels are in the same region if passable pixels that share edges connect them. Routes do not
+pass between two impassable pixels or around the corner of one (see `routes`). A route between two
+pixels therefore exists if and only if the pixels are in the same region.
 """
 
 from typing import Any
@@ -11,11 +11,11 @@ import numpy as np
 from scipy import ndimage
 
 Window = tuple[int, int, int, int]
-"""First and end row, then first and end column, of pixels."""
+"""First and end row, then first and end column, of a window of pixels."""
 
 
 def largest_region(passable: np.ndarray) -> np.ndarray:
-    """Return a mask of the largest region of passable pixels, (row, col)."""
+    """Return a mask (row, col) of the largest region of passable pixels."""
     regions: Any = ndimage.label(passable)
     labels, n_regions = regions
     if n_regions == 0:
@@ -26,7 +26,7 @@ def largest_region(passable: np.ndarray) -> np.ndarray:
 
 
 def linked_to(passable: np.ndarray, window: Window, pixel: tuple[int, ...]) -> np.ndarray:
-    """Return a mask of a window's passable pixels that are connected within it to one of them."""
+    """Return a mask of a window's passable pixels that are connected to `pixel` in the window."""
     top, bottom, left, right = window
     inside = passable[top:bottom, left:right]
     regions: Any = ndimage.label(inside)

@@ -15,16 +15,16 @@ from trustbo.workspace.surface import Surface
 
 SLOWEST = 0.1
 """Speed at the slope limit as a fraction of the speed on level ground."""
-_CLEARANCE = 1.0  # m from obstacles, that routes keep where they can: robots drive beside them
-_CLOSE = 4.0  # cost of a metre within it
+_CLEARANCE = 1.0  # preferred distance from obstacles, since robots stray from routes, m
+_CLOSE = 4.0  # factor on the cost within that distance
 _compiled = njit(cache=True, nogil=True, error_model="numpy")
 
 
 class Routes:
-    """Fastest routes over passable pixels by A*, cached by slope limit."""
+    """Fastest routes over passable pixels, found by A* and cached."""
 
     def __init__(self, surface: Surface) -> None:
-        """Compute the slope, which reduces a robot's speed, and the pixels near obstacles."""
+        """Compute the slope, which reduces a robot's speed, and find the pixels near obstacles."""
         self._surface = surface
         self._slope = np.arctan(np.hypot(*surface.gradient))
         free: Any = ndimage.distance_transform_edt(surface.passable, sampling=surface.pixel)
@@ -35,12 +35,12 @@ class Routes:
     def find(
         self, robot: Robot, start: np.ndarray, goal: np.ndarray, window: Window
     ) -> np.ndarray | None:
-        """Find the fastest route from start to goal, (x, y) in CRS metres; None if there is none.
+        """Find the fastest route from start to goal; None if there is none.
 
-        The route stays inside the pixel window; it has shape (point, 2), in CRS metres.
+        The route stays inside the pixel window. It has shape (point, 2), x and y in CRS metres.
         """
         ends = [self._surface.pixel_at(*p.tolist()) for p in (start, goal)]
-        low, high = sorted(ends)  # the way back is the same
+        low, high = sorted(ends)  # the route back is the same
         key = low, high, window, robot.max_slope
         if key not in self._cached:
             self._cached[key] = self._search(*key)
@@ -56,7 +56,7 @@ class Routes:
     def _search(
         self, start: tuple[int, int], goal: tuple[int, int], window: Window, max_slope: float
     ) -> np.ndarray:
-        """Find the positions of the pixels from start to goal; empty if there is no route."""
+        """Find the positions of a route's pixels from start to goal; empty if there is no route."""
         surface = self._surface
         if max_slope not in self._paces:
             pace = 1.0 / speed_share(self._slope, max_slope)
@@ -82,7 +82,7 @@ def speed_share(tilt, max_slope):
 
 @_compiled
 def _a_star(pace, pixel, start, goal):
-    """Find the fastest route over pixels with paces (s/m, inf where impassable); may be empty."""
+    """Find the fastest route, empty if there is none; `pace` is infinite where impassable."""
     rows, cols = pace.shape
     best = np.full((rows, cols), np.inf)
     came = np.full((rows, cols), -1)
@@ -98,13 +98,13 @@ def _a_star(pace, pixel, start, goal):
             break
         ahead = math.hypot((goal[0] - r) * pixel[0], (goal[1] - c) * pixel[1]) * least
         if estimate > best[r, c] + ahead + 1e-9:
-            continue  # a stale entry: the pixel was improved since
+            continue  # a stale entry: a faster way to the pixel was found
         for dr in range(-1, 2):
             for dc in range(-1, 2):
                 i, j = r + dr, c + dc
                 if (dr == 0 and dc == 0) or not (0 <= i < rows and 0 <= j < cols):
                     continue
-                # No passage between two impassable pixels, nor round the corner of one.
+                # No passage between two impassable pixels or around the corner of one.
                 if not (np.isfinite(pace[i, c]) and np.isfinite(pace[r, j])):
                     continue
                 length = math.hypot(dr * pixel[0], dc * pixel[1])
@@ -131,10 +131,11 @@ def _a_star(pace, pixel, start, goal):
 def at_times(
     surface: Surface, robot: Robot, flat: np.ndarray, first: np.ndarray, n: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find a robot's positions at n evenly spaced times along each route, and the durations.
+    """Find a robot's positions at n evenly spaced times on each route, and the durations.
 
-    The routes are concatenated in `flat` (point, 2); `first` has the index of the first point of
-    each route, and the number of points. Returns shapes (route, time, 2), and (route,) in seconds.
+    The routes are concatenated in `flat`, shape (point, 2). `first` contains the index of each
+    route's first point, and ends with the number of points. Positions have shape (route, time, 2),
+    durations shape (route,), in seconds.
     """
     limits = robot.speed, robot.max_slope
     return _resampled(surface.gradient, surface.pixel, surface.origin, flat, first, limits, n)
@@ -142,7 +143,7 @@ def at_times(
 
 @_compiled
 def _resampled(gradient, pixel, origin, flat, first, limits, n_samples):
-    """Compute `at_times`; speed falls with the larger of pitch and roll."""
+    """Compute the result of `at_times`; the speed falls with the larger of pitch and roll."""
     rows, cols = gradient.shape[1:]
     n = len(first) - 1
     points, duration = np.empty((n, n_samples, 2)), np.empty(n)

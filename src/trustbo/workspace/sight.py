@@ -21,15 +21,14 @@ _JITTER = 0.7  # m
 
 @dataclass(frozen=True)
 class Sight:
-    """Model of sight through terrain and canopy.
+    """Model of sight over terrain and through canopy.
 
-    The ground blocks rays; the canopy, a layer from `crown_base` times its height to its top,
-    transmits exp(-extinction x metres inside). With extinction 0 only the ground blocks; with
-    `math.inf` and crown base 0, the whole surface blocks. In real forest the three cases differ by
-    an order of magnitude.
+    The ground blocks rays. The canopy is a layer from `crown_base` times its height to its top. A
+    ray through d metres of canopy is transmitted with probability exp(-extinction d). If extinction
+    is 0, only the ground blocks rays; if it is `math.inf` and the crown base 0, the surface does.
 
     Attributes:
-        extinction: Extinction coefficient of the canopy, 1/m.
+        extinction: Extinction coefficient of the canopy, in 1/m.
         crown_base: Lower edge of the canopy as a fraction of its height.
 
     Raises:
@@ -42,13 +41,13 @@ class Sight:
     def __post_init__(self) -> None:
         if not self.extinction >= 0.0 or not 0.0 <= self.crown_base <= 1.0:
             raise TrustboError(
-                "need extinction >= 0 and crown_base in [0, 1]; got "
+                "extinction must be at least 0, and crown_base must be in [0, 1]; got "
                 f"{self.extinction} and {self.crown_base}."
             )
 
 
 def optics(watcher: Robot, watched: Robot) -> np.ndarray:
-    """Return sensor and target height (m), range (m) and sine of the field of view, shape (4,)."""
+    """Return sensor height, target height and range, in m, and sine of half the field of view."""
     return np.array([
         watcher.sensor_height,
         watched.target_height,
@@ -59,10 +58,10 @@ def optics(watcher: Robot, watched: Robot) -> np.ndarray:
 
 @cache
 def jittered(n: int) -> np.ndarray:
-    """Return offsets of n viewpoints from a post, (viewpoint, 2), m, evenly over the stopping disc.
+    """Return the offsets of n viewpoints from a post, shape (viewpoint, 2), in metres.
 
-    A robot stops within half a metre of its post, and its field of view tilts with the ground
-    there, so the view from one exact point would not be representative.
+    Viewpoints are spread over a disc, because a robot stops up to half a metre from its post and
+    its field of view tilts with the ground. The view from the exact post is not representative.
     """
     k, order = np.arange(n), np.random.default_rng(0).permutation(n)
     radius, angle = _JITTER * np.sqrt((k + 0.5) / n), 2.4 * k
@@ -72,11 +71,11 @@ def jittered(n: int) -> np.ndarray:
 def detection_probability(
     surface: Surface, sight: Sight, sensor: np.ndarray, target: np.ndarray, optics: np.ndarray
 ) -> np.ndarray:
-    """Compute the probability that an ideal lidar detects each target, (ray,), in [0, 1].
+    """Compute the probability that an ideal lidar detects each target, shape (ray,), in [0, 1].
 
-    It is the transmittance along the ray if the target is within the lidar's range and its vertical
-    field of view, which tilts with the robot; otherwise 0. Sensors and targets have shape (ray, 2),
-    CRS metres; see `optics`, shape (ray, 4) or (4,).
+    The probability is the transmittance along the ray if the target is within the lidar's range and
+    vertical field of view, which tilts with the robot, and 0 otherwise. Sensors and targets have
+    shape (ray, 2), in CRS metres. The values of `optics` have shape (ray, 4) or (4,).
     """
     ends = _ends(
         surface.ground,
@@ -94,7 +93,7 @@ def detection_probability(
 def detection_between(
     surface: Surface, sight: Sight, eye: np.ndarray, target: np.ndarray, optics: np.ndarray
 ) -> np.ndarray:
-    """Compute the detection probability from eyes to targets, (..., 2), broadcast; (...)."""
+    """Broadcast eyes and targets (..., 2), and return their detection probabilities (...)."""
     eye, target = np.broadcast_arrays(eye, target)
     rays = np.ascontiguousarray(eye).reshape(-1, 2), np.ascontiguousarray(target).reshape(-1, 2)
     return detection_probability(surface, sight, *rays, optics).reshape(eye.shape[:-1])
@@ -102,9 +101,9 @@ def detection_between(
 
 @_compiled
 def _ends(ground, gradient, pixel, origin, sensor, target, optics):
-    """Compute row, col and height of both ends of each ray, (ray, 6); NaN where out of view.
+    """Compute row, column and height of both ends of each ray, (ray, 6); NaN if out of view.
 
-    This is a separate loop, so that the memory accesses of many rays overlap.
+    This loop is separate so that the memory accesses of many rays overlap.
     """
     n_rows, n_cols = ground.shape
     ends = np.empty((len(sensor), 6))

@@ -1,4 +1,4 @@
-"""Rasters for positions, motion and sight of the robots."""
+"""Rasters from which positions, motion and sight of robots are computed."""
 
 from typing import Any, NamedTuple
 
@@ -11,7 +11,7 @@ from trustbo.terrain.read import pixel_size
 
 
 class Surface(NamedTuple):
-    """Rasters for sight and motion, and the conversion from positions to pixels."""
+    """Rasters for sight and motion, with the conversion from positions to pixels."""
 
     ground: np.ndarray  # (row, col), m
     canopy: np.ndarray  # (row, col), m: the DSM
@@ -22,14 +22,14 @@ class Surface(NamedTuple):
 
     @property
     def axes(self) -> tuple[np.ndarray, np.ndarray]:
-        """Y of each row of pixels and x of each column, CRS metres."""
+        """Y of each pixel row and x of each pixel column, in CRS metres."""
         rows, cols = self.ground.shape
         y = self.origin[1] - np.arange(rows) * self.pixel[0]
         return y, self.origin[0] + np.arange(cols) * self.pixel[1]
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
-        """Least x and y, and largest x and y, of the pixels' edges."""
+        """Smallest x and y, then largest x and y, of the raster's edges, in CRS metres."""
         y, x = self.axes
         high, wide = 0.5 * self.pixel[0], 0.5 * self.pixel[1]
         return float(x[0] - wide), float(y[-1] - high), float(x[-1] + wide), float(y[0] + high)
@@ -39,7 +39,7 @@ class Surface(NamedTuple):
         return (self.origin[1] - y) / self.pixel[0], (x - self.origin[0]) / self.pixel[1]
 
     def nearest(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the row and column of the pixels at positions."""
+        """Return the rows and columns of the pixels nearest to positions."""
         row, col = self.to_pixel(np.asarray(x), np.asarray(y))
         rows, cols = self.ground.shape
         return (
@@ -48,14 +48,14 @@ class Surface(NamedTuple):
         )
 
     def pixel_at(self, x: float, y: float) -> tuple[int, int]:
-        """Return the row and column of the pixel at one position."""
+        """Return the row and column of the pixel nearest to one position."""
         rows, cols = self.ground.shape
         row, col = round((self.origin[1] - y) / self.pixel[0]), (x - self.origin[0])
         return min(max(row, 0), rows - 1), min(max(round(col / self.pixel[1]), 0), cols - 1)
 
 
 def surface_of(terrain: xr.Dataset, passable: np.ndarray) -> Surface:
-    """Make the surface of a terrain; `passable` has the shape (row, col) of its pixels."""
+    """Make the surface of a terrain; `passable`, shape (row, col), is a mask of its pixels."""
     ground, canopy = (terrain[name].values.astype(float) for name in ("dem", "dsm"))
     return Surface(
         ground=ground,
@@ -68,7 +68,7 @@ def surface_of(terrain: xr.Dataset, passable: np.ndarray) -> Surface:
 
 
 def filled(dem: np.ndarray) -> np.ndarray:
-    """Replace missing heights by the nearest value, as robots may touch the edge of the data."""
+    """Replace missing heights with the nearest height; robots may reach the edge of the data."""
     nearest: Any = ndimage.distance_transform_edt(
         ~np.isfinite(dem), return_distances=False, return_indices=True
     )

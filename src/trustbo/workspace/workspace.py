@@ -1,4 +1,4 @@
-"""Workspace: the awareness of every bound and the passability of every cell."""
+"""Workspace with the awareness of every bound and the passability of every cell."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -47,15 +47,15 @@ class Workspace(Summary):
     """Planning grid with the situational awareness of each robot in each bound.
 
     Attributes:
-        awareness: DataArray (robot, move, row, col, feature) in [0, 1], for the bound into the cell
-            (row, col) by one of the eight `MOVES`; NaN where there is no such bound.
-        passable: DataArray (row, col), bool.
-        grid: Positions of the cells.
-        team: Lead and robots.
-        terrain: DEM and DSM; None without a terrain.
-        pixels: Dataset (y, x) of traversability, visibility and passable; None without a terrain.
-        composites: Fitted composites by feature.
-        posts: Stops, posts and routes of the robots over the terrain; None without a terrain.
+        awareness: DataArray (robot, move, row, col, feature), in [0, 1]. A value applies to the
+            bound that enters the cell (row, col) by one of the `MOVES`; NaN if none exists.
+        passable: Boolean DataArray (row, col).
+        grid: Shape, position and cell size of the planning grid.
+        team: Lead and overwatching robots.
+        terrain: Dataset of the DEM and the DSM; None if the workspace was made from arrays.
+        pixels: Dataset (y, x) of each feature and of `passable`; None without a terrain.
+        composites: Fitted composite indices, keyed by feature.
+        posts: The robots' stops, posts and routes on the terrain; None without a terrain.
     """
 
     awareness: xr.DataArray
@@ -78,33 +78,31 @@ class Workspace(Summary):
         bounds: bool = True,
         sight: Sight | None = None,
     ) -> Self:
-        """Derive traversability, visibility and line of sight from a DEM and a DSM.
+        """Make a workspace with features computed from a DEM and a DSM.
 
-        Features are averaged over a cell's pixels, and used for all bounds into the cell and all
-        robots. A cell is impassable if more than half of its pixels are missing or steeper than the
-        slope limit. Openness is measured over the lidar's range, at most the diagonal of a cell:
-        overwatch does not need sight beyond one bound.
+        The mean of a feature over a cell applies to all robots and to all bounds into the cell.
+        A cell is impassable if more than half of its pixels are missing or steeper than the slope
+        limit. Openness is measured up to the lidar's range, but at most over the diagonal of a
+        cell, because overwatch needs no sight beyond one bound.
 
-        Overwatch relates two cells. Traversability is therefore averaged along the robots' tracks
-        in a bound, and the feature `line_of_sight` is added: the predicted fraction of the bound's
-        time in which a robot and the lead see each other under the assumed sight.
+        Overwatch involves two cells. Traversability is therefore averaged along the robots' tracks
+        in a bound, and the feature `line_of_sight` is added. It is the predicted fraction of time
+        in which a robot and the lead can see each other, given the assumed model of sight.
 
         Args:
-            terrain: Dataset of `read_terrain` or `synthetic_terrain`.
-            shape: Rows and columns of the planning grid.
-            team: Lead and robots; by default a lead and three robots.
-            features: Features of awareness by name: several pixel features for a composite (see
-                `terrain.FEATURES`), or one feature in [0, 1] that is used unchanged. By default
-                traversability and visibility, from `terrain.TRAVERSABILITY` and
-                `terrain.VISIBILITY`.
-            bounds: False to define awareness for cells only, as in the paper: no line of sight, the
-                traversability of the cell entered, and visibility from `terrain.PAPER_VISIBILITY`.
+            terrain: Dataset from `read_terrain` or `synthetic_terrain`.
+            shape: Number of rows and columns of the planning grid.
+            team: Lead and overwatching robots; by default a lead and three robots.
+            features: Pixel features (see `terrain.FEATURES`) of each awareness feature, by name.
+                Several pixel features form a composite index; a single name stands for a feature
+                in [0, 1] that is used unchanged. The default is traversability and visibility.
+            bounds: False to define awareness for cells only, as in the paper: without line of
+                sight, and with the visibility of `terrain.PAPER_VISIBILITY`.
             sight: Assumed model of sight; by default `Sight()`.
 
         Raises:
             TrustboError: The dataset is not a terrain, the grid is too fine for the raster, a cell
-                is too small for the team to stand in, no cell is passable, or a feature has the
-                name of the line of sight.
+                is too small for the team, no cell is passable, or a feature has a reserved name.
 
         Example:
             >>> tb.Workspace.from_terrain(terrain, shape=(10, 10), team=tb.Team(n_robots=3))
@@ -137,18 +135,18 @@ class Workspace(Summary):
         """Make a workspace from arrays, without a terrain.
 
         Args:
-            awareness: Shape (robot, row, col, feature), in [0, 1]; or (robot, move, row, col,
-                feature), for the bound into a cell by each of the eight `MOVES`. Awareness of cells
-                is copied to all moves.
-            passable: Shape (row, col); by default the cells without NaN in `awareness`, or with at
-                least one bound into them.
-            cell_size: Side of a cell, m.
-            team: Lead and robots; by default as many robots as on the first axis of `awareness`.
+            awareness: Awareness of each cell, shape (robot, row, col, feature), which applies to
+                all moves into the cell; or awareness of each bound, shape (robot, move, row, col,
+                feature), for the eight `MOVES` into the cell. Values are in [0, 1].
+            passable: Whether each cell is passable, shape (row, col). By default, cells are
+                passable if `awareness` has no NaN in the cell or in at least one bound into it.
+            cell_size: Side length of a cell, in metres.
+            team: Lead and overwatching robots; by default, `awareness` sets the number of robots.
             features: Names of the features; by default traversability, visibility, z3, ...
 
         Raises:
-            TrustboError: The axes do not match, a value is outside [0, 1] or NaN in a passable
-                cell, or no cell is passable.
+            TrustboError: The shapes do not match, a value is outside [0, 1], a passable cell has a
+                NaN, or no cell is passable.
         """
         known = () if team is None else Team.of(team).names
         features = as_names("features", features)
@@ -160,7 +158,7 @@ class Workspace(Summary):
             raise TrustboError(f"awareness has {len(z)} robots, but the team has {n}.")
         names = features or default_features(z.shape[-1])
         if len(names) != z.shape[-1]:
-            raise TrustboError(f"features must be {z.shape[-1]} names; got {names}.")
+            raise TrustboError(f"features must have {z.shape[-1]} names; got {names}.")
         side, (rows, cols) = require_positive("cell_size", cell_size), free.shape
         grid = Grid((rows, cols), 0.0, rows * side, side, side)
         return cls(*labelled(z, free, grid, team, names), grid, team)
@@ -192,21 +190,21 @@ class Workspace(Summary):
 
     @property
     def surface(self) -> Surface | None:
-        """Rasters for position, motion and sight; None without a terrain."""
+        """Rasters used to compute positions, motion and sight; None without a terrain."""
         return None if self.posts is None else self.posts.surface
 
     @property
     def sight(self) -> Sight | None:
-        """Assumed model of sight, used to choose posts; None without a terrain."""
+        """Model of sight that is assumed in planning; None without a terrain."""
         return None if self.posts is None else self.posts.sight
 
     @cached_property
     def passable_bounds(self) -> xr.DataArray:
-        """Whether a bound has passable cells and routes for the robots, (move, row, col), bool.
+        """Whether the robots can drive each bound, Boolean DataArray (move, row, col).
 
-        The bound enters the cell (row, col) by one of the eight `MOVES`. Routes are searched within
-        the two cells and half a cell around them; without a terrain, there is a route between any
-        two neighbours.
+        A bound enters the cell (row, col) by one of the eight `MOVES`. Both cells must be passable
+        and connected by routes within the two cells and half a cell around them. Without a terrain,
+        any two neighbouring cells are connected.
         """
         exists = existing_bounds(self.passable.values)
         if self.posts is not None:
@@ -215,7 +213,7 @@ class Workspace(Summary):
         return like.copy(data=exists).rename("passable_bounds")
 
     def along(self, path: Sequence[Cell]) -> np.ndarray:
-        """Return the awareness of the bounds of a path, shape (bound, robot, feature), in [0, 1].
+        """Return the awareness of a path's bounds, shape (bound, robot, feature), in [0, 1].
 
         Args:
             path: Cells, each a neighbour of the previous one.
@@ -230,8 +228,8 @@ class Workspace(Summary):
     def in_order(self, mission: Mission) -> Mission:
         """Return a mission with its robots and features in the workspace's order.
 
-        Line of sight is predicted, not measured: it is NaN if the mission does not have it.
-        Features with default names, z3, z4, ..., get the workspace's names at the same positions.
+        Line of sight is predicted, not measured, so it is NaN if the mission does not contain it.
+        Features with the default names z3, z4, ... are given the workspace's names, in order.
 
         Raises:
             TrustboError: The mission has other robots or features, or no map.
@@ -248,12 +246,12 @@ class Workspace(Summary):
         return mission.in_order(self.team.names, self.features, predicted)
 
     def fill(self, mission: Mission) -> Mission:
-        """Fill awareness that a mission did not measure (NaN) with the workspace's.
+        """Replace awareness that a mission did not measure (NaN) with the workspace's awareness.
 
-        Simulators do not measure line of sight; campaigns fill it in automatically.
+        Campaigns do this automatically. Robots do not measure line of sight, for example.
 
         Raises:
-            TrustboError: The mission's path is not a path of neighbouring cells on the grid.
+            TrustboError: The mission's path is not a path of neighbouring passable cells.
         """
         ordered = self.in_order(mission)
         missing = np.isnan(ordered.awareness)
@@ -263,15 +261,15 @@ class Workspace(Summary):
         return replace_awareness(ordered, np.where(missing, known, np.nan))
 
     def locate(self, location: Location, what: str = "location") -> Cell:
-        """Find the cell of a location, which must be passable.
+        """Find the passable cell at a location.
 
         Args:
-            location: Cell (row, col); or a position, `{"x": 1748000.0, "y": 5427000.0}` in metres
-                of the CRS, or `{"lon": 174.7, "lat": -41.3}` in degrees (WGS 84).
-            what: Name of the location in messages.
+            location: Cell (row, col), or a position such as `{"x": 1748000.0, "y": 5427000.0}` in
+                CRS metres or `{"lon": 174.7, "lat": -41.3}` in degrees (WGS 84).
+            what: Name of the location in error messages.
 
         Raises:
-            TrustboError: The location is invalid, off the grid, without data, or impassable.
+            TrustboError: The location is invalid or off the grid, or the cell is impassable.
         """
         cell, grid = self.grid.locate(location, what), self.grid
         if not self.passable.values[cell]:
@@ -285,7 +283,7 @@ class Workspace(Summary):
         return cell
 
     def _why_impassable(self, cell: Cell) -> str:
-        """Explain why a cell is impassable; empty without a terrain."""
+        """Return the reason why a cell is impassable; empty without a terrain."""
         if self.terrain is None:
             return ""
         missing = self.grid.cell_means(self.terrain["dem"].isnull().astype(float))[cell]
