@@ -1,4 +1,4 @@
-"""Simulators of bounding overwatch, including replay of recorded missions."""
+"""Simulators of bounding overwatch, including the replay of recorded missions."""
 
 from trustbo.simulation.events import Degradation, Dust, Fouling, Jam, Season, Trees
 from trustbo.simulation.kinematic import KinematicSimulator
@@ -11,4 +11,4 @@ __all__ = [
     "Degradation", "Dust", "Fouling", "Jam", "KinematicSimulator", "ModelSimulator",
     "RadioSimulator", "ReplaySimulator", "Season", "Trees", "Truth",
 ]  # fmt: skip
-__dir__ = __all__.copy  # completion lists public names alone
+__dir__ = __all__.copy  # tab completion lists only public names

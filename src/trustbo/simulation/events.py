@@ -1,7 +1,7 @@
-"""Events: changes of the world in given missions, with one class for each kind.
+"""Events that change the world in given missions, with one class for each kind of event.
 
-Each kind of event is a frozen dataclass derived from `Event` with a method `change`, which returns
-a world with the event. Positions are x and y in CRS metres.
+The classes are frozen dataclasses derived from `Event`. Their method `change` returns a world with
+the event. Positions are x and y in CRS metres.
 """
 
 import dataclasses
@@ -23,8 +23,8 @@ class Event:
     """Change of the world in given missions.
 
     Attributes:
-        first: First mission with the event; missions count from 0.
-        last: Last mission with the event; None if it does not end.
+        first: First mission with the event; missions are counted from 0.
+        last: Last mission with the event; None if the event does not end.
     """
 
     SHARES: ClassVar[tuple[str, ...]] = ()
@@ -52,12 +52,12 @@ class Event:
 
 @dataclass(frozen=True)
 class Jam(Event):
-    """Jammer, which multiplies detection from or of robots in a circle by 1 - `strength`.
+    """Jammer that multiplies the probability of detections by or of robots in a circle.
 
     Attributes:
         center: Centre of the circle.
-        radius: Radius of the circle, m.
-        strength: Strength, in [0, 1].
+        radius: Radius of the circle, in metres.
+        strength: Strength in [0, 1]; the factor on the probability is 1 - `strength`.
     """
 
     SHARES = ("strength",)
@@ -74,11 +74,11 @@ class Jam(Event):
 
 @dataclass(frozen=True)
 class Degradation(Event):
-    """Degraded lidar of T2, with a lower probability of detection.
+    """Degraded lidar of a robot of T2, which reduces the robot's detection probability.
 
     Attributes:
         robot: Name of the robot.
-        detection: Factor on the probability of detection, in [0, 1].
+        detection: Factor on the detection probability, in [0, 1].
     """
 
     SHARES = ("detection",)
@@ -96,10 +96,10 @@ class Degradation(Event):
 
 @dataclass(frozen=True)
 class Dust(Event):
-    """Dust, rain or fog, which reduce the probability of detection of all lidars.
+    """Dust, rain or fog, which reduces the detection probability of all lidars.
 
     Attributes:
-        detection: Factor on the probability of detection, in [0, 1].
+        detection: Factor on the detection probability, in [0, 1].
     """
 
     SHARES = ("detection",)
@@ -117,9 +117,9 @@ class Trees(Event):
     """Trees felled or newly grown in a circle; they affect sight but not motion.
 
     Attributes:
-        height: Height of the canopy above the ground, m; 0 where trees were felled.
+        height: Height of the canopy above the ground, in metres; 0 if trees were felled.
         center: Centre of the circle.
-        radius: Radius of the circle, m.
+        radius: Radius of the circle, in metres.
     """
 
     height: float
@@ -129,7 +129,7 @@ class Trees(Event):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not 0.0 <= self.height < np.inf:
-            raise TrustboError(f"height (m) must not be negative; got {self.height!r}.")
+            raise TrustboError(f"height must be finite and at least 0; got {self.height!r}.")
 
     def change(self, world: World) -> World:
         """See `Event.change`."""
@@ -144,7 +144,7 @@ class Season(Event):
     """Change of season, which makes the canopy denser or thinner.
 
     Attributes:
-        extinction: Positive factor on the extinction of the true model of sight.
+        extinction: Positive factor on the extinction coefficient of the true model of sight.
     """
 
     extinction: float
@@ -161,18 +161,18 @@ class Season(Event):
 
 @dataclass(frozen=True)
 class Fouling(Event):
-    """Fouling and clearing of T2's lidars, by which detection varies from bound to bound.
+    """Fouling and clearing of T2's lidars, which changes detection from bound to bound.
 
-    The factor on the probability of detection of a robot is f_t = worst + (1 - worst) Phi(z_t),
-    where z_t = correlation z_{t-1} + sqrt(1 - correlation^2) e_t and e_t is standard normal. Time t
-    counts bounds: t = m x every + k - 1 for bound k = 1, 2, ... of mission m = 0, 1, ... The
-    stationary distribution of f is uniform in [worst, 1], with mean (1 + worst) / 2.
+    The factor on the detection probability of a robot is f_t = worst + (1 - worst) Phi(z_t), where
+    z_t = correlation z_{t-1} + sqrt(1 - correlation^2) e_t and e_t is standard normal. The time of
+    bound k = 1, 2, ... in mission m = 0, 1, ... is t = m x every + k - 1. The stationary
+    distribution of f is uniform on [worst, 1], with mean (1 + worst) / 2.
 
     Attributes:
         worst: Smallest factor, in [0, 1].
-        correlation: Correlation of z in successive bounds, in [0, 1).
-        every: Number of bounds between the starts of successive missions; at least the length of a
-            path.
+        correlation: Correlation of z between successive bounds, in [0, 1).
+        every: Number of bounds between the starts of successive missions, at least the number of
+            bounds of a path.
         seed: Seed of the factors.
     """
 
@@ -188,7 +188,7 @@ class Fouling(Event):
         require_whole("every", self.every, 1)
 
     def change(self, world: World) -> World:
-        """See `Event.change`; uses the mean factor for the long run."""
+        """See `Event.change`; the long-run world has the mean factor."""
         if world.mission is None:
             return world._replace(detection=0.5 * (1.0 + self.worst) * world.detection)
         first = world.mission * self.every
@@ -203,7 +203,7 @@ class Fouling(Event):
 
 
 def changed(world: World, events: Iterable[Event], mission: int, long_run: bool = False) -> World:
-    """Return the world of a mission; with `long_run`, the factors of bounds have their means."""
+    """Return the world of a mission; with `long_run`, random factors have their means."""
     world = world._replace(mission=None if long_run else mission)
     for event in events:
         if event.acts_in(mission):
@@ -212,7 +212,7 @@ def changed(world: World, events: Iterable[Event], mission: int, long_run: bool 
 
 
 def _circle(surface: Surface, center: tuple[float, float], radius: float) -> np.ndarray:
-    """Return a mask of the pixels with centres in a circle, (row, col); TrustboError if empty."""
+    """Return a mask (row, col) of the pixels centred in a circle; TrustboError if it is empty."""
     rows, cols = surface.ground.shape
     row, col = surface.to_pixel(*np.asarray(center, dtype=float))
     away = np.hypot(
@@ -223,7 +223,7 @@ def _circle(surface: Surface, center: tuple[float, float], radius: float) -> np.
     if not inside.any():
         left, bottom, right, top = surface.extent
         raise TrustboError(
-            f"no pixel of the terrain is within {radius:g} m of {center}; the terrain has x from "
-            f"{left:.9g} to {right:.9g} and y from {bottom:.9g} to {top:.9g}."
+            f"no pixel of the terrain is within {radius:g} m of {center}; the terrain covers x "
+            f"from {left:.9g} to {right:.9g} and y from {bottom:.9g} to {top:.9g}."
         )
     return inside

@@ -30,20 +30,20 @@ class State(NamedTuple):
     poses: np.ndarray
     """Position and heading of each robot, the lead first, shape (1 + robot, 3)."""
     stops: np.ndarray
-    """Planned positions, at which the routes start, shape (1 + robot, 2)."""
+    """Planned positions of the robots, where routes start, shape (1 + robot, 2)."""
     tracks: np.ndarray
-    """State of the lidars' tracks, see `sensing.new_tracks`."""
+    """State of the lidars' tracks; see `sensing.new_tracks`."""
 
 
 class KinematicSimulator(DescribedSimulator):
-    """Simulator of unicycle robots on a DEM and DSM, with contact by lidar line of sight.
+    """Simulator of unicycle robots on a DEM and a DSM; lidar line of sight determines contact.
 
     In the first phase of a bound, the lead drives to its stop in the next cell while T2 watches
     from its posts in the previous cell. In the second phase, T2 closes up to its next posts while
-    the lead watches. The contact rate of a robot of T2 is the fraction of ticks of both phases in
-    which it is in contact with the lead. Missions have the awareness of the workspace's maps.
+    the lead watches. The contact rate of a robot of T2 is the fraction of ticks, over both phases,
+    in which the robot is in contact with the lead. Missions have the workspace's awareness.
 
-    To simulate other motion, derive from this class and override `drive`.
+    To simulate a different kind of motion, derive from this class and override `drive`.
 
     Example:
         >>> jam = tb.simulation.Jam(center=(1748000.0, 5427000.0), radius=40.0, first=3)
@@ -61,22 +61,22 @@ class KinematicSimulator(DescribedSimulator):
         bound_timeout: float = 600.0,
         events: Sequence[Event] = (),
     ) -> None:
-        """Prepare a terrain for simulation.
+        """Prepare a simulation on a terrain.
 
         Stops, posts and routes are those planned by the workspace. The true terrain, sight and team
-        only affect contact, motion and failure.
+        affect only contact, motion and failure.
 
         Args:
             workspace: A workspace made from a terrain.
             terrain: True DEM and DSM, which must cover the workspace; by default the workspace's.
-            sight: True model of sight; by default the workspace's.
-            team: True robots, with the same names; by default the workspace's.
-            tick: Length of a tick, s.
-            bound_timeout: Longest duration of a bound, s; the mission then ends as "timeout".
+            sight: True model of sight; by default that of the workspace.
+            team: True team, with the same names; by default that of the workspace.
+            tick: Length of a tick, in seconds.
+            bound_timeout: Time in seconds after which a bound, and its mission, end as "timeout".
             events: Changes of the world in given missions, such as `Jam` or `Dust`.
 
         Raises:
-            TrustboError: The workspace has no terrain, the team has other robots, a value is not
+            TrustboError: The workspace has no terrain, the team has other names, a value is not
                 positive, or an event does not fit the terrain or the team.
         """
         self.workspace, self.terrain = workspace, terrain
@@ -84,8 +84,8 @@ class KinematicSimulator(DescribedSimulator):
         self.team = workspace.team if team is None else team
         if self.team.names != workspace.team.names:
             raise TrustboError(
-                f"the true team has robots {self.team.names}, the workspace's "
-                f"{workspace.team.names}; the names must be the same."
+                f"the simulated team has the robots {self.team.names}, but the workspace's team "
+                f"has {workspace.team.names}; the names must match."
             )
         surface = true_surface(workspace, terrain)
         self.tick = require_positive("tick", tick)
@@ -93,11 +93,11 @@ class KinematicSimulator(DescribedSimulator):
         self._max_ticks = round(self.bound_timeout / self.tick)
         self._usual, self.events = world_of(surface, self.sight, self.team), tuple(events)  # pyright: ignore[reportArgumentType]
         for event in self.events:
-            event.change(self._usual)  # refuses what does not fit
+            event.change(self._usual)  # raises if the event does not fit
         self._posts: Posts = workspace.posts  # pyright: ignore[reportAttributeAccessIssue]
 
     def describe(self) -> dict[str, object]:
-        """Return the settings that decide what a mission measures."""
+        """Return the settings that determine what a mission measures."""
         same_team, terrain = self.team == self.workspace.team, self.terrain
         rasters = () if terrain is None else (terrain[n].values for n in ("y", "x", "dem", "dsm"))
         return {
@@ -117,16 +117,16 @@ class KinematicSimulator(DescribedSimulator):
         return {**self.describe(), "events": always}
 
     def world(self, mission: int = 0, *, long_run: bool = False) -> World:
-        """Return the world of a mission; with `long_run`, factors of bounds have their means."""
+        """Return the world of a mission; with `long_run`, random factors have their means."""
         return changed(self._usual, self.events, require_whole("mission", mission, 0), long_run)
 
     def run(self, path: Sequence[Cell], *, seed: int, mission: int = 0) -> Mission:
-        """Run a path from start to goal, or until a bound fails.
+        """Run a path to the goal or until a bound fails.
 
         Args:
             path: Cells, each a neighbour of the previous one.
-            seed: Seed of slip and detections: the same seed gives the same mission.
-            mission: Number of the mission, from 0, which decides the active events.
+            seed: Seed of wheel slip and detections; the same seed gives the same mission.
+            mission: Number of the mission, from 0, which determines the active events.
 
         Raises:
             TrustboError: A cell is off the grid or impassable, or there are fewer than two cells.
@@ -148,7 +148,7 @@ class KinematicSimulator(DescribedSimulator):
         return Mission(tuple(cells), tuple(bounds), bounds[-1].status, *names)
 
     def standing(self, cell: Cell, next_cell: Cell | None) -> State:
-        """Return the team's state with all robots at stop and posts, before the next bound."""
+        """Return the state of a team that stands at the stop and the posts of a cell."""
         posts = self._posts
         stops = np.concatenate([posts.stop(cell)[None], posts.watching(cell, next_cell)])
         poses = np.concatenate([stops, np.zeros((len(stops), 1))], axis=1)
@@ -164,21 +164,20 @@ class KinematicSimulator(DescribedSimulator):
         max_ticks: int,
         rng: np.random.Generator,
     ) -> tuple[np.ndarray, str]:
-        """Drive robots along routes simultaneously, until all arrive or one fails.
+        """Drive robots along routes simultaneously until all arrive or one fails.
 
         Args:
             world: World of the mission.
             poses: Initial positions and headings, shape (robot, 3).
-            robots: True robots.
-            routes: Points of the route of each robot, shape (point, 2); None for a robot without a
-                route.
+            robots: Robots with their true properties.
+            routes: Route of each robot, shape (point, 2); None for a robot without a route.
             window: Pixel window of the planned surface that contains the routes: first and end row,
                 first and end column.
             max_ticks: Number of ticks after which the status is "timeout".
-            rng: Random numbers.
+            rng: Random number generator.
 
         Returns:
-            Poses after each tick, shape (tick, robot, 3), and the status.
+            Poses after each tick, shape (tick, robot, 3), and status.
         """
         return drive_together(world.surface, robots, routes, poses, self.tick, max_ticks, rng)
 
@@ -193,14 +192,14 @@ class KinematicSimulator(DescribedSimulator):
         *,
         expected: bool = False,
     ) -> list[tuple[Drive, np.ndarray, State]]:
-        """Simulate bound k of a mission, from 1, for each possible next cell.
+        """Simulate the k-th bound of a mission, from 1, for each possible next cell.
 
-        Movements that the alternatives share are simulated once. With `expected`, contact is the
-        probability of detection, provided that contact depends on a single scan.
+        Movements shared by several next cells are simulated once. With `expected`, contact is the
+        detection probability, provided that contact depends on a single scan.
 
         Returns:
-            Movements, contact at each tick, shape (tick, robot), and state after the bound, for
-            each next cell.
+            For each next cell, the movements, the contact at each tick, shape (tick, robot), and
+            the state after the bound.
         """
         goals = self._posts.stop(cell)[None]
         lead = self._move(world, state, cell, _LEAD, goals, self._max_ticks, rng)
@@ -241,7 +240,7 @@ class KinematicSimulator(DescribedSimulator):
     ) -> Drive:
         """Drive part of the team to goals (robot, 2) in a cell while the others stand still.
 
-        Routes start at the planned positions, robots at their current poses.
+        Routes start at planned positions, but the robots start at their current poses.
         """
         true, planned = (
             (team.lead, *team.robots)[members] for team in (world.team, self.workspace.team)
@@ -269,7 +268,7 @@ class KinematicSimulator(DescribedSimulator):
         probability: np.ndarray,
         rng: np.random.Generator,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Compute the contact at each tick, (tick, robot), and the tracks after it."""
+        """Return the contact at each tick, (tick, robot), and the tracks after the last tick."""
         detected = rng.random(probability.shape) < probability
         contact, tracks = np.empty(detected.shape, bool), tracks.copy()
         watchers = world.team.robots, (world.team.lead,) * world.team.n_robots
@@ -280,7 +279,7 @@ class KinematicSimulator(DescribedSimulator):
 
 
 def _joined(drives: Sequence[Drive]) -> Drive:
-    """Concatenate movements."""
+    """Concatenate successive movements."""
     poses = np.concatenate([drive.poses for drive in drives])
     moves = np.concatenate([drive.lead_moves for drive in drives])
     return drives[-1]._replace(poses=poses, lead_moves=moves)

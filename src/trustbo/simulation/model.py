@@ -15,14 +15,14 @@ from trustbo.simulation.protocol import DescribedSimulator, require_path
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import along, bounds_along, moves_along
 
-_STREAM = 0x6D697373  # among all streams of a seed
+_STREAM = 0x6D697373  # distinguishes this stream from others with the same seed
 
 
 class ModelSimulator(DescribedSimulator):
     """Simulator that draws contact rates from a trust model, and failures from given probabilities.
 
-    Posteriors and plans of a campaign can be compared with the truth: `Planner.plan(params)` is the
-    best path, and `Planner.evaluate(path, params)` evaluates any other path.
+    Posteriors and plans of a campaign can be compared with the truth. `Planner.plan(params)` finds
+    the best path, and `Planner.evaluate(path, params)` evaluates any other path.
     """
 
     def __init__(
@@ -35,23 +35,23 @@ class ModelSimulator(DescribedSimulator):
         n_ticks: int | None = None,
         p_fail: ArrayLike | None = None,
     ) -> None:
-        """Set the true parameters, awareness and probabilities of failure.
+        """Set the true parameters, awareness and failure probabilities.
 
         Args:
             workspace: Planning grid with awareness and passability.
-            params: True parameters, a single draw.
+            params: True parameters, as a single draw.
             model: Trust model with these parameters; by default `PooledTrust()`. Gaussian rates are
                 clipped to [0, 1]; if many are clipped, the data no longer follow the model.
-            awareness: True awareness of bounds (robot, move, row, col, feature), by default the
-                workspace's; missions measure it along their path.
-            n_ticks: Number of ticks of each bound, for `"beta_binomial"`.
-            p_fail: Probability that each bound ends the mission, shape (move, row, col), such as a
-                draw of `hazard.risk.BoundRisk`; failed robots are "stuck". None for no failures.
+            awareness: True awareness, shape (robot, move, row, col, feature), which missions
+                measure along their paths; by default the workspace's awareness.
+            n_ticks: Number of ticks of each bound, for the beta-binomial family only.
+            p_fail: Probability that a bound fails, shape (move, row, col), such as a draw of
+                `hazard.risk.BoundRisk`. A failed mission is "stuck". None for no failures.
 
         Raises:
-            TrustboError: Parameters or awareness have other robots or features, or several draws;
-                probabilities are for other bounds or outside [0, 1]; or `n_ticks` is missing or not
-                used.
+            TrustboError: Parameters or awareness have other robots or features than the workspace,
+                there are several draws, `p_fail` has another shape or is outside [0, 1], or
+                `n_ticks` is missing or not used.
         """
         require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
         require_kind("params", params, Params, "give parameters, such as TrustParams(...)")
@@ -60,19 +60,19 @@ class ModelSimulator(DescribedSimulator):
         shape = workspace.awareness.shape
         self.awareness = workspace.awareness.values if awareness is None else np.asarray(awareness)
         if self.awareness.shape != shape:
-            raise TrustboError(f"awareness must be {shape}; got shape {self.awareness.shape}.")
+            raise TrustboError(f"awareness must have shape {shape}; got {self.awareness.shape}.")
         if params.leading:
-            raise TrustboError(f"give one draw of params; they have leading axes {params.leading}.")
+            raise TrustboError(f"params must be a single draw; got leading axes {params.leading}.")
         check_params(params, shape[0], shape[-1])
         self.n_ticks = None if n_ticks is None else require_whole("n_ticks", n_ticks, 1)
         if (self.n_ticks is not None) != self.model.family.needs_ticks:
             needs = "needs" if self.model.family.needs_ticks else "does not use"
-            raise TrustboError(f"the family {self.model.family.name} {needs} n_ticks.")
+            raise TrustboError(f"the family {self.model.family.name!r} {needs} n_ticks.")
         bounds = shape[1:4]
         self.p_fail = None if p_fail is None else _require_probabilities(p_fail, bounds)
 
     def run(self, path: Sequence[Cell], *, seed: int, mission: int = 0) -> Mission:
-        """Run a path; the same seed gives the same mission, whatever its number."""
+        """Run a path; the result depends on the seed, but not on the number of the mission."""
         cells = require_path(self.workspace, path)
         z = np.swapaxes(along(self.awareness, cells), 0, 1)
         # Without the last number, seed 0 would give the stream of `default_rng(0)`.
@@ -103,7 +103,7 @@ class ModelSimulator(DescribedSimulator):
         return about
 
     def _end(self, cells: list[Cell], seed: int) -> tuple[int, str]:
-        """Count the bounds that are run, and find the final status of the mission."""
+        """Return the number of bounds that are run and the status of the mission."""
         n = len(cells) - 1
         if self.p_fail is None:
             return n, "ok"
@@ -114,10 +114,10 @@ class ModelSimulator(DescribedSimulator):
 
 
 def _require_probabilities(p_fail: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
-    """Return failure probabilities (move, row, col), NaN where there is no bound."""
+    """Return failure probabilities (move, row, col), which are NaN where there is no bound."""
     p = np.asarray(p_fail, dtype=float)
     if p.shape != shape:
-        raise TrustboError(f"p_fail must be (move, row, col) = {shape}; got {p.shape}.")
+        raise TrustboError(f"p_fail must have the shape (move, row, col) = {shape}; got {p.shape}.")
     if (bad := (p < 0.0) | (p > 1.0)).any():
         raise TrustboError(f"p_fail must be in [0, 1]; got {p[bad][0]:g}.")
     return p

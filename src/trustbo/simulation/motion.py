@@ -12,9 +12,9 @@ from trustbo.workspace.routes import speed_share
 from trustbo.workspace.surface import Surface
 
 LOOKAHEAD = 1.5
-"""Distance along its route to the point that a robot steers for, m."""
+"""Distance in m to the point of the route that a robot steers towards."""
 ARRIVED = 0.5
-"""Distance from its goal at which a robot stops, m."""
+"""Distance in m from the goal at which a robot stops."""
 _LEAST_STEPS = 5
 _compiled = njit(cache=True, nogil=True, error_model="numpy")
 _part = njit(nogil=True, error_model="numpy", **PART)
@@ -30,15 +30,15 @@ def drive(
     max_ticks: int,
     rng: np.random.Generator,
 ) -> tuple[np.ndarray, str]:
-    """Drive a unicycle along a route, steering for a point ahead on it (pure pursuit).
+    """Simulate a unicycle robot that follows a route by pure pursuit.
 
-    Speed falls linearly with the larger of pitch and roll, to a tenth at the limit; a pitch beyond
-    the limit leaves the robot stuck, a roll beyond it tips it over. Wheel slip multiplies the speed
-    of each tick by a random factor with a spread of about 5 %. The route has shape (point, 2), CRS
-    metres; the initial heading is in rad from east, anticlockwise. After `max_ticks` the status is
-    "timeout".
+    The speed falls linearly with the larger of pitch and roll, to a tenth at the slope limit. The
+    robot gets stuck if its pitch exceeds the limit, and tips over if its roll does. Wheel slip
+    multiplies the speed in each tick by a random factor with a spread of about 5 %. The route has
+    shape (point, 2), in CRS metres. The initial heading is in rad, anticlockwise from east. After
+    `max_ticks` the status is "timeout".
 
-    Returns poses (x, y, heading) after each tick, shape (tick, 3), and the status.
+    Returns the poses (x, y, heading) after each tick, shape (tick, 3), and the status.
     """
     poses, code = _drive(
         surface.gradient,
@@ -48,7 +48,7 @@ def drive(
         heading,
         (robot.speed, robot.turn_rate, robot.max_slope),
         tick,
-        # Short enough that no step leaps over the goal.
+        # Enough steps that no step leaps over the goal.
         max(_LEAST_STEPS, math.ceil(robot.speed * tick / (0.5 * ARRIVED))),
         rng.standard_normal(max_ticks),
     )
@@ -64,10 +64,10 @@ def drive_together(
     max_ticks: int,
     rng: np.random.Generator,
 ) -> tuple[np.ndarray, str]:
-    """Drive several robots simultaneously (see `drive`), until all arrive or one fails.
+    """Drive several robots simultaneously (see `drive`) until all arrive or one fails.
 
-    A robot without a route is stuck. Initial poses have shape (robot, 3). Returns poses after each
-    tick, shape (tick, robot, 3), and the status of the first robot that fails.
+    A robot without a route is stuck. Initial poses have shape (robot, 3). Returns the poses after
+    each tick, shape (tick, robot, 3), and the status of the first robot that fails.
     """
     tracks, failures = [], []
     for pose, robot, route in zip(poses, robots, routes, strict=True):
@@ -90,7 +90,7 @@ def _squared(route, i, x, y):
 
 @_part
 def _within_a_turn(angle):
-    """Wrap an angle to [-pi, pi); the slow remainder is computed only if needed."""
+    """Wrap an angle to [-pi, pi), and compute the slow remainder only if needed."""
     if -math.pi <= angle < math.pi:
         return angle
     return (angle + math.pi) % (2.0 * math.pi) - math.pi

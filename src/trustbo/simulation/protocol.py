@@ -14,18 +14,18 @@ from trustbo.workspace import Workspace
 
 
 class Simulator(Protocol):
-    """Simulator that runs a path: one of this package, a custom one, or real robots.
+    """Anything that runs a path, such as a simulator of this package or real robots.
 
-    Optional methods: `describe() -> dict` returns settings that a campaign records, and
-    `describe_world(mission) -> dict` the settings of a mission's world, for `Truth`, which also
-    needs the attribute `workspace`.
+    Two methods are optional. `describe() -> dict` returns settings that a campaign records.
+    `describe_world(mission) -> dict` returns the settings of a mission's world for `Truth`, which
+    also needs the attribute `workspace`.
     """
 
     def run(self, path: Sequence[Cell], *, seed: int, mission: int = 0) -> Mission:
-        """Run a path from its first cell to its last, or until it fails.
+        """Run a path from its first to its last cell, or until a bound fails.
 
         Args:
-            path: Cells, start first.
+            path: Cells from start to goal.
             seed: Random seed.
             mission: Number of the mission, from 0, for simulators whose world changes.
         """
@@ -33,10 +33,10 @@ class Simulator(Protocol):
 
 
 class DescribedSimulator(Summary):
-    """Base class of the package's simulators, displayed by the settings from `describe`."""
+    """Base class of the package's simulators, displayed with the settings from `describe`."""
 
     def describe(self) -> dict[str, object]:
-        """Return the settings that decide what a mission measures."""
+        """Return the settings that determine what a mission measures."""
         raise NotImplementedError
 
     def _rows(self) -> Rows:
@@ -46,7 +46,7 @@ class DescribedSimulator(Summary):
 
 
 def require_path(workspace: Workspace, path: Sequence[Cell]) -> list[Cell]:
-    """Return the cells of a path; TrustboError unless there are at least two, all passable."""
+    """Return the cells of a path; TrustboError unless at least two are given and passable."""
     path = require_cells("path", path)
     cells = [workspace.locate(cell, f"path[{k}]") for k, cell in enumerate(path)]
     if len(cells) < 2:
@@ -55,7 +55,7 @@ def require_path(workspace: Workspace, path: Sequence[Cell]) -> list[Cell]:
 
 
 def digest(*arrays: ArrayLike) -> str:
-    """Hash the values of arrays."""
+    """Return a hash of the values of arrays."""
     found = hashlib.sha256()
     for array in arrays:
         found.update(np.ascontiguousarray(array).tobytes())

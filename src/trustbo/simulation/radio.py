@@ -1,4 +1,4 @@
-"""Simulator with different physics: radio contact by a formula, without line of sight."""
+"""Simulator of radio contact, given by a formula that does not use line of sight."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -18,19 +18,20 @@ from trustbo.workspace import Workspace
 from trustbo.workspace.moves import MOVES, moves_along
 
 FREEDOM, SCALE = 3.0, 0.06
-"""Degrees of freedom and scale of the noise of a rate."""
+"""Degrees of freedom and scale of the noise on contact rates."""
 _REACH, _WINDOW, _FIELD = 60.0, 20.0, 35.0
-"""Unit of distance, width of the window of canopy cover, and scale of the field, m."""
+"""Unit of distance, window width for canopy cover and length scale of the field, in metres."""
 
 
 class RadioSimulator(DescribedSimulator):
     """Simulator whose contact depends on distance, canopy cover, climb and a hidden field.
 
-    The mean contact of robot i in the bound from cell a to b is sigma(2.2 - 3.5 c^1.5 d - 0.1 h +
-    0.9 (0.3 + c) tanh(g) + q_i): d is the distance between the cells' centres in units of 60 m, c
-    the mean cover of canopy above 1.5 m between them, h the climb in m, g a smooth Gaussian field
-    at b that is in no map, and q_i the quality of the robot's radio. Rates have Student t noise
-    with 3 degrees of freedom and scale 0.06, and are clipped to [0, 1]. No bound fails.
+    The mean contact of robot i in the bound from cell a to cell b is sigma(2.2 - 3.5 c^1.5 d -
+    0.1 h + 0.9 (0.3 + c) tanh(g) + q_i). The distance d between the centres of the cells is in
+    units of 60 m. The cover c is the mean fraction of canopy above 1.5 m between the cells, and h
+    is the climb in metres. A smooth Gaussian field that is in no map has the value g at b, and q_i
+    is the quality of the robot's radio. Rates have Student t noise with 3 degrees of freedom
+    and scale 0.06, and are clipped to [0, 1]. No bound fails.
     """
 
     def __init__(
@@ -41,10 +42,10 @@ class RadioSimulator(DescribedSimulator):
         Args:
             workspace: A workspace made from a terrain.
             terrain: True DEM and DSM; by default the workspace's.
-            seed: Seed of the field and of the radios; by default a hash of the terrain.
+            seed: Seed of the field and the radio qualities; by default a hash of the terrain.
 
         Raises:
-            TrustboError: The workspace was not made from a terrain.
+            TrustboError: The workspace has no terrain, and no other terrain is given.
         """
         terrain = workspace.terrain if terrain is None else terrain
         if terrain is None:
@@ -56,7 +57,7 @@ class RadioSimulator(DescribedSimulator):
         self.mean = _mean_contact(workspace, terrain, self.seed)
 
     def run(self, path: Sequence[Cell], *, seed: int, mission: int = 0) -> Mission:
-        """Run a path; the same seed gives the same mission, whatever its number."""
+        """Run a path; the result depends on the seed, but not on the number of the mission."""
         cells = require_path(self.workspace, path)
         mean = self.mean[:, moves_along(cells), *np.array(cells)[1:].T].T  # (bound, robot)
         rng = np.random.default_rng(require_whole("seed", seed, 0))
@@ -65,22 +66,23 @@ class RadioSimulator(DescribedSimulator):
         return Mission.from_arrays(cells, self.workspace.along(cells), rates, **names)  # pyright: ignore[reportArgumentType]
 
     def expected_contact(self) -> xr.Dataset:
-        """Return the expected contact of every bound in closed form, see `Truth.bounds`."""
+        """Return the expected contact of every bound in closed form; see `Truth.bounds`."""
         contact = np.repeat(expected_rate(self.mean).mean(0)[..., None], len(MOVES) + 1, -1)
         contact = np.where(self.workspace.passable_bounds.values[..., None], contact, np.nan)
         return table_of(contact, np.where(np.isfinite(contact), 1.0, np.nan))
 
     def describe(self) -> dict[str, object]:
-        """Return the settings that decide what a mission measures."""
+        """Return the settings that determine what a mission measures."""
         name = type(self).__name__
         return {"simulator": name, "true_terrain": self._terrain, "seed": self.seed}
 
 
 def expected_rate(mean: np.ndarray) -> np.ndarray:
-    """Compute the expectation of a noisy rate that is clipped to [0, 1].
+    """Compute the expected value of a noisy contact rate that is clipped to [0, 1].
 
-    E[clip(X, 0, 1)] is the integral of P(X > x) over [0, 1]. The antiderivative of the distribution
-    function F of Student's t with density f is u F(u) + (freedom + u^2) / (freedom - 1) f(u).
+    E[clip(X, 0, 1)] is the integral of P(X > x) over [0, 1]. For Student's t with nu degrees of
+    freedom, distribution function F and density f, the antiderivative of F is u F(u) + (nu + u^2) /
+    (nu - 1) f(u).
     """
     u = np.stack([-mean, 1.0 - mean]) / SCALE
     tail = (FREEDOM + u**2) / (FREEDOM - 1.0) * student.pdf(u, FREEDOM)
@@ -89,7 +91,7 @@ def expected_rate(mean: np.ndarray) -> np.ndarray:
 
 
 def _mean_contact(workspace: Workspace, terrain: xr.Dataset, seed: int) -> np.ndarray:
-    """Compute mean contact by the formula, (robot, move, row, col), also for absent bounds."""
+    """Compute the mean contact of all moves, (robot, move, row, col), even impossible moves."""
     grid, step, x, y = workspace.grid, pixel_size(terrain), terrain["x"].values, terrain["y"].values
     dem, dsm = terrain["dem"].values, terrain["dsm"].values
     window: Any = [max(1, round(_WINDOW / one)) for one in step]
@@ -106,12 +108,12 @@ def _mean_contact(workspace: Workspace, terrain: xr.Dataset, seed: int) -> np.nd
     sides = np.array([grid.cell_height, grid.cell_width])
 
     def read(raster: np.ndarray, at: np.ndarray) -> np.ndarray:
-        south, east = np.moveaxis((at + 0.5) * sides, -1, 0)  # of the grid's corner
+        south, east = np.moveaxis((at + 0.5) * sides, -1, 0)  # distance from the grid's corner, m
         pixels = (y[0] - grid.top + south) / step[0], (grid.left + east - x[0]) / step[1]
         return ndimage.map_coordinates(raster, pixels, order=1, mode="nearest")
 
     c = np.mean([read(cover, a + share * (b - a)) for share in np.linspace(0.0, 1.0, 9)], axis=0)
-    c = np.clip(c, 0.0, 1.0)  # a running mean has errors of rounding
+    c = np.clip(c, 0.0, 1.0)  # the running mean has rounding errors
     d = np.hypot(*np.moveaxis((b - a) * sides, -1, 0)) / _REACH
     h = np.maximum(read(ground, b) - read(ground, a), 0.0)
     eta = 2.2 - 3.5 * c**1.5 * d - 0.1 * h + 0.9 * (0.3 + c) * np.tanh(read(field, b))

@@ -1,8 +1,8 @@
 """Real-time awareness of the paper: the map fused with the state of the moving robot.
 
-Each feature is the first principal component of the map's value and of the robot's motion
-(traversability) or lidar measurements (visibility). The inputs are means over the ticks of a bound
-in which the robot moves.
+Each feature is the first principal component of the map's value and of measurements by the robot:
+its motion for traversability, and lidar returns for visibility. The inputs are means over the ticks
+of a bound in which the robot moves.
 """
 
 from collections.abc import Sequence
@@ -20,9 +20,9 @@ SIGNS = {
     "traversability": {"map": +1, "speed_ratio": +1, "pitch": -1, "roll": -1},
     "visibility": {"map": +1, "return_range": +1, "visible_share": +1},
 }
-"""Inputs of each feature, and whether they raise it: angles in rad, the range in m."""
+"""Inputs of each feature, with the signs of their effects; angles are in rad, ranges in m."""
 MIN_SAMPLES = 200
-"""Minimum number of robots x bounds for the fit, since few samples make loadings unstable."""
+"""Minimum number of robots times bounds, since loadings from fewer samples are unstable."""
 _SHARES, _ANGLES = np.array([0.25, 0.5, 0.75, 1.0]), np.linspace(0.0, 2.0 * np.pi, 13)[:-1]
 
 
@@ -30,23 +30,25 @@ class RealtimeAwareness:
     """Awareness measured by the robots during a bound.
 
     Attributes:
-        indices: Fitted `CompositeIndex` by feature.
+        indices: Fitted `CompositeIndex` of each feature.
     """
 
     def __init__(self, simulator: KinematicSimulator, missions: Sequence[Mission]) -> None:
-        """Fit the indices to calibration missions of a simulator; TrustboError if too few."""
+        """Fit the indices to calibration missions; TrustboError if there are too few missions."""
         self._workspace, self._world = simulator.workspace, simulator.world()
         self._tick = simulator.tick
         samples = [self.inputs(bound) for mission in missions for bound in mission.bounds]
         if (n := len(samples) * self._world.team.n_robots) < MIN_SAMPLES:
-            raise TrustboError(f"real-time awareness needs {MIN_SAMPLES} robots x bounds; got {n}.")
+            raise TrustboError(
+                f"real-time awareness needs {MIN_SAMPLES} samples (robots x bounds); got {n}."
+            )
         self.indices = {}
         for feature, signs in SIGNS.items():
             of_all = {n: np.concatenate([one[feature][n] for one in samples]) for n in signs}
             self.indices[feature] = CompositeIndex(signs).fit(of_all)
 
     def inputs(self, bound: Bound) -> dict[str, dict[str, np.ndarray]]:
-        """Compute the inputs of each feature, see `SIGNS`, arrays (robot,)."""
+        """Compute the inputs of each feature (see `SIGNS`), each of shape (robot,)."""
         world, workspace, poses = self._world, self._workspace, bound.poses[:, 1:]  # pyright: ignore[reportOptionalSubscript]
         way = np.diff(poses[..., :2], axis=0, prepend=poses[:1, :, :2])
         speed = np.hypot(way[..., 0], way[..., 1]) / self._tick
@@ -78,9 +80,9 @@ class RealtimeAwareness:
         return replace(mission, bounds=tuple(bounds))
 
     def _lidar(self, poses: np.ndarray) -> dict[str, np.ndarray]:
-        """Compute mean range of returns, m, and fraction of clear beams, each (tick, robot).
+        """Compute the mean range of returns (m) and the fraction of clear beams, (tick, robot).
 
-        The mean range is the integral over range of the fraction of beams that reach it.
+        The mean range is the integral over the range of the fraction of beams that reach it.
         """
         world, robot = self._world, self._world.team.robots[0]
         low, high = np.reshape(world.surface.extent, (2, 2))

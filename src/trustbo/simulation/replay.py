@@ -10,7 +10,7 @@ from trustbo.simulation.protocol import DescribedSimulator
 class ReplaySimulator(DescribedSimulator):
     """Simulator that replays missions recorded by robots or by another simulator, in order.
 
-    A campaign with the same workspace, settings and seed as the recorded one asks for the same
+    A campaign with the same workspace, settings and seed as the recorded campaign proposes the same
     paths.
 
     Attributes:
@@ -22,18 +22,18 @@ class ReplaySimulator(DescribedSimulator):
 
         Args:
             missions: Recorded missions, such as the result of `logs.read_missions`.
-            any_path: Whether to replay a mission even if `run` gets another path.
+            any_path: Whether to replay a mission even if `run` is called with another path.
 
         Raises:
             TrustboError: There are no missions, or they have no map.
         """
         if isinstance(missions, Mission) or not missions:
-            raise TrustboError(f"give a list of at least one mission; got {missions!r}.")
+            raise TrustboError(f"missions must be a list of at least one; got {missions!r}.")
         require_map("a replay", missions)
         self.missions, self.any_path = tuple(missions), any_path
 
     def describe(self) -> dict[str, object]:
-        """Return the number of missions, and `any_path`."""
+        """Return the number of missions and the value of `any_path`."""
         n = len(self.missions)
         return {"simulator": type(self).__name__, "missions": n, "any_path": self.any_path}
 
@@ -44,11 +44,11 @@ class ReplaySimulator(DescribedSimulator):
             TrustboError: There is no mission with that number, or it has another path.
         """
         if mission >= len(self.missions):
-            raise TrustboError(f"all {len(self.missions)} recorded missions are replayed.")
+            raise TrustboError(f"all {len(self.missions)} recorded missions were replayed.")
         recorded, asked = self.missions[mission], require_cells("path", path)
         if recorded.path != asked and not self.any_path:
             raise TrustboError(
-                f"mission {mission} was recorded on {path_text(recorded.path)}, not on "
-                f"{path_text(asked)}; to replay it nevertheless, set any_path=True."
+                f"mission {mission} was recorded on the path {path_text(recorded.path)}, not on "
+                f"{path_text(asked)}; set any_path=True to replay the mission anyway."
             )
         return recorded

@@ -13,7 +13,7 @@ from trustbo.workspace import Workspace
 from trustbo.workspace.moves import MOVE_NAMES, MOVES
 
 END = len(MOVES)
-"""Index of "no next move": the bound enters the goal."""
+"""Index that stands for no next move, when a bound enters the goal."""
 _DIMS = ("move", "row", "col", "next_move")
 
 
@@ -24,23 +24,23 @@ class Edge(NamedTuple):
     left: Cell
     cell: Cell
     next_moves: tuple[int, ...]
-    """Indices of `MOVES`, and `END`."""
+    """Indices of the next moves in `MOVES`, and `END`."""
     ahead: tuple[Cell | None, ...]
-    """Next cells; None if the path ends."""
+    """Next cells; None at the end of a path."""
 
 
 type Outcomes = Iterator[tuple[Edge, list[tuple[float, str]]]]
-"""Contact, averaged over robots, and status of a bound for each possible next bound."""
+"""Mean contact over robots and status of each bound, for each possible next bound."""
 
 
 def table_of(contact: np.ndarray, passed: np.ndarray) -> xr.Dataset:
-    """Make a table as in `Truth.bounds` from arrays (move, row, col, next_move)."""
+    """Make a dataset like `Truth.bounds` from arrays (move, row, col, next_move)."""
     names = {"move": list(MOVE_NAMES), "next_move": [*MOVE_NAMES, "end"]}
     return xr.Dataset({"contact": (_DIMS, contact), "passed": (_DIMS, passed)}, names)
 
 
 def edges_of(workspace: Workspace) -> list[Edge]:
-    """List all bounds of a workspace for which its robots have a route."""
+    """List the bounds of a workspace for which all robots have routes."""
     exists = workspace.passable_bounds.values
     around = np.pad(exists, ((0, 0), (1, 1), (1, 1)))
     edges = []
@@ -54,7 +54,7 @@ def edges_of(workspace: Workspace) -> list[Edge]:
 
 
 def replicated(simulator: Any, mission: int, n_replicates: int, seed: int) -> xr.Dataset:
-    """Average over the replicates of all bounds."""
+    """Average the outcomes of all bounds over replicates."""
     if hasattr(simulator, "expected_contact"):
         return simulator.expected_contact()
     workspace = simulator.workspace
@@ -79,7 +79,7 @@ def _of_bounds(
 ) -> Outcomes:
     """Replicate bounds, each from where a preceding bound ended in the previous replicate.
 
-    A replicate 0, which is not counted, begins with all robots at their stop and posts.
+    Replicate 0 begins with all robots at their stop and posts, and is not counted.
     """
     world = simulator.world(mission, long_run=True)
     ends: dict[tuple[Cell, Cell | None], dict[int, State]] = {}
@@ -107,7 +107,7 @@ def _of_bounds(
 def _of_missions(
     simulator: Any, edges: Sequence[Edge], mission: int, n: int, seed: int
 ) -> Outcomes:
-    """Replicate bounds by missions of the bound and each possible next bound."""
+    """Replicate bounds by missions over a bound and each possible next bound."""
     for number in range(n):
         for edge in edges:
             outcomes = []

@@ -1,6 +1,6 @@
-"""Contact by lidar: scans that detect a robot or not, and tracks that persist over some misses.
+"""Contact by lidar: scans that detect robots, and tracks that persist over a few misses.
 
-At each tick, each standing robot scans each moving one once.
+At each tick, each standing robot scans each moving robot once.
 """
 
 from collections.abc import Sequence
@@ -15,26 +15,26 @@ from trustbo.workspace.sight import detection_probability, optics
 
 
 class Drive(NamedTuple):
-    """Movements of one bound."""
+    """Movements of the robots in one bound."""
 
     poses: np.ndarray
     """Position and heading of each robot, the lead first, shape (tick, 1 + robot, 3)."""
     lead_moves: np.ndarray
-    """Whether the lead moves in a tick, else T2 does, shape (tick,)."""
+    """Whether the lead (rather than T2) moves in each tick, shape (tick,)."""
     status: str
     """Outcome of the bound."""
     stops: np.ndarray
-    """Planned positions of the robots afterwards, shape (1 + robot, 2)."""
+    """Planned positions of the robots after the bound, shape (1 + robot, 2)."""
 
 
 def detections(world: World, drives: Sequence[Drive], k: int) -> list[np.ndarray]:
-    """Compute the probability that a scan detects its target, (tick, robot), for each drive.
+    """Compute for each drive the probability that a scan detects its target, (tick, robot).
 
-    The drives are alternatives for bound k of a mission, counted from 1.
+    The drives are alternatives for the k-th bound of a mission, counted from 1.
     """
     team = world.team
     poses = np.concatenate([drive.poses[..., :2] for drive in drives])
-    t2_scans = np.concatenate([drive.lead_moves for drive in drives])[:, None]  # else the lead does
+    t2_scans = np.concatenate([drive.lead_moves for drive in drives])[:, None]  # else the lead
     lead, t2 = np.repeat(poses[:, :1], team.n_robots, axis=1), poses[:, 1:]
     by_t2 = np.stack([optics(robot, team.lead) for robot in team.robots])
     by_lead = np.stack([optics(team.lead, robot) for robot in team.robots])
@@ -54,16 +54,16 @@ def detections(world: World, drives: Sequence[Drive], k: int) -> list[np.ndarray
 
 
 def new_tracks(n_robots: int) -> np.ndarray:
-    """Make tracks without a target: (phase, robot, (tracked, run of contrary scans))."""
+    """Make tracks without targets, (phase, robot, (tracked, successive contrary scans))."""
     return np.zeros((2, n_robots, 2), np.int64)
 
 
 def contact_of(detected: np.ndarray, watchers: Sequence[Robot], tracks: np.ndarray) -> np.ndarray:
-    """Track targets in scans: tracks begin after successive detections and end after misses.
+    """Compute the contact from scans, shape (tick, robot), bool.
 
-    `detected`, shape (tick, robot), has the outcome of each scan. The numbers of scans are
-    `acquire` and `drop` of the watchers, one for each robot. The state of the tracks, shape (robot,
-    2), is updated in place. Returns shape (tick, robot), bool.
+    `detected` has the outcome of each scan, shape (tick, robot). A track begins after `acquire`
+    successive detections and ends after `drop` successive misses, as defined by the watcher of each
+    robot. The state of the tracks, shape (robot, 2), is updated in place.
     """
     limits = np.array([[robot.acquire, robot.drop] for robot in watchers])
     contact = np.empty(detected.shape, bool)

@@ -1,8 +1,8 @@
 """Truth of a simulator: expected contact of every bound, best path, and regret.
 
-The expected contact of a bound depends on three cells: the cell left, the cell entered and the next
-cell, since robots choose posts from which they watch the next bound. The best path is found exactly
-by dynamic programming over bounds and the number of remaining bounds.
+The expected contact of a bound depends on the cell left, the cell entered and the next cell,
+because robots choose their posts for the next bound. The best path is found exactly by dynamic
+programming over bounds and the number of remaining bounds.
 """
 
 from collections.abc import Callable, Sequence
@@ -27,20 +27,20 @@ from trustbo.workspace.moves import MOVES, moves_along
 
 
 class Truth(Summary):
-    """Expected contact and failures of every bound of a simulator, in the world of a mission.
+    """Expected contact and failure of every bound in a simulator, for the world of a mission.
 
     Attributes:
-        workspace: Workspace of the paths.
-        bounds: Dataset with dims move, row, col and next_move (the eight moves, and "end"):
-            `contact`, the expected contact rate, averaged over robots, given that the bound does
-            not fail (0 if it failed in all replicates); and `passed`, the probability that it does
-            not fail. NaN where there is no such bound.
+        workspace: Workspace of the simulator.
+        bounds: Dataset with the dims (move, row, col, next_move); the last next move is "end".
+            `contact` is the mean over robots of the expected contact rate if the bound does not
+            fail, or 0 if it failed in all replicates. `passed` is the probability that the bound
+            does not fail. Both are NaN where there is no bound.
     """
 
     def __init__(
         self, workspace: Workspace, bounds: xr.Dataset, of: "Callable[[int], Truth] | None" = None
     ) -> None:
-        """Store the truth of bounds; `of(mission)` computes it for another mission's world."""
+        """Store the truth of bounds; `of(mission)` computes that of another mission's world."""
         self.workspace, self.bounds, self._of = workspace, bounds, of
 
     def _rows(self) -> Rows:
@@ -60,11 +60,10 @@ class Truth(Summary):
     ) -> Self:
         """Compute the truth of a simulator from replicates of every bound with each next bound.
 
-        If a simulator has a method `expected_contact`, which returns `bounds` in closed form, it is
-        used. For a `KinematicSimulator`, replicates have no detection noise, and begin where a
-        preceding bound ended in the previous replicate. For any other simulator, a replicate is a
-        mission of the bound and the next one. With `Fouling`, contact is the stationary
-        expectation.
+        If the simulator has a method `expected_contact`, which returns `bounds` in closed form, no
+        replicates are needed. Replicates of a `KinematicSimulator` have no detection noise, and
+        begin where a preceding bound ended in the previous replicate. For any other simulator, a
+        replicate is a mission over both bounds. With `Fouling`, contact is the stationary mean.
 
         Args:
             simulator: Simulator with a `workspace`.
@@ -74,7 +73,7 @@ class Truth(Summary):
             folder: Folder in which truths are cached; None for no cache.
 
         Raises:
-            TrustboError: The simulator has no workspace, or contact depends on earlier bounds.
+            TrustboError: The simulator has no workspace, or its contact depends on earlier bounds.
         """
         workspace = getattr(simulator, "workspace", None)
         if not isinstance(workspace, Workspace):
@@ -83,8 +82,8 @@ class Truth(Summary):
             )
         if isinstance(simulator, ModelSimulator):
             raise TrustboError(
-                "in a ModelSimulator the contact of a bound depends on all bounds before it; use "
-                "Planner.evaluate(path, params) and Planner.plan(params)."
+                "in a ModelSimulator, the contact of a bound depends on all earlier bounds; use "
+                "Planner.evaluate(path, params) and Planner.plan(params) instead."
             )
         n_replicates = require_whole("n_replicates", n_replicates, 1)
         found: dict[str, Self] = {}
@@ -102,11 +101,11 @@ class Truth(Summary):
         return of_mission(mission)
 
     def at(self, mission: int) -> "Truth":
-        """Compute the truth of another mission's world; missions count from 0."""
+        """Compute the truth of another mission's world; missions are counted from 0."""
         return self if self._of is None else self._of(mission)
 
     def lost(self, path: Sequence[Cell]) -> float:
-        """Compute the expected contact lost on a path, in bounds, given that no bound fails.
+        """Compute the expected contact lost on a path, in units of bounds, if no bound fails.
 
         Raises:
             TrustboError: A cell is off the grid, impassable, or not a neighbour of the previous
@@ -116,10 +115,10 @@ class Truth(Summary):
         return float((1.0 - contact).sum())
 
     def lost_or_failed(self, path: Sequence[Cell]) -> float:
-        """Compute the expected contact lost if failed and unreached bounds keep no contact.
+        """Compute the expected contact lost, where failed and unreached bounds count as fully lost.
 
-        It is sum_k (1 - S_k c_k) for the contact c_k of bound k, where S_k is the probability that
-        it and all bounds before it are completed. Raises the errors of `lost`.
+        The result is sum_k (1 - S_k c_k), where c_k is the contact of bound k and S_k is the
+        probability that bounds 1 to k are completed. Raises the same errors as `lost`.
         """
         contact, passed = self._along(path)
         return float((1.0 - np.cumprod(passed) * contact).sum())
@@ -132,13 +131,13 @@ class Truth(Summary):
         *,
         failures: bool = False,
     ) -> tuple[Cell, ...]:
-        """Find the exact path with the least `lost` or, with `failures`, `lost_or_failed`.
+        """Find the path that minimises `lost` or, with `failures`, `lost_or_failed`.
 
         Args:
-            start: First cell, or a position in it, see `Workspace.locate`.
-            goal: Last cell, or a position in it.
+            start: First cell, or a position in that cell; see `Workspace.locate`.
+            goal: Last cell, or a position in that cell.
             max_bounds: Maximum number of bounds, as in `Planner`.
-            failures: Whether bounds may fail.
+            failures: Whether to allow for failures of bounds.
 
         Raises:
             TrustboError: A cell is off the grid or impassable.
@@ -151,10 +150,10 @@ class Truth(Summary):
         return _most_kept(contact, passed, *ends, paths.longest, u_turns=paths.turns)
 
     def regret(self, path: Sequence[Cell], max_bounds: int | str = "shortest+4") -> float:
-        """Compute the regret of a path, in % of the contact kept on the best path between its ends.
+        """Compute the regret of a path, as a percentage of the contact kept on the best path.
 
-        It is 100 (lost on the path - lost on the best) / contact kept on the best, all in bounds,
-        and negative if the path is better than the best path of at most `max_bounds` bounds.
+        The regret is the additional contact lost in comparison with the best path of at most
+        `max_bounds` bounds between the same cells. It is negative if a longer path is better.
         """
         best = self.best(path[0], path[-1], max_bounds)
         least = self.lost(best)
@@ -162,7 +161,7 @@ class Truth(Summary):
         return 100.0 * (self.lost(path) - least) / kept if kept > 0.0 else np.nan
 
     def _along(self, path: Sequence[Cell]) -> tuple[np.ndarray, np.ndarray]:
-        """Return contact and probability to pass for the bounds of a path, each (bound,)."""
+        """Return the contact and the completion probability of a path's bounds, each (bound,)."""
         cells = require_path(self.workspace, path)
         moves, (rows, cols) = moves_along(cells), np.array(cells)[1:].T
         where = moves, rows, cols, np.append(moves[1:], END)
@@ -177,7 +176,7 @@ def _settings(simulator: Any, mission: int) -> object:
 
 
 def _kept(folder: FilePath | None, world: str, make: Callable[[], xr.Dataset]) -> xr.Dataset:
-    """Read the table of a world's bounds from its file; compute it if the file does not exist."""
+    """Read the table of a world's bounds from a file, or compute and write the table."""
     if folder is None:
         return make()
     file = Path(folder) / f"truth-{digest(np.frombuffer(world.encode(), np.uint8))}.nc"
@@ -191,15 +190,15 @@ def _kept(folder: FilePath | None, world: str, make: Callable[[], xr.Dataset]) -
 def _most_kept(
     contact: np.ndarray, passed: np.ndarray, start: Cell, goal: Cell, longest: int, *, u_turns: bool
 ) -> tuple[Cell, ...]:
-    """Find the path of at most `longest` bounds with the least loss.
+    """Find the path of at most `longest` bounds that loses the least contact.
 
-    The maximum contact kept from a bound on, V = max p (c + V'), is computed backwards over the
-    bound and the number of bounds after it. This is exact, since the probability p to pass is not
-    negative. Without `u_turns`, no bound leads back to the cell that the previous one left.
+    The maximum contact kept from a bound onwards, V = max p (c + V'), is computed backwards for
+    each number of remaining bounds. The result is exact because the completion probability p is not
+    negative. Without `u_turns`, no bound leads back to the cell that the previous bound left.
     """
     follows = np.ones((END, END), bool)  # (move, next move)
     if not u_turns:
-        follows &= ~np.eye(END, dtype=bool)[::-1]  # the reverse is the m-th from last
+        follows &= ~np.eye(END, dtype=bool)[::-1]  # the reverse of move m is move 7 - m
     possible = np.isfinite(contact[..., :END]) & follows[:, None, None]
     last = (passed * contact)[:, *goal, END]
     value = np.full(contact.shape[:3], -np.inf)  # (move, row, col)
@@ -215,7 +214,7 @@ def _most_kept(
         kept = np.where(ends, kept, -np.inf)
         choices.append(kept.argmax(-1))
         value = kept.max(-1)
-        value[:, *goal] = -np.inf  # a path ends on entering the goal
+        value[:, *goal] = -np.inf  # a path ends at the goal
     n = int(np.argmin(np.arange(1, longest + 1) - np.array(most)))
     path, move = [start], first[n]
     for choice in [*choices[:n][::-1], None]:
@@ -226,7 +225,7 @@ def _most_kept(
 
 
 def _by_cell_left(values: np.ndarray, move: int) -> np.ndarray:
-    """Index the values of the cells that a move enters by the cell that it leaves."""
+    """Index the values of a move by the cell left instead of the cell entered."""
     (down, right), (rows, cols) = MOVES[move], values.shape
     framed = np.pad(values, 1, constant_values=-np.inf)
     return framed[1 + down :, 1 + right :][:rows, :cols]

@@ -1,4 +1,4 @@
-"""World of a mission: true terrain, sight and team after the mission's events."""
+"""World of a mission: the true terrain, sight and team, as changed by events."""
 
 from typing import NamedTuple
 
@@ -14,23 +14,23 @@ from trustbo.workspace.surface import Surface, surface_of
 
 
 class World(NamedTuple):
-    """True conditions that decide contact, motion and failure in a mission."""
+    """True conditions that determine contact, motion and failure in a mission."""
 
     surface: Surface
     """True terrain."""
     sight: Sight
     """True model of sight."""
     team: Team
-    """True lead and robots."""
+    """True properties of the lead and the robots."""
     detection: np.ndarray
-    """Probability of detection by T2's lidars in clear sight, shape (bound, robot); the last
-    row also applies to later bounds."""
+    """Probability that T2's lidars detect the lead in clear sight, shape (bound, robot); the last
+    row also applies to all later bounds."""
     lead_detection: float
-    """Probability of detection by the lead's lidar in clear sight."""
+    """Probability that the lead's lidar detects a robot in clear sight."""
     mission: int | None = 0
     """Number of the mission, from 0; None for the long-run mean over missions."""
     jams: tuple[tuple[np.ndarray, float], ...] = ()
-    """Mask of the pixels inside, shape (row, col), and strength of each jammer."""
+    """For each jammer, a mask of the pixels inside, shape (row, col), and the strength."""
 
 
 def world_of(surface: Surface, sight: Sight, team: Team) -> World:
@@ -40,7 +40,7 @@ def world_of(surface: Surface, sight: Sight, team: Team) -> World:
 
 
 def true_surface(workspace: Workspace, terrain: xr.Dataset | None) -> Surface:
-    """Return the surface used for the simulation: the workspace's or another terrain's.
+    """Return the simulated surface: that of `terrain` or, by default, that of the workspace.
 
     Raises:
         TrustboError: The terrain does not cover the grid or has another CRS, or the workspace has
@@ -50,14 +50,14 @@ def true_surface(workspace: Workspace, terrain: xr.Dataset | None) -> Surface:
     if planned is None or workspace.terrain is None:
         raise TrustboError(
             "the kinematic simulator needs a terrain; make the workspace with "
-            "Workspace.from_terrain, or give your own simulator."
+            "Workspace.from_terrain, or use another simulator."
         )
     if terrain is None:
         return planned
     terrain = require_terrain(terrain)
     if terrain.rio.crs != workspace.terrain.rio.crs:
         raise TrustboError(
-            f"the true terrain has CRS {terrain.rio.crs}, but the workspace has "
+            f"the true terrain has the CRS {terrain.rio.crs}, but the workspace has the CRS "
             f"{workspace.terrain.rio.crs}; reproject the terrain."
         )
     surface = surface_of(terrain, np.isfinite(terrain["dem"].values))
@@ -65,7 +65,7 @@ def true_surface(workspace: Workspace, terrain: xr.Dataset | None) -> Surface:
     short = max(*np.subtract(extent, needed)[:2], *np.subtract(needed, extent)[2:])
     if short > pixel:
         raise TrustboError(
-            f"the true terrain ends {short:.3g} m inside the planning grid; give one that "
-            "covers it."
+            f"the true terrain ends {short:.3g} m inside the planning grid; give a terrain that "
+            "covers the grid."
         )
     return surface
