@@ -55,7 +55,7 @@ class KinematicSimulator(DescribedSimulator):
         workspace: Workspace,
         *,
         terrain: xr.Dataset | None = None,
-        sight: Sight | str | None = None,
+        sight: Sight | None = None,
         team: Team | None = None,
         tick: float = 0.5,
         bound_timeout: float = 600.0,
@@ -91,7 +91,7 @@ class KinematicSimulator(DescribedSimulator):
         self.tick = require_positive("tick", tick)
         self.bound_timeout = require_positive("bound_timeout", bound_timeout)
         self._max_ticks = round(self.bound_timeout / self.tick)
-        self._usual, self.events = world_of(surface, self.sight, self.team), tuple(events)  # pyright: ignore[reportArgumentType]
+        self._usual, self.events = world_of(surface, self.sight, self.team), tuple(events)
         for event in self.events:
             event.change(self._usual)  # raises if the event does not fit
         self._posts: Posts = workspace.posts  # pyright: ignore[reportAttributeAccessIssue]
@@ -102,7 +102,7 @@ class KinematicSimulator(DescribedSimulator):
         rasters = () if terrain is None else (terrain[n].values for n in ("y", "x", "dem", "dsm"))
         return {
             "simulator": type(self).__name__,
-            "sight": dataclasses.asdict(self.sight),  # pyright: ignore[reportArgumentType]
+            "sight": dataclasses.asdict(self.sight),
             "tick": self.tick,
             "bound_timeout": self.bound_timeout,
             "events": [repr(event) for event in self.events],
