@@ -13,7 +13,7 @@ from trustbo.simulation.events import Event, changed
 from trustbo.simulation.motion import drive_together
 from trustbo.simulation.protocol import DescribedSimulator, digest, require_path
 from trustbo.simulation.sensing import Drive, contact_of, detections, new_tracks
-from trustbo.simulation.world import World, true_surface, world_of
+from trustbo.simulation.world import World, true_surface
 from trustbo.team import Robot, Team
 from trustbo.workspace import Workspace
 from trustbo.workspace.posts import Posts
@@ -91,7 +91,9 @@ class KinematicSimulator(DescribedSimulator):
         self.tick = require_positive("tick", tick)
         self.bound_timeout = require_positive("bound_timeout", bound_timeout)
         self._max_ticks = round(self.bound_timeout / self.tick)
-        self._usual, self.events = world_of(surface, self.sight, self.team), tuple(events)
+        detection = np.array([[robot.detection for robot in self.team.robots]])
+        lead_detection, self.events = self.team.lead.detection, tuple(events)
+        self._usual = World(surface, self.sight, self.team, detection, lead_detection)
         for event in self.events:
             event.change(self._usual)  # raises if the event does not fit
         self._posts: Posts = workspace.posts  # pyright: ignore[reportAttributeAccessIssue]

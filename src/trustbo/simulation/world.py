@@ -33,12 +33,6 @@ class World(NamedTuple):
     """For each jammer, a mask of the pixels inside, shape (row, col), and the strength."""
 
 
-def world_of(surface: Surface, sight: Sight, team: Team) -> World:
-    """Make a world without events."""
-    detection = np.array([[robot.detection for robot in team.robots]])
-    return World(surface, sight, team, detection, team.lead.detection)
-
-
 def true_surface(workspace: Workspace, terrain: xr.Dataset | None) -> Surface:
     """Return the simulated surface: that of `terrain` or, by default, that of the workspace.
 
