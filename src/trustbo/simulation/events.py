@@ -5,7 +5,6 @@ the event. Positions are x and y in CRS metres.
 """
 
 import dataclasses
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -200,15 +199,6 @@ class Fouling(Event):
         z: Any = lfilter([1.0], [1.0, -self.correlation], noise)
         factors = self.worst + (1.0 - self.worst) * ndtr(z[:, first:].T)  # (bound, robot)
         return world._replace(detection=world.detection * factors)
-
-
-def changed(world: World, events: Iterable[Event], mission: int, long_run: bool = False) -> World:
-    """Return the world of a mission; with `long_run`, random factors have their means."""
-    world = world._replace(mission=None if long_run else mission)
-    for event in events:
-        if event.acts_in(mission):
-            world = event.change(world)
-    return world
 
 
 def _circle(surface: Surface, center: tuple[float, float], radius: float) -> np.ndarray:

@@ -9,7 +9,7 @@ import xarray as xr
 
 from trustbo.data import Bound, Cell, Mission
 from trustbo.errors import TrustboError, require_positive, require_whole
-from trustbo.simulation.events import Event, changed
+from trustbo.simulation.events import Event
 from trustbo.simulation.motion import drive_together
 from trustbo.simulation.protocol import DescribedSimulator, digest, require_path
 from trustbo.simulation.sensing import Drive, contact_of, detections, new_tracks
@@ -120,7 +120,12 @@ class KinematicSimulator(DescribedSimulator):
 
     def world(self, mission: int = 0, *, long_run: bool = False) -> World:
         """Return the world of a mission; with `long_run`, random factors have their means."""
-        return changed(self._usual, self.events, require_whole("mission", mission, 0), long_run)
+        number = require_whole("mission", mission, 0)
+        world = self._usual._replace(mission=None if long_run else number)
+        for event in self.events:
+            if event.acts_in(number):
+                world = event.change(world)
+        return world
 
     def run(self, path: Sequence[Cell], *, seed: int, mission: int = 0) -> Mission:
         """Run a path to the goal or until a bound fails.
