@@ -228,7 +228,9 @@ class KinematicSimulator(DescribedSimulator):
         seen = detections(world, drives, k)
         found = []
         for run in runs:
-            whole = _joined([drives[i] for i in run])
+            poses = np.concatenate([drives[i].poses for i in run])
+            lead_moves = np.concatenate([drives[i].lead_moves for i in run])
+            whole = drives[run[-1]]._replace(poses=poses, lead_moves=lead_moves)
             contact, tracks = np.concatenate([seen[i] for i in run]), state.tracks
             if not expected:
                 contact, tracks = self._contact(world, tracks, whole, contact, rng)
@@ -283,10 +285,3 @@ class KinematicSimulator(DescribedSimulator):
             mask = drive.lead_moves == (phase == 0)
             contact[mask] = contact_of(detected[mask], lidars, tracks[phase])
         return contact, tracks
-
-
-def _joined(drives: Sequence[Drive]) -> Drive:
-    """Concatenate successive movements."""
-    poses = np.concatenate([drive.poses for drive in drives])
-    moves = np.concatenate([drive.lead_moves for drive in drives])
-    return drives[-1]._replace(poses=poses, lead_moves=moves)
