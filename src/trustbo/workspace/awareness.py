@@ -167,7 +167,7 @@ def unlabelled(
     return as_array("awareness", awareness.transpose(*axes).values), chosen[0], chosen[1]
 
 
-def of_arrays(awareness: ArrayLike, passable: ArrayLike | None) -> tuple[np.ndarray, np.ndarray]:
+def of_arrays(z: np.ndarray, passable: ArrayLike | None) -> tuple[np.ndarray, np.ndarray]:
     """Check the arrays of `Workspace.from_awareness`.
 
     Returns the awareness of bounds (robot, move, row, col, feature), NaN where there is no bound,
@@ -176,7 +176,6 @@ def of_arrays(awareness: ArrayLike, passable: ArrayLike | None) -> tuple[np.ndar
     Raises TrustboError if the axes do not match, a value is outside [0, 1], or a passable cell or a
     bound between passable cells has a NaN.
     """
-    z = as_array("awareness", awareness)
     if z.ndim not in (4, 5) or (z.ndim == 5 and z.shape[1] != len(MOVES)):
         raise TrustboError(f"awareness must have the shape {_AXES}; got shape {z.shape}.")
     if not z.size:
