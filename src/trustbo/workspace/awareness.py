@@ -60,7 +60,13 @@ def cell_maps(
     pixels, composites = {}, {}
     for name, parts in features.items():
         if isinstance(parts, str):
-            pixels[name] = _unit_values(name, values_of(parts))
+            values = pixels[name] = values_of(parts)
+            low, high = np.nanmin(values, initial=0.0), np.nanmax(values, initial=1.0)
+            if low < 0.0 or high > 1.0:
+                raise TrustboError(
+                    f"feature {name!r} is used unchanged and must be in [0, 1]; its values are "
+                    f"{low:g} to {high:g}. Make it a composite index: {{{name!r}: [...]}}."
+                )
             continue
         names = require_kind(f"feature {name!r}", parts, Iterable, remedy)
         values = {part: values_of(part) for part in names}
@@ -76,17 +82,6 @@ def cell_maps(
     maps["passable"] = xr.DataArray(even, dem.coords, dem.dims)
     passable = grid.cell_means(maps["passable"].astype(float)) >= 1.0 - MAX_MISSING
     return z, passable & np.isfinite(z).all(-1), xr.Dataset(maps), composites
-
-
-def _unit_values(name: str, values: np.ndarray) -> np.ndarray:
-    """Return the values of an unchanged feature; TrustboError if a value is outside [0, 1]."""
-    low, high = np.nanmin(values, initial=0.0), np.nanmax(values, initial=1.0)
-    if low < 0.0 or high > 1.0:
-        raise TrustboError(
-            f"feature {name!r} is used unchanged and must be in [0, 1]; its values are {low:g} to "
-            f"{high:g}. Make it a composite index to scale it: {{{name!r}: [...]}}."
-        )
-    return values
 
 
 def of_moves(cells: np.ndarray, passable: np.ndarray) -> np.ndarray:
