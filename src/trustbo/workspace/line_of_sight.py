@@ -134,7 +134,10 @@ def bound_features(
         t2_time = times[:, i]
         total = lead_time * watched + t2_time * closing + (slowest - t2_time) * waiting
         line_of_sight[:, i] = total / (lead_time + slowest)
-        easy[:, i] = _mean(traversability[surface.nearest(track[..., 0], track[..., 1])])
+        values = traversability[surface.nearest(track[..., 0], track[..., 1])]
+        known = np.isfinite(values)
+        with np.errstate(invalid="ignore"):  # NaN if no value is known
+            easy[:, i] = np.where(known, values, 0.0).sum(-1) / known.sum(-1)
     return line_of_sight, easy
 
 
@@ -144,10 +147,3 @@ def _timed(
     """Return a robot's positions (bound, sample, 2) on routes, and the durations (bound,) in s."""
     first = np.cumsum([0, *(len(route) for route in routes)])
     return at_times(surface, robot, np.concatenate(routes), first, N_SAMPLES)
-
-
-def _mean(values: np.ndarray) -> np.ndarray:
-    """Average over the last axis, ignoring NaN; NaN if all values are NaN."""
-    finite = np.isfinite(values)
-    with np.errstate(invalid="ignore"):
-        return np.where(finite, values, 0.0).sum(-1) / finite.sum(-1)
