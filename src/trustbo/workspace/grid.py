@@ -74,13 +74,12 @@ class Grid(Summary):
 
     def _rows(self) -> Rows:
         left, bottom = self.corner
-        rows = [
+        return [
             ("cells", f"{self.shape[0]} rows x {self.shape[1]} columns"),
             ("cell", f"{self.cell_height:.4g} m (north-south) x {self.cell_width:.4g} m"),
             ("corner", f"x {left:.10g}, y {bottom:.10g} m, lower left"),
             ("CRS", self.crs_name),
         ]
-        return rows
 
     def center(self, cell: Cell) -> tuple[float, float]:
         """Return x and y of a cell's centre, in CRS metres."""

@@ -176,7 +176,7 @@ class Workspace(Summary):
             (f"  {name}", f"{float(one.quantile(0.1)):.2f} to {float(one.quantile(0.9)):.2f}")
             for name, one in ((n, shown.sel(feature=n)) for n in self.features)
         ]
-        rows = [
+        return [
             ("cells", f"{grid.shape[0]} x {grid.shape[1]}, {free.mean():.0%} passable"),
             ("cell", f"{grid.cell_height:.4g} m x {grid.cell_width:.4g} m"),
             ("CRS", grid.crs_name),
@@ -186,7 +186,6 @@ class Workspace(Summary):
             ("sight", "none assumed" if self.sight is None else str(self.sight)),
             ("terrain", " x ".join(map(str, n_pixels)) + " pixels" if n_pixels else "none"),
         ]
-        return rows
 
     @property
     def surface(self) -> Surface | None:
