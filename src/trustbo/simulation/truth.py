@@ -91,7 +91,11 @@ class Truth(Summary):
         known = digest(workspace.awareness.values, workspace.passable_bounds.values)
 
         def of_mission(number: int) -> Self:
-            settings = _settings(simulator, require_whole("mission", number, 0))
+            require_whole("mission", number, 0)
+            if hasattr(simulator, "describe_world"):
+                settings = simulator.describe_world(number)
+            else:
+                settings = getattr(simulator, "describe", lambda: type(simulator).__name__)()
             world = to_json([settings, known, n_replicates, seed])
             if world not in found:
                 make = partial(replicated, simulator, number, n_replicates, seed)
@@ -166,13 +170,6 @@ class Truth(Summary):
         moves, (rows, cols) = moves_along(cells), np.array(cells)[1:].T
         where = moves, rows, cols, np.append(moves[1:], END)
         return self.bounds["contact"].values[where], self.bounds["passed"].values[where]
-
-
-def _settings(simulator: Any, mission: int) -> object:
-    """Return the settings of a mission's world."""
-    if hasattr(simulator, "describe_world"):
-        return simulator.describe_world(mission)
-    return getattr(simulator, "describe", lambda: type(simulator).__name__)()
 
 
 def _kept(folder: FilePath | None, world: str, make: Callable[[], xr.Dataset]) -> xr.Dataset:
