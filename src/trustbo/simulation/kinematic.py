@@ -91,9 +91,9 @@ class KinematicSimulator(DescribedSimulator):
         self.tick = require_positive("tick", tick)
         self.bound_timeout = require_positive("bound_timeout", bound_timeout)
         self._max_ticks = round(self.bound_timeout / self.tick)
+        self.events = tuple(events)
         detection = np.array([[robot.detection for robot in self.team.robots]])
-        lead_detection, self.events = self.team.lead.detection, tuple(events)
-        self._usual = World(surface, self.sight, self.team, detection, lead_detection)
+        self._usual = World(surface, self.sight, self.team, detection, self.team.lead.detection)
         for event in self.events:
             event.change(self._usual)  # raises if the event does not fit
         self._posts: Posts = workspace.posts  # pyright: ignore[reportAttributeAccessIssue]
