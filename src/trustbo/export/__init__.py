@@ -1,4 +1,4 @@
-"""Export of results for GIS, robots and tables."""
+"""Export of results to files for GIS, robots and tables."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -15,15 +15,15 @@ WRITERS: dict[str, tuple[str, Callable[[Path, Result], None]]] = {
     "csv": ("missions.csv", write_csv),
     "nav2": ("nav2", write_nav2),
 }
-"""Name of the file or folder, and writer of a result to its path, by format."""
+"""For each format, the name of the file or folder and the function that writes a result."""
 
 
 def export_result(
     result: Result, folder: FilePath, formats: Sequence[str] = ("geotiff", "geojson")
 ) -> list[Path]:
-    """Write a result to a folder in several formats; return the files written.
+    """Write a result to a folder in several formats, and return the paths written.
 
-    Formats are geotiff, geojson, csv and nav2.
+    The formats are geotiff, geojson, csv and nav2.
     """
     written = []
     for name in [require_choice("format", name, WRITERS) for name in formats]:
@@ -36,4 +36,4 @@ def export_result(
 __all__ = [
     "Frame", "export_result", "write_csv", "write_geojson", "write_geotiff", "write_nav2",
 ]  # fmt: skip
-__dir__ = __all__.copy  # completion lists public names alone
+__dir__ = __all__.copy  # tab completion lists only public names

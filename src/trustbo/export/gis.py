@@ -1,4 +1,4 @@
-"""GIS files: maps as GeoTIFF; the path, posts and routes of a plan as GeoJSON; tables as CSV."""
+"""Files for GIS: maps as GeoTIFF, plans as GeoJSON, and missions as CSV."""
 
 import json
 from typing import Any
@@ -19,18 +19,18 @@ from trustbo.planning import Plan
 from trustbo.planning.plan import QUANTILES
 
 LEAD = "lead"
-"""Name of the lead among the robots."""
+"""Name of the lead in files."""
 _BAND = {"low": QUANTILES.index(0.05), "high": QUANTILES.index(0.95)}
 
 
 def write_geotiff(path: FilePath, maps: Result | xr.Dataset) -> None:
     """Write maps of the planning cells as the bands of a GeoTIFF in the terrain's CRS.
 
-    Bands are float32, named after their variables, with the long name as metadata; NaN is nodata.
+    Bands are float32, with variable names as descriptions, long names as tags and NaN as nodata.
 
     Args:
-        path: .tif or .tiff file to write, or to replace.
-        maps: Result, or its maps, `Result.maps()`.
+        path: .tif or .tiff file to write or replace.
+        maps: Result, or maps such as `Result.maps()`.
 
     Raises:
         TrustboError: The maps have no CRS, or the file cannot be written.
@@ -58,22 +58,22 @@ def write_geotiff(path: FilePath, maps: Result | xr.Dataset) -> None:
 
 
 def write_geojson(path: FilePath, plan: Plan | Result) -> None:
-    """Write a path as GeoJSON (RFC 7946), longitude and latitude on WGS 84.
+    """Write a path as GeoJSON (RFC 7946), in longitude and latitude (WGS 84).
 
-    It has a LineString from start to goal, a Point for each cell with its `bound`, `cell`, expected
-    trust of each robot with its 90 % band, and failure probability; with a terrain, also a Point
-    for each post and a LineString for each route. The property `layer` is "path", "bounds", "posts"
-    or "routes". Lines that cross longitude 180 degrees are cut there.
+    The file contains a LineString of the path and a Point for each cell, with the expected trust
+    of each robot, a 90 % interval of the trust, and the failure probability. With a terrain, there
+    is also a Point for each post and a LineString for each route. The property `layer` is "path",
+    "bounds", "posts" or "routes". Lines that cross the longitude of 180 degrees are cut there.
 
     Args:
-        path: File to write, or to replace.
+        path: File to write or replace.
         plan: Plan, or result whose recommended path is written.
 
     Raises:
         TrustboError: The workspace has no CRS, or the file cannot be written.
     """
     plan = plan.plan if isinstance(plan, Result) else plan
-    require_kind("plan", plan, Plan, "give a Plan, as Campaign.ask returns it, or a Result")
+    require_kind("plan", plan, Plan, "give a Plan, such as Campaign.ask returns, or a Result")
     centres = np.array([plan.workspace.grid.center(cell) for cell in plan.path])
     facts = {"name": "most trustworthy path", "n_bounds": len(plan.path) - 1}
     facts |= {"value": float(plan.value), "objective": plan.objective}
@@ -95,21 +95,21 @@ def write_geojson(path: FilePath, plan: Plan | Result) -> None:
 
 
 def write_csv(path: FilePath, result: Result) -> None:
-    """Write a table with one row per mission, bound and robot, numbered from 1.
+    """Write a table with one row for each mission, bound and robot.
 
-    It has the columns of `logs.to_frame`, and `trust_mean` and `trust_sd` of latent trust under the
-    last posterior. Blanks are values that were not measured, the start cell, and the trust of
-    missions that are not in the last posterior.
+    The columns are those of `logs.to_frame` plus `trust_mean` and `trust_sd`, the mean and standard
+    deviation of latent trust under the last posterior. Fields are blank for values that were not
+    measured, and for the trust of missions that are not in the last posterior.
 
     Args:
-        path: File to write, or to replace.
+        path: File to write or replace.
         result: Result of a campaign.
 
     Raises:
         TrustboError: The file cannot be written.
     """
     table, latent = to_frame(result.missions), result.posterior["latent"].to_dataset()
-    # A posterior need not cover all missions: some are excluded, or wait to be learned from.
+    # A posterior may lack missions that are excluded or have not been learned from yet.
     of_mission = {int(j) + 1: i for i, j in enumerate(latent["mission"].values)}
     keys = table[["mission", "bound", "robot"]].itertuples(index=False, name=None)
     robots = result.workspace.team.names
@@ -123,12 +123,12 @@ def write_csv(path: FilePath, result: Result) -> None:
 
 
 def _of(values: Any) -> Any:
-    """Return values of a plan on a terrain; empty without a terrain."""
+    """Return values of a plan, or an empty tuple for a plan without a terrain."""
     return () if values is None else values
 
 
 def _cells(plan: Plan) -> list[dict[str, Any]]:
-    """Return the properties of the cells of a path; unknown ones are omitted."""
+    """Return the properties of a path's cells, without unknown values."""
     columns: dict[str, np.ndarray] = {}
     for i, robot in enumerate(plan.workspace.team.names):
         columns[f"trust_{robot}"] = plan.trust[:, i]
@@ -144,7 +144,7 @@ def _cells(plan: Plan) -> list[dict[str, Any]]:
 
 
 def _feature(plan: Plan, layer: str, places: np.ndarray, about: dict[str, Any]) -> dict[str, Any]:
-    """Make a GeoJSON feature at a position (2,) or along positions (point, 2), CRS metres."""
+    """Make a GeoJSON feature at a position (2,) or along positions (point, 2), in CRS metres."""
     if plan.workspace.grid.crs is None:
         raise TrustboError(_NO_CRS)
     crs, xy = plan.workspace.grid.crs, np.atleast_2d(places)
@@ -152,7 +152,7 @@ def _feature(plan: Plan, layer: str, places: np.ndarray, about: dict[str, Any]) 
     shape = shapely.Point(lon[0], lat[0])
     if np.ndim(places) == 2:
         shape = _cut(shapely.LineString(np.column_stack([np.unwrap(lon, period=360.0), lat])))
-    # RFC 7946, 11.2: no more digits than the precision; the eighth is a millimetre.
+    # RFC 7946, 11.2: no more digits than the precision; the eighth digit is a millimetre.
     rounded = shapely.transform(shape, lambda values: np.round(values, 8))
     geometry = json.loads(shapely.to_geojson(rounded))
     return {"type": "Feature", "geometry": geometry, "properties": {"layer": layer, **about}}
@@ -171,4 +171,4 @@ def _cut(line: shapely.LineString) -> shapely.Geometry:
     return shapely.MultiLineString(parts)
 
 
-_NO_CRS = "only a workspace made from a terrain has a place on Earth; use Workspace.from_terrain."
+_NO_CRS = "this export needs a CRS; make the workspace with Workspace.from_terrain."

@@ -1,8 +1,8 @@
-"""Files for Nav2: cost map for map_server, stops for FollowWaypoints, graph for its route server.
+"""Files for Nav2: a map for map_server, stops for FollowWaypoints, a graph for the route server.
 
-Positions are in a frame with its origin near the robots, because RViz and Nav2 store them in
-float32, which is too coarse for the coordinates of a CRS. `frame.yaml` has the frame's pose in the
-CRS. The files are JSON, which is YAML.
+Positions are given in a frame with its origin near the robots. RViz and Nav2 store positions as
+float32, which is too coarse for CRS coordinates. `frame.yaml` contains the pose of the frame in the
+CRS. YAML files are written as JSON, which is valid YAML.
 """
 
 import json
@@ -23,22 +23,22 @@ from trustbo.workspace import Workspace
 from trustbo.workspace.moves import MOVES
 
 IMPASSABLE, UNKNOWN, WORST = 100, 255, 98
-"""Pixels of a cost map; costmaps publish 99 and 100 where no robot may go."""
+"""Pixel values of a cost map; Nav2 uses 99 and 100 where robots may not go."""
 _MOST_PIXELS = 1e8
 _MOST_IDS = 65_535
-"""Largest id in messages of Nav2 (uint16)."""
+"""Largest id in Nav2 messages (uint16)."""
 _LEAST_COST = 1e-9
-"""Minimum cost of an edge: the route server refuses 0."""
+"""Minimum cost of an edge, since the route server rejects 0."""
 
 
 class Frame(NamedTuple):
     """Coordinate frame of the robots, given by its pose in the CRS.
 
     Attributes:
-        origin: Position of (0, 0) of the frame, x and y in CRS metres.
-        rotation: Angle from east, the x axis of the CRS, to the x axis of the frame, rad,
+        origin: Position of the frame's origin, x and y in CRS metres.
+        rotation: Angle from the x axis of the CRS (east) to the x axis of the frame, in rad,
             anticlockwise.
-        name: Name, used as the `frame_id` of messages.
+        name: Name of the frame, used as the `frame_id` of messages.
     """
 
     origin: tuple[float, float]
@@ -46,12 +46,12 @@ class Frame(NamedTuple):
     name: str = "map"
 
     def of_crs(self, xy: Any) -> np.ndarray:
-        """Convert positions in the CRS, (..., 2), m, to the frame."""
+        """Convert positions (..., 2) from CRS coordinates, in metres, to the local frame."""
         c, s = math.cos(self.rotation), math.sin(self.rotation)
         return (np.asarray(xy, dtype=float) - self.origin) @ np.array([[c, -s], [s, c]])
 
     def to_crs(self, xy: Any) -> np.ndarray:
-        """Convert positions in the frame, (..., 2), m, to the CRS."""
+        """Convert positions (..., 2) from the local frame, in metres, to CRS coordinates."""
         c, s = math.cos(self.rotation), math.sin(self.rotation)
         return np.asarray(xy, dtype=float) @ np.array([[c, s], [-s, c]]) + self.origin
 
@@ -65,12 +65,12 @@ def write_nav2(
         folder: Folder for `cost_map.yaml` and `.pgm`, `waypoints_<robot>.yaml` (on a terrain),
             `route_graph.geojson` and `frame.yaml`.
         result: Result of a campaign.
-        frame: Frame of all files, by default with its origin at the start of the path.
-        pixel: Side of a pixel of the map, m; by default a tenth of a cell's shorter side.
+        frame: Frame of all files; by default, the start of the path is the frame's origin.
+        pixel: Side length of a map pixel, in metres; by default a tenth of a cell's shorter side.
 
     Raises:
-        TrustboError: A robot has no route in a bound; there are more cells than Nav2 has ids; the
-            map has too many pixels; or a file cannot be written.
+        TrustboError: A robot has no route in a bound, the grid has more cells than Nav2 has ids,
+            the map has too many pixels, or a file cannot be written.
     """
     folder, workspace = Path(folder), result.workspace
     place = frame or Frame(workspace.grid.center(result.path[0]))
@@ -96,15 +96,15 @@ def write_ros_map(
     frame: Frame,
     pixel: float | None = None,
 ) -> None:
-    """Write a cost map for map_server of ROS 1 and of Nav2: a .yaml and a .pgm file.
+    """Write a cost map for the map_server of ROS 1 or Nav2, as a .yaml and a .pgm file.
 
     Args:
-        path: .yaml file to write, or to replace.
-        cost: Cost map of the cells, in [0, 1], NaN where unknown, e.g. `Result.maps()["cost"]`. It
-            is written as 100 times the cost, at most 98; 100 is impassable, 255 unknown.
+        path: .yaml file to write or replace.
+        cost: Cost of each cell, in [0, 1], such as `Result.maps()["cost"]`; NaN if unknown. Pixels
+            have 100 times the cost, at most 98; 100 means impassable and 255 unknown.
         workspace: Workspace of the cells.
-        frame: Frame; pixels lie along its axes, and have the cost of the cell at their centre.
-        pixel: Side of a pixel, m; by default a tenth of a cell's shorter side.
+        frame: Frame of the pixels. Each pixel has the cost of the cell at the pixel's centre.
+        pixel: Side length of a pixel, in metres; by default a tenth of a cell's shorter side.
 
     Raises:
         TrustboError: A cost is outside [0, 1], or the map has too many pixels.
@@ -112,7 +112,7 @@ def write_ros_map(
     target = require_suffix(path, ".yaml", ".yml")
     values, corner, side = occupancy(cost.values, workspace, frame, pixel)
     picture = target.with_suffix(".pgm")
-    # Pictures begin in the north. In raw mode, map_server takes the byte of a pixel as its value.
+    # Images begin in the north. In raw mode, map_server reads the byte of a pixel as its value.
     pixels = f"P5\n{values.shape[1]} {values.shape[0]}\n255\n".encode() + values[::-1].tobytes()
     write_file(picture, lambda file: file.write_bytes(pixels))
     about = {"image": picture.name, "mode": "raw", "resolution": side, "origin": [*corner, 0.0],
@@ -123,10 +123,10 @@ def write_ros_map(
 def occupancy(
     cost: np.ndarray, workspace: Workspace, frame: Frame, pixel: float | None = None
 ) -> tuple[np.ndarray, list[float], float]:
-    """Draw the map: pixels (row, col), southern row first; their corner; and their size, m."""
+    """Return pixels (row, col) from the south, the map's lower left corner and the pixel size."""
     if ((cost < 0.0) | (cost > 1.0)).any():
         raise TrustboError(
-            f"cost must be in [0, 1]; got {np.nanmin(cost):g} to {np.nanmax(cost):g}."
+            f"cost must be in [0, 1]; got values from {np.nanmin(cost):g} to {np.nanmax(cost):g}."
         )
     grid, (rows, cols) = workspace.grid, workspace.grid.shape
     shorter = min(grid.cell_height, grid.cell_width)
@@ -134,10 +134,10 @@ def occupancy(
     left, bottom, right, top = grid.bounds
     corners = frame.of_crs([[x, y] for x in (left, right) for y in (bottom, top)])
     corner = corners.min(0)
-    # The quotient may be whole up to rounding.
+    # The quotient may be a whole number plus a rounding error.
     n_x, n_y = np.ceil(np.ptp(corners, axis=0) / side - 1e-6).astype(int)
     if float(n_x) * float(n_y) > _MOST_PIXELS:
-        raise TrustboError(f"pixel={side:g} m gives {n_x} x {n_y} pixels; take a larger one.")
+        raise TrustboError(f"pixel={side:g} m gives {n_x} x {n_y} pixels; use a larger pixel.")
     percent = np.where(np.isnan(cost), UNKNOWN, np.fmin(np.rint(100.0 * cost), WORST))
     percent = np.where(workspace.passable.values, percent, IMPASSABLE)
     values = np.full((n_y, n_x), UNKNOWN, dtype=np.uint8)
@@ -152,15 +152,15 @@ def occupancy(
 
 
 def stops_of(plan: Plan, robot: str, frame: Frame) -> np.ndarray:
-    """Return the poses of a robot's stops in a frame, (stop, 3): x, y and heading.
+    """Return the poses (x, y, heading) of a robot's stops in a frame, shape (stop, 3).
 
-    At each stop the lead faces its next stop. At each post, and at the goal, another robot faces
-    the lead's next stop. The files do not make robots wait for each other. TrustboError: no terrain
-    or route.
+    The lead faces its next stop. The other robots face the lead's next stop at each post, and the
+    lead at the goal. The files do not make robots wait for each other. Raises TrustboError if there
+    is no terrain or no route.
     """
     require_choice("robot", robot, (LEAD, *plan.workspace.team.names))
     if plan.stops is None or plan.posts is None or plan.routes is None:
-        raise TrustboError("waypoints need a terrain; use Workspace.from_terrain.")
+        raise TrustboError("waypoints need a workspace made with Workspace.from_terrain.")
     lead = frame.of_crs(plan.stops)
     if robot == LEAD:
         steps = np.diff(lead, axis=0)
@@ -168,7 +168,7 @@ def stops_of(plan: Plan, robot: str, frame: Frame) -> np.ndarray:
     i = plan.workspace.team.names.index(robot)
     routes = [of_bound[i + 1] for of_bound in plan.routes]
     if any(route is None for route in routes) or routes[-1] is None:
-        raise TrustboError(f"{robot} has no route in a bound; plan another path.")
+        raise TrustboError(f"robot {robot!r} has no route in a bound; plan another path.")
     places = frame.of_crs(np.vstack([plan.posts[:, i], routes[-1][-1:]]))
     return _towards(places, np.vstack([lead[1:], lead[-1:]]) - places)
 
@@ -186,14 +186,14 @@ def _pose(frame: str, x: float, y: float, turn: float) -> dict[str, Any]:
 def _graph(result: Result, frame: Frame) -> str:
     """Return all bounds with the contact lost in each, as GeoJSON for Nav2's route server.
 
-    Nodes are the stops in the cells, with ids row * columns + column. Edges are straight, with ids
-    (1 + move) * cells + the cell entered. Costs are in `metadata`, for Nav2's PenaltyScorer.
+    Nodes are stops, with the id row * columns + column. Edges are straight lines, with the id
+    (1 + move) * cells + id of the stop entered. Nav2's PenaltyScorer reads costs in `metadata`.
     """
     workspace = result.workspace
     cols, n_cells = workspace.grid.shape[1], math.prod(workspace.grid.shape)
     if (1 + len(MOVES)) * n_cells - 1 > _MOST_IDS:
         raise TrustboError(
-            f"a route graph of {n_cells} cells has ids beyond {_MOST_IDS}, the limit of Nav2; "
+            f"a route graph of {n_cells} cells needs ids above {_MOST_IDS}, the limit of Nav2; "
             "use larger cells."
         )
     posts = workspace.posts
@@ -220,7 +220,7 @@ def _feature(kind: str, coordinates: list[Any], properties: dict[str, Any]) -> s
 
 
 def _json(value: Any) -> str:
-    """Write plain values as JSON; floats keep a decimal point, else the loader reads integers."""
+    """Convert values to JSON; floats keep a decimal point, or they would be read as integers."""
     if isinstance(value, dict):
         return "{" + ", ".join(f"{json.dumps(k)}: {_json(v)}" for k, v in value.items()) + "}"
     if isinstance(value, list):
