@@ -1,4 +1,4 @@
-"""Figures. Each function takes data and optional `ax=`, and returns the axes it drew on."""
+"""Figures. All functions except `explore` accept `ax`, and return the axes with the drawing."""
 
 from trustbo.plots.curves import robot_effects, trust_curves
 from trustbo.plots.explore import explore
@@ -16,4 +16,4 @@ __all__ = [
     "trust_curves",
     "trust_maps",
 ]
-__dir__ = __all__.copy  # completion lists public names alone
+__dir__ = __all__.copy  # tab completion lists only public names

@@ -1,4 +1,4 @@
-"""Curves: trust along a mission, history of a campaign, effects of robots."""
+"""Curves of trust along a mission, of a campaign's history and of robot effects."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -30,9 +30,9 @@ _LABELS = {
     "objective": "objective\nwhen planned",
     "regret": "regret (%)",
 }
-"""Variables of a history that `campaign_history` draws, and the labels of their axes."""
+"""Variables of a history that `campaign_history` draws, with their axis labels."""
 SMALL_EFFECT = 0.1
-"""Size of a robot's effect, as a fraction of contact, below which no plan changes."""
+"""Robot effect, as a fraction of contact, that is too small to change plans."""
 
 
 @styled
@@ -40,8 +40,8 @@ def trust_curves(given: xr.DataTree | Plan, mission: int = -1, *, ax: Any = None
     """Draw the trust of each robot along a mission or a plan, with 50 % and 90 % bands.
 
     Args:
-        given: Posterior of `tb.fit`, drawn with the measured contact rates as dots; or a plan over
-            a posterior, such as `Result.plan`.
+        given: Posterior from `tb.fit`, drawn with the measured contact rates as dots; or a plan
+            computed from a posterior, such as `Result.plan`.
         mission: Index of the mission in a posterior; negative indices count from the last.
         ax: Axes to draw on, one for each robot; by default a new figure.
 
@@ -76,10 +76,10 @@ def trust_curves(given: xr.DataTree | Plan, mission: int = -1, *, ax: Any = None
 def _latent_trust(
     posterior: xr.DataTree, mission: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Sequence[str]]:
-    """Return bounds, trust medians and quantiles, measured rates and robots of a mission."""
+    """Return the bounds, trust medians, trust quantiles, rates and robots of a mission."""
     if "latent" not in posterior.children:
         raise TrustboError(
-            "this posterior has no latent trust; give inference.complete(posterior, missions)."
+            "this posterior has no latent trust; use inference.complete(posterior, missions)."
         )
     latent = posterior["latent"].to_dataset()
     n = latent.sizes["mission"]
@@ -95,13 +95,13 @@ def _latent_trust(
 
 @styled
 def campaign_history(history: xr.Dataset, *, ax: Any = None) -> np.ndarray:
-    """Draw the contact and the objective of each mission and, if it is known, the regret.
+    """Draw the contact, the objective and, if known, the regret of each mission.
 
-    A filled dot marks a path that differs from the previous one; a cross marks a mission that did
+    A filled dot marks a path that differs from the previous path. A cross marks a mission that did
     not reach the goal.
 
     Args:
-        history: `Result.history` or `Campaign.history`.
+        history: History of a campaign, from `Result.history` or `Campaign.history`.
         ax: Axes to draw on, one for each variable; by default a new figure.
 
     Returns:
@@ -111,7 +111,7 @@ def campaign_history(history: xr.Dataset, *, ax: Any = None) -> np.ndarray:
         TrustboError: The history is empty.
     """
     if not history.sizes.get("iteration"):
-        raise TrustboError("the history has no mission yet.")
+        raise TrustboError("the history has no missions yet.")
     names = [name for name in _LABELS if name in history]
     if "contact_lost" in names:
         names.remove("contact_rate")
@@ -137,17 +137,17 @@ def campaign_history(history: xr.Dataset, *, ax: Any = None) -> np.ndarray:
 
 @styled
 def robot_effects(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
-    """Draw the effect of each robot by mission, with bars of two standard deviations.
+    """Draw the effect of each robot in each mission, with bars of two standard deviations.
 
-    The band covers effects too small to change a plan; filled markers are effects that stand out.
+    The band covers effects too small to change a plan. Filled markers show effects that stand out.
 
     Args:
-        table: A row for each mission and robot, with the columns `mission`, `robot`, `effect`, `sd`
-            and `stands_out`, such as the `robots` of a check.
+        table: Table with one row for each mission and robot, and the columns `mission`, `robot`,
+            `effect`, `sd` and `stands_out`, such as the table `robots` of a check.
         ax: Axes to draw on; by default a new figure.
 
     Returns:
-        Axes of the effects.
+        Axes with the effects.
 
     Raises:
         TrustboError: A column is missing.

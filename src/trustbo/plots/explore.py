@@ -19,7 +19,7 @@ from trustbo.workspace.grid import Grid, over_cells
 _PLANNED_ON = "trust map that the mission was planned on"
 _MARKERS = ("circle", "square", "diamond", "triangle", "inverted_triangle", "plus")
 _HEIGHT = 640
-"""Height of the page in a notebook, pixels."""
+"""Height of the page in a notebook, in pixels."""
 _UPDATE = """
 const n = mission.value
 const column = layer.value == planned_on ? `mission ${n}` : layer.value
@@ -29,15 +29,15 @@ colours.high = limits[column][1]
 driven.data = paths[n - 1]
 text.text = texts[n - 1]
 """
-"""JavaScript callback for the choice of another layer or mission."""
+"""JavaScript callback that runs when the user selects a layer or a mission."""
 
 
 @dataclass(frozen=True)
 class Explorer:
-    """Interactive page, displayed in notebooks.
+    """Interactive page that notebooks display.
 
     Attributes:
-        html: The self-contained page, which works offline.
+        html: Self-contained page, which works offline.
     """
 
     html: str
@@ -52,12 +52,12 @@ class Explorer:
 
 
 def explore(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> Explorer:
-    """Draw a map with layers, the values of the cell under the pointer, and a slider over missions.
+    """Make an interactive map with layers, cell values under the pointer and a mission slider.
 
     Args:
         plan: Recommended plan, such as `Result.plan`.
         maps: Maps of the cells, dims (y, x) or (row, col), such as `Result.maps()`.
-        history: Path, trust map and outcome of each mission, such as `Result.history`.
+        history: Paths, trust maps and outcomes of the missions, such as `Result.history`.
 
     Returns:
         Page to display or save.
@@ -66,8 +66,8 @@ def explore(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> Explorer:
         TrustboError: The history has no missions.
     """
     if not history.sizes.get("iteration"):
-        raise TrustboError("there is nothing to explore: the history has no mission.")
-    from bokeh.embed import file_html  # half a second, for this alone
+        raise TrustboError("the history has no missions, so there is nothing to explore.")
+    from bokeh.embed import file_html  # slow to import: half a second
     from bokeh.resources import INLINE
 
     html = file_html(_layout(plan, maps, history), INLINE, title="trustbo")
@@ -76,7 +76,7 @@ def explore(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> Explorer:
 
 
 def _layout(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> Any:
-    """Lay out the controls, the map, and the text of the mission."""
+    """Lay out the controls, the map and the description of the mission."""
     from bokeh import models
     from bokeh.layouts import column
     from bokeh.plotting import figure
@@ -146,7 +146,7 @@ def _layout(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> Any:
 
 
 def _layers(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> dict[str, np.ndarray]:
-    """Return the values of each layer (row, col) by name; of missions as "mission 1", ..."""
+    """Return the layers (row, col) by name; trust maps of missions are called "mission 1", ..."""
     free = plan.workspace.passable.values
     layers = {
         str(name).replace("_", " "): over_cells(values).transpose("row", "col").values
@@ -156,7 +156,7 @@ def _layers(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> dict[str, np.n
     trust = history["trust_map"].transpose("iteration", "row", "col").values
     layers |= {f"mission {i + 1}": values for i, values in enumerate(trust)}
     learned = free.copy()
-    learned[plan.path[0]] = False  # trust is assumed at the start
+    learned[plan.path[0]] = False  # the trust at the start is assumed
     about_trust = "trust", "cost", "mission"
     return {
         name: np.where(learned if name.startswith(about_trust) else free, values, np.nan)
@@ -185,12 +185,12 @@ def _draw_plan(plot: Any, plan: Plan) -> None:
 
 
 def _cells(steps: np.ndarray) -> list[Cell]:
-    """Return the cells of a path in a history, in which paths are padded with -1."""
+    """Return the cells of a path from a history, where paths are padded with -1."""
     return [(int(row), int(col)) for row, col in steps if row >= 0]
 
 
 def _places(path: Sequence[Cell], grid: Grid) -> dict[str, Any]:
-    """Return the positions of a path, metres from the lower left corner of the grid."""
+    """Return the positions of a path, in metres from the lower left corner of the grid."""
     x, y = (np.array([grid.center(cell) for cell in path]) - grid.corner).T
     return {"x": x.tolist(), "y": y.tolist()}
 

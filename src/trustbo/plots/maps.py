@@ -20,14 +20,14 @@ from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Grid, over_cells
 
 MOMENTS = (1, 2, 4)
-"""Missions whose maps are drawn by default, besides the map after the last one."""
+"""Missions whose maps are drawn by default, in addition to the map after the last mission."""
 VEGETATION = (0.44, 0.56, 0.39, 0.4)
-"""Semi-transparent green, for light and dark ground."""
-_GROWN = 0.5  # least height of vegetation above the ground, m
-_CONTOURS = 12  # levels of contour lines, at most
-_MOST_PIXELS = 400  # side of the raster that contour lines are traced on
-_SMOOTH = 0.01  # width of its smoothing, as a share of its side
-_ROBUST = (0.02, 0.98)  # quantiles at the ends of the colours
+"""Semi-transparent green that is visible on light and dark backgrounds."""
+_GROWN = 0.5  # minimum height of vegetation above the ground, m
+_CONTOURS = 12  # maximum number of contour levels
+_MOST_PIXELS = 400  # maximum side of the raster on which contour lines are traced
+_SMOOTH = 0.01  # width of the smoothing, as a fraction of the raster's side
+_ROBUST = (0.02, 0.98)  # quantiles at the ends of the colour scale
 
 
 @styled
@@ -40,18 +40,18 @@ def trust_maps(
     missions: Sequence[int] = MOMENTS,
     ax: Any = None,
 ) -> np.ndarray:
-    """Draw the trust maps used to plan missions, with their paths (Fig. 5 of the paper).
+    """Draw the trust maps used to plan missions, with the planned paths (Fig. 5 of the paper).
 
     The last panel shows the map and the recommended path after the last mission. All maps share one
-    colour scale: the 2 % to 98 % quantiles of the learned maps. The start is grey, because its
-    trust is assumed. A trust of 1 corresponds to unbroken contact; larger values have this colour.
+    colour scale, from the 2 % to the 98 % quantile of the learned maps. The start is grey because
+    its trust is assumed. A trust of 1 means unbroken contact; larger values have the same colour.
 
     Args:
         history: Map and path of each iteration, such as `Result.history`.
         trust_map: Map after the last mission, dims (row, col), such as `Result.trust_map`.
         path: Path recommended after the last mission, such as `Result.path`.
         workspace: Workspace of the cells.
-        missions: Missions to draw, from 1; missions that were not run are skipped.
+        missions: Numbers of missions, from 1; missions that were not run are skipped.
         ax: Axes to draw on, one for each panel; by default a new figure.
 
     Returns:
@@ -132,16 +132,16 @@ def cell_map(
     """Draw a map of the planning cells with contour lines; impassable cells are grey.
 
     Args:
-        values: Map, dims (row, col), or (y, x) as in `Result.maps`.
+        values: Map with the dims (row, col), or (y, x) as in `Result.maps`.
         workspace: Workspace of the cells.
         path: Path to draw.
-        limits: Values of the first and last colour; by default the range of the map.
+        limits: Values at the ends of the colour scale; by default the range of the map.
         cmap: Matplotlib `Colormap` or its name.
-        label: Label of the colour bar, by default the name of the map; `""` for no colour bar.
+        label: Label of the colour bar; by default the name of the map, `""` for no colour bar.
         ax: Axes to draw on; by default a new figure.
 
     Returns:
-        Axes of the map; its image is `ax.images[0]`.
+        Axes of the map, whose image is `images[0]` of the axes.
     """
     axes = map_panels(workspace.grid, 1, ax)
     image = draw_cells(axes[0], values, workspace, Normalize(*(limits or (None, None))), cmap)
@@ -163,7 +163,7 @@ def draw_path(ax: Axes, path: Sequence[Cell], grid: Grid) -> None:
 
 
 def map_panels(grid: Grid, n: int, ax: Any) -> np.ndarray:
-    """Return the axes of n maps in metres from the lower left corner of the grid."""
+    """Return axes for n maps, in metres from the lower left corner of the grid."""
     left, right, bottom, top = extent_of(grid)
     tall = float(np.clip((top - bottom) / (right - left), 0.3, 3.0))
     width = 3.0 if n > 1 else 4.0
@@ -191,7 +191,7 @@ def draw_cells(
     norm: Normalize,
     cmap: str | Colormap | None = None,
 ) -> Any:
-    """Draw a map of the planning cells, and return its image."""
+    """Draw a map of the planning cells, and return the image."""
     shown = over_cells(values).transpose("row", "col").values
     data = np.where(workspace.passable.values, shown, np.nan)
     ax.set_facecolor(GREY)
@@ -228,7 +228,7 @@ def draw_contours(ax: Axes, workspace: Workspace, colour: str, opacity: float) -
 
 
 def contours(workspace: Workspace) -> list[np.ndarray]:
-    """Compute contour lines of the ground: at most 12 levels, at multiples of a round number.
+    """Compute contour lines of the ground at no more than 12 round heights.
 
     Returns:
         Lines, each (point, 2): x and y in metres from the map's lower left corner.
@@ -242,7 +242,7 @@ def contours(workspace: Workspace) -> list[np.ndarray]:
     if min(height.shape) < 3 or not valid.any():
         return []
 
-    # A normalised convolution smooths the known heights alone.
+    # A normalised convolution ignores unknown heights.
     width = max(1.0, _SMOOTH * max(height.shape))
     weight = gaussian_filter(valid.astype(float), width)
     smooth = gaussian_filter(np.where(valid, height, 0.0), width) / np.maximum(weight, 1e-9)
@@ -269,7 +269,7 @@ def contour_interval(relief: float) -> float | None:
 
 
 def robust_limits(values: np.ndarray) -> tuple[float, float]:
-    """Return limits of the colour scale: quantiles, so that they are robust to outliers."""
+    """Return the limits of the colour scale, which are quantiles and so robust to outliers."""
     low, high = np.nanquantile(values, _ROBUST).tolist()
     return (low, high) if low < high else (low - 0.5e-3, high + 0.5e-3)
 
@@ -289,5 +289,5 @@ def draw_scale(ax: Axes, grid: Grid) -> None:
 
 
 def extent_of(grid: Grid) -> tuple[float, float, float, float]:
-    """Return left, right, bottom and top of a map, metres from its lower left corner."""
+    """Return left, right, bottom and top of a map, in metres from the map's lower left corner."""
     return (0.0, grid.shape[1] * grid.cell_width, 0.0, grid.shape[0] * grid.cell_height)

@@ -18,10 +18,10 @@ _DASHED = (0, (3, 1.5))
 
 @styled
 def plan_map(plan: Plan, *, bounds: Sequence[int] | None = None, ax: Any = None) -> np.ndarray:
-    """Draw an overview of a plan's path, then each bound.
+    """Draw an overview of a plan's path, and a map of each bound.
 
-    Each bound shows the lead's route between its stops, the posts of the other robots with their
-    sight lines to the lead's next stop, and the routes to their next posts.
+    The map of a bound shows the lead's route between its stops, the posts of the other robots with
+    their sight lines to the lead's next stop, and the routes to their next posts.
 
     Args:
         plan: Plan on a terrain, such as `Result.plan`.
@@ -39,7 +39,7 @@ def plan_map(plan: Plan, *, bounds: Sequence[int] | None = None, ax: Any = None)
     n_bounds = len(plan.path) - 1
     shown = range(1, n_bounds + 1) if bounds is None else bounds
     if not set(shown) <= set(range(1, n_bounds + 1)):
-        raise TrustboError(f"bounds must be some of 1..{n_bounds}; got {bounds!r}.")
+        raise TrustboError(f"bounds must be from 1 to {n_bounds}; got {bounds!r}.")
 
     axes = panels(1 + len(shown), ax, (2.5, 2.6))
     for one in axes:

@@ -1,4 +1,4 @@
-"""Style of all figures, and their axes."""
+"""Style and axes of all figures."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -27,17 +27,17 @@ RC: dict[str, Any] = {
     "image.cmap": "viridis",
     "image.interpolation": "nearest",
 }
-"""Matplotlib settings of all figures; the user's fonts, resolution and colours of text and
-background are kept."""
+"""Matplotlib settings of all figures; the user's fonts, resolution, text colour and background
+colour are kept."""
 styled = mpl.rc_context(RC)  # pyright: ignore[reportArgumentType]
-"""Decorator of a function that draws a figure."""
+"""Decorator for functions that draw figures."""
 ROBOTS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
-"""Colours of Okabe and Ito (2008), by robot; markers distinguish robots without colour."""
+"""Robot colours of Okabe and Ito (2008); markers also distinguish robots without colour."""
 MARKERS = "osD^vPX*<>"
 GREY = "0.55"
-"""Colour of references and impassable cells, visible on light and dark backgrounds."""
+"""Grey of guides and impassable cells, visible on light and dark backgrounds."""
 PAGE = 7.6
-"""Width of a page, inches, which is the maximum width of a new figure."""
+"""Page width in inches, which is the maximum width of a new figure."""
 
 
 def panels(
@@ -48,18 +48,18 @@ def panels(
     Args:
         n: Number of panels.
         ax: The user's axes, one or an array; None for a new figure.
-        size: Width and height of a panel of a new figure, inches.
+        size: Width and height of a panel of a new figure, in inches.
         columns: Maximum number of panels in a row.
         **shared: `sharex` and `sharey` of `plt.subplots`.
 
     Raises:
-        TrustboError: `ax` has fewer axes than there are panels, or is something else.
+        TrustboError: `ax` has too few axes, or contains other objects.
     """
     if ax is not None:
         given = np.asarray(ax, dtype=object).ravel()
         if len(given) < n or not all(isinstance(one, Axes) for one in given):
-            raise TrustboError(f"ax must be at least {n} Axes, one for each panel; got {ax!r:.80}.")
-        for one in given[:n]:  # their texts were made under the settings of the user
+            raise TrustboError(f"ax must have at least {n} Axes, one per panel; got {ax!r:.80}.")
+        for one in given[:n]:  # labels of the user's axes have other sizes
             one.tick_params(labelsize=RC["xtick.labelsize"])
             for text in (one.xaxis.label, one.yaxis.label):
                 text.set_size(RC["axes.labelsize"])
@@ -77,14 +77,14 @@ def panels(
 
 
 def figure_of(axes: Sequence[Axes] | np.ndarray) -> Figure:
-    """Return the top-level figure of some axes."""
+    """Return the top-level figure of axes."""
     figure = axes[0].get_figure(root=True)
     assert isinstance(figure, Figure)  # noqa: S101
     return figure
 
 
 def add_legend(axes: np.ndarray, handles: Sequence[Any]) -> None:
-    """Add a legend below the axes, or inside the first where the figure has no layout engine."""
+    """Add a legend below the axes or, without a constrained layout, inside the first axes."""
     figure = figure_of(axes)
     if isinstance(figure.get_layout_engine(), ConstrainedLayoutEngine):
         columns = min(len(handles), 4 if figure.get_figwidth() > 5.0 else 2)
@@ -94,7 +94,7 @@ def add_legend(axes: np.ndarray, handles: Sequence[Any]) -> None:
 
 
 def accent() -> str:
-    """Return the colour of a single curve: a blue that is visible on the background."""
+    """Return the colour of a single curve, a blue that is visible on the background."""
     red, green, blue = to_rgb(paper())
     return ROBOTS[4] if 0.3 * red + 0.6 * green + 0.1 * blue < 0.5 else ROBOTS[0]
 
@@ -110,10 +110,10 @@ def paper() -> str:
 
 
 def outlined(width: float, colour: str) -> list[patheffects.AbstractPathEffect]:
-    """Return an outline effect; `width` in points includes the line."""
+    """Return an outline effect; `width`, in points, includes the width of the line."""
     return [patheffects.withStroke(linewidth=width, foreground=colour)]
 
 
 def as_text(name: object) -> str:
-    """Escape the dollar signs of a name, so that matplotlib does not read it as a formula."""
+    """Make a name plain text for matplotlib: escape dollar signs and replace underscores."""
     return str(name).replace("$", r"\$").replace("_", " ")
