@@ -1,4 +1,4 @@
-"""HTML report of a result, with its figures, tables and diagnostics."""
+"""HTML report of a result, with figures, tables and diagnostics."""
 
 import base64
 import io
@@ -17,13 +17,13 @@ from trustbo.files import FilePath, write_text
 from trustbo.planning import Plan
 
 __all__ = ["write_report"]
-__dir__ = __all__.copy  # completion lists public names alone
+__dir__ = __all__.copy  # tab completion lists only public names
 
 _DRAWS = 50
-"""Number of posterior draws for the map of uncertainty."""
+"""Number of posterior draws for the uncertainty map."""
 _SHOWN = 3
-"""Number of bounds drawn in detail, those with the least trust."""
-_ENDS = {"n_iterations": "all missions were run", "interrupted": "it was interrupted"}
+"""Number of bounds with the least trust that are drawn in detail."""
+_ENDS = {"n_iterations": "all missions were run", "interrupted": "the campaign was interrupted"}
 _PAGE = """<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
@@ -48,8 +48,8 @@ td, th {{ padding: .2em .7em; text-align: right; border: 0; border-bottom: 1px s
 def write_report(path: FilePath, result: Result) -> None:
     """Write a result as one self-contained HTML page.
 
-    The page begins with the recommended path and its predicted contact and risk, followed by the
-    trust map, the missions, the uncertainties, and the diagnostics and settings.
+    The page begins with the recommended path and the predicted contact and risk. The trust map,
+    the missions, the uncertainties, the diagnostics and the settings follow.
 
     Args:
         path: File to write.
@@ -67,22 +67,22 @@ def write_report(path: FilePath, result: Result) -> None:
 
 
 def _facts(result: Result) -> str:
-    """Make the table of the facts that decide whether to follow the path."""
+    """Make a table of the facts needed to decide whether to follow the path."""
     plan, trust = result.plan, np.minimum(result.plan.trust, 1.0).mean(1)
     worst = int(np.argmin(trust))
     cells = " → ".join(f"{row},{col}" for row, col in plan.path)
     facts = {
         "Path": f"{cells} (row,column; row 0 is north)",
         "Length": f"{len(plan.path) - 1} bounds, {plan.length:.0f} m",
-        "Expected contact": f"{trust.mean():.1%} of the time, mean over robots and bounds",
+        "Expected contact": f"{trust.mean():.1%} of the time, averaged over robots and bounds",
         "Weakest bound": f"bound {worst + 1} into cell {_name(plan.path[worst + 1])}, "
         f"expected contact {trust[worst]:.1%}",
         "Last mission": f"{result.missions[-1].status}, contact "
         f"{np.nanmean(result.missions[-1].contact_rate):.1%} of the time",
-        "Campaign ended": _ENDS.get(result.stop_reason, result.stop_reason),
+        "Reason for stopping": _ENDS.get(result.stop_reason, result.stop_reason),
     }
     if plan.p_arrive is not None:
-        facts["Chance to arrive"] = f"{plan.p_arrive:.1%}, given the slope limit of the robots"
+        facts["Probability of arrival"] = f"{plan.p_arrive:.1%}, given the robots' slope limit"
     rows = "".join(
         f"<tr><th>{escape(name)}</th><td>{escape(text)}</td></tr>" for name, text in facts.items()
     )
@@ -90,16 +90,16 @@ def _facts(result: Result) -> str:
 
 
 def _path(plan: Plan) -> list[str]:
-    """Draw the recommended path with its posts on the terrain, and its bounds."""
+    """Draw the recommended path, with posts on a terrain, and make a table of its bounds."""
     content = [_heading("Recommended path")]
     if plan.stops is not None:
         weakest = sorted((np.argsort(plan.trust.mean(1))[:_SHOWN] + 1).tolist())
         content += [
             _image(lambda: plots.plan_map(plan, bounds=weakest), "path, posts and routes"),
             _note(
-                "The path from its start (circle) to its goal (star), and the bounds with the "
-                "least trust. The robots watch from their posts while the lead drives, and then "
-                "follow to their next posts."
+                "The first map shows the path from start (circle) to goal (star). The others show "
+                "the bounds with the least trust. The robots watch from their posts while the lead "
+                "drives, and then drive to their next posts."
             ),
         ]
     low, high = plan.bands[0], plan.bands[-1]
@@ -115,10 +115,10 @@ def _path(plan: Plan) -> list[str]:
 def _trust(result: Result) -> list[str]:
     return [
         _heading("Trust map"),
-        _image(result.plot_maps, "trust maps after some of the missions"),
+        _image(result.plot_maps, "trust maps after selected missions"),
         _note(
-            "Expected trust in each cell with the path planned on it. A trust of 1 means unbroken "
-            "contact between the lead and the robots that watch it; grey cells are impassable."
+            "Expected trust in each cell, and the path planned with this trust. A trust of 1 means "
+            "unbroken contact between the lead and the other robots. Grey cells are impassable."
         ),
     ]
 
@@ -133,8 +133,8 @@ def _missions(result: Result) -> list[str]:
         _image(result.plot_history, "contact and objective by mission"),
         _table(shown),
         _note(
-            "The objective is the value of the plan before the mission, under the posterior of the "
-            f"missions before it: {result.settings['objective'].replace('_', ' ')}."
+            f"The objective ({result.settings['objective'].replace('_', ' ')}) is the value that "
+            "was predicted for the plan of a mission from all earlier missions."
         ),
     ]
 
@@ -144,7 +144,7 @@ def _uncertainty(result: Result) -> list[str]:
     maps = result.planner.trust_summary(result.posterior, n_draws=_DRAWS)
     driven = {bound.cell for mission in result.missions for bound in mission.bounds}
     new = [_name(cell) for cell in plan.path[1:] if cell not in driven]
-    known = "Every cell of the path was entered before."
+    known = "Every cell of the path was entered in an earlier mission."
     if new:
         known = f"Cells of the path that were never entered: {', '.join(new)}."
     band = ""
@@ -162,8 +162,8 @@ def _uncertainty(result: Result) -> list[str]:
             "standard deviation of trust",
         ),
         _note(
-            f"{known} {band} The intervals hold if the model is right; `trustbo.criticism` checks "
-            "it. Trust where nobody drove follows from the terrain map, which may be out of date."
+            f"{known} {band} The intervals assume an adequate model (see `trustbo.criticism`). "
+            "Trust in cells that no robot entered is predicted from a map that may be out of date."
         ),
     ]
 
@@ -172,7 +172,7 @@ def _diagnostics(result: Result) -> list[str]:
     attrs = result.posterior.attrs
     names = {
         "k_hat": "Pareto k-hat (good below 0.7)",
-        "kish": "effective draws (Kish)",
+        "kish": "effective samples (Kish)",
         "r_hat": "R-hat (good up to 1.01)",
         "ess_bulk": "bulk ESS",
         "divergences": "divergences",
