@@ -1,6 +1,6 @@
-"""The command line: `trustbo demo`, `info`, `run`, `resume` and `export`.
+"""Command-line interface: `trustbo demo`, `info`, `run`, `resume` and `export`.
 
-Each command imports what it needs only when it runs, so that `--help` takes a tenth of a second.
+Commands import heavy modules only when they run, so that `--help` takes a tenth of a second.
 """
 
 import argparse
@@ -22,20 +22,20 @@ POLICIES = ("greedy", "optimistic", "thompson", "ucb", "random")
 OBJECTIVES = ("lost_contact", "terminal", "mean")
 FORMATS = ("geotiff", "geojson", "csv", "nav2")
 BAD_INPUT, INTERRUPTED = 2, 130
-PLACE = "ROW,COL, with row 0 in the north; or x=...,y=... in metres of the CRS; or lon=...,lat=..."
+PLACE = "ROW,COL with row 0 in the north, or x=...,y=... in CRS metres, or lon=...,lat=..."
 _COLUMNS = ["status", "contact_rate", "objective", "k_hat", "r_hat", "path_changed"]
-"""Columns of the table that a finished campaign prints."""
+"""Columns of the table that is printed after a campaign."""
 
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
-    """Run a command and exit; an error is one line on the standard error stream.
+    """Run a command and exit; an error is printed as one line on standard error.
 
     Args:
-        arguments: Words after `trustbo`; by default the arguments of this process.
+        arguments: Arguments after `trustbo`; by default those of this process.
     """
     args = parser().parse_args(arguments)
     warnings.showwarning = lambda message, *_, **__: print(f"warning: {message}", file=sys.stderr)
-    for stream in (sys.stdout, sys.stderr):  # a terminal may lack letters of a path
+    for stream in (sys.stdout, sys.stderr):  # a terminal may not support all characters of a path
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
     try:
@@ -54,11 +54,11 @@ def _exit(message: str, code: int) -> NoReturn:
 
 
 def parser() -> argparse.ArgumentParser:
-    """Make the parser of all commands; `run` of the parsed arguments executes the command."""
+    """Make the parser of all commands; the parsed argument `run` is the function to call."""
     top = argparse.ArgumentParser(
         prog="trustbo",
-        description="Learn how trustworthy robots are on a terrain, and plan their best path.",
-        epilog="exit codes: 0 done; 2 bad input; 130 interrupted",
+        description="Learn how trustworthy robots are on a terrain, and plan the best path.",
+        epilog="exit codes: 0 success, 2 bad input, 130 interrupted",
     )
     version = f"trustbo {importlib.metadata.version('trustbo')}"
     top.add_argument("--version", action="version", version=version)
@@ -75,57 +75,57 @@ def parser() -> argparse.ArgumentParser:
     _add_campaign(add, "out/demo")
 
     add = command(info, "Describe and draw the planning grid of a terrain.", "dem.tif")
-    add("dem", type=Path, metavar="DEM", help="heights of the ground, such as a GeoTIFF")
-    add("dsm", type=Path, nargs="?", metavar="DSM", help="heights of the surface, with trees")
+    add("dem", type=Path, metavar="DEM", help="raster of ground heights, such as a GeoTIFF")
+    add("dsm", type=Path, nargs="?", metavar="DSM", help="raster of surface heights")
     _add_grid(add)
-    add("--out", type=Path, default=Path("grid.png"), metavar="FILE", help="image of the grid")
+    add("--out", type=Path, default=Path("grid.png"), metavar="FILE", help="image file to write")
 
     example = "--dem dem.tif --dsm dsm.tif --start 9,0 --goal 0,9"
     add = command(run, "Run a simulated campaign on a given terrain.", example)
-    add("--dem", type=Path, required=True, metavar="FILE", help="heights of the ground")
-    add("--dsm", type=Path, metavar="FILE", help="heights of the surface, with trees")
+    add("--dem", type=Path, required=True, metavar="FILE", help="raster of ground heights")
+    add("--dsm", type=Path, metavar="FILE", help="raster of surface heights")
     add("--start", type=place, required=True, metavar="PLACE", help=PLACE)
     add("--goal", type=place, required=True, metavar="PLACE", help="as for --start")
     _add_grid(add)
     add("--robots", type=_count, default=3, metavar="N", help="overwatching robots (default 3)")
     add("--max-slope", type=float, default=45.0, metavar="DEG", help="slope limit (default 45)")
     add("--policy", choices=POLICIES, help="how the next path is chosen (default greedy)")
-    add("--objective", choices=OBJECTIVES, help="what a path optimises (default lost_contact)")
+    add("--objective", choices=OBJECTIVES, help="what the path optimises (default lost_contact)")
     add("--paper", action="store_true", help="use the model, awareness and policy of the paper")
     _add_stop(add)
     _add_campaign(add, "out")
 
-    add = command(resume, "Continue a campaign, or add missions.", "out --missions 12")
+    add = command(resume, "Continue a campaign or add missions.", "out --missions 12")
     add("folder", type=Path, metavar="DIR", help="folder of the campaign")
     add("--missions", type=_count, metavar="N", help="total number of missions")
     _add_stop(add)
-    add("--quiet", "-q", action="store_true", help="hide progress bar and table")
+    add("--quiet", "-q", action="store_true", help="hide the progress bar and the table")
 
-    add = command(export, "Write a result for GIS, Nav2 or tables.", "out --format nav2")
+    add = command(export, "Write a result to files for GIS, Nav2 or tables.", "out --format nav2")
     add("folder", type=Path, metavar="DIR", help="folder of the campaign")
     add("--format", dest="formats", choices=FORMATS, nargs="+", default=["geotiff", "geojson"])
-    add("--out", type=Path, metavar="DIR", help="folder of the files (default: the campaign's)")
+    add("--out", type=Path, metavar="DIR", help="output folder (default: that of the campaign)")
     return top
 
 
 def _add_campaign(add: Any, folder: str) -> None:
     """Add the flags of commands that start a campaign."""
-    add("--missions", type=_count, default=8, metavar="N", help="total missions (default 8)")
+    add("--missions", type=_count, default=8, metavar="N", help="number of missions (default 8)")
     add("--seed", type=int, default=0, metavar="N", help="random seed (default 0)")
-    add("--out", type=Path, default=Path(folder), metavar="DIR", help=f"(default {folder})")
-    add("--overwrite", action="store_true", help="replace the campaign in that folder")
-    add("--quiet", "-q", action="store_true", help="hide progress bar and table")
+    add("--out", type=Path, default=Path(folder), metavar="DIR", help=f"folder (default {folder})")
+    add("--overwrite", action="store_true", help="replace an existing campaign in that folder")
+    add("--quiet", "-q", action="store_true", help="hide the progress bar and the table")
 
 
 def _add_grid(add: Any) -> None:
     """Add the flags of the planning grid."""
-    add("--shape", type=shape, default=(10, 10), metavar="ROWS,COLS", help="(default 10,10)")
-    add("--resolution", type=float, metavar="M", help="average the rasters to pixels of M m")
+    add("--shape", type=shape, default=(10, 10), metavar="ROWS,COLS", help="grid (default 10,10)")
+    add("--resolution", type=float, metavar="M", help="average the rasters to M-metre pixels")
 
 
 def _add_stop(add: Any) -> None:
     """Add the flag of the stopping rule."""
-    text = "stop when the path is within this fraction of the best with probability 0.9"
+    text = "stop when the path is within this fraction of the best path with probability 0.9"
     add("--stop-regret", type=float, metavar="SHARE", help=text)
 
 
@@ -159,7 +159,7 @@ def demo(args: argparse.Namespace) -> None:
 
 
 def info(args: argparse.Namespace) -> None:
-    """Print the workspace of a terrain and draw its cells."""
+    """Print a summary of a terrain's workspace and draw the grid."""
     import matplotlib.pyplot as plt
 
     import trustbo as tb
@@ -170,7 +170,7 @@ def info(args: argparse.Namespace) -> None:
     plt.switch_backend("agg")
     tb.plots.grid_map(workspace)
     plt.savefig(args.out, dpi=150)
-    print(f"the grid, with the names of its cells, is drawn in {args.out}")
+    print(f"a figure of the grid is in {args.out}")
 
 
 def run(args: argparse.Namespace) -> None:
@@ -184,7 +184,7 @@ def run(args: argparse.Namespace) -> None:
     team = tb.Team(robots=(robot,) * args.robots, lead=robot)
     terrain = tb.terrain.read_terrain(args.dem, args.dsm, resolution=args.resolution)
     ends = {"start": args.start, "goal": args.goal}
-    for place in ends.values():  # before awareness is computed
+    for place in ends.values():  # before the slow computation of awareness
         Grid.over(terrain, args.shape).locate(place)
     features, options = (tb.paper.WORKSPACE, dict(tb.paper.CAMPAIGN)) if args.paper else ({}, {})
     for name in ("policy", "objective"):
@@ -223,7 +223,7 @@ def resume(args: argparse.Namespace) -> None:
 
 
 def _finish(result: "Result", folder: Path, quiet: bool) -> None:
-    """Write the report and, on a terrain, maps and path for GIS; print the missions."""
+    """Write the report and, with a terrain, maps and path for GIS; print the missions."""
     import matplotlib as mpl
 
     from trustbo.export import export_result
@@ -237,7 +237,7 @@ def _finish(result: "Result", folder: Path, quiet: bool) -> None:
         print(result.table().filter(_COLUMNS).to_string(float_format="%.3f"))
     done = "all missions are done; resume with --missions for more"
     print(f"stopped: {done if result.stop_reason == 'n_iterations' else result.stop_reason}")
-    print(f"recommended: {' '.join(f'{row},{col}' for row, col in result.path)}")
+    print(f"recommended path: {' '.join(f'{row},{col}' for row, col in result.path)}")
     print(f"results are in {folder}; open {folder / 'report.html'}")
 
 
