@@ -154,9 +154,9 @@ def occupancy(
 def stops_of(plan: Plan, robot: str, frame: Frame) -> np.ndarray:
     """Return the poses (x, y, heading) of a robot's stops in a frame, shape (stop, 3).
 
-    The lead faces its next stop. The other robots face the lead's next stop at each post, and the
-    lead at the goal. The files do not make robots wait for each other. Raises TrustboError if there
-    is no terrain or no route.
+    The lead faces its next stop. At each post, the other robots face the lead's next stop; at the
+    goal, they face the lead. The files do not make robots wait for each other. Raises TrustboError
+    if there is no terrain or no route.
     """
     require_choice("robot", robot, (LEAD, *plan.workspace.team.names))
     if plan.stops is None or plan.posts is None or plan.routes is None:

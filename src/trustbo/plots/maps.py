@@ -141,7 +141,7 @@ def cell_map(
         ax: Axes to draw on; by default a new figure.
 
     Returns:
-        Axes of the map, whose image is `images[0]` of the axes.
+        Axes of the map; the image of the map is `images[0]` of these axes.
     """
     axes = map_panels(workspace.grid, 1, ax)
     image = draw_cells(axes[0], values, workspace, Normalize(*(limits or (None, None))), cmap)
@@ -269,7 +269,7 @@ def contour_interval(relief: float) -> float | None:
 
 
 def robust_limits(values: np.ndarray) -> tuple[float, float]:
-    """Return the limits of the colour scale, which are quantiles and so robust to outliers."""
+    """Return the limits of the colour scale: quantiles, which are robust to outliers."""
     low, high = np.nanquantile(values, _ROBUST).tolist()
     return (low, high) if low < high else (low - 0.5e-3, high + 0.5e-3)
 

@@ -28,7 +28,7 @@ class ReplaySimulator(DescribedSimulator):
             TrustboError: There are no missions, or they have no map.
         """
         if isinstance(missions, Mission) or not missions:
-            raise TrustboError(f"missions must be a list of at least one; got {missions!r}.")
+            raise TrustboError(f"missions must be a list of missions; got {missions!r}.")
         require_map("a replay", missions)
         self.missions, self.any_path = tuple(missions), any_path
 

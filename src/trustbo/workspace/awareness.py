@@ -141,7 +141,7 @@ def unlabelled(
 ) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...]]:
     """Return awareness in the axis order of `of_arrays`, and the names of robots and features.
 
-    A DataArray is reordered by its dimensions and labels; the labels are also the default names.
+    A DataArray is reordered by its dimensions and labels. By default, the labels are the names.
     Raises TrustboError if the DataArray has other dimensions or labels than expected.
     """
     if not isinstance(awareness, xr.DataArray):
