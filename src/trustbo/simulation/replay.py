@@ -28,7 +28,7 @@ class ReplaySimulator(DescribedSimulator):
             TrustboError: There are no missions, or they have no map.
         """
         if isinstance(missions, Mission) or not missions:
-            raise TrustboError(f"missions must be a list of missions; got {missions!r}.")
+            raise TrustboError(f"give a list of one or more missions; got {missions!r}.")
         require_map("a replay", missions)
         self.missions, self.any_path = tuple(missions), any_path
 
