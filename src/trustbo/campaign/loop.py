@@ -42,7 +42,7 @@ def iterate(
         simulator: Simulator with `run(path, *, seed, mission) -> Mission`; by default
             `KinematicSimulator(workspace)`.
         truth: Truth of the simulator, `simulation.Truth.of(simulator)`. If given, the history
-            records the regret of each plan, in % of the contact kept on the best admissible path.
+            records the regret of each plan, in % of the expected contact on the best path.
         stop: Stopping rules, called between missions: a `RegretBound`, a function of the campaign
             that returns a reason or None, or several of them.
         directory: Folder that is updated after each mission. If the process dies, `resume`

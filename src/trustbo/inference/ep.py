@@ -1,9 +1,9 @@
 """Expectation propagation (EP) for observations that are not linear in the signal.
 
 Each likelihood term t(f) is replaced by a site exp(-lam f^2 / 2 + eta f). Given the sites, `engine`
-computes the marginals of the signals exactly. Dividing a marginal by its site gives the cavity, and
-the family matches the site to the moments of cavity times term. The log evidence is that of the
-sites plus, for every term, the log ratio of the masses of cavity times term and cavity times site.
+computes the marginals of the signals exactly. Dividing a marginal by its site gives the cavity. The
+site is then changed so that cavity times site has the moments of cavity times term. The log
+evidence is that of the sites plus, for every term, the log ratio of the masses of these products.
 The approximation is stationary in the sites and is corrected by importance weights.
 """
 

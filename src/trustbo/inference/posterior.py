@@ -153,7 +153,7 @@ class Posterior:
         return Student(center, np.linalg.cholesky(cov))
 
     def draw(self, z: np.ndarray, log_p: np.ndarray, n: int, rng: np.random.Generator) -> Draws:
-        """Draw coefficients and signals at equally weighted points, sorted by point.
+        """Draw coefficients and signals given equally weighted hyperparameter points.
 
         Args:
             z: Scores (point, score).

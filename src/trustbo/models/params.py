@@ -92,7 +92,7 @@ class ParameterDraws(Summary):
     def of_places(self, bounds: np.ndarray) -> np.ndarray:
         """Return the sum (..., bound, effect) of the effects of each bound and of the entered cell.
 
-        `bounds` (bound, 3) contains moves, rows and columns; the effect of a negative move is 0.
+        `bounds` (bound, 3) contains moves, rows and columns; effects of move -1 are 0.
         """
         moves, rows, cols = np.asarray(bounds).T
         total: Any = 0.0

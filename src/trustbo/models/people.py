@@ -92,7 +92,7 @@ class HumanTrust(PooledTrust):
         return slots
 
     def layout(self, slots: Slots, *, contrasts: bool = True) -> Layout:
-        """See `TrustModel.layout`; a block is a person, with outcomes and base level as inputs."""
+        """See `TrustModel.layout`: one block per person, with outcomes and base level as inputs."""
         outcomes = [name.startswith((SUCCESS, FAILURE)) for name in slots.features]
         split = np.array([*outcomes, False])  # inputs that decay with beta0
         return Layout(slots.y.shape, joint=True, split=split, apart=True)

@@ -172,8 +172,8 @@ class Planner(Summary):
             x0: Expected trust at the start, shape () or (robot,); by default `params.x0_mean`.
 
         Raises:
-            TrustboError: If the robots or features of the parameters are not those of the
-                workspace, or beta0 is outside the range in which the search is exact.
+            TrustboError: If the parameters are for other robots or features than the workspace, or
+                beta0 is outside the range in which the search is exact.
             InfeasibleError: If no path respects `max_failure`.
         """
         started = time.perf_counter()
@@ -231,8 +231,8 @@ class Planner(Summary):
             x0: Expected trust at the start; by default `params.x0_mean`.
 
         Raises:
-            TrustboError: If the robots or features of the parameters are not those of the
-                workspace, or the path is broken or does not lead from start to goal.
+            TrustboError: If the parameters are for other robots or features than the workspace, or
+                the path has gaps or does not lead from start to goal.
         """
         path, problem = self.require_path(path), self.problem
         draws, cells = draws_of(params, self.workspace, day=True), np.array(path)

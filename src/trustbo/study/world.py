@@ -50,7 +50,7 @@ class World:
         assumed: Assumed sight model; None for the true model.
         team: True lead and robots.
         assumed_team: Assumed lead and robots; None for the true team.
-        aged: Whether the assumed terrain is an outdated survey (see `aged`).
+        aged: Whether the assumed terrain comes from an outdated survey, see the function `aged`.
         events: Events in the true world. The centre of an event is given in fractions of the
             terrain's width and height from the lower left corner, not in CRS metres.
         shape: Shape of the planning grid, (row, col).

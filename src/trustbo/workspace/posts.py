@@ -2,8 +2,8 @@
 
 In a bound a -> c (docs/concepts.md, "Why bounds"), T2 watches the lead's route from posts in a.
 Then the lead watches from its stop in c while T2 leaves these posts. In the previous bound, the
-lead watched from its stop in a while T2 drove to these posts. Among positions p on a lattice around
-the stop in a, the posts of T2 maximise
+lead watched from its stop in cell a while T2 drove to these posts. Among positions p on a lattice
+around the stop in a, the posts of T2 maximise
 
     1/2 mean_k s(p, lead at t_k) + 1/4 s(stop in a, p) + 1/4 s(stop in c, p),
 

@@ -1,4 +1,4 @@
-"""Reports on an ordinal scale: trust plus logistic noise lies between two cut points."""
+"""Reports on an ordinal scale: trust plus logistic noise, divided into levels by cut points."""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar
