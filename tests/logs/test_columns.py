@@ -22,7 +22,7 @@ def assert_expected(columns):
         "\ufeffwho;t\r\n7;0,5\r\n8;#N/A\r\n",
         '"sep=;"\nwho;t;;\n7;0,5;;\n8;;;\n;;;\n',
         "who\tt\n7.0\t0,5\n8.0\t\n",
-        ",who, t \n0,7,.5\n1,8,nan\n",
+        ",Who, T \n0,7,.5\n1,8,nan\n",
         'who,t\n"a person","s"\n"{""ImportId"":1}","{""ImportId"":2}"\n7,5e-1\n8,\n',
     ],
 )
@@ -53,7 +53,7 @@ def test_text_that_is_no_number_is_refused_with_its_row(value):
 
 
 @pytest.mark.parametrize(
-    "content", [b"who,t\n7,1,2\n", b"who,who\n7,1\n", b"who,t\n",
+    "content", [b"who,t\n7\n", b"who,t\n7,1,2\n", b"who,who\n7,1\n", b"who,t\n",
                 b"PK\x03\xff", b"a\xe9,t\n1,2\n"],
 )  # fmt: skip
 def test_files_that_are_no_table_are_refused(content, tmp_path):

@@ -114,6 +114,7 @@ def test_cells_whose_corner_is_cut_are_no_bounds_of_a_planned_path():
         ({}, {"t": [1e9] * 3}),
         ({"t": [0, 1e6, 2e6] * 2}, {}),
         ({"heading": [0.0, 90.0, 350.0, 0.0, 0.0, 0.0]}, {}),
+        ({"x": [2e-5, 3e-5, 4e-5] * 2, "y": [0.0] * 6}, {}),
         ({"t": [0, 4e5, 5e5] * 2, "heading": [np.nan] * 6}, {}),
     ],
 )

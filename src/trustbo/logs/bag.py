@@ -75,7 +75,8 @@ def read_bag(path: FilePath, workspace: Workspace, *, topics: Topics = Topics())
 
     Raises:
         TrustboError: rosbags is not installed; the path is not a bag, or the bag is damaged; a
-            topic is missing; markers are out of order; or `Mission` refuses the data.
+            topic is missing; a clock goes backwards; markers are out of order; or `Mission` refuses
+            the data.
     """
     robots = workspace.team.names
     contact = [topics.contact.replace("{robot}", robot) for robot in robots]
@@ -134,8 +135,10 @@ def _messages(path: Path, needed: Sequence[str], optional: Sequence[str]) -> dic
             f"{str(path)!r} lacks {', '.join(missing)}; it has {found or 'no topics'}. "
             "Topics with other names: topics=Topics(...)."
         )
-    series = {t: pd.Series(m, pd.Index(times[t], dtype=int), object) for t, m in messages.items()}
-    return {topic: one.sort_index(kind="stable") for topic, one in series.items()}
+    for topic, stamps in times.items():
+        if (np.diff(np.array(stamps, dtype=np.int64)) < 0).any():
+            raise TrustboError(f"the clock of {topic} goes backwards.")
+    return {t: pd.Series(m, pd.Index(times[t], dtype=int), object) for t, m in messages.items()}
 
 
 def _contacts(topic: str, messages: pd.Series) -> pd.Series:

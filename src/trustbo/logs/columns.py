@@ -1,5 +1,6 @@
 """Reader of user tables, with parsers of names, numbers and times."""
 
+import csv
 import io
 import re
 import warnings
@@ -28,7 +29,8 @@ class Columns:
     """Columns of a table by name, without the extra lines of spreadsheets and surveys.
 
     These are skipped: a line `sep=`, columns without a name, empty rows, and the header rows of a
-    survey down to the one with ImportId.
+    survey down to the one with ImportId. Column names match regardless of case, and spaces match
+    underscores.
 
     Attributes:
         what: Name of the table in messages, such as "the table of poses".
@@ -53,15 +55,28 @@ class Columns:
         frame = frame.assign(**{n: frame[n].astype(object).map(_cell).astype(object) for n in text})
         imports = [i for i, row in frame.iloc[:3].iterrows() if "ImportId" in str(row.tolist())]
         self.frame = frame.loc[max(imports, default=0) + 1 :].dropna(how="all")
-        if self.frame.empty:
+        if frame.shape[1] and self.frame.empty:
             raise TrustboError(f"{what} has no rows.")
+
+    def find(self, name: str) -> str | None:
+        """Return the name of a column as spelled in the table; None if there is no such column."""
+        if name in self.frame:
+            return name
+        alike = [other for other in self.frame if _folded(other) == _folded(name)]
+        return alike[0] if len(alike) == 1 else None
+
+    def require(self, names: Iterable[str], remedy: str = "") -> None:
+        """Check that columns exist; the TrustboError lists the columns of the table."""
+        if missing := [name for name in names if self.find(name) is None]:
+            there = ", ".join(self.frame) or "no columns"
+            raise TrustboError(f"{self.what} lacks {', '.join(missing)}; it has {there}.{remedy}")
 
     def texts(self, column: str, *, required: bool = True) -> list[str]:
         """Return a column as text, "" if blank; floats such as 1.0 become 1.
 
         All are blank if a column that is not `required` is missing.
         """
-        cells = self.cells(column, required).astype(object)
+        cells = self._cells(column, required).astype(object)
         return ["" if pd.isna(cell) else _WHOLE.sub(r"\1", str(cell)) for cell in cells]
 
     def numbers(
@@ -73,55 +88,70 @@ class Columns:
             TrustboError: A value is not a number or is infinite, blank without `blank`, or not
                 whole with `whole`.
         """
-        cells = self.cells(column, required)
-        values = _numbers(cells).to_numpy(float, na_value=np.nan)
+        cells = self._cells(column, required)
+        parsed = _numbers(cells)
         there = cells.notna().to_numpy()
         faults = {
             "is not a finite number; write decimals with a point, and map words to numbers: "
-            "frame[column].map({'agree': 6})": np.isinf(values) | np.isnan(values) & there,
-            "is blank": np.isnan(values) & (not blank),
-            "must be a whole number": whole & (values > np.floor(values)),
+            "frame[column].map({'agree': 6})": np.isinf(parsed) | np.isnan(parsed) & there,
+            "is blank": np.isnan(parsed) & (not blank),
+            "must be a whole number": whole & (parsed > np.floor(parsed)),
         }
         for fault, bad in faults.items():
             if bad.any():
                 row, value = self.frame.index[bad][0], one_line(cells.iloc[int(np.argmax(bad))])
                 raise TrustboError(f"row {row} of {self.what}: {column} = {value} {fault}.")
-        return values
+        return cells.to_numpy(float, na_value=np.nan)
 
-    def cells(self, column: str, required: bool = True) -> pd.Series:
-        """Return a column as it is; NaN if one that is not `required` is missing."""
-        if column in self.frame:
-            return self.frame[column]
-        if required:
-            there = ", ".join(self.frame)
-            raise TrustboError(f"{self.what} has no column {column!r} among {there}; rename one.")
-        return pd.Series(np.nan, index=self.frame.index)
+    def times(self, column: str) -> tuple[str, pd.Series]:
+        """Return the kind of a column of times, and the times as numbers, or as dates in UTC.
+
+        Raises:
+            TrustboError: A time is blank or neither a number nor a date, or only some dates have a
+                time zone.
+        """
+        cells = self._cells(column)
+        if cells.dtype.kind != "M" and not np.isnan(_numbers(cells.dropna())).any():
+            return "numbers", pd.Series(self.numbers(column, blank=False))
+        zoned = cells.astype(str).str.contains(_ZONE).to_numpy(bool)
+        try:
+            dates = pd.to_datetime(cells, format="ISO8601", utc=True)
+        except ValueError:
+            dates = pd.Series(pd.NaT, index=cells.index)
+        for i in np.flatnonzero(dates.isna().to_numpy() | (zoned != zoned[0])):
+            row, value = self.frame.index[i], one_line(cells.iloc[i])
+            raise TrustboError(
+                f"row {row} of {self.what}: {column} = {value}; give all times in seconds, or as "
+                "dates such as 2026-11-24T10:00:00.5Z, either all with a time zone or none."
+            )
+        return "dates with a time zone" if zoned.all() else "dates without a time zone", dates
+
+    def _cells(self, column: str, required: bool = True) -> pd.Series:
+        if not required and self.find(column) is None:
+            return pd.Series(np.nan, index=self.frame.index)
+        self.require([column])
+        return self.frame[self.find(column)]
 
 
 def seconds_of(first: Columns, second: Columns) -> list[np.ndarray]:
     """Return times `t` of two tables on one clock, each (row,), s, from the first date if dates.
 
     Raises:
-        TrustboError: Times are neither all numbers nor all dates, numbers cannot be seconds, some
-            dates have no time zone, or the times of the two tables do not overlap.
+        TrustboError: Numbers cannot be seconds; only one table has dates, or dates with a time
+            zone; or the times of the two tables do not overlap.
     """
-    tables = first, second
-    texts = pd.concat([table.cells("t").astype(str) for table in tables])
-    if _numbers(texts).notna().any():
-        times = [table.numbers("t", blank=False) for table in tables]
-    else:
-        dates = pd.Series(pd.to_datetime(texts, format="ISO8601", utc=True, errors="coerce"))
-        zoned = texts.str.contains(_ZONE, na=False)
-        bad = (dates.isna() | (zoned != zoned.iloc[0])).to_numpy()
-        if bad.any():
-            raise TrustboError(
-                f"t = {one_line(texts.to_numpy()[bad][0])}: give the times of both tables in "
-                "seconds, or as dates such as 2026-11-24T10:00:00.5Z, all with a time zone or none."
-            )
-        n = len(first.frame)
-        times = np.split((dates - dates.iloc[:n].min()).dt.total_seconds().to_numpy(), [n])
+    (kind, ours), (other, theirs) = first.times("t"), second.times("t")
+    if kind != other:
+        raise TrustboError(
+            f"times of {first.what} are {kind}, of {second.what} {other}; give both as dates in "
+            "UTC, or both in seconds."
+        )
+    if kind != "numbers":
+        start = ours.min()
+        ours, theirs = ((t - start).dt.total_seconds() for t in (ours, theirs))
+    times = [ours.to_numpy(float), theirs.to_numpy(float)]
     spans = [f"{t.min():.9g} to {t.max():.9g} s" for t in times]
-    for table, t, span in zip(tables, times, spans, strict=True):
+    for table, t, span in zip((first, second), times, spans, strict=True):
         if np.ptp(t) > _LONGEST or np.abs(t).max() > 1e11:
             raise TrustboError(
                 f"times of {table.what} are {span}; they must be in seconds (divide milliseconds "
@@ -143,13 +173,17 @@ def require_one_spelling(what: str, names: Iterable[str]) -> None:
     """Raise TrustboError if two names differ only by case, spaces or leading zeros."""
     spelled: dict[str, str] = {}
     for name in dict.fromkeys(names):
-        folded = re.sub(r"[\s_-]+", " ", name.casefold()).strip()
-        folded = re.sub(r"(?<![\d.])0+(?=\d)", "", folded)
-        if (other := spelled.setdefault(folded, name)) != name:
+        if (other := spelled.setdefault(_folded(name), name)) != name:
             raise TrustboError(
                 f"{what}: {other!r} and {name!r} look alike: use one spelling, or names that "
                 "differ by more than case, spaces or leading zeros."
             )
+
+
+def _folded(name: str) -> str:
+    """Return a name in lower case, without leading zeros and with uniform spaces."""
+    spaced = re.sub(r"[\s_-]+", " ", name.casefold()).strip()
+    return re.sub(r"(?<![\d.])0+(?=\d)", "", spaced)
 
 
 def _cell(value: object) -> str | None:
@@ -158,9 +192,9 @@ def _cell(value: object) -> str | None:
     return None if text.lower() in _BLANK else text
 
 
-def _numbers(cells: pd.Series) -> pd.Series:
+def _numbers(cells: pd.Series) -> np.ndarray:
     """Convert cells to numbers; NaN for a cell that is not a number."""
-    return pd.Series(pd.to_numeric(cells, errors="coerce"))
+    return pd.Series(pd.to_numeric(cells, errors="coerce")).to_numpy(float, na_value=np.nan)
 
 
 def _of_values(table: Any) -> pd.DataFrame:
@@ -182,12 +216,17 @@ def _of_file(file: FilePath) -> pd.DataFrame:
         separator = max(_SEPARATORS, key=first.count)
         if named := re.fullmatch(r'"?sep=(.)"?\s*', first, re.IGNORECASE):
             separator, text = named[1], rest
-        as_text: Any = {"header": None, "dtype": str, "na_filter": False}
-        cells = pd.read_csv(io.StringIO(text), sep=separator, **as_text)
-    except (UnicodeDecodeError, pd.errors.EmptyDataError, pd.errors.ParserError) as error:
+        lines = [*csv.reader(io.StringIO(text, newline=""), delimiter=separator)]
+    except (UnicodeDecodeError, csv.Error) as error:
         raise TrustboError(
-            f"{str(file)!r} cannot be read as CSV in UTF-8: {' '.join(str(error).split())}. Save "
-            'it as UTF-8, or give a DataFrame, such as pandas.read_csv(file, encoding="cp1252").'
+            f"{str(file)!r} cannot be read as CSV in UTF-8: {error}. Save it as UTF-8, or give a "
+            'DataFrame, such as pandas.read_csv(file, encoding="cp1252").'
         ) from None
-    frame = cells[1:].set_axis(cells.iloc[0], axis=1)
+    header, *rows = [line for line in lines if line] or [[]]
+    for i, row in enumerate(rows, start=1):
+        if len(row) < len(header) or any(cell.strip() for cell in row[len(header) :]):
+            raise TrustboError(
+                f"row {i} of {str(file)!r} has {len(row)} values, but the header has {len(header)}."
+            )
+    frame = pd.DataFrame([row[: len(header)] for row in rows], columns=header, dtype=object)
     return frame if separator == "," else frame.replace(_DECIMAL_COMMA, r"\1.\2", regex=True)

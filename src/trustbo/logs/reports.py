@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from trustbo.data import Mission, levels_of
-from trustbo.errors import TrustboError, require_choice
+from trustbo.errors import TrustboError
 from trustbo.logs.columns import Columns, require_one_spelling
 
 _YES = ("1", "true", "yes", "success", "succeeded", "ok")
@@ -57,11 +57,14 @@ def read_reports(
     if outcome is None and not inputs:
         raise TrustboError("give the column of outcomes, outcome=, or other columns, inputs=.")
     columns = Columns(table)
+    for name, column in {"person": person, "step": step, "report": report}.items():
+        columns.require([column], f' Name its columns, such as {name}="...".')
     people, steps = np.array(columns.texts(person)), columns.numbers(step, blank=False)
     require_one_spelling(f"column {person}", people.tolist())
     if "" in people:
         raise TrustboError("a person is blank; leave the row out.")
-    y, seen = _unit_of(columns, report, levels), _seen(columns, outcome, inputs)
+    y = _unit_of(columns, report, levels)
+    seen = _seen(columns, outcome, inputs)
     z, missions = np.column_stack([*seen.values()]), []
     for name in dict.fromkeys(people.tolist()):
         of = np.flatnonzero(people == name)
@@ -83,8 +86,11 @@ def _seen(columns: Columns, outcome: str | None, inputs: Sequence[str]) -> dict[
     seen = {}
     if outcome is not None:
         given = [text.lower() for text in columns.texts(outcome)]
-        for text in given:
-            require_choice(outcome, text, ("", *_YES, *_NO))
+        for row, text in zip(columns.frame.index, given, strict=True):
+            if text not in ("", *_YES, *_NO):
+                raise TrustboError(
+                    f"row {row}: {outcome} = {text!r} must be 1 or 0, success or failure, or blank."
+                )
         seen["success"] = np.isin(given, _YES).astype(float)
         seen["failure"] = np.isin(given, _NO).astype(float)
     for name in inputs:
@@ -99,12 +105,14 @@ def _seen(columns: Columns, outcome: str | None, inputs: Sequence[str]) -> dict[
 
 def _unit_of(columns: Columns, report: str, levels: int) -> np.ndarray:
     """Scale reports to [0, 1], (row,), NaN where blank; TrustboError: one is not on the scale."""
-    y = columns.numbers(report, whole=levels > 0)
+    y = columns.numbers(report)
     low, high = (1.0, float(levels)) if levels else (0.0, 1.0)
-    if (off := (y < low) | (y > high)).any():
+    off = (y < low) | (y > high) | (levels > 0) & (y > np.floor(y))
+    if off.any():
+        kind = "whole number" if levels else "number"
         raise TrustboError(
-            f"row {columns.frame.index[off][0]}: {report} = {y[off][0]:g} is not from {low:g} to "
-            f'{high:g}; give the scale, such as scale="likert7", divide percentages by 100, and '
-            "leave missing answers blank."
+            f"row {columns.frame.index[off][0]}: {report} = {y[off][0]:g} is not a {kind} from "
+            f'{low:g} to {high:g}; give the scale, such as scale="likert7", divide percentages by '
+            "100, and leave missing answers blank."
         )
     return (y - low) / (high - low)

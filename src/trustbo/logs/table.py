@@ -52,7 +52,9 @@ def to_frame(missions: Sequence[Mission]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=[*names, *missions[0].features])
 
 
-def read_table(table: Any, workspace: Workspace | None = None) -> list[Mission]:
+def read_table(
+    table: Any, workspace: Workspace | None = None, *, features: Sequence[str] | None = None
+) -> list[Mission]:
     """Read missions from a table with one row per mission, bound and robot.
 
     Columns are `mission`; `bound`, 0 for the start cell, which has no measurements; `robot`; the
@@ -65,8 +67,9 @@ def read_table(table: Any, workspace: Workspace | None = None) -> list[Mission]:
     Args:
         table: Path of a CSV file with a header, separated by commas, semicolons or tabs; or a
             DataFrame, or a mapping of columns.
-        workspace: Workspace whose robots and features are read, in its order; features without a
-            column are NaN. Without a workspace, all remaining columns are features.
+        workspace: Workspace whose robots and features are read, in its order.
+        features: Names of the awareness columns. By default the workspace's features, NaN if a
+            column is missing; without a workspace, all remaining columns.
 
     Returns:
         Missions in the order of the table, without ticks.
@@ -76,76 +79,88 @@ def read_table(table: Any, workspace: Workspace | None = None) -> list[Mission]:
             type, rows of one bound disagree on its cell, or `Mission` refuses the data.
     """
     columns = Columns(table)
-    there, places = {*columns.frame}, ("row", "col")
-    if "row" not in there and "x" in there:
-        places = ("x", "y")
-        if workspace is None:
-            raise TrustboError("cells at x and y need the grid of a workspace; give workspace=.")
-    elif workspace is None and not there & {*places}:
+    at_metres = columns.find("row") is None and columns.find("x") is not None
+    if workspace is None and at_metres:
+        raise TrustboError("cells at x and y need the grid of a workspace; give workspace=.")
+    places = ("x", "y") if at_metres else ("row", "col")
+    if workspace is None and not any(columns.find(name) for name in places):
         places = ()
-    fixed = {*COLUMNS, "x", "y"}
-    features = [name for name in columns.frame if name not in fixed] or FEATURES
-    if workspace is not None:
-        features = workspace.features
-    frame = _parsed(columns, places, features)
-    if places == ("x", "y") and workspace is not None:
-        positions = frame[["x", "y"]].to_numpy()
-        cells = [workspace.grid.locate({"x": x, "y": y}, "position") for x, y in positions]
+    columns.require((*KEYS, *places, "contact_rate"))
+    if features is None:
+        known = {columns.find(name) for name in (*COLUMNS, "x", "y")}
+        rest = [name for name in columns.frame if name not in known] or list(FEATURES)
+        features = rest if workspace is None else workspace.features
+    else:
+        columns.require(features)
+    frame = _parsed(columns, features, places)
+    if at_metres and workspace is not None:
+        pairs = frame[["x", "y"]].to_numpy()
+        cells = [workspace.grid.locate({"x": x, "y": y}, "position") for x, y in pairs]
         frame["row"], frame["col"] = np.transpose(cells)
-    named = dict.fromkeys(name for name in frame["robot"] if name)
-    robots = tuple(named if workspace is None else workspace.team.names)
+    named = frame.loc[frame["robot"] != "", "robot"]
+    robots = tuple(dict.fromkeys(named) if workspace is None else workspace.team.names)
     require_one_spelling("the robots of table and workspace", (*robots, *named))
+    for row, robot in named[~named.isin(robots)].items():
+        raise TrustboError(f"row {row}: robot {robot!r} is not one of {robots}.")
+    for row in frame.index[frame.duplicated([*KEYS])]:
+        raise TrustboError(f"row {row} has the mission, bound and robot of another row.")
     missions = []
     for label, rows in frame.groupby("mission", sort=False):
         try:
-            missions.append(_mission(rows, features, robots))
+            missions.append(_mission(rows, features, robots, bool(places)))
         except TrustboError as error:
             raise TrustboError(f"mission {label}: {error}") from None
     return missions
 
 
-def _parsed(columns: Columns, places: Sequence[str], features: Sequence[str]) -> pd.DataFrame:
-    """Return the columns as text and numbers, "" or NaN where blank."""
+def _parsed(columns: Columns, features: Sequence[str], places: Sequence[str]) -> pd.DataFrame:
+    """Return the columns with the names and types of this module; NaN or None where blank."""
     values: dict[str, Any] = {name: columns.texts(name) for name in ("mission", "robot")}
     require_one_spelling("column mission", values["mission"])
     if "" in values["mission"]:
-        raise TrustboError("the column mission has blank cells; give each row its mission.")
+        row = columns.frame.index[values["mission"].index("")]
+        raise TrustboError(f"row {row}: mission is blank.")
     for name in ("bound", *places):
         values[name] = columns.numbers(name, blank=False, whole=name not in ("x", "y"))
     for name in (*RATES, *features):
-        values[name] = columns.numbers(name, required=name == "contact_rate")
-    values["status"] = columns.texts("status", required=False)
-    return pd.DataFrame(values).astype({"bound": int})
+        values[name] = columns.numbers(name, required=False)
+    values["status"] = [text or None for text in columns.texts("status", required=False)]
+    return pd.DataFrame(values, index=columns.frame.index).astype({"bound": int})
 
 
-def _mission(rows: pd.DataFrame, features: Sequence[str], robots: tuple[str, ...]) -> Mission:
+def _mission(
+    rows: pd.DataFrame, features: Sequence[str], robots: tuple[str, ...], is_mapped: bool
+) -> Mission:
     """Make a mission from its rows."""
-    cells = rows.filter(["bound", "row", "col"]).drop_duplicates().sort_values("bound").astype(int)
-    has_map, numbers = len(cells.columns) > 1, cells["bound"].tolist()
-    first = 0 if has_map else 1
-    if numbers != [*range(first, first + len(numbers))]:
+    first, numbers = 0 if is_mapped else 1, sorted(rows["bound"].unique().tolist())
+    if numbers != (planned := list(range(first, numbers[-1] + 1))):
         raise TrustboError(
-            f"bounds must be numbered {first}, {first + 1}, ..., each with one cell; got {numbers}."
+            f"bounds must be numbered {planned}, 0 being the start cell; got {numbers}."
         )
-    values, statuses = rows[[*RATES, *features]], rows["status"].to_numpy(str)
-    bound = rows["bound"].to_numpy(int)
-    measured = bound[values.notna().to_numpy().any(axis=1) | (statuses != "")]
+    path = None
+    if is_mapped:
+        cells = sorted({*map(tuple, rows[["bound", "row", "col"]].to_numpy(int).tolist())})
+        if len(cells) > len(planned):
+            raise TrustboError("rows of one bound disagree on its cell, row and col.")
+        path = [(row, col) for _, row, col in cells]
+    bound, status = rows["bound"].to_numpy(int), "ok"
+    measured = bound[rows[[*RATES, "status", *features]].notna().to_numpy().any(axis=1)]
     if not len(measured) or measured.min() < 1:
         raise TrustboError("bounds with a measurement must be numbered from 1; got none, or 0.")
-    n_run, ended = int(measured.max()), ~np.isin(statuses, ["", "ok"])
-    status, *others = dict.fromkeys(statuses[ended].tolist()) or ["ok"]
-    if others or (bound[ended] < n_run).any():
-        raise TrustboError("only the last bound that was run may have a status but ok.")
-    run = rows[(bound >= 1) & (bound <= n_run)].set_index(["bound", "robot"])
+    n_run = int(measured.max())
+    for k, ended in zip(bound, rows["status"], strict=True):
+        if isinstance(ended, str) and ended != "ok":
+            if k < n_run or status not in ("ok", ended):
+                raise TrustboError("only the last bound that was run may have a status but ok.")
+            status = ended
     expected = pd.MultiIndex.from_product([range(1, n_run + 1), robots])
-    wrong = run.index[run.index.duplicated()].union(run.index.symmetric_difference(expected))
-    if len(wrong):
-        k, robot = wrong[0]
-        raise TrustboError(f"bound {k} needs one row for each of {robots}; check robot {robot!r}.")
-    arrays = run.loc[expected, values.columns].to_numpy(float).reshape(n_run, len(robots), -1)
-    rate, duration, n_ticks = np.moveaxis(arrays[..., : len(RATES)], -1, 0)
+    of_robot = rows.set_index(["bound", "robot"])
+    if missing := [pair for pair in expected if pair not in of_robot.index]:
+        raise TrustboError("bound {} has no row for {}.".format(*missing[0]))
+    values = of_robot.loc[expected, [*RATES, *features]].to_numpy(float)
+    values = values.reshape(n_run, len(robots), -1)
+    rate, duration, n_ticks = np.moveaxis(values[..., : len(RATES)], -1, 0)
     return Mission.from_arrays(
-        cells[["row", "col"]].to_numpy().tolist() if has_map else None,
-        arrays[..., len(RATES) :], rate, duration, status, n_ticks=n_ticks,
+        path, values[..., len(RATES) :], rate, duration, status, n_ticks=n_ticks,
         features=features, robots=robots,
     )  # fmt: skip

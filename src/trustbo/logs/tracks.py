@@ -13,11 +13,14 @@ from trustbo.errors import TrustboError, require_cells, require_choice, require_
 from trustbo.logs.columns import Columns, require_one_spelling, seconds_of
 from trustbo.workspace import Workspace
 
+EACH = "each"
 _FEATURES = ("near", "ahead")
 _AHEAD = np.pi / 6.0
 """Half of the angle in which a robot is ahead, rad."""
-_MOST_TURNED = 8.0 * np.pi
-"""Largest heading, rad: four turns; larger ones are taken for degrees."""
+_EXTENT = 0.1
+"""Least extent of a log, m."""
+_FEWEST = 2
+"""Minimum number of bounds of a mission without a planned path."""
 
 
 def read_tracks(
@@ -26,7 +29,7 @@ def read_tracks(
     workspace: Workspace | None = None,
     *,
     path: Sequence[Cell] | None = None,
-    lead: str | None = None,
+    lead: str = EACH,
     window: float = 20.0,
     tick: float = 1.0,
     max_gap: float = 5.0,
@@ -68,65 +71,94 @@ def read_tracks(
 
     Raises:
         TrustboError: A column is missing, a value has the wrong type, a robot has two poses at one
-            time or only one, there are fewer than two robots or no detections between robots, times
-            or headings cannot be in seconds and radians, the lead is unknown, or there are no
-            bounds.
+            time or none, there are fewer than two robots or no detections between robots, times,
+            positions or headings cannot be in seconds, metres and radians, the lead is unknown, or
+            the log is too short for two bounds.
     """
-    tick, max_gap = require_positive("tick", tick), require_positive("max_gap", max_gap)
-    where = Columns(poses, "the table of poses")
-    seen = Columns(detections, "the table of detections")
-    t, seen_at = seconds_of(where, seen)
-    tracks = _tracks(where, t)
+    tracks, looks = _read(poses, detections, require_positive("tick", tick))
     robots = tuple(tracks)
-    start = min(track[0, 0] for track in tracks.values())
-    end = max(track[-1, 0] for track in tracks.values())
-    looks = _looks(seen, (seen_at - start) / tick, robots, tick)
+    require_choice("lead", lead, (*robots, EACH))
     team = robots if workspace is None else workspace.team.names
     for name in team:
-        require_choice("robot of the team", name, robots)
-    leads = robots if workspace is None else [name for name in robots if name not in team]
-    if lead is not None:
-        leads = [require_choice("lead", lead, robots)]
-    elif workspace is not None and len(leads) != 1:
-        raise TrustboError(f"lead must be one of {leads or robots}, to read a log with a map.")
+        if name not in robots:
+            raise TrustboError(f"the poses have no robot {name!r} of the team; they have {robots}.")
+    if workspace is not None and lead == EACH:
+        others = [name for name in robots if name not in team]
+        if len(others) != 1:
+            raise TrustboError(f"lead must be one of {others or robots}, to read a log with a map.")
+        lead = others[0]
+    start = min(track[0, 0] for track in tracks.values())
+    end = max(track[-1, 0] for track in tracks.values())
+    n = int(np.floor((end - start) / tick + 1e-9))
+    times, gap = start + (np.arange(n) + 0.5) * tick, require_positive("max_gap", max_gap)
+    places = np.stack([_at(track, times, gap) for track in tracks.values()])
+    looks[:, 0] = np.floor((looks[:, 0] - start) / tick + 1e-9)
+    ticks = _ticks(places, looks[(looks[:, 0] >= 0) & (looks[:, 0] < n)].astype(int))
+    of_team = [robots.index(name) for name in team]
     planned = None if path is None else require_cells("path", path)
     if planned and workspace is None:
         raise TrustboError("path= needs the workspace of its cells.")
-    n = int((end - start) / tick + 1e-9)
-    times = start + (np.arange(n) + 0.5) * tick
-    places = np.stack([_at(track, times, max_gap) for track in tracks.values()])
-    ticks = _ticks(places, looks[:, (looks[2] >= 0) & (looks[2] < n)])
-    of_team, missions = [robots.index(name) for name in team], []
-    for i in map(robots.index, leads):
+    missions, fewest = [], _FEWEST if planned is None else 1
+    for i, name in enumerate(robots):
+        if lead not in (name, EACH):
+            continue
         if workspace is None:
             step = max(round(require_positive("window", window) / tick), 1)
             stretches = [(np.arange(0, n + 1, step), None)]
         else:
             stretches = _crossings(places[i, :, :2], workspace, planned)
         missions += [_mission(ticks[of_team, i], edges, tick, cells, team, workspace)
-                     for edges, cells in stretches if len(edges) > 1]  # fmt: skip
+                     for edges, cells in stretches if len(edges) > fewest]  # fmt: skip
     if not missions:
-        raise TrustboError(
-            f"there is no whole bound in the log of {n * tick:g} s; give a shorter window, or, "
-            "with a map, positions in metres of its grid."
-        )
+        raise TrustboError(f"the log of {n * tick:g} s is too short; give a shorter window.")
     return missions
 
 
-def _tracks(table: Columns, t: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the poses of each robot, (sample, 4): time (s), x, y (m) and heading (rad)."""
-    names, heading = np.array(table.texts("robot")), table.numbers("heading", required=False)
-    if (largest := np.nanmax(np.abs(heading), initial=0.0)) > _MOST_TURNED:
+def _read(poses: Any, detections: Any, tick: float) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Read the poses of each robot, (sample, 4), and detections, (detection, 3).
+
+    A pose is a time (s), x, y (m) and heading (rad), times ascending; a detection is a time and the
+    indices of the watcher and of the robot seen.
+    """
+    where = Columns(poses, "the table of poses")
+    seen = Columns(detections, "the table of detections")
+    t, seen_at = seconds_of(where, seen)
+    names, pairs = where.texts("robot"), [seen.texts(end) for end in ("watcher", "seen")]
+    robots = tuple(dict.fromkeys(names))
+    if len(robots) < 2 or "" in robots:
+        raise TrustboError(f"poses must include at least two named robots; got {robots}.")
+    require_one_spelling("the names in poses and detections", [*names, *pairs[0], *pairs[1]])
+    xy = [where.numbers(name, blank=False) for name in ("x", "y")]
+    if max(np.ptp(xy[0]), np.ptp(xy[1])) < _EXTENT:
         raise TrustboError(
-            f"headings are up to {largest:g}, so they seem to be in degrees; give rad from east, "
-            "anticlockwise: radians(90 - compass heading), modulo 2 pi."
+            f"all poses lie within {_EXTENT:g} m; x and y are metres, not degrees or kilometres."
         )
-    x, y = (table.numbers(name, blank=False) for name in ("x", "y"))
-    rows = np.column_stack([t, x, y, heading])
-    tracks = {name: _track(name, rows[names == name]) for name in dict.fromkeys(names.tolist())}
-    if len(tracks) < 2 or "" in tracks:
-        raise TrustboError(f"poses must be of two named robots at least; got {(*tracks,)}.")
-    return tracks
+    heading = where.numbers("heading", required=False)
+    rows, of = np.column_stack([t, *xy, heading]), np.array(names)
+    index = {name: i for i, name in enumerate(robots)}
+    looks = [(s, index[a], index[b]) for s, a, b in zip(seen_at, *pairs, strict=True)
+             if a in index and b in index and a != b]  # fmt: skip
+    if not looks:
+        raise TrustboError(
+            f"in no detection does one of {robots} detect another; in the first, "
+            f"{pairs[0][0]!r} detects {pairs[1][0]!r}."
+        )
+    readings = pd.DataFrame(looks, columns=["t", "watcher", "seen"]).drop_duplicates()
+    gaps = np.asarray(readings.sort_values("t").groupby(["watcher", "seen"])["t"].diff())
+    gaps = gaps[~np.isnan(gaps)]  # none before the first detection of a pair
+    apart = float(np.quantile(gaps, 0.05)) if len(gaps) else 0.0
+    if apart > 1.5 * tick:
+        warnings.warn(
+            f"two detections of a robot by another are at least {apart:g} s apart, and ticks of "
+            f"{tick:g} s without detections count as lost contact; pass tick={apart:g}.",
+            stacklevel=3,
+        )
+    if silent := {*robots} - {robots[i] for look in looks for i in look[1:]}:
+        warnings.warn(
+            f"no detection names {', '.join(sorted(silent))}; the contact of such a robot is 0.",
+            stacklevel=3,
+        )
+    return {name: _track(name, rows[of == name]) for name in robots}, np.array(looks, dtype=float)
 
 
 def _track(name: str, rows: np.ndarray) -> np.ndarray:
@@ -135,49 +167,31 @@ def _track(name: str, rows: np.ndarray) -> np.ndarray:
     t, x, y, heading = rows.T
     if len(t) < 2 or (np.diff(t) <= 0.0).any():
         raise TrustboError(f"robot {name!r} has a single pose, or two at one time.")
+    dx, dy = np.gradient(x, t), np.gradient(y, t)
+    moves, course = np.hypot(dx, dy) > 1e-3, np.arctan2(dy, dx)  # a slower robot (m/s) stands
     if np.isnan(heading).all():
-        dx, dy = np.gradient(x, t), np.gradient(y, t)
-        course = np.where(np.hypot(dx, dy) > 1e-3, np.arctan2(dy, dx), np.nan)  # m/s: not standing
-        if np.isnan(course).all():
+        if not moves.any():
             raise TrustboError(
                 f"robot {name!r} has no heading, and moves by less than 1 mm/s: are times in "
                 "seconds and positions in metres? If so, give its heading."
             )
-        heading = pd.Series(course).ffill().bfill().to_numpy()
+        heading = pd.Series(np.where(moves, course, np.nan)).ffill().bfill().to_numpy()
     elif np.isnan(heading).any():
         raise TrustboError(f"headings of robot {name!r} are blank in some poses; give all or none.")
+    elif _in_degrees(heading, course[moves], heading[moves]):
+        raise TrustboError(
+            f"headings of robot {name!r} are up to {np.abs(heading).max():g}, so they seem to be "
+            "in degrees; give rad from east, anticlockwise: radians(90 - compass heading)."
+        )
     return np.column_stack([t, x, y, np.unwrap(heading)])
 
 
-def _looks(table: Columns, t: np.ndarray, robots: Sequence[str], tick: float) -> np.ndarray:
-    """Return detections of robots by robots, (3, detection): watcher, robot seen and tick.
-
-    The times `t` are in ticks of `tick` seconds.
-    """
-    looks = pd.DataFrame({"t": t} | {end: table.texts(end) for end in ("watcher", "seen")})
-    ends = looks[["watcher", "seen"]]
-    require_one_spelling("the names in poses and detections", [*robots, *ends.to_numpy().ravel()])
-    looks = looks[ends.isin(robots).all(axis=1) & (ends["watcher"] != ends["seen"])]
-    if looks.empty:
-        raise TrustboError(
-            f"in no detection does one of {robots} detect another; in the first, "
-            f"{ends['watcher'][0]!r} detects {ends['seen'][0]!r}."
-        )
-    once: Any = looks.drop_duplicates()
-    apart = once.sort_values("t").groupby(["watcher", "seen"])["t"].diff().quantile(0.05) * tick
-    if apart > 1.5 * tick:
-        warnings.warn(
-            f"two detections of a robot by another are at least {apart:g} s apart, and ticks of "
-            f"{tick:g} s without detections count as lost contact; pass tick={apart:g}.",
-            stacklevel=3,
-        )
-    if silent := {*robots} - {*looks["watcher"], *looks["seen"]}:
-        warnings.warn(
-            f"no detection names {', '.join(sorted(silent))}; the contact of such a robot is 0.",
-            stacklevel=3,
-        )
-    pairs = ([robots.index(name) for name in looks[end]] for end in ends)
-    return np.array([*pairs, np.floor(looks["t"] + 1e-9)], dtype=int)
+def _in_degrees(heading: np.ndarray, course: np.ndarray, along: np.ndarray) -> bool:
+    """Return whether headings are in degrees, by their jumps or the directions of motion."""
+    if np.abs(heading).max() <= 2.0 * np.pi + 1e-6:
+        return False
+    fit, other = (np.cos(h - course).sum() for h in (along, np.radians(along)))
+    return bool(np.abs(np.diff(heading)).max() > 2.0 * np.pi + 0.1 or other > max(fit, 0.0) + 0.5)
 
 
 def _at(track: np.ndarray, times: np.ndarray, max_gap: float) -> np.ndarray:
@@ -193,7 +207,7 @@ def _ticks(poses: np.ndarray, looks: np.ndarray) -> np.ndarray:
     """Return data of each pair of robots at each tick, (watcher, seen, tick, 2 + feature).
 
     The last axis has whether both poses are known, contact, and the features; all are 0 where a
-    pose is unknown, and on the diagonal. `looks` are watcher, robot seen and tick, (3, detection).
+    pose is unknown, and on the diagonal. `looks` are tick, watcher and robot seen, (detection, 3).
 
     Raises:
         TrustboError: There is no tick at which two poses are known.
@@ -211,7 +225,8 @@ def _ticks(poses: np.ndarray, looks: np.ndarray) -> np.ndarray:
     usual = max(float(np.nanmedian(away)), 1e-9)
     ahead = np.abs(np.angle(across * np.exp(-1j * poses[:, None, :, 2]))) < _AHEAD
     contact = np.zeros(known.shape, dtype=bool)
-    contact[tuple(looks)] = True
+    k, watcher, seen = looks.T
+    contact[watcher, seen, k] = True
     values = np.stack([known, contact, usual / (usual + away), ahead], axis=-1)
     return np.where(known[..., None], values, 0.0)
 
