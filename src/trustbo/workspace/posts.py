@@ -119,12 +119,15 @@ class Posts:
         """
         ends = zip(self.team.robots, self.watching(a, c), self.watching(c, next_cell), strict=True)
         window = self.window(a, c)
-        lead = self.routes.find(self.team.lead, self.stop(a), self.stop(c), window)
-        return lead, *(self.routes.find(*each, window) for each in ends)
+        return self._lead_route(a, c), *(self.routes.find(*each, window) for each in ends)
+
+    def _lead_route(self, a: Cell, c: Cell) -> np.ndarray | None:
+        """Find the lead's route between its stops in a and c, (point, 2); None if there is none."""
+        return self.routes.find(self.team.lead, self.stop(a), self.stop(c), self.window(a, c))
 
     def lead_line(self, a: Cell, c: Cell) -> np.ndarray:
         """Return the lead's route, or a straight line if there is no route, (point, 2)."""
-        route = self.routes.find(self.team.lead, self.stop(a), self.stop(c), self.window(a, c))
+        route = self._lead_route(a, c)
         return np.stack([self.stop(a), self.stop(c)]) if route is None else route
 
     # --- stops of the lead ---
