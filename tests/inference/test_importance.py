@@ -38,7 +38,7 @@ def test_a_gaussian_posterior_has_its_closed_form(d):
 
 
 @pytest.mark.parametrize("starts", [[[0.0, 0.0]], [[0.0, 0.0], [-2.0, 0.0], [2.0, 0.0]]])
-def test_two_modes_share_their_mass(starts):
+def test_two_modes_share_their_mass_or_the_weights_are_refused(starts):
     narrow = stats.multivariate_normal([2.0, 0.0], 0.02 * np.eye(2))
     wide = stats.multivariate_normal([-2.0, 1.0], 0.1 * np.eye(2))
 
@@ -46,12 +46,15 @@ def test_two_modes_share_their_mass(starts):
         terms = [np.log(0.7) + narrow.logpdf(z), np.log(0.3) + wide.logpdf(z)]
         return np.atleast_1d(special.logsumexp(terms, axis=0))
 
-    rng = np.random.default_rng(1)
-    points = importance.sample(log_density, np.array(starts), rng, size=1024, enough=500.0)
-
-    assert points.k_hat < importance.MAX_KHAT
-    assert points.log_evidence == pytest.approx(0.0, abs=0.1)
-    assert points.weight[points.z[:, 0] > 0.0].sum() == pytest.approx(0.7, abs=0.05)
+    n_accepted = 0
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        points = importance.sample(log_density, np.array(starts), rng, size=1024, enough=500.0)
+        if points.k_hat < importance.MAX_KHAT:
+            n_accepted += 1
+            assert points.log_evidence == pytest.approx(0.0, abs=0.1)
+            assert points.weight[points.z[:, 0] > 0.0].sum() == pytest.approx(0.7, abs=0.05)
+    assert n_accepted >= 5
 
 
 def test_a_density_may_vanish_in_places():
@@ -80,11 +83,24 @@ def test_a_student_integrates_to_its_density():
     student = importance.Student(np.array([1.0, -1.0]), np.array([[2.0, 0.0], [0.5, 1.0]]))
 
     z = rng.normal(size=(6, 2))
-    expected = stats.multivariate_t(student.center, student.scale @ student.scale.T, df=8.0)
+    expected = stats.multivariate_t(student.center, student.scale @ student.scale.T, df=importance._DEGREES)
 
     np.testing.assert_allclose(student.log_density(z), expected.logpdf(z), rtol=1e-12)
     within = (student.draw(4096, rng) @ [1.0, 0.0] < 1.0).mean()
     assert within == pytest.approx(0.5, abs=0.02)
+
+
+def test_a_skewed_student_integrates_to_its_density():
+    sides = np.array([[0.5, 2.0], [3.0, 1.0]])
+    student = importance.Student(np.array([1.0, -1.0]), np.array([[2.0, 0.0], [0.5, 1.0]]), sides)
+
+    rng = np.random.default_rng(7)
+    z = student.draw(16384, rng)
+    other = stats.multivariate_t([1.0, 0.0], 8.0 * np.eye(2), df=30.0)
+    ratio = np.exp(other.logpdf(z) - student.log_density(z))
+
+    assert ratio.mean() == pytest.approx(1.0, abs=0.02)
+    assert (ratio * z[:, 0]).mean() == pytest.approx(1.0, abs=0.1)
 
 
 def test_resampling_is_proportional_to_the_weights():

@@ -3,7 +3,8 @@
 Hyperparameters are sampled as *scores* z, which are standard normal a priori. All other variables
 (coefficients, effects, trust) are integrated out of the density and drawn given the scores.
 
-1. `find_mode` searches for a mode from each start and fits a Gaussian by finite differences.
+1. `climb` searches for a mode from each start, and `fit_mode` fits a skewed Student-t there by
+   finite differences.
 2. Each round draws points from the current proposal, from the fits at the modes if there are
    several modes, and from a defensive proposal, which covers regions that other proposals miss. All
    proposals so far form a mixture q, and every point has the weight p(z) / q(z).
@@ -26,11 +27,13 @@ from trustbo.parallel import one_blas_thread
 
 GOOD_KHAT, MAX_KHAT = 0.5, 0.7
 """Limits on the Pareto shape k-hat of the weights, for stopping and for acceptable results."""
-_DEGREES = 8.0  # degrees of freedom of the proposals
-_WIDER = 1.15  # scale of a proposal relative to the points that it is fitted to
+_DEGREES = 10.0  # degrees of freedom of the proposals
+_WIDER = 1.05  # scale of a proposal relative to the points that it is fitted to
+_DEFENSIVE = 8  # other points per defensive point after the first round
 _PER_AXIS = 4.0  # effective points needed per score to estimate moments
 _SLOPE_STEP, _CURVATURE_STEP = 1e-3, 3e-2
 _LEAST_CURVATURE = 0.3  # of minus the log density; 1 for the prior
+_SKEW_STEP, _SKEWS = 2.0, (0.5, 3.0)  # where skewness is measured, in sds, and its limits
 _FARTHEST = 7.0  # largest absolute score of a mode
 
 LogDensity = Callable[[np.ndarray], np.ndarray]
@@ -38,10 +41,15 @@ LogDensity = Callable[[np.ndarray], np.ndarray]
 
 
 class Student(NamedTuple):
-    """Multivariate Student-t distribution."""
+    """Multivariate Student-t distribution, which may be wider on one side of its center.
+
+    A point is center + scale (x sides), where x has a standard Student-t distribution and the
+    elements of x are multiplied by the first or second row of sides, by their sign.
+    """
 
     center: np.ndarray  # (score,)
     scale: np.ndarray  # (score, score), lower triangular
+    sides: np.ndarray = np.ones((2, 1))  # (2, score), factors of negative and positive elements
 
     @classmethod
     def of(cls, z: np.ndarray, weight: np.ndarray, ridge: float = 1e-3) -> Self:
@@ -55,15 +63,18 @@ class Student(NamedTuple):
         d = len(self.center)
         uniform = np.clip(stats.qmc.Sobol(d + 1, rng=rng).random(n), 1e-12, 1.0 - 1e-12)
         chi2 = 2.0 * special.gammaincinv(0.5 * _DEGREES, uniform[:, d:]) / _DEGREES
-        return self.center + special.ndtri(uniform[:, :d]) / np.sqrt(chi2) @ self.scale.T
+        x = special.ndtri(uniform[:, :d]) / np.sqrt(chi2)
+        return self.center + (np.where(x < 0.0, *self.sides) * x) @ self.scale.T
 
     def log_density(self, z: np.ndarray) -> np.ndarray:
         """Compute the log density (point,) of points (point, score)."""
         nu, d = _DEGREES, len(self.center)
-        white = solve_triangular(self.scale, (z - self.center).T, lower=True)
+        x = solve_triangular(self.scale, (z - self.center).T, lower=True).T
+        side = np.where(x < 0.0, *self.sides)
         constant = special.gammaln(0.5 * (nu + d)) - special.gammaln(0.5 * nu)
         constant -= 0.5 * d * np.log(nu * np.pi) + np.log(np.diag(self.scale)).sum()
-        return constant - 0.5 * (nu + d) * np.log1p((white**2).sum(0) / nu)
+        square = ((x / side) ** 2).sum(1)
+        return constant - np.log(side).sum(1) - 0.5 * (nu + d) * np.log1p(square / nu)
 
 
 class Points(NamedTuple):
@@ -125,7 +136,8 @@ def sample(
         log_density: Log posterior density of scores.
         starts: Starting points of the search for modes, shape (start, score).
         rng: Random number generator.
-        size: Number of points per round, a power of 2; half of them are drawn from `defensive`.
+        size: Number of points per round, a power of 2. In the first round, half of them are drawn
+            from `defensive`; in later rounds, another eighth is.
         enough: Effective number of points at which sampling stops if k-hat is good.
         most: Maximum number of rounds.
         defensive: Function that returns a proposal for regions that the current proposal may miss;
@@ -139,11 +151,12 @@ def sample(
         modes = find_modes(log_density, starts)
         proposals = modes if len(modes) > 1 else []
         current = modes[0]
-        while True:
+        for number in range(most):
             own = [current._replace(scale=_WIDER * current.scale), *proposals]
-            share = 1 << int(np.log2(size / 2 / len(own)))
+            n_own, n_others = (size, size // _DEFENSIVE) if number else (size // 2, size // 2)
+            share = 1 << int(np.log2(n_own / len(own)))
             others = defensive(current) if defensive else prior
-            for density, n in [*((one, share) for one in own), (others, size // 2)]:
+            for density, n in [*((one, share) for one in own), (others, n_others)]:
                 new = density.draw(n, rng)
                 z, log_p = np.vstack([z, new]), np.append(log_p, log_density(new))
                 mixture.append((density, n))
@@ -152,16 +165,16 @@ def sample(
             log_q = special.logsumexp(log_q, axis=0) - np.log(len(z))
             points = Points.of(z, log_p, np.where(np.isfinite(log_p), log_p, -np.inf) - log_q)
             current = points.fitted()
-            good = points.k_hat < GOOD_KHAT and points.kish > enough
-            if len(z) > size and (good or len(z) > (most - 1) * size):
-                return points
+            if number and points.k_hat < GOOD_KHAT and points.kish > enough:
+                break
+    return points
 
 
 def find_modes(log_density: LogDensity, starts: np.ndarray) -> list[Student]:
-    """Fit Gaussians at the distinct modes reached from the starts, with the highest mode first."""
+    """Fit proposals at the distinct modes reached from the starts, with the highest mode first."""
     found: list[tuple[float, Student]] = []
     for start in starts:
-        mode = find_mode(log_density, start)
+        mode = fit_mode(log_density, climb(log_density, start))
         found.append((float(log_density(mode.center[None])[0]), mode))
     found.sort(key=lambda pair: -pair[0])
 
@@ -173,10 +186,9 @@ def find_modes(log_density: LogDensity, starts: np.ndarray) -> list[Student]:
     return modes
 
 
-def find_mode(log_density: LogDensity, start: np.ndarray) -> Student:
-    """Find a mode by L-BFGS, and fit a Gaussian with the curvature from finite differences."""
-    d = len(start)
-    axes = np.eye(d)
+def climb(log_density: LogDensity, start: np.ndarray) -> np.ndarray:
+    """Search for a mode (score,) by L-BFGS with slopes from finite differences."""
+    axes = np.eye(len(start))
 
     def cost(z: np.ndarray) -> tuple[float, np.ndarray]:
         value = -log_density(np.vstack([z, z + _SLOPE_STEP * axes]))
@@ -184,11 +196,19 @@ def find_mode(log_density: LogDensity, start: np.ndarray) -> Student:
         return value[0], (value[1:] - value[0]) / _SLOPE_STEP
 
     options = {"maxiter": 40, "ftol": 1e-2 / max(1.0, abs(cost(start)[0]))}
-    bounds = [(-_FARTHEST, _FARTHEST)] * d
-    mode = optimize.minimize(
+    bounds = [(-_FARTHEST, _FARTHEST)] * len(start)
+    return optimize.minimize(
         cost, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options
     ).x
 
+
+def fit_mode(log_density: LogDensity, mode: np.ndarray) -> Student:
+    """Fit the curvature at a mode and, on each side, the width at which the density has dropped.
+
+    A split Student-t fits skewed posteriors (Geweke 1989, Econometrica 57).
+    """
+    d = len(mode)
+    axes = np.eye(d)
     i, j = np.tril_indices(d, -1)
     steps = np.vstack([np.zeros((1, d)), axes, -axes, axes[i] + axes[j]])
     f = np.nan_to_num(log_density(mode + _CURVATURE_STEP * steps), nan=-1e10, neginf=-1e10)
@@ -196,8 +216,12 @@ def find_mode(log_density: LogDensity, start: np.ndarray) -> Student:
     hessian = np.diag(up - 2.0 * f[0] + down)
     hessian[i, j] = hessian[j, i] = both - up[i] - up[j] + f[0]
     curvature, vectors = np.linalg.eigh(-hessian / _CURVATURE_STEP**2)
-    covariance = vectors / np.maximum(curvature, _LEAST_CURVATURE) @ vectors.T
-    return Student(mode, np.linalg.cholesky(covariance))
+    scale = np.linalg.cholesky(vectors / np.maximum(curvature, _LEAST_CURVATURE) @ vectors.T)
+
+    steps = _SKEW_STEP * np.stack([-scale.T, scale.T])
+    there = log_density((mode + steps).reshape(-1, d)).reshape(2, d)
+    drop = np.maximum(f[0] - np.nan_to_num(there, nan=-1e10, neginf=-1e10), 1e-3)
+    return Student(mode, scale, np.clip(_SKEW_STEP / np.sqrt(2.0 * drop), *_SKEWS))
 
 
 def smoothed(log_ratio: np.ndarray) -> tuple[np.ndarray, float, float]:

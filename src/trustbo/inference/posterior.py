@@ -10,7 +10,7 @@ from scipy.special import logsumexp
 from trustbo.inference import ep
 from trustbo.inference.engine import Blocks, Prior, draw_columns, evidence, expected, whiten
 from trustbo.inference.factor import Order, cholesky
-from trustbo.inference.importance import Student, find_mode, smoothed, systematic
+from trustbo.inference.importance import Student, climb, smoothed, systematic
 from trustbo.models.backend import namespace
 from trustbo.models.effects.effect import Theta
 from trustbo.models.model import TrustModel
@@ -138,7 +138,7 @@ class Posterior:
         best = starts[self.log_density(starts).argmax()]
         if not self.exact:
             self.settle(self.theta(best[None]))
-            best = find_mode(self.log_density, best).center
+            best = climb(self.log_density, best)
             self.settle(self.theta(best[None]))
         return best
 
