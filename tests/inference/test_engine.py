@@ -169,3 +169,14 @@ def test_jax_and_numpy_give_one_evidence(name):
         in_jax = {key: jax.numpy.asarray(values) for key, values in theta.items()}
         found = np.asarray(posterior.log_evidence(in_jax))
     np.testing.assert_allclose(found, posterior.log_evidence(theta), rtol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["places and robots", "shared noise", "coupled"])
+def test_slopes_in_jax_are_those_of_the_density_in_numpy(name):
+    posterior, _ = posterior_of(name, gaps=True)
+    z = 0.5 * np.random.default_rng(3).standard_normal(posterior.n_scores)
+    steps = 1e-4 * np.eye(len(z))
+    expected = (posterior.log_density(z + steps) - posterior.log_density(z - steps)) / 2e-4
+    with own_settings():
+        found = jax.grad(lambda one: posterior.log_density(one[None])[0])(jax.numpy.asarray(z))
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5)

@@ -20,7 +20,16 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from scipy import sparse
 
-from trustbo.inference.factor import Factor, Order, add, cholesky, log_diagonal, times
+from trustbo.inference.factor import (
+    Factor,
+    Order,
+    add,
+    cholesky,
+    log_det,
+    log_diagonal,
+    log_integral,
+    times,
+)
 from trustbo.models.backend import namespace
 from trustbo.models.signal import Signal, each
 
@@ -93,7 +102,7 @@ class Prior(NamedTuple):
     @classmethod
     def of(cls, groups: Sequence[tuple[Any, Sequence[Any]]]) -> Self:
         """Combine groups of columns, each with a mean (point, k) or None and with precisions."""
-        means, parts, log_det, known = [], [], 0.0, {}
+        means, parts, total, known = [], [], 0.0, {}
         for mean, precisions in groups:
             if not precisions:
                 continue
@@ -103,13 +112,11 @@ class Prior(NamedTuple):
                 if id(part) not in known:  # robots often share a part
                     xp = namespace(part)
                     one_axis = part.ndim == 2
-                    known[id(part)] = (
-                        xp.log(part).sum(1) if one_axis else 2.0 * log_diagonal(cholesky(part))
-                    )
-                log_det = log_det + known[id(part)]
+                    known[id(part)] = xp.log(part).sum(1) if one_axis else log_det(part)
+                total = total + known[id(part)]
             parts.extend(precisions)
         xp = namespace(parts[0])
-        return cls(xp.concatenate(means, axis=1), parts, log_det)
+        return cls(xp.concatenate(means, axis=1), parts, total)
 
     def add_to(self, A: Any, order: Order) -> Any:
         """Add the prior precision to the entries (point, entry) of A."""
@@ -149,8 +156,8 @@ class Fit(NamedTuple):
     """Evidence and factors at each theta; coefficients are mean + F'^-1 (half + white noise)."""
 
     log_p: Any  # (point,)
-    F: Factor  # of the posterior precision of the coefficients
-    half: Any  # (point, column), a whitened vector
+    F: Any  # Factor of the posterior precision of the coefficients, None in JAX
+    half: Any  # (point, column), a whitened vector, None in JAX
     W: Any  # (point, kind, row, row)
 
 
@@ -174,11 +181,14 @@ def evidence(blocks: Blocks, signal: Signal, prior: Prior, lam: Any, y: Any = No
     pairs = (xp.swapaxes(C, 2, 3) @ C)[:, :, *np.triu_indices(C.shape[3])]
     products = times(b.sums, pairs.reshape(n, -1))
     A = add(xp.zeros((n, b.order.size)), (slice(None), b.at), products)
-    F = Factor.of(b.order, prior.add_to(A, b.order))
-    half = F.forward(h)
+    A = prior.add_to(A, b.order)
     many = np.bincount(b.kind, minlength=len(b.seen)).astype(float)
-    log_p = log_sites @ many + 0.5 * (prior.log_det - (w**2).sum((1, 2)) + (half**2).sum(1))
-    return Fit(log_p - F.log_det, F, half, W)
+    log_p = log_sites @ many + 0.5 * (prior.log_det - (w**2).sum((1, 2)))
+    if xp is not np:
+        return Fit(log_p + log_integral(b.order)(A, h), None, None, W)
+    F = Factor.of(b.order, A)
+    half = F.forward(h)
+    return Fit(log_p + 0.5 * (half**2).sum(1) - F.log_det, F, half, W)
 
 
 def whiten(blocks: Blocks, signal: Signal, lam: Any) -> tuple[Any, Any]:

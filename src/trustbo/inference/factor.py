@@ -11,9 +11,11 @@ where D and G are block diagonal, with one block per mission. Only H is a large 
 factors upper triangles fastest and in place, because its memory order is transposed.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple, Self
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from scipy import sparse
 from scipy.linalg import lapack
@@ -139,27 +141,20 @@ class Factor(NamedTuple):
         leaf = (self.inverse @ h[:, order.leaf][..., None])[..., 0]
         back = xp.einsum("ngkt,ngk->ngt", self.X, leaf).reshape(len(h), -1)
         rest = h[:, order.core] - times(order.spread, back)
-        if isinstance(rest, np.ndarray):
-            pairs = zip(self.H, rest, strict=True)
-            core = np.stack([lapack.dtrtrs(H.T, x, lower=1)[0] for H, x in pairs])  # pyright: ignore[reportAttributeAccessIssue]
-        else:
-            core = jax.lax.linalg.triangular_solve(
-                self.H, rest[..., None], left_side=True, lower=False, transpose_a=True
-            )[..., 0]
+        core = solve_upper(self.H, rest[:, None], transposed=True)[:, 0]
         return xp.concatenate([leaf.reshape(len(h), -1), core], axis=1)
 
-    def back(self, white: np.ndarray) -> np.ndarray:
+    def back(self, white: Any) -> Any:
         """Compute vectors F'^-1 w (point, draw, column) from whitened w (point, draw, ...)."""
-        order, split = self.order, self.order.leaf.size
-        pairs = zip(self.H, white[..., split:], strict=True)
-        core = np.stack([lapack.dtrtrs(H.T, w.T, lower=1, trans=1)[0].T for H, w in pairs])  # pyright: ignore[reportAttributeAccessIssue]
+        xp, order, split = namespace(white), self.order, self.order.leaf.size
+        core = solve_upper(self.H, white[..., split:], transposed=False)
         leaf = white[..., :split].reshape(*white.shape[:2], *order.leaf.shape)
-        padded = np.concatenate([core, np.zeros((*core.shape[:2], 1))], axis=2)
-        leaf = leaf - np.einsum("ngkt,ndgt->ndgk", self.X, padded[..., order.touched])
-        leaf = np.einsum("ngjk,ndgj->ndgk", self.inverse, leaf)
-        found = np.empty((*white.shape[:2], len(order.place) + 1))
-        found[..., order.leaf], found[..., order.core] = leaf, core
-        return found[..., :-1]
+        padded = xp.concatenate([core, xp.zeros((*core.shape[:2], 1))], axis=2)
+        leaf = leaf - xp.einsum("ngkt,ndgt->ndgk", self.X, padded[..., order.touched])
+        leaf = xp.einsum("ngjk,ndgj->ndgk", self.inverse, leaf)
+        found = xp.concatenate([leaf.reshape(*leaf.shape[:2], split), core], axis=2)
+        group = np.where(order.group < 0, len(order.leaf), order.group)
+        return found[..., group * order.leaf.shape[1] + order.place]
 
     def whitened(self, c: np.ndarray) -> np.ndarray:
         """Compute whitened vectors F' c from vectors c (point, column)."""
@@ -172,20 +167,51 @@ class Factor(NamedTuple):
         core = np.einsum("nij,nj->ni", np.triu(self.H), core)
         return np.concatenate([leaf.reshape(len(c), -1), core], axis=1)
 
-    def covariance(self) -> np.ndarray:
+    def covariance(self) -> Any:
         """Compute A^-1 in the layout of A, with halved diagonals for sums over pairs."""
-        entries = np.empty((len(self.H), self.order.size))
-        D, B, C = self.order.views(entries)
-        for H, found in zip(self.H, C, strict=True):
-            upper = np.triu(lapack.dpotri(H.T, lower=1)[0].T)  # pyright: ignore[reportAttributeAccessIssue]
-            found[:] = upper + np.triu(upper, 1).T
-        turned, q = np.swapaxes(self.inverse, 2, 3), np.arange(C.shape[1])
-        i, k = np.minimum(self.order.touched, q[-1]), np.arange(D.shape[2])
-        B[:] = -turned @ self.X @ C[:, i[..., None], i[:, None]]  # X is 0 in the padding
-        D[:] = turned @ self.inverse - B @ np.swapaxes(turned @ self.X, 2, 3)
-        C[:, q, q] *= 0.5
-        D[:, :, k, k] *= 0.5
-        return entries
+        C = inverse_of_upper(self.H)
+        turned, q = self.inverse.swapaxes(2, 3), C.shape[1]
+        i = np.minimum(self.order.touched, q - 1)
+        B = -turned @ self.X @ C[:, i[..., None], i[:, None]]  # X is 0 in the padding
+        D = turned @ self.inverse - B @ (turned @ self.X).swapaxes(2, 3)
+        return self._entries(D, B, C)
+
+    def _entries(self, D: Any, B: Any, C: Any) -> Any:
+        """Arrange symmetric matrices like A, and halve their diagonals."""
+        xp, n = namespace(C), len(C)
+        D, C = (M * (1.0 - 0.5 * np.eye(M.shape[-1])) for M in (D, C))
+        return xp.concatenate([M.reshape(n, -1) for M in (D, B, C)], axis=1)
+
+    def outer(self, c: Any) -> Any:
+        """Compute cc' of vectors c (point, column) in the layout of A, as in `covariance`."""
+        xp, order = namespace(c), self.order
+        c = xp.concatenate([c, xp.zeros((len(c), 1))], axis=1)
+        leaf, core = c[:, order.leaf], c[:, order.core]
+        touched = xp.concatenate([core, xp.zeros((len(c), 1))], axis=1)[:, order.touched]
+        D, B = leaf[..., None] * leaf[:, :, None], leaf[..., None] * touched[:, :, None]
+        return self._entries(D, B, core[..., None] * core[:, None])
+
+
+def log_integral(order: Order) -> Callable[[jax.Array, jax.Array], jax.Array]:
+    """Return the JAX function (h'A^-1 h - log |A|) / 2 of A (point, entry) and h (point, column).
+
+    Its derivatives with respect to h and A are c = A^-1 h and -(A^-1 + cc') / 2, which are faster
+    to compute than derivatives of the factor.
+    """
+
+    def value(A: jax.Array, h: jax.Array) -> tuple[jax.Array, Any]:
+        F = Factor.of(order, A)
+        half = F.forward(h)
+        c = F.back(half[:, None])[:, 0]
+        return 0.5 * (half**2).sum(1) - F.log_det, (F.covariance() + F.outer(c), c)
+
+    def slopes(saved: Any, slope: jax.Array) -> tuple[jax.Array, jax.Array]:
+        pairs, c = saved
+        return -slope[:, None] * pairs, slope[:, None] * c
+
+    function = jax.custom_vjp(lambda A, h: value(A, h)[0])
+    function.defvjp(value, slopes)
+    return function
 
 
 def _summing(row: np.ndarray, kept: np.ndarray, n: int) -> Any:
@@ -198,6 +224,8 @@ def times(M: Any, x: Any) -> Any:
     """Multiply a sparse matrix by vectors x (point, column); returns vectors (point, row)."""
     if isinstance(x, np.ndarray):
         return np.ascontiguousarray((M @ x.T).T)
+    if 20 * M.nnz > M.shape[0] * M.shape[1]:
+        return x @ M.T.toarray()
     M = M.tocoo()
     order = np.argsort(M.row, kind="stable")
     terms = M.data[order, None] * x.T[M.col[order]]
@@ -227,6 +255,34 @@ def upper_factor(A: Any) -> Any:
         if lapack.dpotrf(one.T, lower=1, clean=0, overwrite_a=1)[1]:  # pyright: ignore[reportAttributeAccessIssue]
             one[:] = np.nan
     return A
+
+
+def solve_upper(H: Any, x: Any, *, transposed: bool) -> Any:
+    """Solve H y = x or H' y = x for upper triangles H (point, n, n) and vectors (point, draw, n)."""
+    if not isinstance(H, np.ndarray):
+        return jax.lax.linalg.triangular_solve(
+            H, x.mT, left_side=True, lower=False, transpose_a=transposed
+        ).mT
+    trans = 0 if transposed else 1
+    pairs = zip(H, x, strict=True)
+    return np.stack([lapack.dtrtrs(h.T, y.T, lower=1, trans=trans)[0].T for h, y in pairs])  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def inverse_of_upper(H: Any) -> Any:
+    """Compute (H' H)^-1 for upper triangles H (point, n, n)."""
+    if not isinstance(H, np.ndarray):
+        one = jnp.broadcast_to(jnp.eye(H.shape[1]), H.shape)
+        half = solve_upper(H, one, transposed=True)
+        return half @ half.mT
+    found = np.stack([np.triu(lapack.dpotri(one.T, lower=1)[0].T) for one in H])  # pyright: ignore[reportAttributeAccessIssue]
+    return found + np.triu(found, 1).swapaxes(1, 2)
+
+
+def log_det(A: Any) -> Any:
+    """Compute the log determinants of positive definite matrices."""
+    if not isinstance(A, np.ndarray):
+        return jnp.linalg.slogdet(A)[1]  # has simpler derivatives than a Cholesky factor
+    return 2.0 * log_diagonal(cholesky(A))
 
 
 def cholesky(A: Any) -> Any:

@@ -91,12 +91,14 @@ class Posterior:
             other.sites = ep.Sites(*(np.where(kept, site, 0.0) for site in self.sites))
         return other
 
-    def theta(self, z: np.ndarray) -> dict[str, np.ndarray]:
+    def theta(self, z: Any) -> dict[str, Any]:
         """Convert scores (point, score) to hyperparameters for the model's `signal`."""
         return self.model.theta(self.scores.values(z), self.slots.resolution)
 
-    def log_density(self, z: np.ndarray) -> np.ndarray:
+    def log_density(self, z: Any) -> Any:
         """Compute the unnormalised log posterior density (point,) of scores (point, score)."""
+        if namespace(z) is not np:
+            return self.log_evidence(self.theta(z)) + self.scores.log_prior(z)
         out = np.full(len(z), -np.inf)
         with np.errstate(all="ignore"):  # extreme scores overflow and get no density
             theta, log_prior = self.theta(z), self.scores.log_prior(z)

@@ -14,12 +14,14 @@ import numpy as np
 import numpyro.distributions as dist
 from numpyro.distributions import Distribution
 from scipy import special, stats
+from scipy.interpolate import CubicSpline
 
 from trustbo.errors import TrustboError
-from trustbo.models.backend import call, namespace, own_settings
+from trustbo.models.backend import call, namespace, own_settings, special_functions
 
 NOISES = "delta_w", "delta_v"
 _LOG_ROOT_2PI = 0.5 * np.log(2.0 * np.pi)
+_FARTHEST, _N_KNOTS = 9.0, 2001  # knots of the quantiles in JAX
 
 
 class Scores:
@@ -46,26 +48,29 @@ class Scores:
         """Slice of the scores that contain the log size of the noises."""
         return self.at[NOISES[0]]
 
-    def values(self, z: np.ndarray) -> dict[str, np.ndarray]:
+    def values(self, z: Any) -> dict[str, Any]:
         """Convert scores (point, score) to hyperparameters (point,) or (point, k) by name."""
-        size, angle = np.exp(z[:, self.at["delta_w"]]), z[:, self.at["delta_v"]]
+        xp = namespace(z)
+        size, angle = xp.exp(z[:, self.at["delta_w"]]), z[:, self.at["delta_v"]]
         found = {}
         for name, prior in self.priors.items():
             if name in NOISES:
                 side = 1.0 if name == "delta_w" else -1.0
-                share = np.sin(0.5 * np.pi * special.ndtr(side * angle))
+                share = xp.sin(0.5 * np.pi * special_functions(z).ndtr(side * angle))
                 values = of_size(prior, size * share, name)
-            else:
+            elif xp is np:
                 values = quantile(prior, z[:, self.at[name]], name)
+            else:
+                values = _interpolated(prior, z[:, self.at[name]], name)
             found[name] = values if prior.batch_shape else values[:, 0]
         return found
 
-    def log_prior(self, z: np.ndarray) -> np.ndarray:
+    def log_prior(self, z: Any) -> Any:
         """Compute the log prior density (point,) of scores (point, score)."""
-        size = z[:, self.sizes]
-        others = np.delete(z, np.arange(self.n_scores)[self.sizes], axis=1)
-        normal = -0.5 * (others**2).sum(1) - others.shape[1] * _LOG_ROOT_2PI
-        return normal + (2.0 * size - 0.5 * np.exp(2.0 * size)).sum(1)
+        xp, size = namespace(z), z[:, self.sizes]
+        n_others = z.shape[1] - size.shape[1]
+        normal = -0.5 * ((z**2).sum(1) - (size**2).sum(1)) - n_others * _LOG_ROOT_2PI
+        return normal + (2.0 * size - 0.5 * xp.exp(2.0 * size)).sum(1)
 
     def draw(
         self, n: int, rng: np.random.Generator, *, even: bool = False
@@ -101,6 +106,17 @@ def quantile(prior: Distribution, score: np.ndarray, name: str = "") -> np.ndarr
         high = special.erfcinv(special.ndtr(-np.maximum(score, 0.0)))
         return np.asarray(prior.scale) * np.sqrt(2.0) * np.where(score < 0.0, low, high)
     return _by_numpyro(prior, special.ndtr(score), name)
+
+
+def _interpolated(prior: Distribution, score: jax.Array, name: str) -> jax.Array:
+    """Interpolate `quantile` in JAX, which lacks the quantiles of some distributions."""
+    knots = np.linspace(-_FARTHEST, _FARTHEST, _N_KNOTS)
+    at = np.broadcast_to(knots[:, None], (_N_KNOTS, *score.shape[1:]))
+    terms = jnp.asarray(CubicSpline(knots, quantile(prior, at, name)).c)  # (power, interval, k)
+    interval = jnp.clip(jnp.searchsorted(knots, score) - 1, 0, _N_KNOTS - 2)
+    x = score - jnp.asarray(knots)[interval]
+    a, b, c, d = terms[:, interval, np.arange(score.shape[1])]
+    return ((a * x + b) * x + c) * x + d
 
 
 def of_size(prior: Distribution, size: Any, name: str = "") -> Any:

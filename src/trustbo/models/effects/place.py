@@ -85,10 +85,9 @@ class PlaceEffect(Effect):
     def _cells(self, theta: Theta, cells: np.ndarray) -> Any:
         """Compute the precision (point, cell, cell) of s at cells (cell, 2)."""
         xp: Any = namespace(theta["tau_s"])
-        gap = cells[:, None].astype(float) - cells[None]
-        square, pair = np.unique((gap**2).sum(-1), return_inverse=True)
+        distance = np.linalg.norm(cells[:, None].astype(float) - cells, axis=-1)
         scale = xp.clip(theta["length_scale"], *_LENGTH_SCALES)
-        K = matern(np.sqrt(square), scale[:, None])[:, pair.reshape(gap.shape[:2])]
+        K = matern(distance, scale[:, None, None])
         tau = xp.maximum(theta["tau_s"], LEAST)[:, None, None]
         return inverse(tau**2 * (K + _JITTER * np.eye(len(cells))))
 
