@@ -247,16 +247,13 @@ def sample_prior(
     require_kind("model", model, TrustModel, "give a model such as PooledTrust()")
     n_draws, seed = require_whole("n_draws", n_draws, 1), require_whole("seed", seed, 0)
     prior, rng = _prior(model, n_features, n_robots), np.random.default_rng(seed)
-    sites = prior.named(prior.draw_prior(n_draws, rng))["posterior"]
-    return assemble_params(sites, model.x0, model.memory)
+    return assemble_params(prior.prior_sites(n_draws, rng), model.x0, model.memory)
 
 
 def prior_mean(model: TrustModel, n_features: int, *, n_robots: int = 1) -> Params:
     """Compute the prior mean of the parameters without effects; see `sample_prior`."""
     prior, rng = _prior(model, n_features, n_robots), np.random.default_rng(0)
-    draws = prior.draw_prior(_N_MEAN, rng, even=True)
-    draws = draws._replace(c=prior.prior(draws.theta).mean)
-    sites = prior.named(draws)["posterior"]
+    sites = prior.prior_sites(_N_MEAN, rng, even=True)
     sites = {name: values.mean(0, keepdims=True) for name, values in sites.items()}
     return assemble_params(sites, model.x0, model.memory)
 

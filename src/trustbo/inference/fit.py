@@ -169,7 +169,7 @@ def _laid_out(
         for group, values in groups.items()
     }
     places, model = groups.pop("places", None), posterior.model
-    before = posterior.named(posterior.draw_prior(_N_PRIOR, rng))["posterior"]
+    before = posterior.prior_sites(_N_PRIOR, rng)
     groups["sample_stats"] = {name: v.reshape(*shape, *v.shape[1:]) for name, v in stats.items()}
     groups["prior"] = {name: values[None] for name, values in before.items()}
     tree = to_datatree(groups, missions, model.dims, model.effects)

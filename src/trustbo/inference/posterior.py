@@ -194,12 +194,15 @@ class Posterior:
     def named(self, draws: Draws) -> dict[str, dict[str, np.ndarray]]:
         """Return the variables of draws by group (`posterior` and one per effect) and name."""
         model, theta = self.model, draws.theta
-        names = model.dims.keys() | model.effect_dims.keys()
-        groups = {"posterior": {n: values for n, values in theta.items() if n in names}}
+        groups = {"posterior": self._hyperparameters(theta)}
         for effect, a, b in zip(model.columns, self._ends[:-1], self._ends[1:], strict=True):
             named = effect.named(draws.c[:, a:b], theta, self.slots)
             groups.setdefault(effect.noun or "posterior", {}).update(named)
         return groups
+
+    def _hyperparameters(self, theta: Theta) -> dict[str, np.ndarray]:
+        names = self.model.dims.keys() | self.model.effect_dims.keys()
+        return {name: values for name, values in theta.items() if name in names}
 
     def draws_of(self, groups: Mapping[str, Mapping[str, np.ndarray]]) -> Draws:
         """Make draws from variables by group and name, as returned by `named`."""
@@ -212,11 +215,24 @@ class Posterior:
         ]
         return Draws(theta, np.column_stack(c))
 
-    def draw_prior(self, n: int, rng: np.random.Generator, *, even: bool = False) -> Draws:
-        """Draw hyperparameters and coefficients from the prior; see `Scores.draw`."""
-        theta = self.model.theta(self.scores.draw(n, rng, even=even), self.slots.resolution)
+    def draw_prior(self, n: int, rng: np.random.Generator) -> Draws:
+        """Draw hyperparameters and coefficients from the prior."""
+        theta = self.model.theta(self.scores.draw(n, rng), self.slots.resolution)
         c = [self.prior(chunk).draw(rng) for _, chunk in chunks(theta)]
         return Draws(theta, np.concatenate(c))
+
+    def prior_sites(
+        self, n: int, rng: np.random.Generator, *, even: bool = False
+    ) -> dict[str, np.ndarray]:
+        """Draw parameters (draw, ...) by name from the prior, without effects.
+
+        With `even`, hyperparameters are drawn as in `Scores.draw`, and coefficients are means.
+        """
+        model, slots = self.model, self.slots
+        theta = model.theta(self.scores.draw(n, rng, even=even), slots.resolution)
+        weights = Prior.of([model.weights.prior(theta, slots)])
+        c = weights.mean if even else weights.draw(rng)
+        return self._hyperparameters(theta) | model.weights.named(c, theta, slots)
 
     def given(self, draws: Draws, kept: np.ndarray, rng: np.random.Generator) -> Given:
         """Compute trust, likelihoods and predictions for given draws.
