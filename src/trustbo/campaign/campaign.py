@@ -143,7 +143,8 @@ class Campaign(Result):
             self._keep_in(directory, overwrite)
 
     def _renew(self) -> None:
-        """Clear what was computed from the missions and failures, which have changed."""
+        """Discard the plan and what was computed before the missions or failures changed."""
+        self.state.asked = None
         for name in self._computed():
             delattr(self, name)
 
@@ -240,18 +241,23 @@ class Campaign(Result):
                 "col)."
             )
         learned, row = as_learned(mission, self.workspace), state.row_of(plan, mission) | extra
-        seed = state.seed_of("fit")
-        entry = Entry(plan, mission, learned, self.trust_map, row, state.last)
+        entry = Entry(plan, mission, learned, self.trust_map, row)
+        if self.storage is not None:
+            self.storage.add_mission(len(state.entries) + 1, entry)
+        self._add(entry)
+
+    def _add(self, entry: Entry) -> None:
+        """Learn from a mission that is on disk."""
+        state, seed = self.state, self.state.seed_of("fit")
+        entry.posterior = state.last
         state.entries.append(entry)
         self._renew()
-        if self.storage is not None:
-            self.storage.add_mission(len(state.entries), entry, extra)
-        if reason := why_never_learned(learned):
+        if reason := why_never_learned(entry.mission):
             entry.become(EXCLUDED, reason)
             warnings.warn(f"mission {len(state.entries)} is excluded: {reason}", stacklevel=4)
         else:
             self._learn(seed)
-        self._continue()
+        self._write()
 
     def _learn(self, seed: int) -> None:
         """Fit the posterior after the last mission."""
@@ -271,11 +277,6 @@ class Campaign(Result):
         entry.posterior = Posterior(name, tree)
         if self.storage is not None:
             self.storage.add_posterior(entry.posterior)
-
-    def _continue(self) -> None:
-        """Discard the plan that was run or abandoned, and write the state."""
-        self.state.asked = None
-        self._write()
 
     def _write(self) -> None:
         if self.storage is not None:
@@ -301,7 +302,7 @@ class Campaign(Result):
         entry.become(EXCLUDED, str(reason))
         self._renew()
         self._learn(self.state.seed_of("fit"))
-        self._continue()
+        self._write()
         return self.state.posterior
 
     def fail(self, reason: str, *, where: Cell | None = None) -> None:
@@ -329,7 +330,7 @@ class Campaign(Result):
             )
         self.state.failures.append(Failure(len(self.state.entries), reason, tuple(path), where))
         self._renew()
-        self._continue()
+        self._write()
 
     def run(
         self,
@@ -450,9 +451,8 @@ class Campaign(Result):
                 hazard=Hazard(**given["hazard"]), **{name: given[name] for name in _OPTIONS},
             )  # fmt: skip
             campaign.state, campaign.storage = state, storage
-            campaign._renew()
-            for mission, extra in pending:
-                campaign._take(mission, extra)
+            for entry in pending:
+                campaign._add(entry)
         except BaseException:
             storage.release()
             raise

@@ -107,7 +107,7 @@ def learn(
     warnings.warn(
         f"mission {len(state.entries)} is recorded but cannot be used for learning yet: "
         f"{reason.rstrip('.')}. The campaign tries again with the next mission.",
-        stacklevel=5,
+        stacklevel=6,
     )
     return None
 

@@ -19,7 +19,6 @@ from filelock import FileLock, Timeout
 
 from trustbo.campaign.learning import as_learned
 from trustbo.campaign.state import Entry, Failure, Posterior, State
-from trustbo.data import Mission
 from trustbo.errors import TrustboError
 from trustbo.files import FilePath, interpreting, read_record, to_json, write_text
 from trustbo.logs.netcdf import missions_from_tree, missions_to_tree, read_tree, write_tree
@@ -87,15 +86,15 @@ class Storage:
                 file.unlink()
         write_tree(self.path / WORKSPACE, archive.workspace_to_tree(workspace))
         for n, entry in enumerate(state.entries, start=1):
-            self.add_mission(n, entry, {})
+            self.add_mission(n, entry)
         for posterior, tree in zip(stored.values(), trees, strict=True):
             write_tree(self._posterior(posterior.name), tree)
         self.write_record(state)
 
-    def add_mission(self, n: int, entry: Entry, extra: dict[str, float]) -> None:
-        """Write mission n, from 1, as measured, with its plan and the extra numbers of its row."""
+    def add_mission(self, n: int, entry: Entry) -> None:
+        """Write mission n, from 1, as measured, with its plan and its row."""
         planned = xr.Dataset({"trust_map": entry.trust_map})
-        planned.attrs = {"plan": to_json(plan_to_record(entry.plan)), "extra": to_json(extra)}
+        planned.attrs = {"plan": to_json(plan_to_record(entry.plan)), "row": to_json(entry.row)}
         tree = missions_to_tree([entry.measured])
         tree["planned"] = xr.DataTree(planned)
         write_tree(self.path / MISSIONS / f"{n:04d}.nc", tree)
@@ -124,14 +123,11 @@ class Storage:
         return self.path / POSTERIORS / f"{name}.nc"
 
 
-def read_campaign(
-    directory: FilePath,
-) -> tuple[State, Workspace, list[tuple[Mission, dict[str, float]]]]:
+def read_campaign(directory: FilePath) -> tuple[State, Workspace, list[Entry]]:
     """Read a campaign from its folder.
 
     Returns:
-        State; workspace; and the missions not yet counted in the record, each with the extra
-        numbers of its row.
+        State; workspace; and the missions not yet counted in the record.
 
     Raises:
         TrustboError: The folder contains no campaign, or a file is missing or damaged.
@@ -151,7 +147,7 @@ def read_campaign(
         state = State(record["settings"], [], failures, asked, record["simulation"], reason)
         rows, names = list(record["rows"]), list(record["posteriors"])
         posteriors = {n: Posterior(n, file=folder / POSTERIORS / f"{n}.nc") for n in names if n}
-    pending = []
+    entries = []
     for n in itertools.count(1):
         file = folder / MISSIONS / f"{n:04d}.nc"
         if n > len(rows) and not file.exists():
@@ -159,16 +155,13 @@ def read_campaign(
         tree = read_tree(file)
         with interpreting(file):
             [measured], planned = missions_from_tree(tree), tree["planned"].to_dataset()
-            if n > len(rows):
-                pending.append((measured, json.loads(planned.attrs["extra"])))
-                continue
             plan = plan_from_record(json.loads(planned.attrs["plan"]), workspace)
-            learned, row = as_learned(measured, workspace), rows[n - 1]
-            posterior = posteriors.get(names[n - 1])
-            state.entries.append(
-                Entry(plan, measured, learned, planned["trust_map"], row, posterior)
-            )
-    return state, workspace, pending
+            learned, row = as_learned(measured, workspace), json.loads(planned.attrs["row"])
+            entries.append(Entry(plan, measured, learned, planned["trust_map"], row))
+    for entry, row, name in zip(entries, rows, names, strict=False):
+        entry.row, entry.posterior = row, posteriors.get(name)
+    state.entries = entries[: len(rows)]
+    return state, workspace, entries[len(rows) :]
 
 
 def _require_campaign(folder: Path) -> None:
