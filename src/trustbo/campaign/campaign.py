@@ -14,7 +14,7 @@ from trustbo.campaign.learning import as_learned, base_planner, learn, why_never
 from trustbo.campaign.result import Result, in_a_line
 from trustbo.campaign.state import EXCLUDED, LEARNED, TOLD, Entry, Failure, Posterior, State
 from trustbo.campaign.stopping import Stop
-from trustbo.campaign.storage import Storage, read_campaign
+from trustbo.campaign.storage import Storage, read_campaign, require_campaign
 from trustbo.data import Cell, Mission
 from trustbo.display import compiling, progress_bar
 from trustbo.errors import TrustboError, require_choice, require_kind, require_pair, require_whole
@@ -140,7 +140,7 @@ class Campaign(Result):
         self.progress = True
         self.storage: Storage | None = None
         if directory is not None:
-            self._keep_in(directory, overwrite)
+            self.storage = Storage.begin(directory, workspace, self.state, overwrite=overwrite)
 
     def _renew(self) -> None:
         """Discard the plan and what was computed before the missions or failures changed."""
@@ -274,9 +274,8 @@ class Campaign(Result):
             state.last.release()
         n_excluded = len(state.entries) - n_learned
         name = f"{len(state.entries):04d}" + (f"-{n_excluded}" if n_excluded else "")
-        entry.posterior = Posterior(name, tree)
-        if self.storage is not None:
-            self.storage.add_posterior(entry.posterior)
+        file = None if self.storage is None else self.storage.add_posterior(name, tree)
+        entry.posterior = Posterior(name, tree, file)
 
     def _write(self) -> None:
         if self.storage is not None:
@@ -413,12 +412,6 @@ class Campaign(Result):
         vars(result).update(self._computed())
         return result
 
-    def _keep_in(self, directory: FilePath, overwrite: bool) -> None:
-        """Write the campaign to a folder, and update the folder after each later mission."""
-        storage = Storage(directory, overwrite=overwrite)
-        storage.begin(self.workspace, self.state)
-        self.storage = storage
-
     @classmethod
     def load(
         cls, directory: FilePath, *, model: TrustModel | None = None, policy: Policy | None = None
@@ -436,9 +429,10 @@ class Campaign(Result):
             TrustboError: There is no campaign, another process has locked it, a custom object is
                 missing, or a file of the folder is missing or damaged.
         """
-        storage = Storage(directory, begun=True)
+        require_campaign(directory)
+        storage = Storage(directory)
         try:
-            state, workspace, pending = read_campaign(storage.path)
+            state, workspace, pending = read_campaign(directory)
             given = state.settings
             if given["policy"] not in POLICIES and policy is None:
                 raise TrustboError(

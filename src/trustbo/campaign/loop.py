@@ -6,6 +6,7 @@ from typing import Any
 from trustbo.campaign.campaign import Campaign
 from trustbo.campaign.result import Result
 from trustbo.campaign.stopping import Stop
+from trustbo.campaign.storage import Storage
 from trustbo.errors import TrustboError, require_whole
 from trustbo.files import FilePath
 from trustbo.models.model import TrustModel
@@ -69,7 +70,9 @@ def iterate(
     steps = campaign.run(simulator, n_iterations, truth=truth, stop=stop, progress=progress)
     with campaign:
         if directory is not None:  # now that all input is checked
-            campaign._keep_in(directory, overwrite)
+            campaign.storage = Storage.begin(
+                directory, workspace, campaign.state, overwrite=overwrite
+            )
         for _ in steps:
             pass
         return campaign.result()

@@ -310,11 +310,7 @@ class Result(Summary):
             TrustboError: The folder already contains a campaign and `overwrite` is False, another
                 process has locked it, or the path is a file.
         """
-        storage = Storage(directory, overwrite=overwrite)
-        try:
-            storage.begin(self.workspace, self.state)
-        finally:
-            storage.release()
+        Storage.begin(directory, self.workspace, self.state, overwrite=overwrite).release()
 
 
 def load_result(directory: FilePath) -> Result:

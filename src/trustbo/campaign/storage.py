@@ -12,6 +12,7 @@ write loses nothing: missions beyond the record's count are processed when the f
 import itertools
 import json
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 import xarray as xr
@@ -37,32 +38,13 @@ class Storage:
         path: Path of the folder.
     """
 
-    def __init__(
-        self, directory: FilePath, *, begun: bool = False, overwrite: bool = False
-    ) -> None:
-        """Lock the folder.
-
-        Args:
-            directory: Path of the folder, which is created if necessary.
-            begun: Whether the folder already contains the campaign.
-            overwrite: Whether the folder may contain another campaign, which `begin` removes.
+    def __init__(self, directory: FilePath) -> None:
+        """Lock a folder, which is created if necessary.
 
         Raises:
-            TrustboError: The folder contains no campaign although `begun`, or contains one and
-                `overwrite` is False; another process has locked it; or the path is a file.
+            TrustboError: Another process has locked the folder, or the path is a file.
         """
         self.path = Path(directory)
-        if begun:
-            _require_campaign(self.path)
-        elif not overwrite and any((self.path / n).exists() for n in (RECORD, MISSIONS)):
-            raise TrustboError(
-                f"{str(directory)!r} contains a campaign: continue it with Campaign.load or "
-                "resume, give another folder, or replace it with overwrite=True."
-            )
-        try:
-            self.path.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise TrustboError(f"cannot make {str(directory)!r}: {error.strerror}.") from None
         self._lock = FileLock(self.path / ".lock", timeout=0)
         try:
             self._lock.acquire()
@@ -71,13 +53,38 @@ class Storage:
                 f"another campaign is using {str(directory)!r}; close it first, or give another "
                 "folder."
             ) from None
+        except OSError as error:
+            raise TrustboError(f"cannot make {str(directory)!r}: {error.strerror}.") from None
 
     def release(self) -> None:
         """Release the lock of the folder."""
         self._lock.release()
 
-    def begin(self, workspace: Workspace, state: State) -> None:
-        """Write a whole campaign; files of another campaign are removed, its record first."""
+    @classmethod
+    def begin(
+        cls, directory: FilePath, workspace: Workspace, state: State, *, overwrite: bool
+    ) -> Self:
+        """Lock a folder and write a whole campaign; another campaign is removed, its record first.
+
+        Raises:
+            TrustboError: The folder contains a campaign and `overwrite` is False, another process
+                has locked it, or the path is a file.
+        """
+        path = Path(directory)
+        if not overwrite and any((path / name).exists() for name in (RECORD, MISSIONS)):
+            raise TrustboError(
+                f"{str(directory)!r} contains a campaign: continue it with Campaign.load or "
+                "resume, give another folder, or replace it with overwrite=True."
+            )
+        storage = cls(path)
+        try:
+            storage._write_campaign(workspace, state)
+        except BaseException:
+            storage.release()
+            raise
+        return storage
+
+    def _write_campaign(self, workspace: Workspace, state: State) -> None:
         stored = {e.posterior.name: e.posterior for e in state.entries if e.posterior is not None}
         trees = [posterior() for posterior in stored.values()]  # may be in files that go
         (self.path / RECORD).unlink(missing_ok=True)
@@ -87,8 +94,8 @@ class Storage:
         write_tree(self.path / WORKSPACE, archive.workspace_to_tree(workspace))
         for n, entry in enumerate(state.entries, start=1):
             self.add_mission(n, entry)
-        for posterior, tree in zip(stored.values(), trees, strict=True):
-            write_tree(self._posterior(posterior.name), tree)
+        for name, tree in zip(stored, trees, strict=True):
+            self.add_posterior(name, tree)
         self.write_record(state)
 
     def add_mission(self, n: int, entry: Entry) -> None:
@@ -99,11 +106,11 @@ class Storage:
         tree["planned"] = xr.DataTree(planned)
         write_tree(self.path / MISSIONS / f"{n:04d}.nc", tree)
 
-    def add_posterior(self, posterior: Posterior) -> None:
-        """Write a posterior of parameters."""
-        file = self._posterior(posterior.name)
-        write_tree(file, posterior())
-        posterior.file = file
+    def add_posterior(self, name: str, tree: xr.DataTree) -> Path:
+        """Write a posterior of parameters and return its file."""
+        file = self.path / POSTERIORS / f"{name}.nc"
+        write_tree(file, tree)
+        return file
 
     def write_record(self, state: State) -> None:
         """Write everything except arrays; called last, as the record counts complete missions."""
@@ -119,9 +126,6 @@ class Storage:
         }
         write_text(self.path / RECORD, to_json(record))
 
-    def _posterior(self, name: str) -> Path:
-        return self.path / POSTERIORS / f"{name}.nc"
-
 
 def read_campaign(directory: FilePath) -> tuple[State, Workspace, list[Entry]]:
     """Read a campaign from its folder.
@@ -133,7 +137,7 @@ def read_campaign(directory: FilePath) -> tuple[State, Workspace, list[Entry]]:
         TrustboError: The folder contains no campaign, or a file is missing or damaged.
     """
     folder = Path(directory)
-    _require_campaign(folder)
+    require_campaign(folder)
     record, tree = read_record(folder / RECORD), read_tree(folder / WORKSPACE)
     with interpreting(folder / WORKSPACE):
         workspace = archive.workspace_from_tree(tree)
@@ -146,7 +150,7 @@ def read_campaign(directory: FilePath) -> tuple[State, Workspace, list[Entry]]:
         reason = str(record["stop_reason"])
         state = State(record["settings"], [], failures, asked, record["simulation"], reason)
         rows, names = list(record["rows"]), list(record["posteriors"])
-        posteriors = {n: Posterior(n, file=folder / POSTERIORS / f"{n}.nc") for n in names if n}
+    posteriors = {n: Posterior(n, file=folder / POSTERIORS / f"{n}.nc") for n in names if n}
     entries = []
     for n in itertools.count(1):
         file = folder / MISSIONS / f"{n:04d}.nc"
@@ -164,6 +168,7 @@ def read_campaign(directory: FilePath) -> tuple[State, Workspace, list[Entry]]:
     return state, workspace, entries[len(rows) :]
 
 
-def _require_campaign(folder: Path) -> None:
-    if not (folder / RECORD).exists():
-        raise TrustboError(f"{str(folder)!r} contains no campaign.")
+def require_campaign(directory: FilePath) -> None:
+    """Raise TrustboError if a folder contains no campaign."""
+    if not (Path(directory) / RECORD).exists():
+        raise TrustboError(f"{str(directory)!r} contains no campaign.")
