@@ -34,8 +34,13 @@ class Follower:
         self._workspace, self._goal = campaign.workspace, self.path[-1]
         self.bounds: tuple[Bound, ...] = ()
         self.running = False
+        if (posterior := campaign.state.posterior) is not None:
+            start = TrustFilter(posterior)
+        else:
+            n_robots, family = self._workspace.team.n_robots, campaign.model.observation
+            start = TrustFilter(campaign.draw_prior(1000), n_robots, observation=family)
         # After the bounds that have ended, and if the one in progress ended now.
-        self._before = self._now = _filter_of(campaign)
+        self._before = self._now = start
         self.trust: TrustState = self._now.state
         self._started = self._begun = self._last = -np.inf  # times of mission, bound and tick
         self._counts = np.zeros((2, self._workspace.team.n_robots))  # ticks with contact, and ticks
@@ -96,7 +101,7 @@ class Follower:
         self._require(running=True, t=t)
         unknown = np.full((self._counts.shape[1], len(self._workspace.features)), np.nan)
         seconds, since = np.full(len(unknown), t - self._begun), self._begun - self._started
-        rates, n_ticks = _rates(self._counts)
+        rates, n_ticks = self._measured
         bound = Bound(self.rest[0], unknown, rates, seconds, status, since, n_ticks=n_ticks)
         self.bounds = (*self.bounds, bound)
         self.running, self._last, self._before = False, t, self._now
@@ -135,9 +140,12 @@ class Follower:
         """Set the counts of ticks, (2, robot), of a bound, and the trust if it ended now."""
         now = copy(self._before)  # which replaces its arrays, and changes none of them
         (known,) = known_along(bound, self._workspace)
-        rates, n_ticks = _rates(counts)
+        contacts, ticks = counts
+        n_ticks = np.where(ticks > 0.0, ticks, np.nan)
+        rates = contacts / n_ticks
         self.trust = now.update(known, rates, bound, n_ticks=n_ticks)
         self._now, self._counts, self._last = now, counts, t
+        self._measured = rates, n_ticks
 
     def _require(self, *, running: bool, t: float) -> None:
         """Raise TrustboError for a call in the wrong state, or a time before the last one."""
@@ -146,18 +154,3 @@ class Follower:
             raise TrustboError(f"{some} bound is in progress; call {first} first.")
         if not self._last <= t < np.inf:
             raise TrustboError(f"t = {t} s must be finite, and not before {self._last} s.")
-
-
-def _rates(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return rates from counts of contact and ticks (2, robot), and the ticks; NaN if none."""
-    contacts, ticks = counts
-    n_ticks = np.where(ticks > 0.0, ticks, np.nan)
-    return contacts / n_ticks, n_ticks
-
-
-def _filter_of(campaign: Campaign) -> TrustFilter:
-    """Make a filter with a campaign's last posterior, or with the prior if there is none yet."""
-    if campaign.state.posterior is not None:
-        return TrustFilter(campaign.state.posterior)
-    n_robots, family = campaign.workspace.team.n_robots, campaign.model.observation
-    return TrustFilter(campaign.draw_prior(1000), n_robots, observation=family)
