@@ -22,7 +22,7 @@ from trustbo.models.model import TrustModel
 from trustbo.planning import Planner
 from trustbo.stacking import replace_awareness
 from trustbo.workspace import Workspace
-from trustbo.workspace.moves import along, moves_along, require_on_grid
+from trustbo.workspace.moves import along, require_on_grid
 
 _N_DRAWS, _N_RISKS = 1000, 200
 _STOPPED, _RECOVERED = 2, 0.2
@@ -35,7 +35,6 @@ def known_along(path: Sequence[Cell], workspace: Workspace) -> np.ndarray:
     TrustboError: a cell is off the grid, or is not a neighbour of the previous one.
     """
     cells = require_on_grid(path, workspace.grid.shape)
-    moves_along(cells)
     return np.swapaxes(along(workspace.awareness.values, cells), 0, 1)
 
 

@@ -7,7 +7,7 @@ from trustbo.campaign.campaign import Campaign
 from trustbo.campaign.result import Result
 from trustbo.campaign.stopping import Stop
 from trustbo.campaign.storage import Storage
-from trustbo.errors import TrustboError, require_whole
+from trustbo.errors import TrustboError
 from trustbo.files import FilePath
 from trustbo.models.model import TrustModel
 from trustbo.planning.policies import Policy
@@ -65,7 +65,6 @@ def iterate(
         >>> result = tb.iterate(workspace, start=(9, 0), goal=(0, 9), n_iterations=8)
         >>> result.path
     """
-    n_iterations = require_whole("n_iterations", n_iterations, 1)
     campaign = Campaign(workspace, start, goal, **options)
     steps = campaign.run(simulator, n_iterations, truth=truth, stop=stop, progress=progress)
     with campaign:
