@@ -45,13 +45,11 @@ class RegretBound:
     n_draws: int = 500
 
     def __post_init__(self) -> None:
-        for name in ("eps", "delta"):
-            if not 0.0 < getattr(self, name) < 1.0:
-                raise TrustboError(
-                    f"RegretBound.{name} must be in (0, 1); got {getattr(self, name)!r}."
-                )
-        for name in ("patience", "n_draws"):
-            require_whole(f"RegretBound.{name}", getattr(self, name), 1)
+        for name, value in (("eps", self.eps), ("delta", self.delta)):
+            if not 0.0 < value < 1.0:
+                raise TrustboError(f"RegretBound.{name} must be in (0, 1); got {value!r}.")
+        require_whole("RegretBound.patience", self.patience, 1)
+        require_whole("RegretBound.n_draws", self.n_draws, 1)
 
     def __call__(self, campaign: "Campaign") -> str | None:
         """Return the reason to stop, or None."""
