@@ -270,12 +270,10 @@ class Campaign(Result):
             return
         tree["hazard"] = xr.DataTree(self.hazard)
         entry.row |= diagnostics(tree)
-        if state.last is not None:
-            state.last.release()
         n_excluded = len(state.entries) - n_learned
         name = f"{len(state.entries):04d}" + (f"-{n_excluded}" if n_excluded else "")
-        file = None if self.storage is None else self.storage.add_posterior(name, tree)
-        entry.posterior = Posterior(name, tree, file)
+        stored = tree if self.storage is None else self.storage.add_posterior(name, tree)
+        entry.posterior = Posterior(name, stored)
 
     def _write(self) -> None:
         if self.storage is not None:

@@ -10,9 +10,9 @@ import rioxarray  # noqa: F401  (registers the .rio accessor)
 import xarray as xr
 
 from trustbo.campaign.learning import base_planner, informed_planner, learn_hazard
-from trustbo.campaign.state import COLUMNS, EXCLUDED, GIVEN_UP, LEARNED, TOLD, State
+from trustbo.campaign.state import COLUMNS, State
 from trustbo.campaign.storage import Storage, read_campaign
-from trustbo.data import Cell, Mission, path_text
+from trustbo.data import Cell, Mission
 from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError
 from trustbo.files import FilePath
@@ -58,9 +58,8 @@ class Result(Summary):
 
     def _rows(self) -> Rows:
         settings, state = self.state.settings, self.state
-        counts = {name: len(state.numbers(name)) for name in (LEARNED, TOLD, EXCLUDED)}
-        counts[GIVEN_UP] = len(state.failures)
-        shown = [f"{number} {name}" for name, number in counts.items() if number]
+        counts = self.table()["state"].value_counts()
+        shown = [f"{number} {name}" for name, number in counts.items()]
         rows = [
             ("course", f"{tuple(settings['start'])} to {tuple(settings['goal'])}"),
             ("missions", ", ".join(shown) or "none yet"),
@@ -115,19 +114,17 @@ class Result(Summary):
         numbers = np.atleast_1d(stored.attrs["missions"]).astype(int).tolist()
         # The model is needed for `log_prior` if its priors are not the default.
         whole = complete(stored, [self.missions[j] for j in numbers], model=self.model)
-        groups = {name: group.to_dataset() for name, group in whole.children.items()}
-        for name, group in groups.items():
+        for group in whole.children.values():
             if "mission" in group.dims:
-                groups[name] = group.assign_coords(mission=numbers)
-        labelled = xr.DataTree.from_dict({**groups, "hazard": self.hazard})
-        labelled.attrs = whole.attrs
-        return labelled
+                group.dataset = group.to_dataset().assign_coords(mission=numbers)
+        whole["hazard"] = xr.DataTree(self.hazard)
+        return whole
 
     @cached_property
     def belief(self) -> Params:
         """Parameter draws of the last posterior, or of `initial` before the first posterior."""
-        if self.state.posterior is not None:
-            return params_of(self.state.posterior)
+        if (posterior := self.state.posterior) is not None:
+            return params_of(posterior)
         if self.state.settings["initial"] == "prior_draw":
             return self.draw_prior(1)
         features, n_robots = self.workspace.features, self.workspace.team.n_robots
@@ -137,7 +134,7 @@ class Result(Summary):
     def draw_prior(self, n_draws: int) -> Params:
         """Draw parameters from the prior, leading axis (draw,)."""
         features, n_robots = self.workspace.features, self.workspace.team.n_robots
-        seed, model = State(self.settings).seed_of("prior"), self.model.for_features(features)
+        seed, model = State(self.state.settings).seed_of("prior"), self.model.for_features(features)
         return sample_prior(model, len(features), n_draws, seed, n_robots=n_robots).flat()
 
     @cached_property
@@ -202,7 +199,8 @@ class Result(Summary):
         for row, path in zip(steps, paths, strict=True):
             row[: len(path)] = path
         numbers = pd.RangeIndex(1, len(paths) + 1, name="iteration")
-        history = pd.DataFrame([entry.row for entry in entries], numbers).to_xarray()
+        table = pd.DataFrame([entry.row for entry in entries], numbers)
+        history = table.drop(columns=["where", "n_bounds", "path"]).to_xarray()
         if "regret" in history:
             history["regret"].attrs["units"] = "%"
         history["path"] = ("iteration", "step", "axis"), steps
@@ -218,15 +216,7 @@ class Result(Summary):
         quantities of `history` follow. A mission that was given up, see `Campaign.fail`, has no
         number and the state "given up".
         """
-        rows: list[dict[str, Any]] = []
-        for n, entry in enumerate(self.state.entries, start=1):
-            mission = entry.measured
-            rows.append(entry.row | {
-                "mission": n,
-                "where": path_text([mission.bounds[-1].cell]) if mission.status != "ok" else "",
-                "n_bounds": len(mission.bounds),
-                "path": path_text(entry.plan.path),
-            })  # fmt: skip
+        rows = [entry.row | {"mission": n} for n, entry in enumerate(self.state.entries, start=1)]
         for i, failure in enumerate(self.state.failures):  # each follows the mission before it
             rows.insert(failure.after + i, failure.row())
         names = dict.fromkeys(["mission", *COLUMNS, *chain(*rows)])
@@ -267,7 +257,7 @@ class Result(Summary):
 
     def _places(self) -> xr.Dataset:
         """Make maps of the effects of cells, (row, col), if the model has them."""
-        if self.state.last is None or not (places := self.belief.places):
+        if not (places := self.belief.places):
             return xr.Dataset()
         cells = xr.DataArray(places["place"].mean(1), dims=("draw", "row", "col"))
         maps = xr.Dataset({"place_mean": cells.mean("draw"), "place_sd": cells.std("draw")})

@@ -50,30 +50,21 @@ class Failure(NamedTuple):
         }
 
 
-class Posterior:
-    """Posterior of the parameters after a mission, in memory or in its file.
+class Posterior(NamedTuple):
+    """Posterior of the parameters after a mission.
 
     Attributes:
         name: Name of its file: the number of missions recorded when it was fitted, followed by the
             number of excluded missions if there are any, such as `"0003-1"`.
-        file: File that contains it; None if it is in memory only.
+        stored: The posterior; or, in a campaign with a folder, its file.
     """
 
-    def __init__(
-        self, name: str, tree: xr.DataTree | None = None, file: Path | None = None
-    ) -> None:
-        self.name, self.file, self._tree = name, file, tree
+    name: str
+    stored: xr.DataTree | Path
 
     def __call__(self) -> xr.DataTree:
         """Return the posterior; TrustboError if its file cannot be read."""
-        if self._tree is None:
-            self._tree = read_tree(self.file or "")
-        return self._tree
-
-    def release(self) -> None:
-        """Free the memory of a posterior that is in a file."""
-        if self.file is not None:
-            self._tree = None
+        return read_tree(self.stored) if isinstance(self.stored, Path) else self.stored
 
 
 @dataclass(eq=False)
@@ -166,4 +157,7 @@ class State:
             "status": mission.status,
             "state": TOLD,
             "reason": "",
+            "where": path_text([mission.bounds[-1].cell]) if mission.status != "ok" else "",
+            "n_bounds": len(mission.bounds),
+            "path": path_text(plan.path),
         }

@@ -150,7 +150,7 @@ def read_campaign(directory: FilePath) -> tuple[State, Workspace, list[Entry]]:
         reason = str(record["stop_reason"])
         state = State(record["settings"], [], failures, asked, record["simulation"], reason)
         rows, names = list(record["rows"]), list(record["posteriors"])
-    posteriors = {n: Posterior(n, file=folder / POSTERIORS / f"{n}.nc") for n in names if n}
+    posteriors = {n: Posterior(n, folder / POSTERIORS / f"{n}.nc") for n in names if n}
     entries = []
     for n in itertools.count(1):
         file = folder / MISSIONS / f"{n:04d}.nc"
