@@ -10,7 +10,7 @@ from typing import Any, Self
 import numpy as np
 import xarray as xr
 
-from trustbo.campaign.learning import as_learned, base_planner, learn, why_never_learned
+from trustbo.campaign.learning import as_learned, learn, why_never_learned
 from trustbo.campaign.result import Result, in_a_line
 from trustbo.campaign.state import EXCLUDED, LEARNED, TOLD, Entry, Failure, Posterior, State
 from trustbo.campaign.stopping import Stop
@@ -27,7 +27,7 @@ from trustbo.inference.fit import SAMPLERS
 from trustbo.models import HumanTrust, default_model
 from trustbo.models.model import TrustModel
 from trustbo.models.record import model_from_record, model_to_record
-from trustbo.planning import InfeasibleError, Plan
+from trustbo.planning import InfeasibleError, Plan, Planner
 from trustbo.planning.policies import POLICIES, Policy, resolve_policy
 from trustbo.simulation import KinematicSimulator, Truth
 from trustbo.simulation.protocol import Simulator
@@ -114,23 +114,21 @@ class Campaign(Result):
         require_kind("model", model, TrustModel, "give one such as PooledTrust()")
         if isinstance(model, HumanTrust):
             raise TrustboError("model: HumanTrust describes reports of people, not paths.")
-        self.policy = resolve_policy(policy)
+        self.policy, options = resolve_policy(policy), dict(planner or {})
+        base = Planner(workspace, start, goal, objective, family=model.observation, **options)
         settings = {
+            "start": base.start,
+            "goal": base.goal,
+            "max_bounds": base.max_bounds,
             "policy": policy if isinstance(policy, str) else f"{_name_of(policy)} (custom)",
             "objective": objective,
             "sampler": sampler,
             "seed": require_whole("seed", seed, 0),
             "initial": initial,
-            "observation": model.observation,
-            "planner": dict(planner or {}),
-        }
-        base = base_planner(workspace, {"start": start, "goal": goal, **settings})
-        settings |= {
-            "start": base.start,
-            "goal": base.goal,
-            "max_bounds": base.max_bounds,
+            "planner": options,
             "fit": dict(fit or {}),
             "hazard": asdict(hazard),
+            "observation": model.observation,
             "model": model.in_short(),
             "model_record": model_to_record(model),
         }

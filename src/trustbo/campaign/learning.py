@@ -1,8 +1,7 @@
 """Learning from missions: the posterior, the hazard, and the planner of the next path."""
 
 import warnings
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 import xarray as xr
@@ -131,14 +130,6 @@ def learn_hazard(state: State, workspace: Workspace) -> xr.Dataset:
     if state.last is not None and "hazard" in (last := state.last()).children:
         return last["hazard"].to_dataset()
     return fit_hazard([], workspace, prior)
-
-
-def base_planner(workspace: Workspace, settings: Mapping[str, Any]) -> Planner:
-    """Make the planner of a campaign before any failures are known."""
-    return Planner(
-        workspace, settings["start"], settings["goal"], settings["objective"],
-        family=settings["observation"], **settings["planner"],
-    )  # fmt: skip
 
 
 def informed_planner(planner: Planner, risk: BoundRisk) -> Planner:

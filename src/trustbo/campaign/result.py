@@ -9,7 +9,7 @@ import pandas as pd
 import rioxarray  # noqa: F401  (registers the .rio accessor)
 import xarray as xr
 
-from trustbo.campaign.learning import base_planner, informed_planner, learn_hazard
+from trustbo.campaign.learning import informed_planner, learn_hazard
 from trustbo.campaign.state import COLUMNS, State
 from trustbo.campaign.storage import Storage, read_campaign
 from trustbo.data import Cell, Mission
@@ -40,16 +40,11 @@ class Result(Summary):
     """
 
     def __init__(
-        self,
-        workspace: Workspace,
-        state: State,
-        model: TrustModel | None,
-        base: Planner | None = None,
+        self, workspace: Workspace, state: State, model: TrustModel | None, base: Planner
     ) -> None:
         """Store the state of a campaign; `base` is its planner before any learning."""
-        self.workspace, self.state = workspace, state
+        self.workspace, self.state, self._base = workspace, state, base
         self.model: Any = model
-        self._base = base_planner(workspace, state.settings) if base is None else base
 
     def _computed(self) -> dict[str, Any]:
         """Collect the cached properties by name."""
@@ -316,13 +311,17 @@ def load_result(directory: FilePath) -> Result:
     state, workspace, _ = read_campaign(directory)
     if not state.entries:
         raise TrustboError(f"the campaign in {str(directory)!r} has no mission yet.")
-    model = None
+    given, model = state.settings, None
     try:
-        model = model_from_record(state.settings["model_record"])
+        model = model_from_record(given["model_record"])
     except TrustboError:  # a custom model, which is needed only while nothing was learned
         if state.last is None:
             raise
-    return Result(workspace, state, model)
+    base = Planner(
+        workspace, given["start"], given["goal"], given["objective"],
+        family=given["observation"], **given["planner"],
+    )  # fmt: skip
+    return Result(workspace, state, model, base)
 
 
 def in_a_line(row: dict[str, Any]) -> str:
