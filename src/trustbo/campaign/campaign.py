@@ -21,9 +21,8 @@ from trustbo.errors import TrustboError, require_choice, require_kind, require_p
 from trustbo.files import FilePath, to_json
 from trustbo.hazard import Hazard
 from trustbo.hazard.exposures import CAUSES
-from trustbo.inference import fit
 from trustbo.inference.diagnostics import diagnostics
-from trustbo.inference.fit import SAMPLERS
+from trustbo.inference.fit import SAMPLERS, fit
 from trustbo.models import HumanTrust, default_model
 from trustbo.models.model import TrustModel
 from trustbo.models.record import model_from_record, model_to_record
@@ -292,7 +291,7 @@ class Campaign(Result):
         """
         if not 1 <= require_whole("n", n, 1) <= (n_told := len(self.state.entries)):
             raise TrustboError(f"there is no mission {n} to exclude; {n_told} are recorded.")
-        if (entry := self.state.entries[n - 1]).state == EXCLUDED:
+        if (entry := self.state.entries[n - 1]).row["state"] == EXCLUDED:
             raise TrustboError(f"mission {n} is already excluded: {entry.row['reason']}")
         entry.become(EXCLUDED, str(reason))
         self._renew()

@@ -73,8 +73,7 @@ def learn(
     missions = [state.entries[j].mission for j in numbers]
     sampler, options = state.settings["sampler"], state.settings["fit"]
     # Draws of importance sampling are independent, and effects of places make them large.
-    has_places = any(isinstance(effect, PlaceEffect) for effect in model.effects)
-    few = sampler == "importance" and has_places
+    few = sampler == "importance" and any(isinstance(e, PlaceEffect) for e in model.effects)
     usual = options.get("draws", _N_DRAWS // 4 if few else _N_DRAWS)
     reason = ""
     for shift, draws in enumerate((usual, 2 * usual)):
@@ -85,11 +84,8 @@ def learn(
                 missions, model, sampler=sampler, workspace=workspace, seed=seed + shift,
                 progress=progress, whole=False, **{**options, "draws": draws},
             )  # fmt: skip
-        except PosteriorError as error:
-            reason = error.reason
-        except TrustboError as error:  # no other attempt would take these data
-            reason = str(error)
-            break
+        except TrustboError as error:
+            reason = getattr(error, "reason", str(error))
         except Exception as error:  # a defect must not cost a mission that was driven
             if isinstance(error.__cause__, KeyboardInterrupt):  # numba makes it a SystemError
                 raise error.__cause__ from None
@@ -119,7 +115,7 @@ def learn_hazard(state: State, workspace: Workspace) -> xr.Dataset:
     measured = [
         entry.measured
         for entry in state.entries
-        if entry.state != EXCLUDED or why_never_learned(entry.mission)
+        if entry.row["state"] != EXCLUDED or why_never_learned(entry.mission)
     ]
     lost = [LostMission(f.path, f.where) for f in state.failures if f.path]
     prior = Hazard(**state.settings["hazard"])
@@ -127,7 +123,7 @@ def learn_hazard(state: State, workspace: Workspace) -> xr.Dataset:
         return fit_hazard(measured, workspace, prior, lost=lost, seed=state.seed_of("hazard"))
     except PosteriorError as error:
         warnings.warn(f"{error} The campaign continues with the previous hazard.", stacklevel=5)
-    if state.last is not None and "hazard" in (last := state.last()).children:
+    if (last := state.posterior) is not None:
         return last["hazard"].to_dataset()
     return fit_hazard([], workspace, prior)
 

@@ -1,7 +1,7 @@
 """Result of a campaign: posterior, maps, history and recommended path."""
 
 from functools import cached_property
-from itertools import chain
+from itertools import chain, zip_longest
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,7 +12,7 @@ import xarray as xr
 from trustbo.campaign.learning import informed_planner, learn_hazard
 from trustbo.campaign.state import COLUMNS, State
 from trustbo.campaign.storage import Storage, read_campaign
-from trustbo.data import Cell, Mission
+from trustbo.data import NOWHERE, Cell, Mission
 from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError
 from trustbo.files import FilePath
@@ -62,10 +62,8 @@ class Result(Summary):
             ("policy", f"{settings['policy']}, objective {settings['objective']}"),
         ]
         if state.last is not None:
-            rows.append(
-                ("recommended", f"{len(self.path) - 1} bounds, value {self.plan.value:.3g}")
-            )
-            rows.append(("last mission", in_a_line(state.entries[-1].row)))
+            best = f"{len(self.path) - 1} bounds, value {self.plan.value:.3g}"
+            rows += [("recommended", best), ("last mission", in_a_line(state.entries[-1].row))]
         return rows
 
     @property
@@ -190,9 +188,7 @@ class Result(Summary):
         """
         entries = self.state.entries
         paths = [entry.plan.path for entry in entries]
-        steps = np.full((len(paths), max(map(len, paths)), 2), -1)
-        for row, path in zip(steps, paths, strict=True):
-            row[: len(path)] = path
+        steps = np.stack([*zip_longest(*paths, fillvalue=NOWHERE)], axis=1)
         numbers = pd.RangeIndex(1, len(paths) + 1, name="iteration")
         table = pd.DataFrame([entry.row for entry in entries], numbers)
         history = table.drop(columns=["where", "n_bounds", "path"]).to_xarray()
@@ -239,14 +235,13 @@ class Result(Summary):
             n_draws = 1000 if len(dynamics.start) == 1 else 100
         summary = self.planner.trust_summary(self.posterior, n_draws=n_draws)
         maps = summary.rename(mean="trust_mean", sd="trust_sd")
-        share = self.planner.path_posterior(self.posterior, n_draws=n_draws)
         awareness, places = self.workspace.awareness, self._places()
         taken = {*maps.variables, *maps.dims, "path_probability", "x", "y", "spatial_ref", *places}
         for name in self.workspace.features:
             values = awareness.sel(feature=name, drop=True).mean(("robot", "move"))
             free = f"awareness_{name}" if name in taken else name
             maps[free] = values.assign_attrs(long_name=f"{name}, 0 worst, 1 best")
-        maps["path_probability"] = share
+        maps["path_probability"] = self.planner.path_posterior(self.posterior, n_draws=n_draws)
         maps = maps.assign(places.data_vars)
         return self.workspace.grid.place(maps.where(self.workspace.passable))
 
@@ -311,12 +306,13 @@ def load_result(directory: FilePath) -> Result:
     state, workspace, _ = read_campaign(directory)
     if not state.entries:
         raise TrustboError(f"the campaign in {str(directory)!r} has no mission yet.")
-    given, model = state.settings, None
+    given = state.settings
     try:
         model = model_from_record(given["model_record"])
     except TrustboError:  # a custom model, which is needed only while nothing was learned
         if state.last is None:
             raise
+        model = None
     base = Planner(
         workspace, given["start"], given["goal"], given["objective"],
         family=given["observation"], **given["planner"],

@@ -76,7 +76,8 @@ class Entry:
         measured: Mission as measured.
         mission: Mission with the awareness used for learning, see `learning.as_learned`.
         trust_map: Trust map used for planning, dims (row, col).
-        row: Numbers of the mission by name, with its `state` and the `reason` for this state.
+        row: Numbers of the mission by name, with its `state` (`TOLD`, `LEARNED` or `EXCLUDED`) and
+            the `reason` for this state.
         posterior: Posterior after this mission; None if there is none yet.
     """
 
@@ -86,11 +87,6 @@ class Entry:
     trust_map: xr.DataArray
     row: dict[str, Any]
     posterior: Posterior | None = None
-
-    @property
-    def state(self) -> str:
-        """State of the mission: `TOLD`, `LEARNED` or `EXCLUDED`."""
-        return self.row["state"]
 
     def become(self, state: str, reason: str = "") -> None:
         """Change the state of the mission."""
@@ -134,7 +130,7 @@ class State:
 
     def numbers(self, *states: str) -> list[int]:
         """Return the indices of the missions in one of these states."""
-        return [j for j, entry in enumerate(self.entries) if entry.state in states]
+        return [j for j, entry in enumerate(self.entries) if entry.row["state"] in states]
 
     def seed_of(self, stream: str) -> int:
         """Return the seed of one random stream for the next mission."""
