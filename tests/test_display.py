@@ -1,14 +1,14 @@
 """What a terminal and a notebook show of an object."""
 
+from functools import cache
 from xml.etree import ElementTree
 
 import numpy as np
-import pytest
 from numba import njit
 
 import trustbo as tb
 from trustbo import display
-from trustbo.display import Summary, compiling, progress_bar
+from trustbo.display import Summary, compiling
 from trustbo.models import PooledTrust, Priors, TrustParams
 
 
@@ -42,15 +42,8 @@ def test_every_object_is_displayed():
         ElementTree.fromstring(f"<div>{one._repr_html_()}</div>")
 
 
-@pytest.mark.parametrize(("show", "shown"), [(True, True), (False, False)])
-def test_a_bar_is_shown_if_asked_for(show, shown, capsys):
-    with progress_bar(show, total=2, desc="missions") as bar:
-        bar.update(2)
-    assert ("missions: 100%" in capsys.readouterr().err) == shown
-
-
 def test_compiling_is_announced_once(capsys, monkeypatch):
-    monkeypatch.setattr(display, "_ANNOUNCEMENT", display._Announcement())  # as in a new process
+    monkeypatch.setattr(display, "announce", cache(display.announce.__wrapped__))  # a new process
     for more in (1, 2):
         with compiling():
             njit(lambda x, more=more: x + more)(1)

@@ -11,7 +11,7 @@ import pandas as pd
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from trustbo.display import Rows, Summary, joined, number
+from trustbo.display import Rows, Summary, joined
 from trustbo.errors import TrustboError, require_cells, require_choice, require_whole
 
 Cell = tuple[int, int]
@@ -161,17 +161,15 @@ class Mission(Summary):
     def _rows(self) -> Rows:
         rates, took = self.contact_rate, self.bounds[-1].t1
         planned = f"{path_text(self.path[:1])} to {path_text(self.path[-1:])}"
+        measured = "trust reported" if self.scale else "contact rate"
         by_robot = zip(self.robots, pd.DataFrame(rates).mean(), strict=True)
         return [
             ("path", planned if self.path else "none: no map"),
             ("outcome", f"{self.status}, {len(self.bounds)} bounds run"),
-            (
-                "trust reported" if self.scale else "contact rate",
-                f"{np.isnan(rates).sum()} missing",
-            ),
+            (measured, f"{np.isnan(rates).sum()} missing"),
             *((f"  {name}", f"{rate:.3f}") for name, rate in by_robot),
             ("features", joined(self.features)),
-            ("takes", number(took, "s", 4) if took else "not measured"),
+            ("takes", f"{took:.4g} s" if took else "not measured"),
         ]
 
     @classmethod
@@ -213,15 +211,12 @@ class Mission(Summary):
         labels = {"robot": robots, "feature": features}
         z = _labelled("awareness", awareness, ("bound", "robot", "feature"), **labels)
         y = _labelled("contact_rate", contact_rate, ("bound", "robot"), robot=robots)
-        given = {"awareness": z, "contact_rate": y, "duration": duration, "n_ticks": n_ticks}
-        arrays = {n: as_array(n, np.nan if v is None else v) for n, v in given.items()}
-        z, y, seconds, ticks = arrays.values()
         if z.ndim != 3 or y.shape != z.shape[:2]:
             raise TrustboError(
                 "awareness must be (bound, robot, feature) and contact_rate (bound, robot); "
                 f"got {z.shape} and {y.shape}."
             )
-        seconds, ticks = _per_robot("duration", seconds, y), _per_robot("n_ticks", ticks, y)
+        seconds, ticks = _per_robot("duration", duration, y), _per_robot("n_ticks", n_ticks, y)
         cells = () if path is None else require_cells("path", path)
         if path is not None and len(cells) <= len(y):
             raise TrustboError(
@@ -383,8 +378,8 @@ def require_unit_interval(what: str, values: np.ndarray) -> None:
         raise TrustboError(f"{what}: [{index}] = {values[bad][0]:g} is outside [0, 1]{hint}.")
 
 
-def _labelled(what: str, values: Any, dims: Sequence[str], **names: Sequence[str]) -> Any:
-    """Reorder labelled values to the given dims, and to the given names along some of them.
+def _labelled(what: str, values: Any, dims: Sequence[str], **names: Sequence[str]) -> np.ndarray:
+    """Return an array with the given dims, and with the given names along some of them.
 
     Labels are the dims and coordinates of a DataArray, or the column names of a DataFrame for the
     last dim, if they are strings. TrustboError: the labels are not the given names.
@@ -393,7 +388,7 @@ def _labelled(what: str, values: Any, dims: Sequence[str], **names: Sequence[str
         numbers = values.to_numpy(dtype=object, na_value=np.nan)  # also pd.NA
         values = xr.DataArray(numbers, dims=dims, coords={dims[-1]: list(values)})
     if not isinstance(values, xr.DataArray):
-        return values
+        return as_array(what, values)
     if {*values.dims} != {*dims}:
         raise TrustboError(f"{what} must have the dims {tuple(dims)}; got {values.dims}.")
     for dim, given in names.items():
@@ -402,11 +397,12 @@ def _labelled(what: str, values: Any, dims: Sequence[str], **names: Sequence[str
             raise TrustboError(f"{what} has the {dim}s {there}, not {list(given)}.")
         if there and given:
             values = values.isel({dim: [there.index(name) for name in given]})
-    return values.transpose(*dims)
+    return as_array(what, values.transpose(*dims))
 
 
-def _per_robot(what: str, values: np.ndarray, rates: np.ndarray) -> np.ndarray:
+def _per_robot(what: str, given: ArrayLike | None, rates: np.ndarray) -> np.ndarray:
     """Broadcast values, one for each bound or for each robot in it, to (bound, robot)."""
+    values = as_array(what, np.nan if given is None else given)
     try:
         return np.broadcast_to(values[:, None] if values.ndim == 1 else values, rates.shape)
     except ValueError:

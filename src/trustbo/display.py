@@ -2,8 +2,9 @@
 
 import sys
 import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
+from functools import cache
 from html import escape
 from typing import Any
 
@@ -42,19 +43,9 @@ class Summary:
         return f"<b>{escape(type(self).__name__)}</b><table>{cells}</table>"
 
 
-def number(value: float, unit: str = "", digits: int = 3) -> str:
-    """Write a number with its unit."""
-    return f"{value:.{digits}g}{' ' + unit if unit else ''}"
-
-
 def joined(names: Sequence[str]) -> str:
     """Join names: "a, b and c"."""
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
-
-
-def progress_bar(show: bool, **options: Any) -> tqdm:
-    """Make a progress bar, hidden unless `show`; `options` are passed to tqdm."""
-    return tqdm(disable=not show, **options)
 
 
 def say(line: str) -> None:
@@ -62,26 +53,20 @@ def say(line: str) -> None:
     tqdm.write(line, file=sys.stderr)
 
 
-@contextmanager
-def compiling() -> Iterator[None]:
+def compiling() -> AbstractContextManager[Any]:
     """Print a line when kernels are compiled, which happens once on a machine."""
-    with event.install_listener("numba:compile", _ANNOUNCEMENT):
-        yield
+    return event.install_listener("numba:compile", _Announcement())
 
 
 class _Announcement(event.Listener):
-    """Listener that announces the first compilation of a process."""
-
-    def __init__(self) -> None:
-        self._announced = False
-
     def on_start(self, event: event.Event) -> None:
-        if not self._announced:
-            say("compiling kernels (once, about 30 s)")
-        self._announced = True
+        announce()
 
     def on_end(self, event: event.Event) -> None:
         pass
 
 
-_ANNOUNCEMENT = _Announcement()
+@cache
+def announce() -> None:
+    """Announce the first compilation of a process."""
+    say("compiling kernels (once, about 30 s)")

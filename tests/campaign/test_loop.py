@@ -268,4 +268,6 @@ def test_progress_is_a_line(workspace, capsys):
     run(workspace, n_iterations=1)
     assert capsys.readouterr() == ("", "")
     run(workspace, n_iterations=1, progress=True)
-    assert "k_hat" in capsys.readouterr().err
+    shown = capsys.readouterr().err
+    assert "missions: 100%" in shown
+    assert "k_hat" in shown

@@ -16,7 +16,7 @@ from trustbo.campaign.state import EXCLUDED, LEARNED, TOLD, Entry, Failure, Post
 from trustbo.campaign.stopping import Stop
 from trustbo.campaign.storage import Storage, read_campaign, require_campaign
 from trustbo.data import Cell, Mission
-from trustbo.display import compiling, progress_bar
+from trustbo.display import compiling, tqdm
 from trustbo.errors import TrustboError, require_choice, require_kind, require_pair, require_whole
 from trustbo.files import FilePath, to_json
 from trustbo.hazard import Hazard
@@ -366,10 +366,8 @@ class Campaign(Result):
         """Run missions, see `run`, which checks the arguments."""
         state = self.state
         state.stop_reason = "interrupted"
-        bar = progress_bar(
-            self.progress, total=n_iterations, initial=len(state.entries), desc="missions"
-        )
-        with bar, compiling():
+        options = {"total": n_iterations, "initial": len(state.entries), "desc": "missions"}
+        with tqdm(disable=not self.progress, **options) as bar, compiling():
             # The rules are asked before each mission: they may hold already when one continues.
             while not (reason := self._reason_to_end(n_iterations, rules)):
                 n, plan = len(state.entries), self.ask()
