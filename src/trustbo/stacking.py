@@ -28,21 +28,18 @@ def stack_missions(missions: Sequence[Mission]) -> MissionBatch:
     is NaN; only contact rates may be missing.
     """
     require_same_team(missions)
-    first = missions[0]
+    n_bounds = max(len(mission.bounds) for mission in missions)
+    shape = (len(missions), n_bounds, *missions[0].awareness.shape[1:])
+    batch = MissionBatch(np.zeros(shape), *np.full((2, *shape[:-1]), np.nan))
     for j, mission in enumerate(missions):
         if np.isnan(mission.awareness.sum()):
             k, i, m = np.argwhere(np.isnan(mission.awareness))[0]
             raise TrustboError(
-                f"awareness of mission {j}, bound {k + 1}, robot {first.robots[i]}, feature "
-                f"{first.features[m]} is NaN; pass workspace= to fill it, or drop the bound."
+                f"awareness of mission {j}, bound {k + 1}, robot {mission.robots[i]}, feature "
+                f"{mission.features[m]} is NaN; pass workspace= to fill it, or drop the bound."
             )
-    n_bounds = max(len(mission.bounds) for mission in missions)
-    shape = (len(missions), n_bounds, len(first.robots), len(first.features))
-    batch = MissionBatch(np.zeros(shape), *np.full((2, *shape[:-1]), np.nan))
-    for j, mission in enumerate(missions):
-        batch.awareness[j, : len(mission.bounds)] = mission.awareness
-        batch.contact_rate[j, : len(mission.bounds)] = mission.contact_rate
-        batch.n_ticks[j, : len(mission.bounds)] = mission.n_ticks
+        for name, padded in batch._asdict().items():
+            padded[j, : len(mission.bounds)] = getattr(mission, name)
     return batch
 
 
