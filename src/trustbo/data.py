@@ -4,7 +4,7 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal, Self, get_args
+from typing import Any, Self
 
 import numpy as np
 import pandas as pd
@@ -15,8 +15,7 @@ from trustbo.display import Rows, Summary, joined
 from trustbo.errors import TrustboError, require_cells, require_choice, require_whole
 
 Cell = tuple[int, int]
-Status = Literal["ok", "stuck", "tipped", "timeout", "collision", "lost_contact", "aborted"]
-STATUSES: tuple[str, ...] = get_args(Status)
+STATUSES = ("ok", "stuck", "tipped", "timeout", "collision", "lost_contact", "aborted")
 NOWHERE: Cell = (-1, -1)
 """Cell of the bounds in a log without a map."""
 FEATURES = ("traversability", "visibility")
@@ -81,9 +80,8 @@ class Bound:
             require_unit_interval(f"awareness of {where}", self.awareness)
         elif np.isinf(self.awareness).any():
             raise TrustboError(f"awareness of {where} must be finite, or NaN where not measured.")
-        if (self.duration <= 0).any():
-            robot = int(np.argmax(self.duration <= 0))
-            raise TrustboError(f"duration[{robot}] = {self.duration[robot]:g} s must be positive.")
+        for i in np.flatnonzero(self.duration <= 0.0):
+            raise TrustboError(f"duration[{i}] = {self.duration[i]:g} s must be positive.")
         require_shares(self.contact_rate, self.n_ticks)
 
     @property
@@ -120,22 +118,6 @@ class Mission(Summary):
 
     def __post_init__(self) -> None:
         require_choice("status", self.status, STATUSES)
-        self._require_path()
-        shapes = {bound.awareness.shape for bound in self.bounds}
-        if len(shapes) > 1:
-            raise TrustboError(f"bounds disagree on (robot, feature): {sorted(shapes)}.")
-        n_robots, n_features = shapes.pop()
-        names = {
-            "features": tuple(self.features) or default_features(n_features),
-            "robots": tuple(self.robots) or tuple(f"r{i + 1}" for i in range(n_robots)),
-        }
-        for (name, labels), size in zip(names.items(), (n_features, n_robots), strict=True):
-            if len(labels) != size:
-                raise TrustboError(f"{name} must be {size} names; got {labels}.")
-            object.__setattr__(self, name, labels)
-
-    def _require_path(self) -> None:
-        """Reject bounds that do not match the path, or that enter cells if there is no path."""
         n_run, n_planned = len(self.bounds), len(self.path) - 1
         if not n_run or (self.path and n_run > n_planned):
             most = f" and, on its path, at most {n_planned}" if self.path else ""
@@ -152,6 +134,18 @@ class Mission(Summary):
             if bound.cell != (expected := self.path[k] if self.path else NOWHERE):
                 there = "there is no path" if expected == NOWHERE else f"the path has {expected}"
                 raise TrustboError(f"bound {k} enters {bound.cell}, but {there}.")
+        shapes = {bound.awareness.shape for bound in self.bounds}
+        if len(shapes) > 1:
+            raise TrustboError(f"bounds disagree on (robot, feature): {sorted(shapes)}.")
+        n_robots, n_features = shapes.pop()
+        names = {
+            "features": tuple(self.features) or default_features(n_features),
+            "robots": tuple(self.robots) or tuple(f"r{i + 1}" for i in range(n_robots)),
+        }
+        for (name, labels), size in zip(names.items(), (n_features, n_robots), strict=True):
+            if len(labels) != size:
+                raise TrustboError(f"{name} must be {size} names; got {labels}.")
+            object.__setattr__(self, name, labels)
 
     @property
     def has_map(self) -> bool:
