@@ -234,8 +234,7 @@ class Campaign(Result):
         mission, state, plan = self.workspace.in_order(mission), self.state, self.ask()
         if mission.path[0] != plan.path[0]:
             raise TrustboError(
-                f"the mission starts at {mission.path[0]}, not at {plan.path[0]}; cells are (row, "
-                "col)."
+                f"the mission starts at {mission.path[0]}, not at {plan.path[0]} (row, col)."
             )
         learned, row = as_learned(mission, self.workspace), state.row_of(plan, mission) | extra
         entry = Entry(plan, mission, learned, self.trust_map, row)
@@ -269,8 +268,10 @@ class Campaign(Result):
         entry.row |= diagnostics(tree)
         n_excluded = len(state.entries) - n_learned
         name = f"{len(state.entries):04d}" + (f"-{n_excluded}" if n_excluded else "")
-        stored = tree if self.storage is None else self.storage.add_posterior(name, tree)
-        entry.posterior = Posterior(name, stored)
+        file = None if self.storage is None else self.storage.add_posterior(name, tree)
+        if state.last is not None and state.last.file is not None:
+            state.last.tree = None  # frees the memory
+        entry.posterior = Posterior(name, tree, file)
 
     def _write(self) -> None:
         if self.storage is not None:

@@ -50,21 +50,24 @@ class Failure(NamedTuple):
         }
 
 
-class Posterior(NamedTuple):
+@dataclass(eq=False)
+class Posterior:
     """Posterior of the parameters after a mission.
 
     Attributes:
         name: Name of its file: the number of missions recorded when it was fitted, followed by the
             number of excluded missions if there are any, such as `"0003-1"`.
-        stored: The posterior; or, in a campaign with a folder, its file.
+        tree: The posterior; None if it is only in its file.
+        file: Its file; None if the campaign is in memory only.
     """
 
     name: str
-    stored: xr.DataTree | Path
+    tree: xr.DataTree | None = None
+    file: Path | None = None
 
     def __call__(self) -> xr.DataTree:
         """Return the posterior; TrustboError if its file cannot be read."""
-        return read_tree(self.stored) if isinstance(self.stored, Path) else self.stored
+        return read_tree(self.file or "") if self.tree is None else self.tree
 
 
 @dataclass(eq=False)

@@ -41,8 +41,7 @@ class Storage:
     def __init__(self, directory: FilePath) -> None:
         """Lock a folder, which is created if necessary.
 
-        Raises:
-            TrustboError: Another process has locked the folder, or the path is a file.
+        TrustboError: another process has locked it, or the path is a file.
         """
         self.path = Path(directory)
         self._lock = FileLock(self.path / ".lock", timeout=0)
@@ -66,9 +65,7 @@ class Storage:
     ) -> Self:
         """Lock a folder and write a whole campaign; another campaign is removed, its record first.
 
-        Raises:
-            TrustboError: The folder contains a campaign and `overwrite` is False, another process
-                has locked it, or the path is a file.
+        TrustboError: the folder contains a campaign and `overwrite` is False, or as in `__init__`.
         """
         path = Path(directory)
         if not overwrite and any((path / name).exists() for name in (RECORD, MISSIONS)):
@@ -86,7 +83,7 @@ class Storage:
 
     def _write_campaign(self, workspace: Workspace, state: State) -> None:
         stored = {e.posterior.name: e.posterior for e in state.entries if e.posterior is not None}
-        trees = [posterior() for posterior in stored.values()]  # may be in files that go
+        trees = {name: posterior() for name, posterior in stored.items()}  # some files are removed
         (self.path / RECORD).unlink(missing_ok=True)
         for room in (MISSIONS, POSTERIORS):
             for file in (self.path / room).glob("*.nc"):
@@ -94,7 +91,7 @@ class Storage:
         write_tree(self.path / WORKSPACE, archive.workspace_to_tree(workspace))
         for n, entry in enumerate(state.entries, start=1):
             self.add_mission(n, entry)
-        for name, tree in zip(stored, trees, strict=True):
+        for name, tree in trees.items():
             self.add_posterior(name, tree)
         self.write_record(state)
 
@@ -128,13 +125,9 @@ class Storage:
 
 
 def read_campaign(directory: FilePath) -> tuple[State, Workspace, list[Entry]]:
-    """Read a campaign from its folder.
+    """Read the state, the workspace, and the missions that the record does not count yet.
 
-    Returns:
-        State; workspace; and the missions not yet counted in the record.
-
-    Raises:
-        TrustboError: The folder contains no campaign, or a file is missing or damaged.
+    TrustboError: the folder contains no campaign, or a file is missing or damaged.
     """
     folder = Path(directory)
     require_campaign(folder)
@@ -150,7 +143,7 @@ def read_campaign(directory: FilePath) -> tuple[State, Workspace, list[Entry]]:
         reason = str(record["stop_reason"])
         state = State(record["settings"], [], failures, asked, record["simulation"], reason)
         rows, names = list(record["rows"]), list(record["posteriors"])
-    posteriors = {n: Posterior(n, folder / POSTERIORS / f"{n}.nc") for n in names if n}
+    posteriors = {n: Posterior(n, file=folder / POSTERIORS / f"{n}.nc") for n in names if n}
     entries = []
     for n in itertools.count(1):
         file = folder / MISSIONS / f"{n:04d}.nc"
