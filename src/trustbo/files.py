@@ -46,13 +46,6 @@ def read_file(path: FilePath) -> bytes:
         raise TrustboError(f"{str(path)!r} cannot be read: {error.strerror}.") from None
 
 
-def read_record(path: FilePath) -> dict[str, Any]:
-    """Read a JSON file of fields by name; TrustboError if it is missing or damaged."""
-    content = read_file(path)
-    with interpreting(path):
-        return dict(json.loads(content))
-
-
 @contextmanager
 def interpreting(path: FilePath) -> Iterator[None]:
     """Convert errors from unexpected contents of a file to a TrustboError.

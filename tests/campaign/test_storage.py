@@ -241,6 +241,15 @@ def test_damaged_file_is_named(folder, tmp_path, name, damage):
             assert name in str(error.value)
 
 
+@pytest.mark.parametrize("content", [b"{", b"{}", b"[1]", b"\xff", b"[" * 100000])
+def test_record_with_other_contents_is_named(folder, tmp_path, content):
+    copy = shutil.copytree(folder, tmp_path / "copy")
+    (copy / "campaign.json").write_bytes(content)
+    for load in (tb.Campaign.load, tb.load_result):
+        with pytest.raises(tb.TrustboError, match=r"campaign\.json"):
+            load(copy)
+
+
 def test_missions_and_workspace_on_terrain_are_read_back_with_ticks(tmp_path):
     terrain = tb.terrain.synthetic_terrain((60.0, 60.0), resolution=2.0, seed=1, relief=5.0)
     workspace = tb.Workspace.from_terrain(terrain, (2, 2), tb.Team(2))

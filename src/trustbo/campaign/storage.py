@@ -21,7 +21,7 @@ from filelock import FileLock, Timeout
 from trustbo.campaign.learning import as_learned
 from trustbo.campaign.state import Entry, Failure, Posterior, State
 from trustbo.errors import TrustboError
-from trustbo.files import FilePath, interpreting, read_record, to_json, write_text
+from trustbo.files import FilePath, interpreting, read_file, to_json, write_text
 from trustbo.logs.netcdf import missions_from_tree, missions_to_tree, read_tree, write_tree
 from trustbo.models.backend import VERSIONS
 from trustbo.planning.plan import plan_from_record, plan_to_record
@@ -131,10 +131,11 @@ def read_campaign(directory: FilePath) -> tuple[State, Workspace, list[Entry]]:
     """
     folder = Path(directory)
     require_campaign(folder)
-    record, tree = read_record(folder / RECORD), read_tree(folder / WORKSPACE)
+    content, tree = read_file(folder / RECORD), read_tree(folder / WORKSPACE)
     with interpreting(folder / WORKSPACE):
         workspace = archive.workspace_from_tree(tree)
     with interpreting(folder / RECORD):
+        record = json.loads(content)
         asked = record["asked"] and plan_from_record(record["asked"], workspace)
         failures = [
             Failure(after, reason, tuple(map(tuple, path)), where and tuple(where))
