@@ -55,7 +55,7 @@ class Columns:
         frame = frame.assign(**{n: frame[n].astype(object).map(_cell).astype(object) for n in text})
         imports = [i for i, row in frame.iloc[:3].iterrows() if "ImportId" in str(row.tolist())]
         self.frame = frame.loc[max(imports, default=0) + 1 :].dropna(how="all")
-        if frame.shape[1] and self.frame.empty:
+        if self.frame.empty:
             raise TrustboError(f"{what} has no rows.")
 
     def find(self, name: str) -> str | None:
@@ -65,18 +65,22 @@ class Columns:
         alike = [other for other in self.frame if _folded(other) == _folded(name)]
         return alike[0] if len(alike) == 1 else None
 
-    def require(self, names: Iterable[str], remedy: str = "") -> None:
-        """Check that columns exist; the TrustboError lists the columns of the table."""
-        if missing := [name for name in names if self.find(name) is None]:
-            there = ", ".join(self.frame) or "no columns"
-            raise TrustboError(f"{self.what} lacks {', '.join(missing)}; it has {there}.{remedy}")
+    def refuse(self, column: str, bad: np.ndarray, why: str) -> None:
+        """Raise TrustboError for the first value of a column that is `bad`, (row,), if any is."""
+        if bad.any():
+            row, value = self.frame.index[bad][0], self._cells(column).to_numpy(object)[bad][0]
+            raise TrustboError(f"row {row} of {self.what}: {column} = {one_line(value)} {why}.")
 
-    def texts(self, column: str, *, required: bool = True) -> list[str]:
+    def texts(self, column: str, *, blank: bool = True, required: bool = True) -> list[str]:
         """Return a column as text, "" if blank; floats such as 1.0 become 1.
 
         All are blank if a column that is not `required` is missing.
+
+        Raises:
+            TrustboError: A required column is missing, or a value is blank without `blank`.
         """
         cells = self._cells(column, required).astype(object)
+        self.refuse(column, cells.isna().to_numpy() & (not blank), "is blank; leave the row out")
         return ["" if pd.isna(cell) else _WHOLE.sub(r"\1", str(cell)) for cell in cells]
 
     def numbers(
@@ -85,71 +89,50 @@ class Columns:
         """Return a column as numbers, (row,); NaN where blank, or if an optional column is missing.
 
         Raises:
-            TrustboError: A value is not a number or is infinite, blank without `blank`, or not
-                whole with `whole`.
+            TrustboError: A required column is missing; or a value is not a number or is infinite,
+                blank without `blank`, or not whole with `whole`.
         """
         cells = self._cells(column, required)
-        parsed = _numbers(cells)
-        there = cells.notna().to_numpy()
-        faults = {
+        parsed, there = _numbers(cells), cells.notna().to_numpy()
+        self.refuse(
+            column,
+            np.isinf(parsed) | np.isnan(parsed) & there,
             "is not a finite number; write decimals with a point, and map words to numbers: "
-            "frame[column].map({'agree': 6})": np.isinf(parsed) | np.isnan(parsed) & there,
-            "is blank": np.isnan(parsed) & (not blank),
-            "must be a whole number": whole & (parsed > np.floor(parsed)),
-        }
-        for fault, bad in faults.items():
-            if bad.any():
-                row, value = self.frame.index[bad][0], one_line(cells.iloc[int(np.argmax(bad))])
-                raise TrustboError(f"row {row} of {self.what}: {column} = {value} {fault}.")
+            "frame[column].map({'agree': 6})",
+        )
+        self.refuse(column, np.isnan(parsed) & (not blank), "is blank")
+        self.refuse(column, whole & (parsed > np.floor(parsed)), "must be a whole number")
         return cells.to_numpy(float, na_value=np.nan)
 
-    def times(self, column: str) -> tuple[str, pd.Series]:
-        """Return the kind of a column of times, and the times as numbers, or as dates in UTC.
-
-        Raises:
-            TrustboError: A time is blank or neither a number nor a date, or only some dates have a
-                time zone.
-        """
-        cells = self._cells(column)
-        if cells.dtype.kind != "M" and not np.isnan(_numbers(cells.dropna())).any():
-            return "numbers", pd.Series(self.numbers(column, blank=False))
-        zoned = cells.astype(str).str.contains(_ZONE).to_numpy(bool)
-        try:
-            dates = pd.to_datetime(cells, format="ISO8601", utc=True)
-        except ValueError:
-            dates = pd.Series(pd.NaT, index=cells.index)
-        for i in np.flatnonzero(dates.isna().to_numpy() | (zoned != zoned[0])):
-            row, value = self.frame.index[i], one_line(cells.iloc[i])
-            raise TrustboError(
-                f"row {row} of {self.what}: {column} = {value}; give all times in seconds, or as "
-                "dates such as 2026-11-24T10:00:00.5Z, either all with a time zone or none."
-            )
-        return "dates with a time zone" if zoned.all() else "dates without a time zone", dates
-
     def _cells(self, column: str, required: bool = True) -> pd.Series:
-        if not required and self.find(column) is None:
-            return pd.Series(np.nan, index=self.frame.index)
-        self.require([column])
-        return self.frame[self.find(column)]
+        name = self.find(column)
+        if name is None and required:
+            there = ", ".join(self.frame) or "no columns"
+            raise TrustboError(f"{self.what} lacks {column}; it has {there}. Name or rename one.")
+        return pd.Series(np.nan, self.frame.index) if name is None else self.frame[name]
 
 
 def seconds_of(first: Columns, second: Columns) -> list[np.ndarray]:
     """Return times `t` of two tables on one clock, each (row,), s, from the first date if dates.
 
     Raises:
-        TrustboError: Numbers cannot be seconds; only one table has dates, or dates with a time
-            zone; or the times of the two tables do not overlap.
+        TrustboError: Times are neither all numbers nor all dates, numbers cannot be seconds, some
+            dates have no time zone, or the times of the two tables do not overlap.
     """
-    (kind, ours), (other, theirs) = first.times("t"), second.times("t")
-    if kind != other:
-        raise TrustboError(
-            f"times of {first.what} are {kind}, of {second.what} {other}; give both as dates in "
-            "UTC, or both in seconds."
-        )
-    if kind != "numbers":
-        start = ours.min()
-        ours, theirs = ((t - start).dt.total_seconds() for t in (ours, theirs))
-    times = [ours.to_numpy(float), theirs.to_numpy(float)]
+    texts = pd.Series([*first.texts("t"), *second.texts("t")])
+    if not np.isnan(_numbers(texts)).all():
+        times = [table.numbers("t", blank=False) for table in (first, second)]
+    else:
+        dates = pd.Series(pd.to_datetime(texts, format="ISO8601", utc=True, errors="coerce"))
+        zoned = texts.str.contains(_ZONE)
+        bad = (dates.isna() | (zoned != zoned[0])).to_numpy()
+        if bad.any():
+            raise TrustboError(
+                f"t = {one_line(texts.to_numpy()[bad][0])}; give the times of both tables in "
+                "seconds, or as dates such as 2026-11-24T10:00:00.5Z, all with a time zone or none."
+            )
+        n = len(first.frame)
+        times = np.split((dates - dates[:n].min()).dt.total_seconds().to_numpy(), [n])
     spans = [f"{t.min():.9g} to {t.max():.9g} s" for t in times]
     for table, t, span in zip((first, second), times, spans, strict=True):
         if np.ptp(t) > _LONGEST or np.abs(t).max() > 1e11:

@@ -57,12 +57,8 @@ def read_reports(
     if outcome is None and not inputs:
         raise TrustboError("give the column of outcomes, outcome=, or other columns, inputs=.")
     columns = Columns(table)
-    for name, column in {"person": person, "step": step, "report": report}.items():
-        columns.require([column], f' Name its columns, such as {name}="...".')
-    people, steps = np.array(columns.texts(person)), columns.numbers(step, blank=False)
+    people, steps = np.array(columns.texts(person, blank=False)), columns.numbers(step, blank=False)
     require_one_spelling(f"column {person}", people.tolist())
-    if "" in people:
-        raise TrustboError("a person is blank; leave the row out.")
     y = _unit_of(columns, report, levels)
     seen = _seen(columns, outcome, inputs)
     z, missions = np.column_stack([*seen.values()]), []
@@ -85,34 +81,30 @@ def _seen(columns: Columns, outcome: str | None, inputs: Sequence[str]) -> dict[
     """Return the features by name, each (row,)."""
     seen = {}
     if outcome is not None:
-        given = [text.lower() for text in columns.texts(outcome)]
-        for row, text in zip(columns.frame.index, given, strict=True):
-            if text not in ("", *_YES, *_NO):
-                raise TrustboError(
-                    f"row {row}: {outcome} = {text!r} must be 1 or 0, success or failure, or blank."
-                )
+        given = np.array([text.lower() for text in columns.texts(outcome)])
+        unknown = ~np.isin(given, ["", *_YES, *_NO])
+        columns.refuse(outcome, unknown, "must be 1 or 0, success or failure, or blank")
         seen["success"] = np.isin(given, _YES).astype(float)
         seen["failure"] = np.isin(given, _NO).astype(float)
     for name in inputs:
         seen[name] = columns.numbers(name, blank=False)
-        if (large := np.abs(seen[name]).max()) > _LARGEST:
-            raise TrustboError(
-                f"{name} has values up to {large:g}, but inputs must be of order 1; standardise "
-                "the column: (column - column.mean()) / column.std()."
-            )
+        columns.refuse(
+            name,
+            np.abs(seen[name]) > _LARGEST,
+            "is too large, as inputs must be of order 1; standardise the column: "
+            "(column - column.mean()) / column.std()",
+        )
     return seen
 
 
 def _unit_of(columns: Columns, report: str, levels: int) -> np.ndarray:
     """Scale reports to [0, 1], (row,), NaN where blank; TrustboError: one is not on the scale."""
-    y = columns.numbers(report)
+    y = columns.numbers(report, whole=levels > 0)
     low, high = (1.0, float(levels)) if levels else (0.0, 1.0)
-    off = (y < low) | (y > high) | (levels > 0) & (y > np.floor(y))
-    if off.any():
-        kind = "whole number" if levels else "number"
-        raise TrustboError(
-            f"row {columns.frame.index[off][0]}: {report} = {y[off][0]:g} is not a {kind} from "
-            f'{low:g} to {high:g}; give the scale, such as scale="likert7", divide percentages by '
-            "100, and leave missing answers blank."
-        )
+    columns.refuse(
+        report,
+        (y < low) | (y > high),
+        f'is not from {low:g} to {high:g}; give the scale, such as scale="likert7", divide '
+        "percentages by 100, and leave missing answers blank",
+    )
     return (y - low) / (high - low)

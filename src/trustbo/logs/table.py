@@ -85,13 +85,13 @@ def read_table(
     places = ("x", "y") if at_metres else ("row", "col")
     if workspace is None and not any(columns.find(name) for name in places):
         places = ()
-    columns.require((*KEYS, *places, "contact_rate"))
     if features is None:
         known = {columns.find(name) for name in (*COLUMNS, "x", "y")}
         rest = [name for name in columns.frame if name not in known] or list(FEATURES)
         features = rest if workspace is None else workspace.features
     else:
-        columns.require(features)
+        for name in features:
+            columns.numbers(name)
     frame = _parsed(columns, features, places)
     if at_metres and workspace is not None:
         pairs = frame[["x", "y"]].to_numpy()
@@ -99,68 +99,61 @@ def read_table(
         frame["row"], frame["col"] = np.transpose(cells)
     named = frame.loc[frame["robot"] != "", "robot"]
     robots = tuple(dict.fromkeys(named) if workspace is None else workspace.team.names)
+    if not robots:
+        raise TrustboError("no row names a robot.")
     require_one_spelling("the robots of table and workspace", (*robots, *named))
-    for row, robot in named[~named.isin(robots)].items():
-        raise TrustboError(f"row {row}: robot {robot!r} is not one of {robots}.")
-    for row in frame.index[frame.duplicated([*KEYS])]:
-        raise TrustboError(f"row {row} has the mission, bound and robot of another row.")
+    unknown = ~frame["robot"].isin(["", *robots]).to_numpy()
+    columns.refuse("robot", unknown, f"is not one of {robots}")
+    columns.refuse("bound", frame.duplicated([*KEYS]).to_numpy(), "is there twice for its robot")
     missions = []
     for label, rows in frame.groupby("mission", sort=False):
         try:
-            missions.append(_mission(rows, features, robots, bool(places)))
+            missions.append(_mission(rows, features, robots))
         except TrustboError as error:
             raise TrustboError(f"mission {label}: {error}") from None
     return missions
 
 
 def _parsed(columns: Columns, features: Sequence[str], places: Sequence[str]) -> pd.DataFrame:
-    """Return the columns with the names and types of this module; NaN or None where blank."""
-    values: dict[str, Any] = {name: columns.texts(name) for name in ("mission", "robot")}
+    """Return the columns with the names and types of this module; NaN or "" where blank."""
+    values: dict[str, Any] = {"mission": columns.texts("mission", blank=False)}
     require_one_spelling("column mission", values["mission"])
-    if "" in values["mission"]:
-        row = columns.frame.index[values["mission"].index("")]
-        raise TrustboError(f"row {row}: mission is blank.")
+    for name in ("robot", "status"):
+        values[name] = columns.texts(name, required=name == "robot")
     for name in ("bound", *places):
         values[name] = columns.numbers(name, blank=False, whole=name not in ("x", "y"))
     for name in (*RATES, *features):
-        values[name] = columns.numbers(name, required=False)
-    values["status"] = [text or None for text in columns.texts("status", required=False)]
-    return pd.DataFrame(values, index=columns.frame.index).astype({"bound": int})
+        values[name] = columns.numbers(name, required=name == "contact_rate")
+    return pd.DataFrame(values, index=columns.frame.index)
 
 
-def _mission(
-    rows: pd.DataFrame, features: Sequence[str], robots: tuple[str, ...], is_mapped: bool
-) -> Mission:
+def _mission(rows: pd.DataFrame, features: Sequence[str], robots: tuple[str, ...]) -> Mission:
     """Make a mission from its rows."""
-    first, numbers = 0 if is_mapped else 1, sorted(rows["bound"].unique().tolist())
-    if numbers != (planned := list(range(first, numbers[-1] + 1))):
+    cells = rows.filter(["bound", "row", "col"]).astype(int).drop_duplicates().sort_values("bound")
+    is_mapped, numbers = "row" in cells, cells["bound"].tolist()
+    first = 0 if is_mapped else 1
+    if numbers != [*range(first, first + len(numbers))]:
         raise TrustboError(
-            f"bounds must be numbered {planned}, 0 being the start cell; got {numbers}."
+            f"bounds must be numbered {first}, {first + 1}, ..., 0 being the start cell, and have "
+            f"one cell (row, col) each; got {numbers}."
         )
-    path = None
-    if is_mapped:
-        cells = sorted({*map(tuple, rows[["bound", "row", "col"]].to_numpy(int).tolist())})
-        if len(cells) > len(planned):
-            raise TrustboError("rows of one bound disagree on its cell, row and col.")
-        path = [(row, col) for _, row, col in cells]
-    bound, status = rows["bound"].to_numpy(int), "ok"
-    measured = bound[rows[[*RATES, "status", *features]].notna().to_numpy().any(axis=1)]
+    values, status = rows[[*RATES, *features]], rows["status"].to_numpy(str)
+    bound = rows["bound"].to_numpy(int)
+    measured = bound[values.notna().to_numpy().any(axis=1) | (status != "")]
     if not len(measured) or measured.min() < 1:
         raise TrustboError("bounds with a measurement must be numbered from 1; got none, or 0.")
-    n_run = int(measured.max())
-    for k, ended in zip(bound, rows["status"], strict=True):
-        if isinstance(ended, str) and ended != "ok":
-            if k < n_run or status not in ("ok", ended):
-                raise TrustboError("only the last bound that was run may have a status but ok.")
-            status = ended
+    n_run, ended = int(measured.max()), ~np.isin(status, ["", "ok"])
+    reasons = [*dict.fromkeys(status[ended].tolist())] or ["ok"]
+    if len(reasons) > 1 or (bound[ended] < n_run).any():
+        raise TrustboError("only the last bound that was run may have a status but ok.")
     expected = pd.MultiIndex.from_product([range(1, n_run + 1), robots])
-    of_robot = rows.set_index(["bound", "robot"])
-    if missing := [pair for pair in expected if pair not in of_robot.index]:
-        raise TrustboError("bound {} has no row for {}.".format(*missing[0]))
-    values = of_robot.loc[expected, [*RATES, *features]].to_numpy(float)
-    values = values.reshape(n_run, len(robots), -1)
-    rate, duration, n_ticks = np.moveaxis(values[..., : len(RATES)], -1, 0)
+    of_robot = values.set_index([rows["bound"].astype(int), rows["robot"]])
+    for k, robot in expected.difference(of_robot.index):
+        raise TrustboError(f"bound {k} has no row for {robot}.")
+    arrays = of_robot.loc[expected].to_numpy(float).reshape(n_run, len(robots), -1)
+    rate, duration, n_ticks = np.moveaxis(arrays[..., : len(RATES)], -1, 0)
     return Mission.from_arrays(
-        path, values[..., len(RATES) :], rate, duration, status, n_ticks=n_ticks,
+        cells[["row", "col"]].to_numpy().tolist() if is_mapped else None,
+        arrays[..., len(RATES) :], rate, duration, reasons[0], n_ticks=n_ticks,
         features=features, robots=robots,
     )  # fmt: skip
