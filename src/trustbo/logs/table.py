@@ -52,9 +52,7 @@ def to_frame(missions: Sequence[Mission]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=[*names, *missions[0].features])
 
 
-def read_table(
-    table: Any, workspace: Workspace | None = None, *, features: Sequence[str] | None = None
-) -> list[Mission]:
+def read_table(table: Any, workspace: Workspace | None = None) -> list[Mission]:
     """Read missions from a table with one row per mission, bound and robot.
 
     Columns are `mission`; `bound`, 0 for the start cell, which has no measurements; `robot`; the
@@ -67,9 +65,8 @@ def read_table(
     Args:
         table: Path of a CSV file with a header, separated by commas, semicolons or tabs; or a
             DataFrame, or a mapping of columns.
-        workspace: Workspace whose robots and features are read, in its order.
-        features: Names of the awareness columns. By default the workspace's features, NaN if a
-            column is missing; without a workspace, all remaining columns.
+        workspace: Workspace whose robots and features are read, in its order; a feature without a
+            column is NaN. Without a workspace, all remaining columns are features.
 
     Returns:
         Missions in the order of the table, without ticks.
@@ -85,19 +82,16 @@ def read_table(
     places = ("x", "y") if at_metres else ("row", "col")
     if workspace is None and not any(columns.find(name) for name in places):
         places = ()
-    if features is None:
-        known = {columns.find(name) for name in (*COLUMNS, "x", "y")}
-        rest = [name for name in columns.frame if name not in known] or list(FEATURES)
-        features = rest if workspace is None else workspace.features
-    else:
-        for name in features:
-            columns.numbers(name)
+    known = {columns.find(name) for name in (*COLUMNS, "x", "y")}
+    features = [name for name in columns.frame if name not in known] or list(FEATURES)
+    if workspace is not None:
+        features = list(workspace.features)
     frame = _parsed(columns, features, places)
     if at_metres and workspace is not None:
         pairs = frame[["x", "y"]].to_numpy()
         cells = [workspace.grid.locate({"x": x, "y": y}, "position") for x, y in pairs]
         frame["row"], frame["col"] = np.transpose(cells)
-    named = frame.loc[frame["robot"] != "", "robot"]
+    named = [name for name in frame["robot"] if name]
     robots = tuple(dict.fromkeys(named) if workspace is None else workspace.team.names)
     if not robots:
         raise TrustboError("no row names a robot.")
