@@ -9,7 +9,7 @@ from worlds import hillside
 
 import trustbo as tb
 from trustbo.errors import TrustboError
-from trustbo.logs import Topics, read_bag
+from trustbo.logs import read_bag
 
 pytest.importorskip("rosbags")
 
@@ -29,9 +29,15 @@ def driven(workspace):
 @pytest.mark.parametrize("kind", ["log.bag", "sqlite3", "mcap"])
 def test_bags_of_all_kinds_give_the_missions_back(kind, driven, workspace, tmp_path):
     storage = {} if kind == "log.bag" else {"storage": kind}
-    path = record(driven, tmp_path / kind, names={"/r1/contact": "/r1/sees"}, **storage)
+    path = record(
+        driven,
+        tmp_path / kind,
+        names={f"/{robot}/contact": f"/{robot}/sees" for robot in ("r1", "r2")},
+        **storage,
+    )
     with pytest.raises(TrustboError, match="/r1/contact"):
         read_bag(path, workspace)
+    assert len(read_bag(path, workspace, contact="/{robot}/sees")) == 2
     path = record(driven, tmp_path / f"again-{kind}", **storage)
     found = read_bag(path, workspace)
     assert [m.status for m in found] == ["ok", "aborted"]
@@ -56,7 +62,7 @@ def test_looks_that_failed_are_no_ticks_and_a_bound_ends_with_its_last_contact(w
     log.contact("r1", *of_1, kind="std_msgs/msg/Float32")
     log.contact("r2", (2.0, True), (6.0, False))
     log.messages.sort(key=lambda message: message[0])
-    (one,) = read_bag(log.save(tmp_path / "bag"), workspace, topics=Topics())
+    (one,) = read_bag(log.save(tmp_path / "bag"), workspace)
     np.testing.assert_array_equal(one.contact_rate, [[0.5, 1.0], [1.0, 0.0]])
     np.testing.assert_array_equal(one.n_ticks, [[2, 1], [1, 1]])
     np.testing.assert_allclose(one.duration[:, 0], [1.5, 2.0])

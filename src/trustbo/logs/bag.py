@@ -15,7 +15,6 @@ ignored.
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -35,25 +34,6 @@ type Marker = tuple[int, int, Cell, tuple[Cell, ...]]
 """Time (ns), number and cell of a bound, and the planned path, which may be empty."""
 
 
-@dataclass(frozen=True)
-class Topics:
-    """Names of topics; `{robot}` is replaced by the name of a robot or of the lead.
-
-    Attributes:
-        bound: Topic that marks the start of each bound.
-        status: Topic with the status of bounds and missions.
-        contact: Topic with the contact of each robot.
-        pose: Topic with the pose of each robot and of the lead.
-        lead: Name of the lead.
-    """
-
-    bound: str = "/mission/bound"
-    status: str = "/mission/status"
-    contact: str = "/{robot}/contact"
-    pose: str = "/{robot}/odom"
-    lead: str = "lead"
-
-
 class _Recording(NamedTuple):
     """Records of a bag by time, ns, in the order of the robots; poses begin with the lead."""
 
@@ -62,35 +42,47 @@ class _Recording(NamedTuple):
     poses: list[pd.DataFrame]  # x, y, heading; empty if a robot has none
 
 
-def read_bag(path: FilePath, workspace: Workspace, *, topics: Topics = Topics()) -> list[Mission]:
+def read_bag(
+    path: FilePath,
+    workspace: Workspace,
+    *,
+    bound: str = "/mission/bound",
+    status: str = "/mission/status",
+    contact: str = "/{robot}/contact",
+    pose: str = "/{robot}/odom",
+    lead: str = "lead",
+) -> list[Mission]:
     """Read the missions of a ROS bag.
 
     Args:
         path: A `.bag` file of ROS 1, or the folder of a bag of ROS 2.
         workspace: Workspace whose robots are read, in its order.
-        topics: Names of topics, if not the default ones.
+        bound: Topic that marks the start of each bound.
+        status: Topic with the status of bounds and missions.
+        contact: Topic with the contact of each robot, whose name replaces `{robot}`.
+        pose: Topic with the pose of each robot and of the lead.
+        lead: Name of the lead.
 
     Returns:
         Missions with the ticks of robots. Awareness is NaN; campaigns use the map's awareness.
 
     Raises:
         TrustboError: rosbags is not installed; the path is not a bag, or the bag is damaged; a
-            topic is missing; a clock goes backwards; markers are out of order; or `Mission` refuses
-            the data.
+            topic is missing; markers are out of order; or `Mission` refuses the data.
     """
     robots = workspace.team.names
-    contact = [topics.contact.replace("{robot}", robot) for robot in robots]
-    poses = [topics.pose.replace("{robot}", robot) for robot in (topics.lead, *robots)]
-    messages = _messages(Path(path), [topics.bound, *contact], [topics.status, *poses])
+    contacts = [contact.replace("{robot}", robot) for robot in robots]
+    poses = [pose.replace("{robot}", robot) for robot in (lead, *robots)]
+    messages = _messages(Path(path), [bound, *contacts], [status, *poses])
     if not all(len(messages[topic]) for topic in poses):
         poses = []
     found = _Recording(
-        messages[topics.status].map(lambda message: str(message.data)),
-        [_contacts(topic, messages[topic]) for topic in contact],
+        messages[status].map(lambda message: str(message.data)),
+        [_contacts(topic, messages[topic]) for topic in contacts],
         [_poses(topic, messages[topic]) for topic in poses],
     )
-    markers = sorted(_marker(time, message) for time, message in messages[topics.bound].items())
-    starts = [i for i, (_, bound, *_) in enumerate(markers) if bound == 0]
+    markers = sorted(_marker(time, message) for time, message in messages[bound].items())
+    starts = [i for i, (_, k, *_) in enumerate(markers) if k == 0]
     if not starts or starts[0] > 0:
         raise TrustboError(f"{str(path)!r} must begin with the marker of bound 0, the start cell.")
     missions = []
@@ -106,7 +98,7 @@ def read_bag(path: FilePath, workspace: Workspace, *, topics: Topics = Topics())
 
 
 def _messages(path: Path, needed: Sequence[str], optional: Sequence[str]) -> dict[str, pd.Series]:
-    """Read the messages of each topic by their time of recording, ns."""
+    """Read the messages of each topic in the order of their time of recording, ns."""
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
@@ -133,7 +125,7 @@ def _messages(path: Path, needed: Sequence[str], optional: Sequence[str]) -> dic
         found = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(there.items()))
         raise TrustboError(
             f"{str(path)!r} lacks {', '.join(missing)}; it has {found or 'no topics'}. "
-            "Topics with other names: topics=Topics(...)."
+            'Name other topics, such as contact="/{robot}/sees".'
         )
     for topic, stamps in times.items():
         if (np.diff(np.array(stamps, dtype=np.int64)) < 0).any():
@@ -198,11 +190,11 @@ def _bound(
     found: _Recording, cell: Cell, begin: int, until: int, start: int, workspace: Workspace
 ) -> Bound:
     """Make a bound from its marker to the next one, in a mission that begins at `start`, ns."""
-    statuses = found.status.loc[begin + 1 : until]
+    status = found.status.loc[begin + 1 : until]
     contacts = [contact.loc[begin + 1 : until] for contact in found.contact]
     end = max((int(contact.index[-1]) for contact in contacts if len(contact)), default=begin)
-    if len(statuses):
-        end = int(statuses.index[0])
+    if len(status):
+        end = int(status.index[0])
         contacts = [contact.loc[:end] for contact in contacts]
     n_ticks = np.array([len(contact) or np.nan for contact in contacts])
     ticks = max(contacts, key=len).index
@@ -214,7 +206,7 @@ def _bound(
         np.full((len(contacts), len(workspace.features)), np.nan),
         np.array([contact.mean() for contact in contacts]),
         np.full(len(contacts), (end - begin) / _NS if end > begin else np.nan),
-        statuses.iloc[0] if len(statuses) else "ok",
+        status.iloc[0] if len(status) else "ok",
         (begin - start) / _NS,
         np.stack(poses, axis=1) if poses else None,
         np.stack(seen, axis=1) > 0.5 if not np.isnan(n_ticks).any() else None,
