@@ -69,6 +69,18 @@ def test_looks_that_failed_are_no_ticks_and_a_bound_ends_with_its_last_contact(w
     assert one.bounds[0].poses is None
 
 
+@pytest.mark.parametrize("kind", ["log.bag", "sqlite3", "mcap"])
+def test_messages_that_are_stored_out_of_order_are_put_in_order(kind, workspace, tmp_path):
+    log = Log(1 if kind == "log.bag" else 2)
+    log.contact("r1", (4.0, True), (2.0, False), (3.0, True))
+    log.contact("r2", (3.5, True))
+    for seconds, *marker in ((1.5, 1, 1, 1), (1.0, 0, 2, 0), (3.2, 2, 0, 2)):
+        log.bound(seconds, *marker)
+    (one,) = read_bag(log.save(tmp_path / kind, kind), workspace)
+    np.testing.assert_array_equal(one.contact_rate, [[0.5, np.nan], [1.0, 1.0]])
+    np.testing.assert_allclose(one.duration[:, 0], [1.5, 0.8])
+
+
 @pytest.mark.parametrize(
     "markers", [((1, 1, 1),), ((0, 2, 0), (2, 1, 1)), ((0, 2, 0), (1, 1)), ((0, 2, 0), (-1, 1, 1))]
 )

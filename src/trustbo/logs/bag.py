@@ -127,9 +127,6 @@ def _messages(path: Path, needed: Sequence[str], optional: Sequence[str]) -> dic
             f"{str(path)!r} lacks {', '.join(missing)}; it has {found or 'no topics'}. "
             'Name other topics, such as contact="/{robot}/sees".'
         )
-    for topic, stamps in times.items():
-        if (np.diff(np.array(stamps, dtype=np.int64)) < 0).any():
-            raise TrustboError(f"the clock of {topic} goes backwards.")
     return {t: pd.Series(m, pd.Index(times[t], dtype=int), object) for t, m in messages.items()}
 
 
