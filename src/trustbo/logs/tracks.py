@@ -13,14 +13,11 @@ from trustbo.errors import TrustboError, require_cells, require_choice, require_
 from trustbo.logs.columns import Columns, require_one_spelling, seconds_of
 from trustbo.workspace import Workspace
 
-EACH = "each"
 _FEATURES = ("near", "ahead")
 _AHEAD = np.pi / 6.0
 """Half of the angle in which a robot is ahead, rad."""
 _EXTENT = 0.1
 """Least extent of a log, m."""
-_FEWEST = 2
-"""Minimum number of bounds of a mission without a planned path."""
 
 
 def read_tracks(
@@ -29,7 +26,7 @@ def read_tracks(
     workspace: Workspace | None = None,
     *,
     path: Sequence[Cell] | None = None,
-    lead: str = EACH,
+    lead: str | None = None,
     window: float = 20.0,
     tick: float = 1.0,
     max_gap: float = 5.0,
@@ -75,33 +72,30 @@ def read_tracks(
             positions or headings cannot be in seconds, metres and radians, the lead is unknown, or
             the log is too short for two bounds.
     """
-    tracks, looks = _read(poses, detections, require_positive("tick", tick))
+    tick, max_gap = require_positive("tick", tick), require_positive("max_gap", max_gap)
+    tracks, looks = _read(poses, detections, tick)
     robots = tuple(tracks)
-    require_choice("lead", lead, (*robots, EACH))
     team = robots if workspace is None else workspace.team.names
     for name in team:
-        if name not in robots:
-            raise TrustboError(f"the poses have no robot {name!r} of the team; they have {robots}.")
-    if workspace is not None and lead == EACH:
-        others = [name for name in robots if name not in team]
-        if len(others) != 1:
-            raise TrustboError(f"lead must be one of {others or robots}, to read a log with a map.")
-        lead = others[0]
-    start = min(track[0, 0] for track in tracks.values())
-    end = max(track[-1, 0] for track in tracks.values())
-    n = int(np.floor((end - start) / tick + 1e-9))
-    times, gap = start + (np.arange(n) + 0.5) * tick, require_positive("max_gap", max_gap)
-    places = np.stack([_at(track, times, gap) for track in tracks.values()])
-    looks[:, 0] = np.floor((looks[:, 0] - start) / tick + 1e-9)
-    ticks = _ticks(places, looks[(looks[:, 0] >= 0) & (looks[:, 0] < n)].astype(int))
-    of_team = [robots.index(name) for name in team]
+        require_choice("robot of the team", name, robots)
+    leads = robots if workspace is None else [name for name in robots if name not in team]
+    if lead is not None:
+        leads = [require_choice("lead", lead, robots)]
+    elif workspace is not None and len(leads) != 1:
+        raise TrustboError(f"lead must be one of {leads or robots}, to read a log with a map.")
     planned = None if path is None else require_cells("path", path)
     if planned and workspace is None:
         raise TrustboError("path= needs the workspace of its cells.")
-    missions, fewest = [], _FEWEST if planned is None else 1
-    for i, name in enumerate(robots):
-        if lead not in (name, EACH):
-            continue
+    start = min(track[0, 0] for track in tracks.values())
+    end = max(track[-1, 0] for track in tracks.values())
+    n = int((end - start) / tick + 1e-9)
+    times = start + (np.arange(n) + 0.5) * tick
+    places = np.stack([_at(track, times, max_gap) for track in tracks.values()])
+    looks[:, 0] = np.floor((looks[:, 0] - start) / tick + 1e-9)
+    ticks = _ticks(places, looks[(looks[:, 0] >= 0) & (looks[:, 0] < n)].astype(int))
+    of_team, missions = [robots.index(name) for name in team], []
+    fewest = 2 if planned is None else 1
+    for i in map(robots.index, leads):
         if workspace is None:
             step = max(round(require_positive("window", window) / tick), 1)
             stretches = [(np.arange(0, n + 1, step), None)]
@@ -123,42 +117,41 @@ def _read(poses: Any, detections: Any, tick: float) -> tuple[dict[str, np.ndarra
     where = Columns(poses, "the table of poses")
     seen = Columns(detections, "the table of detections")
     t, seen_at = seconds_of(where, seen)
-    names, pairs = where.texts("robot"), [seen.texts(end) for end in ("watcher", "seen")]
+    names, pairs = where.texts("robot", blank=False), [seen.texts(n) for n in ("watcher", "seen")]
     robots = tuple(dict.fromkeys(names))
-    if len(robots) < 2 or "" in robots:
+    if len(robots) < 2:
         raise TrustboError(f"poses must include at least two named robots; got {robots}.")
     require_one_spelling("the names in poses and detections", [*names, *pairs[0], *pairs[1]])
     xy = [where.numbers(name, blank=False) for name in ("x", "y")]
-    if max(np.ptp(xy[0]), np.ptp(xy[1])) < _EXTENT:
+    if np.ptp(xy, axis=1).max() < _EXTENT:
         raise TrustboError(
             f"all poses lie within {_EXTENT:g} m; x and y are metres, not degrees or kilometres."
         )
     heading = where.numbers("heading", required=False)
     rows, of = np.column_stack([t, *xy, heading]), np.array(names)
-    index = {name: i for i, name in enumerate(robots)}
-    looks = [(s, index[a], index[b]) for s, a, b in zip(seen_at, *pairs, strict=True)
-             if a in index and b in index and a != b]  # fmt: skip
-    if not looks:
+    watcher, other = (pd.Index(robots).get_indexer(pd.Index(one)) for one in pairs)
+    known = (watcher >= 0) & (other >= 0) & (watcher != other)
+    looks = np.column_stack([seen_at, watcher, other])[known]
+    if not len(looks):
         raise TrustboError(
             f"in no detection does one of {robots} detect another; in the first, "
             f"{pairs[0][0]!r} detects {pairs[1][0]!r}."
         )
     readings = pd.DataFrame(looks, columns=["t", "watcher", "seen"]).drop_duplicates()
-    gaps = np.asarray(readings.sort_values("t").groupby(["watcher", "seen"])["t"].diff())
-    gaps = gaps[~np.isnan(gaps)]  # none before the first detection of a pair
-    apart = float(np.quantile(gaps, 0.05)) if len(gaps) else 0.0
+    gaps = readings.sort_values("t").groupby(["watcher", "seen"])["t"].diff()
+    apart = float(pd.Series(gaps).quantile(0.05))  # NaN if no robot detects another twice
     if apart > 1.5 * tick:
         warnings.warn(
             f"two detections of a robot by another are at least {apart:g} s apart, and ticks of "
             f"{tick:g} s without detections count as lost contact; pass tick={apart:g}.",
             stacklevel=3,
         )
-    if silent := {*robots} - {robots[i] for look in looks for i in look[1:]}:
+    if silent := [name for i, name in enumerate(robots) if i not in looks[:, 1:]]:
         warnings.warn(
-            f"no detection names {', '.join(sorted(silent))}; the contact of such a robot is 0.",
+            f"no detection names {', '.join(silent)}; the contact of such a robot is 0.",
             stacklevel=3,
         )
-    return {name: _track(name, rows[of == name]) for name in robots}, np.array(looks, dtype=float)
+    return {name: _track(name, rows[of == name]) for name in robots}, looks
 
 
 def _track(name: str, rows: np.ndarray) -> np.ndarray:
@@ -246,10 +239,11 @@ def _mission(
     sums = np.add.reduceat(ticks[:, : edges[-1]], edges[:-1], axis=1).swapaxes(0, 1)
     n_ticks = np.where(sums[..., :1] > 0.0, sums[..., :1], np.nan)
     means = sums[..., 1:] / n_ticks
-    z, measured = means[..., 1:], ~np.isnan(n_ticks)
-    usual = np.nansum(z, axis=0) / np.maximum(measured.sum(axis=0), 1)
-    z, features = np.where(measured, z, usual), _FEATURES
-    if workspace is not None:
+    z, features = means[..., 1:], _FEATURES
+    if workspace is None:
+        usual = np.nansum(z, axis=0) / np.maximum((~np.isnan(z)).sum(axis=0), 1)
+        z = np.where(np.isnan(z), usual, z)
+    else:
         features = workspace.features
         z = np.full((*n_ticks.shape[:2], len(features)), np.nan)
     status = "ok" if path is None or len(edges) == len(path) else "aborted"
