@@ -2,16 +2,17 @@
 
 import re
 import warnings
-from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
+import xarray as xr
 
 from trustbo.errors import TrustboError
 
 LOWEST, HIGHEST = -450.0, 9000.0
 """Range of heights on land, m: the Dead Sea's shore is at -430 m, Everest's summit at 8849 m."""
 _FILLS = (-99999.0, -32768.0, -32767.0, -9999.0)  # suspicious before a scale is applied, too
+_FILL_NAMES = ("_FillValue", "missing_value", "fill_value", "nodata")
 _METRE = {"m", "metre", "metres", "meter", "meters"}
 _FOOT = {"ft", "foot", "feet", "ftus", "usft"}
 _US = {"us", "survey", "ftus", "usft"}
@@ -23,42 +24,40 @@ def warn(message: str) -> None:
     warnings.warn(message, skip_file_prefixes=(_PACKAGE,), stacklevel=2)
 
 
-def decoded(
-    stored: np.ndarray,
-    name: str,
-    fills: Iterable[float],
-    linear: tuple[float, float],
-    metres: float,
-) -> np.ndarray:
-    """Convert stored values to heights in metres, metres * (scale * stored + offset).
+def in_metres(stored: xr.DataArray, axis: float | None, nodata: float | None) -> np.ndarray:
+    """Convert stored values (row, col) to heights in metres, NaN where missing.
 
-    Args:
-        stored: Values (row, col).
-        name: Name of the raster, for messages.
-        fills: Stored values that mark missing data, as non-finite ones do; they become NaN.
-        linear: Scale and offset.
-        metres: Length of the unit of heights in metres, negative for depths.
+    The unit, scale, offset and fill values are those of the attributes. `nodata` is another fill
+    value, and `axis` is the length of the unit of the CRS's vertical axis in metres, negative for
+    depths, if there is one.
 
     Raises:
         TrustboError: Values are not real numbers, or are impossible as heights on land: undeclared
-            fill values, fill values blended with heights, or heights in another unit.
+            fill values, fill values blended with heights, or heights in another unit. The unit is
+            unknown, or band and CRS disagree on it.
     """
-    if stored.dtype.kind not in "iuf":
-        raise TrustboError(f"{name} holds {stored.dtype}, not heights; give real numbers.")
-    values = stored.astype(float)
+    name, attrs, raw = str(stored.name), stored.attrs, stored.to_numpy()
+    if raw.dtype.kind not in "iuf":
+        raise TrustboError(f"{name} holds {raw.dtype}, not heights; give real numbers.")
+    metres = _unit_of(name, attrs.get("units"), axis)
+    if abs(metres) != 1.0:
+        warn(f"{name} has heights in units of {abs(metres):.6g} m; they are converted to metres.")
+    values = raw.astype(float)
     missing = ~np.isfinite(values)
-    with np.errstate(over="ignore"):
-        for fill in fills:  # rounded to the raster's type: float32 has no exact -3.4e38
-            missing |= stored == fill
-    scale, offset = linear
+    for tag in (nodata, *(attrs.get(key) for key in _FILL_NAMES)):
+        for fill in np.ravel(np.array(tag, float)).tolist():  # NaN if there is no such tag
+            with np.errstate(over="ignore"):
+                missing |= raw == fill  # rounded to the raster's type: float32 has no -3.4e38
+    scale, offset = attrs.get("scale_factor", 1.0), attrs.get("add_offset", 0.0)
     suspicious = np.isin(values, _FILLS if scale != 1.0 else (*_FILLS, -999.0))
     heights = metres * (scale * values + offset)
     heights[missing] = np.nan
     wrong = ~missing & (suspicious | (heights < LOWEST) | (heights > HIGHEST))
     if not wrong.any():
+        _warn_of_zeros(heights, name)
         return heights
     r, c = np.unravel_index(np.argmax(wrong), wrong.shape)
-    value, height = float(stored[r, c]), heights[r, c]
+    value, height = float(raw[r, c]), heights[r, c]
     scaled = "" if value == height else f" (scaled to {height:g} m)"
     where = f"{name} holds {value!r}{scaled} at row {r}, column {c}"
     share = wrong.sum() / np.isfinite(heights).sum()
@@ -75,7 +74,7 @@ def decoded(
     )
 
 
-def warn_of_zeros(heights: np.ndarray, name: str) -> None:
+def _warn_of_zeros(heights: np.ndarray, name: str) -> None:
     """Warn of pixels at exactly 0 m, far from all other heights: an undeclared fill value."""
     zero, low = heights == 0.0, np.abs(heights) <= 10.0
     others = np.isfinite(heights).sum() - zero.sum()
@@ -86,16 +85,10 @@ def warn_of_zeros(heights: np.ndarray, name: str) -> None:
         )
 
 
-def metres_of(name: str, declared: object, axis: float | None) -> float:
+def _unit_of(name: str, declared: object, axis: float | None) -> float:
     """Return the length of the unit of heights in metres, negative for depths.
 
-    Args:
-        name: Name of the raster.
-        declared: Unit of the band, or units of all bands; the first one is used. None if unknown.
-        axis: Length of the unit of the CRS's vertical axis, m, if there is one.
-
-    Raises:
-        TrustboError: The unit is unknown, or band and CRS disagree.
+    `declared` is the unit of the band, or the units of all bands; None if unknown.
     """
     text = str(np.ravel(np.array(declared, object))[0] or "").strip()
     words = set(re.findall(r"[a-z]+", text.lower()))

@@ -20,7 +20,7 @@ from rioxarray.exceptions import MissingSpatialDimensionError
 
 from trustbo.errors import TrustboError, require_positive
 from trustbo.files import FilePath
-from trustbo.terrain.heights import decoded, metres_of, warn, warn_of_zeros
+from trustbo.terrain.heights import in_metres, warn
 from trustbo.terrain.place import (
     horizontal,
     on_metric_grid,
@@ -33,7 +33,6 @@ from trustbo.terrain.place import (
 _MOST_PIXELS = 1e8  # of a raster: some 3 GB while it is read
 _CLIPPED = 0.02  # share of pixels with the surface below the ground, above which a warning is due
 _TALL, _RAISED = 60.0, 20.0  # m: unlikely medians and 5 % quantiles of canopy heights
-_FILL_NAMES = ("_FillValue", "missing_value", "fill_value", "nodata")
 
 
 def read_terrain(
@@ -138,14 +137,7 @@ def _heights(
     name = str(array.name)
     crs = require_map(name, array.rio.crs, given)
     axis, datum = vertical_axis(crs)
-    metres = metres_of(name, array.attrs.get("units"), axis)
-    if abs(metres) != 1.0:
-        warn(f"{name} has heights in units of {abs(metres):.6g} m; they are converted to metres.")
-    tags = [nodata, *(array.attrs.get(key) for key in _FILL_NAMES)]
-    fills = [float(fill) for tag in tags if tag is not None for fill in np.ravel(tag)]
-    scale, offset = array.attrs.get("scale_factor", 1.0), array.attrs.get("add_offset", 0.0)
-    values = decoded(array.to_numpy(), name, fills, (scale, offset), metres)
-    warn_of_zeros(values, name)
+    values = in_metres(array, axis, nodata)
     coords = {axis: array[axis].values for axis in ("y", "x")}
     heights = xr.DataArray(values, coords, name=name, attrs={"datum": datum})
     heights = heights.sortby("y", ascending=False).sortby("x")
@@ -162,10 +154,9 @@ def _stored(raster: FilePath | xr.DataArray, role: str) -> xr.DataArray:
         raise TrustboError(f"{role} must be a path or an xarray.DataArray; got {kind}.")
     name = f"{role}: {fspath(raster)!r}"
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            with rasterio.open(raster) as file:
-                return _of_array(_of_file(file, name), name)
+        quiet = warnings.catch_warnings(action="ignore", category=NotGeoreferencedWarning)
+        with quiet, rasterio.open(raster) as file:
+            return _of_array(_of_file(file, name), name)
     except RasterioError as error:
         raise TrustboError(f"{name} cannot be read by GDAL: {error}.") from None
 
@@ -195,8 +186,6 @@ def _of_file(file: DatasetReader, name: str) -> xr.DataArray:
             f"{name} is a picture: its first band has the colour {first.name!r}; give a raster of "
             "heights, e.g. one band of it with gdal_translate -b."
         )
-    if file.dtypes[0].startswith("complex"):
-        raise TrustboError(f"{name} holds complex numbers, not heights; give real numbers.")
     stored = file.read(1, masked=True)
     values = stored.astype(np.result_type(stored, np.float32)).filled(np.nan)
     alpha = [k for k, colour in enumerate(others, 2) if colour == ColorInterp.alpha]
