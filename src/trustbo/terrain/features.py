@@ -116,17 +116,15 @@ def canopy_cover(terrain: xr.Dataset) -> np.ndarray:
 
 
 @feature("vegetation_density", sign=-1)
-def vegetation_density(
-    terrain: xr.Dataset, *, layer: float = 3.0, crown_base: float = 0.3
-) -> np.ndarray:
-    """Compute the share of the lowest `layer` metres of air that canopy fills.
+def vegetation_density(terrain: xr.Dataset) -> np.ndarray:
+    """Compute the share of the lowest 3 metres of air that canopy fills.
 
-    It is averaged over squares of half-width 5 m. The canopy is the layer from `crown_base` times
-    its height to its top.
+    It is averaged over squares of half-width 5 m. The canopy is the layer from 0.3 times its height
+    to its top.
     """
     height = canopy_height(terrain)
-    filled = np.minimum(height, layer) - np.minimum(crown_base * height, layer)
-    return _local_mean(terrain, np.maximum(filled, 0.0) / layer)
+    filled = np.minimum(height, 3.0) - np.minimum(0.3 * height, 3.0)
+    return _local_mean(terrain, np.maximum(filled, 0.0) / 3.0)
 
 
 @feature("openness", sign=+1)

@@ -52,15 +52,10 @@ def synthetic_terrain(
     crowns = ndimage.gaussian_filter(rng.standard_normal(shape), 2.0 / resolution)
     height = 6.0 * np.exp(0.5 * crowns / crowns.std() - 0.125)
     dsm = dem + np.where(wooded, height, 0.0)
-    left, top = 380_000.0, 5_225_000.0
-    coords = {
-        "y": top - (np.arange(shape[0]) + 0.5) * resolution,
-        "x": left + (np.arange(shape[1]) + 0.5) * resolution,
-    }
-    arrays = (
-        xr.DataArray(a, coords, dims=("y", "x")).rio.write_crs("EPSG:32616") for a in (dem, dsm)
-    )
-    return read_terrain(*arrays)
+    y = 5_225_000.0 - (np.arange(shape[0]) + 0.5) * resolution
+    x = 380_000.0 + (np.arange(shape[1]) + 0.5) * resolution
+    maps = (xr.DataArray(z, {"y": y, "x": x}, ("y", "x")) for z in (dem, dsm))
+    return read_terrain(*(one.rio.write_crs("EPSG:32616") for one in maps))
 
 
 def _fractal(rng: np.random.Generator, shape: tuple[int, int], exponent: float) -> np.ndarray:
