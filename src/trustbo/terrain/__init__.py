@@ -16,7 +16,6 @@ from trustbo.terrain.synthetic import synthetic_terrain
 
 __all__ = [
     "FEATURES", "PAPER_VISIBILITY", "TRAVERSABILITY", "VISIBILITY", "CompositeIndex", "example",
-    "feature", "gradient", "pixel_size", "read_lidar", "read_terrain",
-    "synthetic_terrain",
+    "feature", "gradient", "pixel_size", "read_lidar", "read_terrain", "synthetic_terrain",
 ]  # fmt: skip
 __dir__ = __all__.copy  # completion lists public names alone

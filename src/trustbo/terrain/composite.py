@@ -76,7 +76,17 @@ class CompositeIndex:
             {"feature": [*self.signs], "component": np.arange(1, len(ratios) + 1)},
             {"bottom": float(bottom), "top": float(top)},
         )
-        self._warn()
+        agrees = self.loadings_ * signs
+        for name in agrees["feature"].values[agrees < 0].tolist():
+            warn(
+                f"the loading of {name!r} has the opposite sign to the one declared; check "
+                "loadings_, and leave the feature out if it misleads."
+            )
+        if ratios[0] < 0.5:
+            warn(
+                f"the first component of {', '.join(self.signs)} explains only {ratios[0]:.0%} of "
+                "their variance; check loadings_, and leave one out or use two composites."
+            )
         return self
 
     @property
@@ -111,16 +121,3 @@ class CompositeIndex:
         if missing:
             raise TrustboError(f"the composite needs {', '.join(missing)}; got {list(features)}.")
         return [np.asarray(features[name], float) for name in self.signs]
-
-    def _warn(self) -> None:
-        agrees = self.fitted["loading"] * self.fitted["sign"]
-        for name in agrees["feature"].values[agrees < 0].tolist():
-            warn(
-                f"the loading of {name!r} has the opposite sign to the one declared; check "
-                "loadings_, and leave the feature out if it misleads."
-            )
-        if (ratio := float(self.explained_variance_ratio_[0])) < 0.5:
-            warn(
-                f"the first component of {', '.join(self.signs)} explains only {ratio:.0%} of "
-                "their variance; check loadings_, and leave one out or use two composites."
-            )

@@ -15,9 +15,8 @@ def example() -> xr.Dataset:
     """Read the example of real terrain that is included in the package.
 
     It is a steep hillside under bush in the Wairarapa, New Zealand, near Wellington: 195 m x 278 m
-    at 1 m, 211 m of relief, trees of up to 44.6 m. Copyright in this work is owned by Greater
-    Wellington Regional Council; sourced from the LINZ Data Service, CC BY 4.0. The attribute
-    `attribution` states this; `LICENCE.md` beside the files says which part of it is inferred.
+    at 1 m, 211 m of relief, trees of up to 44.6 m. The attribute `attribution` states the source
+    and the licence; `LICENCE.md` beside the files says which part of it is inferred.
 
     Returns:
         Dataset as from `read_terrain`.

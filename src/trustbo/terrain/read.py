@@ -18,7 +18,7 @@ from rasterio.errors import NotGeoreferencedWarning, RasterioError
 from rasterio.io import DatasetReader
 from rioxarray.exceptions import MissingSpatialDimensionError
 
-from trustbo.errors import TrustboError, require_positive
+from trustbo.errors import TrustboError, require_kind, require_positive
 from trustbo.files import FilePath
 from trustbo.terrain.heights import in_metres, warn
 from trustbo.terrain.place import (
@@ -86,13 +86,10 @@ def read_terrain(
             f"{ground.name} has heights above {datums[0]!r}, but {surface.name} above "
             f"{datums[1]!r}; transform one of them, e.g. with gdalwarp -t_srs."
         )
-    alike = same_grid(ground, surface)
-    ground = on_metric_grid(ground)
-    if alike:
-        surface = on_metric_grid(surface)
-    else:
-        how = Resampling.bilinear
-        surface = surface.rio.reproject_match(ground, resampling=how, nodata=np.nan)
+    alike, ground = same_grid(ground, surface), on_metric_grid(ground)
+    if not alike:
+        surface = surface.rio.reproject_match(ground, resampling=Resampling.bilinear, nodata=np.nan)
+    surface = on_metric_grid(surface)
     terrain = _averaged(_paired(ground, surface), resolution).rio.write_crs(ground.rio.crs)
     return terrain.rio.write_transform(terrain.rio.transform(recalc=True))
 
@@ -102,11 +99,9 @@ def require_terrain(terrain: xr.Dataset) -> xr.Dataset:
 
     TrustboError: `dem` or `dsm` is missing, or `read_terrain` rejects the data.
     """
-    if not isinstance(terrain, xr.Dataset) or not {"dem", "dsm"} <= set(terrain.data_vars):
-        raise TrustboError(
-            "a terrain is a Dataset with dem and dsm over (y, x), as read_terrain gives it; got "
-            f"{type(terrain).__name__}."
-        )
+    remedy = "give a Dataset with dem and dsm over (y, x), as from read_terrain"
+    if not {"dem", "dsm"} <= {*require_kind("terrain", terrain, xr.Dataset, remedy)}:
+        raise TrustboError(f"the terrain has {', '.join(map(str, terrain))}; {remedy}.")
     read = read_terrain(terrain["dem"], terrain["dsm"], crs=terrain.rio.crs)
     return read.assign_attrs(terrain.attrs)
 
@@ -146,12 +141,10 @@ def _heights(
 
 def _stored(raster: FilePath | xr.DataArray, role: str) -> xr.DataArray:
     """Read stored values of a file or an array, dims (y, x), named with `role` for messages."""
+    require_kind(role, raster, str | PathLike | xr.DataArray, "give a path or a DataArray")
     if isinstance(raster, xr.DataArray):
         name = f"{role}: DataArray" + (f" {raster.name!r}" if raster.name else "")
         return _of_array(raster, name)
-    if not isinstance(raster, str | PathLike):
-        kind = type(raster).__name__
-        raise TrustboError(f"{role} must be a path or an xarray.DataArray; got {kind}.")
     name = f"{role}: {fspath(raster)!r}"
     try:
         quiet = warnings.catch_warnings(action="ignore", category=NotGeoreferencedWarning)
