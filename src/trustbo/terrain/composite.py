@@ -29,13 +29,9 @@ class CompositeIndex:
             become 0 and 1.
     """
 
-    fitted: xr.Dataset
-
     def __init__(self, signs: Mapping[str, int], fitted: xr.Dataset | None = None) -> None:
         """Set the features and their signs, and the `fitted` of an earlier fit."""
-        self.signs = dict(signs)
-        if fitted is not None:
-            self.fitted = fitted
+        self.signs, self.fitted = dict(signs), xr.Dataset() if fitted is None else fitted
 
     def fit(self, features: Mapping[str, ArrayLike] | xr.Dataset) -> Self:
         """Fit the limits, the loadings and the scale.

@@ -1,12 +1,8 @@
 """Features of pixels that impede motion or sight.
 
 A feature is a function of a terrain (Dataset of `dem` and `dsm`, dims (y, x), metres) that returns
-an array (row, col), NaN where unknown. `feature` registers such a function for composites:
-
-    @tb.terrain.feature("northness", sign=+1)
-    def northness(terrain):
-        east, north = tb.terrain.gradient(terrain["dem"].values, tb.terrain.pixel_size(terrain))
-        return -north / np.hypot(east, north)
+an array (row, col), NaN where unknown. `feature` registers such a function for composites, as in
+the example of `docs/terrain.md`.
 """
 
 from collections.abc import Callable

@@ -34,12 +34,11 @@ def require_map(name: str, own: Any, given: Any) -> CRS:
             f"{name} is in {crs.to_string()}, but crs= is {given}; leave crs= out, or correct the "
             "raster's own CRS, e.g. with gdal_edit.py -a_srs."
         )
-    if not flat.is_geographic and not flat.is_projected:
-        raise TrustboError(f"{name} is in {crs.to_string()}, not a map of the Earth; reproject it.")
-    if flat.is_projected and abs(flat.linear_units_factor[1] - 1.0) > 1e-9:
+    in_metres = flat.is_projected and abs(flat.linear_units_factor[1] - 1.0) <= 1e-9
+    if not flat.is_geographic and not in_metres:
         raise TrustboError(
-            f"{name} has a map in {flat.linear_units_factor[0]}, not metres; warp it, e.g. with "
-            "gdalwarp -t_srs EPSG:32633."
+            f"{name} is in {crs.to_string()}, not in degrees and not a map in metres; warp it, "
+            "e.g. with gdalwarp -t_srs EPSG:32633."
         )
     return crs
 
