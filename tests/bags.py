@@ -1,9 +1,6 @@
 """ROS bags as robots write them, by rosbags alone: the reader of trustbo has no part in them."""
 
 import json
-import math
-
-import numpy as np
 
 S = 1_000_000_000  # ns
 
@@ -32,28 +29,6 @@ class Log:
     def contact(self, robot, *looks, kind="std_msgs/msg/Bool"):
         for seconds, value in looks:
             self.say(seconds, f"/{robot}/contact", kind, data=value)
-
-    def odometry(self, seconds, robot, x, y, quaternion=(0.0, 0.0, 0.0, 1.0), stamp=None):
-        t, make = round((seconds if stamp is None else stamp) * S), self.type
-        time = make("builtin_interfaces/msg/Time")(sec=t // S, nanosec=t % S)
-        seq = {"seq": 0} if self.version == 1 else {}
-        q = dict(zip("xyzw", quaternion, strict=True))
-        pose = make("geometry_msgs/msg/Pose")(
-            position=make("geometry_msgs/msg/Point")(x=x, y=y, z=1.0),
-            orientation=make("geometry_msgs/msg/Quaternion")(**q),
-        )
-        still = make("geometry_msgs/msg/Vector3")(x=0.0, y=0.0, z=0.0)
-        twist = make("geometry_msgs/msg/Twist")(linear=still, angular=still)
-        unknown = np.zeros(36)
-        self.say(
-            seconds,
-            f"/{robot}/odom",
-            "nav_msgs/msg/Odometry",
-            header=make("std_msgs/msg/Header")(stamp=time, frame_id="odom", **seq),
-            child_frame_id="base",
-            pose=make("geometry_msgs/msg/PoseWithCovariance")(pose=pose, covariance=unknown),
-            twist=make("geometry_msgs/msg/TwistWithCovariance")(twist=twist, covariance=unknown),
-        )
 
     def save(self, path, storage="sqlite3"):
         from rosbags import rosbag1, rosbag2
@@ -87,20 +62,11 @@ def record(missions, path, *, storage="sqlite3", names=None):
             log.text(begin / S, "/mission/bound", json.dumps(marker))
             for tick in range(len(bound.contact)):
                 time = (begin + (end - begin) * (tick + 1) // len(bound.contact)) / S
-                _say_tick(log, time, mission.robots, bound, tick)
+                for robot, seen in zip(mission.robots, bound.contact[tick].tolist(), strict=True):
+                    log.contact(robot, (time, seen))
             log.text(end / S, "/mission/status", bound.status)
         if mission.status != mission.bounds[-1].status:
             log.text((end + 1) / S, "/mission/status", mission.status)
         now = end + S
     log.messages = [(time, (names or {}).get(on, on), *rest) for time, on, *rest in log.messages]
     return log.save(path, storage)
-
-
-def _say_tick(log, seconds, robots, bound, tick):
-    for i, robot in enumerate(robots):
-        log.contact(robot, (seconds, bool(bound.contact[tick, i])))
-    if bound.poses is not None:
-        for robot, pose in zip(("lead", *robots), bound.poses[tick].tolist(), strict=True):
-            x, y, heading = pose
-            turn = 0.0, 0.0, math.sin(heading / 2.0), math.cos(heading / 2.0)
-            log.odometry(seconds, robot, x, y, turn)

@@ -48,10 +48,8 @@ def test_bags_of_all_kinds_give_the_missions_back(kind, driven, workspace, tmp_p
         np.testing.assert_allclose(one.duration, other.duration, atol=1e-8)
         assert np.isnan(one.awareness).all()
         for a, b in zip(one.bounds, other.bounds, strict=True):
-            np.testing.assert_array_equal(a.contact, b.contact)
-            turn = np.exp(1j * a.poses[..., 2]) - np.exp(1j * b.poses[..., 2])
-            np.testing.assert_allclose(a.poses[..., :2], b.poses[..., :2])
-            np.testing.assert_allclose(turn, 0.0, atol=1e-12)
+            assert a.t0 == pytest.approx(b.t0, abs=1e-8)
+            assert (a.status, a.poses, a.contact) == (b.status, None, None)
 
 
 def test_looks_that_failed_are_no_ticks_and_a_bound_ends_with_its_last_contact(workspace, tmp_path):
@@ -66,7 +64,6 @@ def test_looks_that_failed_are_no_ticks_and_a_bound_ends_with_its_last_contact(w
     np.testing.assert_array_equal(one.contact_rate, [[0.5, 1.0], [1.0, 0.0]])
     np.testing.assert_array_equal(one.n_ticks, [[2, 1], [1, 1]])
     np.testing.assert_allclose(one.duration[:, 0], [1.5, 2.0])
-    assert one.bounds[0].poses is None
 
 
 @pytest.mark.parametrize("kind", ["log.bag", "sqlite3", "mcap"])
@@ -94,17 +91,3 @@ def test_markers_out_of_order_are_refused(markers, workspace, tmp_path):
         read_bag(log.save(tmp_path / "bag"), workspace)
     with pytest.raises(TrustboError):
         read_bag(tmp_path / "none.bag", workspace)
-
-
-def test_orientations_that_no_driver_has_set_are_refused(workspace, tmp_path):
-    log = Log()
-    for seconds, *marker in ((1.0, 0, 2, 0), (1.0, 1, 1, 1)):
-        log.bound(seconds, *marker)
-    for robot in ("r1", "r2"):
-        log.contact(robot, (2.0, True), (3.0, True))
-    for robot in ("lead", "r1", "r2"):
-        for seconds in (1.0, 2.0, 3.0):
-            log.odometry(seconds, robot, seconds, 0.0, quaternion=(0.0, 0.0, 0.0, 0.0))
-    log.messages.sort(key=lambda message: message[0])
-    with pytest.raises(TrustboError, match="orientation"):
-        read_bag(log.save(tmp_path / "bag"), workspace)

@@ -6,7 +6,6 @@
     /mission/status   std_msgs/String, "ok", "stuck", ..., at the end of a bound, optional; a second
                       one after the last bound is the mission's.
     /{robot}/contact  std_msgs/Bool, or Float32 and Float64 in [0, 1], at each tick
-    /{robot}/odom     Odometry, PoseStamped or PoseWithCovarianceStamped, optional; also of /lead
 
 A bound lasts from its marker to its status or, without a status, to the last contact before the
 next marker. Its contact rate is the fraction of a robot's ticks with contact; NaN ticks are
@@ -17,7 +16,7 @@ import json
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -34,14 +33,6 @@ type Marker = tuple[int, int, Cell, tuple[Cell, ...]]
 """Time (ns), number and cell of a bound, and the planned path, which may be empty."""
 
 
-class _Recording(NamedTuple):
-    """Records of a bag by time, ns, in the order of the robots; poses begin with the lead."""
-
-    status: pd.Series
-    contact: list[pd.Series]  # 1 with contact, else 0
-    poses: list[pd.DataFrame]  # x, y, heading; empty if a robot has none
-
-
 def read_bag(
     path: FilePath,
     workspace: Workspace,
@@ -49,8 +40,6 @@ def read_bag(
     bound: str = "/mission/bound",
     status: str = "/mission/status",
     contact: str = "/{robot}/contact",
-    pose: str = "/{robot}/odom",
-    lead: str = "lead",
 ) -> list[Mission]:
     """Read the missions of a ROS bag.
 
@@ -60,27 +49,18 @@ def read_bag(
         bound: Topic that marks the start of each bound.
         status: Topic with the status of bounds and missions.
         contact: Topic with the contact of each robot, whose name replaces `{robot}`.
-        pose: Topic with the pose of each robot and of the lead.
-        lead: Name of the lead.
 
     Returns:
-        Missions with the ticks of robots. Awareness is NaN; campaigns use the map's awareness.
+        Missions without ticks. Awareness is NaN; campaigns use the map's awareness.
 
     Raises:
         TrustboError: rosbags is not installed; the path is not a bag, or the bag is damaged; a
             topic is missing; markers are out of order; or `Mission` refuses the data.
     """
-    robots = workspace.team.names
-    contacts = [contact.replace("{robot}", robot) for robot in robots]
-    poses = [pose.replace("{robot}", robot) for robot in (lead, *robots)]
-    messages = _messages(Path(path), [bound, *contacts], [status, *poses])
-    if not all(len(messages[topic]) for topic in poses):
-        poses = []
-    found = _Recording(
-        messages[status].map(lambda message: str(message.data)),
-        [_contacts(topic, messages[topic]) for topic in contacts],
-        [_poses(topic, messages[topic]) for topic in poses],
-    )
+    topics = [contact.replace("{robot}", robot) for robot in workspace.team.names]
+    messages = _messages(Path(path), [bound, *topics], status)
+    statuses = messages[status].map(lambda message: str(message.data))
+    found = statuses, [_contacts(topic, messages[topic]) for topic in topics]
     markers = sorted(_marker(time, message) for time, message in messages[bound].items())
     starts = [i for i, (_, k, *_) in enumerate(markers) if k == 0]
     if not starts or starts[0] > 0:
@@ -91,13 +71,13 @@ def read_bag(
             continue
         until = markers[end][0] if end < len(markers) else _NEVER
         try:
-            missions.append(_mission(found, markers[first:end], until, workspace))
+            missions.append(_mission(*found, markers[first:end], until, workspace))
         except TrustboError as error:
             raise TrustboError(f"{str(path)!r}, mission {len(missions) + 1}: {error}") from None
     return missions
 
 
-def _messages(path: Path, needed: Sequence[str], optional: Sequence[str]) -> dict[str, pd.Series]:
+def _messages(path: Path, needed: Sequence[str], optional: str) -> dict[str, pd.Series]:
     """Read the messages of each topic in the order of their time of recording, ns."""
     try:
         from rosbags.highlevel import AnyReader
@@ -105,7 +85,7 @@ def _messages(path: Path, needed: Sequence[str], optional: Sequence[str]) -> dic
     except ImportError:
         raise TrustboError("ROS bags need rosbags: python -m pip install rosbags") from None
 
-    messages: dict[str, list[Any]] = {topic: [] for topic in (*needed, *optional)}
+    messages: dict[str, list[Any]] = {topic: [] for topic in (*needed, optional)}
     times: dict[str, list[int]] = {topic: [] for topic in messages}
     there = {}
     try:
@@ -137,21 +117,6 @@ def _contacts(topic: str, messages: pd.Series) -> pd.Series:
     return (value.dropna() > 0.5).astype(float)
 
 
-def _poses(topic: str, messages: pd.Series) -> pd.DataFrame:
-    """Return position x and y, and heading in rad from the x axis, in [-pi, pi]."""
-    stamped = [getattr(message.pose, "pose", message.pose) for message in messages]
-    rows = [(p.position.x, p.position.y, *(getattr(p.orientation, i) for i in "xyzw"))
-            for p in stamped]  # fmt: skip
-    east, north, x, y, z, w = np.array(rows).T
-    if (x**2 + y**2 + z**2 + w**2 < 0.5).any():  # all 0 where a driver never sets it
-        raise TrustboError(
-            f"{topic} has poses whose orientation is not a unit quaternion, such as 0, 0, 0, 0; "
-            "record the poses with their headings."
-        )
-    yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y**2 + z**2))
-    return pd.DataFrame({"x": east, "y": north, "heading": yaw}, messages.index)
-
-
 def _marker(time: Any, message: Any) -> Marker:
     """Parse a message that marks the start of a bound."""
     try:
@@ -166,7 +131,13 @@ def _marker(time: Any, message: Any) -> Marker:
         ) from None
 
 
-def _mission(found: _Recording, markers: list[Marker], until: int, workspace: Workspace) -> Mission:
+def _mission(
+    statuses: pd.Series,
+    contacts: list[pd.Series],
+    markers: list[Marker],
+    until: int,
+    workspace: Workspace,
+) -> Mission:
     """Make a mission from its markers; its last bound ends at `until` at the latest."""
     times, numbers, cells, paths = zip(*markers, strict=True)
     if numbers != (*range(len(markers)),):
@@ -174,38 +145,21 @@ def _mission(found: _Recording, markers: list[Marker], until: int, workspace: Wo
     path = paths[0] or cells
     if path[0] != cells[0]:
         raise TrustboError(f"it starts in {cells[0]}, but its path in {path[0]}.")
-    spans = zip(cells[1:], pairwise([*times[1:], until]), strict=True)
-    bounds = tuple(_bound(found, cell, *span, times[0], workspace) for cell, span in spans)
-    statuses = found.status.loc[times[-1] + 1 : until]
-    status = statuses.iloc[-1] if len(statuses) else "ok"
+    bounds = []
+    for cell, begin, until_next in zip(cells[1:], times[1:], [*times[2:], until], strict=True):
+        ended = statuses.loc[begin + 1 : until_next]
+        end = int(ended.index[0]) if len(ended) else until_next
+        looks = [one.loc[begin + 1 : end] for one in contacts]
+        if not len(ended):
+            end = max((int(one.index[-1]) for one in looks if len(one)), default=begin)
+        rate = np.array([one.mean() for one in looks])
+        n_ticks = np.array([len(one) or np.nan for one in looks])
+        duration = np.full(len(looks), (end - begin) / _NS if end > begin else np.nan)
+        status, t0 = ended.iloc[0] if len(ended) else "ok", (begin - times[0]) / _NS
+        z = np.full((len(looks), len(workspace.features)), np.nan)
+        bounds.append(Bound(cell, z, rate, duration, status, t0, n_ticks=n_ticks))
+    last = statuses.loc[times[-1] + 1 : until]
+    status = last.iloc[-1] if len(last) else "ok"
     if status == "ok" and len(bounds) < len(path) - 1:
         status = "aborted"  # no record of the reason
-    return Mission(path, bounds, status, workspace.features, workspace.team.names)
-
-
-def _bound(
-    found: _Recording, cell: Cell, begin: int, until: int, start: int, workspace: Workspace
-) -> Bound:
-    """Make a bound from its marker to the next one, in a mission that begins at `start`, ns."""
-    status = found.status.loc[begin + 1 : until]
-    contacts = [contact.loc[begin + 1 : until] for contact in found.contact]
-    end = max((int(contact.index[-1]) for contact in contacts if len(contact)), default=begin)
-    if len(status):
-        end = int(status.index[0])
-        contacts = [contact.loc[:end] for contact in contacts]
-    n_ticks = np.array([len(contact) or np.nan for contact in contacts])
-    ticks = max(contacts, key=len).index
-    poses, seen = (
-        [np.asarray(one.asof(ticks)) for one in of] for of in (found.poses, found.contact)
-    )
-    return Bound(
-        cell,
-        np.full((len(contacts), len(workspace.features)), np.nan),
-        np.array([contact.mean() for contact in contacts]),
-        np.full(len(contacts), (end - begin) / _NS if end > begin else np.nan),
-        status.iloc[0] if len(status) else "ok",
-        (begin - start) / _NS,
-        np.stack(poses, axis=1) if poses else None,
-        np.stack(seen, axis=1) > 0.5 if not np.isnan(n_ticks).any() else None,
-        n_ticks,
-    )
+    return Mission(path, tuple(bounds), status, workspace.features, workspace.team.names)
