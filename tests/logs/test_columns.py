@@ -52,6 +52,11 @@ def test_text_that_is_no_number_is_refused_with_its_row(value):
         Columns({"t": ["1.0", value]}).numbers("t")
 
 
+def test_optional_columns_that_differ_only_in_case_are_refused():
+    with pytest.raises(TrustboError, match="Status"):
+        Columns({"t": [1.0], "Status": ["ok"], "STATUS": ["stuck"]}).texts("status", required=False)
+
+
 @pytest.mark.parametrize(
     "content", [b"who,t\n7\n", b"who,t\n7,1,2\n", b"who,who\n7,1\n", b"who,t\n",
                 b"PK\x03\xff", b"a\xe9,t\n1,2\n"],

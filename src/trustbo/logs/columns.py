@@ -63,7 +63,9 @@ class Columns:
         if name in self.frame:
             return name
         alike = [other for other in self.frame if _folded(other) == _folded(name)]
-        return alike[0] if len(alike) == 1 else None
+        if len(alike) > 1:
+            raise TrustboError(f"{self.what} has the columns {', '.join(alike)}; rename one of them.")
+        return alike[0] if alike else None
 
     def refuse(self, column: str, bad: np.ndarray, why: str) -> None:
         """Raise TrustboError for the first value of a column that is `bad`, (row,), if any is."""
