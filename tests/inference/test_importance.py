@@ -82,8 +82,8 @@ def test_a_student_integrates_to_its_density():
     rng = np.random.default_rng(5)
     student = importance.Student(np.array([1.0, -1.0]), np.array([[2.0, 0.0], [0.5, 1.0]]))
 
-    z = rng.normal(size=(6, 2))
-    expected = stats.multivariate_t(student.center, student.scale @ student.scale.T, df=importance._DEGREES)
+    z, covariance = rng.normal(size=(6, 2)), student.scale @ student.scale.T
+    expected = stats.multivariate_t(student.center, covariance, df=importance._DEGREES)
 
     np.testing.assert_allclose(student.log_density(z), expected.logpdf(z), rtol=1e-12)
     within = (student.draw(4096, rng) @ [1.0, 0.0] < 1.0).mean()

@@ -258,7 +258,7 @@ def upper_factor(A: Any) -> Any:
 
 
 def solve_upper(H: Any, x: Any, *, transposed: bool) -> Any:
-    """Solve H y = x or H' y = x for upper triangles H (point, n, n) and vectors (point, draw, n)."""
+    """Solve H y = x or H' y = x for upper triangles H (point, n, n) and x (point, draw, n)."""
     if not isinstance(H, np.ndarray):
         return jax.lax.linalg.triangular_solve(
             H, x.mT, left_side=True, lower=False, transpose_a=transposed

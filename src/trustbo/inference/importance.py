@@ -150,10 +150,12 @@ def sample(
     with one_blas_thread():
         modes = find_modes(log_density, starts)
         proposals = modes if len(modes) > 1 else []
-        current = modes[0]
-        for number in range(most):
+        current, n_rounds = modes[0], 0
+        while True:
+            n_rounds += 1
             own = [current._replace(scale=_WIDER * current.scale), *proposals]
-            n_own, n_others = (size, size // _DEFENSIVE) if number else (size // 2, size // 2)
+            first = n_rounds == 1
+            n_own, n_others = (size // 2, size // 2) if first else (size, size // _DEFENSIVE)
             share = 1 << int(np.log2(n_own / len(own)))
             others = defensive(current) if defensive else prior
             for density, n in [*((one, share) for one in own), (others, n_others)]:
@@ -165,9 +167,9 @@ def sample(
             log_q = special.logsumexp(log_q, axis=0) - np.log(len(z))
             points = Points.of(z, log_p, np.where(np.isfinite(log_p), log_p, -np.inf) - log_q)
             current = points.fitted()
-            if number and points.k_hat < GOOD_KHAT and points.kish > enough:
-                break
-    return points
+            good = points.k_hat < GOOD_KHAT and points.kish > enough
+            if (good and not first) or n_rounds == most:
+                return points
 
 
 def find_modes(log_density: LogDensity, starts: np.ndarray) -> list[Student]:

@@ -232,7 +232,7 @@ class Posterior:
         theta = model.theta(self.scores.draw(n, rng, even=even), slots.resolution)
         weights = Prior.of([model.weights.prior(theta, slots)])
         c = weights.mean if even else weights.draw(rng)
-        return self._hyperparameters(theta) | model.weights.named(c, theta, slots)
+        return {**self._hyperparameters(theta), **model.weights.named(c, theta, slots)}
 
     def given(self, draws: Draws, kept: np.ndarray, rng: np.random.Generator) -> Given:
         """Compute trust, likelihoods and predictions for given draws.

@@ -64,7 +64,7 @@ class Columns:
             return name
         alike = [other for other in self.frame if _folded(other) == _folded(name)]
         if len(alike) > 1:
-            raise TrustboError(f"{self.what} has the columns {', '.join(alike)}; rename one of them.")
+            raise TrustboError(f"{self.what} has the columns {', '.join(alike)}; rename one.")
         return alike[0] if alike else None
 
     def refuse(self, column: str, bad: np.ndarray, why: str) -> None:
