@@ -58,8 +58,8 @@ class DrawnPaths:
     def relative_regret(self, path: Sequence[Cell]) -> np.ndarray:
         """Return the regret of a path relative to each draw's best value, shape (draw,).
 
-        For lost_contact, the regret is divided by the contact kept on the best path, which is its
-        number of bounds minus the contact lost. For other objectives, the divisor is the magnitude
+        For lost_contact, the regret is divided by the contact kept on the best path: its number of
+        bounds minus the contact lost. For other objectives, the regret is divided by the magnitude
         of the best value. If the divisor is 0, a positive regret becomes infinite.
         """
         scale = np.abs(self.values)
@@ -85,7 +85,7 @@ class DrawnPaths:
 
     @cached_property
     def _distinct(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Find the distinct paths by decreasing frequency, the index of each draw, and counts."""
+        """Return the distinct paths, most frequent first, each draw's index, and the counts."""
         paths, which, counts = np.unique(
             self.paths, axis=0, return_inverse=True, return_counts=True
         )

@@ -1,4 +1,4 @@
-"""The linear recursion for expected trust, which all models share, and its values along a path."""
+"""Linear recursion for expected trust, shared by all models, and its values along a path."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -18,8 +18,8 @@ class Dynamics(NamedTuple):
     The shapes are transition (..., state, state), drift (..., state, move, row, col), start
     (..., state) and noise_sd (...,), where noise_sd is the mean of delta_v over robots. Each robot
     is a state, and the team's trust is the mean of the states. If all robots have the same beta0,
-    the mean trust is the only state. The drift at (move, row, col) is that of the bound that enters
-    the cell by that move, and NaN if there is no such bound.
+    the mean trust is the only state. The drift at (move, row, col) belongs to the bound that enters
+    the cell by that move; it is NaN if there is no such bound.
     """
 
     transition: np.ndarray
@@ -37,7 +37,7 @@ class Dynamics(NamedTuple):
         return self._replace(drift=self.drift[..., moves, rows, cols][..., None, None, :])
 
     def settled(self) -> np.ndarray:
-        """Return the limit of the team's trust (..., move, row, col) if a bound were repeated."""
+        """Return the limit of the team's trust as each bound is repeated, (..., move, row, col)."""
         gain = np.linalg.inv(np.eye(self.start.shape[-1]) - self.transition)
         return np.einsum("...st,...tmrc->...mrc", gain, self.drift) / self.start.shape[-1]
 
@@ -52,7 +52,7 @@ def trust_dynamics(
         z: Awareness, shape (robot, move, row, col, feature).
         x0: Expected trust before the first bound, shape () or (robot,), with or without the leading
             axes; by default `params.x0_mean`.
-        by_robot: Whether each robot is a state even if the team's mean would suffice.
+        by_robot: Whether to use one state per robot even if the team's mean would suffice.
 
     Raises:
         TrustboError: If the number of robots or features does not match the parameters.
@@ -68,7 +68,7 @@ def trust_dynamics(
         return Dynamics(params.expected_transition(n_robots), drift(params, z), start, sd)
     # The mean over robots obeys the same equation.
     z = z.mean(0, keepdims=True) if n_robots > 1 else z
-    u = drift(params, z).mean(-4, keepdims=True)  # place effects may differ by robot
+    u = drift(params, z).mean(-4, keepdims=True)  # place effects may differ between robots
     return Dynamics(params.expected_transition(1), u, start.mean(-1, keepdims=True), sd)
 
 

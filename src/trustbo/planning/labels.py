@@ -2,19 +2,19 @@
 
 The method is a label-setting algorithm with dominance for the resource-constrained shortest path
 (Martins 1984; Irnich and Desaulniers 2005). A label at a state contains the cost so far, the sums
-r_m of the risks -log(1 - p), and trust, if the loss depends on it. An edge has a cost and possibly
-a loss, which decreases with trust. The cost of a path also includes sum_m F_m (1 - exp(-r_m)), and
-the last of the sums must not exceed a limit.
+r_m of the risks -log(1 - p) and, if the loss depends on trust, trust. An edge has a cost and
+possibly a loss, which decreases with trust. The cost of a path also includes
+sum_m F_m (1 - exp(-r_m)), and the last sum must not exceed a limit.
 
 A label is dropped if another label of its state has no higher cost, no larger sums and no lower
-trust. As B0 >= 0 preserves the order of trust, any path to the goal is then at least as good from
+trust. Because B0 >= 0 preserves the order of trust, any path to the goal is at least as good from
 the other label. If U-turns are forbidden, the other label must come from the same cell, or there
 must be two such labels from different cells. A label is also dropped if it cannot beat the best
 path found so far. The remaining cost is bounded by a sum over edges, which uses the largest
 possible trust and the chord of F_m (1 - exp(-r_m)) over the sums that can still be optimal. The
 limit is relaxed with a Lagrange multiplier, found by bisection (Handler and Zang 1980).
 
-The search is exact, because the dropped labels do not lead to a better path than the one returned.
+The search is exact because no dropped label can lead to a better path than the one returned.
 """
 
 import math
@@ -156,7 +156,7 @@ class Known(NamedTuple):
     """Best path found so far and the path tried last.
 
     The best path has `cost` (1,) and `edges` (bound,), padded with -1. The last path has the edges
-    `trial` (bound,). `sums` (sum,) are those of the cheapest path in the last call of `_try_paths`.
+    `trial` (bound,). `sums` (sum,) holds the sums of the cheapest path in the last `_try_paths`.
     """
 
     cost: np.ndarray
@@ -222,7 +222,7 @@ class Limits(NamedTuple):
 
 @kernel
 def _limits(graph, costs, edge_cost, least_cost, known):
-    """Find good paths and lower limits. If their costs are equal, no search is needed."""
+    """Find good paths and lower limits; no search is needed if the best cost equals the limit."""
     to_go, n_sums = new_to_go(len(graph.cell)), len(costs.failure)
     safest, low = np.empty((len(graph.cell), n_sums)), np.empty(n_sums)
     for m in range(n_sums):
@@ -277,7 +277,7 @@ def _chords(costs, low, gap):
 def _price_of_limit(graph, costs, edge_cost, least_cost, chord, offset, to_go, known):
     """Find the price of the limited sum that gives the best lower limit on the cost of all paths.
 
-    The dual is concave in the price. The slope is the sum of the cheapest path minus the limit.
+    The dual is concave in the price. Its slope is the cheapest path's limited sum minus the limit.
     """
     limit, price = costs.limit, chord.copy()
     lower, chosen, extra, under, over = -np.inf, 0.0, 0.0, 0.0, np.inf
@@ -330,7 +330,7 @@ class Labels(NamedTuple):
 
 @kernel
 def _search(graph, costs, most, edge_cost, limits, known):
-    """Search for the best path, and return a lower limit on its cost, which is equal if exact."""
+    """Search for the best path; return its cost, or a lower limit if the search is not exact."""
     n_numbers = 1 + len(costs.failure) + len(costs.x0)
     made, last = np.empty((4, most), np.int64), np.full(len(graph.cell), -1)
     labels = Labels(np.empty((most, n_numbers)), made[0], made[1], made[2], made[3], last)
@@ -354,7 +354,7 @@ def _search(graph, costs, most, edge_cost, limits, known):
 
 @kernel
 def _extend(graph, costs, edge_cost, limits, known, labels, s, label, n):
-    """Make the successors of a label that can be optimal, and return the number of all labels."""
+    """Add the successors of a label that may be optimal, and return the new number of labels."""
     n_sums = len(costs.failure)
     number, after, sums = labels.number[label], np.empty(len(costs.x0)), np.empty(n_sums)
     for e in range(graph.first[s], graph.first[s + 1]):
@@ -379,7 +379,7 @@ def _extend(graph, costs, edge_cost, limits, known, labels, s, label, n):
 
 @kernel
 def _is_hopeless(costs, limits, h, cost, sums, known):
-    """Check whether no path that enters a state with this cost and these sums can be optimal."""
+    """Check whether entering a state with this cost and these sums rules out an optimal path."""
     if sums[-1] + limits.safest[h, -1] > costs.limit:
         return True
     at_least = cost + limits.priced[h] + limits.offset

@@ -1,4 +1,4 @@
-"""Objectives, which give the value of a path based on the team's expected trust along the path."""
+"""Objectives, which map the team's expected trust along a path to the value of the path."""
 
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
@@ -48,11 +48,11 @@ LOST_CONTACT = Objective("lost_contact", of_contact=True, max_bounds="shortest+4
 TERMINAL = Objective("terminal", credit=lambda left: np.where(left == 0, 1.0, 0.0), value=expit)
 MEAN = Objective("mean", scale=lambda n_bounds: np.maximum(n_bounds, 1.0))
 OBJECTIVES: Mapping[str, Objective] = {row.name: row for row in (LOST_CONTACT, TERMINAL, MEAN)}
-"""Objectives by name; larger values are better.
+"""Objectives, keyed by name; larger values are better.
 
 lost_contact: minus the sum of the expected lost contact in bounds, the tolls and, if the planner
 has a risk, `failure_cost` times the failure probability. (At an expected contact rate of .9, the
-loss on 9 bounds is .9.) terminal: sigma(trust at the goal - tolls), which without tolls is one
+loss on 9 bounds is .9.) terminal: sigma(trust at the goal - tolls); without tolls, this is one
 minus the cost (6) of the paper. mean: the mean over bounds of trust minus toll.
 """
 
@@ -97,7 +97,7 @@ def weights_of(objective: Objective, dynamics: Dynamics, view: Array, longest: i
 def has_history(objective: Objective, family: Family) -> bool:
     """Return whether the loss of a bound depends on the trust with which it is entered.
 
-    With history, the search requires B0 >= 0. Otherwise, the score is a weighted sum of drifts.
+    If it does, the search requires B0 >= 0. If not, the score is a weighted sum of drifts.
     """
     return objective.of_contact and family.expected_rate != "identity"
 
@@ -106,7 +106,7 @@ def capped(objective: Objective, family: Family, dynamics: Dynamics) -> Dynamics
     """Cap the drift and start if rates are linear in trust, so that no bound gains contact.
 
     With u <= 1 - B0 1 and x_0 <= 1 in every state, trust is at most 1 if B0 >= 0. A loop then never
-    increases the value. In all other cases, the dynamics are returned unchanged.
+    increases the value. For other objectives or rates, the dynamics are returned unchanged.
     """
     if not objective.of_contact or has_history(objective, family):
         return dynamics

@@ -17,7 +17,7 @@ from trustbo.workspace.grid import Location
 from trustbo.workspace.moves import MOVES, moves_along, require_on_grid
 
 SIMPLE_EXTRA = 2
-"""Number of bounds beyond the fewest at which a path without U-turns still enters no cell twice."""
+"""Most bounds beyond the fewest for which a path without U-turns never enters a cell twice."""
 STEPS = np.array(MOVES)
 """Row and column step of each move, shape (move, 2)."""
 _MOST_STATES = 20_000_000
@@ -84,8 +84,8 @@ class AdmissiblePaths:
             self.longest = self.shortest + int(named[1] or 0)
         else:
             raise TrustboError(
-                f"unknown max_bounds {max_bounds!r}; give 'shortest', 'shortest+n' for up to n "
-                "more bounds without U-turns, such as 'shortest+2', or an int."
+                f"unknown max_bounds {max_bounds!r}; give 'shortest', an int, or 'shortest+n', "
+                "such as 'shortest+2', to allow up to n more bounds without U-turns."
             )
         if self.longest < self.shortest:
             raise TrustboError(
@@ -137,7 +137,7 @@ class AdmissiblePaths:
     def avoiding(self, bounds: np.ndarray, risk: np.ndarray) -> "AdmissiblePaths":
         """Return the paths that avoid the given bounds.
 
-        If no such path exists, the safest bounds are admitted again until there is one.
+        If no such path exists, bounds are allowed again, safest first, until a path exists.
 
         Args:
             bounds: Mask of the bounds to avoid, shape (move, row, col).
@@ -154,12 +154,12 @@ class AdmissiblePaths:
                 avoided[*least] = False
             try:
                 return AdmissiblePaths(*ends, avoided.copy())
-            except TrustboError:  # the goal cannot be reached, or not within max_bounds
+            except TrustboError:  # the goal cannot be reached within max_bounds
                 continue
         return self
 
     def to(self, cell: Cell, extra: int) -> "AdmissiblePaths":
-        """Return the paths to another cell that have at most `extra` bounds beyond the fewest."""
+        """Return the paths to another cell with at most `extra` bounds more than the fewest."""
         admitted = f"shortest+{extra}"
         return AdmissiblePaths(self.workspace, self.start, cell, admitted, self.avoided)
 
@@ -191,7 +191,7 @@ class AdmissiblePaths:
 
 
 def fewest_bounds(bounds: np.ndarray, cell: Cell, *, back: bool = False) -> np.ndarray:
-    """Count the fewest bounds from one cell to each cell, (row, col); -1 if there is no path.
+    """Find the fewest bounds from one cell to each cell, (row, col); -1 if there is no path.
 
     Args:
         bounds: Mask of the bounds that may be taken, shape (move, row, col).

@@ -39,7 +39,7 @@ class Plan(Summary):
         seconds: Duration of the search in seconds.
         workspace: Workspace of the path.
         risk: Failure probability of each bound, and the arrival probability with its 90 % band;
-            None without a hazard.
+            None if the planner has no risk.
         infeasible: Whether the failure probability of a given path exceeds `max_failure`.
         value_band: Ends of the 90 % band of the value over the parameter draws, without observation
             noise and with the mean failure probability; None with one draw.
@@ -128,7 +128,7 @@ def plan_to_record(plan: Plan) -> dict[str, Any]:
 
 
 def plan_from_record(record: dict[str, Any], workspace: Workspace) -> Plan:
-    """Restore a plan in its workspace from the record of `plan_to_record`."""
+    """Restore a plan in its workspace from a record made by `plan_to_record`."""
     values: dict[str, Any] = {**record, "workspace": workspace}
     for name in ("positions", "trust", "bands"):
         values[name] = np.array(record[name])

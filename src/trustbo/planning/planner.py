@@ -61,10 +61,10 @@ class Planner(Summary):
             start: First cell, or a position inside this cell (see `Workspace.locate`).
             goal: Last cell, or a position inside this cell.
             objective: `"lost_contact"`, `"terminal"` or `"mean"` (see `OBJECTIVES`).
-            max_bounds: Limit on the number of bounds. `"shortest"` admits only paths with the
-                fewest bounds. `"shortest+n"` admits up to n more bounds, but no U-turns. An int
-                admits any walk of up to that many bounds. By default, n is 4 for lost_contact and
-                2 otherwise. With n > 2, a path may enter a cell twice (see `Plan.revisits`).
+            max_bounds: Limit on the number of bounds. `"shortest"` allows only paths with the
+                fewest bounds. `"shortest+n"` allows up to n more bounds, but no U-turns. An int
+                allows any walk of up to that many bounds. The default is n = 4 for lost_contact
+                and n = 2 for the others. If n > 2, paths may revisit cells (see `Plan.revisits`).
             toll: Additional cost of each bound, such as its length or duration. The array must
                 broadcast to (move, row, col), with the moves of `workspace.moves.MOVES`. The unit
                 is bounds for lost_contact and trust for the other objectives.
@@ -75,8 +75,8 @@ class Planner(Summary):
             family: Observation family of the trust model, used only for lost_contact.
 
         Raises:
-            TrustboError: If the start or goal is off the grid or impassable, both are the same
-                cell, `max_bounds` is too small, the toll has the wrong shape, a name is unknown, or
+            TrustboError: If the start or goal is off the grid or impassable, the start equals the
+                goal, `max_bounds` is too small, the toll has the wrong shape, a name is unknown, or
                 a number is out of range.
             NoPathError: If the goal cannot be reached from the start.
         """
@@ -172,8 +172,8 @@ class Planner(Summary):
             x0: Expected trust at the start, shape () or (robot,); by default `params.x0_mean`.
 
         Raises:
-            TrustboError: If the parameters are for other robots or features than the workspace, or
-                beta0 is outside the range in which the search is exact.
+            TrustboError: If the robots or features of the parameters differ from the workspace's,
+                or beta0 is outside the range in which the search is exact.
             InfeasibleError: If no path respects `max_failure`.
         """
         started = time.perf_counter()
@@ -231,8 +231,8 @@ class Planner(Summary):
             x0: Expected trust at the start; by default `params.x0_mean`.
 
         Raises:
-            TrustboError: If the parameters are for other robots or features than the workspace, or
-                the path has gaps or does not lead from start to goal.
+            TrustboError: If the robots or features of the parameters differ from the workspace's,
+                or the path has gaps or does not lead from start to goal.
         """
         path, problem = self.require_path(path), self.problem
         draws, cells = draws_of(params, self.workspace, day=True), np.array(path)
@@ -267,10 +267,10 @@ class Planner(Summary):
 
         Nodes are the passable cells `(row, col)`, with the CRS coordinates `x` and `y` of their
         centres in metres. Edges are the bounds, with their `length` in metres, the `drift` of the
-        team's mean trust and, given a risk, `risk` = -log(1 - p_fail). If repeating a bound leads
-        to trust x, `cost` is -log sigma(x) plus the toll, and `lost` is the contact lost at trust
-        x, in bounds, plus the toll. If trust had no memory, the sum of `lost` along a path would be
-        minus the value of the path for lost_contact without failures.
+        team's mean trust and, given a risk, `risk` = -log(1 - p_fail). `cost` is -log sigma(x) plus
+        the toll, and `lost` is the contact lost at trust x, in bounds, plus the toll; x is the
+        limit of trust as the bound is repeated. If trust had no memory, the sum of `lost` along a
+        path would be minus the path's value for lost_contact without failures.
 
         Args:
             params: Posterior from `fit`, or parameters. Several draws are replaced by their mean.
@@ -314,9 +314,9 @@ class Planner(Summary):
 
         The maximum is over paths without U-turns that have at most two bounds more than the fewest,
         or fewer if `max_bounds` is tighter. Longer walks are excluded because they could gain trust
-        by loitering. With the default `max_bounds`, the map at the goal equals the terminal trust
-        of the `terminal` plan. The map has the shape (row, col), or (robot, row, col) with
-        `per_robot`; several draws add a leading axis (draw,).
+        by loitering. With the default `max_bounds`, the map at the goal equals the trust at the
+        goal of the `terminal` plan. The map has the shape (row, col), or (robot, row, col) with
+        `per_robot`; if there are several draws, it has a leading axis (draw,).
 
         Args:
             params: Posterior from `fit`, or parameters of any model.
@@ -390,7 +390,7 @@ def _toll_of(toll: ArrayLike, bounds: np.ndarray) -> np.ndarray:
 def _value_along(
     problem: Problem, cells: np.ndarray, params: Params, x0: ArrayLike | None
 ) -> tuple[np.ndarray, float, np.ndarray]:
-    """Compute trust (draw, bound, robot) and the value, overall and per draw, if no bound fails."""
+    """Compute trust (draw, bound, robot) and the value, overall and per draw, without failures."""
     z, of_path = along(problem.paths.workspace.awareness.values, cells), params.along(cells)
     z = z[:, None, None]  # as a map with one row
     by_robot = trust_dynamics(of_path, z, x0, by_robot=True)
@@ -400,8 +400,8 @@ def _value_along(
     if not problem.objective.of_contact:
         value = problem.value_along(cells, trust.mean((0, -1)), by_robot.noise_sd)
         return trust, float(value), values
-    # Capping trust in each draw causes bias, so the band uses uncapped trust. But no path loses
-    # less than 0 bounds of contact.
+    # Capping trust in each draw causes bias, so the band uses uncapped trust. However, the contact
+    # lost on a path cannot be negative.
     team = capped(problem.objective, problem.family, trust_dynamics(of_path, z, x0))
     mean = problem.value_along(cells, roll(team).mean(-1), team.noise_sd).mean()
     return trust, float(mean), np.minimum(values, -problem.toll_along(cells))

@@ -46,7 +46,7 @@ def optimistic(
 
 
 def ucb(rng: np.random.Generator, params: Params, planner: Planner, *, kappa: float = 1.0) -> Plan:
-    """Choose the path with the largest mean plus `kappa` sd of the value among the draws' best."""
+    """Choose the path, among the draws' best, with the largest mean + `kappa` sd of the value."""
     drawn = planner.plan_draws(params, n_draws=N_DRAWS, seed=_seed(rng))
     values = drawn.values_of(drawn.candidates)
     chosen = int(np.argmax(values.mean(0) + kappa * values.std(0)))
@@ -67,7 +67,7 @@ POLICIES: Mapping[str, Policy] = {
     "ucb": ucb,
     "random": random,
 }
-"""Policies by name."""
+"""Policies, keyed by name."""
 
 
 def resolve_policy(policy: str | Policy) -> Policy:

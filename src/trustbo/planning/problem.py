@@ -93,7 +93,7 @@ class Problem:
     def value_along(
         self, path: Sequence[Cell] | np.ndarray, trust: np.ndarray, noise_sd: np.ndarray
     ) -> np.ndarray:
-        """Compute the value of a path, shape (...,), under the assumption that no bound fails.
+        """Compute the value of a path, shape (...,), assuming that no bound fails.
 
         The team's `trust` after each bound has shape (..., bound), and `noise_sd` has shape (...,).
         """
@@ -199,7 +199,7 @@ class Problem:
             )
 
     def _infeasible(self, risk: Risk) -> InfeasibleError:
-        """Make the error that reports the safest path if no path respects `max_failure`."""
+        """Make the error for when no path respects `max_failure`; it reports the safest path."""
         graph, n = self.paths.graph, self.paths.graph.longest + 1
         nothing = Weights(np.zeros((1, n, 1)), np.zeros((1, n)), np.ones(n))
         of_bounds = risk_of(risk.p_fail).ravel()
@@ -219,7 +219,7 @@ class Risks(NamedTuple):
     """Risks -log(1 - p_fail) of the bounds, which are summed along a path.
 
     `of_bounds` (bound, sum) has one sum per stratum of the risk and, with a limit, one for the mean
-    of the strata. A path with the sums r_m has the expected failure cost sum_m F_m (1 - exp(-r_m)),
+    of the strata. A path with sums r_m has the expected failure cost sum_m F_m (1 - exp(-r_m)),
     where `failure` (sum,) holds the F_m. `limit` is the largest value allowed for the last sum.
     """
 

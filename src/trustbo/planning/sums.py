@@ -2,7 +2,7 @@
 
 A bound with drift u and j bounds left after it adds w_j . u to the value, for any path length. The
 weight w_j is the sum of credit(i) view . B0^(j - i) over i <= j (see `objectives.weights_of`).
-States are processed in order of bounds left, so successors are final (Bellman 1958).
+States are processed in order of bounds left, so their successors are final (Bellman 1958).
 """
 
 import numpy as np
@@ -57,7 +57,7 @@ def _best_sums(graph, drift, per_bound, constant, scale, toll, scores, paths, be
 
 @kernel
 def costs_of_sums(graph, drift, per_bound, toll, cost) -> None:
-    """Write the cost of each edge for one draw, which is the toll minus w_j . u, to `cost`."""
+    """Write the cost of each edge for one draw, the toll minus w_j . u, to `cost`."""
     for e in range(len(graph.head)):
         left, b = graph.left[graph.head[e]], graph.bound[e]
         cost[e] = toll[b]

@@ -62,8 +62,8 @@ def best_trust(
 ) -> np.ndarray:
     """Find the largest trust with which each cell can be entered; NaN if it is unreachable.
 
-    Paths grow by one bound per iteration. To exclude U-turns, each cell stores the largest trust
-    and its move, and the largest trust by another move. The result is exact for beta0 >= 0.
+    Paths grow by one bound per iteration. To exclude U-turns, each cell stores the largest trust,
+    its last move, and the largest trust by any other move. The result is exact for beta0 >= 0.
 
     Args:
         paths: Admissible paths.

@@ -1,9 +1,9 @@
 """The unrolled graph, which repeats the bounds of a path problem for each number of bounds left.
 
 A state (cell, left) is a cell from which exactly `left` bounds remain. Each edge is a bound and
-leads to a state with one bound less. The paths through the graph are the admissible paths, except
-that U-turns must be excluded if they are forbidden. Kernels process the arrays once, in the order
-of `left`, and `to_networkx` exports the same edges.
+leads to a state with one bound fewer left. Paths through the graph are the admissible paths, except
+that U-turns must be excluded if they are forbidden. Kernels process the arrays once, in order of
+`left`, and `to_networkx` exports the same edges.
 """
 
 from collections.abc import Sequence
@@ -75,8 +75,8 @@ class Unrolled(NamedTuple):
 class ToGo(NamedTuple):
     """Costs (state,) and first edges (state,) of the best and second-best paths to the goal.
 
-    The second-best path begins with another edge. These two paths suffice, because forbidding
-    U-turns excludes at most one first edge.
+    The second-best path begins with another edge. These two paths suffice because a forbidden
+    U-turn excludes at most one first edge.
     """
 
     least: np.ndarray
