@@ -29,8 +29,8 @@ def cell_maps(
 ) -> tuple[np.ndarray, np.ndarray, xr.Dataset, dict[str, CompositeIndex]]:
     """Compute the awareness and the passability of a terrain's cells.
 
-    Openness is computed for the team's sensor and target heights, up to the team's largest lidar
-    range but at most over the diagonal of a cell and half the terrain.
+    Openness is computed for the team's sensor and target heights. Its range is the smallest of the
+    team's largest lidar range, the diagonal of a cell, and half the terrain's shorter side.
 
     Returns:
         Awareness (row, col, feature) in [0, 1], NaN where a cell has no data; passability (row,
@@ -141,8 +141,8 @@ def unlabelled(
 ) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...]]:
     """Return awareness in the axis order of `of_arrays`, and the names of robots and features.
 
-    A DataArray is reordered by its dimensions and labels. By default, the labels are the names.
-    Raises TrustboError if the DataArray has other dimensions or labels than expected.
+    A DataArray is reordered by its dimensions and labels. If no names are given, its labels are
+    used. Raises TrustboError if the DataArray has unexpected dimensions or labels.
     """
     if not isinstance(awareness, xr.DataArray):
         return as_array("awareness", awareness), tuple(names), tuple(features)
@@ -168,8 +168,8 @@ def of_arrays(z: np.ndarray, passable: ArrayLike | None) -> tuple[np.ndarray, np
     Returns the awareness of bounds (robot, move, row, col, feature), NaN where there is no bound,
     and the passability (row, col).
 
-    Raises TrustboError if the axes do not match, a value is outside [0, 1], or a passable cell or a
-    bound between passable cells has a NaN.
+    Raises TrustboError if the axes do not match, a value is outside [0, 1], or the awareness of a
+    passable cell or of a bound between passable cells is NaN.
     """
     if z.ndim not in (4, 5) or (z.ndim == 5 and z.shape[1] != len(MOVES)):
         raise TrustboError(f"awareness must have the shape {_AXES}; got shape {z.shape}.")

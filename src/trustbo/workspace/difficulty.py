@@ -23,7 +23,7 @@ from trustbo.workspace.posts import TRAVERSABLE, Posts
 MEASURES = ("untraversable", "tilt", "narrowness", "tightness")
 """Measures of difficulty; see `difficulty_of`."""
 _AHEAD = 1.5  # distance to the point of the route that a robot faces, m
-_STEP, _SUSTAINED = 0.25, 4  # distance between samples, m, and samples in a mean of tilts
+_STEP, _SUSTAINED = 0.25, 4  # distance between samples, m, and number of samples averaged
 _WIDTH = 2.0  # distance to an impassable pixel at which narrowness is 1/2, m
 _MOST = 2.0  # maximum tilt, as a multiple of the limit
 _TIGHT = 3.0  # log(1 + length in m) at which tightness is 1: 19 m
@@ -36,9 +36,9 @@ _cached: WeakKeyDictionary[Workspace, xr.DataArray] = WeakKeyDictionary()
 def difficulty_of(workspace: Workspace) -> xr.DataArray:
     """Compute the difficulty of a workspace's bounds; the result is cached.
 
-    `untraversable` is one minus the mean traversability of a route's pixels. `tilt` is the largest
-    mean, over 1 m of a route, of the tangent of pitch or roll of a robot that faces a point 1.5 m
-    ahead; it is divided by the tangent of `max_slope`. `narrowness` is 1 / (1 + w / 2 m), where w
+    `untraversable` is one minus the mean traversability of a route's pixels. `tilt` is the tangent
+    of pitch or roll of a robot that faces a point 1.5 m ahead, averaged over 1 m; its maximum along
+    the route is divided by the tangent of `max_slope`. `narrowness` is 1 / (1 + w / 2 m), where w
     is the smallest distance to an impassable pixel. `tightness` is log(1 + l / 1 m) / 3, where l is
     the length of the route beside impassable pixels.
 

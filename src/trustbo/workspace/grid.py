@@ -22,7 +22,7 @@ type Location = Cell | Mapping[str, float]
 """A cell (row, col), or a position with named coordinates; see `Grid.locate`."""
 WGS84 = CRS.from_epsg(4326)
 MAX_MISSING = 0.5
-"""Maximum fraction of a passable cell's pixels that are missing or too steep."""
+"""Maximum fraction of a passable cell's pixels that may be missing or too steep."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -126,8 +126,8 @@ class Grid(Summary):
             what: Name of the location in error messages.
 
         Raises:
-            TrustboError: The location is invalid, off the grid, or in degrees on a grid without a
-                CRS.
+            TrustboError: The location is invalid or off the grid, or is in degrees although the
+                grid has no CRS.
         """
         try:
             row, col = self._row_and_col(location)
@@ -148,7 +148,7 @@ class Grid(Summary):
         return int(row), int(col)
 
     def _row_and_col(self, location: Location) -> tuple[float, float]:
-        """Convert a location, even off the grid, to a row and column, fractional for positions."""
+        """Convert a location, even off the grid, to a row and column (fractional for positions)."""
         if not isinstance(location, Mapping):
             row, col = (operator.index(i) for i in location)
             return row, col
@@ -225,7 +225,7 @@ class Grid(Summary):
         return np.clip(row, 0, rows - 1), np.clip(col, 0, cols - 1)
 
     def require_crs(self) -> CRS:
-        """Return the CRS; TrustboError if the grid has none."""
+        """Return the CRS; raises TrustboError if the grid has none."""
         if self.crs is None:
             raise TrustboError(
                 "the grid has no coordinate reference system, because the workspace was not made "
@@ -238,7 +238,7 @@ def _moved(source: CRS, target: CRS, x: float, y: float) -> tuple[float, float]:
     """Convert a position to another CRS; return infinities if that is impossible."""
     try:
         (u,), (v,) = transform_points(source, target, [x], [y])[:2]
-    except Exception:  # PROJ's errors are GDAL's, without a common base
+    except Exception:  # PROJ raises GDAL's errors, which have no common base
         return math.inf, math.inf
     return u, v
 

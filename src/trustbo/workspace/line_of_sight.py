@@ -10,11 +10,11 @@ phase, and the phases are weighted by their durations:
 
 where p is the detection probability under the assumed model of sight, T_1 is the lead's driving
 time and T_2 is the driving time of the slowest robot. A robot that arrives earlier waits at its
-post. The samples alternate between the next cells to which a path may continue.
+post. The samples cycle through the cells to which a path may continue.
 
 The lead takes the fastest route, as in the simulator. T2 is assumed to follow that route, shifted
-to T2's posts. T2's own fastest routes would need about 50 searches for each bound. They differ from
-the assumed routes by a few metres, over which sight hardly changes.
+to T2's posts. Finding T2's own fastest routes would take about 50 searches for each bound. They
+differ from the assumed routes by a few metres, over which sight hardly changes.
 """
 
 import math
@@ -33,7 +33,7 @@ from trustbo.workspace.routes import at_times
 from trustbo.workspace.sight import Sight, detection_between, jittered, optics
 from trustbo.workspace.surface import Surface
 
-_BLOCK = 256  # bounds computed together, which limits the memory
+_BLOCK = 256  # bounds computed together, to limit memory use
 N_SAMPLES = 16
 """Number of times in each phase at which sight is computed."""
 _AHEAD = 0.5  # cosine of the largest expected turn of a path
@@ -76,7 +76,7 @@ def bound_maps(
 
 
 def geometry(posts: Posts, index: np.ndarray, passable: np.ndarray) -> Geometry:
-    """Collect the geometry of bounds, which `index` lists by (move, row, col)."""
+    """Collect the geometry of the bounds in `index`, (bound, 3), given as (move, row, col)."""
     left = (index[:, 1:] - np.array(MOVES)[index[:, 0]]).tolist()
     bounds = [
         ((i, j), (row, col)) for (i, j), (_, row, col) in zip(left, index.tolist(), strict=True)

@@ -1,4 +1,4 @@
-"""Conversion between workspaces and data trees, which are stored in files."""
+"""Conversion of workspaces to and from data trees, for storage in files."""
 
 import json
 from dataclasses import asdict
@@ -32,7 +32,7 @@ def workspace_to_tree(workspace: Workspace) -> xr.DataTree:
 
 
 def workspace_from_tree(tree: xr.DataTree) -> Workspace:
-    """Convert a data tree from `workspace_to_tree` to a workspace."""
+    """Restore a workspace from a data tree made by `workspace_to_tree`."""
     cells = tree["cells"].to_dataset()
     grid, team = json.loads(tree.attrs["grid"]), json.loads(tree.attrs["team"])
     grid = Grid(**grid | {"shape": tuple(grid["shape"])})

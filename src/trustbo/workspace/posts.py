@@ -8,9 +8,9 @@ around the stop in a, the posts of T2 maximise
     1/2 mean_k s(p, lead at t_k) + 1/4 s(stop in a, p) + 1/4 s(stop in c, p),
 
 where s is the detection probability under the assumed model of sight. Posts are within `RADIUS` of
-the stop, even beyond the edge of the cell, and away from the lead's route. Their ground is well
-below the slope limit, and connected to the stop by such ground. The lead stops where the routes to
-the neighbouring stops are most visible.
+the stop, possibly outside the cell, and away from the lead's route. The slope is well below the
+limit at each post and along some connection to the stop. The lead stops where the routes to the
+neighbouring stops are most visible.
 
 Real obstacles may be missing from maps, and mapped obstacles may not block sight. The choice of
 posts and stops allows for such errors (`Posts._seen`); the feature `line_of_sight` does not.
@@ -34,7 +34,7 @@ from trustbo.workspace.sight import Sight, detection_between, jittered, optics
 from trustbo.workspace.surface import surface_of
 
 TRAVERSABLE = "traversability"
-"""Name of the feature that measures how easy the ground is, averaged along the routes of bounds."""
+"""Name of the feature for ease of driving, averaged along the robots' tracks in each bound."""
 SPACING, RADIUS = 2.0, 25.0
 """Minimum distance in m between T2's robots, and maximum distance of T2 from the lead's stop."""
 _GAP = 4.0  # preferred minimum distance between two posts, m
@@ -42,12 +42,12 @@ _STEP, _STOP_RADIUS = 4.0, 16.0  # lattice spacing, and search radius for the le
 _SMOOTHED = 5.0  # width of the moving average of traversability, m
 _SAFE = 0.7  # steepest ground for posts, as a fraction of the slope limit
 _DISCOUNT = 0.005  # assumed rate at which detection falls with distance, 1/m
-_DOUBT, _DOUBT_REACH = 0.1, 40.0  # probability at 0 m of an unexpected detection; its decay, m
+_DOUBT, _DOUBT_REACH = 0.1, 40.0  # probability of an unexpected detection at 0 m; decay length, m
 _NEARER = 1e-3  # penalty on the score per metre from the stop
 _IN_THE_WAY, _TOO_CLOSE = 5.0, 10.0  # penalties, larger than any probability
-_N_WATCHED = 30  # positions best seen from the stops, for which sight of the route is computed
+_N_WATCHED = 30  # positions, best seen from the stops, whose sight of the route is computed
 _N_AIMS = 6  # times on the lead's route at which sight is computed
-_SHARES = np.array([0.25, 0.5, 0.75, 1.0])  # of the straight line to a neighbouring stop
+_SHARES = np.array([0.25, 0.5, 0.75, 1.0])  # fractions of the straight line to a neighbouring stop
 
 
 class Posts:
@@ -76,7 +76,7 @@ class Posts:
         self._standable = largest_region(self.surface.passable)
         steep = np.arctan(np.hypot(*self.surface.gradient))
         self._safe = self._standable & (steep <= _SAFE * team.max_slope)
-        # Row and column of the cell that each row and column of pixels belongs to.
+        # Cell row of each pixel row, and cell column of each pixel column.
         self._cells = grid.cells_along(*self.surface.axes)
         self._central: dict[Cell, np.ndarray] = {}
         self._stops: dict[Cell, np.ndarray] = {}
@@ -95,8 +95,8 @@ class Posts:
     def linked_bounds(self, exists: np.ndarray) -> np.ndarray:
         """Return which bounds in `exists`, shape (move, row, col), have routes for all robots.
 
-        T2's posts in a cell are connected to the cell's stop within the cell and half a cell around
-        the cell. If the stops of two cells are connected, all robots therefore have routes in both
+        T2's posts are connected to the stop of their cell within the cell and half a cell around
+        it. Therefore, if the stops of two cells are connected, all robots have routes in both
         directions, whatever the next cell is.
         """
         linked, last = np.zeros_like(exists), len(MOVES) - 1
@@ -177,7 +177,7 @@ class Posts:
         return self._posts[cell, next_cell]
 
     def _chosen(self, cell: Cell, ahead: Sequence[Cell | None]) -> np.ndarray:
-        """Choose the best positions for one robot after another, shape (next cell, robot, 2)."""
+        """Choose the best positions, one robot after another, shape (next cell, robot, 2)."""
         here, robots = self.stop(cell), self.team.robots
         position, gap = self._lattice(cell, here, RADIUS), _GAP
         if len(position) < len(robots):  # too little safe ground
@@ -218,7 +218,7 @@ class Posts:
         return scores
 
     def _abreast(self, posts: np.ndarray, direction: np.ndarray) -> None:
-        """Sort identical robots from left to right, so that they keep sides and drive less."""
+        """Sort identical robots from left to right so they keep their sides and drive less."""
         robots = self.team.robots
         to_right = posts @ np.array([direction[1], -direction[0]])
         for robot in dict.fromkeys(robots):
@@ -230,8 +230,8 @@ class Posts:
     ) -> np.ndarray:
         """Compute the detection probability of targets (..., 2), allowing for map errors.
 
-        The probability from the map is reduced with distance. A small probability that a hidden
-        target is visible, which also falls with distance, is added.
+        The probability from the map is reduced with distance. A small probability of seeing a
+        hidden target, which also decreases with distance, is then added.
         """
         view = optics(watcher, watched)
         distance = np.linalg.norm(target - eye, axis=-1)
@@ -264,9 +264,9 @@ class Posts:
         return linked_to(ground, window, pixel), (window[0], window[2])
 
     def _lattice(self, cell: Cell, here: np.ndarray, radius: float) -> np.ndarray:
-        """Return lattice positions (position, 2) that safe ground connects to the position `here`.
+        """Return lattice positions (position, 2) connected to the position `here` by safe ground.
 
-        The connection is within half a cell around the cell, and so in the window of each bound.
+        The connection stays within half a cell of the cell, and thus in the window of each bound.
         """
         steps = np.arange(-radius, radius + 1e-9, _STEP)
         offset = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
@@ -299,8 +299,8 @@ class Posts:
         if n_pixels <= len(names):
             raise TrustboError(
                 f"cell {cell} has {n_pixels} passable pixels, on which robot "
-                f"{names[max(0, n_pixels - 1)]!r} finds no post beside the lead; use larger "
-                "cells, a finer raster or fewer robots."
+                f"{names[max(0, n_pixels - 1)]!r} has no room beside the lead; use larger cells, "
+                "a finer raster or fewer robots."
             )
 
     def _pixels_of(self, cell: Cell) -> tuple[np.ndarray, np.ndarray]:

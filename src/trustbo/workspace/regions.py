@@ -1,8 +1,8 @@
 """Connected regions of passable pixels, for posts, routes, the planner and the simulator.
 
-Two pixels are in the same region if passable pixels that share edges connect them. Routes do not
-pass between two impassable pixels or around the corner of one (see `routes`). A route between two
-pixels therefore exists if and only if the pixels are in the same region.
+Two pixels are in the same region if they are connected by passable pixels that share edges. Routes
+do not pass diagonally between two impassable pixels or cut the corner of one (see `routes`). A
+route between two pixels therefore exists if and only if the pixels are in the same region.
 """
 
 from typing import Any

@@ -35,7 +35,7 @@ class Routes:
     def find(
         self, robot: Robot, start: np.ndarray, goal: np.ndarray, window: Window
     ) -> np.ndarray | None:
-        """Find the fastest route from start to goal; None if there is none.
+        """Return the fastest route from start to goal, or None if there is none.
 
         The route stays inside the pixel window. It has shape (point, 2), x and y in CRS metres.
         """
@@ -104,7 +104,7 @@ def _a_star(pace, pixel, start, goal):
                 i, j = r + dr, c + dc
                 if (dr == 0 and dc == 0) or not (0 <= i < rows and 0 <= j < cols):
                     continue
-                # No passage between two impassable pixels or around the corner of one.
+                # A route must not pass between two impassable pixels or cut the corner of one.
                 if not (np.isfinite(pace[i, c]) and np.isfinite(pace[r, j])):
                     continue
                 length = math.hypot(dr * pixel[0], dc * pixel[1])
@@ -134,8 +134,8 @@ def at_times(
     """Find a robot's positions at n evenly spaced times on each route, and the durations.
 
     The routes are concatenated in `flat`, shape (point, 2). `first` contains the index of each
-    route's first point, and ends with the number of points. Positions have shape (route, time, 2),
-    durations shape (route,), in seconds.
+    route's first point, and ends with the number of points. Positions have shape (route, time, 2)
+    and durations, in seconds, have shape (route,).
     """
     limits = robot.speed, robot.max_slope
     return _resampled(surface.gradient, surface.pixel, surface.origin, flat, first, limits, n)

@@ -25,7 +25,7 @@ class Sight:
 
     The ground blocks rays. The canopy is a layer from `crown_base` times its height to its top. A
     ray through d metres of canopy is transmitted with probability exp(-extinction d). If extinction
-    is 0, only the ground blocks rays; if it is `math.inf` and the crown base 0, the surface does.
+    is 0, only the ground blocks rays; with `math.inf` and a crown base of 0, the surface does.
 
     Attributes:
         extinction: Extinction coefficient of the canopy, in 1/m.
@@ -60,8 +60,8 @@ def optics(watcher: Robot, watched: Robot) -> np.ndarray:
 def jittered(n: int) -> np.ndarray:
     """Return the offsets of n viewpoints from a post, shape (viewpoint, 2), in metres.
 
-    Viewpoints are spread over a disc, because a robot stops up to half a metre from its post and
-    its field of view tilts with the ground. The view from the exact post is not representative.
+    The view from the exact post is not representative, because a robot stops up to half a metre
+    away and its field of view tilts with the ground. The viewpoints are spread over a disc.
     """
     k, order = np.arange(n), np.random.default_rng(0).permutation(n)
     radius, angle = _JITTER * np.sqrt((k + 0.5) / n), 2.4 * k
@@ -93,7 +93,7 @@ def detection_probability(
 def detection_between(
     surface: Surface, sight: Sight, eye: np.ndarray, target: np.ndarray, optics: np.ndarray
 ) -> np.ndarray:
-    """Broadcast eyes and targets (..., 2), and return their detection probabilities (...)."""
+    """Return the detection probability (...) of each target from each eye, (..., 2), broadcast."""
     eye, target = np.broadcast_arrays(eye, target)
     rays = np.ascontiguousarray(eye).reshape(-1, 2), np.ascontiguousarray(target).reshape(-1, 2)
     return detection_probability(surface, sight, *rays, optics).reshape(eye.shape[:-1])

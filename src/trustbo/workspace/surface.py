@@ -55,7 +55,7 @@ class Surface(NamedTuple):
 
 
 def surface_of(terrain: xr.Dataset, passable: np.ndarray) -> Surface:
-    """Make the surface of a terrain; `passable`, shape (row, col), is a mask of its pixels."""
+    """Make the surface of a terrain; `passable` is a mask of its pixels, shape (row, col)."""
     ground, canopy = (terrain[name].values.astype(float) for name in ("dem", "dsm"))
     return Surface(
         ground=ground,

@@ -82,21 +82,21 @@ class Workspace(Summary):
 
         The mean of a feature over a cell applies to all robots and to all bounds into the cell.
         A cell is impassable if more than half of its pixels are missing or steeper than the slope
-        limit. Openness is measured up to the lidar's range, but at most over the diagonal of a
+        limit. Openness is measured up to the lidar's range, but no farther than the diagonal of a
         cell, because overwatch needs no sight beyond one bound.
 
-        Overwatch involves two cells. Traversability is therefore averaged along the robots' tracks
-        in a bound, and the feature `line_of_sight` is added. It is the predicted fraction of time
-        in which a robot and the lead can see each other, given the assumed model of sight.
+        Because overwatch involves two cells, traversability is averaged along the robots' tracks
+        in a bound, and the feature `line_of_sight` is added: the predicted fraction of time in
+        which a robot and the lead can see each other, given the assumed model of sight.
 
         Args:
             terrain: Dataset from `read_terrain` or `synthetic_terrain`.
             shape: Number of rows and columns of the planning grid.
             team: Lead and overwatching robots; by default a lead and three robots.
-            features: Pixel features (see `terrain.FEATURES`) of each awareness feature, by name.
+            features: Mapping of each awareness feature to pixel features (see `terrain.FEATURES`).
                 Several pixel features form a composite index; a single name stands for a feature
                 in [0, 1] that is used unchanged. The default is traversability and visibility.
-            bounds: False to define awareness for cells only, as in the paper: without line of
+            bounds: If False, define awareness for cells only, as in the paper: without line of
                 sight, and with the visibility of `terrain.PAPER_VISIBILITY`.
             sight: Assumed model of sight; by default `Sight()`.
 
@@ -231,7 +231,7 @@ class Workspace(Summary):
         Features with the default names z3, z4, ... are given the workspace's names, in order.
 
         Raises:
-            TrustboError: The mission has other robots or features, or no map.
+            TrustboError: The mission's robots or features do not match, or it has no map.
         """
         require_map("a workspace", [mission])
         unnamed = default_features(len(mission.features))
@@ -245,12 +245,12 @@ class Workspace(Summary):
         return mission.in_order(self.team.names, self.features, predicted)
 
     def fill(self, mission: Mission) -> Mission:
-        """Replace awareness that a mission did not measure (NaN) with the workspace's awareness.
+        """Replace awareness not measured in a mission (NaN) with the workspace's awareness.
 
-        Campaigns do this automatically. Robots do not measure line of sight, for example.
+        For example, robots do not measure line of sight. Campaigns do this automatically.
 
         Raises:
-            TrustboError: The mission's path is not a path of neighbouring passable cells.
+            TrustboError: The mission's path is not a sequence of neighbouring passable cells.
         """
         ordered = self.in_order(mission)
         missing = np.isnan(ordered.awareness)
