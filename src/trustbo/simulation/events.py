@@ -45,7 +45,7 @@ class Event:
         return self.first <= mission and (self.last is None or mission <= self.last)
 
     def change(self, world: World) -> World:
-        """Return the world with the event; TrustboError if the event does not fit the world."""
+        """Return the world with the event; raises TrustboError if it does not fit the world."""
         raise NotImplementedError
 
 
@@ -202,7 +202,7 @@ class Fouling(Event):
 
 
 def _circle(surface: Surface, center: tuple[float, float], radius: float) -> np.ndarray:
-    """Return a mask (row, col) of the pixels centred in a circle; TrustboError if it is empty."""
+    """Return a mask (row, col) of pixels centred in a circle; raises TrustboError if none are."""
     rows, cols = surface.ground.shape
     row, col = surface.to_pixel(*np.asarray(center, dtype=float))
     away = np.hypot(

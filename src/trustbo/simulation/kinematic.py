@@ -41,7 +41,7 @@ class KinematicSimulator(DescribedSimulator):
     In the first phase of a bound, the lead drives to its stop in the next cell while T2 watches
     from its posts in the previous cell. In the second phase, T2 closes up to its next posts while
     the lead watches. The contact rate of a robot of T2 is the fraction of ticks, over both phases,
-    in which the robot is in contact with the lead. Missions have the workspace's awareness.
+    in which the robot is in contact with the lead. Awareness is taken from the workspace.
 
     To simulate a different kind of motion, derive from this class and override `drive`.
 
@@ -63,20 +63,20 @@ class KinematicSimulator(DescribedSimulator):
     ) -> None:
         """Prepare a simulation on a terrain.
 
-        Stops, posts and routes are those planned by the workspace. The true terrain, sight and team
-        affect only contact, motion and failure.
+        The workspace plans the stops, posts and routes. The true terrain, sight and team affect
+        only contact, motion and failure.
 
         Args:
             workspace: A workspace made from a terrain.
             terrain: True DEM and DSM, which must cover the workspace; by default the workspace's.
-            sight: True model of sight; by default that of the workspace.
-            team: True team, with the same names; by default that of the workspace.
+            sight: True model of sight; by default the workspace's.
+            team: True team, with the same names; by default the workspace's.
             tick: Length of a tick, in seconds.
-            bound_timeout: Time in seconds after which a bound, and its mission, end as "timeout".
+            bound_timeout: Time limit of a bound, in seconds; then the mission ends as "timeout".
             events: Changes of the world in given missions, such as `Jam` or `Dust`.
 
         Raises:
-            TrustboError: The workspace has no terrain, the team has other names, a value is not
+            TrustboError: The workspace has no terrain, the team's names differ, a value is not
                 positive, or an event does not fit the terrain or the team.
         """
         self.workspace, self.terrain = workspace, terrain
@@ -199,10 +199,10 @@ class KinematicSimulator(DescribedSimulator):
         *,
         expected: bool = False,
     ) -> list[tuple[Drive, np.ndarray, State]]:
-        """Simulate the k-th bound of a mission, from 1, for each possible next cell.
+        """Simulate the k-th bound of a mission, counted from 1, for each possible next cell.
 
         Movements shared by several next cells are simulated once. With `expected`, contact is the
-        detection probability, provided that contact depends on a single scan.
+        detection probability if contact depends on a single scan.
 
         Returns:
             For each next cell, the movements, the contact at each tick, shape (tick, robot), and
@@ -211,7 +211,7 @@ class KinematicSimulator(DescribedSimulator):
         goals = self._posts.stop(cell)[None]
         lead = self._move(world, state, cell, _LEAD, goals, self._max_ticks, rng)
         drives, runs = [lead], []
-        moves: dict[bytes, int] = {}  # by their goals
+        moves: dict[bytes, int] = {}  # keyed by goals
         for next_cell in ahead:
             run = [0]
             if lead.status == "ok":

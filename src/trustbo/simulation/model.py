@@ -49,9 +49,9 @@ class ModelSimulator(DescribedSimulator):
                 `hazard.risk.BoundRisk`. A failed mission is "stuck". None for no failures.
 
         Raises:
-            TrustboError: Parameters or awareness have other robots or features than the workspace,
-                there are several draws, `p_fail` has another shape or is outside [0, 1], or
-                `n_ticks` is missing or not used.
+            TrustboError: The robots or features of the parameters or awareness do not match the
+                workspace's, there are several draws, `p_fail` has the wrong shape or is outside
+                [0, 1], or `n_ticks` is missing or not used.
         """
         require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
         require_kind("params", params, Params, "give parameters, such as TrustParams(...)")

@@ -48,7 +48,7 @@ def drive(
         heading,
         (robot.speed, robot.turn_rate, robot.max_slope),
         tick,
-        # Enough steps that no step leaps over the goal.
+        # Enough steps that none jumps over the goal.
         max(_LEAST_STEPS, math.ceil(robot.speed * tick / (0.5 * ARRIVED))),
         rng.standard_normal(max_ticks),
     )
@@ -118,7 +118,7 @@ def _drive(gradient, pixel, origin, route, heading, limits, tick, n_steps, slip)
             ahead, left = math.cos(heading), math.sin(heading)
             # Tangents of pitch and roll.
             pitch, roll = abs(gx * ahead + gy * left), abs(gy * ahead - gx * left)
-            if not (roll <= steepest and pitch <= steepest):  # unknown ground fails too
+            if not (roll <= steepest and pitch <= steepest):  # unknown ground also fails
                 poses[k, 0], poses[k, 1], poses[k, 2] = x, y, heading
                 return poses[: k + 1], 2 if roll > steepest else 1
             # A skid-steer robot turns on the spot until it faces its route.

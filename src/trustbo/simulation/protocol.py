@@ -46,7 +46,7 @@ class DescribedSimulator(Summary):
 
 
 def require_path(workspace: Workspace, path: Sequence[Cell]) -> list[Cell]:
-    """Return the cells of a path; TrustboError unless at least two are given and passable."""
+    """Return the cells of a path; raises TrustboError unless it has two or more, all passable."""
     path = require_cells("path", path)
     cells = [workspace.locate(cell, f"path[{k}]") for k, cell in enumerate(path)]
     if len(cells) < 2:

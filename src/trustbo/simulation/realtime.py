@@ -22,7 +22,7 @@ SIGNS = {
 }
 """Inputs of each feature, with the signs of their effects; angles are in rad, ranges in m."""
 MIN_SAMPLES = 200
-"""Minimum number of robots times bounds, since loadings from fewer samples are unstable."""
+"""Minimum number of robots times bounds; loadings from fewer samples are unstable."""
 _SHARES, _ANGLES = np.array([0.25, 0.5, 0.75, 1.0]), np.linspace(0.0, 2.0 * np.pi, 13)[:-1]
 
 
@@ -34,7 +34,7 @@ class RealtimeAwareness:
     """
 
     def __init__(self, simulator: KinematicSimulator, missions: Sequence[Mission]) -> None:
-        """Fit the indices to calibration missions; TrustboError if there are too few missions."""
+        """Fit the indices to calibration missions; raises TrustboError if there are too few."""
         self._workspace, self._world = simulator.workspace, simulator.world()
         self._tick = simulator.tick
         samples = [self.inputs(bound) for mission in missions for bound in mission.bounds]

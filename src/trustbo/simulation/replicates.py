@@ -13,7 +13,7 @@ from trustbo.workspace import Workspace
 from trustbo.workspace.moves import MOVE_NAMES, MOVES
 
 END = len(MOVES)
-"""Index that stands for no next move, when a bound enters the goal."""
+"""Index used instead of the next move for a bound that enters the goal."""
 _DIMS = ("move", "row", "col", "next_move")
 
 
@@ -30,7 +30,7 @@ class Edge(NamedTuple):
 
 
 type Outcomes = Iterator[tuple[Edge, list[tuple[float, str]]]]
-"""Mean contact over robots and status of each bound, for each possible next bound."""
+"""For each bound and each possible next bound, mean contact over robots, and status."""
 
 
 def table_of(contact: np.ndarray, passed: np.ndarray) -> xr.Dataset:
@@ -77,7 +77,7 @@ def replicated(simulator: Any, mission: int, n_replicates: int, seed: int) -> xr
 def _of_bounds(
     simulator: KinematicSimulator, edges: Sequence[Edge], mission: int, n: int, seed: int
 ) -> Outcomes:
-    """Replicate bounds, each from where a preceding bound ended in the previous replicate.
+    """Replicate bounds; each begins where a preceding bound ended in the previous replicate.
 
     Replicate 0 begins with all robots at their stop and posts, and is not counted.
     """
@@ -107,7 +107,7 @@ def _of_bounds(
 def _of_missions(
     simulator: Any, edges: Sequence[Edge], mission: int, n: int, seed: int
 ) -> Outcomes:
-    """Replicate bounds by missions over a bound and each possible next bound."""
+    """Replicate each bound by one mission for each possible next bound."""
     for number in range(n):
         for edge in edges:
             outcomes = []

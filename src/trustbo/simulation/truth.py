@@ -40,12 +40,12 @@ class Truth(Summary):
     def __init__(
         self, workspace: Workspace, bounds: xr.Dataset, of: "Callable[[int], Truth] | None" = None
     ) -> None:
-        """Store the truth of bounds; `of(mission)` computes that of another mission's world."""
+        """Store the bounds; `of(mission)` computes the truth of another mission's world."""
         self.workspace, self.bounds, self._of = workspace, bounds, of
 
     def _rows(self) -> Rows:
         rows, cols = self.workspace.grid.shape
-        worlds = "one" if self._of is None else "those of missions, see at(mission)"
+        worlds = "one" if self._of is None else "one for each mission; see at(mission)"
         return [("bounds", f"of {rows} x {cols} cells"), ("worlds", worlds)]
 
     @classmethod
@@ -156,7 +156,7 @@ class Truth(Summary):
     def regret(self, path: Sequence[Cell], max_bounds: int | str = "shortest+4") -> float:
         """Compute the regret of a path, as a percentage of the contact kept on the best path.
 
-        The regret is the additional contact lost in comparison with the best path of at most
+        The regret is the additional contact lost compared with the best path of at most
         `max_bounds` bounds between the same cells. It is negative if a longer path is better.
         """
         best = self.best(path[0], path[-1], max_bounds)

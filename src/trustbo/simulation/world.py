@@ -34,7 +34,7 @@ class World(NamedTuple):
 
 
 def true_surface(workspace: Workspace, terrain: xr.Dataset | None) -> Surface:
-    """Return the simulated surface: that of `terrain` or, by default, that of the workspace.
+    """Return the surface for simulation, made from `terrain` or, by default, the workspace's.
 
     Raises:
         TrustboError: The terrain does not cover the grid or has another CRS, or the workspace has
