@@ -61,8 +61,8 @@ def run_grid(
     `recommend(campaign)`, its path replaces the campaign's recommendation.
 
     Args:
-        cases: Cases by name.
-        scenes: Functions that make the scenes in the worker processes, by name.
+        cases: Cases, keyed by name.
+        scenes: Functions, keyed by name, that make the scenes in the worker processes.
         folder: Folder for the files of the runs.
         seeds: Seeds of the campaigns.
         n_missions: Number of missions per campaign.
@@ -70,12 +70,12 @@ def run_grid(
 
     Returns:
         One row per run and mission, with `case`, `scene`, `seed`, the labels of the scene, and
-        `mission`, which is 0 before the first mission. `regret` (%) and `lost` (bounds) are for the
-        path recommended after the mission, and `best` is the loss on the best path, evaluated in
-        the world of the next mission (see `Truth`). The mission itself has a `status` and a mean
+        `mission`, which is 0 before the first mission. `regret` (%) and `lost` (bounds) describe
+        the path recommended after the mission, and `best` is the loss on the best path, all in the
+        world of the next mission (see `Truth`). The mission itself has a `status` and a mean
         `contact_rate`. `driven` and `best_driven` are the expected losses on the driven path and on
-        the best path. `failed_driven` is the loss on the driven path minus that on the best path if
-        bounds that fail or are not reached have no contact. `seconds` is the CPU time.
+        the best path. `failed_driven` is the difference of these losses if bounds that fail or are
+        not reached count as fully lost. `seconds` is the CPU time.
 
     Raises:
         TrustboError: If a run failed. The next call repeats failed runs.

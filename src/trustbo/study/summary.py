@@ -21,10 +21,10 @@ def numbers_of(table: pd.DataFrame) -> pd.DataFrame:
     `regret after n` (%) and `lost after n` (the loss minus the best path's, in bounds) describe the
     path recommended after n missions, in the world of the next mission. `regret now` is the mean
     regret. `lost while learning` is the mean loss in the missions minus that on the best path.
-    `lost with failures` is the same if bounds that fail or are not reached have no contact. After
-    `missions to 1 %`, the regret stays within 1 %. If it never does, the value is the number of
-    missions plus one. `arrive` is the fraction of missions that reach the goal, also given for the
-    first three and the later missions. `seconds` is the mean CPU time of a mission.
+    `lost with failures` is the same, but counts bounds that fail or are not reached as fully lost.
+    `missions to 1 %` is the number of missions after which the regret stays within 1 %, or the
+    number of missions plus one if it never does. `arrive` is the fraction of missions that reach
+    the goal, also for the first three and the later ones. `seconds` is the mean CPU time.
     """
     judged = {"mission", "regret", "lost", "best", "status", "contact_rate", "driven",
               "best_driven", "failed_driven", "seconds"}  # fmt: skip
@@ -87,8 +87,8 @@ def differences(numbers: pd.DataFrame, ours: str, by: Sequence[str] = ()) -> pd.
         by: Columns by which pairs are grouped, in addition to the other case.
 
     Returns:
-        Table of differences, `ours` minus the other case, as in `summary`, with the number of
-        `pairs`. The intervals are over scenes, and NaN if there is only one scene.
+        Table of the differences, `ours` minus the other case, in the format of `summary`, with the
+        number of `pairs`. Intervals are over scenes; they are NaN if there is only one scene.
 
     Raises:
         TrustboError: If a case or column is unknown.
@@ -137,7 +137,7 @@ def bootstrap(
 
 
 def _values(numbers: pd.DataFrame) -> dict[str, np.ndarray]:
-    """Return the numeric columns by name."""
+    """Return the numeric columns, keyed by name."""
     first = numbers.columns.get_loc("regret after 0")
     return {name: numbers[name].to_numpy(float) for name in numbers.columns[first:]}
 

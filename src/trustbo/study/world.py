@@ -50,7 +50,7 @@ class World:
         assumed: Assumed sight model; None for the true model.
         team: True lead and robots.
         assumed_team: Assumed lead and robots; None for the true team.
-        aged: Whether the assumed terrain comes from an outdated survey, see the function `aged`.
+        aged: Whether the assumed terrain comes from an outdated survey (see the function `aged`).
         events: Events in the true world. The centre of an event is given in fractions of the
             terrain's width and height from the lower left corner, not in CRS metres.
         shape: Shape of the planning grid, (row, col).
@@ -75,7 +75,7 @@ class World:
 
     @property
     def case(self) -> str:
-        """Name of the case, which is the kind if the name contains only the terrain."""
+        """Name of the case, or the kind if the name contains only the terrain."""
         return self.name.removeprefix(self.ground).removeprefix("-") or self.kind
 
     @property
@@ -131,7 +131,7 @@ class World:
         return KinematicSimulator(workspace, events=self._events(terrain), **given)
 
     def truth(self, folder: FilePath | None = None) -> Truth:
-        """Return the truth of the simulator, which is read from `folder` if already computed."""
+        """Return the truth of the simulator, read from `folder` if it was computed before."""
         return Truth.of(self.simulator(self.workspace()), folder=folder)
 
     def scene(
@@ -165,7 +165,7 @@ class World:
         return placed
 
     def ends(self, course: str) -> tuple[Cell, Cell]:
-        """Return the start and goal of a course, moved to the largest connected region of cells."""
+        """Return the start and goal of a course, moved into the largest connected region."""
         rows, cols = (n - 1 for n in self.shape)
         start, goal = {
             "sw-ne": ((rows, 0), (0, cols)),
@@ -183,7 +183,7 @@ class World:
 
 
 def aged(now: xr.Dataset, seed: int = 0) -> xr.Dataset:
-    """Imitate an outdated survey of a terrain, with errors of the canopy and the ground.
+    """Imitate an outdated survey of a terrain, with errors in the canopy and the ground.
 
     The canopy has 0.7 times its true height, and is missing on 15 % of the area, in patches of
     about 10 m. The ground errors have a standard deviation of 0.3 m and a correlation length of

@@ -16,7 +16,7 @@ from trustbo.workspace.sight import Sight
 _SYNTHETIC = tuple(f"synthetic-{seed}" for seed in range(3))
 _ALDER, _BIRCH, _CEDAR = (f"synthetic-{name}" for name in ("alder", "birch", "cedar"))
 _AFTER = 6
-"""Index of the first mission after a change, which is the seventh mission."""
+"""Index of the first mission after a change (the seventh mission)."""
 _DAYS = (1, 3, 4, 7)
 """Indices of the missions with bad weather."""
 
@@ -116,11 +116,11 @@ def _season(factor: float) -> dict[str, Any]:
     return {"events": (Season(factor, first=_AFTER),)}
 
 
-# In the kind "limit", the assumed slope limit is too high. The case "limit-4" assumes 4 degrees
-# more than the true limit. The latter is the lowest of 14, 18, 22 and 26 degrees at which some path
-# arrives on both diagonal courses, and at least 5 % of the bounds fail. Wellington has no such
-# limit, and on synthetic-2 only 4 % of the bounds fail, so both are left out. In "limit-1", the
-# assumed limit is 18 degrees as in the kind "slopes", and the default 45 degrees on wellington.
+# In the kind "limit", the assumed slope limit is too high. In "limit-4", it is 4 degrees above the
+# true limit, which is 14, 18, 22 or 26 degrees: the lowest for which both diagonal courses have a
+# path that arrives, with at least 5 % of the bounds failing. Wellington has no such limit, and on
+# synthetic-2 only 4 % of the bounds fail, so both are left out. In "limit-1", the assumed limit is
+# 18 degrees, as in the kind "slopes", or the default of 45 degrees on wellington.
 _CASES: tuple[_Case, ...] = (
     ("right", "", (*_SYNTHETIC, *REAL), {}),
     ("wall", "wall", ("synthetic-0", "synthetic-1", "tahoe"), {"sight": Sight(math.inf, 0.0)}),
@@ -174,11 +174,11 @@ def _all() -> list[World]:
 
 
 def worlds(data: FilePath | None = None) -> dict[str, World]:
-    """Return the benchmark worlds by name (see docs/worlds.md).
+    """Return the benchmark worlds, keyed by name (see docs/worlds.md).
 
     Args:
         data: Folder with the real terrains, such as `tahoe/dem.tif`. Without this folder, the only
-            real terrain whose worlds can be used is wellington, which is part of the package.
+            real terrain that can be used is wellington, which is part of the package.
 
     Returns:
         Worlds on 6 synthetic and 4 real terrains.
