@@ -15,7 +15,7 @@ WRITERS: dict[str, tuple[str, Callable[[Path, Result], None]]] = {
     "csv": ("missions.csv", write_csv),
     "nav2": ("nav2", write_nav2),
 }
-"""For each format, the name of the file or folder and the function that writes a result."""
+"""Name of the file or folder, and function that writes a result, keyed by format."""
 
 
 def export_result(

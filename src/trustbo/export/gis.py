@@ -73,7 +73,7 @@ def write_geojson(path: FilePath, plan: Plan | Result) -> None:
         TrustboError: The workspace has no CRS, or the file cannot be written.
     """
     plan = plan.plan if isinstance(plan, Result) else plan
-    require_kind("plan", plan, Plan, "give a Plan, such as Campaign.ask returns, or a Result")
+    require_kind("plan", plan, Plan, "give a Plan, for example from Campaign.ask, or a Result")
     centres = np.array([plan.workspace.grid.center(cell) for cell in plan.path])
     facts = {"name": "most trustworthy path", "n_bounds": len(plan.path) - 1}
     facts |= {"value": float(plan.value), "objective": plan.objective}
@@ -97,9 +97,9 @@ def write_geojson(path: FilePath, plan: Plan | Result) -> None:
 def write_csv(path: FilePath, result: Result) -> None:
     """Write a table with one row for each mission, bound and robot.
 
-    The columns are those of `logs.to_frame` plus `trust_mean` and `trust_sd`, the mean and standard
-    deviation of latent trust under the last posterior. Fields are blank for values that were not
-    measured, and for the trust of missions that are not in the last posterior.
+    The table has the columns of `logs.to_frame`, and `trust_mean` and `trust_sd`: the mean and
+    standard deviation of latent trust under the last posterior. Values that were not measured are
+    blank, as is the trust of missions that are not in the last posterior.
 
     Args:
         path: File to write or replace.
@@ -123,7 +123,7 @@ def write_csv(path: FilePath, result: Result) -> None:
 
 
 def _of(values: Any) -> Any:
-    """Return values of a plan, or an empty tuple for a plan without a terrain."""
+    """Return the values of a plan, or an empty tuple if the plan has no terrain."""
     return () if values is None else values
 
 
@@ -152,7 +152,7 @@ def _feature(plan: Plan, layer: str, places: np.ndarray, about: dict[str, Any]) 
     shape = shapely.Point(lon[0], lat[0])
     if np.ndim(places) == 2:
         shape = _cut(shapely.LineString(np.column_stack([np.unwrap(lon, period=360.0), lat])))
-    # RFC 7946, 11.2: no more digits than the precision; the eighth digit is a millimetre.
+    # RFC 7946, 11.2: no more digits than are precise; the eighth digit is about a millimetre.
     rounded = shapely.transform(shape, lambda values: np.round(values, 8))
     geometry = json.loads(shapely.to_geojson(rounded))
     return {"type": "Feature", "geometry": geometry, "properties": {"layer": layer, **about}}

@@ -1,4 +1,4 @@
-"""Files for Nav2: a map for map_server, stops for FollowWaypoints, a graph for the route server.
+"""Nav2 files: a map for map_server, stops for FollowWaypoints, and a graph for the route server.
 
 Positions are given in a frame with its origin near the robots. RViz and Nav2 store positions as
 float32, which is too coarse for CRS coordinates. `frame.yaml` contains the pose of the frame in the
@@ -23,7 +23,7 @@ from trustbo.workspace import Workspace
 from trustbo.workspace.moves import MOVES
 
 IMPASSABLE, UNKNOWN, WORST = 100, 255, 98
-"""Pixel values of a cost map; Nav2 uses 99 and 100 where robots may not go."""
+"""Pixel values of a cost map; Nav2 uses 99 and 100 for places where robots must not go."""
 _MOST_PIXELS = 1e8
 _MOST_IDS = 65_535
 """Largest id in Nav2 messages (uint16)."""
@@ -69,7 +69,7 @@ def write_nav2(
         pixel: Side length of a map pixel, in metres; by default a tenth of a cell's shorter side.
 
     Raises:
-        TrustboError: A robot has no route in a bound, the grid has more cells than Nav2 has ids,
+        TrustboError: A robot has no route in a bound, the grid has too many cells for Nav2's ids,
             the map has too many pixels, or a file cannot be written.
     """
     folder, workspace = Path(folder), result.workspace
@@ -100,8 +100,8 @@ def write_ros_map(
 
     Args:
         path: .yaml file to write or replace.
-        cost: Cost of each cell, in [0, 1], such as `Result.maps()["cost"]`; NaN if unknown. Pixels
-            have 100 times the cost, at most 98; 100 means impassable and 255 unknown.
+        cost: Cost of each cell, in [0, 1], such as `Result.maps()["cost"]`; NaN if unknown. A pixel
+            has 100 times the cost, at most 98; 100 means impassable and 255 means unknown.
         workspace: Workspace of the cells.
         frame: Frame of the pixels. Each pixel has the cost of the cell at the pixel's centre.
         pixel: Side length of a pixel, in metres; by default a tenth of a cell's shorter side.
@@ -123,7 +123,7 @@ def write_ros_map(
 def occupancy(
     cost: np.ndarray, workspace: Workspace, frame: Frame, pixel: float | None = None
 ) -> tuple[np.ndarray, list[float], float]:
-    """Return pixels (row, col) from the south, the map's lower left corner and the pixel size."""
+    """Return pixels (row, col), south first, the map's lower left corner, and the pixel size."""
     if ((cost < 0.0) | (cost > 1.0)).any():
         raise TrustboError(
             f"cost must be in [0, 1]; got values from {np.nanmin(cost):g} to {np.nanmax(cost):g}."
@@ -141,7 +141,7 @@ def occupancy(
     percent = np.where(np.isnan(cost), UNKNOWN, np.fmin(np.rint(100.0 * cost), WORST))
     percent = np.where(workspace.passable.values, percent, IMPASSABLE)
     values = np.full((n_y, n_x), UNKNOWN, dtype=np.uint8)
-    for i in range(n_y):  # row by row, as maps may be large
+    for i in range(n_y):  # row by row, because maps may be large
         x = (np.arange(n_x) + 0.5) * side
         places = frame.to_crs(np.column_stack([x, np.full(n_x, (i + 0.5) * side)]) + corner)
         col = np.floor((places[:, 0] - left) / grid.cell_width).astype(int)
@@ -220,7 +220,7 @@ def _feature(kind: str, coordinates: list[Any], properties: dict[str, Any]) -> s
 
 
 def _json(value: Any) -> str:
-    """Convert values to JSON; floats keep a decimal point, or they would be read as integers."""
+    """Convert values to JSON; floats keep a decimal point so they are not read as integers."""
     if isinstance(value, dict):
         return "{" + ", ".join(f"{json.dumps(k)}: {_json(v)}" for k, v in value.items()) + "}"
     if isinstance(value, list):
