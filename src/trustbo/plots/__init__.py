@@ -1,4 +1,4 @@
-"""Figures. All functions except `explore` accept `ax`, and return the axes with the drawing."""
+"""Figures. All functions except `explore` accept `ax` and return the axes."""
 
 from trustbo.plots.curves import robot_effects, trust_curves
 from trustbo.plots.explore import explore

@@ -30,17 +30,17 @@ _LABELS = {
     "objective": "objective\nwhen planned",
     "regret": "regret (%)",
 }
-"""Variables of a history that `campaign_history` draws, with their axis labels."""
+"""Variables of a history that `campaign_history` plots, with their axis labels."""
 SMALL_EFFECT = 0.1
 """Robot effect, as a fraction of contact, that is too small to change plans."""
 
 
 @styled
 def trust_curves(given: xr.DataTree | Plan, mission: int = -1, *, ax: Any = None) -> np.ndarray:
-    """Draw the trust of each robot along a mission or a plan, with 50 % and 90 % bands.
+    """Plot the trust of each robot along a mission or a plan, with 50 % and 90 % bands.
 
     Args:
-        given: Posterior from `tb.fit`, drawn with the measured contact rates as dots; or a plan
+        given: Posterior from `tb.fit`, plotted with the measured contact rates as dots; or a plan
             computed from a posterior, such as `Result.plan`.
         mission: Index of the mission in a posterior; negative indices count from the last.
         ax: Axes to draw on, one for each robot; by default a new figure.
@@ -95,7 +95,7 @@ def _latent_trust(
 
 @styled
 def campaign_history(history: xr.Dataset, *, ax: Any = None) -> np.ndarray:
-    """Draw the contact, the objective and, if known, the regret of each mission.
+    """Plot the contact, the objective and, if known, the regret of each mission.
 
     A filled dot marks a path that differs from the previous path. A cross marks a mission that did
     not reach the goal.
@@ -137,9 +137,9 @@ def campaign_history(history: xr.Dataset, *, ax: Any = None) -> np.ndarray:
 
 @styled
 def robot_effects(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
-    """Draw the effect of each robot in each mission, with bars of two standard deviations.
+    """Plot the effect of each robot in each mission, with bars of two standard deviations.
 
-    The band covers effects too small to change a plan. Filled markers show effects that stand out.
+    The band marks effects too small to change a plan. Filled markers show effects that stand out.
 
     Args:
         table: Table with one row for each mission and robot, and the columns `mission`, `robot`,

@@ -16,7 +16,7 @@ from trustbo.plots.maps import contours, extent_of, robust_limits
 from trustbo.plots.style import ROBOTS
 from trustbo.workspace.grid import Grid, over_cells
 
-_PLANNED_ON = "trust map that the mission was planned on"
+_PLANNED_ON = "trust map used to plan the mission"
 _MARKERS = ("circle", "square", "diamond", "triangle", "inverted_triangle", "plus")
 _HEIGHT = 640
 """Height of the page in a notebook, in pixels."""
@@ -52,7 +52,7 @@ class Explorer:
 
 
 def explore(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> Explorer:
-    """Make an interactive map with layers, cell values under the pointer and a mission slider.
+    """Make an interactive map with layers, cell values at the pointer, and a mission slider.
 
     Args:
         plan: Recommended plan, such as `Result.plan`.
@@ -146,7 +146,7 @@ def _layout(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> Any:
 
 
 def _layers(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> dict[str, np.ndarray]:
-    """Return the layers (row, col) by name; trust maps of missions are called "mission 1", ..."""
+    """Return the layers (row, col), keyed by name; trust maps of missions are "mission 1", ..."""
     free = plan.workspace.passable.values
     layers = {
         str(name).replace("_", " "): over_cells(values).transpose("row", "col").values
@@ -165,7 +165,7 @@ def _layers(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> dict[str, np.n
 
 
 def _draw_plan(plot: Any, plan: Plan) -> None:
-    """Draw the recommended path and, on a terrain, the posts and routes of the robots."""
+    """Plot the recommended path and, on a terrain, the posts and routes of the robots."""
     grid = plan.workspace.grid
     corner, path = np.array(grid.corner), _places(plan.path, grid)
     plot.line(path["x"], path["y"], color="black", line_width=5, legend_label="recommended")

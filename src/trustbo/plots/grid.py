@@ -15,9 +15,9 @@ _MOST_NAMED = 24
 
 @styled
 def grid_map(workspace: Workspace, *, ax: Axes | None = None) -> Axes:
-    """Draw the mean height of each cell, labelled with its row and column.
+    """Plot the mean height of each cell, labelled with its row and column.
 
-    Impassable cells are hatched; without a terrain, passable cells are blank.
+    Impassable cells are hatched. Without a terrain, passable cells are blank.
 
     Args:
         workspace: Workspace of the cells.

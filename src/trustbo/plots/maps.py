@@ -20,7 +20,7 @@ from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Grid, over_cells
 
 MOMENTS = (1, 2, 4)
-"""Missions whose maps are drawn by default, in addition to the map after the last mission."""
+"""Missions whose maps are plotted by default, in addition to the map after the last mission."""
 VEGETATION = (0.44, 0.56, 0.39, 0.4)
 """Semi-transparent green that is visible on light and dark backgrounds."""
 _GROWN = 0.5  # minimum height of vegetation above the ground, m
@@ -40,7 +40,7 @@ def trust_maps(
     missions: Sequence[int] = MOMENTS,
     ax: Any = None,
 ) -> np.ndarray:
-    """Draw the trust maps used to plan missions, with the planned paths (Fig. 5 of the paper).
+    """Plot the trust maps used to plan missions, with the planned paths (Fig. 5 of the paper).
 
     The last panel shows the map and the recommended path after the last mission. All maps share one
     colour scale, from the 2 % to the 98 % quantile of the learned maps. The start is grey because
@@ -81,10 +81,10 @@ def trust_maps(
 
 @styled
 def terrain_maps(workspace: Workspace, *, ax: Any = None) -> np.ndarray:
-    """Draw the surface and the index of each feature (Fig. 4 of the paper).
+    """Plot the surface and the index of each feature (Fig. 4 of the paper).
 
-    A feature of bounds, such as line of sight, is averaged over robots and over the bounds into
-    each cell.
+    A feature of bounds, such as line of sight, is averaged over robots and over all bounds that
+    enter a cell.
 
     Args:
         workspace: Workspace made from a terrain.
@@ -129,7 +129,7 @@ def cell_map(
     label: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw a map of the planning cells with contour lines; impassable cells are grey.
+    """Plot a map of the planning cells with contour lines; impassable cells are grey.
 
     Args:
         values: Map with the dims (row, col), or (y, x) as in `Result.maps`.
@@ -137,7 +137,7 @@ def cell_map(
         path: Path to draw.
         limits: Values at the ends of the colour scale; by default the range of the map.
         cmap: Matplotlib `Colormap` or its name.
-        label: Label of the colour bar; by default the name of the map, `""` for no colour bar.
+        label: Label of the colour bar, by default the name of the map; `""` for no colour bar.
         ax: Axes to draw on; by default a new figure.
 
     Returns:
@@ -154,7 +154,7 @@ def cell_map(
 
 
 def draw_path(ax: Axes, path: Sequence[Cell], grid: Grid) -> None:
-    """Draw a path over a map, from its start (circle) to its goal (star)."""
+    """Plot a path over a map, from its start (circle) to its goal (star)."""
     x, y = (np.array([grid.center(cell) for cell in path]) - grid.corner).T
     (line,) = ax.plot(x, y, color="white", linewidth=1.6, solid_joinstyle="round")
     line.set_path_effects(outlined(3.2, "black"))
@@ -260,7 +260,7 @@ def contours(workspace: Workspace) -> list[np.ndarray]:
 
 
 def contour_interval(relief: float) -> float | None:
-    """Choose a round number of metres between contour lines; None on level ground."""
+    """Choose a round contour interval in metres; None on level ground."""
     if not relief > 0.05:
         return None
     magnitude = 10.0 ** np.floor(np.log10(relief / _CONTOURS))
@@ -275,7 +275,7 @@ def robust_limits(values: np.ndarray) -> tuple[float, float]:
 
 
 def draw_scale(ax: Axes, grid: Grid) -> None:
-    """Draw a scale bar of a round number of metres in the lower right corner of a map."""
+    """Draw a scale bar with a round length in metres in the lower right corner of a map."""
     left, right = ax.get_xlim()
     width = right - left
     magnitude = 10.0 ** np.floor(np.log10(0.4 * width))
@@ -289,5 +289,5 @@ def draw_scale(ax: Axes, grid: Grid) -> None:
 
 
 def extent_of(grid: Grid) -> tuple[float, float, float, float]:
-    """Return left, right, bottom and top of a map, in metres from the map's lower left corner."""
+    """Return a map's left, right, bottom and top edges, in metres from its lower left corner."""
     return (0.0, grid.shape[1] * grid.cell_width, 0.0, grid.shape[0] * grid.cell_height)

@@ -18,14 +18,14 @@ _DASHED = (0, (3, 1.5))
 
 @styled
 def plan_map(plan: Plan, *, bounds: Sequence[int] | None = None, ax: Any = None) -> np.ndarray:
-    """Draw an overview of a plan's path, and a map of each bound.
+    """Plot an overview of a plan's path, and a map of each bound.
 
     The map of a bound shows the lead's route between its stops, the posts of the other robots with
     their sight lines to the lead's next stop, and the routes to their next posts.
 
     Args:
         plan: Plan on a terrain, such as `Result.plan`.
-        bounds: Numbers of the bounds to draw, from 1; by default all.
+        bounds: Numbers of the bounds to plot, from 1; by default all.
         ax: Axes to draw on, one for each panel; by default a new figure.
 
     Returns:
@@ -57,7 +57,7 @@ def plan_map(plan: Plan, *, bounds: Sequence[int] | None = None, ax: Any = None)
 
 
 def _draw_bound(ax: Axes, plan: Plan, k: int) -> None:
-    """Draw bound k and its surroundings."""
+    """Plot bound k and its surroundings."""
     stops, posts, routes = plan.stops, plan.posts, plan.routes
     assert stops is not None and posts is not None and routes is not None  # noqa: S101, PT018
     corner = np.array(plan.workspace.grid.corner)

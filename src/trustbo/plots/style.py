@@ -59,7 +59,7 @@ def panels(
         given = np.asarray(ax, dtype=object).ravel()
         if len(given) < n or not all(isinstance(one, Axes) for one in given):
             raise TrustboError(f"ax must have at least {n} Axes, one per panel; got {ax!r:.80}.")
-        for one in given[:n]:  # labels of the user's axes have other sizes
+        for one in given[:n]:  # the user's axes may have labels of other sizes
             one.tick_params(labelsize=RC["xtick.labelsize"])
             for text in (one.xaxis.label, one.yaxis.label):
                 text.set_size(RC["axes.labelsize"])
@@ -94,7 +94,7 @@ def add_legend(axes: np.ndarray, handles: Sequence[Any]) -> None:
 
 
 def accent() -> str:
-    """Return the colour of a single curve, a blue that is visible on the background."""
+    """Return the colour of a single curve: a blue that is visible on the background."""
     red, green, blue = to_rgb(paper())
     return ROBOTS[4] if 0.3 * red + 0.6 * green + 0.1 * blue < 0.5 else ROBOTS[0]
 
