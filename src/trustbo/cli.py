@@ -74,7 +74,7 @@ def parser() -> argparse.ArgumentParser:
     add = command(demo, "Run a campaign on the example hillside.", "--missions 4")
     _add_campaign(add, "out/demo")
 
-    add = command(info, "Describe and draw the planning grid of a terrain.", "dem.tif")
+    add = command(info, "Describe and plot the planning grid of a terrain.", "dem.tif")
     add("dem", type=Path, metavar="DEM", help="raster of ground heights, such as a GeoTIFF")
     add("dsm", type=Path, nargs="?", metavar="DSM", help="raster of surface heights")
     _add_grid(add)
@@ -104,7 +104,7 @@ def parser() -> argparse.ArgumentParser:
     add = command(export, "Write a result to files for GIS, Nav2 or tables.", "out --format nav2")
     add("folder", type=Path, metavar="DIR", help="folder of the campaign")
     add("--format", dest="formats", choices=FORMATS, nargs="+", default=["geotiff", "geojson"])
-    add("--out", type=Path, metavar="DIR", help="output folder (default: that of the campaign)")
+    add("--out", type=Path, metavar="DIR", help="output folder (default: the campaign's)")
     return top
 
 
@@ -125,7 +125,7 @@ def _add_grid(add: Any) -> None:
 
 def _add_stop(add: Any) -> None:
     """Add the flag of the stopping rule."""
-    text = "stop when the path is within this fraction of the best path with probability 0.9"
+    text = "stop when the regret of the path is below this fraction with probability 0.9"
     add("--stop-regret", type=float, metavar="SHARE", help=text)
 
 
@@ -159,7 +159,7 @@ def demo(args: argparse.Namespace) -> None:
 
 
 def info(args: argparse.Namespace) -> None:
-    """Print a summary of a terrain's workspace and draw the grid."""
+    """Print a summary of a terrain's workspace and plot the grid."""
     import matplotlib.pyplot as plt
 
     import trustbo as tb

@@ -1,4 +1,4 @@
-"""Display of objects and of progress: text in a terminal, a table or a bar in a notebook."""
+"""Display of objects and progress: text in a terminal, and tables and bars in a notebook."""
 
 import sys
 import warnings
@@ -10,7 +10,7 @@ from typing import Any
 
 from numba.core import event
 
-with warnings.catch_warnings():  # without ipywidgets, bars in a notebook are of text
+with warnings.catch_warnings():  # without ipywidgets, notebooks show text bars
     warnings.simplefilter("ignore")
     from tqdm.auto import tqdm
 
@@ -20,7 +20,7 @@ _WIDTH = 100
 
 
 class Summary:
-    """Object that is displayed by its main properties."""
+    """Base class of objects that are displayed as a list of their main properties."""
 
     __slots__ = ()
 
@@ -54,7 +54,7 @@ def say(line: str) -> None:
 
 
 def compiling() -> AbstractContextManager[Any]:
-    """Print a line when kernels are compiled, which happens once on a machine."""
+    """Print a line when kernels are compiled, which happens once per machine."""
     return event.install_listener("numba:compile", _Announcement())
 
 

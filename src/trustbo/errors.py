@@ -11,7 +11,7 @@ class TrustboError(ValueError):
 
 
 class PosteriorError(TrustboError):
-    """A posterior whose diagnostics exceed their limits.
+    """Error for a posterior whose diagnostics exceed their limits.
 
     Attributes:
         posterior: Rejected posterior (ArviZ DataTree), for inspection.
@@ -24,7 +24,7 @@ class PosteriorError(TrustboError):
 
 
 def require_choice(what: str, value: object, choices: Iterable[str]) -> str:
-    """Return `value` if it is among `choices`, else raise a TrustboError that lists them."""
+    """Return `value` if it is among `choices`; otherwise, raise a TrustboError that lists them."""
     choices = tuple(choices)
     if not isinstance(value, str) or value not in choices:
         raise TrustboError(f"unknown {what} {value!r}; choose one of {', '.join(choices)}.")
@@ -32,7 +32,7 @@ def require_choice(what: str, value: object, choices: Iterable[str]) -> str:
 
 
 def require_whole(what: str, value: object, minimum: int) -> int:
-    """Return `value` as an int; TrustboError unless it is a whole number of at least `minimum`."""
+    """Return `value` as an int; raises TrustboError unless it is whole and at least `minimum`."""
     try:
         number = operator.index(value)  # pyright: ignore[reportArgumentType]
     except TypeError:
@@ -43,7 +43,7 @@ def require_whole(what: str, value: object, minimum: int) -> int:
 
 
 def require_positive(what: str, value: Any, *, or_zero: bool = False) -> float:
-    """Return `value` as a float if it is a positive, finite number, else raise TrustboError."""
+    """Return `value` as a float; raises TrustboError unless it is a positive, finite number."""
     try:
         number = math.nan if isinstance(value, str) else float(value)
     except (TypeError, ValueError):
@@ -55,7 +55,7 @@ def require_positive(what: str, value: Any, *, or_zero: bool = False) -> float:
 
 
 def require_kind(what: str, value: Any, kind: Any, remedy: str) -> Any:
-    """Return `value` if it is an instance of `kind`, else raise TrustboError with a remedy."""
+    """Return `value`; raises TrustboError with a remedy unless it is an instance of `kind`."""
     if not isinstance(value, kind):
         raise TrustboError(f"{what}: got {type(value).__name__} {one_line(value)}; {remedy}.")
     return value
@@ -67,14 +67,14 @@ def one_line(value: object) -> str:
 
 
 def require_cells(what: str, value: object) -> tuple[tuple[int, int], ...]:
-    """Return cells (row, col) in order, such as a path, or raise TrustboError."""
+    """Return cells (row, col) in order, such as a path; raises TrustboError if any is invalid."""
     if isinstance(value, str) or not isinstance(value, Iterable):
-        raise TrustboError(f"{what} must be cells (row, col), start first; got {value!r:.60}.")
+        raise TrustboError(f"{what} must be a list of cells (row, col); got {value!r:.60}.")
     return tuple(require_pair(f"{what}[{k}]", cell) for k, cell in enumerate(value))
 
 
 def require_pair(what: str, value: object) -> tuple[int, int]:
-    """Return a pair of whole numbers, such as a cell (row, col), as ints, or raise TrustboError."""
+    """Return two whole numbers, such as a cell (row, col), as ints; raises TrustboError if not."""
     try:
         first, second = (operator.index(i) for i in value)  # pyright: ignore[reportGeneralTypeIssues]
     except (TypeError, ValueError):

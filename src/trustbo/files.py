@@ -17,14 +17,14 @@ FilePath = str | PathLike[str]
 
 
 def write_file(path: FilePath, write: Callable[[Path], object]) -> None:
-    """Write a file to a temporary name of the same suffix, flush it to disk, and rename it.
+    """Write a file under a temporary name with the same suffix, flush it to disk, and rename it.
 
     Args:
-        path: File to write; its folder is made if it does not exist.
+        path: File to write; its folder is created if it does not exist.
         write: Function that writes to a given path.
 
     Raises:
-        TrustboError: The file cannot be written; an existing file of that name is unchanged.
+        TrustboError: The file cannot be written; an existing file is left unchanged.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.stem}.tmp{path.suffix}")
@@ -39,7 +39,7 @@ def write_file(path: FilePath, write: Callable[[Path], object]) -> None:
 
 
 def read_file(path: FilePath) -> bytes:
-    """Read a whole file; TrustboError if it is missing or cannot be read."""
+    """Read a whole file; raises TrustboError if it is missing or cannot be read."""
     try:
         return Path(path).read_bytes()
     except OSError as error:
@@ -48,15 +48,15 @@ def read_file(path: FilePath) -> bytes:
 
 @contextmanager
 def interpreting(path: FilePath) -> Iterator[None]:
-    """Convert errors from unexpected contents of a file to a TrustboError.
+    """Convert errors caused by unexpected file contents to a TrustboError.
 
-    A TrustboError passes unchanged.
+    An error that is already a TrustboError is raised unchanged.
     """
     try:
         yield
     except TrustboError:
         raise
-    except Exception as error:  # of many kinds
+    except Exception as error:  # there are many kinds
         message = " ".join(str(error).split())[:200]
         raise TrustboError(
             f"{str(path)!r} is damaged or has unexpected contents ({message})."
@@ -69,7 +69,7 @@ def write_text(path: FilePath, text: str) -> None:
 
 
 def to_json(record: object) -> str:
-    """Return the JSON of a record; NumPy numbers and arrays as lists, other objects as text."""
+    """Convert a record to JSON; NumPy values become numbers or lists, other objects text."""
 
     def plain(value: Any) -> object:
         if isinstance(value, np.ndarray | np.generic):
@@ -77,14 +77,14 @@ def to_json(record: object) -> str:
         if is_dataclass(value) and not isinstance(value, type):
             return {"type": type(value).__name__, **asdict(value)}
         if type(value).__str__ is object.__str__ and type(value).__repr__ is object.__repr__:
-            return type(value).__name__  # else it would be an address
+            return type(value).__name__  # otherwise, the text would be an address
         return str(value)
 
     return json.dumps(record, default=plain)
 
 
 def require_suffix(path: FilePath, *suffixes: str) -> Path:
-    """Return the path of a file to write; TrustboError unless it ends in one of these suffixes."""
+    """Return the path of a file; raises TrustboError unless it ends in one of these suffixes."""
     file = Path(path)
     if file.suffix.lower() not in suffixes:
         raise TrustboError(f"{str(file)!r} must end in {' or '.join(suffixes)}.")

@@ -12,13 +12,13 @@ import numpy as np
 from joblib import cpu_count
 from threadpoolctl import ThreadpoolController
 
-_BLOCK = 64  # rows per call: few enough for the caches
+_BLOCK = 64  # rows per call: few enough to fit in the caches
 _here = threading.local()
 
 PART: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-"""Options of compiled functions that only compiled ones call: a quarter less time to compile.
+"""Options of functions called only by compiled code; they save a quarter of the compile time.
 
-They are not cached on disk; their compiled callers are.
+Such functions are not cached on disk, but their compiled callers are.
 """
 
 
@@ -44,7 +44,7 @@ def over_rows(work: Callable[[int, int], None], n_rows: int) -> None:
 
 
 def in_order[T, R](work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
-    """Yield results in the order of the items; at most as many are in memory as cores."""
+    """Yield results in the order of the items; at most one result per core is in memory."""
 
     def alone(item: T) -> R:
         _here.is_worker = True
@@ -63,9 +63,9 @@ def in_order[T, R](work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
 
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
-    """Limit BLAS to one thread: with more, matrices of about 20 rows take 20 times as long.
+    """Limit BLAS to one thread; with more, matrices of about 20 rows take 20 times as long.
 
-    Also usable as a decorator.
+    The function can also be used as a decorator.
     """
     with _blas().limit(limits=1, user_api="blas"):
         yield
@@ -73,5 +73,5 @@ def one_blas_thread() -> Iterator[None]:
 
 @cache
 def _blas() -> ThreadpoolController:
-    """Return the loaded BLAS libraries; cached, as the search is slow."""
+    """Return the loaded BLAS libraries; cached because the search is slow."""
     return ThreadpoolController()

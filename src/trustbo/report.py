@@ -22,7 +22,7 @@ __dir__ = __all__.copy  # tab completion lists only public names
 _DRAWS = 50
 """Number of posterior draws for the uncertainty map."""
 _SHOWN = 3
-"""Number of bounds with the least trust that are drawn in detail."""
+"""Number of bounds shown in detail, chosen by least trust."""
 _ENDS = {"n_iterations": "all missions were run", "interrupted": "the campaign was interrupted"}
 _PAGE = """<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8">
@@ -48,8 +48,8 @@ td, th {{ padding: .2em .7em; text-align: right; border: 0; border-bottom: 1px s
 def write_report(path: FilePath, result: Result) -> None:
     """Write a result as one self-contained HTML page.
 
-    The page begins with the recommended path and the predicted contact and risk. The trust map,
-    the missions, the uncertainties, the diagnostics and the settings follow.
+    The page begins with the recommended path and the predicted contact and risk, followed by the
+    trust map, the missions, the uncertainties, the diagnostics and the settings.
 
     Args:
         path: File to write.
@@ -90,7 +90,7 @@ def _facts(result: Result) -> str:
 
 
 def _path(plan: Plan) -> list[str]:
-    """Draw the recommended path, with posts on a terrain, and make a table of its bounds."""
+    """Plot the recommended path, with posts on a terrain, and make a table of its bounds."""
     content = [_heading("Recommended path")]
     if plan.stops is not None:
         weakest = sorted((np.argsort(plan.trust.mean(1))[:_SHOWN] + 1).tolist())
@@ -129,12 +129,12 @@ def _missions(result: Result) -> list[str]:
     shown = table.loc[:, [name for name in columns if name in table]].rename_axis("mission")
     shown.columns = [str(name).replace("_", " ") for name in shown.columns]
     return [
-        _heading("Contact by mission"),
-        _image(result.plot_history, "contact and objective by mission"),
+        _heading("Contact in each mission"),
+        _image(result.plot_history, "contact and objective of each mission"),
         _table(shown),
         _note(
-            f"The objective ({result.settings['objective'].replace('_', ' ')}) is the value that "
-            "was predicted for the plan of a mission from all earlier missions."
+            f"The objective ({result.settings['objective'].replace('_', ' ')}) is the value "
+            "predicted for the plan of a mission, based on all earlier missions."
         ),
     ]
 
