@@ -74,7 +74,7 @@ def require_cells(what: str, value: object) -> tuple[tuple[int, int], ...]:
 
 
 def require_pair(what: str, value: object) -> tuple[int, int]:
-    """Return two whole numbers, such as a cell (row, col), as ints; raises TrustboError if not."""
+    """Return two whole numbers, such as a cell (row, col), as ints, or raise TrustboError."""
     try:
         first, second = (operator.index(i) for i in value)  # pyright: ignore[reportGeneralTypeIssues]
     except (TypeError, ValueError):

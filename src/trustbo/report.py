@@ -22,7 +22,7 @@ __dir__ = __all__.copy  # tab completion lists only public names
 _DRAWS = 50
 """Number of posterior draws for the uncertainty map."""
 _SHOWN = 3
-"""Number of bounds shown in detail, chosen by least trust."""
+"""Number of bounds shown in detail: those with the least trust."""
 _ENDS = {"n_iterations": "all missions were run", "interrupted": "the campaign was interrupted"}
 _PAGE = """<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8">

@@ -152,7 +152,7 @@ def _feature(plan: Plan, layer: str, places: np.ndarray, about: dict[str, Any]) 
     shape = shapely.Point(lon[0], lat[0])
     if np.ndim(places) == 2:
         shape = _cut(shapely.LineString(np.column_stack([np.unwrap(lon, period=360.0), lat])))
-    # RFC 7946, 11.2: no more digits than are precise; the eighth digit is about a millimetre.
+    # RFC 7946, 11.2: no more digits than the data justify; the eighth is about a millimetre.
     rounded = shapely.transform(shape, lambda values: np.round(values, 8))
     geometry = json.loads(shapely.to_geojson(rounded))
     return {"type": "Feature", "geometry": geometry, "properties": {"layer": layer, **about}}

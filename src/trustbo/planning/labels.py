@@ -156,7 +156,7 @@ class Known(NamedTuple):
     """Best path found so far and the path tried last.
 
     The best path has `cost` (1,) and `edges` (bound,), padded with -1. The last path has the edges
-    `trial` (bound,). `sums` (sum,) holds the sums of the cheapest path in the last `_try_paths`.
+    `trial` (bound,). `sums` (sum,) belongs to the cheapest path in the last call of `_try_paths`.
     """
 
     cost: np.ndarray

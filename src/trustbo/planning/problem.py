@@ -199,7 +199,7 @@ class Problem:
             )
 
     def _infeasible(self, risk: Risk) -> InfeasibleError:
-        """Make the error for when no path respects `max_failure`; it reports the safest path."""
+        """Make the error raised if no path respects `max_failure`; it reports the safest path."""
         graph, n = self.paths.graph, self.paths.graph.longest + 1
         nothing = Weights(np.zeros((1, n, 1)), np.zeros((1, n)), np.ones(n))
         of_bounds = risk_of(risk.p_fail).ravel()

@@ -72,7 +72,7 @@ class KinematicSimulator(DescribedSimulator):
             sight: True model of sight; by default the workspace's.
             team: True team, with the same names; by default the workspace's.
             tick: Length of a tick, in seconds.
-            bound_timeout: Time limit of a bound, in seconds; then the mission ends as "timeout".
+            bound_timeout: Time limit of a bound, in s; beyond it, the mission ends as "timeout".
             events: Changes of the world in given missions, such as `Jam` or `Dust`.
 
         Raises:

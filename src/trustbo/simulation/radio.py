@@ -29,7 +29,7 @@ class RadioSimulator(DescribedSimulator):
     The mean contact of robot i in the bound from cell a to cell b is sigma(2.2 - 3.5 c^1.5 d -
     0.1 h + 0.9 (0.3 + c) tanh(g) + q_i). The distance d between the centres of the cells is in
     units of 60 m. The cover c is the mean fraction of canopy above 1.5 m between the cells, and h
-    is the climb in metres. g is the value at b of a smooth Gaussian field that is not on any map,
+    is the climb in metres. A smooth Gaussian field, which is not on any map, has the value g at b,
     and q_i is the quality of the robot's radio. Rates have Student t noise with 3 degrees of
     freedom and scale 0.06, and are clipped to [0, 1]. No bound fails.
     """

@@ -24,7 +24,7 @@ def numbers_of(table: pd.DataFrame) -> pd.DataFrame:
     `lost with failures` is the same, but counts bounds that fail or are not reached as fully lost.
     `missions to 1 %` is the number of missions after which the regret stays within 1 %, or the
     number of missions plus one if it never does. `arrive` is the fraction of missions that reach
-    the goal, also for the first three and the later ones. `seconds` is the mean CPU time.
+    the goal, also for the first three and the later ones. `seconds` is the CPU time per mission.
     """
     judged = {"mission", "regret", "lost", "best", "status", "contact_rate", "driven",
               "best_driven", "failed_driven", "seconds"}  # fmt: skip

@@ -93,7 +93,7 @@ def detection_probability(
 def detection_between(
     surface: Surface, sight: Sight, eye: np.ndarray, target: np.ndarray, optics: np.ndarray
 ) -> np.ndarray:
-    """Return the detection probability (...) of each target from each eye, (..., 2), broadcast."""
+    """Return the detection probability (...) of targets from eyes, both (..., 2) and broadcast."""
     eye, target = np.broadcast_arrays(eye, target)
     rays = np.ascontiguousarray(eye).reshape(-1, 2), np.ascontiguousarray(target).reshape(-1, 2)
     return detection_probability(surface, sight, *rays, optics).reshape(eye.shape[:-1])
