@@ -15,7 +15,7 @@ from trustbo.inference.posterior import Draws, Posterior
 from trustbo.models.effects.effect import Effect, Theta
 from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.model import TrustModel
-from trustbo.models.params import Params, RobotParams, assemble_params
+from trustbo.models.params import Params, assemble_params
 from trustbo.models.record import effects_from_record, model_from_record
 from trustbo.models.slots import Slots
 from trustbo.workspace import Workspace
@@ -106,34 +106,31 @@ def params_of(
             f"the posterior has no variable {missing[0]!r}, only {', '.join(sites)}. Give a "
             "posterior from trustbo.fit with unchanged names."
         )
+    if effects:
+        theta, rng = theta_of(posterior, sites), np.random.default_rng(_DAYS) if day else None
+        robots = (len(theta["rest"]), attrs["n_robots"])
+        n = attrs["n_missions"]
+        slopes = [effect.ahead(values_of(posterior, effect), theta, n, rng) for effect in effects]
+        slope = np.broadcast_to(np.sum(slopes, axis=0), robots)
+        features = posterior["posterior"].to_dataset()["feature"].values.tolist()
+        sight = [m for m, name in enumerate(features) if is_line_of_sight(name)]
+        weights = np.zeros((*robots, len(features)))
+        if sight:
+            weights[:, :, sight], slope = slope[..., None] / len(sight), np.zeros(robots)
+        sites["b"] = sites["b"].reshape(robots[0], -1) + slope
+        if "B0" in sites:
+            B, robot = sites["B"].copy(), np.arange(robots[1])
+            B[:, :, robot, robot] += np.swapaxes(weights, 1, 2)
+            sites["B"] = B
+        else:
+            beta = sites["beta"] if sites["beta"].ndim == 3 else sites["beta"][:, None]
+            sites["beta"] = beta + weights
     x0 = {name: attrs[name] for name in ("x0_mean", "x0_sd")}
     params = assemble_params(sites, x0, attrs.get("memory", "level"))
-    if "places" in posterior.children:
-        maps = place_maps_of(posterior["places"].to_dataset(), sites)
-        params = params._replace(**maps)  # pyright: ignore
-    if not effects:
+    if "places" not in posterior.children:
         return params
-    theta, rng = theta_of(posterior, sites), np.random.default_rng(_DAYS) if day else None
-    robots = (len(theta["rest"]), attrs["n_robots"])
-    n = attrs["n_missions"]
-    slopes = [effect.ahead(values_of(posterior, effect), theta, n, rng) for effect in effects]
-    slope = np.broadcast_to(np.sum(slopes, axis=0), robots)
-    features = posterior["posterior"].to_dataset()["feature"].values.tolist()
-    sight = [m for m, name in enumerate(features) if is_line_of_sight(name)]
-    weights = np.zeros((*robots, len(features)))
-    if sight:
-        weights[:, :, sight], slope = slope[..., None] / len(sight), 0.0
-    if "B0" in sites:
-        B, robot = np.array(params.B), np.arange(robots[1])  # pyright: ignore
-        B[:, :, robot, robot] += np.swapaxes(weights, 1, 2)
-        return params._replace(B=B, b=params.b + slope)
-    fields = {
-        name: np.broadcast_to(sites[name].reshape(robots[0], -1), robots)
-        for name in ("beta0", "b", "delta_w", "delta_v")
-    }
-    beta = sites["beta"] if sites["beta"].ndim == 3 else sites["beta"][:, None]
-    fields |= {"beta": beta + weights, "b": fields["b"] + slope}
-    return RobotParams(**fields, **x0, **params.places, memory=params.memory)
+    maps = place_maps_of(posterior["places"].to_dataset(), sites)
+    return params._replace(**maps)  # pyright: ignore
 
 
 def _in_order_of(workspace: Workspace, posterior: xr.DataTree) -> xr.DataTree:
