@@ -18,6 +18,7 @@ from trustbo.models.model import TrustModel
 from trustbo.models.params import Params, assemble_params
 from trustbo.models.record import effects_from_record, model_from_record
 from trustbo.models.slots import Slots
+from trustbo.stacking import require_same_team
 from trustbo.workspace import Workspace
 
 _DAYS = 20261123  # seed of the next mission's effects, for reproducible bands
@@ -190,19 +191,6 @@ def theta_of(posterior: xr.DataTree, sites: Mapping[str, np.ndarray]) -> Theta:
     return {**sites, "rest": 1.0 - sites["beta0"] if level else np.ones_like(sites["beta0"])}
 
 
-def model_of(posterior: xr.DataTree, model: TrustModel | None = None) -> TrustModel:
-    """Return the model of a posterior, with its family and priors.
-
-    Raises TrustboError if the model has custom priors or a custom class and is not given.
-    """
-    data = "constant_data" if "constant_data" in posterior.children else "posterior"
-    coords = posterior[data].to_dataset().coords
-    features = [str(n) for n in coords["feature"].values] if "feature" in coords else []
-    if model is None:
-        model = model_from_record(json.loads(posterior.attrs["model_record"]), features=features)
-    return model.for_features(features)
-
-
 def read_posterior(
     posterior: xr.DataTree,
     missions: Sequence[Mission] | None = None,
@@ -221,9 +209,12 @@ def read_posterior(
             is not given.
     """
     missions = missions_of(posterior) if missions is None else list(missions)
-    model = model_of(posterior, model)
-    slots = model.slots(missions)
-    fitted = Posterior(model, slots)
+    require_same_team(missions)
+    features = missions[0].features
+    if model is None:
+        model = model_from_record(json.loads(posterior.attrs["model_record"]), features=features)
+    model = model.for_features(features)
+    fitted = Posterior(model, model.slots(missions))
     groups = {"posterior": sites_of(posterior)}
     groups |= {effect.noun: values_of(posterior, effect) for effect in model.effects}
     return fitted, fitted.draws_of(groups)
