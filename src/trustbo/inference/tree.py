@@ -172,16 +172,14 @@ def complete(
         },
         "posterior_predictive": {"contact_rate": by_chain(given.predicted)},
         "prior_predictive": {"contact_rate": anew[None]},
+        "log_prior": {
+            name: by_chain(values)
+            for name, values in log_prior(fitted, sites_of(posterior)).items()
+        },
     }
     added = to_datatree(groups, missions, {})
     parts = {**posterior.children, **added.children}
     whole = xr.DataTree.from_dict({name: part.to_dataset() for name, part in parts.items()})
-    index = {name: posterior["posterior"][name] for name in ("chain", "draw")}
-    densities = {
-        name: (("chain", "draw"), by_chain(values))
-        for name, values in log_prior(fitted, sites_of(posterior)).items()
-    }
-    whole["log_prior"] = xr.DataTree(xr.Dataset(densities, index))
     whole.attrs = posterior.attrs | {"log_likelihood_of": "ticks" if counted else "contact_rate"}
     return whole
 
