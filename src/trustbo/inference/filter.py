@@ -45,7 +45,8 @@ class Dynamics:
     ) -> None:
         """Set parameter draws (draw, ...) and the sd (draw,) of the noise that robots share."""
         p: Any = params
-        self.family, self._params, self._coupled = family, p, isinstance(p, CoupledParams)
+        self.family, self._coupled = family, isinstance(p, CoupledParams)
+        self._x0 = p.x0_mean, p.x0_sd
         n, members = len(p.b), n_robots if self._coupled or delta_s is not None else 1
         self.shape = (n, n_robots // members, members)
         self._deviates = p.memory == "deviation"
@@ -73,10 +74,7 @@ class Dynamics:
 
     def start(self) -> Beliefs:
         """Return trust before the first bound."""
-        mean, sd = (
-            self._grouped(np.broadcast_to(getattr(self._params, name), self.shape[:1]))
-            for name in ("x0_mean", "x0_sd")
-        )
+        mean, sd = (self._grouped(x0) for x0 in self._x0)
         return Beliefs(mean, sd[..., None] ** 2 * np.eye(self.shape[2]), mean)
 
     def predict(self, beliefs: Beliefs, z: np.ndarray, effect: Effect = 0.0) -> Beliefs:
@@ -310,7 +308,8 @@ class TrustFilter:
         predicted = self.dynamics.predict(self._beliefs, z, effect)
         self._beliefs, gained = self.dynamics.update(predicted, y, n_ticks)
         self._log_weight = self._log_weight + gained  # a new array, as copies share the old one
-        self.weights = _normalised(self._log_weight)
+        weights = np.exp(self._log_weight - self._log_weight.max())
+        self.weights = weights / weights.sum()
         self.n_bounds += 1
         return self.state
 
@@ -381,8 +380,3 @@ def _average(beliefs: Beliefs, weights: np.ndarray) -> TrustState:
     var = np.diagonal(beliefs.cov, axis1=2, axis2=3).reshape(mean.shape)
     center = weights @ mean
     return TrustState(center, np.sqrt(weights @ (var + (mean - center) ** 2)))
-
-
-def _normalised(log_weight: np.ndarray) -> np.ndarray:
-    weights = np.exp(log_weight - log_weight.max())
-    return weights / weights.sum()
