@@ -13,7 +13,7 @@ from trustbo.inference.draws import params_of, require_posterior, sites_of
 from trustbo.inference.importance import systematic
 from trustbo.models.families import FAMILIES, Family
 from trustbo.models.params import CoupledParams, Params, check_params
-from trustbo.models.slots import broadcast_ticks
+from trustbo.models.slots import NO_TICKS
 from trustbo.workspace.moves import bounds_along, moves_along, require_on_grid
 
 _TICKS = 200.0  # assumed for a future bound
@@ -300,13 +300,13 @@ class TrustFilter:
                 f"the shape of contact_rate must be ({self._n_robots},); got shape {y.shape}."
             )
         require_unit_interval("contact_rate", y)
-        if n_ticks is not None:
-            n_ticks = as_array("n_ticks", n_ticks)
-            n_ticks = n_ticks if n_ticks.ndim else np.full(y.shape, n_ticks)
-            require_shares(y, n_ticks)
-        n_ticks = broadcast_ticks(self.family, n_ticks, y.shape)
+        if n_ticks is None and self.family.needs_ticks:
+            raise TrustboError(NO_TICKS)
+        ticks = as_array("n_ticks", np.nan if n_ticks is None else n_ticks)
+        ticks = ticks if ticks.ndim else np.full(y.shape, ticks)
+        require_shares(y, ticks)
         predicted = self.dynamics.predict(self._beliefs, z, effect)
-        self._beliefs, gained = self.dynamics.update(predicted, y, n_ticks)
+        self._beliefs, gained = self.dynamics.update(predicted, y, ticks)
         self._log_weight = self._log_weight + gained  # a new array, as copies share the old one
         weights = np.exp(self._log_weight - self._log_weight.max())
         self.weights = weights / weights.sum()

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from typing import NamedTuple, Self
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from trustbo.data import is_line_of_sight
 from trustbo.errors import TrustboError
@@ -64,15 +63,6 @@ class Slots(NamedTuple):
         y = self.y.copy()
         y[missions] = np.nan
         return self._replace(y=y)
-
-
-def broadcast_ticks(
-    family: Family, n_ticks: ArrayLike | None, shape: tuple[int, ...]
-) -> np.ndarray:
-    """Broadcast tick counts, or NaN if None; raises TrustboError if the family needs counts."""
-    if n_ticks is None and family.needs_ticks:
-        raise TrustboError(NO_TICKS)
-    return np.broadcast_to(np.asarray(np.nan if n_ticks is None else n_ticks, dtype=float), shape)
 
 
 def require_ticks(family: Family, y: np.ndarray, n_ticks: np.ndarray) -> None:
