@@ -63,17 +63,16 @@ class ParameterDraws(Summary):
         axes = self.AXES[self.WEIGHTS]
         return np.shape(getattr(self, self.WEIGHTS))[axes.index("feature") - len(axes)]
 
-    def transition(self, n_robots: int) -> np.ndarray:
-        """Return B0 (..., robot, robot) of equation (1), which is diagonal for uncoupled robots."""
-        beta0 = np.asarray(self.beta0, dtype=float)  # pyright: ignore
+    def expected_transition(self, n_robots: int) -> np.ndarray:
+        """Return the transition matrix (..., robot, robot) of expected trust.
+
+        It is B0 of equation (1), which is diagonal for uncoupled robots, or 0 if `memory` is
+        "deviation".
+        """
+        beta0 = np.asarray(self.beta0, dtype=float) * (self.memory == "level")  # pyright: ignore
         if not self.BY_ROBOT:
             beta0 = beta0[..., None]
         return np.broadcast_to(beta0, (*self.leading, n_robots))[..., None] * np.eye(n_robots)
-
-    def expected_transition(self, n_robots: int) -> np.ndarray:
-        """Return the transition matrix of expected trust, which is 0 if `memory` is "deviation"."""
-        B0 = self.transition(n_robots)
-        return B0 if self.memory == "level" else np.zeros_like(B0)  # pyright: ignore
 
     def increments(self, awareness: np.ndarray) -> np.ndarray:
         """Compute the drift (..., robot, move, row, col) without the intercept.
@@ -237,8 +236,8 @@ class CoupledParams(ParameterDraws, _Coupled):
         """Standard deviation (..., robot) of each robot's observation noise."""
         return np.sqrt(np.diagonal(self.Delta_v, axis1=-2, axis2=-1))
 
-    def transition(self, n_robots: int) -> np.ndarray:
-        """See `ParameterDraws.transition`."""
+    def expected_transition(self, n_robots: int) -> np.ndarray:
+        """See `ParameterDraws.expected_transition`."""
         return np.asarray(self.B0, dtype=float)
 
 
