@@ -61,13 +61,13 @@ def effects_from_record(record: Mapping[str, Any]) -> tuple[Effect, ...]:
 
     Raises TrustboError if the class of an effect has not been imported.
     """
-    return tuple(_effect_from_record(**effect) for effect in record.get("effects", ()))
-
-
-def _effect_from_record(kind: str, **settings: Any) -> Effect:
-    if kind not in EFFECTS:
-        raise TrustboError(
-            f"unknown effect {kind!r} in the model; import the module that defines this class. "
-            f"Known effects are {', '.join(sorted(EFFECTS))}."
-        )
-    return EFFECTS[kind](**{n: tuple(v) if isinstance(v, list) else v for n, v in settings.items()})
+    effects = []
+    for one in record.get("effects", ()):
+        settings = {n: tuple(v) if isinstance(v, list) else v for n, v in one.items()}
+        if (kind := settings.pop("kind")) not in EFFECTS:
+            raise TrustboError(
+                f"unknown effect {kind!r} in the model; import the module that defines this class. "
+                f"Known effects are {', '.join(sorted(EFFECTS))}."
+            )
+        effects.append(EFFECTS[kind](**settings))
+    return tuple(effects)
