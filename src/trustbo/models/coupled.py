@@ -16,8 +16,6 @@ from trustbo.models.params import CoupledParams
 from trustbo.models.signal import Layout, Signal
 from trustbo.models.slots import Slots
 
-_DIAGONALS = {"beta0", "coupling", "delta_w", "delta_v", "partial_w", "partial_v"}
-
 
 @dataclass(frozen=True, repr=False)
 class CoupledTrust(TrustModel):
@@ -68,7 +66,7 @@ class CoupledTrust(TrustModel):
                 factor = correlation_factor(2.0 * values[f"partial_{noise}"] - 1.0, n)
             factor = values[f"delta_{noise}"][:, :, None] * factor
             derived[f"Delta_{noise}"] = factor @ xp.swapaxes(factor, 1, 2)
-        return derived | {name: values[name] for name in values.keys() - _DIAGONALS}
+        return {**derived, **values}
 
     def layout(self, slots: Slots, *, contrasts: bool = True) -> Layout:
         """See `TrustModel.layout`; each block is a mission."""
