@@ -17,9 +17,6 @@ from trustbo.models.model import TrustModel
 from trustbo.models.signal import Layout, Signal, powers
 from trustbo.models.slots import Slots
 
-MEMORIES = ("level", "deviation")
-"""Quantity carried over between bounds: trust, or its deviation from the expected level."""
-
 
 @dataclass(frozen=True, repr=False)
 class PooledTrust(TrustModel):
@@ -39,7 +36,7 @@ class PooledTrust(TrustModel):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_choice("memory", self.memory, MEMORIES)
+        require_choice("memory", self.memory, ("level", "deviation"))
         if self.shared_noise not in (0, 1):
             raise TrustboError(f"shared_noise must be True or False; got {self.shared_noise!r}.")
         object.__setattr__(self, "shared_noise", bool(self.shared_noise))

@@ -76,20 +76,15 @@ class RobotEffect(Effect):
         return d.reshape(len(d), -1)
 
     def ahead(self, values: Values, theta: Theta, n: int, rng: Generator | None) -> np.ndarray:
-        """See `Effect.ahead`."""
-        d, sd = self.next_mission(values["robot_effect"], theta)
-        if rng is not None:
-            d = d + sd[:, None] * rng.standard_normal(d.shape)
-        return _rest(theta)[..., 0] * d
-
-    def next_mission(self, effect: np.ndarray, theta: Theta) -> tuple[np.ndarray, np.ndarray]:
-        """Predict mean (draw, robot) and sd (draw,) of the next d from d (draw, mission, robot)."""
-        n = effect.shape[1]
+        """See `Effect.ahead`; the next d is normal given d in all n missions."""
         C, slow = self._covariance(theta, n), np.maximum(theta["tau_slow"], LEAST) ** 2
         k = slow[:, None] * self.rho ** np.arange(n, 0, -1)
         gain = np.linalg.solve(C, k[..., None])[..., 0]
-        left = np.maximum(C[:, 0, 0] - (gain * k).sum(1), 0.0)
-        return np.einsum("nm,nmi->ni", gain, effect), np.sqrt(left)
+        d = np.einsum("nm,nmi->ni", gain, values["robot_effect"])
+        if rng is not None:
+            left = np.maximum(C[:, 0, 0] - (gain * k).sum(1), 0.0)
+            d = d + np.sqrt(left)[:, None] * rng.standard_normal(d.shape)
+        return _rest(theta)[..., 0] * d
 
     def _covariance(self, theta: Theta, n: int) -> Any:
         """Compute the covariance (point, mission, mission) of one robot's effects d."""

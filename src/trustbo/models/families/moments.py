@@ -32,20 +32,15 @@ def truncated(a: ndarray, b: ndarray) -> Moments:
     """Compute the log probability, mean and variance of a standard normal between a and b."""
     mirror = a > -b  # use the lower tail, which is more accurate
     a, b = np.where(mirror, -b, a), np.where(mirror, -a, b)
-    log_p = log_between(a, b)
+    with np.errstate(divide="ignore"):  # log(Phi(b) - Phi(a)), accurate for a + b <= 0
+        log_b = special.log_ndtr(b)
+        gap = np.minimum(special.log_ndtr(a) - log_b, -1e-300)
+        log_p = log_b + np.log(-np.expm1(gap))
     with np.errstate(invalid="ignore"):
         at_a, at_b = (np.exp(-0.5 * x**2 - 0.5 * np.log(2.0 * np.pi) - log_p) for x in (a, b))
         slope = np.where(np.isfinite(a), a, 0.0) * at_a - np.where(np.isfinite(b), b, 0.0) * at_b
     mean = at_a - at_b
     return log_p, np.where(mirror, -mean, mean), np.clip(1.0 + slope - mean**2, 0.0, 1.0)
-
-
-def log_between(a: ndarray, b: ndarray) -> ndarray:
-    """Compute log(Phi(b) - Phi(a)) for a + b <= 0."""
-    with np.errstate(divide="ignore"):
-        log_b = special.log_ndtr(b)
-        gap = np.minimum(special.log_ndtr(a) - log_b, -1e-300)
-        return log_b + np.log(-np.expm1(gap))
 
 
 def draw_between(a: ndarray, b: ndarray, rng: Generator) -> ndarray:
