@@ -49,20 +49,6 @@ def place_group(draws: Mapping[str, np.ndarray], places: Visited, seed: int) -> 
     return xr.Dataset(variables, coords, {"shape": list(places.shape), "seed": seed})
 
 
-class _Visited:
-    """Visited places of a group `places`, and their effects with chains joined."""
-
-    def __init__(self, group: xr.Dataset) -> None:
-        rows, cols = (int(n) for n in group.attrs["shape"])
-        self.shape = rows, cols
-        self.cells = np.column_stack([group[f"cell_{name}"].values for name in _MAP])
-        self.bounds = tuple(group[f"bound_{name}"].values for name in ("move", *_MAP))
-        self.s, self.e = (
-            group[name].transpose("chain", "draw", ...).values.reshape(-1, group.sizes[axis])
-            for name, axis in (("place", "cell"), ("place_bound", "bound"))
-        )  # (draw, cell) and (draw, bound)
-
-
 def place_maps_of(group: xr.Dataset, sites: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Draw the effects of all cells and bounds, given the effects at visited places.
 
@@ -74,24 +60,34 @@ def place_maps_of(group: xr.Dataset, sites: Mapping[str, np.ndarray]) -> dict[st
         Arrays place (draw, effect, row, col) and place_bound (draw, effect, move, row, col). The
         axis `effect` has length 1 because effects are common to all robots.
     """
-    visited, seed = _Visited(group), int(group.attrs["seed"])
-    place = _cells(visited, sites, [seed, 0])
+    (rows, cols), seed = (int(n) for n in group.attrs["shape"]), int(group.attrs["seed"])
+    s, e = (
+        group[name].transpose("chain", "draw", ...).values.reshape(-1, group.sizes[axis])
+        for name, axis in (("place", "cell"), ("place_bound", "bound"))
+    )  # (draw, cell) and (draw, bound)
+    cells = np.column_stack([group[f"cell_{name}"].values for name in _MAP])
+    place = _cells(s, cells, (rows, cols), sites, [seed, 0])
     rng = np.random.default_rng([seed, 1])
-    place_bound = rng.standard_normal((len(place), len(MOVE_NAMES), *visited.shape))
+    place_bound = rng.standard_normal((len(place), len(MOVE_NAMES), rows, cols))
     place_bound *= sites["tau_e"][:, None, None, None]
     _centre(place_bound)
-    place_bound[:, *visited.bounds] = visited.e
+    place_bound[:, *(group[f"bound_{name}"].values for name in ("move", *_MAP))] = e
     return {"place": place[:, None], "place_bound": place_bound[:, None]}
 
 
 @one_blas_thread()
-def _cells(visited: _Visited, sites: Mapping[str, np.ndarray], seed: list[int]) -> np.ndarray:
-    """Draw the effect s (draw, row, col) over the grid, given the effect at visited cells."""
-    s, shape = visited.s, visited.shape
-    flat = visited.cells[:, 0] * shape[1] + visited.cells[:, 1]
+def _cells(
+    s: np.ndarray,
+    cells: np.ndarray,
+    shape: tuple[int, int],
+    sites: Mapping[str, np.ndarray],
+    seed: list[int],
+) -> np.ndarray:
+    """Draw the effect (draw, row, col) over the grid, given the effect s at visited cells."""
+    flat = cells[:, 0] * shape[1] + cells[:, 1]
     centre = np.zeros((len(s), shape[0] * shape[1]))
     off = np.empty(centre.shape)
-    for step, rows, scale, weights in _kriging(sites["length_scale"], visited):
+    for step, rows, scale, weights in _kriging(sites["length_scale"], cells, shape):
         rng = np.random.default_rng([*seed, step + 1000])
         free = _prior(shape, scale, int(rows.sum()), rng) * sites["tau_s"][rows, None]
         centre[rows] = s[rows] @ weights
@@ -100,15 +96,15 @@ def _cells(visited: _Visited, sites: Mapping[str, np.ndarray], seed: list[int]) 
 
 
 def _kriging(
-    length_scale: np.ndarray, visited: _Visited
+    length_scale: np.ndarray, cells: np.ndarray, shape: tuple[int, int]
 ) -> Iterator[tuple[int, np.ndarray, float, np.ndarray]]:
     """Yield the index, draws, length scale and kriging weights of each length-scale step.
 
     The weights (visited cell, grid cell) convert s at visited cells to the mean of s everywhere.
     """
-    cells, grid = visited.cells, np.indices(visited.shape).reshape(2, -1).T
+    grid = np.indices(shape).reshape(2, -1).T
     # For larger scales, cells are nearly equal, and `_prior` would need a far larger grid.
-    length_scale = np.minimum(length_scale, _LARGEST * max(visited.shape))
+    length_scale = np.minimum(length_scale, _LARGEST * max(shape))
     steps = np.round(np.log(length_scale) / _STEP).astype(int)
     for step in np.unique(steps):
         scale, weights = float(np.exp(_STEP * step)), np.zeros((len(cells), len(grid)))
