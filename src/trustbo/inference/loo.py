@@ -66,6 +66,7 @@ def loo(posterior: xr.DataTree, *, model: TrustModel | None = None) -> ELPDData:
     theta, log_count = at(draws.theta, first[some]), np.log(count[some] / count[some].sum())
 
     whole = fitted.log_evidence(theta)
+    # average is the log of each mission's mean density under the full posterior.
     density, k_hat, average = np.zeros((3, len(measured)))
     refitted, whole_refit = np.zeros(len(measured), dtype=bool), None
     for i, j in enumerate(measured):
@@ -84,41 +85,19 @@ def loo(posterior: xr.DataTree, *, model: TrustModel | None = None) -> ELPDData:
     shift = fitted.model.family.log_resolution(fitted.slots.y, fitted.slots.n_ticks).sum((1, 2))
     if not np.isnan(shift).any():
         density, average = density + shift[measured], average + shift[measured]
-    return _elpd(density, average, k_hat, measured, refitted, len(draws.c))
-
-
-def _log_evidence(posterior: Posterior, seed: int) -> tuple[float, float]:
-    """Compute the log evidence of a posterior, and the k-hat of its weights."""
-    summary = by_importance(posterior, 1000, seed)[2]
-    return summary["log_evidence"], summary["k_hat"]
-
-
-def _elpd(
-    density: np.ndarray,
-    average: np.ndarray,
-    k_hat: np.ndarray,
-    measured: np.ndarray,
-    refitted: np.ndarray,
-    n_samples: int,
-) -> ELPDData:
-    """Make ArviZ's `ELPDData` from log densities of left-out missions.
-
-    `average` is the log of each mission's mean density under the full posterior.
-    """
     coords = {"mission": measured, "refitted": ("mission", refitted)}
-    elpd, n = float(density.sum()), len(density)
-    bad = ~(k_hat <= MAX_KHAT)
+    elpd, n, bad = float(density.sum()), len(density), ~(k_hat <= MAX_KHAT)
     if bad.any():
         warnings.warn(
             f"Estimated shape parameter of Pareto distribution is greater than {MAX_KHAT:.2f} for "
             f"missions {measured[bad].tolist()}; the results may be inaccurate.",
-            stacklevel=3,
+            stacklevel=2,
         )
     return ELPDData(
         elpd=elpd,
         se=float(np.sqrt(n * density.var())),
         p=float(average.sum()) - elpd,
-        n_samples=n_samples,
+        n_samples=len(draws.c),
         n_data_points=n,
         scale="log",
         warning=bool(bad.any()),
@@ -126,6 +105,12 @@ def _elpd(
         elpd_i=xr.DataArray(density, coords, "mission"),
         pareto_k=xr.DataArray(k_hat, coords, "mission"),
     )
+
+
+def _log_evidence(posterior: Posterior, seed: int) -> tuple[float, float]:
+    """Compute the log evidence of a posterior, and the k-hat of its weights."""
+    summary = by_importance(posterior, 1000, seed)[2]
+    return summary["log_evidence"], summary["k_hat"]
 
 
 def compare(posteriors: Mapping[str, xr.DataTree]) -> pd.DataFrame:
