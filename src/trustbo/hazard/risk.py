@@ -11,7 +11,7 @@ import xarray as xr
 from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_whole
 from trustbo.hazard.prior import LIMIT_NAMES, REFERENCE, TILT, prior_betas, steepness_of
-from trustbo.hazard.strata import MOST, Strata, partition
+from trustbo.hazard.strata import Strata, partition
 from trustbo.workspace import Workspace
 from trustbo.workspace.difficulty import difficulty_of
 from trustbo.workspace.moves import bounds_along
@@ -94,7 +94,7 @@ class BoundRisk:
             out.reshape(n, -1)[:, bounds] = rng.beta(a, b)
         return out
 
-    def strata(self, n: int = MOST) -> Strata:
+    def strata(self, n: int = 5) -> Strata:
         """Average the failure probabilities within at most `n` groups of draws (see `Strata`).
 
         The mean of the groups, weighted by their shares, equals the mean over all draws.

@@ -13,9 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-MOST = 5
-"""Default maximum number of strata; a label of the path search has one sum per stratum."""
-
 
 class Strata(NamedTuple):
     """Failure probabilities in each group of draws."""
