@@ -19,7 +19,7 @@ from trustbo.errors import (
 from trustbo.inference.importance import MAX_KHAT, sample
 from trustbo.inference.place_maps import place_group
 from trustbo.inference.posterior import Draws, Posterior
-from trustbo.inference.tree import complete, to_datatree
+from trustbo.inference.tree import N_PRIOR, complete, to_datatree
 from trustbo.models.backend import VERSIONS
 from trustbo.models.default import default_model
 from trustbo.models.model import TrustModel
@@ -31,7 +31,6 @@ from trustbo.stacking import require_same_team
 from trustbo.workspace import Workspace
 
 SAMPLERS = ("importance", "nuts")
-_N_PRIOR = 500
 
 
 def fit(
@@ -94,7 +93,9 @@ def fit(
     """
     started = time.perf_counter()
     missions = _filled(missions, workspace)
-    model = _default_of(missions) if model is None else model
+    if model is None:
+        scale = missions[0].scale  # of people's reports
+        model = HumanTrust(scale=scale) if scale else default_model(places=has_places(missions))
     require_kind("model", model, TrustModel, "give a model such as PooledTrust()")
     require_choice("sampler", sampler, SAMPLERS)
     sizes = {"draws": draws, "chains": chains, "warmup": warmup}
@@ -163,26 +164,18 @@ def _laid_out(
 ) -> xr.DataTree:
     """Build a DataTree from the data, and from posterior and prior draws."""
     rng = np.random.default_rng([seed, 3])
-    groups = posterior.named(drawn)
+    groups = posterior.named(drawn) | {"sample_stats": stats}
     groups = {
         group: {name: v.reshape(*shape, *v.shape[1:]) for name, v in values.items()}
         for group, values in groups.items()
     }
     places, model = groups.pop("places", None), posterior.model
-    before = posterior.prior_sites(_N_PRIOR, rng)
-    groups["sample_stats"] = {name: v.reshape(*shape, *v.shape[1:]) for name, v in stats.items()}
+    before = posterior.prior_sites(N_PRIOR, rng)
     groups["prior"] = {name: values[None] for name, values in before.items()}
     tree = to_datatree(groups, missions, model.dims, model.effects)
     if places is not None:
         tree["places"] = xr.DataTree(place_group(places, posterior.slots.visited, seed))  # pyright: ignore[reportArgumentType]
     return tree
-
-
-def _default_of(missions: Sequence[Mission]) -> TrustModel:
-    """Return `HumanTrust` for reports, otherwise the default model for the missions."""
-    if scale := missions[0].scale:
-        return HumanTrust(scale=scale)
-    return default_model(places=has_places(missions))
 
 
 def _filled(missions: Sequence[Mission], workspace: Workspace | None) -> list[Mission]:
@@ -204,8 +197,7 @@ def _record(model: TrustModel, posterior: Posterior) -> dict[str, Any]:
         "model_record": json.dumps(model_to_record(model)),
         "n_robots": slots.n_robots,
         "n_missions": slots.n_missions,
-        "x0_mean": float(model.priors.x0_mean),
-        "x0_sd": float(model.priors.x0_sd),
+        **model.x0,
         "resolution": slots.resolution if model.family.adds_noise else 0.0,
         **{f"prior_{name}": text for name, text in model.priors.describe().items()},
         **{f"{name}_version": version for name, version in VERSIONS.items()},

@@ -23,7 +23,7 @@ from trustbo.stacking import MissionBatch, stack_missions
 _OF_RATES = ("mission", "bound", "robot")
 _DIMS = dict.fromkeys(("trust", "trust_mean", "trust_sd", "contact_rate"), _OF_RATES)
 _N_TRAJECTORIES = 200  # kept draws of latent trust, evenly spaced in the chains
-_N_PRIOR = 500
+N_PRIOR = 500
 _KEPT = ("posterior", "sample_stats", "prior", "hazard")
 
 
@@ -154,7 +154,7 @@ def complete(
     some = (np.arange(n_chains)[:, None] * n_draws + kept).ravel()
     given = fitted.given(draws, some, np.random.default_rng([seed, 1]))
     rng = np.random.default_rng([seed, 2])
-    anew = fitted.anew(fitted.draw_prior(_N_PRIOR, rng), rng)
+    anew = fitted.anew(fitted.draw_prior(N_PRIOR, rng), rng)
     shift = fitted.model.family.log_resolution(fitted.slots.y, fitted.slots.n_ticks).sum((1, 2))
     counted = not np.isnan(shift).any()
     likelihood = given.log_likelihood + (shift if counted else 0.0)
