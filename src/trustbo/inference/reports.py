@@ -15,7 +15,6 @@ from trustbo.models.signal import each
 from trustbo.parallel import one_blas_thread
 
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
-GIVEN = ("earlier", "none")
 _ALIKE = 16  # draws of personal trust for each draw of the population parameters
 
 
@@ -61,7 +60,7 @@ def predict_reports(
             "predict_reports needs a posterior of HumanTrust; got a posterior of "
             f"{posterior.attrs.get('model')}. Use trustbo.inference.score instead."
         )
-    require_choice("given", given, GIVEN)
+    require_choice("given", given, ("earlier", "none"))
     seed, n = require_whole("seed", seed, 0), require_whole("n_draws", n_draws, 1)
     of_fit, draws = read_posterior(posterior, model=model)
     if missions[0].features != of_fit.slots.features:
@@ -71,10 +70,9 @@ def predict_reports(
         )
     levels = levels_of(posterior.attrs["scale"])
     ahead = Posterior(of_fit.model, of_fit.model.slots(missions))
-    n = max(1, n // _ALIKE) if fitted else n
-    some = np.unique(np.linspace(0, len(draws.c) - 1, n).astype(int))
-    some = np.repeat(some, _ALIKE) if fitted else some
-    draws = draws.at(some)
+    copies = _ALIKE if fitted else 1
+    some = np.unique(np.linspace(0, len(draws.c) - 1, max(1, n // copies)).astype(int))
+    draws = draws.at(np.repeat(some, copies))
 
     shape = ahead.slots.y.shape
     out = {name: np.full(shape, np.nan) for name in ("mean", "log_score")}
