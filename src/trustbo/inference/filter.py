@@ -14,7 +14,7 @@ from trustbo.inference.importance import systematic
 from trustbo.models.families import FAMILIES, Family
 from trustbo.models.params import CoupledParams, Params, check_params
 from trustbo.models.slots import NO_TICKS
-from trustbo.workspace.moves import bounds_along, moves_along, require_on_grid
+from trustbo.workspace.moves import bounds_along, require_on_grid
 
 _TICKS = 200.0  # assumed for a future bound
 Effect = np.ndarray | float
@@ -351,10 +351,10 @@ class TrustFilter:
             )
         for grid in {np.shape(value)[-2:] for value in places.values()}:
             require_on_grid(cells, grid)
-        moves_along(cells)
+        bounds = bounds_along(cells)
         if not places:
             return [0.0] * n_bounds
-        return list(np.moveaxis(self.params.of_places(bounds_along(cells)), -2, 0))
+        return list(np.moveaxis(self.params.of_places(bounds), -2, 0))
 
     def _checked(self, awareness: ArrayLike, n_axes: int) -> np.ndarray:
         z = as_array("awareness", awareness)
