@@ -1,7 +1,8 @@
 """Check of a fitted model for problems in its posterior and predictions."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -49,8 +50,7 @@ class Check(Summary):
         return [("verdict", self.verdict), *rows]
 
 
-@dataclass(frozen=True)
-class Finding:
+class Finding(NamedTuple):
     """One row of `Check.table`."""
 
     finding: str
@@ -95,8 +95,7 @@ def check(
         "weights": _check_weights(tree),
         "coverage": _check_coverage(trees, missions),
     }
-    rows = {name: asdict(finding) for name, finding in findings.items()}
-    table = pd.DataFrame.from_dict(rows, orient="index").rename_axis("check")
+    table = pd.DataFrame(list(findings.values()), pd.Index(findings, name="check"))
     odd = [finding.finding for finding in findings.values() if finding.stands_out]
     return Check(("; ".join(odd) or "nothing stands out") + ".", table, robots)
 
