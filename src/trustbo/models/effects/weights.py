@@ -28,15 +28,11 @@ class Weights(Effect):
         return mean, [sd**-2.0]
 
     def moments(self, theta: Theta, slots: Slots) -> tuple[Any, Any]:
-        """Return the prior means and standard deviations (point, column) of the coefficients."""
+        """Return the prior means and sds (point, [robot,] column) of the coefficients."""
         mean, sd = self.priors.coefficients(slots.z.shape[3])
-        rest = self.unit(theta)
-        return rest * mean, rest * sd
-
-    def unit(self, theta: Theta) -> Any:
-        """Return the factor (point, [robot,] 1) by which the priors on coefficients are scaled."""
         rest = theta["rest"][..., None]
-        return rest if self.priors.stationary else 0.0 * rest + 1.0
+        rest = rest if self.priors.stationary else 0.0 * rest + 1.0
+        return rest * mean, rest * sd
 
     def named(self, c: np.ndarray, theta: Theta, slots: Slots) -> Values:
         """Return the weights `beta` (draw, feature) and the intercept `b` (draw,)."""
@@ -100,15 +96,14 @@ class CoupledWeights(Weights):
 
     def prior(self, theta: Theta, slots: Slots) -> tuple[Any, list[Any]]:
         """Return the prior on the weights, with `Priors.coupling` for features of other robots."""
-        n, (mean, sd) = slots.n_robots, self.priors.coefficients(slots.z.shape[3])
-        n_features = len(mean) - 1
+        n, n_features = slots.n_robots, slots.z.shape[3]
         own = np.repeat(np.eye(n, dtype=bool), n_features, axis=1)
         own = np.column_stack([own, np.ones(n, dtype=bool)])  # (robot, input)
         feature = np.append(np.tile(np.arange(n_features), n), n_features)
         coupling = self.priors.moments("coupling")
-        xp, rest = namespace(theta["rest"]), self.unit(theta)
-        means = xp.where(own, rest * mean[feature], coupling[0])
-        sds = xp.where(own, rest * sd[feature], coupling[1])
+        (mean, sd), xp = self.moments(theta, slots), namespace(theta["rest"])
+        means = xp.where(own, mean[..., feature], coupling[0])
+        sds = xp.where(own, sd[..., feature], coupling[1])
         return means.reshape(len(means), -1), [sds.reshape(len(sds), -1) ** -2.0]
 
     def named(self, c: np.ndarray, theta: Theta, slots: Slots) -> Values:
