@@ -85,8 +85,7 @@ class ParameterDraws(Summary):
     @property
     def places(self) -> dict[str, np.ndarray]:
         """Place effects `place` and `place_bound` by name, if the model has them."""
-        effects = {name: getattr(self, name, None) for name in PLACES}
-        return {name: np.asarray(value) for name, value in effects.items() if value is not None}
+        return {name: np.asarray(v) for name, v in self.by_name.items() if name in PLACES}
 
     def of_places(self, bounds: np.ndarray) -> np.ndarray:
         """Return the sum (..., bound, effect) of the effects of each bound and of the entered cell.
