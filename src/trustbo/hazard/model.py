@@ -79,6 +79,8 @@ def fit_hazard(
     points, places = sample(prior, exposures, np.random.default_rng(require_whole("seed", seed, 0)))
 
     group = _to_dataset(prior, exposures, points, places, difficulty, seed)
+    k_hat = float(np.clip(points.k_hat, -1.0, 1e3))
+    group.attrs = {"k_hat": k_hat, "kish": points.kish, "seed": seed}
     group.attrs |= {f"prior_{name}": list(value) for name, value in asdict(hazard).items()}
     group = group.assign(p_fail=(_MAPS, BoundRisk(group, workspace).mean))
     group.attrs["seconds"] = time.perf_counter() - started
@@ -194,7 +196,7 @@ def _to_dataset(
     difficulty: xr.DataArray,
     seed: int,
 ) -> xr.Dataset:
-    """Make the group `hazard` without `p_fail`."""
+    """Make the group `hazard` without `p_fail` and attributes."""
     rng = np.random.default_rng([seed, 2])
     chosen = rng.permutation(points.resample(_N_DRAWS, rng))
     weights, limit, strength = prior.values(points.z[chosen])
@@ -222,10 +224,5 @@ def _to_dataset(
             "measure": [m for m in difficulty["measure"].values.tolist() if m != TILT],
             "axis": list(_MAPS),
             "move": list(MOVE_NAMES),
-        },
-        {
-            "k_hat": float(np.clip(points.k_hat, -1.0, 1e3)),
-            "kish": points.kish,
-            "seed": seed,
         },
     )
