@@ -92,7 +92,10 @@ def fit(
         >>> az.summary(posterior)
     """
     started = time.perf_counter()
-    missions = _filled(missions, workspace)
+    require_same_team(missions)
+    if workspace is not None:
+        require_kind("workspace", workspace, Workspace, "give the workspace of the missions")
+        missions = [workspace.fill(mission) for mission in missions]
     if model is None:
         scale = missions[0].scale  # of people's reports
         model = HumanTrust(scale=scale) if scale else default_model(places=has_places(missions))
@@ -176,15 +179,6 @@ def _laid_out(
     if places is not None:
         tree["places"] = xr.DataTree(place_group(places, posterior.slots.visited, seed))  # pyright: ignore[reportArgumentType]
     return tree
-
-
-def _filled(missions: Sequence[Mission], workspace: Workspace | None) -> list[Mission]:
-    """Check that missions have one team, and fill in missing awareness from a workspace."""
-    require_same_team(missions)
-    if workspace is None:
-        return list(missions)
-    require_kind("workspace", workspace, Workspace, "give the workspace of the missions")
-    return [workspace.fill(mission) for mission in missions]
 
 
 def _record(model: TrustModel, posterior: Posterior) -> dict[str, Any]:
