@@ -15,6 +15,7 @@ from trustbo import plots
 from trustbo.campaign.result import Result
 from trustbo.files import FilePath, write_text
 from trustbo.planning import Plan
+from trustbo.plots.style import drawing
 
 __all__ = ["write_report"]
 __dir__ = __all__.copy  # tab completion lists only public names
@@ -220,7 +221,7 @@ def _table(frame: pd.DataFrame) -> str:
 
 def _image(draw: Callable[[], Any], alt: str) -> str:
     """Draw a figure and return it as an image for the page."""
-    with plt.style.context("default"):
+    with drawing("default"):
         figure = np.ravel(draw())[0].get_figure(root=True)
         file = io.BytesIO()
         figure.savefig(file, format="png", dpi=130, bbox_inches="tight")

@@ -1,5 +1,6 @@
 """Figures: they draw on new axes and on those of the user, and show the numbers given."""
 
+import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
@@ -60,6 +61,17 @@ def test_settings_of_matplotlib_stay_as_they_were(result):
     before = dict(plt.rcParams)
     result.plot_maps()
     assert dict(plt.rcParams) == before
+
+
+def test_a_backend_that_the_first_figure_loads_stays_interactive(tmp_path, monkeypatch):
+    lines = "import matplotlib", "from matplotlib.backends.backend_agg import *"
+    (tmp_path / "own.py").write_text("\n".join([*lines, "matplotlib.interactive(True)"]))
+    monkeypatch.syspath_prepend(tmp_path)
+    with mpl.rc_context({"backend": "module://own"}):
+        monkeypatch.setattr(plt, "_backend_mod", None)  # as before the first figure
+        plots.robot_effects(EFFECTS)
+        assert mpl.is_interactive()
+    plt.switch_backend("agg")
 
 
 def test_too_few_axes_are_refused(result):

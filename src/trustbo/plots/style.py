@@ -1,6 +1,7 @@
 """Style and axes of all figures."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import matplotlib as mpl
@@ -29,8 +30,6 @@ RC: dict[str, Any] = {
 }
 """Matplotlib settings of all figures; the user's fonts, resolution, text colour and background
 colour are kept."""
-styled = mpl.rc_context(RC)  # pyright: ignore[reportArgumentType]
-"""Decorator for functions that draw figures."""
 ROBOTS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
 """Robot colours of Okabe and Ito (2008); markers also distinguish robots without colour."""
 MARKERS = "osD^vPX*<>"
@@ -38,6 +37,22 @@ GREY = "0.55"
 """Grey of guides and impassable cells, visible on light and dark backgrounds."""
 PAGE = 7.6
 """Page width in inches, which is the maximum width of a new figure."""
+
+
+@contextmanager
+def drawing(style: Any) -> Iterator[None]:
+    """Draw with a style of Matplotlib, and restore the user's settings.
+
+    Matplotlib loads its backend with the first figure. In notebooks, this turns on a setting that
+    later figures need to be displayed, so the backend is loaded before the settings are stored.
+    """
+    plt.draw_if_interactive()
+    with plt.style.context(style):
+        yield
+
+
+styled = drawing(RC)
+"""Decorator for functions that draw figures."""
 
 
 def panels(
