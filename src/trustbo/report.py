@@ -34,7 +34,8 @@ body {{ font: 16px/1.5 system-ui, sans-serif; max-width: 52em; margin: 1.5em aut
   color: #1c1f22; background: #fff }}
 h1 {{ font-size: 1.6em }} h2 {{ font-size: 1.2em; margin-top: 2em }}
 img {{ max-width: 100%; height: auto }}
-.wide {{ overflow-x: auto }}
+.wide {{ overflow-x: auto; margin: 1em 0 }}
+@media (max-width: 46em) {{ img {{ max-width: 42rem }} }}
 table {{ border-collapse: collapse; font-size: .85em; border: 0 }}
 td, th {{ padding: .2em .7em; text-align: right; border: 0; border-bottom: 1px solid #ddd }}
 .facts td, .facts th {{ text-align: left; vertical-align: top; font-size: 1.1em }}
@@ -163,7 +164,7 @@ def _uncertainty(result: Result) -> list[str]:
             "standard deviation of trust",
         ),
         _note(
-            f"{known} {band} The intervals assume an adequate model (see `trustbo.criticism`). "
+            f"{known} {band} The intervals assume an adequate model (see trustbo.criticism). "
             "Trust in cells that no robot entered is predicted from a map that may be out of date."
         ),
     ]
@@ -227,4 +228,5 @@ def _image(draw: Callable[[], Any], alt: str) -> str:
         figure.savefig(file, format="png", dpi=130, bbox_inches="tight")
         plt.close(figure)
     data = base64.b64encode(file.getvalue()).decode()
-    return f'<img alt="{escape(alt)}" src="data:image/png;base64,{data}">'
+    image = f'<img alt="{escape(alt)}" src="data:image/png;base64,{data}">'
+    return f'<div class="wide">{image}</div>'
