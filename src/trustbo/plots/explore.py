@@ -84,7 +84,9 @@ def _layout(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> Any:
     grid = plan.workspace.grid
     layers = _layers(plan, maps, history)
     names = [name for name in layers if not name.startswith("mission ")]
+    trusts = [name for name in layers if name == "trust mean" or name not in names]
     limits = {name: robust_limits(values) for name, values in layers.items()}
+    limits |= dict.fromkeys(trusts, robust_limits(np.stack([layers[name] for name in trusts])))
     x, y = np.meshgrid(grid.x - grid.corner[0], grid.y - grid.corner[1])
     row, col = np.indices(grid.shape)
     columns = {name: values.ravel() for name, values in layers.items()}
@@ -107,7 +109,8 @@ def _layout(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> Any:
     fill: Any = {"field": "value", "transform": colours}
     drawn = plot.rect("x", "y", source=cells, fill_color=fill, line_color=None, **size)
     plot.add_layout(models.ColorBar(color_mapper=colours, height=12), "below")
-    tips = [("cell", "@cell_row,@cell_col"), *((n, f"@{{{n}}}{{0.000}}") for n in names)]
+    tips = [("cell", "@cell_row,@cell_col"), ("shown", "@value{0.000}")]
+    tips += ((n, f"@{{{n}}}{{0.000}}") for n in names)
     plot.add_tools(models.HoverTool(renderers=[drawn], tooltips=tips))
     lines = contours(plan.workspace)
     if lines:
@@ -141,7 +144,7 @@ def _layout(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> Any:
     update = models.CustomJS(args=shared, code=_UPDATE)
     layer.js_on_change("value", update)
     mission.js_on_change("value", update)
-    styles = {"max-width": "900px", "margin": "0 auto"}
+    styles = {"max-width": "900px", "margin": "0 auto", "padding": "0 8px"}
     return column(layer, mission, text, plot, sizing_mode="stretch_width", styles=styles)
 
 
