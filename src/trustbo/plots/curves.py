@@ -154,7 +154,8 @@ def robot_effects(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
     """
     for name in ("mission", "robot", "effect", "sd", "stands_out"):
         require_choice("column", name, [str(column) for column in table.columns])
-    (one,) = panels(1, ax, (5.0, 2.6))
+    axes = panels(1, ax, (5.0, 2.6))
+    one = axes[0]
     one.axhspan(-SMALL_EFFECT, SMALL_EFFECT, color=GREY, alpha=0.25, linewidth=0.0)
     groups = list(table.groupby("robot", sort=False))
     shifts = np.linspace(-0.2, 0.2, len(groups)) if len(groups) > 1 else [0.0]
@@ -167,5 +168,5 @@ def robot_effects(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
         one.plot(x[odd], y[odd], marker, color=colour)
     one.set(xlabel="mission", ylabel="effect on contact in full sight")
     one.xaxis.set_major_locator(MaxNLocator(integer=True))
-    one.legend(ncols=len(groups))
+    add_legend(axes, one.get_legend_handles_labels()[0])
     return one

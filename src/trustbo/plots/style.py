@@ -102,7 +102,7 @@ def add_legend(axes: np.ndarray, handles: Sequence[Any]) -> None:
     """Add a legend below the axes or, without a constrained layout, inside the first axes."""
     figure = figure_of(axes)
     if isinstance(figure.get_layout_engine(), ConstrainedLayoutEngine):
-        columns = min(len(handles), 4 if figure.get_figwidth() > 5.0 else 2)
+        columns = min(len(handles), 4 if figure.get_figwidth() >= 5.0 else 2)
         figure.legend(handles=list(handles), loc="outside lower center", ncols=columns)
     else:
         axes[0].legend(handles=list(handles))
