@@ -1,4 +1,4 @@
-"""A campaign: `ask` for a path, run it by any means, `tell` the mission."""
+"""A campaign: `ask` for a path, run it by any means, then `tell` the mission."""
 
 import inspect
 import json
@@ -36,7 +36,7 @@ from trustbo.workspace.grid import Location
 _ARRIVES = 0.9
 """Arrival probability below which a campaign without a cost of failures issues a warning."""
 _OPTIONS = ("objective", "sampler", "seed", "initial", "planner", "fit")
-"""Settings that are arguments of `Campaign`, unchanged."""
+"""Settings that store arguments of `Campaign` unchanged."""
 _FIT = inspect.signature(fit)
 
 
@@ -84,22 +84,22 @@ class Campaign(Result):
             model: Trust model; by default `models.default_model()`, with place and robot effects.
             policy: Name in `planning.POLICIES`, or a callable `policy(rng, draws, planner)` that
                 returns a Plan.
-            objective: Objective of the paths, see `planning.Planner`.
-            sampler: Sampler of the posterior, see `trustbo.fit`.
+            objective: Objective of the paths; see `planning.Planner`.
+            sampler: Sampler of the posterior; see `trustbo.fit`.
             seed: Seed of all random numbers.
-            directory: Folder that is updated after each mission. It is locked until the end of
-                `with campaign:`, or of the process.
+            directory: Folder that is updated after each mission. It stays locked until the
+                `with campaign:` block exits or the process ends.
             overwrite: Whether to remove an existing campaign from that folder first.
             initial: Parameters for the first plan: `"prior_mean"`, or `"prior_draw"` for one random
-                draw of the prior, as in the paper.
-            hazard: Priors of the probability that a bound fails, by default `Hazard()`.
+                draw from the prior, as in the paper.
+            hazard: Priors of the probability that a bound fails; by default `Hazard()`.
             planner: Further options of `planning.Planner`, such as `{"max_failure": 0.1}`. Failures
                 have no cost until the first one is recorded, unless `failure_cost` is given.
             fit: Further options of `trustbo.fit`, such as `{"draws": 500}`.
 
         Raises:
-            TrustboError: Start, goal or a name does not exist; the sampler does not support the
-                model; or the folder already contains a campaign and `overwrite` is False.
+            TrustboError: The start or goal is not a passable cell, a name is unknown, the sampler
+                does not support the model, or the folder already contains a campaign.
             NoPathError: The goal cannot be reached.
         """
         require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
@@ -108,7 +108,7 @@ class Campaign(Result):
         hazard = Hazard() if hazard is None else hazard
         require_kind("hazard", hazard, Hazard, "give a trustbo.hazard.Hazard")
         own = {"workspace": workspace, "seed": seed, "progress": True, "whole": False}
-        _FIT.bind([], model, sampler=sampler, **own, **(fit or {}))  # a wrong option: TypeError
+        _FIT.bind([], model, sampler=sampler, **own, **(fit or {}))  # TypeError if one is wrong
         model = default_model() if model is None else model
         require_kind("model", model, TrustModel, "give one such as PooledTrust()")
         if isinstance(model, HumanTrust):
@@ -131,7 +131,7 @@ class Campaign(Result):
             "model": model.in_short(),
             "model_record": model_to_record(model),
         }
-        state = State(json.loads(to_json(settings)))  # as a file returns them
+        state = State(json.loads(to_json(settings)))  # as if read from a file
         super().__init__(workspace, state, model, base)
         self._warned_of_risk = False
         self.progress = True
@@ -140,7 +140,7 @@ class Campaign(Result):
             self.storage = Storage.begin(directory, workspace, self.state, overwrite=overwrite)
 
     def _renew(self) -> None:
-        """Discard the plan and what was computed before the missions or failures changed."""
+        """Discard the plan and cached properties after the missions or failures have changed."""
         self.state.asked = None
         for name in self._computed():
             delattr(self, name)
@@ -180,7 +180,7 @@ class Campaign(Result):
         return self._accept(self.planner.evaluate(path, self.belief.mean()))
 
     def _accept(self, plan: Plan) -> Plan:
-        """Store a plan, with bands over the posterior, as the next one to run."""
+        """Store a plan, with posterior bands, as the next one to run."""
         given = self.planner.evaluate(plan.path, self.belief)
         self._warn_of_risk(plan, 1.0 if given.p_arrive is None else given.p_arrive)
         self.state.asked = accepted = plan.with_draws(given)
@@ -188,7 +188,7 @@ class Campaign(Result):
         return accepted
 
     def _warn_of_risk(self, plan: Plan, p_arrive: float) -> None:
-        """Warn of a plan that exceeds `max_failure`; or, once, of a likely failure at no cost."""
+        """Warn if a plan exceeds `max_failure` or, once, if failure is likely but has no cost."""
         options = self.state.settings["planner"]
         if plan.infeasible:
             warnings.warn(
@@ -217,19 +217,19 @@ class Campaign(Result):
             mission: Mission as measured, whether or not it reached the goal.
 
         Returns:
-            Posterior of the parameters given all usable missions. If this mission cannot be used,
-            or not yet, the previous posterior or None is returned with a warning.
+            Posterior of the parameters given all usable missions. If this mission cannot be used
+            (yet), a warning is issued, and the previous posterior or None is returned.
 
         Raises:
             TrustboError: Robots or features differ from the workspace's; or the path leaves the
-                grid, jumps, or begins in a different cell than the plan. The mission is then not
+                grid, jumps, or begins in a different cell from the plan. The mission is then not
                 stored.
         """
         self._take(mission, {})
         return self.state.posterior
 
     def _take(self, mission: Mission, extra: dict[str, float]) -> None:
-        """Write a mission, and more numbers of its row, to disk; then learn from it."""
+        """Write a mission, with the `extra` values of its row, to disk, then learn from it."""
         require_kind("mission", mission, Mission, "tell one trustbo.Mission at a time")
         mission, state, plan = self.workspace.in_order(mission), self.state, self.ask()
         if mission.path[0] != plan.path[0]:
@@ -306,8 +306,8 @@ class Campaign(Result):
         If bounds were run, `tell` a mission with these bounds and its status instead.
 
         Args:
-            reason: Reason, for the record. One of `hazard.CAUSES`, such as "stuck", means that a
-                bound of the plan failed; the failure then updates the hazard model.
+            reason: Reason, for the record. A reason in `hazard.CAUSES`, such as "stuck", means that
+                a bound of the plan failed; the failure then updates the hazard model.
             where: Cell that the team failed to enter, if known.
 
         Raises:
@@ -320,8 +320,8 @@ class Campaign(Result):
         where = None if where is None else require_pair("where", where)
         if where is not None and (reason not in CAUSES or where not in path[1:]):
             raise TrustboError(
-                f"where = {where} must be a cell that the plan enters, {path[1:]}, and reason one "
-                f"of {', '.join(CAUSES)}; got {reason!r}."
+                f"where = {where} must be a cell that the plan enters, {path[1:]}, and reason must "
+                f"be one of {', '.join(CAUSES)}; got {reason!r}."
             )
         self.state.failures.append(Failure(len(self.state.entries), reason, tuple(path), where))
         self._renew()
@@ -338,20 +338,20 @@ class Campaign(Result):
     ) -> Iterator[tuple[Plan, Mission]]:
         """Run missions in a simulator, one per step of the returned iterator.
 
-        No mission is run before the iteration: `for plan, mission in campaign.run(simulator, 8)`.
+        Nothing runs until you iterate: `for plan, mission in campaign.run(simulator, 8)`.
         The arguments are the same as in `iterate`; `n_iterations` includes earlier missions.
 
         Yields:
-            Plan of each mission and the mission, after the posterior was updated with it.
+            Each plan and its mission, after the posterior has been updated with it.
 
         Raises:
-            TrustboError: Bad input, before any work starts.
+            TrustboError: The input is invalid; raised before any work starts.
         """
         require_whole("n_iterations", n_iterations, 1)
         runner = KinematicSimulator(self.workspace) if simulator is None else simulator
         if isinstance(runner, type) or not callable(getattr(runner, "run", None)):
             raise TrustboError(
-                f"simulator must have run(path, *, seed, mission) -> Mission; got {runner!r}."
+                f"simulator needs a method run(path, *, seed, mission) -> Mission; got {runner!r}."
             )
         rules: list[Stop] = [] if stop is None else [stop] if callable(stop) else list(stop)
         if not all(map(callable, rules)) or not isinstance(truth, Truth | None):
@@ -364,12 +364,12 @@ class Campaign(Result):
     def _run(
         self, simulator: Simulator, n_iterations: int, truth: Truth | None, rules: Sequence[Stop]
     ) -> Iterator[tuple[Plan, Mission]]:
-        """Run missions, see `run`, which checks the arguments."""
+        """Run missions; `run` has checked the arguments."""
         state = self.state
         state.stop_reason = "interrupted"
         options = {"total": n_iterations, "initial": len(state.entries), "desc": "missions"}
         with tqdm(disable=not self.progress, **options) as bar, compiling():
-            # The rules are asked before each mission: they may hold already when one continues.
+            # Rules are checked before each mission, as one may already hold when a run continues.
             while not (reason := self._reason_to_end(n_iterations, rules)):
                 n, plan = len(state.entries), self.ask()
                 mission = simulator.run(plan.path, seed=state.seed_of("mission"), mission=n)
@@ -385,14 +385,14 @@ class Campaign(Result):
         self._write()
 
     def _reason_to_end(self, n_iterations: int, rules: Sequence[Stop]) -> str | None:
-        """Return the reason of the first stopping rule that applies, else None."""
+        """Return the reason given by the first stopping rule that applies, or None."""
         n = len(self.state.entries)
         for rule in rules if n else ():
             if verdict := rule(self):
                 return verdict if isinstance(verdict, str) else _name_of(rule)
         return "n_iterations" if n >= n_iterations else None
 
-    # --- what is known, and the folder ---
+    # --- results and storage ---
 
     def result(self) -> Result:
         """Return the result so far, as `iterate` does.
@@ -412,7 +412,7 @@ class Campaign(Result):
     ) -> Self:
         """Continue a campaign where it stopped, in the same folder.
 
-        A mission that was recorded but not used for learning yet is used now.
+        A mission that was recorded but not yet used for learning is used now.
 
         Args:
             directory: Folder that was passed as `directory`, or to `Result.save`.
@@ -420,8 +420,8 @@ class Campaign(Result):
             policy: The same policy, if it is custom.
 
         Raises:
-            TrustboError: There is no campaign, another process has locked it, a custom object is
-                missing, or a file of the folder is missing or damaged.
+            TrustboError: The folder contains no campaign or is locked by another process, a custom
+                object is not given, or a file of the folder is missing or damaged.
         """
         require_campaign(directory)
         storage = Storage(directory)

@@ -22,7 +22,7 @@ class Follower:
     Awareness is taken from the map.
 
     Attributes:
-        path: Cells of the mission, start first: first the cells entered, then the planned ones.
+        path: Cells of the mission in order: the cells entered, followed by the planned ones.
         bounds: Bounds that have ended.
         trust: Current trust, shapes (robot,); during a bound, the trust if the bound ended now.
         running: Whether a bound is in progress.
@@ -39,25 +39,25 @@ class Follower:
         else:
             n_robots, family = self._workspace.team.n_robots, campaign.model.observation
             start = TrustFilter(campaign.draw_prior(1000), n_robots, observation=family)
-        # After the bounds that have ended, and if the one in progress ended now.
+        # Filters after the bounds that have ended, and as if the one in progress ended now.
         self._before = self._now = start
         self.trust: TrustState = self._now.state
-        self._started = self._begun = self._last = -np.inf  # times of mission, bound and tick
-        self._counts = np.zeros((2, self._workspace.team.n_robots))  # ticks with contact, and ticks
+        self._started = self._begun = self._last = -np.inf  # mission, bound, last call
+        self._counts = np.zeros((2, self._workspace.team.n_robots))  # ticks with contact, all ticks
 
     @property
     def rest(self) -> tuple[Cell, ...]:
-        """Cell where the lead is or that it is entering, and the planned cells after it."""
+        """Cell that the lead is in or is entering, followed by the planned cells."""
         return self.path[len(self.bounds) + self.running :]
 
     def begin(self, t: float, cell: Cell | None = None) -> None:
-        """Begin the next bound at time `t`, into the planned cell or another one.
+        """Begin the next bound at time `t`, into the planned cell or into `cell`.
 
-        After an unplanned cell, the plan is dropped, and each bound requires `cell`.
+        An unplanned cell discards the plan; every later bound then requires `cell`.
 
         Raises:
             TrustboError: A bound is in progress, the mission is over, no cell is planned, the cell
-                is not a neighbour, or the time is before the last one.
+                is not a neighbour, or `t` is before the previous time.
         """
         self._require(running=False, t=t)
         if self.bounds and self.bounds[-1].status != "ok":
@@ -81,8 +81,8 @@ class Follower:
                 was not measured.
 
         Raises:
-            TrustboError: No bound is in progress, a value is not 0, 1 or NaN, there is not one
-                value per robot, or the time is before the last one.
+            TrustboError: No bound is in progress, a value is not 0, 1 or NaN, the number of values
+                is not the number of robots, or `t` is before the previous time.
         """
         self._require(running=True, t=t)
         seen = as_array("in_contact", in_contact)
@@ -120,9 +120,9 @@ class Follower:
         return self._now.predict(known_along(rest, self._workspace), rest)
 
     def to_mission(self) -> Mission:
-        """Return the completed bounds as a mission; its awareness is not measured, hence NaN.
+        """Return the completed bounds as a mission, whose awareness is NaN (not measured).
 
-        Its status is the status of the last bound, or `"aborted"` if that bound is `"ok"` but did
+        The mission has the status of its last bound, or `"aborted"` if that bound is `"ok"` but did
         not reach the goal.
 
         Raises:
@@ -137,8 +137,8 @@ class Follower:
         return Mission(self.path, self.bounds, status, workspace.features, workspace.team.names)
 
     def _count(self, t: float, counts: np.ndarray, bound: tuple[Cell, Cell]) -> None:
-        """Set the counts of ticks, (2, robot), of a bound, and the trust if it ended now."""
-        now = copy(self._before)  # which replaces its arrays, and changes none of them
+        """Store the tick counts of a bound, (2, robot), and the trust if the bound ended now."""
+        now = copy(self._before)  # `update` replaces arrays and modifies none
         (known,) = known_along(bound, self._workspace)
         contacts, ticks = counts
         n_ticks = np.where(ticks > 0.0, ticks, np.nan)
@@ -148,9 +148,9 @@ class Follower:
         self._measured = rates, n_ticks
 
     def _require(self, *, running: bool, t: float) -> None:
-        """Raise TrustboError for a call in the wrong state, or a time before the last one."""
+        """Raise TrustboError if the call is out of order or `t` is before the previous time."""
         if running != self.running:
             some, first = ("no", "begin") if running else ("a", "end")
             raise TrustboError(f"{some} bound is in progress; call {first} first.")
         if not self._last <= t < np.inf:
-            raise TrustboError(f"t = {t} s must be finite, and not before {self._last} s.")
+            raise TrustboError(f"t = {t} s must be finite and not before {self._last} s.")

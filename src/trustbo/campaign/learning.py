@@ -25,7 +25,7 @@ from trustbo.workspace.moves import along, require_on_grid
 
 _N_DRAWS, _N_RISKS = 1000, 200
 _STOPPED, _RECOVERED = 2, 0.2
-"""Number of failures after which a bound is avoided, unless its failure probability is lower."""
+"""Failures after which a bound is avoided, and failure probability below which it is not."""
 
 
 def known_along(path: Sequence[Cell], workspace: Workspace) -> np.ndarray:
@@ -38,7 +38,7 @@ def known_along(path: Sequence[Cell], workspace: Workspace) -> np.ndarray:
 
 
 def as_learned(mission: Mission, workspace: Workspace) -> Mission:
-    """Replace measured awareness by the awareness of the map, which the planner also uses.
+    """Replace measured awareness with the awareness of the map, which the planner also uses.
 
     Weights fitted to measured awareness would be biased when the planner applies them to the map's
     awareness. TrustboError: see `known_along`.
@@ -54,8 +54,8 @@ def why_never_learned(mission: Mission) -> str:
         k, i, m = np.argwhere(np.isnan(mission.awareness))[0]
         return (
             f"awareness of bound {k + 1}, robot {mission.robots[i]}, feature "
-            f"{mission.features[m]} was not measured, and cell {mission.bounds[k].cell} has none "
-            "in the map."
+            f"{mission.features[m]} was not measured, and the map has none in cell "
+            f"{mission.bounds[k].cell}."
         )
     return ""
 
@@ -72,7 +72,7 @@ def learn(
     waiting, numbers = state.numbers(TOLD), state.numbers(TOLD, LEARNED)
     missions = [state.entries[j].mission for j in numbers]
     sampler, options = state.settings["sampler"], state.settings["fit"]
-    # Draws of importance sampling are independent, and effects of places make them large.
+    # Importance draws are independent, and each is large if the model has place effects.
     few = sampler == "importance" and any(isinstance(e, PlaceEffect) for e in model.effects)
     usual = options.get("draws", _N_DRAWS // 4 if few else _N_DRAWS)
     reason = ""
@@ -86,8 +86,8 @@ def learn(
             )  # fmt: skip
         except TrustboError as error:
             reason = getattr(error, "reason", str(error))
-        except Exception as error:  # a defect must not cost a mission that was driven
-            if isinstance(error.__cause__, KeyboardInterrupt):  # numba makes it a SystemError
+        except Exception as error:  # a bug must not lose a mission that was driven
+            if isinstance(error.__cause__, KeyboardInterrupt):  # numba raises SystemError from it
                 raise error.__cause__ from None
             reason = f"{type(error).__name__}: {error}"
         else:
@@ -100,7 +100,7 @@ def learn(
         state.entries[j].become(TOLD, reason)
     warnings.warn(
         f"mission {len(state.entries)} is recorded but cannot be used for learning yet: "
-        f"{reason.rstrip('.')}. The campaign tries again with the next mission.",
+        f"{reason.rstrip('.')}. Learning is retried after the next mission.",
         stacklevel=6,
     )
     return None
@@ -109,8 +109,8 @@ def learn(
 def learn_hazard(state: State, workspace: Workspace) -> xr.Dataset:
     """Fit the failure probabilities of bounds to all missions; see `fit_hazard`.
 
-    A mission that was excluded because it measured no contact rate still shows where it failed. If
-    the diagnostics fail, the previous posterior is returned with a warning.
+    A mission that can never be used for learning trust still shows where the team failed. If the
+    diagnostics fail, the previous posterior is returned with a warning.
     """
     measured = [
         entry.measured
@@ -129,13 +129,13 @@ def learn_hazard(state: State, workspace: Workspace) -> xr.Dataset:
 
 
 def informed_planner(planner: Planner, risk: BoundRisk) -> Planner:
-    """Make the planner given the failure probabilities of bounds.
+    """Make a planner that accounts for the failure probabilities of bounds.
 
     A bound that failed twice is avoided unless there is no other path, or its failure probability
-    fell below 0.2. The user's slope limit is trusted until a failure contradicts it: before the
-    first failure, failures have no cost unless the user gave `failure_cost`. With the prior alone,
-    the cost would rule out longer paths that keep contact and on which nothing fails. After the
-    first failure, the cost is computed jointly over strata of the posterior, since bounds share the
+    has fallen below 0.2. The user's slope limit is trusted until a failure contradicts it: before
+    the first failure, failures have no cost unless the user gave `failure_cost`. Under the prior
+    alone, a cost would rule out longer paths that keep contact and never fail. After the first
+    failure, the cost is computed jointly over strata of the posterior, since all bounds share the
     slope limit.
     """
     if (stopped := to_avoid(risk)).any():

@@ -39,16 +39,16 @@ def iterate(
             CRS, `{"x": 1748000, "y": 5427000}`, or in degrees, `{"lon": 174.7, "lat": -41.3}`; see
             `Workspace.locate`.
         goal: Last cell, or a position in it.
-        n_iterations: Largest number of missions.
+        n_iterations: Maximum number of missions.
         simulator: Simulator with `run(path, *, seed, mission) -> Mission`; by default
             `KinematicSimulator(workspace)`.
         truth: Truth of the simulator, `simulation.Truth.of(simulator)`. If given, the history
             records the regret of each plan, in % of the expected contact on the best path.
         stop: Stopping rules, called between missions: a `RegretBound`, a function of the campaign
-            that returns a reason or None, or several of them.
+            that returns a reason or None, or a sequence of these.
         directory: Folder that is updated after each mission. If the process dies, `resume`
             continues from it.
-        overwrite: Whether to remove another campaign from that folder first.
+        overwrite: Whether to remove an existing campaign from that folder first.
         progress: Whether to show a progress bar.
         **options: Further arguments of `Campaign`: `model`, `policy`, `objective`, `sampler`,
             `seed`, `initial`, `hazard`, `planner`, `fit`.
@@ -90,8 +90,8 @@ def resume(
 ) -> Result:
     """Continue a campaign that `iterate(directory=...)` began, with identical results.
 
-    If a stopping rule ended the campaign, its result is returned, unless `stop` or more missions
-    are given. Stopping rules are not stored and must be given again.
+    If a stopping rule ended the campaign, its result is returned unless you pass `stop` or ask for
+    more missions. Stopping rules are not stored and must be given again.
 
     Args:
         directory: Folder of the campaign.
@@ -104,8 +104,8 @@ def resume(
         progress: Whether to show a progress bar.
 
     Raises:
-        TrustboError: There is no campaign, another process has locked it, a custom object or the
-            simulator differs from the original one, or a file of the folder is missing or damaged.
+        TrustboError: The folder contains no campaign or is locked by another process, a custom
+            object or the simulator differs from the original one, or a file is missing or damaged.
     """
     with Campaign.load(directory, model=model, policy=policy) as campaign:
         state, before = campaign.state, campaign.state.simulation

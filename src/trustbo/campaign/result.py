@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 class Result(Summary):
-    """Result of the missions of a campaign; properties are computed at first access.
+    """Result of the missions of a campaign; properties are computed on first access.
 
     Attributes:
         workspace: Workspace of the campaign.
@@ -93,8 +93,8 @@ class Result(Summary):
     def posterior(self) -> xr.DataTree:
         """Posterior after the last mission, with all groups, for ArviZ.
 
-        Its missions are labelled by their index in `missions`; see `inference.complete` for the
-        groups of earlier posteriors.
+        Its missions are labelled by their index in `missions`. To add all groups to an earlier
+        posterior, use `inference.complete`.
 
         Raises:
             TrustboError: Nothing could be learned yet.
@@ -102,10 +102,10 @@ class Result(Summary):
         if (stored := self.state.posterior) is None:
             raise TrustboError(
                 f"there is no posterior: none of {len(self.missions)} missions can be used for "
-                "learning yet. They are recorded; table() has the reasons."
+                "learning yet. They are recorded; table() gives the reasons."
             )
         numbers = np.atleast_1d(stored.attrs["missions"]).astype(int).tolist()
-        # The model is needed for `log_prior` if its priors are not the default.
+        # `log_prior` needs the model if its priors are not the default ones.
         whole = complete(stored, [self.missions[j] for j in numbers], model=self.model)
         for group in whole.children.values():
             if "mission" in group.dims:
@@ -115,7 +115,7 @@ class Result(Summary):
 
     @cached_property
     def belief(self) -> Params:
-        """Parameter draws of the last posterior, or of `initial` before the first posterior."""
+        """Parameter draws of the last posterior; before the first one, as `initial` specifies."""
         if (posterior := self.state.posterior) is not None:
             return params_of(posterior)
         if self.state.settings["initial"] == "prior_draw":
@@ -132,7 +132,7 @@ class Result(Summary):
 
     @cached_property
     def hazard(self) -> xr.Dataset:
-        """Group `hazard` of the posterior, see `hazard.fit_hazard`."""
+        """Group `hazard` of the posterior; see `hazard.fit_hazard`."""
         return learn_hazard(self.state, self.workspace)
 
     @cached_property
@@ -142,7 +142,7 @@ class Result(Summary):
 
     @cached_property
     def planner(self) -> Planner:
-        """Planner that accounts for the failures so far, see `informed_planner`."""
+        """Planner that accounts for the failures so far; see `informed_planner`."""
         return informed_planner(self._base, self.risk)
 
     # --- the path to take ---
@@ -162,7 +162,7 @@ class Result(Summary):
     def plan(self) -> Plan:
         """Recommended plan, the best under the posterior mean, with posterior credible bands."""
         best = self.recommend()
-        draws = self.state.posterior or self.belief  # of which it draws effects of the next mission
+        draws = self.state.posterior or self.belief  # to draw effects of the next mission
         return best.with_draws(self.planner.evaluate(best.path, draws))
 
     @property
@@ -179,12 +179,12 @@ class Result(Summary):
     def history(self) -> xr.Dataset:
         """Dataset of the quantities of each mission, with dim `iteration` (1, 2, ...).
 
-        It contains the planned `path` (row and col of each step, -1 after the goal), its
-        `objective` when it was planned, whether it differs from the previous plan (`path_changed`)
-        and the `trust_map` used for planning; the mean `contact_rate` of the mission, the
-        `contact_lost` in bounds (bounds that were not run lose all contact), its `status`, its
-        `state` (`"told"`, not used yet; `"learned"`; `"excluded"`) with the `reason`, and the
-        diagnostics of the posterior (see `fit`).
+        For each plan, it contains the `path` (row and col of each step, -1 after the goal), its
+        `objective` when it was planned, `path_changed` (whether it differs from the previous plan)
+        and the `trust_map` used for planning. For each mission, it contains the mean
+        `contact_rate`, the `contact_lost` in bounds (bounds that were not run lose all contact),
+        the `status`, the `state` (`"told"`, not used yet; `"learned"`; `"excluded"`) with its
+        `reason`, and the diagnostics of the posterior (see `fit`).
         """
         entries = self.state.entries
         paths = [entry.plan.path for entry in entries]
@@ -204,8 +204,8 @@ class Result(Summary):
         The first columns are `status`, `state`, the `reason` for the state or the failure, the cell
         `where` the mission failed, the mean `contact_rate`, the plan's `objective`, the number
         `n_bounds` of bounds run, `path_changed`, and the `path` as text, "9,0 8,1". The other
-        quantities of `history` follow. A mission that was given up, see `Campaign.fail`, has no
-        number and the state "given up".
+        quantities of `history` follow. A mission that was given up (see `Campaign.fail`) has
+        no number, and its state is "given up".
         """
         rows = [entry.row | {"mission": n} for n, entry in enumerate(self.state.entries, start=1)]
         for i, failure in enumerate(self.state.failures):  # each follows the mission before it
@@ -223,12 +223,12 @@ class Result(Summary):
 
         Returns:
             Dataset over (y, x), the centres of the cells' rows and columns in CRS metres, so that
-            `isel(y=row, x=col)` is a cell; `maps.rio` has the CRS and writes rasters. It contains
-            `trust_mean` and `trust_sd` over the posterior, the mean `cost` 1 - sigma(trust),
-            `path_probability` (that a cell is on the best path), and the awareness of each feature,
-            averaged over robots, under its name, or as `awareness_<name>` if another map or a dim
-            has that name. Values are NaN where no robot can go. For models with place effects, it
-            also contains `place_mean` and `place_sd` of the effect of each cell.
+            `isel(y=row, x=col)` selects a cell; `maps.rio` has the CRS and writes rasters. It
+            contains `trust_mean` and `trust_sd` over the posterior, the mean `cost`
+            1 - sigma(trust), `path_probability` (that a cell is on the best path), and the
+            awareness of each feature averaged over robots and moves, under the feature's name, or
+            as `awareness_<name>` if that name is taken. Impassable cells are NaN. For models with
+            place effects, it also contains `place_mean` and `place_sd` of the effect of each cell.
         """
         if n_draws is None:
             dynamics = self.planner.problem.dynamics(self.belief.mean())
@@ -246,7 +246,7 @@ class Result(Summary):
         return self.workspace.grid.place(maps.where(self.workspace.passable))
 
     def _places(self) -> xr.Dataset:
-        """Make maps of the effects of cells, (row, col), if the model has them."""
+        """Make maps of the place effects, (row, col), if the model has them."""
         if not (places := self.belief.places):
             return xr.Dataset()
         cells = xr.DataArray(places["place"].mean(1), dims=("draw", "row", "col"))
@@ -256,19 +256,19 @@ class Result(Summary):
         return maps
 
     def plot_maps(self, **options: Any) -> np.ndarray:
-        """Draw trust maps and paths of four missions; options and Axes as in `plots.trust_maps`."""
+        """Plot trust maps and paths of four missions; see `plots.trust_maps` for the options."""
         from trustbo import plots  # imports matplotlib
 
         return plots.trust_maps(self.history, self.trust_map, self.path, self.workspace, **options)
 
     def plot_history(self, **options: Any) -> np.ndarray:
-        """Draw contact and objective by mission, see `plots.curves.campaign_history`."""
+        """Plot contact and objective for each mission; see `plots.curves.campaign_history`."""
         from trustbo.plots.curves import campaign_history
 
         return campaign_history(self.history, **options)
 
     def explore(self) -> "Explorer":
-        """Draw an interactive map with layers, the values of each cell, and a slider over missions.
+        """Make an interactive map with layers, the values of each cell, and a slider over missions.
 
         It is displayed in notebooks; `.save(path)` writes it to one HTML file that works offline.
 
@@ -309,7 +309,7 @@ def load_result(directory: FilePath) -> Result:
     given = state.settings
     try:
         model = model_from_record(given["model_record"])
-    except TrustboError:  # a custom model, which is needed only while nothing was learned
+    except TrustboError:  # a custom model is needed only as long as nothing has been learned
         if state.last is None:
             raise
         model = None

@@ -12,9 +12,9 @@ from trustbo.logs.netcdf import read_tree
 from trustbo.planning import Plan
 
 TOLD, LEARNED, EXCLUDED, GIVEN_UP = "told", "learned", "excluded", "given up"
-"""States of a mission: recorded, in the posterior, excluded, or ended without a report."""
+"""States of a mission: recorded, used for learning, excluded, or given up unmeasured."""
 _STREAMS = ("policy", "fit", "mission", "prior", "awareness", "hazard")
-"""Random streams; a seed depends on the position, so new names are added at the end."""
+"""Random streams; seeds depend on their order, so new names are added at the end."""
 COLUMNS = (
     "status", "state", "reason", "where", "contact_rate", "objective", "n_bounds", "path_changed",
     "path",
@@ -57,7 +57,7 @@ class Posterior:
     Attributes:
         name: Name of its file: the number of missions recorded when it was fitted, followed by the
             number of excluded missions if there are any, such as `"0003-1"`.
-        tree: The posterior; None if it is only in its file.
+        tree: The posterior; None if it is stored only in `file`.
         file: Its file; None if the campaign is in memory only.
     """
 
@@ -105,7 +105,7 @@ class State:
         entries: Recorded missions, in order.
         failures: Failed missions.
         asked: Plan returned by `ask` and not run yet.
-        simulation: Settings that the simulator describes, and `n_iterations`.
+        simulation: Settings reported by the simulator, and `n_iterations`.
         stop_reason: Why the last run ended.
     """
 
@@ -128,7 +128,7 @@ class State:
 
     @property
     def posterior(self) -> xr.DataTree | None:
-        """Parameters given the missions so far; None if nothing was learned."""
+        """Posterior of the parameters given the missions so far; None if nothing was learned."""
         return None if self.last is None else self.last()
 
     def numbers(self, *states: str) -> list[int]:

@@ -15,28 +15,28 @@ if TYPE_CHECKING:
     from trustbo.campaign.campaign import Campaign
 
 Stop = Callable[["Campaign"], str | bool | None]
-"""Rule that is called between missions; a reason (or True) ends the campaign."""
+"""Rule called between missions; it ends the campaign by returning a reason (or True)."""
 
 
 @dataclass(frozen=True)
 class RegretBound:
     """Stop when the recommended path is nearly optimal, with high probability, twice in a row.
 
-    Under each of `n_draws` posterior draws the best path is planned exactly. The regret of the
-    recommended path under a draw is, for lost_contact, the additional contact that it loses, as a
-    fraction of the contact that the best path keeps; for other objectives, a fraction of the best
-    path's value. Stop when P(regret <= eps) >= 1 - delta after each of the last `patience`
-    missions, and robots have completed every bound of the path at least once, since the map may be
-    wrong about bounds that were never driven.
+    The best path is planned exactly under each of `n_draws` posterior draws. For lost_contact, the
+    regret of the recommended path is the additional contact that it loses, as a fraction of the
+    contact that the best path keeps; for other objectives, it is a fraction of the best path's
+    value. The campaign stops when P(regret <= eps) >= 1 - delta after each of the last `patience`
+    missions and robots have completed every bound of the path at least once, because the map may
+    be wrong about bounds that were never driven.
 
     Attributes:
         eps: Acceptable regret, as a fraction; 0.05 is 5 %.
-        delta: Probability of a larger regret.
+        delta: Acceptable probability of a larger regret.
         patience: Number of successive missions after which the condition must hold.
         n_draws: Number of posterior draws.
 
     Raises:
-        TrustboError: A fraction is outside (0, 1), or a number is not whole.
+        TrustboError: `eps` or `delta` is outside (0, 1), or a count is not a positive whole number.
     """
 
     eps: float = 0.05
@@ -60,7 +60,7 @@ class RegretBound:
         if min(sure) < 1.0 - self.delta:
             return None
         risk, bounds = campaign.risk, tuple(bounds_along(np.array(campaign.recommend().path)).T)
-        if not (risk.exposures[bounds] > risk.failures[bounds]).all():  # some never completed
+        if not (risk.exposures[bounds] > risk.failures[bounds]).all():  # some were never completed
             return None
         return f"regret_bound: P(regret <= {self.eps:g}) = {sure[0]:.3f} >= {1.0 - self.delta:g}"
 

@@ -5,8 +5,8 @@
     posteriors/0001.nc    draws of the parameters after the first mission
     campaign.json         settings, numbers and states; counts the missions that are complete
 
-Every file is written to a temporary name, flushed to disk and renamed. A process that dies at any
-write loses nothing: missions beyond the record's count are processed when the folder is opened.
+Every file is written to a temporary name, flushed to disk and renamed. A process that dies during
+a write loses nothing: missions beyond the record's count are processed when the folder is opened.
 """
 
 import itertools
@@ -53,7 +53,7 @@ class Storage:
                 "folder."
             ) from None
         except OSError as error:
-            raise TrustboError(f"cannot make {str(directory)!r}: {error.strerror}.") from None
+            raise TrustboError(f"cannot create {str(directory)!r}: {error.strerror}.") from None
 
     def release(self) -> None:
         """Release the lock of the folder."""
@@ -63,9 +63,9 @@ class Storage:
     def begin(
         cls, directory: FilePath, workspace: Workspace, state: State, *, overwrite: bool
     ) -> Self:
-        """Lock a folder and write a whole campaign; another campaign is removed, its record first.
+        """Lock a folder and write a whole campaign; an existing one is removed, its record first.
 
-        TrustboError: the folder contains a campaign and `overwrite` is False, or as in `__init__`.
+        TrustboError: the folder contains a campaign and `overwrite` is False, or cannot be locked.
         """
         path = Path(directory)
         if not overwrite and any((path / name).exists() for name in (RECORD, MISSIONS)):
@@ -83,7 +83,7 @@ class Storage:
 
     def _write_campaign(self, workspace: Workspace, state: State) -> None:
         stored = {e.posterior.name: e.posterior for e in state.entries if e.posterior is not None}
-        trees = {name: posterior() for name, posterior in stored.items()}  # some files are removed
+        trees = {name: posterior() for name, posterior in stored.items()}  # read before deletion
         (self.path / RECORD).unlink(missing_ok=True)
         for room in (MISSIONS, POSTERIORS):
             for file in (self.path / room).glob("*.nc"):
