@@ -1,15 +1,15 @@
-"""Missions in ROS bags: `.bag` files of ROS 1, folders of ROS 2, read by rosbags (extra `ros`).
+"""Missions in ROS bags (`.bag` files or ROS 2 folders), read with rosbags (extra `ros`).
 
     /mission/bound    std_msgs/String, JSON {"bound": k, "cell": [row, col]}, at the start of bound
                       k. Bound 0 is the start of a mission, in its start cell, and may have "path",
                       the planned cells.
-    /mission/status   std_msgs/String, "ok", "stuck", ..., at the end of a bound, optional; a second
-                      one after the last bound is the mission's.
-    /{robot}/contact  std_msgs/Bool, or Float32 and Float64 in [0, 1], at each tick
+    /mission/status   std_msgs/String, "ok", "stuck", ..., optional, at the end of a bound; a second
+                      one after the last bound is the status of the mission.
+    /{robot}/contact  std_msgs/Bool, or Float32 or Float64 in [0, 1], at each tick
 
-A bound lasts from its marker to its status or, without a status, to the last contact before the
-next marker. Its contact rate is the fraction of a robot's ticks with contact; NaN ticks are
-ignored.
+A bound lasts from its marker to its status or, without a status, to the last contact message
+before the next marker. Its contact rate is the fraction of a robot's ticks with contact; NaN ticks
+are ignored.
 """
 
 import json
@@ -27,7 +27,7 @@ from trustbo.files import FilePath
 from trustbo.workspace import Workspace
 
 _NEVER = np.iinfo(np.int64).max
-_NS = 1e9  # in a second
+_NS = 1e9  # nanoseconds per second
 
 type Marker = tuple[int, int, Cell, tuple[Cell, ...]]
 """Time (ns), number and cell of a bound, and the planned path, which may be empty."""
@@ -45,7 +45,7 @@ def read_bag(
 
     Args:
         path: A `.bag` file of ROS 1, or the folder of a bag of ROS 2.
-        workspace: Workspace whose robots are read, in its order.
+        workspace: Workspace whose robots are read, in the order of its team.
         bound: Topic that marks the start of each bound.
         status: Topic with the status of bounds and missions.
         contact: Topic with the contact of each robot, whose name replaces `{robot}`.
@@ -55,7 +55,7 @@ def read_bag(
 
     Raises:
         TrustboError: rosbags is not installed; the path is not a bag, or the bag is damaged; a
-            topic is missing; markers are out of order; or `Mission` refuses the data.
+            topic is missing; markers are out of order; or `Mission` rejects the data.
     """
     topics = [contact.replace("{robot}", robot) for robot in workspace.team.names]
     messages = _messages(Path(path), [bound, *topics], status)
@@ -78,7 +78,7 @@ def read_bag(
 
 
 def _messages(path: Path, needed: Sequence[str], optional: str) -> dict[str, pd.Series]:
-    """Read the messages of each topic in the order of their time of recording, ns."""
+    """Read the messages of each topic, indexed and sorted by recording time, ns."""
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
@@ -89,29 +89,29 @@ def _messages(path: Path, needed: Sequence[str], optional: str) -> dict[str, pd.
     times: dict[str, list[int]] = {topic: [] for topic in messages}
     there = {}
     try:
-        # Bags of ROS 2 before Iron do not define their types.
+        # ROS 2 bags recorded before Iron do not define their message types.
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             there = {c.topic: c.msgtype for c in reader.connections}
             chosen = [c for c in reader.connections if c.topic in messages]
             for c, time, raw in reader.messages(connections=chosen) if chosen else ():
                 times[c.topic].append(time)
                 messages[c.topic].append(reader.deserialize(raw, c.msgtype))
-    except Exception as error:  # rosbags raises many kinds for a file that is damaged or no bag
+    except Exception as error:  # rosbags raises many types of errors for bad files
         raise TrustboError(
             f"{str(path)!r} cannot be read as a ROS bag ({error or type(error).__name__}); give a "
-            "whole .bag file of ROS 1, or the folder of a bag of ROS 2 with its metadata.yaml."
+            "complete .bag file of ROS 1, or the folder of a ROS 2 bag with its metadata.yaml."
         ) from None
     if missing := [topic for topic in needed if topic not in there]:
         found = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(there.items()))
         raise TrustboError(
             f"{str(path)!r} lacks {', '.join(missing)}; it has {found or 'no topics'}. "
-            'Name other topics, such as contact="/{robot}/sees".'
+            'Pass other topics, such as contact="/{robot}/sees".'
         )
     return {t: pd.Series(m, pd.Index(times[t], dtype=int), object) for t, m in messages.items()}
 
 
 def _contacts(topic: str, messages: pd.Series) -> pd.Series:
-    """Return contact at the ticks of a robot, 1 or 0, without those that are NaN."""
+    """Return the contact of a robot at each tick, 1 or 0; NaN ticks are dropped."""
     value = messages.map(lambda message: float(message.data)).astype(float)
     require_unit_interval(topic, value.to_numpy())
     return (value.dropna() > 0.5).astype(float)
@@ -141,10 +141,10 @@ def _mission(
     """Make a mission from its markers; its last bound ends at `until` at the latest."""
     times, numbers, cells, paths = zip(*markers, strict=True)
     if numbers != (*range(len(markers)),):
-        raise TrustboError(f"bounds are in the order {list(numbers)}.")
+        raise TrustboError(f"bounds must be numbered 0, 1, 2, ... in order; got {list(numbers)}.")
     path = paths[0] or cells
     if path[0] != cells[0]:
-        raise TrustboError(f"it starts in {cells[0]}, but its path in {path[0]}.")
+        raise TrustboError(f"it starts in {cells[0]}, but its path starts in {path[0]}.")
     bounds = []
     for cell, begin, until_next in zip(cells[1:], times[1:], [*times[2:], until], strict=True):
         ended = statuses.loc[begin + 1 : until_next]

@@ -1,4 +1,4 @@
-"""Reader of user tables, with parsers of names, numbers and times."""
+"""Reader for user tables, with parsers for names, numbers and times."""
 
 import csv
 import io
@@ -22,23 +22,23 @@ _DECIMAL_COMMA = re.compile(r"^\s*([+-]?\d*),(\d+)\s*$")
 _ZONE = r":.*(?:Z|[+-]\d\d(?::?\d\d)?)$"
 """End of a date with a time zone."""
 _LONGEST = 7 * 86_400.0
-"""Longest log, s: a longer span means another unit, or an outlier."""
+"""Longest log, s: a longer span indicates another unit or an outlier."""
 
 
 class Columns:
     """Columns of a table by name, without the extra lines of spreadsheets and surveys.
 
-    These are skipped: a line `sep=`, columns without a name, empty rows, and the header rows of a
-    survey down to the one with ImportId. Column names match regardless of case, and spaces match
-    underscores.
+    The following are skipped: a line `sep=`, columns without a name, empty rows, and the header
+    rows of a survey down to the one with ImportId. Column names match regardless of case, and
+    spaces match underscores.
 
     Attributes:
         what: Name of the table in messages, such as "the table of poses".
-        frame: Values; None in blank cells of text. The index is the row, 1 below the header.
+        frame: Values; None in blank text cells. The index counts rows from 1 below the header.
     """
 
     def __init__(self, table: Any, what: str = "the table") -> None:
-        """Read a CSV file (commas, semicolons or tabs), or any columns that pandas accepts.
+        """Read a CSV file (commas, semicolons or tabs), or any table that pandas accepts.
 
         Raises:
             TrustboError: The file does not exist or is not a table, a column is repeated, or there
@@ -68,7 +68,7 @@ class Columns:
         return alike[0] if alike else None
 
     def refuse(self, column: str, bad: np.ndarray, why: str) -> None:
-        """Raise TrustboError for the first value of a column that is `bad`, (row,), if any is."""
+        """Raise TrustboError for the first value of a column that is marked in `bad`, (row,)."""
         if bad.any():
             row, value = self.frame.index[bad][0], self._cells(column).to_numpy(object)[bad][0]
             raise TrustboError(f"row {row} of {self.what}: {column} = {one_line(value)} {why}.")
@@ -76,10 +76,10 @@ class Columns:
     def texts(self, column: str, *, blank: bool = True, required: bool = True) -> list[str]:
         """Return a column as text, "" if blank; floats such as 1.0 become 1.
 
-        All are blank if a column that is not `required` is missing.
+        If a column that is not `required` is missing, all of its values are blank.
 
         Raises:
-            TrustboError: A required column is missing, or a value is blank without `blank`.
+            TrustboError: A required column is missing, or a value is blank and `blank` is False.
         """
         cells = self._cells(column, required).astype(object)
         self.refuse(column, cells.isna().to_numpy() & (not blank), "is blank; leave the row out")
@@ -91,8 +91,8 @@ class Columns:
         """Return a column as numbers, (row,); NaN where blank, or if an optional column is missing.
 
         Raises:
-            TrustboError: A required column is missing; or a value is not a number or is infinite,
-                blank without `blank`, or not whole with `whole`.
+            TrustboError: A required column is missing; or a value is not a finite number, is blank
+                although `blank` is False, or is not whole although `whole` is True.
         """
         cells = self._cells(column, required)
         parsed, there = _numbers(cells), cells.notna().to_numpy()
@@ -110,16 +110,16 @@ class Columns:
         name = self.find(column)
         if name is None and required:
             there = ", ".join(self.frame) or "no columns"
-            raise TrustboError(f"{self.what} lacks {column}; it has {there}. Name or rename one.")
+            raise TrustboError(f"{self.what} lacks {column}; it has {there}. Choose or rename one.")
         return pd.Series(np.nan, self.frame.index) if name is None else self.frame[name]
 
 
 def seconds_of(first: Columns, second: Columns) -> list[np.ndarray]:
-    """Return times `t` of two tables on one clock, each (row,), s, from the first date if dates.
+    """Return the times `t` of two tables, each (row,), s; dates count from the earliest of `first`.
 
     Raises:
-        TrustboError: Times are neither all numbers nor all dates, numbers cannot be seconds, some
-            dates have no time zone, or the times of the two tables do not overlap.
+        TrustboError: Times are neither all numbers nor all dates, the numbers cannot be seconds,
+            only some dates have a time zone, or the times of the two tables do not overlap.
     """
     texts = pd.Series([*first.texts("t"), *second.texts("t")])
     if not np.isnan(_numbers(texts)).all():
@@ -130,8 +130,8 @@ def seconds_of(first: Columns, second: Columns) -> list[np.ndarray]:
         bad = (dates.isna() | (zoned != zoned[0])).to_numpy()
         if bad.any():
             raise TrustboError(
-                f"t = {one_line(texts.to_numpy()[bad][0])}; give the times of both tables in "
-                "seconds, or as dates such as 2026-11-24T10:00:00.5Z, all with a time zone or none."
+                f"t = {one_line(texts.to_numpy()[bad][0])}; give all times in seconds, or all "
+                "as dates such as 2026-11-24T10:00:00.5Z, with a time zone in all of them or none."
             )
         n = len(first.frame)
         times = np.split((dates - dates[:n].min()).dt.total_seconds().to_numpy(), [n])
@@ -144,8 +144,8 @@ def seconds_of(first: Columns, second: Columns) -> list[np.ndarray]:
             )
     inside = ((times[1] >= times[0].min()) & (times[1] <= times[0].max())).mean()
     message = (
-        f"{inside:.0%} of the times of {second.what}, {spans[1]}, are within those of "
-        f"{first.what}, {spans[0]}; check the zero, the unit and the time zone of both clocks."
+        f"only {inside:.0%} of the times of {second.what} ({spans[1]}) are within those of "
+        f"{first.what} ({spans[0]}); check the zero, the unit and the time zone of both clocks."
     )
     if not inside:
         raise TrustboError(message)
@@ -172,7 +172,7 @@ def _folded(name: str) -> str:
 
 
 def _cell(value: object) -> str | None:
-    """Return the text of a cell, None if blank."""
+    """Return the text of a cell; None if it is blank."""
     text = str(value).strip()
     return None if text.lower() in _BLANK else text
 

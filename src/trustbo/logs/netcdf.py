@@ -1,4 +1,4 @@
-"""Missions in netCDF files: their bounds one after the other, with the ticks of the robots."""
+"""Missions in netCDF files, stored as consecutive bounds with the ticks of the robots."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -26,7 +26,7 @@ def read_tree(path: FilePath) -> xr.DataTree:
     try:
         with xr.open_datatree(content, engine="netcdf4") as tree:
             return tree.load()
-    except Exception:  # the library raises many kinds for bytes that are no netCDF
+    except Exception:  # the library raises many types of errors for bad files
         raise TrustboError(f"{str(path)!r} is damaged or not a netCDF file.") from None
 
 
@@ -36,7 +36,7 @@ def write_tree(path: FilePath, tree: xr.DataTree) -> None:
 
 
 def write_missions(path: FilePath, missions: Sequence[Mission]) -> None:
-    """Write at least one mission, with ticks, to a netCDF file.
+    """Write one or more missions, with their ticks, to a netCDF file.
 
     TrustboError: the missions have different robots or features, or the file cannot be written.
     """
@@ -61,7 +61,7 @@ def read_missions(path: FilePath) -> list[Mission]:
 
 
 def missions_to_tree(missions: Sequence[Mission]) -> xr.DataTree:
-    """Convert missions to a tree; ticks are stored of the bounds with both poses and contacts.
+    """Convert missions to a tree; ticks are stored for bounds with both poses and contacts.
 
     TrustboError: the missions have different robots or features.
     """
@@ -91,7 +91,7 @@ def missions_to_tree(missions: Sequence[Mission]) -> xr.DataTree:
 
 
 def missions_from_tree(tree: xr.DataTree) -> list[Mission]:
-    """Convert a tree of `missions_to_tree` back; LookupError or ValueError if it is not one."""
+    """Invert `missions_to_tree`; LookupError or ValueError if the tree has another form."""
     table = {str(name): array.values for name, array in tree.to_dataset().variables.items()}
 
     def parts(values: np.ndarray, counts: str) -> list[np.ndarray]:
@@ -116,7 +116,7 @@ def missions_from_tree(tree: xr.DataTree) -> list[Mission]:
 
 
 def _ticks(bound: Bound) -> tuple[np.ndarray, np.ndarray]:
-    """Return poses (tick, member, component) and contacts (tick, robot), if both are stored."""
+    """Return poses (tick, member, component) and contacts (tick, robot); empty if one is None."""
     if bound.poses is None or bound.contact is None:
         n_robots = len(bound.contact_rate)
         return np.empty((0, 1 + n_robots, 3)), np.empty((0, n_robots), dtype=bool)

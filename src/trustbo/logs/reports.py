@@ -13,7 +13,7 @@ from trustbo.logs.columns import Columns, require_one_spelling
 _YES = ("1", "true", "yes", "success", "succeeded", "ok")
 _NO = ("0", "false", "no", "failure", "failed", "fail")
 _LARGEST = 10.0
-"""Largest input: its weight has the same prior as the weight of an outcome, which is 0 or 1."""
+"""Largest input allowed, as its weight has the same prior as that of an outcome, 0 or 1."""
 
 
 def read_reports(
@@ -28,19 +28,19 @@ def read_reports(
 ) -> list[Mission]:
     """Read trust reports from a table with one row per person and step.
 
-    Each report follows the outcome of its step. A first row without an outcome is the report before
-    the first observation. Steps are sorted; a blank means that no report was given. Each person
-    becomes a mission without a map, each step a bound of one robot, and each report a rate in [0,
-    1]. The inputs since the previous report become the features of the step.
+    Each report follows the outcome of its step. A first row without an outcome has the report given
+    before the first observation. Steps are sorted; a blank means that no report was given. Each
+    person becomes a mission without a map, each step a bound of one robot, and each report a rate
+    in [0, 1]. The inputs since the previous report become the features of the step.
 
     Args:
         table: Path of a CSV file with a header, separated by commas, semicolons or tabs; or a
             DataFrame, a mapping of columns or a structured array.
         person: Column that identifies the person.
-        step: Column of the step, a number.
-        report: Column of the report.
-        outcome: Column with the robot's outcome: 1, `true`, `yes` or `success`, or 0, `false`, `no`
-            or `failure`, or blank. It becomes the features `success` and `failure`.
+        step: Column with the number of the step.
+        report: Column with the report.
+        outcome: Column with the robot's outcome: 1, `true`, `yes` or `success`; 0, `false`, `no`
+            or `failure`; or blank. It becomes the features `success` and `failure`.
         inputs: Columns of further features; standardise columns whose values are not of order 1.
         scale: `"unit"`, reports in [0, 1]; `"likert7"` (or `"ordinal7"`), whole numbers 1 to 7.
 
@@ -55,7 +55,7 @@ def read_reports(
     """
     levels = levels_of(scale)
     if outcome is None and not inputs:
-        raise TrustboError("give the column of outcomes, outcome=, or other columns, inputs=.")
+        raise TrustboError("give the column of outcomes (outcome=) or other columns (inputs=).")
     columns = Columns(table)
     people, steps = np.array(columns.texts(person, blank=False)), columns.numbers(step, blank=False)
     require_one_spelling(f"column {person}", people.tolist())
@@ -68,7 +68,7 @@ def read_reports(
         if (np.diff(steps[of]) == 0.0).any():
             raise TrustboError(f"{person} {name}: two rows have the same step.")
         if np.isnan(y[of]).all():
-            raise TrustboError(f"{person} {name}: there is no report; leave out the rows.")
+            raise TrustboError(f"{person} {name}: there is no report; leave out these rows.")
         made = Mission.from_arrays(
             None, z[of][:, None], y[of][:, None], n_ticks=levels - 1.0 if levels else None,
             features=[*seen], robots=["report"],
@@ -98,13 +98,13 @@ def _seen(columns: Columns, outcome: str | None, inputs: Sequence[str]) -> dict[
 
 
 def _unit_of(columns: Columns, report: str, levels: int) -> np.ndarray:
-    """Scale reports to [0, 1], (row,), NaN where blank; TrustboError: one is not on the scale."""
+    """Scale reports to [0, 1], (row,), NaN where blank; TrustboError if one is off the scale."""
     y = columns.numbers(report, whole=levels > 0)
     low, high = (1.0, float(levels)) if levels else (0.0, 1.0)
     columns.refuse(
         report,
         (y < low) | (y > high),
-        f'is not from {low:g} to {high:g}; give the scale, such as scale="likert7", divide '
+        f'is not between {low:g} and {high:g}; give the scale, such as scale="likert7", divide '
         "percentages by 100, and leave missing answers blank",
     )
     return (y - low) / (high - low)

@@ -26,14 +26,14 @@ def to_frame(missions: Sequence[Mission]) -> pd.DataFrame:
     a map has no bound 0.
 
     Raises:
-        TrustboError: The missions have different robots or features, only some have a path, or a
-            feature has the name of another column.
+        TrustboError: The missions have different robots or features, only some of them have a path,
+            or a feature has the name of another column.
     """
     require_same_team(missions)
     if taken := {*missions[0].features} & {*COLUMNS, "x", "y"}:
-        raise TrustboError(f"features {sorted(taken)} have names of other columns; rename them.")
+        raise TrustboError(f"features {sorted(taken)} are names of other columns; rename them.")
     if len({mission.has_map for mission in missions}) > 1:
-        raise TrustboError("some missions have a path, and some none; write them to two tables.")
+        raise TrustboError("some missions have a path and some do not; write them to two tables.")
     rows = []
     for j, mission in enumerate(missions, start=1):
         n_run = len(mission.bounds)
@@ -55,12 +55,12 @@ def to_frame(missions: Sequence[Mission]) -> pd.DataFrame:
 def read_table(table: Any, workspace: Workspace | None = None) -> list[Mission]:
     """Read missions from a table with one row per mission, bound and robot.
 
-    Columns are `mission`; `bound`, 0 for the start cell, which has no measurements; `robot`; the
-    cell (`row`, `col`), or a position (`x`, `y`, metres of the workspace's CRS); and
-    `contact_rate`. Optional are `duration` (s), `n_ticks`, `status`, and a column for each feature.
-    The status of the last bound is the mission's. A blank means "not measured", or the status
-    "ok". Bounds after the last one with a measurement were planned but not run. Without cells, the
-    log has no map.
+    The columns are `mission`; `bound` (0 for the start cell, which has no measurements); `robot`;
+    the cell (`row`, `col`), or a position (`x`, `y` in metres of the workspace's CRS); and
+    `contact_rate`. Optional columns are `duration` (s), `n_ticks`, `status`, and one per feature.
+    The status of the last bound is that of the mission. A blank means "not measured"; a blank
+    status means "ok". Bounds after the last one with a measurement were planned but not run. A
+    table without cells is a log without a map.
 
     Args:
         table: Path of a CSV file with a header, separated by commas, semicolons or tabs; or a
@@ -73,12 +73,12 @@ def read_table(table: Any, workspace: Workspace | None = None) -> list[Mission]:
 
     Raises:
         TrustboError: A column, bound or robot is missing, a row is repeated, a value has the wrong
-            type, rows of one bound disagree on its cell, or `Mission` refuses the data.
+            type, rows of one bound disagree on its cell, or `Mission` rejects the data.
     """
     columns = Columns(table)
     at_metres = columns.find("row") is None and columns.find("x") is not None
     if workspace is None and at_metres:
-        raise TrustboError("cells at x and y need the grid of a workspace; give workspace=.")
+        raise TrustboError("positions x and y need the grid of a workspace; give workspace=.")
     places = ("x", "y") if at_metres else ("row", "col")
     if workspace is None and not any(columns.find(name) for name in places):
         places = ()
@@ -95,10 +95,10 @@ def read_table(table: Any, workspace: Workspace | None = None) -> list[Mission]:
     robots = tuple(dict.fromkeys(named) if workspace is None else workspace.team.names)
     if not robots:
         raise TrustboError("no row names a robot.")
-    require_one_spelling("the robots of table and workspace", (*robots, *named))
+    require_one_spelling("the robots of the table and the workspace", (*robots, *named))
     unknown = ~frame["robot"].isin(["", *robots]).to_numpy()
     columns.refuse("robot", unknown, f"is not one of {robots}")
-    columns.refuse("bound", frame.duplicated([*KEYS]).to_numpy(), "is there twice for its robot")
+    columns.refuse("bound", frame.duplicated([*KEYS]).to_numpy(), "is repeated for its robot")
     missions = []
     for label, rows in frame.groupby("mission", sort=False):
         try:
@@ -128,18 +128,18 @@ def _mission(rows: pd.DataFrame, features: Sequence[str], robots: tuple[str, ...
     first = 0 if is_mapped else 1
     if numbers != [*range(first, first + len(numbers))]:
         raise TrustboError(
-            f"bounds must be numbered {first}, {first + 1}, ..., 0 being the start cell, and have "
+            f"bounds must be numbered {first}, {first + 1}, ... (0 is the start cell) and have "
             f"one cell (row, col) each; got {numbers}."
         )
     values, status = rows[[*RATES, *features]], rows["status"].to_numpy(str)
     bound = rows["bound"].to_numpy(int)
     measured = bound[values.notna().to_numpy().any(axis=1) | (status != "")]
     if not len(measured) or measured.min() < 1:
-        raise TrustboError("bounds with a measurement must be numbered from 1; got none, or 0.")
+        raise TrustboError("bounds with a measurement must be numbered from 1; got none or 0.")
     n_run, ended = int(measured.max()), ~np.isin(status, ["", "ok"])
     reasons = [*dict.fromkeys(status[ended].tolist())] or ["ok"]
     if len(reasons) > 1 or (bound[ended] < n_run).any():
-        raise TrustboError("only the last bound that was run may have a status but ok.")
+        raise TrustboError("only the last bound that was run may have a status other than ok.")
     expected = pd.MultiIndex.from_product([range(1, n_run + 1), robots])
     of_robot = values.set_index([rows["bound"].astype(int), rows["robot"]])
     for k, robot in expected.difference(of_robot.index):

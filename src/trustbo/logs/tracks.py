@@ -1,4 +1,4 @@
-"""Logs of poses and detections, converted to missions in which all robots watch one lead."""
+"""Conversion of poses and detections to missions in which all robots watch one lead."""
 
 import warnings
 from collections.abc import Sequence
@@ -15,9 +15,9 @@ from trustbo.workspace import Workspace
 
 _FEATURES = ("near", "ahead")
 _AHEAD = np.pi / 6.0
-"""Half of the angle in which a robot is ahead, rad."""
+"""Half-angle of the sector ahead of a robot, rad."""
 _EXTENT = 0.1
-"""Least extent of a log, m."""
+"""Smallest extent of a log, m."""
 
 
 def read_tracks(
@@ -33,16 +33,16 @@ def read_tracks(
 ) -> list[Mission]:
     """Read a log of poses and detections as missions in which all robots watch the lead.
 
-    A contact rate is the fraction of a bound's ticks in which a robot detected the lead, and
-    `n_ticks` is the number of ticks in which both poses are known.
+    The contact rate of a robot in a bound is the fraction of ticks in which it detected the lead,
+    counting only the `n_ticks` ticks in which both poses are known.
 
     With a workspace, each move of the lead to another cell is a bound, and missions have the robots
     and features of the workspace, for `Campaign.tell`; awareness is NaN. A mission ends where the
-    lead leaves the grid or jumps to a cell that is not a neighbour. With the planned `path`, a
-    bound begins where the lead enters the next cell of the path, so that cells whose corners it
-    cuts are not bounds; if it does not reach the last cell, the status is `"aborted"`.
+    lead leaves the grid or jumps to a cell that is not a neighbour. If the planned `path` is given,
+    a bound begins where the lead enters the next cell of the path, so that cells whose corners it
+    cuts are not bounds. If it does not reach the last cell, the status is `"aborted"`.
 
-    Without a workspace, bounds are windows of time. The lead is also listed as a robot, so that all
+    Without a workspace, bounds are time windows. The lead is also listed as a robot, so that all
     missions have the same robots; its contact rates are NaN, because they are not measured, and its
     features are 0. A bound without any tick with known poses is not measured; its features are the
     means over the robot's other bounds. Features are averaged over a bound: `near` is
@@ -50,13 +50,13 @@ def read_tracks(
     degrees of the heading.
 
     Args:
-        poses: Columns t, robot, x, y (m) and, if known, heading (rad from east, anticlockwise); by
-            default the heading is the direction of motion. Times are seconds, or dates with times.
-            The path of a CSV file, a DataFrame, or a mapping of columns.
-        detections: Columns t, watcher, seen, on the same clock. Detections of objects without poses
-            are ignored.
+        poses: Path of a CSV file, a DataFrame, or a mapping of columns: t (seconds, or dates with
+            times), robot, x, y (m) and, if known, heading (rad from east, anticlockwise); by
+            default, the heading is the direction of motion.
+        detections: Another such table with the columns t (on the same clock), watcher and seen.
+            Detections of objects without poses are ignored.
         workspace: Map of the cells that the lead enters.
-        path: Path that was planned, such as `campaign.ask().path`, if there is a workspace.
+        path: Planned path, such as `campaign.ask().path`; it needs a workspace.
         lead: Name of the lead. By default the robot that is not in the workspace's team; without a
             workspace, every robot is used as the lead in turn.
         window: Length of a bound without a workspace, s.
@@ -67,10 +67,10 @@ def read_tracks(
         Missions sorted by lead and time, with a path if a workspace is given.
 
     Raises:
-        TrustboError: A column is missing, a value has the wrong type, a robot has two poses at one
-            time or none, there are fewer than two robots or no detections between robots, times,
-            positions or headings cannot be in seconds, metres and radians, the lead is unknown, or
-            the log is too short for two bounds.
+        TrustboError: A column is missing; a value has the wrong type; a robot has two poses at one
+            time or fewer than two poses; there are fewer than two robots or no detections between
+            robots; times, positions or headings cannot be in seconds, metres and radians; the lead
+            is unknown; or the log is too short for two bounds.
     """
     tick, max_gap = require_positive("tick", tick), require_positive("max_gap", max_gap)
     tracks, looks = _read(poses, detections, tick)
@@ -82,7 +82,7 @@ def read_tracks(
     if lead is not None:
         leads = [require_choice("lead", lead, robots)]
     elif workspace is not None and len(leads) != 1:
-        raise TrustboError(f"lead must be one of {leads or robots}, to read a log with a map.")
+        raise TrustboError(f"a log with a map has one lead; pass lead=, one of {leads or robots}.")
     planned = None if path is None else require_cells("path", path)
     if planned and workspace is None:
         raise TrustboError("path= needs the workspace of its cells.")
@@ -111,8 +111,8 @@ def read_tracks(
 def _read(poses: Any, detections: Any, tick: float) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Read the poses of each robot, (sample, 4), and detections, (detection, 3).
 
-    A pose is a time (s), x, y (m) and heading (rad), times ascending; a detection is a time and the
-    indices of the watcher and of the robot seen.
+    Poses hold the time (s), x, y (m) and heading (rad), sorted by time; detections hold the time
+    and the indices of the watcher and of the robot seen.
     """
     where = Columns(poses, "the table of poses")
     seen = Columns(detections, "the table of detections")
@@ -125,7 +125,7 @@ def _read(poses: Any, detections: Any, tick: float) -> tuple[dict[str, np.ndarra
     xy = [where.numbers(name, blank=False) for name in ("x", "y")]
     if np.ptp(xy, axis=1).max() < _EXTENT:
         raise TrustboError(
-            f"all poses lie within {_EXTENT:g} m; x and y are metres, not degrees or kilometres."
+            f"all poses lie within {_EXTENT:g} m; x and y are in metres, not degrees or kilometres."
         )
     heading = where.numbers("heading", required=False)
     rows, of = np.column_stack([t, *xy, heading]), np.array(names)
@@ -134,7 +134,7 @@ def _read(poses: Any, detections: Any, tick: float) -> tuple[dict[str, np.ndarra
     looks = np.column_stack([seen_at, watcher, other])[known]
     if not len(looks):
         raise TrustboError(
-            f"in no detection does one of {robots} detect another; in the first, "
+            f"no detection is between two of the robots {robots}; in the first, "
             f"{pairs[0][0]!r} detects {pairs[1][0]!r}."
         )
     readings = pd.DataFrame(looks, columns=["t", "watcher", "seen"]).drop_duplicates()
@@ -142,30 +142,30 @@ def _read(poses: Any, detections: Any, tick: float) -> tuple[dict[str, np.ndarra
     apart = float(pd.Series(gaps).quantile(0.05))  # NaN if no robot detects another twice
     if apart > 1.5 * tick:
         warnings.warn(
-            f"two detections of a robot by another are at least {apart:g} s apart, and ticks of "
-            f"{tick:g} s without detections count as lost contact; pass tick={apart:g}.",
+            f"detections of one robot by another are at least {apart:g} s apart, but every tick of "
+            f"{tick:g} s without a detection counts as lost contact; pass tick={apart:g}.",
             stacklevel=3,
         )
     if silent := [name for i, name in enumerate(robots) if i not in looks[:, 1:]]:
         warnings.warn(
-            f"no detection names {', '.join(silent)}; the contact of such a robot is 0.",
+            f"no detection names {', '.join(silent)}; robots without detections have contact 0.",
             stacklevel=3,
         )
     return {name: _track(name, rows[of == name]) for name in robots}, looks
 
 
 def _track(name: str, rows: np.ndarray) -> np.ndarray:
-    """Sort the poses of one robot (sample, 4) by time, with unwrapped heading."""
+    """Sort the poses of one robot (sample, 4) by time, and unwrap the heading."""
     rows = rows[np.argsort(rows[:, 0], kind="stable")]
     t, x, y, heading = rows.T
     if len(t) < 2 or (np.diff(t) <= 0.0).any():
-        raise TrustboError(f"robot {name!r} has a single pose, or two at one time.")
+        raise TrustboError(f"robot {name!r} has only one pose, or two poses at one time.")
     dx, dy = np.gradient(x, t), np.gradient(y, t)
-    moves, course = np.hypot(dx, dy) > 1e-3, np.arctan2(dy, dx)  # a slower robot (m/s) stands
+    moves, course = np.hypot(dx, dy) > 1e-3, np.arctan2(dy, dx)  # m/s; slower is standing
     if np.isnan(heading).all():
         if not moves.any():
             raise TrustboError(
-                f"robot {name!r} has no heading, and moves by less than 1 mm/s: are times in "
+                f"robot {name!r} has no heading, and moves at less than 1 mm/s: are times in "
                 "seconds and positions in metres? If so, give its heading."
             )
         heading = pd.Series(np.where(moves, course, np.nan)).ffill().bfill().to_numpy()
@@ -174,13 +174,13 @@ def _track(name: str, rows: np.ndarray) -> np.ndarray:
     elif _in_degrees(heading, course[moves], heading[moves]):
         raise TrustboError(
             f"headings of robot {name!r} are up to {np.abs(heading).max():g}, so they seem to be "
-            "in degrees; give rad from east, anticlockwise: radians(90 - compass heading)."
+            "in degrees; give radians from east, anticlockwise: radians(90 - compass heading)."
         )
     return np.column_stack([t, x, y, np.unwrap(heading)])
 
 
 def _in_degrees(heading: np.ndarray, course: np.ndarray, along: np.ndarray) -> bool:
-    """Return whether headings are in degrees, by their jumps or the directions of motion."""
+    """Return whether jumps or directions of motion show that headings are in degrees."""
     if np.abs(heading).max() <= 2.0 * np.pi + 1e-6:
         return False
     fit, other = (np.cos(h - course).sum() for h in (along, np.radians(along)))
@@ -199,13 +199,13 @@ def _at(track: np.ndarray, times: np.ndarray, max_gap: float) -> np.ndarray:
 def _ticks(poses: np.ndarray, looks: np.ndarray) -> np.ndarray:
     """Return data of each pair of robots at each tick, (watcher, seen, tick, 2 + feature).
 
-    The last axis has whether both poses are known, contact, and the features; all are 0 where a
-    pose is unknown, and on the diagonal. `looks` are tick, watcher and robot seen, (detection, 3).
+    The last axis holds whether both poses are known, the contact, and the features; all are 0 where
+    a pose is unknown and on the diagonal. `looks` has tick, watcher and robot seen, (detection, 3).
 
     Raises:
         TrustboError: There is no tick at which two poses are known.
     """
-    place = poses[..., 0] + 1j * poses[..., 1]  # a point of the plane is a complex number
+    place = poses[..., 0] + 1j * poses[..., 1]  # points of the plane as complex numbers
     across = place[None] - place[:, None]
     away = np.abs(across)
     away[np.eye(len(place), dtype=bool)] = np.nan
@@ -213,7 +213,7 @@ def _ticks(poses: np.ndarray, looks: np.ndarray) -> np.ndarray:
     if not known.any():
         raise TrustboError(
             "the poses of two robots are never known at the same time: the log is too short, or "
-            "poses are further apart than max_gap."
+            "the gaps between poses are longer than max_gap."
         )
     usual = max(float(np.nanmedian(away)), 1e-9)
     ahead = np.abs(np.angle(across * np.exp(-1j * poses[:, None, :, 2]))) < _AHEAD
@@ -234,7 +234,7 @@ def _mission(
 ) -> Mission:
     """Make a mission from the ticks (watcher, tick, 2 + feature) of one lead.
 
-    `edges`, shape (bound + 1,), has the first tick of each bound, and the end.
+    `edges`, shape (bound + 1,), holds the first tick of each bound and the end of the last.
     """
     sums = np.add.reduceat(ticks[:, : edges[-1]], edges[:-1], axis=1).swapaxes(0, 1)
     n_ticks = np.where(sums[..., :1] > 0.0, sums[..., :1], np.nan)
@@ -256,12 +256,12 @@ def _mission(
 def _crossings(
     xy: np.ndarray, workspace: Workspace, planned: Sequence[Cell] | None
 ) -> list[tuple[np.ndarray, list[Cell]]]:
-    """Find edges and path of each sequence of neighbouring cells that the lead entered."""
+    """Find the edges and path of each sequence of neighbouring cells that the lead entered."""
     cells: list[Cell] = []
     for x, y in xy:
         try:
             cells.append(workspace.grid.locate({"x": x, "y": y}, "position"))
-        except TrustboError:  # off the grid, or not known
+        except TrustboError:  # off the grid, or unknown
             cells.append(NOWHERE)
     if planned is not None:
         edges = []
