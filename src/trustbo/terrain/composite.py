@@ -12,32 +12,32 @@ from trustbo.errors import TrustboError
 from trustbo.terrain.heights import warn
 
 MAX_PIXELS = 1_000_000
-"""Maximum number of samples for the fit of an index, spread evenly over the given ones."""
+"""Maximum number of samples used to fit an index, spread evenly over the given ones."""
 
 
 class CompositeIndex:
     """First principal component of winsorised, standardised features, oriented and scaled.
 
-    Each feature is winsorised at its 1st and 99th percentile and standardised; the first component
+    Each feature is winsorised at its 1st and 99th percentiles and standardised; the first component
     is oriented so that the loadings agree with the declared signs (sum of loading x sign > 0); the
-    2nd and 98th percentile of its score become 0 and 1.
+    2nd and 98th percentiles of its score become 0 and 1.
 
     Attributes:
-        signs: Signs by feature: +1 if it raises the index, -1 if it lowers it.
-        fitted: Dataset of the fit: sign, limits, mean, standard deviation and loading by feature;
-            shares of the variance by component; attributes `bottom` and `top`, the scores that
-            become 0 and 1.
+        signs: Sign of each feature: +1 if it raises the index, -1 if it lowers it.
+        fitted: Dataset of the fit: sign, limits, mean, standard deviation and loading of each
+            feature; share of the variance of each component; attributes `bottom` and `top`, the
+            scores that become 0 and 1.
     """
 
     def __init__(self, signs: Mapping[str, int], fitted: xr.Dataset | None = None) -> None:
-        """Set the features and their signs, and the `fitted` of an earlier fit."""
+        """Set the features with their signs and, optionally, the `fitted` of an earlier fit."""
         self.signs, self.fitted = dict(signs), xr.Dataset() if fitted is None else fitted
 
     def fit(self, features: Mapping[str, ArrayLike] | xr.Dataset) -> Self:
         """Fit the limits, the loadings and the scale.
 
         Args:
-            features: Values by feature, arrays of one shape; samples with a NaN are left out.
+            features: Values of each feature, arrays of one shape; samples with a NaN are left out.
 
         Raises:
             TrustboError: A declared feature is missing, or no sample has all of them.
@@ -81,13 +81,13 @@ class CompositeIndex:
         if ratios[0] < 0.5:
             warn(
                 f"the first component of {', '.join(self.signs)} explains only {ratios[0]:.0%} of "
-                "their variance; check loadings_, and leave one out or use two composites."
+                "their variance; check loadings_, and leave a feature out or use two composites."
             )
         return self
 
     @property
     def loadings_(self) -> xr.DataArray:
-        """Loadings (feature), a unit vector with the declared orientation; 0 if constant."""
+        """Loadings (feature): unit vector with the declared orientation, 0 if constant."""
         return self.fitted["loading"]
 
     @property
@@ -96,7 +96,7 @@ class CompositeIndex:
         return self.fitted["explained_variance_ratio"]
 
     def transform(self, features: Mapping[str, ArrayLike] | xr.Dataset) -> np.ndarray:
-        """Compute the index of every sample, in [0, 1] and of the features' shape.
+        """Compute the index of every sample, in [0, 1], with the shape of the features.
 
         It is NaN where a feature is NaN, and 0.5 everywhere if all features were constant.
 

@@ -15,7 +15,7 @@ def example() -> xr.Dataset:
     """Read the example of real terrain that is included in the package.
 
     It is a steep hillside under bush in the Wairarapa, New Zealand, near Wellington: 195 m x 278 m
-    at 1 m, 211 m of relief, trees of up to 44.6 m. The attribute `attribution` states the source
+    at 1 m, 211 m of relief, trees up to 44.6 m tall. The attribute `attribution` states the source
     and the licence; `LICENCE.md` beside the files says which part of it is inferred.
 
     Returns:

@@ -2,7 +2,7 @@
 
 A feature is a function of a terrain (Dataset of `dem` and `dsm`, dims (y, x), metres) that returns
 an array (row, col), NaN where unknown. `feature` registers such a function for composites, as in
-the example of `docs/terrain.md`.
+the example in `docs/terrain.md`.
 """
 
 from collections.abc import Callable
@@ -22,7 +22,7 @@ TRAVERSABILITY = ("slope", "roughness", "tri", "step_height")
 VISIBILITY = ("vegetation_density", "openness")
 """Pixel features of visibility (z2): vegetation lowers it, openness raises it."""
 PAPER_VISIBILITY = ("canopy_height", "canopy_cover", "openness")
-"""Visibility in the paper's setting; in forest it has the wrong sign."""
+"""Pixel features of visibility in the paper; in forest, their index has the wrong sign."""
 
 
 class Feature(NamedTuple):
@@ -42,7 +42,7 @@ def feature[F: Callable[..., np.ndarray]](name: str, *, sign: int) -> Callable[[
     TrustboError: the name is taken, or the sign is neither 1 nor -1.
     """
     if name in FEATURES:
-        raise TrustboError(f"there is a feature {name!r} already; take another name.")
+        raise TrustboError(f"feature {name!r} already exists; choose another name.")
     if sign not in (1, -1):
         raise TrustboError(f"sign must be 1 or -1; got {sign!r}.")
 
@@ -54,9 +54,9 @@ def feature[F: Callable[..., np.ndarray]](name: str, *, sign: int) -> Callable[[
 
 
 def _window(z: np.ndarray) -> dict[tuple[int, int], np.ndarray]:
-    """Return the nine heights of each pixel's 3 x 3 window, by steps (down, right).
+    """Return the nine heights of each pixel's 3 x 3 window, by step (down, right).
 
-    Beyond the raster's edge the ground is level.
+    The ground is taken to be level beyond the edge of the raster.
     """
     wide, (rows, cols) = np.pad(z, 1, mode="edge"), z.shape
     steps = (-1, 0, 1)
@@ -80,7 +80,7 @@ def slope(terrain: xr.Dataset) -> np.ndarray:
 
 @feature("roughness", sign=-1)
 def roughness(terrain: xr.Dataset) -> np.ndarray:
-    """Compute highest minus lowest ground in the 3 x 3 window, m (Wilson et al. 2007)."""
+    """Compute the range of ground heights in the 3 x 3 window, m (Wilson et al. 2007)."""
     window = np.stack(list(_window(terrain["dem"].values).values()))
     return window.max(0) - window.min(0)
 
@@ -113,7 +113,7 @@ def canopy_cover(terrain: xr.Dataset) -> np.ndarray:
 
 @feature("vegetation_density", sign=-1)
 def vegetation_density(terrain: xr.Dataset) -> np.ndarray:
-    """Compute the share of the lowest 3 metres of air that canopy fills.
+    """Compute the fraction of the lowest 3 m above ground that canopy fills.
 
     It is averaged over squares of half-width 5 m. The canopy is the layer from 0.3 times its height
     to its top.
@@ -130,7 +130,7 @@ def openness(
     """Compute the expected fraction of clear rays from a pixel to targets all around.
 
     Rays are `reach` metres long and run from `eye` to `target` metres above ground. Rays that end
-    off the raster are ignored; a pixel without other rays is NaN, so keep `reach` below half the
+    off the raster are ignored; a pixel with no other rays is NaN, so keep `reach` below half the
     terrain's shorter side. Pixels of a 4 x 4 square share the value of its centre.
     """
     ground, surface = terrain["dem"].values, terrain["dsm"].values

@@ -11,7 +11,7 @@ from trustbo.errors import TrustboError
 
 LOWEST, HIGHEST = -450.0, 9000.0
 """Range of heights on land, m: the Dead Sea's shore is at -430 m, Everest's summit at 8849 m."""
-_FILLS = (-99999.0, -32768.0, -32767.0, -9999.0)  # suspicious before a scale is applied, too
+_FILLS = (-99999.0, -32768.0, -32767.0, -9999.0)  # also suspicious before scaling
 _FILL_NAMES = ("_FillValue", "missing_value", "fill_value", "nodata")
 _METRE = {"m", "metre", "metres", "meter", "meters"}
 _FOOT = {"ft", "foot", "feet", "ftus", "usft"}
@@ -27,14 +27,14 @@ def warn(message: str) -> None:
 def in_metres(stored: xr.DataArray, axis: float | None, nodata: float | None) -> np.ndarray:
     """Convert stored values (row, col) to heights in metres, NaN where missing.
 
-    The unit, scale, offset and fill values are those of the attributes. `nodata` is another fill
-    value, and `axis` is the length of the unit of the CRS's vertical axis in metres, negative for
-    depths, if there is one.
+    The unit, scale, offset and fill values are read from the attributes. `nodata` is another fill
+    value. `axis` is the unit of the CRS's vertical axis in metres, negative for depths, or None if
+    there is no such axis.
 
     Raises:
         TrustboError: Values are not real numbers, or are impossible as heights on land: undeclared
-            fill values, fill values blended with heights, or heights in another unit. The unit is
-            unknown, or band and CRS disagree on it.
+            fill values, fill values blended with heights, or heights in another unit. Or the unit
+            is unknown, or the band and the CRS disagree on it.
     """
     name, attrs, raw = str(stored.name), stored.attrs, stored.to_numpy()
     if raw.dtype.kind not in "iuf":
@@ -68,40 +68,40 @@ def in_metres(stored: xr.DataArray, axis: float | None, nodata: float | None) ->
             "scale, e.g. with gdal_edit.py -scale 0.01."
         )
     raise TrustboError(
-        f"{where}, which is not a height on land: a fill value that no tag declares, or one "
+        f"{where}, which is not a height on land: it may be an undeclared fill value, or one "
         f"that resampling has blended with heights. Pass nodata={value!r}, or resample the raster "
         "again with its fill value declared."
     )
 
 
 def _warn_of_zeros(heights: np.ndarray, name: str) -> None:
-    """Warn of pixels at exactly 0 m, far from all other heights: an undeclared fill value."""
+    """Warn of pixels at exactly 0 m that are far from all other heights (missing values?)."""
     zero, low = heights == 0.0, np.abs(heights) <= 10.0
     others = np.isfinite(heights).sum() - zero.sum()
     if zero.any() and low.sum() < 1.1 * zero.sum() < 1.1 * others:  # else the ground is level
         warn(
-            f"{name} is exactly 0 m on {zero.mean():.1%} of its pixels, and nearly nowhere else "
-            "below 10 m: zeros may be missing heights; pass nodata=0 if they are."
+            f"{name} is exactly 0 m on {zero.mean():.1%} of its pixels, but hardly any other "
+            "height is below 10 m: zeros may be missing heights; pass nodata=0 if they are."
         )
 
 
 def _unit_of(name: str, declared: object, axis: float | None) -> float:
-    """Return the length of the unit of heights in metres, negative for depths.
+    """Return the unit of the heights in metres, negative for depths.
 
-    `declared` is the unit of the band, or the units of all bands; None if unknown.
+    `declared` is the unit of the band, or a list with the unit of each band; None if unknown.
     """
     text = str(np.ravel(np.array(declared, object))[0] or "").strip()
     words = set(re.findall(r"[a-z]+", text.lower()))
     in_metres, in_feet = bool(words & _METRE), bool(words & _FOOT)
     if text and in_metres == in_feet:
         raise TrustboError(
-            f"{name} has heights in {text!r}; metres and feet are known: convert them, or declare "
+            f"{name} has heights in {text!r}, not in metres or feet; convert them, or declare "
             "the true unit, e.g. with gdal_edit.py -units m."
         )
     length = 1.0 if not in_feet else 1200.0 / 3937.0 if words & _US else 0.3048
     if text and axis and abs(length / abs(axis) - 1.0) > 1e-5:
         raise TrustboError(
-            f"{name} has heights in {text!r} by its band, but in units of {abs(axis):.6g} m by its "
-            "CRS; declare the true unit, e.g. with gdal_edit.py -units m, or CRS, with -a_srs."
+            f"the band of {name} declares heights in {text!r}, but its CRS units of "
+            f"{abs(axis):.6g} m; correct one with gdal_edit.py, options -units and -a_srs."
         )
     return axis or length

@@ -17,20 +17,20 @@ from trustbo.terrain.place import require_map
 from trustbo.terrain.read import check_size, read_terrain
 
 GROUND_GAP, MAX_GAP = 10.0, 3.0
-"""Maximum distances of a pixel from one with ground points and from the one that fills it, m."""
+"""Maximum distances of a pixel to one with ground points, and to the one that fills it, m."""
 
 
 def read_lidar(points: FilePath, resolution: float = 1.0, *, crs: object = None) -> xr.Dataset:
     """Grid classified lidar points into ground (DEM) and surface (DSM).
 
     The ground is interpolated at the pixel centres from a triangulation of the points of class 2;
-    it is missing more than 10 m away from pixels with such points. The surface is the highest
-    return in each pixel. A pixel without returns has the height above ground of the nearest pixel
-    with returns, up to 3 m away. Noise (classes 7 and 18) and withheld points are ignored.
+    it is NaN more than 10 m away from pixels with such points. The surface is the highest return in
+    each pixel. A pixel without returns takes the height above ground of the nearest pixel with
+    returns, up to 3 m away. Noise (classes 7 and 18) and withheld points are ignored.
 
     Args:
         points: A LAS or LAZ file.
-        resolution: Pixel size, m; pixel edges are at its multiples.
+        resolution: Pixel size, m; pixel edges are at multiples of it.
         crs: Coordinate reference system of a file without one, e.g. `"EPSG:32633"`.
 
     Returns:
@@ -38,11 +38,11 @@ def read_lidar(points: FilePath, resolution: float = 1.0, *, crs: object = None)
 
     Raises:
         TrustboError: laspy is not installed; the file is unreadable or has no projected CRS; there
-            are no ground points; heights are impossible; no pixel has both heights.
+            are no ground points; heights are impossible; or no pixel has both heights.
     """
     step = require_positive("resolution", resolution)
     xyz, is_ground, own = _read_points(fspath(points), crs)
-    # Pixels count from the upper left corner; a point on an edge is in the pixel south or east.
+    # Pixels are counted from the upper left; points on an edge are in the pixel south or east.
     place = np.array([[1.0, -1.0]]) * xyz[:, :2] / step
     corner = np.floor(place.min(0) + 1e-6)
     cols, rows = np.maximum(np.ceil(place.max(0) - 1e-6) - corner, 1.0).astype(int).tolist()
@@ -57,11 +57,11 @@ def read_lidar(points: FilePath, resolution: float = 1.0, *, crs: object = None)
         dem = LinearNDInterpolator((place - corner)[is_ground], xyz[is_ground, 2])(centres)
     except (QhullError, ValueError):
         raise TrustboError(
-            "need ground points (class 2) that span an area; classify the ground, e.g. with PDAL's "
+            "the ground points (class 2) must span an area; classify the ground, e.g. with PDAL's "
             "filters.smrf."
         ) from None
     dem[np.asarray(distance_transform_edt(no_ground, step)) > GROUND_GAP] = np.nan
-    # Heights above ground: on a slope, absolute heights would make steps and false canopy.
+    # Heights above ground: on a slope, absolute heights would create steps and false canopy.
     canopy = np.maximum(highest - dem, 0.0)
     nearest: Any = distance_transform_edt(np.isnan(canopy), step, return_indices=True)
     canopy = np.where(nearest[0] <= MAX_GAP, canopy[tuple(nearest[1])], np.nan)
@@ -79,7 +79,7 @@ def _read_points(path: str, given: object) -> tuple[np.ndarray, np.ndarray, CRS]
     try:
         cloud = laspy.read(path)
         own = cloud.header.parse_crs()
-    # A file cut short is a ValueError of NumPy's or a RuntimeError of lazrs' or PROJ's.
+    # A truncated file raises ValueError in NumPy, or RuntimeError in lazrs or PROJ.
     except (laspy.errors.LaspyException, OSError, RuntimeError, ValueError) as error:
         raise TrustboError(f"{path!r} cannot be read as LAS or LAZ: {error}.") from None
     label = np.asarray(cloud.classification, np.uint8)

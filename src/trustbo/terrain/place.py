@@ -12,7 +12,7 @@ from rasterio.warp import transform
 
 from trustbo.errors import TrustboError
 
-_NORTH = 22.5  # degrees between columns and north, half the angle between two of the eight moves
+_NORTH = 22.5  # degrees; half the angle between two neighbouring moves
 
 
 def require_map(name: str, own: Any, given: Any) -> CRS:
@@ -25,9 +25,7 @@ def require_map(name: str, own: Any, given: Any) -> CRS:
     try:
         crs, *other = [CRS.from_user_input(one) for one in (own, given) if one is not None]
     except CRSError:
-        raise TrustboError(
-            f"crs {given!r} is not one PROJ knows; give e.g. 'EPSG:32633'."
-        ) from None
+        raise TrustboError(f"crs {given!r} is unknown to PROJ; give e.g. 'EPSG:32633'.") from None
     flat = horizontal(crs)
     if other and flat != horizontal(other[0]):
         raise TrustboError(
@@ -37,7 +35,7 @@ def require_map(name: str, own: Any, given: Any) -> CRS:
     in_metres = flat.is_projected and abs(flat.linear_units_factor[1] - 1.0) <= 1e-9
     if not flat.is_geographic and not in_metres:
         raise TrustboError(
-            f"{name} is in {crs.to_string()}, not in degrees and not a map in metres; warp it, "
+            f"{name} is in {crs.to_string()}, which is neither in degrees nor in metres; warp it, "
             "e.g. with gdalwarp -t_srs EPSG:32633."
         )
     return crs
@@ -86,7 +84,7 @@ def placed(heights: xr.DataArray, name: str) -> xr.DataArray:
 def _middle(heights: xr.DataArray, crs: str, step: float = 0.0) -> np.ndarray:
     """Convert a raster's centre, and points one step east and north of it, to another CRS.
 
-    NaN if the centre is outside the domain of the raster's CRS.
+    The result is NaN if the centre is outside the domain of the raster's CRS.
     """
     x, y = (0.5 * float(heights[axis][0] + heights[axis][-1]) for axis in ("x", "y"))
     try:
@@ -96,7 +94,7 @@ def _middle(heights: xr.DataArray, crs: str, step: float = 0.0) -> np.ndarray:
 
 
 def on_metric_grid(heights: xr.DataArray) -> xr.DataArray:
-    """Warp heights to a metric map with north at the top, unless they already are on one."""
+    """Warp heights to a metric map with north at the top, unless they are already on one."""
     lon, lat = _middle(heights, "EPSG:4326")[:, 0].tolist()
     at = f"+lat_0={lat} +lon_0={lon} +datum=WGS84 +units=m"
     if not heights.rio.crs.is_geographic:

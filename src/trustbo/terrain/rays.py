@@ -1,14 +1,14 @@
 """Transmittance of rays over a raster, blocked by the ground and attenuated by the canopy.
 
-Heights belong to pixel centres and are bilinear between them. The canopy over the ground g is the
-layer from g + crown_base (s - g) to the surface s. A ray with m metres inside it transmits
+Heights are given at pixel centres and bilinear between them. The canopy above the ground g is the
+layer from g + crown_base (s - g) to the surface s. A ray with m metres inside the canopy transmits
 
     exp(-extinction m),
 
-or nothing if it meets the ground or leaves the data. It is followed from square to square between
-four pixel centres; within one, heights along a ray are quadratic, so that the metres inside are
-exact. As no point is both below the canopy and above it, the share of a ray inside is the share
-above the crown base, plus the share below the surface, minus 1.
+or nothing if it hits the ground or leaves the data. Rays are followed through the squares between
+four pixel centres. Within a square, the heights along a ray are quadratic, so that m is exact. As
+no point is both below the canopy and above it, the fraction of a ray inside the canopy is the
+fraction above the crown base, plus the fraction below the surface, minus 1.
 """
 
 import math
@@ -42,7 +42,7 @@ def bilinear(heights, r, c):
 
 @_part
 def _along(raster, i, j, p, q, dp, dq):
-    """Compute coefficients of the height along a line in a square, (p, q) to (p + dp, q + dq)."""
+    """Compute coefficients of the height on a line in a square from (p, q) to (p + dp, q + dq)."""
     corner = raster[i, j]
     down, right = raster[i + 1, j] - corner, raster[i, j + 1] - corner
     both = raster[i + 1, j + 1] - raster[i, j + 1] - down
@@ -55,7 +55,7 @@ def _share_positive(c0, c1, c2):
     """Compute the fraction of [0, 1] in which c0 + c1 t + c2 t^2 is positive."""
     sign = 1.0 if c0 > 0.0 else -1.0
     c0, c1, c2 = sign * c0, sign * c1, sign * c2
-    square, share = c1 * c1 - 4.0 * c2 * c0, 1.0  # of the sign at 0
+    square, share = c1 * c1 - 4.0 * c2 * c0, 1.0  # with the sign at 0
     if c0 + c1 + c2 < 0.0:  # one root
         half = -0.5 * (c1 + math.copysign(math.sqrt(square), c1))
         share = c0 / half if c1 < 0.0 else half / c2
@@ -68,7 +68,7 @@ def _share_positive(c0, c1, c2):
 def _first_square(x0, dx, n):
     """Find the first of n - 1 squares along an axis, the step to the next, and the crossings.
 
-    The last two are the position of the first crossing, and its distance from the next.
+    Crossings are given by the position of the first one and its distance from the next.
     """
     if dx > 0.0:
         square = min(int(x0), n - 2)
@@ -83,10 +83,10 @@ def _first_square(x0, dx, n):
 def transmittance(ground, surface, pixel, start, end, extinction, crown_base):
     """Compute the transmittance of a ray from `start` to `end`, each (row, col, height in m).
 
-    It is 0 if the ground blocks the ray, or if the ray leaves the raster or passes missing data.
+    It is 0 if the ground blocks the ray, or if the ray leaves the raster or crosses missing data.
     """
     (r0, c0, z0), (r1, c1, z1), (rows, cols) = start, end, ground.shape
-    # Not the reverse comparisons: they are false for NaN.
+    # With `not`, NaN is rejected too: all comparisons with it are false.
     if not (r0 >= 0.0 and r1 >= 0.0 and r0 <= rows - 1 and r1 <= rows - 1):
         return 0.0
     if not (c0 >= 0.0 and c1 >= 0.0 and c0 <= cols - 1 and c1 <= cols - 1):
@@ -126,7 +126,7 @@ def transmittance(ground, surface, pixel, start, end, extinction, crown_base):
 
 @_kernel
 def transmittances(ground, surface, pixel, ends, extinction, crown_base):
-    """Compute transmittances of rays (ray, 6): row, col, height of both ends; 0 if NaN."""
+    """Compute transmittances of rays (ray, 6): row, col, height of both ends; 0 if any is NaN."""
     out = np.zeros(len(ends))
     for i in range(len(ends)):
         start, end = (ends[i, 0], ends[i, 1], ends[i, 2]), (ends[i, 3], ends[i, 4], ends[i, 5])
@@ -140,8 +140,8 @@ def openness(ground, surface, pixel, reach, heights, canopy, coarse, first, last
     """Compute the mean transmittance to 16 points on a circle of radius `reach` metres.
 
     It is written to `coarse`, one value for each square of BLOCK x BLOCK pixels, for the rows of
-    squares from `first` to `last`. Eye and target have `heights` above ground; `canopy` is the
-    extinction (1/m) and the crown base. Rays that end outside the data are ignored.
+    squares from `first` to `last`. `heights` are those of eye and target above ground; `canopy`
+    is the extinction (1/m) and the crown base. Rays that end outside the data are ignored.
     """
     middle = 0.5 * (BLOCK - 1)
     for i in range(first, last):

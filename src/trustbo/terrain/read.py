@@ -30,9 +30,9 @@ from trustbo.terrain.place import (
     vertical_axis,
 )
 
-_MOST_PIXELS = 1e8  # of a raster: some 3 GB while it is read
-_CLIPPED = 0.02  # share of pixels with the surface below the ground, above which a warning is due
-_TALL, _RAISED = 60.0, 20.0  # m: unlikely medians and 5 % quantiles of canopy heights
+_MOST_PIXELS = 1e8  # per raster: about 3 GB while it is read
+_CLIPPED = 0.02  # fraction of pixels with the surface below the ground that causes a warning
+_TALL, _RAISED = 60.0, 20.0  # m: higher medians and 5 % quantiles of canopy height are unlikely
 
 
 def read_terrain(
@@ -46,9 +46,9 @@ def read_terrain(
     """Read a digital elevation model (ground) and a digital surface model (canopy, roofs).
 
     Both are resampled to the DEM's grid. The DEM is warped to its UTM zone (outside all zones, to a
-    local transverse Mercator map) if it is in degrees, or if its map is rotated from north or wrong
-    in length by over 1 %, as EPSG:3857 is. Where the surface is below the ground, it is raised.
-    Heights in feet, according to the band or the CRS, are converted to metres, with a warning;
+    local transverse Mercator map) if it is in degrees, or if its map is rotated by over 22.5
+    degrees or distorts lengths by over 1 %, as EPSG:3857 does. A surface below the ground is raised
+    to it. If the band or the CRS declares feet, heights are converted to metres, with a warning;
     depths become negative heights.
 
     Args:
@@ -56,20 +56,20 @@ def read_terrain(
             `https://...`), or a DataArray with coordinates and a CRS set by rioxarray. The first
             band is read. NaN, infinity, nodata values and pixels hidden by a mask or an alpha band
             are missing; scale and offset are applied.
-        dsm: Heights of the surface, in the same forms, on any grid that overlaps the DEM's. Without
-            it, the surface is the ground, with a warning.
+        dsm: Heights of the surface, in the same forms, on any grid that overlaps the DEM's. If it
+            is omitted, the ground is used as the surface, and a warning is issued.
         crs: Coordinate reference system of rasters without one, e.g. `"EPSG:32633"`.
-        resolution: Pixel size in metres: smaller pixels are averaged over whole numbers of pixels,
-            to about this size.
-        nodata: Another stored value that marks missing data.
+        resolution: Pixel size in metres; smaller pixels are averaged in square blocks of about
+            this size.
+        nodata: Additional stored value that marks missing data.
 
     Returns:
         Dataset with `dem` and `dsm`, float64 in metres, dims (y, x) with north at the top, NaN
-        where one of the two has no data; the CRS is in `spatial_ref`.
+        where either has no data; the CRS is in `spatial_ref`.
 
     Raises:
         TrustboError: A source is not a raster of heights, is not georeferenced, or is too large for
-            the memory; values are impossible as heights on land; the vertical datums differ; no
+            memory; values are impossible as heights on land; the vertical datums differ; or no
             pixel has both heights.
 
     Example:
@@ -116,8 +116,8 @@ def check_size(shape: tuple[int, ...], name: str) -> None:
     """Check that a raster fits into memory."""
     if math.prod(shape) > _MOST_PIXELS:
         raise TrustboError(
-            f"{name} has {shape} pixels, too many for the memory; take a part of it or a larger "
-            "resolution, e.g. with gdalwarp -tr 5 5 -r average."
+            f"{name} has {shape} pixels, too many for the memory; crop it or use larger "
+            "pixels, e.g. with gdalwarp -tr 5 5 -r average."
         )
 
 
@@ -126,7 +126,7 @@ def _heights(
 ) -> xr.DataArray:
     """Read the heights of one raster, dem or dsm, in metres with north at the top.
 
-    The attribute `datum` is the vertical datum, None if nothing declares one.
+    The attribute `datum` is the vertical datum; None if none is declared.
     """
     array = _stored(raster, role)
     name = str(array.name)
@@ -140,7 +140,7 @@ def _heights(
 
 
 def _stored(raster: FilePath | xr.DataArray, role: str) -> xr.DataArray:
-    """Read stored values of a file or an array, dims (y, x), named with `role` for messages."""
+    """Read stored values of a file or an array, dims (y, x), named after `role` in messages."""
     require_kind(role, raster, str | PathLike | xr.DataArray, "give a path or a DataArray")
     if isinstance(raster, xr.DataArray):
         name = f"{role}: DataArray" + (f" {raster.name!r}" if raster.name else "")
@@ -169,20 +169,20 @@ def _of_file(file: DatasetReader, name: str) -> xr.DataArray:
     turned = abs(t.b) * file.height > 1e-3 * abs(t.a) or abs(t.d) * file.width > 1e-3 * abs(t.e)
     if t.is_identity or turned:
         raise TrustboError(
-            f"{name} has no georeference, or one by control points or a rotated grid; warp it to a "
-            "map, e.g. with gdalwarp -t_srs EPSG:32633, or declare its corners, e.g. with "
+            f"{name} is not georeferenced, or only by control points or a rotated grid; warp it to "
+            "a map, e.g. with gdalwarp -t_srs EPSG:32633, or declare its corners, e.g. with "
             "gdal_edit.py -a_ullr."
         )
     first, *others = file.colorinterp
     if first not in (ColorInterp.undefined, ColorInterp.gray):
         raise TrustboError(
             f"{name} is a picture: its first band has the colour {first.name!r}; give a raster of "
-            "heights, e.g. one band of it with gdal_translate -b."
+            "heights, e.g. one of its bands, extracted with gdal_translate -b."
         )
     stored = file.read(1, masked=True)
     values = stored.astype(np.result_type(stored, np.float32)).filled(np.nan)
     alpha = [k for k, colour in enumerate(others, 2) if colour == ColorInterp.alpha]
-    for k in alpha:  # GDAL does not mask by an alpha band of floats
+    for k in alpha:  # GDAL's mask ignores alpha bands of floats
         values[file.read(k) == 0] = np.nan
     _warn_of_bands(file.count - len(alpha), name)
     attrs = {
@@ -197,7 +197,7 @@ def _of_file(file: DatasetReader, name: str) -> xr.DataArray:
 
 def _warn_of_bands(n: int, name: str) -> None:
     if n > 1:
-        warn(f"{name} has {n} bands; the first is taken as heights.")
+        warn(f"{name} has {n} bands; the first one is used as heights.")
 
 
 def _of_array(array: xr.DataArray, name: str) -> xr.DataArray:
@@ -210,8 +210,8 @@ def _of_array(array: xr.DataArray, name: str) -> xr.DataArray:
     bands = [dim for dim in array.dims if dim not in (y, x)]
     if not {y, x} <= set(array.dims) & set(array.coords) or len(bands) > 1 or not array.size:
         raise TrustboError(
-            f"{name} has axes {dict(array.sizes)}; need rows and columns, named (y, x), with "
-            "coordinates, and one axis of bands at most."
+            f"{name} has axes {dict(array.sizes)}; it needs rows and columns, named (y, x), with "
+            "coordinates, and at most one axis of bands."
         )
     _warn_of_bands(max([array.sizes[dim] for dim in bands], default=1), name)
     array = array.isel(dict.fromkeys(bands, 0)).transpose(y, x)
@@ -220,13 +220,13 @@ def _of_array(array: xr.DataArray, name: str) -> xr.DataArray:
 
 
 def _even(values: np.ndarray, what: str) -> np.ndarray:
-    """Return evenly spaced coordinates; TrustboError if only one, or uneven beyond rounding.
+    """Return evenly spaced coordinates; TrustboError if they are uneven or there is only one.
 
-    Coordinates that passed through float32 are rounded to 0.5 m in the north of a UTM zone.
+    Coordinates that were stored as float32 are rounded to 0.5 m in the north of a UTM zone.
     """
     given = values.astype(float)
     if len(given) < 2:
-        raise TrustboError(f"{what} has one value; a terrain needs two rows and columns at least.")
+        raise TrustboError(f"{what} has one value; a terrain needs at least two rows and columns.")
     even = np.linspace(given[0], given[-1], len(given))
     step, off = abs(even[1] - even[0]), np.abs(given - even).max()
     single = (given.astype(np.float32) == given).all()
@@ -237,25 +237,25 @@ def _even(values: np.ndarray, what: str) -> np.ndarray:
 
 
 def _paired(ground: xr.DataArray, surface: xr.DataArray) -> xr.Dataset:
-    """Combine two rasters on one grid: common NaN, and no surface below the ground."""
+    """Combine two rasters on one grid, with common NaN and no surface below the ground."""
     dem, dsm = ground.values, surface.values
     valid = np.isfinite(dem) & np.isfinite(dsm)
     if not valid.any():
         raise TrustboError(
-            "no pixel has both a DEM and a DSM height: they are of two places, or one of them is "
+            "no pixel has both a DEM and a DSM height: they show two places, or one of them is "
             "all nodata where they overlap."
         )
     canopy = (dsm - dem)[valid]
     if (share := (canopy < 0.0).mean()) > _CLIPPED:
         warn(
             f"the DSM lies below the DEM on {share:.1%} of pixels; it is raised to the DEM there. "
-            "Check that both have the same vertical datum, and are not swapped."
+            "Check that both have the same vertical datum and that they are not swapped."
         )
     low, middle = np.quantile(canopy, [0.05, 0.5])
     if low > _RAISED or middle > _TALL:
         warn(
             f"the DSM lies {middle:.3g} m above the DEM in the median, and over {low:.3g} m nearly "
-            "everywhere: check that both share one unit and one vertical datum."
+            "everywhere: check that both have the same unit and the same vertical datum."
         )
     heights = {"dem": ("ground", dem), "dsm": ("surface", np.fmax(dem, dsm))}
     maps = {
@@ -266,7 +266,7 @@ def _paired(ground: xr.DataArray, surface: xr.DataArray) -> xr.Dataset:
 
 
 def _averaged(terrain: xr.Dataset, resolution: float | None) -> xr.Dataset:
-    """Average square blocks of about a resolution, m; NaN if over half of a block is missing.
+    """Average square blocks of side `resolution`, m; NaN if over half of a block is missing.
 
     Incomplete blocks at the edge are dropped.
     """
@@ -276,7 +276,7 @@ def _averaged(terrain: xr.Dataset, resolution: float | None) -> xr.Dataset:
     shape = terrain["dem"].shape
     if min(shape) < 2 * factor:
         raise TrustboError(
-            f"{shape} pixels are too few to average {factor} x {factor}; lower resolution=."
+            f"{shape} pixels are too few to average {factor} x {factor}; reduce resolution=."
         )
     squares: Any = terrain.coarsen(y=factor, x=factor, boundary="trim")
     return squares.mean().where(2 * squares.count() >= factor**2)

@@ -15,7 +15,7 @@ def synthetic_terrain(
     *,
     relief: float = 30.0,
 ) -> xr.Dataset:
-    """Make a terrain: fractional Brownian relief and clumped vegetation of varying height.
+    """Make a terrain with fractional Brownian relief and clumped vegetation of varying height.
 
     The relief has a Hurst exponent of 0.9. Vegetation with a mean height of 6 m covers 40 % of the
     area. The terrain lies on the Keweenaw peninsula in northern Michigan (EPSG:32616).
@@ -24,7 +24,7 @@ def synthetic_terrain(
         size: Height (north-south) and width (east-west), m.
         resolution: Pixel size, m.
         seed: Seed of the terrain.
-        relief: Highest minus lowest ground, m.
+        relief: Difference between the highest and the lowest ground, m.
 
     Returns:
         Dataset as from `read_terrain`.
