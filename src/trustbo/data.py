@@ -21,7 +21,7 @@ NOWHERE: Cell = (-1, -1)
 FEATURES = ("traversability", "visibility")
 """Names of the first two features, z1 and z2 of the paper."""
 LINE_OF_SIGHT = "line_of_sight"
-"""Name of the predicted contact rate; `line_of_sight_1`, `_2`, ... where several are assumed."""
+"""Feature name of the predicted contact rate; `line_of_sight_1`, `_2`, ... if several."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,9 +43,9 @@ class Bound:
             not recorded.
 
     Raises:
-        TrustboError: The arrays disagree on the number of robots; a value outside [0, 1], a
-            duration that is not positive, an n_ticks below 1, a rate that is not a whole number of
-            ticks divided by n_ticks, or an unknown status.
+        TrustboError: The arrays disagree on the number of robots, a value is outside [0, 1], a
+            duration is not positive, n_ticks is not a positive whole number, a rate is not a
+            multiple of 1 / n_ticks, or the status is unknown.
     """
 
     cell: Cell
@@ -66,7 +66,7 @@ class Bound:
         if self.awareness.ndim != 2 or not self.awareness.size:
             raise TrustboError(
                 "awareness of a bound must be (robot, feature), with at least one robot and one "
-                f"feature; got shape {self.awareness.shape}. Without features, give one that is 0."
+                f"feature; got shape {self.awareness.shape}. If there are none, give one that is 0."
             )
         per_robot = self.awareness.shape[:1]
         for name in ("contact_rate", "duration"):
@@ -74,7 +74,7 @@ class Bound:
                 raise TrustboError(f"{name} of a bound must be {per_robot}; got shape {shape}.")
         require_choice("status", self.status, STATUSES)
         mapped = self.cell != NOWHERE
-        where = f"the bound into cell {self.cell}" if mapped else "a bound of no map"
+        where = f"the bound into cell {self.cell}" if mapped else "a bound without a map"
         require_unit_interval(f"contact_rate of {where}", self.contact_rate)
         if mapped:
             require_unit_interval(f"awareness of {where}", self.awareness)
@@ -101,12 +101,12 @@ class Mission(Summary):
         status: `"ok"` if the mission reached the goal, else the reason why it did not.
         features: Names of the features, in the order of the last axis of `awareness`.
         robots: Names of the overwatching robots.
-        scale: Scale of a person's trust reports, such as `"likert7"`, which `contact_rate` then
-            contains instead of contact (see `logs.read_reports`); empty in all other missions.
+        scale: Scale of a person's trust reports, such as `"likert7"`, if `contact_rate` holds such
+            reports instead of contact (see `logs.read_reports`); empty in all other missions.
 
     Raises:
-        TrustboError: Bounds that do not fit the path, or disagree on robots or features; an unknown
-            status or scale.
+        TrustboError: The bounds do not fit the path, or disagree on robots or features, or the
+            status is unknown.
     """
 
     path: tuple[Cell, ...]
@@ -120,7 +120,7 @@ class Mission(Summary):
         require_choice("status", self.status, STATUSES)
         n_run, n_planned = len(self.bounds), len(self.path) - 1
         if not n_run or (self.path and n_run > n_planned):
-            most = f" and, on its path, at most {n_planned}" if self.path else ""
+            most = f" and at most {n_planned} on its path" if self.path else ""
             raise TrustboError(
                 f"a mission has at least one bound{most}; got {n_run}. If no bound was run, use "
                 "`Campaign.fail`."
@@ -185,8 +185,8 @@ class Mission(Summary):
         `from_arrays(path, z, y, status="stuck")`. A bound that was not measured is a row of NaN.
 
         Args:
-            path: Planned cells, start first; None for a log without a map, whose missions have no
-                plans and no place effects.
+            path: Planned cells, start first; None for a log without a map, which supports neither
+                planning nor place effects.
             awareness: Shape (bound, robot, feature), in [0, 1]; any finite values in a log without
                 a map.
             contact_rate: Shape (bound, robot), in [0, 1].
@@ -194,13 +194,13 @@ class Mission(Summary):
             status: Outcome of the mission.
             n_ticks: Number of ticks over which `contact_rate` is averaged, shape (bound, robot) or
                 (bound,); None where not recorded.
-            features: Names of the features; by default traversability, visibility, z3, ...; a
-                workspace with as many features renames z3, ..., see `Workspace.in_order`.
+            features: Names of the features; by default traversability, visibility, z3, ... (a
+                workspace with the same number of features renames z3, ...).
             robots: Names of the robots; by default r1, r2, ...
 
         Raises:
-            TrustboError: Axes that do not fit together, a value outside [0, 1], or an unknown
-                status.
+            TrustboError: The axes do not fit together, a value is outside [0, 1], or the status is
+                unknown.
         """
         labels = {"robot": robots, "feature": features}
         z = _labelled("awareness", awareness, ("bound", "robot", "feature"), **labels)
@@ -214,8 +214,8 @@ class Mission(Summary):
         cells = () if path is None else require_cells("path", path)
         if path is not None and len(cells) <= len(y):
             raise TrustboError(
-                f"{len(y)} bounds need a path of {len(y) + 1} cells; got {len(cells)}. Give None "
-                "for a log without a map."
+                f"{len(y)} bounds need a path of at least {len(y) + 1} cells; got {len(cells)}. "
+                "Give None for a log without a map."
             )
         ends = np.cumsum(np.nan_to_num(seconds).max(axis=1)).tolist()
         entered, statuses = cells[1:] or (NOWHERE,) * len(y), ["ok"] * (len(y) - 1) + [status]
@@ -245,8 +245,8 @@ class Mission(Summary):
         for what, wanted in names.items():
             if sorted(own[what]) != sorted(wanted):
                 raise TrustboError(
-                    f"the mission has {what} {getattr(self, what)}, not {wanted}; give {what}= "
-                    "these names, or use the workspace of this team."
+                    f"the mission has {what} {getattr(self, what)}, not {wanted}; pass these "
+                    f"names as {what}=, or use the workspace of this team."
                 )
         i, m = ([own[what].index(name) for name in wanted] for what, wanted in names.items())
         bounds = []
@@ -260,7 +260,7 @@ class Mission(Summary):
             bounds.append(replace(b, awareness=z[np.ix_(i, m)], **per_robot))
         return replace(self, bounds=tuple(bounds), **names)
 
-    # Stacked once: every refit reads these of every mission.
+    # Stacked once, because every refit reads these arrays of every mission.
 
     @cached_property
     def awareness(self) -> np.ndarray:
@@ -308,7 +308,7 @@ def require_map(what: str, missions: Iterable[Mission]) -> None:
         if not mission.has_map:
             raise TrustboError(
                 f"{what} needs the cells of a map, but mission {j} has none (path=None); missions "
-                "without a map can only be fitted, without effects of places, and scored."
+                "without a map can only be fitted (without place effects) and scored."
             )
 
 
@@ -373,10 +373,10 @@ def require_unit_interval(what: str, values: np.ndarray) -> None:
 
 
 def _labelled(what: str, values: Any, dims: Sequence[str], **names: Sequence[str]) -> np.ndarray:
-    """Return an array with the given dims, and with the given names along some of them.
+    """Return an array with its dims, and the names along some of them, in the given order.
 
     Labels are the dims and coordinates of a DataArray, or the column names of a DataFrame for the
-    last dim, if they are strings. TrustboError: the labels are not the given names.
+    last dim, if they are strings. TrustboError: the labels are not the given dims or names.
     """
     if isinstance(values, pd.DataFrame) and all(isinstance(name, str) for name in values):
         numbers = values.to_numpy(dtype=object, na_value=np.nan)  # also pd.NA
@@ -395,7 +395,7 @@ def _labelled(what: str, values: Any, dims: Sequence[str], **names: Sequence[str
 
 
 def _per_robot(what: str, given: ArrayLike | None, rates: np.ndarray) -> np.ndarray:
-    """Broadcast values, one for each bound or for each robot in it, to (bound, robot)."""
+    """Broadcast one number, or values (bound,) or (bound, robot), to (bound, robot)."""
     values = as_array(what, np.nan if given is None else given)
     try:
         return np.broadcast_to(values[:, None] if values.ndim == 1 else values, rates.shape)

@@ -11,7 +11,7 @@ from trustbo.errors import TrustboError, one_line
 
 
 class MissionBatch(NamedTuple):
-    """Stacked missions, padded to the longest one with bounds whose rates were not measured."""
+    """Stacked missions, padded to the length of the longest one with unmeasured bounds."""
 
     awareness: np.ndarray
     """Shape (mission, bound, robot, feature); 0 in the padding."""
@@ -47,8 +47,8 @@ def require_same_team(missions: Sequence[Mission]) -> None:
     """Raise TrustboError unless there are missions, all with the same robots and features."""
     if not isinstance(missions, Sequence) or not missions:
         raise TrustboError(
-            f"missions must be a list of at least one mission; got {one_line(missions)}. Write "
-            "[mission] for one, and .missions of a result or campaign."
+            f"missions must be a list of at least one mission; got {one_line(missions)}. For a "
+            "single mission, give [mission]; for a result or a campaign, give its .missions."
         )
     first = missions[0]
     for j, mission in enumerate(missions):
@@ -56,13 +56,13 @@ def require_same_team(missions: Sequence[Mission]) -> None:
             raise TrustboError(f"mission {j} is not a Mission; got {one_line(mission)}.")
         if (mission.robots, mission.features) != (first.robots, first.features):
             raise TrustboError(
-                f"mission {j} has robots {mission.robots} and features {mission.features}, mission "
-                f"0 has {first.robots} and {first.features}; all must agree."
+                f"mission {j} has robots {mission.robots} and features {mission.features}, but "
+                f"mission 0 has {first.robots} and {first.features}; all must agree."
             )
 
 
 def replace_awareness(mission: Mission, awareness: np.ndarray) -> Mission:
-    """Replace a mission's awareness by given values, (bound, robot, feature), that are not NaN.
+    """Replace a mission's awareness with given values, (bound, robot, feature), except NaN.
 
     Values of planned bounds that were not run are ignored.
     """

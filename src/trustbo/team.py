@@ -20,8 +20,8 @@ class Robot(Summary):
         lidar_range: Distance up to which the lidar tracks another robot, m.
         vertical_fov: Half the vertical field of view, rad, measured from the plane of the body.
         sensor_height: Height of the lidar above ground, m.
-        target_height: Height of the point that other robots aim at, m above ground; by default the
-            lidar.
+        target_height: Height above ground of the point on this robot that the lidars of other
+            robots aim at, m.
         max_slope: Steepest pitch or roll that the robot withstands, rad.
         detection: Quality of the lidar: fraction of unobstructed scans that detect their target, in
             (0, 1].
@@ -30,7 +30,7 @@ class Robot(Summary):
 
     Raises:
         TrustboError: A value is not positive, an angle exceeds 90 degrees, a fraction exceeds 1, or
-            a number of scans is not whole.
+            a number of scans is not a whole number.
     """
 
     speed: float = 2.0
@@ -54,7 +54,7 @@ class Robot(Summary):
         for name in ("vertical_fov", "max_slope"):
             if getattr(self, name) >= np.pi / 2:
                 raise TrustboError(
-                    f"Robot.{name} is an angle in radians below pi/2; got {getattr(self, name):g} "
+                    f"Robot.{name} must be in radians, below pi/2; got {getattr(self, name):g} "
                     "(degrees? use numpy.deg2rad)."
                 )
 
@@ -76,13 +76,13 @@ class Team(Summary):
     """The lead T1 and the overwatching subteam T2.
 
     Attributes:
-        n_robots: Number of robots in T2; taken from `robots` where these are given.
+        n_robots: Number of robots in T2; taken from `robots` if these are given.
         robots: Members of T2; by default `n_robots` identical robots.
         lead: Lead robot T1.
         names: Names of the members of T2; by default r1, r2, ...
 
     Raises:
-        TrustboError: There are no robots, or the names are not one distinct name per robot.
+        TrustboError: There are no robots, or `names` does not hold one distinct name per robot.
 
     Example:
         >>> tb.Team(robots=(tb.Robot(lidar_range=60.0), tb.Robot()), names=("spot", "husky"))
