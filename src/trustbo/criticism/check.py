@@ -74,8 +74,8 @@ def check(
     other models, and `az.psense_summary(posterior)` for the sensitivity to the priors.
 
     Args:
-        posterior: Posterior from `fit`, or all posteriors of a campaign (`Result.posteriors`). In
-            a campaign, the last is checked, and each prediction of the next mission is scored.
+        posterior: Posterior from `fit`, or all posteriors of a campaign (`Result.posteriors`). For
+            a campaign, the last one is checked, and each prediction of the next mission is scored.
         missions: All missions of the campaign; by default, the missions in the last posterior.
 
     Raises:

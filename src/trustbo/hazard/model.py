@@ -56,9 +56,9 @@ def fit_hazard(
     Returns:
         The group `hazard` of a posterior. The posterior draws are `intercept` (draw),
         `coefficient` (draw, measure), `strength` (draw) and, with a terrain, `margin` and `width`
-        (draw) of the slope limit in degrees. `place` (draw, lost) is the bound, counted from 1, at
-        which each mission lost at an unknown place failed. `p_fail` (move, row, col) is the
-        posterior mean failure probability, and NaN where there is no bound. `exposures` and
+        (draw) of the slope limit in degrees. `place` (draw, lost) is the number, from 1, of the
+        bound at which each mission lost at an unknown place failed. `p_fail` (move, row, col) is
+        the posterior mean failure probability, and NaN where there is no bound. `exposures` and
         `failures` (move, row, col) count known outcomes. Use `BoundRisk` to draw from it.
 
     Raises:

@@ -26,8 +26,8 @@ _SOME = 256  # approximate number of bounds whose mean probability orders the dr
 class BoundRisk:
     """Posterior of the probability that each bound of a workspace ends the mission.
 
-    Maps have shape (move, row, col), where (row, col) is the cell that a bound enters and the moves
-    are those of `MOVES`. Failure probabilities are NaN where there is no bound.
+    Maps have shape (move, row, col), where (row, col) is the cell that a bound enters and moves are
+    ordered as in `MOVES`. Failure probabilities are NaN where there is no bound.
 
     Attributes:
         exists: Whether each bound exists, shape (move, row, col).
@@ -156,7 +156,7 @@ class Risk:
     """Probability that each bound of a workspace ends the mission.
 
     Attributes:
-        p_fail: Posterior mean, shape (move, row, col), with the moves of `MOVES`. NaN where there
+        p_fail: Posterior mean, shape (move, row, col), with moves as in `MOVES`; NaN where there
             is no bound.
         draws: Posterior draws, shape (draw, move, row, col), or None.
         strata: Mean failure probabilities of groups of draws, used for the expected cost of
@@ -230,6 +230,6 @@ class PathRisk(NamedTuple):
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> Self:
-        """Restore the risk from the record of `to_record`."""
+        """Restore the risk from a record made by `to_record`."""
         low, high = record["p_arrive_band"]
         return cls(np.array(record["p_fail"]), record["p_arrive"], (low, high))

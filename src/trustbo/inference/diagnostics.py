@@ -18,8 +18,8 @@ def diagnostics(posterior: xr.DataTree) -> dict[str, float]:
     """Return the diagnostics of the sampler.
 
     Returns:
-        Importance sampling has `k_hat`, which is good below 0.5, and `kish`, the effective number
-        of points. NUTS has the worst `r_hat` and `ess_bulk` over all hyperparameters, and the
+        For importance sampling, `k_hat`, which is good below 0.5, and `kish`, the effective number
+        of points. For NUTS, the worst `r_hat` and `ess_bulk` over all hyperparameters, and the
         number of `divergences`.
 
     Raises:
@@ -48,5 +48,5 @@ def complaints_of(
     if not least >= MIN_ESS:
         complaints.append(f"bulk ESS is {least:.0f} (minimum {MIN_ESS:.0f})")
     if divergences:
-        complaints.append(f"the number of divergences is {divergences} (limit 0)")
+        complaints.append(f"{divergences} transitions diverged (limit 0)")
     return dict(zip(NUTS_NAMES, (worst, least, divergences), strict=True)), complaints

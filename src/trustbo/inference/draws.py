@@ -22,7 +22,7 @@ from trustbo.stacking import require_same_team
 from trustbo.workspace import Workspace
 
 _DAYS = 20261123  # seed of the next mission's effects, for reproducible bands
-_N_MEAN = 4096  # draws that are averaged to a prior mean
+_N_MEAN = 4096  # draws averaged to compute a prior mean
 _ATTRIBUTES = "observation", "x0_mean", "x0_sd", "model_record"
 
 

@@ -3,8 +3,8 @@
 Each likelihood term t(f) is replaced by a site exp(-lam f^2 / 2 + eta f). Given the sites, `engine`
 computes the marginals of the signals exactly. Dividing a marginal by its site gives the cavity. The
 site is then changed so that cavity times site has the moments of cavity times term. The log
-evidence is that of the sites plus, for every term, the log ratio of the masses of these products.
-The approximation is stationary in the sites and is corrected by importance weights.
+evidence is the evidence of the sites plus, for every term, the log ratio of the masses of these
+products. The approximation is stationary in the sites and is corrected by importance weights.
 """
 
 from typing import Any, NamedTuple
@@ -116,10 +116,10 @@ def _overlap(y: np.ndarray, lam: np.ndarray, m: np.ndarray, v: np.ndarray) -> np
 def draw(
     joint: Joint, sites: Sites, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Draw coefficients and signals at each theta, with weights whose mean is the evidence.
+    """Draw coefficients and signals at each theta, with weights that average to the evidence.
 
-    Coefficients are drawn from a mixture of two Student-t distributions, which are centred on the
-    EP posterior and on a posterior with less precise sites.
+    Coefficients are drawn from a mixture of two Student-t distributions, one centred on the
+    EP posterior and one on a posterior with less precise sites.
 
     Returns:
         Coefficients (point, column), signals (point, block, row) and log weights (point,).

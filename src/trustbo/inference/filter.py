@@ -366,7 +366,7 @@ class TrustFilter:
             )
         if np.isnan(z).any():
             raise TrustboError(
-                "awareness must not be NaN; replace unmeasured values by those of the map, "
+                "awareness must not be NaN; replace unmeasured values with those of the map, "
                 "workspace.along(path), with shape (bound, robot, feature)."
             )
         if self._bounded:

@@ -51,7 +51,7 @@ def fit(
 
     Args:
         missions: Missions of one team; NaN marks contact rates that were not measured.
-        model: Trust model, by default `models.default_model()` with place and robot effects. Place
+        model: Trust model; by default `models.default_model()` with place and robot effects. Place
             effects are omitted if a mission has no map or a path jumps. For reports of people (see
             `logs.read_reports`), the default is `HumanTrust` with the scale of the reports.
         sampler: `"importance"` takes independent draws by adaptive importance sampling without
@@ -75,8 +75,8 @@ def fit(
         beta[feature], b, delta_w and delta_v), and each effect has a separate group. `latent`
         contains trust[chain, draw, mission, bound, robot], and trust_mean and trust_sd over all
         draws. `log_likelihood` contains contact_rate[chain, draw, mission], so that LOO leaves out
-        whole missions. If all rates have n_ticks, the log-likelihoods are those of tick counts
-        (attribute `log_likelihood_of`) and comparable between observation families. Other groups
+        whole missions. If all rates have n_ticks, the log-likelihoods refer to tick counts
+        (see `log_likelihood_of`) and are comparable between observation families. Other groups
         are `posterior_predictive`, `prior`, `prior_predictive`, `log_prior`, `sample_stats`,
         `observed_data` and `constant_data`. Bounds are labelled from 1, and short missions are
         padded with NaN.

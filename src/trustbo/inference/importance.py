@@ -44,7 +44,7 @@ class Student(NamedTuple):
     """Multivariate Student-t distribution, which may be wider on one side of its center.
 
     A point is center + scale (x sides), where x has a standard Student-t distribution and the
-    elements of x are multiplied by the first or second row of sides, by their sign.
+    elements of x are multiplied by the first or second row of sides, depending on their sign.
     """
 
     center: np.ndarray  # (score,)
@@ -137,7 +137,7 @@ def sample(
         starts: Starting points of the search for modes, shape (start, score).
         rng: Random number generator.
         size: Number of points per round, a power of 2. In the first round, half of them are drawn
-            from `defensive`; in later rounds, another eighth is.
+            from `defensive`; later rounds draw an additional eighth from it.
         enough: Effective number of points at which sampling stops if k-hat is good.
         most: Maximum number of rounds.
         defensive: Function that returns a proposal for regions that the current proposal may miss;

@@ -19,7 +19,7 @@ from trustbo.models.signal import Signal, each
 from trustbo.models.slots import Slots
 
 _CHUNK = 16  # points evaluated at once
-_SIZES = (0.3, 1.0, 1.8, 2.6)  # log ratios of the rates' spread to starting noises
+_SIZES = (0.3, 1.0, 1.8, 2.6)  # log ratios of the spread of rates to the initial noises
 _LARGEST_NOISE, _LEAST_NOISE = 50.0, 1e-6
 _SWEEPS = 1  # EP sweeps at each point, from the sites at the mode
 _SETTLED, _DAMPING = 12, 0.7  # to find the sites at the mode
@@ -145,7 +145,7 @@ class Posterior:
         return best
 
     def defensive(self, proposal: Student) -> Student:
-        """Make a proposal that is fitted for beta0 and noises, and near the prior elsewhere."""
+        """Make a proposal that fits beta0 and the noises, and is near the prior elsewhere."""
         core = self.scores.core
         others = np.setdiff1d(np.arange(self.n_scores), core)
         cov = 1.5 * proposal.scale @ proposal.scale.T

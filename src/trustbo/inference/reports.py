@@ -29,7 +29,7 @@ def predict_reports(
     seed: int = 0,
     model: TrustModel | None = None,
 ) -> xr.Dataset:
-    """Predict each report of a person, who may be new, from the person's earlier reports.
+    """Predict each report of a person, possibly a new one, from the person's earlier reports.
 
     Earlier reports reweight the posterior draws, to infer a person's start, level and gains.
     Reports at the same bound are not used to predict each other.

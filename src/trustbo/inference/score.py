@@ -31,7 +31,7 @@ def score(
     is averaged over parameter draws and place effects, and includes process and observation noise.
 
     Args:
-        posterior: Posterior that predicts all `missions` and was fitted to none of these; or all
+        posterior: Posterior that predicts all `missions` and was fitted to none of them; or all
             posteriors of a campaign (`Result.posteriors`), each of which predicts the next mission.
         missions: Missions to predict; for a campaign, all missions in order.
         workspace: Workspace of the missions, used to fill in missing awareness as in `fit`.
@@ -128,7 +128,7 @@ def _summary(
 def _trees(
     posterior: xr.DataTree | Sequence[xr.DataTree], missions: Sequence[Mission]
 ) -> list[xr.DataTree]:
-    """List the posterior that predicts each mission, in a campaign from the second mission on."""
+    """List the posterior that predicts each mission; a campaign starts with the second mission."""
     if not missions:
         raise TrustboError("score needs missions to predict; got none.")
     if isinstance(posterior, xr.DataTree) or not isinstance(posterior, Sequence):

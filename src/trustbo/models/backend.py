@@ -6,7 +6,7 @@ warning is silenced because text progress bars suffice.
 arviz_base leaves a lazily loaded numpyro in `sys.modules`. If a submodule is imported first, as in
 `import arviz; import numpyro.distributions`, packages lack their submodules and numpyro fails
 ("numpyro.distributions has no attribute 'distribution'"). Accessing an attribute of numpyro first
-avoids the error. Submodules that are already missing are set as attributes.
+avoids the error. Submodules already missing from packages are set.
 """
 
 import sys

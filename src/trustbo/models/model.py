@@ -41,8 +41,8 @@ class TrustModel(Summary, ABC):
         priors: Prior on each parameter. The default depends on the observation family and the
             feature names; see `Priors.of`.
         observation: Observation family: `"gaussian"` as in the paper, `"censored"` for rates that
-            are censored at 0 and 1, or `"beta_binomial"` for ticks in contact out of
-            `Bound.n_ticks`, with trust on the logit scale.
+            are censored at 0 and 1, or `"beta_binomial"` for the number of ticks in
+            contact out of `Bound.n_ticks`, with trust on the logit scale.
         effects: Effects on the drift, such as `PlaceEffect()` for places and `RobotEffect()` for
             each robot in each mission. The paper's models have no effects.
 

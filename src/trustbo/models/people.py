@@ -110,7 +110,7 @@ class HumanTrust(PooledTrust):
         return Signal(m, T, S, theta["delta_v"][:, None, None])
 
     def _lasting(self, theta: Theta, slots: Slots) -> Any:
-        """Compute the share (point, row, row) of an input at one row that remains at another."""
+        """Compute the fraction (point, row, row) of an input at one row that is left at another."""
         xp: Any = namespace(theta["beta0"])
         return xp.kron(powers(theta["beta0"], slots.n_bounds), np.eye(slots.n_robots))
 

@@ -28,7 +28,7 @@ class Priors(Summary):
     """Priors on the parameters, as scalar NumPyro distributions, and on initial trust.
 
     The default x_0 ~ N(0.5, 0.5^2) is not specified in the paper. Models ignore the priors on
-    parameters that they do not have. Weights need Normal priors because weights are integrated out;
+    parameters that they do not have. Weights need Normal priors because they are integrated out;
     beta0 and noise scales need priors with quantiles (icdf).
 
     Attributes:
