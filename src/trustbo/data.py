@@ -291,7 +291,7 @@ class Mission(Summary):
 def levels_of(scale: object) -> int:
     """Return the number of levels of a scale; 0 for "unit".
 
-    TrustboError: the name is not "unit", "likertN" or "ordinalN" with a number N of at least 2.
+    Raises TrustboError unless it is "unit", or "likertN" or "ordinalN" with N of at least 2.
     """
     found = re.fullmatch(r"(likert|ordinal)(\d*)", scale) if isinstance(scale, str) else None
     if scale != "unit" and found is None:
@@ -341,7 +341,7 @@ def require_shares(rate: np.ndarray, ticks: np.ndarray) -> None:
 
 
 def as_array(what: str, values: ArrayLike) -> np.ndarray:
-    """Return an array of floats, NaN where masked; TrustboError if the values are not numbers."""
+    """Return an array of floats, NaN where masked; raises TrustboError for other values."""
     try:
         if np.ma.isMaskedArray(values):
             return np.ma.filled(np.ma.asarray(values, dtype=float), np.nan)
@@ -351,7 +351,7 @@ def as_array(what: str, values: ArrayLike) -> np.ndarray:
 
 
 def as_names(what: str, given: Iterable[str]) -> tuple[str, ...]:
-    """Return names as a tuple; TrustboError if one is not a string or is repeated."""
+    """Return names as a tuple; raises TrustboError if one is not a string or is repeated."""
     listed = isinstance(given, Iterable) and not isinstance(given, str)
     names = tuple(given) if listed else ()
     if not listed or not all(isinstance(name, str) for name in names):
@@ -376,7 +376,7 @@ def _labelled(what: str, values: Any, dims: Sequence[str], **names: Sequence[str
     """Return an array with its dims, and the names along some of them, in the given order.
 
     Labels are the dims and coordinates of a DataArray, or the column names of a DataFrame for the
-    last dim, if they are strings. TrustboError: the labels are not the given dims or names.
+    last dim, if they are strings. Raises TrustboError if they are not the given dims or names.
     """
     if isinstance(values, pd.DataFrame) and all(isinstance(name, str) for name in values):
         numbers = values.to_numpy(dtype=object, na_value=np.nan)  # also pd.NA

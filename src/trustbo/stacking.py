@@ -24,8 +24,8 @@ class MissionBatch(NamedTuple):
 def stack_missions(missions: Sequence[Mission]) -> MissionBatch:
     """Stack missions with the same robots and features, of any length, into one batch.
 
-    TrustboError: there are no missions, they disagree on robots or features, or an awareness value
-    is NaN; only contact rates may be missing.
+    Raises TrustboError if there are no missions, robots or features differ between missions, or an
+    awareness value is NaN; only contact rates may be missing.
     """
     require_same_team(missions)
     n_bounds = max(len(mission.bounds) for mission in missions)

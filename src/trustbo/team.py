@@ -115,7 +115,7 @@ class Team(Summary):
 
     @classmethod
     def of(cls, team: Self | None) -> Self:
-        """Return the team, by default three identical robots; TrustboError if it is not a team."""
+        """Return the team, by default three identical robots; raises TrustboError if not a Team."""
         return cls() if team is None else require_kind("team", team, Team, "give Team(n_robots=3)")
 
     def _rows(self) -> Rows:

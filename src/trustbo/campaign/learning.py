@@ -31,7 +31,7 @@ _STOPPED, _RECOVERED = 2, 0.2
 def known_along(path: Sequence[Cell], workspace: Workspace) -> np.ndarray:
     """Return the map's awareness in the bounds of a path, shape (bound, robot, feature).
 
-    TrustboError: a cell is off the grid, or is not a neighbour of the previous one.
+    Raises TrustboError if a cell is off the grid or is not a neighbour of the previous one.
     """
     cells = require_on_grid(path, workspace.grid.shape)
     return np.swapaxes(along(workspace.awareness.values, cells), 0, 1)
@@ -41,7 +41,7 @@ def as_learned(mission: Mission, workspace: Workspace) -> Mission:
     """Replace measured awareness with the awareness of the map, which the planner also uses.
 
     Weights fitted to measured awareness would be biased when the planner applies them to the map's
-    awareness. TrustboError: see `known_along`.
+    awareness. Raises TrustboError in the same cases as `known_along`.
     """
     return replace_awareness(mission, known_along(mission.path, workspace))
 

@@ -66,7 +66,7 @@ class Posterior:
     file: Path | None = None
 
     def __call__(self) -> xr.DataTree:
-        """Return the posterior; TrustboError if its file cannot be read."""
+        """Return the posterior; raises TrustboError if its file cannot be read."""
         return read_tree(self.file or "") if self.tree is None else self.tree
 
 

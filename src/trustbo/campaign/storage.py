@@ -41,7 +41,7 @@ class Storage:
     def __init__(self, directory: FilePath) -> None:
         """Lock a folder, which is created if necessary.
 
-        TrustboError: another process has locked it, or the path is a file.
+        Raises TrustboError if another process has locked it or the path is a file.
         """
         self.path = Path(directory)
         self._lock = FileLock(self.path / ".lock", timeout=0)
@@ -65,7 +65,7 @@ class Storage:
     ) -> Self:
         """Lock a folder and write a whole campaign; an existing one is removed, its record first.
 
-        TrustboError: the folder contains a campaign and `overwrite` is False, or cannot be locked.
+        Raises TrustboError if the folder is locked, or has a campaign and `overwrite` is False.
         """
         path = Path(directory)
         if not overwrite and any((path / name).exists() for name in (RECORD, MISSIONS)):
@@ -127,7 +127,7 @@ class Storage:
 def read_campaign(directory: FilePath) -> tuple[State, Workspace, list[Entry]]:
     """Read the state, the workspace, and the missions that the record does not count yet.
 
-    TrustboError: the folder contains no campaign, or a file is missing or damaged.
+    Raises TrustboError if the folder contains no campaign, or a file is missing or damaged.
     """
     folder = Path(directory)
     require_campaign(folder)

@@ -38,7 +38,7 @@ def write_tree(path: FilePath, tree: xr.DataTree) -> None:
 def write_missions(path: FilePath, missions: Sequence[Mission]) -> None:
     """Write one or more missions, with their ticks, to a netCDF file.
 
-    TrustboError: the missions have different robots or features, or the file cannot be written.
+    Raises TrustboError if robots or features differ, or the file cannot be written.
     """
     write_tree(path, missions_to_tree(missions))
 
@@ -63,7 +63,7 @@ def read_missions(path: FilePath) -> list[Mission]:
 def missions_to_tree(missions: Sequence[Mission]) -> xr.DataTree:
     """Convert missions to a tree; ticks are stored for bounds with both poses and contacts.
 
-    TrustboError: the missions have different robots or features.
+    Raises TrustboError if robots or features differ between missions.
     """
     require_same_team(missions)
     bounds = [bound for mission in missions for bound in mission.bounds]
@@ -91,7 +91,7 @@ def missions_to_tree(missions: Sequence[Mission]) -> xr.DataTree:
 
 
 def missions_from_tree(tree: xr.DataTree) -> list[Mission]:
-    """Invert `missions_to_tree`; LookupError or ValueError if the tree has another form."""
+    """Invert `missions_to_tree`; raises LookupError or ValueError for a tree of another form."""
     table = {str(name): array.values for name, array in tree.to_dataset().variables.items()}
 
     def parts(values: np.ndarray, counts: str) -> list[np.ndarray]:

@@ -98,7 +98,7 @@ def _seen(columns: Columns, outcome: str | None, inputs: Sequence[str]) -> dict[
 
 
 def _unit_of(columns: Columns, report: str, levels: int) -> np.ndarray:
-    """Scale reports to [0, 1], (row,), NaN where blank; TrustboError if one is off the scale."""
+    """Scale reports to [0, 1], (row,), NaN if blank; raises TrustboError if off the scale."""
     y = columns.numbers(report, whole=levels > 0)
     low, high = (1.0, float(levels)) if levels else (0.0, 1.0)
     columns.refuse(

@@ -39,7 +39,7 @@ FEATURES: dict[str, Feature] = {}
 def feature[F: Callable[..., np.ndarray]](name: str, *, sign: int) -> Callable[[F], F]:
     """Register a function as a feature of pixels under a new name (decorator).
 
-    TrustboError: the name is taken, or the sign is neither 1 nor -1.
+    Raises TrustboError if the name is taken or the sign is neither 1 nor -1.
     """
     if name in FEATURES:
         raise TrustboError(f"feature {name!r} already exists; choose another name.")

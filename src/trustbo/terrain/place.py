@@ -18,7 +18,7 @@ _NORTH = 22.5  # degrees; half the angle between two neighbouring moves
 def require_map(name: str, own: Any, given: Any) -> CRS:
     """Return a raster's CRS, in degrees or metres: its own, or the given one if it has none.
 
-    TrustboError: there is no CRS, it differs from the given one, or it is not in degrees or metres.
+    Raises TrustboError if the CRS is missing, not the given one, or not in degrees or metres.
     """
     if own is None and given is None:
         raise TrustboError(f"{name} has no coordinate reference system; pass crs=.")

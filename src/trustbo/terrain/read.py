@@ -220,7 +220,7 @@ def _of_array(array: xr.DataArray, name: str) -> xr.DataArray:
 
 
 def _even(values: np.ndarray, what: str) -> np.ndarray:
-    """Return evenly spaced coordinates; TrustboError if they are uneven or there is only one.
+    """Return evenly spaced coordinates; raises TrustboError if they are uneven or fewer than two.
 
     Coordinates that were stored as float32 are rounded to 0.5 m in the north of a UTM zone.
     """
