@@ -145,16 +145,17 @@ def by_importance(
         start = posterior.start()[None]
         size = size if len(start[0]) < 12 else 4 * size
         points = sample(posterior.log_density, start, rng, size=size, defensive=posterior.defensive)
-        chosen = points.resample(n, rng)
-        drawn = posterior.draw(points.z[chosen], points.log_p[chosen], n, rng)
+        # Draws that correct EP are the costly part; more of them give a more reliable k-hat.
+        chosen = points.resample(n if posterior.exact else 2 * size, rng)
+        drawn, which = posterior.draw(points.z[chosen], points.log_p[chosen], n, rng)
         k_hat = max(points.k_hat, drawn.k_hat)
         if k_hat <= MAX_KHAT:
             break
     shuffled = rng.permutation(n)
-    drawn = drawn.at(shuffled)
+    log_p = points.log_p[chosen[which[shuffled]]]
     log_evidence = points.log_evidence + drawn.log_correction
     summary = {"k_hat": k_hat, "kish": points.kish, "log_evidence": log_evidence}
-    return drawn, {"lp": points.log_p[chosen][shuffled]}, summary
+    return drawn.at(shuffled), {"lp": log_p}, summary
 
 
 def _laid_out(

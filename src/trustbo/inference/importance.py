@@ -27,9 +27,9 @@ from trustbo.parallel import one_blas_thread
 
 GOOD_KHAT, MAX_KHAT = 0.5, 0.7
 """Limits on the Pareto shape k-hat of the weights, for stopping and for acceptable results."""
-_DEGREES = 10.0  # degrees of freedom of the proposals
-_WIDER = 1.05  # scale of a proposal relative to the points that it is fitted to
-_DEFENSIVE = 8  # other points per defensive point after the first round
+_DEGREES = 8.0  # degrees of freedom of the proposals
+_WIDER = 1.1  # scale of a proposal relative to the points that it is fitted to
+_DEFENSIVE = 4  # other points per defensive point after the first round
 _PER_AXIS = 4.0  # effective points needed per score to estimate moments
 _SLOPE_STEP, _CURVATURE_STEP = 1e-3, 3e-2
 _LEAST_CURVATURE = 0.3  # of minus the log density; 1 for the prior

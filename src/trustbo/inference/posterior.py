@@ -23,7 +23,6 @@ _SIZES = (0.3, 1.0, 1.8, 2.6)  # log ratios of the spread of rates to the initia
 _LARGEST_NOISE, _LEAST_NOISE = 50.0, 1e-6
 _SWEEPS = 1  # EP sweeps at each point, from the sites at the mode
 _SETTLED, _DAMPING = 12, 0.7  # to find the sites at the mode
-_WEIGHTED = 512  # weighted draws that correct EP
 _PARTICLES = 4  # signals for each draw
 
 
@@ -154,7 +153,9 @@ class Posterior:
         cov[others, others] = 1.2
         return Student(center, np.linalg.cholesky(cov))
 
-    def draw(self, z: np.ndarray, log_p: np.ndarray, n: int, rng: np.random.Generator) -> Draws:
+    def draw(
+        self, z: np.ndarray, log_p: np.ndarray, n: int, rng: np.random.Generator
+    ) -> tuple[Draws, np.ndarray]:
         """Draw coefficients and signals given equally weighted hyperparameter points.
 
         Args:
@@ -162,23 +163,24 @@ class Posterior:
             log_p: Log density (point,) of the scores.
             n: Number of draws; for Gaussian rates, one draw per point is returned instead.
             rng: Random number generator.
+
+        Returns:
+            The draws, and the index (draw,) of the point of each draw.
         """
-        unique, index, count = np.unique(z, axis=0, return_inverse=True, return_counts=True)
         if self.exact:
+            unique, index, count = np.unique(z, axis=0, return_inverse=True, return_counts=True)
             c = self.draw_columns(self.theta(unique), rng, count)
             order = np.argsort(np.argsort(index.ravel(), kind="stable"), kind="stable")
-            return Draws(at(self.theta(unique), index.ravel()), c[order])
-        some = np.linspace(0, len(z) - 1, min(_WEIGHTED, len(z))).astype(int)
-        theta, parts = self.theta(z[some]), []
+            return Draws(at(self.theta(unique), index.ravel()), c[order]), np.arange(len(z))
+        theta, parts = self.theta(z), []
         for _, chunk in chunks(theta):
             joint = self._joint(chunk)
             sites = ep.log_evidence(joint, self.sites, _SWEEPS)[1]
             parts.append(ep.draw(joint, sites, rng))
         c, f, log_weight = (np.concatenate(part) for part in zip(*parts, strict=True))
-        raw = log_weight + self.scores.log_prior(z[some]) - log_p[some]
-        weight, k_hat, log_mean = smoothed(raw)
+        weight, k_hat, log_mean = smoothed(log_weight + self.scores.log_prior(z) - log_p)
         chosen = systematic(weight, n, rng)
-        return Draws(at(theta, chosen), c[chosen], f[chosen], k_hat, log_mean)
+        return Draws(at(theta, chosen), c[chosen], f[chosen], k_hat, log_mean), chosen
 
     def draw_columns(
         self, theta: Theta, rng: np.random.Generator, count: np.ndarray | None = None
