@@ -54,7 +54,7 @@ def _exit(message: str, code: int) -> NoReturn:
 
 
 def parser() -> argparse.ArgumentParser:
-    """Make the parser of all commands; the parsed argument `run` is the function to call."""
+    """Build the parser for all commands; the parsed argument `run` is the function to call."""
     top = argparse.ArgumentParser(
         prog="trustbo",
         description="Learn how trustworthy robots are on a terrain, and plan the best path.",

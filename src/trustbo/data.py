@@ -296,7 +296,7 @@ def levels_of(scale: object) -> int:
     found = re.fullmatch(r"(likert|ordinal)(\d*)", scale) if isinstance(scale, str) else None
     if scale != "unit" and found is None:
         raise TrustboError(
-            f'scale must be "unit" or, with the number of levels, "likert7" or "ordinal7"; got '
+            'scale must be "unit", "likertN" or "ordinalN", where N is the number of levels; got '
             f"{scale!r}."
         )
     return 0 if found is None else require_whole("levels of a scale", int(found[2] or 7), 2)

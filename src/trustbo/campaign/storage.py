@@ -125,7 +125,7 @@ class Storage:
 
 
 def read_campaign(directory: FilePath) -> tuple[State, Workspace, list[Entry]]:
-    """Read the state, the workspace, and the missions that the record does not count yet.
+    """Read the state, the workspace, and missions that are not in the record yet.
 
     Raises TrustboError if the folder contains no campaign, or a file is missing or damaged.
     """

@@ -39,7 +39,7 @@ def to_datatree(
         groups: Arrays by group and name, with leading axes (chain, draw) except for moments.
         missions: Missions of the posterior.
         site_dims: Axes of the model's parameters.
-        effects: Effects of the model, whose variables may be in the groups.
+        effects: Effects of the model; the groups may include variables of these effects.
     """
     observed = stack_missions(missions)
     n_missions, n_bounds = observed.contact_rate.shape[:2]

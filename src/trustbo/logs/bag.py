@@ -51,7 +51,7 @@ def read_bag(
         contact: Topic with the contact of each robot, whose name replaces `{robot}`.
 
     Returns:
-        Missions without ticks. Awareness is NaN; campaigns use the map's awareness.
+        Missions without ticks. Awareness is NaN; campaigns use awareness from the map.
 
     Raises:
         TrustboError: rosbags is not installed; the path is not a bag, or the bag is damaged; a
