@@ -137,7 +137,7 @@ def sample(
         starts: Starting points of the search for modes, shape (start, score).
         rng: Random number generator.
         size: Number of points per round, a power of 2. In the first round, half of them are drawn
-            from `defensive`; later rounds draw an additional eighth from it.
+            from `defensive`; later rounds draw an additional quarter of `size` from it.
         enough: Effective number of points at which sampling stops if k-hat is good.
         most: Maximum number of rounds.
         defensive: Function that returns a proposal for regions that the current proposal may miss;
