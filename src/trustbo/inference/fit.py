@@ -141,13 +141,13 @@ def by_importance(
 ) -> tuple[Draws, dict[str, np.ndarray], dict[str, Any]]:
     """Draw by importance sampling, and return draws, statistics (draw,) and a summary."""
     rng = np.random.default_rng(seed)
-    for size in (256, 1024):
+    for size, n_sweeps in ((256, 1), (1024, 4)):
         start = posterior.start()[None]
         size = size if len(start[0]) < 12 else 4 * size
         points = sample(posterior.log_density, start, rng, size=size, defensive=posterior.defensive)
         # Draws that correct EP are the costly part; more of them give a more reliable k-hat.
         chosen = points.resample(n if posterior.exact else 2 * size, rng)
-        drawn, which = posterior.draw(points.z[chosen], points.log_p[chosen], n, rng)
+        drawn, which = posterior.draw(points.z[chosen], points.log_p[chosen], n, rng, n_sweeps)
         k_hat = max(points.k_hat, drawn.k_hat)
         if k_hat <= MAX_KHAT:
             break

@@ -154,7 +154,7 @@ class Posterior:
         return Student(center, np.linalg.cholesky(cov))
 
     def draw(
-        self, z: np.ndarray, log_p: np.ndarray, n: int, rng: np.random.Generator
+        self, z: np.ndarray, log_p: np.ndarray, n: int, rng: np.random.Generator, n_sweeps: int
     ) -> tuple[Draws, np.ndarray]:
         """Draw coefficients and signals given equally weighted hyperparameter points.
 
@@ -163,6 +163,7 @@ class Posterior:
             log_p: Log density (point,) of the scores.
             n: Number of draws; for Gaussian rates, one draw per point is returned instead.
             rng: Random number generator.
+            n_sweeps: Number of EP sweeps at each point.
 
         Returns:
             The draws, and the index (draw,) of the point of each draw.
@@ -175,7 +176,7 @@ class Posterior:
         theta, parts = self.theta(z), []
         for _, chunk in chunks(theta):
             joint = self._joint(chunk)
-            sites = ep.log_evidence(joint, self.sites, _SWEEPS)[1]
+            sites = ep.log_evidence(joint, self.sites, n_sweeps)[1]
             parts.append(ep.draw(joint, sites, rng))
         c, f, log_weight = (np.concatenate(part) for part in zip(*parts, strict=True))
         weight, k_hat, log_mean = smoothed(log_weight + self.scores.log_prior(z) - log_p)
