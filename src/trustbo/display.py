@@ -48,11 +48,6 @@ def joined(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
-def say(line: str) -> None:
-    """Print a line above the progress bars."""
-    tqdm.write(line, file=sys.stderr)
-
-
 def compiling() -> AbstractContextManager[Any]:
     """Print a line when kernels are compiled, which happens once per machine."""
     return event.install_listener("numba:compile", _Announcement())
@@ -68,5 +63,5 @@ class _Announcement(event.Listener):
 
 @cache
 def announce() -> None:
-    """Announce the first compilation of a process."""
-    say("compiling kernels (once, about 30 s)")
+    """Announce the first compilation of a process, above the progress bars."""
+    tqdm.write("compiling kernels (once, about 30 s)", file=sys.stderr)

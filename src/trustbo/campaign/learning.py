@@ -8,7 +8,6 @@ import xarray as xr
 
 from trustbo.campaign.state import EXCLUDED, LEARNED, TOLD, State
 from trustbo.data import Cell, Mission
-from trustbo.display import say
 from trustbo.errors import PosteriorError, TrustboError
 from trustbo.hazard import Hazard
 from trustbo.hazard.exposures import LostMission
@@ -51,12 +50,8 @@ def why_never_learned(mission: Mission) -> str:
     if not np.isfinite(mission.contact_rate).any():
         return "no contact rate was measured."
     if np.isnan(mission.awareness).any():
-        k, i, m = np.argwhere(np.isnan(mission.awareness))[0]
-        return (
-            f"awareness of bound {k + 1}, robot {mission.robots[i]}, feature "
-            f"{mission.features[m]} was not measured, and the map has none in cell "
-            f"{mission.bounds[k].cell}."
-        )
+        k = int(np.argwhere(np.isnan(mission.awareness))[0, 0])
+        return f"the map has no awareness in cell {mission.bounds[k].cell} of bound {k + 1}."
     return ""
 
 
@@ -65,37 +60,32 @@ def learn(
 ) -> xr.DataTree | None:
     """Fit the posterior of the parameters to all missions that are not excluded.
 
-    Its attribute `missions` lists their indices. If the diagnostics fail, sampling is repeated with
-    twice the draws. If they fail again, None is returned with a warning, and the states of the
-    missions do not change.
+    Its attribute `missions` lists their indices. If the diagnostics fail, None is returned with a
+    warning, and the states of the missions do not change.
     """
     waiting, numbers = state.numbers(TOLD), state.numbers(TOLD, LEARNED)
     missions = [state.entries[j].mission for j in numbers]
     sampler, options = state.settings["sampler"], state.settings["fit"]
     # Importance draws are independent, and each is large if the model has place effects.
     few = sampler == "importance" and any(isinstance(e, PlaceEffect) for e in model.effects)
-    usual = options.get("draws", _N_DRAWS // 4 if few else _N_DRAWS)
-    reason = ""
-    for shift, draws in enumerate((usual, 2 * usual)):
-        if reason and progress:
-            say(f"retrying with {draws} draws: {reason}.")
-        try:
-            tree = fit(
-                missions, model, sampler=sampler, workspace=workspace, seed=seed + shift,
-                progress=progress, whole=False, **{**options, "draws": draws},
-            )  # fmt: skip
-        except TrustboError as error:
-            reason = getattr(error, "reason", str(error))
-        except Exception as error:  # a bug must not lose a mission that was driven
-            if isinstance(error.__cause__, KeyboardInterrupt):  # numba raises SystemError from it
-                raise error.__cause__ from None
-            reason = f"{type(error).__name__}: {error}"
-        else:
-            tree = parameters_alone(tree)
-            tree.attrs["missions"] = numbers
-            for j in waiting:
-                state.entries[j].become(LEARNED)
-            return tree
+    usual = {"draws": _N_DRAWS // 4 if few else _N_DRAWS}
+    try:
+        tree = fit(
+            missions, model, sampler=sampler, workspace=workspace, seed=seed, progress=progress,
+            whole=False, **(usual | options),
+        )  # fmt: skip
+    except TrustboError as error:
+        reason = getattr(error, "reason", str(error))
+    except Exception as error:  # a bug must not lose a mission that was driven
+        if isinstance(error.__cause__, KeyboardInterrupt):  # numba raises SystemError from it
+            raise error.__cause__ from None
+        reason = f"{type(error).__name__}: {error}"
+    else:
+        tree = parameters_alone(tree)
+        tree.attrs["missions"] = numbers
+        for j in waiting:
+            state.entries[j].become(LEARNED)
+        return tree
     for j in waiting:
         state.entries[j].become(TOLD, reason)
     warnings.warn(
