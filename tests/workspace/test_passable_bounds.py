@@ -5,7 +5,7 @@ import numpy as np
 
 import trustbo as tb
 from trustbo.workspace.moves import MOVES, existing_bounds
-from trustbo.workspace.regions import linked_to
+from trustbo.workspace.routes import linked_to
 
 
 def walled(gap=None, side=60, shape=(3, 3)):

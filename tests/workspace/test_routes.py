@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from trustbo.team import Robot
-from trustbo.workspace.regions import largest_region
-from trustbo.workspace.routes import Routes, _a_star
+from trustbo.workspace.routes import Routes, _a_star, largest_region
 from trustbo.workspace.surface import Surface
 
 

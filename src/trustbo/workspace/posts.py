@@ -28,8 +28,7 @@ from trustbo.errors import TrustboError
 from trustbo.team import Robot, Team
 from trustbo.workspace.grid import Grid
 from trustbo.workspace.moves import MOVES
-from trustbo.workspace.regions import Window, largest_region, linked_to
-from trustbo.workspace.routes import Routes, at_times
+from trustbo.workspace.routes import Routes, Window, at_times, largest_region, linked_to
 from trustbo.workspace.sight import Sight, detection_between, jittered, optics
 from trustbo.workspace.surface import surface_of
 

@@ -1,4 +1,9 @@
-"""Fastest routes over passable pixels."""
+"""Fastest routes over passable pixels, and the regions that routes connect.
+
+Two pixels are in the same region if they are connected by passable pixels that share edges. A route
+between two pixels therefore exists if and only if they are in the same region: it does not pass
+diagonally between two impassable pixels or cut the corner of one.
+"""
 
 import heapq
 import math
@@ -10,9 +15,10 @@ from scipy import ndimage
 
 from trustbo.parallel import plain
 from trustbo.team import Robot
-from trustbo.workspace.regions import Window
 from trustbo.workspace.surface import Surface
 
+Window = tuple[int, int, int, int]
+"""First and end row, then first and end column, of a window of pixels."""
 SLOWEST = 0.1
 """Speed at the slope limit as a fraction of the speed on level ground."""
 _CLEARANCE = 1.0  # preferred distance from obstacles, since robots stray from routes, m
@@ -173,3 +179,22 @@ def _resampled(gradient, pixel, origin, flat, first, limits, n_samples):
             for axis in range(2):
                 points[b, s, axis] = way[k - 1, axis] + share * (way[k, axis] - way[k - 1, axis])
     return points, duration
+
+
+def largest_region(passable: np.ndarray) -> np.ndarray:
+    """Return a mask (row, col) of the largest region of passable pixels."""
+    regions: Any = ndimage.label(passable)
+    labels, n_regions = regions
+    if n_regions == 0:
+        return passable
+    sizes = np.bincount(labels.ravel())
+    sizes[0] = 0
+    return labels == np.argmax(sizes)
+
+
+def linked_to(passable: np.ndarray, window: Window, pixel: tuple[int, ...]) -> np.ndarray:
+    """Return a mask of a window's passable pixels that are connected to `pixel` in the window."""
+    top, bottom, left, right = window
+    inside = passable[top:bottom, left:right]
+    regions: Any = ndimage.label(inside)
+    return inside & (regions[0] == regions[0][pixel[0] - top, pixel[1] - left])
