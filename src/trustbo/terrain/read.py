@@ -257,11 +257,9 @@ def _paired(ground: xr.DataArray, surface: xr.DataArray) -> xr.Dataset:
             f"the DSM lies {middle:.3g} m above the DEM in the median, and over {low:.3g} m nearly "
             "everywhere: check that both have the same unit and the same vertical datum."
         )
-    heights = {"dem": ("ground", dem), "dsm": ("surface", np.fmax(dem, dsm))}
-    maps = {
-        name: (("y", "x"), np.where(valid, z, np.nan), {"long_name": long_name, "units": "m"})
-        for name, (long_name, z) in heights.items()
-    }
+    heights = {"dem": dem, "dsm": np.fmax(dem, dsm)}
+    masked = {name: np.where(valid, z, np.nan) for name, z in heights.items()}
+    maps = {name: (("y", "x"), z, {"units": "m"}) for name, z in masked.items()}
     return xr.Dataset(maps, {axis: ground[axis].values for axis in ("y", "x")})
 
 
