@@ -7,7 +7,7 @@ import jax
 import matplotlib as mpl
 import pytest
 
-from trustbo.terrain.example import EXAMPLE_FILES
+from trustbo.terrain.examples import EXAMPLE_FILES
 
 mpl.use("Agg")
 jax.config.update("jax_numpy_rank_promotion", "raise")

@@ -18,7 +18,7 @@ from trustbo.simulation import KinematicSimulator, RadioSimulator, Truth
 from trustbo.simulation.events import Event
 from trustbo.study.grid import Scene
 from trustbo.team import Team
-from trustbo.terrain.example import EXAMPLE_FILES
+from trustbo.terrain.examples import EXAMPLE_FILES
 from trustbo.workspace import Workspace
 from trustbo.workspace.sight import Sight
 

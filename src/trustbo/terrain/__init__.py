@@ -1,7 +1,7 @@
 """Terrain rasters and features of their pixels."""
 
 from trustbo.terrain.composite import CompositeIndex
-from trustbo.terrain.example import example
+from trustbo.terrain.examples import example, synthetic_terrain
 from trustbo.terrain.features import (
     FEATURES,
     PAPER_VISIBILITY,
@@ -12,7 +12,6 @@ from trustbo.terrain.features import (
 )
 from trustbo.terrain.lidar import read_lidar
 from trustbo.terrain.read import pixel_size, read_terrain
-from trustbo.terrain.synthetic import synthetic_terrain
 
 __all__ = [
     "FEATURES", "PAPER_VISIBILITY", "TRAVERSABILITY", "VISIBILITY", "CompositeIndex", "example",

@@ -1,4 +1,6 @@
-"""Synthetic terrain with fractal relief and patches of vegetation."""
+"""Terrains to try out the package: a real hillside, and synthetic relief with vegetation."""
+
+from pathlib import Path
 
 import numpy as np
 import xarray as xr
@@ -6,6 +8,26 @@ from scipy import ndimage
 
 from trustbo.errors import TrustboError, require_positive, require_whole
 from trustbo.terrain.read import check_size, read_terrain
+
+_FOLDER = Path(__file__).parent / "data" / "wellington"
+EXAMPLE_FILES = str(_FOLDER / "dem.tif"), str(_FOLDER / "dsm.tif")
+"""Paths of the DEM and the DSM of `example`."""
+
+
+def example() -> xr.Dataset:
+    """Read the example of real terrain that is included in the package.
+
+    It is a steep hillside under bush in the Wairarapa, New Zealand, near Wellington: 195 m x 278 m
+    at 1 m, 211 m of relief, trees up to 44.6 m tall. The attribute `attribution` states the source
+    and the licence; `LICENCE.md` beside the files says which part of it is inferred.
+
+    Returns:
+        Dataset as from `read_terrain`.
+    """
+    return read_terrain(*EXAMPLE_FILES).assign_attrs(
+        attribution="Copyright in this work is owned by Greater Wellington Regional Council; "
+        "sourced from the LINZ Data Service, CC BY 4.0"
+    )
 
 
 def synthetic_terrain(
@@ -37,9 +59,7 @@ def synthetic_terrain(
     shape = (round(height / step), round(width / step))
     check_size(shape, f"size {size} m at {resolution} m")
     if min(shape) < 4:
-        raise TrustboError(
-            f"size {size} m at {resolution} m is {shape} pixels; at least 4 x 4 are needed."
-        )
+        raise TrustboError(f"size {size} m is under 4 pixels of {resolution} m.")
     relief = require_positive("relief", relief, or_zero=True)
     rng = np.random.default_rng(require_whole("seed", seed, 0))
     ground = _fractal(rng, shape, exponent=1.9)

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 import trustbo as tb
-from trustbo.terrain.example import EXAMPLE_FILES
+from trustbo.terrain.examples import EXAMPLE_FILES
 
 
 def test_the_example_is_ground_and_canopy_with_its_owner():
