@@ -144,7 +144,7 @@ def test_robots_and_teams_are_checked():
         Robot(max_slope=30.0)
     with pytest.raises(TrustboError, match="n_robots must be a whole number"):
         Team(n_robots=0)
-    with pytest.raises(TrustboError, match="must be a sequence of Robot"):
+    with pytest.raises(TrustboError, match="sequence of Robot"):
         Team(robots=Robot())
     with pytest.raises(TrustboError, match="3 different names"):
         Team(n_robots=3, names=("a", "b", "c", "a"))

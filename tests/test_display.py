@@ -34,7 +34,7 @@ def test_every_object_is_displayed():
     simulator = tb.simulation.ModelSimulator(workspace, params)
     mission = simulator.run([(2, 0), (1, 1), (0, 2)], seed=0)
     objects = [
-        workspace, workspace.grid, workspace.team, workspace.team.lead, mission,
+        workspace, workspace.grid, workspace.team, mission,
         planner, planner.plan(params), params, Priors(), PooledTrust(), simulator,
     ]  # fmt: skip
     for one in objects:

@@ -10,8 +10,8 @@ from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError, require_kind, require_positive, require_whole
 
 
-@dataclass(frozen=True, repr=False)
-class Robot(Summary):
+@dataclass(frozen=True)
+class Robot:
     """One ground robot with a lidar. The defaults describe a Husky-sized skid-steer vehicle.
 
     Attributes:
@@ -58,18 +58,6 @@ class Robot(Summary):
                     "(degrees? use numpy.deg2rad)."
                 )
 
-    def _rows(self) -> Rows:
-        vertical, slope = (
-            f"{np.rad2deg(a):.3g} degrees" for a in (self.vertical_fov, self.max_slope)
-        )
-        return [
-            ("speed", f"{self.speed:g} m/s, turns {self.turn_rate:g} rad/s"),
-            ("slope limit", slope),
-            ("lidar", f"range {self.lidar_range:g} m, {vertical} up and down"),
-            ("sensor", f"{self.sensor_height:g} m high, aims {self.target_height:g} m"),
-            ("detection", f"{self.detection:.0%}; {self.acquire} to acquire, {self.drop} to drop"),
-        ]
-
 
 @dataclass(frozen=True, repr=False)
 class Team(Summary):
@@ -94,13 +82,9 @@ class Team(Summary):
     names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        if not isinstance(self.robots, Sequence) or not all(
-            isinstance(robot, Robot) for robot in self.robots
-        ):
-            raise TrustboError(
-                f"Team.robots must be a sequence of Robot; got {type(self.robots).__name__}. For "
-                "identical robots, give n_robots=."
-            )
+        remedy = "give a sequence of Robot, or n_robots= for identical robots"
+        for robot in require_kind("Team.robots", self.robots, Sequence, remedy):
+            require_kind("Team.robots", robot, Robot, remedy)
         robots = tuple(self.robots) or (Robot(),) * require_whole("n_robots", self.n_robots, 1)
         names = tuple(self.names) or tuple(f"r{i + 1}" for i in range(len(robots)))
         if not len(set(names)) == len(names) == len(robots):
