@@ -5,12 +5,11 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from functools import cache
 from typing import Any
 
 import numpy as np
 from joblib import cpu_count
-from threadpoolctl import ThreadpoolController
+from threadpoolctl import threadpool_limits
 
 _BLOCK = 64  # rows per call: few enough to fit in the caches
 _here = threading.local()
@@ -65,13 +64,7 @@ def in_order[T, R](work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
 def one_blas_thread() -> Iterator[None]:
     """Limit BLAS to one thread; with more, matrices of about 20 rows take 20 times as long.
 
-    The function can also be used as a decorator.
+    The function can also be used as a decorator. It takes 3 ms to find the BLAS libraries.
     """
-    with _blas().limit(limits=1, user_api="blas"):
+    with threadpool_limits(limits=1, user_api="blas"):
         yield
-
-
-@cache
-def _blas() -> ThreadpoolController:
-    """Return the loaded BLAS libraries; cached because the search is slow."""
-    return ThreadpoolController()
