@@ -1,6 +1,5 @@
 """Parallel work in threads, which use all cores because compiled code releases the GIL."""
 
-import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -12,7 +11,6 @@ from joblib import cpu_count
 from threadpoolctl import threadpool_limits
 
 _BLOCK = 64  # rows per call: few enough to fit in the caches
-_here = threading.local()
 
 PART: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 """Options of functions called only by compiled code; they save a quarter of the compile time.
@@ -31,28 +29,19 @@ def plain(values: np.ndarray) -> np.ndarray:
 
 
 def over_rows(work: Callable[[int, int], None], n_rows: int) -> None:
-    """Call `work(first, last)` on blocks of rows, on all cores unless called in a worker thread."""
+    """Call `work(first, last)` on blocks of rows, on all cores."""
     blocks = [(first, min(first + _BLOCK, n_rows)) for first in range(0, n_rows, _BLOCK)]
     work(0, 0)  # compiles in one thread
-    if len(blocks) == 1 or getattr(_here, "is_worker", False):
-        for block in blocks:
-            work(*block)
-        return
     with ThreadPoolExecutor(cpu_count()) as pool:
         list(pool.map(lambda block: work(*block), blocks))
 
 
 def in_order[T, R](work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
     """Yield results in the order of the items; at most one result per core is in memory."""
-
-    def alone(item: T) -> R:
-        _here.is_worker = True
-        return work(item)
-
     pending: deque[Future[R]] = deque()
     with ThreadPoolExecutor(cpu_count()) as pool:
         for item in items:
-            pending.append(pool.submit(alone, item))
+            pending.append(pool.submit(work, item))
             del item
             if len(pending) >= cpu_count():
                 yield pending.popleft().result()
