@@ -3,7 +3,7 @@
 import pytest
 
 from trustbo.errors import TrustboError
-from trustbo.files import read_file, require_suffix, write_file
+from trustbo.files import read_file, write_file
 
 
 def test_failed_write_leaves_the_file_before(tmp_path):
@@ -28,9 +28,3 @@ def test_refusal_of_the_system_names_the_file(tmp_path):
 def test_missing_file_is_named(tmp_path):
     with pytest.raises(TrustboError, match=r"a\.json.* cannot be read"):
         read_file(tmp_path / "a.json")
-
-
-def test_files_are_written_with_the_suffix_of_their_format(tmp_path):
-    assert require_suffix(tmp_path / "a.CSV", ".csv").name == "a.CSV"
-    with pytest.raises(TrustboError, match=r"a\.png"):
-        require_suffix(tmp_path / "a.png", ".csv")

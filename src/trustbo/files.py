@@ -81,11 +81,3 @@ def to_json(record: object) -> str:
         return str(value)
 
     return json.dumps(record, default=plain)
-
-
-def require_suffix(path: FilePath, *suffixes: str) -> Path:
-    """Return the path of a file; raises TrustboError unless it ends in one of these suffixes."""
-    file = Path(path)
-    if file.suffix.lower() not in suffixes:
-        raise TrustboError(f"{str(file)!r} must end in {' or '.join(suffixes)}.")
-    return file

@@ -77,6 +77,13 @@ def test_all_formats_are_written_to_a_folder(result, tmp_path):
         export_result(result, tmp_path, ["kmz"])
 
 
+def test_a_file_has_the_suffix_of_its_format(maps, tmp_path):
+    write_geotiff(tmp_path / "maps.TIF", maps)
+    with pytest.raises(TrustboError, match=r"maps\.png"):
+        write_geotiff(tmp_path / "maps.png", maps)
+    assert [file.name for file in tmp_path.iterdir()] == ["maps.TIF"]
+
+
 def test_without_a_terrain_there_is_no_place_on_earth(result, maps, nowhere, tmp_path):
     bare = dataclasses.replace(result.plan, workspace=nowhere.workspace)
     for write, what in ((write_geojson, bare), (write_geotiff, maps.drop_vars("spatial_ref"))):

@@ -1,6 +1,7 @@
 """Files for GIS: maps as GeoTIFF, plans as GeoJSON, and missions as CSV."""
 
 import json
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from shapely import affinity
 
 from trustbo.campaign.result import Result
 from trustbo.errors import TrustboError, require_kind
-from trustbo.files import FilePath, require_suffix, write_file, write_text
+from trustbo.files import FilePath, write_file, write_text
 from trustbo.logs.table import to_frame
 from trustbo.planning import Plan
 from trustbo.planning.plan import QUANTILES
@@ -120,6 +121,14 @@ def write_csv(path: FilePath, result: Result) -> None:
             values[i, k, r] if i >= 0 and 0 <= k < n_bounds else np.nan for i, k, r in at
         ]
     write_text(path, table.to_csv(index=False, lineterminator="\n"))
+
+
+def require_suffix(path: FilePath, *suffixes: str) -> Path:
+    """Return the path of a file; raises TrustboError unless it ends in one of these suffixes."""
+    file = Path(path)
+    if file.suffix.lower() not in suffixes:
+        raise TrustboError(f"{str(file)!r} must end in {' or '.join(suffixes)}.")
+    return file
 
 
 def _of(values: Any) -> Any:

@@ -15,8 +15,8 @@ import xarray as xr
 
 from trustbo.campaign.result import Result
 from trustbo.errors import TrustboError, require_choice, require_positive
-from trustbo.export.gis import LEAD
-from trustbo.files import FilePath, require_suffix, write_file, write_text
+from trustbo.export.gis import LEAD, require_suffix
+from trustbo.files import FilePath, write_file, write_text
 from trustbo.planning import Plan
 from trustbo.planning.problem import mean_of
 from trustbo.workspace import Workspace
