@@ -147,11 +147,6 @@ class Mission(Summary):
                 raise TrustboError(f"{name} must be {size} names; got {labels}.")
             object.__setattr__(self, name, labels)
 
-    @property
-    def has_map(self) -> bool:
-        """Whether the bounds enter cells of a map."""
-        return bool(self.path)
-
     def _rows(self) -> Rows:
         rates, took = self.contact_rate, self.bounds[-1].t1
         planned = f"{path_text(self.path[:1])} to {path_text(self.path[-1:])}"
@@ -305,7 +300,7 @@ def levels_of(scale: object) -> int:
 def require_map(what: str, missions: Iterable[Mission]) -> None:
     """Raise TrustboError for missions of a log without a map."""
     for j, mission in enumerate(missions):
-        if not mission.has_map:
+        if not mission.path:
             raise TrustboError(
                 f"{what} needs the cells of a map, but mission {j} has none (path=None); missions "
                 "without a map can only be fitted (without place effects) and scored."

@@ -98,7 +98,7 @@ def _predict(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return log densities (bound, robot) and draws (draw, bound, robot) of the rates."""
     log_scores, drawn, (z, y, ticks) = np.full(batch.contact_rate.shape, np.nan), [], batch
-    path = mission.path[: len(z) + 1] if trust.params.places and mission.has_map else None
+    path = mission.path[: len(z) + 1] if trust.params.places and mission.path else None
     effects, start = trust.effects(path, len(z)), trust.dynamics.start()
     for k, (beliefs, rates) in enumerate(trust.dynamics.ahead(start, z, ticks, effects, rng)):
         density = np.logaddexp.reduce(trust.dynamics.log_densities(beliefs, y[k], ticks[k]), axis=0)

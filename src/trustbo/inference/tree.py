@@ -87,10 +87,10 @@ def _data_groups(
     for j, mission in enumerate(missions):
         duration[j, : len(mission.bounds)] = mission.duration
         cell[j, : len(mission.bounds)] = [bound.cell for bound in mission.bounds]
-    starts = [mission.path[0] if mission.has_map else NOWHERE for mission in missions]
+    starts = [mission.path[0] if mission.path else NOWHERE for mission in missions]
     # The cells give the number of bounds, except for missions without a map.
     n_bounds = [len(mission.bounds) for mission in missions]
-    counted = {} if all(m.has_map for m in missions) else {"n_bounds": (("mission",), n_bounds)}
+    counted = {} if all(m.path for m in missions) else {"n_bounds": (("mission",), n_bounds)}
     dims, labelled = _OF_RATES, {name: coords[name] for name in _OF_RATES}
     rates = xr.Dataset({"contact_rate": (dims, observed.contact_rate)}, labelled)
     constant = xr.Dataset(

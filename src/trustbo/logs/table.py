@@ -32,15 +32,15 @@ def to_frame(missions: Sequence[Mission]) -> pd.DataFrame:
     require_same_team(missions)
     if taken := {*missions[0].features} & {*COLUMNS, "x", "y"}:
         raise TrustboError(f"features {sorted(taken)} are names of other columns; rename them.")
-    if len({mission.has_map for mission in missions}) > 1:
+    if len({bool(mission.path) for mission in missions}) > 1:
         raise TrustboError("some missions have a path and some do not; write them to two tables.")
     rows = []
     for j, mission in enumerate(missions, start=1):
         n_run = len(mission.bounds)
-        for k in range(0 if mission.has_map else 1, max(len(mission.path), n_run + 1)):
+        for k in range(0 if mission.path else 1, max(len(mission.path), n_run + 1)):
             for i, robot in enumerate(mission.robots):
                 row: dict[str, Any] = dict(zip(KEYS, (j, k, robot), strict=True))
-                if mission.has_map:
+                if mission.path:
                     row["row"], row["col"] = mission.path[k]
                 if 1 <= k <= n_run:
                     bound = mission.bounds[k - 1]
@@ -48,7 +48,7 @@ def to_frame(missions: Sequence[Mission]) -> pd.DataFrame:
                     row["status"] = mission.status if k == n_run else "ok"
                     row |= dict(zip(mission.features, bound.awareness[i], strict=True))
                 rows.append(row)
-    names = [name for name in COLUMNS if missions[0].has_map or name not in ("row", "col")]
+    names = [name for name in COLUMNS if missions[0].path or name not in ("row", "col")]
     return pd.DataFrame(rows, columns=[*names, *missions[0].features])
 
 
