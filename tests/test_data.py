@@ -6,7 +6,6 @@ import pytest
 
 from trustbo.data import Bound, Mission
 from trustbo.errors import TrustboError
-from trustbo.stacking import replace_awareness
 from trustbo.team import Robot, Team
 
 PATH = [(2, 0), (1, 1), (0, 2)]
@@ -126,13 +125,12 @@ def test_masked_rates_and_rates_that_pandas_calls_missing_are_not_measured():
         np.testing.assert_array_equal(found, np.where(missing, np.nan, y))
 
 
-def test_awareness_is_replaced_where_other_values_are_known():
+def test_a_mission_takes_another_awareness_and_keeps_its_rates():
     z, y = arrays()
-    known = np.random.default_rng(0).uniform(size=(3, 3, 2))  # of a planned bound too
-    known[0, 1] = np.nan
-    replaced = replace_awareness(Mission.from_arrays(PATH, z, y), known)
-    np.testing.assert_array_equal(replaced.awareness[0, 1], z[0, 1])
-    np.testing.assert_array_equal(replaced.awareness[1], known[1])
+    other = np.random.default_rng(0).uniform(size=z.shape)
+    found = Mission.from_arrays(PATH, z, y).with_awareness(other)
+    np.testing.assert_array_equal(found.awareness, other)
+    np.testing.assert_array_equal(found.contact_rate, y)
 
 
 def test_robots_and_teams_are_checked():

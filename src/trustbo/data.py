@@ -217,6 +217,11 @@ class Mission(Summary):
         measured = zip(entered, z, y, seconds, statuses, [0.0, *ends], ticks, strict=False)
         bounds = tuple(Bound(*values, n_ticks=n) for *values, n in measured)
         named = as_names("features", features), as_names("robots", robots)
+    def with_awareness(self, awareness: np.ndarray) -> Self:
+        """Return the mission with another awareness, shape (bound, robot, feature)."""
+        bounds = zip(self.bounds, awareness, strict=True)
+        return replace(self, bounds=tuple(replace(bound, awareness=z) for bound, z in bounds))
+
         return cls(cells, bounds, status, *named)
 
     def in_order(

@@ -1,7 +1,6 @@
 """Stack missions of different lengths into one batch of arrays."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -59,14 +58,3 @@ def require_same_team(missions: Sequence[Mission]) -> None:
                 f"mission {j} has robots {mission.robots} and features {mission.features}, but "
                 f"mission 0 has {first.robots} and {first.features}; all must agree."
             )
-
-
-def replace_awareness(mission: Mission, awareness: np.ndarray) -> Mission:
-    """Replace a mission's awareness with given values, (bound, robot, feature), except NaN.
-
-    Values of planned bounds that were not run are ignored.
-    """
-    given = awareness[: len(mission.bounds)]
-    values = np.where(np.isnan(given), mission.awareness, given)
-    bounds = zip(mission.bounds, values, strict=True)
-    return replace(mission, bounds=tuple(replace(bound, awareness=z) for bound, z in bounds))

@@ -18,7 +18,6 @@ from trustbo.inference.tree import parameters_alone
 from trustbo.models import PlaceEffect
 from trustbo.models.model import TrustModel
 from trustbo.planning import Planner
-from trustbo.stacking import replace_awareness
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import along, require_on_grid
 
@@ -42,7 +41,8 @@ def as_learned(mission: Mission, workspace: Workspace) -> Mission:
     Weights fitted to measured awareness would be biased when the planner applies them to the map's
     awareness. Raises TrustboError in the same cases as `known_along`.
     """
-    return replace_awareness(mission, known_along(mission.path, workspace))
+    known = known_along(mission.path, workspace)[: len(mission.bounds)]
+    return mission.with_awareness(np.where(np.isnan(known), mission.awareness, known))
 
 
 def why_never_learned(mission: Mission) -> str:

@@ -6,7 +6,6 @@ of a bound in which the robot moves.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -70,14 +69,12 @@ class RealtimeAwareness:
 
     def measured(self, mission: Mission) -> Mission:
         """Return the mission with the features of `SIGNS` as measured by the robots."""
-        bounds = []
-        for bound in mission.bounds:
-            awareness = bound.awareness.copy()
+        z = mission.awareness.copy()
+        for k, bound in enumerate(mission.bounds):
             for feature, inputs in self.inputs(bound).items():
                 column = mission.features.index(feature)
-                awareness[:, column] = self.indices[feature].transform(inputs)
-            bounds.append(replace(bound, awareness=awareness))
-        return replace(mission, bounds=tuple(bounds))
+                z[k, :, column] = self.indices[feature].transform(inputs)
+        return mission.with_awareness(z)
 
     def _lidar(self, poses: np.ndarray) -> dict[str, np.ndarray]:
         """Compute the mean range of returns (m) and the fraction of clear beams, (tick, robot).

@@ -22,7 +22,6 @@ from trustbo.data import (
 )
 from trustbo.display import Rows, Summary, compiling
 from trustbo.errors import TrustboError, require_positive
-from trustbo.stacking import replace_awareness
 from trustbo.team import Team
 from trustbo.terrain.composite import CompositeIndex
 from trustbo.terrain.features import PAPER_VISIBILITY, TRAVERSABILITY, VISIBILITY
@@ -257,7 +256,7 @@ class Workspace(Summary):
         if not missing.any():
             return ordered
         known = self.along(ordered.path)[: len(missing)]
-        return replace_awareness(ordered, np.where(missing, known, np.nan))
+        return ordered.with_awareness(np.where(missing, known, ordered.awareness))
 
     def locate(self, location: Location, what: str = "location") -> Cell:
         """Find the passable cell at a location.
