@@ -138,13 +138,11 @@ class Mission(Summary):
         if len(shapes) > 1:
             raise TrustboError(f"bounds disagree on (robot, feature): {sorted(shapes)}.")
         n_robots, n_features = shapes.pop()
-        names = {
-            "features": tuple(self.features) or default_features(n_features),
-            "robots": tuple(self.robots) or tuple(f"r{i + 1}" for i in range(n_robots)),
-        }
-        for (name, labels), size in zip(names.items(), (n_features, n_robots), strict=True):
-            if len(labels) != size:
-                raise TrustboError(f"{name} must be {size} names; got {labels}.")
+        robots = tuple(f"r{i + 1}" for i in range(n_robots))
+        for name, usual in (("features", default_features(n_features)), ("robots", robots)):
+            labels = tuple(getattr(self, name)) or usual
+            if len(labels) != len(usual):
+                raise TrustboError(f"{name} must be {len(usual)} names; got {labels}.")
             object.__setattr__(self, name, labels)
 
     def _rows(self) -> Rows:
@@ -217,25 +215,20 @@ class Mission(Summary):
         measured = zip(entered, z, y, seconds, statuses, [0.0, *ends], ticks, strict=False)
         bounds = tuple(Bound(*values, n_ticks=n) for *values, n in measured)
         named = as_names("features", features), as_names("robots", robots)
+        return cls(cells, bounds, status, *named)
+
     def with_awareness(self, awareness: np.ndarray) -> Self:
         """Return the mission with another awareness, shape (bound, robot, feature)."""
         bounds = zip(self.bounds, awareness, strict=True)
         return replace(self, bounds=tuple(replace(bound, awareness=z) for bound, z in bounds))
 
-        return cls(cells, bounds, status, *named)
-
     def in_order(
-        self, robots: Sequence[str], features: Sequence[str], unmeasured: Sequence[str] = ()
+        self, robots: Sequence[str], features: Sequence[str], unmeasured: Sequence[str]
     ) -> Self:
         """Return the mission with its robots and features in the order of these names.
 
-        Args:
-            robots: Names of the robots.
-            features: Names of the features.
-            unmeasured: Features that may be missing from the mission; their values are then NaN.
-
-        Raises:
-            TrustboError: The mission has other robots or features.
+        Features in `unmeasured` may be missing from the mission; their values are then NaN. Raises
+        TrustboError if the mission has other robots or features.
         """
         names = {"robots": tuple(robots), "features": tuple(features)}
         if names == {"robots": self.robots, "features": self.features}:
@@ -260,8 +253,6 @@ class Mission(Summary):
             bounds.append(replace(b, awareness=z[np.ix_(i, m)], **per_robot))
         return replace(self, bounds=tuple(bounds), **names)
 
-    # Stacked once, because every refit reads these arrays of every mission.
-
     @cached_property
     def awareness(self) -> np.ndarray:
         """Measured awareness, shape (bound, robot, feature)."""
@@ -283,6 +274,7 @@ class Mission(Summary):
         return self._stacked("n_ticks")
 
     def _stacked(self, name: str) -> np.ndarray:
+        """Stack an array of the bounds; cached, as every refit reads those of every mission."""
         array = np.stack([getattr(bound, name) for bound in self.bounds])
         array.flags.writeable = False
         return array
@@ -366,9 +358,8 @@ def require_unit_interval(what: str, values: np.ndarray) -> None:
     bad = (values < 0.0) | (values > 1.0)
     if bad.any():
         index = ", ".join(str(i) for i in np.argwhere(bad)[0])
-        is_rating = np.nanmax(values) <= 10.0
-        rating = "; rating from 1 to n? (rating - 1) / (n - 1)" if is_rating else ""
-        hint = f" (percent? divide by 100{rating})" if np.nanmin(values) >= 0.0 else ""
+        scaled = "percent? divide by 100; rating from 1 to n? (rating - 1) / (n - 1)"
+        hint = f" ({scaled})" if np.nanmin(values) >= 0.0 else ""
         raise TrustboError(f"{what}: [{index}] = {values[bad][0]:g} is outside [0, 1]{hint}.")
 
 
