@@ -1,5 +1,7 @@
 """Robots, bounds and missions: refused early, with the value and the remedy."""
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -131,6 +133,13 @@ def test_a_mission_takes_another_awareness_and_keeps_its_rates():
     found = Mission.from_arrays(PATH, z, y).with_awareness(other)
     np.testing.assert_array_equal(found.awareness, other)
     np.testing.assert_array_equal(found.contact_rate, y)
+
+
+def test_a_scale_of_reports_is_checked():
+    mission = Mission.from_arrays(None, *arrays())
+    assert replace(mission, scale="likert5").scale == "likert5"
+    with pytest.raises(TrustboError, match="scale"):
+        replace(mission, scale="stars")
 
 
 def test_robots_and_teams_are_checked():

@@ -106,7 +106,7 @@ class Mission(Summary):
 
     Raises:
         TrustboError: The bounds do not fit the path, or disagree on robots or features, or the
-            status is unknown.
+            status or the scale is unknown.
     """
 
     path: tuple[Cell, ...]
@@ -144,6 +144,8 @@ class Mission(Summary):
             if len(labels) != len(usual):
                 raise TrustboError(f"{name} must be {len(usual)} names; got {labels}.")
             object.__setattr__(self, name, labels)
+        if self.scale:
+            levels_of(self.scale)
 
     def _rows(self) -> Rows:
         rates, took = self.contact_rate, self.bounds[-1].t1
