@@ -143,8 +143,8 @@ def test_what_cannot_be_planned_is_refused(workspace):
         with pytest.raises(TrustboError, match=r"start|goal"):
             Planner(workspace, *ends)
     for name, value in (
-        ("objective", "best"), ("family", "normal"), ("max_bounds", 3), ("max_bounds", "long"),
-        ("max_failure", 1.0), ("max_failure", True), ("failure_cost", -1.0),
+        ("objective", "best"), ("family", "normal"), ("max_bounds", 3), ("max_bounds", 0),
+        ("max_bounds", "long"), ("max_failure", 1.0), ("max_failure", True), ("failure_cost", -1.0),
     ):  # fmt: skip
         with pytest.raises(TrustboError, match=name):
             Planner(workspace, *ENDS, **{name: value})

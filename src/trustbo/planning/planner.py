@@ -82,7 +82,8 @@ class Planner(Summary):
         """
         row = OBJECTIVES[require_choice("objective", objective, OBJECTIVES)]
         chosen = FAMILIES[require_choice("family", family, FAMILIES)]
-        paths = AdmissiblePaths(workspace, start, goal, max_bounds or row.max_bounds)
+        most = row.max_bounds if max_bounds is None else max_bounds
+        paths = AdmissiblePaths(workspace, start, goal, most)
         tolls = _toll_of(toll, paths.bounds)
         self.problem = Problem(paths, row, chosen, tolls, max_failure, failure_cost)
 
