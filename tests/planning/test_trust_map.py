@@ -39,8 +39,9 @@ def test_a_trust_map_is_the_best_of_all_paths_to_each_cell(workspace, model):
     assert np.isnan(maps[:, 1, 1]).all()
 
 
-def test_the_trust_of_the_goal_is_that_of_the_terminal_plan(workspace):
-    params = sample_prior(PooledTrust(), 2, 1, seed=1).draw(0)
+@pytest.mark.parametrize("beta0", [0.4, -0.6])
+def test_the_trust_of_the_goal_is_that_of_the_terminal_plan(workspace, beta0):
+    params = sample_prior(PooledTrust(), 2, 1, seed=1).draw(0)._replace(beta0=beta0)
     planner = Planner(workspace, *ENDS, "terminal")
     closed = np.random.default_rng(5).uniform(size=(8, 4, 4)) < 0.2
     planner = planner.avoiding(closed, np.zeros((8, 4, 4)))

@@ -42,7 +42,8 @@ def _largest(paths: AdmissiblePaths, dynamics: Dynamics, view: np.ndarray) -> np
     extra = min(SIMPLE_EXTRA, paths.longest - paths.shortest)
     weights = view @ dynamics.transition  # (draw, state)
     beta0 = np.divide(weights, view, out=np.zeros_like(weights), where=view > 0.0)
-    if (weights == beta0.max(-1, keepdims=True) * view).all():  # view . x has its own recursion
+    scalar = (weights == beta0.max(-1, keepdims=True) * view).all()  # view . x has a recursion
+    if scalar and (beta0 >= 0.0).all():
         drift = np.einsum("s,dsmrc->dmrc", view, dynamics.drift)
         drift = np.where(paths.bounds, drift, np.nan)
         return best_trust(paths, extra, drift, beta0.max(-1), dynamics.start @ view)
