@@ -1,5 +1,7 @@
 """Truth: tables against missions, best paths against enumeration, files."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -128,6 +130,9 @@ def test_a_truth_is_found_once_and_read_from_its_file_again(tmp_path, monkeypatc
             Truth.of(Plain(grid((2, 2))), folder=tmp_path, **options)
     with pytest.raises(TypeError):
         Truth.of(Plain(grid((2, 3))), n_replicates=2, folder=tmp_path)
+    patient = Team(robots=(Robot(acquire=3),))
+    with pytest.raises(TypeError):
+        Truth.of(Plain(replace(grid((2, 2)), team=patient)), n_replicates=2, folder=tmp_path)
 
 
 @pytest.mark.parametrize("failures", [False, True])

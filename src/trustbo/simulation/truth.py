@@ -96,7 +96,7 @@ class Truth(Summary):
                 settings = simulator.describe_world(number)
             else:
                 settings = getattr(simulator, "describe", lambda: type(simulator).__name__)()
-            world = to_json([settings, known, n_replicates, seed])
+            world = to_json([settings, known, workspace.team, n_replicates, seed])
             if world not in found:
                 make = partial(replicated, simulator, number, n_replicates, seed)
                 found[world] = cls(workspace, _kept(folder, world, make), of_mission)
