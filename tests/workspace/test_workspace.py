@@ -114,3 +114,14 @@ def test_bad_arrays_are_refused():
         Workspace.from_awareness(hole, np.ones((3, 4)))
     with pytest.raises(TrustboError, match="no cell is passable"):
         Workspace.from_awareness(awareness, np.zeros((3, 4)))
+
+
+def test_arrays_with_other_moves_are_refused():
+    awareness = Workspace.from_awareness(np.full((2, 3, 4, 2), 0.5)).awareness
+    np.testing.assert_array_equal(
+        Workspace.from_awareness(awareness.isel(move=slice(None, None, -1))).awareness, awareness
+    )
+    with pytest.raises(TrustboError, match="move"):
+        Workspace.from_awareness(awareness.assign_coords(move=np.arange(8)))
+    of_cells = awareness.isel(move=1).fillna(0.5)
+    assert Workspace.from_awareness(of_cells).passable.all()

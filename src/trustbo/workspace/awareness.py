@@ -149,13 +149,14 @@ def unlabelled(
     axes = [axis for axis in _DIMS if axis != "move" or "move" in awareness.dims]
     if set(awareness.dims) != set(axes):
         raise TrustboError(f"awareness must have the dims {_AXES}; got {awareness.dims}.")
-    if "move" in awareness.coords:
-        awareness = awareness.sel(move=list(MOVE_NAMES))
     chosen = []
-    for axis, given in (("robot", names), ("feature", features)):
-        labels = awareness[axis].values.astype(str).tolist() if axis in awareness.coords else []
+    for axis, given in (("robot", names), ("feature", features), ("move", MOVE_NAMES)):
+        labels = awareness[axis].values.astype(str).tolist() if axis in awareness.indexes else []
         if labels and given and set(labels) != set(given):
-            raise TrustboError(f"awareness has {axis} labels {labels}; expected {list(given)}.")
+            raise TrustboError(
+                f"awareness has the {axis} labels {labels}, but {list(given)} are expected; rename "
+                "the labels."
+            )
         if labels and given:
             awareness = awareness.sel({axis: list(given)})
         chosen.append(tuple(given or labels))
