@@ -1,4 +1,4 @@
-"""Planning of the most trustworthy path under a posterior of the trust model."""
+"""Search for the most trustworthy path, given a posterior of the trust model."""
 
 from trustbo.planning import policies, reference
 from trustbo.planning.dynamics import roll_trust
@@ -13,4 +13,4 @@ __all__ = [
     "OBJECTIVES", "POLICIES", "InfeasibleError", "NoPathError", "Plan", "Planner",
     "policies", "reference", "roll_trust",
 ]  # fmt: skip
-__dir__ = __all__.copy  # completion lists only public names
+__dir__ = __all__.copy  # tab completion lists only public names

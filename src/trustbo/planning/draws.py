@@ -1,4 +1,4 @@
-"""Best paths for each draw of a posterior, with their values, regrets and frequencies."""
+"""Best path for each draw of a posterior, with the values, regrets and frequencies of paths."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from trustbo.planning.problem import EXACT, Problem
 
 @dataclass(frozen=True, eq=False)
 class DrawnPaths:
-    """Best path of a planning problem for each parameter draw.
+    """The best path of a planning problem for each parameter draw.
 
     Attributes:
         problem: Planning problem.
@@ -40,11 +40,11 @@ class DrawnPaths:
 
     @cached_property
     def values(self) -> np.ndarray:
-        """Value of the best path of each draw, shape (draw,)."""
+        """Value of each draw's best path under that draw, shape (draw,)."""
         values, which = np.empty(len(self.paths)), self._distinct[1]
         for i, path in enumerate(self.candidates):
-            some = Dynamics(*(value[which == i] for value in self.dynamics))
-            values[which == i] = self._value(some, path)
+            best = which == i
+            values[best] = self._value(Dynamics(*(value[best] for value in self.dynamics)), path)
         return values
 
     def values_of(self, paths: Sequence[Sequence[Cell]]) -> np.ndarray:
@@ -52,15 +52,16 @@ class DrawnPaths:
         return np.stack([self._value(self.dynamics, path) for path in paths], axis=1)
 
     def regret(self, path: Sequence[Cell]) -> np.ndarray:
-        """Return the regret of a path, shape (draw,): each draw's best value minus the path's."""
+        """Return the best value of each draw minus the value of the given path, shape (draw,)."""
         return np.maximum(0.0, self.values - self.values_of([path])[:, 0])
 
     def relative_regret(self, path: Sequence[Cell]) -> np.ndarray:
         """Return the regret of a path relative to each draw's best value, shape (draw,).
 
-        For lost_contact, the regret is divided by the contact kept on the best path: its number of
-        bounds minus the contact lost. For other objectives, the regret is divided by the magnitude
-        of the best value. If the divisor is 0, a positive regret becomes infinite.
+        For lost_contact, the regret is divided by the contact kept on the best path, which is the
+        number of bounds of that path minus the lost contact and the failure cost. For other
+        objectives, the regret is divided by the absolute best value. If the divisor is 0, a
+        positive regret becomes infinite.
         """
         scale = np.abs(self.values)
         if self.problem.objective.of_contact:
@@ -71,13 +72,14 @@ class DrawnPaths:
         return np.divide(regret, scale, out=nothing, where=scale > 0.0)
 
     def share(self) -> np.ndarray:
-        """Return the fraction of the paths that enter each cell, shape (row, col)."""
+        """Return the fraction of draws whose best path contains each cell, shape (row, col)."""
         count = np.zeros(self.problem.paths.bounds.shape[1:])
         for path, n in zip(self.candidates, self.counts, strict=True):
-            count[tuple(np.array(path).T)] += n  # a cell entered twice counts once
+            count[tuple(np.array(path).T)] += n  # adds n once, even if a path enters the cell twice
         return count / len(self.paths)
 
     def _value(self, dynamics: Dynamics, path: Sequence[Cell]) -> np.ndarray:
+        """Compute the value of a path for each draw of `dynamics`, shape (draw,)."""
         problem = self.problem
         along = capped(problem.objective, problem.family, dynamics.along(path))
         value = problem.value_along(path, roll(along).mean(-1), along.noise_sd)
@@ -94,7 +96,7 @@ class DrawnPaths:
 
 
 def choose_draws(params: Params, n_draws: int | None, seed: int) -> Params:
-    """Choose `n_draws` draws at random, or all if None; the result has leading axis (draw,)."""
+    """Choose `n_draws` draws at random, or all draws if None; the leading axis is (draw,)."""
     flat = params.flat()
     n = flat.leading[0]
     if n_draws is None or require_whole("n_draws", n_draws, 1) >= n:

@@ -1,4 +1,4 @@
-"""Linear recursion for expected trust, shared by all models, and its values along a path."""
+"""Linear recursion for expected trust, which all models share, and expected trust on a path."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -19,7 +19,7 @@ class Dynamics(NamedTuple):
     (..., state) and noise_sd (...,), where noise_sd is the mean of delta_v over robots. Each robot
     is a state, and the team's trust is the mean of the states. If all robots have the same beta0,
     the mean trust is the only state. The drift at (move, row, col) belongs to the bound that enters
-    the cell by that move; it is NaN if there is no such bound.
+    the cell by that move; the drift is NaN if there is no such bound.
     """
 
     transition: np.ndarray
@@ -28,16 +28,16 @@ class Dynamics(NamedTuple):
     noise_sd: np.ndarray
 
     def flat(self) -> "Dynamics":
-        """Return the dynamics with a leading axis (draw,), of length 1 if there was none."""
+        """Return the dynamics with a leading axis (draw,), which has length 1 for a single draw."""
         return self if self.start.ndim > 1 else Dynamics(*(value[None] for value in self))
 
     def along(self, path: Sequence[Cell] | np.ndarray) -> "Dynamics":
-        """Select the drift of the bounds of a path, shape (..., state, 1, 1, bound)."""
+        """Return the dynamics with the drift of a path's bounds, (..., state, 1, 1, bound)."""
         moves, rows, cols = bounds_along(path).T
         return self._replace(drift=self.drift[..., moves, rows, cols][..., None, None, :])
 
     def settled(self) -> np.ndarray:
-        """Return the limit of the team's trust as each bound is repeated, (..., move, row, col)."""
+        """Return the limit of the team's trust if a bound is repeated, (..., move, row, col)."""
         gain = np.linalg.inv(np.eye(self.start.shape[-1]) - self.transition)
         return np.einsum("...st,...tmrc->...mrc", gain, self.drift) / self.start.shape[-1]
 
@@ -50,8 +50,8 @@ def trust_dynamics(
     Args:
         params: Parameters of any model.
         z: Awareness, shape (robot, move, row, col, feature).
-        x0: Expected trust before the first bound, shape () or (robot,), with or without the leading
-            axes; by default `params.x0_mean`.
+        x0: Expected trust before the first bound, shape (), (robot,) or (..., robot); by default
+            `params.x0_mean`.
         by_robot: Whether to use one state per robot even if the team's mean would suffice.
 
     Raises:
@@ -66,7 +66,7 @@ def trust_dynamics(
     sd = np.broadcast_to(sd.mean(-1) if params.BY_ROBOT else sd, leading)
     if params.BY_ROBOT or by_robot:
         return Dynamics(params.expected_transition(n_robots), drift(params, z), start, sd)
-    # The mean over robots obeys the same equation.
+    # With a common beta0, the mean trust of the robots obeys the same equation.
     z = z.mean(0, keepdims=True) if n_robots > 1 else z
     u = drift(params, z).mean(-4, keepdims=True)  # place effects may differ between robots
     return Dynamics(params.expected_transition(1), u, start.mean(-1, keepdims=True), sd)
@@ -75,7 +75,7 @@ def trust_dynamics(
 def drift(params: Params, awareness: np.ndarray) -> np.ndarray:
     """Compute the drift u = sum_m beta_m z_m + b of each bound, (..., robot, move, row, col).
 
-    The drift includes any place effects, which `ParameterDraws.along` selects for a path.
+    The drift includes any place effects. For a path, pass parameters from `params.along(path)`.
 
     Args:
         params: Parameters of any model, with leading axes (...,).
@@ -116,14 +116,14 @@ def roll_trust(params: Params, awareness: ArrayLike, x0: ArrayLike | None = None
 
     Raises:
         TrustboError: If the number of robots or features does not match the parameters, or place
-            effects are given on the grid instead of along the path.
+            effects are given for the grid instead of the path.
     """
     of_robots = np.swapaxes(np.asarray(awareness, dtype=float), 0, 1)
     return roll(trust_dynamics(params, of_robots[:, None, None], x0, by_robot=True))
 
 
 def roll(along: Dynamics) -> np.ndarray:
-    """Compute trust (..., bound, state) after each bound of a path (see `Dynamics.along`)."""
+    """Compute expected trust after each bound, (..., bound, state), from `Dynamics.along(path)`."""
     drift = np.moveaxis(along.drift[..., 0, 0, :], -1, 0)  # (bound, ..., state)
     trust = [along.start]
     for u in drift:

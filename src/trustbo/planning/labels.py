@@ -1,4 +1,4 @@
-"""Label search on the unrolled graph, for paths whose cost depends on history or risk.
+"""Label search on the unrolled graph, for objectives that are nonlinear in trust, or with a risk.
 
 The method is a label-setting algorithm with dominance for the resource-constrained shortest path
 (Martins 1984; Irnich and Desaulniers 2005). A label at a state contains the cost so far, the sums
@@ -9,10 +9,11 @@ sum_m F_m (1 - exp(-r_m)), and the last sum must not exceed a limit.
 A label is dropped if another label of its state has no higher cost, no larger sums and no lower
 trust. Because B0 >= 0 preserves the order of trust, any path to the goal is at least as good from
 the other label. If U-turns are forbidden, the other label must come from the same cell, or there
-must be two such labels from different cells. A label is also dropped if it cannot beat the best
-path found so far. The remaining cost is bounded by a sum over edges, which uses the largest
-possible trust and the chord of F_m (1 - exp(-r_m)) over the sums that can still be optimal. The
-limit is relaxed with a Lagrange multiplier, found by bisection (Handler and Zang 1980).
+must be two such labels from different cells. A label is also dropped if no path that continues it
+can be better than the best path found so far. To check this, the remaining cost is bounded from
+below by a sum over edges, which uses the largest possible trust and the chord of
+F_m (1 - exp(-r_m)) over the sums that can still be optimal. The limit is relaxed with a Lagrange
+multiplier, found by bisection (Handler and Zang 1980).
 
 The search is exact because no dropped label can lead to a better path than the one returned.
 """
@@ -27,23 +28,23 @@ from trustbo.planning.sums import costs_of_sums
 from trustbo.planning.unrolled import Unrolled, edges_from, fill_to_go, kernel, new_to_go
 
 MAX_LABELS = 300_000
-"""Maximum number of labels. Beyond it, a search returns the best path found and a lower limit."""
+"""Maximum number of labels. A larger search stops with the best path found and a lower limit."""
 LOGISTIC, CLIPPED = range(2)
-"""Loss of a bound: 1 - sigma(trust), or 1 - E[y] for a normal y clipped to [0, 1]."""
+"""Loss of a bound: 1 - sigma(trust), or 1 - E[y] for y ~ N(trust, sd^2) clipped to [0, 1]."""
 LOSSES = {"logistic": LOGISTIC, "clipped": CLIPPED}
-"""Loss for each nonlinear `Family.expected_rate`."""
+"""Loss of a bound for each nonlinear `Family.expected_rate`."""
 TINY_SD = 1e-9
-"""Smallest standard deviation of a rate, used instead of 0."""
+"""Smallest standard deviation of a contact rate; smaller values are replaced."""
 
 
 class Costs(NamedTuple):
     """Costs of paths for one draw.
 
-    `loss` is one of `LOSSES`. `weight` (left, robot) times `drift` (robot, bound) reduces the cost.
-    `start` (left,) is a constant for each number of bounds. `transition` (robot, robot) and `x0`
-    (robot,) define trust, or are empty if no loss depends on trust. `sd` is the sd of a rate.
-    Bounds have a `toll` (bound,) and `risk` (bound, sum). `failure` (sum,) holds the factors F_m,
-    and `limit` is the largest value of the last sum.
+    `loss` is a value of `LOSSES`. A bound costs its loss plus its `toll` (bound,) minus `weight`
+    (left, robot) times `drift` (robot, bound). `start` (left,) is the constant cost of paths with a
+    given number of bounds. `transition` (robot, robot) and `x0` (robot,) define the recursion for
+    trust, or are empty if there is no loss. `sd` is the sd of a rate. `risk` has the shape (bound,
+    sum), `failure` (sum,) contains F_m, and `limit` is the largest value allowed for the last sum.
     """
 
     loss: int
@@ -70,8 +71,8 @@ def best_labels(
         scale: Divisor of the cost for each number of bounds of a path, shape (length,).
 
     Returns:
-        Costs (draw,), lower limits on the costs (draw,), and paths (draw, cell) as flat cell
-        indices, padded with -1. A cost is inf if no path is within the limit.
+        Costs (draw,), lower limits on the costs of any path (draw,), and paths (draw, cell) as flat
+        cell indices, padded with -1. A cost is inf if no path is within the limit.
     """
     searches = [graph]
     divisor = scale[graph.left[graph.starts]]
@@ -93,6 +94,7 @@ def best_labels(
 
 @kernel
 def _best_labels(graph, costs, most, cost, lower, paths, begin, end):
+    """Write the results of `_best_path` for the draws from `begin` to `end`."""
     loss, drift, weight, start, transition, x0, sd, toll, risk, failure, limit = costs
     for d in range(begin, end):
         trust = transition[d], x0[d], sd[d]
@@ -113,7 +115,7 @@ def _lost(loss, x, sd):
 
 @kernel
 def _lost_on(graph, costs, e, x, after):
-    """Compute the contact lost on an edge entered with trust x, and write the new trust."""
+    """Compute the contact lost on edge e, entered with trust x; write the new trust to `after`."""
     mean, n = 0.0, len(costs.x0)
     if n == 0:
         return 0.0
@@ -127,7 +129,7 @@ def _lost_on(graph, costs, e, x, after):
 
 @kernel
 def _least_costs(graph, costs, edge_cost):
-    """Compute the cost (edge,) of each edge if it is entered with the largest possible trust."""
+    """Compute the cost (edge,) of each edge, entered with the largest possible trust."""
     if len(costs.x0) == 0:
         return edge_cost
     cost = np.full(len(graph.head), np.inf)
@@ -135,7 +137,7 @@ def _least_costs(graph, costs, edge_cost):
     for s in graph.starts:
         most[s] = costs.x0
     for s in range(len(graph.cell) - 1, 0, -1):
-        if most[s, 0] == -np.inf:  # reachable only via the goal
+        if most[s, 0] == -np.inf:  # every path to the state passes through the goal
             continue
         for e in range(graph.first[s], graph.first[s + 1]):
             cost[e] = edge_cost[e] + _lost_on(graph, costs, e, most[s], after)
@@ -145,7 +147,7 @@ def _least_costs(graph, costs, edge_cost):
 
 @kernel
 def _failing(failure, r):
-    """Compute the expected cost of failure, given the sums r (sum,)."""
+    """Compute the expected cost of failure, given the sums r of the risks, shape (sum,)."""
     total = 0.0
     for m in range(len(r)):
         total -= failure[m] * math.expm1(-r[m])
@@ -155,8 +157,9 @@ def _failing(failure, r):
 class Known(NamedTuple):
     """Best path found so far and the path tried last.
 
-    The best path has `cost` (1,) and `edges` (bound,), padded with -1. The last path has the edges
-    `trial` (bound,). `sums` (sum,) belongs to the cheapest path in the last call of `_try_paths`.
+    The best path has `cost` (1,) and `edges` (bound,), padded with -1. The path tried last has the
+    edges `trial` (bound,). `sums` (sum,) are the sums of the cheapest path that the last call of
+    `_try_paths` tried.
     """
 
     cost: np.ndarray
@@ -167,9 +170,9 @@ class Known(NamedTuple):
 
 @kernel
 def _try_paths(graph, costs, edge_cost, to_go, known):
-    """Try the cheapest path according to `to_go` from each start, and return the least cost.
+    """Evaluate the cheapest path from each start according to `to_go`, and return the least cost.
 
-    Store the best path within the limit and the sums of the cheapest path in `known`.
+    The best path within the limit and the sums of the cheapest path are written to `known`.
     """
     least, after, x = np.inf, np.empty(len(costs.x0)), np.empty(len(costs.x0))
     sums = np.empty(len(costs.failure))
@@ -196,7 +199,7 @@ def _try_paths(graph, costs, edge_cost, to_go, known):
 
 @kernel
 def _fill_priced(graph, costs, least_cost, price, to_go):
-    """Fill `to_go` for edge costs that include the risks at the given price (sum,)."""
+    """Fill `to_go` for edge costs that include the risks multiplied by their prices (sum,)."""
     cost = least_cost.copy()
     for e in range(len(cost)):
         for m in range(len(price)):
@@ -208,8 +211,9 @@ class Limits(NamedTuple):
     """Lower limits on the cost of the rest of a path, used to drop labels.
 
     `lower` is a lower limit on the cost of all paths. From each state, `safest` (state, sum) is the
-    smallest remaining sum, and `free` (state,) is the least remaining cost without risk. `priced`
-    (state,) plus `offset` is a lower limit on the remaining cost with `price` (sum,) for each sum.
+    smallest remaining sum of risks, and `free` (state,) is the least remaining cost without the
+    cost of failure. `priced` (state,) plus `offset` plus `price` (sum,) times the sums so far is a
+    lower limit on the remaining cost, including failure and the relaxed limit.
     """
 
     lower: float
@@ -222,7 +226,7 @@ class Limits(NamedTuple):
 
 @kernel
 def _limits(graph, costs, edge_cost, least_cost, known):
-    """Find good paths and lower limits; no search is needed if the best cost equals the limit."""
+    """Find good paths and lower limits; no search is needed if the best path attains `lower`."""
     to_go, n_sums = new_to_go(len(graph.cell)), len(costs.failure)
     safest, low = np.empty((len(graph.cell), n_sums)), np.empty(n_sums)
     for m in range(n_sums):
@@ -254,8 +258,8 @@ def _limits(graph, costs, edge_cost, least_cost, known):
 def _chords(costs, low, gap):
     """Find the slopes (sum,) and the constant of a plane below the failure cost of optimal paths.
 
-    An optimal path has sums of at least `low` and a failure cost of at most `gap`, which is the
-    cost of the best path found so far minus the least cost without risk.
+    An optimal path has sums of at least `low` and a failure cost of at most `gap`. The gap is the
+    cost of the best path found so far minus the least cost without failure.
     """
     failure, slopes, constant = costs.failure, np.zeros(len(low)), 0.0
     at_low = _failing(failure, low)
@@ -275,9 +279,10 @@ def _chords(costs, low, gap):
 
 @kernel
 def _price_of_limit(graph, costs, edge_cost, least_cost, chord, offset, to_go, known):
-    """Find the price of the limited sum that gives the best lower limit on the cost of all paths.
+    """Find the price of the limited sum that maximises the lower limit on the cost of all paths.
 
-    The dual is concave in the price. Its slope is the cheapest path's limited sum minus the limit.
+    The lower limit (the Lagrangian dual) is concave in the price. The slope is the limited sum of
+    the cheapest path minus the limit.
     """
     limit, price = costs.limit, chord.copy()
     lower, chosen, extra, under, over = -np.inf, 0.0, 0.0, 0.0, np.inf
@@ -313,11 +318,12 @@ def _best_path(graph, costs, most, path):
 
 
 class Labels(NamedTuple):
-    """Table of labels, with the cost, sums and trust of each in `number` (label, number).
+    """Table of labels.
 
-    With shape (label,), `edge` is the edge that led to a label, `left` the cell before this edge,
-    `parent` the previous label of the path, and `before` the previous label of the same state.
-    `last` (state,) is the newest label of each state. Missing entries are -1.
+    `number` (label, number) contains the cost, the sums and the trust of each label. The other
+    columns have shape (label,): `edge` is the edge that led to the label, `left` the cell before
+    this edge, `parent` the previous label of the path, and `before` the previous label of the same
+    state. `last` (state,) is the newest label of each state. Missing entries are -1.
     """
 
     number: np.ndarray
@@ -330,7 +336,7 @@ class Labels(NamedTuple):
 
 @kernel
 def _search(graph, costs, most, edge_cost, limits, known):
-    """Search for the best path; return its cost, or a lower limit if the search is not exact."""
+    """Search for the best path; return its cost, or a lower limit if there are too many labels."""
     n_numbers = 1 + len(costs.failure) + len(costs.x0)
     made, last = np.empty((4, most), np.int64), np.full(len(graph.cell), -1)
     labels = Labels(np.empty((most, n_numbers)), made[0], made[1], made[2], made[3], last)
@@ -379,7 +385,7 @@ def _extend(graph, costs, edge_cost, limits, known, labels, s, label, n):
 
 @kernel
 def _is_hopeless(costs, limits, h, cost, sums, known):
-    """Check whether entering a state with this cost and these sums rules out an optimal path."""
+    """Check whether no path that enters state h with this cost and these sums can be optimal."""
     if sums[-1] + limits.safest[h, -1] > costs.limit:
         return True
     at_least = cost + limits.priced[h] + limits.offset
@@ -392,7 +398,7 @@ def _is_hopeless(costs, limits, h, cost, sums, known):
 
 @kernel
 def _write_edges(graph, labels, label, edges):
-    """Write the edges of the path to a label."""
+    """Write the edges of the path that leads to a label, padded with -1, to `edges`."""
     n, k = label, 0
     while labels.parent[n] >= 0:
         n, k = labels.parent[n], k + 1

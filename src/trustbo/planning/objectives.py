@@ -1,4 +1,4 @@
-"""Objectives, which map the team's expected trust along a path to the value of the path."""
+"""Objectives, which compute the value of a path from the team's expected trust along the path."""
 
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
@@ -27,19 +27,19 @@ class Objective(NamedTuple):
 
         (sum_k credit(K - k) x_k - tolls) / scale(K),
 
-    or, for objectives `of_contact`, minus the sum of the expected lost contact and the tolls. To
-    add an objective, add an entry to `OBJECTIVES`; the searches need no change.
+    or, if `of_contact` is True, minus the sum of the expected lost contact and the tolls. To add an
+    objective, add an entry to `OBJECTIVES`; the searches need no change.
     """
 
     name: str
     credit: Callable[[Array], Array] = _ones
-    """Weight of trust after a bound, (left,), as a function of the number of bounds left."""
+    """Weight of the trust after a bound, as a function of the number of bounds left."""
     scale: Callable[[Array], Array] = _ones
-    """Divisor of the sum, (length,), as a function of the number of bounds of the path."""
+    """Divisor of the sum, as a function of the number of bounds of the path."""
     value: Callable[[Array], Array] = _same
     """Increasing function that maps the score to the reported value."""
     of_contact: bool = False
-    """Whether the value measures expected contact, which a failure reduces."""
+    """Whether the value measures expected contact, so that failures have a cost in bounds."""
     max_bounds: str = "shortest+2"
     """Default limit on the number of bounds."""
 
@@ -51,32 +51,33 @@ OBJECTIVES: Mapping[str, Objective] = {row.name: row for row in (LOST_CONTACT, T
 """Objectives, keyed by name; larger values are better.
 
 lost_contact: minus the sum of the expected lost contact in bounds, the tolls and, if the planner
-has a risk, `failure_cost` times the failure probability. (At an expected contact rate of .9, the
-loss on 9 bounds is .9.) terminal: sigma(trust at the goal - tolls); without tolls, this is one
-minus the cost (6) of the paper. mean: the mean over bounds of trust minus toll.
+has a risk, `failure_cost` times the failure probability. With an expected contact rate of 0.9, a
+path of 9 bounds loses 0.9 bounds. terminal: sigma(trust at the goal - tolls); without tolls, the
+value is one minus the cost (6) of the paper. mean: the mean over bounds of trust minus toll.
 """
 
 
 class Weights(NamedTuple):
-    """Weights of the drift in a score that is a sum over bounds."""
+    """Weights of the drifts of bounds in the score of a path, if the score is a sum over bounds."""
 
     per_bound: Array
     """Weight w_j of a bound with j bounds left after it, shape (draw, left, state)."""
     constant: Array
-    """Term that depends only on the number of bounds, shape (draw, length)."""
+    """Term of the score that depends only on the number of bounds, shape (draw, length)."""
     scale: Array
     """Divisor of the sum over the bounds of a path, shape (length,)."""
 
 
 def weights_of(objective: Objective, dynamics: Dynamics, view: Array, longest: int) -> Weights:
-    """Compute the weights of the drift for paths of up to `longest` bounds.
+    """Compute the weights of the drifts in the score of paths of up to `longest` bounds.
 
     The recursion unrolls to x_k = B0^k x_0 + sum_{i <= k} B0^(k - i) u_i, and the team's trust is
     view . x. Therefore, w_j = sum_{i <= j} credit(i) view . B0^(j - i) for a bound with j bounds
     left after it, and x_0 adds sum_k credit(K - k) view . B0^k x_0 for a path of K bounds.
 
     Args:
-        objective: One of the objectives in `OBJECTIVES`; contact is assumed to equal trust.
+        objective: One of the objectives in `OBJECTIVES`. For lost_contact, the expected contact
+            rate is assumed to equal trust.
         dynamics: Recursion for trust, with leading axis (draw,).
         view: Weights of the states in the team's trust, shape (state,).
         longest: Largest number of bounds of a path.
@@ -95,18 +96,20 @@ def weights_of(objective: Objective, dynamics: Dynamics, view: Array, longest: i
 
 
 def has_history(objective: Objective, family: Family) -> bool:
-    """Return whether the loss of a bound depends on the trust with which it is entered.
+    """Return whether the objective is a nonlinear function of trust.
 
-    If it does, the search requires B0 >= 0. If not, the score is a weighted sum of drifts.
+    If so, the search has to keep track of trust and requires B0 >= 0. Otherwise, the score of a
+    path is a weighted sum of the drifts of its bounds.
     """
     return objective.of_contact and family.expected_rate != "identity"
 
 
 def capped(objective: Objective, family: Family, dynamics: Dynamics) -> Dynamics:
-    """Cap the drift and start if rates are linear in trust, so that no bound gains contact.
+    """Cap the drift and the initial trust, so that trust never exceeds 1 and no rate exceeds 1.
 
-    With u <= 1 - B0 1 and x_0 <= 1 in every state, trust is at most 1 if B0 >= 0. A loop then never
-    increases the value. For other objectives or rates, the dynamics are returned unchanged.
+    If the drift of each state is at most 1 minus the row sum of B0, B0 >= 0 and x_0 <= 1, trust is
+    at most 1. A loop then never increases the value. Only lost_contact with rates that are linear
+    in trust needs the cap; for other objectives or rates, the dynamics are returned unchanged.
     """
     if not objective.of_contact or has_history(objective, family):
         return dynamics

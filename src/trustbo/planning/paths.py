@@ -10,18 +10,21 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from trustbo.data import Cell
-from trustbo.errors import TrustboError, require_kind, require_whole
+from trustbo.errors import TrustboError, one_line, require_kind, require_whole
 from trustbo.planning.unrolled import Unrolled
 from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Location
 from trustbo.workspace.moves import MOVES, moves_along, require_on_grid
 
 SIMPLE_EXTRA = 2
-"""Most bounds beyond the fewest for which a path without U-turns never enters a cell twice."""
+"""Largest number of bounds beyond the fewest for which all paths without U-turns are simple.
+
+A simple path contains no cell twice.
+"""
 STEPS = np.array(MOVES)
 """Row and column step of each move, shape (move, 2)."""
 _MOST_STATES = 20_000_000
-"""Maximum number of states of the unrolled graph; its arrays then need about 3 GB."""
+"""Maximum number of states of the unrolled graph; a graph of this size needs about 3 GB."""
 _SHORTEST = re.compile(r"shortest(?:\+(\d+))?")
 
 
@@ -30,7 +33,7 @@ class NoPathError(TrustboError, nx.NetworkXNoPath):
 
 
 class AdmissiblePaths:
-    """Start, goal and the admissible paths between them.
+    """Admissible paths from a start to a goal.
 
     A path ends when it enters the goal, and has at least `shortest` and at most `longest` bounds.
 
@@ -39,8 +42,8 @@ class AdmissiblePaths:
         start: First cell.
         goal: Last cell.
         max_bounds: Limit on the number of bounds (see `Planner`).
-        turns: Whether U-turns are allowed; true if `max_bounds` is a number.
-        avoided: Mask (move, row, col) of bounds that paths must avoid, or None.
+        turns: Whether U-turns are allowed; True if `max_bounds` is a number.
+        avoided: Mask (move, row, col) of the bounds that paths must avoid, or None.
         bounds: Mask (move, row, col) of bounds that a path may take, indexed by the cell entered.
         bounds_to_goal: Fewest bounds from each cell to the goal, (row, col); -1 if unreachable.
         shortest: Smallest number of bounds of a path.
@@ -55,7 +58,7 @@ class AdmissiblePaths:
         max_bounds: int | str = "shortest+2",
         avoided: np.ndarray | None = None,
     ) -> None:
-        """Check the start and goal and count the fewest bounds; see `Planner` for the errors."""
+        """Check the arguments and find the shortest path; see `Planner` for the errors."""
         self.workspace = require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
         self.start = workspace.locate(start, "start")
         self.goal = workspace.locate(goal, "goal")
@@ -73,8 +76,8 @@ class AdmissiblePaths:
             n_goal = int((self.bounds_to_goal >= 0).sum())
             raise NoPathError(
                 f"no path leads from {self.start} to {self.goal}. Of {n_cells} passable cells, "
-                f"{n_reached} can be reached from the start, and {n_goal} are connected to the "
-                "goal. Choose another start or goal, or a team with a larger max_slope."
+                f"{n_reached} can be reached from the start, and the goal can be reached from "
+                f"{n_goal}. Choose another start or goal, or a team with a larger max_slope."
             )
         self.turns = not isinstance(max_bounds, str)
         self.max_bounds = max_bounds
@@ -110,7 +113,8 @@ class AdmissiblePaths:
         if (n_states := int(n_left.sum())) > _MOST_STATES:
             raise TrustboError(
                 f"max_bounds = {self.max_bounds!r} (up to {self.longest} bounds) is too large: the "
-                f"search has {n_states:.3g} states, but at most {_MOST_STATES:.3g} are allowed."
+                f"search has {n_states:.3g} states, but at most {_MOST_STATES:.3g} are allowed. "
+                "Give a smaller max_bounds."
             )
         cell = np.repeat(np.arange(rows * cols, dtype=np.int32), n_left)
         base = np.concatenate([[0], np.cumsum(n_left)])
@@ -123,7 +127,7 @@ class AdmissiblePaths:
         for m, step in enumerate(STEPS @ (cols, 1)):  # no bound enters a cell across a border
             tail = np.flatnonzero((cell + step >= 0) & (cell + step < rows * cols) & (left > 0))
             other = cell[tail] + step
-            more = left[tail] - 1 - far[other]  # bounds left after the move, beyond the fewest
+            more = left[tail] - 1 - far[other]  # bounds left after the move, minus the fewest
             fits = bounds[m, other] & (more >= 0) & (more < n_left[other])
             head[tail[fits], m] = rank[base[other[fits]] + more[fits]]
         tail, move = np.nonzero(head >= 0)
@@ -159,12 +163,12 @@ class AdmissiblePaths:
         return self
 
     def to(self, cell: Cell, extra: int) -> "AdmissiblePaths":
-        """Return the paths to another cell with at most `extra` bounds more than the fewest."""
+        """Return the paths from the start to another cell, with up to `extra` additional bounds."""
         admitted = f"shortest+{extra}"
         return AdmissiblePaths(self.workspace, self.start, cell, admitted, self.avoided)
 
     def cells(self, flat: np.ndarray) -> tuple[Cell, ...]:
-        """Convert flat indices to cells, without the negative indices used for padding."""
+        """Convert flat indices to cells; negative indices are padding and are dropped."""
         rows, cols = np.divmod(flat[flat >= 0], self.bounds.shape[-1])
         return tuple(zip(rows.tolist(), cols.tolist(), strict=True))
 
@@ -172,31 +176,32 @@ class AdmissiblePaths:
         """Check that a path leads from start to goal and return it as a tuple of cells.
 
         Raises:
-            TrustboError: If a bound is impossible, or the path does not lead from start to goal.
+            TrustboError: If the robots cannot drive a bound, or the path does not lead from start
+                to goal.
         """
         cells = tuple(require_on_grid(path, self.bounds.shape[1:]))
         if len(cells) < 2 or (cells[0], cells[-1]) != (self.start, self.goal):
             raise TrustboError(
-                f"a path must lead from {self.start} to {self.goal}; got {len(cells)} cells, "
-                f"from {cells[:1]} to {cells[-1:]}."
+                f"a path must lead from {self.start} to {self.goal}; got {one_line(list(cells))}."
             )
         entered = np.array(cells[1:]).T
         broken = ~self.workspace.passable_bounds.values[moves_along(cells), *entered]
         if broken.any():
             k = int(np.argmax(broken))
             raise TrustboError(
-                f"the path is broken: no bound leads from {cells[k]} to {cells[k + 1]}."
+                f"no bound leads from {cells[k]} to {cells[k + 1]}: a cell is impassable, or no "
+                "route connects the cells. Give another path."
             )
         return cells
 
 
 def fewest_bounds(bounds: np.ndarray, cell: Cell, *, back: bool = False) -> np.ndarray:
-    """Find the fewest bounds from one cell to each cell, (row, col); -1 if there is no path.
+    """Count the fewest bounds from one cell to each cell, (row, col); -1 if there is no path.
 
     Args:
         bounds: Mask of the bounds that may be taken, shape (move, row, col).
-        cell: First cell.
-        back: Whether to count the bounds from each cell to `cell` instead.
+        cell: Cell at which all paths start.
+        back: If True, count the bounds from each cell to `cell` instead.
     """
     rows, cols = bounds.shape[1:]
     move, entered = np.nonzero(bounds.reshape(len(bounds), -1))

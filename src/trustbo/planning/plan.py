@@ -1,4 +1,4 @@
-"""Plans: a path with its expected trust and value, and the robots' routes along the path."""
+"""Plan: a path with its expected trust and value, and the routes of the robots."""
 
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -12,15 +12,15 @@ from trustbo.hazard.risk import PathRisk
 from trustbo.workspace import Workspace
 
 QUANTILES = (0.05, 0.25, 0.75, 0.95)
-"""Quantiles in `Plan.bands`: the ends of the 90 % and the 50 % bands."""
+"""Quantile levels of `Plan.bands`: the ends of the 90 % and the 50 % bands."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Plan(Summary):
     """A path, its expected trust and value, and whether it is provably optimal.
 
-    The properties `stops`, `posts` and `routes` are computed on demand, in CRS metres.
-    Without a terrain in memory, these properties are None.
+    The properties `stops`, `posts` and `routes` are computed on demand, in CRS metres. If the
+    workspace has no terrain, these properties are None.
 
     Attributes:
         path: Cells from start to goal.
@@ -34,13 +34,13 @@ class Plan(Summary):
         objective: Name of the objective.
         exact: Whether the search proved that no admissible path is better.
         limit: Upper limit on the value of any admissible path. The limit equals `value` if `exact`
-            is True, and is NaN for a given path.
-        revisits: Number of bounds that enter a cell visited before.
+            is True, and is NaN if the path was given.
+        revisits: Number of bounds that enter a cell that the path contains already.
         seconds: Duration of the search in seconds.
         workspace: Workspace of the path.
         risk: Failure probability of each bound, and the arrival probability with its 90 % band;
             None if the planner has no risk.
-        infeasible: Whether the failure probability of a given path exceeds `max_failure`.
+        infeasible: Whether the failure probability of the path exceeds `max_failure`.
         value_band: Ends of the 90 % band of the value over the parameter draws, without observation
             noise and with the mean failure probability; None with one draw.
     """
@@ -62,7 +62,7 @@ class Plan(Summary):
     value_band: tuple[float, float] | None = None
 
     def with_draws(self, given: Self) -> Self:
-        """Return this plan with the bands of `given`, a plan of the same path for many draws."""
+        """Return this plan with the bands of `given`, a plan for the same path and many draws."""
         return replace(self, bands=given.bands, value_band=given.value_band)
 
     def _rows(self) -> Rows:
@@ -87,12 +87,12 @@ class Plan(Summary):
 
     @property
     def p_fail(self) -> np.ndarray | None:
-        """Probability that each bound, once begun, ends the mission, shape (bound,)."""
+        """Probability that each bound, once begun, ends the mission, shape (bound,), or None."""
         return None if self.risk is None else self.risk.p_fail
 
     @property
     def p_arrive(self) -> float | None:
-        """Probability that the mission reaches the goal, averaged over the draws of the risk."""
+        """Probability of reaching the goal, averaged over the draws of the risk, or None."""
         return None if self.risk is None else self.risk.p_arrive
 
     @cached_property
@@ -109,10 +109,10 @@ class Plan(Summary):
 
     @cached_property
     def routes(self) -> tuple[tuple[np.ndarray | None, ...], ...] | None:
-        """Routes of the lead and then of each T2 robot for each bound, with shape (point, 2).
+        """Routes of the lead and of each robot of T2 in each bound, each with shape (point, 2).
 
-        T2 moves to its posts for the next bound or, at the goal, to positions around the lead. The
-        entry of a robot without a route is None.
+        The lead comes first. T2 moves to its posts for the next bound or, at the goal, to positions
+        around the lead. An entry is None if the robot has no route.
         """
         posts, path = self.workspace.posts, self.path
         if posts is None:
@@ -128,7 +128,7 @@ def plan_to_record(plan: Plan) -> dict[str, Any]:
 
 
 def plan_from_record(record: dict[str, Any], workspace: Workspace) -> Plan:
-    """Restore a plan in its workspace from a record made by `plan_to_record`."""
+    """Restore a plan of a workspace from a record made by `plan_to_record`."""
     values: dict[str, Any] = {**record, "workspace": workspace}
     for name in ("positions", "trust", "bands"):
         values[name] = np.array(record[name])

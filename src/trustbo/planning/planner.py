@@ -31,7 +31,7 @@ from trustbo.workspace.moves import along
 
 
 class Planner(Summary):
-    """Search for the most trustworthy path in a workspace.
+    """Planner that finds the most trustworthy path in a workspace.
 
     Attributes:
         problem: Admissible paths, objective and costs.
@@ -66,13 +66,13 @@ class Planner(Summary):
                 allows any walk of up to that many bounds. The default is n = 4 for lost_contact
                 and n = 2 for the others. If n > 2, paths may revisit cells (see `Plan.revisits`).
             toll: Additional cost of each bound, such as its length or duration. The array must
-                broadcast to (move, row, col), with the moves of `workspace.moves.MOVES`. The unit
-                is bounds for lost_contact and trust for the other objectives.
+                broadcast to (move, row, col), with the moves of `workspace.moves.MOVES`. Tolls are
+                in bounds for lost_contact, and in units of trust for the other objectives.
             max_failure: Largest failure probability of a path, in [0, 1); by default, no limit.
             failure_cost: Cost of a failure in bounds, for lost_contact. The value is reduced by
                 this cost times the failure probability. The default is the smallest number of
                 bounds of a path, so a failed mission counts as a mission without contact.
-            family: Observation family of the trust model, used only for lost_contact.
+            family: Name of the trust model's observation family, used only for lost_contact.
 
         Raises:
             TrustboError: If the start or goal is off the grid or impassable, the start equals the
@@ -80,12 +80,12 @@ class Planner(Summary):
                 a number is out of range.
             NoPathError: If the goal cannot be reached from the start.
         """
-        row = OBJECTIVES[require_choice("objective", objective, OBJECTIVES)]
-        chosen = FAMILIES[require_choice("family", family, FAMILIES)]
-        most = row.max_bounds if max_bounds is None else max_bounds
+        aim = OBJECTIVES[require_choice("objective", objective, OBJECTIVES)]
+        rates = FAMILIES[require_choice("family", family, FAMILIES)]
+        most = aim.max_bounds if max_bounds is None else max_bounds
         paths = AdmissiblePaths(workspace, start, goal, most)
         tolls = _toll_of(toll, paths.bounds)
-        self.problem = Problem(paths, row, chosen, tolls, max_failure, failure_cost)
+        self.problem = Problem(paths, aim, rates, tolls, max_failure, failure_cost)
 
     def _rows(self) -> Rows:
         problem, paths = self.problem, self.problem.paths
@@ -118,6 +118,7 @@ class Planner(Summary):
         return self.problem.paths.max_bounds
 
     def _with(self, **changes: Any) -> Self:
+        """Return a copy of the planner with changed attributes of the problem."""
         other = copy(self)
         other.problem = replace(self.problem, **changes)
         return other
@@ -145,7 +146,7 @@ class Planner(Summary):
             p_fail: Posterior mean, shape (move, row, col); NaN where there is no bound.
             draws: Posterior draws, shape (draw, move, row, col), for `p_arrive` and its 90 % band.
             strata: Mean failure probabilities of groups of draws, such as `BoundRisk.strata()`, for
-                the expected cost of failure; by default, `p_fail` with independent failures.
+                the expected cost of failure. By default, bounds fail independently with `p_fail`.
 
         Raises:
             TrustboError: If the shapes do not match, or a probability is outside [0, 1].
@@ -168,8 +169,8 @@ class Planner(Summary):
         """Find the best admissible path for given parameters, or for the mean of a posterior.
 
         Args:
-            params: Posterior from `fit`, or parameters. With several draws, the path is optimal for
-                their mean, and the bands are quantiles over the draws (see `evaluate`).
+            params: Posterior from `fit`, or parameters. If there are several draws, the path is
+                optimal for their mean, and the bands are quantiles over the draws.
             x0: Expected trust at the start, shape () or (robot,); by default `params.x0_mean`.
 
         Raises:
@@ -221,14 +222,14 @@ class Planner(Summary):
     def evaluate(
         self, path: Sequence[Cell], params: Params | xr.DataTree, *, x0: ArrayLike | None = None
     ) -> Plan:
-        """Evaluate a given path; in the plan, `exact` is False and `limit` is NaN.
+        """Return a plan for a given path; its `exact` is False and its `limit` is NaN.
 
         Args:
             path: Cells from start to goal, each adjacent to the previous one.
-            params: Posterior from `fit`, or parameters. With several draws, `trust` is their mean
-                and `bands` are their quantiles. `value` is computed from the mean trust or, for
-                lost_contact, averaged over the draws. The draws of a posterior include robot
-                effects drawn for the next mission (see `params_of`).
+            params: Posterior from `fit`, or parameters. If there are several draws, `trust` is the
+                mean and `bands` are quantiles of trust over the draws. `value` is computed from the
+                mean trust or, for lost_contact, averaged over the draws. The draws of a posterior
+                include robot effects drawn for the next mission (see `params_of`).
             x0: Expected trust at the start; by default `params.x0_mean`.
 
         Raises:
@@ -239,10 +240,11 @@ class Planner(Summary):
         draws, cells = draws_of(params, self.workspace, day=True), np.array(path)
         trust, value, values = _value_along(problem, cells, draws, x0)
         cost, (rows, cols) = problem.failure_along(cells), cells.T
-        bands = np.repeat(trust, len(QUANTILES), axis=0), None
+        bands, value_band = np.repeat(trust, len(QUANTILES), axis=0), None
         if len(trust) > 1:
+            bands = np.quantile(trust, QUANTILES, axis=0)
             low, high = np.quantile(values - cost, (QUANTILES[0], QUANTILES[-1])).tolist()
-            bands = np.quantile(trust, QUANTILES, axis=0), (low, high)
+            value_band = low, high
         grid = self.workspace.grid
         positions = np.stack([grid.x[cols], grid.y[rows]], axis=1)
         return Plan(
@@ -250,7 +252,7 @@ class Planner(Summary):
             positions=positions,
             length=float(np.hypot(*np.diff(positions, axis=0).T).sum()),
             trust=trust.mean(0),
-            bands=bands[0],
+            bands=bands,
             value=value - cost,
             objective=problem.objective.name,
             exact=False,
@@ -260,7 +262,7 @@ class Planner(Summary):
             workspace=self.workspace,
             risk=None if problem.risk is None else problem.risk.along(cells),
             infeasible=not problem.is_within_limit(cells),
-            value_band=bands[1],
+            value_band=value_band,
         )
 
     def graph(self, params: Params | xr.DataTree) -> nx.DiGraph:
@@ -268,10 +270,10 @@ class Planner(Summary):
 
         Nodes are the passable cells `(row, col)`, with the CRS coordinates `x` and `y` of their
         centres in metres. Edges are the bounds, with their `length` in metres, the `drift` of the
-        team's mean trust and, given a risk, `risk` = -log(1 - p_fail). `cost` is -log sigma(x) plus
-        the toll, and `lost` is the contact lost at trust x, in bounds, plus the toll; x is the
-        limit of trust as the bound is repeated. If trust had no memory, the sum of `lost` along a
-        path would be minus the path's value for lost_contact without failures.
+        team's mean trust and, given a risk, `risk` = -log(1 - p_fail). Let x be the limit of trust
+        if a bound is repeated. Then `cost` is -log sigma(x) plus the toll, and `lost` is the
+        contact lost at trust x, in bounds, plus the toll. If beta0 is 0, minus the sum of `lost`
+        along a path is the value of the path for lost_contact, without failures.
 
         Args:
             params: Posterior from `fit`, or parameters. Several draws are replaced by their mean.
@@ -282,7 +284,10 @@ class Planner(Summary):
         problem, mean = self.problem, mean_of(params, self.workspace)
         dynamics = problem.dynamics(mean)
         if (radius := np.abs(np.linalg.eigvals(dynamics.transition)).max()) >= 1.0:
-            raise TrustboError(f"trust converges only if abs(beta0) < 1; got {radius:g}.")
+            raise TrustboError(
+                f"the graph needs abs(beta0) < 1, because trust must converge; got {radius:g}. "
+                "Give other parameters, or use `plan` to find a path."
+            )
         contact = capped(LOST_CONTACT, problem.family, dynamics)
         grid, bounds = self.workspace.grid, problem.paths.bounds
         length = np.hypot(*(STEPS * (grid.cell_height, grid.cell_width)).T)  # (move,)
@@ -311,13 +316,13 @@ class Planner(Summary):
     def trust_map(
         self, params: Params | xr.DataTree, *, per_robot: bool = False, x0: ArrayLike | None = None
     ) -> xr.DataArray:
-        """Compute the largest expected trust with which each cell can be reached; NaN if it cannot.
+        """Compute the largest expected trust on arrival at each cell; NaN if it is unreachable.
 
-        The maximum is over paths without U-turns that have at most two bounds more than the fewest,
-        or fewer if `max_bounds` is tighter. Longer walks are excluded because they could gain trust
-        by loitering. With the default `max_bounds`, the map at the goal equals the trust at the
-        goal of the `terminal` plan. The map has the shape (row, col), or (robot, row, col) with
-        `per_robot`; if there are several draws, it has a leading axis (draw,).
+        The maximum is over paths to the cell, without U-turns, that have at most two bounds more
+        than the fewest, or fewer if `max_bounds` is tighter. Longer walks are excluded because they
+        could gain trust by loitering. With the default `max_bounds`, the map at the goal equals the
+        trust at the goal of the `terminal` plan. The map has the shape (row, col), or (robot, row,
+        col) with `per_robot`. If there are several draws, the map has a leading axis (draw,).
 
         Args:
             params: Posterior from `fit`, or parameters of any model.
@@ -335,7 +340,9 @@ class Planner(Summary):
     def trust_summary(
         self, posterior: Params | xr.DataTree, *, n_draws: int = 200, seed: int = 0
     ) -> xr.Dataset:
-        """Compute the `mean` and `sd` of the trust map and the mean `cost`, of shape (row, col).
+        """Compute the mean and sd of the trust map, and the mean cost, over draws of a posterior.
+
+        The variables `mean`, `sd` and `cost` of the dataset have the shape (row, col).
 
         Args:
             posterior: Posterior from `fit`, or parameters with leading axis (draw,).
@@ -352,9 +359,10 @@ class Planner(Summary):
     def path_posterior(
         self, posterior: Params | xr.DataTree, *, n_draws: int | None = 1000, seed: int = 0
     ) -> xr.DataArray:
-        """Estimate the probability (row, col) that each cell lies on the best path.
+        """Estimate the probability that each cell lies on the best path, shape (row, col).
 
-        The best path is found for each draw, or the safest path if none respects `max_failure`.
+        The best path is found for each draw. If no path respects `max_failure`, the safest path has
+        probability 1.
 
         Args:
             posterior: Posterior from `fit`, or parameters with leading axis (draw,).
@@ -371,7 +379,7 @@ class Planner(Summary):
 
 
 def _toll_of(toll: ArrayLike, bounds: np.ndarray) -> np.ndarray:
-    """Return the tolls (move, row, col), which are 0 where there is no bound.
+    """Return the toll of each bound, shape (move, row, col); 0 where there is no bound.
 
     Raises TrustboError if the shape does not broadcast or the toll of a bound is not finite.
     """
@@ -384,16 +392,22 @@ def _toll_of(toll: ArrayLike, bounds: np.ndarray) -> np.ndarray:
         ) from None
     if not np.isfinite(tolls).all():
         move, row, col = np.argwhere(~np.isfinite(tolls))[0].tolist()
-        raise TrustboError(f"toll[{move}, {row}, {col}] = {tolls[move, row, col]} is not finite.")
+        raise TrustboError(
+            f"toll[{move}, {row}, {col}] = {tolls[move, row, col]} is not finite; give a finite "
+            "toll for every bound."
+        )
     return tolls
 
 
 def _value_along(
     problem: Problem, cells: np.ndarray, params: Params, x0: ArrayLike | None
 ) -> tuple[np.ndarray, float, np.ndarray]:
-    """Compute trust (draw, bound, robot) and the value, overall and per draw, without failures."""
+    """Compute trust (draw, bound, robot), the value of a path, and the value for each draw.
+
+    The values do not include the expected cost of failure.
+    """
     z, of_path = along(problem.paths.workspace.awareness.values, cells), params.along(cells)
-    z = z[:, None, None]  # as a map with one row
+    z = z[:, None, None]  # a map with one move and one row, whose columns are the bounds
     by_robot = trust_dynamics(of_path, z, x0, by_robot=True)
     trust = roll(by_robot)
     trust = trust.reshape(-1, *trust.shape[-2:])
@@ -401,8 +415,8 @@ def _value_along(
     if not problem.objective.of_contact:
         value = problem.value_along(cells, trust.mean((0, -1)), by_robot.noise_sd)
         return trust, float(value), values
-    # Capping trust in each draw causes bias, so the band uses uncapped trust. However, the contact
-    # lost on a path cannot be negative.
+    # Capping the trust of each draw causes bias, so the value of each draw uses uncapped trust.
+    # However, the contact lost on a path cannot be negative.
     team = capped(problem.objective, problem.family, trust_dynamics(of_path, z, x0))
     mean = problem.value_along(cells, roll(team).mean(-1), team.noise_sd).mean()
     return trust, float(mean), np.minimum(values, -problem.toll_along(cells))

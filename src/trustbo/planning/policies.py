@@ -1,7 +1,8 @@
 """Policies, which choose the next plan based on posterior draws.
 
-A policy is any callable `policy(rng, params, planner) -> Plan`, which can be passed instead of a
-name. The policies below compute the trust and value of a plan from the posterior mean.
+A policy is any callable `policy(rng, params, planner) -> Plan`. A callable can be passed wherever
+the name of a policy is accepted. The policies below report the trust and value of their plan for
+the posterior mean of the parameters.
 """
 
 from collections.abc import Callable, Mapping
@@ -16,7 +17,7 @@ from trustbo.planning.plan import Plan
 from trustbo.planning.planner import Planner
 
 Policy = Callable[[np.random.Generator, Params, Planner], Plan]
-"""Function that maps a generator, draws with leading axis (draw,) and a planner to a plan."""
+"""Function of a random generator, draws with leading axis (draw,) and a planner; returns a plan."""
 
 N_DRAWS = 200
 """Number of draws for which `ucb` finds the best path."""
@@ -36,7 +37,10 @@ def thompson(rng: np.random.Generator, params: Params, planner: Planner) -> Plan
 def optimistic(
     rng: np.random.Generator, params: Params, planner: Planner, *, quantile: float = 0.9
 ) -> Plan:
-    """Plan the best path with the drift u of each bound set to a high quantile over the draws."""
+    """Plan the best path for optimistic drifts.
+
+    The drift u of each bound is a high quantile over the draws; other parameters are means.
+    """
     some = choose_draws(params, 1000, _seed(rng))
     transition, drift, start, sd = planner.problem.dynamics(some)
     best = Dynamics(
@@ -46,7 +50,7 @@ def optimistic(
 
 
 def ucb(rng: np.random.Generator, params: Params, planner: Planner, *, kappa: float = 1.0) -> Plan:
-    """Choose the path, among the draws' best, with the largest mean + `kappa` sd of the value."""
+    """Choose, among the draws' best paths, that with the largest mean + `kappa` sd of the value."""
     drawn = planner.plan_draws(params, n_draws=N_DRAWS, seed=_seed(rng))
     values = drawn.values_of(drawn.candidates)
     chosen = int(np.argmax(values.mean(0) + kappa * values.std(0)))
@@ -54,7 +58,7 @@ def ucb(rng: np.random.Generator, params: Params, planner: Planner, *, kappa: fl
 
 
 def random(rng: np.random.Generator, params: Params, planner: Planner) -> Plan:
-    """Plan the best path under drifts drawn uniformly from [0, 1], ignoring the posterior."""
+    """Plan the best path for random drifts, uniform on [0, 1], without using the posterior."""
     drift = rng.uniform(size=(1, *planner.problem.paths.bounds.shape))
     dynamics = Dynamics(np.zeros((1, 1)), drift, np.zeros(1), np.full((), 0.1))
     return planner.evaluate(planner.best_path(dynamics), params.mean())

@@ -1,4 +1,4 @@
-"""The planning problem: its admissible paths, objective and costs, and its best paths."""
+"""Planning problem: admissible paths, objective and costs, and the search for the best path."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,8 +24,8 @@ from trustbo.workspace import Workspace
 from trustbo.workspace.moves import MOVE_NAMES, bounds_along
 
 EXACT = 1e-12
-"""Largest difference from the upper limit on the score at which a path counts as optimal."""
-_CERTAIN = 700.0  # replaces -log(1 - p) = inf for a bound that always fails
+"""Tolerance: a path is optimal if its score is within this distance of the upper limit."""
+_CERTAIN = 700.0  # used instead of -log(1 - p) = inf for a bound that always fails
 
 
 class InfeasibleError(TrustboError):
@@ -43,7 +43,7 @@ class InfeasibleError(TrustboError):
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Admissible paths, objective and costs of a planner (see the arguments of `Planner`).
+    """Admissible paths, objective and costs of a planner; see `Planner` for their meaning.
 
     Attributes:
         paths: Admissible paths.
@@ -81,7 +81,7 @@ class Problem:
 
     @property
     def price(self) -> float:
-        """Cost of a failure in bounds; 0 without a risk or if the objective is not `of_contact`."""
+        """Cost of a failure in bounds; 0 without a risk, or if contact is not the objective."""
         if self.risk is None or not self.objective.of_contact:
             return 0.0
         return float(self.paths.shortest) if self.failure_cost is None else self.failure_cost
@@ -106,7 +106,7 @@ class Problem:
         return objective.value((trust @ credit - toll) / scale)
 
     def failure_along(self, path: Sequence[Cell] | np.ndarray) -> float:
-        """Compute the expected cost of failure: `price` times a path's failure probability."""
+        """Compute the expected cost of failure: `price` times the failure probability of a path."""
         return self.price * self.risk.priced(path) if self.risk and self.price else 0.0
 
     def is_within_limit(self, path: Sequence[Cell] | np.ndarray) -> bool:
@@ -123,7 +123,7 @@ class Problem:
 
     @cached_property
     def risks(self) -> "Risks | None":
-        """Risks that the search sums along a path, or None if plans do not depend on risk.
+        """Risks of the bounds, as the search needs them; None if plans do not depend on risk.
 
         Raises:
             TrustboError: If `max_failure` is set without a risk, or `p_fail` of a bound is NaN.
@@ -154,7 +154,7 @@ class Problem:
         return Risks(np.ascontiguousarray(of_bounds), self.price * shares, limit)
 
     def best(self, dynamics: Dynamics) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Find the best admissible path for each draw of `dynamics`, which may be a single draw.
+        """Find the best admissible path for each draw of the dynamics, or for a single draw.
 
         Returns:
             Scores (draw,), upper limits on the score of any path (draw,), and paths (draw, cell) as
@@ -188,6 +188,7 @@ class Problem:
         return -cost, -lower, paths
 
     def _require_valid(self, dynamics: Dynamics, history: bool) -> None:
+        """Raise TrustboError if the search is not exact for these dynamics."""
         if not self.objective.of_contact:
             return
         beta0 = np.diagonal(dynamics.transition, axis1=-2, axis2=-1)
@@ -199,7 +200,7 @@ class Problem:
             )
 
     def _infeasible(self, risk: Risk) -> InfeasibleError:
-        """Make the error raised if no path respects `max_failure`; it reports the safest path."""
+        """Return an error that says that no path respects `max_failure`, with the safest path."""
         graph, n = self.paths.graph, self.paths.graph.longest + 1
         nothing = Weights(np.zeros((1, n, 1)), np.zeros((1, n)), np.ones(n))
         of_bounds = risk_of(risk.p_fail).ravel()
@@ -216,11 +217,12 @@ class Problem:
 
 
 class Risks(NamedTuple):
-    """Risks -log(1 - p_fail) of the bounds, which are summed along a path.
+    """Risks -log(1 - p_fail) of the bounds, which the search sums along a path.
 
-    `of_bounds` (bound, sum) has one sum per stratum of the risk and, with a limit, one for the mean
-    of the strata. A path with sums r_m has the expected failure cost sum_m F_m (1 - exp(-r_m)),
-    where `failure` (sum,) holds the F_m. `limit` is the largest value allowed for the last sum.
+    `of_bounds` (bound, sum) has one column per stratum of the risk and, with several strata and a
+    limit, one for their mean. A path whose risks add up to r_m in column m has the expected failure
+    cost sum_m F_m (1 - exp(-r_m)), where `failure` (sum,) contains the F_m. `limit` is the largest
+    value allowed for the sum of the last column.
     """
 
     of_bounds: np.ndarray
@@ -229,7 +231,7 @@ class Risks(NamedTuple):
 
 
 def risk_of(p_fail: np.ndarray) -> np.ndarray:
-    """Compute the risk -log(1 - p_fail), which is finite for p_fail = 1 and 0 without a bound."""
+    """Compute the risk -log(1 - p_fail), which is at most 700, and 0 where there is no bound."""
     with np.errstate(divide="ignore"):
         return np.minimum(-np.log1p(-np.nan_to_num(p_fail)), _CERTAIN)
 
@@ -237,8 +239,8 @@ def risk_of(p_fail: np.ndarray) -> np.ndarray:
 def draws_of(posterior: Params | xr.DataTree, workspace: Workspace, *, day: bool = False) -> Params:
     """Return the draws of a posterior, with leading axis (draw,), or given parameters unchanged.
 
-    The features and robots of a posterior are reordered by name to match the workspace. For `day`,
-    see `params_of`. Raises TrustboError if the type, the features or the robots are wrong.
+    The features and robots of a posterior are reordered by name to match the workspace (for `day`,
+    see `params_of`). Raises TrustboError if the type, the features or the robots are wrong.
     """
     if isinstance(posterior, xr.DataTree):
         return params_of(posterior, workspace, day=day)

@@ -47,8 +47,8 @@ def plan(planner: Planner, params: Params | xr.DataTree) -> Plan:
 def shortest_paths(planner: Planner, dynamics: Dynamics) -> Iterator[tuple[Cell, ...]]:
     """Find the best path for each number of bounds with `networkx.bellman_ford_path`.
 
-    A bound with drift u and j bounds left after it adds w_j . u minus its toll to the value, where
-    w_j = sum_{i <= j} credit(i) view . B0^(j - i).
+    A bound with drift u and j bounds left after it adds w_j . u minus its toll to the value. Here,
+    w_j = sum_{i <= j} credit(i) view . B0^(j - i), and view . x is the team's mean trust.
     """
     problem = planner.problem
     graph, n_states = problem.paths.graph, len(dynamics.start)
@@ -59,21 +59,21 @@ def shortest_paths(planner: Planner, dynamics: Dynamics) -> Iterator[tuple[Cell,
         carried = carried @ dynamics.transition + credit[j] * view
         weights.append(carried)
     drift, toll = dynamics.drift.reshape(n_states, -1), problem.toll.ravel()
-    left = graph.left[graph.head]  # number of bounds left after each edge
+    left = graph.left[graph.head]  # bounds left after each edge
     cost = [toll[b] - weights[j] @ drift[:, b] for b, j in zip(graph.bound, left, strict=True)]
     network = graph.to_networkx(cost)
     for s in graph.starts:
         start = None, int(graph.cell[s]), int(graph.left[s])
         try:
             nodes = nx.bellman_ford_path(network, start, "goal", weight="cost")
-        except (nx.NetworkXNoPath, nx.NodeNotFound):  # every path has a U-turn
+        except (nx.NetworkXNoPath, nx.NodeNotFound):  # every path of this length has a U-turn
             continue
         cells = np.array([node[1] for node in nodes[:-1]])
         yield (*problem.paths.cells(cells), planner.goal)
 
 
 def every_path(paths: AdmissiblePaths) -> Iterator[tuple[Cell, ...]]:
-    """Enumerate all admissible paths; feasible only for small grids."""
+    """Enumerate all admissible paths, which is feasible only for small grids."""
     onward: dict[Cell, list[Cell]] = {}
     for move, row, col in np.argwhere(paths.bounds).tolist():
         down, right = MOVES[move]

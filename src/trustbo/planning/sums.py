@@ -1,8 +1,8 @@
 """Dynamic programming on the unrolled graph, for objectives that are sums over the bounds.
 
-A bound with drift u and j bounds left after it adds w_j . u to the value, for any path length. The
-weight w_j is the sum of credit(i) view . B0^(j - i) over i <= j (see `objectives.weights_of`).
-States are processed in order of bounds left, so their successors are final (Bellman 1958).
+A bound with drift u and j bounds left after it adds w_j . u to the value, whatever the length of
+the path. The weights w_j are computed by `objectives.weights_of`. States are processed in order of
+the number of bounds left, so that the successors of a state are final (Bellman 1958).
 """
 
 import numpy as np
@@ -24,7 +24,7 @@ def best_sums(
         toll: Additional cost of each bound, shape (bound,).
 
     Returns:
-        Scores (draw,) and paths (draw, cell), given as flat cell indices and padded with -1.
+        Scores (draw,) and paths (draw, cell) as flat cell indices, padded with -1.
     """
     n = len(drift)
     scores, paths = np.full(n, -np.inf), np.full((n, graph.longest + 1), -1, np.int32)
@@ -38,6 +38,7 @@ def best_sums(
 
 @kernel
 def _best_sums(graph, drift, per_bound, constant, scale, toll, scores, paths, begin, end):
+    """Write the best score and path of the draws from `begin` to `end`."""
     cost, to_go = np.empty(len(graph.head)), new_to_go(len(graph.cell))
     edges = np.empty(paths.shape[1], np.int64)
     for d in range(begin, end):
@@ -57,7 +58,7 @@ def _best_sums(graph, drift, per_bound, constant, scale, toll, scores, paths, be
 
 @kernel
 def costs_of_sums(graph, drift, per_bound, toll, cost) -> None:
-    """Write the cost of each edge for one draw, the toll minus w_j . u, to `cost`."""
+    """Write the cost of each edge for one draw, which is the toll minus w_j . u, to `cost`."""
     for e in range(len(graph.head)):
         left, b = graph.left[graph.head[e]], graph.bound[e]
         cost[e] = toll[b]

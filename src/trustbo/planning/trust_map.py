@@ -1,4 +1,4 @@
-"""Trust map: the largest expected trust with which each cell can be reached."""
+"""Trust map: the largest expected trust on arrival at each cell."""
 
 import numpy as np
 import xarray as xr
@@ -16,7 +16,7 @@ from trustbo.planning.sums import best_sums
 def trust_map(
     problem: Problem, params: Params, *, per_robot: bool = False, x0: ArrayLike | None = None
 ) -> xr.DataArray:
-    """Compute the map of `Planner.trust_map`."""
+    """Compute the trust map; see `Planner.trust_map`."""
     dynamics = problem.dynamics(params, x0, by_robot=per_robot).flat()
     like = problem.paths.workspace.awareness.isel(move=0, feature=0, drop=True)
     n_states = dynamics.start.shape[-1]
@@ -38,7 +38,7 @@ def cost_of(trust: xr.DataArray) -> xr.DataArray:
 
 
 def _largest(paths: AdmissiblePaths, dynamics: Dynamics, view: np.ndarray) -> np.ndarray:
-    """Compute the largest trust view . x in each cell, (draw, row, col); NaN if unreachable."""
+    """Compute the largest trust, view . x, on arrival at each cell, (draw, row, col)."""
     extra = min(SIMPLE_EXTRA, paths.longest - paths.shortest)
     weights = view @ dynamics.transition  # (draw, state)
     beta0 = np.divide(weights, view, out=np.zeros_like(weights), where=view > 0.0)
@@ -49,10 +49,10 @@ def _largest(paths: AdmissiblePaths, dynamics: Dynamics, view: np.ndarray) -> np
         return best_trust(paths, extra, drift, beta0.max(-1), dynamics.start @ view)
     drift = dynamics.drift.reshape(*dynamics.start.shape, -1)
     values = np.full((len(drift), *paths.bounds.shape[1:]), np.nan)
+    no_toll = np.zeros(paths.bounds.size)
     for row, col in np.argwhere(paths.bounds_from_start > 0).tolist():
         graph = paths.to((row, col), extra).graph
         weights = weights_of(TERMINAL, dynamics, view, graph.longest)
-        no_toll = np.zeros(paths.bounds.size)
         values[:, row, col], _ = best_sums(graph, drift, weights, no_toll)
     values[:, *paths.start] = dynamics.start @ view
     return values
@@ -61,10 +61,10 @@ def _largest(paths: AdmissiblePaths, dynamics: Dynamics, view: np.ndarray) -> np
 def best_trust(
     paths: AdmissiblePaths, extra: int, drift: np.ndarray, beta0: np.ndarray, x0: np.ndarray
 ) -> np.ndarray:
-    """Find the largest trust with which each cell can be entered; NaN if it is unreachable.
+    """Find the largest trust on arrival at each cell, for beta0 >= 0; NaN if it is unreachable.
 
     Paths grow by one bound per iteration. To exclude U-turns, each cell stores the largest trust,
-    its last move, and the largest trust by any other move. The result is exact for beta0 >= 0.
+    the move that attains it, and the largest trust after any other move.
 
     Args:
         paths: Admissible paths.
@@ -88,7 +88,7 @@ def best_trust(
     for k in range(1, int(fewest.max()) + extra + 1):
         for m, step in enumerate(STEPS):
             before = np.where(by == n_moves - 1 - m, second, top)  # the reverse move is forbidden
-            before = np.roll(before, step, axis=(1, 2))  # wraps only the margin
+            before = np.roll(before, step, axis=(1, 2))  # only the margin wraps around
             carried = np.where(np.isneginf(before), before, beta0[:, None, None] * before)
             entered[m] = carried + u[:, m]
         entered[:, :, k > reach] = -np.inf

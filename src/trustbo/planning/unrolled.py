@@ -1,8 +1,8 @@
-"""The unrolled graph, which repeats the bounds of a path problem for each number of bounds left.
+"""Unrolled graph, which contains a copy of each cell and bound for each number of bounds left.
 
-A state (cell, left) is a cell from which exactly `left` bounds remain. Each edge is a bound and
+A state (cell, left) is a cell from which exactly `left` bounds remain. Each edge is a bound, and
 leads to a state with one bound fewer left. Paths through the graph are the admissible paths, except
-that U-turns must be excluded if they are forbidden. Kernels process the arrays once, in order of
+that U-turns must be excluded if they are forbidden. Compiled kernels process the states in order of
 `left`, and `to_networkx` exports the same edges.
 """
 
@@ -14,19 +14,19 @@ import numpy as np
 from numba import njit
 
 kernel = njit(cache=True, nogil=True, error_model="numpy")
-"""Numba decorator that caches kernels on disk, releases the GIL, and lets 1 / 0 return inf."""
+"""Numba decorator: kernels are cached on disk, release the GIL, and evaluate 1 / 0 as inf."""
 
 
 class Unrolled(NamedTuple):
     """Graph whose states are sorted by the bounds left, and whose edges are sorted by their tails.
 
-    Fields:
+    Attributes:
         cell: Flat index of the cell of each state, shape (state,).
-        left: Number of bounds left in each state, shape (state,); the first is the goal.
-        first: Index of the first edge that leaves each state, shape (state + 1,).
+        left: Number of bounds left in each state, shape (state,); state 0 is the goal.
+        first: Index of the first edge that leaves each state, then the number of edges.
         head: State to which each edge leads, shape (edge,).
         bound: Flat index move * cells + cell of the bound of each edge, shape (edge,).
-        starts: State at the start for each number of bounds in ascending order, shape (length,).
+        starts: Index of the start state of each path length, ascending, shape (length,).
         turns: Whether U-turns are allowed.
     """
 
@@ -75,8 +75,8 @@ class Unrolled(NamedTuple):
 class ToGo(NamedTuple):
     """Costs (state,) and first edges (state,) of the best and second-best paths to the goal.
 
-    The second-best path begins with another edge. These two paths suffice because a forbidden
-    U-turn excludes at most one first edge.
+    The best path has the cost `least` and the first edge `edge`. The second-best path, with another
+    first edge, has `second` and `other`. A forbidden U-turn excludes at most one first edge.
     """
 
     least: np.ndarray
@@ -87,7 +87,7 @@ class ToGo(NamedTuple):
 
 @kernel
 def new_to_go(n_states: int) -> ToGo:
-    """Allocate the costs to the goal for `n_states` states."""
+    """Allocate arrays for the costs from `n_states` states to the goal."""
     edge, other = np.full(n_states, -1), np.full(n_states, -1)
     return ToGo(np.zeros(n_states), edge, np.full(n_states, np.inf), other)
 
