@@ -1,4 +1,4 @@
-"""Planning grid: awareness and passability of cells, posts, routes and line of sight."""
+"""Planning grid: awareness of bounds, passable cells, posts, routes and line of sight."""
 
 from trustbo.workspace.sight import Sight
 from trustbo.workspace.workspace import Workspace

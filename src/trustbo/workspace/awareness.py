@@ -1,7 +1,7 @@
 """Awareness of bounds, from the pixels of a terrain or from a user's arrays.
 
 Overwatch involves two cells, so awareness is defined for each bound, that is, for a cell and a move
-into the cell. Maps of cells are copied to all moves.
+into the cell. The awareness of a cell applies to all moves into the cell.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -34,16 +34,16 @@ def cell_maps(
 
     Returns:
         Awareness (row, col, feature) in [0, 1], NaN where a cell has no data; passability (row,
-        col); a dataset (y, x) of each feature and of passability; and the fitted composites.
+        col); a dataset (y, x) of each feature and of passability; and the fitted composite indices.
 
     Raises:
-        TrustboError: A feature is unknown, has the reserved name of the line of sight, or is used
-            unchanged but has values outside [0, 1].
+        TrustboError: A feature is unknown, has a name that is reserved for line of sight, or is
+            used unchanged but has values outside [0, 1].
     """
     remedy = "map each feature to its pixel features, such as {'ease': ('slope', 'tri')}"
     for name in require_kind("features", features, Mapping, remedy):
         if is_line_of_sight(name):
-            raise TrustboError(f"the name {name!r} is reserved; choose another name.")
+            raise TrustboError(f"feature name {name!r} is reserved; choose another name.")
     sides = [n * step for n, step in zip(terrain["dem"].shape, pixel_size(terrain), strict=True)]
     diagonal = float(np.hypot(grid.cell_height, grid.cell_width))
     ranges = [robot.lidar_range for robot in team.robots]
@@ -65,29 +65,28 @@ def cell_maps(
             if low < 0.0 or high > 1.0:
                 raise TrustboError(
                     f"feature {name!r} is used unchanged and must be in [0, 1]; its values are "
-                    f"{low:g} to {high:g}. Make it a composite index: {{{name!r}: [...]}}."
+                    f"{low:g} to {high:g}. Make it a composite index: {{{name!r}: [{parts!r}]}}."
                 )
             continue
         names = require_kind(f"feature {name!r}", parts, Iterable, remedy)
         values = {part: values_of(part) for part in names}
         index = CompositeIndex({part: FEATURES[part].sign for part in values}).fit(values)
         pixels[name], composites[name] = index.transform(values), index
-    even = slope(terrain) <= team.max_slope
-    dem = terrain["dem"]
+    dem, is_drivable = terrain["dem"], slope(terrain) <= team.max_slope
     maps = {
         name: xr.DataArray(values, dem.coords, dem.dims, attrs={"units": "1"})
         for name, values in pixels.items()
     }
     z = np.stack([grid.cell_means(one) for one in maps.values()], axis=-1)
-    maps["passable"] = xr.DataArray(even, dem.coords, dem.dims)
+    maps["passable"] = xr.DataArray(is_drivable, dem.coords, dem.dims)
     passable = grid.cell_means(maps["passable"].astype(float)) >= 1.0 - MAX_MISSING
     return z, passable & np.isfinite(z).all(-1), xr.Dataset(maps), composites
 
 
 def of_moves(cells: np.ndarray, passable: np.ndarray) -> np.ndarray:
-    """Copy maps (..., row, col, feature) to all moves, shape (..., move, row, col, feature).
+    """Copy maps of cells (..., row, col, feature) to all moves, (..., move, row, col, feature).
 
-    Values are NaN where a move is not a bound between two passable cells.
+    Values are NaN where a move does not lead from one passable cell to another.
     """
     exists = existing_bounds(passable)[..., None]
     return np.where(exists, cells[..., None, :, :, :], np.nan)
@@ -98,17 +97,17 @@ def with_line_of_sight(
 ) -> np.ndarray:
     """Append line of sight to the awareness of bounds (robot, move, row, col, feature).
 
-    If traversability is one of the `features`, it is replaced with its mean along the robots'
+    If traversability is one of the `features`, its values are replaced with means along the robots'
     tracks. Raises TrustboError if a cell is too small for the team.
     """
     for row, col in np.argwhere(passable).tolist():
         posts.require_room((row, col))
     is_known = TRAVERSABLE in features
-    easy = pixels[TRAVERSABLE if is_known else "passable"].values
-    seen, easy = bound_maps(posts, passable, easy)
+    of_pixels = pixels[TRAVERSABLE if is_known else "passable"].values
+    seen, traversability = bound_maps(posts, passable, of_pixels)
     if is_known:
-        of_feature = z[..., list(features).index(TRAVERSABLE)]
-        of_feature[...] = np.where(np.isfinite(easy), easy, of_feature)
+        of_cells = z[..., list(features).index(TRAVERSABLE)]
+        of_cells[...] = np.where(np.isfinite(traversability), traversability, of_cells)
     return np.clip(np.concatenate([z, seen[..., None]], axis=-1), 0.0, 1.0)
 
 
@@ -121,8 +120,8 @@ def labelled(
     """
     if not passable.any():
         raise TrustboError(
-            "no cell is passable: more than half of every cell has no data or is too steep. Use a "
-            "grid of another shape, or a team with a larger max_slope."
+            "no cell is passable. With a terrain, use a grid of another shape or a team with a "
+            "larger max_slope; with arrays, give passable cells."
         )
     cells = {
         **{axis: np.arange(n) for axis, n in zip(("row", "col"), grid.shape, strict=True)},
@@ -141,8 +140,8 @@ def unlabelled(
 ) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...]]:
     """Return awareness in the axis order of `of_arrays`, and the names of robots and features.
 
-    A DataArray is reordered by its dimensions and labels. If no names are given, its labels are
-    used. Raises TrustboError if the DataArray has unexpected dimensions or labels.
+    A DataArray is reordered by its dimensions and labels. Names that are not given are taken from
+    the labels. Raises TrustboError if the DataArray has unexpected dimensions or labels.
     """
     if not isinstance(awareness, xr.DataArray):
         return as_array("awareness", awareness), tuple(names), tuple(features)
@@ -164,10 +163,10 @@ def unlabelled(
 
 
 def of_arrays(z: np.ndarray, passable: ArrayLike | None) -> tuple[np.ndarray, np.ndarray]:
-    """Check the arrays of `Workspace.from_awareness`.
+    """Check the arrays of `Workspace.from_awareness`, and return awareness and passability.
 
-    Returns the awareness of bounds (robot, move, row, col, feature), NaN where there is no bound,
-    and the passability (row, col).
+    The awareness of bounds (robot, move, row, col, feature) is NaN where there is no bound. The
+    passability has the shape (row, col).
 
     Raises TrustboError if the axes do not match, a value is outside [0, 1], or the awareness of a
     passable cell or of a bound between passable cells is NaN.
@@ -181,7 +180,7 @@ def of_arrays(z: np.ndarray, passable: ArrayLike | None) -> tuple[np.ndarray, np
         )
     if (bad := (z < 0.0) | (z > 1.0)).any():
         index = tuple(int(i) for i in np.argwhere(bad)[0])
-        raise TrustboError(f"awareness{list(index)} = {z[index]:g} is outside [0, 1].")
+        raise TrustboError(f"awareness{list(index)} = {z[index]:g} is outside [0, 1]; rescale it.")
     finite = np.isfinite(z).all((0, -1))  # ([move], row, col)
     reached = finite if z.ndim == 4 else finite.any(0)
     free = reached if passable is None else np.asarray(passable, dtype=bool)

@@ -1,8 +1,8 @@
 """Difficulty of bounds, measured on the robots' routes relative to the robots' limits.
 
 Each measure is 0 on easy routes and about 1 at the robots' limit. The measure of a bound is the
-maximum over the routes of the lead and of T2. T2's routes assume that the next bound has the same
-direction.
+maximum over the routes of the lead and of T2. The routes of T2 depend on the next bound, which is
+assumed to have the same direction.
 """
 
 import math
@@ -24,11 +24,10 @@ MEASURES = ("untraversable", "tilt", "narrowness", "tightness")
 """Measures of difficulty; see `difficulty_of`."""
 _AHEAD = 1.5  # distance to the point of the route that a robot faces, m
 _STEP, _SUSTAINED = 0.25, 4  # distance between samples, m, and number of samples averaged
-_WIDTH = 2.0  # distance to an impassable pixel at which narrowness is 1/2, m
-_MOST = 2.0  # maximum tilt, as a multiple of the limit
+_WIDTH = 2.0  # distance to an impassable pixel at which narrowness is 0.5, m
+_MOST = 2.0  # largest value of the measure tilt
 _TIGHT = 3.0  # log(1 + length in m) at which tightness is 1: 19 m
 _BLOCK = 16  # bounds per task of a thread
-
 
 _cached: WeakKeyDictionary[Workspace, xr.DataArray] = WeakKeyDictionary()
 
@@ -36,11 +35,11 @@ _cached: WeakKeyDictionary[Workspace, xr.DataArray] = WeakKeyDictionary()
 def difficulty_of(workspace: Workspace) -> xr.DataArray:
     """Compute the difficulty of a workspace's bounds; the result is cached.
 
-    `untraversable` is one minus the mean traversability of a route's pixels. `tilt` is the tangent
-    of pitch or roll of a robot that faces a point 1.5 m ahead, averaged over 1 m; its maximum along
-    the route is divided by the tangent of `max_slope`. `narrowness` is 1 / (1 + w / 2 m), where w
-    is the smallest distance to an impassable pixel. `tightness` is log(1 + l / 1 m) / 3, where l is
-    the length of the route beside impassable pixels.
+    `untraversable` is one minus the mean traversability of a route's pixels, or 0.5 if unknown.
+    `tilt` is the largest tangent of pitch or roll along the route, averaged over 1 m, divided by
+    the tangent of `max_slope`; it is at most 2. The robot faces a point 1.5 m ahead. `narrowness`
+    is 1 / (1 + w / 2 m), where w is the smallest distance to an impassable pixel. `tightness` is
+    log(1 + l / 1 m) / 3, where l is the length of the route beside impassable pixels.
 
     Returns:
         DataArray (move, row, col, measure), NaN where there is no bound. Without a terrain, the
@@ -81,23 +80,23 @@ def _measure(workspace: Workspace, posts: Posts, exists: np.ndarray, out: np.nda
 
 
 def _of_bound(
-    posts: Posts, easy: np.ndarray, room: np.ndarray, bound: Sequence[np.ndarray | None]
+    posts: Posts, easy: np.ndarray, room: np.ndarray, routes: Sequence[np.ndarray | None]
 ) -> np.ndarray:
     """Compute the maximum of each measure over the robots' routes in a bound, shape (measure,)."""
     surface, team = posts.surface, posts.team
     ground = surface.gradient, surface.pixel, surface.origin
     robots = team.lead, *team.robots
     worst = np.zeros(len(MEASURES))
-    for robot, way in zip(robots, bound, strict=True):
-        if way is None:
-            continue  # the robot has no route
-        pixels = surface.nearest(*way.T)
-        of_way, gaps = easy[pixels], room[pixels]
-        of_way = of_way[np.isfinite(of_way)]
+    for robot, route in zip(robots, routes, strict=True):
+        if route is None:
+            continue
+        pixels = surface.nearest(*route.T)
+        of_route, gaps = easy[pixels], room[pixels]
+        of_route = of_route[np.isfinite(of_route)]
         tight = (gaps <= 1.001 * max(surface.pixel)).sum() * min(surface.pixel)
         measures = (
-            1.0 - of_way.mean() if len(of_way) else 0.5,
-            min(_tilt(way, *ground) / np.tan(robot.max_slope), _MOST),
+            1.0 - of_route.mean() if len(of_route) else 0.5,
+            min(_tilt(route, *ground) / np.tan(robot.max_slope), _MOST),
             1.0 / (1.0 + gaps.min() / _WIDTH),
             np.log1p(tight) / _TIGHT,
         )

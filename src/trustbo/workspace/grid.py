@@ -82,14 +82,14 @@ class Grid(Summary):
         ]
 
     def center(self, cell: Cell) -> tuple[float, float]:
-        """Return x and y of a cell's centre, in CRS metres."""
+        """Return the coordinates x and y of a cell's centre, in CRS metres."""
         row, col = require_pair("cell", cell)
         x = self.left + (col + 0.5) * self.cell_width
         return x, self.top - (row + 0.5) * self.cell_height
 
     @property
     def corner(self) -> tuple[float, float]:
-        """X and y of the lower left corner, in CRS metres."""
+        """Coordinates x and y of the lower left corner, in CRS metres."""
         return self.left, self.top - self.shape[0] * self.cell_height
 
     @property
@@ -100,12 +100,12 @@ class Grid(Summary):
 
     @property
     def x(self) -> np.ndarray:
-        """X of the centre of each column, shape (col,), in CRS metres."""
+        """Coordinate x of the centre of each column, shape (col,), in CRS metres."""
         return self.left + (np.arange(self.shape[1]) + 0.5) * self.cell_width
 
     @property
     def y(self) -> np.ndarray:
-        """Y of the centre of each row, shape (row,), in CRS metres."""
+        """Coordinate y of the centre of each row, shape (row,), in CRS metres."""
         return self.top - (np.arange(self.shape[0]) + 0.5) * self.cell_height
 
     @property
@@ -131,7 +131,7 @@ class Grid(Summary):
         """
         try:
             row, col = self._row_and_col(location)
-        except TrustboError:  # no CRS
+        except TrustboError:  # no CRS; a TrustboError is also a ValueError
             raise
         except (TypeError, ValueError, KeyError, OverflowError):
             raise TrustboError(
@@ -148,7 +148,7 @@ class Grid(Summary):
         return int(row), int(col)
 
     def _row_and_col(self, location: Location) -> tuple[float, float]:
-        """Convert a location, even off the grid, to a row and column (fractional for positions)."""
+        """Convert a location to a row and column, which are fractional for a position."""
         if not isinstance(location, Mapping):
             row, col = (operator.index(i) for i in location)
             return row, col
@@ -161,7 +161,7 @@ class Grid(Summary):
         return (self.top - y) / self.cell_height, (x - self.left) / self.cell_width
 
     def _extent_text(self) -> str:
-        """Describe the extent in the CRS and in degrees; empty without a CRS."""
+        """Describe the extent of the grid for error messages; empty without a CRS."""
         if self.crs is None:
             return ""
         left, bottom, right, top = self.bounds
@@ -189,7 +189,7 @@ class Grid(Summary):
         return lon, lat
 
     def place(self, maps: xr.Dataset) -> xr.Dataset:
-        """Georeference maps of the cells: rename (row, col) to (y, x); set transform and CRS."""
+        """Rename the dimensions (row, col) of maps to (y, x), and set the transform and the CRS."""
         placed = maps.drop_vars(["row", "col", "y", "x"], errors="ignore").rename(row="y", col="x")
         placed = placed.assign_coords(y=self.y, x=self.x)
         for axis in ("y", "x"):
@@ -200,13 +200,13 @@ class Grid(Summary):
         return placed.rio.write_transform(from_origin(self.left, self.top, *step))
 
     def cell_means(self, values: xr.DataArray) -> np.ndarray:
-        """Average the valid pixels of each cell.
+        """Average the finite pixel values of each cell.
 
         Args:
             values: Pixel values, dims (y, x), on a raster that the grid covers.
 
         Returns:
-            Means, shape (row, col); NaN where a cell has no valid pixel.
+            Means, shape (row, col); NaN where a cell has no finite value.
         """
         row, col = self.cells_along(values["y"].values, values["x"].values)
         cell, z = row[:, None] * self.shape[1] + col, values.transpose("y", "x").values
@@ -235,7 +235,7 @@ class Grid(Summary):
 
 
 def _moved(source: CRS, target: CRS, x: float, y: float) -> tuple[float, float]:
-    """Convert a position to another CRS; return infinities if that is impossible."""
+    """Convert a position to another CRS; return infinite coordinates if this is impossible."""
     try:
         (u,), (v,) = transform_points(source, target, [x], [y])[:2]
     except Exception:  # PROJ raises GDAL's errors, which have no common base
@@ -244,7 +244,7 @@ def _moved(source: CRS, target: CRS, x: float, y: float) -> tuple[float, float]:
 
 
 def over_cells[Map: (xr.Dataset, xr.DataArray)](maps: Map) -> Map:
-    """Rename the dimensions (y, x) of maps such as `Result.maps()` to (row, col)."""
+    """Rename the dimensions (y, x) of maps, such as those of `Result.maps()`, to (row, col)."""
     if not {"y", "x"} <= set(maps.dims):
         return maps
     return maps.drop_vars(["y", "x"], errors="ignore").rename(y="row", x="col")

@@ -1,4 +1,4 @@
-"""Line of sight in a bound: predicted fraction of time in which robot and lead see each other.
+"""Line of sight: predicted fraction of a bound in which a robot and the lead see each other.
 
 A bound a -> c has two phases (docs/concepts.md, "Why bounds"). First, T2 watches from its posts
 in a while the lead drives to its stop in c. Then the lead watches from this stop while T2 closes up
@@ -10,11 +10,11 @@ phase, and the phases are weighted by their durations:
 
 where p is the detection probability under the assumed model of sight, T_1 is the lead's driving
 time and T_2 is the driving time of the slowest robot. A robot that arrives earlier waits at its
-post. The samples cycle through the cells to which a path may continue.
+post. The assumed next cell changes with k, so that all cells ahead are represented.
 
 The lead takes the fastest route, as in the simulator. T2 is assumed to follow that route, shifted
-to T2's posts. Finding T2's own fastest routes would take about 50 searches for each bound. They
-differ from the assumed routes by a few metres, over which sight hardly changes.
+to T2's posts. Finding T2's own fastest routes would take about 50 searches for each bound. These
+routes differ from the assumed routes by a few metres, over which sight hardly changes.
 """
 
 import math
@@ -35,14 +35,14 @@ from trustbo.workspace.surface import Surface
 
 _BLOCK = 256  # bounds computed together, to limit memory use
 N_SAMPLES = 16
-"""Number of times in each phase at which sight is computed."""
-_AHEAD = 0.5  # cosine of the largest expected turn of a path
+"""Number of times at which sight is computed in each phase of a bound."""
+_AHEAD = 0.5  # cosine of the largest turn after which a cell counts as ahead
 
 
 class Geometry(NamedTuple):
-    """Stops, posts and routes of the robots in given bounds, x and y in CRS metres."""
+    """Stops, posts and routes of the robots in given bounds; x and y are in CRS metres."""
 
-    routes: list[np.ndarray]  # of the lead, (point, 2) each
+    routes: list[np.ndarray]  # of the lead, each (point, 2)
     posts: np.ndarray  # (bound, robot, 2), from which T2 watches the lead
     ends: np.ndarray  # (bound, sample, robot, 2), to which T2 closes up
     stops: np.ndarray  # (bound, 2), from which the lead watches T2
@@ -76,7 +76,7 @@ def bound_maps(
 
 
 def geometry(posts: Posts, index: np.ndarray, passable: np.ndarray) -> Geometry:
-    """Collect the geometry of the bounds in `index`, (bound, 3), given as (move, row, col)."""
+    """Collect the geometry of bounds; `index` (bound, 3) contains their (move, row, col)."""
     left = (index[:, 1:] - np.array(MOVES)[index[:, 0]]).tolist()
     bounds = [
         ((i, j), (row, col)) for (i, j), (_, row, col) in zip(left, index.tolist(), strict=True)
@@ -114,7 +114,7 @@ def bound_features(
     lead, lead_time = _timed(surface, team.lead, given.routes)
     drives = [_timed(surface, robot, given.routes) for robot in team.robots]
     first, last = (np.stack([route[end] for route in given.routes]) for end in (0, -1))
-    # T2's routes may be much longer or shorter than the lead's.
+    # Scale T2's times by the ratio of the straight distances of T2 and of the lead.
     distance = np.linalg.norm(given.ends - given.posts[:, None], axis=-1).mean(1)
     longer = distance / np.maximum(np.linalg.norm(last - first, axis=1), 1.0)[:, None]
     times = np.stack([time for _, time in drives], axis=1) * longer  # (bound, robot)
@@ -144,6 +144,6 @@ def bound_features(
 def _timed(
     surface: Surface, robot: Robot, routes: Sequence[np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return a robot's positions (bound, sample, 2) on routes, and the durations (bound,) in s."""
+    """Return a robot's positions (bound, sample, 2) on routes, and the durations (bound,), s."""
     first = np.cumsum([0, *(len(route) for route in routes)])
     return at_times(surface, robot, np.concatenate(routes), first, N_SAMPLES)

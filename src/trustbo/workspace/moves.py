@@ -50,7 +50,7 @@ def bounds_along(path: Sequence[Cell] | np.ndarray) -> np.ndarray:
 
 
 def existing_bounds(passable: np.ndarray) -> np.ndarray:
-    """Return whether each move into each cell is a bound, shape (move, row, col).
+    """Return whether each move into each cell is a bound, as a mask (move, row, col).
 
     A bound leads from one passable cell to another; `passable` has the shape (row, col).
     """
@@ -61,7 +61,7 @@ def existing_bounds(passable: np.ndarray) -> np.ndarray:
 
 
 def along(maps: np.ndarray, path: Sequence[Cell] | np.ndarray) -> np.ndarray:
-    """Select the values for the bounds of a path, shape (..., bound, feature).
+    """Select the values of maps for the bounds of a path, shape (..., bound, feature).
 
     The maps have the shape (..., move, row, col, feature).
     """

@@ -20,7 +20,7 @@ def workspace_to_tree(workspace: Workspace) -> xr.DataTree:
     tree = {"cells": cells}
     tree |= {f"composites/{n}": index.fitted for n, index in workspace.composites.items()}
     if workspace.terrain is not None and workspace.pixels is not None:
-        pixels = workspace.pixels.drop_vars("spatial_ref", errors="ignore")  # kept in the terrain
+        pixels = workspace.pixels.drop_vars("spatial_ref", errors="ignore")  # in the terrain
         tree |= {"terrain": workspace.terrain, "pixels": pixels}
     result = xr.DataTree.from_dict(tree)
     result.attrs = {
@@ -44,7 +44,7 @@ def workspace_from_tree(tree: xr.DataTree) -> Workspace:
     terrain = pixels = posts = None
     if "terrain" in tree:
         terrain = tree["terrain"].to_dataset().set_coords("spatial_ref")
-        for array in terrain.data_vars.values():  # where rioxarray expects it
+        for array in terrain.data_vars.values():  # rioxarray reads the encoding
             if "grid_mapping" in array.attrs:
                 array.encoding["grid_mapping"] = array.attrs.pop("grid_mapping")
         pixels = tree["pixels"].to_dataset().assign_coords(spatial_ref=terrain["spatial_ref"])

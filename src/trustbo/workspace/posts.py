@@ -2,15 +2,15 @@
 
 In a bound a -> c (docs/concepts.md, "Why bounds"), T2 watches the lead's route from posts in a.
 Then the lead watches from its stop in c while T2 leaves these posts. In the previous bound, the
-lead watched from its stop in cell a while T2 drove to these posts. Among positions p on a lattice
-around the stop in a, the posts of T2 maximise
+lead watched from its stop in a while T2 drove to these posts. The posts of T2 are those positions p
+on a lattice around the stop in a that maximise
 
     1/2 mean_k s(p, lead at t_k) + 1/4 s(stop in a, p) + 1/4 s(stop in c, p),
 
 where s is the detection probability under the assumed model of sight. Posts are within `RADIUS` of
 the stop, possibly outside the cell, and away from the lead's route. The slope is well below the
-limit at each post and along some connection to the stop. The lead stops where the routes to the
-neighbouring stops are most visible.
+limit at each post and along at least one way from the post to the stop. The lead stops where the
+routes to the neighbouring stops are most visible.
 
 Real obstacles may be missing from maps, and mapped obstacles may not block sight. The choice of
 posts and stops allows for such errors (`Posts._seen`); the feature `line_of_sight` does not.
@@ -33,19 +33,19 @@ from trustbo.workspace.sight import Sight, detection_between, jittered, optics
 from trustbo.workspace.surface import surface_of
 
 TRAVERSABLE = "traversability"
-"""Name of the feature for ease of driving, averaged along the robots' tracks in each bound."""
+"""Name of the feature that is averaged along the robots' tracks in each bound."""
 SPACING, RADIUS = 2.0, 25.0
 """Minimum distance in m between T2's robots, and maximum distance of T2 from the lead's stop."""
 _GAP = 4.0  # preferred minimum distance between two posts, m
 _STEP, _STOP_RADIUS = 4.0, 16.0  # lattice spacing, and search radius for the lead's stop, m
-_SMOOTHED = 5.0  # width of the moving average of traversability, m
+_SMOOTHED = 5.0  # width of the moving average of traversability for stops, m
 _SAFE = 0.7  # steepest ground for posts, as a fraction of the slope limit
 _DISCOUNT = 0.005  # assumed rate at which detection falls with distance, 1/m
-_DOUBT, _DOUBT_REACH = 0.1, 40.0  # probability of an unexpected detection at 0 m; decay length, m
+_DOUBT, _DOUBT_REACH = 0.1, 40.0  # probability of seeing a hidden target; its decay length, m
 _NEARER = 1e-3  # penalty on the score per metre from the stop
 _IN_THE_WAY, _TOO_CLOSE = 5.0, 10.0  # penalties, larger than any probability
-_N_WATCHED = 30  # positions, best seen from the stops, whose sight of the route is computed
-_N_AIMS = 6  # times on the lead's route at which sight is computed
+_N_WATCHED = 30  # number of positions, best seen from the stops, that are rated for all aims
+_N_AIMS = 6  # number of times on the lead's route at which sight is computed
 _SHARES = np.array([0.25, 0.5, 0.75, 1.0])  # fractions of the straight line to a neighbouring stop
 
 
@@ -84,7 +84,7 @@ class Posts:
     # --- routes ---
 
     def window(self, *cells: Cell) -> Window:
-        """Return the pixel window (rows, then columns) of cells with a margin of half a cell."""
+        """Return the pixel window that contains cells and a margin of half a cell around them."""
         (rows, cols), shape = self.surface.ground.shape, np.array(self.grid.shape)
         size = np.array([rows, cols]) / shape
         top, left = ((np.min(cells, axis=0) - 0.5) * size).astype(int).tolist()
@@ -92,10 +92,10 @@ class Posts:
         return max(0, top), min(rows, bottom), max(0, left), min(cols, right)
 
     def linked_bounds(self, exists: np.ndarray) -> np.ndarray:
-        """Return which bounds in `exists`, shape (move, row, col), have routes for all robots.
+        """Return a mask (move, row, col) of the bounds in `exists` with routes for all robots.
 
-        T2's posts are connected to the stop of their cell within the cell and half a cell around
-        it. Therefore, if the stops of two cells are connected, all robots have routes in both
+        T2's posts are connected to the stop of their cell within the cell and a margin of half a
+        cell. Therefore, if the stops of two cells are connected, all robots have routes in both
         directions, whatever the next cell is.
         """
         linked, last = np.zeros_like(exists), len(MOVES) - 1
@@ -121,23 +121,24 @@ class Posts:
         return self._lead_route(a, c), *(self.routes.find(*each, window) for each in ends)
 
     def _lead_route(self, a: Cell, c: Cell) -> np.ndarray | None:
-        """Find the lead's route between its stops in a and c, (point, 2); None if there is none."""
+        """Find the lead's route from its stop in a to its stop in c, (point, 2), or None."""
         return self.routes.find(self.team.lead, self.stop(a), self.stop(c), self.window(a, c))
 
     def lead_line(self, a: Cell, c: Cell) -> np.ndarray:
-        """Return the lead's route, or a straight line if there is no route, (point, 2)."""
+        """Return the lead's route in a bound, (point, 2), or a straight line if there is none."""
         route = self._lead_route(a, c)
         return np.stack([self.stop(a), self.stop(c)]) if route is None else route
 
     # --- stops of the lead ---
 
     def stop(self, cell: Cell) -> np.ndarray:
-        """Find the position in a cell, (2,), from which routes to other stops are most visible."""
+        """Return the lead's stop, (2,), from which routes to other stops are most visible."""
         if cell not in self._stops:
-            self._stops[cell] = self._seeing_stop(cell)
+            self._stops[cell] = self._choose_stop(cell)
         return self._stops[cell]
 
-    def _seeing_stop(self, cell: Cell) -> np.ndarray:
+    def _choose_stop(self, cell: Cell) -> np.ndarray:
+        """Choose the lead's stop among positions in a cell."""
         here = self._central_stop(cell)
         around = [self._central_stop(c) for c in self._around(cell)]
         goals = np.array([goal for goal in around if self._is_in_region(goal)])
@@ -152,7 +153,7 @@ class Posts:
         return position[np.argmax(seen - _NEARER * np.linalg.norm(position - here, axis=1))]
 
     def _central_stop(self, cell: Cell) -> np.ndarray:
-        """Find a position on easy ground near the cell's centre, (2,)."""
+        """Find a position with high traversability near the cell's centre, (2,)."""
         if cell not in self._central:
             row, col = self._pixels_of(cell)
             position = self._position(row, col)
@@ -164,19 +165,19 @@ class Posts:
     # --- posts of T2 ---
 
     def watching(self, cell: Cell, next_cell: Cell | None) -> np.ndarray:
-        """Find the posts in a cell from which T2 watches the lead's next move, shape (robot, 2).
+        """Return the posts in a cell from which T2 watches the lead's next move, shape (robot, 2).
 
-        Without a next cell, T2 stands around the lead at the goal.
+        If `next_cell` is None, the cell is the goal, and T2 stands around the lead.
         """
-        if (cell, next_cell) not in self._posts:  # all neighbours take little more time
+        if (cell, next_cell) not in self._posts:  # all next cells take little more time
             around = [c for c in self._around(cell) if self._is_in_region(self.stop(c))]
             ahead = list(dict.fromkeys([None, *around, next_cell]))
-            for c, posts in zip(ahead, self._chosen(cell, ahead), strict=True):
+            for c, posts in zip(ahead, self._choose_posts(cell, ahead), strict=True):
                 self._posts[cell, c] = posts
         return self._posts[cell, next_cell]
 
-    def _chosen(self, cell: Cell, ahead: Sequence[Cell | None]) -> np.ndarray:
-        """Choose the best positions, one robot after another, shape (next cell, robot, 2)."""
+    def _choose_posts(self, cell: Cell, ahead: Sequence[Cell | None]) -> np.ndarray:
+        """Choose the posts for each next cell, one robot at a time, (next cell, robot, 2)."""
         here, robots = self.stop(cell), self.team.robots
         position, gap = self._lattice(cell, here, RADIUS), _GAP
         if len(position) < len(robots):  # too little safe ground
@@ -196,7 +197,7 @@ class Posts:
     def _scores(
         self, cell: Cell, ahead: Sequence[Cell | None], position: np.ndarray
     ) -> dict[Robot, np.ndarray]:
-        """Score positions as posts of each robot, shape (next cell, position); see the module."""
+        """Score positions as posts of each robot, (next cell, position); see the formula above."""
         here, lead = self.stop(cell), self.team.lead
         stops = np.array([here, *(here if c is None else self.stop(c) for c in ahead)])
         routes = [np.stack([here] * 2) if c is None else self.lead_line(cell, c) for c in ahead]
@@ -211,13 +212,13 @@ class Posts:
             best = np.argsort(nearer - seen, axis=1, kind="stable")[:, :_N_WATCHED]
             eyes = position[best][:, :, None] + jittered(_N_AIMS)
             watched = 0.5 * self._seen(eyes, aims[:, None], robot, lead).mean(-1)
-            score = seen - 1.0  # for positions without computed sight of the route
+            score = seen - 1.0  # for positions whose sight of the route is not computed
             np.put_along_axis(score, best, np.take_along_axis(seen, best, 1) + watched, 1)
             scores[robot] = score - _IN_THE_WAY * blocking - nearer
         return scores
 
     def _abreast(self, posts: np.ndarray, direction: np.ndarray) -> None:
-        """Sort identical robots from left to right so they keep their sides and drive less."""
+        """Sort identical robots from left to right, so that their routes do not cross."""
         robots = self.team.robots
         to_right = posts @ np.array([direction[1], -direction[0]])
         for robot in dict.fromkeys(robots):
@@ -227,10 +228,10 @@ class Posts:
     def _seen(
         self, eye: np.ndarray, target: np.ndarray, watcher: Robot, watched: Robot
     ) -> np.ndarray:
-        """Compute the detection probability of targets (..., 2), allowing for map errors.
+        """Compute the detection probability of targets (..., 2), allowing for errors in the map.
 
-        The probability from the map is reduced with distance. A small probability of seeing a
-        hidden target, which also decreases with distance, is then added.
+        The probability from the map is reduced with distance. Then a small probability of seeing a
+        hidden target is added, which also decreases with distance.
         """
         view = optics(watcher, watched)
         distance = np.linalg.norm(target - eye, axis=-1)
@@ -253,9 +254,10 @@ class Posts:
     def _linked_to(
         self, position: np.ndarray, *cells: Cell, over: np.ndarray | None = None
     ) -> tuple[np.ndarray, tuple[int, int]]:
-        """Return a mask of the pixels around cells that are linked to a position, and its corner.
+        """Return a mask of the pixels connected to a position, and the mask's first row and column.
 
-        The pixels are connected over passable ground or, if given, over the mask `over`.
+        The mask covers the window of the given cells. The pixels are connected by passable pixels
+        or, if given, by the pixels of the mask `over`.
         """
         ground = self.surface.passable if over is None else over
         window = self.window(*cells)
@@ -263,7 +265,7 @@ class Posts:
         return linked_to(ground, window, pixel), (window[0], window[2])
 
     def _lattice(self, cell: Cell, here: np.ndarray, radius: float) -> np.ndarray:
-        """Return lattice positions (position, 2) connected to the position `here` by safe ground.
+        """Return lattice positions (position, 2) around `here`, connected to `here` by safe ground.
 
         The connection stays within half a cell of the cell, and thus in the window of each bound.
         """
@@ -279,14 +281,14 @@ class Posts:
         return self._position(row[kept], col[kept])
 
     def _pixels_near(self, cell: Cell, here: np.ndarray) -> np.ndarray:
-        """Find positions in a cell that are connected to the stop, near the stop if possible."""
+        """Return positions in a cell, connected to the stop `here` and near it if possible."""
         row, col = self._pixels_of(cell)
         region, (top, left) = self._linked_to(here, cell)
         linked = region[row - top, col - left]
         position = self._position(row, col)[linked if linked.any() else slice(None)]
         distance, n_robots = np.linalg.norm(position - here, axis=1), len(self.team.robots)
         near = np.flatnonzero((distance <= RADIUS) & (distance >= SPACING))
-        if len(near) < n_robots:  # few passable pixels, or large ones
+        if len(near) < n_robots:  # few or large pixels
             order = np.argsort(distance, kind="stable")
             near = order[distance[order] > 0.0][:n_robots]
             near = near if len(near) else order

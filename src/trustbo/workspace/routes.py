@@ -18,11 +18,11 @@ from trustbo.team import Robot
 from trustbo.workspace.surface import Surface
 
 Window = tuple[int, int, int, int]
-"""First and end row, then first and end column, of a window of pixels."""
+"""Window of pixels: first row, end row, first column and end column; ends are exclusive."""
 SLOWEST = 0.1
 """Speed at the slope limit as a fraction of the speed on level ground."""
-_CLEARANCE = 1.0  # preferred distance from obstacles, since robots stray from routes, m
-_CLOSE = 4.0  # factor on the cost within that distance
+_CLEARANCE = 1.0  # preferred distance from obstacles, because robots stray from routes, m
+_CLOSE = 4.0  # factor on the cost of a route that is closer to an obstacle
 _compiled = njit(cache=True, nogil=True, error_model="numpy")
 
 
@@ -30,7 +30,7 @@ class Routes:
     """Fastest routes over passable pixels, found by A* and cached."""
 
     def __init__(self, surface: Surface) -> None:
-        """Compute the slope, which reduces a robot's speed, and find the pixels near obstacles."""
+        """Compute the slope of each pixel, and find the pixels near obstacles."""
         self._surface = surface
         self._slope = np.arctan(np.hypot(*surface.gradient))
         free: Any = ndimage.distance_transform_edt(surface.passable, sampling=surface.pixel)
@@ -46,14 +46,14 @@ class Routes:
         The route stays inside the pixel window. It has shape (point, 2), x and y in CRS metres.
         """
         ends = [self._surface.pixel_at(*p.tolist()) for p in (start, goal)]
-        low, high = sorted(ends)  # the route back is the same
+        low, high = sorted(ends)  # the reversed route is the same
         key = low, high, window, robot.max_slope
         if key not in self._cached:
             self._cached[key] = self._search(*key)
         cached = self._cached[key]
         if not len(cached):
             return None
-        if len(cached) == 1:  # a single-pixel route still needs two ends
+        if len(cached) == 1:  # start and goal are in the same pixel
             return np.stack([start, goal])
         route = cached[:: 1 if ends[0] == low else -1].copy()
         route[0], route[-1] = start, goal
@@ -62,7 +62,7 @@ class Routes:
     def _search(
         self, start: tuple[int, int], goal: tuple[int, int], window: Window, max_slope: float
     ) -> np.ndarray:
-        """Find the positions of a route's pixels from start to goal; empty if there is no route."""
+        """Find the pixels of a route, and return their positions; empty if there is no route."""
         surface = self._surface
         if max_slope not in self._paces:
             pace = 1.0 / speed_share(self._slope, max_slope)
@@ -82,13 +82,13 @@ class Routes:
 
 @_compiled
 def speed_share(tilt, max_slope):
-    """Compute the speed at a tilt (rad) as a fraction of the speed on level ground."""
+    """Compute the speed at a pitch or roll (rad) as a fraction of the speed on level ground."""
     return np.maximum(SLOWEST, 1.0 - (1.0 - SLOWEST) * tilt / max_slope)
 
 
 @_compiled
 def _a_star(pace, pixel, start, goal):
-    """Find the fastest route, empty if there is none; `pace` is infinite where impassable."""
+    """Find the pixels of the fastest route by A*; `pace` is infinite where impassable."""
     rows, cols = pace.shape
     best = np.full((rows, cols), np.inf)
     came = np.full((rows, cols), -1)
@@ -139,8 +139,8 @@ def at_times(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Find a robot's positions at n evenly spaced times on each route, and the durations.
 
-    The routes are concatenated in `flat`, shape (point, 2). `first` contains the index of each
-    route's first point, and ends with the number of points. Positions have shape (route, time, 2)
+    The routes are concatenated in `flat`, shape (point, 2). `first` contains the index of the first
+    point of each route, followed by the number of points. Positions have shape (route, time, 2),
     and durations, in seconds, have shape (route,).
     """
     limits = robot.speed, robot.max_slope
@@ -149,7 +149,7 @@ def at_times(
 
 @_compiled
 def _resampled(gradient, pixel, origin, flat, first, limits, n_samples):
-    """Compute the result of `at_times`; the speed falls with the larger of pitch and roll."""
+    """Compute the result of `at_times`; the speed decreases with the larger of pitch and roll."""
     rows, cols = gradient.shape[1:]
     n = len(first) - 1
     points, duration = np.empty((n, n_samples, 2)), np.empty(n)
@@ -193,7 +193,7 @@ def largest_region(passable: np.ndarray) -> np.ndarray:
 
 
 def linked_to(passable: np.ndarray, window: Window, pixel: tuple[int, ...]) -> np.ndarray:
-    """Return a mask of a window's passable pixels that are connected to `pixel` in the window."""
+    """Return a mask of the passable pixels connected to `pixel` within a window."""
     top, bottom, left, right = window
     inside = passable[top:bottom, left:right]
     regions: Any = ndimage.label(inside)

@@ -1,4 +1,4 @@
-"""Sight between robots: range, field of view, and obstruction by ground and canopy."""
+"""Sight between robots, limited by range, field of view, ground and canopy."""
 
 import math
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from trustbo.workspace.surface import Surface
 _compiled = njit(cache=True, nogil=True, error_model="numpy")
 _part = njit(nogil=True, error_model="numpy", **PART)
 
-_JITTER = 0.7  # m
+_JITTER = 0.7  # radius of the disc of viewpoints around a post, m
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Sight:
 
     The ground blocks rays. The canopy is a layer from `crown_base` times its height to its top. A
     ray through d metres of canopy is transmitted with probability exp(-extinction d). If extinction
-    is 0, only the ground blocks rays; with `math.inf` and a crown base of 0, the surface does.
+    is 0, the canopy is transparent; with `math.inf` and a crown base of 0, the canopy is solid.
 
     Attributes:
         extinction: Extinction coefficient of the canopy, in 1/m.
@@ -47,7 +47,7 @@ class Sight:
 
 
 def optics(watcher: Robot, watched: Robot) -> np.ndarray:
-    """Return sensor height, target height and range, in m, and sine of half the field of view."""
+    """Return sensor height, target height and range, in m, and the sine of `vertical_fov`."""
     return np.array([
         watcher.sensor_height,
         watched.target_height,
@@ -61,7 +61,7 @@ def jittered(n: int) -> np.ndarray:
     """Return the offsets of n viewpoints from a post, shape (viewpoint, 2), in metres.
 
     The view from the exact post is not representative, because a robot stops up to half a metre
-    away and its field of view tilts with the ground. The viewpoints are spread over a disc.
+    away, and its field of view tilts with the ground. The viewpoints are spread over a disc.
     """
     k, order = np.arange(n), np.random.default_rng(0).permutation(n)
     radius, angle = _JITTER * np.sqrt((k + 0.5) / n), 2.4 * k
@@ -74,8 +74,8 @@ def detection_probability(
     """Compute the probability that an ideal lidar detects each target, shape (ray,), in [0, 1].
 
     The probability is the transmittance along the ray if the target is within the lidar's range and
-    vertical field of view, which tilts with the robot, and 0 otherwise. Sensors and targets have
-    shape (ray, 2), in CRS metres. The values of `optics` have shape (ray, 4) or (4,).
+    vertical field of view, and 0 otherwise. The field of view tilts with the robot. Sensors and
+    targets have shape (ray, 2), in CRS metres. `optics` has shape (ray, 4) or (4,).
     """
     ends = _ends(
         surface.ground,
@@ -93,22 +93,22 @@ def detection_probability(
 def detection_between(
     surface: Surface, sight: Sight, eye: np.ndarray, target: np.ndarray, optics: np.ndarray
 ) -> np.ndarray:
-    """Return the detection probability (...) of targets from eyes, both (..., 2) and broadcast."""
+    """Compute the detection probability (...) between positions (..., 2), which are broadcast."""
     eye, target = np.broadcast_arrays(eye, target)
-    rays = np.ascontiguousarray(eye).reshape(-1, 2), np.ascontiguousarray(target).reshape(-1, 2)
-    return detection_probability(surface, sight, *rays, optics).reshape(eye.shape[:-1])
+    ends = np.ascontiguousarray(eye).reshape(-1, 2), np.ascontiguousarray(target).reshape(-1, 2)
+    return detection_probability(surface, sight, *ends, optics).reshape(eye.shape[:-1])
 
 
 @_compiled
 def _ends(ground, gradient, pixel, origin, sensor, target, optics):
-    """Compute row, column and height of both ends of each ray, (ray, 6); NaN if out of view.
+    """Compute row, column and height of both ends of each ray, (ray, 6).
 
-    This loop is separate so that the memory accesses of many rays overlap.
+    The first height is NaN if the target is out of view. The loop is separate from ray tracing so
+    that the memory accesses of many rays overlap.
     """
     n_rows, n_cols = ground.shape
     ends = np.empty((len(sensor), 6))
     for i in range(len(sensor)):
-        # The outer half of an edge pixel has the height of its centre.
         r0 = _inward((origin[1] - sensor[i, 1]) / pixel[0], n_rows)
         c0 = _inward((sensor[i, 0] - origin[0]) / pixel[1], n_cols)
         r1 = _inward((origin[1] - target[i, 1]) / pixel[0], n_rows)
@@ -120,7 +120,7 @@ def _ends(ground, gradient, pixel, origin, sensor, target, optics):
         row = min(max(int(r0 + 0.5), 0), n_rows - 1)
         col = min(max(int(c0 + 0.5), 0), n_cols - 1)
         gx, gy = gradient[0, row, col], gradient[1, row, col]
-        # Height above the plane of the body, whose normal is (-gx, -gy, 1).
+        # Distance from the plane of the robot's body, whose normal is (-gx, -gy, 1).
         above = abs(up - gx * east - gy * north) / math.sqrt(1.0 + gx * gx + gy * gy)
         seen = distance <= optics[i, 2] and above <= optics[i, 3] * max(distance, 1e-9)
         ends[i, 0], ends[i, 1], ends[i, 2] = r0, c0, z0 if seen else math.nan
@@ -130,4 +130,5 @@ def _ends(ground, gradient, pixel, origin, sensor, target, optics):
 
 @_part
 def _inward(x, n):
+    """Move a coordinate in the outer half of an edge pixel to the centre of this pixel."""
     return min(max(x, 0.0), n - 1.0) if -0.5 <= x <= n - 0.5 else x

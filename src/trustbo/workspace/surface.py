@@ -1,4 +1,4 @@
-"""Rasters from which positions, motion and sight of robots are computed."""
+"""Rasters from which the positions, motion and sight of robots are computed."""
 
 from typing import Any, NamedTuple
 
@@ -22,14 +22,14 @@ class Surface(NamedTuple):
 
     @property
     def axes(self) -> tuple[np.ndarray, np.ndarray]:
-        """Y of each pixel row and x of each pixel column, in CRS metres."""
+        """Coordinate y of each pixel row and x of each pixel column, in CRS metres."""
         rows, cols = self.ground.shape
         y = self.origin[1] - np.arange(rows) * self.pixel[0]
         return y, self.origin[0] + np.arange(cols) * self.pixel[1]
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
-        """Smallest x and y, then largest x and y, of the raster's edges, in CRS metres."""
+        """Edges of the raster in CRS metres: smallest x, smallest y, largest x and largest y."""
         y, x = self.axes
         high, wide = 0.5 * self.pixel[0], 0.5 * self.pixel[1]
         return float(x[0] - wide), float(y[-1] - high), float(x[-1] + wide), float(y[0] + high)
@@ -50,12 +50,12 @@ class Surface(NamedTuple):
     def pixel_at(self, x: float, y: float) -> tuple[int, int]:
         """Return the row and column of the pixel nearest to one position."""
         rows, cols = self.ground.shape
-        row, col = round((self.origin[1] - y) / self.pixel[0]), (x - self.origin[0])
-        return min(max(row, 0), rows - 1), min(max(round(col / self.pixel[1]), 0), cols - 1)
+        row, col = (self.origin[1] - y) / self.pixel[0], (x - self.origin[0]) / self.pixel[1]
+        return min(max(round(row), 0), rows - 1), min(max(round(col), 0), cols - 1)
 
 
 def surface_of(terrain: xr.Dataset, passable: np.ndarray) -> Surface:
-    """Make the surface of a terrain; `passable` is a mask of its pixels, shape (row, col)."""
+    """Make the surface of a terrain; `passable` is a mask (row, col) of the terrain's pixels."""
     ground, canopy = (terrain[name].values.astype(float) for name in ("dem", "dsm"))
     return Surface(
         ground=ground,
@@ -68,7 +68,7 @@ def surface_of(terrain: xr.Dataset, passable: np.ndarray) -> Surface:
 
 
 def filled(dem: np.ndarray) -> np.ndarray:
-    """Replace missing heights with the nearest height; robots may reach the edge of the data."""
+    """Replace missing heights with the nearest height, because robots may reach missing data."""
     nearest: Any = ndimage.distance_transform_edt(
         ~np.isfinite(dem), return_distances=False, return_indices=True
     )

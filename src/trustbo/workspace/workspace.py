@@ -47,7 +47,7 @@ class Workspace(Summary):
 
     Attributes:
         awareness: DataArray (robot, move, row, col, feature), in [0, 1]. A value applies to the
-            bound that enters the cell (row, col) by one of the `MOVES`; NaN if none exists.
+            bound that enters the cell (row, col) by the move; NaN if there is no such bound.
         passable: Boolean DataArray (row, col).
         grid: Shape, position and cell size of the planning grid.
         team: Lead and overwatching robots.
@@ -82,21 +82,21 @@ class Workspace(Summary):
         The mean of a feature over a cell applies to all robots and to all bounds into the cell.
         A cell is impassable if more than half of its pixels are missing or steeper than the slope
         limit. Openness is measured up to the lidar's range, but no farther than the diagonal of a
-        cell, because overwatch needs no sight beyond one bound.
+        cell, because T2 does not watch the lead beyond one bound.
 
-        Because overwatch involves two cells, traversability is averaged along the robots' tracks
-        in a bound, and the feature `line_of_sight` is added: the predicted fraction of time in
-        which a robot and the lead can see each other, given the assumed model of sight.
+        Because overwatch involves two cells, traversability is averaged along the robots' tracks in
+        a bound. In addition, the feature `line_of_sight` is the predicted fraction of time in which
+        a robot and the lead can see each other, given the assumed model of sight.
 
         Args:
             terrain: Dataset from `read_terrain` or `synthetic_terrain`.
             shape: Number of rows and columns of the planning grid.
             team: Lead and overwatching robots; by default a lead and three robots.
             features: Mapping of each awareness feature to pixel features (see `terrain.FEATURES`).
-                Several pixel features form a composite index; a single name stands for a feature
-                in [0, 1] that is used unchanged. The default is traversability and visibility.
-            bounds: If False, define awareness for cells only, as in the paper: without line of
-                sight, and with the visibility of `terrain.PAPER_VISIBILITY`.
+                A list of pixel features forms a composite index; a single name is used unchanged
+                and must be in [0, 1]. The default is traversability and visibility.
+            bounds: If False, define awareness for cells only, as in the paper, without line of
+                sight and with the visibility of `terrain.PAPER_VISIBILITY`.
             sight: Assumed model of sight; by default `Sight()`.
 
         Raises:
@@ -137,8 +137,8 @@ class Workspace(Summary):
             awareness: Awareness of each cell, shape (robot, row, col, feature), which applies to
                 all moves into the cell; or awareness of each bound, shape (robot, move, row, col,
                 feature), for the eight `MOVES` into the cell. Values are in [0, 1].
-            passable: Whether each cell is passable, shape (row, col). By default, cells are
-                passable if `awareness` has no NaN in the cell or in at least one bound into it.
+            passable: Whether each cell is passable, shape (row, col). By default, a cell is
+                passable if its awareness, or that of at least one bound into it, has no NaN.
             cell_size: Side length of a cell, in metres.
             team: Lead and overwatching robots; by default, `awareness` sets the number of robots.
             features: Names of the features; by default traversability, visibility, z3, ...
@@ -154,7 +154,9 @@ class Workspace(Summary):
         team = Team(len(z), names=robots) if team is None else Team.of(team)
         if len(team.robots) != len(z):
             n = len(team.robots)
-            raise TrustboError(f"awareness has {len(z)} robots, but the team has {n}.")
+            raise TrustboError(
+                f"awareness has {len(z)} robots, but the team has {n}; the numbers must match."
+            )
         names = features or default_features(z.shape[-1])
         if len(names) != z.shape[-1]:
             raise TrustboError(f"features must have {z.shape[-1]} names; got {names}.")
@@ -193,12 +195,12 @@ class Workspace(Summary):
 
     @property
     def sight(self) -> Sight | None:
-        """Model of sight that is assumed in planning; None without a terrain."""
+        """Model of sight assumed for posts and line of sight; None without a terrain."""
         return None if self.posts is None else self.posts.sight
 
     @cached_property
     def passable_bounds(self) -> xr.DataArray:
-        """Whether the robots can drive each bound, Boolean DataArray (move, row, col).
+        """Boolean DataArray (move, row, col) that says whether the robots can drive each bound.
 
         A bound enters the cell (row, col) by one of the eight `MOVES`. Both cells must be passable
         and connected by routes within the two cells and half a cell around them. Without a terrain,
@@ -226,11 +228,11 @@ class Workspace(Summary):
     def in_order(self, mission: Mission) -> Mission:
         """Return a mission with its robots and features in the workspace's order.
 
-        Line of sight is predicted, not measured, so it is NaN if the mission does not contain it.
-        Features with the default names z3, z4, ... are given the workspace's names, in order.
+        Line of sight is predicted, not measured, and is NaN if it is missing in the mission.
+        Features with the default names z3, z4, ... get the workspace's names, in order.
 
         Raises:
-            TrustboError: The mission's robots or features do not match, or it has no map.
+            TrustboError: The mission has no map, or its robots or features do not match.
         """
         require_map("a workspace", [mission])
         unnamed = default_features(len(mission.features))
@@ -244,9 +246,9 @@ class Workspace(Summary):
         return mission.in_order(self.team.names, self.features, predicted)
 
     def fill(self, mission: Mission) -> Mission:
-        """Replace awareness not measured in a mission (NaN) with the workspace's awareness.
+        """Replace awareness that a mission did not measure (NaN) with the workspace's awareness.
 
-        For example, robots do not measure line of sight. Campaigns do this automatically.
+        For example, robots do not measure line of sight. Campaigns fill missions automatically.
 
         Raises:
             TrustboError: The mission's path is not a sequence of neighbouring passable cells.
@@ -281,7 +283,7 @@ class Workspace(Summary):
         return cell
 
     def _why_impassable(self, cell: Cell) -> str:
-        """Return the reason why a cell is impassable; empty without a terrain."""
+        """Return the reason why a cell is impassable for a message; empty without a terrain."""
         if self.terrain is None:
             return ""
         missing = self.grid.cell_means(self.terrain["dem"].isnull().astype(float))[cell]
