@@ -1,4 +1,4 @@
-"""Events that change the world in given missions, with one class for each kind of event.
+"""Events that change the simulated world in given missions, with one class per kind of event.
 
 The classes are frozen dataclasses derived from `Event`. Their method `change` returns a world with
 the event. Positions are x and y in CRS metres.
@@ -19,7 +19,7 @@ from trustbo.workspace.surface import Surface
 
 @dataclass(frozen=True, kw_only=True)
 class Event:
-    """Change of the world in given missions.
+    """Change of the simulated world in given missions.
 
     Attributes:
         first: First mission with the event; missions are counted from 0.
@@ -27,7 +27,7 @@ class Event:
     """
 
     SHARES: ClassVar[tuple[str, ...]] = ()
-    """Attributes that must be in [0, 1]."""
+    """Names of the attributes that must be in [0, 1]."""
 
     first: int = 0
     last: int | None = None
@@ -45,18 +45,18 @@ class Event:
         return self.first <= mission and (self.last is None or mission <= self.last)
 
     def change(self, world: World) -> World:
-        """Return the world with the event; raises TrustboError if it does not fit the world."""
+        """Return the world with the event; raises TrustboError if the event does not fit."""
         raise NotImplementedError
 
 
 @dataclass(frozen=True)
 class Jam(Event):
-    """Jammer that multiplies the probability of detections by or of robots in a circle.
+    """Jammer that makes it less probable that robots in a circle detect others or are detected.
 
     Attributes:
         center: Centre of the circle.
         radius: Radius of the circle, in metres.
-        strength: Strength in [0, 1]; the factor on the probability is 1 - `strength`.
+        strength: Strength in [0, 1]; the detection probability is multiplied by 1 - `strength`.
     """
 
     SHARES = ("strength",)
@@ -73,11 +73,11 @@ class Jam(Event):
 
 @dataclass(frozen=True)
 class Degradation(Event):
-    """Degraded lidar of a robot of T2, which reduces the robot's detection probability.
+    """Degraded lidar of a robot of T2, which detects the lead with a lower probability.
 
     Attributes:
         robot: Name of the robot.
-        detection: Factor on the detection probability, in [0, 1].
+        detection: Factor by which the detection probability is multiplied, in [0, 1].
     """
 
     SHARES = ("detection",)
@@ -98,7 +98,7 @@ class Dust(Event):
     """Dust, rain or fog, which reduces the detection probability of all lidars.
 
     Attributes:
-        detection: Factor on the detection probability, in [0, 1].
+        detection: Factor by which the detection probability is multiplied, in [0, 1].
     """
 
     SHARES = ("detection",)
@@ -113,7 +113,7 @@ class Dust(Event):
 
 @dataclass(frozen=True)
 class Trees(Event):
-    """Trees felled or newly grown in a circle; they affect sight but not motion.
+    """Trees felled or grown in a circle; the change affects sight but not motion.
 
     Attributes:
         height: Height of the canopy above the ground, in metres; 0 if trees were felled.
@@ -140,7 +140,7 @@ class Trees(Event):
 
 @dataclass(frozen=True)
 class Season(Event):
-    """Change of season, which makes the canopy denser or thinner.
+    """Change of season, in which the canopy becomes denser or thinner.
 
     Attributes:
         extinction: Positive factor on the extinction coefficient of the true model of sight.
@@ -160,7 +160,7 @@ class Season(Event):
 
 @dataclass(frozen=True)
 class Fouling(Event):
-    """Fouling and clearing of T2's lidars, which changes detection from bound to bound.
+    """Fouling of T2's lidars, which changes the detection probability from bound to bound.
 
     The factor on the detection probability of a robot is f_t = worst + (1 - worst) Phi(z_t), where
     z_t = correlation z_{t-1} + sqrt(1 - correlation^2) e_t and e_t is standard normal. The time of
@@ -169,10 +169,10 @@ class Fouling(Event):
 
     Attributes:
         worst: Smallest factor, in [0, 1].
-        correlation: Correlation of z between successive bounds, in [0, 1).
-        every: Number of bounds between the starts of successive missions, at least the number of
-            bounds of a path.
-        seed: Seed of the factors.
+        correlation: Correlation of z between successive bounds, in [0, 1].
+        every: Number of bounds between the starts of successive missions. It should be at least the
+            number of bounds of a path.
+        seed: Seed of the random factors.
     """
 
     SHARES = ("worst", "correlation")
@@ -187,7 +187,7 @@ class Fouling(Event):
         require_whole("every", self.every, 1)
 
     def change(self, world: World) -> World:
-        """See `Event.change`; the long-run world has the mean factor."""
+        """See `Event.change`; for the long-run mean over missions, the factor is its mean."""
         if world.mission is None:
             return world._replace(detection=0.5 * (1.0 + self.worst) * world.detection)
         first = world.mission * self.every
@@ -202,7 +202,7 @@ class Fouling(Event):
 
 
 def _circle(surface: Surface, center: tuple[float, float], radius: float) -> np.ndarray:
-    """Return a mask (row, col) of pixels centred in a circle; raises TrustboError if none are."""
+    """Return a mask (row, col) of the pixels in a circle; raises TrustboError if there are none."""
     rows, cols = surface.ground.shape
     row, col = surface.to_pixel(*np.asarray(center, dtype=float))
     away = np.hypot(
@@ -214,6 +214,6 @@ def _circle(surface: Surface, center: tuple[float, float], radius: float) -> np.
         left, bottom, right, top = surface.extent
         raise TrustboError(
             f"no pixel of the terrain is within {radius:g} m of {center}; the terrain covers x "
-            f"from {left:.9g} to {right:.9g} and y from {bottom:.9g} to {top:.9g}."
+            f"from {left:.9g} to {right:.9g} and y from {bottom:.9g} to {top:.9g}. Move the event."
         )
     return inside

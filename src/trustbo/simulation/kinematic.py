@@ -19,7 +19,7 @@ from trustbo.workspace import Workspace
 from trustbo.workspace.posts import Posts
 from trustbo.workspace.sight import Sight
 
-_LEAD, _T2 = slice(0, 1), slice(1, None)  # of the team's arrays
+_LEAD, _T2 = slice(0, 1), slice(1, None)  # robots in arrays with the lead first
 
 
 class State(NamedTuple):
@@ -30,13 +30,13 @@ class State(NamedTuple):
     poses: np.ndarray
     """Position and heading of each robot, the lead first, shape (1 + robot, 3)."""
     stops: np.ndarray
-    """Planned positions of the robots, where routes start, shape (1 + robot, 2)."""
+    """Planned positions of the robots, at which routes start, shape (1 + robot, 2)."""
     tracks: np.ndarray
     """State of the lidars' tracks; see `sensing.new_tracks`."""
 
 
 class KinematicSimulator(DescribedSimulator):
-    """Simulator of unicycle robots on a DEM and a DSM; lidar line of sight determines contact.
+    """Simulator of unicycle robots on a terrain; contact depends on lidar line of sight.
 
     In the first phase of a bound, the lead drives to its stop in the next cell while T2 watches
     from its posts in the previous cell. In the second phase, T2 closes up to its next posts while
@@ -72,7 +72,7 @@ class KinematicSimulator(DescribedSimulator):
             sight: True model of sight; by default the workspace's.
             team: True team, with the same names; by default the workspace's.
             tick: Length of a tick, in seconds.
-            bound_timeout: Time limit of a bound, in s; beyond it, the mission ends as "timeout".
+            bound_timeout: Time limit of a bound, in s; a longer bound ends the mission ("timeout").
             events: Changes of the world in given missions, such as `Jam` or `Dust`.
 
         Raises:
@@ -99,7 +99,7 @@ class KinematicSimulator(DescribedSimulator):
         self._posts: Posts = workspace.posts  # pyright: ignore[reportAttributeAccessIssue]
 
     def describe(self) -> dict[str, object]:
-        """Return the settings that determine what a mission measures."""
+        """Return the settings that affect the measurements of a mission."""
         same_team, terrain = self.team == self.workspace.team, self.terrain
         rasters = () if terrain is None else (terrain[n].values for n in ("y", "x", "dem", "dsm"))
         return {
@@ -113,13 +113,13 @@ class KinematicSimulator(DescribedSimulator):
         }
 
     def describe_world(self, mission: int) -> dict[str, object]:
-        """Return the settings of a mission's world; equal worlds have equal settings."""
+        """Return the settings of a mission's world, which are equal for equal worlds."""
         acting = [event for event in self.events if event.acts_in(mission)]
         always = [repr(dataclasses.replace(event, first=0, last=None)) for event in acting]
         return {**self.describe(), "events": always}
 
     def world(self, mission: int = 0, *, long_run: bool = False) -> World:
-        """Return the world of a mission; with `long_run`, random factors have their means."""
+        """Return the world of a mission; if `long_run`, random factors are replaced by means."""
         number = require_whole("mission", mission, 0)
         world = self._usual._replace(mission=None if long_run else number)
         for event in self.events:
@@ -178,8 +178,8 @@ class KinematicSimulator(DescribedSimulator):
             poses: Initial positions and headings, shape (robot, 3).
             robots: Robots with their true properties.
             routes: Route of each robot, shape (point, 2); None for a robot without a route.
-            window: Pixel window of the planned surface that contains the routes: first and end row,
-                first and end column.
+            window: Window of the workspace's pixels that contains the routes: first row, end row,
+                first column and end column.
             max_ticks: Number of ticks after which the status is "timeout".
             rng: Random number generator.
 
@@ -201,8 +201,8 @@ class KinematicSimulator(DescribedSimulator):
     ) -> list[tuple[Drive, np.ndarray, State]]:
         """Simulate the k-th bound of a mission, counted from 1, for each possible next cell.
 
-        Movements shared by several next cells are simulated once. With `expected`, contact is the
-        detection probability if contact depends on a single scan.
+        Movements shared by several next cells are simulated once. If `expected` is True and contact
+        depends on a single scan, the detection probability is returned as contact.
 
         Returns:
             For each next cell, the movements, the contact at each tick, shape (tick, robot), and
@@ -247,9 +247,9 @@ class KinematicSimulator(DescribedSimulator):
         max_ticks: int,
         rng: np.random.Generator,
     ) -> Drive:
-        """Drive part of the team to goals (robot, 2) in a cell while the others stand still.
+        """Drive `members` of the team to goals (robot, 2) in a cell while the others stand still.
 
-        Routes start at planned positions, but the robots start at their current poses.
+        Routes are planned from planned positions, but the robots start at their current positions.
         """
         true, planned = (
             (team.lead, *team.robots)[members] for team in (world.team, self.workspace.team)

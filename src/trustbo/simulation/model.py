@@ -1,4 +1,4 @@
-"""Simulator that draws contact rates from a trust model, and failures from given probabilities."""
+"""Simulator that draws missions from a trust model instead of moving robots."""
 
 from collections.abc import Sequence
 
@@ -15,14 +15,14 @@ from trustbo.simulation.protocol import DescribedSimulator, require_path
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import along, bounds_along, moves_along
 
-_STREAM = 0x6D697373  # distinguishes this stream from others with the same seed
+_STREAM = 0x6D697373  # makes the random numbers differ from others with the same seed
 
 
 class ModelSimulator(DescribedSimulator):
     """Simulator that draws contact rates from a trust model, and failures from given probabilities.
 
-    Posteriors and plans of a campaign can be compared with the truth. `Planner.plan(params)` finds
-    the best path, and `Planner.evaluate(path, params)` evaluates any other path.
+    Because the true parameters are known, posteriors and plans of a campaign can be compared with
+    the truth: `Planner.plan(params)` and, for a given path, `Planner.evaluate(path, params)`.
     """
 
     def __init__(
@@ -41,12 +41,12 @@ class ModelSimulator(DescribedSimulator):
             workspace: Planning grid with awareness and passability.
             params: True parameters, as a single draw.
             model: Trust model with these parameters; by default `PooledTrust()`. Gaussian rates are
-                clipped to [0, 1]; if many are clipped, the data no longer follow the model.
+                clipped to [0, 1]; if many rates are clipped, the data do not follow the model.
             awareness: True awareness, shape (robot, move, row, col, feature), which missions
                 measure along their paths; by default the workspace's awareness.
             n_ticks: Number of ticks of each bound, for the beta-binomial family only.
             p_fail: Probability that a bound fails, shape (move, row, col), such as a draw of
-                `hazard.risk.BoundRisk`. A failed mission is "stuck". None for no failures.
+                `hazard.risk.BoundRisk`. Failed bounds are "stuck". By default, no bound fails.
 
         Raises:
             TrustboError: The robots or features of the parameters or awareness do not match the
@@ -67,7 +67,7 @@ class ModelSimulator(DescribedSimulator):
         self.n_ticks = None if n_ticks is None else require_whole("n_ticks", n_ticks, 1)
         if (self.n_ticks is not None) != self.model.family.needs_ticks:
             needs = "needs" if self.model.family.needs_ticks else "does not use"
-            raise TrustboError(f"the family {self.model.family.name!r} {needs} n_ticks.")
+            raise TrustboError(f"family {self.model.family.name!r} {needs} n_ticks; got {n_ticks}.")
         bounds = shape[1:4]
         self.p_fail = None if p_fail is None else _require_probabilities(p_fail, bounds)
 
@@ -75,7 +75,7 @@ class ModelSimulator(DescribedSimulator):
         """Run a path; the result depends on the seed, but not on the number of the mission."""
         cells = require_path(self.workspace, path)
         z = np.swapaxes(along(self.awareness, cells), 0, 1)
-        # Without the last number, seed 0 would give the stream of `default_rng(0)`.
+        # Without _STREAM, seed 0 would give the same numbers as `default_rng(0)`.
         rng = np.random.default_rng([0, require_whole("seed", seed, 0), _STREAM])
         of_bounds = np.full(z.shape[:2], np.nan if self.n_ticks is None else self.n_ticks)
         effects, params = [0.0] * len(z), self.params.flat()
@@ -103,7 +103,7 @@ class ModelSimulator(DescribedSimulator):
         return about
 
     def _end(self, cells: list[Cell], seed: int) -> tuple[int, str]:
-        """Return the number of bounds that are run and the status of the mission."""
+        """Return the number of bounds that the team starts, and the status of the mission."""
         n = len(cells) - 1
         if self.p_fail is None:
             return n, "ok"
@@ -114,7 +114,7 @@ class ModelSimulator(DescribedSimulator):
 
 
 def _require_probabilities(p_fail: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
-    """Return failure probabilities (move, row, col), which are NaN where there is no bound."""
+    """Check failure probabilities (move, row, col), and return them as an array."""
     p = np.asarray(p_fail, dtype=float)
     if p.shape != shape:
         raise TrustboError(f"p_fail must have the shape (move, row, col) = {shape}; got {p.shape}.")

@@ -15,7 +15,7 @@ LOOKAHEAD = 1.5
 """Distance in m to the point of the route that a robot steers towards."""
 ARRIVED = 0.5
 """Distance in m from the goal at which a robot stops."""
-_LEAST_STEPS = 5
+_LEAST_STEPS = 5  # smallest number of integration steps per tick
 _compiled = njit(cache=True, nogil=True, error_model="numpy")
 _part = njit(nogil=True, error_model="numpy", **PART)
 _STATUS = ("ok", "stuck", "tipped", "timeout")
@@ -33,10 +33,10 @@ def drive(
     """Simulate a unicycle robot that follows a route by pure pursuit.
 
     The speed falls linearly with the larger of pitch and roll, to a tenth at the slope limit. The
-    robot gets stuck if its pitch exceeds the limit, and tips over if its roll does. Wheel slip
-    multiplies the speed in each tick by a random factor with a spread of about 5 %. The route has
-    shape (point, 2), in CRS metres. The initial heading is in rad, anticlockwise from east. After
-    `max_ticks` the status is "timeout".
+    robot gets stuck if its pitch exceeds the limit, and tips over if its roll exceeds the limit.
+    Wheel slip multiplies the speed in each tick by a random factor with an sd of about 5 %. The
+    route has shape (point, 2), in CRS metres. The initial heading is in rad, anticlockwise from
+    east. After `max_ticks` ticks, the status is "timeout".
 
     Returns the poses (x, y, heading) after each tick, shape (tick, 3), and the status.
     """
@@ -48,7 +48,7 @@ def drive(
         heading,
         (robot.speed, robot.turn_rate, robot.max_slope),
         tick,
-        # Enough steps that none jumps over the goal.
+        # The steps are short enough that no step jumps over the goal.
         max(_LEAST_STEPS, math.ceil(robot.speed * tick / (0.5 * ARRIVED))),
         rng.standard_normal(max_ticks),
     )
@@ -67,7 +67,7 @@ def drive_together(
     """Drive several robots simultaneously (see `drive`) until all arrive or one fails.
 
     A robot without a route is stuck. Initial poses have shape (robot, 3). Returns the poses after
-    each tick, shape (tick, robot, 3), and the status of the first robot that fails.
+    each tick, shape (tick, robot, 3), and the status: "ok", or that of the first robot that fails.
     """
     tracks, failures = [], []
     for pose, robot, route in zip(poses, robots, routes, strict=True):
@@ -85,12 +85,13 @@ def drive_together(
 
 @_part
 def _squared(route, i, x, y):
+    """Compute the squared distance from (x, y) to point i of a route."""
     return (route[i, 0] - x) ** 2 + (route[i, 1] - y) ** 2
 
 
 @_part
 def _within_a_turn(angle):
-    """Wrap an angle to [-pi, pi), and compute the slow remainder only if needed."""
+    """Wrap an angle to [-pi, pi); the remainder is slow and computed only if needed."""
     if -math.pi <= angle < math.pi:
         return angle
     return (angle + math.pi) % (2.0 * math.pi) - math.pi
@@ -118,7 +119,7 @@ def _drive(gradient, pixel, origin, route, heading, limits, tick, n_steps, slip)
             ahead, left = math.cos(heading), math.sin(heading)
             # Tangents of pitch and roll.
             pitch, roll = abs(gx * ahead + gy * left), abs(gy * ahead - gx * left)
-            if not (roll <= steepest and pitch <= steepest):  # unknown ground also fails
+            if not (roll <= steepest and pitch <= steepest):  # NaN slopes also fail
                 poses[k, 0], poses[k, 1], poses[k, 2] = x, y, heading
                 return poses[: k + 1], 2 if roll > steepest else 1
             # A skid-steer robot turns on the spot until it faces its route.

@@ -1,4 +1,4 @@
-"""Protocol of simulators, and functions shared by the simulators of this package."""
+"""Protocol for simulators, and a base class and functions that trustbo's simulators share."""
 
 import hashlib
 from collections.abc import Sequence
@@ -14,11 +14,11 @@ from trustbo.workspace import Workspace
 
 
 class Simulator(Protocol):
-    """Anything that runs a path, such as a simulator of this package or real robots.
+    """Protocol for objects that run a path, such as a simulator or an interface to real robots.
 
     Two methods are optional. `describe() -> dict` returns settings that a campaign records.
-    `describe_world(mission) -> dict` returns the settings of a mission's world for `Truth`, which
-    also needs the attribute `workspace`.
+    `describe_world(mission) -> dict` returns the settings of a mission's world for `Truth`. To
+    compute a `Truth`, the simulator also needs the attribute `workspace`.
     """
 
     def run(self, path: Sequence[Cell], *, seed: int, mission: int = 0) -> Mission:
@@ -33,10 +33,10 @@ class Simulator(Protocol):
 
 
 class DescribedSimulator(Summary):
-    """Base class of the package's simulators, displayed with the settings from `describe`."""
+    """Base class of trustbo's simulators, which displays the settings from `describe`."""
 
     def describe(self) -> dict[str, object]:
-        """Return the settings that determine what a mission measures."""
+        """Return the settings that affect the measurements of a mission."""
         raise NotImplementedError
 
     def _rows(self) -> Rows:
@@ -46,16 +46,16 @@ class DescribedSimulator(Summary):
 
 
 def require_path(workspace: Workspace, path: Sequence[Cell]) -> list[Cell]:
-    """Return the cells of a path; raises TrustboError unless it has two or more, all passable."""
+    """Return the cells of a path; raises TrustboError unless it has at least 2, all passable."""
     path = require_cells("path", path)
     cells = [workspace.locate(cell, f"path[{k}]") for k, cell in enumerate(path)]
     if len(cells) < 2:
-        raise TrustboError(f"a path needs at least two cells; got {cells}.")
+        raise TrustboError(f"a path needs at least two cells, start and goal; got {cells}.")
     return cells
 
 
 def digest(*arrays: ArrayLike) -> str:
-    """Return a hash of the values of arrays."""
+    """Return a hash of the values of arrays, as 16 hexadecimal digits."""
     found = hashlib.sha256()
     for array in arrays:
         found.update(np.ascontiguousarray(array).tobytes())

@@ -1,4 +1,4 @@
-"""Simulator of radio contact, given by a formula that does not use line of sight."""
+"""Simulator of radio contact, which is given by a formula without line of sight."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -20,7 +20,7 @@ from trustbo.workspace.moves import MOVES, moves_along
 FREEDOM, SCALE = 3.0, 0.06
 """Degrees of freedom and scale of the noise on contact rates."""
 _REACH, _WINDOW, _FIELD = 60.0, 20.0, 35.0
-"""Unit of distance, window width for canopy cover and length scale of the field, in metres."""
+"""In metres: unit of distance, window width for canopy cover, and length scale of the field."""
 
 
 class RadioSimulator(DescribedSimulator):
@@ -28,10 +28,10 @@ class RadioSimulator(DescribedSimulator):
 
     The mean contact of robot i in the bound from cell a to cell b is sigma(2.2 - 3.5 c^1.5 d -
     0.1 h + 0.9 (0.3 + c) tanh(g) + q_i). The distance d between the centres of the cells is in
-    units of 60 m. The cover c is the mean fraction of canopy above 1.5 m between the cells, and h
-    is the climb in metres. A smooth Gaussian field, which is not on any map, has the value g at b,
-    and q_i is the quality of the robot's radio. Rates have Student t noise with 3 degrees of
-    freedom and scale 0.06, and are clipped to [0, 1]. No bound fails.
+    units of 60 m. The cover c is the fraction of ground between the cells with a canopy above
+    1.5 m, and h is the climb in metres. The value g at b is from a smooth Gaussian field, which is
+    not on any map. The quality of the robot's radio is q_i. Rates have Student t noise with 3
+    degrees of freedom and scale 0.06, and are clipped to [0, 1]. No bound fails.
     """
 
     def __init__(
@@ -62,17 +62,18 @@ class RadioSimulator(DescribedSimulator):
         mean = self.mean[:, moves_along(cells), *np.array(cells)[1:].T].T  # (bound, robot)
         rng = np.random.default_rng(require_whole("seed", seed, 0))
         rates = np.clip(mean + SCALE * rng.standard_t(FREEDOM, mean.shape), 0.0, 1.0)
-        names = {"features": self.workspace.features, "robots": self.workspace.team.names}
-        return Mission.from_arrays(cells, self.workspace.along(cells), rates, **names)  # pyright: ignore[reportArgumentType]
+        z, features = self.workspace.along(cells), self.workspace.features
+        robots = self.workspace.team.names
+        return Mission.from_arrays(cells, z, rates, features=features, robots=robots)
 
     def expected_contact(self) -> xr.Dataset:
-        """Return the expected contact of every bound in closed form; see `Truth.bounds`."""
+        """Compute the expected contact of every bound in closed form; see `Truth.bounds`."""
         contact = np.repeat(expected_rate(self.mean).mean(0)[..., None], len(MOVES) + 1, -1)
         contact = np.where(self.workspace.passable_bounds.values[..., None], contact, np.nan)
         return table_of(contact, np.where(np.isfinite(contact), 1.0, np.nan))
 
     def describe(self) -> dict[str, object]:
-        """Return the settings that determine what a mission measures."""
+        """Return the settings that affect the measurements of a mission."""
         name = type(self).__name__
         return {"simulator": name, "true_terrain": self._terrain, "seed": self.seed}
 
@@ -91,7 +92,7 @@ def expected_rate(mean: np.ndarray) -> np.ndarray:
 
 
 def _mean_contact(workspace: Workspace, terrain: xr.Dataset, seed: int) -> np.ndarray:
-    """Compute the mean contact of all moves, (robot, move, row, col), even impossible moves."""
+    """Compute the mean contact of all moves, (robot, move, row, col), possible or not."""
     grid, step, x, y = workspace.grid, pixel_size(terrain), terrain["x"].values, terrain["y"].values
     dem, dsm = terrain["dem"].values, terrain["dsm"].values
     window: Any = [max(1, round(_WINDOW / one)) for one in step]

@@ -1,8 +1,8 @@
-"""Real-time awareness of the paper: the map fused with the state of the moving robot.
+"""Real-time awareness of the paper, which combines the map with measurements of moving robots.
 
-Each feature is the first principal component of the map's value and of measurements by the robot:
-its motion for traversability, and lidar returns for visibility. The inputs are means over the ticks
-of a bound in which the robot moves.
+Each feature is the first principal component of its value on the map and the robot's measurements.
+The robot measures its motion for traversability, and lidar returns for visibility. The inputs are
+means over the ticks of a bound in which the robot moves.
 """
 
 from collections.abc import Sequence
@@ -19,9 +19,9 @@ SIGNS = {
     "traversability": {"map": +1, "speed_ratio": +1, "pitch": -1, "roll": -1},
     "visibility": {"map": +1, "return_range": +1, "visible_share": +1},
 }
-"""Inputs of each feature, with the signs of their effects; angles are in rad, ranges in m."""
+"""Inputs of each feature, with the signs of their effects; pitch is in rad, range in m."""
 MIN_SAMPLES = 200
-"""Minimum number of robots times bounds; loadings from fewer samples are unstable."""
+"""Smallest number of samples (robots x bounds); loadings from fewer samples are unstable."""
 _SHARES, _ANGLES = np.array([0.25, 0.5, 0.75, 1.0]), np.linspace(0.0, 2.0 * np.pi, 13)[:-1]
 
 
@@ -39,7 +39,8 @@ class RealtimeAwareness:
         samples = [self.inputs(bound) for mission in missions for bound in mission.bounds]
         if (n := len(samples) * self._world.team.n_robots) < MIN_SAMPLES:
             raise TrustboError(
-                f"real-time awareness needs {MIN_SAMPLES} samples (robots x bounds); got {n}."
+                f"real-time awareness needs {MIN_SAMPLES} samples (robots x bounds); got {n}. Give "
+                "more missions."
             )
         self.indices = {}
         for feature, signs in SIGNS.items():
@@ -60,7 +61,7 @@ class RealtimeAwareness:
         }
         place = workspace.surface.nearest(poses[..., 0], poses[..., 1])  # pyright: ignore[reportOptionalMemberAccess]
         moved = speed > 0.0
-        moved[0] |= ~moved.any(0)
+        moved[0] |= ~moved.any(0)  # the first tick represents a robot that never moves
         found = {}
         for feature, signs in SIGNS.items():
             ticks = state | {"map": workspace.pixels[feature].values[place]}  # pyright: ignore[reportOptionalSubscript]

@@ -22,7 +22,7 @@ class ReplaySimulator(DescribedSimulator):
 
         Args:
             missions: Recorded missions, such as the result of `logs.read_missions`.
-            any_path: Whether to replay a mission even if `run` is called with another path.
+            any_path: If True, a mission is also replayed if `run` is called with another path.
 
         Raises:
             TrustboError: There are no missions, or they have no map.
@@ -38,13 +38,16 @@ class ReplaySimulator(DescribedSimulator):
         return {"simulator": type(self).__name__, "missions": n, "any_path": self.any_path}
 
     def run(self, path: Sequence[Cell], *, seed: int, mission: int = 0) -> Mission:
-        """Return the mission with a given number; `seed` is not used.
+        """Return the recorded mission with the number `mission`; `seed` is not used.
 
         Raises:
             TrustboError: There is no mission with that number, or it has another path.
         """
         if mission >= len(self.missions):
-            raise TrustboError(f"all {len(self.missions)} recorded missions were replayed.")
+            raise TrustboError(
+                f"mission {mission} is not among the {len(self.missions)} recorded missions, which "
+                "are counted from 0; run fewer missions."
+            )
         recorded, asked = self.missions[mission], require_cells("path", path)
         if recorded.path != asked and not self.any_path:
             raise TrustboError(

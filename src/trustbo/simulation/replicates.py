@@ -1,4 +1,4 @@
-"""Replicates of a simulator's bounds: contact and status for each possible next bound."""
+"""Replicates of the bounds of a simulator, with the contact for each possible next bound."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
@@ -18,19 +18,19 @@ _DIMS = ("move", "row", "col", "next_move")
 
 
 class Edge(NamedTuple):
-    """A bound and its possible next bounds."""
+    """Bound with its possible next bounds."""
 
     move: int
     left: Cell
     cell: Cell
     next_moves: tuple[int, ...]
-    """Indices of the next moves in `MOVES`, and `END`."""
+    """Indices of the possible next moves in `MOVES`, then `END`."""
     ahead: tuple[Cell | None, ...]
-    """Next cells; None at the end of a path."""
+    """Next cell for each of `next_moves`; None for `END`."""
 
 
 type Outcomes = Iterator[tuple[Edge, list[tuple[float, str]]]]
-"""For each bound and each possible next bound, mean contact over robots, and status."""
+"""Bounds, each with the mean contact over robots and the status for each next move."""
 
 
 def table_of(contact: np.ndarray, passed: np.ndarray) -> xr.Dataset:
@@ -54,7 +54,7 @@ def edges_of(workspace: Workspace) -> list[Edge]:
 
 
 def replicated(simulator: Any, mission: int, n_replicates: int, seed: int) -> xr.Dataset:
-    """Average the outcomes of all bounds over replicates."""
+    """Average the contact and success of all bounds over replicates; see `Truth.of`."""
     if hasattr(simulator, "expected_contact"):
         return simulator.expected_contact()
     workspace = simulator.workspace
@@ -77,9 +77,9 @@ def replicated(simulator: Any, mission: int, n_replicates: int, seed: int) -> xr
 def _of_bounds(
     simulator: KinematicSimulator, edges: Sequence[Edge], mission: int, n: int, seed: int
 ) -> Outcomes:
-    """Replicate bounds; each begins where a preceding bound ended in the previous replicate.
+    """Replicate bounds; each bound begins where a preceding bound ended in the previous replicate.
 
-    Replicate 0 begins with all robots at their stop and posts, and is not counted.
+    In replicate 0, which is not returned, the robots begin at their stop and posts.
     """
     world = simulator.world(mission, long_run=True)
     ends: dict[tuple[Cell, Cell | None], dict[int, State]] = {}
@@ -107,7 +107,7 @@ def _of_bounds(
 def _of_missions(
     simulator: Any, edges: Sequence[Edge], mission: int, n: int, seed: int
 ) -> Outcomes:
-    """Replicate each bound by one mission for each possible next bound."""
+    """Replicate each bound by a short mission for each possible next bound."""
     for number in range(n):
         for edge in edges:
             outcomes = []

@@ -1,4 +1,4 @@
-"""Contact by lidar: scans that detect robots, and tracks that persist over a few misses.
+"""Contact by lidar: scans detect robots, and tracks persist over a few misses.
 
 At each tick, each standing robot scans each moving robot once.
 """
@@ -28,7 +28,7 @@ class Drive(NamedTuple):
 
 
 def detections(world: World, drives: Sequence[Drive], k: int) -> list[np.ndarray]:
-    """Compute for each drive the probability that a scan detects its target, (tick, robot).
+    """Compute the probability, for each drive, that each scan detects its target, (tick, robot).
 
     The drives are alternatives for the k-th bound of a mission, counted from 1.
     """
@@ -54,16 +54,16 @@ def detections(world: World, drives: Sequence[Drive], k: int) -> list[np.ndarray
 
 
 def new_tracks(n_robots: int) -> np.ndarray:
-    """Make tracks without targets, (phase, robot, (tracked, successive contrary scans))."""
+    """Return tracks (phase, robot, 2): tracked or not, and number of successive contrary scans."""
     return np.zeros((2, n_robots, 2), np.int64)
 
 
 def contact_of(detected: np.ndarray, watchers: Sequence[Robot], tracks: np.ndarray) -> np.ndarray:
     """Compute the contact from scans, shape (tick, robot), bool.
 
-    `detected` has the outcome of each scan, shape (tick, robot). A track begins after `acquire`
-    successive detections and ends after `drop` successive misses, as defined by the watcher of each
-    robot. The state of the tracks, shape (robot, 2), is updated in place.
+    `detected` (tick, robot) contains the outcome of each scan. A track begins after `acquire`
+    successive detections and ends after `drop` successive misses, which are properties of the
+    watcher. The state of the tracks, shape (robot, 2), is updated in place.
     """
     limits = np.array([[robot.acquire, robot.drop] for robot in watchers])
     contact = np.empty(detected.shape, bool)
@@ -73,6 +73,7 @@ def contact_of(detected: np.ndarray, watchers: Sequence[Robot], tracks: np.ndarr
 
 @njit(cache=True)
 def _track(detected, limits, tracks, contact):
+    """Write the contact after each scan, and update the tracks."""
     for k in range(detected.shape[0]):
         for i in range(detected.shape[1]):
             tracked = tracks[i, 0]

@@ -27,7 +27,7 @@ from trustbo.workspace.moves import MOVES, moves_along
 
 
 class Truth(Summary):
-    """Expected contact and failure of every bound in a simulator, for the world of a mission.
+    """Expected contact and failure of every bound in a simulator, in the world of a mission.
 
     Attributes:
         workspace: Workspace of the simulator.
@@ -61,9 +61,9 @@ class Truth(Summary):
         """Compute the truth of a simulator from replicates of every bound with each next bound.
 
         If the simulator has a method `expected_contact`, which returns `bounds` in closed form, no
-        replicates are needed. Replicates of a `KinematicSimulator` have no detection noise, and
-        begin where a preceding bound ended in the previous replicate. For any other simulator, a
-        replicate is a mission over both bounds. With `Fouling`, contact is the stationary mean.
+        replicates are needed. Replicates of a `KinematicSimulator` begin where a preceding bound
+        ended in the previous replicate, without detection noise if `acquire` = `drop` = 1. For any
+        other simulator, a replicate is a mission over both bounds. `Fouling` has the mean factor.
 
         Args:
             simulator: Simulator with a `workspace`.
@@ -87,7 +87,6 @@ class Truth(Summary):
             )
         n_replicates = require_whole("n_replicates", n_replicates, 1)
         found: dict[str, Self] = {}
-
         known = digest(workspace.awareness.values, workspace.passable_bounds.values)
 
         def of_mission(number: int) -> Self:
@@ -99,17 +98,17 @@ class Truth(Summary):
             world = to_json([settings, known, workspace.team, n_replicates, seed])
             if world not in found:
                 make = partial(replicated, simulator, number, n_replicates, seed)
-                found[world] = cls(workspace, _kept(folder, world, make), of_mission)
+                found[world] = cls(workspace, _cached(folder, world, make), of_mission)
             return found[world]
 
         return of_mission(mission)
 
     def at(self, mission: int) -> "Truth":
-        """Compute the truth of another mission's world; missions are counted from 0."""
+        """Return the truth for the world of another mission; missions are counted from 0."""
         return self if self._of is None else self._of(mission)
 
     def lost(self, path: Sequence[Cell]) -> float:
-        """Compute the expected contact lost on a path, in units of bounds, if no bound fails.
+        """Compute the contact lost on a path, in bounds, if no bound fails; NaN without a route.
 
         Raises:
             TrustboError: A cell is off the grid, impassable, or not a neighbour of the previous
@@ -119,7 +118,7 @@ class Truth(Summary):
         return float((1.0 - contact).sum())
 
     def lost_or_failed(self, path: Sequence[Cell]) -> float:
-        """Compute the expected contact lost, where failed and unreached bounds count as fully lost.
+        """Compute the expected contact lost, in bounds; failed and unreached bounds lose 1 each.
 
         The result is sum_k (1 - S_k c_k), where c_k is the contact of bound k and S_k is the
         probability that bounds 1 to k are completed. Raises the same errors as `lost`.
@@ -141,10 +140,10 @@ class Truth(Summary):
             start: First cell, or a position in that cell; see `Workspace.locate`.
             goal: Last cell, or a position in that cell.
             max_bounds: Maximum number of bounds, as in `Planner`.
-            failures: Whether to allow for failures of bounds.
+            failures: Whether to minimise `lost_or_failed` instead of `lost`.
 
         Raises:
-            TrustboError: A cell is off the grid or impassable.
+            TrustboError: A cell is off the grid or impassable, or `max_bounds` is too small.
             NoPathError: The goal cannot be reached.
         """
         paths = AdmissiblePaths(self.workspace, start, goal, max_bounds)
@@ -172,8 +171,8 @@ class Truth(Summary):
         return self.bounds["contact"].values[where], self.bounds["passed"].values[where]
 
 
-def _kept(folder: FilePath | None, world: str, make: Callable[[], xr.Dataset]) -> xr.Dataset:
-    """Read the table of a world's bounds from a file, or compute and write the table."""
+def _cached(folder: FilePath | None, world: str, make: Callable[[], xr.Dataset]) -> xr.Dataset:
+    """Read the table of a world's bounds from the cache, or compute and store the table."""
     if folder is None:
         return make()
     file = Path(folder) / f"truth-{digest(np.frombuffer(world.encode(), np.uint8))}.nc"
@@ -189,9 +188,9 @@ def _most_kept(
 ) -> tuple[Cell, ...]:
     """Find the path of at most `longest` bounds that loses the least contact.
 
-    The maximum contact kept from a bound onwards, V = max p (c + V'), is computed backwards for
-    each number of remaining bounds. The result is exact because the completion probability p is not
-    negative. Without `u_turns`, no bound leads back to the cell that the previous bound left.
+    The maximum contact kept from a bound onwards is V = max p (c + V'), with the contact c and the
+    completion probability p of the bound, and V' of the next bound. V is computed backwards for
+    each number of remaining bounds. Without `u_turns`, no bound reverses the previous bound.
     """
     follows = np.ones((END, END), bool)  # (move, next move)
     if not u_turns:
@@ -222,7 +221,7 @@ def _most_kept(
 
 
 def _by_cell_left(values: np.ndarray, move: int) -> np.ndarray:
-    """Index the values of a move by the cell left instead of the cell entered."""
+    """Index the values (row, col) of a move by the cell left instead of the cell entered."""
     (down, right), (rows, cols) = MOVES[move], values.shape
     framed = np.pad(values, 1, constant_values=-np.inf)
     return framed[1 + down :, 1 + right :][:rows, :cols]

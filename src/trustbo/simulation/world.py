@@ -1,4 +1,4 @@
-"""World of a mission: the true terrain, sight and team, as changed by events."""
+"""World of a mission: true terrain, model of sight and team, as changed by events."""
 
 from typing import NamedTuple
 
@@ -30,11 +30,11 @@ class World(NamedTuple):
     mission: int | None = 0
     """Number of the mission, from 0; None for the long-run mean over missions."""
     jams: tuple[tuple[np.ndarray, float], ...] = ()
-    """For each jammer, a mask of the pixels inside, shape (row, col), and the strength."""
+    """For each jammer, a mask (row, col) of the pixels in its circle, and its strength."""
 
 
 def true_surface(workspace: Workspace, terrain: xr.Dataset | None) -> Surface:
-    """Return the surface for simulation, made from `terrain` or, by default, the workspace's.
+    """Return the surface of the true terrain, which by default is that of the workspace.
 
     Raises:
         TrustboError: The terrain does not cover the grid or has another CRS, or the workspace has
