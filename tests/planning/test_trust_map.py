@@ -58,3 +58,11 @@ def test_the_summary_and_the_cost_are_over_the_maps_of_draws(workspace):
     np.testing.assert_allclose(summary["cost"], (1.0 / (1.0 + np.exp(maps))).mean(0))
     cost = planner.cost_map(draws.draw(0))
     np.testing.assert_allclose(cost, 1.0 / (1.0 + np.exp(planner.trust_map(draws.draw(0)))))
+
+
+def test_draws_of_several_chains_are_mapped_like_one_axis_of_draws(workspace):
+    draws = sample_prior(PooledTrust(), 2, 6, seed=1)
+    flat = draws.flat()  # x0 has no axis of draws otherwise
+    chains = flat.map(lambda value, n: np.reshape(value, (2, 3, *np.shape(value)[1:])))
+    planner = Planner(workspace, *ENDS)
+    np.testing.assert_array_equal(planner.trust_map(chains), planner.trust_map(draws))

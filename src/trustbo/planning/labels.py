@@ -86,7 +86,7 @@ def best_labels(
         def work(begin: int, end: int, k: int = k, part: Unrolled = part) -> None:
             _best_labels(part, costs, most, cost[k], lower[k], paths[k], begin, end)
 
-        over_rows(work, n) if n > 1 else work(0, n)
+        over_rows(work, n)
         cost[k], lower[k] = cost[k] / divisor[k], lower[k] / divisor[k]
     best = cost.argmin(0)
     return cost.min(0), lower.min(0), paths[best, np.arange(n)]

@@ -237,14 +237,16 @@ def risk_of(p_fail: np.ndarray) -> np.ndarray:
 
 
 def draws_of(posterior: Params | xr.DataTree, workspace: Workspace, *, day: bool = False) -> Params:
-    """Return the draws of a posterior, with leading axis (draw,), or given parameters unchanged.
+    """Return the draws of a posterior or parameters, with a leading axis (draw,) if there is one.
 
     The features and robots of a posterior are reordered by name to match the workspace (for `day`,
     see `params_of`). Raises TrustboError if the type, the features or the robots are wrong.
     """
     if isinstance(posterior, xr.DataTree):
         return params_of(posterior, workspace, day=day)
-    return require_kind("posterior", posterior, Params, "give a posterior from fit, or parameters")
+    remedy = "give a posterior from fit, or parameters"
+    params: Params = require_kind("posterior", posterior, Params, remedy)
+    return params.flat() if len(params.leading) > 1 else params
 
 
 def mean_of(params: Params | xr.DataTree, workspace: Workspace) -> Params:

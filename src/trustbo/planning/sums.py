@@ -32,7 +32,7 @@ def best_sums(
     def work(begin: int, end: int) -> None:
         _best_sums(graph, drift, *weights, toll, scores, paths, begin, end)
 
-    over_rows(work, n) if n > 1 else work(0, n)
+    over_rows(work, n)
     return scores, paths
 
 
