@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import trustbo as tb
-from trustbo.models import PlaceEffect, PooledTrust, RobotEffect
+from trustbo.models import CoupledTrust, PlaceEffect, PooledTrust, RobotEffect
 
 MODEL = PooledTrust(effects=(PlaceEffect(), RobotEffect()))
 
@@ -50,8 +50,22 @@ def test_a_place_with_less_contact_stands_out():
     assert found.table.loc["places", "size"] < -0.1
 
 
-def test_a_weight_of_the_wrong_sign_stands_out():
-    found = checked(drawn(slope=-0.8), PooledTrust())
+def test_place_effects_on_logits_are_reported_as_contact():
+    counted = [
+        tb.Mission.from_arrays(
+            m.path, m.awareness, np.round(50 * m.contact_rate) / 50, features=m.features, n_ticks=50
+        )
+        for m in drawn(place=-0.35)
+    ]
+    found = checked(counted, PooledTrust(observation="beta_binomial", effects=(PlaceEffect(),)))
+
+    assert found.table.loc["places", "label"] == "(0, 5)"
+    assert -0.6 < found.table.loc["places", "size"] < -0.1
+
+
+@pytest.mark.parametrize("model", [PooledTrust(), CoupledTrust()], ids=["pooled", "coupled"])
+def test_a_weight_of_the_wrong_sign_stands_out(model):
+    found = checked(drawn(slope=-0.8), model)
 
     assert found.table.loc["weights", "stands_out"]
     assert found.table.loc["weights", "label"] == "line_of_sight"

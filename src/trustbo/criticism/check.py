@@ -162,10 +162,11 @@ def _check_weights(posterior: xr.DataTree) -> Finding:
     if "prior" not in posterior.children or name not in posterior["prior"]:
         return Finding("not tested: the posterior contains no prior draws")
     features = posterior["posterior"].to_dataset()["feature"].values
-    prior, draws = (
-        joined_draws(posterior[group].to_dataset()[name]).reshape(-1, len(features))
-        for group in ("prior", "posterior")
-    )
+    groups = (posterior[group].to_dataset() for group in ("prior", "posterior"))
+    prior, draws = (joined_draws(group[name]) for group in groups)
+    if name == "B":  # keep the weights of each robot's own features, which have an expected sign
+        prior, draws = (np.einsum("dmii->dim", B) for B in (prior, draws))
+    prior, draws = (weights.reshape(-1, len(features)) for weights in (prior, draws))
     sign = np.sign(prior.mean(0))
     expected = (prior * sign > 0.0).mean(0) > _SIGNED
     wrong = (draws * sign < 0.0).mean(0) * expected
