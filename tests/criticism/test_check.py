@@ -87,6 +87,17 @@ def test_intervals_of_a_campaign_that_are_too_narrow_stand_out():
     assert tb.check(posteriors, noisy).table.loc["coverage", "stands_out"]
 
 
+def test_coverage_is_not_tested_without_rates():
+    first, other = drawn(n_missions=2)
+    blank = np.full(other.contact_rate.shape, np.nan)
+    other = tb.Mission.from_arrays(other.path, other.awareness, blank, features=other.features)
+    posteriors = [tb.fit([first, *more], PooledTrust(), progress=False) for more in ([], [other])]
+
+    found = tb.check(posteriors).table.loc["coverage"]
+    assert not found["stands_out"]
+    assert "not tested" in found["finding"]
+
+
 def test_what_is_no_posterior_of_contact_is_refused():
     with pytest.raises(tb.TrustboError):
         tb.check({})
