@@ -167,6 +167,9 @@ def test_counts_need_their_numbers_of_ticks():
     counting = TrustFilter(constant(OF_FAMILY["beta_binomial"]), 2, observation="beta_binomial")
     with pytest.raises(TrustboError, match="The beta-binomial family counts ticks"):
         counting.update(np.full((2, 2), 0.5), [1.0, 1.0])
+    with pytest.raises(TrustboError, match="n_ticks"):
+        counting.update(np.full((2, 2), 0.5), [1.0, 1.0], n_ticks=[np.nan, 20.0])
+    counting.update(np.full((2, 2), 0.5), [np.nan, 1.0], n_ticks=[np.nan, 20.0])
 
 
 @pytest.mark.parametrize("family", ["gaussian", "censored", "beta_binomial"])

@@ -300,9 +300,9 @@ class TrustFilter:
                 f"the shape of contact_rate must be ({self._n_robots},); got shape {y.shape}."
             )
         require_unit_interval("contact_rate", y)
-        if n_ticks is None and self.family.needs_ticks:
-            raise TrustboError(NO_TICKS)
         ticks = as_array("n_ticks", np.nan if n_ticks is None else n_ticks)
+        if self.family.needs_ticks and (np.isnan(ticks) & ~np.isnan(y)).any():
+            raise TrustboError(NO_TICKS)
         ticks = ticks if ticks.ndim else np.full(y.shape, ticks)
         require_shares(y, ticks)
         predicted = self.dynamics.predict(self._beliefs, z, effect)
