@@ -158,3 +158,13 @@ def test_compare_ranks_as_arviz_does_and_refuses_other_missions():
         compare({"level": fits["level"], "fewer": fit(missions[:5], PooledTrust())})
     with pytest.raises(TrustboError):
         compare({"level": fits["level"]})
+    ticks = [
+        [
+            Mission.from_arrays(m.path, m.awareness, np.round(10 * m.contact_rate) / 10, n_ticks=n)
+            for m in missions[:2]
+        ]
+        for n in (10, None)
+    ]
+    counted, uncounted = (fit(given, PooledTrust(), whole=False, check=False) for given in ticks)
+    with pytest.raises(TrustboError, match="tick"):
+        compare({"counted": counted, "uncounted": uncounted})

@@ -126,7 +126,7 @@ def compare(posteriors: Mapping[str, xr.DataTree]) -> pd.DataFrame:
         `warning`, which is true if a Pareto k is high.
 
     Raises:
-        TrustboError: If there are fewer than two posteriors, or their missions differ.
+        TrustboError: If there are fewer than two posteriors, or their rates or tick counts differ.
 
     Example:
         >>> tb.compare({"pooled": pooled, "hierarchical": hierarchical})
@@ -137,12 +137,12 @@ def compare(posteriors: Mapping[str, xr.DataTree]) -> pd.DataFrame:
         )
     trees = {name: require_posterior("compare", tree) for name, tree in posteriors.items()}
     (first, reference), *others = (
-        (name, stack_missions(missions_of(tree)).contact_rate) for name, tree in trees.items()
+        (name, np.stack(stack_missions(missions_of(tree))[1:])) for name, tree in trees.items()
     )
-    for name, rates in others:
-        if not np.array_equal(reference, rates, equal_nan=True):
+    for name, data in others:
+        if not np.array_equal(reference, data, equal_nan=True):
             raise TrustboError(
-                f"{name!r} and {first!r} were fitted to different missions, with rates of shape "
-                f"{rates.shape} and {reference.shape}; fit both to the same missions."
+                f"{name!r} and {first!r} were fitted to different rates or tick counts, of shape "
+                f"{data.shape[1:]} and {reference.shape[1:]}; fit both to the same missions."
             )
     return ranked({name: loo(tree) for name, tree in trees.items()})
