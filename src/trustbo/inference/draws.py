@@ -16,7 +16,7 @@ from trustbo.models.effects.effect import Effect, Theta
 from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.model import TrustModel
 from trustbo.models.params import Params, assemble_params
-from trustbo.models.record import effects_from_record, model_from_record
+from trustbo.models.record import effects_from_record, model_from_record, with_default_priors
 from trustbo.models.slots import Slots
 from trustbo.stacking import require_same_team
 from trustbo.workspace import Workspace
@@ -185,10 +185,7 @@ def values_of(posterior: xr.DataTree, effect: Effect) -> dict[str, np.ndarray]:
 
 def theta_of(posterior: xr.DataTree, sites: Mapping[str, np.ndarray]) -> Theta:
     """Return the hyperparameters of draws by name, including `rest`; see `Theta`."""
-    if "B0" in sites:
-        return {**sites, "rest": 1.0 - np.diagonal(sites["B0"], axis1=1, axis2=2)}
-    level = posterior.attrs.get("memory", "level") == "level"
-    return {**sites, "rest": 1.0 - sites["beta0"] if level else np.ones_like(sites["beta0"])}
+    return with_default_priors(json.loads(posterior.attrs["model_record"])).derived(sites)
 
 
 def read_posterior(

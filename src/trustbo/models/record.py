@@ -30,10 +30,10 @@ def model_to_record(model: TrustModel) -> dict[str, Any]:
 def model_from_record(
     record: dict[str, Any], given: TrustModel | None = None, features: Sequence[str] = ()
 ) -> TrustModel:
-    """Rebuild a model from its record; a model with custom priors or class must be `given`.
+    """Rebuild a model from its record; a model with custom priors must be `given`.
 
-    `features` are the posterior's features, on which default priors depend. Raises TrustboError if
-    a custom model is not given, or if the given model differs from the record.
+    The default priors depend on `features`, the feature names of the posterior. Raises TrustboError
+    if a custom model is not given, or if the given model differs from the record.
     """
     if given is not None:
         if model_to_record(given) != record:
@@ -41,19 +41,28 @@ def model_from_record(
                 f"the model must match the record {record}; got {model_to_record(given)}."
             )
         return given
-    if (kind := MODELS.get(record["class"])) is not None:
-        ours = ("class", "priors", "by_feature", "effects")
-        options = {name: value for name, value in record.items() if name not in ours}
-        usual = kind(effects=effects_from_record(record), **options)
-        of_features = Priors.of(features, record["observation"])
-        for priors in (usual.priors, replace(usual.priors), of_features):
-            model = replace(usual, priors=priors)
-            if model_to_record(model) == record:
-                return model
+    default = with_default_priors(record)
+    of_features = Priors.of(features, record["observation"])
+    for priors in (default.priors, replace(default.priors), of_features):
+        model = replace(default, priors=priors)
+        if model_to_record(model) == record:
+            return model
     raise TrustboError(
-        f"the model {record['class']} has custom priors or a custom class; give the model with "
-        f"model=. The priors are {record['priors']}."
+        f"the priors of the model {record['class']} are custom, and cannot be rebuilt from their "
+        f"text {record['priors']}; give the model with model=."
     )
+
+
+def with_default_priors(record: Mapping[str, Any]) -> TrustModel:
+    """Make a model with the class, options and effects of a record, and with default priors.
+
+    Raises TrustboError if the class of the model or of an effect has not been imported.
+    """
+    if (kind := MODELS.get(record["class"])) is None:
+        raise TrustboError(f"unknown model {record['class']!r}; import the module that defines it.")
+    others = ("class", "priors", "by_feature", "effects")
+    options = {name: value for name, value in record.items() if name not in others}
+    return kind(effects=effects_from_record(record), **options)
 
 
 def effects_from_record(record: Mapping[str, Any]) -> tuple[Effect, ...]:
