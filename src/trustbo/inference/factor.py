@@ -20,7 +20,7 @@ import numpy as np
 from scipy import sparse
 from scipy.linalg import lapack
 
-from trustbo.models.backend import namespace
+from trustbo.models.backend import inverse_from_factor, namespace
 
 
 class Order(NamedTuple):
@@ -274,8 +274,7 @@ def inverse_of_upper(H: Any) -> Any:
         one = jnp.broadcast_to(jnp.eye(H.shape[1]), H.shape)
         half = solve_upper(H, one, transposed=True)
         return half @ half.mT
-    found = np.stack([np.triu(lapack.dpotri(one.T, lower=1)[0].T) for one in H])  # pyright: ignore[reportAttributeAccessIssue]
-    return found + np.triu(found, 1).swapaxes(1, 2)
+    return inverse_from_factor(np.triu(H))
 
 
 def log_det(A: Any) -> Any:

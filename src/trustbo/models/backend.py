@@ -59,6 +59,12 @@ def inverse(A: Any) -> Any:
     for one in half:  # symmetric, so the transpose, in LAPACK's memory order, is equal
         if lapack.dpotrf(one.T, lower=1, overwrite_a=1)[1]:  # pyright: ignore[reportAttributeAccessIssue]
             one[:] = np.nan
+    return inverse_from_factor(H)
+
+
+def inverse_from_factor(H: np.ndarray) -> np.ndarray:
+    """Compute (H' H)^-1 for upper triangular matrices H (point, n, n), which are overwritten."""
+    for one in H:
         lapack.dpotri(one.T, lower=1, overwrite_c=1)  # pyright: ignore[reportAttributeAccessIssue]
     return half + np.swapaxes(np.triu(half, 1), 1, 2)
 
