@@ -8,7 +8,7 @@ from scipy import sparse
 from scipy.special import logsumexp
 
 from trustbo.inference import ep
-from trustbo.inference.engine import Blocks, Prior, draw_columns, evidence, expected, whiten
+from trustbo.inference.engine import Blocks, Fit, Prior, draw_columns, evidence, expected, whiten
 from trustbo.inference.factor import Order, cholesky
 from trustbo.inference.importance import Student, climb, smoothed, systematic
 from trustbo.models.backend import namespace
@@ -112,13 +112,11 @@ class Posterior:
     def log_evidence(self, theta: Theta) -> Any:
         """Compute log p(rates | theta) at each point, with EP if rates are not Gaussian."""
         if namespace(theta["rest"]) is not np:
-            signal, prior = self._at(theta)
-            return evidence(self.blocks, signal, prior, self._lam(signal)).log_p
+            return self._fit(theta)[0].log_p
         found = np.empty(len(theta["rest"]))
         for i, chunk in chunks(theta):
             if self.exact:
-                signal, prior = self._at(chunk)
-                found[i] = evidence(self.blocks, signal, prior, self._lam(signal)).log_p
+                found[i] = self._fit(chunk)[0].log_p
             else:
                 found[i] = ep.log_evidence(self._joint(chunk), self.sites, _SWEEPS)[0]
         return found
@@ -170,9 +168,10 @@ class Posterior:
         """
         if self.exact:
             unique, index, count = np.unique(z, axis=0, return_inverse=True, return_counts=True)
-            c = self.draw_columns(self.theta(unique), rng, count)
-            order = np.argsort(np.argsort(index.ravel(), kind="stable"), kind="stable")
-            return Draws(at(self.theta(unique), index.ravel()), c[order]), np.arange(len(z))
+            theta, index = self.theta(unique), index.ravel()
+            c = self.draw_columns(theta, rng, count)
+            order = np.argsort(np.argsort(index, kind="stable"), kind="stable")
+            return Draws(at(theta, index), c[order]), np.arange(len(z))
         theta, parts = self.theta(z), []
         for _, chunk in chunks(theta):
             joint = self._joint(chunk)
@@ -189,8 +188,7 @@ class Posterior:
         """Draw the coefficients at each point given Gaussian rates, once or `count` times."""
         count, drawn = np.ones(len(theta["rest"]), dtype=int) if count is None else count, []
         for where, chunk in chunks(theta):
-            signal, prior = self._at(chunk)
-            fit = evidence(self.blocks, signal, prior, self._lam(signal))
+            fit, prior = self._fit(chunk)
             drawn.append(draw_columns(prior, fit, count[where], rng))
         return np.concatenate(drawn)
 
@@ -320,6 +318,15 @@ class Posterior:
 
     def prior(self, theta: Theta) -> Prior:
         """Return the prior on all coefficients at each theta."""
+    def _fit(self, theta: Theta) -> tuple[Fit, Prior]:
+        """Compute the evidence of Gaussian rates at each theta; also return the prior."""
+        signal, prior = self._at(theta)
+        return evidence(self.blocks, signal, prior, self._lam(signal)), prior
+
+    def _at(self, theta: Theta) -> tuple[Signal, Prior]:
+        """Return the distribution of the signals and the prior at each theta."""
+        return self.model.signal(theta, self.slots, self.layout), self.prior(theta)
+
         return Prior.of([effect.prior(theta, self.slots) for effect in self.model.columns])
 
     def _lam(self, signal: Signal) -> Any:
