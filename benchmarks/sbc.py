@@ -90,7 +90,7 @@ def rank(model, missions, n, seed, n_ranked=N_RANKED):
     for j in range(n):
         rng = np.random.default_rng([seed, j])
         truth = before.draw_prior(1, rng)
-        rates = np.where(measured, before.anew(truth, rng)[0], np.nan)
+        rates = np.where(measured, before.replicate(truth, rng)[0], np.nan)
         posterior = Posterior(model, slots._replace(y=rates))
         drawn, _, summary = by_importance(posterior, n_ranked, int(rng.integers(2**31)))
         if summary["k_hat"] <= MAX_KHAT:

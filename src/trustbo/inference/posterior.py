@@ -255,17 +255,17 @@ class Posterior:
             x, log_p = given_mean(theta, signal, mean, rng)
             trust[where] = self.layout.slots(x)
             log_likelihood[where] = log_p.reshape(len(log_p), shape[1], -1).sum(2)
-            predicted[where] = self._anew(signal, mean, rng)
+            predicted[where] = self._rates(signal, mean, rng)
         many = np.bincount(index, minlength=shape[0]) / len(index)
         mean = np.tensordot(many, trust, 1)
         sd = np.sqrt(np.maximum(np.tensordot(many, trust**2, 1) - mean**2, 0.0))
         return Given(trust[index[kept]], mean, sd, log_likelihood[index], predicted[index])
 
-    def anew(self, draws: Draws, rng: np.random.Generator) -> np.ndarray:
+    def replicate(self, draws: Draws, rng: np.random.Generator) -> np.ndarray:
         """Draw replicated rates (draw, mission, bound, robot) of the missions."""
         rates = np.empty((len(draws.c), *self.slots.y.shape))
         for i, _, signal, mean in self.signals(draws):
-            rates[i] = self._anew(signal, mean, rng)
+            rates[i] = self._rates(signal, mean, rng)
         return rates
 
     def signals(self, draws: Draws) -> Iterator[tuple[slice, Theta, Signal, np.ndarray]]:
@@ -306,8 +306,8 @@ class Posterior:
         x = mean + (gain @ (f - mean)[..., None])[..., 0]
         return x + (_root(S - gain @ S) @ rng.standard_normal((*x.shape, 1)))[..., 0], log_p
 
-    def _anew(self, signal: Signal, mean: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Draw replicated rates (draw, mission, bound, robot) of the missions."""
+    def _rates(self, signal: Signal, mean: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Draw replicated rates (draw, mission, bound, robot) given the mean signals."""
         root = each(_root(signal.covariance), self.blocks.label[self.blocks.kind])
         f = self.layout.slots(mean + (root @ rng.standard_normal((*mean.shape, 1)))[..., 0])
         sd = signal.sd[..., None] if signal.sd.shape[2] == 1 else self.layout.slots(signal.sd)

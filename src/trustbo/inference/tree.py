@@ -154,7 +154,7 @@ def complete(
     some = (np.arange(n_chains)[:, None] * n_draws + kept).ravel()
     given = fitted.given(draws, some, np.random.default_rng([seed, 1]))
     rng = np.random.default_rng([seed, 2])
-    anew = fitted.anew(fitted.draw_prior(N_PRIOR, rng), rng)
+    replicated = fitted.replicate(fitted.draw_prior(N_PRIOR, rng), rng)
     shift = fitted.model.family.log_resolution(fitted.slots.y, fitted.slots.n_ticks).sum((1, 2))
     counted = not np.isnan(shift).any()
     likelihood = given.log_likelihood + (shift if counted else 0.0)
@@ -171,7 +171,7 @@ def complete(
             "draw": kept,
         },
         "posterior_predictive": {"contact_rate": by_chain(given.predicted)},
-        "prior_predictive": {"contact_rate": anew[None]},
+        "prior_predictive": {"contact_rate": replicated[None]},
         "log_prior": {
             name: by_chain(values)
             for name, values in log_prior(fitted, sites_of(posterior)).items()
