@@ -89,8 +89,8 @@ class Scores:
         return found
 
 
-def quantile(prior: Distribution, score: np.ndarray, name: str = "") -> np.ndarray:
-    """Compute the quantile of a prior at Phi(score), accurate in both tails."""
+def quantile(prior: Distribution, score: np.ndarray, name: str) -> np.ndarray:
+    """Compute the quantile of a prior at probability Phi(score), accurate in both tails."""
     prior = _base(prior)
     if isinstance(prior, dist.Normal):
         return np.asarray(prior.loc) + np.asarray(prior.scale) * score
@@ -119,7 +119,7 @@ def _interpolated(prior: Distribution, score: jax.Array, name: str) -> jax.Array
     return ((a * x + b) * x + c) * x + d
 
 
-def of_size(prior: Distribution, size: Any, name: str = "") -> Any:
+def of_size(prior: Distribution, size: Any, name: str) -> Any:
     """Compute the quantile of a prior at the probability P(|N(0, 1)| < size)."""
     prior = _base(prior)
     if isinstance(prior, dist.HalfNormal):
