@@ -3,4 +3,4 @@
 from trustbo.hazard.prior import Hazard
 
 __all__ = ["Hazard"]
-__dir__ = __all__.copy  # completion lists only public names
+__dir__ = __all__.copy  # tab completion lists only public names

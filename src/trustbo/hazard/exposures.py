@@ -10,7 +10,7 @@ from trustbo.errors import TrustboError
 from trustbo.workspace.moves import bounds_along
 
 CAUSES = ("stuck", "tipped", "timeout", "collision", "lost_contact")
-"""Mission statuses after a failed bound. In an aborted mission, the last bound has no outcome."""
+"""Statuses of missions whose last bound failed; aborted missions do not count as failed."""
 
 
 class LostMission(NamedTuple):
@@ -19,7 +19,7 @@ class LostMission(NamedTuple):
     Attributes:
         path: Planned cells, beginning with the start.
         where: Cell that the team failed to enter, or None if unknown. If the path enters this
-            cell more than once, the failure is at its first entry.
+            cell more than once, the first of these bounds failed.
     """
 
     path: tuple[Cell, ...]
@@ -27,7 +27,7 @@ class LostMission(NamedTuple):
 
 
 class Exposures(NamedTuple):
-    """Exposure counts of attempted bounds, which are sufficient statistics of the hazard model.
+    """Exposures of attempted bounds, which are sufficient statistics of the hazard model.
 
     Attributes:
         bounds: Distinct bounds in lexicographic order, shape (bound, 3). The columns are the index
@@ -74,7 +74,8 @@ def _reported(mission: Mission) -> tuple[Sequence[Cell], bool]:
 
 
 def _located(mission: LostMission) -> tuple[Sequence[Cell], bool]:
+    """Return the path of a lost mission up to `where`, and True because the last bound failed."""
     if mission.where not in mission.path[1:]:
-        raise TrustboError(f"the path {mission.path} never enters where = {mission.where}.")
+        raise TrustboError(f"where must be a cell that the path enters; got {mission}.")
     n = mission.path.index(mission.where, 1)
     return mission.path[: n + 1], True

@@ -7,8 +7,8 @@ exceeds the slope limit:
     1 - m_e = sigma(-logit_e) sigma(-(t_e + margin) / width),
     logit_e = intercept + sum_j coefficient_j (difficulty_ej - 1/2).
 
-The p_e are integrated out, and the other parameters are drawn by importance sampling of their
-normal scores. During adaptation of the proposals, missions lost at unknown places are treated as
+The p_e are integrated out, and normal scores of the other parameters are drawn by importance
+sampling. While the proposals are adapted, missions lost at unknown places are treated as
 independent. Then the place of each of these failures is imputed at every point (sequential
 imputation; Kong, Liu and Wong 1994), and the weights are corrected for the joint posterior.
 """
@@ -31,7 +31,7 @@ from trustbo.workspace import Workspace
 from trustbo.workspace.difficulty import difficulty_of
 from trustbo.workspace.moves import MOVE_NAMES
 
-_ROUND, _ENOUGH, _N_DRAWS = 1024, 500.0, 1000
+_ROUND, _ENOUGH, _N_DRAWS = 1024, 500.0, 1000  # points per round, effective points, and draws
 _MAPS = "move", "row", "col"
 
 
@@ -59,7 +59,7 @@ def fit_hazard(
         (draw) of the slope limit in degrees. `place` (draw, lost) is the number, from 1, of the
         bound at which each mission lost at an unknown place failed. `p_fail` (move, row, col) is
         the posterior mean failure probability, and NaN where there is no bound. `exposures` and
-        `failures` (move, row, col) count known outcomes. Use `BoundRisk` to draw from it.
+        `failures` (move, row, col) count known outcomes. `BoundRisk` draws failure probabilities.
 
     Raises:
         TrustboError: If the path of a mission skips cells or leaves the grid.
@@ -70,7 +70,7 @@ def fit_hazard(
     shape, cells = difficulty.shape[1:3], exposures.bounds[:, 1:]
     for cell in cells[((cells < 0) | (cells >= shape)).any(1)]:
         name = tuple(cell.tolist())
-        raise TrustboError(f"a mission enters {name}, outside the grid of shape {shape}.")
+        raise TrustboError(f"a mission enters {name}, outside the workspace of shape {shape}.")
 
     # A bound that was driven but does not exist on the map has the largest difficulty.
     met = np.nan_to_num(difficulty.values[*exposures.bounds.T], nan=1.0)
@@ -85,7 +85,7 @@ def fit_hazard(
     group = group.assign(p_fail=(_MAPS, BoundRisk(group, workspace).mean))
     group.attrs["seconds"] = time.perf_counter() - started
     if not points.k_hat <= importance.MAX_KHAT:
-        reason = f"hazard posterior rejected: k-hat = {points.k_hat:.2f} > {importance.MAX_KHAT:g}."
+        reason = f"the hazard posterior has k-hat {points.k_hat:.2f} > {importance.MAX_KHAT:g}."
         raise PosteriorError(reason, group, "Use more informative priors in Hazard(...).")
     return group
 
@@ -99,7 +99,7 @@ def sample(
     times, bad = np.bincount(kind, minlength=len(counts)), failed > 0.0
 
     def log_any_fails(alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
-        """Compute the log probability that all lost missions fail, as if independent."""
+        """Compute the log probability that all lost missions fail, as if they were independent."""
         if not paths:
             return np.zeros(len(alpha))
         a, b = alpha + failed, beta + n - failed
@@ -115,7 +115,7 @@ def sample(
         return total - _log_rising(strength, counts) @ times
 
     starts = np.zeros((3, len(prior.center)))
-    starts[1:, -1] = -1.5, 1.5  # low and high strength, as its posterior may have two modes
+    starts[1:, -1] = -1.5, 1.5  # low and high strength, as the posterior may have two modes
     for more in (1, 8):  # repeat with more points if the weights are uneven
         size, enough = more * _ROUND, more * _ENOUGH
         points = importance.sample(log_density, starts, rng, size=size, enough=enough)
@@ -158,7 +158,7 @@ def impute(
             fails = a[:, e] / (a[:, e] + done[:, e])
             within[:, k] = survived * fails
             survived = survived * (1.0 - fails)
-            done[:, e] += 1.0  # a path may enter a cell again
+            done[:, e] += 1.0  # a path may include a bound twice
         favour = _lookahead(path, paths[j + 1 :], a, b)
         cumulative = (within * favour).cumsum(1)
         total = cumulative[:, -1]
@@ -172,10 +172,10 @@ def impute(
 def _lookahead(
     path: np.ndarray, later: Sequence[np.ndarray], a: np.ndarray, b: np.ndarray
 ) -> np.ndarray:
-    """Compute how much a failure at each bound (point, bound) makes later failures more likely.
+    """Compute the factor by which a failure at each bound makes later failures more probable.
 
-    Without this factor, the rare points that attribute several failures to one bound would have
-    large weights.
+    Without this factor (point, bound), the rare points that attribute several failures to one bound
+    would have large weights.
     """
     favour = np.ones((len(a), len(path)))
     for other in later:

@@ -14,13 +14,13 @@ from trustbo.errors import TrustboError, require_positive
 REFERENCE = 0.5
 """Difficulty at which the intercept is the logit of the prior mean."""
 TILT = "tilt"
-"""Difficulty measure to which the slope limit applies."""
+"""Name of the difficulty measure to which the slope limit applies."""
 LIMIT_NAMES = ("margin", "width")
 """Parameters of the robots' slope limit, in degrees."""
 FLOOR = 1e-12
 """Smallest alpha and beta of a Beta prior, needed because the prior mean may round to 0 or 1."""
-_LARGEST_LOG = 50.0
-_FARTHEST = 40.0  # largest tabulated margin, in sds of the wide normal
+_LARGEST_LOG = 50.0  # largest absolute log of the width and the strength
+_FARTHEST = 40.0  # largest tabulated quantile of the margin, in sds of the wider normal
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,8 @@ class Hazard:
 
     Attributes:
         intercept: Prior on the logit of the mean failure probability at medium difficulty.
-        coefficient: Prior on the weight of each difficulty measure, which is 0 for an easy route
-            and 1 at the robots' limit. Tilt has no weight, but enters through the slope limit.
+        coefficient: Prior on the weight of each difficulty measure. Difficulty is 0 for an easy
+            route and 1 at the robots' limit. Tilt has no weight, as the slope limit includes it.
         margin: Prior on the number of degrees by which the true slope limit is below the stated
             limit, if the stated limit is about right. All bounds share the margin, so a failure on
             one bound makes failures on equally steep bounds more probable.
@@ -42,8 +42,8 @@ class Hazard:
             probability of 0 if the limit was measured.
         log_width: Prior on the log of the limit's width in degrees. The failure probability
             increases from .1 to .9 if the tilt increases by 4.4 widths.
-        log_strength: Prior on the log of the strength s, which is the weight of the prior mean in
-            units of observations. The strength is small if each bound either always or never fails.
+        log_strength: Prior on the log of the strength s, the number of observations that the prior
+            mean of a bound is worth. If each bound either always or never fails, s is small.
 
     Raises:
         TrustboError: If an sd is not positive, or the probability in `doubt` is outside [0, 1).
@@ -69,7 +69,7 @@ class Hazard:
     def of_bounds(
         self, difficulty: np.ndarray, measures: Sequence[str], max_slope: float
     ) -> "BoundPrior":
-        """Make the prior for bounds with the given difficulty (bound, measure) and limit in rad."""
+        """Make the prior for bounds with difficulty (bound, measure) and a slope limit in rad."""
         weighted = [m for m, name in enumerate(measures) if name != TILT]
         normals, steepness = [self.intercept, *[self.coefficient] * len(weighted)], None
         if TILT in measures:
@@ -82,8 +82,8 @@ class Hazard:
 class BoundPrior(NamedTuple):
     """Beta priors on the failure probabilities of bounds, as functions of normal scores z.
 
-    Each parameter is center + scale z, on the log scale for the width and strength. The margin is
-    the corresponding quantile of its mixture prior.
+    Each parameter is center + scale z, except that the width and the strength are exp(center +
+    scale z), and the margin is the quantile of its mixture prior at probability Phi(z).
     """
 
     center: np.ndarray  # (parameter,)
@@ -135,7 +135,7 @@ def prior_betas(
 
 
 def steepness_of(tilt: np.ndarray, max_slope: float) -> np.ndarray:
-    """Convert a tilt, relative to the tangent of the limit (rad), to degrees beyond the limit."""
+    """Convert tilt = tan(slope) / tan(max_slope) to degrees beyond the limit max_slope (rad)."""
     return np.rad2deg(np.arctan(tilt * np.tan(max_slope)) - max_slope)
 
 
@@ -152,7 +152,7 @@ def mixture_quantile(z: np.ndarray, narrow: float, share: float, wide: float) ->
 
 @cache
 def _quantile_curve(narrow: float, share: float, wide: float) -> PchipInterpolator:
-    """Compute the quantile function for z >= 0, which suffices as the mixture is symmetric."""
+    """Tabulate the quantile function for z >= 0; the mixture is symmetric."""
     largest = _FARTHEST * max(narrow, wide)
     x = narrow * np.sinh(np.linspace(0.0, np.arcsinh(largest / narrow), 4000))
     # Use the logs of the upper tails, because 1 - F rounds to 0 beyond 38 sds.

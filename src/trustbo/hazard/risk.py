@@ -18,7 +18,7 @@ from trustbo.workspace.moves import bounds_along
 
 ROUNDING = 1e-12
 """Tolerance for rounding errors when the risk of a path is compared with its limit."""
-_BAND = (0.05, 0.95)
+_BAND = (0.05, 0.95)  # levels of the ends of `p_arrive_band`
 _ENTRIES = 1 << 20  # maximum size of an array (draw, bound)
 _SOME = 256  # approximate number of bounds whose mean probability orders the draws
 
@@ -143,7 +143,7 @@ class BoundRisk:
 def add_lost(path: np.ndarray, place: np.ndarray, a: np.ndarray, b: np.ndarray) -> None:
     """Update a and b (point, bound) with a mission that failed at index `place` (point,) of `path`.
 
-    Negative indices in `path` stand for bounds that are not in `a` and `b`.
+    `path` contains indices of bounds in `a` and `b`, negative for bounds that `a` and `b` lack.
     """
     for k, e in enumerate(path):
         if e >= 0:
@@ -204,8 +204,8 @@ class Risk:
             return PathRisk(p, float(reach[-1]), (np.nan, np.nan))
         drawn = self.draws[:, *index]
         low, high = np.quantile(np.prod(1.0 - drawn, axis=1), _BAND).tolist()
-        # Passing all bounds is more probable than if they were independent. The ratio of the two
-        # probabilities is not affected by the sampling error of each mean p_fail.
+        # Passing all bounds is more probable than if bounds were independent. The sampling errors
+        # of the mean p_fail nearly cancel in the ratio of the two probabilities.
         together = np.cumprod(1.0 - drawn, axis=1).mean(0)
         apart = np.cumprod((1.0 - drawn).mean(0))
         ratio = np.divide(together, apart, out=np.ones_like(apart), where=apart > 0.0)

@@ -5,8 +5,8 @@ hyperparameters, bounds fail independently, so a path fails with probability
 
     E[1 - prod_k (1 - p_k)] = mean over draws of 1 - prod_k (1 - E[p_k | draw]).
 
-Strata are groups of draws, ordered from mild to severe. Each group is treated as one draw with the
-mean probabilities of its members, so a search needs only one sum per stratum.
+Strata are groups of draws, ordered from low to high failure probabilities. Each group is treated as
+one draw with the mean probabilities of its members, so a search needs only one sum per stratum.
 """
 
 from typing import NamedTuple
@@ -28,7 +28,7 @@ def partition(values: np.ndarray, n: int) -> np.ndarray:
 
     Dynamic programming minimises the sum of squared deviations from the group means (Fisher 1958).
     Group k is values[ends[k - 1] : ends[k]], where `ends` is the result. Groups of equal size would
-    mix the few severe draws with mild ones. Time and memory are quadratic in the number of values.
+    mix the few largest values with others. Time and memory are quadratic in the number of values.
     """
     size = len(values)
     total, squares = (np.concatenate([[0.0], np.cumsum(v)]) for v in (values, values**2))
