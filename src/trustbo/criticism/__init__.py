@@ -3,4 +3,4 @@
 from trustbo.criticism.check import check
 
 __all__ = ["check"]
-__dir__ = __all__.copy  # completion lists only public names
+__dir__ = __all__.copy  # tab completion lists only public names

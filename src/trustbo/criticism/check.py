@@ -1,4 +1,4 @@
-"""Check of a fitted model for problems in its posterior and predictions."""
+"""Check a fitted model for problems in its posterior and its predictions."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,9 +24,9 @@ from trustbo.models.families import FAMILIES
 
 SIZE, SURE = 0.1, 0.95
 """Smallest effect on contact that may change a plan, and the probability required to report it."""
-_SIGNED = 0.6  # a weight has an expected sign if the sign's prior probability exceeds this
+_SIGNED = 0.6  # prior probability of a sign above which the sign is expected
 _TOLERANCE = 0.05  # tolerated error of the coverage of 90 % intervals
-_ERRORS = 2.0  # number of standard errors from which a difference is significant
+_ERRORS = 2.0  # number of standard errors above which a difference is significant
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -34,7 +34,7 @@ class Check(Summary):
     """Result of the check of a fitted model.
 
     Attributes:
-        verdict: Text with the findings that stand out.
+        verdict: The findings that stand out, as text.
         table: One row per check (index `check`). The columns are the text of the `finding`, whether
             it `stands_out`, the most affected `label`, and the `size` and `probability`.
         robots: One row per mission and robot, with the `effect` (share of line of sight minus the
@@ -75,7 +75,7 @@ def check(
 
     Args:
         posterior: Posterior from `fit`, or all posteriors of a campaign (`Result.posteriors`). For
-            a campaign, the last one is checked, and each prediction of the next mission is scored.
+            a campaign, the last posterior is checked, and the predictions of the others are scored.
         missions: All missions of the campaign; by default, the missions in the last posterior.
 
     Raises:
@@ -86,7 +86,8 @@ def check(
     tree = require_posterior("check", trees[-1])
     if is_of_people(tree):
         raise TrustboError(
-            "check needs a posterior fitted to contact rates; got one fitted to people's reports."
+            "check needs a posterior of contact rates; got a posterior of HumanTrust. Use "
+            "trustbo.inference.predict_reports instead."
         )
     robots = effects_of_robots(tree)
     findings = {
@@ -101,12 +102,12 @@ def check(
 
 
 def effects_of_robots(posterior: xr.DataTree) -> pd.DataFrame:
-    """Tabulate the robot effects (see `Check.robots`); empty if the model has none."""
+    """Tabulate the robot effects as in `Check.robots`; the table is empty if there are none."""
     if "robots" not in posterior.children:
         return pd.DataFrame()
     group = posterior["robots"].to_dataset()
     draws = joined_draws(group["robot_effect"])
-    # The weight of line of sight already accounts for the common level of all effects.
+    # The weight of line of sight already includes what all robots and missions have in common.
     draws = draws - np.median(draws, axis=(1, 2), keepdims=True)
     draws = draws / FAMILIES[posterior.attrs["observation"]].line_of_sight[0]
     probability = np.maximum((draws < -SIZE).mean(0), (draws > SIZE).mean(0))
@@ -118,6 +119,7 @@ def effects_of_robots(posterior: xr.DataTree) -> pd.DataFrame:
 
 
 def _check_robots(robots: pd.DataFrame) -> Finding:
+    """Check whether the effect of a robot in a mission differs from the median."""
     if not len(robots):
         return Finding("not tested: the model has no robot effects")
     effect, odd = robots["effect"].to_numpy(), robots["stands_out"].to_numpy()
@@ -129,13 +131,14 @@ def _check_robots(robots: pd.DataFrame) -> Finding:
         rows = odd & (robot == name)
         when = f"mission {joined(mission[rows].astype(str).tolist())}"
         when = "all missions" if rows.sum() == (robot == name).sum() else when
-        words.append(f"{name} has {effect[rows].mean():+.2f} contact at full sight in {when}")
+        words.append(f"{name}: {effect[rows].mean():+.2f} contact at full line of sight in {when}")
     most = int(np.argmax(np.abs(effect) * odd))
     size, p = float(effect[most]), float(robots["probability"].to_numpy()[most])
     return Finding(joined(words), True, str(robot[most]), size, p)
 
 
 def _check_places(posterior: xr.DataTree) -> Finding:
+    """Check whether the effect of a place on stationary trust is large."""
     if "places" not in posterior.children:
         return Finding("not tested: the model has no place effects")
     places = posterior["places"].to_dataset()
@@ -159,6 +162,7 @@ def _check_places(posterior: xr.DataTree) -> Finding:
 
 
 def _check_weights(posterior: xr.DataTree) -> Finding:
+    """Check whether the sign of a weight contradicts the prior."""
     name = "beta" if "beta" in posterior["posterior"] else "B"
     if "prior" not in posterior.children or name not in posterior["prior"]:
         return Finding("not tested: the posterior contains no prior draws")
@@ -172,7 +176,7 @@ def _check_weights(posterior: xr.DataTree) -> Finding:
     expected = (prior * sign > 0.0).mean(0) > _SIGNED
     wrong = (draws * sign < 0.0).mean(0) * expected
     most, odd = int(wrong.argmax()), [str(feature) for feature in features[wrong > SURE]]
-    words = "the sign of every weight agrees with its prior"
+    words = "no weight has a sign that contradicts its prior"
     if odd:
         words = f"the sign of the weight contradicts the prior for {joined(odd)}"
     size, p = float(draws[:, most].mean()), float(wrong[most])
@@ -180,14 +184,15 @@ def _check_weights(posterior: xr.DataTree) -> Finding:
 
 
 def _check_coverage(trees: list[xr.DataTree], missions: Sequence[Mission] | None) -> Finding:
+    """Check whether 90 % intervals one mission ahead contain 90 % of the rates."""
     if len(trees) < 2:
         return Finding("not tested: this check needs all posteriors of a campaign")
     pit = score(trees, missions_of(trees[-1]) if missions is None else missions)["pit"]
     within = (abs(pit - 0.5) <= 0.45).where(pit.notnull()).mean(("bound", "robot")).values
     within = within[np.isfinite(within)]
+    if not len(within):
+        return Finding("not tested: no rate of the predicted missions was measured")
     off = float(within.mean() - 0.9)
     error = within.std(ddof=1) / np.sqrt(len(within)) if len(within) > 1 else np.inf
     words = f"90 % intervals one mission ahead contain {within.mean():.0%} of the rates"
     return Finding(words, bool(abs(off) > max(_TOLERANCE, _ERRORS * error)), "90 %", off)
-    if not len(within):
-        return Finding("not tested: no rate of the predicted missions was measured")
