@@ -1,12 +1,12 @@
 """Import numpyro with its submodules, and define the JAX settings for all computations.
 
-In Jupyter without ipywidgets, importing numpyro raises the warning "IProgress not found". The
+In Jupyter without ipywidgets, importing numpyro issues the warning "IProgress not found". The
 warning is silenced because text progress bars suffice.
 
 arviz_base leaves a lazily loaded numpyro in `sys.modules`. If a submodule is imported first, as in
 `import arviz; import numpyro.distributions`, packages lack their submodules and numpyro fails
 ("numpyro.distributions has no attribute 'distribution'"). Accessing an attribute of numpyro first
-avoids the error. Submodules already missing from packages are set.
+avoids the error. If submodules are already missing from their packages, they are set below.
 """
 
 import sys
@@ -55,8 +55,8 @@ def inverse(A: Any) -> Any:
     """Invert positive definite matrices (point, n, n); in NumPy, other matrices give NaN."""
     if isinstance(A, jax.Array):
         return jnp.linalg.inv(A)
-    half = A.copy()
-    for one in half:  # symmetric, so the transpose, in LAPACK's memory order, is equal
+    H = A.copy()
+    for one in H:  # `one.T` equals the symmetric `one`, and has LAPACK's memory order
         if lapack.dpotrf(one.T, lower=1, overwrite_a=1)[1]:  # pyright: ignore[reportAttributeAccessIssue]
             one[:] = np.nan
     return inverse_from_factor(H)
@@ -66,7 +66,7 @@ def inverse_from_factor(H: np.ndarray) -> np.ndarray:
     """Compute (H' H)^-1 for upper triangular matrices H (point, n, n), which are overwritten."""
     for one in H:
         lapack.dpotri(one.T, lower=1, overwrite_c=1)  # pyright: ignore[reportAttributeAccessIssue]
-    return half + np.swapaxes(np.triu(half, 1), 1, 2)
+    return H + np.swapaxes(np.triu(H, 1), 1, 2)
 
 
 @partial(jax.jit, static_argnums=1)

@@ -34,7 +34,7 @@ class CoupledTrust(TrustModel):
         return CoupledWeights(self.priors)
 
     def hyperpriors(self, n_robots: int, n_features: int) -> dict[str, Distribution]:
-        """See `TrustModel.hyperpriors`; correlations are parametrised by partial correlations."""
+        """See `TrustModel.hyperpriors`; the correlations R are given by partial correlations."""
         n, priors = n_robots, self.priors
         names = ("beta0", "delta_w", "delta_v")
         named = {name: getattr(priors, name).expand((n,)) for name in names}
@@ -49,7 +49,7 @@ class CoupledTrust(TrustModel):
         return named | partials
 
     def derived(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """See `TrustModel.derived`; builds the matrices B0, Delta_w and Delta_v."""
+        """See `TrustModel.derived`; adds the matrices B0, Delta_w and Delta_v."""
         if "B0" in values:
             B0 = values["B0"]
             return {**values, "rest": 1.0 - namespace(B0).diagonal(B0, axis1=1, axis2=2)}
@@ -57,7 +57,7 @@ class CoupledTrust(TrustModel):
         n = beta0.shape[1]
         B0 = beta0[:, :, None] * np.eye(n)
         if n > 1:
-            place = np.eye(n * n)[~np.eye(n, dtype=bool).ravel()]  # of each off-diagonal entry
+            place = np.eye(n * n)[~np.eye(n, dtype=bool).ravel()]  # position of each coupling
             B0 = B0 + (values["coupling"] @ place).reshape(-1, n, n)
         derived: dict[str, Any] = {"B0": B0, "rest": 1.0 - beta0}
         for noise in ("w", "v"):
@@ -75,7 +75,7 @@ class CoupledTrust(TrustModel):
     def signal(self, theta: Theta, slots: Slots, layout: Layout) -> Signal:
         """Compute the trust of all robots at all bounds, with rows ordered as (bound, robot).
 
-        Observation noise is the sum of shared (Delta_v - eps I) and independent noise (eps I).
+        The observation noise has a shared part (Delta_v - eps I) and an independent part (eps I).
         """
         B0, K, R = theta["B0"], slots.n_bounds, slots.n_robots
         xp: Any = namespace(B0)
@@ -114,7 +114,7 @@ class CoupledTrust(TrustModel):
 
 
 def correlation_factor(r: Any, n: int) -> Any:
-    """Compute Cholesky factors (point, n, n) of correlations from partial correlations."""
+    """Compute Cholesky factors (point, n, n) of correlation matrices from partial correlations."""
     xp, k, rows = namespace(r), 0, []
     for i in range(n):
         left, row = xp.ones(len(r)), []

@@ -1,4 +1,4 @@
-"""The protocol of trust models: an equation in matrix form, priors, and a NumPyro program."""
+"""Base class of trust models: an equation in matrix form, priors, and a NumPyro program."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -67,11 +67,9 @@ class TrustModel(Summary, ABC):
         given: Any = self.effects
         effects = (given,) if isinstance(given, Effect) else tuple(given)
         if unknown := [effect for effect in effects if not isinstance(effect, Effect)]:
-            raise TrustboError(
-                f"effects must contain objects such as PlaceEffect(); got {unknown[0]!r}."
-            )
+            raise TrustboError(f"effects must be objects like PlaceEffect(); got {unknown[0]!r}.")
         if len({type(effect) for effect in effects}) < len(effects):
-            raise TrustboError(f"effects must have different classes; got {effects!r}.")
+            raise TrustboError(f"effects must be of different classes; got {effects!r}.")
         object.__setattr__(self, "effects", effects)
 
     # --- defined by each model ---
@@ -87,14 +85,14 @@ class TrustModel(Summary, ABC):
 
     @abstractmethod
     def derived(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Convert hyperparameters to the form that `signal` takes, and add `rest`; see `Theta`.
+        """Convert hyperparameters to the arguments of `signal`, and add `rest`; see `Theta`.
 
-        `values` are hyperparameters (point, ...) by name, from `hyperpriors` or from a posterior.
+        `values` are hyperparameters (point, ...) by name, as in `hyperpriors` or in a posterior.
         """
 
     @abstractmethod
     def layout(self, slots: Slots, *, contrasts: bool = True) -> Layout:
-        """Arrange the slots in blocks; without contrasts, each row is the rate of one robot."""
+        """Arrange slots in blocks; unless `contrasts` is true, each row is one robot's rate."""
 
     @abstractmethod
     def signal(self, theta: Theta, slots: Slots, layout: Layout) -> Signal:
@@ -103,7 +101,7 @@ class TrustModel(Summary, ABC):
     @property
     @abstractmethod
     def dims(self) -> dict[str, tuple[str, ...]]:
-        """Axes of each parameter in a posterior, excluding effects."""
+        """Axes of each parameter in a posterior by name, excluding parameters of effects."""
 
     # --- shared by all models ---
 
@@ -114,7 +112,7 @@ class TrustModel(Summary, ABC):
 
     @property
     def effect_dims(self) -> dict[str, tuple[str, ...]]:
-        """Axes of the effects' hyperparameters."""
+        """Axes of the effects' hyperparameters by name; all are scalars."""
         return {name: () for effect in self.effects for name in effect.names}
 
     @property
@@ -133,7 +131,7 @@ class TrustModel(Summary, ABC):
         return priors | {n: p for e in self.effects for n, p in e.hyperpriors().items()}
 
     def theta(self, values: Mapping[str, Any], resolution: float) -> dict[str, Any]:
-        """Convert hyperparameters, named as in `all_hyperpriors`, to the argument of `signal`.
+        """Convert hyperparameters, named as in `all_hyperpriors`, to the `theta` of `signal`.
 
         Noise with standard deviation `resolution` is added to `delta_v` in quadrature. Without this
         noise, the density of rates that fit perfectly, such as constant rates, would be unbounded.
@@ -145,14 +143,14 @@ class TrustModel(Summary, ABC):
         return self.derived(values)
 
     def rates(self, theta: Theta, drift: Any) -> Distribution | None:
-        """Return the distribution of rates at one point, given the drift (mission, bound, robot).
+        """Return the distribution of rates given one theta and the drift (mission, bound, robot).
 
         The result is None if trust cannot be integrated out.
         """
         return None
 
     def prior_terms(self, sites: Mapping[str, np.ndarray]) -> dict[str, tuple[str, np.ndarray]]:
-        """Return the `Priors` field and the values of each further log-prior term, by label."""
+        """Return further terms of the log prior by label, each as (field of `Priors`, values)."""
         return {name: (name, sites[name]) for name in ("beta", "b")}
 
     def slots(self, missions: Sequence[Mission], workspace: Workspace | None = None) -> Slots:
@@ -172,7 +170,7 @@ class TrustModel(Summary, ABC):
         return slots
 
     def for_features(self, features: Sequence[str]) -> Self:
-        """Return the model with default priors for these features; custom priors are kept.
+        """Return the model with default priors for these features, or with its custom priors.
 
         `fit` and campaigns call this method; see `Priors.of`.
         """
@@ -183,7 +181,7 @@ class TrustModel(Summary, ABC):
     def program(self, slots: Slots) -> None:
         """Run the model as a NumPyro program, for a kernel such as `NUTS(model.program)`.
 
-        All variables are sampled except trust, which is integrated out if `rates` is a
+        All variables are sampled, except that trust is integrated out if `rates` returns a
         distribution. Call this method within `jax.enable_x64(True)`; effects need float64.
         """
         values = {
@@ -214,7 +212,7 @@ class TrustModel(Summary, ABC):
         numpyro.factor("contact_rate", jnp.where(seen, log_p, 0.0).sum())
 
     def options(self) -> dict[str, Any]:
-        """Return the options to record, except priors, effects and the default memory."""
+        """Return the options by name, except priors, effects and `memory` if it is "level"."""
         others = ("priors", "effects", *("memory",) * (self.memory == "level"))
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in others}
 
@@ -227,11 +225,11 @@ class TrustModel(Summary, ABC):
 
     def in_short(self) -> str:
         """Return a short text with the class, effects, family and non-default options."""
-        usual = {f.name: f.default for f in fields(self)}
+        defaults = {f.name: f.default for f in fields(self)}
         others = [
             f"{name} {value}"
             for name, value in self.options().items()
-            if name != "observation" and value != usual.get(name)
+            if name != "observation" and value != defaults.get(name)
         ]
         return ", ".join(
             [type(self).__name__, *(e.noun for e in self.effects), self.observation, *others]

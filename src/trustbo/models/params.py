@@ -16,6 +16,7 @@ PLACES: Mapping[str, tuple[str, ...]] = {
     "place": ("effect", "row", "col"),
     "place_bound": ("effect", "move", "row", "col"),
 }
+"""Axes of the fields that contain place effects, after the leading axes."""
 
 
 class ParameterDraws(Summary):
@@ -66,8 +67,8 @@ class ParameterDraws(Summary):
     def expected_transition(self, n_robots: int) -> np.ndarray:
         """Return the transition matrix (..., robot, robot) of expected trust.
 
-        It is B0 of equation (1), which is diagonal for uncoupled robots, or 0 if `memory` is
-        "deviation".
+        The matrix is B0 of equation (1). It is diagonal if robots do not influence each other, and
+        0 if `memory` is "deviation".
         """
         beta0 = np.asarray(self.beta0, dtype=float) * (self.memory == "level")  # pyright: ignore
         if not self.BY_ROBOT:
@@ -103,9 +104,9 @@ class ParameterDraws(Summary):
     def along(self, path: Sequence[Cell] | np.ndarray) -> Self:
         """Return the parameters for the bounds of a path, with place effects in the intercept.
 
-        Without place effects, the parameters are returned unchanged. Otherwise, place effects are
-        removed, and b has the shape (..., 1, bound, robot). The last axis of b has length 1 if b is
-        common to all robots.
+        Without place effects, the parameters are returned unchanged. Otherwise, the fields of place
+        effects are None, and b has the shape (..., 1, bound, robot). The last axis of b has length
+        1 if b is common to all robots.
         """
         if not self.places:
             return self
@@ -114,8 +115,8 @@ class ParameterDraws(Summary):
         b = b + self.of_places(bounds_along(path))[..., None, :, :]
         return self._replace(b=b, place=None, place_bound=None)  # pyright: ignore[reportAttributeAccessIssue]
 
-    def draw(self, index: int) -> Self:
-        """Select one draw, and drop the leading axis."""
+    def draw(self, index: int | np.ndarray) -> Self:
+        """Select draws by index; a single index also drops the leading axis."""
         return self.map(lambda value, n: np.asarray(value)[index] if np.ndim(value) > n else value)
 
     def mean(self) -> Self:
@@ -246,7 +247,7 @@ Params = TrustParams | RobotParams | CoupledParams
 def assemble_params(
     sites: Mapping[str, np.ndarray], x0: Mapping[str, float], memory: str = "level"
 ) -> Params:
-    """Build parameters from sites (draw, ...) by name and from x0_mean and x0_sd.
+    """Build parameters from variables (draw, ...) by name, and from x0_mean and x0_sd.
 
     `memory` is the quantity carried over between bounds; see `PooledTrust`.
     """
@@ -261,7 +262,7 @@ def assemble_params(
 
 
 def check_params(params: Params, n_robots: int | None, n_features: int) -> None:
-    """Check that parameters match `n_features` and, unless it is None, `n_robots`.
+    """Check that the shapes of parameters match `n_features` and, unless None, `n_robots`.
 
     Raises TrustboError if the number of robots or features differs, or a covariance is not
     symmetric and positive definite.

@@ -21,7 +21,7 @@ from trustbo.models.slots import Slots
 SUCCESS, FAILURE = "success", "failure"
 """Prefixes of the names of outcome features."""
 SDS = "tau_start", "tau_level", "tau_gain"
-"""Standard deviations of the personal coefficients."""
+"""Names of the standard deviations of the personal coefficients."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -32,14 +32,14 @@ class HumanTrust(PooledTrust):
 
     base^k = b + weights . features^k + personal level. The personal start enters d^1, and personal
     gains enter d^k. Start, level and gains are independent, with mean 0 and standard deviations
-    tau_start, tau_level and tau_gain. Because a person has only one mission, these coefficients
-    enter the covariance of trust instead of the columns. Inputs are outcomes: features whose names
+    tau_start, tau_level and tau_gain. A person has only one mission, so these coefficients are
+    part of the covariance of trust and have no columns. Inputs are outcomes: features whose names
     begin with `success` or `failure`, possibly scaled by task demands. A person is stored as a
     mission, a step as a bound, and a rated task as a robot, as in `trustbo.logs.read_reports`.
 
     Attributes:
-        scale: `"unit"` for numbers in [0, 1], censored at 0 and 1; or `"likert7"` for seven levels,
-            with cut points halfway between levels and logistic noise with sd delta_v.
+        scale: `"unit"` for numbers in [0, 1], censored at 0 and 1; or, for example, `"likert7"` for
+            seven levels, with cut points halfway between levels and logistic noise with sd delta_v.
         tau_start: Scale of the half-normal prior on the standard deviation of personal starts.
         tau_level: Scale of the half-normal prior on the standard deviation of personal levels.
         tau_gain: Scale of the half-normal prior on the standard deviation of personal gains.
@@ -56,7 +56,7 @@ class HumanTrust(PooledTrust):
 
     def __post_init__(self) -> None:
         levels_of(self.scale)
-        object.__setattr__(self, "observation", "censored")  # on the unit scale; see `family`
+        object.__setattr__(self, "observation", "censored")  # only on the unit scale; see `family`
         if self.priors is None:
             object.__setattr__(self, "priors", _default_priors())
         super().__post_init__()
@@ -85,9 +85,9 @@ class HumanTrust(PooledTrust):
         bad = ~np.isnan(slots.y) & ~np.isclose(slots.n_ticks, wanted, equal_nan=True)
         if bad.any():
             raise TrustboError(
-                f"HumanTrust(scale={self.scale!r}) needs reports with n_ticks = {wanted:g} (levels "
-                f"minus 1), but some have n_ticks = {slots.n_ticks[bad][0]:g}. Give the same scale "
-                "to read_reports and HumanTrust."
+                f"HumanTrust(scale={self.scale!r}) needs reports with n_ticks = {wanted:g} (number "
+                "of levels minus 1, or nan on the unit scale); got n_ticks = "
+                f"{slots.n_ticks[bad][0]:g}. Give the same scale to read_reports and HumanTrust."
             )
         return slots
 
@@ -98,7 +98,7 @@ class HumanTrust(PooledTrust):
         return Layout(slots.y.shape, joint=True, split=split, apart=True)
 
     def signal(self, theta: Theta, slots: Slots, layout: Layout) -> Signal:
-        """Compute trust, with the inputs that decay with beta0 before the other inputs."""
+        """Compute trust at all bounds; the inputs that decay with beta0 precede the others."""
         xp: Any = namespace(theta["beta0"])
         lasting = self._lasting(theta, slots)
         parts = self.parts(theta, slots)
@@ -110,7 +110,7 @@ class HumanTrust(PooledTrust):
         return Signal(m, T, S, theta["delta_v"][:, None, None])
 
     def _lasting(self, theta: Theta, slots: Slots) -> Any:
-        """Compute the fraction (point, row, row) of an input at one row that is left at another."""
+        """Compute the fraction (point, row, row) of each row's input that is left at later rows."""
         xp: Any = namespace(theta["beta0"])
         return xp.kron(powers(theta["beta0"], slots.n_bounds), np.eye(slots.n_robots))
 
@@ -146,7 +146,7 @@ class HumanTrust(PooledTrust):
 def _default_priors() -> Priors:
     """Make default priors with long memory and gains of a few tenths.
 
-    Trust changes mainly with outcomes, and `tau_start` replaces the prior on x_0.
+    Trust changes mainly with outcomes. `tau_start` replaces the prior on x_0.
     """
     with own_settings():
         return Priors(

@@ -58,7 +58,7 @@ class PooledTrust(TrustModel):
         return {**values, "rest": rest}
 
     def layout(self, slots: Slots, *, contrasts: bool = True) -> Layout:
-        """Make one block per robot or, with shared noise, per contrast of robots or per mission.
+        """Make one block per robot; with shared noise, one per contrast of robots or per mission.
 
         Helmert contrasts of the robots' rates are independent if all robots are measured.
         """
@@ -80,7 +80,7 @@ class PooledTrust(TrustModel):
         S = delta_w**2 * (T @ xp.swapaxes(T, 1, 2))
         S = S + self.x0["x0_sd"] ** 2 * start[:, :, None] * start[:, None, :]
         m = self.x0["x0_mean"] * start
-        if self.memory == "deviation":  # x - u is carried over, with mean 0 at first
+        if self.memory == "deviation":  # x - u is carried over, and has mean 0 at first
             m, T = 0.0 * m, xp.broadcast_to(xp.eye(K), T.shape)
         m, T, S = m[:, None], T[:, None], S[:, None]
         sd = theta["delta_v"][:, None, None]
@@ -92,7 +92,7 @@ class PooledTrust(TrustModel):
             return Signal(m, T, S, sd, xp.kron(noise, np.ones((n, n))))
         if n == 1:
             return Signal(m, T, S, sd, noise)
-        first = np.array([1.0, 0.0])[:, None]  # only the robots' mean has m and shared noise
+        first = np.array([1.0, 0.0])[:, None]  # only the mean of robots has m and noise
         return Signal(np.sqrt(n) * first * m, T, S, sd, n * first[..., None] * noise)
 
     def rates(self, theta: Theta, drift: Any) -> ContactRate | None:

@@ -27,9 +27,9 @@ def _built(kind: Any, *parameters: float) -> Distribution:
 class Priors(Summary):
     """Priors on the parameters, as scalar NumPyro distributions, and on initial trust.
 
-    The default x_0 ~ N(0.5, 0.5^2) is not specified in the paper. Models ignore the priors on
-    parameters that they do not have. Weights need Normal priors because they are integrated out;
-    beta0 and noise scales need priors with quantiles (icdf).
+    The paper does not specify the prior on initial trust; the default is x_0 ~ N(0.5, 0.5^2).
+    Models ignore the priors on parameters that they do not have. Weights are integrated out and
+    need Normal priors; beta0 and noise scales need priors with quantiles (icdf).
 
     Attributes:
         beta0: Autoregression coefficient, or the diagonal of B0 in the coupled model.
@@ -45,8 +45,8 @@ class Priors(Summary):
         concentration: Concentration of the LKJ prior on noise correlations in the coupled model.
         x0_mean: Mean of trust before the first bound.
         x0_sd: Standard deviation of trust before the first bound; 0 fixes trust at `x0_mean`.
-        stationary: Whether `beta` and `b` are priors on beta / (1 - beta0) and b / (1 - beta0), the
-            coefficients of stationary trust, which is the limit of trust under constant features.
+        stationary: Whether `beta` and `b` are priors on beta / (1 - beta0) and b / (1 - beta0).
+            These are the coefficients of stationary trust, the limit under constant features.
 
     Raises:
         TrustboError: If a prior has the wrong shape or support, the prior on a weight is not
@@ -93,11 +93,12 @@ class Priors(Summary):
     def of(cls, features: Sequence[str], observation: str = "gaussian") -> "Priors":
         """Return the default priors for features with the given names.
 
-        The feature `line_of_sight` predicts the contact rate, so stationary trust has prior slope 1
-        in this feature or in the mean of n such features (`line_of_sight_1`, ...). With beta_los /
-        (1 - beta0) ~ N(1 / n, 0.3^2 / n), other weights ~ N(0, 0.25^2), and b / (1 - beta0) ~ N(0,
-        0.15^2), most rates drawn from the prior are in [0, 1]. For tick counts, the priors are
-        scaled by 5 and centred on a rate of 0.5. Without such a feature, `default` is returned.
+        The feature `line_of_sight` predicts the contact rate. Stationary trust therefore has prior
+        slope 1 in this feature, or in the mean of n such features (`line_of_sight_1`, ...). Their
+        weights, divided by 1 - beta0, have the prior N(1 / n, 0.3^2 / n), other weights N(0,
+        0.25^2), and the intercept N(0, 0.15^2). Most rates drawn from these priors are in [0, 1].
+        For tick counts, the priors are scaled by 5, and line of sight 0.5 predicts the rate 0.5.
+        Without line of sight, the result is `default`.
         """
         is_sight = np.array([is_line_of_sight(name) for name in features])
         default, n = cls.default(observation), max(int(is_sight.sum()), 1)
@@ -119,11 +120,9 @@ class Priors(Summary):
         return np.asarray(prior.loc, dtype=float), np.asarray(prior.scale, dtype=float)
 
     def coefficients(self, n_features: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the means and sds (feature + 1,) of the weights, followed by the intercept."""
-        mean, sd = (
-            np.append(np.broadcast_to(of_beta, n_features), of_b)
-            for of_beta, of_b in zip(self.moments("beta"), self.moments("b"), strict=True)
-        )
+        """Return the prior means and sds (feature + 1,) of the weights and, last, the intercept."""
+        pairs = zip(self.moments("beta"), self.moments("b"), strict=True)
+        mean, sd = (np.append(np.broadcast_to(beta, n_features), b) for beta, b in pairs)
         return mean, sd
 
     def log_density(self, name: str, values: np.ndarray, rest: np.ndarray) -> np.ndarray:
@@ -132,8 +131,8 @@ class Priors(Summary):
         Args:
             name: Name of a field.
             values: Parameter values with shape (...), or (..., feature) for `beta`.
-            rest: Drift that raises stationary trust by 1, with a shape that broadcasts to the
-                values; used only if `stationary` is true.
+            rest: Drift that raises stationary trust by 1, with a shape that broadcasts to that of
+                the values; used only if `stationary` is true.
         """
         prior = getattr(self, name)
         if not self.stationary or name not in ("beta", "b"):
@@ -150,12 +149,12 @@ def _wanted(name: str, prior: Any) -> str:
     if not isinstance(prior, Distribution) or len(prior.shape()) > (name == "beta"):
         return "a scalar NumPyro distribution, e.g. Normal(0.0, 1.0)"
     if name in ("beta", "b", "coupling"):
-        wanted, good = "Normal because it is integrated out", isinstance(prior, dist.Normal)
-        wanted += " (for other priors, write a NumPyro model with models.ContactRate)"
+        wanted, good = "Normal, because the model integrates", isinstance(prior, dist.Normal)
+        wanted += f" {name} out (for other priors, write a NumPyro model with models.ContactRate)"
     elif name == "beta0":
         wanted, good = "on (0, 1), e.g. Beta(2.0, 2.0)", prior.support is constraints.unit_interval
     else:
-        wanted = "positive, e.g. HalfNormal(0.2), for a standard deviation"
+        wanted = "on positive numbers, e.g. HalfNormal(0.2)"
         good = np.all(np.asarray(getattr(prior.support, "lower_bound", -np.inf)) >= 0.0)
     return "" if good else wanted
 
@@ -171,5 +170,6 @@ def _as_text(prior: Distribution | float) -> str:
 
 
 def _numbers(values: object) -> str:
+    """Format a number or a vector as text."""
     array = np.asarray(values, dtype=float)
     return f"{array:g}" if not array.ndim else f"[{', '.join(f'{v:g}' for v in array)}]"

@@ -12,9 +12,9 @@ from trustbo.models.priors import Priors
 
 
 def model_to_record(model: TrustModel) -> dict[str, Any]:
-    """Record a model's class, options and effects, and the priors as text.
+    """Convert the class, options and effects of a model, and its priors as text, to a dict.
 
-    `by_feature` is true if the priors depend on the feature names.
+    The entry `by_feature` is true if the priors depend on the feature names.
     """
     effects: Any = model.effects
     record = {
@@ -38,7 +38,7 @@ def model_from_record(
     if given is not None:
         if model_to_record(given) != record:
             raise TrustboError(
-                f"the model must match the record {record}; got {model_to_record(given)}."
+                f"the given model must match the record {record}; got {model_to_record(given)}."
             )
         return given
     default = with_default_priors(record)

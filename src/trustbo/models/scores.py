@@ -2,7 +2,7 @@
 
 A score is standard normal a priori, except for the two noises. The noises have half-normal scores
 (a_w, a_v) = size (sin(angle), cos(angle)), and the coordinates are log size and a normal score of
-the angle. The rates determine the size, but may not determine the angle.
+the angle. The data usually determine the size well, but often not the angle.
 """
 
 from collections.abc import Mapping
@@ -21,31 +21,31 @@ from trustbo.models.backend import call, namespace, own_settings, special_functi
 
 NOISES = "delta_w", "delta_v"
 _LOG_ROOT_2PI = 0.5 * np.log(2.0 * np.pi)
-_FARTHEST, _N_KNOTS = 9.0, 2001  # knots of the quantiles in JAX
+_FARTHEST, _N_KNOTS = 9.0, 2001  # largest score and number of knots of quantiles in JAX
 
 
 class Scores:
     """Conversion between scores (point, score) and hyperparameters with independent priors."""
 
     def __init__(self, priors: Mapping[str, Distribution]) -> None:
-        """Set the scalar or vector priors on the hyperparameters, in the order of the scores."""
+        """Set the scalar or vector priors by name; scores have the same order as the priors."""
         self.priors = dict(priors)
         sizes = {name: int(np.prod(prior.batch_shape)) for name, prior in priors.items()}
         ends = np.cumsum([0, *sizes.values()])
         self.at = {n: slice(a, b) for n, a, b in zip(sizes, ends[:-1], ends[1:], strict=True)}
         self.n_scores = int(ends[-1])
         for name, prior in self.priors.items():
-            quantile(prior, np.zeros(sizes[name]), name)  # fails if there are no quantiles
+            quantile(prior, np.zeros(sizes[name]), name)  # raises if there are no quantiles
 
     @property
     def core(self) -> np.ndarray:
-        """Indices of the scores of beta0 and the noises, which the rates determine."""
+        """Indices of the scores of beta0 and the noises, which the data determine best."""
         names = ("beta0", *NOISES)
         return np.concatenate([np.arange(self.n_scores)[self.at[n]] for n in names if n in self.at])
 
     @property
     def sizes(self) -> slice:
-        """Slice of the scores that contain the log size of the noises."""
+        """Slice of the scores that are the log sizes of the noises."""
         return self.at[NOISES[0]]
 
     def values(self, z: Any) -> dict[str, Any]:
@@ -152,9 +152,10 @@ def _base(prior: Any) -> Any:
 
 
 def _by_numpyro(prior: Distribution, p: np.ndarray, name: str) -> np.ndarray:
+    """Compute quantiles with NumPyro; raises TrustboError if the prior on `name` has none."""
     try:
         with own_settings():
-            share = jax.numpy.asarray(np.clip(p, 1e-300, 1.0 - 1e-16))
+            share = jnp.asarray(np.clip(p, 1e-300, 1.0 - 1e-16))
             return np.asarray(call(prior, "icdf", share), dtype=float)
     except (NotImplementedError, ImportError):  # some quantiles need another package
         raise TrustboError(

@@ -12,20 +12,20 @@ class Layout(NamedTuple):
     """Layout of slots in blocks and rows.
 
     A block is a robot in a mission, with one row per bound. If `joint`, a block is a mission, with
-    rows (bound, robot). With a rotation, a block is an orthonormal combination of robots' signals.
+    rows (bound, robot). With a `rotation`, blocks are orthonormal combinations of robots' signals.
     """
 
     shape: Any  # numbers of missions, bounds and robots
     joint: bool = False
     rotation: np.ndarray | None = None  # (combination, robot)
     split: np.ndarray | None = None
-    """Mask of columns whose inputs are separate and precede the inputs of other columns."""
+    """Mask of columns with separate inputs, which precede the inputs of other columns."""
     apart: bool = False
     """Whether all blocks have different signal matrices."""
 
     @property
     def label(self) -> np.ndarray:
-        """Label of each block; with a rotation, the first combination has a separate label."""
+        """Label (block,) of each block; blocks with equal labels have equal signal matrices."""
         n_missions, _, n_robots = self.shape
         if self.joint:
             return np.arange(n_missions) * int(self.apart)
@@ -68,8 +68,8 @@ class Layout(NamedTuple):
 class Signal(NamedTuple):
     """Trust x = m + T u + e of each block at each point, with e ~ N(0, S) and inputs u = U c.
 
-    Each row of a block is an observation. The second axis is the label (see
-    `inference.engine.Blocks`); the axis has length 1 if all blocks have equal matrices.
+    Each row of a block is an observation. The second axis is the label of a block (see `Layout`),
+    and has length 1 if all blocks have equal matrices.
     """
 
     m: Any  # (point, label, row)
@@ -85,7 +85,7 @@ class Signal(NamedTuple):
 
 
 def each(M: Any, label: np.ndarray) -> Any:
-    """Select values (point, block, ...) by block label, or one block if all blocks are equal."""
+    """Select values (point, block, ...) by block label; keep length 1 if all blocks are equal."""
     return M if M.shape[1] == 1 else M[:, label]
 
 

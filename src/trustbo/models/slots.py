@@ -11,15 +11,15 @@ from trustbo.models.families import Family
 from trustbo.models.visited import Visited
 
 NO_TICKS = (
-    "The beta-binomial family counts ticks. Give the tick count n_ticks of each bound in "
-    'Mission.from_arrays(..., n_ticks=...), or use observation="censored".'
+    "The beta-binomial family counts ticks. Give the tick count of each bound as n_ticks, for "
+    'example in Mission.from_arrays, or use observation="censored".'
 )
 UNKNOWN_RESOLUTION, COARSEST_RESOLUTION = 0.005, 0.1
-"""Resolution of a rate whose tick count is unknown, and the coarsest resolution."""
+"""Resolution assumed for rates with an unknown tick count, and limit on `Slots.resolution`."""
 
 
 class Slots(NamedTuple):
-    """Rates and features of missions, padded to the number of bounds in the longest mission."""
+    """Rates and features of missions, padded to the number of bounds of the longest mission."""
 
     y: np.ndarray  # (mission, bound, robot), NaN where not measured
     z: np.ndarray  # (mission, bound, robot, feature), 0 in the padding
@@ -50,7 +50,7 @@ class Slots(NamedTuple):
 
     @property
     def resolution(self) -> float:
-        """Median of 1 / n_ticks over the measured rates, at most `COARSEST_RESOLUTION`."""
+        """Median resolution 1 / n_ticks of the measured rates, at most `COARSEST_RESOLUTION`."""
         ticks = np.nan_to_num(self.n_ticks[~np.isnan(self.y)])
         if not len(ticks):
             return UNKNOWN_RESOLUTION
@@ -71,5 +71,5 @@ def require_ticks(family: Family, y: np.ndarray, n_ticks: np.ndarray) -> None:
     if family.needs_ticks and without.any():
         j, k, i = np.argwhere(without)[0]
         raise TrustboError(
-            f"robot {i} has a rate but no n_ticks in bound {k + 1} of mission {j}. {NO_TICKS}"
+            f"robot {i} has a rate but no n_ticks at bound {k + 1} of mission {j}. {NO_TICKS}"
         )

@@ -9,11 +9,11 @@ from trustbo.data import Mission, require_map
 from trustbo.errors import TrustboError
 from trustbo.workspace.moves import bounds_along
 
-_MOST = 4000  # visited bounds; the cost grows with the cube of this number
+_MOST = 4000  # maximum number of visited bounds; the cost grows with the cube of the number
 
 
 class Visited(NamedTuple):
-    """Cells entered and directed bounds made by missions, sorted and without duplicates."""
+    """Cells entered and directed bounds driven in missions, sorted and without duplicates."""
 
     shape: tuple[int, int]  # rows and columns of the grid
     cells: np.ndarray  # (cell, 2): row, col
@@ -25,8 +25,8 @@ class Visited(NamedTuple):
 def bounds_of(missions: Sequence[Mission], shape: tuple[int, int] | None = None) -> np.ndarray:
     """Return an array (mission, bound, 3) of moves, rows and columns, with -1 in the padding.
 
-    `shape` contains the numbers of missions and bounds, by default those in `missions`. Raises
-    TrustboError if a path jumps or a mission has no map.
+    `shape` contains the numbers of missions and bounds, by default those of `missions`. Raises
+    TrustboError if a path skips cells or a mission has no map.
     """
     require_map("a model with place effects", missions)
     if shape is None:
@@ -57,7 +57,7 @@ def visited(bounds: np.ndarray, shape: tuple[int, int] | None = None) -> Visited
     """Index the places of bounds (mission, bound, 3); see `bounds_of`.
 
     `shape` is the shape of the grid, by default ending at the last row and column visited. Raises
-    TrustboError if a cell is outside the grid, or there are too many bounds for a dense factor.
+    TrustboError if a cell is outside the grid, or if the missions visited more than 4000 bounds.
     """
     there = bounds[..., 0] >= 0
     found, index_of = np.unique(bounds[there], axis=0, return_inverse=True)

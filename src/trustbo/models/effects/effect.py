@@ -1,4 +1,4 @@
-"""The protocol of effects, which add columns with Gaussian coefficients to the drift of trust.
+"""Base class of effects, which add columns with Gaussian coefficients to the drift of trust.
 
 The drift of all slots is u = U c, where the coefficients c are Gaussian given the hyperparameters
 theta. To add an effect, write a frozen dataclass with the methods of `Effect`. Inference and
@@ -49,11 +49,11 @@ class Effect:
     names: ClassVar[tuple[str, ...]] = ()
     """Names of the hyperparameters."""
     noun: ClassVar[str] = ""
-    """Plural noun for the effect, which is also the name of its group in a posterior."""
+    """Plural noun for what has the effect; also the name of the group in a posterior."""
     variables: ClassVar[Mapping[str, tuple[str, ...]]] = {}
-    """Axes of each variable of the effect, after (chain, draw)."""
+    """Axes of each variable of the effect by name, after (chain, draw)."""
     coords: ClassVar[Mapping[str, Sequence[Any]]] = {}
-    """Labels of axes other than mission, bound, robot and feature."""
+    """Labels along the axes of the variables other than mission, bound, robot and feature."""
 
     def __init_subclass__(cls) -> None:
         if cls.noun:
@@ -72,8 +72,8 @@ class Effect:
         """Return the prior on the coefficients at each theta, in NumPy or JAX.
 
         Returns:
-            The mean (point, column), or None if it is 0, and the precisions of consecutive groups
-            of columns, each (point, k, k), or (point, k) if independent.
+            The mean (point, column), or None if it is 0, and a list of precisions for consecutive
+            groups of columns. Each has shape (point, k, k), or (point, k) for independent columns.
         """
         raise NotImplementedError
 
@@ -86,9 +86,9 @@ class Effect:
         raise NotImplementedError
 
     def ahead(self, values: Values, theta: Theta, n: int, rng: Generator | None) -> np.ndarray:
-        """Return the slope (draw, robot) of drift in line of sight after n missions, 0 by default.
+        """Return the effect (draw, robot) on drift per unit of line of sight after n missions.
 
-        With `rng`, mission-specific effects are drawn; otherwise, expected effects are used.
+        The effect is drawn if `rng` is given, otherwise expected. By default, the effect is 0.
         """
         return np.zeros((len(theta["rest"]), 1))
 

@@ -18,7 +18,7 @@ from trustbo.models.visited import bounds_of, visited
 from trustbo.workspace import Workspace
 
 _JITTER = 1e-8  # added to the correlation matrix of cells
-_LENGTH_SCALES = 1e-6, 1e6  # in cells; beyond these, cells are independent or equal
+_LENGTH_SCALES = 1e-6, 1e6  # limits in cells, at which cells are independent or equal
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class PlaceEffect(Effect):
     length_scale_sd: float = 0.5
     names = ("tau_s", "length_scale", "tau_e")
     noun = "places"
-    variables: ClassVar = {"place": (), "place_bound": ()}  # laid out by `place_maps.place_group`
+    variables: ClassVar = {"place": (), "place_bound": ()}  # axes are in `place_maps.place_group`
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -92,7 +92,7 @@ class PlaceEffect(Effect):
         return inverse(tau**2 * (K + _JITTER * np.eye(len(cells))))
 
     def named(self, c: np.ndarray, theta: Theta, slots: Slots) -> Values:
-        """Return cell effects place (draw, cell) and bound effects place_bound (draw, bound)."""
+        """Return the effects `place` (draw, cell) and `place_bound` (draw, bound)."""
         places: Any = slots.visited
         n = len(places.cells)
         return {"place": c[:, :n], "place_bound": c[:, n:]}

@@ -1,6 +1,6 @@
 """Effect of a robot in a mission, with a persistent part and a mission-specific part.
 
-For example, a damaged detector has a lasting effect, but rain does not. The stationary trust of
+For example, damage to a detector has a lasting effect, but rain does not. The stationary trust of
 robot i in mission m has the additional term l d[i, m], where l is the predicted line of sight. The
 effect d is independent between robots and has the following covariance over missions:
 
@@ -58,7 +58,7 @@ class RobotEffect(Effect):
         )
 
     def prior(self, theta: Theta, slots: Slots) -> tuple[Any, list[Any]]:
-        """Return independent priors for the robots, in one shared array if `rest` is common."""
+        """Return independent priors for the robots, as one array if `rest` is the same for all."""
         rest = theta["rest"]
         Q = namespace(rest).linalg.inv(self._covariance(theta, slots.n_missions))
         if rest.ndim == 1:
@@ -76,7 +76,7 @@ class RobotEffect(Effect):
         return d.reshape(len(d), -1)
 
     def ahead(self, values: Values, theta: Theta, n: int, rng: Generator | None) -> np.ndarray:
-        """See `Effect.ahead`; the next d is normal given d in all n missions."""
+        """See `Effect.ahead`; the next effect d is drawn given d in all n missions."""
         C, slow = self._covariance(theta, n), np.maximum(theta["tau_slow"], LEAST) ** 2
         k = slow[:, None] * self.rho ** np.arange(n, 0, -1)
         gain = np.linalg.solve(C, k[..., None])[..., 0]

@@ -45,7 +45,7 @@ class Weights(Effect):
 
 @dataclass(frozen=True)
 class RobotWeights(Weights):
-    """Separate coefficients N(mu, tau^2) for each robot; mu has a prior, and tau is in theta."""
+    """Separate coefficients N(mu, tau^2) for each robot; the hyperparameter tau is in theta."""
 
     def columns(self, slots: Slots) -> Any:
         """Return the features and a constant 1 for each robot; the robot varies fastest."""
@@ -57,9 +57,9 @@ class RobotWeights(Weights):
         """Return a prior that correlates the robots' coefficients through a common mean."""
         n, (mean, sd) = slots.n_robots, self.moments(theta, slots)
         tau = namespace(mean).maximum(_spreads(theta), LEAST)
-        alike = sd**2 / (tau**2 + n * sd**2)  # (sd^2 11' + tau^2 1)^-1 in closed form
+        share = sd**2 / (tau**2 + n * sd**2)  # (sd^2 11' + tau^2 I)^-1 in closed form
         parts = [
-            (np.eye(n) - alike[:, m, None, None]) / tau[:, m, None, None] ** 2
+            (np.eye(n) - share[:, m, None, None]) / tau[:, m, None, None] ** 2
             for m in range(mean.shape[1])
         ]
         return namespace(mean).repeat(mean, n, axis=1), parts
@@ -127,5 +127,6 @@ def _inputs(slots: Slots) -> np.ndarray:
 
 
 def _spreads(theta: Theta) -> Any:
+    """Return the standard deviations tau (point, column) of the weights and the intercept."""
     xp: Any = namespace(theta["tau_b"])
     return xp.concatenate([theta["tau_beta"], theta["tau_b"][:, None]], axis=1)

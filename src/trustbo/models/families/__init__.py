@@ -1,8 +1,4 @@
-"""Observation families, which are distributions of a contact rate given trust.
-
-To add a family, start from `censored` (moments in closed form) or `beta_binomial` (moments by
-Gauss-Hermite quadrature), and add it to `FAMILIES`.
-"""
+"""Observation families, which are distributions of a contact rate given trust."""
 
 from trustbo.models.families.beta_binomial import BetaBinomial
 from trustbo.models.families.censored import Censored
@@ -13,6 +9,5 @@ from trustbo.models.families.levels import Levels
 FAMILIES: dict[str, Family] = {
     family.name: family for family in (Gaussian(), Censored(), BetaBinomial())
 }
-
 
 __all__ = ["FAMILIES", "Family", "Levels"]

@@ -15,7 +15,7 @@ from trustbo.models.backend import namespace, own_settings, special_functions
 from trustbo.models.families.family import Array, Drawn, Family, Moments
 from trustbo.models.families.moments import draw_between_knots, log_normal, match_by_nodes
 
-_KNOTS = np.linspace(-5.0, 5.0, 21)  # of the density to draw from, in sds from the mean
+_KNOTS = np.linspace(-5.0, 5.0, 21)  # knots of the proposal, in sds from the mean
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class BetaBinomial(Family):
     needs_ticks: ClassVar[bool] = True
     adds_noise: ClassVar[bool] = False
     expected_rate: ClassVar[str] = "logistic"
-    line_of_sight: ClassVar[tuple[float, float]] = 5.0, 0.5  # rate 0.5 at 0.5, 0.92 at 1
+    line_of_sight: ClassVar[tuple[float, float]] = 5.0, 0.5  # rate 0.5 at sight 0.5, 0.92 at 1
 
     def priors(self) -> dict[str, Any]:
         """See `Family.priors`; wider than the defaults because trust is a logit."""

@@ -1,7 +1,7 @@
-"""The protocol of observation families: rates given signals, and signals given rates.
+"""Base class of observation families: rates given signals, and signals given rates.
 
-A signal f is trust plus noise shared between rates. To add a family, write a subclass of `Family`,
-with functions from `moments` where they apply, and add it to `families.FAMILIES`.
+A signal f is trust plus noise shared between rates. To add a family, start from `censored` (moments
+in closed form) or `beta_binomial` (moments by quadrature), and add it to `families.FAMILIES`.
 """
 
 from abc import ABC, abstractmethod
@@ -23,8 +23,8 @@ Drawn = tuple[Array, Array]
 class Family(ABC):
     """Base class of observation families.
 
-    All methods take arrays that broadcast: rates y, tick counts N, and the noise sd (delta_v).
-    `_match` and `_draw` receive only measured rates, in arrays of equal shape.
+    All methods take arrays that broadcast: rates y, tick counts N, and the noise sd (delta_v). In
+    `_match` and `_draw`, no rate is NaN and all arrays have the same shape.
     """
 
     name: ClassVar[str]
@@ -66,7 +66,7 @@ class Family(ABC):
         return trust
 
     def is_density(self, y: Array) -> Array:
-        """Return a mask of the rates with a density, which are the signal plus normal noise."""
+        """Return a mask of the rates that are the signal plus normal noise and have a density."""
         return np.zeros(y.shape, dtype=bool)
 
     def priors(self) -> dict[str, Any]:
@@ -74,7 +74,7 @@ class Family(ABC):
         return {}
 
     def match(self, y: Array, N: Array, m: Array, v: Array, sd: Array) -> Moments:
-        """Compute moments of N(f; m, v) times the likelihood of y, or 0, m and v where y is NaN."""
+        """Compute the moments of `_match`; where y is NaN, they are 0, m and v."""
         seen, arrays = _measured(y, N, m, v, sd)
         one, mean, var = self._match(*arrays)
         return np.where(seen, one, 0.0), np.where(seen, mean, m), np.where(seen, var, v)

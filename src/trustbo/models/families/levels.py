@@ -19,7 +19,7 @@ tails allow for mistaken reports (Monahan and Stefanski 1992)."""
 
 @dataclass(frozen=True)
 class Levels(Family):
-    """Reports of level j out of n as rates j / (n - 1), with cut points halfway between levels."""
+    """Reports of level j = 0, ..., n - 1 as rates j / (n - 1), with cut points halfway between."""
 
     levels: int = 7
     name: ClassVar[str] = "levels"

@@ -21,7 +21,7 @@ def log_normal(e: Array, variance: Array) -> Array:
 
 
 def match_interval(low: ndarray, high: ndarray, m: ndarray, v: ndarray, noise: ndarray) -> Moments:
-    """Compute moments of N(f; m, v) given that f plus normal noise lies between two numbers."""
+    """Compute moments of N(f; m, v) given that f plus normal noise lies between low and high."""
     total = v + noise**2
     sd = np.sqrt(total)
     log_p, e, spread = truncated(*((end - m) / sd for end in (low, high)))
@@ -57,7 +57,7 @@ def draw_between(a: ndarray, b: ndarray, rng: Generator) -> ndarray:
 
 
 def draw_between_knots(knots: ndarray, log_f: ndarray, rng: Generator) -> Drawn:
-    """Draw from a density that is log-linear between knots (..., knot); also return its log."""
+    """Draw from a density whose log is linear between knots (..., knot); also return the log."""
     width, rise = np.diff(knots), np.diff(log_f)
     rise = np.where(np.abs(rise) < 1e-9, 1e-9, rise)
     log_mass = log_f[..., :-1] + np.log(width) + np.log(np.expm1(rise) / rise)
