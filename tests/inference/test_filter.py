@@ -89,7 +89,7 @@ def test_bad_input_is_named():
         TrustboError, match=r"awareness must be \(3 robots, 2 features\); got shape"
     ):
         live.update(good[:2], [0.5, 0.5, 0.5])
-    with pytest.raises(TrustboError, match=r"contact_rate must be \(3,\); got shape \(2,\)"):
+    with pytest.raises(TrustboError, match=r"contact_rate must have shape \(3,\)"):
         live.update(good, [0.5, 0.5])
     with pytest.raises(TrustboError, match=r"contact_rate: \[2\] = 1.5 is outside \[0, 1\]"):
         live.update(good, [0.5, 0.5, 1.5])
@@ -132,11 +132,11 @@ def test_bounds_that_cannot_be_are_named():
         ((0.0, 0.5), (1, 0)): r"a cell must be two whole numbers \(row, col\); got \(0.0, 0.5\)",
         ((0, 0), (2, 0)): "no bound leads from",
         (2, 0): r"two whole numbers \(row, col\); got 2",
-        ((0, 0),): "need 2 cells",
+        ((0, 0),): "must have 2 cells",
     }.items():
         with pytest.raises(TrustboError, match=message):
             live.update(z, y, bound)
-    with pytest.raises(TrustboError, match="need 3 cells"):
+    with pytest.raises(TrustboError, match="must have 3 cells"):
         live.predict([z, z], [(0, 0), (0, 1)])
     assert live.n_bounds == 0
     np.testing.assert_array_equal(live.predict([z], np.array([(4, 4), (4, 5)])).mean.shape, (1, 3))

@@ -1,4 +1,4 @@
-"""Diagnostics of a posterior, and the limits beyond which `fit` raises an error."""
+"""Diagnostics of a sampler, and the limits beyond which `fit` raises an error."""
 
 from collections.abc import Mapping
 
@@ -15,7 +15,7 @@ NUTS_NAMES = "r_hat", "ess_bulk", "divergences"
 
 
 def diagnostics(posterior: xr.DataTree) -> dict[str, float]:
-    """Return the diagnostics of the sampler.
+    """Return the diagnostics of the sampler that drew a posterior.
 
     Returns:
         For importance sampling, `k_hat`, which is good below 0.5, and `kish`, the effective number
@@ -33,7 +33,7 @@ def diagnostics(posterior: xr.DataTree) -> dict[str, float]:
 def complaints_of(
     draws: Mapping[str, np.ndarray], diverging: np.ndarray
 ) -> tuple[dict[str, float], list[str]]:
-    """Return the NUTS diagnostics of draws (chain, draw, ...), and a list of failed checks."""
+    """Compute the NUTS diagnostics of draws (chain, draw, ...), and list the failed checks."""
     flat = {name: values.reshape(*values.shape[:2], -1) for name, values in draws.items()}
     # Parameters that are constant in the model have no diagnostics.
     free = {name: v[:, :, np.ptp(v, axis=(0, 1)) > 0.0] for name, v in flat.items()}

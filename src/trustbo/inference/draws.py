@@ -21,18 +21,16 @@ from trustbo.models.slots import Slots
 from trustbo.stacking import require_same_team
 from trustbo.workspace import Workspace
 
-_DAYS = 20261123  # seed of the next mission's effects, for reproducible bands
+_DAY_SEED = 20261123  # seed of the next mission's robot effects, so that bands are reproducible
 _N_MEAN = 4096  # draws averaged to compute a prior mean
-_ATTRIBUTES = "observation", "x0_mean", "x0_sd", "model_record"
+_ATTRIBUTES = "observation", "x0_mean", "x0_sd", "model_record"  # required in a posterior
 
 
 def require_posterior(who: str, value: object) -> xr.DataTree:
     """Return `value` if it is a posterior from `fit`, otherwise raise TrustboError naming `who`."""
     if not isinstance(value, xr.DataTree):
         remedy = " Give the attribute .posterior." if hasattr(value, "posterior") else ""
-        raise TrustboError(
-            f"{who} needs a posterior from fit; got a {type(value).__name__}.{remedy}"
-        )
+        raise TrustboError(f"{who} needs a posterior from fit; got {type(value).__name__}.{remedy}")
     missing = [] if "posterior" in value.children else ["posterior"]
     missing += [name for name in _ATTRIBUTES if name not in value.attrs]
     if missing:
@@ -44,10 +42,10 @@ def require_posterior(who: str, value: object) -> xr.DataTree:
 
 
 def sites_of(posterior: xr.DataTree) -> dict[str, np.ndarray]:
-    """Return all draws of a posterior by name, with chains joined in a leading axis (draw,).
+    """Return the parameter draws of a posterior by name, with chains joined in an axis (draw,).
 
     Raises:
-        TrustboError: If some draws are NaN, for example after masking.
+        TrustboError: If a draw is NaN, for example after masking with xarray.
     """
     draws = posterior["posterior"].to_dataset()
     sites = {str(name): joined_draws(array) for name, array in draws.items()}
@@ -79,9 +77,8 @@ def params_of(
     Args:
         posterior: DataTree from `fit`.
         workspace: Workspace for planning; features and robots are reordered to match the workspace.
-        day: Whether to draw the mission-specific effects of the next mission, for bands and
-            predicted rates. By default, expected effects are used, as needed for planning. Place
-            effects do not depend on this option.
+        day: Whether to draw the mission-specific robot effects of the next mission, for credible
+            bands and predicted rates. By default, expected effects are used, as planning needs.
 
     Returns:
         `TrustParams`, `RobotParams` or `CoupledParams`, depending on the model. A pooled model with
@@ -108,7 +105,7 @@ def params_of(
             "posterior from trustbo.fit with unchanged names."
         )
     if effects:
-        theta, rng = theta_of(posterior, sites), np.random.default_rng(_DAYS) if day else None
+        theta, rng = theta_of(posterior, sites), np.random.default_rng(_DAY_SEED) if day else None
         robots = (len(theta["rest"]), attrs["n_robots"])
         n = attrs["n_missions"]
         slopes = [effect.ahead(values_of(posterior, effect), theta, n, rng) for effect in effects]
@@ -145,7 +142,7 @@ def _in_order_of(workspace: Workspace, posterior: xr.DataTree) -> xr.DataTree:
             continue
         have = [str(name) for name in with_axis[axis].values]
         of_all = axis == "robot" and axis not in draws.dims and "robots" not in posterior.children
-        if of_all:  # parameters shared by all robots apply to any team
+        if of_all:  # parameters that all robots share apply to any team
             continue
         if sorted(have) != sorted(names):
             raise TrustboError(

@@ -8,8 +8,8 @@ and a signal f,
 where every observation is a Gaussian site N(y; f, 1 / lam). Sites are exact for Gaussian rates, and
 matched by expectation propagation (`ep`) for other families. With L L' = 1 + lam^1/2 (S + noise)
 lam^1/2 and W = L^-1 lam^1/2, the model is a regression of W (y - m) on W T U with unit noise.
-Products of columns for pairs of inputs, summed over blocks of one kind, do not depend on theta. So
-U' (W T)' (W T) U is one sparse product for all theta, whatever the number of missions.
+Products of columns for pairs of inputs, summed over blocks of one kind, do not depend on theta.
+Therefore, U' (W T)' (W T) U needs one sparse product for all theta and any number of missions.
 
 The same code runs in NumPy without compilation and in JAX with derivatives.
 """
@@ -48,15 +48,9 @@ class Blocks(NamedTuple):
 
     @classmethod
     def of(
-        cls,
-        y: np.ndarray,
-        U: Any,
-        label: np.ndarray,
-        *,
-        order: Order,
-        apart: bool = False,
+        cls, y: np.ndarray, U: Any, label: np.ndarray, *, order: Order, apart: bool = False
     ) -> Self:
-        """Arrange blocks; blocks with equal labels and equal missing rows are of one kind.
+        """Group blocks into kinds; a kind has blocks with equal labels and equal missing rows.
 
         Args:
             y: Observations (block, row), NaN where not measured.
@@ -109,7 +103,7 @@ class Prior(NamedTuple):
             n = sum(part.shape[1] for part in precisions)
             means.append(np.zeros((len(precisions[0]), n)) if mean is None else mean)
             for part in precisions:
-                if id(part) not in known:  # robots often share a part
+                if id(part) not in known:  # robots often share one array
                     xp = namespace(part)
                     one_axis = part.ndim == 2
                     known[id(part)] = xp.log(part).sum(1) if one_axis else log_det(part)
@@ -119,7 +113,7 @@ class Prior(NamedTuple):
         return cls(xp.concatenate(means, axis=1), parts, total)
 
     def add_to(self, A: Any, order: Order) -> Any:
-        """Add the prior precision to the entries (point, entry) of A."""
+        """Add the prior precision to A (point, entry), the stored entries of precision matrices."""
         start = 0
         for part in self.parts:
             i = np.arange(start, start := start + part.shape[1])
@@ -140,7 +134,7 @@ class Prior(NamedTuple):
         return 0.5 * (self.log_det - c.shape[1] * np.log(2.0 * np.pi) - square)
 
     def draw(self, rng: np.random.Generator) -> np.ndarray:
-        """Draw coefficients (point, column), once at each point."""
+        """Draw coefficients (point, column) from the prior, once at each point."""
         drawn = []
         for part in self.parts:
             e = rng.standard_normal(part.shape[:2])
@@ -162,7 +156,7 @@ class Fit(NamedTuple):
 
 
 def evidence(blocks: Blocks, signal: Signal, prior: Prior, lam: Any, y: Any = None) -> Fit:
-    """Compute log p(y | theta) at all points, with signals and coefficients integrated out.
+    """Compute log p(y | theta) at each theta, with signals and coefficients integrated out.
 
     Args:
         blocks: Data of all blocks.
@@ -195,7 +189,7 @@ def whiten(blocks: Blocks, signal: Signal, lam: Any) -> tuple[Any, Any]:
     """Return whitening matrices W (point, kind, row, row) and log densities at zero residual."""
     V = each(signal.covariance, blocks.label)
     xp, some = namespace(V), lam > 0.0
-    d = xp.where(some, xp.where(some, lam, 1.0) ** 0.5, 0.0)  # avoids the infinite slope at 0
+    d = xp.where(some, xp.where(some, lam, 1.0) ** 0.5, 0.0)  # lam**0.5 has no slope at 0
     L = cholesky(np.eye(V.shape[-1]) + d[..., :, None] * V * d[..., None, :])
     log_sites = 0.5 * xp.log(xp.where(some, lam, 2.0 * np.pi) / (2.0 * np.pi)).sum(-1)
     return xp.linalg.inv(L) * d[..., None, :], log_sites - log_diagonal(L)
@@ -211,7 +205,7 @@ def expected(blocks: Blocks, signal: Signal, c: Any) -> Any:
 
 
 def draw_columns(prior: Prior, fit: Fit, count: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Draw coefficients (sum of count, column), `count` times at each point."""
+    """Draw coefficients (draw, column) from the posterior, `count` times at each point."""
     drawn = []
     for i, many in enumerate(count):
         one = Factor(fit.F.order, *(part[i : i + 1] for part in fit.F[1:]))
@@ -236,9 +230,8 @@ def marginals(
     mean = at + np.einsum("nbij,nbj->nbi", gain, y - at)
     k, j = np.triu_indices(T.shape[3])
     M = np.zeros((n, len(blocks.y), T.shape[3], T.shape[3]))  # U cov U' for each block
-    M[..., k, j] = times(blocks.sums.T, fit.F.covariance()[:, blocks.at]).reshape(
-        n, len(blocks.y), -1
-    )
+    pairs = times(blocks.sums.T, fit.F.covariance()[:, blocks.at])
+    M[..., k, j] = pairs.reshape(n, len(blocks.y), -1)
     M = M + np.swapaxes(M, 2, 3)
     var = np.diagonal(V, axis1=2, axis2=3) - (gain * V).sum(3) + ((G @ M) * G).sum(3)
     return mean, np.broadcast_to(var, (n, len(blocks.y), rows))

@@ -2,9 +2,9 @@
 
 Each likelihood term t(f) is replaced by a site exp(-lam f^2 / 2 + eta f). Given the sites, `engine`
 computes the marginals of the signals exactly. Dividing a marginal by its site gives the cavity. The
-site is then changed so that cavity times site has the moments of cavity times term. The log
-evidence is the evidence of the sites plus, for every term, the log ratio of the masses of these
-products. The approximation is stationary in the sites and is corrected by importance weights.
+site is then updated so that cavity times site has the moments of cavity times likelihood term. The
+log evidence is that of the sites plus, for each term, the log ratio of the masses of the two
+products. Its derivative in the sites is 0 at convergence. Importance weights correct the draws.
 """
 
 from typing import Any, NamedTuple
@@ -19,11 +19,11 @@ from trustbo.models.families.moments import log_normal
 from trustbo.models.signal import Signal, each
 
 _LEAST = 1e-9  # smallest precision of a cavity or a site
-_TEMPERED = 0.6  # share of the site precisions in the wider proposal
+_TEMPERED = 0.6  # factor on the site precisions in the wider proposal
 
 
 class Terms(NamedTuple):
-    """Observations of blocks, each of a separate kind, and the observation family."""
+    """Observations of all blocks and their family; each block must be a separate kind."""
 
     family: Family
     y: np.ndarray  # (block, row), NaN where not measured
@@ -45,7 +45,7 @@ class Joint(NamedTuple):
 
 
 class Sites(NamedTuple):
-    """Sites (point, block, row) with precision lam and precision-weighted mean eta."""
+    """Gaussian sites (point, block, row) with precision lam and precision-weighted mean eta."""
 
     lam: np.ndarray
     eta: np.ndarray
@@ -76,7 +76,7 @@ def first_sites(terms: Terms) -> Sites:
 def _matched(
     terms: Terms, rest: np.ndarray, slope: np.ndarray, mean: np.ndarray, var: np.ndarray
 ) -> Sites:
-    """Find sites whose products with cavities N(slope / rest, 1 / rest) have these moments."""
+    """Find the sites whose products with cavities N(slope / rest, 1 / rest) match mean and var."""
     seen = ~np.isnan(terms.y)
     lam = np.where(seen, np.maximum(1.0 / var - rest, _LEAST), 0.0)
     return Sites(lam, np.where(seen, mean * (lam + rest) - slope, 0.0))
@@ -107,7 +107,7 @@ def log_evidence(
 
 
 def _overlap(y: np.ndarray, lam: np.ndarray, m: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Compute the log mass of N(f; m, v) times the site N(y; f, 1 / lam); 0 without a site."""
+    """Compute the log mass of N(f; m, v) times the site N(y; f, 1 / lam), or 0 without a site."""
     some = lam > 0.0
     total = v + 1.0 / np.where(some, lam, 1.0)
     return np.where(some, log_normal(y - m, total), 0.0)
@@ -116,7 +116,7 @@ def _overlap(y: np.ndarray, lam: np.ndarray, m: np.ndarray, v: np.ndarray) -> np
 def draw(
     joint: Joint, sites: Sites, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Draw coefficients and signals at each theta, with weights that average to the evidence.
+    """Draw coefficients and signals at each theta, with weights whose mean is the evidence.
 
     Coefficients are drawn from a mixture of two Student-t distributions, one centred on the
     EP posterior and one on a posterior with less precise sites.
@@ -127,17 +127,17 @@ def draw(
     blocks, signal, prior, terms = joint
     n, p = len(signal.sd), blocks.U.shape[1]
     nu = max(8.0, 2.0 * p)
-    laws = []
+    proposals = []
     for share in (1.0, _TEMPERED):
         share = np.where(terms.linear, 1.0, share)
         lam, y = share * sites.lam, sites.y
         fit = evidence(blocks, signal, prior, lam, y)
-        laws.append((prior.mean + fit.F.back(fit.half[:, None])[:, 0], fit.F))
-    wide, t = rng.random(n) < 0.5, rng.standard_normal((n, 1, laws[0][1].size))
+        proposals.append((prior.mean + fit.F.back(fit.half[:, None])[:, 0], fit.F))
+    wide, t = rng.random(n) < 0.5, rng.standard_normal((n, 1, proposals[0][1].size))
     t /= np.sqrt(rng.chisquare(nu, (n, 1, 1)) / nu)
-    narrow, wider = (center + F.back(t)[:, 0] for center, F in laws)
+    narrow, wider = (center + F.back(t)[:, 0] for center, F in proposals)
     c = np.where(wide[:, None], wider, narrow)
-    log_q = np.logaddexp(*(_log_student(c, *law, nu) for law in laws)) - np.log(2.0)  # pyright: ignore[reportCallIssue]
+    log_q = np.logaddexp(*(_log_student(c, *one, nu) for one in proposals)) - np.log(2.0)  # pyright: ignore[reportCallIssue]
     f, log_block = draw_signals(joint, expected(blocks, signal, c), sites, rng)
     return c, f, prior.log_density(c) - log_q + log_block.sum(1)
 

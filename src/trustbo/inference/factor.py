@@ -2,13 +2,13 @@
 
 Columns that are independent a priori and occur in only one mission, such as bounds visited once,
 are *leaves*. All other columns are the *core*. Given the core, leaves of different missions are
-independent. If leaves come first, the precision A = F F' and its factor F are
+independent. With the leaves first, the precision A = F F' and its factor F are
 
     A = [D  B ]    F = [G   0 ]    G G' = D,  X = G^-1 B,  H' H = C - X' X,
         [B' C ]        [X'  H']
 
 where D and G are block diagonal, with one block per mission. Only H is a large dense factor. LAPACK
-factors upper triangles fastest and in place, because its memory order is transposed.
+factors upper triangles fastest and in place, because LAPACK stores columns contiguously.
 """
 
 from collections.abc import Callable
@@ -24,13 +24,13 @@ from trustbo.models.backend import inverse_from_factor, namespace
 
 
 class Order(NamedTuple):
-    """Order in which columns are eliminated, and the layout of D, B and C in one vector."""
+    """Order in which columns are eliminated, and storage of the blocks D, B and C in a vector."""
 
     leaf: np.ndarray  # (mission, place), leaf columns, padded with the number of columns
     core: np.ndarray  # core columns
     group: np.ndarray  # (column,), mission of a leaf, -1 for the core
     place: np.ndarray  # (column,), index among the leaves of the mission, or in the core
-    touched: np.ndarray  # (mission, number), places of core columns in a mission with leaves
+    touched: np.ndarray  # (mission, number), places of the core columns that occur in a mission
     number: np.ndarray  # (mission, column), index in `touched`
     spread: Any  # sparse (core, mission * touched), sums the missions' terms of a vector
     pairs: Any  # sparse (pair, mission * touched * touched), sums the missions' terms of C
@@ -74,13 +74,13 @@ class Order(NamedTuple):
 
     @property
     def shapes(self) -> tuple[tuple[int, ...], ...]:
-        """Shapes of D, B and C at one point."""
+        """Shapes of the blocks D, B and C at one point."""
         (g, k), q = self.leaf.shape, len(self.core)
         return (g, k, k), (g, k, self.touched.shape[1]), (q, q)
 
     @property
     def size(self) -> int:
-        """Length of the vector that contains D, B and C."""
+        """Length of the vector that contains the blocks D, B and C."""
         return sum(int(np.prod(shape)) for shape in self.shapes)
 
     def entry(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -96,7 +96,7 @@ class Order(NamedTuple):
         return np.where(other | (~of_leaf & (self.group[b] >= 0)), -1, index)
 
     def views(self, A: Any) -> Any:
-        """Return views (point, ...) of D, B and C in vectors (point, entry)."""
+        """Return views (point, ...) of the blocks D, B and C in vectors (point, entry)."""
         ends = np.cumsum([0, *(int(np.prod(shape)) for shape in self.shapes)])
         return tuple(
             A[:, i:j].reshape(len(A), *shape)
@@ -105,7 +105,7 @@ class Order(NamedTuple):
 
 
 class Factor(NamedTuple):
-    """Factor F at each point; whitened vectors begin with the leaves, including padding."""
+    """Factor F of the precision at each point; whitened vectors begin with the padded leaves."""
 
     order: Order
     inverse: Any  # (point, mission, place, place), G^-1
@@ -114,7 +114,7 @@ class Factor(NamedTuple):
 
     @classmethod
     def of(cls, order: Order, A: Any) -> Self:
-        """Factor precisions stored in vectors (point, entry), which NumPy overwrites."""
+        """Factor precisions stored in vectors A (point, entry); in NumPy, A is overwritten."""
         D, B, C = order.views(A)
         xp = namespace(A)
         padding = (order.leaf == len(order.place))[..., None] * np.eye(order.leaf.shape[1])
@@ -168,22 +168,22 @@ class Factor(NamedTuple):
         return np.concatenate([leaf.reshape(len(c), -1), core], axis=1)
 
     def covariance(self) -> Any:
-        """Compute A^-1 in the layout of A, with halved diagonals for sums over pairs."""
+        """Compute A^-1 at the stored entries of A; diagonals are halved for sums over pairs."""
         C = inverse_of_upper(self.H)
-        turned, q = self.inverse.swapaxes(2, 3), C.shape[1]
+        transposed, q = self.inverse.swapaxes(2, 3), C.shape[1]
         i = np.minimum(self.order.touched, q - 1)
-        B = -turned @ self.X @ C[:, i[..., None], i[:, None]]  # X is 0 in the padding
-        D = turned @ self.inverse - B @ (turned @ self.X).swapaxes(2, 3)
+        B = -transposed @ self.X @ C[:, i[..., None], i[:, None]]  # X is 0 in the padding
+        D = transposed @ self.inverse - B @ (transposed @ self.X).swapaxes(2, 3)
         return self._entries(D, B, C)
 
     def _entries(self, D: Any, B: Any, C: Any) -> Any:
-        """Arrange symmetric matrices like A, and halve their diagonals."""
+        """Join D, B and C in vectors like those of A, with halved diagonals of D and C."""
         xp, n = namespace(C), len(C)
         D, C = (M * (1.0 - 0.5 * np.eye(M.shape[-1])) for M in (D, C))
         return xp.concatenate([M.reshape(n, -1) for M in (D, B, C)], axis=1)
 
     def outer(self, c: Any) -> Any:
-        """Compute cc' of vectors c (point, column) in the layout of A, as in `covariance`."""
+        """Compute the same entries as `covariance`, for the matrices cc' of c (point, column)."""
         xp, order = namespace(c), self.order
         c = xp.concatenate([c, xp.zeros((len(c), 1))], axis=1)
         leaf, core = c[:, order.leaf], c[:, order.core]
@@ -195,8 +195,8 @@ class Factor(NamedTuple):
 def log_integral(order: Order) -> Callable[[jax.Array, jax.Array], jax.Array]:
     """Return the JAX function (h'A^-1 h - log |A|) / 2 of A (point, entry) and h (point, column).
 
-    Its derivatives with respect to h and A are c = A^-1 h and -(A^-1 + cc') / 2, which are faster
-    to compute than derivatives of the factor.
+    The derivatives with respect to h and A are c = A^-1 h and -(A^-1 + cc') / 2. Computing them
+    directly is faster than differentiating the factor.
     """
 
     def value(A: jax.Array, h: jax.Array) -> tuple[jax.Array, Any]:
@@ -247,7 +247,7 @@ def log_diagonal(L: Any) -> Any:
 
 
 def upper_factor(A: Any) -> Any:
-    """Factor A = H' H with upper H, in place in NumPy; failures are NaN as in `cholesky`."""
+    """Factor A = H' H with upper H, in place in NumPy; NaN where A is not positive definite."""
     if not isinstance(A, np.ndarray):
         lower = jax.lax.linalg.cholesky(A.mT, symmetrize_input=False)
         return lower.mT
@@ -269,7 +269,7 @@ def solve_upper(H: Any, x: Any, *, transposed: bool) -> Any:
 
 
 def inverse_of_upper(H: Any) -> Any:
-    """Compute (H' H)^-1 for upper triangles H (point, n, n)."""
+    """Compute (H' H)^-1 for upper triangles H (point, n, n); entries below are ignored."""
     if not isinstance(H, np.ndarray):
         one = jnp.broadcast_to(jnp.eye(H.shape[1]), H.shape)
         half = solve_upper(H, one, transposed=True)
@@ -280,7 +280,7 @@ def inverse_of_upper(H: Any) -> Any:
 def log_det(A: Any) -> Any:
     """Compute the log determinants of positive definite matrices."""
     if not isinstance(A, np.ndarray):
-        return jnp.linalg.slogdet(A)[1]  # has simpler derivatives than a Cholesky factor
+        return jnp.linalg.slogdet(A)[1]  # simpler to differentiate than a Cholesky factor
     return 2.0 * log_diagonal(cholesky(A))
 
 

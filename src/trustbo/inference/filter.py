@@ -1,4 +1,4 @@
-"""Filtering of trust during a mission, bound by bound."""
+"""Filter for the trust of robots during a mission, updated after every bound."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
@@ -16,7 +16,7 @@ from trustbo.models.params import CoupledParams, Params, check_params
 from trustbo.models.slots import NO_TICKS
 from trustbo.workspace.moves import bounds_along, require_on_grid
 
-_TICKS = 200.0  # assumed for a future bound
+_TICKS = 200.0  # number of ticks assumed for a future bound
 Effect = np.ndarray | float
 """Place effect of a bound, an array (draw, robot or 1) or a number."""
 
@@ -97,7 +97,7 @@ class Dynamics:
     def update(
         self, predicted: Beliefs, y: np.ndarray, n_ticks: np.ndarray
     ) -> tuple[Beliefs, np.ndarray]:
-        """Update trust with rates (robot,), NaN where unmeasured; also return the log density."""
+        """Update trust with rates (robot,), NaN where unmeasured; also return their log density."""
         y, n_ticks = (a.reshape(self.shape[1:]) for a in (y, n_ticks))
         members, (mean, J, drift), first = self.shape[2], predicted, 0
         if self._noise is not None:  # the joint normal has trust first, then signals
@@ -127,7 +127,7 @@ class Dynamics:
         rng: np.random.Generator,
         effect: Effect = 0.0,
     ) -> tuple[Beliefs, np.ndarray]:
-        """Draw trust after a bound given earlier trust, and rates (draw, robot) in the bound."""
+        """Draw trust after a bound given drawn trust before the bound; also return drawn rates."""
         now = self.draw(self.predict(drawn, z, effect), rng)
         signal = now.mean
         if self._noise is not None:
@@ -143,7 +143,7 @@ class Dynamics:
         effects: Sequence[Effect],
         rng: np.random.Generator,
     ) -> Iterator[tuple[Beliefs, np.ndarray]]:
-        """Yield predicted trust after each bound, and rates drawn jointly for all bounds."""
+        """Yield predicted trust and jointly drawn rates (draw, robot), one bound at a time."""
         x = self.draw(beliefs, rng)
         for of_bound, ticks, effect in zip(z, n_ticks, effects, strict=True):
             beliefs = self.predict(beliefs, of_bound, effect)
@@ -152,7 +152,7 @@ class Dynamics:
 
 
 def _product(A: np.ndarray, B: np.ndarray) -> np.ndarray:
-    """Multiply matrices; avoiding matmul is much faster for 1 x 1 matrices."""
+    """Multiply matrices; the elementwise product is much faster for 1 x 1 matrices."""
     return A * B if A.shape[-1] == 1 else A @ B
 
 
@@ -231,7 +231,7 @@ class TrustFilter:
         delta_s, self._bounded = None, True
         if isinstance(posterior, xr.DataTree):
             require_posterior("TrustFilter", posterior)
-            if "constant_data" in posterior.children:  # without a map, awareness is unbounded
+            if "constant_data" in posterior.children:  # without a map, any awareness is valid
                 self._bounded = bool((posterior["constant_data"]["row"] >= 0).any())
             n_robots, observation = posterior.attrs["n_robots"], posterior.attrs["observation"]
             delta_s = sites_of(posterior).get("delta_s")
@@ -244,14 +244,14 @@ class TrustFilter:
             )
         n_robots = posterior.n_robots if n_robots is None else n_robots
         if n_robots is None:
-            raise TrustboError("TrustParams do not contain the number of robots; give n_robots=.")
+            raise TrustboError("TrustParams do not contain the number of robots; give n_robots.")
         self._n_robots = require_whole("n_robots", n_robots, 1)
         self._n_features = posterior.n_features
         check_params(posterior, self._n_robots, self._n_features)
         flat = posterior.flat()
         n, most = len(flat.b), require_whole("max_draws", max_draws, 1)
         kept = np.linspace(0, n - 1, min(n, most)).astype(int)
-        self.params: Params = flat.draw(kept)  # pyright: ignore[reportArgumentType]
+        self.params: Params = flat.draw(kept)
         self.family = FAMILIES[observation]
         delta_s = None if delta_s is None else delta_s[kept]
         self.dynamics = Dynamics(self.params, self.family, self._n_robots, delta_s)
@@ -296,15 +296,13 @@ class TrustFilter:
         z, effect = self._checked(awareness, 2), self.effects(bound, 1)[0]
         y = as_array("contact_rate", contact_rate)
         if y.shape != (self._n_robots,):
-            raise TrustboError(
-                f"the shape of contact_rate must be ({self._n_robots},); got shape {y.shape}."
-            )
+            raise TrustboError(f"contact_rate must have shape ({self._n_robots},); got {y.shape}.")
         require_unit_interval("contact_rate", y)
         ticks = as_array("n_ticks", np.nan if n_ticks is None else n_ticks)
-        if self.family.needs_ticks and (np.isnan(ticks) & ~np.isnan(y)).any():
-            raise TrustboError(NO_TICKS)
         ticks = ticks if ticks.ndim else np.full(y.shape, ticks)
         require_shares(y, ticks)
+        if self.family.needs_ticks and (np.isnan(ticks) & ~np.isnan(y)).any():
+            raise TrustboError(NO_TICKS)
         predicted = self.dynamics.predict(self._beliefs, z, effect)
         self._beliefs, gained = self.dynamics.update(predicted, y, ticks)
         self._log_weight = self._log_weight + gained  # a new array, as copies share the old one
@@ -316,7 +314,7 @@ class TrustFilter:
     def predict(self, awareness: ArrayLike, path: Sequence[Cell] | None = None) -> TrustForecast:
         """Predict trust and contact rates along future bounds.
 
-        One rate is drawn for each parameter draw. For tick counts, 200 ticks per bound are assumed.
+        One rate per bound and robot is drawn for each parameter draw. Tick counts are out of 200.
 
         Args:
             awareness: Awareness along the path, shape (bound, robot, feature).
@@ -338,7 +336,7 @@ class TrustFilter:
         return TrustForecast(mean, sd, draws.mean(0), low, high, draws)
 
     def effects(self, path: Sequence[Cell] | None, n_bounds: int) -> Sequence[Effect]:
-        """Check the cells of a path, and return the place effect of each bound, 0 by default."""
+        """Check the cells of a path, and return the place effect of each bound, by default 0."""
         places = self.params.places
         if path is None and not places:
             return [0.0] * n_bounds
@@ -346,8 +344,8 @@ class TrustFilter:
         cells = [require_pair("a cell", cell) for cell in given]
         if len(cells) != n_bounds + 1:
             raise TrustboError(
-                f"need {n_bounds + 1} cells, beginning with the current cell of the team; got "
-                f"{path!r}."
+                f"bound or path must have {n_bounds + 1} cells, beginning with the current cell of "
+                f"the team; got {path!r}."
             )
         for grid in {np.shape(value)[-2:] for value in places.values()}:
             require_on_grid(cells, grid)
@@ -357,6 +355,7 @@ class TrustFilter:
         return list(np.moveaxis(self.params.of_places(bounds), -2, 0))
 
     def _checked(self, awareness: ArrayLike, n_axes: int) -> np.ndarray:
+        """Return awareness as an array; raises TrustboError if its shape or values are wrong."""
         z = as_array("awareness", awareness)
         expected = (self._n_robots, self._n_features)
         if z.ndim != n_axes or z.shape[-2:] != expected or not len(z):
@@ -375,7 +374,7 @@ class TrustFilter:
 
 
 def _average(beliefs: Beliefs, weights: np.ndarray) -> TrustState:
-    """Compute the mean and standard deviation of the mixture over draws."""
+    """Compute the mean and standard deviation of trust over weighted draws."""
     mean = beliefs.mean.reshape(len(weights), -1)
     var = np.diagonal(beliefs.cov, axis1=2, axis2=3).reshape(mean.shape)
     center = weights @ mean

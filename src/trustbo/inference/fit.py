@@ -9,13 +9,7 @@ import numpy as np
 import xarray as xr
 
 from trustbo.data import Mission
-from trustbo.errors import (
-    PosteriorError,
-    TrustboError,
-    require_choice,
-    require_kind,
-    require_whole,
-)
+from trustbo.errors import PosteriorError, TrustboError, require_choice, require_kind, require_whole
 from trustbo.inference.importance import MAX_KHAT, sample
 from trustbo.inference.place_maps import place_group
 from trustbo.inference.posterior import Draws, Posterior
@@ -59,8 +53,8 @@ def fit(
             NumPyro's NUTS, which also samples trust unless rates are Gaussian.
         workspace: Workspace of the missions. If given, features and robots are reordered to match
             the workspace, missing awareness such as line of sight is filled in (see
-            `Workspace.fill`), and place effects cover the whole grid. Otherwise, place effects end
-            at the last row and column visited.
+            `Workspace.fill`), and place effects cover the whole grid. Otherwise, the grid of place
+            effects ends at the last row and column visited.
         draws: Number of draws per chain.
         chains: Number of chains, among which the draws of importance sampling are divided.
         warmup: Number of warm-up draws per chain of NUTS, which are discarded.
@@ -75,8 +69,8 @@ def fit(
         beta[feature], b, delta_w and delta_v), and each effect has a separate group. `latent`
         contains trust[chain, draw, mission, bound, robot], and trust_mean and trust_sd over all
         draws. `log_likelihood` contains contact_rate[chain, draw, mission], so that LOO leaves out
-        whole missions. If all rates have n_ticks, the log-likelihoods refer to tick counts
-        (see `log_likelihood_of`) and are comparable between observation families. Other groups
+        whole missions. If all rates have n_ticks, the log-likelihoods refer to tick counts (see the
+        attribute `log_likelihood_of`) and are comparable between observation families. Other groups
         are `posterior_predictive`, `prior`, `prior_predictive`, `log_prior`, `sample_stats`,
         `observed_data` and `constant_data`. Bounds are labelled from 1, and short missions are
         padded with NaN.
@@ -97,7 +91,7 @@ def fit(
         require_kind("workspace", workspace, Workspace, "give the workspace of the missions")
         missions = [workspace.fill(mission) for mission in missions]
     if model is None:
-        scale = missions[0].scale  # of people's reports
+        scale = missions[0].scale  # empty unless the missions are people's reports
         model = HumanTrust(scale=scale) if scale else default_model(places=has_places(missions))
     require_kind("model", model, TrustModel, "give a model such as PooledTrust()")
     require_choice("sampler", sampler, SAMPLERS)
@@ -107,7 +101,7 @@ def fit(
     model = model.for_features(missions[0].features)
     slots = model.slots(missions, workspace)
     if np.isnan(slots.y).all():
-        raise TrustboError("every contact rate is NaN; give at least one measured rate.")
+        raise TrustboError("every contact rate is NaN; fit needs at least one measured rate.")
     posterior = Posterior(model, slots)
     with one_blas_thread():
         if sampler == "importance":
@@ -116,7 +110,7 @@ def fit(
                 f"importance weights are uneven (k-hat {summary['k_hat']:.2f}, limit {MAX_KHAT})"
             ]  # fmt: skip
         else:
-            from trustbo.inference.nuts import sample_by_nuts  # compiles NumPyro's kernels
+            from trustbo.inference.nuts import sample_by_nuts  # slow to import
 
             drawn, stats, summary, complaints = sample_by_nuts(
                 posterior, chains=chains, draws=draws, warmup=warmup, seed=seed, progress=progress
@@ -125,10 +119,10 @@ def fit(
     tree.attrs |= _record(model, posterior) | summary | {"sampler": sampler, "seed": seed}
     if check and complaints:
         raise PosteriorError(
-            f"the diagnostics of the posterior are bad: {'; '.join(complaints)}.",
+            f"the sampler's diagnostics are bad: {'; '.join(complaints)}.",
             tree,
-            "Give more missions, narrower priors or, for NUTS, larger draws and warmup; or pass "
-            "check=False to get the posterior anyway.",
+            "Give more missions, use narrower priors or, for NUTS, increase draws and warmup. To "
+            "get the posterior anyway, pass check=False.",
         )
     if whole:
         tree = complete(tree, missions, model=model)
@@ -139,13 +133,13 @@ def fit(
 def by_importance(
     posterior: Posterior, n: int, seed: int
 ) -> tuple[Draws, dict[str, np.ndarray], dict[str, Any]]:
-    """Draw by importance sampling, and return draws, statistics (draw,) and a summary."""
+    """Draw n times by importance sampling; return draws, statistics (draw,) and a summary."""
     rng = np.random.default_rng(seed)
     for size, n_sweeps in ((256, 1), (1024, 4)):
         start = posterior.start()[None]
         size = size if len(start[0]) < 12 else 4 * size
         points = sample(posterior.log_density, start, rng, size=size, defensive=posterior.defensive)
-        # Draws that correct EP are the costly part; more of them give a more reliable k-hat.
+        # Correcting EP at these points takes most time, but more points make k-hat more reliable.
         chosen = points.resample(n if posterior.exact else 2 * size, rng)
         drawn, which = posterior.draw(points.z[chosen], points.log_p[chosen], n, rng, n_sweeps)
         k_hat = max(points.k_hat, drawn.k_hat)
@@ -174,8 +168,8 @@ def _laid_out(
         for group, values in groups.items()
     }
     places, model = groups.pop("places", None), posterior.model
-    before = posterior.prior_sites(N_PRIOR, rng)
-    groups["prior"] = {name: values[None] for name, values in before.items()}
+    prior_draws = posterior.prior_sites(N_PRIOR, rng)
+    groups["prior"] = {name: values[None] for name, values in prior_draws.items()}
     tree = to_datatree(groups, missions, model.dims, model.effects)
     if places is not None:
         tree["places"] = xr.DataTree(place_group(places, posterior.slots.visited, seed))  # pyright: ignore[reportArgumentType]

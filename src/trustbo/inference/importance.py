@@ -29,10 +29,10 @@ GOOD_KHAT, MAX_KHAT = 0.5, 0.7
 """Limits on the Pareto shape k-hat of the weights, for stopping and for acceptable results."""
 _DEGREES = 8.0  # degrees of freedom of the proposals
 _WIDER = 1.1  # scale of a proposal relative to the points that it is fitted to
-_DEFENSIVE = 4  # other points per defensive point after the first round
-_PER_AXIS = 4.0  # effective points needed per score to estimate moments
-_SLOPE_STEP, _CURVATURE_STEP = 1e-3, 3e-2
-_LEAST_CURVATURE = 0.3  # of minus the log density; 1 for the prior
+_DEFENSIVE = 4  # points of other proposals per defensive point after the first round
+_PER_AXIS = 4.0  # effective points per dimension needed to estimate moments
+_SLOPE_STEP, _CURVATURE_STEP = 1e-3, 3e-2  # steps of finite differences
+_LEAST_CURVATURE = 0.3  # least curvature of -log density at a mode; the prior has curvature 1
 _SKEW_STEP, _SKEWS = 2.0, (0.5, 3.0)  # where skewness is measured, in sds, and its limits
 _FARTHEST = 7.0  # largest absolute score of a mode
 
@@ -59,7 +59,7 @@ class Student(NamedTuple):
         return cls(mean, np.linalg.cholesky(covariance + ridge * np.eye(z.shape[1])))
 
     def draw(self, n: int, rng: np.random.Generator) -> np.ndarray:
-        """Draw points (n, score) from a scrambled Sobol sequence; n must be a power of 2."""
+        """Draw points (n, score) with a scrambled Sobol sequence; n must be a power of 2."""
         d = len(self.center)
         uniform = np.clip(stats.qmc.Sobol(d + 1, rng=rng).random(n), 1e-12, 1.0 - 1e-12)
         chi2 = 2.0 * special.gammaincinv(0.5 * _DEGREES, uniform[:, d:]) / _DEGREES
@@ -107,7 +107,7 @@ class Points(NamedTuple):
         return 1.0 / float((self.weight**2).sum())
 
     def fitted(self) -> Student:
-        """Fit a Student-t to the points' moments, with flattened weights if few points dominate."""
+        """Fit a Student-t to the points' moments; if few points dominate, flatten their weights."""
         weight, least = self.weight, _PER_AXIS * self.z.shape[1]
         for _ in range(6):
             if (weight**2).sum() * least <= 1.0:
@@ -136,8 +136,8 @@ def sample(
         log_density: Log posterior density of scores.
         starts: Starting points of the search for modes, shape (start, score).
         rng: Random number generator.
-        size: Number of points per round, a power of 2. In the first round, half of them are drawn
-            from `defensive`; later rounds draw an additional quarter of `size` from it.
+        size: Number of points per round, a power of 2. In the first round, half of the points are
+            drawn from the defensive proposal; later rounds draw an additional quarter from it.
         enough: Effective number of points at which sampling stops if k-hat is good.
         most: Maximum number of rounds.
         defensive: Function that returns a proposal for regions that the current proposal may miss;
@@ -189,7 +189,7 @@ def find_modes(log_density: LogDensity, starts: np.ndarray) -> list[Student]:
 
 
 def climb(log_density: LogDensity, start: np.ndarray) -> np.ndarray:
-    """Search for a mode (score,) by L-BFGS with slopes from finite differences."""
+    """Search for a mode (score,) by L-BFGS with derivatives from finite differences."""
     axes = np.eye(len(start))
 
     def cost(z: np.ndarray) -> tuple[float, np.ndarray]:
@@ -205,7 +205,7 @@ def climb(log_density: LogDensity, start: np.ndarray) -> np.ndarray:
 
 
 def fit_mode(log_density: LogDensity, mode: np.ndarray) -> Student:
-    """Fit the curvature at a mode and, on each side, the width at which the density has dropped.
+    """Fit a Student-t at a mode, with the curvature there and separate widths on the two sides.
 
     A split Student-t fits skewed posteriors (Geweke 1989, Econometrica 57).
     """

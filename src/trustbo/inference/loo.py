@@ -4,8 +4,8 @@ With coefficients, effects and trust integrated out, only the hyperparameters th
 
     p(y_j | y_-j) = 1 / E[ p(y_-j | theta) / p(y | theta) | y ],
 
-so the importance weights are ratios of the evidence without and with mission j. Weights of full
-draws would fail for the effects of bounds that occur only in mission j.
+so the importance weights are ratios of the evidence without and with mission j. If coefficients
+were not integrated out, the weights would be poor for bounds that occur only in mission j.
 """
 
 import warnings
@@ -27,7 +27,7 @@ from trustbo.models.model import TrustModel
 from trustbo.parallel import one_blas_thread
 from trustbo.stacking import stack_missions
 
-_POINTS = 500  # maximum number of distinct hyperparameter values
+_POINTS = 500  # maximum number of distinct hyperparameter draws that are used
 
 
 @one_blas_thread()
@@ -56,9 +56,7 @@ def loo(posterior: xr.DataTree, *, model: TrustModel | None = None) -> ELPDData:
     fitted.settle(draws.theta)
     measured = np.flatnonzero(~np.isnan(fitted.slots.y).all((1, 2)))
     if len(measured) < 2:
-        raise TrustboError(
-            f"LOO needs at least two missions with measured rates; got {len(measured)}."
-        )
+        raise TrustboError(f"loo needs at least 2 missions with rates; got {len(measured)}.")
 
     rows = np.column_stack([v.reshape(len(draws.c), -1) for v in draws.theta.values()])
     _, first, count = np.unique(rows, axis=0, return_index=True, return_counts=True)
@@ -66,7 +64,7 @@ def loo(posterior: xr.DataTree, *, model: TrustModel | None = None) -> ELPDData:
     theta, log_count = at(draws.theta, first[some]), np.log(count[some] / count[some].sum())
 
     whole = fitted.log_evidence(theta)
-    # average is the log of each mission's mean density under the full posterior.
+    # `average` is the log of the mean density of each mission under the full posterior.
     density, k_hat, average = np.zeros((3, len(measured)))
     refitted, whole_refit = np.zeros(len(measured), dtype=bool), None
     for i, j in enumerate(measured):
@@ -108,7 +106,7 @@ def loo(posterior: xr.DataTree, *, model: TrustModel | None = None) -> ELPDData:
 
 
 def _log_evidence(posterior: Posterior, seed: int) -> tuple[float, float]:
-    """Compute the log evidence of a posterior, and the k-hat of its weights."""
+    """Compute the log evidence by importance sampling, and the k-hat of the weights."""
     summary = by_importance(posterior, 1000, seed)[2]
     return summary["log_evidence"], summary["k_hat"]
 

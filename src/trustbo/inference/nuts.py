@@ -21,7 +21,7 @@ from trustbo.inference.diagnostics import complaints_of
 from trustbo.inference.posterior import Draws, Posterior
 from trustbo.models.backend import own_settings
 
-_POINTS = 2000  # resampled points used for the covariance
+_POINTS = 2000  # resampled points from which the covariance is estimated
 _FIELDS = {
     "num_steps": "n_steps",
     "diverging": "diverging",
@@ -86,9 +86,9 @@ def sample_by_nuts(
 
 
 def _marginal_kernel(posterior: Posterior, center: np.ndarray, scale: np.ndarray) -> NUTS:
-    """Make the kernel for scores, whitened by their mean and a Cholesky factor."""
+    """Make the kernel for scores that are whitened by a mean and a Cholesky factor."""
 
-    @jax.jit  # NumPyro also calls it outside of compiled code
+    @jax.jit  # NumPyro also calls this function outside of compiled code
     def potential(white: jax.Array) -> jax.Array:
         z = center + scale @ white
         return -posterior.log_density(z[None])[0]
@@ -97,7 +97,7 @@ def _marginal_kernel(posterior: Posterior, center: np.ndarray, scale: np.ndarray
 
 
 def _full_kernel(posterior: Posterior, z: np.ndarray) -> NUTS:
-    """Make the kernel for the model's program, which starts at the median of scores z."""
+    """Make the kernel for the model's program; chains start at the median of the scores z."""
     values = posterior.scores.values(z)
     center = {name: jnp.asarray(np.median(v, axis=0)) for name, v in values.items()}
 

@@ -2,12 +2,12 @@
 
 Effects s of unvisited cells are drawn by Matheron's rule: a prior draw over the whole grid is
 corrected by kriging at the visited cells. Prior draws use the fast Fourier transform of a circulant
-covariance (Dietrich and Newsam 1997) on a torus large enough for correlations to nearly vanish.
-Effects e of unvisited bounds are drawn from the prior. Rounding length scales to steps of 10 %
-changes the correlation of neighbouring cells by less than 0.01.
+covariance on a torus (Dietrich and Newsam 1997), which is so large that correlations around it are
+nearly 0. Length scales are rounded to steps of 10 %, which changes the correlation of neighbouring
+cells by less than 0.01. Effects e of unvisited bounds are drawn from the prior.
 
-The random part is centred over the draws, so that the mean map is the posterior mean of the
-effects, without Monte Carlo error where nothing was measured.
+The random part of the draws is centred at 0. The mean map is therefore the posterior mean of the
+effects, without Monte Carlo error in places that were not visited.
 """
 
 from collections.abc import Iterator, Mapping
@@ -25,12 +25,12 @@ from trustbo.workspace.moves import MOVE_NAMES
 _STEP = 0.1  # step of log length scales
 _LARGEST = 4.0  # largest length scale, in units of the grid's longer side
 _REACH = 5.0  # distance in length scales at which the correlation is 0.002
-_JITTER = 1e-9
+_JITTER = 1e-9  # added to the correlation matrix of visited cells
 _MAP = "row", "col"
 
 
 def place_group(draws: Mapping[str, np.ndarray], places: Visited, seed: int) -> xr.Dataset:
-    """Build the posterior group with the draws at visited places.
+    """Build the posterior group `places`, with the effects of visited cells and bounds.
 
     Args:
         draws: Arrays place (chain, draw, cell) and place_bound (chain, draw, bound).
@@ -98,12 +98,12 @@ def _cells(
 def _kriging(
     length_scale: np.ndarray, cells: np.ndarray, shape: tuple[int, int]
 ) -> Iterator[tuple[int, np.ndarray, float, np.ndarray]]:
-    """Yield the index, draws, length scale and kriging weights of each length-scale step.
+    """Yield the index, mask of draws, length scale and kriging weights of each step of the scale.
 
     The weights (visited cell, grid cell) convert s at visited cells to the mean of s everywhere.
     """
     grid = np.indices(shape).reshape(2, -1).T
-    # For larger scales, cells are nearly equal, and `_prior` would need a far larger grid.
+    # For larger length scales, the effects of all cells are nearly equal, and `_prior` is slow.
     length_scale = np.minimum(length_scale, _LARGEST * max(shape))
     steps = np.round(np.log(length_scale) / _STEP).astype(int)
     for step in np.unique(steps):
@@ -136,7 +136,7 @@ def _prior(
 
 
 def _centre(draws: np.ndarray) -> np.ndarray:
-    """Centre draws at 0 in place without changing the variance; a single draw is unchanged."""
+    """Centre draws at 0 in place, keeping the expected variance; a single draw is unchanged."""
     n = len(draws)
     if n > 1:
         draws -= draws.mean(0)

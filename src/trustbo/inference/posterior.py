@@ -1,4 +1,4 @@
-"""The posterior of a model: a density for samplers, and draws of all other variables."""
+"""The posterior of a model: a density for samplers, and draws given the hyperparameters."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple, Self
@@ -19,21 +19,21 @@ from trustbo.models.signal import Signal, each
 from trustbo.models.slots import Slots
 
 _CHUNK = 16  # points evaluated at once
-_SIZES = (0.3, 1.0, 1.8, 2.6)  # log ratios of the spread of rates to the initial noises
-_LARGEST_NOISE, _LEAST_NOISE = 50.0, 1e-6
-_SWEEPS = 1  # EP sweeps at each point, from the sites at the mode
-_SETTLED, _DAMPING = 12, 0.7  # to find the sites at the mode
-_PARTICLES = 4  # signals for each draw
+_SIZES = (0.3, 1.0, 1.8, 2.6)  # log ratios of the sd of rates to the noises at each start
+_LARGEST_NOISE, _LEAST_NOISE = 50.0, 1e-6  # limits of the size of the noises; see `Scores`
+_SWEEPS = 1  # EP sweeps at each point, beginning with the sites at the mode
+_SETTLED, _DAMPING = 12, 0.7  # EP sweeps and damping to find the sites at the mode
+_PARTICLES = 4  # signals drawn for each draw of the coefficients
 
 
 class Draws(NamedTuple):
-    """Draws of hyperparameters and coefficients, and of signals if drawn with EP."""
+    """Draws of hyperparameters and coefficients, and of signals if rates are not Gaussian."""
 
     theta: dict[str, np.ndarray]  # (draw, ...)
     c: np.ndarray  # (draw, column)
     f: np.ndarray | None = None  # (draw, block, row)
     k_hat: float = 0.0
-    """Pareto shape of the weights that correct EP, 0 if the evidence is exact."""
+    """Pareto shape of the weights that correct EP, or 0 if the evidence is exact."""
     log_correction: float = 0.0
     """Correction of the log evidence by the weights that correct EP."""
 
@@ -57,7 +57,7 @@ class Posterior:
     """Posterior of a trust model's hyperparameters, coefficients and signals."""
 
     def __init__(self, model: TrustModel, slots: Slots) -> None:
-        """Build the columns and blocks of the missions."""
+        """Prepare the columns and blocks of a model for the rates and features in `slots`."""
         self.model, self.slots = model, slots
         self.layout = model.layout(slots)
         self.scores = Scores(model.all_hyperpriors(slots))
@@ -74,7 +74,7 @@ class Posterior:
             self.sites = ep.first_sites(self.terms)
 
     def _order(self) -> Order:
-        """Find the elimination order; independent columns that occur in one mission are leaves."""
+        """Find the order in which the columns are eliminated; see `Order`."""
         n, (rows, p) = self.slots.n_missions, self._U.shape
         parts = self.prior(self.theta(np.zeros((1, self.n_scores)))).parts
         free = np.concatenate([np.full(part.shape[1], part.ndim == 2) for part in parts])
@@ -99,7 +99,7 @@ class Posterior:
         if namespace(z) is not np:
             return self.log_evidence(self.theta(z)) + self.scores.log_prior(z)
         out = np.full(len(z), -np.inf)
-        with np.errstate(all="ignore"):  # extreme scores overflow and get no density
+        with np.errstate(all="ignore"):  # extreme scores overflow and get zero density
             theta, log_prior = self.theta(z), self.scores.log_prior(z)
             size = np.exp(z[:, self.scores.sizes])
             flat = [np.asarray(values).reshape(len(z), -1) for values in theta.values()]
@@ -122,7 +122,7 @@ class Posterior:
         return found
 
     def settle(self, theta: Theta) -> None:
-        """Find the EP sites at the mean of the points, for use as initial sites at other points."""
+        """Find the EP sites at the mean of theta, for use as initial sites at all other points."""
         if not self.exact:
             center = {name: values.mean(0, keepdims=True) for name, values in theta.items()}
             self.sites = ep.log_evidence(self._joint(center), self.sites, _SETTLED, _DAMPING)[1]
@@ -142,7 +142,7 @@ class Posterior:
         return best
 
     def defensive(self, proposal: Student) -> Student:
-        """Make a proposal that fits beta0 and the noises, and is near the prior elsewhere."""
+        """Make a wider proposal for beta0 and the noises; other scores stay near the prior."""
         core = self.scores.core
         others = np.setdiff1d(np.arange(self.n_scores), core)
         cov = 1.5 * proposal.scale @ proposal.scale.T
@@ -202,6 +202,7 @@ class Posterior:
         return groups
 
     def _hyperparameters(self, theta: Theta) -> dict[str, np.ndarray]:
+        """Select the hyperparameters that the group `posterior` contains."""
         names = self.model.dims.keys() | self.model.effect_dims.keys()
         return {name: values for name, values in theta.items() if name in names}
 
@@ -227,7 +228,7 @@ class Posterior:
     ) -> dict[str, np.ndarray]:
         """Draw parameters (draw, ...) by name from the prior, without effects.
 
-        With `even`, hyperparameters are drawn as in `Scores.draw`, and coefficients are means.
+        With `even`, hyperparameters are evenly spaced quantiles, and coefficients prior means.
         """
         model, slots = self.model, self.slots
         theta = model.theta(self.scores.draw(n, rng, even=even), slots.resolution)
@@ -244,7 +245,7 @@ class Posterior:
             rng: Random number generator.
         """
         rows = [v.reshape(len(draws.c), -1) for v in draws.theta.values()]
-        _, some, index = np.unique(  # EP draws repeat; evaluate each once
+        _, some, index = np.unique(  # EP draws may repeat, so evaluate each distinct draw once
             np.column_stack([*rows, draws.c]), axis=0, return_index=True, return_inverse=True
         )
         index, draws = index.ravel(), draws.at(some)
@@ -277,7 +278,7 @@ class Posterior:
     def _exact_trust(
         self, theta: Theta, signal: Signal, mean: np.ndarray, rng: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Draw trust (draw, block, row) given Gaussian rates; also return log-likelihoods."""
+        """Draw trust given Gaussian rates; also return log-likelihoods (draw, block)."""
         b, S = self.blocks, each(signal.S, self.blocks.label)
         W, log_sites = whiten(b, signal, self._lam(signal))
         off = b.y - mean
@@ -291,7 +292,7 @@ class Posterior:
     def _ep_trust(
         self, theta: Theta, signal: Signal, mean: np.ndarray, rng: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Draw trust for non-Gaussian rates with weighted particles for each block."""
+        """Draw trust given non-Gaussian rates by weighted particles; returns as `_exact_trust`."""
         joint = ep.Joint(self.blocks, signal, self.prior(theta), self.terms)
         sites = ep.log_evidence(joint, self.sites, _SWEEPS)[1]
         drawn = [ep.draw_signals(joint, mean, sites, rng) for _ in range(_PARTICLES)]
@@ -313,11 +314,10 @@ class Posterior:
         sd = signal.sd[..., None] if signal.sd.shape[2] == 1 else self.layout.slots(signal.sd)
         return self.model.family.sample(f, sd, self.slots.n_ticks, rng)
 
-    def _at(self, theta: Theta) -> tuple[Signal, Prior]:
-        return self.model.signal(theta, self.slots, self.layout), self.prior(theta)
-
     def prior(self, theta: Theta) -> Prior:
         """Return the prior on all coefficients at each theta."""
+        return Prior.of([effect.prior(theta, self.slots) for effect in self.model.columns])
+
     def _fit(self, theta: Theta) -> tuple[Fit, Prior]:
         """Compute the evidence of Gaussian rates at each theta; also return the prior."""
         signal, prior = self._at(theta)
@@ -327,12 +327,12 @@ class Posterior:
         """Return the distribution of the signals and the prior at each theta."""
         return self.model.signal(theta, self.slots, self.layout), self.prior(theta)
 
-        return Prior.of([effect.prior(theta, self.slots) for effect in self.model.columns])
-
     def _lam(self, signal: Signal) -> Any:
+        """Return the precisions (point, kind, row) of Gaussian rates, 0 where not measured."""
         return self.blocks.seen / signal.sd**2
 
     def _joint(self, theta: Theta) -> ep.Joint:
+        """Return the blocks, signals, prior and observations for EP at each theta."""
         return ep.Joint(self.blocks, *self._at(theta), self.terms)
 
 

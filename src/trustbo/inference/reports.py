@@ -10,12 +10,12 @@ from trustbo.data import Mission, levels_of
 from trustbo.errors import TrustboError, require_choice, require_whole
 from trustbo.inference.draws import is_of_people, read_posterior, require_posterior
 from trustbo.inference.posterior import Draws, Posterior
+from trustbo.inference.score import QUANTILES
 from trustbo.models.model import TrustModel
 from trustbo.models.signal import each
 from trustbo.parallel import one_blas_thread
 
-QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
-_ALIKE = 16  # draws of personal trust for each draw of the population parameters
+_ALIKE = 16  # draws of a fitted person's trust for each draw of the population parameters
 
 
 @one_blas_thread()
@@ -29,17 +29,17 @@ def predict_reports(
     seed: int = 0,
     model: TrustModel | None = None,
 ) -> xr.Dataset:
-    """Predict each report of a person, possibly a new one, from the person's earlier reports.
+    """Predict each report of fitted or new persons from the earlier reports of the same person.
 
-    Earlier reports reweight the posterior draws, to infer a person's start, level and gains.
+    The earlier reports determine the weights of draws of the person's start, level and gains.
     Reports at the same bound are not used to predict each other.
 
     Args:
         posterior: Posterior of `HumanTrust`.
         missions: One mission per person; NaN reports are also predicted.
         given: `"earlier"` to use earlier reports of the person, or `"none"` to use no reports.
-        fitted: Whether the fit included the earlier reports of these persons. If so, these reports
-            do not reweight the population parameters again.
+        fitted: Whether the posterior was fitted to the earlier reports of these persons. If so,
+            these reports do not change the weights of the population parameters again.
         n_draws: Maximum number of draws of a person's trust.
         seed: Random seed.
         model: Model of the posterior; needed if the priors are custom.
@@ -58,15 +58,15 @@ def predict_reports(
     if not is_of_people(require_posterior("predict_reports", posterior)):
         raise TrustboError(
             "predict_reports needs a posterior of HumanTrust; got a posterior of "
-            f"{posterior.attrs.get('model')}. Use trustbo.inference.score instead."
+            f"{posterior.attrs.get('model')}. Use trustbo.inference.score for contact rates."
         )
     require_choice("given", given, ("earlier", "none"))
     seed, n = require_whole("seed", seed, 0), require_whole("n_draws", n_draws, 1)
     of_fit, draws = read_posterior(posterior, model=model)
     if missions[0].features != of_fit.slots.features:
         raise TrustboError(
-            f"the posterior has the inputs {of_fit.slots.features}, but the missions have "
-            f"{missions[0].features}; the inputs must match."
+            f"the posterior was fitted to the inputs {of_fit.slots.features}, but the missions "
+            f"have {missions[0].features}; give missions with the inputs of the posterior."
         )
     levels = levels_of(posterior.attrs["scale"])
     ahead = Posterior(of_fit.model, of_fit.model.slots(missions))
@@ -140,7 +140,7 @@ def _prediction(
     levels: int,
     rng: np.random.Generator,
 ) -> dict[str, Any]:
-    """Predict a report whose trust is N(center, var) in each draw."""
+    """Predict a report given trust ~ N(center, var) in each draw, with weights (draw,)."""
     family, sd = ahead.model.family, draws.theta["delta_v"]
     y, ticks = ahead.slots.y[slot], ahead.slots.n_ticks[slot]
     found: dict[str, Any] = {}

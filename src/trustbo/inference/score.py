@@ -27,8 +27,8 @@ def score(
 ) -> xr.Dataset:
     """Score predicted contact rates along the paths of missions.
 
-    A prediction is the marginal distribution of a rate before the mission starts. The distribution
-    is averaged over parameter draws and place effects, and includes process and observation noise.
+    A prediction is the marginal distribution of a rate before the mission starts. It is averaged
+    over parameter draws and place effects, and includes process and observation noise.
 
     Args:
         posterior: Posterior that predicts all `missions` and was fitted to none of them; or all
@@ -128,7 +128,7 @@ def _summary(
 def _trees(
     posterior: xr.DataTree | Sequence[xr.DataTree], missions: Sequence[Mission]
 ) -> list[xr.DataTree]:
-    """List the posterior that predicts each mission; a campaign starts with the second mission."""
+    """List the posterior that predicts each mission; in a campaign, the first one is left out."""
     if not missions:
         raise TrustboError("score needs missions to predict; got none.")
     if isinstance(posterior, xr.DataTree) or not isinstance(posterior, Sequence):
@@ -136,11 +136,11 @@ def _trees(
     trees = [require_posterior("score", tree) for tree in posterior]
     if not len(missions) - 1 <= len(trees) <= len(missions):
         raise TrustboError(
-            f"got {len(trees)} posteriors and {len(missions)} missions; give one posterior per "
-            "mission, as in Result.posteriors."
+            f"got {len(trees)} posteriors and {len(missions)} missions; give the posterior after "
+            "each mission, as in Result.posteriors."
         )
     if len(missions) == 1:
-        raise TrustboError("a campaign needs at least two missions to be scored; got one.")
+        raise TrustboError("score needs at least two missions of a campaign; got one.")
     return trees[: len(missions) - 1]
 
 

@@ -23,8 +23,8 @@ from trustbo.stacking import MissionBatch, stack_missions
 _OF_RATES = ("mission", "bound", "robot")
 _DIMS = dict.fromkeys(("trust", "trust_mean", "trust_sd", "contact_rate"), _OF_RATES)
 _N_TRAJECTORIES = 200  # kept draws of latent trust, evenly spaced in the chains
-N_PRIOR = 500
-_KEPT = ("posterior", "sample_stats", "prior", "hazard")
+N_PRIOR = 500  # draws in the groups `prior` and `prior_predictive`
+_KEPT = ("posterior", "sample_stats", "prior", "hazard")  # groups kept by `parameters_alone`
 
 
 def to_datatree(
@@ -33,12 +33,12 @@ def to_datatree(
     site_dims: dict[str, tuple[str, ...]],
     effects: Sequence[Effect] = (),
 ) -> xr.DataTree:
-    """Name the axes, remove the padding, and set values after a mission's end to NaN.
+    """Build a DataTree with named axes, without padding, and with NaN after a mission's end.
 
     Args:
         groups: Arrays by group and name, with leading axes (chain, draw) except for moments.
         missions: Missions of the posterior.
-        site_dims: Axes of the model's parameters.
+        site_dims: Axes of the model's parameters by name, without (chain, draw).
         effects: Effects of the model; the groups may include variables of these effects.
     """
     observed = stack_missions(missions)
@@ -72,7 +72,7 @@ def to_datatree(
         index = {"chain": np.arange(shape[0]), "draw": np.arange(shape[1])}
         index = index if draw is None else index | {"draw": draw}
         labelled = {name: labels for name, labels in (coords | index).items() if name in used}
-        # ArviZ labels variables by the dims of the first one, so those with most dims come first.
+        # ArviZ takes the dims from the first variable, so variables with the most dims come first.
         ordered = dict(sorted(variables.items(), key=lambda item: -len(item[1][0])))
         tree[group] = xr.Dataset(ordered, labelled)
     tree["observed_data"], tree["constant_data"] = _data_groups(observed, missions, coords)
@@ -82,13 +82,14 @@ def to_datatree(
 def _data_groups(
     observed: MissionBatch, missions: Sequence[Mission], coords: dict[str, object]
 ) -> tuple[xr.Dataset, xr.Dataset]:
+    """Build the groups `observed_data` and `constant_data`."""
     shape = observed.contact_rate.shape
     duration, cell = np.full(shape, np.nan), np.full((*shape[:2], 2), -1)
     for j, mission in enumerate(missions):
         duration[j, : len(mission.bounds)] = mission.duration
         cell[j, : len(mission.bounds)] = [bound.cell for bound in mission.bounds]
     starts = [mission.path[0] if mission.path else NOWHERE for mission in missions]
-    # The cells give the number of bounds, except for missions without a map.
+    # The number of bounds follows from the cells, except for missions without a map.
     n_bounds = [len(mission.bounds) for mission in missions]
     counted = {} if all(m.path for m in missions) else {"n_bounds": (("mission",), n_bounds)}
     dims, labelled = _OF_RATES, {name: coords[name] for name in _OF_RATES}
@@ -128,7 +129,7 @@ def complete(
     """Add latent trust, log-likelihoods and predictions to a posterior.
 
     A campaign stores only the parameters of its posteriors because the other groups grow with the
-    number of missions. The other groups are reproducible and can be computed at any time.
+    number of missions. The other groups can be computed at any time with the same result.
 
     Args:
         posterior: DataTree from `fit`, or one of `Result.posteriors`.
