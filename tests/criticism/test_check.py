@@ -99,5 +99,6 @@ def test_coverage_is_not_tested_without_rates():
 
 
 def test_what_is_no_posterior_of_contact_is_refused():
-    with pytest.raises(tb.TrustboError):
-        tb.check({})
+    for nothing in ({}, []):
+        with pytest.raises(tb.TrustboError):
+            tb.check(nothing)

@@ -114,6 +114,8 @@ def test_what_is_not_of_these_people_is_refused(posterior, persons):
     other = tb.Mission.from_arrays(None, np.zeros((2, 1, 1)), [[0.5], [0.5]], n_ticks=ticks)
     with pytest.raises(TrustboError, match="inputs"):
         predict_reports(posterior, [other])
+    with pytest.raises(TrustboError, match="at least one mission"):
+        predict_reports(posterior, [])
     with pytest.raises(TrustboError):
         predict_reports(fit(persons, PooledTrust(), progress=False, whole=False), persons)
     with pytest.raises(TrustboError, match="levels"):

@@ -83,7 +83,7 @@ def check(
             contains no data although `missions` is None.
     """
     trees = list(posterior) if isinstance(posterior, Sequence) else [posterior]
-    tree = require_posterior("check", trees[-1])
+    tree = require_posterior("check", trees[-1] if trees else None)
     if is_of_people(tree):
         raise TrustboError(
             "check needs a posterior of contact rates; got a posterior of HumanTrust. Use "

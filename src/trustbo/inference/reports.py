@@ -14,6 +14,7 @@ from trustbo.inference.score import QUANTILES
 from trustbo.models.model import TrustModel
 from trustbo.models.signal import each
 from trustbo.parallel import one_blas_thread
+from trustbo.stacking import require_same_team
 
 _ALIKE = 16  # draws of a fitted person's trust for each draw of the population parameters
 
@@ -60,6 +61,7 @@ def predict_reports(
             "predict_reports needs a posterior of HumanTrust; got a posterior of "
             f"{posterior.attrs.get('model')}. Use trustbo.inference.score for contact rates."
         )
+    require_same_team(missions)
     require_choice("given", given, ("earlier", "none"))
     seed, n = require_whole("seed", seed, 0), require_whole("n_draws", n_draws, 1)
     of_fit, draws = read_posterior(posterior, model=model)
