@@ -39,7 +39,7 @@ def test_a_robot_that_degrades_stands_out_from_then_on():
 
     odd = found.robots[found.robots["stands_out"]]
     assert found.table.loc["robots", "label"] == "r2"
-    assert set(zip(odd["mission"], odd["robot"], strict=True)) == {(j, "r2") for j in range(4, 8)}
+    assert set(zip(odd["mission"], odd["robot"], strict=True)) == {(j, "r2") for j in range(5, 9)}
 
 
 def test_a_place_with_less_contact_stands_out():

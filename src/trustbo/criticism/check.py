@@ -37,8 +37,9 @@ class Check(Summary):
         verdict: The findings that stand out, as text.
         table: One row per check (index `check`). The columns are the text of the `finding`, whether
             it `stands_out`, the most affected `label`, and the `size` and `probability`.
-        robots: One row per mission and robot, with the `effect` (share of line of sight minus the
-            median), its `sd`, the `probability` that it exceeds .1 in size, and `stands_out`.
+        robots: One row per `mission` (counted from 1) and `robot`, with the `effect` (share of line
+            of sight minus the median), its `sd`, the `probability` that it exceeds .1 in size, and
+            `stands_out`.
     """
 
     verdict: str
@@ -113,8 +114,8 @@ def effects_of_robots(posterior: xr.DataTree) -> pd.DataFrame:
     probability = np.maximum((draws < -SIZE).mean(0), (draws > SIZE).mean(0))
     columns = {"effect": draws.mean(0), "sd": draws.std(0), "probability": probability}
     columns["stands_out"] = probability > SURE
-    dims = ("mission", "robot")
-    index = pd.MultiIndex.from_product([group[name].values for name in dims], names=dims)
+    labels = group["mission"].values + 1, group["robot"].values
+    index = pd.MultiIndex.from_product(labels, names=("mission", "robot"))
     return pd.DataFrame({n: v.ravel() for n, v in columns.items()}, index).reset_index()
 
 
