@@ -23,8 +23,8 @@ __dir__ = __all__.copy  # tab completion lists only public names
 _DRAWS = 50
 """Number of posterior draws for the uncertainty map."""
 _SHOWN = 3
-"""Number of bounds shown in detail: those with the least trust."""
-_ENDS = {"n_iterations": "all missions were run", "interrupted": "the campaign was interrupted"}
+"""Number of bounds shown in detail, which are the bounds with the least trust."""
+_ENDS = {"n_iterations": "all missions were run", "interrupted": "none; more missions can be run"}
 _PAGE = """<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
@@ -50,8 +50,8 @@ td, th {{ padding: .2em .7em; text-align: right; border: 0; border-bottom: 1px s
 def write_report(path: FilePath, result: Result) -> None:
     """Write a result as one self-contained HTML page.
 
-    The page begins with the recommended path and the predicted contact and risk, followed by the
-    trust map, the missions, the uncertainties, the diagnostics and the settings.
+    The page begins with the recommended path and its predicted contact and risk. The trust map,
+    the missions, the uncertainty, the diagnostics and the settings follow.
 
     Args:
         path: File to write.
@@ -60,8 +60,7 @@ def write_report(path: FilePath, result: Result) -> None:
     Raises:
         TrustboError: There is no posterior yet, or the file cannot be written.
     """
-    plan, body = result.plan, []
-    body += [_facts(result), *_path(plan), *_trust(result), *_missions(result)]
+    body = [_facts(result), *_path(result.plan), *_trust(result), *_missions(result)]
     body += [*_uncertainty(result), *_diagnostics(result), *_settings(result)]
     n = len(result.missions)
     title = f"Recommended path after {n} mission{'s' * (n != 1)}"
@@ -69,18 +68,20 @@ def write_report(path: FilePath, result: Result) -> None:
 
 
 def _facts(result: Result) -> str:
-    """Make a table of the facts needed to decide whether to follow the path."""
-    plan, trust = result.plan, np.minimum(result.plan.trust, 1.0).mean(1)
-    worst = int(np.argmin(trust))
+    """Make a table of the facts needed to decide whether to drive the path."""
+    plan, problem = result.plan, result.planner.problem
+    noise_sd = problem.dynamics(result.belief.mean()).noise_sd
+    contact = np.minimum(problem.family.mean_rate(plan.trust, noise_sd), 1.0).mean(1)
+    worst, rate = int(np.argmin(contact)), result.state.entries[-1].row["contact_rate"]
+    last = f"{rate:.1%} of the time" if np.isfinite(rate) else "not measured"
     cells = " → ".join(f"{row},{col}" for row, col in plan.path)
     facts = {
         "Path": f"{cells} (row,column; row 0 is north)",
         "Length": f"{len(plan.path) - 1} bounds, {plan.length:.0f} m",
-        "Expected contact": f"{trust.mean():.1%} of the time, averaged over robots and bounds",
+        "Expected contact": f"{contact.mean():.1%} of the time, averaged over robots and bounds",
         "Weakest bound": f"bound {worst + 1} into cell {_name(plan.path[worst + 1])}, "
-        f"expected contact {trust[worst]:.1%}",
-        "Last mission": f"{result.missions[-1].status}, contact "
-        f"{np.nanmean(result.missions[-1].contact_rate):.1%} of the time",
+        f"expected contact {contact[worst]:.1%}",
+        "Last mission": f"status {result.missions[-1].status}, contact {last}",
         "Reason for stopping": _ENDS.get(result.stop_reason, result.stop_reason),
     }
     if plan.p_arrive is not None:
@@ -92,7 +93,7 @@ def _facts(result: Result) -> str:
 
 
 def _path(plan: Plan) -> list[str]:
-    """Plot the recommended path, with posts on a terrain, and make a table of its bounds."""
+    """Plot the recommended path if there is a terrain, and make a table of its bounds."""
     content = [_heading("Recommended path")]
     if plan.stops is not None:
         weakest = sorted((np.argsort(plan.trust.mean(1))[:_SHOWN] + 1).tolist())
@@ -115,12 +116,14 @@ def _path(plan: Plan) -> list[str]:
 
 
 def _trust(result: Result) -> list[str]:
+    is_logit = result.settings["observation"] == "beta_binomial"
+    scale = "Trust is the logit of contact." if is_logit else "A trust of 1 means unbroken contact."
     return [
         _heading("Trust map"),
         _image(result.plot_maps, "trust maps after selected missions"),
         _note(
-            "Expected trust in each cell, and the path planned with this trust. A trust of 1 means "
-            "unbroken contact between the lead and the other robots. Grey cells are impassable."
+            f"Expected trust in each cell, and the path planned with this trust. {scale} "
+            "Grey cells are impassable."
         ),
     ]
 
@@ -146,7 +149,7 @@ def _uncertainty(result: Result) -> list[str]:
     maps = result.planner.trust_summary(result.posterior, n_draws=_DRAWS)
     driven = {bound.cell for mission in result.missions for bound in mission.bounds}
     new = [_name(cell) for cell in plan.path[1:] if cell not in driven]
-    known = "Every cell of the path was entered in an earlier mission."
+    known = "Every cell of the path was entered in a mission."
     if new:
         known = f"Cells of the path that were never entered: {', '.join(new)}."
     band = ""
@@ -156,7 +159,7 @@ def _uncertainty(result: Result) -> list[str]:
             f"The objective is {plan.value:.3g}, with a 90 % interval of {low:.3g} to {high:.3g}."
         )
     return [
-        _heading("What is uncertain"),
+        _heading("Uncertainty"),
         _image(
             lambda: plots.cell_map(
                 maps["sd"], result.workspace, path=plan.path, label="sd of expected trust"
@@ -165,13 +168,12 @@ def _uncertainty(result: Result) -> list[str]:
         ),
         _note(
             f"{known} {band} The intervals assume an adequate model (see trustbo.criticism). "
-            "Trust in cells that no robot entered is predicted from a map that may be out of date."
+            "In cells that were never entered, trust is predicted from a map that may be outdated."
         ),
     ]
 
 
 def _diagnostics(result: Result) -> list[str]:
-    attrs = result.posterior.attrs
     names = {
         "k_hat": "Pareto k-hat (good below 0.7)",
         "kish": "effective samples (Kish)",
@@ -180,15 +182,15 @@ def _diagnostics(result: Result) -> list[str]:
         "divergences": "divergences",
     }
     last = result.history.isel(iteration=-1)
-    rows = {text: float(last[name]) for name, text in names.items() if name in last}
-    rows = {text: value for text, value in rows.items() if np.isfinite(value)}
+    known = [name for name in names if name in last and np.isfinite(last[name])]
+    rows = {names[name]: float(last[name]) for name in known}
     table: Any = summary(result.posterior, round_to="none")
     kept = [name for name in ("mean", "sd", "eti89_lb", "eti89_ub") if name in table]
     return [
         _heading("Diagnostics"),
-        _note(f"Sampler of the last posterior: {escape(str(attrs.get('sampler', 'unknown')))}."),
+        _note(f"Sampler: {result.posterior.attrs.get('sampler', 'unknown')}."),
         _table(pd.Series(rows, name="value").rename_axis("diagnostic").to_frame()),
-        _table(table[kept or list(table.columns)].rename_axis("parameter")),
+        _table(table[kept].rename_axis("parameter")),
     ]
 
 
@@ -221,7 +223,7 @@ def _table(frame: pd.DataFrame) -> str:
 
 
 def _image(draw: Callable[[], Any], alt: str) -> str:
-    """Draw a figure and return it as an image for the page."""
+    """Draw a figure and return an HTML image with the figure."""
     with drawing("default"):
         figure = np.ravel(draw())[0].get_figure(root=True)
         file = io.BytesIO()

@@ -1,5 +1,7 @@
 """Figures: they draw on new axes and on those of the user, and show the numbers given."""
 
+import re
+
 import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
@@ -8,7 +10,7 @@ import pytest
 
 import trustbo as tb
 from trustbo import plots
-from trustbo.plots.maps import contour_interval, contours, draw_path, extent_of
+from trustbo.plots.maps import contour_interval, contours, draw_path, extent_of, trust_limits
 from trustbo.report import write_report
 
 EFFECTS = pd.DataFrame(
@@ -103,6 +105,11 @@ def test_contour_lines_of_a_plane_are_level():
     assert [contour_interval(relief) for relief in (0.0, 12.0, 60.0, 240.0)] == [None, 1, 5, 20]
 
 
+@pytest.mark.parametrize(("high", "limit"), [(0.9, 0.9), (1.05, 1.0), (4.0, 4.0)])
+def test_scales_of_trust_end_at_1_unless_trust_is_a_logit(high, limit):
+    assert trust_limits(np.array([0.5, high] * 50)) == (0.5, limit)
+
+
 def test_the_explorer_is_one_page_without_addresses(result, tmp_path):
     page = result.explore()
     page.save(tmp_path / "map.html")
@@ -119,3 +126,15 @@ def test_the_report_is_one_page_with_the_path_and_every_figure(result, tmp_path)
     assert "→".join(f" {row},{col} " for row, col in result.path).strip() in html
     assert html.count('src="data:image/png;base64,') == 4
     assert "http" not in html
+
+
+def test_the_report_has_contact_and_not_the_logit_of_it(result, tmp_path):
+    model = tb.models.PooledTrust(observation="beta_binomial")
+    ends = (3, 0), (0, 2)
+    found = tb.iterate(result.workspace, *ends, n_iterations=1, model=model, progress=False)
+    write_report(tmp_path / "report.html", found)
+    html = (tmp_path / "report.html").read_text(encoding="utf-8")
+    contact = 1.0 / (1.0 + np.exp(-found.plan.trust.mean(1)))
+    assert found.plan.trust.max() > 1.0
+    shown = float(re.search(r"Expected contact</th><td>([\d.]+)%", html)[1])
+    assert shown == pytest.approx(100.0 * contact.mean(), abs=1.0)

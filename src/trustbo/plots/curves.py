@@ -1,4 +1,4 @@
-"""Curves of trust along a mission, of a campaign's history and of robot effects."""
+"""Figures of trust along a mission, of a campaign's history and of robot effects."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -18,29 +18,29 @@ from trustbo.plots.style import (
     accent,
     add_legend,
     as_text,
+    background,
     ink,
     panels,
-    paper,
     styled,
 )
 
 _LABELS = {
     "contact_lost": "contact lost\n(bounds)",
     "contact_rate": "contact rate",
-    "objective": "objective\nwhen planned",
+    "objective": "objective\n(predicted)",
     "regret": "regret (%)",
 }
-"""Variables of a history that `campaign_history` plots, with their axis labels."""
+"""Axis labels of the variables that `campaign_history` plots, keyed by name."""
 SMALL_EFFECT = 0.1
-"""Robot effect, as a fraction of contact, that is too small to change plans."""
+"""Robot effect, as a fraction of contact, up to which plans hardly change."""
 
 
 @styled
 def trust_curves(given: xr.DataTree | Plan, mission: int = -1, *, ax: Any = None) -> np.ndarray:
-    """Plot the trust of each robot along a mission or a plan, with 50 % and 90 % bands.
+    """Plot the trust in each robot along a mission or a plan, with 50 % and 90 % bands.
 
     Args:
-        given: Posterior from `tb.fit`, plotted with the measured contact rates as dots; or a plan
+        given: Posterior from `tb.fit`, whose measured contact rates are plotted as dots; or a plan
             computed from a posterior, such as `Result.plan`.
         mission: Index of the mission in a posterior; negative indices count from the last.
         ax: Axes to draw on, one for each robot; by default a new figure.
@@ -76,7 +76,7 @@ def trust_curves(given: xr.DataTree | Plan, mission: int = -1, *, ax: Any = None
 def _latent_trust(
     posterior: xr.DataTree, mission: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Sequence[str]]:
-    """Return the bounds, trust medians, trust quantiles, rates and robots of a mission."""
+    """Return bounds, trust medians and quantiles, contact rates and robots of a mission."""
     if "latent" not in posterior.children:
         raise TrustboError(
             "this posterior has no latent trust; use inference.complete(posterior, missions)."
@@ -84,7 +84,7 @@ def _latent_trust(
     latent = posterior["latent"].to_dataset()
     n = latent.sizes["mission"]
     if not -n <= mission < n:
-        raise TrustboError(f"mission must be from {-n} to {n - 1}; got {mission!r}.")
+        raise TrustboError(f"mission must be an index from {-n} to {n - 1}; got {mission!r}.")
     trust = latent["trust"].isel(mission=mission).stack(all_draws=("chain", "draw"))
     trust = trust.dropna("bound", how="all").transpose("all_draws", "bound", "robot")
     rates = posterior["observed_data"]["contact_rate"].isel(mission=mission)
@@ -97,7 +97,7 @@ def _latent_trust(
 def campaign_history(history: xr.Dataset, *, ax: Any = None) -> np.ndarray:
     """Plot the contact, the objective and, if known, the regret of each mission.
 
-    A filled dot marks a path that differs from the previous path. A cross marks a mission that did
+    A filled dot marks a plan that differs from the previous plan. A cross marks a mission that did
     not reach the goal.
 
     Args:
@@ -106,12 +106,7 @@ def campaign_history(history: xr.Dataset, *, ax: Any = None) -> np.ndarray:
 
     Returns:
         Axes, shape (variable,): contact lost (or the contact rate), objective, and regret.
-
-    Raises:
-        TrustboError: The history is empty.
     """
-    if not history.sizes.get("iteration"):
-        raise TrustboError("the history has no missions yet.")
     names = [name for name in _LABELS if name in history]
     if "contact_lost" in names:
         names.remove("contact_rate")
@@ -126,7 +121,7 @@ def campaign_history(history: xr.Dataset, *, ax: Any = None) -> np.ndarray:
             dots = {"markerfacecolor": fill, "markeredgecolor": accent(), "label": label}
             one.plot(mission[which], values[which], "o", markersize=5.5, **dots)
         if failed.any():
-            cross = {"color": ROBOTS[1], "markersize": 9.0, "label": "not at the goal"}
+            cross = {"color": ROBOTS[1], "markersize": 9.0, "label": "goal not reached"}
             one.plot(mission[failed], values[failed], "x", **cross)
         one.set_ylabel(_LABELS[name])
     axes[-1].set_xlabel("mission")
@@ -139,11 +134,12 @@ def campaign_history(history: xr.Dataset, *, ax: Any = None) -> np.ndarray:
 def robot_effects(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
     """Plot the effect of each robot in each mission, with bars of two standard deviations.
 
-    The band marks effects too small to change a plan. Filled markers show effects that stand out.
+    The grey band marks effects too small to change a plan. Filled markers show robots that stand
+    out from the team.
 
     Args:
-        table: Table with one row for each mission and robot, and the columns `mission`, `robot`,
-            `effect`, `sd` and `stands_out`, such as the table `robots` of a check.
+        table: Table `robots` of a `tb.check`, with one row for each mission and robot. Its columns
+            are `mission` (from 1), `robot`, `effect`, `sd` and `stands_out`.
         ax: Axes to draw on; by default a new figure.
 
     Returns:
@@ -164,9 +160,9 @@ def robot_effects(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
         x, y = rows["mission"].to_numpy() + shifts[i], rows["effect"].to_numpy()
         odd = rows["stands_out"].to_numpy(dtype=bool)
         one.errorbar(x, y, 2.0 * rows["sd"].to_numpy(), color=colour, fmt="none", elinewidth=1.0)
-        one.plot(x, y, marker, color=colour, markerfacecolor=paper(), label=str(name))
+        one.plot(x, y, marker, color=colour, markerfacecolor=background(), label=str(name))
         one.plot(x[odd], y[odd], marker, color=colour)
-    one.set(xlabel="mission", ylabel="effect on contact in full sight")
+    one.set(xlabel="mission", ylabel="effect on contact at full sight")
     one.xaxis.set_major_locator(MaxNLocator(integer=True))
     add_legend(axes, one.get_legend_handles_labels()[0])
     return one

@@ -1,4 +1,4 @@
-"""Interactive map of a result as one self-contained HTML page."""
+"""Interactive map of a result, as a self-contained HTML page."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,24 +9,23 @@ import numpy as np
 import xarray as xr
 
 from trustbo.data import Cell
-from trustbo.errors import TrustboError
 from trustbo.files import FilePath, write_text
 from trustbo.planning import Plan
-from trustbo.plots.maps import contours, extent_of, robust_limits
+from trustbo.plots.maps import contours, extent_of, robust_limits, trust_limits
 from trustbo.plots.style import ROBOTS
 from trustbo.workspace.grid import Grid, over_cells
 
 _PLANNED_ON = "trust map used to plan the mission"
 _MARKERS = ("circle", "square", "diamond", "triangle", "inverted_triangle", "plus")
 _HEIGHT = 640
-"""Height of the page in a notebook, in pixels."""
+"""Height of the page in a notebook, pixels."""
 _UPDATE = """
 const n = mission.value
 const column = layer.value == planned_on ? `mission ${n}` : layer.value
 cells.data = {...cells.data, value: cells.data[column]}
 colours.low = limits[column][0]
 colours.high = limits[column][1]
-driven.data = paths[n - 1]
+planned.data = paths[n - 1]
 text.text = texts[n - 1]
 """
 """JavaScript callback that runs when the user selects a layer or a mission."""
@@ -34,10 +33,10 @@ text.text = texts[n - 1]
 
 @dataclass(frozen=True)
 class Explorer:
-    """Interactive page that notebooks display.
+    """Interactive HTML page, which notebooks display.
 
     Attributes:
-        html: Self-contained page, which works offline.
+        html: Source of the page, which works offline.
     """
 
     html: str
@@ -52,7 +51,7 @@ class Explorer:
 
 
 def explore(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> Explorer:
-    """Make an interactive map with layers, cell values at the pointer, and a mission slider.
+    """Make an interactive map with layers, cell values at the pointer, and a slider over missions.
 
     Args:
         plan: Recommended plan, such as `Result.plan`.
@@ -60,14 +59,9 @@ def explore(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> Explorer:
         history: Paths, trust maps and outcomes of the missions, such as `Result.history`.
 
     Returns:
-        Page to display or save.
-
-    Raises:
-        TrustboError: The history has no missions.
+        Page, which notebooks display and `save` writes to a file.
     """
-    if not history.sizes.get("iteration"):
-        raise TrustboError("the history has no missions, so there is nothing to explore.")
-    from bokeh.embed import file_html  # slow to import: half a second
+    from bokeh.embed import file_html  # imported here, as it takes half a second
     from bokeh.resources import INLINE
 
     html = file_html(_layout(plan, maps, history), INLINE, title="trustbo")
@@ -86,7 +80,7 @@ def _layout(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> Any:
     names = [name for name in layers if not name.startswith("mission ")]
     trusts = [name for name in layers if name == "trust mean" or name not in names]
     limits = {name: robust_limits(values) for name, values in layers.items()}
-    limits |= dict.fromkeys(trusts, robust_limits(np.stack([layers[name] for name in trusts])))
+    limits |= dict.fromkeys(trusts, trust_limits(np.stack([layers[name] for name in trusts])))
     x, y = np.meshgrid(grid.x - grid.corner[0], grid.y - grid.corner[1])
     row, col = np.indices(grid.shape)
     columns = {name: values.ravel() for name, values in layers.items()}
@@ -109,7 +103,7 @@ def _layout(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> Any:
     fill: Any = {"field": "value", "transform": colours}
     drawn = plot.rect("x", "y", source=cells, fill_color=fill, line_color=None, **size)
     plot.add_layout(models.ColorBar(color_mapper=colours, height=12), "below")
-    tips = [("cell", "@cell_row,@cell_col"), ("shown", "@value{0.000}")]
+    tips = [("cell", "@cell_row,@cell_col"), ("selected layer", "@value{0.000}")]
     tips += ((n, f"@{{{n}}}{{0.000}}") for n in names)
     plot.add_tools(models.HoverTool(renderers=[drawn], tooltips=tips))
     lines = contours(plan.workspace)
@@ -121,10 +115,10 @@ def _layout(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> Any:
     paths = [_places(_cells(one), grid) for one in history["path"].values]
     texts = [_text(history.isel(iteration=i)) for i in range(len(paths))]
     n_missions = len(paths)
-    driven = models.ColumnDataSource(paths[-1])
+    planned = models.ColumnDataSource(paths[-1])
     plot.line(
-        "x", "y", source=driven, color="#d55e00", line_width=4, line_dash="dashed",
-        legend_label="mission",
+        "x", "y", source=planned, color="#d55e00", line_width=4, line_dash="dashed",
+        legend_label="plan of the mission",
     )  # fmt: skip
     _draw_plan(plot, plan)
     plot.legend.click_policy = "hide"
@@ -138,7 +132,7 @@ def _layout(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> Any:
     )  # fmt: skip
     text = models.Div(text=texts[-1], sizing_mode="stretch_width")
     shared = {
-        "cells": cells, "colours": colours, "driven": driven, "layer": layer, "mission": mission,
+        "cells": cells, "colours": colours, "planned": planned, "layer": layer, "mission": mission,
         "text": text, "limits": limits, "paths": paths, "texts": texts, "planned_on": _PLANNED_ON,
     }  # fmt: skip
     update = models.CustomJS(args=shared, code=_UPDATE)
@@ -149,7 +143,7 @@ def _layout(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> Any:
 
 
 def _layers(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> dict[str, np.ndarray]:
-    """Return the layers (row, col), keyed by name; trust maps of missions are "mission 1", ..."""
+    """Return maps (row, col), keyed by name; "mission 1" is the trust map of the first mission."""
     free = plan.workspace.passable.values
     layers = {
         str(name).replace("_", " "): over_cells(values).transpose("row", "col").values
@@ -168,7 +162,7 @@ def _layers(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> dict[str, np.n
 
 
 def _draw_plan(plot: Any, plan: Plan) -> None:
-    """Plot the recommended path and, on a terrain, the posts and routes of the robots."""
+    """Plot the recommended path and, with a terrain, the posts and routes of the robots."""
     grid = plan.workspace.grid
     corner, path = np.array(grid.corner), _places(plan.path, grid)
     plot.line(path["x"], path["y"], color="black", line_width=5, legend_label="recommended")
@@ -188,21 +182,21 @@ def _draw_plan(plot: Any, plan: Plan) -> None:
 
 
 def _cells(steps: np.ndarray) -> list[Cell]:
-    """Return the cells of a path from a history, where paths are padded with -1."""
+    """Return the cells of a path in a history, without the padding of -1."""
     return [(int(row), int(col)) for row, col in steps if row >= 0]
 
 
 def _places(path: Sequence[Cell], grid: Grid) -> dict[str, Any]:
-    """Return the positions of a path, in metres from the lower left corner of the grid."""
+    """Return the x and y of a path's cells, in metres from the lower left corner of the grid."""
     x, y = (np.array([grid.center(cell) for cell in path]) - grid.corner).T
     return {"x": x.tolist(), "y": y.tolist()}
 
 
 def _text(mission: xr.Dataset) -> str:
-    """Describe a mission in one line."""
+    """Describe a mission in one line of HTML."""
     return (
         f"<b>Mission {int(mission['iteration'])}</b>: {escape(str(mission['status'].item()))}, "
         f"contact rate {float(mission['contact_rate']):.3f}, "
-        f"{len(_cells(mission['path'].values)) - 1} bounds, "
-        f"objective {float(mission['objective']):.3f} when planned"
+        f"plan of {len(_cells(mission['path'].values)) - 1} bounds, "
+        f"predicted objective {float(mission['objective']):.3f}"
     )

@@ -1,4 +1,4 @@
-"""Planning grid of a workspace, with labelled cells."""
+"""Figure of the planning grid, with labelled cells."""
 
 import numpy as np
 from matplotlib import colormaps
@@ -8,9 +8,9 @@ from matplotlib.colors import ListedColormap
 from trustbo.plots.style import figure_of, panels, styled
 from trustbo.workspace import Workspace
 
-_WIDTH = 7.0
-_MOST_NAMED = 24
-"""Number of rows or columns above which only the edges of the grid are labelled."""
+_WIDTH = 7.0  # of a new figure, inches
+_MAX_LABELLED = 24
+"""Number of rows or columns up to which every cell is labelled."""
 
 
 @styled
@@ -24,7 +24,7 @@ def grid_map(workspace: Workspace, *, ax: Axes | None = None) -> Axes:
         ax: Axes to draw on; by default a new figure.
 
     Returns:
-        Axes of the grid.
+        Axes of the figure.
     """
     grid, (rows, cols) = workspace.grid, workspace.grid.shape
     tall = grid.cell_height / grid.cell_width
@@ -39,7 +39,7 @@ def grid_map(workspace: Workspace, *, ax: Axes | None = None) -> Axes:
     one.pcolor(*edges, closed, cmap=ListedColormap(["0.8"]), hatch="///", edgecolor="0.6", lw=0.0)
     one.vlines(edges[0], -0.5, rows - 0.5, color="black", lw=0.4, alpha=0.5)
     one.hlines(edges[1], -0.5, cols - 0.5, color="black", lw=0.4, alpha=0.5)
-    if max(rows, cols) <= _MOST_NAMED:
+    if max(rows, cols) <= _MAX_LABELLED:
         room = figure_of([one]).get_figwidth() * one.get_position().width / cols  # inches
         size = min(8.0, 72.0 * room / 3.2)
         for row, col in np.ndindex(*grid.shape):

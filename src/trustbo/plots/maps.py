@@ -14,20 +14,21 @@ from scipy.ndimage import gaussian_filter
 
 from trustbo.data import Cell
 from trustbo.errors import TrustboError
-from trustbo.plots.style import GREY, as_text, ink, outlined, panels, paper, styled
+from trustbo.plots.style import GREY, as_text, background, ink, outlined, panels, styled
 from trustbo.terrain import pixel_size
 from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Grid, over_cells
 
 MOMENTS = (1, 2, 4)
-"""Missions whose maps are plotted by default, in addition to the map after the last mission."""
+"""Missions for which `trust_maps` plots the map used for planning, by default."""
 VEGETATION = (0.44, 0.56, 0.39, 0.4)
-"""Semi-transparent green that is visible on light and dark backgrounds."""
+"""Colour of vegetation: a semi-transparent green for light and dark backgrounds."""
 _GROWN = 0.5  # minimum height of vegetation above the ground, m
 _CONTOURS = 12  # maximum number of contour levels
-_MOST_PIXELS = 400  # maximum side of the raster on which contour lines are traced
-_SMOOTH = 0.01  # width of the smoothing, as a fraction of the raster's side
+_MAX_PIXELS = 400  # maximum number of rows or columns when contour lines are computed
+_SMOOTH = 0.01  # sd of the smoothing, as a fraction of the raster's longer side
 _ROBUST = (0.02, 0.98)  # quantiles at the ends of the colour scale
+_LOGIT = 1.5  # trust above this value is on the logit scale of beta-binomial models
 
 
 @styled
@@ -40,14 +41,14 @@ def trust_maps(
     missions: Sequence[int] = MOMENTS,
     ax: Any = None,
 ) -> np.ndarray:
-    """Plot the trust maps used to plan missions, with the planned paths (Fig. 5 of the paper).
+    """Plot the trust maps used to plan missions, and the planned paths (Fig. 5 of the paper).
 
     The last panel shows the map and the recommended path after the last mission. All maps share one
     colour scale, from the 2 % to the 98 % quantile of the learned maps. The start is grey because
-    its trust is assumed. A trust of 1 means unbroken contact; larger values have the same colour.
+    its trust is assumed. A trust slightly above 1 has the colour of 1 (unbroken contact).
 
     Args:
-        history: Map and path of each iteration, such as `Result.history`.
+        history: Trust map and path of each mission, such as `Result.history`.
         trust_map: Map after the last mission, dims (row, col), such as `Result.trust_map`.
         path: Path recommended after the last mission, such as `Result.path`.
         workspace: Workspace of the cells.
@@ -66,8 +67,8 @@ def trust_maps(
 
     values = np.stack([one.transpose("row", "col").values for one in maps])
     values[:, *path[0]] = np.nan
-    low, high = robust_limits(values[[n > 0 for n in learned]])
-    norm = Normalize(low, min(high, 1.0) if low < 1.0 else high)
+    low, high = trust_limits(values[[n > 0 for n in learned]])
+    norm = Normalize(low, high)
 
     axes = map_panels(workspace.grid, len(maps), ax)
     for one, trust, cells, n in zip(axes, values, paths, learned, strict=True):
@@ -75,15 +76,16 @@ def trust_maps(
         draw_path(one, cells, workspace.grid)
         one.set_title("prior" if n == 0 else f"after {n} mission{'s' * (n > 1)}")
     draw_scale(axes[0], workspace.grid)
-    colour_bar(axes, ScalarMappable(norm), "expected trust (1: unbroken contact)", extend="both")
+    unit = " (1: unbroken contact)" if high <= 1.0 else ""
+    colour_bar(axes, ScalarMappable(norm), f"expected trust{unit}", extend="both")
     return axes
 
 
 @styled
 def terrain_maps(workspace: Workspace, *, ax: Any = None) -> np.ndarray:
-    """Plot the surface and the index of each feature (Fig. 4 of the paper).
+    """Plot the heights of the DSM and the index of each feature (Fig. 4 of the paper).
 
-    A feature of bounds, such as line of sight, is averaged over robots and over all bounds that
+    Features of bounds, such as line of sight, are averaged over robots and over all bounds that
     enter a cell.
 
     Args:
@@ -137,7 +139,7 @@ def cell_map(
         path: Path to draw.
         limits: Values at the ends of the colour scale; by default the range of the map.
         cmap: Matplotlib `Colormap` or its name.
-        label: Label of the colour bar, by default the name of the map; `""` for no colour bar.
+        label: Label of the colour bar; by default the name of the map; `""` for no colour bar.
         ax: Axes to draw on; by default a new figure.
 
     Returns:
@@ -163,7 +165,7 @@ def draw_path(ax: Axes, path: Sequence[Cell], grid: Grid) -> None:
 
 
 def map_panels(grid: Grid, n: int, ax: Any) -> np.ndarray:
-    """Return axes for n maps, in metres from the lower left corner of the grid."""
+    """Return axes for n maps; positions are in metres from the lower left corner of the grid."""
     left, right, bottom, top = extent_of(grid)
     tall = float(np.clip((top - bottom) / (right - left), 0.3, 3.0))
     width = 3.0 if n > 1 else 4.0
@@ -214,7 +216,7 @@ def draw_ground(ax: Axes, workspace: Workspace) -> None:
 
 
 def draw_cell_edges(ax: Axes, grid: Grid) -> None:
-    """Draw the cell edges."""
+    """Draw the edges of all cells."""
     _, right, _, top = extent_of(grid)
     style: dict[str, Any] = {"color": "white", "linewidth": 0.3, "alpha": 0.5}
     ax.vlines(np.arange(1, grid.shape[1]) * grid.cell_width, 0.0, top, **style)
@@ -222,27 +224,27 @@ def draw_cell_edges(ax: Axes, grid: Grid) -> None:
 
 
 def draw_contours(ax: Axes, workspace: Workspace, colour: str, opacity: float) -> None:
-    """Draw contour lines of the ground; none without a terrain."""
+    """Draw contour lines of the ground, if there is a terrain."""
     lines = LineCollection(contours(workspace), colors=colour, alpha=opacity, linewidths=0.5)
     ax.add_collection(lines, autolim=False)
 
 
 def contours(workspace: Workspace) -> list[np.ndarray]:
-    """Compute contour lines of the ground at no more than 12 round heights.
+    """Compute contour lines of the ground at up to 12 round heights.
 
     Returns:
-        Lines, each (point, 2): x and y in metres from the map's lower left corner.
+        Lines, each (point, 2): x and y in metres from the lower left corner of the grid.
     """
     if workspace.terrain is None:
         return []
     terrain = workspace.terrain
-    step = -(-max(terrain["dem"].shape) // _MOST_PIXELS)
+    step = -(-max(terrain["dem"].shape) // _MAX_PIXELS)
     height = terrain["dem"].values[::step, ::step]
     valid = np.isfinite(height)
     if min(height.shape) < 3 or not valid.any():
         return []
 
-    # A normalised convolution ignores unknown heights.
+    # Smooth the known heights only (normalised convolution).
     width = max(1.0, _SMOOTH * max(height.shape))
     weight = gaussian_filter(valid.astype(float), width)
     smooth = gaussian_filter(np.where(valid, height, 0.0), width) / np.maximum(weight, 1e-9)
@@ -260,7 +262,7 @@ def contours(workspace: Workspace) -> list[np.ndarray]:
 
 
 def contour_interval(relief: float) -> float | None:
-    """Choose a round contour interval in metres; None on level ground."""
+    """Choose a round contour interval, m, for this height range, m; None on level ground."""
     if not relief > 0.05:
         return None
     magnitude = 10.0 ** np.floor(np.log10(relief / _CONTOURS))
@@ -269,25 +271,31 @@ def contour_interval(relief: float) -> float | None:
 
 
 def robust_limits(values: np.ndarray) -> tuple[float, float]:
-    """Return the limits of the colour scale: quantiles, which are robust to outliers."""
+    """Return limits of a colour scale: the 2 % and 98 % quantiles, to be robust to outliers."""
     low, high = np.nanquantile(values, _ROBUST).tolist()
     return (low, high) if low < high else (low - 0.5e-3, high + 0.5e-3)
 
 
+def trust_limits(values: np.ndarray) -> tuple[float, float]:
+    """Return `robust_limits`, where an upper limit just above 1 (unbroken contact) becomes 1."""
+    low, high = robust_limits(values)
+    return low, 1.0 if low < 1.0 < high < _LOGIT else high
+
+
 def draw_scale(ax: Axes, grid: Grid) -> None:
-    """Draw a scale bar with a round length in metres in the lower right corner of a map."""
+    """Draw a scale bar of a round length in the lower right corner of a map."""
     left, right = ax.get_xlim()
     width = right - left
     magnitude = 10.0 ** np.floor(np.log10(0.4 * width))
     length = max(f * magnitude for f in (1, 2, 5) if f * magnitude <= 0.4 * width * (1 + 1e-9))
     ends = [0.96 - length / width, 0.96]
     (bar,) = ax.plot(ends, [0.045, 0.045], color=ink(), linewidth=2.0, transform=ax.transAxes)
-    bar.set(solid_capstyle="butt", path_effects=outlined(4.0, paper()))
+    bar.set(solid_capstyle="butt", path_effects=outlined(4.0, background()))
     label = f"{length / 1000:g} km" if length >= 1000 else f"{length:g} m"
     text = ax.text(0.96, 0.065, label, ha="right", color=ink(), transform=ax.transAxes)
-    text.set_path_effects(outlined(2.5, paper()))
+    text.set_path_effects(outlined(2.5, background()))
 
 
 def extent_of(grid: Grid) -> tuple[float, float, float, float]:
-    """Return a map's left, right, bottom and top edges, in metres from its lower left corner."""
+    """Return the left, right, bottom and top edges of a grid, m from its lower left corner."""
     return (0.0, grid.shape[1] * grid.cell_width, 0.0, grid.shape[0] * grid.cell_height)

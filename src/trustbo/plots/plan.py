@@ -1,4 +1,4 @@
-"""Maps of a plan, bound by bound: stops of the lead, posts, sight lines and routes."""
+"""Maps of each bound of a plan: stops of the lead, posts, sight lines and routes."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -11,14 +11,14 @@ from matplotlib.patches import Patch
 from trustbo.errors import TrustboError
 from trustbo.planning import Plan
 from trustbo.plots.maps import VEGETATION, draw_ground, draw_path, draw_scale, extent_of
-from trustbo.plots.style import GREY, MARKERS, ROBOTS, add_legend, ink, panels, paper, styled
+from trustbo.plots.style import GREY, MARKERS, ROBOTS, add_legend, background, ink, panels, styled
 
 _DASHED = (0, (3, 1.5))
 
 
 @styled
 def plan_map(plan: Plan, *, bounds: Sequence[int] | None = None, ax: Any = None) -> np.ndarray:
-    """Plot an overview of a plan's path, and a map of each bound.
+    """Plot a map of the path of a plan, and a map of each bound.
 
     The map of a bound shows the lead's route between its stops, the posts of the other robots with
     their sight lines to the lead's next stop, and the routes to their next posts.
@@ -26,7 +26,7 @@ def plan_map(plan: Plan, *, bounds: Sequence[int] | None = None, ax: Any = None)
     Args:
         plan: Plan on a terrain, such as `Result.plan`.
         bounds: Numbers of the bounds to plot, from 1; by default all.
-        ax: Axes to draw on, one for each panel; by default a new figure.
+        ax: Axes to draw on, one for the path and one for each bound; by default a new figure.
 
     Returns:
         Axes, shape (1 + bound,).
@@ -35,11 +35,11 @@ def plan_map(plan: Plan, *, bounds: Sequence[int] | None = None, ax: Any = None)
         TrustboError: The workspace has no terrain, or there is no such bound.
     """
     if plan.stops is None:
-        raise TrustboError("plan_map needs a plan on a workspace made from a terrain.")
+        raise TrustboError("plan_map needs a workspace made with Workspace.from_terrain.")
     n_bounds = len(plan.path) - 1
     shown = range(1, n_bounds + 1) if bounds is None else bounds
     if not set(shown) <= set(range(1, n_bounds + 1)):
-        raise TrustboError(f"bounds must be from 1 to {n_bounds}; got {bounds!r}.")
+        raise TrustboError(f"bounds must be numbers from 1 to {n_bounds}; got {bounds!r}.")
 
     axes = panels(1 + len(shown), ax, (2.5, 2.6))
     for one in axes:
@@ -57,7 +57,7 @@ def plan_map(plan: Plan, *, bounds: Sequence[int] | None = None, ax: Any = None)
 
 
 def _draw_bound(ax: Axes, plan: Plan, k: int) -> None:
-    """Plot bound k and its surroundings."""
+    """Plot bound k, counted from 0, and its surroundings."""
     stops, posts, routes = plan.stops, plan.posts, plan.routes
     assert stops is not None and posts is not None and routes is not None  # noqa: S101, PT018
     corner = np.array(plan.workspace.grid.corner)
@@ -86,7 +86,7 @@ def _draw_bound(ax: Axes, plan: Plan, k: int) -> None:
 
 
 def _window(middle: float, half: float, low: float, high: float) -> tuple[float, float]:
-    """Return the limits of a window around a point, shifted into the map."""
+    """Return the limits of a window around a point, shifted so that it is within the map."""
     width = min(2.0 * half, high - low)
     left = float(np.clip(middle - width / 2.0, low, high - width))
     return left, left + width
@@ -110,9 +110,9 @@ def _legend(names: Sequence[str]) -> list[Line2D | Patch]:
 
 
 def _filled(colour: str, size: float = 6.0) -> dict[str, Any]:
-    edge = paper()
+    edge = background()
     return {"color": colour, "markersize": size, "markeredgecolor": edge, "markeredgewidth": 0.7}
 
 
 def _open(colour: str) -> dict[str, Any]:
-    return {"markersize": 5.0, "markerfacecolor": paper(), "markeredgecolor": colour}
+    return {"markersize": 5.0, "markerfacecolor": background(), "markeredgecolor": colour}

@@ -1,4 +1,4 @@
-"""Style and axes of all figures."""
+"""Style, colours and axes of all figures."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -31,20 +31,21 @@ RC: dict[str, Any] = {
 """Matplotlib settings of all figures; the user's fonts, resolution, text colour and background
 colour are kept."""
 ROBOTS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
-"""Robot colours of Okabe and Ito (2008); markers also distinguish robots without colour."""
+"""Colours of the robots, from the palette of Okabe and Ito (2008)."""
 MARKERS = "osD^vPX*<>"
+"""Markers of the robots, which distinguish them in print without colour."""
 GREY = "0.55"
-"""Grey of guides and impassable cells, visible on light and dark backgrounds."""
+"""Colour of impassable cells and auxiliary lines, for light and dark backgrounds."""
 PAGE = 7.6
 """Page width in inches, which is the maximum width of a new figure."""
 
 
 @contextmanager
 def drawing(style: Any) -> Iterator[None]:
-    """Draw with a style of Matplotlib, and restore the user's settings.
+    """Draw with a Matplotlib style, and restore the user's settings afterwards.
 
-    Matplotlib loads its backend with the first figure. In notebooks, this turns on a setting that
-    later figures need to be displayed, so the backend is loaded before the settings are stored.
+    Matplotlib loads its backend with the first figure. In notebooks, the backend then turns on a
+    setting for displaying figures. Load the backend first, so that restoring keeps this setting.
     """
     plt.draw_if_interactive()
     with plt.style.context(style):
@@ -52,13 +53,13 @@ def drawing(style: Any) -> Iterator[None]:
 
 
 styled = drawing(RC)
-"""Decorator for functions that draw figures."""
+"""Decorator that applies `RC` to a function that draws a figure."""
 
 
 def panels(
     n: int, ax: Any, size: tuple[float, float], *, columns: int = 4, **shared: Any
 ) -> np.ndarray:
-    """Return the axes of n panels, row by row: the user's axes, or axes of a new figure.
+    """Return axes for n panels, row by row: the user's axes, or the axes of a new figure.
 
     Args:
         n: Number of panels.
@@ -74,7 +75,7 @@ def panels(
         given = np.asarray(ax, dtype=object).ravel()
         if len(given) < n or not all(isinstance(one, Axes) for one in given):
             raise TrustboError(f"ax must have at least {n} Axes, one per panel; got {ax!r:.80}.")
-        for one in given[:n]:  # the user's axes may have labels of other sizes
+        for one in given[:n]:  # the font sizes of the user's axes may differ
             one.tick_params(labelsize=RC["xtick.labelsize"])
             for text in (one.xaxis.label, one.yaxis.label):
                 text.set_size(RC["axes.labelsize"])
@@ -92,7 +93,7 @@ def panels(
 
 
 def figure_of(axes: Sequence[Axes] | np.ndarray) -> Figure:
-    """Return the top-level figure of axes."""
+    """Return the figure that contains the axes, not a subfigure."""
     figure = axes[0].get_figure(root=True)
     assert isinstance(figure, Figure)  # noqa: S101
     return figure
@@ -109,8 +110,8 @@ def add_legend(axes: np.ndarray, handles: Sequence[Any]) -> None:
 
 
 def accent() -> str:
-    """Return the colour of a single curve: a blue that is visible on the background."""
-    red, green, blue = to_rgb(paper())
+    """Return the colour of a single curve: a light blue on dark backgrounds, else a dark blue."""
+    red, green, blue = to_rgb(background())
     return ROBOTS[4] if 0.3 * red + 0.6 * green + 0.1 * blue < 0.5 else ROBOTS[0]
 
 
@@ -119,16 +120,16 @@ def ink() -> str:
     return mpl.rcParams["text.color"]
 
 
-def paper() -> str:
-    """Return the colour of the background."""
+def background() -> str:
+    """Return the background colour of axes."""
     return mpl.rcParams["axes.facecolor"]
 
 
 def outlined(width: float, colour: str) -> list[patheffects.AbstractPathEffect]:
-    """Return an outline effect; `width`, in points, includes the width of the line."""
+    """Return the path effect of an outline; `width`, in points, includes the line itself."""
     return [patheffects.withStroke(linewidth=width, foreground=colour)]
 
 
 def as_text(name: object) -> str:
-    """Make a name plain text for matplotlib: escape dollar signs and replace underscores."""
+    """Convert a name to plain text for Matplotlib: escape "$", and replace "_" with a space."""
     return str(name).replace("$", r"\$").replace("_", " ")
