@@ -101,6 +101,17 @@ def test_a_missing_file_is_an_error_of_one_line(words, capsys, tmp_path, monkeyp
     assert list(tmp_path.iterdir()) == []
 
 
+def test_an_interrupted_command_says_how_to_resume_a_campaign(campaign, capsys, monkeypatch):
+    def interrupt(*args, **kwargs):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(tb, "resume", interrupt)
+    monkeypatch.setattr(tb, "load_result", interrupt)
+    for command, remedy in (("resume", True), ("export", False)):
+        assert call(command, campaign) == 130
+        assert (f"trustbo resume {campaign}" in capsys.readouterr().err) is remedy
+
+
 @pytest.mark.parametrize(
     "changed",
     [

@@ -4,11 +4,11 @@ Commands import heavy modules only when they run, so that `--help` takes a tenth
 """
 
 import argparse
-import importlib.metadata
 import io
 import sys
 import warnings
 from collections.abc import Callable, Sequence
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -22,27 +22,29 @@ POLICIES = ("greedy", "optimistic", "thompson", "ucb", "random")
 OBJECTIVES = ("lost_contact", "terminal", "mean")
 FORMATS = ("geotiff", "geojson", "csv", "nav2")
 BAD_INPUT, INTERRUPTED = 2, 130
-PLACE = "ROW,COL with row 0 in the north, or x=...,y=... in CRS metres, or lon=...,lat=..."
+PLACE = "ROW,COL with row 0 in the north, x=...,y=... in CRS metres, or lon=...,lat=... (degrees)"
 _COLUMNS = ["status", "contact_rate", "objective", "k_hat", "r_hat", "path_changed"]
 """Columns of the table that is printed after a campaign."""
 
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
-    """Run a command and exit; an error is printed as one line on standard error.
+    """Run a command and exit; errors are printed as one line on standard error.
 
     Args:
-        arguments: Arguments after `trustbo`; by default those of this process.
+        arguments: Words after `trustbo`; by default, those of this process.
     """
     args = parser().parse_args(arguments)
     warnings.showwarning = lambda message, *_, **__: print(f"warning: {message}", file=sys.stderr)
-    for stream in (sys.stdout, sys.stderr):  # a terminal may not support all characters of a path
+    for stream in (sys.stdout, sys.stderr):  # a terminal may not support all characters
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
     try:
         args.run(args)
     except KeyboardInterrupt:
-        folder = getattr(args, "folder", getattr(args, "out", None))
-        _exit(f"interrupted; continue with: trustbo resume {folder}", INTERRUPTED)
+        folder = getattr(args, "folder", None) or args.out
+        can_resume = args.run is not export and Path(folder, "campaign.json").is_file()
+        remedy = f"; continue with: trustbo resume {folder}" if can_resume else ""
+        _exit(f"interrupted{remedy}", INTERRUPTED)
     except (TrustboError, OSError) as error:
         _exit(f"error: {error}", BAD_INPUT)
     sys.exit(0)
@@ -57,11 +59,10 @@ def parser() -> argparse.ArgumentParser:
     """Build the parser for all commands; the parsed argument `run` is the function to call."""
     top = argparse.ArgumentParser(
         prog="trustbo",
-        description="Learn how trustworthy robots are on a terrain, and plan the best path.",
+        description="Learn where robots are trustworthy on a terrain, and plan the best path.",
         epilog="exit codes: 0 success, 2 bad input, 130 interrupted",
     )
-    version = f"trustbo {importlib.metadata.version('trustbo')}"
-    top.add_argument("--version", action="version", version=version)
+    top.add_argument("--version", action="version", version=f"trustbo {version('trustbo')}")
     top.set_defaults(run=lambda _: top.print_help())
     commands = top.add_subparsers(metavar="COMMAND")
 
@@ -85,17 +86,17 @@ def parser() -> argparse.ArgumentParser:
     add("--dem", type=Path, required=True, metavar="FILE", help="raster of ground heights")
     add("--dsm", type=Path, metavar="FILE", help="raster of surface heights")
     add("--start", type=place, required=True, metavar="PLACE", help=PLACE)
-    add("--goal", type=place, required=True, metavar="PLACE", help="as for --start")
+    add("--goal", type=place, required=True, metavar="PLACE", help="in the same format as --start")
     _add_grid(add)
     add("--robots", type=_count, default=3, metavar="N", help="overwatching robots (default 3)")
     add("--max-slope", type=float, default=45.0, metavar="DEG", help="slope limit (default 45)")
-    add("--policy", choices=POLICIES, help="how the next path is chosen (default greedy)")
-    add("--objective", choices=OBJECTIVES, help="what the path optimises (default lost_contact)")
+    add("--policy", choices=POLICIES, help="policy that chooses the paths (default greedy)")
+    add("--objective", choices=OBJECTIVES, help="objective of the paths (default lost_contact)")
     add("--paper", action="store_true", help="use the model, awareness and policy of the paper")
     _add_stop(add)
     _add_campaign(add, "out")
 
-    add = command(resume, "Continue a campaign or add missions.", "out --missions 12")
+    add = command(resume, "Continue a campaign, or add missions to it.", "out --missions 12")
     add("folder", type=Path, metavar="DIR", help="folder of the campaign")
     add("--missions", type=_count, metavar="N", help="total number of missions")
     _add_stop(add)
@@ -103,8 +104,8 @@ def parser() -> argparse.ArgumentParser:
 
     add = command(export, "Write a result to files for GIS, Nav2 or tables.", "out --format nav2")
     add("folder", type=Path, metavar="DIR", help="folder of the campaign")
-    add("--format", dest="formats", choices=FORMATS, nargs="+", default=["geotiff", "geojson"])
-    add("--out", type=Path, metavar="DIR", help="output folder (default: the campaign's)")
+    add("--format", choices=FORMATS, nargs="+", default=FORMATS[:2], help="default geotiff geojson")
+    add("--out", type=Path, metavar="DIR", help="output folder (default: campaign folder)")
     return top
 
 
@@ -119,14 +120,14 @@ def _add_campaign(add: Any, folder: str) -> None:
 
 def _add_grid(add: Any) -> None:
     """Add the flags of the planning grid."""
-    add("--shape", type=shape, default=(10, 10), metavar="ROWS,COLS", help="grid (default 10,10)")
+    add("--shape", type=shape, default=(10, 10), metavar="ROWS,COLS", help="cells (default 10,10)")
     add("--resolution", type=float, metavar="M", help="average the rasters to M-metre pixels")
 
 
 def _add_stop(add: Any) -> None:
     """Add the flag of the stopping rule."""
-    text = "stop when the regret of the path is below this fraction with probability 0.9"
-    add("--stop-regret", type=float, metavar="SHARE", help=text)
+    text = "stop when the relative regret of the path is at most this, with probability 0.9"
+    add("--stop-regret", type=float, metavar="FRACTION", help=text)
 
 
 def _count(text: str) -> int:
@@ -159,7 +160,7 @@ def demo(args: argparse.Namespace) -> None:
 
 
 def info(args: argparse.Namespace) -> None:
-    """Print a summary of a terrain's workspace and plot the grid."""
+    """Print a summary of the workspace of a terrain, and plot the grid."""
     import matplotlib.pyplot as plt
 
     import trustbo as tb
@@ -170,7 +171,7 @@ def info(args: argparse.Namespace) -> None:
     plt.switch_backend("agg")
     tb.plots.grid_map(workspace)
     plt.savefig(args.out, dpi=150)
-    print(f"a figure of the grid is in {args.out}")
+    print(f"the figure of the grid is in {args.out}")
 
 
 def run(args: argparse.Namespace) -> None:
@@ -184,18 +185,17 @@ def run(args: argparse.Namespace) -> None:
     team = tb.Team(robots=(robot,) * args.robots, lead=robot)
     terrain = tb.terrain.read_terrain(args.dem, args.dsm, resolution=args.resolution)
     ends = {"start": args.start, "goal": args.goal}
-    for place in ends.values():  # before the slow computation of awareness
-        Grid.over(terrain, args.shape).locate(place)
+    for end in ends.values():  # before the slow computation of awareness
+        Grid.over(terrain, args.shape).locate(end)
     features, options = (tb.paper.WORKSPACE, dict(tb.paper.CAMPAIGN)) if args.paper else ({}, {})
-    for name in ("policy", "objective"):
-        if getattr(args, name) is not None:
-            options[name] = getattr(args, name)
+    given = {"policy": args.policy, "objective": args.objective}
+    options |= {name: value for name, value in given.items() if value is not None}
     workspace = tb.Workspace.from_terrain(terrain, args.shape, team, **features)
     _run(args, workspace, **ends, **options, stop=_stop(args))
 
 
 def _run(args: argparse.Namespace, workspace: "Workspace", **options: Any) -> None:
-    """Run a campaign in a folder and write its report."""
+    """Run a campaign in a folder, and write the report."""
     import trustbo as tb
 
     result = tb.iterate(
@@ -206,14 +206,14 @@ def _run(args: argparse.Namespace, workspace: "Workspace", **options: Any) -> No
 
 
 def _stop(args: argparse.Namespace) -> Any:
-    """Make the stopping rule given by the flag `--stop-regret`; None without the flag."""
+    """Make the stopping rule of the flag `--stop-regret`; None without the flag."""
     from trustbo import RegretBound
 
     return None if args.stop_regret is None else RegretBound(eps=args.stop_regret)
 
 
 def resume(args: argparse.Namespace) -> None:
-    """Continue the campaign in a folder and update its report."""
+    """Continue the campaign in a folder, and write the report again."""
     import trustbo as tb
 
     result = tb.resume(
@@ -223,7 +223,7 @@ def resume(args: argparse.Namespace) -> None:
 
 
 def _finish(result: "Result", folder: Path, quiet: bool) -> None:
-    """Write the report and, with a terrain, maps and path for GIS; print the missions."""
+    """Write the report and, with a terrain, maps and path for GIS; print a summary."""
     import matplotlib as mpl
 
     from trustbo.export import export_result
@@ -235,16 +235,16 @@ def _finish(result: "Result", folder: Path, quiet: bool) -> None:
         export_result(result, folder, ("geotiff", "geojson"))
     if not quiet:
         print(result.table().filter(_COLUMNS).to_string(float_format="%.3f"))
-    done = "all missions are done; resume with --missions for more"
+    done = "all missions were run; for more, use trustbo resume with --missions"
     print(f"stopped: {done if result.stop_reason == 'n_iterations' else result.stop_reason}")
     print(f"recommended path: {' '.join(f'{row},{col}' for row, col in result.path)}")
     print(f"results are in {folder}; open {folder / 'report.html'}")
 
 
 def export(args: argparse.Namespace) -> None:
-    """Write a result in other formats."""
+    """Write a result to files, and print their names."""
     import trustbo as tb
 
     result = tb.load_result(args.folder)
-    for file in tb.export.export_result(result, args.out or args.folder, args.formats):
+    for file in tb.export.export_result(result, args.out or args.folder, args.format):
         print(file)
