@@ -282,5 +282,6 @@ def test_bad_arguments_are_refused_at_once(workspace):
     walls[2] = False
     with pytest.raises(tb.NoPathError):
         begin(tb.Workspace.from_awareness(workspace.awareness.values, walls))
-    with pytest.raises(tb.TrustboError, match="mission"):
-        begin(workspace).result()
+    for early in (lambda: begin(workspace).result(), lambda: begin(workspace).history):
+        with pytest.raises(tb.TrustboError, match="mission"):
+            early()

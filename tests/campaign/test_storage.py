@@ -63,7 +63,7 @@ def drive(campaign):
         if len(state.entries) == n:
             simulator.fail_at = 1 if n == 2 else None
             campaign.tell(simulator.run(campaign.ask().path, seed=state.seed_of("mission")))
-        if n == 2 and len(state.entries) == 3 and not state.numbers("excluded"):
+        if n == 2 and len(state.entries) == 3 and not state.indices("excluded"):
             campaign.exclude(1, "the lidar was covered")
     return campaign.result()
 
@@ -140,7 +140,7 @@ def test_campaign_that_dies_while_it_learns_learns_when_it_is_loaded(
             with pytest.raises(Dead):
                 campaign.tell(mission)
     with tb.Campaign.load(tmp_path) as again:
-        assert again.state.numbers("learned") == [0]
+        assert again.state.indices("learned") == [0]
         same(drive(again), tb.load_result(folder))
 
 

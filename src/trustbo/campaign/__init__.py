@@ -1,4 +1,4 @@
-"""Campaigns: plan, run, learn, and plan again. Names are loaded when first used."""
+"""Campaigns, their results and stopping rules; modules are imported on first use."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""A campaign: `ask` for a path, run it by any means, then `tell` the mission."""
+"""Campaign with an ask/tell interface: `ask` for a path, drive it, and `tell` the mission."""
 
 import inspect
 import json
@@ -33,24 +33,24 @@ from trustbo.simulation.protocol import Simulator
 from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Location
 
-_ARRIVES = 0.9
+_LIKELY_ARRIVAL = 0.9
 """Arrival probability below which a campaign without a cost of failures issues a warning."""
 _OPTIONS = ("objective", "sampler", "seed", "initial", "planner", "fit")
-"""Settings that store arguments of `Campaign` unchanged."""
+"""Arguments of `Campaign` that are stored unchanged in the settings."""
 _FIT = inspect.signature(fit)
 
 
 class Campaign(Result):
-    """Campaign with an ask/tell interface: learns from missions and proposes the next path.
+    """Campaign that learns from missions and proposes the next path (ask/tell interface).
 
-    `ask` plans a path, `tell` records the mission that was run and learns from it. With a
+    `ask` plans a path, and `tell` records the mission on this path and learns from it. With a
     `directory`, each mission is written to disk before the posterior is updated, and
     `Campaign.load` continues after a crash with identical results.
 
     Attributes:
         policy: Policy that chooses the paths.
         storage: Folder of the campaign; None if it is in memory only.
-        progress: Whether fits show their progress; `run` sets it.
+        progress: Whether fits show a progress bar; `run` sets this attribute.
 
     Example:
         >>> with tb.Campaign(workspace, (9, 0), (0, 9), directory="field") as campaign:
@@ -75,12 +75,12 @@ class Campaign(Result):
         planner: Mapping[str, Any] | None = None,
         fit: Mapping[str, Any] | None = None,
     ) -> None:
-        """Prepare a campaign; nothing is computed yet.
+        """Check the arguments and prepare the campaign; no path is planned yet.
 
         Args:
             workspace: Workspace of the paths.
-            start: First cell of every path, or a position in it; see `Workspace.locate`.
-            goal: Last cell of every path, or a position in it.
+            start: First cell of every path, or a position in this cell; see `Workspace.locate`.
+            goal: Last cell of every path, or a position in this cell.
             model: Trust model; by default `models.default_model()`, with place and robot effects.
             policy: Name in `planning.POLICIES`, or a callable `policy(rng, draws, planner)` that
                 returns a Plan.
@@ -89,7 +89,7 @@ class Campaign(Result):
             seed: Seed of all random numbers.
             directory: Folder that is updated after each mission. It stays locked until the
                 `with campaign:` block exits or the process ends.
-            overwrite: Whether to remove an existing campaign from that folder first.
+            overwrite: Whether to replace an existing campaign in that folder.
             initial: Parameters for the first plan: `"prior_mean"`, or `"prior_draw"` for one random
                 draw from the prior, as in the paper.
             hazard: Priors of the probability that a bound fails; by default `Hazard()`.
@@ -108,11 +108,11 @@ class Campaign(Result):
         hazard = Hazard() if hazard is None else hazard
         require_kind("hazard", hazard, Hazard, "give a trustbo.hazard.Hazard")
         own = {"workspace": workspace, "seed": seed, "progress": True, "whole": False}
-        _FIT.bind([], model, sampler=sampler, **own, **(fit or {}))  # TypeError if one is wrong
+        _FIT.bind([], model, sampler=sampler, **own, **(fit or {}))  # TypeError if one is unknown
         model = default_model() if model is None else model
-        require_kind("model", model, TrustModel, "give one such as PooledTrust()")
+        require_kind("model", model, TrustModel, "give a trust model, such as PooledTrust()")
         if isinstance(model, HumanTrust):
-            raise TrustboError("model: HumanTrust describes reports of people, not paths.")
+            raise TrustboError("model: HumanTrust cannot plan paths; give PooledTrust() instead.")
         self.policy, options = resolve_policy(policy), dict(planner or {})
         base = Planner(workspace, start, goal, objective, family=model.observation, **options)
         settings = {
@@ -159,9 +159,9 @@ class Campaign(Result):
         rng = np.random.default_rng(self.state.seed_of("policy"))
         try:
             plan = self.policy(rng, self.belief, self.planner)
-        except InfeasibleError as error:  # `_accept` warns
+        except InfeasibleError as error:  # `_accept` issues the warning
             plan = self.planner.evaluate(error.path, self.belief.mean())
-        require_kind(name, plan, Plan, "a policy returns a trustbo.planning.Plan")
+        require_kind(name, plan, Plan, "a policy must return a trustbo.planning.Plan")
         try:
             self.planner.require_path(plan.path)
         except TrustboError as error:
@@ -180,7 +180,7 @@ class Campaign(Result):
         return self._accept(self.planner.evaluate(path, self.belief.mean()))
 
     def _accept(self, plan: Plan) -> Plan:
-        """Store a plan, with posterior bands, as the next one to run."""
+        """Add posterior bands to a plan, and store it as the next plan to run."""
         given = self.planner.evaluate(plan.path, self.belief)
         self._warn_of_risk(plan, 1.0 if given.p_arrive is None else given.p_arrive)
         self.state.asked = accepted = plan.with_draws(given)
@@ -193,48 +193,48 @@ class Campaign(Result):
         if plan.infeasible:
             warnings.warn(
                 f"the plan exceeds max_failure = {options['max_failure']:g}: it arrives with "
-                f"probability {p_arrive:.3g}.",
+                f"probability {p_arrive:.3g}. Suggest a safer path, or increase max_failure.",
                 stacklevel=4,
             )
         limited = any(options.get(name) is not None for name in ("max_failure", "failure_cost"))
-        if limited or self._warned_of_risk or self.risk.has_failures or p_arrive >= _ARRIVES:
+        if limited or self._warned_of_risk or self.risk.has_failures or p_arrive >= _LIKELY_ARRIVAL:
             return
         self._warned_of_risk = True
         warnings.warn(
             f"the plan arrives with probability {p_arrive:.2f} only, and failures have no cost "
-            'until one is recorded; pass planner={"max_failure": ...} or {"failure_cost": ...}, '
-            "or lower max_slope of the team's robots.",
+            'until the first one; pass planner={"max_failure": ...} or {"failure_cost": ...}, '
+            "or lower the max_slope of the robots.",
             stacklevel=4,
         )
 
     def tell(self, mission: Mission) -> xr.DataTree | None:
         """Record a mission and learn from it.
 
-        Learning uses the awareness of the map. Robots and features may be in any order, and the
-        path may differ from the planned one.
+        For learning, the awareness of the map replaces the measured awareness. Robots and features
+        may be in any order, and the path may differ from the planned path.
 
         Args:
-            mission: Mission as measured, whether or not it reached the goal.
+            mission: Measured mission, whether or not it reached the goal.
 
         Returns:
             Posterior of the parameters given all usable missions. If this mission cannot be used
             (yet), a warning is issued, and the previous posterior or None is returned.
 
         Raises:
-            TrustboError: Robots or features differ from the workspace's; or the path leaves the
-                grid, jumps, or begins in a different cell from the plan. The mission is then not
-                stored.
+            TrustboError: The robots or features differ from the workspace's, or the path leaves
+                the grid, skips cells, or does not begin at the start of the plan. The mission is
+                then not stored.
         """
         self._take(mission, {})
         return self.state.posterior
 
     def _take(self, mission: Mission, extra: dict[str, float]) -> None:
-        """Write a mission, with the `extra` values of its row, to disk, then learn from it."""
-        require_kind("mission", mission, Mission, "tell one trustbo.Mission at a time")
+        """Write a mission and its table row, with `extra` values, to disk; then learn from it."""
+        require_kind("mission", mission, Mission, "give one trustbo.Mission at a time")
         mission, state, plan = self.workspace.in_order(mission), self.state, self.ask()
         if mission.path[0] != plan.path[0]:
             raise TrustboError(
-                f"the mission starts at {mission.path[0]}, not at {plan.path[0]} (row, col)."
+                f"the mission starts in cell {mission.path[0]}; it must start in {plan.path[0]}."
             )
         learned, row = as_learned(mission, self.workspace), state.row_of(plan, mission) | extra
         entry = Entry(plan, mission, learned, self.trust_map, row)
@@ -243,7 +243,7 @@ class Campaign(Result):
         self._add(entry)
 
     def _add(self, entry: Entry) -> None:
-        """Learn from a mission that is on disk."""
+        """Add a recorded mission to the state, and learn from it."""
         state, seed = self.state, self.state.seed_of("fit")
         entry.posterior = state.last
         state.entries.append(entry)
@@ -256,9 +256,9 @@ class Campaign(Result):
         self._write()
 
     def _learn(self, seed: int) -> None:
-        """Fit the posterior after the last mission."""
+        """Fit the posterior after the last mission to all missions that are not excluded."""
         state, entry = self.state, self.state.entries[-1]
-        if not (n_learned := len(state.numbers(TOLD, LEARNED))):
+        if not (n_used := len(state.indices(TOLD, LEARNED))):
             entry.posterior = None
             return
         tree = learn(state, self.model, self.workspace, seed, self.progress)
@@ -266,7 +266,7 @@ class Campaign(Result):
             return
         tree["hazard"] = xr.DataTree(self.hazard)
         entry.row |= diagnostics(tree)
-        n_excluded = len(state.entries) - n_learned
+        n_excluded = len(state.entries) - n_used
         name = f"{len(state.entries):04d}" + (f"-{n_excluded}" if n_excluded else "")
         file = None if self.storage is None else self.storage.add_posterior(name, tree)
         if state.last is not None and state.last.file is not None:
@@ -278,11 +278,11 @@ class Campaign(Result):
             self.storage.write_record(self.state)
 
     def exclude(self, n: int, reason: str) -> xr.DataTree | None:
-        """Exclude a mission from learning permanently; `tell` with the same mission adds it again.
+        """Exclude a mission from learning; to use it again, pass the mission to `tell`.
 
         Args:
             n: Number of the mission, from 1.
-            reason: Reason, for the record.
+            reason: Reason to store in the table of missions.
 
         Returns:
             Posterior of the parameters given the other missions; None if there are none.
@@ -290,8 +290,8 @@ class Campaign(Result):
         Raises:
             TrustboError: There is no such mission, or it is already excluded.
         """
-        if not 1 <= require_whole("n", n, 1) <= (n_told := len(self.state.entries)):
-            raise TrustboError(f"there is no mission {n} to exclude; {n_told} are recorded.")
+        if require_whole("n", n, 1) > (n_told := len(self.state.entries)):
+            raise TrustboError(f"there is no mission {n} to exclude; the last is mission {n_told}.")
         if (entry := self.state.entries[n - 1]).row["state"] == EXCLUDED:
             raise TrustboError(f"mission {n} is already excluded: {entry.row['reason']}")
         entry.become(EXCLUDED, str(reason))
@@ -306,22 +306,22 @@ class Campaign(Result):
         If bounds were run, `tell` a mission with these bounds and its status instead.
 
         Args:
-            reason: Reason, for the record. A reason in `hazard.CAUSES`, such as "stuck", means that
-                a bound of the plan failed; the failure then updates the hazard model.
+            reason: Reason to store in the table of missions. Only a reason in `hazard.CAUSES`, such
+                as "stuck", means that a bound of the plan failed, and is used to learn the hazard.
             where: Cell that the team failed to enter, if known.
 
         Raises:
-            TrustboError: The reason is empty; or `where` is not on the plan, or is given with a
-                reason that is not a cause.
+            TrustboError: The reason is empty, the plan does not enter `where`, or `where` is given
+                but the reason is not in `hazard.CAUSES`.
         """
         if not isinstance(reason, str) or not reason.strip():
-            raise TrustboError(f"reason must be text, such as {CAUSES[0]!r}; got {reason!r}.")
+            raise TrustboError(f"reason must be a text such as {CAUSES[0]!r}; got {reason!r}.")
         path = self.ask().path if reason in CAUSES or where is not None else ()
         where = None if where is None else require_pair("where", where)
         if where is not None and (reason not in CAUSES or where not in path[1:]):
             raise TrustboError(
-                f"where = {where} must be a cell that the plan enters, {path[1:]}, and reason must "
-                f"be one of {', '.join(CAUSES)}; got {reason!r}."
+                f"where = {where} must be a cell that the plan enters, {path[1:]}, with one of the "
+                f"reasons {', '.join(CAUSES)}; got reason {reason!r}."
             )
         self.state.failures.append(Failure(len(self.state.entries), reason, tuple(path), where))
         self._renew()
@@ -338,11 +338,11 @@ class Campaign(Result):
     ) -> Iterator[tuple[Plan, Mission]]:
         """Run missions in a simulator, one per step of the returned iterator.
 
-        Nothing runs until you iterate: `for plan, mission in campaign.run(simulator, 8)`.
+        Missions run only while you iterate: `for plan, mission in campaign.run(simulator, 8)`.
         The arguments are the same as in `iterate`; `n_iterations` includes earlier missions.
 
         Yields:
-            Each plan and its mission, after the posterior has been updated with it.
+            Each plan and its mission, after the posterior has been updated.
 
         Raises:
             TrustboError: The input is invalid; raised before any work starts.
@@ -364,12 +364,12 @@ class Campaign(Result):
     def _run(
         self, simulator: Simulator, n_iterations: int, truth: Truth | None, rules: Sequence[Stop]
     ) -> Iterator[tuple[Plan, Mission]]:
-        """Run missions; `run` has checked the arguments."""
+        """Run missions for `run`, which has checked the arguments."""
         state = self.state
         state.stop_reason = "interrupted"
         options = {"total": n_iterations, "initial": len(state.entries), "desc": "missions"}
         with tqdm(disable=not self.progress, **options) as bar, compiling():
-            # Rules are checked before each mission, as one may already hold when a run continues.
+            # Check rules before each mission: one may already apply when a campaign is resumed.
             while not (reason := self._reason_to_end(n_iterations, rules)):
                 n, plan = len(state.entries), self.ask()
                 mission = simulator.run(plan.path, seed=state.seed_of("mission"), mission=n)
@@ -385,7 +385,7 @@ class Campaign(Result):
         self._write()
 
     def _reason_to_end(self, n_iterations: int, rules: Sequence[Stop]) -> str | None:
-        """Return the reason given by the first stopping rule that applies, or None."""
+        """Return the reason of the first stopping rule that applies, or None to continue."""
         n = len(self.state.entries)
         for rule in rules if n else ():
             if verdict := rule(self):
@@ -410,18 +410,18 @@ class Campaign(Result):
     def load(
         cls, directory: FilePath, *, model: TrustModel | None = None, policy: Policy | None = None
     ) -> Self:
-        """Continue a campaign where it stopped, in the same folder.
+        """Load a campaign from its folder, lock the folder, and continue where it stopped.
 
-        A mission that was recorded but not yet used for learning is used now.
+        A mission that was written to disk but not yet used for learning is used now.
 
         Args:
             directory: Folder that was passed as `directory`, or to `Result.save`.
-            model: The same model, if it or its priors are custom.
-            policy: The same policy, if it is custom.
+            model: Model of the campaign; required if the model or its priors are custom.
+            policy: Policy of the campaign; required if it is a custom function.
 
         Raises:
             TrustboError: The folder contains no campaign or is locked by another process, a custom
-                object is not given, or a file of the folder is missing or damaged.
+                model or policy is not given, or a file is missing or damaged.
         """
         require_campaign(directory)
         storage = Storage(directory)
@@ -430,7 +430,7 @@ class Campaign(Result):
             given = state.settings
             if given["policy"] not in POLICIES and policy is None:
                 raise TrustboError(
-                    f"the campaign's policy {given['policy']!r} is a custom function; give policy=."
+                    f"the policy {given['policy']!r} is not stored; pass the function as policy=."
                 )
             campaign = cls(
                 workspace, given["start"], given["goal"],

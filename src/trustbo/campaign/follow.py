@@ -39,11 +39,11 @@ class Follower:
         else:
             n_robots, family = self._workspace.team.n_robots, campaign.model.observation
             start = TrustFilter(campaign.draw_prior(1000), n_robots, observation=family)
-        # Filters after the bounds that have ended, and as if the one in progress ended now.
+        # `_before` has the bounds that have ended, and `_now` also the bound in progress.
         self._before = self._now = start
         self.trust: TrustState = self._now.state
-        self._started = self._begun = self._last = -np.inf  # mission, bound, last call
-        self._counts = np.zeros((2, self._workspace.team.n_robots))  # ticks with contact, all ticks
+        self._started = self._begun = self._last = -np.inf  # times of start and last call
+        self._counts = np.zeros((2, self._workspace.team.n_robots))  # ticks with contact; all ticks
 
     @property
     def rest(self) -> tuple[Cell, ...]:
@@ -53,7 +53,7 @@ class Follower:
     def begin(self, t: float, cell: Cell | None = None) -> None:
         """Begin the next bound at time `t`, into the planned cell or into `cell`.
 
-        An unplanned cell discards the plan; every later bound then requires `cell`.
+        An unplanned cell discards the rest of the plan; all later bounds then need a `cell`.
 
         Raises:
             TrustboError: A bound is in progress, the mission is over, no cell is planned, the cell
@@ -61,10 +61,10 @@ class Follower:
         """
         self._require(running=False, t=t)
         if self.bounds and self.bounds[-1].status != "ok":
-            raise TrustboError(f"the mission is over: {self.bounds[-1].status}.")
+            raise TrustboError(f"the mission is over ({self.bounds[-1].status}); call to_mission.")
         here, *planned = self.rest
         if cell is None and not planned:
-            raise TrustboError(f"no cell is planned after {here}; give the cell of the bound.")
+            raise TrustboError(f"no cell is planned after {here}; pass the next cell to begin.")
         cell = planned[0] if cell is None else require_pair("cell", cell)
         self._count(t, np.zeros_like(self._counts), (here, cell))
         if planned[:1] != [cell]:
@@ -116,7 +116,7 @@ class Follower:
         """
         rest = list(self.rest)
         if len(rest) < 2:
-            raise TrustboError(f"no cell is planned after {rest[0]}.")
+            raise TrustboError(f"no cell is planned after {rest[0]}; nothing is left to predict.")
         return self._now.predict(known_along(rest, self._workspace), rest)
 
     def to_mission(self) -> Mission:
@@ -129,7 +129,7 @@ class Follower:
             TrustboError: A bound is in progress, or none was run (use `Campaign.fail`).
         """
         if self.running or not self.bounds:
-            state = "a bound is in progress" if self.running else "no bound was run"
+            state = "a bound is in progress; call end" if self.running else "no bound was run"
             raise TrustboError(f"there is no mission yet: {state}.")
         status, workspace = self.bounds[-1].status, self._workspace
         if status == "ok" and self.rest != (self._goal,):
@@ -137,8 +137,8 @@ class Follower:
         return Mission(self.path, self.bounds, status, workspace.features, workspace.team.names)
 
     def _count(self, t: float, counts: np.ndarray, bound: tuple[Cell, Cell]) -> None:
-        """Store the tick counts of a bound, (2, robot), and the trust if the bound ended now."""
-        now = copy(self._before)  # `update` replaces arrays and modifies none
+        """Store tick counts (2, robot) of a bound, and the trust as if the bound ended now."""
+        now = copy(self._before)  # shallow, since `update` replaces arrays
         (known,) = known_along(bound, self._workspace)
         contacts, ticks = counts
         n_ticks = np.where(ticks > 0.0, ticks, np.nan)

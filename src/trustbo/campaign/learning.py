@@ -22,14 +22,15 @@ from trustbo.workspace import Workspace
 from trustbo.workspace.moves import along, require_on_grid
 
 _N_DRAWS, _N_RISKS = 1000, 200
+"""Numbers of posterior draws of the trust parameters, and of the failure probabilities."""
 _STOPPED, _RECOVERED = 2, 0.2
-"""Failures after which a bound is avoided, and failure probability below which it is not."""
+"""Failures after which a bound is avoided, and failure probability below which it is allowed."""
 
 
 def known_along(path: Sequence[Cell], workspace: Workspace) -> np.ndarray:
     """Return the map's awareness in the bounds of a path, shape (bound, robot, feature).
 
-    Raises TrustboError if a cell is off the grid or is not a neighbour of the previous one.
+    The path may have impassable cells. Raises TrustboError if it leaves the grid or skips cells.
     """
     cells = require_on_grid(path, workspace.grid.shape)
     return np.swapaxes(along(workspace.awareness.values, cells), 0, 1)
@@ -60,13 +61,13 @@ def learn(
 ) -> xr.DataTree | None:
     """Fit the posterior of the parameters to all missions that are not excluded.
 
-    Its attribute `missions` lists their indices. If the diagnostics fail, None is returned with a
-    warning, and the states of the missions do not change.
+    The attribute `missions` of the posterior lists the indices of these missions. If the fit fails,
+    None is returned with a warning, and the states of the missions do not change.
     """
-    waiting, numbers = state.numbers(TOLD), state.numbers(TOLD, LEARNED)
-    missions = [state.entries[j].mission for j in numbers]
+    waiting, used = state.indices(TOLD), state.indices(TOLD, LEARNED)
+    missions = [state.entries[j].mission for j in used]
     sampler, options = state.settings["sampler"], state.settings["fit"]
-    # Importance draws are independent, and each is large if the model has place effects.
+    # Importance draws are independent, so fewer suffice; draws of place effects are large.
     few = sampler == "importance" and any(isinstance(e, PlaceEffect) for e in model.effects)
     usual = {"draws": _N_DRAWS // 4 if few else _N_DRAWS}
     try:
@@ -76,13 +77,13 @@ def learn(
         )  # fmt: skip
     except TrustboError as error:
         reason = getattr(error, "reason", str(error))
-    except Exception as error:  # a bug must not lose a mission that was driven
-        if isinstance(error.__cause__, KeyboardInterrupt):  # numba raises SystemError from it
+    except Exception as error:  # a bug must not lose a recorded mission
+        if isinstance(error.__cause__, KeyboardInterrupt):  # numba wraps it
             raise error.__cause__ from None
         reason = f"{type(error).__name__}: {error}"
     else:
         tree = parameters_alone(tree)
-        tree.attrs["missions"] = numbers
+        tree.attrs["missions"] = used
         for j in waiting:
             state.entries[j].become(LEARNED)
         return tree
@@ -99,8 +100,8 @@ def learn(
 def learn_hazard(state: State, workspace: Workspace) -> xr.Dataset:
     """Fit the failure probabilities of bounds to all missions; see `fit_hazard`.
 
-    A mission that can never be used for learning trust still shows where the team failed. If the
-    diagnostics fail, the previous posterior is returned with a warning.
+    Missions that cannot be used for learning trust are included, since they show where the team
+    failed. If the diagnostics fail, the previous posterior is returned with a warning.
     """
     measured = [
         entry.measured
@@ -112,7 +113,7 @@ def learn_hazard(state: State, workspace: Workspace) -> xr.Dataset:
     try:
         return fit_hazard(measured, workspace, prior, lost=lost, seed=state.seed_of("hazard"))
     except PosteriorError as error:
-        warnings.warn(f"{error} The campaign continues with the previous hazard.", stacklevel=5)
+        warnings.warn(f"{error} The campaign uses the previous hazard posterior.", stacklevel=5)
     if (last := state.posterior) is not None:
         return last["hazard"].to_dataset()
     return fit_hazard([], workspace, prior)
@@ -122,11 +123,10 @@ def informed_planner(planner: Planner, risk: BoundRisk) -> Planner:
     """Make a planner that accounts for the failure probabilities of bounds.
 
     A bound that failed twice is avoided unless there is no other path, or its failure probability
-    has fallen below 0.2. The user's slope limit is trusted until a failure contradicts it: before
-    the first failure, failures have no cost unless the user gave `failure_cost`. Under the prior
-    alone, a cost would rule out longer paths that keep contact and never fail. After the first
-    failure, the cost is computed jointly over strata of the posterior, since all bounds share the
-    slope limit.
+    has fallen below 0.2. Before the first failure, the user's slope limit is trusted, and failures
+    have no cost unless the user gave `failure_cost`. Under the prior alone, a cost would rule out
+    longer paths that keep contact and never fail. The cost is computed jointly over strata of the
+    hazard posterior, since all bounds share the slope limit.
     """
     if (stopped := to_avoid(risk)).any():
         planner = planner.avoiding(stopped, risk.mean)

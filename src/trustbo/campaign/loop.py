@@ -1,4 +1,4 @@
-"""The loop: plan, run, learn, and plan again."""
+"""Run whole campaigns in a simulator, and resume them."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -31,24 +31,24 @@ def iterate(
     progress: bool = True,
     **options: Any,
 ) -> Result:
-    """Run a campaign: plan a path, run it, learn from the contact rates, plan again.
+    """Run a campaign in a simulator: plan a path, run it, learn from the contact, and repeat.
 
     Args:
         workspace: Workspace of the paths.
-        start: First cell, (row, col) with row 0 at the top; or a position in it, in metres of the
-            CRS, `{"x": 1748000, "y": 5427000}`, or in degrees, `{"lon": 174.7, "lat": -41.3}`; see
-            `Workspace.locate`.
-        goal: Last cell, or a position in it.
+        start: First cell (row, col), with row 0 in the north. Or a position in this cell in CRS
+            metres, `{"x": 1748000, "y": 5427000}`, or in degrees, `{"lon": 174.7, "lat": -41.3}`;
+            see `Workspace.locate`.
+        goal: Last cell, or a position in this cell.
         n_iterations: Maximum number of missions.
         simulator: Simulator with `run(path, *, seed, mission) -> Mission`; by default
             `KinematicSimulator(workspace)`.
         truth: Truth of the simulator, `simulation.Truth.of(simulator)`. If given, the history
-            records the regret of each plan, in % of the expected contact on the best path.
+            contains the regret of each plan, in % of the expected contact on the best path.
         stop: Stopping rules, called between missions: a `RegretBound`, a function of the campaign
             that returns a reason or None, or a sequence of these.
         directory: Folder that is updated after each mission. If the process dies, `resume`
             continues from it.
-        overwrite: Whether to remove an existing campaign from that folder first.
+        overwrite: Whether to replace an existing campaign in that folder.
         progress: Whether to show a progress bar.
         **options: Further arguments of `Campaign`: `model`, `policy`, `objective`, `sampler`,
             `seed`, `initial`, `hazard`, `planner`, `fit`.
@@ -68,7 +68,7 @@ def iterate(
     campaign = Campaign(workspace, start, goal, **options)
     steps = campaign.run(simulator, n_iterations, truth=truth, stop=stop, progress=progress)
     with campaign:
-        if directory is not None:  # now that all input is checked
+        if directory is not None:  # after all input has been checked
             campaign.storage = Storage.begin(
                 directory, workspace, campaign.state, overwrite=overwrite
             )
@@ -95,17 +95,17 @@ def resume(
 
     Args:
         directory: Folder of the campaign.
-        simulator: The same simulator, unless it was the default.
-        truth: Truth of the simulator, see `iterate`.
+        simulator: Simulator of the campaign; required unless it was the default.
+        truth: Truth of the simulator; see `iterate`.
         n_iterations: Total number of missions; by default the number passed to `iterate`.
-        model: The same model; see `Campaign.load`.
-        policy: The same policy; see `Campaign.load`.
+        model: Model of the campaign, if it is custom; see `Campaign.load`.
+        policy: Policy of the campaign, if it is custom.
         stop: Stopping rules, as in `iterate`.
         progress: Whether to show a progress bar.
 
     Raises:
-        TrustboError: The folder contains no campaign or is locked by another process, a custom
-            object or the simulator differs from the original one, or a file is missing or damaged.
+        TrustboError: The folder contains no campaign or is locked by another process, the model,
+            policy or simulator differs from the original, or a file is missing or damaged.
     """
     with Campaign.load(directory, model=model, policy=policy) as campaign:
         state, before = campaign.state, campaign.state.simulation

@@ -47,7 +47,7 @@ class Result(Summary):
         self.model: Any = model
 
     def _computed(self) -> dict[str, Any]:
-        """Collect the cached properties by name."""
+        """Return the cached properties that have been computed, keyed by name."""
         cached = (name for name, of in vars(Result).items() if isinstance(of, cached_property))
         return {name: vars(self)[name] for name in cached if name in vars(self)}
 
@@ -101,21 +101,21 @@ class Result(Summary):
         """
         if (stored := self.state.posterior) is None:
             raise TrustboError(
-                f"there is no posterior: none of {len(self.missions)} missions can be used for "
-                "learning yet. They are recorded; table() gives the reasons."
+                f"there is no posterior: none of the {len(self.missions)} recorded missions can be "
+                "used for learning yet; table() lists the reasons."
             )
-        numbers = np.atleast_1d(stored.attrs["missions"]).astype(int).tolist()
-        # `log_prior` needs the model if its priors are not the default ones.
-        whole = complete(stored, [self.missions[j] for j in numbers], model=self.model)
+        indices = np.atleast_1d(stored.attrs["missions"]).astype(int).tolist()
+        # The group `log_prior` requires the model if its priors are not the defaults.
+        whole = complete(stored, [self.missions[j] for j in indices], model=self.model)
         for group in whole.children.values():
             if "mission" in group.dims:
-                group.dataset = group.to_dataset().assign_coords(mission=numbers)
+                group.dataset = group.to_dataset().assign_coords(mission=indices)
         whole["hazard"] = xr.DataTree(self.hazard)
         return whole
 
     @cached_property
     def belief(self) -> Params:
-        """Parameter draws of the last posterior; before the first one, as `initial` specifies."""
+        """Parameter draws of the last posterior, or of the prior before anything was learned."""
         if (posterior := self.state.posterior) is not None:
             return params_of(posterior)
         if self.state.settings["initial"] == "prior_draw":
@@ -125,7 +125,7 @@ class Result(Summary):
         return prior_mean(model, len(features), n_robots=n_robots).flat()
 
     def draw_prior(self, n_draws: int) -> Params:
-        """Draw parameters from the prior, leading axis (draw,)."""
+        """Draw parameters from the prior, with a leading axis (draw,)."""
         features, n_robots = self.workspace.features, self.workspace.team.n_robots
         seed, model = State(self.state.settings).seed_of("prior"), self.model.for_features(features)
         return sample_prior(model, len(features), n_draws, seed, n_robots=n_robots).flat()
@@ -162,7 +162,7 @@ class Result(Summary):
     def plan(self) -> Plan:
         """Recommended plan, the best under the posterior mean, with posterior credible bands."""
         best = self.recommend()
-        draws = self.state.posterior or self.belief  # to draw effects of the next mission
+        draws = self.state.posterior or self.belief  # a posterior includes robot effects
         return best.with_draws(self.planner.evaluate(best.path, draws))
 
     @property
@@ -185,8 +185,12 @@ class Result(Summary):
         `contact_rate`, the `contact_lost` in bounds (bounds that were not run lose all contact),
         the `status`, the `state` (`"told"`, not used yet; `"learned"`; `"excluded"`) with its
         `reason`, and the diagnostics of the posterior (see `fit`).
+
+        Raises:
+            TrustboError: There is no mission yet.
         """
-        entries = self.state.entries
+        if not (entries := self.state.entries):
+            raise TrustboError("the campaign has no mission yet; call tell or run first.")
         paths = [entry.plan.path for entry in entries]
         steps = np.stack([*zip_longest(*paths, fillvalue=NOWHERE)], axis=1)
         numbers = pd.RangeIndex(1, len(paths) + 1, name="iteration")
@@ -203,57 +207,52 @@ class Result(Summary):
 
         The first columns are `status`, `state`, the `reason` for the state or the failure, the cell
         `where` the mission failed, the mean `contact_rate`, the plan's `objective`, the number
-        `n_bounds` of bounds run, `path_changed`, and the `path` as text, "9,0 8,1". The other
-        quantities of `history` follow. A mission that was given up (see `Campaign.fail`) has
+        `n_bounds` of bounds run, `path_changed`, and the planned `path` as text, "9,0 8,1". The
+        other quantities of `history` follow. A mission that was given up (see `Campaign.fail`) has
         no number, and its state is "given up".
         """
         rows = [entry.row | {"mission": n} for n, entry in enumerate(self.state.entries, start=1)]
-        for i, failure in enumerate(self.state.failures):  # each follows the mission before it
+        for i, failure in enumerate(self.state.failures):  # after the mission that precedes it
             rows.insert(failure.after + i, failure.row())
         names = dict.fromkeys(["mission", *COLUMNS, *chain(*rows)])
         table = pd.DataFrame(rows, columns=list(names))
         return table.astype({"mission": "Int64"}).set_index("mission")
 
     def maps(self, *, n_draws: int | None = None) -> xr.Dataset:
-        """Compute every map of the planning cells after the last mission, for GIS and figures.
+        """Compute the maps of the planning cells after the last mission, for GIS and figures.
 
         Args:
-            n_draws: Number of posterior draws; by default 1000, or 100 for models in which robots
-                influence each other, which need a separate search for each cell.
+            n_draws: Number of posterior draws; by default 1000, or 100 for models whose robots have
+                different parameters, which need a separate search for each cell.
 
         Returns:
-            Dataset over (y, x), the centres of the cells' rows and columns in CRS metres, so that
-            `isel(y=row, x=col)` selects a cell; `maps.rio` has the CRS and writes rasters. It
-            contains `trust_mean` and `trust_sd` over the posterior, the mean `cost`
-            1 - sigma(trust), `path_probability` (that a cell is on the best path), and the
-            awareness of each feature averaged over robots and moves, under the feature's name, or
-            as `awareness_<name>` if that name is taken. Impassable cells are NaN. For models with
-            place effects, it also contains `place_mean` and `place_sd` of the effect of each cell.
+            Dataset with dims (y, x), whose coordinates are the cell centres in CRS metres;
+            `isel(y=row, x=col)` selects a cell. The accessor `.rio` has the CRS and writes rasters.
+            The maps are `trust_mean` and `trust_sd` over the posterior, the mean `cost`
+            1 - sigma(trust), `path_probability` (that a cell is on the best path), and each
+            feature, averaged over robots and moves (as `awareness_<name>` if the name is taken).
+            With place effects, also `place_mean` and `place_sd`. Impassable cells are NaN.
         """
         if n_draws is None:
             dynamics = self.planner.problem.dynamics(self.belief.mean())
             n_draws = 1000 if len(dynamics.start) == 1 else 100
         summary = self.planner.trust_summary(self.posterior, n_draws=n_draws)
         maps = summary.rename(mean="trust_mean", sd="trust_sd")
-        awareness, places = self.workspace.awareness, self._places()
-        taken = {*maps.variables, *maps.dims, "path_probability", "x", "y", "spatial_ref", *places}
+        awareness, places = self.workspace.awareness, self.belief.places
+        taken = {*maps.variables, *maps.dims, "path_probability", "x", "y", "spatial_ref"}
+        taken |= {"place_mean", "place_sd"} if places else set()
         for name in self.workspace.features:
             values = awareness.sel(feature=name, drop=True).mean(("robot", "move"))
             free = f"awareness_{name}" if name in taken else name
             maps[free] = values.assign_attrs(long_name=f"{name}, 0 worst, 1 best")
         maps["path_probability"] = self.planner.path_posterior(self.posterior, n_draws=n_draws)
-        maps = maps.assign(places.data_vars)
+        if places:
+            cells = xr.DataArray(places["place"].mean(1), dims=("draw", "row", "col"))
+            about = {"long_name": "mean of the effect of the cell on trust", "units": "1"}
+            maps["place_mean"] = cells.mean("draw").assign_attrs(about)
+            about["long_name"] = "standard deviation of the effect of the cell on trust"
+            maps["place_sd"] = cells.std("draw").assign_attrs(about)
         return self.workspace.grid.place(maps.where(self.workspace.passable))
-
-    def _places(self) -> xr.Dataset:
-        """Make maps of the place effects, (row, col), if the model has them."""
-        if not (places := self.belief.places):
-            return xr.Dataset()
-        cells = xr.DataArray(places["place"].mean(1), dims=("draw", "row", "col"))
-        maps = xr.Dataset({"place_mean": cells.mean("draw"), "place_sd": cells.std("draw")})
-        for what, values in zip(("mean", "standard deviation"), maps.values(), strict=True):
-            values.attrs = {"long_name": f"{what} of the effect of the cell on trust", "units": "1"}
-        return maps
 
     def plot_maps(self, **options: Any) -> np.ndarray:
         """Plot trust maps and paths of four missions; see `plots.trust_maps` for the options."""
@@ -270,7 +269,7 @@ class Result(Summary):
     def explore(self) -> "Explorer":
         """Make an interactive map with layers, the values of each cell, and a slider over missions.
 
-        It is displayed in notebooks; `.save(path)` writes it to one HTML file that works offline.
+        Notebooks display the map; its method `save(path)` writes one HTML file that works offline.
 
         Raises:
             TrustboError: Nothing could be learned yet.
@@ -284,7 +283,7 @@ class Result(Summary):
 
         Args:
             directory: Folder to write to.
-            overwrite: Whether to remove an existing campaign from it first.
+            overwrite: Whether to replace an existing campaign in that folder.
 
         Raises:
             TrustboError: The folder already contains a campaign and `overwrite` is False, another
@@ -294,22 +293,22 @@ class Result(Summary):
 
 
 def load_result(directory: FilePath) -> Result:
-    """Read the result of a campaign from its folder.
+    """Read the result of a campaign from its folder, without locking the folder.
 
     Args:
-        directory: Folder of a campaign, or one that `Result.save` wrote.
+        directory: Folder of a campaign, or a folder written by `Result.save`.
 
     Raises:
-        TrustboError: The folder contains no campaign, or one without missions; or a file is missing
-            or damaged.
+        TrustboError: The folder contains no campaign, the campaign has no mission yet, or a file is
+            missing or damaged.
     """
     state, workspace, _ = read_campaign(directory)
     if not state.entries:
-        raise TrustboError(f"the campaign in {str(directory)!r} has no mission yet.")
+        raise TrustboError(f"the campaign in {str(directory)!r} has no mission; run one first.")
     given = state.settings
     try:
         model = model_from_record(given["model_record"])
-    except TrustboError:  # a custom model is needed only as long as nothing has been learned
+    except TrustboError:  # a custom model is needed only if nothing has been learned
         if state.last is None:
             raise
         model = None
@@ -321,7 +320,7 @@ def load_result(directory: FilePath) -> Result:
 
 
 def in_a_line(row: dict[str, Any]) -> str:
-    """Describe a mission in one line: its status, value and regret, and the posterior after it."""
+    """Describe a mission in one line, with the diagnostics of the posterior after the mission."""
     names = ("objective", "contact_rate", "regret", "k_hat", "kish", "r_hat", "ess_bulk")
     numbers = [f"{name} {row[name]:.3g}" for name in names if name in row]
     return ", ".join([row["status"], row["state"], *numbers])

@@ -1,4 +1,4 @@
-"""State of a campaign: missions with their plans and posteriors, and failed missions."""
+"""State of a campaign: missions with plans and posteriors, and missions given up."""
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -12,18 +12,18 @@ from trustbo.logs.netcdf import read_tree
 from trustbo.planning import Plan
 
 TOLD, LEARNED, EXCLUDED, GIVEN_UP = "told", "learned", "excluded", "given up"
-"""States of a mission: recorded, used for learning, excluded, or given up unmeasured."""
+"""States of a mission: recorded, used for learning, excluded, or given up without data."""
 _STREAMS = ("policy", "fit", "mission", "prior", "awareness", "hazard")
-"""Random streams; seeds depend on their order, so new names are added at the end."""
+"""Random streams; the seeds depend on their order, so add new names at the end."""
 COLUMNS = (
     "status", "state", "reason", "where", "contact_rate", "objective", "n_bounds", "path_changed",
     "path",
 )  # fmt: skip
-"""First columns of a table of missions."""
+"""First columns of the table of missions, see `Result.table`."""
 
 
 class Failure(NamedTuple):
-    """A mission that was given up, without measurements.
+    """Mission that was given up without measurements.
 
     Attributes:
         after: Number of missions recorded before it.
@@ -38,7 +38,7 @@ class Failure(NamedTuple):
     where: Cell | None = None
 
     def row(self) -> dict[str, Any]:
-        """Return the row of the table of missions."""
+        """Return the failure's row in the table of missions."""
         return {
             "status": self.reason if self.path else "aborted",
             "state": GIVEN_UP,
@@ -57,8 +57,8 @@ class Posterior:
     Attributes:
         name: Name of its file: the number of missions recorded when it was fitted, followed by the
             number of excluded missions if there are any, such as `"0003-1"`.
-        tree: The posterior; None if it is stored only in `file`.
-        file: Its file; None if the campaign is in memory only.
+        tree: Draws in memory; None if they are stored only in `file`.
+        file: File of the draws; None if the campaign is in memory only.
     """
 
     name: str
@@ -66,21 +66,21 @@ class Posterior:
     file: Path | None = None
 
     def __call__(self) -> xr.DataTree:
-        """Return the posterior; raises TrustboError if its file cannot be read."""
+        """Return the draws; raises TrustboError if the file cannot be read."""
         return read_tree(self.file or "") if self.tree is None else self.tree
 
 
 @dataclass(eq=False)
 class Entry:
-    """A recorded mission.
+    """Recorded mission, with its plan and the posterior after it.
 
     Attributes:
         plan: Plan returned by `ask`.
-        measured: Mission as measured.
-        mission: Mission with the awareness used for learning, see `learning.as_learned`.
+        measured: Mission with the measured awareness.
+        mission: Mission with the awareness used for learning; see `learning.as_learned`.
         trust_map: Trust map used for planning, dims (row, col).
-        row: Numbers of the mission by name, with its `state` (`TOLD`, `LEARNED` or `EXCLUDED`) and
-            the `reason` for this state.
+        row: Values of the mission in `Result.table`, keyed by column, including the `state`
+            (`TOLD`, `LEARNED` or `EXCLUDED`) and the `reason` for this state.
         posterior: Posterior after this mission; None if there is none yet.
     """
 
@@ -103,7 +103,7 @@ class State:
     Attributes:
         settings: Arguments of the campaign, JSON-serialisable.
         entries: Recorded missions, in order.
-        failures: Failed missions.
+        failures: Missions that were given up.
         asked: Plan returned by `ask` and not run yet.
         simulation: Settings reported by the simulator, and `n_iterations`.
         stop_reason: Why the last run ended.
@@ -117,21 +117,21 @@ class State:
     stop_reason: str = "interrupted"
 
     def copy(self) -> Self:
-        """Return a copy that later missions do not change."""
+        """Return a copy that does not change when missions are added later."""
         entries = [replace(entry, row=dict(entry.row)) for entry in self.entries]
         return replace(self, entries=entries, failures=list(self.failures))
 
     @property
     def last(self) -> Posterior | None:
-        """Posterior after the last mission."""
+        """Posterior after the last mission, possibly in a file; None if there is none."""
         return self.entries[-1].posterior if self.entries else None
 
     @property
     def posterior(self) -> xr.DataTree | None:
-        """Posterior of the parameters given the missions so far; None if nothing was learned."""
+        """Posterior of the parameters after the last mission; None if nothing was learned."""
         return None if self.last is None else self.last()
 
-    def numbers(self, *states: str) -> list[int]:
+    def indices(self, *states: str) -> list[int]:
         """Return the indices of the missions in one of these states."""
         return [j for j, entry in enumerate(self.entries) if entry.row["state"] in states]
 
@@ -140,11 +140,11 @@ class State:
         n = len(self.entries)
         entropy = [self.settings["seed"], _STREAMS.index(stream), n]
         if n_failures := sum(failure.after == n for failure in self.failures):
-            entropy.append(n_failures)  # another attempt may choose another path
+            entropy.append(n_failures)  # after `fail`, a random policy may choose another path
         return int(np.random.SeedSequence(entropy).generate_state(1)[0])
 
     def row_of(self, plan: Plan, mission: Mission) -> dict[str, Any]:
-        """Make the row of a new mission."""
+        """Return the row of a new mission for `Result.table`."""
         before = self.entries[-1].plan if self.entries else plan
         rates = mission.contact_rate
         contact = float(np.nanmean(rates)) if np.isfinite(rates).any() else np.nan

@@ -15,18 +15,18 @@ if TYPE_CHECKING:
     from trustbo.campaign.campaign import Campaign
 
 Stop = Callable[["Campaign"], str | bool | None]
-"""Rule called between missions; it ends the campaign by returning a reason (or True)."""
+"""Function called between missions; returning a reason (or True) ends the campaign."""
 
 
 @dataclass(frozen=True)
 class RegretBound:
-    """Stop when the recommended path is nearly optimal, with high probability, twice in a row.
+    """Stop when the recommended path is nearly optimal, with high probability.
 
     The best path is planned exactly under each of `n_draws` posterior draws. For lost_contact, the
     regret of the recommended path is the additional contact that it loses, as a fraction of the
-    contact that the best path keeps; for other objectives, it is a fraction of the best path's
+    contact kept on the best path. For other objectives, regret is a fraction of the best path's
     value. The campaign stops when P(regret <= eps) >= 1 - delta after each of the last `patience`
-    missions and robots have completed every bound of the path at least once, because the map may
+    missions, and every bound of the recommended path has been completed at least once. The map may
     be wrong about bounds that were never driven.
 
     Attributes:
@@ -60,7 +60,7 @@ class RegretBound:
         if min(sure) < 1.0 - self.delta:
             return None
         risk, bounds = campaign.risk, tuple(bounds_along(np.array(campaign.recommend().path)).T)
-        if not (risk.exposures[bounds] > risk.failures[bounds]).all():  # some were never completed
+        if not (risk.exposures[bounds] > risk.failures[bounds]).all():  # a bound is new
             return None
         return f"regret_bound: P(regret <= {self.eps:g}) = {sure[0]:.3f} >= {1.0 - self.delta:g}"
 
@@ -73,6 +73,6 @@ class RegretBound:
         try:
             path = planner.plan(draws.mean()).path
             drawn = planner.plan_draws(draws, n_draws=self.n_draws)
-        except InfeasibleError:  # no path respects the limit
+        except InfeasibleError:  # no path satisfies `max_failure`
             return 0.0
         return float(np.mean(drawn.relative_regret(path) <= self.eps))

@@ -1,12 +1,12 @@
-"""Folder of a campaign: a file for each mission and each posterior, and one record, written last.
+"""Folder of a campaign, with one file per mission and posterior.
 
     workspace.nc          written once
-    missions/0001.nc      mission as measured, with its plan, before anything is learned from it
+    missions/0001.nc      measurements and plan of the first mission, written before learning
     posteriors/0001.nc    draws of the parameters after the first mission
-    campaign.json         settings, numbers and states; counts the missions that are complete
+    campaign.json         settings, the rows of completed missions, and failures; written last
 
-Every file is written to a temporary name, flushed to disk and renamed. A process that dies during
-a write loses nothing: missions beyond the record's count are processed when the folder is opened.
+Every file is written under a temporary name, flushed to disk and renamed. If the process dies, no
+mission is lost: `Campaign.load` learns from the missions that are not in campaign.json yet.
 """
 
 import itertools
@@ -39,7 +39,7 @@ class Storage:
     """
 
     def __init__(self, directory: FilePath) -> None:
-        """Lock a folder, which is created if necessary.
+        """Lock a folder, and create it if necessary.
 
         Raises TrustboError if another process has locked it or the path is a file.
         """
@@ -63,7 +63,7 @@ class Storage:
     def begin(
         cls, directory: FilePath, workspace: Workspace, state: State, *, overwrite: bool
     ) -> Self:
-        """Lock a folder and write a whole campaign; an existing one is removed, its record first.
+        """Lock a folder and write a whole campaign; an existing campaign is removed.
 
         Raises TrustboError if the folder is locked, or has a campaign and `overwrite` is False.
         """
@@ -84,9 +84,9 @@ class Storage:
     def _write_campaign(self, workspace: Workspace, state: State) -> None:
         stored = {e.posterior.name: e.posterior for e in state.entries if e.posterior is not None}
         trees = {name: posterior() for name, posterior in stored.items()}  # read before deletion
-        (self.path / RECORD).unlink(missing_ok=True)
-        for room in (MISSIONS, POSTERIORS):
-            for file in (self.path / room).glob("*.nc"):
+        (self.path / RECORD).unlink(missing_ok=True)  # first, so that nothing partial is loaded
+        for folder in (MISSIONS, POSTERIORS):
+            for file in (self.path / folder).glob("*.nc"):
                 file.unlink()
         write_tree(self.path / WORKSPACE, archive.workspace_to_tree(workspace))
         for n, entry in enumerate(state.entries, start=1):
@@ -96,7 +96,7 @@ class Storage:
         self.write_record(state)
 
     def add_mission(self, n: int, entry: Entry) -> None:
-        """Write mission n, from 1, as measured, with its plan and its row."""
+        """Write the measurements, plan and table row of mission n, counted from 1."""
         planned = xr.Dataset({"trust_map": entry.trust_map})
         planned.attrs = {"plan": to_json(plan_to_record(entry.plan)), "row": to_json(entry.row)}
         tree = missions_to_tree([entry.measured])
@@ -104,13 +104,13 @@ class Storage:
         write_tree(self.path / MISSIONS / f"{n:04d}.nc", tree)
 
     def add_posterior(self, name: str, tree: xr.DataTree) -> Path:
-        """Write a posterior of parameters and return its file."""
+        """Write the posterior draws of the parameters, and return the file."""
         file = self.path / POSTERIORS / f"{name}.nc"
         write_tree(file, tree)
         return file
 
     def write_record(self, state: State) -> None:
-        """Write everything except arrays; called last, as the record counts complete missions."""
+        """Write campaign.json; called last because it lists the completed missions."""
         record = {
             "settings": state.settings,
             "simulation": state.simulation,
@@ -125,7 +125,7 @@ class Storage:
 
 
 def read_campaign(directory: FilePath) -> tuple[State, Workspace, list[Entry]]:
-    """Read the state, the workspace, and missions that are not in the record yet.
+    """Read the state, the workspace, and the missions that are not in campaign.json yet.
 
     Raises TrustboError if the folder contains no campaign, or a file is missing or damaged.
     """
@@ -165,4 +165,4 @@ def read_campaign(directory: FilePath) -> tuple[State, Workspace, list[Entry]]:
 def require_campaign(directory: FilePath) -> None:
     """Raise TrustboError if a folder contains no campaign."""
     if not (Path(directory) / RECORD).exists():
-        raise TrustboError(f"{str(directory)!r} contains no campaign.")
+        raise TrustboError(f"{str(directory)!r} contains no campaign; give another folder.")
