@@ -1,4 +1,4 @@
-"""Display of objects and progress: text in a terminal, and tables and bars in a notebook."""
+"""Display of objects and progress, as text in a terminal and as HTML in a notebook."""
 
 import sys
 import warnings
@@ -10,22 +10,22 @@ from typing import Any
 
 from numba.core import event
 
-with warnings.catch_warnings():  # without ipywidgets, notebooks show text bars
+with warnings.catch_warnings():  # tqdm warns if ipywidgets is missing
     warnings.simplefilter("ignore")
     from tqdm.auto import tqdm
 
 Rows = list[tuple[str, str]]
-"""Names of the main properties of an object, and their values with units."""
+"""Names and values, with units, of the main properties of an object."""
 _WIDTH = 100
 
 
 class Summary:
-    """Base class of objects that are displayed as a list of their main properties."""
+    """Base class of objects whose text and HTML display lists their main properties."""
 
     __slots__ = ()
 
     def _rows(self) -> Rows:
-        """Return names and values to display."""
+        """Return the names and values to display."""
         raise NotImplementedError
 
     def __repr__(self) -> str:
@@ -44,12 +44,12 @@ class Summary:
 
 
 def joined(names: Sequence[str]) -> str:
-    """Join names: "a, b and c"."""
+    """Join one or more names: "a, b and c"."""
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
 def compiling() -> AbstractContextManager[Any]:
-    """Print a line when kernels are compiled, which happens once per machine."""
+    """Return a context in which the first compilation of a kernel prints a line."""
     return event.install_listener("numba:compile", _Announcement())
 
 
@@ -63,5 +63,5 @@ class _Announcement(event.Listener):
 
 @cache
 def announce() -> None:
-    """Announce the first compilation of a process, above the progress bars."""
+    """Print that kernels are being compiled, once per process and above any progress bar."""
     tqdm.write("compiling kernels (once, about 30 s)", file=sys.stderr)

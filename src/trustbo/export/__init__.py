@@ -15,7 +15,7 @@ WRITERS: dict[str, tuple[str, Callable[[Path, Result], None]]] = {
     "csv": ("missions.csv", write_csv),
     "nav2": ("nav2", write_nav2),
 }
-"""Name of the file or folder, and function that writes a result, keyed by format."""
+"""File or folder name and writing function of each format."""
 
 
 def export_result(

@@ -20,14 +20,14 @@ from trustbo.planning import Plan
 from trustbo.planning.plan import QUANTILES
 
 LEAD = "lead"
-"""Name of the lead in files."""
+"""Name of the lead in exported files."""
 _BAND = {"low": QUANTILES.index(0.05), "high": QUANTILES.index(0.95)}
 
 
 def write_geotiff(path: FilePath, maps: Result | xr.Dataset) -> None:
     """Write maps of the planning cells as the bands of a GeoTIFF in the terrain's CRS.
 
-    Bands are float32, with variable names as descriptions, long names as tags and NaN as nodata.
+    Bands are float32 with nodata NaN, and have the variable names as descriptions.
 
     Args:
         path: .tif or .tiff file to write or replace.
@@ -61,10 +61,10 @@ def write_geotiff(path: FilePath, maps: Result | xr.Dataset) -> None:
 def write_geojson(path: FilePath, plan: Plan | Result) -> None:
     """Write a path as GeoJSON (RFC 7946), in longitude and latitude (WGS 84).
 
-    The file contains a LineString of the path and a Point for each cell, with the expected trust
-    of each robot, a 90 % interval of the trust, and the failure probability. With a terrain, there
-    is also a Point for each post and a LineString for each route. The property `layer` is "path",
-    "bounds", "posts" or "routes". Lines that cross the longitude of 180 degrees are cut there.
+    The file contains a LineString of the path and a Point for each cell. The properties of a cell
+    are the trust of each robot with its 90 % interval, and the failure probability. With a terrain,
+    there is also a Point for each post and a LineString for each route. The property `layer` is
+    "path", "bounds", "posts" or "routes". Lines are cut where they cross the 180th meridian.
 
     Args:
         path: File to write or replace.
@@ -99,18 +99,18 @@ def write_csv(path: FilePath, result: Result) -> None:
     """Write a table with one row for each mission, bound and robot.
 
     The table has the columns of `logs.to_frame`, and `trust_mean` and `trust_sd`: the mean and
-    standard deviation of latent trust under the last posterior. Values that were not measured are
-    blank, as is the trust of missions that are not in the last posterior.
+    standard deviation of latent trust under the last posterior. Missing measurements are blank, and
+    so is the trust in missions that are not in the last posterior.
 
     Args:
         path: File to write or replace.
         result: Result of a campaign.
 
     Raises:
-        TrustboError: The file cannot be written.
+        TrustboError: There is no posterior yet, or the file cannot be written.
     """
     table, latent = to_frame(result.missions), result.posterior["latent"].to_dataset()
-    # A posterior may lack missions that are excluded or have not been learned from yet.
+    # The posterior lacks missions that are excluded or not learned from yet.
     of_mission = {int(j) + 1: i for i, j in enumerate(latent["mission"].values)}
     keys = table[["mission", "bound", "robot"]].itertuples(index=False, name=None)
     robots = result.workspace.team.names
@@ -132,12 +132,12 @@ def require_suffix(path: FilePath, *suffixes: str) -> Path:
 
 
 def _of(values: Any) -> Any:
-    """Return the values of a plan, or an empty tuple if the plan has no terrain."""
+    """Return posts or routes of a plan; an empty tuple if the plan has no terrain."""
     return () if values is None else values
 
 
 def _cells(plan: Plan) -> list[dict[str, Any]]:
-    """Return the properties of a path's cells, without unknown values."""
+    """Return the GeoJSON properties of the cells of a path; unknown values are left out."""
     columns: dict[str, np.ndarray] = {}
     for i, robot in enumerate(plan.workspace.team.names):
         columns[f"trust_{robot}"] = plan.trust[:, i]
@@ -153,7 +153,7 @@ def _cells(plan: Plan) -> list[dict[str, Any]]:
 
 
 def _feature(plan: Plan, layer: str, places: np.ndarray, about: dict[str, Any]) -> dict[str, Any]:
-    """Make a GeoJSON feature at a position (2,) or along positions (point, 2), in CRS metres."""
+    """Make a GeoJSON Point at a position (2,) or LineString of positions (point, 2), CRS metres."""
     if plan.workspace.grid.crs is None:
         raise TrustboError(_NO_CRS)
     crs, xy = plan.workspace.grid.crs, np.atleast_2d(places)
@@ -161,14 +161,14 @@ def _feature(plan: Plan, layer: str, places: np.ndarray, about: dict[str, Any]) 
     shape = shapely.Point(lon[0], lat[0])
     if np.ndim(places) == 2:
         shape = _cut(shapely.LineString(np.column_stack([np.unwrap(lon, period=360.0), lat])))
-    # RFC 7946, 11.2: no more digits than the data justify; the eighth is about a millimetre.
+    # RFC 7946, 11.2: no needless digits; the eighth decimal is about a millimetre.
     rounded = shapely.transform(shape, lambda values: np.round(values, 8))
     geometry = json.loads(shapely.to_geojson(rounded))
     return {"type": "Feature", "geometry": geometry, "properties": {"layer": layer, **about}}
 
 
 def _cut(line: shapely.LineString) -> shapely.Geometry:
-    """Cut a line with continuous longitudes at 180 degrees (RFC 7946, 3.1.9)."""
+    """Cut a line at longitude 180 degrees (RFC 7946, 3.1.9); its longitudes must not jump."""
     west, _, east, _ = line.bounds
     if -180.0 <= west and east <= 180.0:
         return line

@@ -23,21 +23,21 @@ from trustbo.workspace import Workspace
 from trustbo.workspace.moves import MOVES
 
 IMPASSABLE, UNKNOWN, WORST = 100, 255, 98
-"""Pixel values of a cost map; Nav2 uses 99 and 100 for places where robots must not go."""
-_MOST_PIXELS = 1e8
-_MOST_IDS = 65_535
+"""Pixel values of impassable cells, unknown cells and the highest cost; Nav2 forbids 99 and 100."""
+_MAX_PIXELS = 1e8
+_MAX_ID = 65_535
 """Largest id in Nav2 messages (uint16)."""
-_LEAST_COST = 1e-9
+_MIN_COST = 1e-9
 """Minimum cost of an edge, since the route server rejects 0."""
 
 
 class Frame(NamedTuple):
-    """Coordinate frame of the robots, given by its pose in the CRS.
+    """Coordinate frame of the robots, defined by the pose of its origin in the CRS.
 
     Attributes:
         origin: Position of the frame's origin, x and y in CRS metres.
         rotation: Angle from the x axis of the CRS (east) to the x axis of the frame, in rad,
-            anticlockwise.
+            counterclockwise.
         name: Name of the frame, used as the `frame_id` of messages.
     """
 
@@ -46,12 +46,12 @@ class Frame(NamedTuple):
     name: str = "map"
 
     def of_crs(self, xy: Any) -> np.ndarray:
-        """Convert positions (..., 2) from CRS coordinates, in metres, to the local frame."""
+        """Convert positions (..., 2) from CRS metres to this frame, in metres."""
         c, s = math.cos(self.rotation), math.sin(self.rotation)
         return (np.asarray(xy, dtype=float) - self.origin) @ np.array([[c, -s], [s, c]])
 
     def to_crs(self, xy: Any) -> np.ndarray:
-        """Convert positions (..., 2) from the local frame, in metres, to CRS coordinates."""
+        """Convert positions (..., 2) from this frame, in metres, to CRS metres."""
         c, s = math.cos(self.rotation), math.sin(self.rotation)
         return np.asarray(xy, dtype=float) @ np.array([[c, s], [-s, c]]) + self.origin
 
@@ -112,7 +112,7 @@ def write_ros_map(
     target = require_suffix(path, ".yaml", ".yml")
     values, corner, side = occupancy(cost.values, workspace, frame, pixel)
     picture = target.with_suffix(".pgm")
-    # Images begin in the north. In raw mode, map_server reads the byte of a pixel as its value.
+    # The first row of an image is in the north. In raw mode, map_server reads bytes as costs.
     pixels = f"P5\n{values.shape[1]} {values.shape[0]}\n255\n".encode() + values[::-1].tobytes()
     write_file(picture, lambda file: file.write_bytes(pixels))
     about = {"image": picture.name, "mode": "raw", "resolution": side, "origin": [*corner, 0.0],
@@ -123,7 +123,7 @@ def write_ros_map(
 def occupancy(
     cost: np.ndarray, workspace: Workspace, frame: Frame, pixel: float | None = None
 ) -> tuple[np.ndarray, list[float], float]:
-    """Return pixels (row, col), south first, the map's lower left corner, and the pixel size."""
+    """Return pixels (row, col), southern row first, the lower left corner and the pixel size."""
     if ((cost < 0.0) | (cost > 1.0)).any():
         raise TrustboError(
             f"cost must be in [0, 1]; got values from {np.nanmin(cost):g} to {np.nanmax(cost):g}."
@@ -136,7 +136,7 @@ def occupancy(
     corner = corners.min(0)
     # The quotient may be a whole number plus a rounding error.
     n_x, n_y = np.ceil(np.ptp(corners, axis=0) / side - 1e-6).astype(int)
-    if float(n_x) * float(n_y) > _MOST_PIXELS:
+    if float(n_x) * float(n_y) > _MAX_PIXELS:
         raise TrustboError(f"pixel={side:g} m gives {n_x} x {n_y} pixels; use a larger pixel.")
     percent = np.where(np.isnan(cost), UNKNOWN, np.fmin(np.rint(100.0 * cost), WORST))
     percent = np.where(workspace.passable.values, percent, IMPASSABLE)
@@ -155,7 +155,7 @@ def stops_of(plan: Plan, robot: str, frame: Frame) -> np.ndarray:
     """Return the poses (x, y, heading) of a robot's stops in a frame, shape (stop, 3).
 
     The lead faces its next stop. At each post, the other robots face the lead's next stop; at the
-    goal, they face the lead. The files do not make robots wait for each other. Raises TrustboError
+    goal, they face the lead. Waypoints do not make robots wait for each other. Raises TrustboError
     if there is no terrain or no route.
     """
     require_choice("robot", robot, (LEAD, *plan.workspace.team.names))
@@ -187,13 +187,13 @@ def _graph(result: Result, frame: Frame) -> str:
     """Return all bounds with the contact lost in each, as GeoJSON for Nav2's route server.
 
     Nodes are stops, with the id row * columns + column. Edges are straight lines, with the id
-    (1 + move) * cells + id of the stop entered. Nav2's PenaltyScorer reads costs in `metadata`.
+    (1 + move) * cells + id of the stop entered. Nav2's PenaltyScorer reads the cost in `metadata`.
     """
     workspace = result.workspace
     cols, n_cells = workspace.grid.shape[1], math.prod(workspace.grid.shape)
-    if (1 + len(MOVES)) * n_cells - 1 > _MOST_IDS:
+    if (1 + len(MOVES)) * n_cells - 1 > _MAX_ID:
         raise TrustboError(
-            f"a route graph of {n_cells} cells needs ids above {_MOST_IDS}, the limit of Nav2; "
+            f"a route graph of {n_cells} cells needs ids above {_MAX_ID}, the limit of Nav2; "
             "use larger cells."
         )
     posts = workspace.posts
@@ -207,7 +207,7 @@ def _graph(result: Result, frame: Frame) -> str:
     for a, c, lost in graph.edges(data="lost"):
         move = MOVES.index((c[0] - a[0], c[1] - a[1]))
         first, last = (row * cols + col for row, col in (a, c))
-        cost = max(float(lost), _LEAST_COST)
+        cost = max(float(lost), _MIN_COST)
         about = {"id": (1 + move) * n_cells + last, "startid": first, "endid": last, "cost": cost}
         about |= {"overridable": True, "metadata": {"penalty": cost}}
         features.append(_feature("MultiLineString", [[where[a], where[c]]], about))
@@ -220,7 +220,7 @@ def _feature(kind: str, coordinates: list[Any], properties: dict[str, Any]) -> s
 
 
 def _json(value: Any) -> str:
-    """Convert values to JSON; floats keep a decimal point so they are not read as integers."""
+    """Convert values to JSON; floats keep a decimal point, or Nav2 reads them as integers."""
     if isinstance(value, dict):
         return "{" + ", ".join(f"{json.dumps(k)}: {_json(v)}" for k, v in value.items()) + "}"
     if isinstance(value, list):

@@ -1,4 +1,4 @@
-"""Grids of campaigns (cases x scenes x seeds), which run in parallel and can be resumed."""
+"""Grids of campaigns (cases x scenes x seeds) that run in parallel and can be resumed."""
 
 import copy
 import re
@@ -23,20 +23,20 @@ from trustbo.workspace import Workspace
 
 
 class Scene(NamedTuple):
-    """Setting of a campaign: the assumed workspace, a simulator, the start and the goal."""
+    """World of a simulated campaign: the assumed workspace, the simulator, start and goal."""
 
     workspace: Workspace
     simulator: Simulator
     start: Cell
     goal: Cell
     truth: Truth | None = None
-    """Truth of the simulator, used to evaluate paths."""
+    """Truth of the simulator, used to compute the regret and loss of paths."""
     options: Mapping[str, Any] = {}
-    """Options of `Campaign` in this scene; the options of a case override them."""
+    """Options of `Campaign` in this scene, which the options of a case override."""
     labels: Mapping[str, Any] = {}
-    """Additional columns of the table."""
+    """Additional columns of the table that `run_grid` returns, and their values."""
     judged: Mapping[str, Any] = {}
-    """Options of `Truth.best` for the reference path, such as `max_bounds`."""
+    """Options of `Truth.best` for the best path, such as `max_bounds`."""
 
 
 type Case = Mapping[str, Any] | Callable[[Scene], Mapping[str, Any]]
@@ -52,7 +52,7 @@ def run_grid(
     n_missions: int = 15,
     n_jobs: int = -1,
 ) -> pd.DataFrame:
-    """Run each case in each scene with each seed, and evaluate the paths of each mission.
+    """Run a campaign for each case, scene and seed, and evaluate the paths of all missions.
 
     Each run writes a file whose name contains the case, scene, seed and number of missions. A run
     is skipped if its file exists. Runs are parallelised with joblib; `joblib.parallel_config`
@@ -63,7 +63,7 @@ def run_grid(
     Args:
         cases: Cases, keyed by name.
         scenes: Functions, keyed by name, that make the scenes in the worker processes.
-        folder: Folder for the files of the runs.
+        folder: Folder for the files of the runs, one CSV file per run.
         seeds: Seeds of the campaigns.
         n_missions: Number of missions per campaign.
         n_jobs: Number of processes; -1 for one per core, 1 to use only this process.
@@ -72,26 +72,28 @@ def run_grid(
         One row per run and mission, with `case`, `scene`, `seed`, the labels of the scene, and
         `mission`, which is 0 before the first mission. `regret` (%) and `lost` (bounds) describe
         the path recommended after the mission, and `best` is the loss on the best path, all in the
-        world of the next mission (see `Truth`). The mission itself has a `status` and a mean
-        `contact_rate`. `driven` and `best_driven` are the expected losses on the driven path and on
+        world of the next mission (see `Truth`). `status` and mean `contact_rate` describe the
+        mission itself. `driven` and `best_driven` are the expected losses on the driven path and on
         the best path. `failed_driven` is the difference of these losses if bounds that fail or are
         not reached count as fully lost. `seconds` is the CPU time.
 
     Raises:
-        TrustboError: If a run failed. The next call repeats failed runs.
+        TrustboError: If a run failed; call the function again to repeat failed runs.
 
     Example:
         >>> cases = {"greedy": {}, "thompson": {"policy": "thompson"}}
         >>> table = tb.study.run_grid(cases, {"hills": make_scene}, "out", seeds=range(3))
     """
     require_whole("n_missions", n_missions, 1)
-    kept, runs = Path(folder), list(product(seeds, scenes, cases))
+    root, runs = Path(folder), list(product(seeds, scenes, cases))
     files = {
-        (seed, scene, case): kept / f"{_plain(case)}~{_plain(scene)}~{seed}~{n_missions}.csv"
+        (seed, scene, case): root / f"{_plain(case)}~{_plain(scene)}~{seed}~{n_missions}.csv"
         for seed, scene, case in runs
     }
     if len(set(files.values())) < len(runs):
-        raise TrustboError("the names of cases and scenes must differ in more than punctuation.")
+        raise TrustboError(
+            "names of cases, and of scenes, must differ in more than punctuation; rename one."
+        )
     errors = Parallel(n_jobs=n_jobs)(
         delayed(_run)(cases[case], scenes[scene], (case, scene, seed), n_missions, file)
         for (seed, scene, case), file in files.items()
@@ -112,7 +114,7 @@ def _plain(name: str) -> str:
 def _run(
     case: Case, scene: Callable[[], Scene], names: tuple[str, str, int], n_missions: int, file: Path
 ) -> str:
-    """Run a campaign and write its rows to a file; return the error, if any."""
+    """Run a campaign and write its rows to a file; return the error message, or ""."""
     labels = dict(zip(("case", "scene", "seed"), names, strict=True))
     try:
         with warnings.catch_warnings(), threadpool_limits(1):
@@ -129,7 +131,7 @@ def _run(
 
 
 def _rows(case: Case, scene: Scene, seed: int, n_missions: int) -> Iterator[dict[str, Any]]:
-    """Run a campaign and yield its rows; the first row describes the state before any mission."""
+    """Run a campaign and yield its rows; the first is from before the first mission."""
     options = case(scene) if callable(case) else case
     given = {
         "workspace": scene.workspace, "start": scene.start, "goal": scene.goal, "seed": seed,
@@ -151,7 +153,7 @@ def _rows(case: Case, scene: Scene, seed: int, n_missions: int) -> Iterator[dict
 
 
 def _recommended(campaign: Campaign, scene: Scene, mission: int) -> dict[str, float]:
-    """Compute the regret and the loss of the path recommended for a mission."""
+    """Compute regret and loss of the path recommended before `mission`, an index from 0."""
     if scene.truth is None:
         return {}
     choose = getattr(campaign.policy, "recommend", None)
@@ -163,7 +165,7 @@ def _recommended(campaign: Campaign, scene: Scene, mission: int) -> dict[str, fl
 
 
 def _driven(path: Sequence[Cell], scene: Scene, mission: int) -> dict[str, float]:
-    """Compute the expected losses on the path of a mission and on the best path."""
+    """Compute the expected losses on the path of `mission`, an index from 0, and on the best."""
     if scene.truth is None:
         return {}
     truth, ends = scene.truth.at(mission), (scene.start, scene.goal)

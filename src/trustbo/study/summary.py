@@ -9,9 +9,9 @@ import pandas as pd
 from trustbo.errors import require_choice
 
 SHOWN = (0, 1, 3, 8, 15)
-"""Numbers of missions after which the regret is reported."""
+"""Numbers of missions after which the regret and the loss are reported."""
 NEAR = 1.0
-"""Regret in % below which a recommendation counts as nearly optimal."""
+"""Regret in % up to which a recommended path counts as nearly optimal."""
 _RUN = ["case", "scene", "seed"]
 
 
@@ -20,11 +20,12 @@ def numbers_of(table: pd.DataFrame) -> pd.DataFrame:
 
     `regret after n` (%) and `lost after n` (the loss minus the best path's, in bounds) describe the
     path recommended after n missions, in the world of the next mission. `regret now` is the mean
-    regret. `lost while learning` is the mean loss in the missions minus that on the best path.
-    `lost with failures` is the same, but counts bounds that fail or are not reached as fully lost.
+    regret. `lost while learning` is the mean loss in the missions minus the loss on the best path.
+    `lost with failures` is the same if bounds that fail or are not reached count as fully lost.
     `missions to 1 %` is the number of missions after which the regret stays within 1 %, or the
     number of missions plus one if it never does. `arrive` is the fraction of missions that reach
-    the goal, also for the first three and the later ones. `seconds` is the CPU time per mission.
+    the goal, `arrive of the first 3` and `arrive later` the same for the first three and the other
+    missions. `seconds` is the CPU time per mission.
     """
     judged = {"mission", "regret", "lost", "best", "status", "contact_rate", "driven",
               "best_driven", "failed_driven", "seconds"}  # fmt: skip
@@ -39,28 +40,28 @@ def _numbers(run: pd.DataFrame) -> dict[str, float]:
     run = run.sort_values("mission")
     driven, regret = run.iloc[1:], run["regret"].to_numpy()
     after = [n for n in SHOWN if n < len(run)]
-    lost, home = (run["lost"] - run["best"]).to_numpy(), driven["status"] == "ok"
-    away = np.flatnonzero(~(regret <= NEAR))
+    lost, arrived = (run["lost"] - run["best"]).to_numpy(), driven["status"] == "ok"
+    far = np.flatnonzero(~(regret <= NEAR))
     return {
         **{f"regret after {n}": regret[n] for n in after},
         **{f"lost after {n}": lost[n] for n in after},
         "regret now": np.nanmean(regret),
         "lost while learning": (driven["driven"] - driven["best_driven"]).mean(),
         "lost with failures": driven["failed_driven"].mean(),
-        f"missions to {NEAR:g} %": float(away[-1] + 1 if len(away) else 0),
-        "arrive": home.mean(),
-        "arrive of the first 3": home[:3].mean(),
-        "arrive later": home[3:].mean(),
+        f"missions to {NEAR:g} %": float(far[-1] + 1 if len(far) else 0),
+        "arrive": arrived.mean(),
+        "arrive of the first 3": arrived[:3].mean(),
+        "arrive later": arrived[3:].mean(),
         "seconds": driven["seconds"].mean(),
     }
 
 
 def summary(numbers: pd.DataFrame, by: str | Sequence[str] = "case") -> pd.DataFrame:
-    """Compute means (medians for quantities after n missions) with 95 % intervals over scenes.
+    """Compute means (medians for "... after n") over runs, with 95 % intervals over scenes.
 
     Args:
         numbers: Rows of `numbers_of`.
-        by: Columns by which runs are grouped.
+        by: Columns by which the runs are grouped.
 
     Returns:
         Table with two column levels: the quantity, and its `value`, `low` and `high`.
@@ -84,7 +85,7 @@ def differences(numbers: pd.DataFrame, ours: str, by: Sequence[str] = ()) -> pd.
     Args:
         numbers: Rows of `numbers_of`.
         ours: Case from which the other cases are subtracted.
-        by: Columns by which pairs are grouped, in addition to the other case.
+        by: Columns, besides the other case, by which the pairs of runs are grouped.
 
     Returns:
         Table of the differences, `ours` minus the other case, in the format of `summary`, with the
@@ -115,7 +116,7 @@ def bootstrap(
     clusters: np.ndarray,
     middle: Callable[[np.ndarray], Any] | None = None,
 ) -> dict[tuple[str, str], float]:
-    """Estimate each quantity by `middle`, by default as in `summary`, with a 95 % interval.
+    """Compute `middle` (by default, the mean or median as in `summary`) and its 95 % interval.
 
     The runs of a cluster are resampled together, and all quantities use the same resamples.
     """
@@ -127,7 +128,7 @@ def bootstrap(
     ]
     row = {}
     for name, values in numbers.items():
-        if np.isnan(values).all():  # such as arrivals in later missions if there are none
+        if np.isnan(values).all():  # such as "arrive later" after three missions
             row |= {(name, what): np.nan for what in ("value", "low", "high")}
             continue
         usual = middle or (np.nanmedian if " after " in name else np.nanmean)
@@ -137,7 +138,7 @@ def bootstrap(
 
 
 def _values(numbers: pd.DataFrame) -> dict[str, np.ndarray]:
-    """Return the numeric columns, keyed by name."""
+    """Return the quantities of the runs, which follow the label columns, keyed by name."""
     first = numbers.columns.get_loc("regret after 0")
     return {name: numbers[name].to_numpy(float) for name in numbers.columns[first:]}
 

@@ -1,4 +1,4 @@
-"""Benchmark worlds, which have a true and an assumed terrain, sight and team, and four courses."""
+"""Benchmark worlds: true and assumed terrain, sight model and team, and four courses."""
 
 import hashlib
 from dataclasses import dataclass, field, replace
@@ -25,11 +25,11 @@ from trustbo.workspace.sight import Sight
 REAL = ("wellington", "tahoe", "bcts", "topography")
 """Folder names of the real terrains; each folder contains dem.tif and dsm.tif."""
 COURSES = ("sw-ne", "nw-se", "n-s", "w-e")
-"""Courses through a world: along both diagonals, from north to south, and from west to east."""
+"""Courses (start and goal) of a world: both diagonals, north to south, and west to east."""
 _STRIP = 250
-"""Extent in y, in metres, to which real terrains of more than twice this extent are cropped."""
+"""Extent in y, in metres, to which a real terrain is cropped if it is more than twice as long."""
 _RELIEF = 0.06
-"""Relief of a synthetic terrain as a fraction of its longer side."""
+"""Height range of a synthetic terrain, as a fraction of its longer side."""
 
 
 def drawn(ground: str, what: str) -> np.random.Generator:
@@ -39,11 +39,11 @@ def drawn(ground: str, what: str) -> np.random.Generator:
 
 @dataclass(frozen=True)
 class World:
-    """A terrain with events, and the true and assumed sight and team.
+    """Benchmark world: a terrain, its events, and the true and assumed sight model and team.
 
     Attributes:
         name: Name of the terrain, followed by the name of the case.
-        kind: Kind of the world, used as a label in tables.
+        kind: Name of a group of worlds, used as a label in tables.
         ground: Name of the terrain, `"synthetic-N"` for a synthetic terrain with seed N,
             `"synthetic-NAME"` for one whose seed is drawn from the name, or a name in `REAL`.
         sight: True sight model.
@@ -51,8 +51,8 @@ class World:
         team: True lead and robots.
         assumed_team: Assumed lead and robots; None for the true team.
         aged: Whether the assumed terrain comes from an outdated survey (see the function `aged`).
-        events: Events in the true world. The centre of an event is given in fractions of the
-            terrain's width and height from the lower left corner, not in CRS metres.
+        events: Events in the true world. The centre of an event is a position relative to the
+            terrain's lower left corner, in fractions of its width and height.
         shape: Shape of the planning grid, (row, col).
         cell: Side length of the planning cells on a synthetic terrain, in metres.
         radio: Whether contact is simulated by `RadioSimulator`.
@@ -80,7 +80,7 @@ class World:
 
     @property
     def is_made(self) -> bool:
-        """Whether the terrain is synthetic and has no files."""
+        """Whether the terrain is synthetic; otherwise, it is read from files."""
         return self.ground.startswith("synthetic")
 
     @property
@@ -89,9 +89,9 @@ class World:
         return self.is_made or self.ground == "wellington"
 
     def files(self) -> list[str]:
-        """Return the files of a real terrain.
+        """Return the DEM and DSM files of a real terrain.
 
-        Raises TrustboError if files are missing; the message names the folder that is needed.
+        Raises TrustboError if files are missing; the message names the files that are needed.
         """
         if self.data is None and self.is_packaged:
             return list(EXAMPLE_FILES)
@@ -123,7 +123,7 @@ class World:
         return _workspace(assumed, tuple(sorted(options.items())))
 
     def simulator(self, workspace: Workspace) -> KinematicSimulator | RadioSimulator:
-        """Make a simulator of the true world with posts and routes from the assumed workspace."""
+        """Make a simulator of the true world; posts and routes are from the assumed workspace."""
         terrain = self.true_terrain()
         if self.radio:
             return RadioSimulator(workspace, terrain=terrain)
@@ -131,7 +131,7 @@ class World:
         return KinematicSimulator(workspace, events=self._events(terrain), **given)
 
     def truth(self, folder: FilePath | None = None) -> Truth:
-        """Return the truth of the simulator, read from `folder` if it was computed before."""
+        """Return the truth of the simulator; `folder` caches it on disk."""
         return Truth.of(self.simulator(self.workspace()), folder=folder)
 
     def scene(
@@ -141,7 +141,7 @@ class World:
         max_bounds: int | str = "shortest+4",
         **options: Any,
     ) -> Scene:
-        """Make the scene of a course through the world for `run_grid`, and cache the truth.
+        """Make the scene of a course for `run_grid`; `folder` caches the truth on disk.
 
         See `workspace` for `options`. Raises TrustboError for an unknown course or missing files.
         """
@@ -165,7 +165,7 @@ class World:
         return placed
 
     def ends(self, course: str) -> tuple[Cell, Cell]:
-        """Return the start and goal of a course, moved into the largest connected region."""
+        """Return the start and goal of a course, moved to the largest region of passable cells."""
         rows, cols = (n - 1 for n in self.shape)
         start, goal = {
             "sw-ne": ((rows, 0), (0, cols)),
@@ -185,9 +185,9 @@ class World:
 def aged(now: xr.Dataset, seed: int = 0) -> xr.Dataset:
     """Imitate an outdated survey of a terrain, with errors in the canopy and the ground.
 
-    The canopy has 0.7 times its true height, and is missing on 15 % of the area, in patches of
-    about 10 m. The ground errors have a standard deviation of 0.3 m and a correlation length of
-    about 10 m.
+    The canopy has 0.7 times its true height. On 15 % of the area, in patches of about 10 m, the
+    canopy is missing. The ground errors have a standard deviation of 0.3 m and a correlation length
+    of about 10 m.
     """
     rng, step = np.random.default_rng(seed), abs(float(now["x"][1] - now["x"][0]))
     dem, dsm = now["dem"].values, now["dsm"].values
@@ -206,7 +206,7 @@ def aged(now: xr.Dataset, seed: int = 0) -> xr.Dataset:
 
 @lru_cache(maxsize=4)
 def _workspace(assumed: World, given: tuple[tuple[str, Any], ...]) -> Workspace:
-    """Make the workspace with the assumed terrain, sight and team."""
+    """Make the workspace from the assumed terrain, sight model and team."""
     ground = assumed.true_terrain()
     ground = aged(ground) if assumed.aged else ground
     options: dict[str, Any] = {"sight": assumed.sight, **dict(given)}

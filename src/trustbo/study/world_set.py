@@ -1,4 +1,4 @@
-"""The set of benchmark worlds."""
+"""Set of benchmark worlds, listed in docs/worlds.md."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -16,16 +16,12 @@ from trustbo.workspace.sight import Sight
 _SYNTHETIC = tuple(f"synthetic-{seed}" for seed in range(3))
 _ALDER, _BIRCH, _CEDAR = (f"synthetic-{name}" for name in ("alder", "birch", "cedar"))
 _AFTER = 6
-"""Index of the first mission after a change (the seventh mission)."""
+"""Index of the first mission after a change of the world, the seventh mission."""
 _DAYS = (1, 3, 4, 7)
 """Indices of the missions with bad weather."""
 
 type _Case = tuple[str, str, tuple[str, ...], Mapping[str, Any] | Callable[[str], dict[str, Any]]]
-"""Kind, case, terrain names, and settings of `World` or a function that returns the settings."""
-
-
-def _climbing(degrees: float) -> dict[str, Any]:
-    return {"team": _team_of(degrees)}
+"""Kind, case, terrain names, and settings of `World`, or a function of the terrain's name."""
 
 
 def _team_of(degrees: float) -> Team:
@@ -40,7 +36,7 @@ def _limit(true: float, assumed: float) -> dict[str, Any]:
 
 
 def _is_drawn(ground: str) -> bool:
-    """Return whether the events on a terrain are drawn from its name instead of set by hand."""
+    """Return whether the events on a terrain are random, with a seed from the terrain's name."""
     return ground not in _SYNTHETIC
 
 
@@ -49,19 +45,19 @@ def _one_robot(ground: str) -> int:
 
 
 def _days(ground: str) -> tuple[int, ...]:
-    """Return the four missions with bad weather among the first nine missions."""
+    """Return the indices of four of the first nine missions, which have bad weather."""
     days = drawn(ground, "days").permutation(9)[:4] if _is_drawn(ground) else _DAYS
     return tuple(sorted(int(day) for day in days))
 
 
 def _place(ground: str) -> tuple[float, float]:
-    """Choose the centre of events within 20 % of the terrain's middle, as fractions of its size."""
+    """Choose the centre of an event near the middle, as fractions of the terrain's size."""
     x, y = drawn(ground, "place").uniform(0.3, 0.7, 2) if _is_drawn(ground) else (0.5, 0.5)
     return float(x), float(y)
 
 
 def _reach(ground: str) -> float:
-    """Return the radius of a jammer in metres; real terrains are half as wide as synthetic ones."""
+    """Return the radius of a jammer, m, which is smaller on real terrains as they are smaller."""
     return 40.0 if ground in REAL else 90.0
 
 
@@ -116,11 +112,11 @@ def _season(factor: float) -> dict[str, Any]:
     return {"events": (Season(factor, first=_AFTER),)}
 
 
-# In the kind "limit", the assumed slope limit is too high. In "limit-4", it is 4 degrees above the
-# true limit, which is 14, 18, 22 or 26 degrees: the lowest for which both diagonal courses have a
-# path that arrives, with at least 5 % of the bounds failing. Wellington has no such limit, and on
-# synthetic-2 only 4 % of the bounds fail, so both are left out. In "limit-1", the assumed limit is
-# 18 degrees, as in the kind "slopes", or the default of 45 degrees on wellington.
+# In the kind "limit", the assumed slope limit is too high. In "limit-4", the assumed limit is 4
+# degrees above the true limit of 14, 18, 22 or 26 degrees. The true limit is the lowest at which
+# both diagonal courses have a path that arrives and at least 5 % of the bounds fail. Wellington and
+# synthetic-2 have no such limit. In "limit-1", the assumed limit is 18 degrees, as in the kind
+# "slopes", or 45 degrees, the default, on wellington.
 _CASES: tuple[_Case, ...] = (
     ("right", "", (*_SYNTHETIC, *REAL), {}),
     ("wall", "wall", ("synthetic-0", "synthetic-1", "tahoe"), {"sight": Sight(math.inf, 0.0)}),
@@ -129,8 +125,8 @@ _CASES: tuple[_Case, ...] = (
     ("canopy", "dense", ("synthetic-1", "wellington"), {"assumed": Sight(extinction=0.3)}),
     ("canopy", "thin", ("synthetic-2", "tahoe"), {"assumed": Sight(extinction=0.1 / 3.0)}),
     ("canopy", "low", ("synthetic-0", "topography", "bcts"), {"assumed": Sight(crown_base=0.0)}),
-    ("slopes", "slopes", ("synthetic-0",), _climbing(14.0)),
-    ("slopes", "slopes", ("tahoe", "topography"), _climbing(18.0)),
+    ("slopes", "slopes", ("synthetic-0",), {"team": _team_of(14.0)}),
+    ("slopes", "slopes", ("tahoe", "topography"), {"team": _team_of(18.0)}),
     ("canopy", "thin-canopy", (_ALDER, _CEDAR, "wellington"),
      {"sight": Sight(extinction=0.06, crown_base=0.4),
       "assumed": Sight(extinction=0.4, crown_base=0.0)}),
@@ -178,7 +174,7 @@ def worlds(data: FilePath | None = None) -> dict[str, World]:
 
     Args:
         data: Folder with the real terrains, such as `tahoe/dem.tif`. Without this folder, the only
-            real terrain that can be used is wellington, which is part of the package.
+            real terrain that can be used is wellington, which is included in the package.
 
     Returns:
         Worlds on 6 synthetic and 4 real terrains.
