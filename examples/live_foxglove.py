@@ -1,13 +1,13 @@
-"""Show a mission in Foxglove while it is driven: map, path, and trust of each robot.
+"""Show a mission live in Foxglove: the trust map, the path, and the trust in each robot.
 
-Run `pip install foxglove-sdk`, then `python examples/live_foxglove.py`; in Foxglove choose "Open
-connection", "Foxglove WebSocket", ws://localhost:8765. Topics:
+Run `pip install foxglove-sdk`, then `python examples/live_foxglove.py`. In Foxglove, choose "Open
+connection", "Foxglove WebSocket", ws://localhost:8765. The script publishes these topics:
 
-    /map    foxglove.Grid         expected trust with which a cell can be reached
-    /path   foxglove.SceneUpdate  cells still to be entered
-    /trust  JSON                  mean and sd of the trust of each robot now, and its mean ahead
+    /map    foxglove.Grid         expected trust on arrival at each cell
+    /path   foxglove.SceneUpdate  cells that have not been entered yet
+    /trust  JSON                  mean and sd of the current trust in each robot, predicted means
 
-The mission is a simulated one, ten times as fast; for robots, give `Follower.tick` their ticks.
+The mission is simulated at ten times its speed; for robots, pass their ticks to `Follower.tick`.
 """
 
 import time
@@ -18,7 +18,7 @@ import trustbo as tb
 
 
 def state_of(follower, robots):
-    """Trust of each robot now and ahead, as JSON."""
+    """Return the current and the predicted trust in each robot, for a JSON message."""
     ahead = follower.ahead().mean.T if len(follower.rest) > 1 else np.empty((len(robots), 0))
     columns = zip(robots, *follower.trust, ahead, strict=True)
     state = {r: {"mean": float(m), "sd": float(s), "ahead": a.tolist()} for r, m, s, a in columns}
@@ -26,7 +26,7 @@ def state_of(follower, robots):
 
 
 def grid_of(values, grid):
-    """Message of a map (row, col), whose first row is the northern one; Foxglove begins south."""
+    """Make the message of a map (row, col); Foxglove expects the southern row first."""
     from foxglove import messages as fg
 
     data = np.flipud(values).astype("<f4")
@@ -41,7 +41,7 @@ def grid_of(values, grid):
 
 
 def path_of(follower, grid):
-    """Message of the cells still to be entered, from where the lead is."""
+    """Make the message of the rest of the path, from the current cell of the lead."""
     from foxglove import messages as fg
 
     line = fg.LinePrimitive(
@@ -53,7 +53,7 @@ def path_of(follower, grid):
 
 
 def main(faster=10.0):
-    """Simulate a mission and show it."""
+    """Simulate a mission and publish it."""
     import foxglove
 
     foxglove.start_server()

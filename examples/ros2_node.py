@@ -1,19 +1,19 @@
-"""ROS 2 node that follows the missions of a campaign, and tells each to the campaign.
+"""ROS 2 node that follows missions and passes each completed mission to a campaign.
 
-It needs ROS 2 (rclpy, std_msgs) and trustbo in the same Python. Begin a campaign with a folder,
-`trustbo.Campaign(workspace, start, goal, directory="out/field")`, then start the node:
+The node needs ROS 2 (rclpy, std_msgs) and trustbo in the same Python. First create a campaign with
+a folder, `trustbo.Campaign(workspace, start, goal, directory="out/field")`. Then start the node:
 
     python3 ros2_node.py --ros-args -p folder:=out/field
 
-It subscribes to topics that `trustbo.logs.read_bag` reads from bags too:
+The node subscribes to these topics, which `trustbo.logs.read_bag` can also read from bags:
 
     /<robot>/contact  std_msgs/Bool    whether the robot has contact with the lead, at each tick
-    /mission/bound    std_msgs/String  {"bound": 2, "cell": [8, 1]} as bound 2 begins
-    /mission/status   std_msgs/String  ok, stuck, ... as a bound ends
+    /mission/bound    std_msgs/String  {"bound": 2, "cell": [8, 1]} when bound 2 begins
+    /mission/status   std_msgs/String  ok, stuck, ... when a bound ends
 
-and publishes, after each of these messages:
+After each of these messages, the node publishes:
 
-    /mission/trust    std_msgs/Float64MultiArray  mean of the trust of each robot, then its sd
+    /mission/trust    std_msgs/Float64MultiArray  trust in each robot: all means, then all sds
     /mission/path     std_msgs/String             cells of the mission as JSON
 """
 
@@ -25,10 +25,10 @@ import trustbo as tb
 
 
 def take(follower, robots, topic, data, t):
-    """Give a message to a follower; True if the mission is over.
+    """Pass a message to a follower, and return whether the mission is over.
 
-    The topic is "bound", "status", or a robot's name, of its contact. Contact between two bounds
-    is ignored. A bound that still runs when the next one begins is over, with status ok.
+    The topic is "bound", "status", or the name of a robot (its contact). Contact between bounds is
+    ignored. A bound that is still in progress when the next bound begins ends with status ok.
     """
     if topic == "bound":
         marker = json.loads(data)
@@ -45,7 +45,7 @@ def take(follower, robots, topic, data, t):
 
 
 def main():
-    """Follow one mission after the other until the node is stopped."""
+    """Follow missions, one after the other, until the node is stopped."""
     import rclpy
     from std_msgs.msg import Bool, Float64MultiArray, String
 

@@ -1,8 +1,9 @@
-"""Clean executed notebooks before they are committed: no run times, no progress, smaller figures.
+"""Clean executed notebooks before they are committed.
 
-Figures get a palette of 256 colours where hardly a pixel changes.
+    python scripts/clean_notebooks.py notebooks/*.ipynb
 
-python scripts/clean_notebooks.py notebooks/*.ipynb
+The script removes run times, progress bars and local paths. It also reduces figures to a palette of
+256 colours if this hardly changes a pixel.
 """
 
 import base64
@@ -15,17 +16,17 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-MOST = 8
-"""Largest change of a colour, of 255, of all but one pixel in a hundred."""
+MAX_CHANGE = 8
+"""Largest accepted change of a colour value (0 to 255) in 99 % of the pixels."""
 
 
 def smaller(png: str) -> str:
-    """The same figure with a palette, if that is smaller and looks the same; both in base64."""
+    """Return a PNG image (base64) with a palette if that is smaller and looks the same."""
     image = Image.open(io.BytesIO(base64.b64decode(png))).convert("RGB")
     kept = io.BytesIO()
     palette = image.quantize(256, kmeans=1)
     change = np.abs(np.subtract(palette.convert("RGB"), image, dtype=np.int16)).max(-1)
-    if np.quantile(change, 0.99) > MOST:
+    if np.quantile(change, 0.99) > MAX_CHANGE:
         return png
     palette.save(kept, "PNG", optimize=True)
     found = base64.b64encode(kept.getvalue()).decode()
@@ -33,7 +34,7 @@ def smaller(png: str) -> str:
 
 
 def is_progress(output: dict) -> bool:
-    """Whether an output only has progress bars, or a line about them or about compilation."""
+    """Return whether an output contains only progress bars, or a message on them or compilation."""
     text = "".join(output.get("text", []))
     about = text.startswith("compiling kernels") or "TqdmWarning" in text
     return about or bool(re.fullmatch(r"(\r[^\n]*)+", text))
@@ -47,7 +48,7 @@ def clean(path: Path) -> None:
         if "outputs" in cell:
             cell["outputs"] = [output for output in cell["outputs"] if not is_progress(output)]
         for output in cell.get("outputs", []):
-            if "text" in output:  # no path of a machine
+            if "text" in output:  # shorten local paths
                 text = "".join(output["text"])
                 text = re.sub(r"/\S+/(src/trustbo/|site-packages/|\d+\.py:)", r"\1", text)
                 output["text"] = text.splitlines(keepends=True)

@@ -1,11 +1,11 @@
-"""A campaign on an old map: what a bound is, and trust and path before and after eight missions.
+"""Run a demo campaign in which the map is outdated, and write its report.
 
-Run: python scripts/demo.py [--out out/demo] [--picture FILE]
+    python scripts/demo.py [--out out/demo] [--picture FILE]
 
-On the hillside near Wellington that comes with the package, 3 m of scrub have grown within 45 m of
-the middle of the first path since the survey. The map does not show it. The folder has the
-campaign, its report, and maps and path for GIS; `--picture` also runs the campaign in a world where
-the map is right, finds the best path of both worlds, and draws the first figure of the docs.
+The terrain is the hillside near Wellington in the package. Since the survey, 3 m of scrub have
+grown within 45 m of the middle of the first path. The output folder contains the campaign, its
+report, and maps and path for GIS. With `--picture`, the script also runs the campaign in a world
+where the map is right, finds the best path in both worlds, and draws the first figure of the docs.
 """
 
 import argparse
@@ -33,20 +33,20 @@ from trustbo.plots.style import GREY, ROBOTS, outlined
 START, GOAL, MISSIONS = (9, 0), (0, 9), 8
 HEIGHT, RADIUS = 3.0, 45.0
 BOUND = 10
-"""Bound of the new path that is drawn, from 1."""
+"""Number of the bound of the new path that is drawn in panel (a), from 1."""
 ASPECT = 1.43
-"""Width of a panel divided by its height, that of the hillside."""
+"""Width of a panel divided by its height, as for the hillside."""
 
 
 def main() -> None:
-    """Run the campaign, print what it learned, and draw the picture."""
+    """Run the campaign, print a summary, and draw the picture if asked to."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--out", type=Path, default=Path("out/demo"))
     parser.add_argument("--picture", type=Path)
     given = parser.parse_args()
 
     mpl.use("agg")
-    # The hillside is nearly as steep as the limit of the robots, which is right in the simulator.
+    # The slope limit, which the hillside nearly reaches, is exact in the simulator.
     warnings.filterwarnings("ignore", "the plan arrives with probability")
     workspace = tb.Workspace.from_terrain(tb.terrain.example(), shape=(10, 10))
     with tb.Campaign(workspace, START, GOAL, directory=given.out, overwrite=True) as campaign:
@@ -62,8 +62,8 @@ def main() -> None:
     tb.export.export_result(result, given.out)
     lost = result.history["contact_lost"].values
     print(
-        f"learned: scrub that the map does not show cost {lost[0]:.1f} of {len(path) - 1} "
-        f"bounds of contact in mission 1; the new path lost {lost[-1]:.1f} in mission {MISSIONS}"
+        f"contact lost to scrub that the map does not show: {lost[0]:.1f} of {len(path) - 1} "
+        f"bounds in mission 1, and {lost[-1]:.1f} bounds on the new path in mission {MISSIONS}"
     )
     print(f"results are in {given.out}; open {given.out / 'report.html'}")
     if given.picture is not None:
@@ -76,7 +76,7 @@ def draw(
     center: tuple[float, float],
     file: Path,
 ) -> None:
-    """Draw a bound, trust and path before and after, and the contact lost by mission."""
+    """Draw a bound, the contact lost per mission, and trust and path before and after."""
     workspace = result.workspace
     right = tb.simulation.KinematicSimulator(workspace)
     known = tb.iterate(workspace, START, GOAL, n_iterations=MISSIONS, simulator=right)
@@ -101,7 +101,7 @@ def draw(
 
 
 def draw_bound(ax: Axes, plan: tb.planning.Plan) -> None:
-    """Draw one bound: T1 drives its route while T2 watches from its overwatch points."""
+    """Draw one bound: T1 drives its route while T2 watches from overwatch points."""
     corner = np.array(plan.workspace.grid.corner)
     draw_ground(ax, plan.workspace)
     route, *others = (one - corner for one in plan.routes[BOUND - 1])
@@ -132,13 +132,13 @@ def draw_bound(ax: Axes, plan: tb.planning.Plan) -> None:
 def draw_trust(
     figure: Figure, axes: np.ndarray, result: tb.Result, center: tuple[float, float]
 ) -> None:
-    """Draw the trust map and path of the first plan and after the last mission, on one scale."""
+    """Draw trust map and path before the first and after the last mission, on one scale."""
     workspace = result.workspace
     maps = [result.history["trust_map"].sel(iteration=1), result.trust_map]
     for values in maps:
-        values[START] = np.nan  # trust is assumed there
+        values[START] = np.nan  # the trust at the start is assumed
     low, _ = robust_limits(np.stack(maps))
-    norm = mpl.colors.Normalize(low, 1.0)
+    norm = mpl.colors.Normalize(low, 1.0)  # 1: unbroken contact
     paths = [result.missions[0].path, result.path]
     titles = ["(c) trust by the old map, first path", f"(d) after {MISSIONS} missions, new path"]
     x, y = np.array(center) - workspace.grid.corner
@@ -160,7 +160,7 @@ def draw_lost(
     colour: str,
     label: str,
 ) -> None:
-    """Draw the expected contact lost on the path of each mission, and on the best path."""
+    """Draw the expected contact lost on the path of each mission and on the best path."""
     truth = tb.simulation.Truth.of(simulator)
     values = [truth.lost(mission.path) for mission in result.missions]
     best = truth.lost(truth.best(START, GOAL))

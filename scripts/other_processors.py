@@ -1,12 +1,12 @@
-"""Run the tests as other processors would, and print how many pass under each setting.
+"""Run the tests with the arithmetic of other processors, and count the tests that pass.
 
     python scripts/other_processors.py [--each] [arguments of pytest]
 
-OpenBLAS, NumPy, Numba and XLA choose their instructions by the processor, so the last digits differ
-from one processor to the next. Each setting makes one of the four compute as on another processor;
-those that this processor or this build lacks are named and left out. A pass of the suite takes one
-setting of each library; `--each` gives every setting its own pass. Without arguments of pytest a
-pass is that of `make test`. The caches stay apart: Numba's by the processor's name, JAX's by flags.
+OpenBLAS, NumPy, Numba and XLA select instructions for the processor, so the last digits of results
+differ between processors. A setting makes one of these libraries compute as on another processor.
+Settings that this processor or build does not support are skipped and listed. Each run of the tests
+combines one setting of each library; with `--each`, every setting has its own run. Without
+arguments of pytest, a run is the same as `make test`. Numba and JAX cache kernels per setting.
 """
 
 import os
@@ -24,22 +24,22 @@ from numpy._core._multiarray_umath import __cpu_dispatch__, __cpu_features__
 ROOT = Path(__file__).resolve().parents[1]
 PYTEST = [sys.executable, "-m", "pytest", "-q", "--numprocesses", "2", "--dist", "worksteal"]
 NOT_OPTIMISED = "--xla_backend_optimization_level=0"
-"""As in the Makefile."""
+"""Flag that `make test` also sets, to compile faster."""
 
 DISPATCHED = [name for name in __cpu_dispatch__ if __cpu_features__[name]]
-"""Features of this processor that NumPy uses where it finds them, and can be told not to use."""
+"""Features of this processor that NumPy uses and that can be disabled."""
 AVX512 = [name for name in DISPATCHED if name.startswith("AVX512") or name == "X86_V4"]
 CORES = ("Haswell", "SkylakeX", "Zen", "Nehalem")
-"""Core types of OpenBLAS; the last has neither AVX nor fused multiplication and addition."""
+"""Core types of OpenBLAS. Nehalem has neither AVX nor fused multiply-add."""
 
 
 class Setting(NamedTuple):
-    """An environment variable that makes one library compute as on another processor.
+    """Environment variable that makes one library compute as on another processor.
 
     Attributes:
         variable: Name of the variable.
-        value: Its value.
-        lacking: Why it cannot be set here; empty if it can.
+        value: Value of the variable.
+        lacking: Why this machine does not support the setting; empty if supported.
     """
 
     variable: str
@@ -51,7 +51,7 @@ class Setting(NamedTuple):
 
 
 def openblas(core: str) -> Setting:
-    """The setting of a core type, which is tried in a process of its own, as it may crash."""
+    """Make the setting of a core type, and try it in a separate process because it may crash."""
     code = (
         "import numpy as np, scipy.linalg, threadpoolctl\n"
         "a = np.random.default_rng(0).random((500, 500))\n"
@@ -62,25 +62,25 @@ def openblas(core: str) -> Setting:
     tried = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     lacking = ""
     if tried.returncode != 0:
-        lacking = "a product of matrices crashes under it here"
-    elif (taken := tried.stdout.strip()) != str({core}):
-        lacking = f"this build of OpenBLAS takes {taken} for it"
+        lacking = "a matrix product crashes with this core type"
+    elif (used := tried.stdout.strip()) != str({core}):
+        lacking = f"this build of OpenBLAS uses {used} instead"
     return Setting("OPENBLAS_CORETYPE", core, lacking)
 
 
 def numpy(features: list[str], name: str) -> Setting:
-    """The setting of NumPy without some features, which have a name together."""
-    lacking = "" if features else "NumPy uses none of it on this processor"
+    """Make the setting of NumPy without these features, a group called `name`."""
+    lacking = "" if features else "NumPy uses none of these features on this processor"
     return Setting("NPY_DISABLE_CPU_FEATURES", " ".join(features) or name, lacking)
 
 
 def xla(isa: str) -> Setting:
-    """The setting of XLA with an instruction set at most."""
+    """Make the setting of XLA that uses no instructions beyond `isa`."""
     return Setting("XLA_FLAGS", f"{NOT_OPTIMISED} --xla_cpu_max_isa={isa}")
 
 
 def settings_by_library() -> list[list[Setting]]:
-    """Settings of OpenBLAS, NumPy, Numba and XLA."""
+    """Return the settings of OpenBLAS, NumPy, Numba and XLA."""
     return [
         [openblas(core) for core in CORES],
         [numpy(AVX512, "AVX-512"), numpy(DISPATCHED, "all")],
@@ -90,7 +90,7 @@ def settings_by_library() -> list[list[Setting]]:
 
 
 def outcome(case: ElementTree.Element) -> str:
-    """Whether a test passed, failed or was skipped."""
+    """Return whether a test passed, failed or was skipped."""
     tags = {child.tag for child in case}
     if tags & {"failure", "error"}:
         return "failed"
@@ -98,7 +98,7 @@ def outcome(case: ElementTree.Element) -> str:
 
 
 def run(settings: list[Setting], arguments: list[str]) -> tuple[Counter[str], list[str]]:
-    """Number of tests by outcome, and names of those that failed, of one pass."""
+    """Run the tests once; return the number of tests by outcome, and the names of failed tests."""
     print(f"\n=== {', '.join(map(str, settings)) or 'this processor'}", flush=True)
     environment = (
         os.environ | {"XLA_FLAGS": NOT_OPTIMISED} | {s.variable: s.value for s in settings}
@@ -115,7 +115,7 @@ def run(settings: list[Setting], arguments: list[str]) -> tuple[Counter[str], li
 
 
 def main() -> None:
-    """Run all passes, the first with nothing set, and print the table."""
+    """Run the tests without settings and then with each combination, and print a table."""
     arguments = [argument for argument in sys.argv[1:] if argument != "--each"] or ["tests"]
     libraries = settings_by_library()
     here = [[setting for setting in library if not setting.lacking] for library in libraries]
@@ -133,7 +133,7 @@ def main() -> None:
         for name in failed:
             print(f"{'':26}{name}")
     for setting in (setting for library in libraries for setting in library if setting.lacking):
-        print(f"{'left out':>24}  {setting}: {setting.lacking}")
+        print(f"{'skipped':>24}  {setting}: {setting.lacking}")
     sys.exit(any(failed for _, _, failed in rows))
 
 

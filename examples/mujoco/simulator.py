@@ -1,10 +1,10 @@
-"""A simulator of one's own: robots slip, get stuck, tip over and collide in MuJoCo.
+"""Custom simulator with MuJoCo, in which robots slip, get stuck, tip over and collide.
 
     pip install mujoco
     python examples/mujoco/simulator.py
 
-It inherits bounds, posts and contacts from `KinematicSimulator` and replaces the motion.
-Import it with this folder on the path, for example
+`MujocoSimulator` inherits bounds, posts and contacts from `KinematicSimulator` and replaces the
+motion. To import the class, add this folder to `sys.path`. Example:
 
     result = tb.iterate(workspace, start, goal, simulator=MujocoSimulator(workspace))
 """
@@ -28,42 +28,42 @@ from trustbo.workspace.routes import SLOWEST
 from trustbo.workspace.surface import Surface
 
 MARGIN = 5.0
-"""Width of the ground simulated around the pixels that a route may use, m."""
+"""Width of the simulated margin around the pixels that a route may use, m."""
 CONTROL = 0.05
-"""Longest time between two commands to the wheels, s."""
+"""Maximum time between two commands to the wheels, s."""
 TIPPED, ON_ITS_SIDE = math.radians(75.0), math.radians(60.0)
-"""Angle of a body with the vertical, and with the ground's normal, beyond which it has tipped."""
+"""Angles to the vertical, and to the ground's normal, from which a robot has tipped over, rad."""
 PROGRESS = 0.25
-"""Distance along its route that a robot must gain not to be stuck, m."""
+"""Distance along the route that counts as progress; without progress a robot is stuck, m."""
 CLEARANCE, AVOIDANCE_RANGE = 1.3, 4.0
-"""Distance that a robot keeps from another, centre to centre, and range of avoidance, m."""
+"""Distance kept between the centres of two robots, and range at which they avoid, m."""
 COLLISION_TIME = 3.0
-"""Upper limit of the time from a touch to a failure that counts as a collision, s."""
+"""Maximum time from a contact of two robots to a failure that counts as a collision, s."""
 STILL = 0.05
-"""Least displacement of a robot at its goal that counts as motion, m."""
+"""Minimum displacement per tick of a robot at its goal that counts as motion, m."""
 SLOW = 1.5
-"""Highest speed at which a robot that reaches its goal stops there, m/s."""
+"""Maximum speed at which a robot that reaches its goal counts as arrived, m/s."""
 GRIP_SD, SLIP_SD = 0.1, 0.05
-"""Log standard deviations of a robot's grip per drive, and of a side's wheel speed per tick."""
+"""Log standard deviations of the grip per robot and drive, and of wheel speeds per tick."""
 
 
 class MujocoSimulator(KinematicSimulator):
-    """Simulator of skid-steer robots with weight, grip and torque on the DEM as a heightfield.
+    """Physics simulator of skid-steer robots on the DEM as a heightfield.
 
-    Bounds, posts, routes and contacts are those of `KinematicSimulator`; motion along the
-    routes is physics. All robots are of the size of a Husky (1.0 x 0.7 x 0.4 m, 50 kg); the
-    `max_slope` of a `Robot` sets the height of its centre of mass and the grip of its wheels: it
-    tips over and slides some degrees beyond it. Robots steer for a point ahead, slow down on slopes
-    as kinematic ones do, and go round each other.
+    Bounds, posts, routes and contacts are computed as in `KinematicSimulator`; MuJoCo simulates the
+    motion. All robots have the size of a Husky (1.0 x 0.7 x 0.4 m, 50 kg). The `max_slope` of a
+    `Robot` determines its centre of mass and its grip, so that the robot tips over or slides a few
+    degrees above `max_slope`. Robots steer towards a point ahead, slow down on slopes as in
+    `KinematicSimulator`, and avoid each other.
 
-    A mission ends as `"tipped"` if a body leans 75 degrees, or 60 degrees from the ground under it;
-    as `"stuck"` if a robot comes no farther along its route for `stuck_after` seconds, has no
-    route, or slides off the ground around the two cells; as `"collision"` instead if it touched
-    another one just before; as `"timeout"` after `bound_timeout`; as `"aborted"` if the physics
-    breaks down.
+    The mission ends as `"tipped"` if a robot leans by 75 degrees, or by 60 degrees to the ground.
+    The status is `"stuck"` if a robot makes no progress for `stuck_after` seconds, has no route, or
+    slides off the simulated ground. In both cases, the status is `"collision"` if the robot touched
+    another robot shortly before. The status is `"timeout"` after `bound_timeout` seconds, and
+    `"aborted"` if the physics diverges.
 
-    Only robots that move are in the physics: those that watch are no obstacles, nor is vegetation.
-    Same seed, same mission, on one machine with one version of MuJoCo.
+    Robots that watch and vegetation are not part of the physics, so they are no obstacles. The same
+    seed gives the same mission on the same machine and version of MuJoCo.
     """
 
     def __init__(
@@ -78,15 +78,15 @@ class MujocoSimulator(KinematicSimulator):
         """Prepare a terrain for simulation.
 
         Args:
-            workspace: A workspace made from a terrain.
-            friction: Mean friction coefficient of the wheels on the ground; None: the least that
-                each robot needs for its `max_slope`.
+            workspace: Workspace made from a terrain.
+            friction: Mean friction coefficient of the wheels on the ground; by default, the minimum
+                that each robot needs for its `max_slope`.
             stuck_after: Time without progress after which a robot is stuck, s.
-            step: Longest physics step, s.
+            step: Maximum physics step, s.
             **options: Options of `KinematicSimulator`, such as `sight` and `tick`.
 
         Raises:
-            TrustboError: A value that is not positive, or what `KinematicSimulator` refuses.
+            TrustboError: A value is not positive, or `KinematicSimulator` raises the error.
         """
         super().__init__(workspace, **options)
         self.friction = None if friction is None else require_positive("friction", friction)
@@ -94,7 +94,7 @@ class MujocoSimulator(KinematicSimulator):
         self.step = require_positive("step", step)
 
     def describe(self) -> dict[str, object]:
-        """Return the settings that decide what a mission measures."""
+        """Return the settings that affect the measurements."""
         return {
             **super().describe(),
             "friction": self.friction,
@@ -146,7 +146,7 @@ class MujocoSimulator(KinematicSimulator):
     def _true_window(
         self, true: Surface, window: tuple[int, int, int, int]
     ) -> tuple[int, int, int, int]:
-        """The window's pixels on the true surface, whose raster may be another."""
+        """Return the window in pixels of the true surface, whose raster may differ."""
         planned = self.workspace.surface
         if planned.pixel == true.pixel and planned.origin == true.origin:
             return window
@@ -156,20 +156,20 @@ class MujocoSimulator(KinematicSimulator):
 
 
 class _Convoy:
-    """Group of robots that drive at the same time, each along one route."""
+    """Robots that drive at the same time, each along its route."""
 
     def __init__(
         self, physics: Physics, legs: "list[_Leg]", surface: Surface, stuck_after: float
     ) -> None:
-        """Begin; the surface's gradient determines which robots lie on their side."""
+        """Prepare a drive; the gradient of the surface determines which robots have tipped over."""
         self._physics, self._legs = physics, legs
         self._surface, self._stuck_after = surface, stuck_after
         self._untouched = np.full(len(legs), np.inf)  # s
 
     def advance(self, slip: np.ndarray, seconds: float, n_steps: int) -> str:
-        """Command the wheels, let the physics run `n_steps`, and return "underway" or the status.
+        """Command the wheels, advance by `n_steps`, and return the status or "underway".
 
-        `slip` are factors on the wheels' speeds, shape (robot, side).
+        The commanded wheel speeds are multiplied by `slip`, shape (robot, side).
         """
         physics, legs, poses = self._physics, self._legs, self._physics.poses
         tilt = np.arccos(np.clip(physics.up[:, 2], -1.0, 1.0))
@@ -178,7 +178,7 @@ class _Convoy:
             if not leg.arrived:
                 others = np.delete(poses[:, :2], i, axis=0)
                 asked[i] = leg.steer(poses[i], tilt[i], others)
-        # Wheels that slip are asked for the missing speed on top; robots that have arrived brake.
+        # Slipping wheels are commanded to turn faster; robots that have arrived brake.
         short = np.clip(asked - physics.rates, -1.0, 1.0)
         short[[leg.arrived for leg in legs]] = 0.0
         physics.command(wheel_speeds(*(asked + short).T) * slip)
@@ -199,9 +199,9 @@ class _Convoy:
         return "ok" if all(leg.arrived for leg in legs) else "underway"
 
     def record(self, last: np.ndarray) -> np.ndarray:
-        """Poses to record after the last ones, shape (robot, 3).
+        """Return the poses to record after the `last` ones, shape (robot, 3).
 
-        A robot that only creeps at its goal has not moved: it measures nothing more.
+        A robot that creeps slightly at its goal keeps its last pose.
         """
         if not self._physics.is_finite:
             return last
@@ -219,10 +219,10 @@ class _Convoy:
 
 
 class _Leg:
-    """Route of one robot to its goal, its progress, and its steering."""
+    """Route of one robot, with its progress and steering."""
 
     def __init__(self, route: np.ndarray, robot: Robot) -> None:
-        """Begin a route, shape (point, 2), CRS metres."""
+        """Start at the beginning of a route, shape (point, 2), CRS metres."""
         along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(route, axis=0), axis=1)))
         self._along = np.linspace(0.0, along[-1], max(2, math.ceil(along[-1] / 0.25) + 1))
         self._points = np.column_stack([np.interp(self._along, along, xy) for xy in route.T])
@@ -231,9 +231,9 @@ class _Leg:
         self.idle, self.arrived = 0.0, False
 
     def update(self, position: np.ndarray, speed: float, seconds: float) -> None:
-        """Update the progress of the robot, some seconds after the last update.
+        """Update the progress; `seconds` is the time since the last update.
 
-        A robot that slides past its goal has not arrived.
+        A robot that slides past its goal too fast has not arrived.
         """
         near = self._points[self._position : self._position + 12]
         self._position += int(np.argmin(((near - position) ** 2).sum(1)))
@@ -245,10 +245,10 @@ class _Leg:
             self.idle += seconds
 
     def steer(self, pose: np.ndarray, tilt: float, others: np.ndarray) -> tuple[float, float]:
-        """Speed, m/s, and yaw rate, rad/s, towards a point ahead, round other robots.
+        """Return the speed, m/s, and yaw rate, rad/s, towards a point ahead, around other robots.
 
-        From the pose (x, y, heading), the body's angle with the vertical, rad, and the positions of
-        the other robots, shape (robot, 2), CRS metres.
+        `pose` is (x, y, heading), `tilt` is the angle of the body to the vertical, rad, and
+        `others` are positions of the other robots, shape (robot, 2), CRS metres.
         """
         robot, left = self._robot, math.dist(pose[:2], self._points[-1])
         ahead = np.searchsorted(self._along, self._along[self._position] + self._reach)
@@ -256,16 +256,16 @@ class _Leg:
         bearing = _around(math.atan2(dy, dx), left, others - pose[:2])
         error = _wrapped(bearing - pose[2])
         share = max(SLOWEST, 1.0 - (1.0 - SLOWEST) * tilt / robot.max_slope)
-        # Slow enough to stop at the goal; turns on the spot until it faces its route.
+        # Slow down before the goal, and turn on the spot until the robot faces its route.
         speed = min(robot.speed * share, 2.0 * left) * max(0.0, math.cos(error))
         return speed, min(robot.turn_rate, max(-robot.turn_rate, 2.0 * error))
 
 
 def _around(bearing: float, left: float, others: np.ndarray) -> float:
-    """Bearing to steer for, rad, corrected to pass other robots with clearance.
+    """Return the bearing, rad, corrected to pass other robots with clearance.
 
-    `left` is the distance to the goal, m; others' positions are relative to this one, (robot, 2),
-    m.
+    `left` is the distance to the goal, m; `others` are positions relative to this robot, shape
+    (robot, 2), m.
     """
     for x, y in others:
         gap = math.hypot(x, y)
@@ -274,7 +274,7 @@ def _around(bearing: float, left: float, others: np.ndarray) -> float:
         off = _wrapped(bearing - math.atan2(y, x))
         least = math.asin(min(1.0, CLEARANCE / max(gap, 1e-6)))
         if abs(off) < least:
-            # Pass on the nearer side; head on, to the right.
+            # Pass on the nearer side, or on the right if the other robot is straight ahead.
             bearing += (least if off > 1e-3 else -least) - off
     return _wrapped(bearing)
 

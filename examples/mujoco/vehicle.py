@@ -1,4 +1,4 @@
-"""Skid-steer vehicles on a heightfield in MuJoCo: model, placement and motion."""
+"""MuJoCo model of skid-steer robots on a heightfield, their placement and motion."""
 
 import math
 from collections.abc import Sequence
@@ -10,32 +10,32 @@ import numpy as np
 from trustbo.team import Robot
 from trustbo.workspace.surface import Surface, filled
 
-# A Husky: 1.0 x 0.7 x 0.4 m over all, 50 kg.
+# Dimensions of a Husky: 1.0 x 0.7 x 0.4 m overall, 50 kg.
 MASS, WHEEL_MASS = 50.0, 2.5
 WHEEL_RADIUS, WHEEL_WIDTH = 0.165, 0.12
 WHEELBASE, TRACK = 0.66, 0.57
-"""Distances of the axles, and of the left and right wheels, m."""
+"""Distance between the axles, and between the left and right wheels, m."""
 STIFFNESS, DAMPING = 5000.0, 400.0
-"""Stiffness and damping of a wheel's spring, N/m and N s/m: all four stay on rough ground."""
+"""Stiffness, N/m, and damping, N s/m, of wheel springs, to keep all wheels on rough ground."""
 TORQUE = 80.0
-"""Largest torque of a wheel's motor, N m: enough to spin it on any grip."""
+"""Maximum torque of a wheel motor, N m, which can spin the wheel at any grip."""
 TIP_MARGIN, GRIP_MARGIN = math.radians(8.0), math.radians(12.0)
-"""Angle beyond `max_slope` at which a robot tips over on rigid springs, and slides, rad."""
+"""Angles above `max_slope` at which a robot (with rigid springs) tips over, and slides, rad."""
 APART = 1.1
-"""Least distance between the centres of robots that are placed, m."""
+"""Minimum distance between the centres of robots when they are placed, m."""
 SETTLING = 1.0
-"""Longest wait until robots put on the ground are at rest, s."""
+"""Maximum time for robots to come to rest after they were placed, s."""
 _BODY, _CLEARANCE = (0.90, 0.45, 0.24), 0.13  # length, width, height; above ground, m
 _LOWEST, _HIGHEST = 0.10, 0.40  # limits of the centre of mass, m above ground
 _WHEELS = np.array([(x * WHEELBASE, y * TRACK) for x in (0.5, -0.5) for y in (0.5, -0.5)])
 _HULL = MASS - len(_WHEELS) * WHEEL_MASS
-# Wheels slip sideways in a turn: a skid-steer robot yaws as if its track were so much wider, by
-# the balance of Coulomb friction; with the grip of a climber, by 40 % more (measured).
+# Wheels slip sideways in a turn, so a skid-steer robot yaws as if its track were wider. The factor
+# follows from the balance of Coulomb friction; with high grip, the track is 40 % wider (measured).
 _YAW_TRACK = 1.4 * (TRACK + WHEELBASE**2 / TRACK)
 
 
 class Ground(NamedTuple):
-    """Crop of the terrain, in metres from its centre and from its lowest point."""
+    """Part of the terrain; x and y are relative to its centre, heights to its lowest point, m."""
 
     heights: np.ndarray  # (row, col), m, row 0 in the south
     pixel: tuple[float, float]  # height, width of a pixel, m
@@ -43,12 +43,12 @@ class Ground(NamedTuple):
 
     @property
     def half_size(self) -> np.ndarray:
-        """Half the distance between the outer pixels' centres along x and y, m."""
+        """Half the distance between the centres of the outer pixels along x and y, m."""
         rows, cols = self.heights.shape
         return 0.5 * np.array([(cols - 1) * self.pixel[1], (rows - 1) * self.pixel[0]])
 
     def height(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Bilinear height, m, at positions in metres from the centre."""
+        """Interpolate heights (bilinear), m, at positions in metres from the centre."""
         rows, cols = self.heights.shape
         col = np.clip((x + self.half_size[0]) / self.pixel[1], 0.0, cols - 1.001)
         row = np.clip((y + self.half_size[1]) / self.pixel[0], 0.0, rows - 1.001)
@@ -60,9 +60,9 @@ class Ground(NamedTuple):
 
 
 def crop(surface: Surface, window: tuple[int, int, int, int], margin: float) -> Ground:
-    """Crop a window (first row, end row, first col, end col) of pixels and a margin, m, around it.
+    """Crop a window (first row, end row, first col, end col) of pixels, and a margin, m.
 
-    Missing heights are those of the nearest pixel; beyond the terrain's edge, of the edge.
+    Missing heights, and heights beyond the edge of the terrain, are those of the nearest pixel.
     """
     (height, width), (rows, cols) = surface.pixel, surface.ground.shape
     more = [math.ceil(margin / size) for size in surface.pixel]
@@ -76,28 +76,28 @@ def crop(surface: Surface, window: tuple[int, int, int, int], margin: float) -> 
 
 
 def grip_of(robot: Robot) -> float:
-    """Friction coefficient with which a robot climbs its `max_slope`, and a little more."""
+    """Return the friction coefficient at which a robot slides `GRIP_MARGIN` above `max_slope`."""
     return math.tan(min(robot.max_slope + GRIP_MARGIN, math.radians(80.0)))
 
 
 def center_of_mass(robot: Robot) -> float:
-    """Height above ground, m, at which a robot tips over a little beyond its `max_slope`."""
+    """Return the height of the centre of mass, m, to tip over `TIP_MARGIN` above `max_slope`."""
     angle = min(robot.max_slope + TIP_MARGIN, math.radians(85.0))
     return min(_HIGHEST, max(_LOWEST, 0.5 * TRACK / math.tan(angle)))
 
 
 class Physics:
-    """Physics of robots on a ground, driven by the speeds of their left and right wheels.
+    """Physics of robots that are driven by the speeds of their left and right wheels.
 
-    Poses are x, y (CRS metres) and heading (rad from east, anticlockwise).
+    Poses are x, y (CRS metres) and heading (rad from east, counterclockwise).
     """
 
     def __init__(
         self, ground: Ground, robots: Sequence[Robot], grip: Sequence[float], step: float
     ) -> None:
-        """Build the model of robots, whose `max_slope` sets the centre of mass, for steps in s.
+        """Build the model; the `max_slope` of a robot determines its centre of mass.
 
-        `grip` is the friction coefficient of each robot's wheels.
+        `grip` is the friction coefficient of each robot's wheels, and `step` the time step, s.
         """
         self._ground, self._step = ground, step
         self.model = mujoco.MjModel.from_xml_string(_model(ground, robots, grip, step))
@@ -110,9 +110,9 @@ class Physics:
         self._brake = self.model.dof_frictionloss.reshape(len(robots), -1)[:, 7::2]
 
     def place(self, poses: np.ndarray) -> None:
-        """Place robots, poses (robot, 3), parallel to the ground, and wait until they are at rest.
+        """Place robots at poses (robot, 3), parallel to the ground, and wait until they rest.
 
-        Those that would overlap are moved apart.
+        Robots that would overlap are moved apart.
         """
         local = poses - [*self._ground.center, 0.0]
         local[:, :2] = _spread(local[:, :2])
@@ -125,7 +125,7 @@ class Physics:
                 break
 
     def command(self, speeds: np.ndarray) -> None:
-        """Set speeds of the left and right wheels, (robot, 2), m/s; (0, 0) is the parking brake."""
+        """Set the speeds of left and right wheels, (robot, 2), m/s; (0, 0) applies the brake."""
         self.data.ctrl[:] = np.tile(speeds, 2).ravel() / WHEEL_RADIUS
         parked = (speeds == 0.0).all(1)
         self._brake[:] = np.where(parked, TORQUE, 0.0)[:, None]
@@ -143,7 +143,7 @@ class Physics:
 
     @property
     def rates(self) -> np.ndarray:
-        """Speed ahead, m/s, and yaw rate, rad/s, of the bodies, shape (robot, 2)."""
+        """Forward speed, m/s, and yaw rate, rad/s, of the bodies, shape (robot, 2)."""
         ahead = (self._qvel[:, :3] * self._axes[0]).sum(1)
         return np.column_stack([ahead, self._qvel[:, 5]])
 
@@ -164,13 +164,13 @@ class Physics:
 
     @property
     def off_ground(self) -> np.ndarray:
-        """Whether each robot has left the crop, shape (robot,)."""
+        """Whether each robot has left the simulated ground, shape (robot,)."""
         inside = (np.abs(self._qpos[:, :2]) < self._ground.half_size).all(1)
         return ~inside | (self._qpos[:, 2] < -1.0)
 
     @property
     def touching(self) -> np.ndarray:
-        """Whether each robot touches another one, shape (robot,)."""
+        """Whether each robot touches another robot, shape (robot,)."""
         bodies = self.model.body_rootid[self.model.geom_bodyid[self.data.contact.geom]]
         return np.isin(self._bodies, bodies[(bodies > 0).all(1)])
 
@@ -183,11 +183,11 @@ class Physics:
         return np.column_stack(ahead), np.column_stack(up)
 
     def _standing(self, x: float, y: float, heading: float) -> np.ndarray:
-        """Position and quaternion of a robot whose wheels touch the ground, shape (7,)."""
+        """Return position and quaternion of a robot whose wheels touch the ground, shape (7,)."""
         turn = np.array([[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]])
         wheels = _WHEELS @ turn.T
         z = self._ground.height(x + wheels[:, 0], y + wheels[:, 1])
-        # The plane closest to the ground under the wheels, raised until it is above all four.
+        # Fit a plane to the ground under the wheels, and raise it above all four contact points.
         slope = np.linalg.lstsq(wheels, z - z.mean(), rcond=None)[0]
         base = float((z - wheels @ slope).max())
         up = np.array([*-slope, 1.0]) / np.sqrt(1.0 + slope @ slope)
@@ -199,20 +199,20 @@ class Physics:
 
 
 def wheel_speeds(speed: np.ndarray, yaw_rate: np.ndarray) -> np.ndarray:
-    """Speeds of the left and right wheels, (robot, 2), m/s, for a speed and a yaw rate."""
+    """Return the speeds of the left and right wheels, (robot, 2), m/s, for speed and yaw rate."""
     aside = 0.5 * _YAW_TRACK * yaw_rate
     return np.column_stack([speed - aside, speed + aside])
 
 
 def _spread(xy: np.ndarray) -> np.ndarray:
-    """Positions (robot, 2), those too close pushed apart."""
+    """Push positions (robot, 2) apart that are too close to each other."""
     xy, turn = xy.copy(), 2.0 * np.pi * np.arange(len(xy)) / len(xy)
     for _ in range(100):
         gap = xy[:, None] - xy
         distance = np.linalg.norm(gap, axis=2) + APART * np.eye(len(xy))
         if (distance >= APART - 1e-3).all():
             break
-        # Robots on one spot leave it in different directions.
+        # Robots at the same position are pushed in different directions.
         xy += (
             0.01 * (distance.min(1) < 1e-3)[:, None] * np.column_stack([np.cos(turn), np.sin(turn)])
         )
@@ -222,12 +222,12 @@ def _spread(xy: np.ndarray) -> np.ndarray:
 
 
 def _relief(ground: Ground) -> float:
-    """Height of the heightfield, m; MuJoCo needs one above 0."""
+    """Return the height of the heightfield, m, which must be positive in MuJoCo."""
     return max(float(ground.heights.max()), 1e-3)
 
 
 def _model(ground: Ground, robots: Sequence[Robot], grip: Sequence[float], step: float) -> str:
-    """Model in MJCF, MuJoCo's XML."""
+    """Return the model in MJCF, the XML format of MuJoCo."""
     (rows, cols), (x, y) = ground.heights.shape, ground.half_size
     bodies = "".join(_body(i, r, g) for i, (r, g) in enumerate(zip(robots, grip, strict=True)))
     motors = "".join(
@@ -248,13 +248,13 @@ def _model(ground: Ground, robots: Sequence[Robot], grip: Sequence[float], step:
 
 
 def _body(i: int, robot: Robot, grip: float) -> str:
-    """MJCF of one vehicle; its origin is in the axles' plane, between the wheels."""
+    """Return the MJCF of one robot, with the origin at axle height between the wheels."""
     length, width, height = _BODY
-    # Height of the hull that puts the centre of mass of hull and wheels at the wanted height.
+    # Raise the centre of the hull so that hull and wheels have the required centre of mass.
     raised = (center_of_mass(robot) - WHEEL_RADIUS) * MASS / _HULL
     inertia = [_HULL / 12.0 * (a * a + b * b)
                for a, b in ((width, height), (length, height), (length, width))]  # fmt: skip
-    # The springs are at rest under the hull's weight.
+    # The springs are in equilibrium under the weight of the hull.
     sag = -0.25 * _HULL * 9.81 / STIFFNESS
     wheels = "".join(
         f'<body pos="{x} {y} 0"><joint type="slide" axis="0 0 1" range="-0.08 0.08" limited="true" '
