@@ -1,4 +1,4 @@
-"""Arguments, timer and tables of the benchmark scripts."""
+"""Command-line arguments, timing and tables shared by the benchmark scripts."""
 
 import argparse
 import csv
@@ -19,16 +19,16 @@ def arguments(
     seeds: int | None = None,
     out: str = "",
 ) -> argparse.ArgumentParser:
-    """Parser of the arguments that scripts share; a script adds those that it alone has.
+    """Make a parser with the arguments that scripts share; a script adds its own arguments.
 
     Args:
         doc: Docstring of the script.
-        quick: Effect of --quick; without it, the script has no short trial.
-        data: Whether the script reads real terrains; --data is `TRUSTBO_DATA` by default.
-        names: Parts of the script that can be chosen; all by default.
+        quick: Help text of --quick; if empty, the script has no such argument.
+        data: Whether the script reads data; the default of --data is `TRUSTBO_DATA`.
+        names: Parts of the script that can be selected; by default, all of them run.
         n: Default of -n, the number of cases.
-        seeds: Default of --seeds.
-        out: Default of --out, where results are kept.
+        seeds: Default of --seeds, the number of seeds.
+        out: Default of --out, the folder of the results.
     """
     parser = argparse.ArgumentParser(
         description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -51,12 +51,12 @@ def arguments(
 
 
 def parsed(parser: argparse.ArgumentParser) -> argparse.Namespace:
-    """Arguments of this call, with the chosen names checked and the data as a folder."""
+    """Parse the arguments of this process; check the selected names, and make --data a path."""
     given = parser.parse_args()
     if choices := getattr(given, "choices", None):
         for name in given.names:
             if name not in choices:
-                parser.error(f"unknown name {name!r}; choose some of {', '.join(choices)}")
+                parser.error(f"unknown name {name!r}; choose from {', '.join(choices)}")
         given.names = given.names or choices
     if getattr(given, "data", None) is not None:
         given.data = Path(given.data)
@@ -67,14 +67,14 @@ def parsed(parser: argparse.ArgumentParser) -> argparse.Namespace:
 
 
 def timed(work: Callable[[], Any]) -> tuple[float, Any]:
-    """Seconds of a call, and its result."""
+    """Call a function; return the elapsed time in seconds, and the result."""
     started = time.perf_counter()
     result = work()
     return time.perf_counter() - started, result
 
 
 def verdict(met: bool) -> str:
-    """Word for a target that is met or missed."""
+    """Return the table entry for a target that is met or missed."""
     return "yes" if met else "NO"
 
 
@@ -82,10 +82,10 @@ def verdict(met: bool) -> str:
 
 
 class Table:
-    """Markdown table, printed row by row; it can be written as CSV."""
+    """Markdown table that is printed row by row, and can be written as CSV."""
 
     def __init__(self, *columns: str, first: int = 0, others: int = 0) -> None:
-        """Print the head; `first` and `others` are the least widths of the columns."""
+        """Print the header; `first` and `others` are the minimum widths of the columns."""
         self.columns, self.rows = columns, []
         self._widths = [first, *(others for _ in columns[1:])]
         self._print(columns)

@@ -1,18 +1,18 @@
-"""Failures: the table of docs/failures.md, in Markdown.
+"""Predicted and actual failures of plans: the table of docs/failures.md, in Markdown.
 
     python benchmarks/failures.py [part ...] --data DIR --out out/failures
 
-Worlds with tight slope limits, named ground:limit:excess. The assumed limit is the true one plus
-the excess, in degrees: 0, geometry knows all that it can; above, ways lead over ground that stops
-robots.
+The worlds have tight slope limits and are named terrain:limit:excess. The assumed limit is the true
+limit plus the excess, in degrees. With an excess of 0, the hazard model has the right limit. With a
+larger excess, some bounds that seem passable stop the robots.
 
-The part `reliability` compares the chance to arrive that a campaign's plan has before missions 1,
-2, 5 and 15 with the share of runs of that plan which arrive. It has a file for each campaign in
---out, and goes on where it stopped; --jobs processes share the courses. `product` is that of
-1 - p_fail.
+The part `reliability` evaluates the plans before missions 1, 2, 5 and 15 of a campaign. It compares
+their predicted arrival probability with the fraction of simulated runs that arrive. `product` is
+the product of 1 - p_fail over the bounds. Each campaign has a file in --out, so the script can be
+resumed. --jobs sets the number of processes.
 
-The part `price` prints the chance to fail by which a plan on wellington is priced: by the product
-of means, by strata, and by all draws.
+The part `price` prints the failure probability of plans on wellington, computed from the product of
+means, from strata, and from all draws.
 """
 
 import csv
@@ -36,15 +36,15 @@ from trustbo.workspace.moves import moves_along
 GROUNDS = (("topography", 18), ("tahoe", 18), ("synthetic-0", 14), ("wellington", 38))
 WORLDS = [f"{ground}:{limit}:{excess}" for ground, limit in GROUNDS for excess in (0, 4)]
 REFERENCE = Path(__file__).parent / "reference" / "failures_0.3.csv"
-"""Reliability by version 0.3, 20 runs of each plan of two campaigns a course."""
+"""Reliability of version 0.3, from 20 runs of each plan of two campaigns per course."""
 ASSUMED = {"0": "the true limit", "4": "4 degrees more", "both": "both"}
-"""Names of its excess in the reference."""
+"""Names of the excess in the reference file."""
 ASKED = (1, 2, 5, 15)
-"""Missions before which the reliability of the plan is judged."""
+"""Numbers of the missions whose plans are evaluated."""
 
 
 def world_of(name, data):
-    """World with the assumed slope limit, and the simulator of the true one."""
+    """Make the world with the assumed slope limit, and the simulator with the true limit."""
     ground, limit, excess = name.split(":")
     assumed, team = (climbing(float(limit) + more) for more in (float(excess), 0.0))
     world = World(name, "slopes", ground, team=assumed, data=data)
@@ -53,13 +53,13 @@ def world_of(name, data):
 
 
 def climbing(degrees):
-    """Team of robots that stand a slope."""
+    """Make a team of robots with this slope limit in degrees."""
     robot = tb.Robot(max_slope=float(np.deg2rad(degrees)))
     return tb.Team(robots=(robot,) * 3, lead=robot)
 
 
 def judged_plans(world, simulator, course, seed, given):
-    """Chance to arrive of a campaign's plans, and the share of runs of each that arrive."""
+    """Compute predicted arrival probabilities of plans, and the fraction of runs that arrive."""
     campaign, gathered = tb.Campaign(
         simulator.workspace, *world.ends(course), sampler="importance", seed=seed
     ), []  # fmt: skip
@@ -84,7 +84,7 @@ def judged_plans(world, simulator, course, seed, given):
 
 
 def judge_course(name, course, given):
-    """Campaigns of a course, those that the folder lacks run now, by seed."""
+    """Return the evaluated plans of a course, keyed by seed; run campaigns without a file."""
     warnings.simplefilter("ignore")
     folder, gathered, built = Path(given.out) / "reliability", {}, None
     folder.mkdir(parents=True, exist_ok=True)
@@ -99,7 +99,7 @@ def judge_course(name, course, given):
 
 
 def reliability(names, given):
-    """Judged plans of all campaigns, by world and course."""
+    """Return the evaluated plans of all campaigns, keyed by world and course."""
     tasks = [(name, course) for name in names for course in given.courses]
     if given.jobs == 1:
         return {task: judge_course(*task, given) for task in tasks}
@@ -110,9 +110,9 @@ def reliability(names, given):
 
 
 def print_reliability(gathered):
-    """Means by mission and excess; intervals, 95 %, are bootstraps over courses of worlds.
+    """Print means by mission and excess, with 95 % bootstrap intervals over worlds and courses.
 
-    Those of version 0.3 are of all four grounds and courses, whichever were run now.
+    The results of version 0.3 include all four terrains and courses, also if fewer were run now.
     """
     with REFERENCE.open(newline="") as stream:
         before = {(r["assumed"], int(r["before mission"])): r for r in csv.DictReader(stream)}
@@ -154,11 +154,11 @@ PRIORS = {
     "N(1, 4²)": Hazard(margin=(1.0, 4.0), doubt=(0.0, 4.0)),
     "N(0, .5²), N(0, 4²)": Hazard(),
 }
-"""Priors of the margin: that of version 0.3, and the default."""
+"""Priors of the margin: the prior of version 0.3, and the default."""
 
 
 def print_price():
-    """Chance to fail of plans before any mission and after one failure, by three roads."""
+    """Print the failure probability of plans before any mission and after one failure."""
     table = Table("prior of the margin", "course", "plan", "product", "five strata", "draws")
     workspace = tb.Workspace.from_terrain(tb.terrain.example(), (10, 10), tb.Team())
     courses = {"sw-ne": ((9, 0), (0, 9)), "nw-se": ((0, 0), (9, 9))}
@@ -172,7 +172,7 @@ def print_price():
 
 
 def chances(risk, path):
-    """Chance that a path fails: product of means, strata, and mean over 20 000 draws."""
+    """Compute the failure probability of a path from means, from strata, and from 20 000 draws."""
     joint = [Risk(risk.mean, strata=strata).priced(path) for strata in (None, risk.strata())]
     rows, cols = np.array(path[1:]).T
     drawn = risk.draw(20_000, seed=1)[:, moves_along(path), rows, cols]
@@ -182,12 +182,12 @@ def chances(risk, path):
 def main():
     parser = arguments(
         __doc__, names=["reliability", "price"], data=True, seeds=3, out="out/failures",
-        quick="one course and few missions of each world",
+        quick="one course, one seed and ten runs per plan",
     )  # fmt: skip
     parser.add_argument("--worlds", nargs="*", default=WORLDS)
     parser.add_argument("--courses", nargs="*", default=COURSES, choices=COURSES)
-    parser.add_argument("--runs", type=int, default=50, help="runs of a plan, reliability")
-    parser.add_argument("--jobs", type=int, default=1, help="processes, reliability")
+    parser.add_argument("--runs", type=int, default=50, help="runs per plan (part reliability)")
+    parser.add_argument("--jobs", type=int, default=1, help="processes (part reliability)")
     given = parsed(parser)
     warnings.simplefilter("ignore")
     if given.quick:

@@ -1,14 +1,15 @@
-"""Share of 25 planted faults that the tests catch.
+"""Mutation testing: the fraction of 25 faults, inserted into the source, that the tests detect.
 
-Each fault changes one place of the source so that results are wrong and nothing crashes. It is
-planted in a copy of the repository, never in the repository. The tests of its room then run up to
-the first that fails, and, where none does, those of the neighbouring rooms. A test that also fails
-without the fault is left out. A fault whose text is no longer in the source is not planted, and
-does not count as caught: whoever changed the code plants it anew, in the code that took its place.
+Each fault changes one place of the source so that results are wrong but nothing crashes. The fault
+is inserted into a copy of the repository, never into the repository itself. The tests of the same
+subpackage run until one fails. If none fails, the tests of the neighbouring subpackages run. A test
+that also fails without the fault is ignored. If the text to replace is no longer in the source, the
+fault cannot be inserted and counts as not detected. Whoever changes such code should adapt the
+fault to the new code.
 
-The text of a fault is sought in its file, else in all of the source, as files may have moved.
-Kernels that call others from a cache would not notice a change there, so that a fault in a file
-with kernels runs with an empty cache.
+The text is searched in the file of the fault and, as code may have moved, in the whole source.
+Cached kernels would not notice a change in the kernels that they call. Therefore, a fault in a file
+with kernels is tested with an empty cache.
 """
 
 import os
@@ -38,11 +39,11 @@ NEIGHBOURS = {
     "campaign": ("cli", "study"),
     "export": ("cli",),
 }
-"""Folders of tests by room, in `src/trustbo` and in `tests`: those of its neighbours."""
+"""Neighbouring subpackages, whose tests run in addition, keyed by subpackage."""
 
 
 class Fault(NamedTuple):
-    """Change of the source that makes results wrong."""
+    """Change of the source that makes results wrong: replace `before` with `after` in `file`."""
 
     name: str
     file: str
@@ -122,7 +123,7 @@ FAULTS = (
 
 
 def place_of(fault: Fault, root: Path = ROOT) -> Path | None:
-    """File that has the text of a fault exactly once; None if there is none, or several."""
+    """Return the only file with the text of a fault; None if there is no single place."""
     source = root / SOURCE
     for files in ([source / fault.file], sorted(source.rglob("*.py"))):
         found = {f: f.read_text().count(fault.before) for f in files if f.is_file()}
@@ -133,7 +134,7 @@ def place_of(fault: Fault, root: Path = ROOT) -> Path | None:
 
 
 def copy_to(folder: Path) -> Path:
-    """Copy all tracked files, as they are now."""
+    """Copy all tracked files, including uncommitted changes, to a folder."""
     listed = subprocess.check_output(["git", "ls-files", "-z"], cwd=ROOT, text=True)
     for name in filter(None, listed.split("\0")):
         if (ROOT / name).is_file():
@@ -143,9 +144,9 @@ def copy_to(folder: Path) -> Path:
 
 
 def first_failure(copy: Path, kernels: Path, tests: Sequence[str], minutes: float) -> str | None:
-    """First of some tests that fails in a copy, None if all pass; RuntimeError: pytest did not run.
+    """Run tests in a copy; return the name of the first test that fails, or None if all pass.
 
-    Compiled kernels are in the folder `kernels`.
+    The folder `kernels` caches compiled kernels. Raises RuntimeError if pytest did not run.
     """
     paths = [str(copy / folder) for folder in ("src", "tests", "benchmarks")]
     environment = {
@@ -165,13 +166,13 @@ def first_failure(copy: Path, kernels: Path, tests: Sequence[str], minutes: floa
         raise RuntimeError(f"no test failed within {minutes:g} minutes") from None
     if failed := re.search(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", done.stdout, re.MULTILINE):
         return failed[1]
-    if done.returncode not in (0, 5):  # 5: the tests are all slow
+    if done.returncode not in (0, 5):  # 5: all tests are slow and were deselected
         raise RuntimeError(f"pytest did not run: {(done.stdout + done.stderr)[-300:]}")
     return None
 
 
 def stages(fault: Fault, copy: Path, reach: str) -> Iterator[list[str]]:
-    """Folders of tests to run one after the other."""
+    """Yield the groups of test folders to run, one after the other."""
     room = fault.file.split("/")[0]
     for folders in ((room,), NEIGHBOURS[room] if reach != "room" else ()):
         if there := [f"tests/{name}" for name in folders if (copy / "tests" / name).is_dir()]:
@@ -181,9 +182,9 @@ def stages(fault: Fault, copy: Path, reach: str) -> Iterator[list[str]]:
 
 
 def caught_by(fault: Fault, copy: Path, reach: str, minutes: float) -> tuple[bool, str]:
-    """Whether a fault is caught in a copy, and by which test, or what became of it."""
+    """Return whether the tests detect a fault, and the test that failed or another outcome."""
     if (file := place_of(fault, copy)) is None:
-        return False, "not planted: the code has changed"
+        return False, "not inserted: the code has changed"
     text, ran, unfit = file.read_text(), [], []
     kernels = copy / ".kernels"
     if "njit" in text:
@@ -202,26 +203,26 @@ def caught_by(fault: Fault, copy: Path, reach: str, minutes: float) -> tuple[boo
                 unfit.append(failed)
             ran += folders
     except RuntimeError as error:
-        return False, f"not known: {error}"
+        return False, f"unknown: {error}"
     finally:
         file.write_text(text)
-    return False, f"NOT CAUGHT by {', '.join(ran)}"
+    return False, f"NOT DETECTED by {', '.join(ran)}"
 
 
 def main() -> None:
-    parser = arguments(__doc__, quick="only find the faults in the source; run no tests")
+    parser = arguments(__doc__, quick="only locate the faults in the source; run no tests")
     parser.add_argument("--only", action="append", metavar="NAME",
-                        help="faults whose names contain this; may be repeated")  # fmt: skip
+                        help="faults whose names contain this text; can be repeated")  # fmt: skip
     parser.add_argument("--reach", choices=("room", "near", "whole"), default="near",
-                        help="tests of the room, of its neighbours too, or all")  # fmt: skip
-    parser.add_argument("--jobs", type=int, default=1, help="faults at a time, default 1")
-    parser.add_argument("--minutes", type=float, default=30.0, help="limit of a run of tests")
+                        help="tests of the subpackage, with its neighbours, or all")  # fmt: skip
+    parser.add_argument("--jobs", type=int, default=1, help="faults tested in parallel (default 1)")
+    parser.add_argument("--minutes", type=float, default=30.0, help="limit per run (default 30)")
     given = parsed(parser)
     faults = [f for f in FAULTS if not given.only or any(name in f.name for name in given.only)]
-    table, n_caught = Table("fault", "caught by", "seconds", first=54), 0
+    table, n_caught = Table("fault", "detected by", "seconds", first=54), 0
     if given.quick:
         for fault in faults:
-            table.row(fault.name, place_of(fault) or "not planted: the code has changed", "")
+            table.row(fault.name, place_of(fault) or "not inserted: the code has changed", "")
         return
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(given.jobs) as pool:
         copies: Queue[Path] = Queue()
@@ -238,7 +239,7 @@ def main() -> None:
         for fault, (seconds, (caught, how)) in zip(faults, pool.map(run, faults), strict=True):
             n_caught += caught
             table.row(fault.name, how, f"{seconds:.0f}")
-    print(f"caught {n_caught} of {len(faults)}")
+    print(f"detected {n_caught} of {len(faults)}")
 
 
 if __name__ == "__main__":

@@ -1,13 +1,13 @@
-"""Random planning problems against every path written out, and against networkx.
+"""Fuzz test of the planner: random problems, compared with an enumeration of all paths.
 
-Run: python benchmarks/fuzz_plans.py [-n N] [--first I] [--seed S] [--networkx] [--quick]
+    python benchmarks/fuzz_plans.py [-n N] [--first I] [--seed S] [--networkx] [--quick]
 
-Draws grids with holes and closed bounds, awareness of cells or bounds, effects of places, models of
-equal, different and coupled robots, objectives and families, tolls, limits on bounds with and
-without U-turns, and risks with limits, costs and strata, of numbers that are usual, large, tied or
-0. The plan must have the best score of all admissible paths (`peers.every_path`, which shares no
-code with the planner); with --networkx also the value of `planning.reference.plan`. Problem I of a
-seed is always the same.
+The problems vary the grid (holes, closed bounds), the awareness (of cells or bounds), place
+effects, the model (equal, different or coupled robots), the objective, the family, tolls, limits on
+the number of bounds, U-turns, and risks (limits, costs, strata). Numbers are usual, large, tied or
+0. The plan must have the best score of all admissible paths, which `peers.every_path` enumerates
+without code of the planner. With --networkx, the plan must also have the value of
+`planning.reference.plan`. Problem I of a seed is always the same.
 """
 
 import sys
@@ -36,7 +36,7 @@ def pick(rng, *values):
 
 
 def numbers(rng, kind, size=()):
-    """Random numbers: usual, large, tied, or mostly 0."""
+    """Draw random numbers that are usual, large, tied, or mostly 0."""
     x = rng.normal(size=size)
     if kind == "large":
         return x * pick(rng, 30.0, 1000.0)
@@ -46,13 +46,13 @@ def numbers(rng, kind, size=()):
 
 
 def draw_grid(rng):
-    """Passable cells, closed bounds, where each move leads from a cell, (move, cell), and ends."""
+    """Draw passable cells, closed bounds, the target of each move (move, cell), and the ends."""
     shape = tuple(rng.integers(2, pick(rng, 3, 4, 5, 7), 2).tolist())
     if rng.random() < 0.15:
         shape = (pick(rng, 1, 2), int(rng.integers(3, 9)))
     passable = rng.random(shape) > pick(rng, 0.0, 0.1, 0.25)
     closed = rng.random((8, *shape)) < pick(rng, 0.0, 0.0, 0.0, 0.2)
-    if rng.random() < 0.2:  # four ways
+    if rng.random() < 0.2:  # no diagonal moves
         closed |= (np.abs(STEPS).sum(1) == 2)[:, None, None]
     into = np.full((8, passable.size), -1)
     for m, step in enumerate(STEPS):
@@ -73,7 +73,7 @@ def draw_grid(rng):
 
 
 def draw_model(rng, z, kind):
-    """Parameters of a random model, its drift (state, move, row, col), B0, x0 and sd."""
+    """Draw the parameters of a model; also return drift (state, move, row, col), B0, x0 and sd."""
     n, sd = len(z), pick(rng, 0.01, 0.1, 0.4)
     beta0 = float(pick(rng, 0.0, 0.3, 0.7, 0.95, 1.0))
     x0, model = float(numbers(rng, kind)), pick(rng, "pooled", "robots", "coupled")
@@ -103,7 +103,7 @@ def draw_model(rng, z, kind):
 
 
 def draw_risk(rng, shape, of_contact):
-    """Chances (move, row, col), strata of them or None, and options of the planner."""
+    """Draw failure probabilities (move, row, col), strata or None, and options of the planner."""
     p = np.where(rng.random(shape) < 0.4, rng.uniform(0.0, 0.5, shape), 0.02)
     p = np.where(rng.random(shape) < 0.1, rng.choice([0.0, 1.0, 0.1], shape), p)
     strata, options = None, {}
@@ -121,7 +121,7 @@ def draw_risk(rng, shape, of_contact):
 
 
 def risks_of(p, strata, cost):
-    """Sums of risks (sum, move, cell) and the cost of failing by each, the mean's the last."""
+    """Return risks (sum, move, cell) of each stratum and, last, of the mean, and their costs."""
     some, failure = p[None], np.array([cost])
     if strata is not None and cost > 0.0:
         some = np.concatenate([strata.p_fail, p[None]])
@@ -132,7 +132,7 @@ def risks_of(p, strata, cost):
 
 
 def draw_problem(rng):
-    """A planner, parameters, and the same as a `World`."""
+    """Draw a problem, as a planner with parameters and as a `World`."""
     passable, closed, into, start, goal = draw_grid(rng)
     shape, n = passable.shape, pick(rng, 1, 2, 3)
     z = rng.random((n, *(() if rng.random() < 0.3 else (8,)), *shape, 2))
@@ -172,7 +172,7 @@ def draw_problem(rng):
 
 
 def faults(planner, params, world, best):
-    """What is wrong with the plan of a problem whose best score is known; and if it was exact."""
+    """Return what is wrong with a plan, given the best score, and whether the plan is exact."""
     try:
         plan = planner.plan(params)
     except InfeasibleError as error:
@@ -193,7 +193,7 @@ def faults(planner, params, world, best):
 
 
 def problem_of(seed, index, most=_MOST_WALKS):
-    """A random problem that can be enumerated, and the score of its best walk."""
+    """Draw a problem that can be enumerated, and compute the score of its best walk."""
     rng = np.random.default_rng([seed, index])
     while True:
         planner, params, world = draw_problem(rng)
@@ -206,7 +206,7 @@ def problem_of(seed, index, most=_MOST_WALKS):
 
 
 def main():
-    words = arguments(__doc__, n=1000, quick="200 problems")
+    words = arguments(__doc__, n=1000, quick="only 200 problems")
     for name in ("--first", "--seed"):
         words.add_argument(name, type=int, default=0)
     words.add_argument("--networkx", action="store_true")

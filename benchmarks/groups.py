@@ -1,7 +1,8 @@
-"""Results of benchmarks/worlds.py by groups and kinds of worlds, paired, and beside version 0.3.
+"""Paired comparisons of methods by group and kind of world, and comparison with version 0.3.
 
-Rows are means over the seeds of one method on a world and course, see `rows_of`. `lost` is contact
-lost while learning in bounds a mission, where a bound that fails or is not reached keeps none.
+The results are from benchmarks/worlds.py. A row (see `rows_of`) is the mean over seeds of one
+method on one world and course. `lost` is the contact lost while learning, in bounds per mission;
+bounds that fail or are not reached count as fully lost.
 """
 
 from collections.abc import Iterable, Sequence
@@ -19,7 +20,7 @@ OURS, BASELINES = "trustbo", ("running mean", "residual process", "line of sight
 KINDS = ("right", "wall", "bare", "slopes", "aged", "canopy", "shapes", "teams",
          "robots", "days", "foul", "change", "jammer", "physics", "limit")  # fmt: skip
 CALM = KINDS[:8]
-"""Kinds in which nothing goes wrong: the survey may be wrong, robots and missions are alike."""
+"""Kinds in which robots and missions are alike; only the survey or the sight may be wrong."""
 WRONG = KINDS[8:]
 GROUPS = {
     "all": KINDS,
@@ -27,15 +28,15 @@ GROUPS = {
     "goes wrong": WRONG,
     "goes wrong, without jammer and physics": tuple(set(WRONG) - {"jammer", "physics"}),
 }
-"""Kinds of worlds by the name of their group."""
+"""Kinds of worlds in each group, keyed by the name of the group."""
 LOST = "lost_with_failures"
 COLUMNS = ["lost_while_learning", "regret_now", "arrive", LOST, "arrive_first_3", "arrive_later"]
-"""Quantities of a row; the first three are those of version 0.3."""
+"""Quantities of a row; only the first three are available for version 0.3."""
 REFERENCES = [
     Path(__file__).parent / "reference" / name for name in ("worlds_0.3.csv", "limits_0.3.csv")
 ]
 DEAD = "dead-detector"
-"""Case of kind `change` that is compared with version 0.3 by name."""
+"""Case of the kind `change` that is also compared with version 0.3 separately."""
 
 
 NAMES = {
@@ -43,43 +44,43 @@ NAMES = {
     "lost with failures": LOST, "arrive of the first 3": "arrive_first_3",
     "arrive later": "arrive_later",
 }  # fmt: skip
-"""Columns of `study.numbers_of` by their names in a row."""
+"""New column names, keyed by the column names of `study.numbers_of`."""
 
 
 def rows_of(numbers: pd.DataFrame) -> pd.DataFrame:
-    """Rows of `study.numbers_of`: a method on a world and course, means over seeds."""
+    """Average the results of `study.numbers_of` over seeds, for each method, world and course."""
     rows = numbers.rename(columns=NAMES)
     labels = ["world", "kind", "course", "method"]
     return rows.groupby(labels, as_index=False)[COLUMNS].mean()
 
 
 def references() -> pd.DataFrame:
-    """Rows of version 0.3, NaN where it has no such quantity.
+    """Read the rows of version 0.3, with NaN for quantities that are not available.
 
-    Of kinds other than `limit` its contact lost is without failures, of which trustbo had none.
+    Except for the kind `limit`, the contact lost excludes failures, as trustbo had none there.
     """
     return pd.concat([pd.read_csv(file) for file in REFERENCES if file.is_file()])
 
 
 def grounds_of(names: Iterable[str]) -> np.ndarray:
-    """Terrain of each world: worlds of one terrain are no independent evidence."""
+    """Return the terrain of each world; results on the same terrain are not independent."""
     grounds = sorted({world.ground for world in worlds().values()}, key=len, reverse=True)
     return np.array([next((g for g in grounds if n.startswith(g)), n) for n in names])
 
 
 def paired(rows: pd.DataFrame, methods: Sequence[str], quantity: str = LOST) -> pd.DataFrame:
-    """A quantity by world, course and kind, with a column for each method that all rows have."""
+    """Tabulate a quantity by world, course and kind, with a column for each method."""
     index = ["world", "course", "kind"]
     wide = rows.pivot_table(quantity, index, "method").reindex(columns=list(methods))
     return wide.dropna()
 
 
 def clustered(values: np.ndarray, clusters: np.ndarray) -> tuple[float, float, float, float]:
-    """Mean, ends of its 95 % interval, and p-value of no difference, by clustered errors.
+    """Compute the mean, its 95 % interval and the p-value of a zero mean, by clustered errors.
 
     The variance of the mean is G / (G - 1) sum_g (sum_{i in g} (d_i - mean))^2 / n^2 over G
-    clusters, and t has G - 1 degrees of freedom (Liang & Zeger 1986); clusters of one value make
-    it the t test. NaN for one cluster.
+    clusters, and t has G - 1 degrees of freedom (Liang & Zeger 1986). If each cluster has one
+    value, this is the t test. With one cluster, the interval and the p-value are NaN.
     """
     mean, (_, index) = float(np.mean(values)), np.unique(clusters, return_inverse=True)
     n_clusters = index.max() + 1
@@ -95,7 +96,7 @@ def clustered(values: np.ndarray, clusters: np.ndarray) -> tuple[float, float, f
 
 
 def holm(p_values: Sequence[float]) -> np.ndarray:
-    """P-values corrected for their number by Holm's method; NaN are no tests."""
+    """Correct p-values for multiple tests by Holm's method; NaN values are not counted as tests."""
     p = np.array(p_values, dtype=float)
     corrected, tests = np.full(len(p), np.nan), np.flatnonzero(np.isfinite(p))
     order = tests[np.argsort(p[tests], kind="stable")]
@@ -105,10 +106,10 @@ def holm(p_values: Sequence[float]) -> np.ndarray:
 
 
 def by_group(rows: pd.DataFrame) -> pd.DataFrame:
-    """Means of `lost` by group and method, and trustbo less each other and less the best baseline.
+    """Compute means of `lost` by group and method, and the differences of trustbo to baselines.
 
-    Intervals, 95 %, are of a bootstrap over terrains, which all worlds of a terrain enter together.
-    The best baseline of a group is the one of the smallest mean in it.
+    The 95 % intervals are from a bootstrap over terrains; worlds on the same terrain are resampled
+    together. The best baseline of a group is the baseline with the smallest mean in this group.
 
     Returns:
         Table with columns group, n (worlds), what, `value`, `low` and `high`.
@@ -129,16 +130,16 @@ def by_group(rows: pd.DataFrame) -> pd.DataFrame:
         found = bootstrap(numbers, grounds, np.mean)
         for name in numbers:
             value, *ends = (found[name, what] for what in ("value", "low", "high"))
-            ends = ends if len(set(grounds)) > 1 else [np.nan, np.nan]  # one has no interval
+            ends = ends if len(set(grounds)) > 1 else [np.nan, np.nan]  # no interval
             table.append([group, names.nunique(), name, value, *ends])
     return pd.DataFrame(table, columns=["group", "n", "what", "value", "low", "high"])
 
 
 def by_kind(rows: pd.DataFrame) -> pd.DataFrame:
-    """Trustbo's `lost` less that of the best baseline of each kind, with p-values.
+    """Compute `lost` of trustbo minus `lost` of the best baseline, for each kind of world.
 
-    Intervals and p-values are of the t test with errors clustered by terrain; `p_holm` are
-    corrected for the number of kinds.
+    Intervals and p-values are from a t test with errors clustered by terrain. `p_holm` is corrected
+    for the number of kinds.
     """
     methods = [OURS, *(name for name in BASELINES if name in set(rows["method"]))]
     wide, table = paired(rows, methods), []
@@ -157,14 +158,14 @@ def by_kind(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def arrivals(rows: pd.DataFrame) -> pd.DataFrame:
-    """Share of missions that arrive by kind and method, of all, the first three and the others."""
+    """Compute the fraction of missions that arrive (all, first three, later) by kind and method."""
     return rows.groupby(["kind", "method"])[["arrive", "arrive_first_3", "arrive_later"]].mean()
 
 
 def beside(rows: pd.DataFrame, reference: pd.DataFrame) -> pd.DataFrame:
-    """Trustbo's contact lost now less that of version 0.3, on the same worlds and courses.
+    """Compute the contact lost now minus that of version 0.3, on the same worlds and courses.
 
-    With failures where the reference has them, that is of kind `limit`; else without.
+    Failures count as lost contact if the reference includes failures (kind `limit`).
     """
     ours = [table[table["method"] == OURS] for table in (rows, reference)]
     both = ours[0].merge(ours[1], on=["world", "kind", "course"], suffixes=("", "_0.3"))
@@ -190,13 +191,13 @@ def beside(rows: pd.DataFrame, reference: pd.DataFrame) -> pd.DataFrame:
 
 
 def report_groups(rows: pd.DataFrame) -> None:
-    """Print the tables by group and kind, of arrivals, and beside version 0.3, in Markdown."""
-    print("\n**Lost while learning, with failures**: bounds a mission, by group\n")
+    """Print Markdown tables by group and kind, of arrivals, and compared with version 0.3."""
+    print("\n**Lost while learning, with failures**: bounds per mission, by group\n")
     groups = by_group(rows)
     table = Table("group (worlds)", "method", "lost [95 % by terrain]")
     for row in groups.itertuples():
         table.row(f"{row.group} ({row.n})", row.what, interval(row, 3))
-    print(f"\n**{OURS} less the best baseline of each kind**\n")
+    print(f"\n**{OURS} minus the best baseline of each kind**\n")
     kinds = by_kind(rows)
     methods = [name for name in (OURS, *BASELINES) if name in kinds]
     table = Table("kind (worlds)", *methods, "best", "difference [95 %]", "p", "p, Holm")
@@ -204,7 +205,7 @@ def report_groups(rows: pd.DataFrame) -> None:
         means = [f"{row[name]:.3f}" for name in methods]
         p_values = [f"{row[name]:.3g}" for name in ("p", "p_holm")]
         table.row(f"{row['kind']} ({row['n']})", *means, row["best"], interval(row, 3), *p_values)
-    print("\n**Missions that arrive**: share of all\n")
+    print("\n**Missions that arrive**: fraction of all missions\n")
     home = arrivals(rows)
     methods = [name for name in (OURS, *BASELINES) if name in set(rows["method"])]
     table = Table("kind", *methods)
@@ -220,7 +221,7 @@ def report_groups(rows: pd.DataFrame) -> None:
     reference = references()
     if (compared := beside(rows, reference)).empty:
         return
-    print(f"\n**{OURS} beside version 0.3**: lost on the same worlds and courses\n")
+    print(f"\n**{OURS} compared with version 0.3**: lost on the same worlds and courses\n")
     table = Table("worlds", "0.3", "now", "difference [95 %]", "p", "home, 0.3", "home")
     for _, row in compared.iterrows():
         means = [f"{row[name]:.3f}" for name in ("0.3", "now")]
@@ -230,7 +231,7 @@ def report_groups(rows: pd.DataFrame) -> None:
 
 
 def interval(row: object, places: int) -> str:
-    """Value and its interval."""
+    """Format a value with its interval."""
     value, low, high = (
         row[name] if isinstance(row, pd.Series) else getattr(row, name)
         for name in ("value", "low", "high")

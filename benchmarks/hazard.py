@@ -1,11 +1,12 @@
-"""Hazard posteriors against tempered sequential Monte Carlo.
+"""Accuracy of hazard posteriors, compared with tempered sequential Monte Carlo.
 
     python benchmarks/hazard.py --sets 100 --particles 4096
 
-In each simulated data set, 15 missions cross 10 of 80 bounds; every third one that fails is lost
-somewhere unknown. In half of the sets the true slope limit is 4 degrees below the stated one. For
-the default prior of the margin and for a single wide normal, the script prints how many posterior
-means are off by more than .2 prior sds at an accepted k-hat, and how many posteriors are refused.
+In each simulated data set, 15 missions cross 10 of 80 bounds. In every third mission, the place of
+a failure is unknown. In half of the data sets, the true slope limit is 4 degrees below the stated
+limit. The script compares the default prior of the margin with a single wide normal
+distribution. For each prior, it prints how many posterior means are off by more than .2 prior sds
+at an accepted k-hat, and how many posteriors are rejected.
 """
 
 import argparse
@@ -26,7 +27,7 @@ LIMIT, N_BOUNDS, MOVES = np.deg2rad(22.0), 80, 8
 
 
 def simulate(seed):
-    """Difficulty (bound, measure) and exposures of one data set."""
+    """Simulate the difficulty (bound, measure) and the exposures of one data set."""
     rng = np.random.default_rng(seed)
     difficulty = rng.uniform(0.0, 1.0, (N_BOUNDS, len(MEASURES)))
     steepness = np.rad2deg(np.arctan(difficulty[:, 1] * np.tan(LIMIT)) - LIMIT)
@@ -50,7 +51,7 @@ def simulate(seed):
 
 
 def log_likelihood(prior, exposures, z):
-    """Exact log likelihood of scores; the lost missions by inclusion and exclusion."""
+    """Compute the exact log likelihood of scores, with inclusion-exclusion for lost missions."""
     alpha, beta = prior.betas(z)
     a, b = alpha + exposures.failed, beta + exposures.n - exposures.failed
     met = exposures.n > 0.0
@@ -67,7 +68,7 @@ def log_likelihood(prior, exposures, z):
 
 
 def reference(prior, exposures, n, seed):
-    """Posterior mean of the scores by tempered sequential Monte Carlo, from draws of the prior."""
+    """Compute the posterior mean of the scores by tempered sequential Monte Carlo."""
     rng, d = np.random.default_rng(seed), len(prior.center)
     z, power = rng.standard_normal((n, d)), 0.0
     log_l = log_likelihood(prior, exposures, z)
@@ -98,7 +99,7 @@ def reference(prior, exposures, n, seed):
 
 
 def main():
-    """Print one row for each prior of the margin."""
+    """Print one line for each prior of the margin."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--sets", type=int, default=100)
     parser.add_argument("--particles", type=int, default=4096)
@@ -119,7 +120,7 @@ def main():
         print(
             f"{name}: off by > .2 prior sds {((off > 0.2) & ~refused).sum()} of {given.sets}, "
             f"largest {off[~refused].max():.2f}, median {np.median(off):.3f}; "
-            f"refused {refused.sum()}, largest k-hat {k_hat.max():.2f}; "
+            f"rejected {refused.sum()}, largest k-hat {k_hat.max():.2f}; "
             f"{np.median(seconds):.2f} s"
         )
 

@@ -1,13 +1,14 @@
-"""Seconds and effective draws of fits, beside NumPyro's NUTS on the plain program.
+"""CPU time and effective draws of fits, compared with NUTS in NumPyro and in PyMC.
 
     python benchmarks/inference.py [fits] [nuts] [paper] [filter]
 
-`fits`: processor seconds of the hyperparameters and coefficients of the default model over 15, 60
-and 200 missions, of shared noise and of censored rates; the first in a process, and the median of
-three. `nuts`: the default model on eight missions by `sampler="nuts"`, compiling included, and the
-distance of its means from those of importance sampling. `paper`: effective draws per second on the
-paper's model with 600 rates, against `MCMC(NUTS(model.program))` and PyMC with nutpie. `filter`:
-milliseconds of a bound of three robots under 1000 draws.
+`fits`: CPU time of fits of the default model to 15, 60 and 200 missions, and with shared noise or
+censored rates. Both the first fit of a process and the median of later fits are printed.
+`nuts`: CPU time of `sampler="nuts"` for the default model and eight missions, with compilation, and
+the difference of the means to importance sampling.
+`paper`: effective draws per second for the paper's model and 600 rates, compared with
+`MCMC(NUTS(model.program))` and with PyMC and nutpie.
+`filter`: time to update the filter with one bound of three robots, with 1000 draws.
 """
 
 import sys
@@ -28,7 +29,7 @@ EFFECTS = (PlaceEffect(), RobotEffect())
 
 
 def missions(n, n_bounds=10, size=10, limit=False, seed=0):
-    """Missions of three robots over random walks."""
+    """Simulate missions of three robots on random walks."""
     rng, found = np.random.default_rng(seed), []
     for _ in range(n):
         path = [tuple(rng.integers(size, size=2).tolist())]
@@ -44,7 +45,7 @@ def missions(n, n_bounds=10, size=10, limit=False, seed=0):
 
 
 def timed_fits():
-    """Seconds of a fit without predictions."""
+    """Print the CPU time of fits without predictions."""
     cases = {
         "default model, 15 missions": (15, PooledTrust(effects=EFFECTS), False),
         "60 missions": (60, PooledTrust(effects=EFFECTS), False),
@@ -64,7 +65,7 @@ def timed_fits():
 
 
 def nuts():
-    """NUTS of the default model on eight missions."""
+    """Print CPU time and error of NUTS for the default model and eight missions."""
     data, model = missions(8), PooledTrust(effects=EFFECTS)
     exact = tb.fit(data, model, draws=4000, whole=False)["posterior"].to_dataset()
     started = time.process_time()
@@ -76,19 +77,19 @@ def nuts():
 
 
 def paper():
-    """Effective draws per second of the paper's model, beside NumPyro and PyMC with nutpie."""
+    """Print effective draws per second for the paper's model, also of NumPyro and nutpie."""
     data, model = missions(20), PooledTrust().for_features(["line_of_sight", "slope"])
     tb.fit(data, model, whole=False)
     started = time.process_time()
     ours = tb.fit(data, model, whole=False).attrs["kish"] / (time.process_time() - started)
-    print(f"paper's model, 600 rates: {ours:.0f} effective draws a second")
+    print(f"paper's model, 600 rates: {ours:.0f} effective draws per second")
     for peer, (draws, seconds) in {"NumPyro": by_numpyro(model, data), **by_nutpie(data)}.items():
         least = min(float(sampling_diagnostics.ess(draws[n])) for n in ("beta0", "delta_w"))
-        print(f"{peer}: {least / seconds:.0f} a second, a ratio of {ours * seconds / least:.1f}")
+        print(f"{peer}: {least / seconds:.0f} per second, a ratio of {ours * seconds / least:.1f}")
 
 
 def by_numpyro(model, data):
-    """Draws of NumPyro's NUTS on the plain program, and seconds without compiling."""
+    """Return draws of NumPyro's NUTS for the program, and the CPU time without compiling."""
     with own_settings():
         mcmc = MCMC(
             NUTS(model.program), num_warmup=500, num_samples=1000, num_chains=4,
@@ -103,25 +104,25 @@ def by_numpyro(model, data):
 
 
 def by_nutpie(data):
-    """The same of PyMC with nutpie; nothing where these are not installed."""
+    """Return draws and CPU time of PyMC with nutpie; empty if they are not installed."""
     try:
         from peers.pymc_nutpie import pooled, sampled
     except ImportError as error:
-        print(f"left out: {error}")
+        print(f"skipped: {error}")
         return {}
     z, y = (np.stack([getattr(m, name) for m in data]) for name in ("awareness", "contact_rate"))
     return {"PyMC with nutpie": sampled(pooled(z, y), ("beta0", "delta_w"))}
 
 
 def one_bound():
-    """Milliseconds of a bound of a filter, the least of many."""
+    """Print the shortest time that the filter needs for one bound."""
     live = TrustFilter(sample_prior(PooledTrust(), 2, 1000, 0), 3)
     z, y, seconds = np.full((3, 2), 0.5), [0.5, 0.6, 0.7], []
     for _ in range(300):
         started = time.perf_counter()
         live.update(z, y)
         seconds.append(time.perf_counter() - started)
-    print(f"TrustFilter, a bound: {1000.0 * min(seconds):.2f} ms")
+    print(f"TrustFilter, one bound: {1000.0 * min(seconds):.2f} ms")
 
 
 if __name__ == "__main__":

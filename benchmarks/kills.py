@@ -1,6 +1,6 @@
-"""Campaigns whose process is killed: each resumes with results identical to the undisturbed one.
+"""Crash test: campaigns are killed at random moments; resuming must give identical results.
 
-Run: python benchmarks/kills.py [--kills 20]
+python benchmarks/kills.py [--kills 20]
 """
 
 import argparse
@@ -21,14 +21,14 @@ N_MISSIONS = 8
 
 
 def simulator():
-    """Simulator of a workspace of 4 x 4 cells."""
+    """Make a simulator for a workspace of 4 x 4 cells."""
     workspace = tb.Workspace.from_awareness(np.random.default_rng(0).uniform(size=(3, 4, 4, 2)))
     truth = TrustParams(0.6, np.array([0.3, 0.2]), 0.05, 0.05, 0.05)
     return tb.simulation.ModelSimulator(workspace, truth)
 
 
 def go_on(folder):
-    """Run the campaign of a folder to its end."""
+    """Start or resume the campaign in a folder, and run it to the end."""
     robots = simulator()
     options = {"simulator": robots, "n_iterations": N_MISSIONS, "progress": False}
     if (Path(folder) / "campaign.json").exists():
@@ -37,17 +37,17 @@ def go_on(folder):
 
 
 def numbers(folder):
-    """Paths and draws of a campaign, as bytes."""
+    """Return the paths and the draws (as bytes) of a campaign."""
     result = tb.load_result(folder)
     draws = [v.values.tobytes() for t in result.posteriors for v in t["posterior"].values()]
     return [m.path for m in result.missions], result.path, draws
 
 
 def main():
-    """Kill processes at random moments, and compare."""
+    """Kill processes at random moments, resume their campaigns, and compare."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=20)
-    parser.add_argument("--folder", help="campaign that a process of this program runs")
+    parser.add_argument("--folder", help="run one campaign here (used by the script itself)")
     given = parser.parse_args()
     if given.folder:
         go_on(given.folder)
@@ -61,7 +61,7 @@ def main():
             for _ in range(4):
                 process = subprocess.Popen([sys.executable, __file__, "--folder", str(folder)])
                 record, before = folder / "campaign.json", time.time()
-                while process.poll() is None:  # a process that still imports has nothing to lose
+                while process.poll() is None:  # nothing to lose before the record exists
                     if record.exists() and record.stat().st_mtime > before:
                         time.sleep(rng.uniform(0.0, 0.5))
                         process.send_signal(signal.SIGKILL)

@@ -1,10 +1,10 @@
-"""A log of real robots: models fitted to one half, scored one bound ahead on the other.
+"""Predictions for a log of real robots: models are fitted to one half and scored on the other.
 
-Run: python benchmarks/logs.py [score] [memory] [--data FOLDER] [--window 20 10] [--quick]
+    python benchmarks/logs.py [score] [memory] [--data FOLDER] [--window 20 10] [--quick]
 
-FOLDER, by default TRUSTBO_DATA, has `mrclam/`, a run of the UTIAS data set as published: Leung,
-Halpern, Barfoot and Liu, International Journal of Robotics Research 30 (8), 2011. The files are
-the user's: their terms are the producer's.
+FOLDER (by default, the environment variable TRUSTBO_DATA) must contain `mrclam/`, a run of the
+UTIAS data set as published (Leung, Halpern, Barfoot and Liu, International Journal of Robotics
+Research 30 (8), 2011). The files are not included; the terms of their producers apply.
 """
 
 from dataclasses import replace
@@ -26,10 +26,10 @@ MODELS = {
 
 
 def read_mrclam(run):
-    """Tables of poses and detections of a run of the five robots.
+    """Read tables of poses and detections from the folder `run` of five robots.
 
-    `run` has Robot1_Groundtruth.dat, Robot1_Measurement.dat, ... and Barcodes.dat; or poses.csv and
-    detections.csv.
+    The folder contains Robot1_Groundtruth.dat, Robot1_Measurement.dat, ... and Barcodes.dat, or
+    poses.csv and detections.csv.
     """
     if not (run / "Barcodes.dat").exists():
         return [pd.read_csv(next(run.glob(f"{name}.csv*"))) for name in ("poses", "detections")]
@@ -37,7 +37,7 @@ def read_mrclam(run):
     poses, detections = [], []
     for i in range(1, 6):
         track = np.loadtxt(run / f"Robot{i}_Groundtruth.dat")
-        times = np.arange(track[0, 0], track[-1, 0], 0.5)  # of a hundred poses a second
+        times = np.arange(track[0, 0], track[-1, 0], 0.5)  # the log has 100 poses per second
         kept = track[np.unique(np.searchsorted(track[:, 0], times))]
         poses.append(pd.DataFrame(kept, columns=["t", "x", "y", "heading"]).assign(robot=i))
         for t, code, *_ in np.loadtxt(run / f"Robot{i}_Measurement.dat"):
@@ -49,7 +49,7 @@ def read_mrclam(run):
 
 
 def halves(poses, detections):
-    """Tables of both halves of a log."""
+    """Split the tables of a log into two halves."""
     middle = poses["t"].max() // 40.0 * 20.0
     return {
         name: [table[(table["t"] >= a) & (table["t"] <= b)] for table in (poses, detections)]
@@ -57,8 +57,8 @@ def halves(poses, detections):
     }
 
 
-def made_up():
-    """Robots on circles that see each other the less, the further they are apart."""
+def simulated():
+    """Simulate robots on circles; detections become rarer with distance."""
     rng, t, rows, seen = np.random.default_rng(0), np.arange(0.0, 600.0, 0.5), [], []
     for i in range(4):
         a = t / (20.0 + 5.0 * i) + i
@@ -73,7 +73,7 @@ def made_up():
 
 
 def score(logs, window):
-    """Log score of each model on the half that it was not fitted to."""
+    """Print the log score of each model, one bound ahead, on the other half of the log."""
     table = Table("window", "fitted to", "model", "log score", "n")
     for learned, other in (("first", "second"), ("second", "first")):
         train, test = (tb.logs.read_tracks(*logs[name], window=window) for name in (learned, other))
@@ -85,7 +85,7 @@ def score(logs, window):
 
 
 def memory(logs, window):
-    """Log Bayes factor for trust that carries over from one bound to the next."""
+    """Print the log Bayes factor for trust that depends on trust in the previous bound."""
     table = Table("window", "half", "for beta0 > 0", "beta0")
     for name, tables in logs.items():
         missions, model = tb.logs.read_tracks(*tables, window=window), MODELS["counts"]
@@ -98,10 +98,10 @@ def memory(logs, window):
 
 
 def main():
-    parser = arguments(__doc__, names=("score", "memory"), data=True, quick="a made-up log")
+    parser = arguments(__doc__, names=("score", "memory"), data=True, quick="use a simulated log")
     parser.add_argument("--window", type=float, nargs="+", default=[20.0, 10.0])
     given = parsed(parser)
-    logs = halves(*(made_up() if given.quick else read_mrclam(given.data / "mrclam")))
+    logs = halves(*(simulated() if given.quick else read_mrclam(given.data / "mrclam")))
     for name, part in (("score", score), ("memory", memory)):
         if name in given.names:
             for window in given.window:

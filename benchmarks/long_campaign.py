@@ -1,6 +1,6 @@
-"""Seconds without the fit, memory and size on disk of a mission, early and late in a campaign.
+"""Time per mission without the fit, memory and disk space, early and late in a campaign.
 
-Run: python benchmarks/long_campaign.py [--missions 150]
+python benchmarks/long_campaign.py [--missions 150]
 """
 
 import argparse
@@ -18,7 +18,7 @@ ENDS = (9, 0), (0, 9)
 
 
 def main():
-    """Run one campaign, and print the numbers around mission 10 and at the end."""
+    """Run one campaign, and print the results around mission 10 and at the end."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--missions", type=int, default=150)
     n = parser.parse_args().missions
@@ -45,7 +45,7 @@ def main():
     for name, part in (("missions 6 to 15", early), (f"missions {n - 9} to {n}", late)):
         print(f"{name}: {np.median(seconds[part]):.3f} s without the fit, "
               f"{np.max(megabytes[part]):.0f} MB")  # fmt: skip
-    print(f"on disk: {size / n / 1e6:.2f} MB a mission")
+    print(f"on disk: {size / n / 1e6:.2f} MB per mission")
 
 
 if __name__ == "__main__":

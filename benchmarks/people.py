@@ -1,11 +1,11 @@
-"""HumanTrust on the reports of two studies, beside baselines, for people left out of the fit.
+"""Predictions of HumanTrust for people left out of the fit, in two studies, against baselines.
 
-Run: python benchmarks/people.py [soh] [azevedo] [--data FOLDER]
+    python benchmarks/people.py [soh] [azevedo] [--data FOLDER]
 
-The folder (`TRUSTBO_DATA` by default, or its `humans/`) holds tables that this project may not
-ship, made from the public files of clear-nus/human-trust-transfer (soh_household.csv,
-soh_driving.csv) and hazevedosa/bidirectional-trust (azevedo_sa.csv). The readers below name the
-columns.
+The folder (by default, the environment variable `TRUSTBO_DATA`), or its subfolder `humans/`,
+contains tables that this project may not distribute. They were made from public files of
+clear-nus/human-trust-transfer (soh_household.csv, soh_driving.csv) and of
+hazevedosa/bidirectional-trust (azevedo_sa.csv). `read_soh` and `read_azevedo_sa` name the columns.
 """
 
 from dataclasses import replace
@@ -27,14 +27,14 @@ def main():
     parser = arguments(__doc__, names=("soh", "azevedo"), data=True)
     given = parsed(parser)
     if given.data is None:
-        parser.error("give --data, or set TRUSTBO_DATA: the head of the script says what it holds")
+        parser.error("give --data or set TRUSTBO_DATA; the script's docstring lists the files")
     folder = given.data / "humans" if (given.data / "humans").is_dir() else given.data
     for name in given.names:
         {"soh": soh, "azevedo": azevedo}[name](folder)
 
 
 def soh(folder):
-    """Their scale, expit(rating - 3.5), and protocol: 10 folds of people, of C, D and E alone."""
+    """Score predictions for tasks C, D and E as the study does: 10 folds, expit(rating - 3.5)."""
     table = Table("study", "method", "given", "MAE", "target", "met")
     for name, (means, transfer, own) in SOH.items():
         people = read_soh(folder / f"soh_{name}.csv")
@@ -75,7 +75,7 @@ def soh(folder):
 
 
 def azevedo(folder):
-    """A third rating given two, of half of the people; and parts of the model by LOO."""
+    """Predict the third rating of half of the people; compare variants of the model by LOO."""
     people = read_azevedo_sa(folder / "azevedo_sa.csv")
     n = len(people)
     out = np.random.default_rng(0).permutation(n)[: n // 2]
@@ -107,11 +107,11 @@ def azevedo(folder):
 
 
 def read_soh(file):
-    """Missions of a study of Soh et al. (2018): trust in tasks before and after two were seen.
+    """Read missions of a study of Soh et al. (2018): trust in tasks before and after watching two.
 
-    Bound 1 is before, with reports of tasks A to E, A and B being those that are seen then; bound 2
-    is after, with reports of C, D and E. Features are the task, `task_1` to `task_12`, the outcome,
-    and it again for tasks of the category of the seen ones (1 to 6, 7 to 12).
+    Bound 1 contains the reports on tasks A to E before watching, and bound 2 the reports on C, D
+    and E after watching A and B. The features are the task (`task_1` to `task_12`), the outcome,
+    and the outcome again for tasks in the category (1 to 6 or 7 to 12) of the watched tasks.
     """
     table = pd.read_csv(file)
     features = [f"task_{n}" for n in range(1, 13)]
@@ -135,11 +135,12 @@ def read_soh(file):
 
 
 def read_azevedo_sa(file):
-    """Missions of Azevedo-Sa et al. (2021): trust in a driving task after three others.
+    """Read missions of Azevedo-Sa et al. (2021): trust in a driving task after watching others.
 
-    A seen task's demand is the share of its needs, sensing and processing, that are no less than
-    those of the asked task; the mean need of the asked task is the input `need`. The column trust
-    is the logistic function of the rating, 1 to 7, less 4.
+    Each task needs a level of sensing and of processing. The demand of a watched task is the
+    fraction of these needs that are at least as large as in the task asked about. The input `need`
+    is the mean need of the task asked about. The column `trust` is expit(rating - 4), with ratings
+    from 1 to 7.
     """
     table = pd.read_csv(file)
     table["report"] = np.clip(np.round(logit(table["trust"].clip(0.01, 0.99)) + 4.0), 1, 7)
@@ -153,13 +154,13 @@ def read_azevedo_sa(file):
 
 
 def median_of(probability, values):
-    """Median of levels with these values."""
+    """Return the median of a distribution over levels with these values."""
     at = (np.cumsum(probability, axis=-1) < 0.5).sum(-1)
     return values[np.minimum(at, len(values) - 1)]
 
 
 def without_last(mission):
-    """Mission whose last report is not known."""
+    """Return a copy of a mission whose last report is missing."""
     y = mission.contact_rate.copy()
     y[-1] = np.nan
     return tb.Mission.from_arrays(

@@ -1,11 +1,12 @@
-"""Speed of planning beside networkx, scipy and version 0.3.
+"""Speed of planning, compared with networkx and scipy.
 
-Run: python benchmarks/planning.py [--quick]
+    python benchmarks/planning.py [--quick]
 
-Processor milliseconds, medians of 5 (of networkx, one run on fewer draws, scaled). The reference on
-networkx and the compiled searches find the same values (checked to 1e-9). scipy and networkx find
-shortest paths of costs without a history, `planner.graph`, which is an easier problem. For 0.3, run
-`tests/benchmarks/planning.py` of its commit on the same machine.
+The table contains CPU times in milliseconds, as medians of 5 runs. The reference planner on
+networkx runs once with fewer draws, and its time is scaled. Both planners must find the same values
+(tolerance 1e-9). Dijkstra's algorithm in scipy and networkx solves an easier problem: the costs in
+`planner.graph` do not depend on earlier bounds. To compare with version 0.3, run
+`tests/benchmarks/planning.py` of that version on the same machine.
 """
 
 import time
@@ -26,7 +27,7 @@ PARAMS = TrustParams(0.6, np.array([0.8, 0.6]), -0.2, 0.1, 0.1)
 
 
 def workspace_of(n, seed=0):
-    """One robot on n x n cells, with smooth features where there are many."""
+    """Make a workspace of one robot on n x n cells, with smooth features if n > 10."""
     rng = np.random.default_rng(seed)
     z = rng.uniform(size=(n, n, 2))
     if n > 10:
@@ -36,7 +37,7 @@ def workspace_of(n, seed=0):
 
 
 def milliseconds(run, n=5):
-    """Median processor time of a call that has run before."""
+    """Return the median CPU time of a call, in milliseconds, after one call to warm up."""
     run()
     took = []
     for _ in range(n):
@@ -47,7 +48,7 @@ def milliseconds(run, n=5):
 
 
 def many_draws(table, n, few):
-    """1000 draws of the posterior on n x n cells, from corner to corner."""
+    """Time the plans of 1000 prior draws on n x n cells, from corner to corner."""
     workspace, ends = workspace_of(n), ((n - 1, 0), (0, n - 1))
     for objective in ("terminal", "lost_contact"):
         planner = Planner(workspace, *ends, objective)
@@ -64,14 +65,14 @@ def many_draws(table, n, few):
 
 
 def strata_of(n):
-    """Chances to fail of n x n cells, in five strata from mild to severe."""
+    """Make failure probabilities of n x n cells, in five strata from mild to severe."""
     base = np.random.default_rng(1).uniform(0.0, 0.2 / n, (8, n, n))
     severity = np.array([0.1, 0.4, 1.0, 3.0, 8.0])[:, None, None, None]
     return Strata(np.minimum(base * severity, 1.0), np.array([0.4, 0.3, 0.15, 0.1, 0.05]))
 
 
 def one_plan(table, n):
-    """A plan with and without a price of failures, and within a limit."""
+    """Time a plan without a failure cost, with a failure cost, and with `max_failure`."""
     workspace, strata = workspace_of(n), strata_of(n)
     mean = np.tensordot(strata.shares, strata.p_fail, 1)
     for family in ("gaussian", "censored"):
@@ -89,7 +90,7 @@ def one_plan(table, n):
 
 
 def large(table, n, peers):
-    """One plan on n x n cells, from the workspace to the path; and costs without a history."""
+    """Time one plan on n x n cells, including `Planner`; also Dijkstra in scipy and networkx."""
     workspace = workspace_of(n)
     for label, ends in (
         ("corners", ((0, 0), (n - 1, n - 1))),

@@ -2,11 +2,11 @@
 
     python benchmarks/sbc.py [row ...] --sets 200 --jobs 16 --csv FILE
 
-Each true parameter is ranked among posterior draws, over data sets simulated from the prior (Talts
-et al. 2018). If prior, likelihood and sampler are consistent, ranks are uniform. A row is a model;
-its missions are random walks over a small grid, with gaps. Each parameter's ranks are tested for
-uniformity; a row counts those that are rejected at 1 % after Holm's correction for all tests of the
-run. To check a model of your own, add a row.
+Data sets are simulated from the prior, and each true parameter is ranked among posterior draws
+(Talts et al. 2018). If prior, likelihood and sampler are consistent, the ranks are uniform. Each
+row of the table is a model. Its missions are random walks on a small grid, with missing rates. The
+ranks of each parameter are tested for uniformity. A row counts the parameters that are rejected at
+1 % after Holm's correction for all tests. To check your own model, add a row to `ROWS`.
 """
 
 import argparse
@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 from common import Table
+from groups import holm
 from joblib import Parallel, delayed
 from scipy import stats
 from tqdm import tqdm
@@ -32,9 +33,9 @@ from trustbo.models import (
     RobotEffect,
 )
 
-LEVEL = 0.01  # of a test over all rows
-N_RANKED = 399  # draws that each truth is ranked among
-PART = 10  # data sets of a process at a time
+LEVEL = 0.01  # significance level, for all tests together
+N_RANKED = 399  # number of draws among which a true parameter is ranked
+PART = 10  # number of data sets per task of a process
 EFFECTS = (PlaceEffect(), RobotEffect())
 ROWS = {
     "pooled": PooledTrust(),
@@ -53,7 +54,7 @@ ROWS = {
 
 
 def walks(n_missions=4, n_bounds=6, n_robots=2, size=4):
-    """Missions over random walks, whose rates are replaced."""
+    """Make missions on random walks; `rank` replaces their rates."""
     rng, missions = np.random.default_rng(0), []
     for _ in range(n_missions):
         path = [tuple(rng.integers(size, size=2).tolist())]
@@ -69,7 +70,7 @@ def walks(n_missions=4, n_bounds=6, n_robots=2, size=4):
 
 
 def people(n_persons=10, n_steps=5):
-    """Persons who meet successes and failures."""
+    """Make reports of persons who see successes and failures; `rank` replaces the reports."""
     rng, persons = np.random.default_rng(0), []
     for _ in range(n_persons):
         z = rng.uniform(size=(n_steps, 1, 2))
@@ -80,9 +81,9 @@ def people(n_persons=10, n_steps=5):
 
 
 def rank(model, missions, n, seed, n_ranked=N_RANKED):
-    """Ranks (data set, parameter) of n data sets, and the number that the sampler refused.
+    """Compute the ranks (data set, parameter) of n data sets, and the number of rejected fits.
 
-    Measured rates are replaced by simulated ones; Gaussian rates are not clipped to [0, 1].
+    Measured rates are replaced by simulated rates; Gaussian rates are not clipped to [0, 1].
     """
     model = model.for_features(missions[0].features)
     slots = model.slots(missions)
@@ -100,7 +101,7 @@ def rank(model, missions, n, seed, n_ranked=N_RANKED):
 
 
 def numbers(groups):
-    """Draws of every parameter, and of the first and last element of each effect."""
+    """Return the draws of all parameters, and of the first and last element of each effect."""
     found = {}
     for group, variables in groups.items():
         for name, values in variables.items():
@@ -113,15 +114,15 @@ def numbers(groups):
 
 
 def label(name, values, i):
-    """Name of element i of a variable."""
+    """Return the name of element i of a variable."""
     if values.ndim == 1:
         return name
     return f"{name}[{','.join(map(str, np.unravel_index(i, values.shape[1:])))}]"
 
 
 def uniformity(ranks, n_ranked):
-    """P-value of a chi-squared test; bins are as equal as n_ranked + 1 ranks allow."""
-    n_bins = min(20, max(2, len(ranks) // 5))  # five ranks to a bin, for the test to hold
+    """Compute the p-value of a chi-squared test of uniformity, with nearly equal bins."""
+    n_bins = min(20, max(2, len(ranks) // 5))  # the test needs five ranks per bin
     edges = np.linspace(0, n_ranked + 1, n_bins + 1).astype(int)
     counts, _ = np.histogram(ranks, edges - 0.5)
     expected = len(ranks) * np.diff(edges) / (n_ranked + 1)
@@ -129,25 +130,18 @@ def uniformity(ranks, n_ranked):
 
 
 def part_of(name, n, seed):
-    """Ranks of some data sets of a row, in a process of their own."""
+    """Compute the ranks of some data sets of a row; runs in a worker process."""
     model = ROWS[name]
     return rank(model, people() if isinstance(model, HumanTrust) else walks(), n, seed)
 
 
-def holm(p):
-    """P-values adjusted for the number of tests (Holm 1979)."""
-    order = np.argsort(p)
-    adjusted = np.maximum.accumulate(np.asarray(p)[order] * np.arange(len(p), 0, -1))
-    return np.minimum(adjusted, 1.0)[np.argsort(order)]
-
-
 def main():
-    """Rank in processes, and print one row for each model."""
+    """Compute the ranks in parallel, and print one row for each model."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("rows", nargs="*", choices=[*ROWS, []])
-    parser.add_argument("--sets", type=int, default=200, help="data sets of a row")
-    parser.add_argument("--jobs", type=int, default=1, help="processes")
-    parser.add_argument("--csv", type=Path, help="file of the table")
+    parser.add_argument("--sets", type=int, default=200, help="data sets per row (default 200)")
+    parser.add_argument("--jobs", type=int, default=1, help="number of processes (default 1)")
+    parser.add_argument("--csv", type=Path, help="CSV file to write the table to")
     given = parser.parse_args()
     names = given.rows or list(ROWS)
 

@@ -1,15 +1,15 @@
-"""The open benchmark: the tables of docs/worlds.md, in Markdown.
+"""Benchmark of methods on simulated worlds; prints the tables of docs/worlds.md in Markdown.
 
     python benchmarks/worlds.py --data DIR --out out/worlds
     python benchmarks/worlds.py --kind aged --kind wall --method trustbo --method "running mean"
 
-The 17 worlds x 2 courses that changes of the default are judged by:
+The following smaller set of 17 worlds and 2 courses is used to evaluate changes of the defaults:
 
     python benchmarks/worlds.py --set --out out/set --csv set.csv
 
-All worlds x 4 courses x methods, 15 missions each; called again, it goes on where it stopped, with
-other parts too: the tables are those of the chosen parts. `--csv` writes a row for each world,
-course and method.
+By default, the benchmark runs all worlds, 4 courses and all methods, with 15 missions each. If you
+call it again, also with other options, existing results in --out are reused. The tables contain the
+selected results. `--csv` writes a row for each world, course and method.
 """
 
 from dataclasses import replace
@@ -38,7 +38,7 @@ SET_COURSES = ("sw-ne", "nw-se")
 
 
 def beside_pooled(make: Any, scene: tb.study.Scene) -> dict[str, Any]:
-    """Options of a method whose campaign fits the pooled model, which it does not use."""
+    """Add the fast pooled model to the options of a method that does not use a posterior."""
     return {"model": tb.models.PooledTrust(), **make(scene)}
 
 
@@ -56,12 +56,12 @@ METHODS: dict[str, Any] = {
     "shortest path": lambda scene: {"policy": unlearned.shortest()},
     "paper": {**tb.paper.CAMPAIGN, "sampler": "importance"},
 }
-"""Methods by the names of their rows; that of the paper has awareness of cells."""
+"""Options of each method, keyed by its name; "paper" uses the awareness of cells."""
 for _name, _make in METHODS.items():
     if callable(_make):
         METHODS[_name] = partial(beside_pooled, _make)
 CASES = ("canopy", "robots", "days", "change", "jammer", "limit")
-"""Kinds of which each case has a table."""
+"""Kinds of worlds for which each case has its own table."""
 COLUMNS = ["regret after 0", "regret after 3", "regret after 8", "regret after 15", "regret now",
            "lost while learning", "lost with failures", "missions to 1 %", "arrive",
            "seconds"]  # fmt: skip
@@ -75,15 +75,15 @@ def main():
     parser = arguments(
         __doc__, data=True, seeds=1, out="out/worlds", quick="three small worlds, 3 missions"
     )
-    parser.add_argument("--kind", action="append", help="a kind of worlds; by default all")
-    parser.add_argument("--world", action="append", help="a world; by default all of the kinds")
-    parser.add_argument("--course", action="append", help="a course; by default all")
-    parser.add_argument("--set", action="store_true", help="17 worlds x 2 courses")
-    parser.add_argument("--method", action="append", choices=METHODS, help="by default all")
-    parser.add_argument("--missions", type=int, default=15, help="of a campaign; default 15")
+    parser.add_argument("--kind", action="append", help="kind of worlds (default all)")
+    parser.add_argument("--world", action="append", help="world (default all)")
+    parser.add_argument("--course", action="append", help="course (default all)")
+    parser.add_argument("--set", action="store_true", help="smaller set: 17 worlds x 2 courses")
+    parser.add_argument("--method", action="append", choices=METHODS, help="default all")
+    parser.add_argument("--missions", type=int, default=15, help="per campaign (default 15)")
     parser.add_argument("--max-bounds", default="shortest+4")
-    parser.add_argument("--jobs", type=int, default=-1, help="processes; default one a core")
-    parser.add_argument("--csv", type=Path, help="file of the rows of all campaigns")
+    parser.add_argument("--jobs", type=int, default=-1, help="processes (default one per core)")
+    parser.add_argument("--csv", type=Path, help="CSV file for the rows")
     given = parsed(parser)
     names = SET if given.set else given.world
     courses = given.course or (SET_COURSES if given.set else COURSES)
@@ -116,7 +116,7 @@ def main():
 
 
 def small(chosen: list[World]) -> list[World]:
-    """A small synthetic world of each of three kinds."""
+    """Make a small synthetic world of each of three kinds."""
     made = {world.kind: world for world in reversed(chosen) if world.is_made}
     return [
         replace(made[kind], name=f"{made[kind].name}-small", shape=(5, 5), cell=40.0)
@@ -126,14 +126,14 @@ def small(chosen: list[World]) -> list[World]:
 
 
 def find_truths(world: World, folder: Path, n_missions: int) -> None:
-    """Find the truths of all missions, each world once, before campaigns need them."""
+    """Compute the truths of all missions of a world, which campaigns then read from `folder`."""
     truth = world.truth(folder)
     for mission in range(n_missions + 1):
         truth.at(mission)
 
 
 def report(numbers: pd.DataFrame, csv: Path | None = None):
-    """Print tables of all worlds, kinds and cases, of the differences, and of the groups."""
+    """Print tables of all worlds, kinds and cases, of differences, and of groups."""
     order = [name for name in METHODS if name in set(numbers["case"])]
     rank = numbers["case"].map(order.index)
     numbers = numbers.iloc[np.argsort(rank, kind="stable")]
@@ -152,15 +152,15 @@ def report(numbers: pd.DataFrame, csv: Path | None = None):
         return
     for by in ((), ("kind",)):
         table = differences(numbers, OURS, by)
-        print(f"\n{OURS} less each other method, same world, course and seed\n")
+        print(f"\n{OURS} minus each other method, same world, course and seed\n")
         print(f"{as_text(table, OF_DIFFERENCES)}\n\n" + "\n".join(worse_than(table)))
     report_groups(rows_of(numbers))
 
 
 def worse_than(table: pd.DataFrame) -> list[str]:
-    """Rows and quantities of `differences` in which ours is significantly worse, as text.
+    """List the quantities and methods of `differences` for which ours is significantly worse.
 
-    Those whose interval is above 0, or below it for `arrive`.
+    The 95 % interval of the difference is then above 0 or, for `arrive`, below 0.
     """
     lines = []
     for name in dict.fromkeys(str(name) for name, _ in table.columns):
@@ -175,7 +175,7 @@ def worse_than(table: pd.DataFrame) -> list[str]:
 
 
 def as_text(table: pd.DataFrame, columns: list[str]) -> str:
-    """Some columns of `summary` or `differences` in Markdown, each value with its interval."""
+    """Format columns of `summary` or `differences` in Markdown, each value with its interval."""
     names = [name for name in columns if name in table.columns.levels[0]]
     head = [" and ".join(table.index.names)]
     head += [f"{name} (%)" if "regret" in name else name for name in names]
