@@ -34,7 +34,7 @@ def smaller(png: str) -> str:
 
 
 def is_progress(output: dict) -> bool:
-    """Return whether an output contains only progress bars, or a message on them or compilation."""
+    """Return whether an output is a progress bar or a message about bars or compilation."""
     text = "".join(output.get("text", []))
     about = text.startswith("compiling kernels") or "TqdmWarning" in text
     return about or bool(re.fullmatch(r"(\r[^\n]*)+", text))

@@ -205,7 +205,7 @@ def wheel_speeds(speed: np.ndarray, yaw_rate: np.ndarray) -> np.ndarray:
 
 
 def _spread(xy: np.ndarray) -> np.ndarray:
-    """Push positions (robot, 2) apart that are too close to each other."""
+    """Return positions (robot, 2), moved apart where robots are too close to each other."""
     xy, turn = xy.copy(), 2.0 * np.pi * np.arange(len(xy)) / len(xy)
     for _ in range(100):
         gap = xy[:, None] - xy
