@@ -205,6 +205,15 @@ def test_folder_is_locked_for_one_campaign_at_a_time(workspace, tmp_path):
         tb.Campaign(workspace, *ENDS, directory=tmp_path / "file" / "deep")
 
 
+def test_closed_campaign_records_nothing_more(workspace, tmp_path):
+    with tb.Campaign(workspace, *ENDS, directory=tmp_path) as campaign:
+        mission = ModelSimulator(workspace).run(campaign.ask().path, seed=0)
+    for change in (lambda: campaign.tell(mission), lambda: campaign.fail("rain")):
+        with pytest.raises(tb.TrustboError, match="closed"):
+            change()
+    assert tb.Campaign.load(tmp_path).missions == []
+
+
 def test_custom_objects_are_required_again(workspace, tmp_path):
     def straight(rng, draws, planner):
         return planner.evaluate([(2, 0), (1, 1), (0, 2)], draws.mean())

@@ -452,7 +452,6 @@ class Campaign(Result):
     def __exit__(self, *error: object) -> None:
         if self.storage is not None:
             self.storage.release()
-            self.storage = None
 
 
 def _name_of(function: object) -> str:

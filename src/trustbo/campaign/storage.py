@@ -99,6 +99,7 @@ class Storage:
         """Write the measurements, plan and table row of mission n, counted from 1."""
         planned = xr.Dataset({"trust_map": entry.trust_map})
         planned.attrs = {"plan": to_json(plan_to_record(entry.plan)), "row": to_json(entry.row)}
+        self._require_lock()
         tree = missions_to_tree([entry.measured])
         tree["planned"] = xr.DataTree(planned)
         write_tree(self.path / MISSIONS / f"{n:04d}.nc", tree)
@@ -111,6 +112,7 @@ class Storage:
 
     def write_record(self, state: State) -> None:
         """Write campaign.json; called last because it lists the completed missions."""
+        self._require_lock()
         record = {
             "settings": state.settings,
             "simulation": state.simulation,
@@ -122,6 +124,14 @@ class Storage:
             "versions": VERSIONS | {"numpy": np.__version__},
         }
         write_text(self.path / RECORD, to_json(record))
+
+    def _require_lock(self) -> None:
+        """Raise TrustboError after `release`, because another process may then use the folder."""
+        if not self._lock.is_locked:
+            raise TrustboError(
+                f"the campaign in {str(self.path)!r} was closed at the end of its `with` block; "
+                "continue it with Campaign.load."
+            )
 
 
 def read_campaign(directory: FilePath) -> tuple[State, Workspace, list[Entry]]:
