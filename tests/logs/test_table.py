@@ -56,28 +56,16 @@ def test_rows_may_come_in_any_order_and_columns_in_any_case():
     np.testing.assert_array_equal(one.awareness[..., 0], [[0.2], [0.3]])
 
 
-def test_robots_and_features_of_a_workspace_come_in_its_order():
+def test_robots_and_features_come_in_the_order_of_a_workspace():
     z = np.full((2, 3, 3, 3), 0.5)
     team = tb.Team(2, names=("a", "b"))
     workspace = tb.Workspace.from_awareness(z, team=team, features=("slope", "visibility", "z3"))
-    table = rows(robot=["b", "b", "a"], bound=[0, 1, 1], col=[0, 1, 1], battery=["87 %"] * 3)
-    (one,) = read_table(table, workspace)
+    table = rows(robot=["b", "b", "a"], bound=[0, 1, 1], col=[0, 1, 1], z3=None, slope=[""] * 3)
+    (one,) = map(workspace.in_order, read_table(table.assign(z3="")))
     assert (one.robots, one.features) == (("a", "b"), workspace.features)
     np.testing.assert_array_equal(one.contact_rate, [[0.75, 0.5]])
     np.testing.assert_array_equal(one.awareness[0, :, 1], [0.3, 0.2])
     assert np.isnan(one.awareness[..., [0, 2]]).all()
-
-
-def test_positions_become_cells():
-    terrain = tb.terrain.synthetic_terrain((90.0, 90.0), seed=5)
-    workspace = tb.Workspace.from_terrain(terrain, (3, 3), tb.Team(1))
-    x, y = np.transpose([workspace.grid.center(cell) for cell in PATH])
-    assert read_table(rows(row=None, col=None, x=x, y=y), workspace)[0].path == tuple(PATH)
-    for far in (0.0, 1e9, None):
-        with pytest.raises(TrustboError):
-            read_table(rows(row=None, col=None, x=[far] * 3, y=y), workspace)
-    with pytest.raises(TrustboError, match="workspace"):
-        read_table(rows(row=None, col=None, x=x, y=y))
 
 
 def test_bounds_that_were_planned_and_not_run_are_part_of_the_path():

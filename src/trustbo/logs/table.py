@@ -10,7 +10,6 @@ from trustbo.data import FEATURES, Mission
 from trustbo.errors import TrustboError
 from trustbo.logs.columns import Columns, require_one_spelling
 from trustbo.stacking import require_same_team
-from trustbo.workspace import Workspace
 
 KEYS = ("mission", "bound", "robot")
 RATES = ("contact_rate", "duration", "n_ticks")
@@ -30,7 +29,7 @@ def to_frame(missions: Sequence[Mission]) -> pd.DataFrame:
             or a feature has the name of another column.
     """
     require_same_team(missions)
-    if taken := {*missions[0].features} & {*COLUMNS, "x", "y"}:
+    if taken := {*missions[0].features} & {*COLUMNS}:
         raise TrustboError(f"features {sorted(taken)} are names of other columns; rename them.")
     if len({bool(mission.path) for mission in missions}) > 1:
         raise TrustboError("some missions have a path and some do not; write them to two tables.")
@@ -52,21 +51,18 @@ def to_frame(missions: Sequence[Mission]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=[*names, *missions[0].features])
 
 
-def read_table(table: Any, workspace: Workspace | None = None) -> list[Mission]:
+def read_table(table: Any) -> list[Mission]:
     """Read missions from a table with one row per mission, bound and robot.
 
     The columns are `mission`; `bound` (0 for the start cell, which has no measurements); `robot`;
-    the cell (`row`, `col`), or a position (`x`, `y` in metres of the workspace's CRS); and
-    `contact_rate`. Optional columns are `duration` (s), `n_ticks`, `status`, and one per feature.
-    The status of the last bound is that of the mission. A blank means "not measured"; a blank
-    status means "ok". Bounds after the last one with a measurement were planned but not run. A
-    table without cells is a log without a map.
+    the cell (`row`, `col`); and `contact_rate`. Optional columns are `duration` (s), `n_ticks` and
+    `status`. Other columns are features, by default `traversability` and `visibility` without any
+    value. The status of the last bound is that of the mission. A blank means "not measured", and a
+    blank status "ok". Bounds after the last one with a measurement were planned but not run. A
+    table without `row` and `col` is a log without a map.
 
     Args:
-        table: Path of a CSV file with a header, separated by commas, semicolons or tabs; or a
-            DataFrame, or a mapping of columns.
-        workspace: Workspace whose robots and features are read, in its order; a feature without a
-            column is NaN. Without a workspace, all remaining columns are features.
+        table: Path of a CSV file (commas, semicolons or tabs), a DataFrame, or a mapping of lists.
 
     Returns:
         Missions in the order of the table, without ticks.
@@ -76,28 +72,13 @@ def read_table(table: Any, workspace: Workspace | None = None) -> list[Mission]:
             type, rows of one bound disagree on its cell, or `Mission` rejects the data.
     """
     columns = Columns(table)
-    at_metres = columns.find("row") is None and columns.find("x") is not None
-    if workspace is None and at_metres:
-        raise TrustboError("positions x and y need the grid of a workspace; give workspace=.")
-    places = ("x", "y") if at_metres else ("row", "col")
-    if workspace is None and not any(columns.find(name) for name in places):
-        places = ()
-    known = {columns.find(name) for name in (*COLUMNS, "x", "y")}
+    known = [columns.find(name) for name in COLUMNS]
     features = [name for name in columns.frame if name not in known] or list(FEATURES)
-    if workspace is not None:
-        features = list(workspace.features)
-    frame = _parsed(columns, features, places)
-    if at_metres and workspace is not None:
-        pairs = frame[["x", "y"]].to_numpy()
-        cells = [workspace.grid.locate({"x": x, "y": y}, "position") for x, y in pairs]
-        frame["row"], frame["col"] = np.transpose(cells)
-    named = [name for name in frame["robot"] if name]
-    robots = tuple(dict.fromkeys(named) if workspace is None else workspace.team.names)
+    frame = _parsed(columns, features)
+    robots = tuple(name for name in frame["robot"].unique() if name)
     if not robots:
         raise TrustboError("no row names a robot.")
-    require_one_spelling("the robots of the table and the workspace", (*robots, *named))
-    unknown = ~frame["robot"].isin(["", *robots]).to_numpy()
-    columns.refuse("robot", unknown, f"is not one of {robots}")
+    require_one_spelling("column robot", robots)
     columns.refuse("bound", frame.duplicated([*KEYS]).to_numpy(), "is repeated for its robot")
     missions = []
     for label, rows in frame.groupby("mission", sort=False):
@@ -108,14 +89,15 @@ def read_table(table: Any, workspace: Workspace | None = None) -> list[Mission]:
     return missions
 
 
-def _parsed(columns: Columns, features: Sequence[str], places: Sequence[str]) -> pd.DataFrame:
+def _parsed(columns: Columns, features: Sequence[str]) -> pd.DataFrame:
     """Return the columns with the names and types of this module; NaN or "" where blank."""
     values: dict[str, Any] = {"mission": columns.texts("mission", blank=False)}
     require_one_spelling("column mission", values["mission"])
     for name in ("robot", "status"):
         values[name] = columns.texts(name, required=name == "robot")
-    for name in ("bound", *places):
-        values[name] = columns.numbers(name, blank=False, whole=name not in ("x", "y"))
+    is_mapped = any(columns.find(name) for name in ("row", "col"))
+    for name in ("bound", "row", "col") if is_mapped else ("bound",):
+        values[name] = columns.numbers(name, blank=False, whole=True).astype(int)
     for name in (*RATES, *features):
         values[name] = columns.numbers(name, required=name == "contact_rate")
     return pd.DataFrame(values, index=columns.frame.index)
@@ -123,7 +105,7 @@ def _parsed(columns: Columns, features: Sequence[str], places: Sequence[str]) ->
 
 def _mission(rows: pd.DataFrame, features: Sequence[str], robots: tuple[str, ...]) -> Mission:
     """Make a mission from its rows."""
-    cells = rows.filter(["bound", "row", "col"]).astype(int).drop_duplicates().sort_values("bound")
+    cells = rows.filter(["bound", "row", "col"]).drop_duplicates().sort_values("bound")
     is_mapped, numbers = "row" in cells, cells["bound"].tolist()
     first = 0 if is_mapped else 1
     if numbers != [*range(first, first + len(numbers))]:
@@ -131,23 +113,20 @@ def _mission(rows: pd.DataFrame, features: Sequence[str], robots: tuple[str, ...
             f"bounds must be numbered {first}, {first + 1}, ... (0 is the start cell) and have "
             f"one cell (row, col) each; got {numbers}."
         )
-    values, status = rows[[*RATES, *features]], rows["status"].to_numpy(str)
-    bound = rows["bound"].to_numpy(int)
-    measured = bound[values.notna().to_numpy().any(axis=1) | (status != "")]
-    if not len(measured) or measured.min() < 1:
+    values, status = rows.set_index([*KEYS[1:]])[[*RATES, *features]], rows["status"]
+    measured = rows.loc[values.notna().to_numpy().any(axis=1) | (status != ""), "bound"]
+    if measured.empty or measured.min() < 1:
         raise TrustboError("bounds with a measurement must be numbered from 1; got none or 0.")
-    n_run, ended = int(measured.max()), ~np.isin(status, ["", "ok"])
-    reasons = [*dict.fromkeys(status[ended].tolist())] or ["ok"]
-    if len(reasons) > 1 or (bound[ended] < n_run).any():
+    n_run, ended = int(measured.max()), rows.loc[~status.isin(["", "ok"])]
+    if ended["status"].nunique() > 1 or (ended["bound"] < n_run).any():
         raise TrustboError("only the last bound that was run may have a status other than ok.")
     expected = pd.MultiIndex.from_product([range(1, n_run + 1), robots])
-    of_robot = values.set_index([rows["bound"].astype(int), rows["robot"]])
-    for k, robot in expected.difference(of_robot.index):
+    for k, robot in expected.difference(values.index):
         raise TrustboError(f"bound {k} has no row for {robot}.")
-    arrays = of_robot.loc[expected].to_numpy(float).reshape(n_run, len(robots), -1)
+    arrays = values.loc[expected].to_numpy(float).reshape(n_run, len(robots), -1)
     rate, duration, n_ticks = np.moveaxis(arrays[..., : len(RATES)], -1, 0)
     return Mission.from_arrays(
         cells[["row", "col"]].to_numpy().tolist() if is_mapped else None,
-        arrays[..., len(RATES) :], rate, duration, reasons[0], n_ticks=n_ticks,
+        arrays[..., len(RATES) :], rate, duration, [*ended["status"], "ok"][0], n_ticks=n_ticks,
         features=features, robots=robots,
     )  # fmt: skip
