@@ -23,7 +23,8 @@ def workspace():
 def driven(workspace):
     simulator = tb.simulation.KinematicSimulator(workspace)
     first = simulator.run([(2, 0), (1, 1), (0, 2)], seed=0)
-    return [first, replace(first, bounds=first.bounds[:1], status="aborted")]
+    bound = replace(first.bounds[0], status="aborted")
+    return [first, replace(first, bounds=(bound,), status="aborted")]
 
 
 @pytest.mark.parametrize("kind", ["log.bag", "sqlite3", "mcap"])
