@@ -22,6 +22,7 @@ def assert_expected(columns):
         "\ufeffwho;t\r\n7;0,5\r\n8;#N/A\r\n",
         '"sep=;"\nwho;t;;\n7;0,5;;\n8;;;\n;;;\n',
         "who\tt\n7.0\t0,5\n8.0\t\n",
+        "who;t\n7;5,0e-1\n8;\n",
         ",Who, T \n0,7,.5\n1,8,nan\n",
         'who,t\n"a person","s"\n"{""ImportId"":1}","{""ImportId"":2}"\n7,5e-1\n8,\n',
     ],
@@ -65,9 +66,8 @@ def test_files_that_are_no_table_are_refused(content, tmp_path):
     (tmp_path / "bad.csv").write_bytes(content)
     with pytest.raises(TrustboError):
         Columns(tmp_path / "bad.csv")
-    for table in (tmp_path / "none.csv", 5, {"a": [1], "b": [1, 2]}):
-        with pytest.raises(TrustboError):
-            Columns(table)
+    with pytest.raises(TrustboError):
+        Columns(tmp_path / "none.csv")
 
 
 @pytest.mark.parametrize("names", [["a", "A"], ["1", "01"], ["r 1", "r_1"]])
@@ -78,21 +78,6 @@ def test_one_name_in_two_spellings_is_refused(names):
 
 def of(*times):
     return Columns({"t": list(times)}, "the table")
-
-
-def test_numbers_and_dates_of_any_zone_are_seconds_of_one_clock():
-    zone = pd.Timestamp("2026-11-24T12:00:00+02:00")
-    utc = "2026-11-24T10:00:00Z", "2026-11-24T10:00:03+00"
-    for first, second in (
-        (of(0.0, 3.0), of(0.0, 1.5)),
-        (of(*utc), Columns({"t": pd.Series([zone, zone + pd.Timedelta("1.5s")])})),
-        (of(*utc), of("2026-11-24 12:00:00+0200", "2026-11-24T13:00:01.5+03:00")),
-    ):
-        a, b = seconds_of(first, second)
-        np.testing.assert_allclose(a, [0.0, 3.0])
-        np.testing.assert_allclose(b, [0.0, 1.5])
-    naive = of("2026-11-24 10:00", "2026-11-24 10:01")
-    np.testing.assert_allclose(seconds_of(naive, naive)[1], [0.0, 60.0])
 
 
 @pytest.mark.parametrize(

@@ -16,29 +16,28 @@ SEEN = {"t": [0.5, 0.7, 6.2], "watcher": [*"aab"], "seen": [*"bba"]}
 
 def features_of(poses, watcher, lead):
     """Features near and ahead of one robot at each tick, (feature, tick)."""
-    (one,) = read_tracks(poses, SEEN, lead=lead, window=1.0, max_gap=10.0)
+    (one,) = read_tracks(poses, SEEN, lead=lead, window=1.0)
     return one.awareness[:, one.robots.index(watcher)].T
 
 
 @pytest.mark.filterwarnings("ignore:no detection names c")
 def test_geometry_is_that_of_the_plane():
-    poses = {"t": [0.0, 10.0] * 3, "robot": [*"aabbcc"], "x": [0, 0, 4, 4, 2, 2],
-             "y": [0, 0, 0, 0, -2, 8], "heading": [0, 0, 0, 0, 0, 1.0]}  # fmt: skip
+    poses = {"t": [0.0, 5.0, 10.0] * 3, "robot": [*"aaabbbccc"], "x": [0] * 3 + [4] * 3 + [2] * 3,
+             "y": [0] * 6 + [-2, 3, 8], "heading": [0.0] * 6 + [0, 0.5, 1.0]}  # fmt: skip
     near, ahead = features_of(poses, "a", "b")
     np.testing.assert_array_equal(ahead, features_of(poses, "b", "a")[1] == 0.0)  # b faces east
     away = np.hypot(2.0, np.arange(10) - 1.5)  # of a and of b from c
     usual = np.median([*away, *away, *[4.0] * 10])
     np.testing.assert_allclose(near, usual / (usual + 4.0))
     np.testing.assert_allclose(features_of(poses, "a", "c")[0], usual / (usual + away))
-    (one,) = read_tracks(poses, SEEN, lead="b", window=1.0, max_gap=10.0)
+    (one,) = read_tracks(poses, SEEN, lead="b", window=1.0)
     np.testing.assert_array_equal(one.contact_rate[:, 0], [1.0] + [0.0] * 9)
 
 
 def test_robot_without_detections_is_warned_of():
     with pytest.warns(UserWarning, match="no detection names b"):
-        read_tracks(POSES | {"robot": [*"aabbcc"], "t": [0.0, 8.0] * 3},
-                    SEEN | {"watcher": [*"aac"], "seen": [*"cca"]},
-                    window=4.0, max_gap=9.0)  # fmt: skip
+        read_tracks(POSES | {"robot": [*"aabbcc"], "t": [0.0, 4.0] * 3},
+                    SEEN | {"watcher": [*"aac"], "seen": [*"cca"]}, window=4.0)  # fmt: skip
 
 
 def test_windows_are_bounds_and_rates_are_shares_of_their_ticks():
@@ -65,6 +64,8 @@ def test_crossings_of_the_lead_are_bounds_of_a_map():
     assert (one.robots, one.features) == (("b",), workspace.features)
     np.testing.assert_array_equal(one.contact_rate[:, 0], [0.0, 0.0, 0.5])
     assert np.isnan(one.awareness).all()
+    (out,) = read_tracks(poses | {"x": [0.0, 4.0, 12.0] * 2}, SEEN, workspace, lead="a")
+    assert out.path == one.path  # and not the cell that is off the grid
     with pytest.raises(TrustboError, match="r1"):
         read_tracks(poses, SEEN, tb.Workspace.from_awareness(z), lead="a")
 
@@ -120,5 +121,5 @@ def test_cells_whose_corner_is_cut_are_no_bounds_of_a_planned_path():
 )
 def test_tables_in_other_units_or_names_are_refused_in_one_line(poses, seen):
     with pytest.raises(TrustboError) as caught:
-        read_tracks(pd.DataFrame(POSES | poses), SEEN | seen)
+        read_tracks(pd.DataFrame(POSES | poses), SEEN | seen, window=4.0)
     assert "\n" not in str(caught.value)

@@ -3,7 +3,6 @@
 import csv
 import io
 import re
-import warnings
 from collections.abc import Iterable
 from os import PathLike
 from typing import Any
@@ -14,15 +13,10 @@ import pandas as pd
 from trustbo.errors import TrustboError, one_line
 from trustbo.files import FilePath, read_file
 
-_SEPARATORS = ",;\t"
 _BLANK = ("", "na", "n/a", "#n/a", "#na", "nan", "nat", "none", "null", "<na>")
 """Markers of missing values, in lower case, as written by R, Excel, pandas and SQL."""
 _WHOLE = re.compile(r"^(-?\d+)\.0+$")
-_DECIMAL_COMMA = re.compile(r"^\s*([+-]?\d*),(\d+)\s*$")
-_ZONE = r":.*(?:Z|[+-]\d\d(?::?\d\d)?)$"
-"""End of a date with a time zone."""
-_LONGEST = 7 * 86_400.0
-"""Longest log, s: a longer span indicates another unit or an outlier."""
+_DECIMAL_COMMA = re.compile(r"^\s*([+-]?\d*),(\d+(?:[eE][+-]?\d+)?)\s*$")
 
 
 class Columns:
@@ -42,17 +36,19 @@ class Columns:
 
         Raises:
             TrustboError: The file does not exist or is not a table, a column is repeated, or there
-                are no rows.
+                are no rows. Errors of pandas are raised for other values that are not tables.
         """
         self.what = what
-        frame = _of_file(table) if isinstance(table, str | PathLike) else _of_values(table)
+        frame = _of_file(table) if isinstance(table, str | PathLike) else pd.DataFrame(table).copy()
+        if any(frame.index.names):
+            frame = frame.reset_index()
         frame.columns = [str(name).strip() for name in frame.columns]
         frame = frame.loc[:, [not re.fullmatch(r"(Unnamed: \d+)?", n) for n in frame.columns]]
         if not frame.columns.is_unique:
             raise TrustboError(f"{what} repeats a column name: {', '.join(frame.columns)}.")
         frame.index = pd.RangeIndex(1, len(frame) + 1)
-        text = [name for name in frame if frame[name].dtype.kind not in "biufM"]
-        frame = frame.assign(**{n: frame[n].astype(object).map(_cell).astype(object) for n in text})
+        text = frame.select_dtypes(exclude=["number", "bool"]).columns
+        frame[text] = frame[text].astype(object).map(_cell).astype(object)
         imports = [i for i, row in frame.iloc[:3].iterrows() if "ImportId" in str(row.tolist())]
         self.frame = frame.loc[max(imports, default=0) + 1 :].dropna(how="all")
         if self.frame.empty:
@@ -60,9 +56,8 @@ class Columns:
 
     def find(self, name: str) -> str | None:
         """Return the name of a column as spelled in the table; None if there is no such column."""
-        if name in self.frame:
-            return name
-        alike = [other for other in self.frame if _folded(other) == _folded(name)]
+        same = [other for other in self.frame if other == name]
+        alike = same or [other for other in self.frame if _folded(other) == _folded(name)]
         if len(alike) > 1:
             raise TrustboError(f"{self.what} has the columns {', '.join(alike)}; rename one.")
         return alike[0] if alike else None
@@ -95,12 +90,12 @@ class Columns:
                 although `blank` is False, or is not whole although `whole` is True.
         """
         cells = self._cells(column, required)
-        parsed, there = _numbers(cells), cells.notna().to_numpy()
+        parsed = pd.Series(pd.to_numeric(cells, errors="coerce")).to_numpy(float, na_value=np.nan)
         self.refuse(
             column,
-            np.isinf(parsed) | np.isnan(parsed) & there,
-            "is not a finite number; write decimals with a point, and map words to numbers: "
-            "frame[column].map({'agree': 6})",
+            ~np.isfinite(parsed) & cells.notna().to_numpy(),
+            "is not a finite number; write decimals with a point, dates in seconds, and words as "
+            "numbers: frame[column].map({'agree': 6})",
         )
         self.refuse(column, np.isnan(parsed) & (not blank), "is blank")
         self.refuse(column, whole & (parsed > np.floor(parsed)), "must be a whole number")
@@ -115,42 +110,25 @@ class Columns:
 
 
 def seconds_of(first: Columns, second: Columns) -> list[np.ndarray]:
-    """Return the times `t` of two tables, each (row,), s; dates count from the earliest of `first`.
+    """Return the times `t` of two tables on one clock, each (row,), s.
 
     Raises:
-        TrustboError: Times are neither all numbers nor all dates, the numbers cannot be seconds,
-            only some dates have a time zone, or the times of the two tables do not overlap.
+        TrustboError: The times cannot be seconds, or over half of the times of `second` are outside
+            the times of `first`.
     """
-    texts = pd.Series([*first.texts("t"), *second.texts("t")])
-    if not np.isnan(_numbers(texts)).all():
-        times = [table.numbers("t", blank=False) for table in (first, second)]
-    else:
-        dates = pd.Series(pd.to_datetime(texts, format="ISO8601", utc=True, errors="coerce"))
-        zoned = texts.str.contains(_ZONE)
-        bad = (dates.isna() | (zoned != zoned[0])).to_numpy()
-        if bad.any():
-            raise TrustboError(
-                f"t = {one_line(texts.to_numpy()[bad][0])}; give all times in seconds, or all "
-                "as dates such as 2026-11-24T10:00:00.5Z, with a time zone in all of them or none."
-            )
-        n = len(first.frame)
-        times = np.split((dates - dates[:n].min()).dt.total_seconds().to_numpy(), [n])
+    times = [table.numbers("t", blank=False) for table in (first, second)]
     spans = [f"{t.min():.9g} to {t.max():.9g} s" for t in times]
-    for table, t, span in zip((first, second), times, spans, strict=True):
-        if np.ptp(t) > _LONGEST or np.abs(t).max() > 1e11:
-            raise TrustboError(
-                f"times of {table.what} are {span}; they must be in seconds (divide milliseconds "
-                "by 1000) and span at most 7 days."
-            )
+    if np.ptp(times[0]) > 7 * 86_400.0 or np.abs(times[0]).max() > 1e11:
+        raise TrustboError(
+            f"times of {first.what} are {spans[0]}; they must be in seconds (divide milliseconds "
+            "by 1000) and span at most 7 days."
+        )
     inside = ((times[1] >= times[0].min()) & (times[1] <= times[0].max())).mean()
-    message = (
-        f"only {inside:.0%} of the times of {second.what} ({spans[1]}) are within those of "
-        f"{first.what} ({spans[0]}); check the zero, the unit and the time zone of both clocks."
-    )
-    if not inside:
-        raise TrustboError(message)
     if inside < 0.5:
-        warnings.warn(message, stacklevel=4)
+        raise TrustboError(
+            f"only {inside:.0%} of the times of {second.what} ({spans[1]}) are within those of "
+            f"{first.what} ({spans[0]}); check the zero, the unit and the time zone of both clocks."
+        )
     return times
 
 
@@ -177,28 +155,12 @@ def _cell(value: object) -> str | None:
     return None if text.lower() in _BLANK else text
 
 
-def _numbers(cells: pd.Series) -> np.ndarray:
-    """Convert cells to numbers; NaN for a cell that is not a number."""
-    return pd.Series(pd.to_numeric(cells, errors="coerce")).to_numpy(float, na_value=np.nan)
-
-
-def _of_values(table: Any) -> pd.DataFrame:
-    """Make a DataFrame from a DataFrame, a mapping of columns or a structured array."""
-    try:
-        frame = pd.DataFrame(table)
-    except (TypeError, ValueError) as error:
-        raise TrustboError(
-            f"give the path of a CSV file or a DataFrame; got {one_line(table)}: {error}."
-        ) from None
-    return frame.reset_index() if any(frame.index.names) else frame.copy()
-
-
 def _of_file(file: FilePath) -> pd.DataFrame:
     """Read the cells of a CSV file as text; decimal commas need a separator other than a comma."""
     try:
         text = read_file(file).decode("utf-8-sig")
         first, _, rest = text.partition("\n")
-        separator = max(_SEPARATORS, key=first.count)
+        separator = max(",;\t", key=first.count)
         if named := re.fullmatch(r'"?sep=(.)"?\s*', first, re.IGNORECASE):
             separator, text = named[1], rest
         lines = [*csv.reader(io.StringIO(text, newline=""), delimiter=separator)]
