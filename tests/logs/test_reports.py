@@ -53,7 +53,6 @@ def test_a_person_is_a_mission_and_outcomes_are_inputs():
         ({}, {"outcome": None}),
         ({}, {"outcome": "result"}),
         ({"load": ["", 1, 0, 0, 1]}, {"inputs": ["load"]}),
-        ({"age": [9, 9, 9, 61, 61]}, {"inputs": ["age"]}),
     ],
 )
 def test_an_odd_table_is_refused_in_one_line(changes, options):

@@ -12,8 +12,6 @@ from trustbo.logs.columns import Columns, require_one_spelling
 
 _YES = ("1", "true", "yes", "success", "succeeded", "ok")
 _NO = ("0", "false", "no", "failure", "failed", "fail")
-_LARGEST = 10.0
-"""Largest input allowed, as its weight has the same prior as that of an outcome, 0 or 1."""
 
 
 def read_reports(
@@ -49,9 +47,8 @@ def read_reports(
         number of levels minus 1, such as 6.
 
     Raises:
-        TrustboError: A file or column is missing, a row is repeated, a value has the wrong type or
-            is off the scale, an input is too large, a person has no reports, or there is neither an
-            outcome nor an input.
+        TrustboError: A column is missing, a row is repeated, a value has the wrong type or is off
+            the scale, a person has no reports, or there is neither an outcome nor an input.
     """
     levels = levels_of(scale)
     if outcome is None and not inputs:
@@ -59,7 +56,15 @@ def read_reports(
     columns = Columns(table)
     people, steps = np.array(columns.texts(person, blank=False)), columns.numbers(step, blank=False)
     require_one_spelling(f"column {person}", people.tolist())
-    y = _unit_of(columns, report, levels)
+    given = columns.numbers(report, whole=levels > 0)
+    low, high = (1, levels) if levels else (0, 1)
+    columns.refuse(
+        report,
+        (given < low) | (given > high),
+        f'is not between {low} and {high}; give the scale, such as scale="likert7", divide '
+        "percentages by 100, and leave missing answers blank",
+    )
+    y = (given - low) / (high - low)
     seen = _seen(columns, outcome, inputs)
     z, missions = np.column_stack([*seen.values()]), []
     for name in dict.fromkeys(people.tolist()):
@@ -86,25 +91,4 @@ def _seen(columns: Columns, outcome: str | None, inputs: Sequence[str]) -> dict[
         columns.refuse(outcome, unknown, "must be 1 or 0, success or failure, or blank")
         seen["success"] = np.isin(given, _YES).astype(float)
         seen["failure"] = np.isin(given, _NO).astype(float)
-    for name in inputs:
-        seen[name] = columns.numbers(name, blank=False)
-        columns.refuse(
-            name,
-            np.abs(seen[name]) > _LARGEST,
-            "is too large, as inputs must be of order 1; standardise the column: "
-            "(column - column.mean()) / column.std()",
-        )
-    return seen
-
-
-def _unit_of(columns: Columns, report: str, levels: int) -> np.ndarray:
-    """Scale reports to [0, 1], (row,), NaN if blank; raises TrustboError if off the scale."""
-    y = columns.numbers(report, whole=levels > 0)
-    low, high = (1.0, float(levels)) if levels else (0.0, 1.0)
-    columns.refuse(
-        report,
-        (y < low) | (y > high),
-        f'is not between {low:g} and {high:g}; give the scale, such as scale="likert7", divide '
-        "percentages by 100, and leave missing answers blank",
-    )
-    return (y - low) / (high - low)
+    return seen | {name: columns.numbers(name, blank=False) for name in inputs}
