@@ -61,10 +61,7 @@ def read_missions(path: FilePath) -> list[Mission]:
 
 
 def missions_to_tree(missions: Sequence[Mission]) -> xr.DataTree:
-    """Convert missions to a tree; ticks are stored for bounds with both poses and contacts.
-
-    Raises TrustboError if robots or features differ between missions.
-    """
+    """Convert missions of one team to a tree, with ticks of bounds with poses and contacts."""
     require_same_team(missions)
     bounds = [bound for mission in missions for bound in mission.bounds]
     ticks = [_ticks(bound) for bound in bounds]
