@@ -114,8 +114,11 @@ def sample(
         total += _log_rising(alpha[:, bad], failed[bad]).sum(1)
         return total - _log_rising(strength, counts) @ times
 
-    starts = np.zeros((3, len(prior.center)))
-    starts[1:, -1] = -1.5, 1.5  # low and high strength, as the posterior may have two modes
+    # The posterior may have modes at low and high strength, and at a correct and a wrong limit.
+    elsewhere = {-1: 1.5} if prior.steepness is None else {-1: 1.5, -3: 1.8}
+    starts = np.zeros((1 + 2 * len(elsewhere), len(prior.center)))
+    for k, (score, value) in enumerate(elsewhere.items()):
+        starts[2 * k + 1 : 2 * k + 3, score] = -value, value
     for more in (1, 8):  # repeat with more points if the weights are uneven
         size, enough = more * _ROUND, more * _ENOUGH
         points = importance.sample(log_density, starts, rng, size=size, enough=enough)

@@ -8,8 +8,9 @@ Hyperparameters are sampled as *scores* z, which are standard normal a priori. A
 2. Each round draws points from the current proposal, from the fits at the modes if there are
    several modes, and from a defensive proposal, which covers regions that other proposals miss. All
    proposals so far form a mixture q, and every point has the weight p(z) / q(z).
-3. The moments of the weighted points give the next proposal. Sampling stops when k-hat and the
-   effective number of points are good.
+3. The moments of the weighted points give the next proposal. If k-hat is bad in any round, kernels
+   at points drawn by weight (West 1993) are the proposals from then on, because they also describe
+   curved densities. Sampling stops when k-hat and the effective number of points are good.
 
 The weights are Pareto-smoothed (Vehtari, Simpson, Gelman, Yao and Gabry 2024). The mean weight
 before smoothing is an estimate of the evidence.
@@ -29,6 +30,7 @@ GOOD_KHAT, MAX_KHAT = 0.5, 0.7
 """Limits on the Pareto shape k-hat of the weights, for stopping and for acceptable results."""
 _DEGREES = 8.0  # degrees of freedom of the proposals
 _WIDER = 1.1  # scale of a proposal relative to the points that it is fitted to
+_KERNELS, _KERNEL_SCALE = 16, 0.7  # number of kernels, and their scale relative to the points
 _DEFENSIVE = 4  # points of other proposals per defensive point after the first round
 _PER_AXIS = 4.0  # effective points per dimension needed to estimate moments
 _SLOPE_STEP, _CURVATURE_STEP = 1e-3, 3e-2  # steps of finite differences
@@ -57,6 +59,10 @@ class Student(NamedTuple):
         mean = weight @ z
         covariance = (z - mean).T * weight @ (z - mean)
         return cls(mean, np.linalg.cholesky(covariance + ridge * np.eye(z.shape[1])))
+
+    def scaled(self, factor: float) -> Self:
+        """Return the distribution with its scale multiplied by a factor."""
+        return self._replace(scale=factor * self.scale)
 
     def draw(self, n: int, rng: np.random.Generator) -> np.ndarray:
         """Draw points (n, score) with a scrambled Sobol sequence; n must be a power of 2."""
@@ -150,12 +156,11 @@ def sample(
     with one_blas_thread():
         modes = find_modes(log_density, starts)
         proposals = modes if len(modes) > 1 else []
-        current, n_rounds = modes[0], 0
+        current, n_rounds, uneven = modes[0], 0, False
+        own = [current.scaled(_WIDER), *proposals]
         while True:
             n_rounds += 1
-            own = [current._replace(scale=_WIDER * current.scale), *proposals]
-            first = n_rounds == 1
-            n_own, n_others = (size // 2, size // 2) if first else (size, size // _DEFENSIVE)
+            n_own, n_others = (size // 2,) * 2 if n_rounds == 1 else (size, size // _DEFENSIVE)
             share = 1 << int(np.log2(n_own / len(own)))
             others = defensive(current) if defensive else prior
             for density, n in [*((one, share) for one in own), (others, n_others)]:
@@ -166,10 +171,14 @@ def sample(
             log_q = [density.log_density(z) + np.log(n) for density, n in mixture]
             log_q = special.logsumexp(log_q, axis=0) - np.log(len(z))
             points = Points.of(z, log_p, np.where(np.isfinite(log_p), log_p, -np.inf) - log_q)
-            current = points.fitted()
             good = points.k_hat < GOOD_KHAT and points.kish > enough
-            if (good and not first) or n_rounds == most:
+            if (good and n_rounds > 1) or n_rounds == most:
                 return points
+            current, uneven = points.fitted(), uneven or points.k_hat >= GOOD_KHAT
+            own = [current.scaled(_WIDER), *proposals]
+            if uneven:
+                kernel, chosen = current.scaled(_KERNEL_SCALE), points.resample(_KERNELS, rng)
+                own = [kernel._replace(center=center) for center in points.z[chosen]]
 
 
 def find_modes(log_density: LogDensity, starts: np.ndarray) -> list[Student]:
