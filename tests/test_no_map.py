@@ -81,7 +81,7 @@ def test_a_robot_that_stands_out_is_found_without_places():
     assert found.table.loc["robots", "label"] == "r2"
     odd = found.robots[found.robots["stands_out"]]
     assert set(odd["robot"]) == {"r2"}
-    assert set(odd["mission"]) == {3, 4, 5}
+    assert set(odd["mission"]) == {4, 5, 6}
 
 
 def test_what_needs_a_map_refuses_them_in_a_sentence(missions, posterior):
