@@ -65,8 +65,8 @@ class Bound:
             object.__setattr__(self, name, as_array(name, values))
         if self.awareness.ndim != 2 or not self.awareness.size:
             raise TrustboError(
-                "awareness of a bound must be (robot, feature), with at least one robot and one "
-                f"feature; got shape {self.awareness.shape}. If there are none, give one that is 0."
+                "awareness of a bound must have shape (robot, feature) without zeros; got "
+                f"{self.awareness.shape}. If you have no features, give one feature that is 0."
             )
         per_robot = self.awareness.shape[:1]
         for name in ("contact_rate", "duration"):

@@ -55,7 +55,7 @@ def require_positive(what: str, value: Any, *, or_zero: bool = False) -> float:
 
 
 def require_kind(what: str, value: Any, kind: Any, remedy: str) -> Any:
-    """Return `value`; raises TrustboError with a remedy unless it is an instance of `kind`."""
+    """Return `value` if it is an instance of `kind`; otherwise raise a TrustboError."""
     if not isinstance(value, kind):
         raise TrustboError(f"{what}: got {type(value).__name__} {one_line(value)}; {remedy}.")
     return value

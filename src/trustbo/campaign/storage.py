@@ -1,4 +1,4 @@
-"""Folder of a campaign, with one file per mission and posterior.
+"""Folder of a campaign, with one file for each mission and one for each posterior.
 
     workspace.nc          written once
     missions/0001.nc      measurements and plan of the first mission, written before learning

@@ -2,9 +2,9 @@
 
 Each likelihood term t(f) is replaced by a site exp(-lam f^2 / 2 + eta f). Given the sites, `engine`
 computes the marginals of the signals exactly. Dividing a marginal by its site gives the cavity. The
-site is then updated so that cavity times site has the moments of cavity times likelihood term. The
-log evidence is that of the sites plus, for each term, the log ratio of the masses of the two
-products. Its derivative in the sites is 0 at convergence. Importance weights correct the draws.
+site is then updated so that the product of the cavity and the site has the moments of the product
+of the cavity and the likelihood term. The log evidence is the log evidence of the sites plus, for
+each term, the log ratio of the masses of these products. Importance weights correct the draws.
 """
 
 from typing import Any, NamedTuple

@@ -193,9 +193,9 @@ class TrustFilter:
     """Rao-Blackwellised filter for the trust of each robot during a mission.
 
     Given a parameter draw and Gaussian rates, trust is Gaussian and the Kalman filter is exact. For
-    other families, moments are matched after each rate (assumed-density filtering). The draws are
-    reweighted by the predictive density of the rates. After bound k, the filter represents p(trust,
-    parameters | earlier missions, bounds 1..k), up to Monte Carlo error and moment matching.
+    other families, moments are matched after each observed rate (assumed-density filtering). The
+    draws are reweighted by the predictive density of the rates. After bound k, the filter
+    approximates p(trust, parameters | earlier missions, bounds 1..k).
 
     To follow a bound tick by tick, update a copy of the filter with the rate so far, as in
     `tb.Follower`.

@@ -126,8 +126,8 @@ def seconds_of(first: Columns, second: Columns) -> list[np.ndarray]:
     inside = ((times[1] >= times[0].min()) & (times[1] <= times[0].max())).mean()
     if inside < 0.5:
         raise TrustboError(
-            f"only {inside:.0%} of the times of {second.what} ({spans[1]}) are within those of "
-            f"{first.what} ({spans[0]}); check the zero, the unit and the time zone of both clocks."
+            f"only {inside:.0%} of the times of {second.what} ({spans[1]}) are within the range of "
+            f"{first.what} ({spans[0]}); check the epoch, unit and time zone of both clocks."
         )
     return times
 

@@ -35,10 +35,10 @@ def read_tracks(
     counting only the `n_ticks` ticks in which both poses are known. Poses are interpolated if they
     are at most 5 s apart.
 
-    With a workspace, there is one mission, for `Campaign.tell`, with the robots and features of the
-    workspace; awareness is NaN. A bound begins where the lead enters the next cell of its path, so
-    that cells whose corners it cuts are not bounds if the planned path is given. If the lead does
-    not reach the last cell, the status is `"aborted"`.
+    With a workspace, the result is one mission for `Campaign.tell`, with the robots and features of
+    the workspace and without measured awareness. A bound begins where the lead enters the next cell
+    of its path. If the planned path is given, cells whose corners the lead cuts are not bounds. If
+    the lead does not reach the last cell, the status is `"aborted"`.
 
     Without a workspace, bounds are time windows. The lead is also listed as a robot, so that all
     missions have the same robots; its contact rates are NaN, because they are not measured, and its

@@ -97,8 +97,8 @@ class Priors(Summary):
         slope 1 in this feature, or in the mean of n such features (`line_of_sight_1`, ...). Their
         weights, divided by 1 - beta0, have the prior N(1 / n, 0.3^2 / n), other weights N(0,
         0.25^2), and the intercept N(0, 0.15^2). Most rates drawn from these priors are in [0, 1].
-        For tick counts, the priors are scaled by 5, and line of sight 0.5 predicts the rate 0.5.
-        Without line of sight, the result is `default`.
+        For tick counts, the priors are scaled by 5, and a line of sight of 0.5 predicts a rate of
+        0.5. Without line of sight, the result is `default`.
         """
         is_sight = np.array([is_line_of_sight(name) for name in features])
         default, n = cls.default(observation), max(int(is_sight.sum()), 1)

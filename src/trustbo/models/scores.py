@@ -75,7 +75,7 @@ class Scores:
     def draw(
         self, n: int, rng: np.random.Generator, *, even: bool = False
     ) -> dict[str, np.ndarray]:
-        """Draw hyperparameters (draw,) or (draw, k) from their priors.
+        """Draw hyperparameters from their priors, with shapes (draw,) or (draw, k).
 
         With `even`, the draws are evenly spaced quantiles of each prior in random order.
         """

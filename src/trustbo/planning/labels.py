@@ -210,10 +210,10 @@ def _fill_priced(graph, costs, least_cost, price, to_go):
 class Limits(NamedTuple):
     """Lower limits on the cost of the rest of a path, used to drop labels.
 
-    `lower` is a lower limit on the cost of all paths. From each state, `safest` (state, sum) is the
-    smallest remaining sum of risks, and `free` (state,) is the least remaining cost without the
-    cost of failure. `priced` (state,) plus `offset` plus `price` (sum,) times the sums so far is a
-    lower limit on the remaining cost, including failure and the relaxed limit.
+    `lower` is a lower limit on the cost of all paths. For each state, `free` (state,) is the
+    smallest remaining cost, excluding the cost of failure, and `safest` (state, sum) is the
+    smallest sum of the remaining risks. `priced` (state,) plus `offset` plus `price` (sum,) times
+    the sums so far is a lower limit on the remaining cost, with failure and the relaxed limit.
     """
 
     lower: float

@@ -73,7 +73,7 @@ def weights_of(objective: Objective, dynamics: Dynamics, view: Array, longest: i
 
     The recursion unrolls to x_k = B0^k x_0 + sum_{i <= k} B0^(k - i) u_i, and the team's trust is
     view . x. Therefore, w_j = sum_{i <= j} credit(i) view . B0^(j - i) for a bound with j bounds
-    left after it, and x_0 adds sum_k credit(K - k) view . B0^k x_0 for a path of K bounds.
+    left after it. In a path of K bounds, x_0 adds sum_{1 <= k <= K} credit(K - k) view . B0^k x_0.
 
     Args:
         objective: One of the objectives in `OBJECTIVES`. For lost_contact, the expected contact

@@ -320,8 +320,8 @@ class Planner(Summary):
 
         The maximum is over paths to the cell, without U-turns, that have at most two bounds more
         than the fewest, or fewer if `max_bounds` is tighter. Longer walks are excluded because they
-        could gain trust by loitering. With the default `max_bounds`, the map at the goal equals the
-        trust at the goal of the `terminal` plan. The map has the shape (row, col), or (robot, row,
+        could gain trust by loitering. With the default `max_bounds`, the value at the goal equals
+        the final trust of the `terminal` plan. The map has the shape (row, col), or (robot, row,
         col) with `per_robot`. If there are several draws, the map has a leading axis (draw,).
 
         Args:

@@ -68,7 +68,7 @@ def best_trust(
 
     Args:
         paths: Admissible paths.
-        extra: Number of bounds beyond the fewest that a path to a cell may have.
+        extra: Number of bounds that a path to a cell may have beyond the shortest path.
         drift: Drift of each bound, shape (draw, move, row, col); NaN where there is no bound.
         beta0: Autoregressive coefficient, shape (draw,).
         x0: Trust at the start, shape (draw,).

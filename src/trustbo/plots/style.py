@@ -126,7 +126,7 @@ def background() -> str:
 
 
 def outlined(width: float, colour: str) -> list[patheffects.AbstractPathEffect]:
-    """Return the path effect of an outline; `width`, in points, includes the line itself."""
+    """Return an effect that outlines a line; `width` is the total width, in points."""
     return [patheffects.withStroke(linewidth=width, foreground=colour)]
 
 

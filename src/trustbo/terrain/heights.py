@@ -102,6 +102,6 @@ def _unit_of(name: str, declared: object, axis: float | None) -> float:
     if text and axis and abs(length / abs(axis) - 1.0) > 1e-5:
         raise TrustboError(
             f"the band of {name} declares heights in {text!r}, but its CRS units of "
-            f"{abs(axis):.6g} m; correct one with gdal_edit.py, options -units and -a_srs."
+            f"{abs(axis):.6g} m; correct either with gdal_edit.py -units or gdal_edit.py -a_srs."
         )
     return axis or length

@@ -22,7 +22,7 @@ class Surface(NamedTuple):
 
     @property
     def axes(self) -> tuple[np.ndarray, np.ndarray]:
-        """Coordinate y of each pixel row and x of each pixel column, in CRS metres."""
+        """The y coordinates of the rows and the x coordinates of the columns of pixels, in metres."""
         rows, cols = self.ground.shape
         y = self.origin[1] - np.arange(rows) * self.pixel[0]
         return y, self.origin[0] + np.arange(cols) * self.pixel[1]
