@@ -22,7 +22,7 @@ class Surface(NamedTuple):
 
     @property
     def axes(self) -> tuple[np.ndarray, np.ndarray]:
-        """The y coordinates of the rows and the x coordinates of the columns of pixels, in metres."""
+        """The y coordinates of pixel rows and the x coordinates of pixel columns, in metres."""
         rows, cols = self.ground.shape
         y = self.origin[1] - np.arange(rows) * self.pixel[0]
         return y, self.origin[0] + np.arange(cols) * self.pixel[1]
