@@ -69,7 +69,7 @@ def write_text(path: FilePath, text: str) -> None:
 
 
 def to_json(record: object) -> str:
-    """Convert a record to JSON; NumPy values become numbers or lists, other objects text."""
+    """Convert a record to JSON; NumPy values become numbers or lists, and others text."""
 
     def plain(value: Any) -> object:
         if isinstance(value, np.ndarray | np.generic):

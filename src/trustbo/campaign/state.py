@@ -123,7 +123,7 @@ class State:
 
     @property
     def last(self) -> Posterior | None:
-        """Posterior after the last mission, possibly in a file; None if there is none."""
+        """Posterior after the last mission; None if no mission has been used for learning."""
         return self.entries[-1].posterior if self.entries else None
 
     @property

@@ -51,7 +51,7 @@ class Frame(NamedTuple):
         return (np.asarray(xy, dtype=float) - self.origin) @ np.array([[c, -s], [s, c]])
 
     def to_crs(self, xy: Any) -> np.ndarray:
-        """Convert positions (..., 2) from this frame, in metres, to CRS metres."""
+        """Convert positions (..., 2) in this frame to CRS coordinates, both in metres."""
         c, s = math.cos(self.rotation), math.sin(self.rotation)
         return np.asarray(xy, dtype=float) @ np.array([[c, s], [-s, c]]) + self.origin
 

@@ -64,9 +64,9 @@ def read_tracks(
         One mission per lead, with a path if a workspace is given.
 
     Raises:
-        TrustboError: A column is missing, a value has another type or unit, a robot has fewer than
-            two poses or two at one time, no robot detects another, the lead is unknown, or the log
-            has no complete bound.
+        TrustboError: A column is missing; a value has a wrong type or unit; a robot has a single
+            pose or two poses at the same time; no robot detects another; the lead is unknown; or
+            the log has no complete bound.
     """
     tick, window = require_positive("tick", tick), require_positive("window", window)
     if path is not None and workspace is None:

@@ -85,7 +85,7 @@ class Signal(NamedTuple):
 
 
 def each(M: Any, label: np.ndarray) -> Any:
-    """Select values (point, block, ...) by block label; keep length 1 if all blocks are equal."""
+    """Select values (point, block, ...) by block label; a block axis of length 1 is kept."""
     return M if M.shape[1] == 1 else M[:, label]
 
 

@@ -1,4 +1,4 @@
-"""Linear recursion for expected trust, which all models share, and expected trust on a path."""
+"""The linear recursion for expected trust, shared by all models, and its values along a path."""
 
 from collections.abc import Sequence
 from typing import NamedTuple

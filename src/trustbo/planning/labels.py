@@ -68,7 +68,7 @@ def best_labels(
     Args:
         graph: Unrolled graph.
         costs: Costs; drift, weight, start, transition, x0 and sd have a leading axis (draw,).
-        scale: Divisor of the cost for each number of bounds of a path, shape (length,).
+        scale: Value by which the cost of a path with each number of bounds is divided, (length,).
 
     Returns:
         Costs (draw,), lower limits on the costs of any path (draw,), and paths (draw, cell) as flat

@@ -34,7 +34,7 @@ class World(NamedTuple):
 
 
 def true_surface(workspace: Workspace, terrain: xr.Dataset | None) -> Surface:
-    """Return the surface of the true terrain, which by default is that of the workspace.
+    """Return the surface of the true terrain; by default, the surface of the workspace.
 
     Raises:
         TrustboError: The terrain does not cover the grid or has another CRS, or the workspace has
