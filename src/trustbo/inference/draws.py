@@ -21,6 +21,7 @@ from trustbo.models.slots import Slots
 from trustbo.stacking import require_same_team
 from trustbo.workspace import Workspace
 
+QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)  # of predictions
 _DAY_SEED = 20261123  # seed of the next mission's robot effects, so that bands are reproducible
 _N_MEAN = 4096  # draws averaged to compute a prior mean
 _ATTRIBUTES = "observation", "x0_mean", "x0_sd", "model_record"  # required in a posterior

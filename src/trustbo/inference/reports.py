@@ -8,9 +8,8 @@ import xarray as xr
 
 from trustbo.data import Mission, levels_of
 from trustbo.errors import TrustboError, require_choice, require_whole
-from trustbo.inference.draws import is_of_people, read_posterior, require_posterior
+from trustbo.inference.draws import QUANTILES, is_of_people, read_posterior, require_posterior
 from trustbo.inference.posterior import Draws, Posterior
-from trustbo.inference.score import QUANTILES
 from trustbo.models.model import TrustModel
 from trustbo.models.signal import each
 from trustbo.parallel import one_blas_thread

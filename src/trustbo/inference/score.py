@@ -7,13 +7,12 @@ import xarray as xr
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError, require_whole
-from trustbo.inference.draws import require_posterior
+from trustbo.inference.draws import QUANTILES, require_posterior
 from trustbo.inference.filter import TrustFilter
 from trustbo.models.slots import require_ticks
 from trustbo.stacking import MissionBatch, stack_missions
 from trustbo.workspace import Workspace
 
-QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 INTERVALS = {"coverage_50": 0.5, "coverage_90": 0.9}
 _DIMS = ("mission", "bound", "robot")
 
