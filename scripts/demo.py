@@ -9,7 +9,6 @@ where the map is right, finds the best path in both worlds, and draws the first 
 """
 
 import argparse
-import warnings
 from pathlib import Path
 
 import matplotlib as mpl
@@ -46,8 +45,6 @@ def main() -> None:
     given = parser.parse_args()
 
     mpl.use("agg")
-    # The slope limit, which the hillside nearly reaches, is exact in the simulator.
-    warnings.filterwarnings("ignore", "the plan arrives with probability")
     workspace = tb.Workspace.from_terrain(tb.terrain.example(), shape=(10, 10))
     with tb.Campaign(workspace, START, GOAL, directory=given.out, overwrite=True) as campaign:
         path = campaign.ask().path
@@ -56,18 +53,17 @@ def main() -> None:
         changed = tb.simulation.KinematicSimulator(workspace, events=[scrub])
         for _ in campaign.run(changed, MISSIONS):
             pass
-        result = campaign.result()
 
-    tb.report.write_report(given.out / "report.html", result)
-    tb.export.export_result(result, given.out)
-    lost = result.history["contact_lost"].values
+    tb.report.write_report(given.out / "report.html", campaign)
+    tb.export.export_result(campaign, given.out)
+    lost = campaign.history["contact_lost"].values
     print(
         f"contact lost to scrub that the map does not show: {lost[0]:.1f} of {len(path) - 1} "
         f"bounds in mission 1, and {lost[-1]:.1f} bounds on the new path in mission {MISSIONS}"
     )
     print(f"results are in {given.out}; open {given.out / 'report.html'}")
     if given.picture is not None:
-        draw(result, changed, center, given.picture)
+        draw(campaign, changed, center, given.picture)
 
 
 def draw(

@@ -130,7 +130,7 @@ def _trust(result: Result) -> list[str]:
 
 def _missions(result: Result) -> list[str]:
     table = result.table()
-    columns = ("status", "contact_rate", "contact_lost", "objective", "regret", "n_bounds")
+    columns = ("status", "contact_rate", "contact_lost", "objective", "n_bounds")
     shown = table.loc[:, [name for name in columns if name in table]].rename_axis("mission")
     shown.columns = [str(name).replace("_", " ") for name in shown.columns]
     return [
@@ -146,7 +146,7 @@ def _missions(result: Result) -> list[str]:
 
 def _uncertainty(result: Result) -> list[str]:
     plan = result.plan
-    maps = result.planner.trust_summary(result.posterior, n_draws=_DRAWS)
+    maps = result.maps(n_draws=_DRAWS)
     driven = {bound.cell for mission in result.missions for bound in mission.bounds}
     new = [_name(cell) for cell in plan.path[1:] if cell not in driven]
     known = "Every cell of the path was entered in a mission."
@@ -162,7 +162,7 @@ def _uncertainty(result: Result) -> list[str]:
         _heading("Uncertainty"),
         _image(
             lambda: plots.cell_map(
-                maps["sd"], result.workspace, path=plan.path, label="sd of expected trust"
+                maps["trust_sd"], result.workspace, path=plan.path, label="sd of expected trust"
             ),
             "standard deviation of trust",
         ),

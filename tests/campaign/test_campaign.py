@@ -206,10 +206,10 @@ def test_refused_posterior_leaves_a_mission_told_until_the_next_is_learned(works
     assert "R-hat" in campaign.table()["reason"][1]
     np.testing.assert_array_equal(campaign.belief.beta, begin(workspace).belief.beta)
     with pytest.raises(tb.TrustboError, match="posterior"):
-        _ = campaign.result().posterior
+        _ = campaign.posterior
     campaign.tell(rates(workspace, campaign.ask().path, seed=1))
     assert states(campaign) == ["learned", "learned"]
-    assert campaign.result().posteriors[0] is None
+    assert campaign.posteriors[0] is None
     assert campaign.posterior["constant_data"].sizes["mission"] == 2
 
 
@@ -255,9 +255,8 @@ def test_excluded_mission_is_forgotten_until_it_is_told_again(workspace):
     rest = [campaign.missions[j] for j in (0, 2)]
     again = fit(rest, PooledTrust(), sampler="importance", seed=seed, draws=300)
     np.testing.assert_array_equal(again["posterior"]["beta"], posterior["posterior"]["beta"])
-    for n in (2, 4):  # excluded already; and none
-        with pytest.raises(tb.TrustboError, match=str(n)):
-            campaign.exclude(n, "again")
+    with pytest.raises(tb.TrustboError, match="4"):
+        campaign.exclude(4, "no such mission")
     campaign.tell(missions[1])
     assert campaign.posterior["constant_data"].sizes["mission"] == 3
     for n in (1, 3, 4):
@@ -282,6 +281,5 @@ def test_bad_arguments_are_refused_at_once(workspace):
     walls[2] = False
     with pytest.raises(tb.NoPathError):
         begin(tb.Workspace.from_awareness(workspace.awareness.values, walls))
-    for early in (lambda: begin(workspace).result(), lambda: begin(workspace).history):
-        with pytest.raises(tb.TrustboError, match="mission"):
-            early()
+    with pytest.raises(tb.TrustboError, match="mission"):
+        _ = begin(workspace).history

@@ -150,25 +150,14 @@ def test_failure_is_priced_from_the_first_one_on(hills):
     assert price(begin(hills, objective="mean")) == 0.0
 
 
-def test_result_prices_failures_as_its_campaign_does(hills):
+def test_results_change_with_a_failure_and_price_it(hills):
     simulator, campaign = tb.simulation.KinematicSimulator(hills), begin(hills)
     campaign.tell(simulator.run(campaign.ask().path, seed=0))
-    before = campaign.result()
-    assert price(campaign) == before.planner.problem.price == 0.0
+    before = campaign.plan
+    assert campaign.planner.problem.price == 0.0
     campaign.fail("stuck", where=campaign.ask().path[1])
-    after = campaign.result()
-    assert after.planner.problem.price == campaign.planner.problem.paths.shortest
-    assert after.plan.value == campaign.recommend().value < before.plan.value
-    assert before.planner.problem.price == 0.0
-
-
-def test_unpriced_plan_that_may_well_fail_warns_once(steep):
-    campaign = begin(steep)
-    with pytest.warns(UserWarning, match="failure_cost"):
-        plan = campaign.ask()
-    assert plan.p_arrive < 0.9
-    campaign.suggest(plan.path)  # warnings are errors
-    assert begin(steep, planner={"failure_cost": 0.1}).ask().p_arrive < 0.9
+    assert campaign.planner.problem.price == campaign.planner.problem.paths.shortest
+    assert campaign.plan.value == campaign.recommend().value < before.value
 
 
 def test_price_after_a_failure_is_joint_over_strata(steep):

@@ -221,7 +221,7 @@ def test_a_campaign_s_posterior_of_parameters_alone_is_followed():
     shape = len(path) - 1, 2
     z, y = rng.uniform(size=(*shape, 2)), rng.uniform(size=shape)
     whole = campaign.tell(tb.Mission.from_arrays(path, z, y))
-    alone = TrustFilter(campaign.result().posteriors[-1])
+    alone = TrustFilter(campaign.posteriors[-1])
     assert alone.state.mean.shape == (2,)
     expected = TrustFilter(params_of(whole), 2).update(z[0], y[0])
     np.testing.assert_array_equal(alone.update(z[0], y[0]).mean, expected.mean)

@@ -113,7 +113,7 @@ def test_an_infeasible_limit_is_an_error_with_the_safest_path(workspace):
     assert error.value.path == max(survival, key=survival.get)
     assert error.value.p_fail == pytest.approx(1.0 - max(survival.values()), rel=1e-9)
     assert planner.evaluate(error.value.path, PARAMS).infeasible
-    assert planner.path_posterior(PARAMS.flat()).sum() == len(error.value.path)
+    assert planner.maps(PARAMS.flat())["path_probability"].sum() == len(error.value.path)
     with pytest.raises(TrustboError, match="max_failure"):
         Planner(workspace, *ENDS, max_failure=0.1).plan(PARAMS)  # without a risk
 

@@ -52,9 +52,9 @@ def test_the_trust_of_the_goal_is_that_of_the_terminal_plan(workspace, beta0):
 def test_the_summary_and_the_cost_are_over_the_maps_of_draws(workspace):
     draws = sample_prior(PooledTrust(), 2, 50, seed=1)
     planner = Planner(workspace, *ENDS)
-    maps, summary = planner.trust_map(draws).values, planner.trust_summary(draws, n_draws=50)
-    np.testing.assert_allclose(summary["mean"], maps.mean(0))
-    np.testing.assert_allclose(summary["sd"], maps.std(0))
+    maps, summary = planner.trust_map(draws).values, planner.maps(draws)
+    np.testing.assert_allclose(summary["trust_mean"], maps.mean(0))
+    np.testing.assert_allclose(summary["trust_sd"], maps.std(0))
     np.testing.assert_allclose(summary["cost"], (1.0 / (1.0 + np.exp(maps))).mean(0))
     cost = planner.cost_map(draws.draw(0))
     np.testing.assert_allclose(cost, 1.0 / (1.0 + np.exp(planner.trust_map(draws.draw(0)))))

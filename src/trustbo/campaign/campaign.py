@@ -5,6 +5,7 @@ import json
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
+from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
@@ -28,13 +29,11 @@ from trustbo.models.model import TrustModel
 from trustbo.models.record import model_from_record, model_to_record
 from trustbo.planning import InfeasibleError, Plan, Planner
 from trustbo.planning.policies import POLICIES, Policy, resolve_policy
-from trustbo.simulation import KinematicSimulator, Truth
+from trustbo.simulation import KinematicSimulator
 from trustbo.simulation.protocol import Simulator
 from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Location
 
-_LIKELY_ARRIVAL = 0.9
-"""Arrival probability below which a campaign without a cost of failures issues a warning."""
 _OPTIONS = ("objective", "sampler", "seed", "initial", "planner", "fit")
 """Arguments of `Campaign` that are stored unchanged in the settings."""
 _FIT = inspect.signature(fit)
@@ -50,7 +49,6 @@ class Campaign(Result):
     Attributes:
         policy: Policy that chooses the paths.
         storage: Folder of the campaign; None if it is in memory only.
-        progress: Whether fits show a progress bar; `run` sets this attribute.
 
     Example:
         >>> with tb.Campaign(workspace, (9, 0), (0, 9), directory="field") as campaign:
@@ -133,8 +131,7 @@ class Campaign(Result):
         }
         state = State(json.loads(to_json(settings)))  # as if read from a file
         super().__init__(workspace, state, model, base)
-        self._warned_of_risk = False
-        self.progress = True
+        self._progress = True  # of fits
         self.storage: Storage | None = None
         if directory is not None:
             self.storage = Storage.begin(directory, workspace, self.state, overwrite=overwrite)
@@ -142,8 +139,9 @@ class Campaign(Result):
     def _renew(self) -> None:
         """Discard the plan and cached properties after the missions or failures have changed."""
         self.state.asked = None
-        for name in self._computed():
-            delattr(self, name)
+        for name, of in vars(Result).items():
+            if isinstance(of, cached_property):
+                vars(self).pop(name, None)
 
     # --- ask and tell ---
 
@@ -181,31 +179,17 @@ class Campaign(Result):
 
     def _accept(self, plan: Plan) -> Plan:
         """Add posterior bands to a plan, and store it as the next plan to run."""
-        given = self.planner.evaluate(plan.path, self.belief)
-        self._warn_of_risk(plan, 1.0 if given.p_arrive is None else given.p_arrive)
-        self.state.asked = accepted = plan.with_draws(given)
-        self._write()
-        return accepted
-
-    def _warn_of_risk(self, plan: Plan, p_arrive: float) -> None:
-        """Warn if a plan exceeds `max_failure` or, once, if failure is likely but has no cost."""
-        options = self.state.settings["planner"]
+        accepted = plan.with_draws(self.planner.evaluate(plan.path, self.belief))
         if plan.infeasible:
             warnings.warn(
-                f"the plan exceeds max_failure = {options['max_failure']:g}: it arrives with "
-                f"probability {p_arrive:.3g}. Suggest a safer path, or increase max_failure.",
-                stacklevel=4,
+                f"the plan exceeds max_failure = {self.planner.problem.max_failure:g}: it arrives "
+                f"with probability {accepted.p_arrive:.3g}. Suggest a safer path, or increase "
+                "max_failure.",
+                stacklevel=3,
             )
-        limited = any(options.get(name) is not None for name in ("max_failure", "failure_cost"))
-        if limited or self._warned_of_risk or self.risk.has_failures or p_arrive >= _LIKELY_ARRIVAL:
-            return
-        self._warned_of_risk = True
-        warnings.warn(
-            f"the plan arrives with probability {p_arrive:.2f} only, and failures have no cost "
-            'until the first one; pass planner={"max_failure": ...} or {"failure_cost": ...}, '
-            "or lower the max_slope of the robots.",
-            stacklevel=4,
-        )
+        self.state.asked = accepted
+        self._write()
+        return accepted
 
     def tell(self, mission: Mission) -> xr.DataTree | None:
         """Record a mission and learn from it.
@@ -225,22 +209,18 @@ class Campaign(Result):
                 the grid, skips cells, or does not begin at the start of the plan. The mission is
                 then not stored.
         """
-        self._take(mission, {})
-        return self.state.posterior
-
-    def _take(self, mission: Mission, extra: dict[str, float]) -> None:
-        """Write a mission and its table row, with `extra` values, to disk; then learn from it."""
         require_kind("mission", mission, Mission, "give one trustbo.Mission at a time")
         mission, state, plan = self.workspace.in_order(mission), self.state, self.ask()
         if mission.path[0] != plan.path[0]:
             raise TrustboError(
                 f"the mission starts in cell {mission.path[0]}; it must start in {plan.path[0]}."
             )
-        learned, row = as_learned(mission, self.workspace), state.row_of(plan, mission) | extra
-        entry = Entry(plan, mission, learned, self.trust_map, row)
+        learned = as_learned(mission, self.workspace)
+        entry = Entry(plan, mission, learned, self.trust_map, state.row_of(plan, mission))
         if self.storage is not None:
             self.storage.add_mission(len(state.entries) + 1, entry)
         self._add(entry)
+        return state.posterior
 
     def _add(self, entry: Entry) -> None:
         """Add a recorded mission to the state, and learn from it."""
@@ -250,7 +230,7 @@ class Campaign(Result):
         self._renew()
         if reason := why_never_learned(entry.mission):
             entry.become(EXCLUDED, reason)
-            warnings.warn(f"mission {len(state.entries)} is excluded: {reason}", stacklevel=4)
+            warnings.warn(f"mission {len(state.entries)} is excluded: {reason}", stacklevel=3)
         else:
             self._learn(seed)
         self._write()
@@ -261,7 +241,7 @@ class Campaign(Result):
         if not (n_used := len(state.indices(TOLD, LEARNED))):
             entry.posterior = None
             return
-        tree = learn(state, self.model, self.workspace, seed, self.progress)
+        tree = learn(state, self.model, self.workspace, seed, self._progress)
         if tree is None:
             return
         tree["hazard"] = xr.DataTree(self.hazard)
@@ -288,13 +268,11 @@ class Campaign(Result):
             Posterior of the parameters given the other missions; None if there are none.
 
         Raises:
-            TrustboError: There is no such mission, or it is already excluded.
+            TrustboError: There is no such mission.
         """
         if require_whole("n", n, 1) > (n_told := len(self.state.entries)):
             raise TrustboError(f"there is no mission {n} to exclude; the last is mission {n_told}.")
-        if (entry := self.state.entries[n - 1]).row["state"] == EXCLUDED:
-            raise TrustboError(f"mission {n} is already excluded: {entry.row['reason']}")
-        entry.become(EXCLUDED, str(reason))
+        self.state.entries[n - 1].become(EXCLUDED, str(reason))
         self._renew()
         self._learn(self.state.seed_of("fit"))
         self._write()
@@ -332,8 +310,7 @@ class Campaign(Result):
         simulator: Simulator | None = None,
         n_iterations: int = 8,
         *,
-        truth: Truth | None = None,
-        stop: Stop | Sequence[Stop] | None = None,
+        stop: Stop | None = None,
         progress: bool = False,
     ) -> Iterator[tuple[Plan, Mission]]:
         """Run missions in a simulator, one per step of the returned iterator.
@@ -353,58 +330,40 @@ class Campaign(Result):
             raise TrustboError(
                 f"simulator needs a method run(path, *, seed, mission) -> Mission; got {runner!r}."
             )
-        rules: list[Stop] = [] if stop is None else [stop] if callable(stop) else list(stop)
-        if not all(map(callable, rules)) or not isinstance(truth, Truth | None):
-            raise TrustboError(f"stop={stop!r} or truth={truth!r} is invalid; see tb.iterate.")
+        if stop is not None and not callable(stop):
+            raise TrustboError(f"stop must be a function of the campaign; got {stop!r}.")
         describe = getattr(runner, "describe", lambda: {"simulator": type(runner).__name__})
         self.state.simulation = json.loads(to_json({**describe(), "n_iterations": n_iterations}))
-        self.progress = progress
-        return self._run(runner, n_iterations, truth, rules)
+        self._progress = progress
+        return self._run(runner, n_iterations, stop)
 
     def _run(
-        self, simulator: Simulator, n_iterations: int, truth: Truth | None, rules: Sequence[Stop]
+        self, simulator: Simulator, n_iterations: int, stop: Stop | None
     ) -> Iterator[tuple[Plan, Mission]]:
         """Run missions for `run`, which has checked the arguments."""
         state = self.state
         state.stop_reason = "interrupted"
         options = {"total": n_iterations, "initial": len(state.entries), "desc": "missions"}
-        with tqdm(disable=not self.progress, **options) as bar, compiling():
-            # Check rules before each mission: one may already apply when a campaign is resumed.
-            while not (reason := self._reason_to_end(n_iterations, rules)):
+        with tqdm(disable=not self._progress, **options) as bar, compiling():
+            # Check the rule before each mission: it may already apply when a campaign is resumed.
+            while not (reason := self._reason_to_end(n_iterations, stop)):
                 n, plan = len(state.entries), self.ask()
                 mission = simulator.run(plan.path, seed=state.seed_of("mission"), mission=n)
-                extra = {}
-                if truth is not None:
-                    longest = self.planner.max_bounds
-                    extra["regret"] = truth.at(n).regret(plan.path, max_bounds=longest)
-                self._take(mission, extra)
+                self.tell(mission)
                 bar.set_postfix_str(in_a_line(state.entries[-1].row), refresh=False)
                 bar.update()
                 yield plan, mission
         state.stop_reason = reason
         self._write()
 
-    def _reason_to_end(self, n_iterations: int, rules: Sequence[Stop]) -> str | None:
-        """Return the reason of the first stopping rule that applies, or None to continue."""
+    def _reason_to_end(self, n_iterations: int, stop: Stop | None) -> str | None:
+        """Return the reason to stop, or None to continue."""
         n = len(self.state.entries)
-        for rule in rules if n else ():
-            if verdict := rule(self):
-                return verdict if isinstance(verdict, str) else _name_of(rule)
+        if n and stop is not None and (verdict := stop(self)):
+            return verdict if isinstance(verdict, str) else _name_of(stop)
         return "n_iterations" if n >= n_iterations else None
 
-    # --- results and storage ---
-
-    def result(self) -> Result:
-        """Return the result so far, as `iterate` does.
-
-        Raises:
-            TrustboError: There is no mission yet.
-        """
-        if not self.state.entries:
-            raise TrustboError("the campaign has no mission yet; call tell or run first.")
-        result = Result(self.workspace, self.state.copy(), self.model, self._base)
-        vars(result).update(self._computed())
-        return result
+    # --- folder ---
 
     @classmethod
     def load(

@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from trustbo.campaign.campaign import Campaign
-from trustbo.campaign.learning import known_along
 from trustbo.data import Bound, Cell, Mission, as_array
 from trustbo.errors import TrustboError, require_pair
 from trustbo.inference import TrustFilter
@@ -19,7 +18,8 @@ class Follower:
     Call `begin`, `tick` and `end` for each bound; after the last one, `to_mission` returns the
     mission for `Campaign.tell`. Times are in seconds, from a single clock. Trust is estimated by a
     `TrustFilter` with the campaign's last posterior, or with the prior before the first one.
-    Awareness is taken from the map.
+    Awareness is taken from the map. All methods raise TrustboError if they are called out of order
+    or if an argument, such as a time before the previous time, is invalid.
 
     Attributes:
         path: Cells of the mission in order: the cells entered, followed by the planned ones.
@@ -34,16 +34,16 @@ class Follower:
         self._workspace, self._goal = campaign.workspace, self.path[-1]
         self.bounds: tuple[Bound, ...] = ()
         self.running = False
+        n_robots, family = self._workspace.team.n_robots, campaign.model.observation
         if (posterior := campaign.state.posterior) is not None:
             start = TrustFilter(posterior)
         else:
-            n_robots, family = self._workspace.team.n_robots, campaign.model.observation
             start = TrustFilter(campaign.draw_prior(1000), n_robots, observation=family)
         # `_before` has the bounds that have ended, and `_now` also the bound in progress.
         self._before = self._now = start
-        self.trust: TrustState = self._now.state
+        self.trust: TrustState = start.state
         self._started = self._begun = self._last = -np.inf  # times of start and last call
-        self._counts = np.zeros((2, self._workspace.team.n_robots))  # ticks with contact; all ticks
+        self._counts = np.zeros((2, n_robots))  # ticks with contact; all ticks
 
     @property
     def rest(self) -> tuple[Cell, ...]:
@@ -51,13 +51,9 @@ class Follower:
         return self.path[len(self.bounds) + self.running :]
 
     def begin(self, t: float, cell: Cell | None = None) -> None:
-        """Begin the next bound at time `t`, into the planned cell or into `cell`.
+        """Begin the next bound at time `t`, into the planned cell or into a neighbouring `cell`.
 
         An unplanned cell discards the rest of the plan; all later bounds then need a `cell`.
-
-        Raises:
-            TrustboError: A bound is in progress, the mission is over, no cell is planned, the cell
-                is not a neighbour, or `t` is before the previous time.
         """
         self._require(running=False, t=t)
         if self.bounds and self.bounds[-1].status != "ok":
@@ -73,31 +69,22 @@ class Follower:
         self._begun, self.running = t, True
 
     def tick(self, t: float, in_contact: ArrayLike) -> None:
-        """Add a tick to the bound in progress.
+        """Add a tick at time `t` to the bound in progress.
 
-        Args:
-            t: Time, s.
-            in_contact: Whether each robot has contact with the lead, shape (robot,); NaN where it
-                was not measured.
-
-        Raises:
-            TrustboError: No bound is in progress, a value is not 0, 1 or NaN, the number of values
-                is not the number of robots, or `t` is before the previous time.
+        `in_contact` is 1 for each robot that has contact with the lead, 0 for the others, and NaN
+        where it was not measured, shape (robot,).
         """
         self._require(running=True, t=t)
         seen = as_array("in_contact", in_contact)
         measured = ~np.isnan(seen)
         if measured.shape != self._counts[0].shape or not np.isin(seen[measured], (0, 1)).all():
             raise TrustboError(f"in_contact must be 0, 1 or NaN for each robot; got {seen}.")
+        counts = self._counts + np.stack([np.nan_to_num(seen), measured])
         here, cell = self.path[len(self.bounds) :][:2]
-        self._count(t, self._counts + np.stack([np.nan_to_num(seen), measured]), (here, cell))
+        self._count(t, counts, (here, cell))
 
     def end(self, t: float, status: str = "ok") -> None:
-        """End the bound in progress; a status other than `"ok"` ends the mission.
-
-        Raises:
-            TrustboError: No bound is in progress, the status is unknown, or the duration is zero.
-        """
+        """End the bound in progress; a status other than `"ok"` ends the mission."""
         self._require(running=True, t=t)
         unknown = np.full((self._counts.shape[1], len(self._workspace.features)), np.nan)
         seconds, since = np.full(len(unknown), t - self._begun), self._begun - self._started
@@ -110,23 +97,17 @@ class Follower:
         """Predict trust and contact rates in the bounds of `rest`, shapes (bound, robot).
 
         A bound in progress is treated as if it ended now.
-
-        Raises:
-            TrustboError: No bound is planned.
         """
-        rest = list(self.rest)
-        if len(rest) < 2:
-            raise TrustboError(f"no cell is planned after {rest[0]}; nothing is left to predict.")
-        return self._now.predict(known_along(rest, self._workspace), rest)
+        here, *planned = self.rest
+        if not planned:
+            raise TrustboError(f"no cell is planned after {here}; nothing is left to predict.")
+        return self._now.predict(self._workspace.along(self.rest, anywhere=True), self.rest)
 
     def to_mission(self) -> Mission:
         """Return the completed bounds as a mission, whose awareness is NaN (not measured).
 
         The mission has the status of its last bound, or `"aborted"` if that bound is `"ok"` but did
-        not reach the goal.
-
-        Raises:
-            TrustboError: A bound is in progress, or none was run (use `Campaign.fail`).
+        not reach the goal. If no bound was run, use `Campaign.fail` instead.
         """
         if self.running or not self.bounds:
             state = "a bound is in progress; call end" if self.running else "no bound was run"
@@ -139,13 +120,11 @@ class Follower:
     def _count(self, t: float, counts: np.ndarray, bound: tuple[Cell, Cell]) -> None:
         """Store tick counts (2, robot) of a bound, and the trust as if the bound ended now."""
         now = copy(self._before)  # shallow, since `update` replaces arrays
-        (known,) = known_along(bound, self._workspace)
-        contacts, ticks = counts
-        n_ticks = np.where(ticks > 0.0, ticks, np.nan)
-        rates = contacts / n_ticks
+        [known] = self._workspace.along(bound, anywhere=True)
+        n_ticks = np.where(counts[1] > 0.0, counts[1], np.nan)
+        self._measured = rates, n_ticks = counts[0] / n_ticks, n_ticks
         self.trust = now.update(known, rates, bound, n_ticks=n_ticks)
         self._now, self._counts, self._last = now, counts, t
-        self._measured = rates, n_ticks
 
     def _require(self, *, running: bool, t: float) -> None:
         """Raise TrustboError if the call is out of order or `t` is before the previous time."""

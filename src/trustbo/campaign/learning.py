@@ -1,13 +1,12 @@
 """Learning from missions: the posterior, the hazard, and the planner of the next path."""
 
 import warnings
-from collections.abc import Sequence
 
 import numpy as np
 import xarray as xr
 
 from trustbo.campaign.state import EXCLUDED, LEARNED, TOLD, State
-from trustbo.data import Cell, Mission
+from trustbo.data import Mission
 from trustbo.errors import PosteriorError, TrustboError
 from trustbo.hazard import Hazard
 from trustbo.hazard.exposures import LostMission
@@ -19,7 +18,6 @@ from trustbo.models import PlaceEffect
 from trustbo.models.model import TrustModel
 from trustbo.planning import Planner
 from trustbo.workspace import Workspace
-from trustbo.workspace.moves import along, require_on_grid
 
 _N_DRAWS, _N_RISKS = 1000, 200
 """Numbers of posterior draws of the trust parameters, and of the failure probabilities."""
@@ -27,22 +25,13 @@ _STOPPED, _RECOVERED = 2, 0.2
 """Failures after which a bound is avoided, and failure probability below which it is allowed."""
 
 
-def known_along(path: Sequence[Cell], workspace: Workspace) -> np.ndarray:
-    """Return the map's awareness in the bounds of a path, shape (bound, robot, feature).
-
-    The path may have impassable cells. Raises TrustboError if it leaves the grid or skips cells.
-    """
-    cells = require_on_grid(path, workspace.grid.shape)
-    return np.swapaxes(along(workspace.awareness.values, cells), 0, 1)
-
-
 def as_learned(mission: Mission, workspace: Workspace) -> Mission:
     """Replace measured awareness with the awareness of the map, which the planner also uses.
 
     Weights fitted to measured awareness would be biased when the planner applies them to the map's
-    awareness. Raises TrustboError in the same cases as `known_along`.
+    awareness. Raises TrustboError if the path leaves the grid or skips cells.
     """
-    known = known_along(mission.path, workspace)[: len(mission.bounds)]
+    known = workspace.along(mission.path, anywhere=True)[: len(mission.bounds)]
     return mission.with_awareness(np.where(np.isnan(known), mission.awareness, known))
 
 
@@ -92,7 +81,7 @@ def learn(
     warnings.warn(
         f"mission {len(state.entries)} is recorded but cannot be used for learning yet: "
         f"{reason.rstrip('.')}. Learning is retried after the next mission.",
-        stacklevel=6,
+        stacklevel=5,
     )
     return None
 
@@ -139,5 +128,4 @@ def informed_planner(planner: Planner, risk: BoundRisk) -> Planner:
 
 def to_avoid(risk: BoundRisk) -> np.ndarray:
     """Find bounds that failed twice and are still likely to fail, (move, row, col)."""
-    with np.errstate(invalid="ignore"):
-        return (risk.stopped >= _STOPPED - 1e-9) & ~(risk.mean < _RECOVERED)
+    return (risk.stopped >= _STOPPED - 1e-9) & ~(risk.mean < _RECOVERED)

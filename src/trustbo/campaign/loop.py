@@ -1,17 +1,14 @@
 """Run whole campaigns in a simulator, and resume them."""
 
-from collections.abc import Sequence
 from typing import Any
 
 from trustbo.campaign.campaign import Campaign
-from trustbo.campaign.result import Result
 from trustbo.campaign.stopping import Stop
 from trustbo.campaign.storage import Storage
 from trustbo.errors import TrustboError
 from trustbo.files import FilePath
 from trustbo.models.model import TrustModel
 from trustbo.planning.policies import Policy
-from trustbo.simulation import Truth
 from trustbo.simulation.protocol import Simulator
 from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Location
@@ -24,28 +21,24 @@ def iterate(
     *,
     n_iterations: int = 8,
     simulator: Simulator | None = None,
-    truth: Truth | None = None,
-    stop: Stop | Sequence[Stop] | None = None,
+    stop: Stop | None = None,
     directory: FilePath | None = None,
     overwrite: bool = False,
     progress: bool = True,
     **options: Any,
-) -> Result:
+) -> Campaign:
     """Run a campaign in a simulator: plan a path, run it, learn from the contact, and repeat.
 
     Args:
         workspace: Workspace of the paths.
-        start: First cell (row, col), with row 0 in the north. Or a position in this cell in CRS
-            metres, `{"x": 1748000, "y": 5427000}`, or in degrees, `{"lon": 174.7, "lat": -41.3}`;
-            see `Workspace.locate`.
+        start: First cell (row, col), with row 0 in the north, or a position in this cell, such as
+            `{"x": 1748000, "y": 5427000}` in CRS metres; see `Workspace.locate`.
         goal: Last cell, or a position in this cell.
         n_iterations: Maximum number of missions.
         simulator: Simulator with `run(path, *, seed, mission) -> Mission`; by default
             `KinematicSimulator(workspace)`.
-        truth: Truth of the simulator, `simulation.Truth.of(simulator)`. If given, the history
-            contains the regret of each plan, in % of the expected contact on the best path.
-        stop: Stopping rules, called between missions: a `RegretBound`, a function of the campaign
-            that returns a reason or None, or a sequence of these.
+        stop: Stopping rule, called between missions: a `RegretBound`, or a function of the campaign
+            that returns a reason or None.
         directory: Folder that is updated after each mission. If the process dies, `resume`
             continues from it.
         overwrite: Whether to replace an existing campaign in that folder.
@@ -54,7 +47,7 @@ def iterate(
             `seed`, `initial`, `hazard`, `planner`, `fit`.
 
     Returns:
-        Result of all missions.
+        Campaign after the last mission; its properties are the results.
 
     Raises:
         TrustboError: The input is invalid, or the folder already contains a campaign; raised before
@@ -66,41 +59,38 @@ def iterate(
         >>> result.path
     """
     campaign = Campaign(workspace, start, goal, **options)
-    steps = campaign.run(simulator, n_iterations, truth=truth, stop=stop, progress=progress)
+    steps = campaign.run(simulator, n_iterations, stop=stop, progress=progress)
     with campaign:
         if directory is not None:  # after all input has been checked
-            campaign.storage = Storage.begin(
-                directory, workspace, campaign.state, overwrite=overwrite
-            )
+            state = campaign.state
+            campaign.storage = Storage.begin(directory, workspace, state, overwrite=overwrite)
         for _ in steps:
             pass
-        return campaign.result()
+    return campaign
 
 
 def resume(
     directory: FilePath,
     *,
     simulator: Simulator | None = None,
-    truth: Truth | None = None,
     n_iterations: int | None = None,
     model: TrustModel | None = None,
     policy: Policy | None = None,
-    stop: Stop | Sequence[Stop] | None = None,
+    stop: Stop | None = None,
     progress: bool = True,
-) -> Result:
+) -> Campaign:
     """Continue a campaign that `iterate(directory=...)` began, with identical results.
 
-    If a stopping rule ended the campaign, its result is returned unless you pass `stop` or ask for
-    more missions. Stopping rules are not stored and must be given again.
+    If a stopping rule ended the campaign, no mission is run unless you pass `stop` or ask for more
+    missions. Stopping rules are not stored and must be given again.
 
     Args:
         directory: Folder of the campaign.
         simulator: Simulator of the campaign; required unless it was the default.
-        truth: Truth of the simulator; see `iterate`.
         n_iterations: Total number of missions; by default the number passed to `iterate`.
         model: Model of the campaign, if it is custom; see `Campaign.load`.
         policy: Policy of the campaign, if it is custom.
-        stop: Stopping rules, as in `iterate`.
+        stop: Stopping rule, as in `iterate`.
         progress: Whether to show a progress bar.
 
     Raises:
@@ -111,9 +101,9 @@ def resume(
         state, before = campaign.state, campaign.state.simulation
         ended = state.stop_reason not in ("interrupted", "n_iterations")
         if ended and stop is None and (n_iterations or 0) <= len(state.entries):
-            return campaign.result()
+            return campaign
         total = before.get("n_iterations", 8) if n_iterations is None else n_iterations
-        steps = campaign.run(simulator, total, truth=truth, stop=stop, progress=progress)
+        steps = campaign.run(simulator, total, stop=stop, progress=progress)
         for name, value in state.simulation.items():
             if name != "n_iterations" and repr(before.get(name, value)) != repr(value):
                 raise TrustboError(
@@ -122,4 +112,4 @@ def resume(
                 )
         for _ in steps:
             pass
-        return campaign.result()
+    return campaign

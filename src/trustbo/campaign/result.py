@@ -10,7 +10,7 @@ import rioxarray  # noqa: F401  (registers the .rio accessor)
 import xarray as xr
 
 from trustbo.campaign.learning import informed_planner, learn_hazard
-from trustbo.campaign.state import COLUMNS, State
+from trustbo.campaign.state import State
 from trustbo.campaign.storage import Storage, read_campaign
 from trustbo.data import NOWHERE, Cell, Mission
 from trustbo.display import Rows, Summary
@@ -24,6 +24,7 @@ from trustbo.models.model import TrustModel
 from trustbo.models.params import Params
 from trustbo.models.record import model_from_record
 from trustbo.planning import InfeasibleError, Plan, Planner
+from trustbo.simulation import Truth
 from trustbo.workspace import Workspace
 
 if TYPE_CHECKING:
@@ -46,11 +47,6 @@ class Result(Summary):
         self.workspace, self.state, self._base = workspace, state, base
         self.model: Any = model
 
-    def _computed(self) -> dict[str, Any]:
-        """Return the cached properties that have been computed, keyed by name."""
-        cached = (name for name, of in vars(Result).items() if isinstance(of, cached_property))
-        return {name: vars(self)[name] for name in cached if name in vars(self)}
-
     def _rows(self) -> Rows:
         settings, state = self.state.settings, self.state
         counts = self.table()["state"].value_counts()
@@ -69,8 +65,8 @@ class Result(Summary):
     @property
     def settings(self) -> dict[str, Any]:
         """Settings of the campaign, its model and its simulator."""
-        version = {"trustbo_version": VERSIONS["trustbo"]}
-        return {**self.state.settings, **self.state.simulation, **version}
+        state, version = self.state, VERSIONS["trustbo"]
+        return {**state.settings, **state.simulation, "trustbo_version": version}
 
     @property
     def stop_reason(self) -> str:
@@ -179,12 +175,8 @@ class Result(Summary):
     def history(self) -> xr.Dataset:
         """Dataset of the quantities of each mission, with dim `iteration` (1, 2, ...).
 
-        For each plan, it contains the `path` (row and col of each step, -1 after the goal), its
-        `objective` when it was planned, `path_changed` (whether it differs from the previous plan)
-        and the `trust_map` used for planning. For each mission, it contains the mean
-        `contact_rate`, the `contact_lost` in bounds (bounds that were not run lose all contact),
-        the `status`, the `state` (`"told"`, not used yet; `"learned"`; `"excluded"`) with its
-        `reason`, and the diagnostics of the posterior (see `fit`).
+        It contains the planned `path` (row and col of each step, -1 after the goal), the
+        `trust_map` used for planning, and the numbers and texts of `table`.
 
         Raises:
             TrustboError: There is no mission yet.
@@ -196,8 +188,6 @@ class Result(Summary):
         numbers = pd.RangeIndex(1, len(paths) + 1, name="iteration")
         table = pd.DataFrame([entry.row for entry in entries], numbers)
         history = table.drop(columns=["where", "n_bounds", "path"]).to_xarray()
-        if "regret" in history:
-            history["regret"].attrs["units"] = "%"
         history["path"] = ("iteration", "step", "axis"), steps
         history["trust_map"] = xr.concat([entry.trust_map for entry in entries], numbers)
         return history.assign_coords(axis=["row", "col"])
@@ -205,54 +195,28 @@ class Result(Summary):
     def table(self) -> pd.DataFrame:
         """Return a table with one row per mission, labelled by its number, from 1.
 
-        The first columns are `status`, `state`, the `reason` for the state or the failure, the cell
-        `where` the mission failed, the mean `contact_rate`, the plan's `objective`, the number
-        `n_bounds` of bounds run, `path_changed`, and the planned `path` as text, "9,0 8,1". The
-        other quantities of `history` follow. A mission that was given up (see `Campaign.fail`) has
-        no number, and its state is "given up".
+        The columns are `status`, `state` ("told", not used yet; "learned"; "excluded"; "given up",
+        see `Campaign.fail`, without a number), the `reason` for the state or the failure, the cell
+        `where` the mission failed, the mean `contact_rate`, the `objective` of the plan, the number
+        `n_bounds` of bounds run, `path_changed` (whether the plan differs from the previous one),
+        the planned `path` as text, "9,0 8,1", `contact_lost` in bounds (bounds that were not run
+        lose all contact), and the diagnostics of the posterior (see `fit`).
         """
         rows = [entry.row | {"mission": n} for n, entry in enumerate(self.state.entries, start=1)]
         for i, failure in enumerate(self.state.failures):  # after the mission that precedes it
             rows.insert(failure.after + i, failure.row())
-        names = dict.fromkeys(["mission", *COLUMNS, *chain(*rows)])
-        table = pd.DataFrame(rows, columns=list(names))
+        head = "mission status state reason where contact_rate objective n_bounds path_changed path"
+        columns = dict.fromkeys([*head.split(), *chain(*rows)])
+        table = pd.DataFrame(rows, columns=list(columns))
         return table.astype({"mission": "Int64"}).set_index("mission")
 
-    def maps(self, *, n_draws: int | None = None) -> xr.Dataset:
-        """Compute the maps of the planning cells after the last mission, for GIS and figures.
+    def maps(self, *, n_draws: int = 250) -> xr.Dataset:
+        """Compute maps of the cells after the last mission; see `planning.Planner.maps`.
 
-        Args:
-            n_draws: Number of posterior draws; by default 1000, or 100 for models whose robots have
-                different parameters, which need a separate search for each cell.
-
-        Returns:
-            Dataset with dims (y, x), whose coordinates are the cell centres in CRS metres;
-            `isel(y=row, x=col)` selects a cell. The accessor `.rio` has the CRS and writes rasters.
-            The maps are `trust_mean` and `trust_sd` over the posterior, the mean `cost`
-            1 - sigma(trust), `path_probability` (that a cell is on the best path), and each
-            feature, averaged over robots and moves (as `awareness_<name>` if the name is taken).
-            With place effects, also `place_mean` and `place_sd`. Impassable cells are NaN.
+        Raises:
+            TrustboError: Nothing could be learned yet.
         """
-        if n_draws is None:
-            dynamics = self.planner.problem.dynamics(self.belief.mean())
-            n_draws = 1000 if len(dynamics.start) == 1 else 100
-        summary = self.planner.trust_summary(self.posterior, n_draws=n_draws)
-        maps = summary.rename(mean="trust_mean", sd="trust_sd")
-        awareness, places = self.workspace.awareness, self.belief.places
-        taken = {*maps.variables, *maps.dims, "path_probability", "x", "y", "spatial_ref"}
-        taken |= {"place_mean", "place_sd"} if places else set()
-        for name in self.workspace.features:
-            values = awareness.sel(feature=name, drop=True).mean(("robot", "move"))
-            free = f"awareness_{name}" if name in taken else name
-            maps[free] = values.assign_attrs(long_name=f"{name}, 0 worst, 1 best")
-        maps["path_probability"] = self.planner.path_posterior(self.posterior, n_draws=n_draws)
-        if places:
-            cells = xr.DataArray(places["place"].mean(1), dims=("draw", "row", "col"))
-            about = {"long_name": "mean of the effect of the cell on trust", "units": "1"}
-            maps["place_mean"] = cells.mean("draw").assign_attrs(about)
-            about["long_name"] = "standard deviation of the effect of the cell on trust"
-            maps["place_sd"] = cells.std("draw").assign_attrs(about)
-        return self.workspace.grid.place(maps.where(self.workspace.passable))
+        return self.planner.maps(self.posterior, n_draws=n_draws)
 
     def plot_maps(self, **options: Any) -> np.ndarray:
         """Plot trust maps and paths of four missions; see `plots.trust_maps` for the options."""
@@ -260,20 +224,22 @@ class Result(Summary):
 
         return plots.trust_maps(self.history, self.trust_map, self.path, self.workspace, **options)
 
-    def plot_history(self, **options: Any) -> np.ndarray:
-        """Plot contact and objective for each mission; see `plots.curves.campaign_history`."""
+    def plot_history(self, truth: Truth | None = None, **options: Any) -> np.ndarray:
+        """Plot contact, objective and, given the simulator's truth, regret for each mission.
+
+        See `plots.curves.campaign_history` for the options.
+        """
         from trustbo.plots.curves import campaign_history
 
-        return campaign_history(self.history, **options)
+        history, longest = self.history, self.planner.max_bounds
+        if truth is not None:
+            paths = [entry.plan.path for entry in self.state.entries]
+            regret = [truth.at(n).regret(path, longest) for n, path in enumerate(paths)]
+            history = history.assign(regret=("iteration", regret))
+        return campaign_history(history, **options)
 
     def explore(self) -> "Explorer":
-        """Make an interactive map with layers, the values of each cell, and a slider over missions.
-
-        Notebooks display the map; its method `save(path)` writes one HTML file that works offline.
-
-        Raises:
-            TrustboError: Nothing could be learned yet.
-        """
+        """Make an interactive map of the layers and missions for notebooks; see `plots.explore`."""
         from trustbo import plots
 
         return plots.explore(self.plan, self.maps(), self.history)
@@ -281,9 +247,7 @@ class Result(Summary):
     def save(self, directory: FilePath, *, overwrite: bool = False) -> None:
         """Write the campaign to a folder that `load_result` and `Campaign.load` read.
 
-        Args:
-            directory: Folder to write to.
-            overwrite: Whether to replace an existing campaign in that folder.
+        An existing campaign in that folder is replaced only with `overwrite`.
 
         Raises:
             TrustboError: The folder already contains a campaign and `overwrite` is False, another
@@ -293,10 +257,9 @@ class Result(Summary):
 
 
 def load_result(directory: FilePath) -> Result:
-    """Read the result of a campaign from its folder, without locking the folder.
+    """Read the result of a campaign from its folder, or from a folder written by `Result.save`.
 
-    Args:
-        directory: Folder of a campaign, or a folder written by `Result.save`.
+    The folder is not locked, so the campaign may still be running.
 
     Raises:
         TrustboError: The folder contains no campaign, the campaign has no mission yet, or a file is
@@ -321,6 +284,6 @@ def load_result(directory: FilePath) -> Result:
 
 def in_a_line(row: dict[str, Any]) -> str:
     """Describe a mission in one line, with the diagnostics of the posterior after the mission."""
-    names = ("objective", "contact_rate", "regret", "k_hat", "kish", "r_hat", "ess_bulk")
+    names = ("objective", "contact_rate", "k_hat", "kish", "r_hat", "ess_bulk")
     numbers = [f"{name} {row[name]:.3g}" for name in names if name in row]
     return ", ".join([row["status"], row["state"], *numbers])

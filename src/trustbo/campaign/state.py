@@ -1,8 +1,8 @@
 """State of a campaign: missions with plans and posteriors, and missions given up."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -15,11 +15,6 @@ TOLD, LEARNED, EXCLUDED, GIVEN_UP = "told", "learned", "excluded", "given up"
 """States of a mission: recorded, used for learning, excluded, or given up without data."""
 _STREAMS = ("policy", "fit", "mission", "prior", "awareness", "hazard")
 """Random streams; the seeds depend on their order, so add new names at the end."""
-COLUMNS = (
-    "status", "state", "reason", "where", "contact_rate", "objective", "n_bounds", "path_changed",
-    "path",
-)  # fmt: skip
-"""First columns of the table of missions, see `Result.table`."""
 
 
 class Failure(NamedTuple):
@@ -115,11 +110,6 @@ class State:
     asked: Plan | None = None
     simulation: dict[str, Any] = field(default_factory=dict)
     stop_reason: str = "interrupted"
-
-    def copy(self) -> Self:
-        """Return a copy that does not change when missions are added later."""
-        entries = [replace(entry, row=dict(entry.row)) for entry in self.entries]
-        return replace(self, entries=entries, failures=list(self.failures))
 
     @property
     def last(self) -> Posterior | None:

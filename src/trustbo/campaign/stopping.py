@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from trustbo.errors import TrustboError, require_whole
+from trustbo.errors import TrustboError
 from trustbo.inference import params_of
 from trustbo.planning import InfeasibleError
 from trustbo.workspace.moves import bounds_along
@@ -16,53 +16,46 @@ if TYPE_CHECKING:
 
 Stop = Callable[["Campaign"], str | bool | None]
 """Function called between missions; returning a reason (or True) ends the campaign."""
+_N_DRAWS = 500
 
 
 @dataclass(frozen=True)
 class RegretBound:
     """Stop when the recommended path is nearly optimal, with high probability.
 
-    The best path is planned exactly under each of `n_draws` posterior draws. For lost_contact, the
+    The best path is planned exactly under each of 500 posterior draws. For lost_contact, the
     regret of the recommended path is the additional contact that it loses, as a fraction of the
     contact kept on the best path. For other objectives, regret is a fraction of the best path's
-    value. The campaign stops when P(regret <= eps) >= 1 - delta after each of the last `patience`
+    value. The campaign stops when P(regret <= eps) >= 1 - delta after each of the last two
     missions, and every bound of the recommended path has been completed at least once. The map may
     be wrong about bounds that were never driven.
 
     Attributes:
         eps: Acceptable regret, as a fraction; 0.05 is 5 %.
         delta: Acceptable probability of a larger regret.
-        patience: Number of successive missions after which the condition must hold.
-        n_draws: Number of posterior draws.
 
     Raises:
-        TrustboError: `eps` or `delta` is outside (0, 1), or a count is not a positive whole number.
+        TrustboError: `eps` or `delta` is outside (0, 1).
     """
 
     eps: float = 0.05
     delta: float = 0.1
-    patience: int = 2
-    n_draws: int = 500
 
     def __post_init__(self) -> None:
         for name, value in (("eps", self.eps), ("delta", self.delta)):
             if not 0.0 < value < 1.0:
                 raise TrustboError(f"RegretBound.{name} must be in (0, 1); got {value!r}.")
-        require_whole("RegretBound.patience", self.patience, 1)
-        require_whole("RegretBound.n_draws", self.n_draws, 1)
 
     def __call__(self, campaign: "Campaign") -> str | None:
         """Return the reason to stop, or None."""
         n = len(campaign.state.entries)
-        if n <= self.patience:
-            return None
-        sure = [self.probability(campaign, n - i) for i in range(self.patience)]
-        if min(sure) < 1.0 - self.delta:
+        sure = self.probability(campaign, n)
+        if n <= 2 or min(sure, self.probability(campaign, n - 1)) < 1.0 - self.delta:
             return None
         risk, bounds = campaign.risk, tuple(bounds_along(np.array(campaign.recommend().path)).T)
         if not (risk.exposures[bounds] > risk.failures[bounds]).all():  # a bound is new
             return None
-        return f"regret_bound: P(regret <= {self.eps:g}) = {sure[0]:.3f} >= {1.0 - self.delta:g}"
+        return f"regret_bound: P(regret <= {self.eps:g}) = {sure:.3f} >= {1.0 - self.delta:g}"
 
     def probability(self, campaign: "Campaign", n_missions: int) -> float:
         """Compute P(regret of the recommended path <= eps) after the first `n_missions`."""
@@ -72,7 +65,7 @@ class RegretBound:
         planner, draws = campaign.planner, params_of(posterior())
         try:
             path = planner.plan(draws.mean()).path
-            drawn = planner.plan_draws(draws, n_draws=self.n_draws)
+            drawn = planner.plan_draws(draws, n_draws=_N_DRAWS)
         except InfeasibleError:  # no path satisfies `max_failure`
             return 0.0
         return float(np.mean(drawn.relative_regret(path) <= self.eps))

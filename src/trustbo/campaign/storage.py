@@ -99,20 +99,18 @@ class Storage:
         """Write the measurements, plan and table row of mission n, counted from 1."""
         planned = xr.Dataset({"trust_map": entry.trust_map})
         planned.attrs = {"plan": to_json(plan_to_record(entry.plan)), "row": to_json(entry.row)}
-        self._require_lock()
         tree = missions_to_tree([entry.measured])
         tree["planned"] = xr.DataTree(planned)
-        write_tree(self.path / MISSIONS / f"{n:04d}.nc", tree)
+        write_tree(self._locked / MISSIONS / f"{n:04d}.nc", tree)
 
     def add_posterior(self, name: str, tree: xr.DataTree) -> Path:
         """Write the posterior draws of the parameters, and return the file."""
-        file = self.path / POSTERIORS / f"{name}.nc"
+        file = self._locked / POSTERIORS / f"{name}.nc"
         write_tree(file, tree)
         return file
 
     def write_record(self, state: State) -> None:
         """Write campaign.json; called last because it lists the completed missions."""
-        self._require_lock()
         record = {
             "settings": state.settings,
             "simulation": state.simulation,
@@ -123,15 +121,17 @@ class Storage:
             "stop_reason": state.stop_reason,
             "versions": VERSIONS | {"numpy": np.__version__},
         }
-        write_text(self.path / RECORD, to_json(record))
+        write_text(self._locked / RECORD, to_json(record))
 
-    def _require_lock(self) -> None:
-        """Raise TrustboError after `release`, because another process may then use the folder."""
+    @property
+    def _locked(self) -> Path:
+        """Path of the folder; raises TrustboError after `release`, as others may then use it."""
         if not self._lock.is_locked:
             raise TrustboError(
                 f"the campaign in {str(self.path)!r} was closed at the end of its `with` block; "
                 "continue it with Campaign.load."
             )
+        return self.path
 
 
 def read_campaign(directory: FilePath) -> tuple[State, Workspace, list[Entry]]:

@@ -337,45 +337,48 @@ class Planner(Summary):
         """Compute the cost f = 1 - sigma(trust) of each cell, equation (6), from `trust_map`."""
         return cost_of(self.trust_map(params, per_robot=per_robot, x0=x0))
 
-    def trust_summary(
-        self, posterior: Params | xr.DataTree, *, n_draws: int = 200, seed: int = 0
+    def maps(
+        self, posterior: Params | xr.DataTree, *, n_draws: int = 250, seed: int = 0
     ) -> xr.Dataset:
-        """Compute the mean and sd of the trust map, and the mean cost, over draws of a posterior.
-
-        The variables `mean`, `sd` and `cost` of the dataset have the shape (row, col).
+        """Compute maps of the cells under a posterior, for GIS and figures.
 
         Args:
             posterior: Posterior from `fit`, or parameters with leading axis (draw,).
             n_draws: Number of draws, chosen at random without replacement.
             seed: Seed for choosing the draws.
+
+        Returns:
+            Dataset with dims (y, x), whose coordinates are the cell centres in CRS metres;
+            `isel(y=row, x=col)` selects a cell. The accessor `.rio` has the CRS and writes rasters.
+            The maps are the mean `trust_mean` and standard deviation `trust_sd` of `trust_map`, the
+            mean `cost` of `cost_map`, the probability `path_probability` that a cell is on the best
+            path (on the safest path if no path respects `max_failure`), with place effects also
+            their `place_mean` and `place_sd`, and each feature, averaged over robots and moves (as
+            `awareness_<name>` if the name is taken). Impassable cells are NaN.
         """
         params = choose_draws(draws_of(posterior, self.workspace), n_draws, seed)
-        trust = trust_map(self.problem, params)
-        cost = cost_of(trust).mean("draw").assign_attrs(long_name="mean cost 1 - sigma(trust)")
-        mean = trust.mean("draw").assign_attrs(long_name="mean expected trust")
-        sd = trust.std("draw").assign_attrs(long_name="sd of expected trust")
-        return xr.Dataset({"mean": mean, "sd": sd, "cost": cost})
-
-    def path_posterior(
-        self, posterior: Params | xr.DataTree, *, n_draws: int | None = 1000, seed: int = 0
-    ) -> xr.DataArray:
-        """Estimate the probability that each cell lies on the best path, shape (row, col).
-
-        The best path is found for each draw. If no path respects `max_failure`, the safest path has
-        probability 1.
-
-        Args:
-            posterior: Posterior from `fit`, or parameters with leading axis (draw,).
-            n_draws: Number of draws, chosen at random without replacement.
-            seed: Seed for choosing the draws.
-        """
+        trust, passable = trust_map(self.problem, params), self.workspace.passable
         try:
-            share = self.plan_draws(posterior, n_draws=n_draws, seed=seed).share()
+            share = self.plan_draws(params, n_draws=n_draws).share()
         except InfeasibleError as error:
-            share = np.zeros(self.workspace.passable.shape)
+            share = np.zeros(passable.shape)
             share[tuple(np.array(error.path).T)] = 1.0
-        share = self.workspace.passable.copy(data=share).rename("path_probability")
-        return share.assign_attrs(long_name="P(cell on the best path)")
+        maps = {
+            "trust_mean": (trust.mean("draw"), "mean expected trust"),
+            "trust_sd": (trust.std("draw"), "sd of expected trust"),
+            "cost": (cost_of(trust).mean("draw"), "mean cost 1 - sigma(trust)"),
+            "path_probability": (passable.copy(data=share), "P(cell on the best path)"),
+        }
+        if params.places:
+            place = xr.DataArray(params.places["place"].mean(1), dims=("draw", "row", "col"))
+            maps["place_mean"] = place.mean("draw"), "mean place effect"
+            maps["place_sd"] = place.std("draw"), "sd of the place effect"
+        awareness, taken = self.workspace.awareness, {*maps, "x", "y", "row", "col", "spatial_ref"}
+        for name in self.workspace.features:
+            mean = awareness.sel(feature=name, drop=True).mean(("robot", "move"))
+            maps[f"awareness_{name}" if name in taken else name] = mean, f"{name}, 0 worst, 1 best"
+        dataset = xr.Dataset({name: v.assign_attrs(long_name=t) for name, (v, t) in maps.items()})
+        return self.workspace.grid.place(dataset.where(passable))
 
 
 def _toll_of(toll: ArrayLike, bounds: np.ndarray) -> np.ndarray:

@@ -212,17 +212,19 @@ class Workspace(Summary):
         like = self.passable.expand_dims(move=list(MOVE_NAMES), axis=0)
         return like.copy(data=exists).rename("passable_bounds")
 
-    def along(self, path: Sequence[Cell]) -> np.ndarray:
+    def along(self, path: Sequence[Cell], *, anywhere: bool = False) -> np.ndarray:
         """Return the awareness of a path's bounds, shape (bound, robot, feature), in [0, 1].
 
         Args:
             path: Cells, each a neighbour of the previous one.
+            anywhere: Whether impassable cells are allowed; their awareness may be NaN.
 
         Raises:
             TrustboError: A cell is off the grid, impassable, or not a neighbour of the previous
                 one.
         """
-        cells = [self.locate(cell, f"path[{k}]") for k, cell in enumerate(path)]
+        locate = self.grid.locate if anywhere else self.locate
+        cells = [locate(cell, f"path[{k}]") for k, cell in enumerate(path)]
         return np.swapaxes(along(self.awareness.values, cells), 0, 1)
 
     def in_order(self, mission: Mission) -> Mission:
