@@ -1,4 +1,4 @@
-"""The paper as printed: Zheng, Smereka, Mikulski and Wang 2021, arXiv 2201.01878.
+"""Settings and data of the paper: Zheng, Smereka, Mikulski and Wang 2021, arXiv 2201.01878.
 
     >>> workspace = tb.Workspace.from_terrain(terrain, **tb.paper.WORKSPACE)
     >>> result = tb.iterate(workspace, start, goal, **tb.paper.CAMPAIGN)

@@ -29,7 +29,7 @@ class Follower:
     """
 
     def __init__(self, campaign: Campaign) -> None:
-        """Start before the first bound of the path that `campaign.ask()` returns."""
+        """Follow the path that `campaign.ask()` returns, from its start."""
         self.path: tuple[Cell, ...] = tuple(campaign.ask().path)
         self._workspace, self._goal = campaign.workspace, self.path[-1]
         self.bounds: tuple[Bound, ...] = ()

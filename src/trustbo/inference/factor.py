@@ -168,7 +168,7 @@ class Factor(NamedTuple):
         return np.concatenate([leaf.reshape(len(c), -1), core], axis=1)
 
     def covariance(self) -> Any:
-        """Compute A^-1 at the stored entries of A; diagonals are halved for sums over pairs."""
+        """Compute A^-1 at the stored entries of A, with halved diagonals for sums over pairs."""
         C = inverse_of_upper(self.H)
         transposed, q = self.inverse.swapaxes(2, 3), C.shape[1]
         i = np.minimum(self.order.touched, q - 1)

@@ -28,7 +28,7 @@ class Columns:
 
     Attributes:
         what: Name of the table in messages, such as "the table of poses".
-        frame: Values; None in blank text cells. The index counts rows from 1 below the header.
+        frame: Table; blank text cells are None. The index counts rows from 1 below the header.
     """
 
     def __init__(self, table: Any, what: str = "the table") -> None:
@@ -110,7 +110,7 @@ class Columns:
 
 
 def seconds_of(first: Columns, second: Columns) -> list[np.ndarray]:
-    """Return the times `t` of two tables on one clock, each (row,), s.
+    """Return the times `t` of two tables, which must share a clock, each (row,), in s.
 
     Raises:
         TrustboError: The times cannot be seconds, or over half of the times of `second` are outside

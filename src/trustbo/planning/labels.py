@@ -71,7 +71,7 @@ def best_labels(
         scale: Value by which the cost of a path with each number of bounds is divided, (length,).
 
     Returns:
-        Costs (draw,), lower limits on the costs of any path (draw,), and paths (draw, cell) as flat
+        Costs (draw,), lower bounds on the cost of any path (draw,), and paths (draw, cell) as flat
         cell indices, padded with -1. A cost is inf if no path is within the limit.
     """
     searches = [graph]
@@ -210,10 +210,10 @@ def _fill_priced(graph, costs, least_cost, price, to_go):
 class Limits(NamedTuple):
     """Lower limits on the cost of the rest of a path, used to drop labels.
 
-    `lower` is a lower limit on the cost of all paths. For each state, `free` (state,) is the
+    `lower` is a lower bound on the cost of all paths. For each state, `free` (state,) is the
     smallest remaining cost, excluding the cost of failure, and `safest` (state, sum) is the
     smallest sum of the remaining risks. `priced` (state,) plus `offset` plus `price` (sum,) times
-    the sums so far is a lower limit on the remaining cost, with failure and the relaxed limit.
+    the sums so far is a lower bound on the remaining cost, with failure and the relaxed limit.
     """
 
     lower: float

@@ -194,9 +194,9 @@ class Problem:
         beta0 = np.diagonal(dynamics.transition, axis1=-2, axis2=-1)
         if beta0.min() < 0.0 or (history and dynamics.transition.min() < 0.0):
             raise TrustboError(
-                f"the objective {self.objective.name!r} requires beta0 >= 0, and B0 >= 0 if rates "
-                f"are nonlinear in trust; got {dynamics.transition.min():g}. Use 'terminal' or "
-                "'mean' instead."
+                f"the objective {self.objective.name!r} requires beta0 >= 0. If rates are "
+                "nonlinear in trust, it also requires all entries of B0 >= 0. The smallest is "
+                f"{dynamics.transition.min():g}; use 'terminal' or 'mean' instead."
             )
 
     def _infeasible(self, risk: Risk) -> InfeasibleError:

@@ -1,8 +1,8 @@
 """Real-time awareness of the paper, which combines the map with measurements of moving robots.
 
 Each feature is the first principal component of its value on the map and the robot's measurements.
-The robot measures its motion for traversability, and lidar returns for visibility. The inputs are
-means over the ticks of a bound in which the robot moves.
+The robot estimates traversability from its motion, and visibility from the returns of its lidar.
+The inputs are means over the ticks of a bound in which the robot moves.
 """
 
 from collections.abc import Sequence

@@ -62,8 +62,8 @@ def contact_of(detected: np.ndarray, watchers: Sequence[Robot], tracks: np.ndarr
     """Compute the contact from scans, shape (tick, robot), bool.
 
     `detected` (tick, robot) contains the outcome of each scan. A track begins after `acquire`
-    successive detections and ends after `drop` successive misses, which are properties of the
-    watcher. The state of the tracks, shape (robot, 2), is updated in place.
+    successive detections and ends after `drop` successive misses; both numbers are properties of
+    the watcher. The state of the tracks, shape (robot, 2), is updated in place.
     """
     limits = np.array([[robot.acquire, robot.drop] for robot in watchers])
     contact = np.empty(detected.shape, bool)

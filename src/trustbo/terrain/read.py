@@ -242,8 +242,8 @@ def _paired(ground: xr.DataArray, surface: xr.DataArray) -> xr.Dataset:
     valid = np.isfinite(dem) & np.isfinite(dsm)
     if not valid.any():
         raise TrustboError(
-            "no pixel has both a DEM and a DSM height: they show two places, or one of them is "
-            "all nodata where they overlap."
+            "no pixel has both a DEM and a DSM height: the rasters cover different areas, or one "
+            "is all nodata where they overlap."
         )
     canopy = (dsm - dem)[valid]
     if (share := (canopy < 0.0).mean()) > _CLIPPED:

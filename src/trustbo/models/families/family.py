@@ -66,7 +66,7 @@ class Family(ABC):
         return trust
 
     def is_density(self, y: Array) -> Array:
-        """Return a mask of the rates that are the signal plus normal noise and have a density."""
+        """Return a mask of the rates whose likelihood is a density, not a probability."""
         return np.zeros(y.shape, dtype=bool)
 
     def priors(self) -> dict[str, Any]:
