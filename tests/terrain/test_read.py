@@ -386,7 +386,7 @@ def test_coordinates_of_another_crs_are_refused(crs, step, x, y):
 
 
 def test_rasters_of_two_places_or_all_nodata_are_refused(tif):
-    with pytest.raises(TrustboError, match="two places"):
+    with pytest.raises(TrustboError, match="different areas"):
         read_terrain(tif, array(plane(), left=600_000.0))
     with pytest.raises(TrustboError, match="nodata"):
         read_terrain(tif, array(np.full((8, 10), np.nan)))
