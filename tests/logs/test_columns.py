@@ -23,6 +23,7 @@ def assert_expected(columns):
         '"sep=;"\nwho;t;;\n7;0,5;;\n8;;;\n;;;\n',
         "who\tt\n7.0\t0,5\n8.0\t\n",
         "who;t\n7;5,0e-1\n8;\n",
+        'who;t;note\n7;0,5;"a; b\nand c"\n8;;d\n',
         ",Who, T \n0,7,.5\n1,8,nan\n",
         'who,t\n"a person","s"\n"{""ImportId"":1}","{""ImportId"":2}"\n7,5e-1\n8,\n',
     ],
@@ -39,6 +40,8 @@ def test_files_of_spreadsheets_and_surveys_are_read(text, tmp_path):
         {"who": [7.0, "8"], "t": ["0.5", "none"]},
         pd.DataFrame({"who": [7.0, 8.0], "t": [0.5, np.nan]}),
         pd.DataFrame({"t": ["0.5", pd.NA]}, index=pd.Index([7, 8], name="who")),
+        pd.DataFrame({"who": [7, 8], "t": [0.5, None]}).set_index("who", drop=False),
+        pd.DataFrame({"who": [7, 8], "t": pd.to_timedelta([500, None], unit="ms")}),
         pd.DataFrame({"Unnamed: 0": [0, 1], "who": ["7", "8"], "t": [0.5, np.nan]}),
         np.array([(7, 0.5), (8, np.nan)], dtype=[("who", int), ("t", float)]),
     ],
@@ -53,6 +56,14 @@ def test_text_that_is_no_number_is_refused_with_its_row(value):
         Columns({"t": ["1.0", value]}).numbers("t")
 
 
+def test_commas_that_may_separate_thousands_are_refused(tmp_path):
+    (tmp_path / "a.tsv").write_text("t\tx\n1,020\t1,020\n12,500\t0,98\n")
+    table = Columns(tmp_path / "a.tsv")
+    np.testing.assert_array_equal(table.numbers("x"), [1.02, 0.98])
+    with pytest.raises(TrustboError, match=r"row 1.*1,020"):
+        table.numbers("t")
+
+
 def test_optional_columns_that_differ_only_in_case_are_refused():
     with pytest.raises(TrustboError, match="Status"):
         Columns({"t": [1.0], "Status": ["ok"], "STATUS": ["stuck"]}).texts("status", required=False)
@@ -60,7 +71,8 @@ def test_optional_columns_that_differ_only_in_case_are_refused():
 
 @pytest.mark.parametrize(
     "content", [b"who,t\n7\n", b"who,t\n7,1,2\n", b"who,who\n7,1\n", b"who,t\n",
-                b"PK\x03\xff", b"a\xe9,t\n1,2\n"],
+                b"PK\x03\xff", b"a\xe9,t\n1,2\n", b'who,t\n7,"1\n8,2\n',
+                b'who,t\n7,"1\n8,2\n9,3"\n'],
 )  # fmt: skip
 def test_files_that_are_no_table_are_refused(content, tmp_path):
     (tmp_path / "bad.csv").write_bytes(content)

@@ -102,6 +102,7 @@ def test_bounds_that_were_planned_and_not_run_are_part_of_the_path():
         {"robot": ["r1", "r1", "r2"]},
         {"robot": ["r1", "r1", "R1"]},
         {"robot": [None] * 3},
+        {"robot": ["r1", "NA", "r1"]},
         {"contact_rate": [None] * 3, "visibility": [None] * 3},
         {"mission": [1] * 4, "bound": [0, 1, 1, 2], "robot": ["r1", "r1", "r2", "r1"],
          "row": [0, 0, 1, 0], "col": [0, 1, 1, 2], "contact_rate": [None, 0.5, 0.5, 0.5],

@@ -117,9 +117,48 @@ def test_cells_whose_corner_is_cut_are_no_bounds_of_a_planned_path():
         ({"heading": [0.0, 90.0, 350.0, 0.0, 0.0, 0.0]}, {}),
         ({"x": [2e-5, 3e-5, 4e-5] * 2, "y": [0.0] * 6}, {}),
         ({"t": [0, 4e5, 5e5] * 2, "heading": [np.nan] * 6}, {}),
+        ({"x": [0.0, 4.0, 5e5] * 2}, {}),  # a pose without a fix
+        ({"t": [86396, 86399, 3, 86396, 86399, 3]}, {"t": [86397, 86398, 4]}),
+        ({"heading": [90.0] * 6}, {}),  # a compass, along a straight line
+        ({"x": [0.0] * 6, "y": [0.0] * 3 + [3.0] * 3, "heading": [90.0] * 6}, {}),
     ],
 )
 def test_tables_in_other_units_or_names_are_refused_in_one_line(poses, seen):
     with pytest.raises(TrustboError) as caught:
         read_tracks(pd.DataFrame(POSES | poses), SEEN | seen, window=4.0)
     assert "\n" not in str(caught.value)
+
+
+def circling(heading):
+    """Poses of two robots on a circle, with a heading made from the true one."""
+    t = np.arange(60.0)
+    angle = np.concatenate([t / 10.0, 2.0 + t / 10.0])
+    x, y = 10.0 * np.cos(angle), 10.0 * np.sin(angle)
+    robots = np.repeat(["a", "b"], len(t))
+    return {"t": [*t, *t], "robot": robots, "x": x, "y": y, "heading": heading(angle + np.pi / 2)}
+
+
+@pytest.mark.parametrize(
+    "right", [lambda h: h, lambda h: h + 8 * np.pi, lambda h: h + np.pi, lambda h: h % (2 * np.pi)]
+)
+def test_headings_in_radians_from_east_are_read_even_of_robots_that_reverse(right):
+    (one,) = read_tracks(circling(right), SEEN, lead="a")
+    assert one.robots == ("a", "b")
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [np.degrees, lambda h: np.degrees(h) % 360, lambda h: np.pi / 2 - h,
+     lambda h: (np.pi / 2 - h) % (2 * np.pi), lambda h: np.degrees(np.pi / 2 - h) % 360],
+)  # fmt: skip
+def test_headings_in_degrees_or_of_a_compass_are_refused(wrong):
+    with pytest.raises(TrustboError, match="headings of robot 'a'"):
+        read_tracks(circling(wrong), SEEN, lead="a")
+
+
+def test_poses_off_the_map_are_refused_with_both_places():
+    workspace = tb.Workspace.from_awareness(
+        np.full((1, 2, 4, 2), 0.5), cell_size=2.0, team=tb.Team(1, names=("b",))
+    )
+    with pytest.raises(TrustboError, match="never on the grid"):
+        read_tracks(POSES | {"x": [50.0, 54.0, 58.0] * 2}, SEEN, workspace, lead="a")

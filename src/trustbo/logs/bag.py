@@ -31,15 +31,12 @@ _BOUND, _STATUS = "/mission/bound", "/mission/status"
 def read_bag(
     path: FilePath, workspace: Workspace, *, contact: str = "/{robot}/contact"
 ) -> list[Mission]:
-    """Read the missions of a ROS bag.
+    """Read the missions of a ROS bag, without ticks, pauses and measured awareness.
 
     Args:
         path: A `.bag` file of ROS 1, or the folder of a bag of ROS 2.
         workspace: Workspace whose robots are read, in the order of its team.
         contact: Topic with the contact of each robot, whose name replaces `{robot}`.
-
-    Returns:
-        Missions without ticks and pauses. Awareness is NaN; campaigns use awareness from the map.
 
     Raises:
         TrustboError: rosbags is not installed, the path is not a complete bag, a topic is missing,

@@ -16,6 +16,7 @@ from trustbo.files import FilePath, read_file
 _BLANK = ("", "na", "n/a", "#n/a", "#na", "nan", "nat", "none", "null", "<na>")
 """Markers of missing values, in lower case, as written by R, Excel, pandas and SQL."""
 _WHOLE = re.compile(r"^(-?\d+)\.0+$")
+_THOUSANDS = re.compile(r"\s*[+-]?[1-9]\d{0,2}(,\d{3})+\s*")
 _DECIMAL_COMMA = re.compile(r"^\s*([+-]?\d*),(\d+(?:[eE][+-]?\d+)?)\s*$")
 
 
@@ -34,19 +35,19 @@ class Columns:
     def __init__(self, table: Any, what: str = "the table") -> None:
         """Read a CSV file (commas, semicolons or tabs), or any table that pandas accepts.
 
-        Raises:
-            TrustboError: The file does not exist or is not a table, a column is repeated, or there
-                are no rows. Errors of pandas are raised for other values that are not tables.
+        Raises TrustboError if a file is not a table, a column is repeated, or there are no rows.
         """
         self.what = what
         frame = _of_file(table) if isinstance(table, str | PathLike) else pd.DataFrame(table).copy()
-        if any(frame.index.names):
-            frame = frame.reset_index()
+        if any(names := frame.index.names):
+            frame = frame.drop(columns=[name for name in names if name in frame]).reset_index()
         frame.columns = [str(name).strip() for name in frame.columns]
         frame = frame.loc[:, [not re.fullmatch(r"(Unnamed: \d+)?", n) for n in frame.columns]]
         if not frame.columns.is_unique:
             raise TrustboError(f"{what} repeats a column name: {', '.join(frame.columns)}.")
         frame.index = pd.RangeIndex(1, len(frame) + 1)
+        spans = frame.select_dtypes("timedelta").columns
+        frame[spans] = frame[spans] / pd.Timedelta(seconds=1)
         text = frame.select_dtypes(exclude=["number", "bool"]).columns
         frame[text] = frame[text].astype(object).map(_cell).astype(object)
         imports = [i for i, row in frame.iloc[:3].iterrows() if "ImportId" in str(row.tolist())]
@@ -56,8 +57,9 @@ class Columns:
 
     def find(self, name: str) -> str | None:
         """Return the name of a column as spelled in the table; None if there is no such column."""
-        same = [other for other in self.frame if other == name]
-        alike = same or [other for other in self.frame if _folded(other) == _folded(name)]
+        if name in self.frame:
+            return name
+        alike = [other for other in self.frame if _folded(other) == _folded(name)]
         if len(alike) > 1:
             raise TrustboError(f"{self.what} has the columns {', '.join(alike)}; rename one.")
         return alike[0] if alike else None
@@ -71,10 +73,8 @@ class Columns:
     def texts(self, column: str, *, blank: bool = True, required: bool = True) -> list[str]:
         """Return a column as text, "" if blank; floats such as 1.0 become 1.
 
-        If a column that is not `required` is missing, all of its values are blank.
-
-        Raises:
-            TrustboError: A required column is missing, or a value is blank and `blank` is False.
+        Raises TrustboError if a required column is missing (others are then blank), or if a value
+        is blank although `blank` is False.
         """
         cells = self._cells(column, required).astype(object)
         self.refuse(column, cells.isna().to_numpy() & (not blank), "is blank; leave the row out")
@@ -85,17 +85,16 @@ class Columns:
     ) -> np.ndarray:
         """Return a column as numbers, (row,); NaN where blank, or if an optional column is missing.
 
-        Raises:
-            TrustboError: A required column is missing; or a value is not a finite number, is blank
-                although `blank` is False, or is not whole although `whole` is True.
+        Raises TrustboError if a required column is missing, or if a value is not a finite number,
+        is blank although `blank` is False, or is not whole although `whole` is True.
         """
         cells = self._cells(column, required)
         parsed = pd.Series(pd.to_numeric(cells, errors="coerce")).to_numpy(float, na_value=np.nan)
         self.refuse(
             column,
             ~np.isfinite(parsed) & cells.notna().to_numpy(),
-            "is not a finite number; write decimals with a point, dates in seconds, and words as "
-            "numbers: frame[column].map({'agree': 6})",
+            "is not a finite number; write decimals with a point, thousands without a mark, dates "
+            "in seconds, and words as numbers: frame[column].map({'agree': 6})",
         )
         self.refuse(column, np.isnan(parsed) & (not blank), "is blank")
         self.refuse(column, whole & (parsed > np.floor(parsed)), "must be a whole number")
@@ -110,11 +109,9 @@ class Columns:
 
 
 def seconds_of(first: Columns, second: Columns) -> list[np.ndarray]:
-    """Return the times `t` of two tables, which must share a clock, each (row,), in s.
+    """Return the times `t` of two tables, each (row,), in s.
 
-    Raises:
-        TrustboError: The times cannot be seconds, or over half of the times of `second` are outside
-            the times of `first`.
+    Raises TrustboError if the times are not in seconds, or the tables do not share a clock.
     """
     times = [table.numbers("t", blank=False) for table in (first, second)]
     spans = [f"{t.min():.9g} to {t.max():.9g} s" for t in times]
@@ -138,8 +135,7 @@ def require_one_spelling(what: str, names: Iterable[str]) -> None:
     for name in dict.fromkeys(names):
         if (other := spelled.setdefault(_folded(name), name)) != name:
             raise TrustboError(
-                f"{what}: {other!r} and {name!r} look alike: use one spelling, or names that "
-                "differ by more than case, spaces or leading zeros."
+                f"{what}: {other!r} and {name!r} look alike; use one spelling, or other names."
             )
 
 
@@ -163,17 +159,23 @@ def _of_file(file: FilePath) -> pd.DataFrame:
         separator = max(",;\t", key=first.count)
         if named := re.fullmatch(r'"?sep=(.)"?\s*', first, re.IGNORECASE):
             separator, text = named[1], rest
-        lines = [*csv.reader(io.StringIO(text, newline=""), delimiter=separator)]
+        lines = [*csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True)]
     except (UnicodeDecodeError, csv.Error) as error:
         raise TrustboError(
-            f"{str(file)!r} cannot be read as CSV in UTF-8: {error}. Save it as UTF-8, or give a "
-            'DataFrame, such as pandas.read_csv(file, encoding="cp1252").'
+            f"{str(file)!r} cannot be read as CSV in UTF-8: {error}. Close its quotes and save it "
+            'as UTF-8, or give a DataFrame, such as pandas.read_csv(file, encoding="cp1252").'
         ) from None
     header, *rows = [line for line in lines if line] or [[]]
+    n = len(header)
     for i, row in enumerate(rows, start=1):
-        if len(row) < len(header) or any(cell.strip() for cell in row[len(header) :]):
-            raise TrustboError(
-                f"row {i} of {str(file)!r} has {len(row)} values, but the header has {len(header)}."
-            )
-    frame = pd.DataFrame([row[: len(header)] for row in rows], columns=header, dtype=object)
-    return frame if separator == "," else frame.replace(_DECIMAL_COMMA, r"\1.\2", regex=True)
+        if len(row) < n or any(cell.strip() for cell in row[n:]):
+            raise TrustboError(f"row {i} of {str(file)!r} has {len(row)} values, the header {n}.")
+        hidden = [line for cell in row for line in cell.splitlines()[1:]]
+        if any(line.count(separator) >= n - 1 > 0 for line in hidden):
+            raise TrustboError(f"a quote in row {i} of {str(file)!r} is closed in a later row.")
+    frame = pd.DataFrame([row[:n] for row in rows], columns=header, dtype=object)
+    for name in frame if separator != "," else ():
+        commas = [text for text in frame[name] if "," in text]
+        if not all(map(_THOUSANDS.fullmatch, commas)):  # else `numbers` refuses them
+            frame[name] = frame[name].replace(_DECIMAL_COMMA, r"\1.\2", regex=True)
+    return frame

@@ -17,11 +17,7 @@ _ARRAYS = {"awareness": "1", "contact_rate": "1", "duration": "s", "n_ticks": "1
 
 
 def read_tree(path: FilePath) -> xr.DataTree:
-    """Read a netCDF file of groups into memory.
-
-    Raises:
-        TrustboError: The file does not exist, is damaged, or is not netCDF.
-    """
+    """Read a netCDF file of groups into memory; raises TrustboError if this fails."""
     content = read_file(path)
     try:
         with xr.open_datatree(content, engine="netcdf4") as tree:
@@ -36,18 +32,12 @@ def write_tree(path: FilePath, tree: xr.DataTree) -> None:
 
 
 def write_missions(path: FilePath, missions: Sequence[Mission]) -> None:
-    """Write one or more missions, with their ticks, to a netCDF file.
-
-    Raises TrustboError if robots or features differ, or the file cannot be written.
-    """
+    """Write missions with the same robots and features, and their ticks, to a netCDF file."""
     write_tree(path, missions_to_tree(missions))
 
 
 def read_missions(path: FilePath) -> list[Mission]:
-    """Read missions, and their ticks, from a netCDF file or from the folder of a campaign.
-
-    Args:
-        path: File of missions, or folder of a campaign, whose missions are returned as measured.
+    """Read missions, as measured, from a netCDF file or from the folder of a campaign.
 
     Raises:
         TrustboError: The file does not exist, is damaged, or contains no missions.
@@ -92,7 +82,6 @@ def missions_from_tree(tree: xr.DataTree) -> list[Mission]:
     table = {str(name): array.values for name, array in tree.to_dataset().variables.items()}
 
     def parts(values: np.ndarray, counts: str) -> list[np.ndarray]:
-        """Return the values of each mission or bound."""
         return np.split(values, np.cumsum(table[counts])[:-1])
 
     robots, features = (tuple(map(str, table[name])) for name in ("robot", "feature"))

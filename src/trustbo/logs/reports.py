@@ -32,8 +32,7 @@ def read_reports(
     in [0, 1]. The inputs since the previous report become the features of the step.
 
     Args:
-        table: Path of a CSV file with a header, separated by commas, semicolons or tabs; or a
-            DataFrame, a mapping of columns or a structured array.
+        table: Path of a CSV file (commas, semicolons or tabs), a DataFrame, or a mapping of lists.
         person: Column that identifies the person.
         step: Column with the number of the step.
         report: Column with the report.

@@ -52,7 +52,7 @@ def to_frame(missions: Sequence[Mission]) -> pd.DataFrame:
 
 
 def read_table(table: Any) -> list[Mission]:
-    """Read missions from a table with one row per mission, bound and robot.
+    """Read missions, without ticks, from a table with one row per mission, bound and robot.
 
     The columns are `mission`; `bound` (0 for the start cell, which has no measurements); `robot`;
     the cell (`row`, `col`); and `contact_rate`. Optional columns are `duration` (s), `n_ticks` and
@@ -64,9 +64,6 @@ def read_table(table: Any) -> list[Mission]:
     Args:
         table: Path of a CSV file (commas, semicolons or tabs), a DataFrame, or a mapping of lists.
 
-    Returns:
-        Missions in the order of the table, without ticks.
-
     Raises:
         TrustboError: A column, bound or robot is missing, a row is repeated, a value has the wrong
             type, rows of one bound disagree on its cell, or `Mission` rejects the data.
@@ -76,10 +73,10 @@ def read_table(table: Any) -> list[Mission]:
     features = [name for name in columns.frame if name not in known] or list(FEATURES)
     frame = _parsed(columns, features)
     robots = tuple(name for name in frame["robot"].unique() if name)
-    if not robots:
-        raise TrustboError("no row names a robot.")
     require_one_spelling("column robot", robots)
     columns.refuse("bound", frame.duplicated([*KEYS]).to_numpy(), "is repeated for its robot")
+    nameless = (frame["robot"] == "") & frame["contact_rate"].notna()
+    columns.refuse("contact_rate", nameless.to_numpy(), "has no robot; 'NA' and 'none' are blank")
     missions = []
     for label, rows in frame.groupby("mission", sort=False):
         try:

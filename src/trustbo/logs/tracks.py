@@ -15,8 +15,8 @@ from trustbo.logs.columns import Columns, require_one_spelling, seconds_of
 from trustbo.workspace import Workspace
 
 _FEATURES = ("near", "ahead")
-_GAP = 5.0
-"""Longest gap between two poses that is interpolated, s."""
+_GAP, _FASTEST = 5.0, 100.0
+"""Longest gap between two poses that is interpolated, s, and fastest robot, m/s."""
 
 
 def read_tracks(
@@ -29,7 +29,7 @@ def read_tracks(
     window: float = 20.0,
     tick: float = 1.0,
 ) -> list[Mission]:
-    """Read a log of poses and detections as missions in which all robots watch the lead.
+    """Read a log of poses and detections as missions, one for each lead, which all robots watch.
 
     The contact rate of a robot in a bound is the fraction of ticks in which it detected the lead,
     counting only the `n_ticks` ticks in which both poses are known. Poses are interpolated if they
@@ -41,11 +41,10 @@ def read_tracks(
     the lead does not reach the last cell, the status is `"aborted"`.
 
     Without a workspace, bounds are time windows. The lead is also listed as a robot, so that all
-    missions have the same robots; its contact rates are NaN, because they are not measured, and its
-    features are 0. A bound without any tick with known poses is not measured; its features are the
-    means over the robot's other bounds. Features are averaged over a bound: `near` is
-    r / (r + range) with the median range r of the log, and `ahead` is whether the lead is within 30
-    degrees of the heading.
+    missions have the same robots, with contact rates NaN and features 0. A bound without any tick
+    with known poses is not measured; its features are the means over the robot's other bounds.
+    Features are averaged over a bound: `near` is r / (r + range) with the median range r of the
+    log, and `ahead` is whether the lead is within 30 degrees of the heading.
 
     Args:
         poses: Path of a CSV file, a DataFrame, or a mapping of columns: t (s), robot, x, y (m) and,
@@ -60,13 +59,9 @@ def read_tracks(
         window: Length of a bound without a workspace, s.
         tick: Length of a tick, s.
 
-    Returns:
-        One mission per lead, with a path if a workspace is given.
-
     Raises:
-        TrustboError: A column is missing; a value has a wrong type or unit; a robot has a single
-            pose or two poses at the same time; no robot detects another; the lead is unknown; or
-            the log has no complete bound.
+        TrustboError: Values, times, poses or units are invalid, no robot detects another, the lead
+            is unknown, or the log has no complete bound.
     """
     tick, window = require_positive("tick", tick), require_positive("window", window)
     if path is not None and workspace is None:
@@ -120,8 +115,7 @@ def _read(poses: Any, detections: Any, tick: float) -> tuple[pd.DataFrame, pd.Da
     looks = looks.loc[known & (looks["robot"] != looks["lead"])].drop_duplicates()
     if looks.empty:
         raise TrustboError(
-            f"no detection is between two of the robots {', '.join(robots)}; give their names in "
-            "the columns watcher and seen."
+            f"no detection (watcher, seen) is between two of the robots {', '.join(robots)}."
         )
     gaps = looks.sort_values("t").groupby(["robot", "lead"])["t"].diff()
     apart = float(gaps.quantile(0.05))  # NaN if no robot detects another twice
@@ -132,21 +126,30 @@ def _read(poses: Any, detections: Any, tick: float) -> tuple[pd.DataFrame, pd.Da
             stacklevel=3,
         )
     if silent := [name for name in robots if name not in looks[["robot", "lead"]].values]:
-        warnings.warn(
-            f"no detection names {', '.join(silent)}; robots without detections have contact 0.",
-            stacklevel=3,
-        )
+        warnings.warn(f"no detection names {', '.join(silent)}; their contact is 0.", stacklevel=3)
     return tracks, looks
 
 
 def _track(tracks: pd.DataFrame, name: str) -> pd.DataFrame:
     """Return the poses of one robot, sorted by time, with its heading, unwrapped."""
-    track = tracks.loc[tracks["robot"] == name].sort_values("t")
+    track = tracks.loc[tracks["robot"] == name]
+    drops, track = -np.diff(track["t"]), track.sort_values("t")
     t, x, y, heading = track[["t", "x", "y", "heading"]].to_numpy().T
     if len(t) < 2 or (np.diff(t) <= 0.0).any():
         raise TrustboError(f"robot {name!r} has only one pose, or two poses at one time.")
+    if (drops > 0.0).sum() == 1 and drops.max() > 0.5 * np.ptp(t):
+        raise TrustboError(
+            f"times of robot {name!r} fall by {drops.max():g} s in the middle of the log; correct "
+            "them if its clock was reset, or sort the rows."
+        )
     dx, dy = np.gradient(x, t), np.gradient(y, t)
-    moves, course = np.hypot(dx, dy) > 1e-3, np.arctan2(dy, dx)  # m/s; slower is standing
+    speed, course = np.hypot(dx, dy), np.arctan2(dy, dx)
+    if speed.max() > _FASTEST:
+        raise TrustboError(
+            f"robot {name!r} moves at {speed.max():.3g} m/s at t = {t[speed.argmax()]:.9g} s; "
+            "leave out poses without a fix, such as (0, 0), and give x and y in metres."
+        )
+    moves = speed > 1e-3  # m/s; slower is standing
     if np.isnan(heading).all():
         heading = pd.Series(np.where(moves, course, np.nan)).ffill().bfill().to_numpy()
     if np.isnan(heading).any():
@@ -154,12 +157,18 @@ def _track(tracks: pd.DataFrame, name: str) -> pd.DataFrame:
             f"headings of robot {name!r} are blank in some poses, or in all although it moves at "
             "less than 1 mm/s; give all headings, times in seconds and positions in metres."
         )
-    fit, other = (np.cos(h - course)[moves].sum() for h in (heading, np.radians(heading)))
-    jumps = np.abs(np.diff(heading)).max() > 2.0 * np.pi + 0.1
-    if np.abs(heading).max() > 2.0 * np.pi + 1e-6 and (jumps or other > max(fit, 0.0) + 0.5):
+    most, n = np.abs(heading).max(), max(moves.sum(), 1)
+    large = most > 2.0 * np.pi + 1e-6
+    others = [np.radians(heading), np.radians(90.0 - heading)] if large else [np.pi / 2.0 - heading]
+    own, *fits = (np.cos(h - course)[moves].sum() / n for h in (heading, *others))
+    jumps = not moves.any() or np.abs(np.diff(heading)).max() > 2.0 * np.pi + 0.1
+    turns = abs(np.exp(1j * course)[moves].sum()) < 0.9 * n
+    if (large and (jumps or max(fits) > max(own, 0.0) + 0.5)) or (
+        turns and max(fits) > 0.9 > own + 0.4
+    ):
         raise TrustboError(
-            f"headings of robot {name!r} are up to {np.abs(heading).max():g}, so they seem to be "
-            "in degrees; give radians from east, anticlockwise: radians(90 - compass heading)."
+            f"headings of robot {name!r}, up to {most:g}, seem to be in degrees or clockwise from "
+            "north; give radians from east, anticlockwise: radians(90 - compass degrees)."
         )
     return track.assign(heading=np.unwrap(heading))
 
@@ -222,6 +231,12 @@ def _crossings(
     for k, x, y in zip(places["tick"], places["x"], places["y"], strict=True):
         with suppress(TrustboError):  # off the grid
             entered.append((k, workspace.grid.locate({"x": x, "y": y})))
+    if not entered:
+        x, y = places[["x", "y"]].median()
+        raise TrustboError(
+            f"the lead is never on the grid: its poses are around ({x:.8g}, {y:.8g}). Give x and y "
+            f"in {workspace.grid.crs_name}, in which the lower left is {workspace.grid.corner}."
+        )
     if path is None:
         path = [cell for cell, _ in groupby(cell for _, cell in entered)]
     path, edges = require_cells("path", path), []
