@@ -265,6 +265,28 @@ def test_excluded_mission_is_forgotten_until_it_is_told_again(workspace):
     assert campaign.state.last is None
 
 
+def test_bounds_that_were_not_run_lose_all_contact_whatever_path_a_mission_has(workspace):
+    campaign = begin(workspace)
+    path = campaign.ask().path
+    told = rates(workspace, path, fail_at=2)
+    campaign.tell(told)
+    campaign.suggest(path)
+    campaign.tell(replace(told, path=path[: len(told.bounds) + 1]))
+    lost = campaign.table()["contact_lost"].tolist()
+    assert lost[0] == lost[1] == pytest.approx(len(path) - 1 - told.contact_rate.mean(1).sum())
+
+
+def test_a_failure_without_rates_counts_until_a_user_excludes_it(workspace):
+    campaign = begin(workspace)
+    told = rates(workspace, DIAGONAL, fail_at=2)
+    bounds = [replace(b, contact_rate=np.full(3, np.nan)) for b in told.bounds]
+    with pytest.warns(UserWarning, match="excluded"):
+        campaign.tell(replace(told, bounds=tuple(bounds)))
+    assert campaign.hazard["failures"].values.sum() == 1
+    campaign.exclude(1, "the driver's mistake")
+    assert campaign.hazard["failures"].values.sum() == 0
+
+
 def test_bad_arguments_are_refused_at_once(workspace):
     for options, said in (
         ({"policy": "bold"}, "policy"),

@@ -1,6 +1,7 @@
 """The loop of a campaign: it learns, stops by rules, resumes, and collects a result."""
 
 import itertools
+import pickle
 import time
 
 import numpy as np
@@ -251,9 +252,36 @@ def test_campaign_that_a_rule_has_ended_resumes_only_on_request(workspace, tmp_p
     assert len(tb.resume(tmp_path, n_iterations=n + 1, **options).missions) == n + 1
 
 
+def test_missions_of_real_robots_are_not_continued_in_a_simulator(workspace, tmp_path):
+    with tb.Campaign(workspace, *ENDS, directory=tmp_path) as campaign:
+        campaign.tell(ModelSimulator(workspace).run(campaign.ask().path, seed=0))
+    with pytest.raises(tb.TrustboError, match="not simulated"):
+        tb.resume(tmp_path, n_iterations=2, progress=False)
+    simulator = ModelSimulator(workspace)
+    more = tb.resume(tmp_path, simulator=simulator, n_iterations=2, progress=False)
+    assert len(more.missions) == 2
+
+
+def test_a_closed_campaign_keeps_its_results_and_can_be_pickled(workspace, tmp_path):
+    closed = run(workspace, n_iterations=2, directory=tmp_path)
+    before = closed.table()
+    for change in (
+        lambda: closed.exclude(1, "a test"), lambda: closed.fail("rain"),
+        lambda: closed.tell(closed.missions[0]),
+    ):  # fmt: skip
+        with pytest.raises(tb.TrustboError, match="closed"):
+            change()
+    assert closed.table().equals(before)
+    again = pickle.loads(pickle.dumps(closed))
+    assert again.path == closed.path
+    assert again.storage is None
+
+
 @pytest.mark.parametrize(
-    "options", [{"n_iterations": 0}, {"n_iterations": 2.5}, {"simulator": object()}, {"seed": -1}]
-)
+    "options",
+    [{"n_iterations": 0}, {"n_iterations": 2.5}, {"simulator": object()}, {"seed": -1},
+     {"stop": tb.RegretBound}],
+)  # fmt: skip
 def test_bad_input_is_refused_before_anything_is_written(workspace, tmp_path, options):
     with pytest.raises(tb.TrustboError, match=next(iter(options))):
         run(workspace, directory=tmp_path / "never", **options)

@@ -214,6 +214,17 @@ def test_closed_campaign_records_nothing_more(workspace, tmp_path):
     assert tb.Campaign.load(tmp_path).missions == []
 
 
+def test_a_mission_that_waits_to_be_learned_is_in_the_result(folder, tmp_path):
+    whole, copy = tb.load_result(folder), shutil.copytree(folder, tmp_path / "copy")
+    record = json.loads((copy / "campaign.json").read_text())
+    for name in ("rows", "posteriors"):
+        del record[name][-1]
+    (copy / "campaign.json").write_text(json.dumps(record))
+    waiting = tb.load_result(copy)
+    assert len(waiting.missions) == len(whole.missions)
+    assert waiting.table()["state"].dropna().iloc[-1] == "told"
+
+
 def test_custom_objects_are_required_again(workspace, tmp_path):
     def straight(rng, draws, planner):
         return planner.evaluate([(2, 0), (1, 1), (0, 2)], draws.mean())
@@ -223,8 +234,9 @@ def test_custom_objects_are_required_again(workspace, tmp_path):
     with tb.Campaign(workspace, *ENDS, model=model, directory=tmp_path, **options) as campaign:
         campaign.tell(ModelSimulator(workspace).run(campaign.ask().path, seed=0))
         expected = campaign
-    with pytest.raises(tb.TrustboError, match="policy"):
-        tb.Campaign.load(tmp_path, model=model)
+    for wrong in (None, tb.planning.POLICIES["greedy"]):
+        with pytest.raises(tb.TrustboError, match="policy"):
+            tb.Campaign.load(tmp_path, policy=wrong, model=model)
     for wrong in (None, PooledTrust()):
         with pytest.raises(tb.TrustboError, match="model"):
             tb.Campaign.load(tmp_path, policy=straight, model=wrong)

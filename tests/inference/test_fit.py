@@ -1,9 +1,7 @@
 """`fit`: posteriors laid out for ArviZ, read by names, and refused when they are bad."""
 
 import sys
-from functools import partial
 
-import arviz as az
 import arviz as az
 import numpy as np
 import numpyro.distributions as dist

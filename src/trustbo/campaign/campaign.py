@@ -143,8 +143,6 @@ class Campaign(Result):
             if isinstance(of, cached_property):
                 vars(self).pop(name, None)
 
-    # --- ask and tell ---
-
     def ask(self) -> Plan:
         """Plan the next path; further calls return the same plan until `tell`, `fail` or `suggest`.
 
@@ -182,9 +180,8 @@ class Campaign(Result):
         accepted = plan.with_draws(self.planner.evaluate(plan.path, self.belief))
         if plan.infeasible:
             warnings.warn(
-                f"the plan exceeds max_failure = {self.planner.problem.max_failure:g}: it arrives "
-                f"with probability {accepted.p_arrive:.3g}. Suggest a safer path, or increase "
-                "max_failure.",
+                f"the plan arrives with probability {accepted.p_arrive:.3g} only, and max_failure "
+                "does not allow this. Suggest a safer path, or increase max_failure.",
                 stacklevel=3,
             )
         self.state.asked = accepted
@@ -265,13 +262,15 @@ class Campaign(Result):
             reason: Reason to store in the table of missions.
 
         Returns:
-            Posterior of the parameters given the other missions; None if there are none.
+            Posterior of the parameters given the other missions; None if there are none. If it
+            cannot be computed, a warning is issued, and the previous posterior is returned.
 
         Raises:
             TrustboError: There is no such mission.
         """
         if require_whole("n", n, 1) > (n_told := len(self.state.entries)):
             raise TrustboError(f"there is no mission {n} to exclude; the last is mission {n_told}.")
+        self._write()  # raises if the campaign is closed
         self.state.entries[n - 1].become(EXCLUDED, str(reason))
         self._renew()
         self._learn(self.state.seed_of("fit"))
@@ -301,6 +300,7 @@ class Campaign(Result):
                 f"where = {where} must be a cell that the plan enters, {path[1:]}, with one of the "
                 f"reasons {', '.join(CAUSES)}; got reason {reason!r}."
             )
+        self._write()  # raises if the campaign is closed
         self.state.failures.append(Failure(len(self.state.entries), reason, tuple(path), where))
         self._renew()
         self._write()
@@ -330,7 +330,7 @@ class Campaign(Result):
             raise TrustboError(
                 f"simulator needs a method run(path, *, seed, mission) -> Mission; got {runner!r}."
             )
-        if stop is not None and not callable(stop):
+        if stop is not None and (isinstance(stop, type) or not callable(stop)):
             raise TrustboError(f"stop must be a function of the campaign; got {stop!r}.")
         describe = getattr(runner, "describe", lambda: {"simulator": type(runner).__name__})
         self.state.simulation = json.loads(to_json({**describe(), "n_iterations": n_iterations}))
@@ -362,8 +362,6 @@ class Campaign(Result):
         if n and stop is not None and (verdict := stop(self)):
             return verdict if isinstance(verdict, str) else _name_of(stop)
         return "n_iterations" if n >= n_iterations else None
-
-    # --- folder ---
 
     @classmethod
     def load(
@@ -397,6 +395,8 @@ class Campaign(Result):
                 policy=given["policy"] if policy is None else policy,
                 hazard=Hazard(**given["hazard"]), **{name: given[name] for name in _OPTIONS},
             )  # fmt: skip
+            if (name := campaign.state.settings["policy"]) != given["policy"]:
+                raise TrustboError(f"policy {name!r} is not the campaign's, {given['policy']!r}.")
             campaign.state, campaign.storage = state, storage
             for entry in pending:
                 campaign._add(entry)
@@ -404,6 +404,9 @@ class Campaign(Result):
             storage.release()
             raise
         return campaign
+
+    def __getstate__(self) -> dict[str, Any]:
+        return vars(self) | {"storage": None}  # a lock cannot be pickled
 
     def __enter__(self) -> Self:
         return self

@@ -95,7 +95,7 @@ def learn_hazard(state: State, workspace: Workspace) -> xr.Dataset:
     measured = [
         entry.measured
         for entry in state.entries
-        if entry.row["state"] != EXCLUDED or why_never_learned(entry.mission)
+        if entry.row["state"] != EXCLUDED or entry.row["reason"] == why_never_learned(entry.mission)
     ]
     lost = [LostMission(f.path, f.where) for f in state.failures if f.path]
     prior = Hazard(**state.settings["hazard"])
@@ -117,15 +117,11 @@ def informed_planner(planner: Planner, risk: BoundRisk) -> Planner:
     longer paths that keep contact and never fail. The cost is computed jointly over strata of the
     hazard posterior, since all bounds share the slope limit.
     """
-    if (stopped := to_avoid(risk)).any():
+    stopped = (risk.stopped >= _STOPPED - 1e-9) & ~(risk.mean < _RECOVERED)
+    if stopped.any():
         planner = planner.avoiding(stopped, risk.mean)
     if planner.problem.failure_cost is None and not risk.has_failures:
         planner = planner.with_failure_cost(0.0)
     priced = planner.problem.objective.of_contact and planner.problem.failure_cost != 0.0
     strata = risk.strata() if priced else None
     return planner.with_risk(risk.mean, risk.draw(_N_RISKS), strata)
-
-
-def to_avoid(risk: BoundRisk) -> np.ndarray:
-    """Find bounds that failed twice and are still likely to fail, (move, row, col)."""
-    return (risk.stopped >= _STOPPED - 1e-9) & ~(risk.mean < _RECOVERED)

@@ -43,15 +43,13 @@ def iterate(
             continues from it.
         overwrite: Whether to replace an existing campaign in that folder.
         progress: Whether to show a progress bar.
-        **options: Further arguments of `Campaign`: `model`, `policy`, `objective`, `sampler`,
-            `seed`, `initial`, `hazard`, `planner`, `fit`.
+        **options: Further arguments of `Campaign`, such as `model`, `policy` or `fit`.
 
     Returns:
         Campaign after the last mission; its properties are the results.
 
     Raises:
-        TrustboError: The input is invalid, or the folder already contains a campaign; raised before
-            any work starts.
+        TrustboError: The input is invalid or the folder has a campaign; raised before any work.
         NoPathError: The goal cannot be reached.
 
     Example:
@@ -87,7 +85,7 @@ def resume(
     Args:
         directory: Folder of the campaign.
         simulator: Simulator of the campaign; required unless it was the default.
-        n_iterations: Total number of missions; by default the number passed to `iterate`.
+        n_iterations: Total number of missions, earlier ones included; by default as before.
         model: Model of the campaign, if it is custom; see `Campaign.load`.
         policy: Policy of the campaign, if it is custom.
         stop: Stopping rule, as in `iterate`.
@@ -99,6 +97,10 @@ def resume(
     """
     with Campaign.load(directory, model=model, policy=policy) as campaign:
         state, before = campaign.state, campaign.state.simulation
+        if state.entries and not before and simulator is None:
+            raise TrustboError(
+                f"{str(directory)!r} was not simulated; use Campaign.load, or give simulator=."
+            )
         ended = state.stop_reason not in ("interrupted", "n_iterations")
         if ended and stop is None and (n_iterations or 0) <= len(state.entries):
             return campaign

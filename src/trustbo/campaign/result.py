@@ -65,15 +65,13 @@ class Result(Summary):
     @property
     def settings(self) -> dict[str, Any]:
         """Settings of the campaign, its model and its simulator."""
-        state, version = self.state, VERSIONS["trustbo"]
-        return {**state.settings, **state.simulation, "trustbo_version": version}
+        state, version = self.state, {"trustbo_version": VERSIONS["trustbo"]}
+        return {**state.simulation, **state.settings, **version}
 
     @property
     def stop_reason(self) -> str:
         """Why the campaign ended."""
         return self.state.stop_reason
-
-    # --- what was learned ---
 
     @property
     def missions(self) -> list[Mission]:
@@ -141,8 +139,6 @@ class Result(Summary):
         """Planner that accounts for the failures so far; see `informed_planner`."""
         return informed_planner(self._base, self.risk)
 
-    # --- the path to take ---
-
     def recommend(self) -> Plan:
         """Plan the best path under the mean of `belief`, regardless of the policy.
 
@@ -176,10 +172,8 @@ class Result(Summary):
         """Dataset of the quantities of each mission, with dim `iteration` (1, 2, ...).
 
         It contains the planned `path` (row and col of each step, -1 after the goal), the
-        `trust_map` used for planning, and the numbers and texts of `table`.
-
-        Raises:
-            TrustboError: There is no mission yet.
+        `trust_map` used for planning, and the numbers and texts of `table`. Raises TrustboError if
+        there is no mission yet.
         """
         if not (entries := self.state.entries):
             raise TrustboError("the campaign has no mission yet; call tell or run first.")
@@ -213,8 +207,7 @@ class Result(Summary):
     def maps(self, *, n_draws: int = 250) -> xr.Dataset:
         """Compute maps of the cells after the last mission; see `planning.Planner.maps`.
 
-        Raises:
-            TrustboError: Nothing could be learned yet.
+        Raises TrustboError if nothing could be learned yet.
         """
         return self.planner.maps(self.posterior, n_draws=n_draws)
 
@@ -265,7 +258,10 @@ def load_result(directory: FilePath) -> Result:
         TrustboError: The folder contains no campaign, the campaign has no mission yet, or a file is
             missing or damaged.
     """
-    state, workspace, _ = read_campaign(directory)
+    state, workspace, pending = read_campaign(directory)
+    for entry in pending:  # recorded, but not learned yet
+        entry.posterior = state.last
+        state.entries.append(entry)
     if not state.entries:
         raise TrustboError(f"the campaign in {str(directory)!r} has no mission; run one first.")
     given = state.settings

@@ -136,13 +136,14 @@ class State:
     def row_of(self, plan: Plan, mission: Mission) -> dict[str, Any]:
         """Return the row of a new mission for `Result.table`."""
         before = self.entries[-1].plan if self.entries else plan
-        rates = mission.contact_rate
+        planned = plan.path if mission.path[-1] != plan.path[-1] else ()
+        longest, rates = max(len(mission.path), len(planned)) - 1, mission.contact_rate
         contact = float(np.nanmean(rates)) if np.isfinite(rates).any() else np.nan
         return {
             "objective": plan.value,
             "path_changed": plan.path != before.path,
             "contact_rate": contact,
-            "contact_lost": len(mission.path) - 1 - len(mission.bounds) * contact,
+            "contact_lost": longest - len(mission.bounds) * contact,
             "status": mission.status,
             "state": TOLD,
             "reason": "",

@@ -26,9 +26,9 @@ class RegretBound:
     The best path is planned exactly under each of 500 posterior draws. For lost_contact, the
     regret of the recommended path is the additional contact that it loses, as a fraction of the
     contact kept on the best path. For other objectives, regret is a fraction of the best path's
-    value. The campaign stops when P(regret <= eps) >= 1 - delta after each of the last two
-    missions, and every bound of the recommended path has been completed at least once. The map may
-    be wrong about bounds that were never driven.
+    value. From the third mission on, the campaign stops if P(regret <= eps) >= 1 - delta after each
+    of the last two missions, and every bound of the recommended path has been completed at least
+    once, since the map may be wrong about bounds that were never driven.
 
     Attributes:
         eps: Acceptable regret, as a fraction; 0.05 is 5 %.
@@ -48,9 +48,10 @@ class RegretBound:
 
     def __call__(self, campaign: "Campaign") -> str | None:
         """Return the reason to stop, or None."""
-        n = len(campaign.state.entries)
+        if (n := len(campaign.state.entries)) <= 2:
+            return None
         sure = self.probability(campaign, n)
-        if n <= 2 or min(sure, self.probability(campaign, n - 1)) < 1.0 - self.delta:
+        if min(sure, self.probability(campaign, n - 1)) < 1.0 - self.delta:
             return None
         risk, bounds = campaign.risk, tuple(bounds_along(np.array(campaign.recommend().path)).T)
         if not (risk.exposures[bounds] > risk.failures[bounds]).all():  # a bound is new

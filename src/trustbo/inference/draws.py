@@ -110,7 +110,7 @@ def params_of(
         robots = (len(theta["rest"]), attrs["n_robots"])
         n = attrs["n_missions"]
         slopes = [effect.ahead(values_of(posterior, effect), theta, n, rng) for effect in effects]
-        slope = np.broadcast_to(np.sum(slopes, axis=0), robots)
+        slope = np.broadcast_to(sum(slopes), robots)
         features = posterior["posterior"].to_dataset()["feature"].values.tolist()
         sight = [m for m, name in enumerate(features) if is_line_of_sight(name)]
         weights = np.zeros((*robots, len(features)))

@@ -320,9 +320,9 @@ class Planner(Summary):
 
         The maximum is over paths to the cell, without U-turns, that have at most two bounds more
         than the fewest, or fewer if `max_bounds` is tighter. Longer walks are excluded because they
-        could gain trust by loitering. With the default `max_bounds`, the value at the goal equals
-        the final trust of the `terminal` plan. The map has the shape (row, col), or (robot, row,
-        col) with `per_robot`. If there are several draws, the map has a leading axis (draw,).
+        could gain trust by loitering. With the default `max_bounds` and no toll, the value at the
+        goal equals the final trust of the `terminal` plan. The map has the shape (row, col), or
+        (robot, row, col) with `per_robot`, and a leading axis (draw,) if there are several draws.
 
         Args:
             params: Posterior from `fit`, or parameters of any model.
@@ -369,7 +369,7 @@ class Planner(Summary):
             "cost": (cost_of(trust).mean("draw"), "mean cost 1 - sigma(trust)"),
             "path_probability": (passable.copy(data=share), "P(cell on the best path)"),
         }
-        if params.places:
+        if "place" in params.places:
             place = xr.DataArray(params.places["place"].mean(1), dims=("draw", "row", "col"))
             maps["place_mean"] = place.mean("draw"), "mean place effect"
             maps["place_sd"] = place.std("draw"), "sd of the place effect"
