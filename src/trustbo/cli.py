@@ -23,16 +23,11 @@ OBJECTIVES = ("lost_contact", "terminal", "mean")
 FORMATS = ("geotiff", "geojson", "csv", "nav2")
 BAD_INPUT, INTERRUPTED = 2, 130
 PLACE = "ROW,COL with row 0 in the north, x=...,y=... in CRS metres, or lon=...,lat=... (degrees)"
-_COLUMNS = ["status", "contact_rate", "objective", "k_hat", "r_hat", "path_changed"]
-"""Columns of the table that is printed after a campaign."""
+_COLUMNS = ["status", "contact_rate", "objective", "k_hat", "r_hat", "path_changed"]  # printed
 
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
-    """Run a command and exit; errors are printed as one line on standard error.
-
-    Args:
-        arguments: Words after `trustbo`; by default, those of this process.
-    """
+    """Run a command and exit; errors are printed as one line on standard error."""
     args = parser().parse_args(arguments)
     warnings.showwarning = lambda message, *_, **__: print(f"warning: {message}", file=sys.stderr)
     for stream in (sys.stdout, sys.stderr):  # a terminal may not support all characters
@@ -78,7 +73,7 @@ def parser() -> argparse.ArgumentParser:
     add = command(info, "Describe and plot the planning grid of a terrain.", "dem.tif")
     add("dem", type=Path, metavar="DEM", help="raster of ground heights, such as a GeoTIFF")
     add("dsm", type=Path, nargs="?", metavar="DSM", help="raster of surface heights")
-    _add_grid(add)
+    _add_workspace(add)
     add("--out", type=Path, default=Path("grid.png"), metavar="FILE", help="image file to write")
 
     example = "--dem dem.tif --dsm dsm.tif --start 9,0 --goal 0,9"
@@ -87,12 +82,10 @@ def parser() -> argparse.ArgumentParser:
     add("--dsm", type=Path, metavar="FILE", help="raster of surface heights")
     add("--start", type=place, required=True, metavar="PLACE", help=PLACE)
     add("--goal", type=place, required=True, metavar="PLACE", help="in the same format as --start")
-    _add_grid(add)
-    add("--robots", type=_count, default=3, metavar="N", help="overwatching robots (default 3)")
-    add("--max-slope", type=float, default=45.0, metavar="DEG", help="slope limit (default 45)")
+    _add_workspace(add)
     add("--policy", choices=POLICIES, help="policy that chooses the paths (default greedy)")
     add("--objective", choices=OBJECTIVES, help="objective of the paths (default lost_contact)")
-    add("--paper", action="store_true", help="use the model, awareness and policy of the paper")
+    add("--paper", action="store_true", help="use the settings of the paper, with NUTS")
     _add_stop(add)
     _add_campaign(add, "out")
 
@@ -118,10 +111,12 @@ def _add_campaign(add: Any, folder: str) -> None:
     add("--quiet", "-q", action="store_true", help="hide the progress bar and the table")
 
 
-def _add_grid(add: Any) -> None:
-    """Add the flags of the planning grid."""
+def _add_workspace(add: Any) -> None:
+    """Add the flags of the planning grid and of the team."""
     add("--shape", type=shape, default=(10, 10), metavar="ROWS,COLS", help="cells (default 10,10)")
     add("--resolution", type=float, metavar="M", help="average the rasters to M-metre pixels")
+    add("--robots", type=_count, default=3, metavar="N", help="overwatching robots (default 3)")
+    add("--max-slope", type=float, default=45.0, metavar="DEG", help="slope limit (default 45)")
 
 
 def _add_stop(add: Any) -> None:
@@ -165,8 +160,7 @@ def info(args: argparse.Namespace) -> None:
 
     import trustbo as tb
 
-    terrain = tb.terrain.read_terrain(args.dem, args.dsm, resolution=args.resolution)
-    workspace = tb.Workspace.from_terrain(terrain, args.shape)
+    workspace = _workspace(args)
     print(workspace)
     plt.switch_backend("agg")
     tb.plots.grid_map(workspace)
@@ -176,22 +170,28 @@ def info(args: argparse.Namespace) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Run a simulated campaign on the user's terrain."""
+    import trustbo as tb
+
+    features, options = (tb.paper.WORKSPACE, dict(tb.paper.CAMPAIGN)) if args.paper else ({}, {})
+    given = {"policy": args.policy, "objective": args.objective}
+    options |= {name: value for name, value in given.items() if value is not None}
+    workspace = _workspace(args, **features)
+    _run(args, workspace, start=args.start, goal=args.goal, **options, stop=_stop(args))
+
+
+def _workspace(args: argparse.Namespace, **features: Any) -> "Workspace":
+    """Make the workspace of a command with the flags of `_add_workspace`."""
     from math import radians
 
     import trustbo as tb
     from trustbo.workspace.grid import Grid
 
+    terrain = tb.terrain.read_terrain(args.dem, args.dsm, resolution=args.resolution)
+    for end in (args.start, args.goal) if args.run is run else ():  # before what is slow
+        Grid.over(terrain, args.shape).locate(end)
     robot = tb.Robot(max_slope=radians(args.max_slope))
     team = tb.Team(robots=(robot,) * args.robots, lead=robot)
-    terrain = tb.terrain.read_terrain(args.dem, args.dsm, resolution=args.resolution)
-    ends = {"start": args.start, "goal": args.goal}
-    for end in ends.values():  # before the slow computation of awareness
-        Grid.over(terrain, args.shape).locate(end)
-    features, options = (tb.paper.WORKSPACE, dict(tb.paper.CAMPAIGN)) if args.paper else ({}, {})
-    given = {"policy": args.policy, "objective": args.objective}
-    options |= {name: value for name, value in given.items() if value is not None}
-    workspace = tb.Workspace.from_terrain(terrain, args.shape, team, **features)
-    _run(args, workspace, **ends, **options, stop=_stop(args))
+    return tb.Workspace.from_terrain(terrain, args.shape, team, **features)
 
 
 def _run(args: argparse.Namespace, workspace: "Workspace", **options: Any) -> None:

@@ -240,8 +240,8 @@ class Mission(Summary):
         for what, wanted in names.items():
             if sorted(own[what]) != sorted(wanted):
                 raise TrustboError(
-                    f"the mission has {what} {getattr(self, what)}, not {wanted}; pass these "
-                    f"names as {what}=, or use the workspace of this team."
+                    f"the mission has {what} {getattr(self, what)}, not {wanted}; rename them, or "
+                    "use a workspace with these names."
                 )
         i, m = ([own[what].index(name) for name in wanted] for what, wanted in names.items())
         bounds = []

@@ -175,7 +175,7 @@ def _uncertainty(result: Result) -> list[str]:
 
 def _diagnostics(result: Result) -> list[str]:
     names = {
-        "k_hat": "Pareto k-hat (good below 0.7)",
+        "k_hat": "Pareto k-hat (at most 0.7, good below 0.5)",
         "kish": "effective samples (Kish)",
         "r_hat": "R-hat (good up to 1.01)",
         "ess_bulk": "bulk ESS",

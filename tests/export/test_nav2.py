@@ -1,14 +1,19 @@
 """Files for Nav2, read as its loaders read them."""
 
+import copy
+import dataclasses
 import json
 
 import networkx as nx
 import numpy as np
 import pytest
+from worlds import unequal_robots
 
+import trustbo as tb
 from trustbo.errors import TrustboError
 from trustbo.export import Frame, write_nav2
 from trustbo.export.nav2 import write_ros_map
+from trustbo.workspace.moves import bounds_along
 
 
 def picture(file):
@@ -72,3 +77,34 @@ def test_the_route_graph_has_the_costs_of_all_bounds(result, tmp_path):
     assert {*found.edges} == {*graph.edges}
     for a, c, lost in graph.edges(data="lost"):
         assert found.edges[a, c]["cost"] == pytest.approx(max(lost, 1e-9))
+
+
+def test_edges_cost_their_failures_after_the_first_one(tmp_path):
+    workspace = unequal_robots(blocked=[(0, 0)])
+    campaign = tb.Campaign(workspace, (2, 0), (0, 3))
+    driven = tb.simulation.KinematicSimulator(workspace).run(campaign.ask().path, seed=0)
+    campaign.tell(driven)
+    failed = campaign.ask().path[:2]
+    campaign.fail("stuck", where=failed[1])
+    write_nav2(tmp_path, campaign)
+    features = json.loads((tmp_path / "route_graph.geojson").read_text())["features"]
+    ids = [row * workspace.grid.shape[1] + col for row, col in failed]
+    found = [f["properties"] for f in features if f["properties"].get("startid") == ids[0]]
+    [edge] = [one for one in found if one["endid"] == ids[1]]
+    graph, price = campaign.planner.graph(campaign.posterior), campaign.planner.problem.price
+    p_fail = campaign.risk.mean[bounds_along(failed)[0][0], *failed[1]]
+    assert edge["metadata"]["p_fail"] == pytest.approx(p_fail)
+    assert edge["cost"] == pytest.approx(graph.edges[failed]["lost"] + price * p_fail)
+    assert edge["cost"] > max(one["cost"] for one in found if one is not edge)
+
+
+@pytest.mark.parametrize("name", ["/tb3_0", "../r1", "lead"])
+def test_names_of_robots_that_are_no_names_of_files_are_refused(name, result, tmp_path):
+    other = copy.copy(result)
+    team = dataclasses.replace(
+        result.workspace.team, names=(name, *result.workspace.team.names[1:])
+    )
+    other.workspace = dataclasses.replace(result.workspace, team=team)
+    with pytest.raises(tb.TrustboError, match="name"):
+        write_nav2(tmp_path, other)
+    assert not list(tmp_path.iterdir())

@@ -184,12 +184,35 @@ def test_heights_in_centimetres_are_said_to_be_in_another_unit(tmp_path):
 
 
 def test_zeros_apart_from_all_heights_are_warned_of_and_a_coast_is_not():
-    clipped = plane(dtype=float)
-    clipped[:3, :3] = 0.0
-    with pytest.warns(UserWarning, match="exactly 0 m"):
-        read_terrain(array(clipped), array(clipped))
+    for rows in (3, 7):
+        clipped = plane(dtype=float)
+        clipped[:rows, :rows] = 0.0
+        with pytest.warns(UserWarning, match="exactly 0 m"):
+            read_terrain(array(clipped), array(clipped))
+    level = array(plane(np.nan, float) * 0.0)
+    read_terrain(level, level)
     coast = array(np.maximum(plane(dtype=float) - 95.0, 0.0))
     read_terrain(coast, coast)  # warnings are errors
+
+
+@pytest.mark.parametrize("units", ["m m-1", "m/s", "kg m-2", "0.1 m", "m**-1"])
+def test_units_that_are_no_lengths_are_refused(units):
+    with pytest.raises(TrustboError, match="not in metres or feet"):
+        read_terrain(array(plane()).assign_attrs(units=units))
+
+
+def test_depths_of_cf_files_are_below_sea_level_and_axes_in_km_are_refused():
+    depths = array(plane(dtype=float)).assign_attrs(units="m", positive="down")
+    np.testing.assert_array_equal(read_terrain(depths, depths)["dem"], -plane(dtype=float))
+    far = array(plane())
+    far["x"].attrs["units"] = "km"
+    with pytest.raises(TrustboError, match="km"):
+        read_terrain(far, far)
+
+
+def test_blocks_of_pixels_that_are_not_square_are_square():
+    tall = array(plane(shape=(40, 40))).assign_coords(y=4_999_998.0 - 4.0 * np.arange(40.0))
+    assert pixel_size(read_terrain(tall, tall, resolution=8.0)) == (8.0, 8.0)
 
 
 def test_pictures_are_refused_and_several_bands_are_warned_of(tmp_path):

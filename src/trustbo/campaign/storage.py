@@ -70,8 +70,8 @@ class Storage:
         path = Path(directory)
         if not overwrite and any((path / name).exists() for name in (RECORD, MISSIONS)):
             raise TrustboError(
-                f"{str(directory)!r} contains a campaign: continue it with Campaign.load or "
-                "resume, give another folder, or replace it with overwrite=True."
+                f"{str(directory)!r} contains a campaign: continue it (Campaign.load, resume), "
+                "give another folder, or replace it (overwrite)."
             )
         storage = cls(path)
         try:

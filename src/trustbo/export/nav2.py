@@ -7,6 +7,7 @@ CRS. YAML files are written as JSON, which is valid YAML.
 
 import json
 import math
+import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -65,7 +66,7 @@ def write_nav2(
         folder: Folder for `cost_map.yaml` and `.pgm`, `waypoints_<robot>.yaml` (on a terrain),
             `route_graph.geojson` and `frame.yaml`.
         result: Result of a campaign.
-        frame: Frame of all files; by default, the start of the path is the frame's origin.
+        frame: Frame of all files; by default, the centre of the first cell is the frame's origin.
         pixel: Side length of a map pixel, in metres; by default a tenth of a cell's shorter side.
 
     Raises:
@@ -75,6 +76,12 @@ def write_nav2(
     folder, workspace = Path(folder), result.workspace
     place = frame or Frame(workspace.grid.center(result.path[0]))
     names = () if result.plan.stops is None else (LEAD, *workspace.team.names)
+    for name in names[1:]:
+        if not re.fullmatch(r"[\w -][\w .-]*", name) or name == LEAD:
+            raise TrustboError(
+                f"the robot's name {name!r} cannot be part of a file name, or is that of the lead; "
+                "use letters, digits, '_' and '-'."
+            )
     stops = {robot: stops_of(result.plan, robot, place) for robot in names}
     graph = _graph(result, place)
     write_ros_map(folder / "cost_map.yaml", result.maps()["cost"], workspace, frame=place,
@@ -184,10 +191,11 @@ def _pose(frame: str, x: float, y: float, turn: float) -> dict[str, Any]:
 
 
 def _graph(result: Result, frame: Frame) -> str:
-    """Return all bounds with the contact lost in each, as GeoJSON for Nav2's route server.
+    """Return all bounds with their expected costs, as GeoJSON for Nav2's route server.
 
-    Nodes are stops, with the id row * columns + column. Edges are straight lines, with the id
-    (1 + move) * cells + id of the stop entered. Nav2's PenaltyScorer reads the cost in `metadata`.
+    The cost of a bound is the contact lost in it plus its failure probability times the cost of a
+    failure. Nodes are stops, with the id row * columns + column. Edges are straight lines, with the
+    id (1 + move) * cells + id of the stop entered. Nav2's PenaltyScorer reads `penalty`.
     """
     workspace = result.workspace
     cols, n_cells = workspace.grid.shape[1], math.prod(workspace.grid.shape)
@@ -204,12 +212,14 @@ def _graph(result: Result, frame: Frame) -> str:
     for (row, col), xy in where.items():
         about = {"id": row * cols + col, "frame": frame.name, "metadata": {"row": row, "col": col}}
         features.append(_feature("Point", xy, about))
-    for a, c, lost in graph.edges(data="lost"):
+    price = result.planner.problem.price
+    for a, c, edge in graph.edges(data=True):
         move = MOVES.index((c[0] - a[0], c[1] - a[1]))
         first, last = (row * cols + col for row, col in (a, c))
-        cost = max(float(lost), _MIN_COST)
+        p_fail = -math.expm1(-edge.get("risk", 0.0))
+        cost = max(edge["lost"] + price * p_fail, _MIN_COST)
         about = {"id": (1 + move) * n_cells + last, "startid": first, "endid": last, "cost": cost}
-        about |= {"overridable": True, "metadata": {"penalty": cost}}
+        about |= {"overridable": True, "metadata": {"penalty": cost, "p_fail": p_fail}}
         features.append(_feature("MultiLineString", [[where[a], where[c]]], about))
     return '{"type": "FeatureCollection", "features": [\n' + ",\n".join(features) + "\n]}\n"
 

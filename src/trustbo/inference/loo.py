@@ -121,7 +121,7 @@ def compare(posteriors: Mapping[str, xr.DataTree]) -> pd.DataFrame:
     Returns:
         Table from `arviz.compare` with one row per posterior, the best first. The columns include
         `elpd`, `elpd_diff` and its standard error `dse` in nats, the stacking `weight`, and
-        `warning`, which is true if a Pareto k is high.
+        `diag_elpd`, which names a high Pareto k.
 
     Raises:
         TrustboError: If there are fewer than two posteriors, or their rates or tick counts differ.

@@ -134,9 +134,7 @@ def require_one_spelling(what: str, names: Iterable[str]) -> None:
     spelled: dict[str, str] = {}
     for name in dict.fromkeys(names):
         if (other := spelled.setdefault(_folded(name), name)) != name:
-            raise TrustboError(
-                f"{what}: {other!r} and {name!r} look alike; use one spelling, or other names."
-            )
+            raise TrustboError(f"{what}: {other!r} and {name!r} look alike; use one spelling.")
 
 
 def _folded(name: str) -> str:

@@ -71,6 +71,8 @@ def read_table(table: Any) -> list[Mission]:
     columns = Columns(table)
     known = [columns.find(name) for name in COLUMNS]
     features = [name for name in columns.frame if name not in known] or list(FEATURES)
+    if odd := {"x", "y", "lon", "lat", "time", "timestamp"} & {*map(str.lower, features)}:
+        raise TrustboError(f"{sorted(odd)} are no features; drop them, and give cells as row, col.")
     frame = _parsed(columns, features)
     robots = tuple(name for name in frame["robot"].unique() if name)
     require_one_spelling("column robot", robots)
@@ -90,8 +92,8 @@ def _parsed(columns: Columns, features: Sequence[str]) -> pd.DataFrame:
     """Return the columns with the names and types of this module; NaN or "" where blank."""
     values: dict[str, Any] = {"mission": columns.texts("mission", blank=False)}
     require_one_spelling("column mission", values["mission"])
-    for name in ("robot", "status"):
-        values[name] = columns.texts(name, required=name == "robot")
+    values["robot"] = columns.texts("robot")
+    values["status"] = [text.lower() for text in columns.texts("status", required=False)]
     is_mapped = any(columns.find(name) for name in ("row", "col"))
     for name in ("bound", "row", "col") if is_mapped else ("bound",):
         values[name] = columns.numbers(name, blank=False, whole=True).astype(int)
@@ -113,13 +115,13 @@ def _mission(rows: pd.DataFrame, features: Sequence[str], robots: tuple[str, ...
     values, status = rows.set_index([*KEYS[1:]])[[*RATES, *features]], rows["status"]
     measured = rows.loc[values.notna().to_numpy().any(axis=1) | (status != ""), "bound"]
     if measured.empty or measured.min() < 1:
-        raise TrustboError("bounds with a measurement must be numbered from 1; got none or 0.")
+        raise TrustboError("bounds with a rate or feature must be numbered from 1; got none or 0.")
     n_run, ended = int(measured.max()), rows.loc[~status.isin(["", "ok"])]
     if ended["status"].nunique() > 1 or (ended["bound"] < n_run).any():
         raise TrustboError("only the last bound that was run may have a status other than ok.")
     expected = pd.MultiIndex.from_product([range(1, n_run + 1), robots])
     for k, robot in expected.difference(values.index):
-        raise TrustboError(f"bound {k} has no row for {robot}.")
+        raise TrustboError(f"bound {k} has no row for {robot}; add it, with blank values.")
     arrays = values.loc[expected].to_numpy(float).reshape(n_run, len(robots), -1)
     rate, duration, n_ticks = np.moveaxis(arrays[..., : len(RATES)], -1, 0)
     return Mission.from_arrays(

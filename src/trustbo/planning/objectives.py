@@ -1,6 +1,6 @@
 """Objectives, which compute the value of a path from the team's expected trust along the path."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -47,7 +47,7 @@ class Objective(NamedTuple):
 LOST_CONTACT = Objective("lost_contact", of_contact=True, max_bounds="shortest+4")
 TERMINAL = Objective("terminal", credit=lambda left: np.where(left == 0, 1.0, 0.0), value=expit)
 MEAN = Objective("mean", scale=lambda n_bounds: np.maximum(n_bounds, 1.0))
-OBJECTIVES: Mapping[str, Objective] = {row.name: row for row in (LOST_CONTACT, TERMINAL, MEAN)}
+OBJECTIVES: dict[str, Objective] = {row.name: row for row in (LOST_CONTACT, TERMINAL, MEAN)}
 """Objectives, keyed by name; larger values are better.
 
 lost_contact: minus the sum of the expected lost contact in bounds, the tolls and, if the planner

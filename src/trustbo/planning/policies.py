@@ -5,7 +5,7 @@ the name of a policy is accepted. The policies below report the trust and value 
 the posterior mean of the parameters.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 import numpy as np
 
@@ -64,7 +64,7 @@ def random(rng: np.random.Generator, params: Params, planner: Planner) -> Plan:
     return planner.evaluate(planner.best_path(dynamics), params.mean())
 
 
-POLICIES: Mapping[str, Policy] = {
+POLICIES: dict[str, Policy] = {
     "greedy": greedy,
     "optimistic": optimistic,
     "thompson": thompson,

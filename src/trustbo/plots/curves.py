@@ -95,13 +95,13 @@ def _latent_trust(
 
 @styled
 def campaign_history(history: xr.Dataset, *, ax: Any = None) -> np.ndarray:
-    """Plot the contact, the objective and, if known, the regret of each mission.
+    """Plot the contact, the objective and, if given, the regret of each mission.
 
     A filled dot marks a plan that differs from the previous plan. A cross marks a mission that did
     not reach the goal.
 
     Args:
-        history: History of a campaign, from `Result.history` or `Campaign.history`.
+        history: History of a campaign, `Result.history`; see `Result.plot_history` for regret.
         ax: Axes to draw on, one for each variable; by default a new figure.
 
     Returns:

@@ -28,6 +28,7 @@ _CONTOURS = 12  # maximum number of contour levels
 _MAX_PIXELS = 400  # maximum number of rows or columns when contour lines are computed
 _SMOOTH = 0.01  # sd of the smoothing, as a fraction of the raster's longer side
 _ROBUST = (0.02, 0.98)  # quantiles at the ends of the colour scale
+_BESIDE = 1.1  # width of axis labels and colour bar, in inches
 _LOGIT = 1.5  # trust above this value is on the logit scale of beta-binomial models
 
 
@@ -74,9 +75,9 @@ def trust_maps(
     for one, trust, cells, n in zip(axes, values, paths, learned, strict=True):
         draw_cells(one, maps[0].copy(data=trust), workspace, norm)
         draw_path(one, cells, workspace.grid)
-        one.set_title("prior" if n == 0 else f"after {n} mission{'s' * (n > 1)}")
+        one.set_title("before the first mission" if n == 0 else f"after {n} mission{'s' * (n > 1)}")
     draw_scale(axes[0], workspace.grid)
-    unit = " (1: unbroken contact)" if high <= 1.0 else ""
+    unit = "\n(1: unbroken contact)" if high <= 1.0 else ""
     colour_bar(axes, ScalarMappable(norm), f"expected trust{unit}", extend="both")
     return axes
 
@@ -116,7 +117,7 @@ def terrain_maps(workspace: Workspace, *, ax: Any = None) -> np.ndarray:
         draw_cell_edges(one, grid)
     draw_scale(surface, grid)
     colour_bar(axes, heights, "height (m)", location="bottom", aspect=40)
-    colour_bar(axes, ScalarMappable(Normalize(0.0, 1.0)), "index (0 worst, 1 best)")
+    colour_bar(axes, ScalarMappable(Normalize(0.0, 1.0)), "index\n(0 worst, 1 best)")
     return axes
 
 
@@ -168,8 +169,9 @@ def map_panels(grid: Grid, n: int, ax: Any) -> np.ndarray:
     """Return axes for n maps; positions are in metres from the lower left corner of the grid."""
     left, right, bottom, top = extent_of(grid)
     tall = float(np.clip((top - bottom) / (right - left), 0.3, 3.0))
-    width = 3.0 if n > 1 else 4.0
-    axes = panels(n, ax, (width, width * tall + 0.4), columns=2 if n == 4 else 3)
+    width, columns = 3.0 if n > 1 else 4.0, 2 if n == 4 else 3
+    inner = width - _BESIDE / min(n, columns)
+    axes = panels(n, ax, (width, inner * tall + 0.4), columns=columns)
     for one in axes:
         one.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
         one.spines[:].set_visible(True)

@@ -40,6 +40,8 @@ def in_metres(stored: xr.DataArray, axis: float | None, nodata: float | None) ->
     if raw.dtype.kind not in "iuf":
         raise TrustboError(f"{name} holds {raw.dtype}, not heights; give real numbers.")
     metres = _unit_of(name, attrs.get("units"), axis)
+    if attrs.get("positive") == "down":  # as in the CF conventions
+        metres = -abs(metres)
     if abs(metres) != 1.0:
         warn(f"{name} has heights in units of {abs(metres):.6g} m; they are converted to metres.")
     values = raw.astype(float)
@@ -76,9 +78,8 @@ def in_metres(stored: xr.DataArray, axis: float | None, nodata: float | None) ->
 
 def _warn_of_zeros(heights: np.ndarray, name: str) -> None:
     """Warn of pixels at exactly 0 m that are far from all other heights (missing values?)."""
-    zero, low = heights == 0.0, np.abs(heights) <= 10.0
-    others = np.isfinite(heights).sum() - zero.sum()
-    if zero.any() and low.sum() < 1.1 * zero.sum() < 1.1 * others:  # else the ground is level
+    zero, low, high = heights == 0.0, np.abs(heights) <= 10.0, np.abs(heights) > 10.0
+    if zero.any() and high.any() and low.sum() < 1.1 * zero.sum():
         warn(
             f"{name} is exactly 0 m on {zero.mean():.1%} of its pixels, but hardly any other "
             "height is below 10 m: zeros may be missing heights; pass nodata=0 if they are."
@@ -93,7 +94,7 @@ def _unit_of(name: str, declared: object, axis: float | None) -> float:
     text = str(np.ravel(np.array(declared, object))[0] or "").strip()
     words = set(re.findall(r"[a-z]+", text.lower()))
     in_metres, in_feet = bool(words & _METRE), bool(words & _FOOT)
-    if text and in_metres == in_feet:
+    if text and (in_metres == in_feet or re.search(r"^[\d.]|/|[a-z] ?(\^|\*\*)?-\d", text.lower())):
         raise TrustboError(
             f"{name} has heights in {text!r}, not in metres or feet; convert them, or declare "
             "the true unit, e.g. with gdal_edit.py -units m."

@@ -60,7 +60,7 @@ def read_terrain(
             is omitted, the ground is used as the surface, and a warning is issued.
         crs: Coordinate reference system of rasters without one, e.g. `"EPSG:32633"`.
         resolution: Pixel size in metres; smaller pixels are averaged in square blocks of about
-            this size.
+            this size, and incomplete blocks at the edge are dropped.
         nodata: Additional stored value that marks missing data.
 
     Returns:
@@ -216,6 +216,8 @@ def _of_array(array: xr.DataArray, name: str) -> xr.DataArray:
     _warn_of_bands(max([array.sizes[dim] for dim in bands], default=1), name)
     array = array.isel(dict.fromkeys(bands, 0)).transpose(y, x)
     rows, cols = (_even(array[axis].values, f"{name}'s {axis}") for axis in (y, x))
+    if (unit := str(array[x].attrs.get("units")).lower()).startswith(("k", "f", "us", "rad")):
+        raise TrustboError(f"{name} has x in {unit!r}; convert x and y to metres.")
     return array.rename({y: "y", x: "x"}).assign_coords(y=rows, x=cols).rename(name)
 
 
@@ -264,17 +266,12 @@ def _paired(ground: xr.DataArray, surface: xr.DataArray) -> xr.Dataset:
 
 
 def _averaged(terrain: xr.Dataset, resolution: float | None) -> xr.Dataset:
-    """Average square blocks of side `resolution`, m; NaN if over half of a block is missing.
-
-    Incomplete blocks at the edge are dropped.
-    """
+    """Average square blocks of side `resolution`, m; NaN if over half of a block is missing."""
     if resolution is None:
         return terrain
-    factor = max(1, round(require_positive("resolution", resolution) / pixel_size(terrain)[0]))
-    shape = terrain["dem"].shape
-    if min(shape) < 2 * factor:
-        raise TrustboError(
-            f"{shape} pixels are too few to average {factor} x {factor}; reduce resolution=."
-        )
-    squares: Any = terrain.coarsen(y=factor, x=factor, boundary="trim")
-    return squares.mean().where(2 * squares.count() >= factor**2)
+    side, shape = require_positive("resolution", resolution), terrain["dem"].shape
+    tall, wide = (max(1, round(side / pixel)) for pixel in pixel_size(terrain))
+    if shape[0] < 2 * tall or shape[1] < 2 * wide:
+        raise TrustboError(f"{shape} pixels are too few for {tall} x {wide}; reduce resolution=.")
+    squares: Any = terrain.coarsen(y=tall, x=wide, boundary="trim")
+    return squares.mean().where(2 * squares.count() >= tall * wide)
