@@ -41,8 +41,8 @@ class Plan(Summary):
         risk: Failure probability of each bound, and the arrival probability with its 90 % band;
             None if the planner has no risk.
         infeasible: Whether the failure probability of the path exceeds `max_failure`.
-        value_band: Ends of the 90 % band of the value over the parameter draws, without observation
-            noise and with the mean failure probability; None with one draw.
+        value_band: Ends of the 90 % band of the value over the draws, with the mean failure
+            probability; None with one draw. `value` limits trust to 1 and may lie outside.
     """
 
     path: tuple[Cell, ...]
