@@ -95,7 +95,8 @@ def learn_hazard(state: State, workspace: Workspace) -> xr.Dataset:
     measured = [
         entry.measured
         for entry in state.entries
-        if entry.row["state"] != EXCLUDED or entry.row["reason"] == why_never_learned(entry.mission)
+        if entry.row["state"] != EXCLUDED
+        or entry.row["reason"] == (why_never_learned(entry.mission) or None)
     ]
     lost = [LostMission(f.path, f.where) for f in state.failures if f.path]
     prior = Hazard(**state.settings["hazard"])

@@ -46,7 +46,7 @@ def iterate(
         **options: Further arguments of `Campaign`, such as `model`, `policy` or `fit`.
 
     Returns:
-        Campaign after the last mission; its properties are the results.
+        Campaign after the last mission, whose properties are the results; a `directory` is closed.
 
     Raises:
         TrustboError: The input is invalid or the folder has a campaign; raised before any work.

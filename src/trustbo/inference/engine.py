@@ -1,7 +1,7 @@
 """Evidence of a model with blocks of jointly normal signals that share columns.
 
-A block is a robot in a mission, a mission of dependent robots, or a person. Each block has trust x
-and a signal f,
+A block is a robot in a mission, a whole mission if its robots are dependent, or a person. Each
+block has trust x and a signal f,
 
     x = m + T U c + e,    f = x + n,    e ~ N(0, S),  n ~ N(0, noise),  c ~ N(mean, precision^-1),
 

@@ -269,7 +269,7 @@ def solve_upper(H: Any, x: Any, *, transposed: bool) -> Any:
 
 
 def inverse_of_upper(H: Any) -> Any:
-    """Compute (H' H)^-1 for upper triangles H (point, n, n); entries below are ignored."""
+    """Compute (H' H)^-1 for upper-triangular H (point, n, n); other entries are ignored."""
     if not isinstance(H, np.ndarray):
         one = jnp.broadcast_to(jnp.eye(H.shape[1]), H.shape)
         half = solve_upper(H, one, transposed=True)

@@ -67,7 +67,7 @@ def predict_reports(
     if missions[0].features != of_fit.slots.features:
         raise TrustboError(
             f"the posterior was fitted to the inputs {of_fit.slots.features}, but the missions "
-            f"have {missions[0].features}; give missions with the inputs of the posterior."
+            f"have {missions[0].features}; give missions with the same inputs as the posterior."
         )
     levels = levels_of(posterior.attrs["scale"])
     ahead = Posterior(of_fit.model, of_fit.model.slots(missions))

@@ -37,8 +37,8 @@ def read_tracks(
 
     With a workspace, the result is one mission for `Campaign.tell`, with the robots and features of
     the workspace and without measured awareness. A bound begins where the lead enters the next cell
-    of its path. If the planned path is given, cells whose corners the lead cuts are not bounds. If
-    the lead does not reach the last cell, the status is `"aborted"`.
+    of its path. If the planned path is given, a cell is not a bound if the lead only cuts its
+    corner. If the lead does not reach the last cell, the status is `"aborted"`.
 
     Without a workspace, bounds are time windows. The lead is also listed as a robot, so that all
     missions have the same robots, with contact rates NaN and features 0. A bound without any tick

@@ -58,7 +58,7 @@ class PooledTrust(TrustModel):
         return {**values, "rest": rest}
 
     def layout(self, slots: Slots, *, contrasts: bool = True) -> Layout:
-        """Make one block per robot; with shared noise, one per contrast of robots or per mission.
+        """Make one block per robot; if noise is shared, one per contrast of robots or per mission.
 
         Helmert contrasts of the robots' rates are independent if all robots are measured.
         """

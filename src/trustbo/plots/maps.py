@@ -285,7 +285,7 @@ def trust_limits(values: np.ndarray) -> tuple[float, float]:
 
 
 def draw_scale(ax: Axes, grid: Grid) -> None:
-    """Draw a scale bar of a round length in the lower right corner of a map."""
+    """Draw a scale bar, whose length is a round number, in the lower right corner of a map."""
     left, right = ax.get_xlim()
     width = right - left
     magnitude = 10.0 ** np.floor(np.log10(0.4 * width))

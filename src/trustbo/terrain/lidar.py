@@ -31,7 +31,7 @@ def read_lidar(points: FilePath, resolution: float = 1.0, *, crs: object = None)
     Args:
         points: A LAS or LAZ file.
         resolution: Pixel size, m; pixel edges are at multiples of it.
-        crs: Coordinate reference system of a file without one, e.g. `"EPSG:32633"`.
+        crs: Coordinate reference system, if the file has none, e.g. `"EPSG:32633"`.
 
     Returns:
         Dataset with `dem` and `dsm` as from `read_terrain`.

@@ -97,7 +97,7 @@ class Effect:
         return {name: dist.HalfNormal(getattr(self, name)) for name in self.names}
 
     def slots(self, slots: Slots, missions: Sequence[Mission], on: Workspace | None) -> Slots:
-        """Add the data that the columns need to the slots; `on` is the workspace, if known."""
+        """Fill the slots with the data that the columns need; `on` is the workspace, if known."""
         return slots
 
 
