@@ -184,13 +184,10 @@ def test_heights_in_centimetres_are_said_to_be_in_another_unit(tmp_path):
 
 
 def test_zeros_apart_from_all_heights_are_warned_of_and_a_coast_is_not():
-    for rows in (3, 7):
-        clipped = plane(dtype=float)
-        clipped[:rows, :rows] = 0.0
-        with pytest.warns(UserWarning, match="exactly 0 m"):
-            read_terrain(array(clipped), array(clipped))
-    level = array(plane(np.nan, float) * 0.0)
-    read_terrain(level, level)
+    clipped = plane(dtype=float)
+    clipped[:3, :3] = 0.0
+    with pytest.warns(UserWarning, match="exactly 0 m"):
+        read_terrain(array(clipped), array(clipped))
     coast = array(np.maximum(plane(dtype=float) - 95.0, 0.0))
     read_terrain(coast, coast)  # warnings are errors
 

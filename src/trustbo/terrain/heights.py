@@ -78,8 +78,9 @@ def in_metres(stored: xr.DataArray, axis: float | None, nodata: float | None) ->
 
 def _warn_of_zeros(heights: np.ndarray, name: str) -> None:
     """Warn of pixels at exactly 0 m that are far from all other heights (missing values?)."""
-    zero, low, high = heights == 0.0, np.abs(heights) <= 10.0, np.abs(heights) > 10.0
-    if zero.any() and high.any() and low.sum() < 1.1 * zero.sum():
+    zero, low = heights == 0.0, np.abs(heights) <= 10.0
+    others = np.isfinite(heights).sum() - zero.sum()
+    if zero.any() and low.sum() < 1.1 * zero.sum() < 1.1 * others:  # else the ground is level
         warn(
             f"{name} is exactly 0 m on {zero.mean():.1%} of its pixels, but hardly any other "
             "height is below 10 m: zeros may be missing heights; pass nodata=0 if they are."
