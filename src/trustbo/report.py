@@ -123,7 +123,7 @@ def _trust(result: Result) -> list[str]:
         _image(result.plot_maps, "trust maps after selected missions"),
         _note(
             f"Expected trust in each cell, and the path planned with this trust. {scale} "
-            "Grey cells are impassable."
+            "Impassable cells are grey, and so is the start, whose trust is assumed."
         ),
     ]
 
@@ -156,7 +156,8 @@ def _uncertainty(result: Result) -> list[str]:
     if plan.value_band is not None:
         low, high = plan.value_band
         band = (
-            f"The objective is {plan.value:.3g}, with a 90 % interval of {low:.3g} to {high:.3g}."
+            f"The objective is {plan.value:.3g}, with a 90 % interval of {low:.3g} to {high:.3g}; "
+            "only the objective limits trust to 1, so it can lie outside."
         )
     return [
         _heading("Uncertainty"),
