@@ -175,19 +175,19 @@ def run(args: argparse.Namespace) -> None:
     features, options = (tb.paper.WORKSPACE, dict(tb.paper.CAMPAIGN)) if args.paper else ({}, {})
     given = {"policy": args.policy, "objective": args.objective}
     options |= {name: value for name, value in given.items() if value is not None}
-    workspace = _workspace(args, **features)
+    workspace = _workspace(args, args.start, args.goal, **features)
     _run(args, workspace, start=args.start, goal=args.goal, **options, stop=_stop(args))
 
 
-def _workspace(args: argparse.Namespace, **features: Any) -> "Workspace":
-    """Make the workspace of a command with the flags of `_add_workspace`."""
+def _workspace(args: argparse.Namespace, *ends: Any, **features: Any) -> "Workspace":
+    """Make the workspace of the flags of `_add_workspace`; check the ends of paths first."""
     from math import radians
 
     import trustbo as tb
     from trustbo.workspace.grid import Grid
 
     terrain = tb.terrain.read_terrain(args.dem, args.dsm, resolution=args.resolution)
-    for end in (args.start, args.goal) if args.run is run else ():  # before what is slow
+    for end in ends:  # before the slow computation of awareness
         Grid.over(terrain, args.shape).locate(end)
     robot = tb.Robot(max_slope=radians(args.max_slope))
     team = tb.Team(robots=(robot,) * args.robots, lead=robot)

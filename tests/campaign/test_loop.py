@@ -201,6 +201,8 @@ class Steady:
 def test_regret_against_the_truth_is_in_the_figure_of_the_history(workspace):
     truth = tb.simulation.Truth.of(Steady(workspace))
     result = run(workspace, n_iterations=2, simulator=Steady(workspace))
+    with pytest.raises(tb.TrustboError, match="truth"):
+        result.plot_history(Steady(workspace))
     line = result.plot_history(truth)[-1].get_lines()[0]
     best = truth.best(*ENDS, max_bounds="shortest+4")
     kept = len(best) - 1 - truth.lost(best)

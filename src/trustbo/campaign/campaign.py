@@ -11,7 +11,7 @@ from typing import Any, Self
 import numpy as np
 import xarray as xr
 
-from trustbo.campaign.learning import as_learned, learn, why_never_learned
+from trustbo.campaign.learning import as_learned, is_excluded_by_user, learn, why_never_learned
 from trustbo.campaign.result import Result, in_a_line
 from trustbo.campaign.state import EXCLUDED, LEARNED, TOLD, Entry, Failure, Posterior, State
 from trustbo.campaign.stopping import Stop
@@ -137,7 +137,9 @@ class Campaign(Result):
             self.storage = Storage.begin(directory, workspace, self.state, overwrite=overwrite)
 
     def _renew(self) -> None:
-        """Discard the plan and cached properties after the missions or failures have changed."""
+        """Discard the plan and cached properties before the missions or failures change."""
+        if self.storage is not None:
+            self.storage.locked()  # raises TrustboError if the campaign is closed
         self.state.asked = None
         for name, of in vars(Result).items():
             if isinstance(of, cached_property):
@@ -223,8 +225,8 @@ class Campaign(Result):
         """Add a recorded mission to the state, and learn from it."""
         state, seed = self.state, self.state.seed_of("fit")
         entry.posterior = state.last
-        state.entries.append(entry)
         self._renew()
+        state.entries.append(entry)
         if reason := why_never_learned(entry.mission):
             entry.become(EXCLUDED, reason)
             warnings.warn(f"mission {len(state.entries)} is excluded: {reason}", stacklevel=3)
@@ -266,13 +268,14 @@ class Campaign(Result):
             cannot be computed, a warning is issued, and the previous posterior is returned.
 
         Raises:
-            TrustboError: There is no such mission.
+            TrustboError: There is no such mission, or it is already excluded by a user.
         """
         if require_whole("n", n, 1) > (n_told := len(self.state.entries)):
             raise TrustboError(f"there is no mission {n} to exclude; the last is mission {n_told}.")
-        self._write()  # raises if the campaign is closed
-        self.state.entries[n - 1].become(EXCLUDED, str(reason))
+        if is_excluded_by_user(entry := self.state.entries[n - 1]):
+            raise TrustboError(f"mission {n} is already excluded: {entry.row['reason']}")
         self._renew()
+        entry.become(EXCLUDED, str(reason))
         self._learn(self.state.seed_of("fit"))
         self._write()
         return self.state.posterior
@@ -300,9 +303,8 @@ class Campaign(Result):
                 f"where = {where} must be a cell that the plan enters, {path[1:]}, with one of the "
                 f"reasons {', '.join(CAUSES)}; got reason {reason!r}."
             )
-        self._write()  # raises if the campaign is closed
-        self.state.failures.append(Failure(len(self.state.entries), reason, tuple(path), where))
         self._renew()
+        self.state.failures.append(Failure(len(self.state.entries), reason, tuple(path), where))
         self._write()
 
     def run(

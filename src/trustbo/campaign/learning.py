@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 import xarray as xr
 
-from trustbo.campaign.state import EXCLUDED, LEARNED, TOLD, State
+from trustbo.campaign.state import EXCLUDED, LEARNED, TOLD, Entry, State
 from trustbo.data import Mission
 from trustbo.errors import PosteriorError, TrustboError
 from trustbo.hazard import Hazard
@@ -43,6 +43,12 @@ def why_never_learned(mission: Mission) -> str:
         k = int(np.argwhere(np.isnan(mission.awareness))[0, 0])
         return f"the map has no awareness in cell {mission.bounds[k].cell} of bound {k + 1}."
     return ""
+
+
+def is_excluded_by_user(entry: Entry) -> bool:
+    """Return whether a mission was excluded for another reason than `why_never_learned`."""
+    own = why_never_learned(entry.mission) or None
+    return entry.row["state"] == EXCLUDED and entry.row["reason"] != own
 
 
 def learn(
@@ -92,12 +98,7 @@ def learn_hazard(state: State, workspace: Workspace) -> xr.Dataset:
     Missions that cannot be used for learning trust are included, since they show where the team
     failed. If the diagnostics fail, the previous posterior is returned with a warning.
     """
-    measured = [
-        entry.measured
-        for entry in state.entries
-        if entry.row["state"] != EXCLUDED
-        or entry.row["reason"] == (why_never_learned(entry.mission) or None)
-    ]
+    measured = [entry.measured for entry in state.entries if not is_excluded_by_user(entry)]
     lost = [LostMission(f.path, f.where) for f in state.failures if f.path]
     prior = Hazard(**state.settings["hazard"])
     try:

@@ -14,7 +14,7 @@ from trustbo.campaign.state import State
 from trustbo.campaign.storage import Storage, read_campaign
 from trustbo.data import NOWHERE, Cell, Mission
 from trustbo.display import Rows, Summary
-from trustbo.errors import TrustboError
+from trustbo.errors import TrustboError, require_kind
 from trustbo.files import FilePath
 from trustbo.hazard.risk import BoundRisk
 from trustbo.inference import complete, params_of, sample_prior
@@ -224,9 +224,10 @@ class Result(Summary):
         """
         from trustbo.plots.curves import campaign_history
 
-        history, longest = self.history, self.planner.max_bounds
+        history = self.history
         if truth is not None:
-            paths = [entry.plan.path for entry in self.state.entries]
+            require_kind("truth", truth, Truth, "give simulation.Truth.of(simulator)")
+            longest, paths = self.planner.max_bounds, [e.plan.path for e in self.state.entries]
             regret = [truth.at(n).regret(path, longest) for n, path in enumerate(paths)]
             history = history.assign(regret=("iteration", regret))
         return campaign_history(history, **options)
@@ -250,9 +251,7 @@ class Result(Summary):
 
 
 def load_result(directory: FilePath) -> Result:
-    """Read the result of a campaign from its folder, or from a folder written by `Result.save`.
-
-    The folder is not locked, so the campaign may still be running.
+    """Read the result of a campaign, which may still be running, from its folder (not locked).
 
     Raises:
         TrustboError: The folder contains no campaign, the campaign has no mission yet, or a file is

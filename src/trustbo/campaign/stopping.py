@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 
 Stop = Callable[["Campaign"], str | bool | None]
 """Function called between missions; returning a reason (or True) ends the campaign."""
-_N_DRAWS = 500
 
 
 @dataclass(frozen=True)
@@ -66,7 +65,7 @@ class RegretBound:
         planner, draws = campaign.planner, params_of(posterior())
         try:
             path = planner.plan(draws.mean()).path
-            drawn = planner.plan_draws(draws, n_draws=_N_DRAWS)
+            drawn = planner.plan_draws(draws, n_draws=500)
         except InfeasibleError:  # no path satisfies `max_failure`
             return 0.0
         return float(np.mean(drawn.relative_regret(path) <= self.eps))

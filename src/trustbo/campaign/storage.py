@@ -101,11 +101,11 @@ class Storage:
         planned.attrs = {"plan": to_json(plan_to_record(entry.plan)), "row": to_json(entry.row)}
         tree = missions_to_tree([entry.measured])
         tree["planned"] = xr.DataTree(planned)
-        write_tree(self._locked / MISSIONS / f"{n:04d}.nc", tree)
+        write_tree(self.locked() / MISSIONS / f"{n:04d}.nc", tree)
 
     def add_posterior(self, name: str, tree: xr.DataTree) -> Path:
         """Write the posterior draws of the parameters, and return the file."""
-        file = self._locked / POSTERIORS / f"{name}.nc"
+        file = self.locked() / POSTERIORS / f"{name}.nc"
         write_tree(file, tree)
         return file
 
@@ -121,11 +121,10 @@ class Storage:
             "stop_reason": state.stop_reason,
             "versions": VERSIONS | {"numpy": np.__version__},
         }
-        write_text(self._locked / RECORD, to_json(record))
+        write_text(self.locked() / RECORD, to_json(record))
 
-    @property
-    def _locked(self) -> Path:
-        """Path of the folder; raises TrustboError after `release`, as others may then use it."""
+    def locked(self) -> Path:
+        """Return the folder's path; raises TrustboError after `release`, when others may use it."""
         if not self._lock.is_locked:
             raise TrustboError(
                 f"the campaign in {str(self.path)!r} was closed at the end of its `with` block; "
