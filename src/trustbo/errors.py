@@ -2,8 +2,12 @@
 
 import math
 import operator
+import warnings
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
+
+_PACKAGE = str(Path(__file__).parent)
 
 
 class TrustboError(ValueError):
@@ -21,6 +25,11 @@ class PosteriorError(TrustboError):
     def __init__(self, reason: str, posterior: object = None, remedy: str = "") -> None:
         super().__init__(f"{reason} {remedy}".rstrip())
         self.posterior, self.reason = posterior, reason.rstrip(".")
+
+
+def warn(message: str) -> None:
+    """Issue a UserWarning that points at the line outside of trustbo that made the call."""
+    warnings.warn(message, stacklevel=2, skip_file_prefixes=(_PACKAGE,))
 
 
 def require_choice(what: str, value: object, choices: Iterable[str]) -> str:

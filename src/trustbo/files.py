@@ -1,9 +1,14 @@
-"""Atomic writing of files, and errors for files that cannot be read."""
+"""Atomic writing of files, and errors for files that cannot be read or written."""
 
+import hashlib
 import json
 import os
+import secrets
+import signal
+import stat
+import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, is_dataclass
 from os import PathLike
 from pathlib import Path
@@ -14,36 +19,139 @@ import numpy as np
 from trustbo.errors import TrustboError
 
 FilePath = str | PathLike[str]
+TEMPORARY = ".tmp-"
+"""Beginning of the names of temporary files."""
 
 
-def write_file(path: FilePath, write: Callable[[Path], object]) -> None:
-    """Write a file under a temporary name with the same suffix, flush it to disk, and rename it.
-
-    Args:
-        path: File to write; its folder is created if it does not exist.
-        write: Function that writes to a given path.
+def to_path(path: FilePath) -> Path:
+    """Return a path with `~` expanded.
 
     Raises:
-        TrustboError: The file cannot be written; an existing file is left unchanged.
+        TrustboError: The path is not a text or a path, or it is empty, or no file can have it.
     """
-    path = Path(path)
-    temporary = path.with_name(f".{path.stem}.tmp{path.suffix}")
+    if not isinstance(path, str | PathLike) or not isinstance(text := os.fspath(path), str):
+        raise TrustboError(f"a path must be a text or a pathlib.Path; got {path!r:.60}.")
+    if not text or "\0" in text:
+        raise TrustboError(f"{text!r:.60} is not a path; give the path of a file or folder.")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write(temporary)
+        os.fsencode(text)
+        return Path(text).expanduser()
+    except UnicodeEncodeError:
+        raise TrustboError(f"{text!r:.60} is not a valid path on this system.") from None
+    except RuntimeError:
+        raise TrustboError(f"{text!r:.60}: the home folder of '~' is unknown.") from None
+
+
+def write_file(
+    path: FilePath, content: bytes | Callable[[Path], object], *, make_folder: bool = True
+) -> None:
+    """Write a whole file or nothing.
+
+    The file is written under an unused temporary name in the same folder, flushed to disk and
+    renamed. If anything fails, the temporary file is removed and an existing file is unchanged. A
+    link is followed, and an existing file keeps its permissions.
+
+    Args:
+        path: File to write; `~` is the home folder.
+        content: Content of the file, or a function that writes it to a given path.
+        make_folder: Whether to create the folder if it does not exist.
+
+    Raises:
+        TrustboError: The file cannot be written.
+    """
+    given = to_path(path)
+    try:
+        target = Path(os.path.realpath(given))
+        if target.exists() and not target.is_file():
+            raise TrustboError(f"cannot write {str(given)!r}: it is not a file.")
+        if make_folder:
+            target.parent.mkdir(parents=True, exist_ok=True)
+        _replace(target, content)
+    except OSError as error:
+        raise TrustboError(f"cannot write {str(given)!r}: {error.strerror or error}.") from error
+
+
+def _replace(target: Path, content: bytes | Callable[[Path], object]) -> None:
+    """Write a temporary file, flush it to disk, and give it the name of the target."""
+    temporary = target.with_name(f"{TEMPORARY}{secrets.token_hex(4)}{target.suffix}")
+    # Unlike the modules of `tempfile`, this respects the umask.
+    descriptor = os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666)
+    try:
+        with os.fdopen(descriptor, "wb") as stream:
+            if isinstance(content, bytes):
+                stream.write(content)
+            else:
+                content(temporary)
         with temporary.open("rb+") as stream:
             os.fsync(stream.fileno())
-        os.replace(temporary, path)
-    except OSError as error:
-        raise TrustboError(f"cannot write {str(path)!r}: {error.strerror or error}.") from error
+        with suppress(OSError):
+            temporary.chmod(stat.S_IMODE(target.stat().st_mode))
+        os.replace(temporary, target)
+    finally:
+        temporary.unlink(missing_ok=True)
+    sync_folder(target.parent)
 
 
-def read_file(path: FilePath) -> bytes:
-    """Read a whole file; raises TrustboError if it is missing or cannot be read."""
+def sync_folder(folder: Path) -> None:
+    """Flush the names in a folder to disk, so that renamed files survive a loss of power.
+
+    Errors are ignored, as in SQLite: the files are already in place, and not every file system can
+    flush a folder.
+    """
+    with suppress(OSError):
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
+@contextmanager
+def holding_interrupts() -> Iterator[None]:
+    """Hold back Ctrl-C until the block ends, so that memory and disk agree.
+
+    Use it for short blocks. Python interrupts the main thread only, so other threads need nothing.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    usual = signal.getsignal(signal.SIGINT)
+    if not callable(usual):  # ignored, or handled outside of Python
+        yield
+        return
+    received: list[tuple[Any, ...]] = []
+    signal.signal(signal.SIGINT, lambda *args: received.append(args))
     try:
-        return Path(path).read_bytes()
+        yield
+    finally:
+        signal.signal(signal.SIGINT, usual)
+        if received:
+            usual(*received[0])
+
+
+def read_file(path: FilePath, sha256: str = "") -> bytes:
+    """Read a whole file.
+
+    Raises:
+        TrustboError: The file is missing or cannot be read, or `sha256` is given and is not the
+            hash of its content.
+    """
+    given = to_path(path)
+    try:
+        content = given.read_bytes()
     except OSError as error:
-        raise TrustboError(f"{str(path)!r} cannot be read: {error.strerror}.") from None
+        raise TrustboError(f"{str(given)!r} cannot be read: {error.strerror}.") from None
+    if sha256 and hash_of(content) != sha256:
+        raise TrustboError(
+            f"{str(given)!r} is damaged or was replaced: its content is not the recorded one. "
+            "Restore the file from a copy."
+        )
+    return content
+
+
+def hash_of(content: bytes) -> str:
+    """Return the SHA-256 hash of a file's content."""
+    return hashlib.sha256(content).hexdigest()
 
 
 @contextmanager
@@ -64,8 +172,8 @@ def interpreting(path: FilePath) -> Iterator[None]:
 
 
 def write_text(path: FilePath, text: str) -> None:
-    """Write a text file atomically."""
-    write_file(path, lambda file: file.write_text(text, encoding="utf-8"))
+    """Write a text file atomically; see `write_file`."""
+    write_file(path, text.encode())
 
 
 def to_json(record: object) -> str:
@@ -81,3 +189,27 @@ def to_json(record: object) -> str:
         return str(value)
 
     return json.dumps(record, default=plain)
+
+
+def to_plain(what: str, value: Any) -> Any:
+    """Return a value as it would be read back from JSON, with arrays as lists.
+
+    Raises:
+        TrustboError: JSON cannot store the value, or changes it.
+    """
+
+    def plain(part: Any) -> object:
+        if isinstance(part, str | None | bool | int | float):
+            return part
+        if isinstance(part, list | tuple):
+            return [plain(p) for p in part]
+        if isinstance(part, dict) and all(isinstance(name, str) for name in part):
+            return {name: plain(p) for name, p in part.items()}
+        if hasattr(part, "__array__") and np.asarray(part).dtype.kind in "biuf":
+            return np.asarray(part).tolist()
+        raise TrustboError(
+            f"{what}: {part!r:.60} cannot be stored in the folder of a campaign; give numbers, "
+            "texts, lists or arrays."
+        )
+
+    return plain(value)

@@ -9,26 +9,67 @@ import xarray as xr
 
 from trustbo.data import NOWHERE, Bound, Mission
 from trustbo.errors import TrustboError
-from trustbo.files import FilePath, interpreting, read_file, write_file
+from trustbo.files import FilePath, hash_of, interpreting, read_file, write_file
 from trustbo.stacking import require_same_team
 
 _ARRAYS = {"awareness": "1", "contact_rate": "1", "duration": "s", "n_ticks": "1"}
 """Arrays of a bound, (robot,) or (robot, feature), and their units."""
+_SEAL = b"sha256:"
+_SEAL_LENGTH = len(_SEAL) + 64
+"""Beginning and length of the hash that follows the content of a file."""
 
 
-def read_tree(path: FilePath) -> xr.DataTree:
-    """Read a netCDF file of groups into memory; raises TrustboError if this fails."""
-    content = read_file(path)
+def read_tree(path: FilePath, sha256: str = "") -> xr.DataTree:
+    """Read a netCDF file of groups into memory.
+
+    Raises:
+        TrustboError: The file is missing or damaged, or `sha256` is given and is not its hash.
+    """
+    content = read_file(path, sha256)
     try:
-        with xr.open_datatree(content, engine="netcdf4") as tree:
-            return tree.load()
+        return tree_from_bytes(content)
     except Exception:  # the library raises many types of errors for bad files
         raise TrustboError(f"{str(path)!r} is damaged or not a netCDF file.") from None
 
 
 def write_tree(path: FilePath, tree: xr.DataTree) -> None:
-    """Write a netCDF file of groups."""
-    write_file(path, lambda file: tree.to_netcdf(file, engine="netcdf4"))
+    """Write a netCDF file of groups atomically; see `write_file`."""
+    write_file(path, tree_to_bytes(tree))
+
+
+def tree_from_bytes(content: bytes) -> xr.DataTree:
+    """Read the content of a netCDF file of groups into memory; raises various errors."""
+    seal = content[-_SEAL_LENGTH:]
+    if seal.startswith(_SEAL):
+        content = content[:-_SEAL_LENGTH]
+        if seal != _seal_of(content):
+            raise ValueError("the hash at the end of the file is not that of its content")
+    with xr.open_datatree(content, engine="netcdf4") as tree:
+        return tree.load()
+
+
+def tree_to_bytes(tree: xr.DataTree) -> bytes:
+    """Return the content of a netCDF file with checksums.
+
+    Other programs check the checksums of the numbers. They ignore the hash of the whole content at
+    the end, which also covers texts, shapes and indices.
+
+    The content is made in memory, because the netCDF library keeps a file open if the disk is full.
+    """
+    encoding: dict[str, Any] = {}
+    for group in tree.subtree:
+        variables = group.to_dataset(inherit=False).variables
+        encoding[group.path] = {
+            name: {"fletcher32": True}
+            for name, variable in variables.items()
+            if variable.ndim and variable.dtype.kind in "biufM"  # texts and scalars have none
+        }
+    content = bytes(tree.to_netcdf(engine="netcdf4", encoding=encoding))
+    return content + _seal_of(content)
+
+
+def _seal_of(content: bytes) -> bytes:
+    return _SEAL + hash_of(content).encode()
 
 
 def write_missions(path: FilePath, missions: Sequence[Mission]) -> None:
