@@ -49,7 +49,7 @@ def test_type_checkers_are_told_that_it_is_typed():
 def test_every_public_name_is_there():
     for name in trustbo.__all__:
         assert getattr(trustbo, name) is not None
-    assert trustbo.__version__.count(".") == 2
+    assert re.fullmatch(r"\d+\.\d+\.\d+(\.dev\d+)?", trustbo.__version__)
 
 
 def test_a_kernel_without_ipywidgets_is_not_warned_of_progress_bars():

@@ -255,6 +255,19 @@ class Mission(Summary):
             bounds.append(replace(b, awareness=z[np.ix_(i, m)], **per_robot))
         return replace(self, bounds=tuple(bounds), **names)
 
+    def has_same_data(self, other: "Mission") -> bool:
+        """Return whether another mission has the same path, outcome and measurements."""
+        about = ("path", "status", "features", "robots", "scale")
+        if any(getattr(self, name) != getattr(other, name) for name in about):
+            return False
+        if [bound.status for bound in self.bounds] != [bound.status for bound in other.bounds]:
+            return False
+        measured = ("awareness", "contact_rate", "duration", "n_ticks")
+        return all(
+            np.array_equal(getattr(self, name), getattr(other, name), equal_nan=True)
+            for name in measured
+        )
+
     @cached_property
     def awareness(self) -> np.ndarray:
         """Measured awareness, shape (bound, robot, feature)."""

@@ -1,71 +1,28 @@
 """The folder of a campaign: a process that dies at any write resumes with identical results."""
 
+import errno
 import json
 import os
 import re
 import shutil
+import subprocess
+import sys
 from dataclasses import fields
 
 import numpy as np
 import pytest
+from folders import ENDS, OPTIONS, begin, drive, same
 from worlds import ModelSimulator, random_cells
 
 import trustbo as tb
 from trustbo.data import Bound
+from trustbo.logs.netcdf import tree_from_bytes
 from trustbo.models import PooledTrust, Priors
-
-ENDS = ((2, 0), (0, 2))
-OPTIONS = {"policy": "thompson", "sampler": "importance", "seed": 3, "fit": {"draws": 50}}
 
 
 @pytest.fixture(scope="module")
 def workspace():
     return random_cells(2, 3)
-
-
-def numbers(result):
-    """All numbers of a result by name."""
-    found = {
-        "path": np.array(result.path),
-        "trust": result.plan.trust,
-        "map": result.trust_map.values,
-    }
-    for name, column in result.history.data_vars.items():
-        found[name] = column.values
-    for j, tree in enumerate(result.posteriors):
-        for group in {"posterior", "places", "robots", "hazard"} & {
-            *(tree.children if tree else ())
-        }:
-            for name, values in tree[group].data_vars.items():
-                found[f"{group} {name} after {j + 1}"] = values.values
-    for j, mission in enumerate(result.missions):
-        found[f"awareness of {j + 1}"] = mission.awareness
-        found[f"rates of {j + 1}"] = mission.contact_rate
-    return found | {"failures": np.array([str(f) for f in result.state.failures])}
-
-
-def same(one, other):
-    one, other = numbers(one), numbers(other)
-    assert one.keys() == other.keys()
-    for name, values in one.items():
-        np.testing.assert_array_equal(values, other[name], err_msg=name)
-
-
-def drive(campaign):
-    """Run a campaign of four missions, of which one fails, one is given up, one is excluded."""
-    state, simulator = campaign.state, ModelSimulator(campaign.workspace, blind=True)
-    if not state.entries:
-        campaign.tell(simulator.run(campaign.ask().path, seed=state.seed_of("mission")))
-    if len(state.entries) == 1 and not state.failures:
-        campaign.ask()
-        campaign.fail("stuck", where=campaign.ask().path[1])
-    for n in (1, 2, 3):
-        if len(state.entries) == n:
-            simulator.fail_at = 1 if n == 2 else None
-            campaign.tell(simulator.run(campaign.ask().path, seed=state.seed_of("mission")))
-        if n == 2 and len(state.entries) == 3 and not state.indices("excluded"):
-            campaign.exclude(1, "the lidar was covered")
-    return campaign
 
 
 class Dead(BaseException):
@@ -191,11 +148,17 @@ def test_folder_that_holds_a_campaign_is_refused_or_replaced(workspace, folder, 
 
 
 def test_folder_is_locked_for_one_campaign_at_a_time(workspace, tmp_path):
-    with tb.Campaign(workspace, *ENDS, directory=tmp_path / "a"):
+    other = "import sys, trustbo as tb; tb.Campaign.load(sys.argv[1])"
+
+    def elsewhere():
+        command = [sys.executable, "-c", other, tmp_path / "a"]
+        return subprocess.run(command, capture_output=True, text=True, check=False)
+
+    with tb.Campaign(workspace, *ENDS, directory=tmp_path / "a") as campaign:
+        assert "another campaign" in elsewhere().stderr
         with pytest.raises(tb.TrustboError, match="another campaign"):
-            tb.Campaign.load(tmp_path / "a")
-    with tb.Campaign.load(tmp_path / "a"):
-        pass
+            campaign.save(tmp_path / "a", overwrite=True)
+    assert elsewhere().returncode == 0
     for load in (tb.Campaign.load, tb.load_result, tb.resume):
         with pytest.raises(tb.TrustboError, match="nothing"):
             load(tmp_path / "nothing")
@@ -216,10 +179,11 @@ def test_closed_campaign_records_nothing_more(workspace, tmp_path):
 
 def test_a_mission_that_waits_to_be_learned_is_in_the_result(folder, tmp_path):
     whole, copy = tb.load_result(folder), shutil.copytree(folder, tmp_path / "copy")
-    record = json.loads((copy / "campaign.json").read_text())
-    for name in ("rows", "posteriors"):
-        del record[name][-1]
-    (copy / "campaign.json").write_text(json.dumps(record))
+    with tb.Campaign.load(copy) as campaign:
+        last = campaign.state.entries.pop()
+        del campaign.storage.files["missions/0004.nc"]
+        campaign.storage.write(campaign.state)
+    assert last.row["state"] == "learned"
     waiting = tb.load_result(copy)
     assert len(waiting.missions) == len(whole.missions)
     assert waiting.table()["state"].dropna().iloc[-1] == "told"
@@ -301,3 +265,218 @@ def test_files_of_a_campaign_do_not_grow_with_its_missions(workspace, tmp_path):
         sizes = [file.stat().st_size for file in (tmp_path / room).glob("*.nc")]
         assert max(sizes) < 0.4e6
         assert max(sizes) < 1.1 * min(sizes)
+
+
+# --- what others do to the folder ---
+
+
+def test_cell_of_a_notebook_can_be_run_again(workspace, tmp_path):
+    def cell(**options):
+        return begin(workspace, tmp_path / "field", **options)
+
+    first = cell()
+    mission = ModelSimulator(workspace).run(first.ask().path, seed=0)
+    second = cell(overwrite=True)
+    with pytest.raises(tb.TrustboError, match="opened again"):
+        first.tell(mission)
+    second.tell(mission)
+    third = tb.Campaign.load(tmp_path / "field")
+    assert len(third.missions) == 1
+    with pytest.raises(tb.TrustboError, match="opened again"):
+        second.fail("rain")
+    third.close()
+    third.close()
+    with pytest.raises(tb.TrustboError, match="contains a campaign"):
+        cell()
+
+
+def same_draws(one, other):
+    for name, values in one["posterior"].data_vars.items():
+        np.testing.assert_array_equal(values, other["posterior"][name])
+
+
+def test_folder_that_was_moved_or_deleted_is_noticed_before_anything_is_written(
+    workspace, tmp_path
+):
+    campaign = begin(workspace, tmp_path / "field")
+    mission = ModelSimulator(workspace).run(campaign.ask().path, seed=0)
+    (tmp_path / "field").rename(tmp_path / "moved")
+    for change in (lambda: campaign.tell(mission), lambda: campaign.fail("rain")):
+        with pytest.raises(tb.TrustboError, match="moved"):
+            change()
+        assert not (tmp_path / "field").exists()
+    (tmp_path / "field").mkdir()
+    with pytest.raises(tb.TrustboError, match="moved"):
+        campaign.tell(mission)
+    (tmp_path / "field").rmdir()
+    (tmp_path / "moved").rename(tmp_path / "field")
+    campaign.tell(mission)
+    campaign.tell(ModelSimulator(workspace).run(campaign.ask().path, seed=1))
+    shutil.rmtree(tmp_path / "field")
+    with pytest.raises(tb.TrustboError, match="moved"):
+        campaign.tell(mission, again=True)
+    with pytest.warns(UserWarning, match="posteriors"):
+        campaign.save(tmp_path / "rescued")
+    with tb.Campaign.load(tmp_path / "rescued") as rescued:
+        assert len(rescued.missions) == 2
+        assert rescued.posteriors[0] is None
+        same_draws(rescued.posteriors[1], campaign.state.posterior)
+
+
+def test_record_that_another_program_changed_is_noticed(workspace, folder, tmp_path):
+    copy = shutil.copytree(folder, tmp_path / "copy")
+    with tb.Campaign.load(copy) as campaign:
+        (copy / ".lock").unlink()  # as somebody who tidies up
+        campaign.fail("rain")
+        record = (copy / "campaign.json").read_bytes()
+        (copy / "campaign.json").unlink()
+        campaign.fail("rain")  # it is written again
+        (copy / "campaign.json").write_bytes(record)
+        with pytest.raises(tb.TrustboError, match=r"campaign\.json"):
+            campaign.fail("rain")
+        assert len(campaign.state.failures) == 3
+
+
+def test_deleted_lock_does_not_let_two_processes_in(workspace, tmp_path):
+    script = (
+        "import sys, trustbo as tb; c = tb.Campaign.load(sys.argv[1]); print(flush=True);"
+        "sys.stdin.read()"
+    )
+    with begin(workspace, tmp_path) as campaign:
+        (tmp_path / ".lock").unlink()
+        command = [sys.executable, "-c", script, tmp_path]
+        other = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        other.stdout.readline()
+        with pytest.raises(tb.TrustboError, match="another campaign"):
+            campaign.fail("rain")
+        other.communicate()
+        campaign.fail("rain")
+
+
+def test_file_system_without_locks_is_used_with_a_warning(workspace, tmp_path, monkeypatch):
+    def refuse(*args):
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr("fcntl.flock", refuse)
+    with pytest.warns(UserWarning, match="no locks"):
+        campaign = begin(workspace, tmp_path)
+    campaign.fail("rain")
+    other = (tmp_path / "campaign.json").read_bytes()
+    (tmp_path / "campaign.json").unlink()
+    (tmp_path / "campaign.json").write_bytes(other)  # as by another process
+    with pytest.raises(tb.TrustboError, match="another program"):
+        campaign.fail("rain")
+    campaign.close()
+
+
+FORK = """
+import os, sys
+import trustbo as tb
+
+campaign = tb.Campaign.load(sys.argv[1])
+child = os.fork()
+try:
+    campaign.fail("rain")
+except tb.TrustboError as error:
+    assert child == 0 and "fork" in str(error)
+    os._exit(7)
+assert child and os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7
+campaign.fail("rain")
+"""
+
+
+def test_copy_of_the_process_cannot_record(workspace, tmp_path):
+    begin(workspace, tmp_path).close()
+    subprocess.run([sys.executable, "-W", "ignore", "-c", FORK, tmp_path], check=True)
+    with tb.Campaign.load(tmp_path) as campaign:
+        assert len(campaign.state.failures) == 2
+
+
+def test_files_of_others_are_never_deleted(workspace, folder, tmp_path):
+    copy = shutil.copytree(folder, tmp_path / "copy")
+    (copy / "missions" / "thesis.nc").write_text("mine")
+    begin(workspace, copy, overwrite=True).close()
+    assert (copy / "missions" / "thesis.nc").read_text() == "mine"
+    for name in ("workspace.nc", "missions/0001.nc"):
+        other = tmp_path / name[:4]
+        (other / name).parent.mkdir(parents=True)
+        (other / name).write_text("mine")
+        with pytest.raises(tb.TrustboError, match=name):
+            begin(workspace, other, overwrite=True).tell(
+                ModelSimulator(workspace).run(((2, 0), (1, 1), (0, 2)), seed=0)
+            )
+        assert (other / name).read_text() == "mine"
+
+
+def test_campaign_is_not_replaced_through_a_link(workspace, folder, tmp_path):
+    copy = shutil.copytree(folder, tmp_path / "copy")
+    (copy / "missions").rename(tmp_path / "big disk")
+    (copy / "missions").symlink_to(tmp_path / "big disk")
+    files = sorted((tmp_path / "big disk").iterdir())
+    with pytest.raises(tb.TrustboError, match="link"):
+        begin(workspace, copy, overwrite=True)
+    assert sorted((tmp_path / "big disk").iterdir()) == files
+    same(tb.load_result(copy), tb.load_result(folder))
+
+
+def test_another_version_is_named_before_anything_else_is_read(folder, tmp_path):
+    for versions in ({"trustbo": "0.3.0"}, {"trustbo": "9.9"}, {}, None):
+        copy = tmp_path / str(versions)
+        copy.mkdir()
+        (copy / "campaign.json").write_text(json.dumps({"rows": 3, "versions": versions}))
+        for load in (tb.Campaign.load, tb.load_result):
+            with pytest.raises(tb.TrustboError) as error:
+                load(copy)
+            assert tb.__version__ in str(error.value)
+            assert (versions or {}).get("trustbo", "unknown") in str(error.value)
+
+
+def test_missing_mission_before_others_is_named(folder, tmp_path):
+    copy = shutil.copytree(folder, tmp_path / "copy")
+    shutil.copy(copy / "missions" / "0001.nc", copy / "missions" / "0006.nc")
+    with pytest.raises(tb.TrustboError, match=r"0005\.nc"):
+        tb.Campaign.load(copy)
+
+
+@pytest.mark.parametrize("name", ["workspace.nc", "missions/0002.nc", "posteriors/0004-1.nc"])
+def test_file_of_another_campaign_is_noticed(workspace, folder, tmp_path, name):
+    copy = shutil.copytree(folder, tmp_path / "copy")
+    with begin(random_cells(2, 3), tmp_path / "other", seed=8) as other:
+        drive(other)
+    shutil.copy(tmp_path / "other" / name, copy / name)
+    with pytest.raises(tb.TrustboError, match="replaced"):
+        _ = tb.load_result(copy).posterior
+
+
+@pytest.mark.parametrize(
+    "name", ["workspace.nc", "missions/0002.nc", "posteriors/0002.nc", "campaign.json"]
+)
+@pytest.mark.slow
+def test_flipped_bit_is_never_silent(folder, tmp_path, name):
+    copy = shutil.copytree(folder, tmp_path / "copy")
+    content = (copy / name).read_bytes()
+    places = np.random.default_rng(0).integers(len(content), size=30)
+    for k, place in enumerate(places):
+        changed = bytearray(content)
+        changed[place] ^= 1 << k % 8
+        (copy / name).write_bytes(changed)
+        with pytest.raises(tb.TrustboError, match=name):
+            _ = tb.load_result(copy).posteriors
+
+
+def test_flipped_bit_in_a_mission_that_waits_is_never_silent(folder):
+    """Its hash is not in campaign.json yet, so the file's own checksums must show it."""
+    file = folder / "missions" / "0004.nc"
+    content = file.read_bytes()
+    expected = tree_from_bytes(content)
+    n_refused = 0
+    for k, place in enumerate(np.random.default_rng(0).integers(len(content), size=300)):
+        changed = bytearray(content)
+        changed[place] ^= 1 << k % 8
+        try:
+            assert tree_from_bytes(bytes(changed)).identical(expected)
+        except AssertionError:
+            raise
+        except Exception:  # the library has many types of errors
+            n_refused += 1
+    assert n_refused > 290  # the others are in the word before the hash

@@ -2,24 +2,33 @@
 
 import inspect
 import json
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict
-from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
 import xarray as xr
 
+from trustbo.campaign.folder import FolderStorage
 from trustbo.campaign.learning import as_learned, is_excluded_by_user, learn, why_never_learned
+from trustbo.campaign.read import lock_campaign, read_campaign
+from trustbo.campaign.record import RECORD
 from trustbo.campaign.result import Result, in_a_line
 from trustbo.campaign.state import EXCLUDED, LEARNED, TOLD, Entry, Failure, Posterior, State
 from trustbo.campaign.stopping import Stop
-from trustbo.campaign.storage import Storage, read_campaign, require_campaign
+from trustbo.campaign.storage import MemoryStorage, Storage
 from trustbo.data import Cell, Mission
 from trustbo.display import compiling, tqdm
-from trustbo.errors import TrustboError, require_choice, require_kind, require_pair, require_whole
-from trustbo.files import FilePath, to_json
+from trustbo.errors import (
+    TrustboError,
+    require_choice,
+    require_kind,
+    require_pair,
+    require_whole,
+    warn,
+)
+from trustbo.files import FilePath, holding_interrupts, interpreting, to_json, to_plain
 from trustbo.hazard import Hazard
 from trustbo.hazard.exposures import CAUSES
 from trustbo.inference.diagnostics import diagnostics
@@ -44,11 +53,15 @@ class Campaign(Result):
 
     `ask` plans a path, and `tell` records the mission on this path and learns from it. With a
     `directory`, each mission is written to disk before the posterior is updated, and
-    `Campaign.load` continues after a crash with identical results.
+    `Campaign.load` continues after a crash with identical results. An operation that raises an
+    error has recorded nothing and can be repeated. If something fails later, such as the writing of
+    the posterior, the mission is recorded, a warning says so, and the next call makes up for it.
+
+    All methods can be called from any thread; they run one at a time.
 
     Attributes:
         policy: Policy that chooses the paths.
-        storage: Folder of the campaign; None if it is in memory only.
+        storage: `FolderStorage` of the campaign, or a `MemoryStorage`.
 
     Example:
         >>> with tb.Campaign(workspace, (9, 0), (0, 9), directory="field") as campaign:
@@ -85,9 +98,10 @@ class Campaign(Result):
             objective: Objective of the paths; see `planning.Planner`.
             sampler: Sampler of the posterior; see `trustbo.fit`.
             seed: Seed of all random numbers.
-            directory: Folder that is updated after each mission. It stays locked until the
-                `with campaign:` block exits or the process ends.
-            overwrite: Whether to replace an existing campaign in that folder.
+            directory: Folder that is updated after each mission. It stays locked until `close` is
+                called, the `with campaign:` block exits, or the process ends.
+            overwrite: Whether to replace an existing campaign in that folder. If an older campaign
+                of this process uses the folder, it is closed.
             initial: Parameters for the first plan: `"prior_mean"`, or `"prior_draw"` for one random
                 draw from the prior, as in the paper.
             hazard: Priors of the probability that a bound fails; by default `Hazard()`.
@@ -97,7 +111,8 @@ class Campaign(Result):
 
         Raises:
             TrustboError: The start or goal is not a passable cell, a name is unknown, the sampler
-                does not support the model, or the folder already contains a campaign.
+                does not support the model, an option cannot be stored in a file, or the folder
+                already contains a campaign or cannot be written.
             NoPathError: The goal cannot be reached.
         """
         require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
@@ -111,8 +126,11 @@ class Campaign(Result):
         require_kind("model", model, TrustModel, "give a trust model, such as PooledTrust()")
         if isinstance(model, HumanTrust):
             raise TrustboError("model: HumanTrust cannot plan paths; give PooledTrust() instead.")
-        self.policy, options = resolve_policy(policy), dict(planner or {})
+        self.policy = resolve_policy(policy)
+        options = dict(planner or {})
         base = Planner(workspace, start, goal, objective, family=model.observation, **options)
+        if "toll" in options:
+            options["toll"] = base.problem.toll  # in the order of the moves, rows and columns
         settings = {
             "start": base.start,
             "goal": base.goal,
@@ -122,8 +140,8 @@ class Campaign(Result):
             "sampler": sampler,
             "seed": require_whole("seed", seed, 0),
             "initial": initial,
-            "planner": options,
-            "fit": dict(fit or {}),
+            "planner": to_plain("planner", options),
+            "fit": to_plain("fit", dict(fit or {})),
             "hazard": asdict(hazard),
             "observation": model.observation,
             "model": model.in_short(),
@@ -132,27 +150,120 @@ class Campaign(Result):
         state = State(json.loads(to_json(settings)))  # as if read from a file
         super().__init__(workspace, state, model, base)
         self._progress = True  # of fits
-        self.storage: Storage | None = None
+        self.storage: Storage = MemoryStorage()
+        self._turn = self.storage.turn
         if directory is not None:
-            self.storage = Storage.begin(directory, workspace, self.state, overwrite=overwrite)
+            self.store_in(directory, overwrite=overwrite)
 
-    def _renew(self) -> None:
-        """Discard the plan and cached properties before the missions or failures change."""
-        if self.storage is not None:
-            self.storage.locked()  # raises TrustboError if the campaign is closed
-        self.state.asked = None
-        for name, of in vars(Result).items():
-            if isinstance(of, cached_property):
-                vars(self).pop(name, None)
+    def store_in(self, directory: FilePath, *, overwrite: bool = False) -> None:
+        """Write the campaign to a folder, and record everything there from now on.
+
+        Args:
+            directory: Folder, as in the constructor.
+            overwrite: Whether to replace an existing campaign in that folder.
+
+        Raises:
+            TrustboError: The folder already contains a campaign or cannot be written.
+        """
+        with self._turn:
+            self._use(
+                FolderStorage.begin(
+                    directory, self.workspace, self.state, overwrite=overwrite, take_over=overwrite
+                )
+            )
+
+    def _use(self, storage: Storage) -> None:
+        """Record everything in a storage from now on."""
+        self.storage = storage
+        self._turn = storage.turn
+
+    @contextmanager
+    def _recorded(self) -> Iterator[None]:
+        """Change the state in the block, and write it; if this fails, undo the changes."""
+        state = self.state
+        before = {n: list(v) if isinstance(v, list) else v for n, v in vars(state).items()}
+        rows = [entry.row for entry in state.entries]
+        with holding_interrupts():
+            try:
+                yield
+                self.storage.write(state)
+            except BaseException:
+                vars(state).update(before)
+                for entry, row in zip(state.entries, rows, strict=True):
+                    entry.row = row
+                raise
+
+    def _catch_up(self) -> None:
+        """Learn from the missions, if an earlier call could not."""
+        state = self.state
+        if state.due is None:
+            return
+        entry = state.entries[-1]
+        n_used = len(state.indices(TOLD, LEARNED))
+        tree, reason = None, ""
+        if n_used:
+            tree, reason = learn(self.state, self.model, self.workspace, state.due, self._progress)
+        if tree is not None:
+            tree["hazard"] = xr.DataTree(self.hazard)
+        with holding_interrupts():
+            state.due = None
+            if not n_used:
+                entry.posterior = None
+            elif tree is None:
+                for j in state.indices(TOLD):
+                    state.entries[j].become(TOLD, reason)
+            else:
+                for j in state.indices(TOLD):
+                    state.entries[j].become(LEARNED)
+                entry.row = entry.row | diagnostics(tree)
+                n_excluded = len(state.entries) - n_used
+                name = f"{len(state.entries):04d}" + (f"-{n_excluded}" if n_excluded else "")
+                entry.posterior = Posterior(name, tree)
+            # The failure probabilities do not depend on what was learned about trust.
+            hazard = {name: self._computed[name] for name in ("hazard",) if name in self._computed}
+            self._computed = hazard
+        if reason:
+            warn(
+                f"mission {len(state.entries)} is recorded but cannot be used for learning yet: "
+                f"{reason.rstrip('.')}. Learning is retried after the next mission."
+            )
+
+    def _finish(self, what: str) -> None:
+        """Learn and write after something was recorded, whose description is `what`.
+
+        What fails here is made up for by the next call, so it must not look like a failed call.
+        """
+        try:
+            self._catch_up()
+            with holding_interrupts():
+                self.storage.write(self.state)
+        except TrustboError as error:
+            warn(
+                f"{what}, and what was learned is in memory, but it could not be written: {error} "
+                "The next call writes it."
+            )
+        except BaseException as error:
+            error.add_note(f"{what}; it will be learned at the next call.")
+            raise
 
     def ask(self) -> Plan:
         """Plan the next path; further calls return the same plan until `tell`, `fail` or `suggest`.
 
+        The plan is recorded before it is returned.
+
         Raises:
-            TrustboError: The policy did not return a plan, or its path is invalid.
+            TrustboError: The policy did not return a plan, its path is invalid, or the plan cannot
+                be recorded.
         """
-        if self.state.asked is not None:
+        with self._turn:
+            if self.state.asked is None:
+                return self._accept(self._propose())
             return self.state.asked
+
+    def _propose(self) -> Plan:
+        """Plan the next path with the policy."""
+        self.storage.require_open()
+        self._catch_up()
         name = f"policy {self.state.settings['policy']!r}"
         rng = np.random.default_rng(self.state.seed_of("policy"))
         try:
@@ -164,7 +275,7 @@ class Campaign(Result):
             self.planner.require_path(plan.path)
         except TrustboError as error:
             raise TrustboError(f"{name}: {error}") from None
-        return self._accept(plan)
+        return plan
 
     def suggest(self, path: Sequence[Cell]) -> Plan:
         """Set the next path manually; `ask` then returns it.
@@ -173,24 +284,31 @@ class Campaign(Result):
             path: Cells from start to goal.
 
         Raises:
-            TrustboError: The path is invalid, or does not lead from start to goal.
+            TrustboError: The path is invalid, or does not lead from start to goal, or it cannot be
+                recorded. `ask` then returns the same plan as before.
         """
-        return self._accept(self.planner.evaluate(path, self.belief.mean()))
+        with self._turn:
+            self.storage.require_open()
+            self._catch_up()
+            return self._accept(self.planner.evaluate(path, self.belief.mean()))
+
+    def _with_bands(self, plan: Plan) -> Plan:
+        """Add the posterior bands to a plan."""
+        return plan.with_draws(self.planner.evaluate(plan.path, self.belief))
 
     def _accept(self, plan: Plan) -> Plan:
-        """Add posterior bands to a plan, and store it as the next plan to run."""
-        accepted = plan.with_draws(self.planner.evaluate(plan.path, self.belief))
+        """Record a plan, with posterior bands, as the next one to run."""
+        accepted = self._with_bands(plan)
+        with self._recorded():
+            self.state.asked = accepted
         if plan.infeasible:
-            warnings.warn(
+            warn(
                 f"the plan arrives with probability {accepted.p_arrive:.3g} only, and max_failure "
-                "does not allow this. Suggest a safer path, or increase max_failure.",
-                stacklevel=3,
+                "does not allow this. Suggest a safer path, or increase max_failure."
             )
-        self.state.asked = accepted
-        self._write()
         return accepted
 
-    def tell(self, mission: Mission) -> xr.DataTree | None:
+    def tell(self, mission: Mission, *, again: bool = False) -> xr.DataTree | None:
         """Record a mission and learn from it.
 
         For learning, the awareness of the map replaces the measured awareness. Robots and features
@@ -198,63 +316,82 @@ class Campaign(Result):
 
         Args:
             mission: Measured mission, whether or not it reached the goal.
+            again: Whether to accept a mission with the same data as an earlier one. Without it,
+                such a mission is refused, since it was probably told twice.
 
         Returns:
             Posterior of the parameters given all usable missions. If this mission cannot be used
             (yet), a warning is issued, and the previous posterior or None is returned.
 
         Raises:
-            TrustboError: The robots or features differ from the workspace's, or the path leaves
-                the grid, skips cells, or does not begin at the start of the plan. The mission is
-                then not stored.
+            TrustboError: The robots or features differ from the workspace's; the path leaves the
+                grid, skips cells, or does not begin at the start of the plan; the mission was told
+                before; or it cannot be written. The mission is then not recorded.
+
+        Warns:
+            UserWarning: The mission is recorded but excluded or not learned yet, or what was
+                learned could not be written.
         """
         require_kind("mission", mission, Mission, "give one trustbo.Mission at a time")
-        mission, state, plan = self.workspace.in_order(mission), self.state, self.ask()
-        if mission.path[0] != plan.path[0]:
-            raise TrustboError(
-                f"the mission starts in cell {mission.path[0]}; it must start in {plan.path[0]}."
-            )
-        learned = as_learned(mission, self.workspace)
-        entry = Entry(plan, mission, learned, self.trust_map, state.row_of(plan, mission))
-        if self.storage is not None:
-            self.storage.add_mission(len(state.entries) + 1, entry)
-        self._add(entry)
-        return state.posterior
+        with self._turn:
+            self.storage.require_open()
+            mission = self.workspace.in_order(mission)
+            if not again:
+                self._require_new(mission)
+            # If nothing was asked since the last mission, this plans a path, which may take long.
+            plan = self.state.asked or self._with_bands(self._propose())
+            if mission.path[0] != plan.path[0]:
+                raise TrustboError(
+                    f"the mission starts in cell {mission.path[0]}; it must start in "
+                    f"{plan.path[0]}."
+                )
+            learned = as_learned(mission, self.workspace)
+            row = self.state.row_of(plan, mission)
+            entry = Entry(plan, mission, learned, self.trust_map, row)
+            n_before = len(self.state.entries)
+            try:
+                with holding_interrupts():
+                    self.storage.add_mission(n_before + 1, entry)
+                    self._add(entry)
+            except BaseException as error:
+                if len(self.state.entries) > n_before:  # an interrupt that was held back
+                    error.add_note(
+                        f"mission {n_before + 1} is recorded; it will be learned at the next call."
+                    )
+                raise
+            self._finish_mission(entry)
+            return self.state.posterior
+
+    def _require_new(self, mission: Mission) -> None:
+        """Raise TrustboError if a mission with the same data is recorded and not excluded."""
+        if not np.isfinite(mission.contact_rate).any():
+            return  # nothing can be learned twice
+        for n, entry in enumerate(self.state.entries, start=1):
+            if entry.measured.has_same_data(mission) and not is_excluded_by_user(entry):
+                raise TrustboError(
+                    f"mission {n} has the same data, so this mission is recorded already. If it is "
+                    "another mission, call tell(mission, again=True)."
+                )
 
     def _add(self, entry: Entry) -> None:
-        """Add a recorded mission to the state, and learn from it."""
-        state, seed = self.state, self.state.seed_of("fit")
+        """Add a mission that is on disk to the state; the fit is then due."""
+        state = self.state
         entry.posterior = state.last
-        self._renew()
+        seed = state.seed_of("fit")
+        state.asked = None
         state.entries.append(entry)
+        self._computed.clear()
         if reason := why_never_learned(entry.mission):
             entry.become(EXCLUDED, reason)
-            warnings.warn(f"mission {len(state.entries)} is excluded: {reason}", stacklevel=3)
         else:
-            self._learn(seed)
-        self._write()
+            state.due = seed
 
-    def _learn(self, seed: int) -> None:
-        """Fit the posterior after the last mission to all missions that are not excluded."""
-        state, entry = self.state, self.state.entries[-1]
-        if not (n_used := len(state.indices(TOLD, LEARNED))):
-            entry.posterior = None
-            return
-        tree = learn(state, self.model, self.workspace, seed, self._progress)
-        if tree is None:
-            return
-        tree["hazard"] = xr.DataTree(self.hazard)
-        entry.row |= diagnostics(tree)
-        n_excluded = len(state.entries) - n_used
-        name = f"{len(state.entries):04d}" + (f"-{n_excluded}" if n_excluded else "")
-        file = None if self.storage is None else self.storage.add_posterior(name, tree)
-        if state.last is not None and state.last.file is not None:
-            state.last.tree = None  # frees the memory
-        entry.posterior = Posterior(name, tree, file)
-
-    def _write(self) -> None:
-        if self.storage is not None:
-            self.storage.write_record(self.state)
+    def _finish_mission(self, entry: Entry) -> None:
+        """Learn from the last mission, or warn that it is excluded."""
+        n = len(self.state.entries)
+        if entry.row["state"] == EXCLUDED:
+            warn(f"mission {n} is excluded: {entry.row['reason']}")
+        self._finish(f"mission {n} is recorded")
 
     def exclude(self, n: int, reason: str) -> xr.DataTree | None:
         """Exclude a mission from learning; to use it again, pass the mission to `tell`.
@@ -268,17 +405,26 @@ class Campaign(Result):
             cannot be computed, a warning is issued, and the previous posterior is returned.
 
         Raises:
-            TrustboError: There is no such mission, or it is already excluded by a user.
+            TrustboError: There is no such mission, it is already excluded by a user, or the
+                exclusion cannot be recorded. The mission is then not excluded.
         """
-        if require_whole("n", n, 1) > (n_told := len(self.state.entries)):
-            raise TrustboError(f"there is no mission {n} to exclude; the last is mission {n_told}.")
-        if is_excluded_by_user(entry := self.state.entries[n - 1]):
-            raise TrustboError(f"mission {n} is already excluded: {entry.row['reason']}")
-        self._renew()
-        entry.become(EXCLUDED, str(reason))
-        self._learn(self.state.seed_of("fit"))
-        self._write()
-        return self.state.posterior
+        with self._turn:
+            self.storage.require_open()
+            if require_whole("n", n, 1) > (n_told := len(self.state.entries)):
+                raise TrustboError(
+                    f"there is no mission {n} to exclude; the last is mission {n_told}."
+                )
+            entry = self.state.entries[n - 1]
+            if is_excluded_by_user(entry):
+                raise TrustboError(f"mission {n} is already excluded: {entry.row['reason']}")
+            self._catch_up()
+            with self._recorded():
+                self.state.due = self.state.seed_of("fit")
+                self.state.asked = None
+                entry.become(EXCLUDED, str(reason))
+            self._computed.clear()
+            self._finish(f"the exclusion of mission {n} is recorded")
+            return self.state.posterior
 
     def fail(self, reason: str, *, where: Cell | None = None) -> None:
         """Report that no bound of the planned mission was measured; `ask` then plans again.
@@ -291,21 +437,27 @@ class Campaign(Result):
             where: Cell that the team failed to enter, if known.
 
         Raises:
-            TrustboError: The reason is empty, the plan does not enter `where`, or `where` is given
-                but the reason is not in `hazard.CAUSES`.
+            TrustboError: The reason is empty, the plan does not enter `where`, `where` is given but
+                the reason is not in `hazard.CAUSES`, or the failure cannot be recorded. The failure
+                is then not counted.
         """
         if not isinstance(reason, str) or not reason.strip():
             raise TrustboError(f"reason must be a text such as {CAUSES[0]!r}; got {reason!r}.")
-        path = self.ask().path if reason in CAUSES or where is not None else ()
-        where = None if where is None else require_pair("where", where)
-        if where is not None and (reason not in CAUSES or where not in path[1:]):
-            raise TrustboError(
-                f"where = {where} must be a cell that the plan enters, {path[1:]}, with one of the "
-                f"reasons {', '.join(CAUSES)}; got reason {reason!r}."
-            )
-        self._renew()
-        self.state.failures.append(Failure(len(self.state.entries), reason, tuple(path), where))
-        self._write()
+        with self._turn:
+            self.storage.require_open()
+            path = self.ask().path if reason in CAUSES or where is not None else ()
+            where = None if where is None else require_pair("where", where)
+            if where is not None and (reason not in CAUSES or where not in path[1:]):
+                raise TrustboError(
+                    f"where = {where} must be a cell that the plan enters, {path[1:]}, with one of "
+                    f"the reasons {', '.join(CAUSES)}; got reason {reason!r}."
+                )
+            self._catch_up()
+            with self._recorded():
+                failure = Failure(len(self.state.entries), reason, tuple(path), where)
+                self.state.failures.append(failure)
+                self.state.asked = None
+            self._computed.clear()
 
     def run(
         self,
@@ -335,8 +487,10 @@ class Campaign(Result):
         if stop is not None and (isinstance(stop, type) or not callable(stop)):
             raise TrustboError(f"stop must be a function of the campaign; got {stop!r}.")
         describe = getattr(runner, "describe", lambda: {"simulator": type(runner).__name__})
-        self.state.simulation = json.loads(to_json({**describe(), "n_iterations": n_iterations}))
-        self._progress = progress
+        with self._turn:
+            settings = {**describe(), "n_iterations": n_iterations}
+            self.state.simulation = json.loads(to_json(settings))
+            self._progress = progress
         return self._run(runner, n_iterations, stop)
 
     def _run(
@@ -349,14 +503,15 @@ class Campaign(Result):
         with tqdm(disable=not self._progress, **options) as bar, compiling():
             # Check the rule before each mission: it may already apply when a campaign is resumed.
             while not (reason := self._reason_to_end(n_iterations, stop)):
-                n, plan = len(state.entries), self.ask()
+                plan = self.ask()
+                n = len(state.entries)
                 mission = simulator.run(plan.path, seed=state.seed_of("mission"), mission=n)
-                self.tell(mission)
+                self.tell(mission, again=True)  # a simulator without noise may repeat itself
                 bar.set_postfix_str(in_a_line(state.entries[-1].row), refresh=False)
                 bar.update()
                 yield plan, mission
-        state.stop_reason = reason
-        self._write()
+        with self._turn, self._recorded():
+            state.stop_reason = reason
 
     def _reason_to_end(self, n_iterations: int, stop: Stop | None) -> str | None:
         """Return the reason to stop, or None to continue."""
@@ -382,40 +537,60 @@ class Campaign(Result):
             TrustboError: The folder contains no campaign or is locked by another process, a custom
                 model or policy is not given, or a file is missing or damaged.
         """
-        require_campaign(directory)
-        storage = Storage(directory)
+        lock = lock_campaign(directory)
         try:
-            state, workspace, pending = read_campaign(directory)
+            state, workspace, pending, files = read_campaign(lock.path)
             given = state.settings
-            if given["policy"] not in POLICIES and policy is None:
-                raise TrustboError(
-                    f"the policy {given['policy']!r} is not stored; pass the function as policy=."
+            with interpreting(lock.path / RECORD):
+                if given["policy"] not in POLICIES and policy is None:
+                    raise TrustboError(
+                        f"the policy {given['policy']!r} is not stored; pass the function as "
+                        "policy=."
+                    )
+                campaign = cls(
+                    workspace,
+                    given["start"],
+                    given["goal"],
+                    model=model_from_record(given["model_record"], model),
+                    policy=given["policy"] if policy is None else policy,
+                    hazard=Hazard(**given["hazard"]),
+                    **{name: given[name] for name in _OPTIONS},
                 )
-            campaign = cls(
-                workspace, given["start"], given["goal"],
-                model=model_from_record(given["model_record"], model),
-                policy=given["policy"] if policy is None else policy,
-                hazard=Hazard(**given["hazard"]), **{name: given[name] for name in _OPTIONS},
-            )  # fmt: skip
             if (name := campaign.state.settings["policy"]) != given["policy"]:
                 raise TrustboError(f"policy {name!r} is not the campaign's, {given['policy']!r}.")
-            campaign.state, campaign.storage = state, storage
+            campaign.state = state
+            campaign._use(FolderStorage(lock, files))
+            if state.due is not None:
+                campaign._finish("an exclusion is recorded")
             for entry in pending:
+                campaign._catch_up()
                 campaign._add(entry)
+                campaign._finish_mission(entry)
         except BaseException:
-            storage.release()
+            lock.release()
             raise
         return campaign
 
+    def close(self) -> None:
+        """Release the folder, so that others can use it; a campaign in memory can go on.
+
+        The results can still be used. Further calls have no effect.
+        """
+        with self._turn:
+            self.storage.close()
+
     def __getstate__(self) -> dict[str, Any]:
-        return vars(self) | {"storage": None}  # a lock cannot be pickled
+        return super().__getstate__() | {"storage": None}  # the copy is in memory
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        self._use(MemoryStorage())
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *error: object) -> None:
-        if self.storage is not None:
-            self.storage.release()
+        self.close()
 
 
 def _name_of(function: object) -> str:

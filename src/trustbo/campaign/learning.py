@@ -1,13 +1,11 @@
 """Learning from missions: the posterior, the hazard, and the planner of the next path."""
 
-import warnings
-
 import numpy as np
 import xarray as xr
 
 from trustbo.campaign.state import EXCLUDED, LEARNED, TOLD, Entry, State
 from trustbo.data import Mission
-from trustbo.errors import PosteriorError, TrustboError
+from trustbo.errors import PosteriorError, TrustboError, warn
 from trustbo.hazard import Hazard
 from trustbo.hazard.exposures import LostMission
 from trustbo.hazard.model import fit_hazard
@@ -53,15 +51,19 @@ def is_excluded_by_user(entry: Entry) -> bool:
 
 def learn(
     state: State, model: TrustModel, workspace: Workspace, seed: int, progress: bool
-) -> xr.DataTree | None:
+) -> tuple[xr.DataTree | None, str]:
     """Fit the posterior of the parameters to all missions that are not excluded.
 
-    The attribute `missions` of the posterior lists the indices of these missions. If the fit fails,
-    None is returned with a warning, and the states of the missions do not change.
+    The attribute `missions` of the posterior lists the indices of these missions. The state does
+    not change.
+
+    Returns:
+        The posterior and an empty text; or, if the fit fails, None and the reason.
     """
-    waiting, used = state.indices(TOLD), state.indices(TOLD, LEARNED)
+    used = state.indices(TOLD, LEARNED)
     missions = [state.entries[j].mission for j in used]
-    sampler, options = state.settings["sampler"], state.settings["fit"]
+    sampler = state.settings["sampler"]
+    options = state.settings["fit"]
     # Importance draws are independent, so fewer suffice; draws of place effects are large.
     few = sampler == "importance" and any(isinstance(e, PlaceEffect) for e in model.effects)
     usual = {"draws": _N_DRAWS // 4 if few else _N_DRAWS}
@@ -71,25 +73,14 @@ def learn(
             whole=False, **(usual | options),
         )  # fmt: skip
     except TrustboError as error:
-        reason = getattr(error, "reason", str(error))
+        return None, getattr(error, "reason", str(error))
     except Exception as error:  # a bug must not lose a recorded mission
         if isinstance(error.__cause__, KeyboardInterrupt):  # numba wraps it
             raise error.__cause__ from None
-        reason = f"{type(error).__name__}: {error}"
-    else:
-        tree = parameters_alone(tree)
-        tree.attrs["missions"] = used
-        for j in waiting:
-            state.entries[j].become(LEARNED)
-        return tree
-    for j in waiting:
-        state.entries[j].become(TOLD, reason)
-    warnings.warn(
-        f"mission {len(state.entries)} is recorded but cannot be used for learning yet: "
-        f"{reason.rstrip('.')}. Learning is retried after the next mission.",
-        stacklevel=5,
-    )
-    return None
+        return None, f"{type(error).__name__}: {error}"
+    tree = parameters_alone(tree)
+    tree.attrs["missions"] = used
+    return tree, ""
 
 
 def learn_hazard(state: State, workspace: Workspace) -> xr.Dataset:
@@ -104,7 +95,7 @@ def learn_hazard(state: State, workspace: Workspace) -> xr.Dataset:
     try:
         return fit_hazard(measured, workspace, prior, lost=lost, seed=state.seed_of("hazard"))
     except PosteriorError as error:
-        warnings.warn(f"{error} The campaign uses the previous hazard posterior.", stacklevel=5)
+        warn(f"{error} The campaign uses the previous hazard posterior.")
     if (last := state.posterior) is not None:
         return last["hazard"].to_dataset()
     return fit_hazard([], workspace, prior)

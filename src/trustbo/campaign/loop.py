@@ -4,7 +4,6 @@ from typing import Any
 
 from trustbo.campaign.campaign import Campaign
 from trustbo.campaign.stopping import Stop
-from trustbo.campaign.storage import Storage
 from trustbo.errors import TrustboError
 from trustbo.files import FilePath
 from trustbo.models.model import TrustModel
@@ -60,8 +59,7 @@ def iterate(
     steps = campaign.run(simulator, n_iterations, stop=stop, progress=progress)
     with campaign:
         if directory is not None:  # after all input has been checked
-            state = campaign.state
-            campaign.storage = Storage.begin(directory, workspace, state, overwrite=overwrite)
+            campaign.store_in(directory, overwrite=overwrite)
         for _ in steps:
             pass
     return campaign

@@ -1,6 +1,6 @@
 """Result of a campaign: posterior, maps, history and recommended path."""
 
-from functools import cached_property
+import threading
 from itertools import chain, zip_longest
 from typing import TYPE_CHECKING, Any
 
@@ -9,13 +9,16 @@ import pandas as pd
 import rioxarray  # noqa: F401  (registers the .rio accessor)
 import xarray as xr
 
+from trustbo.campaign.cache import computed
+from trustbo.campaign.folder import FolderStorage, without_lost_posteriors
 from trustbo.campaign.learning import informed_planner, learn_hazard
+from trustbo.campaign.read import read_campaign
+from trustbo.campaign.record import RECORD
 from trustbo.campaign.state import State
-from trustbo.campaign.storage import Storage, read_campaign
 from trustbo.data import NOWHERE, Cell, Mission
 from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError, require_kind
-from trustbo.files import FilePath
+from trustbo.files import FilePath, interpreting, to_path
 from trustbo.hazard.risk import BoundRisk
 from trustbo.inference import complete, params_of, sample_prior
 from trustbo.inference.draws import prior_mean
@@ -44,8 +47,19 @@ class Result(Summary):
         self, workspace: Workspace, state: State, model: TrustModel | None, base: Planner
     ) -> None:
         """Store the state of a campaign; `base` is its planner before any learning."""
-        self.workspace, self.state, self._base = workspace, state, base
+        self.workspace = workspace
+        self.state = state
         self.model: Any = model
+        self._base = base
+        self._turn = threading.RLock()
+        self._computed: dict[str, Any] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        return vars(self) | {"_turn": None}  # a lock cannot be pickled
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._turn = threading.RLock()
 
     def _rows(self) -> Rows:
         settings, state = self.state.settings, self.state
@@ -83,7 +97,7 @@ class Result(Summary):
         """Posterior of the parameters after each mission; None where there was none yet."""
         return [entry.posterior and entry.posterior() for entry in self.state.entries]
 
-    @cached_property
+    @computed
     def posterior(self) -> xr.DataTree:
         """Posterior after the last mission, with all groups, for ArviZ.
 
@@ -107,7 +121,7 @@ class Result(Summary):
         whole["hazard"] = xr.DataTree(self.hazard)
         return whole
 
-    @cached_property
+    @computed
     def belief(self) -> Params:
         """Parameter draws of the last posterior, or of the prior before anything was learned."""
         if (posterior := self.state.posterior) is not None:
@@ -124,17 +138,17 @@ class Result(Summary):
         seed, model = State(self.state.settings).seed_of("prior"), self.model.for_features(features)
         return sample_prior(model, len(features), n_draws, seed, n_robots=n_robots).flat()
 
-    @cached_property
+    @computed
     def hazard(self) -> xr.Dataset:
         """Group `hazard` of the posterior; see `hazard.fit_hazard`."""
         return learn_hazard(self.state, self.workspace)
 
-    @cached_property
+    @computed
     def risk(self) -> BoundRisk:
         """Failure probability of each bound, given all missions so far."""
         return BoundRisk(self.hazard, self.workspace)
 
-    @cached_property
+    @computed
     def planner(self) -> Planner:
         """Planner that accounts for the failures so far; see `informed_planner`."""
         return informed_planner(self._base, self.risk)
@@ -150,7 +164,7 @@ class Result(Summary):
         except InfeasibleError as error:
             return self.planner.evaluate(error.path, mean)
 
-    @cached_property
+    @computed
     def plan(self) -> Plan:
         """Recommended plan, the best under the posterior mean, with posterior credible bands."""
         best = self.recommend()
@@ -162,12 +176,12 @@ class Result(Summary):
         """Recommended path."""
         return list(self.plan.path)
 
-    @cached_property
+    @computed
     def trust_map(self) -> xr.DataArray:
         """Trust map of the team after the last mission, dims (row, col)."""
         return self.planner.trust_map(self.belief.mean())
 
-    @cached_property
+    @computed
     def history(self) -> xr.Dataset:
         """Dataset of the quantities of each mission, with dim `iteration` (1, 2, ...).
 
@@ -241,13 +255,17 @@ class Result(Summary):
     def save(self, directory: FilePath, *, overwrite: bool = False) -> None:
         """Write the campaign to a folder that `load_result` and `Campaign.load` read.
 
-        An existing campaign in that folder is replaced only with `overwrite`.
+        An existing campaign in that folder is replaced only with `overwrite`, when the new one is
+        complete on disk. Other files in the folder are not changed.
 
         Raises:
             TrustboError: The folder already contains a campaign and `overwrite` is False, another
-                process has locked it, or the path is a file.
+                campaign uses it, other files have the names of a campaign's files, or the folder
+                cannot be written.
         """
-        Storage.begin(directory, self.workspace, self.state, overwrite=overwrite).release()
+        with self._turn:
+            state = without_lost_posteriors(self.state)
+            FolderStorage.begin(directory, self.workspace, state, overwrite=overwrite).close()
 
 
 def load_result(directory: FilePath) -> Result:
@@ -257,23 +275,24 @@ def load_result(directory: FilePath) -> Result:
         TrustboError: The folder contains no campaign, the campaign has no mission yet, or a file is
             missing or damaged.
     """
-    state, workspace, pending = read_campaign(directory)
+    state, workspace, pending, _ = read_campaign(directory)
     for entry in pending:  # recorded, but not learned yet
         entry.posterior = state.last
         state.entries.append(entry)
     if not state.entries:
         raise TrustboError(f"the campaign in {str(directory)!r} has no mission; run one first.")
-    given = state.settings
-    try:
-        model = model_from_record(given["model_record"])
-    except TrustboError:  # a custom model is needed only if nothing has been learned
-        if state.last is None:
-            raise
-        model = None
-    base = Planner(
-        workspace, given["start"], given["goal"], given["objective"],
-        family=given["observation"], **given["planner"],
-    )  # fmt: skip
+    with interpreting(to_path(directory) / RECORD):
+        given = state.settings
+        try:
+            model = model_from_record(given["model_record"])
+        except TrustboError:  # a custom model is needed only if nothing has been learned
+            if state.last is None:
+                raise
+            model = None
+        base = Planner(
+            workspace, given["start"], given["goal"], given["objective"],
+            family=given["observation"], **given["planner"],
+        )  # fmt: skip
     return Result(workspace, state, model, base)
 
 

@@ -45,6 +45,18 @@ class Failure(NamedTuple):
         }
 
 
+class StoredFile(NamedTuple):
+    """File of a campaign.
+
+    Attributes:
+        path: Path of the file.
+        sha256: Hash of its content.
+    """
+
+    path: Path
+    sha256: str
+
+
 @dataclass(eq=False)
 class Posterior:
     """Posterior of the parameters after a mission.
@@ -53,16 +65,20 @@ class Posterior:
         name: Name of its file: the number of missions recorded when it was fitted, followed by the
             number of excluded missions if there are any, such as `"0003-1"`.
         tree: Draws in memory; None if they are stored only in `file`.
-        file: File of the draws; None if the campaign is in memory only.
+        file: File of the draws; None if they have not been written.
     """
 
     name: str
     tree: xr.DataTree | None = None
-    file: Path | None = None
+    file: StoredFile | None = None
 
     def __call__(self) -> xr.DataTree:
         """Return the draws; raises TrustboError if the file cannot be read."""
-        return read_tree(self.file or "") if self.tree is None else self.tree
+        if self.tree is not None:
+            return self.tree
+        if self.file is None:
+            raise ValueError("a posterior is in memory or in a file")
+        return read_tree(*self.file)
 
 
 @dataclass(eq=False)
@@ -87,8 +103,8 @@ class Entry:
     posterior: Posterior | None = None
 
     def become(self, state: str, reason: str = "") -> None:
-        """Change the state of the mission."""
-        self.row |= {"state": state, "reason": reason}
+        """Change the state of the mission, in a new row, so that the change can be undone."""
+        self.row = self.row | {"state": state, "reason": reason}
 
 
 @dataclass(eq=False)
@@ -102,6 +118,8 @@ class State:
         asked: Plan returned by `ask` and not run yet.
         simulation: Settings reported by the simulator, and `n_iterations`.
         stop_reason: Why the last run ended.
+        due: Seed of the fit that is due because the missions have changed; None if the posterior
+            is up to date, or if learning is retried after the next mission.
     """
 
     settings: dict[str, Any]
@@ -110,6 +128,7 @@ class State:
     asked: Plan | None = None
     simulation: dict[str, Any] = field(default_factory=dict)
     stop_reason: str = "interrupted"
+    due: int | None = None
 
     @property
     def last(self) -> Posterior | None:

@@ -1,0 +1,315 @@
+"""Folder of a campaign, with one file for each mission and one for each posterior.
+
+    workspace.nc          written once
+    missions/0001.nc      measurements and plan of the first mission, written before learning
+    posteriors/0001.nc    draws of the parameters after the first mission
+    campaign.json         settings, the rows of completed missions, failures, and hashes of the
+                          other files; written last
+
+Every file is written under a temporary name, flushed to disk and renamed. A mission is recorded
+when its file has its name. Everything else is recorded when campaign.json is replaced. If the
+process dies, no mission is lost: `Campaign.load` learns from the missions that are not in
+campaign.json yet.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Self
+
+import xarray as xr
+
+from trustbo.campaign.lock import FolderLock
+from trustbo.campaign.record import RECORD, record_to_bytes
+from trustbo.campaign.replace import (
+    commit_replacement,
+    discard_remains,
+    finish_replacement,
+    is_being_replaced,
+    new_folder,
+    recorded_files,
+    remove_tree,
+)
+from trustbo.campaign.state import Entry, Posterior, State, StoredFile
+from trustbo.errors import TrustboError, warn
+from trustbo.files import (
+    FilePath,
+    hash_of,
+    holding_interrupts,
+    read_file,
+    to_json,
+    to_path,
+    write_file,
+)
+from trustbo.logs.netcdf import missions_to_tree, read_tree, tree_from_bytes, tree_to_bytes
+from trustbo.planning.plan import plan_to_record
+from trustbo.workspace import Workspace
+from trustbo.workspace.netcdf import workspace_to_tree
+
+WORKSPACE = "workspace.nc"
+MISSIONS = "missions"
+POSTERIORS = "posteriors"
+
+
+class FolderStorage:
+    """Folder of a campaign, locked until `close` or the end of the process.
+
+    Attributes:
+        path: Absolute path of the folder.
+        turn: Lock between threads, held during each operation of the campaign.
+        files: Hash of each file of the campaign, keyed by its path in the folder.
+    """
+
+    def __init__(self, lock: FolderLock, files: dict[str, str]) -> None:
+        """Use a locked folder that contains a campaign with these files."""
+        self.path = lock.path
+        self.turn = lock.turn
+        self.files = files
+        self._lock = lock
+        self._written = _version_of(self.path / RECORD)
+
+    @classmethod
+    def begin(
+        cls,
+        directory: FilePath,
+        workspace: Workspace,
+        state: State,
+        *,
+        overwrite: bool,
+        take_over: bool = False,
+    ) -> Self:
+        """Lock a folder and write a whole campaign.
+
+        If this fails, the folder is as before. An existing campaign is replaced only when the new
+        one is complete on disk, and no other files are changed.
+
+        Args:
+            directory: Folder, which is created if it does not exist.
+            workspace: Workspace of the campaign.
+            state: State of the campaign.
+            overwrite: Whether to replace an existing campaign in the folder.
+            take_over: Whether to close an older campaign of this process that uses the folder.
+
+        Raises:
+            TrustboError: Another campaign uses the folder; it contains a campaign and `overwrite`
+                is False; it contains other files with the names of a campaign's files; or it cannot
+                be written.
+        """
+        path = to_path(directory)
+        if not overwrite:
+            _require_no_campaign(path)
+        is_new = not path.exists()
+        _make_folder(path)
+        lock = FolderLock(path, take_over=take_over)
+        try:
+            finish_replacement(lock.path)
+            discard_remains(lock.path)
+            if not overwrite:
+                _require_no_campaign(path)
+            if (lock.path / RECORD).exists():
+                files = _replace_campaign(lock.path, workspace, state)
+            else:
+                files = _write_first(lock.path, workspace, state)
+            return cls(lock, files)
+        except BaseException:
+            lock.release()
+            if is_new:
+                remove_tree(path)
+            raise
+
+    def require_open(self) -> None:
+        """Raise TrustboError if the campaign was closed, or if others have changed its folder."""
+        path = self._lock.require()
+        found = _version_of(path / RECORD)
+        # A record that is missing is written again; another record belongs to somebody else.
+        if found is not None and found != self._written:
+            raise TrustboError(
+                f"{str(path / RECORD)!r} was changed by another program while the campaign was "
+                "open, so nothing was recorded. Continue with Campaign.load."
+            )
+
+    def add_mission(self, n: int, entry: Entry) -> None:
+        """Write the measurements, plan and table row of mission n."""
+        self.require_open()
+        name = f"{MISSIONS}/{n:04d}.nc"
+        if (self.path / name).exists():
+            raise TrustboError(
+                f"{str(self.path / name)!r} exists, but is not a mission of this campaign; move it "
+                "to another folder."
+            )
+        self._write(name, tree_to_bytes(_entry_to_tree(entry)))
+
+    def write(self, state: State) -> None:
+        """Write the posteriors that have no files yet, and then campaign.json."""
+        self.require_open()
+        for entry in state.entries:
+            posterior = entry.posterior
+            if posterior is None or posterior.tree is None:
+                continue
+            if posterior.file is None:
+                name = f"{POSTERIORS}/{posterior.name}.nc"
+                posterior.file = self._write(name, tree_to_bytes(posterior.tree))
+            if posterior is not state.last:
+                posterior.tree = None  # frees the memory
+        record = record_to_bytes(state, self.files)
+        write_file(self.path / RECORD, record, make_folder=False)
+        self._written = _version_of(self.path / RECORD)
+
+    def close(self) -> None:
+        """Release the folder."""
+        self._lock.release()
+
+    def _write(self, name: str, content: bytes) -> StoredFile:
+        """Write a file in the folder, which is never created again if it was moved."""
+        stored = _write_stored(self.path, name, content)
+        self.files[name] = stored.sha256
+        return stored
+
+
+def _write_stored(folder: Path, name: str, content: bytes) -> StoredFile:
+    """Write a file of a folder, given its path in the folder."""
+    file = folder / name
+    try:
+        file.parent.mkdir(exist_ok=True)
+    except OSError as error:
+        raise TrustboError(f"cannot create {str(file.parent)!r}: {error.strerror}.") from error
+    write_file(file, content, make_folder=False)
+    return StoredFile(file, hash_of(content))
+
+
+def _entry_to_tree(entry: Entry) -> xr.DataTree:
+    """Convert a mission with its plan and its table row to a data tree."""
+    planned = xr.Dataset({"trust_map": entry.trust_map})
+    planned.attrs = {"plan": to_json(plan_to_record(entry.plan)), "row": to_json(entry.row)}
+    tree = missions_to_tree([entry.measured])
+    tree["planned"] = xr.DataTree(planned)
+    return tree
+
+
+def _contents(workspace: Workspace, state: State) -> Iterator[tuple[str, bytes]]:
+    """Make the files of a campaign, except campaign.json: path in the folder, and content."""
+    yield WORKSPACE, tree_to_bytes(workspace_to_tree(workspace))
+    posteriors = {}
+    for n, entry in enumerate(state.entries, start=1):
+        yield f"{MISSIONS}/{n:04d}.nc", tree_to_bytes(_entry_to_tree(entry))
+        if entry.posterior is not None:
+            posteriors[entry.posterior.name] = entry.posterior
+    for name, posterior in posteriors.items():
+        yield f"{POSTERIORS}/{name}.nc", _content_of(posterior)
+
+
+def _content_of(posterior: Posterior) -> bytes:
+    """Return the content of a posterior's file; a file is copied, so that it keeps its hash."""
+    if posterior.file is not None:
+        try:
+            return read_file(*posterior.file)
+        except TrustboError:
+            if posterior.tree is None:
+                raise
+    return tree_to_bytes(posterior())
+
+
+def without_lost_posteriors(state: State) -> State:
+    """Return a state without the posteriors whose files cannot be read any more, with a warning."""
+    entries = []
+    lost = []
+    for n, entry in enumerate(state.entries, start=1):
+        posterior = entry.posterior
+        if posterior is not None and posterior.tree is None and posterior.file is not None:
+            try:
+                read_file(*posterior.file)
+            except TrustboError:
+                entry = replace(entry, posterior=None)
+                lost.append(n)
+        entries.append(entry)
+    if not lost:
+        return state
+    warn(
+        f"the posteriors after the missions {lost} cannot be read and are not saved. The missions "
+        "are complete."
+    )
+    return replace(state, entries=entries)
+
+
+def _write_first(folder: Path, workspace: Workspace, state: State) -> dict[str, str]:
+    """Write a campaign to a folder that contains none, and return the hashes of its files.
+
+    If this fails, the files are removed again. Files with these names that exist already are
+    replaced only if they have the same content, as after a process that died here.
+    """
+    files: dict[str, str] = {}
+    written: list[Path] = []
+    try:
+        for name, content in _contents(workspace, state):
+            file = folder / name
+            if file.exists() and not _has_content(file, content):
+                raise TrustboError(
+                    f"{str(file)!r} exists, but no campaign in this folder lists it; move it, or "
+                    "give another folder."
+                )
+            files[name] = _write_stored(folder, name, content).sha256
+            written.append(file)
+        write_file(folder / RECORD, record_to_bytes(state, files), make_folder=False)
+    except BaseException:
+        for file in (folder / RECORD, *written):
+            file.unlink(missing_ok=True)
+        raise
+    return files
+
+
+def _replace_campaign(folder: Path, workspace: Workspace, state: State) -> dict[str, str]:
+    """Write a campaign beside the one in the folder, and then replace that one."""
+    old = recorded_files(folder)
+    beside = new_folder(folder)
+    try:
+        files = {
+            name: _write_stored(beside, name, content).sha256
+            for name, content in _contents(workspace, state)
+        }
+        for name in files:
+            if name not in old and (folder / name).exists():
+                raise TrustboError(
+                    f"{str(folder / name)!r} exists, but is not a file of the campaign in this "
+                    "folder; move it, or give another folder."
+                )
+        write_file(beside / RECORD, record_to_bytes(state, files), make_folder=False)
+        with holding_interrupts():
+            commit_replacement(folder, beside, old, list(files))
+            finish_replacement(folder)
+    except BaseException:
+        remove_tree(beside)
+        raise
+    return files
+
+
+def _make_folder(path: Path) -> None:
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise TrustboError(f"cannot create {str(path)!r}: {error.strerror}.") from error
+
+
+def _require_no_campaign(path: Path) -> None:
+    """Raise TrustboError if a folder contains a campaign."""
+    if (path / RECORD).exists() or is_being_replaced(path):
+        raise TrustboError(
+            f"{str(path)!r} contains a campaign: continue it (Campaign.load, resume), give another "
+            "folder, or replace it (overwrite)."
+        )
+
+
+def _has_content(file: Path, content: bytes) -> bool:
+    """Return whether a netCDF file has the same values; the bytes contain the time of writing."""
+    try:
+        return read_tree(file).identical(tree_from_bytes(content))
+    except TrustboError:
+        return False
+
+
+def _version_of(file: Path) -> tuple[int, int, int] | None:
+    """Return numbers that change when a file is replaced or edited; None if there is none."""
+    try:
+        found = file.stat()
+    except OSError:
+        return None
+    return found.st_ino, found.st_mtime_ns, found.st_size

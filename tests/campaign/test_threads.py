@@ -1,0 +1,112 @@
+"""Campaigns that are used from several threads."""
+
+import asyncio
+import threading
+
+import numpy as np
+import pytest
+from folders import begin, same
+from worlds import ModelSimulator, random_cells
+
+import trustbo as tb
+
+N_THREADS = 4
+
+
+@pytest.fixture(scope="module")
+def workspace():
+    return random_cells(2, 3)
+
+
+def run_all(work):
+    """Call `work(i)` in four threads at once, and raise the errors that they raise."""
+    errors = []
+
+    def caught(i):
+        try:
+            work(i)
+        except Exception as error:
+            errors.append(error)
+
+    threads = [threading.Thread(target=caught, args=(i,)) for i in range(N_THREADS)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    if errors:
+        raise errors[0]
+
+
+def run_mission(campaign, n):
+    """Run the n-th mission, of which the third one is given up."""
+    path = campaign.ask().path
+    if n == 2:
+        campaign.fail("stuck", where=path[1])
+        path = campaign.ask().path
+    seed = campaign.state.seed_of("mission")
+    campaign.tell(ModelSimulator(campaign.workspace, blind=True).run(path, seed=seed))
+
+
+def test_campaign_driven_by_turns_from_four_threads_equals_the_serial_one(workspace, tmp_path):
+    n_missions = 5
+    with begin(workspace, tmp_path / "serial") as serial:
+        for n in range(n_missions):
+            run_mission(serial, n)
+    turn = threading.Condition()
+
+    with begin(workspace, tmp_path / "threads") as campaign:
+
+        def work(i):
+            for n in range(i, n_missions, N_THREADS):
+                with turn:
+                    turn.wait_for(lambda n=n: len(campaign.missions) == n)
+                    run_mission(campaign, n)
+                    turn.notify_all()
+
+        run_all(work)
+    same(campaign, serial)
+    same(tb.load_result(tmp_path / "threads"), serial)
+
+
+def test_missions_told_at_once_are_all_recorded_and_learned(workspace, tmp_path):
+    path = ((2, 0), (1, 1), (0, 2))
+    told = [ModelSimulator(workspace).run(path, seed=seed) for seed in range(N_THREADS)]
+    with begin(workspace, tmp_path) as campaign:
+        run_all(lambda i: (campaign.ask(), campaign.tell(told[i]), campaign.plan))
+        found = {mission.contact_rate.tobytes() for mission in campaign.missions}
+        assert found == {mission.contact_rate.tobytes() for mission in told}
+        assert campaign.posterior["constant_data"].sizes["mission"] == N_THREADS
+        with begin(workspace, tmp_path / "serial") as serial:
+            for mission in campaign.missions:
+                serial.ask()
+                serial.tell(mission)
+        np.testing.assert_array_equal(
+            campaign.posterior["posterior"]["b"], serial.posterior["posterior"]["b"]
+        )
+    same(tb.load_result(tmp_path), campaign)
+
+
+def test_tell_in_a_thread_does_not_block_an_event_loop(workspace, tmp_path):
+    async def main(campaign, mission):
+        ticks = 0
+        task = asyncio.create_task(asyncio.to_thread(campaign.tell, mission))
+        while not task.done():
+            ticks += 1
+            await asyncio.sleep(0.001)
+        return await task, ticks
+
+    with begin(workspace, tmp_path) as campaign:
+        mission = ModelSimulator(workspace).run(campaign.ask().path, seed=0)
+        posterior, ticks = asyncio.run(main(campaign, mission))
+    assert ticks > 1
+    np.testing.assert_array_equal(posterior["posterior"]["b"], campaign.posterior["posterior"]["b"])
+
+
+def test_campaign_is_closed_from_another_thread(workspace, tmp_path):
+    campaign = begin(workspace, tmp_path)
+    thread = threading.Thread(target=campaign.close)
+    thread.start()
+    thread.join()
+    with pytest.raises(tb.TrustboError, match="closed"):
+        campaign.fail("rain")
+    tb.Campaign.load(tmp_path).close()

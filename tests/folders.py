@@ -1,0 +1,60 @@
+"""Campaigns in folders: a small one with every kind of event, and all numbers of a result."""
+
+import numpy as np
+from worlds import ModelSimulator
+
+import trustbo as tb
+
+ENDS = ((2, 0), (0, 2))
+OPTIONS = {"policy": "thompson", "sampler": "importance", "seed": 3, "fit": {"draws": 50}}
+
+
+def numbers(result):
+    """All numbers of a result by name."""
+    found = {
+        "path": np.array(result.path),
+        "trust": result.plan.trust,
+        "map": result.trust_map.values,
+    }
+    for name, column in result.history.data_vars.items():
+        found[name] = column.values
+    for j, tree in enumerate(result.posteriors):
+        for group in {"posterior", "places", "robots", "hazard"} & {
+            *(tree.children if tree else ())
+        }:
+            for name, values in tree[group].data_vars.items():
+                found[f"{group} {name} after {j + 1}"] = values.values
+    for j, mission in enumerate(result.missions):
+        found[f"awareness of {j + 1}"] = mission.awareness
+        found[f"rates of {j + 1}"] = mission.contact_rate
+    return found | {"failures": np.array([str(f) for f in result.state.failures])}
+
+
+def same(one, other):
+    """Assert that two results have equal numbers."""
+    one, other = numbers(one), numbers(other)
+    assert one.keys() == other.keys()
+    for name, values in one.items():
+        np.testing.assert_array_equal(values, other[name], err_msg=name)
+
+
+def drive(campaign):
+    """Run a campaign of four missions, of which one fails, one is given up, one is excluded."""
+    state, simulator = campaign.state, ModelSimulator(campaign.workspace, blind=True)
+    if not state.entries:
+        campaign.tell(simulator.run(campaign.ask().path, seed=state.seed_of("mission")))
+    if len(state.entries) == 1 and not state.failures:
+        campaign.ask()
+        campaign.fail("stuck", where=campaign.ask().path[1])
+    for n in (1, 2, 3):
+        if len(state.entries) == n:
+            simulator.fail_at = 1 if n == 2 else None
+            campaign.tell(simulator.run(campaign.ask().path, seed=state.seed_of("mission")))
+        if n == 2 and len(state.entries) == 3 and not state.indices("excluded"):
+            campaign.exclude(1, "the lidar was covered")
+    return campaign
+
+
+def begin(workspace, folder, **options):
+    """Begin a campaign in a folder."""
+    return tb.Campaign(workspace, *ENDS, directory=folder, **OPTIONS | options)
