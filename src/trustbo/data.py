@@ -20,6 +20,8 @@ NOWHERE: Cell = (-1, -1)
 """Cell of the bounds in a log without a map."""
 FEATURES = ("traversability", "visibility")
 """Names of the first two features, z1 and z2 of the paper."""
+SHARE_TOLERANCE = 1e-6
+"""Largest difference of a contact rate from a multiple of 1 / n_ticks."""
 LINE_OF_SIGHT = "line_of_sight"
 """Feature name of the predicted contact rate; `line_of_sight_1`, `_2`, ... if several."""
 
@@ -340,10 +342,11 @@ def require_shares(rate: np.ndarray, ticks: np.ndarray) -> None:
         raise TrustboError(f"n_ticks of a bound must be {rate.shape}; got shape {ticks.shape}.")
     for i in np.flatnonzero((ticks < 1.0) | (ticks != np.round(ticks)) & ~np.isnan(ticks)):
         raise TrustboError(f"n_ticks[{i}] = {ticks[i]:g} must be a whole number of ticks.")
-    off = np.abs(rate * ticks - np.round(rate * ticks)) > 1e-6 * ticks
+    off = np.abs(rate * ticks - np.round(rate * ticks)) > SHARE_TOLERANCE * ticks
     for i in np.flatnonzero(off):
         raise TrustboError(
-            f"contact_rate[{i}] = {rate[i]:g} is not a multiple of 1 / {ticks[i]:g} (n_ticks)."
+            f"contact_rate[{i}] = {rate[i]:g} is not a multiple of 1 / {ticks[i]:g} (n_ticks); "
+            "give all decimals, or leave n_ticks out."
         )
 
 

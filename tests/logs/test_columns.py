@@ -1,11 +1,19 @@
 """Columns of users' tables: what spreadsheets, surveys and other tools add, and clocks."""
 
+import gzip
+
 import numpy as np
 import pandas as pd
 import pytest
+import xarray as xr
 
 from trustbo.errors import TrustboError
-from trustbo.logs.columns import Columns, require_one_spelling, seconds_of
+from trustbo.logs.columns import (
+    Columns,
+    require_one_spelling,
+    require_plain_names,
+    seconds_of,
+)
 
 EXPECTED = {"who": ["7", "8"], "t": [0.5, np.nan]}
 
@@ -44,10 +52,52 @@ def test_files_of_spreadsheets_and_surveys_are_read(text, tmp_path):
         pd.DataFrame({"who": [7, 8], "t": pd.to_timedelta([500, None], unit="ms")}),
         pd.DataFrame({"Unnamed: 0": [0, 1], "who": ["7", "8"], "t": [0.5, np.nan]}),
         np.array([(7, 0.5), (8, np.nan)], dtype=[("who", int), ("t", float)]),
+        pd.DataFrame({"who": [7, 8], "t": [0.5, np.nan]}).to_xarray(),
+        pd.DataFrame({"who": [7, 8], "t": [0.5, np.nan]}).set_index("who").to_xarray(),
     ],
 )
-def test_frames_mappings_and_arrays_are_read(table):
+def test_frames_datasets_mappings_and_arrays_are_read(table):
     assert_expected(Columns(table))
+
+
+@pytest.mark.parametrize(
+    "table",
+    [
+        3,
+        None,
+        b"who,t",
+        {"who": [7, 8], "t": [0.5]},
+        {"who": 7, "t": 0.5},
+        xr.DataArray([7, 8]),
+        ["first.csv", "second.csv"],
+    ],
+)
+def test_values_that_are_no_table_are_refused(table):
+    with pytest.raises(TrustboError, match="the table"):
+        Columns(table)
+
+
+def test_a_table_may_have_no_rows_where_that_means_something(tmp_path):
+    (tmp_path / "none.csv").write_text("who,t\n")
+    for table in (tmp_path / "none.csv", {"who": [], "t": []}):
+        columns = Columns(table, may_be_empty=True)
+        assert columns.texts("who") == []
+        assert columns.numbers("t").shape == (0,)
+
+
+@pytest.mark.parametrize(
+    ("cells", "decimals"),
+    [(["0.5", "0.429", "", "1"], 3), (["4.29e-1"], 3), ([0.43, np.nan, 1.0], 2), ([1, 0], 0)],
+)
+def test_decimals_are_those_that_are_written(cells, decimals):
+    assert Columns({"t": cells, "who": "a"}).decimals("t") == decimals
+
+
+@pytest.mark.parametrize("name", ["=cmd|' /C calc'!A0", "+1", "-1", "@a", " a", "NA", "1.0", ""])
+def test_names_that_a_table_would_change_are_refused(name):
+    require_plain_names("robot", ["a b", "ü-7", "12"])
+    with pytest.raises(TrustboError, match="robot"):
+        require_plain_names("robot", ["a", name])
 
 
 @pytest.mark.parametrize("value", ["1_10", "1,5", "inf", "0x10", "one", "10:02", "1.234,5"])
@@ -72,7 +122,8 @@ def test_optional_columns_that_differ_only_in_case_are_refused():
 @pytest.mark.parametrize(
     "content", [b"who,t\n7\n", b"who,t\n7,1,2\n", b"who,who\n7,1\n", b"who,t\n",
                 b"PK\x03\xff", b"a\xe9,t\n1,2\n", b'who,t\n7,"1\n8,2\n',
-                b'who,t\n7,"1\n8,2\n9,3"\n'],
+                b'who,t\n7,"1\n8,2\n9,3"\n', gzip.compress(b"who,t\n7,1\n"), b"PK\x03\x04\x14",
+                b"\xd0\xcf\x11\xe0", b"PAR1\x15"],
 )  # fmt: skip
 def test_files_that_are_no_table_are_refused(content, tmp_path):
     (tmp_path / "bad.csv").write_bytes(content)
@@ -103,8 +154,18 @@ def of(*times):
         (of("2026-11-24T10:00Z", "2026-11-24T10:01Z"), of(3.0)),
         (of("2026-11-24T10:00Z", "2026-11-24T10:01"), of("2026-11-24T10:00Z")),
         (of("24.11.2026 10:00", "24.11.2026 10:01"), of("2026-11-24T10:00Z")),
+        (of(1.7e9, 1.7e9 + 1.0), of(*np.float32([1.7e9]))),
+        (of(*np.float32([1.7e9, 1.7e9 + 300.0])), of(1.7e9 + 1.0)),
+        (of("1699999488", "1700000000"), of(1.7e9 - 1.0)),  # written from float32
     ],
 )
 def test_clocks_that_cannot_be_one_are_refused(first, second):
     with pytest.raises(TrustboError):
         seconds_of(first, second)
+
+
+def test_times_in_float32_are_read_where_it_holds_their_seconds():
+    t = np.float32([0.0, 0.5, 119.25])
+    np.testing.assert_array_equal(seconds_of(of(*t), of(*t[1:]))[1], t[1:])
+    whole = of(1.7e9, 1.7e9 + 1.0, 1.7e9 + 2.0)
+    np.testing.assert_array_equal(seconds_of(whole, whole)[0], 1.7e9 + np.arange(3.0))

@@ -115,6 +115,47 @@ def test_what_is_amiss_is_refused_in_one_line(columns):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    "values", [[0.9, 0.8, 0.7], [None, 90.0, 80.0], [None, "full", "low"], [None, -0.1, 0.2]]
+)
+def test_a_further_column_that_is_no_awareness_is_named(values):
+    with pytest.raises(TrustboError, match="battery"):
+        read_table(rows(battery=values))
+
+
+@pytest.mark.parametrize("decimals", [2, 3, 6])
+def test_rounded_rates_are_read_as_the_nearest_share_of_their_ticks(decimals, tmp_path):
+    n_ticks = np.array([[7, 9], [13, 30]])
+    rate = np.array([[3, 5], [4, 30]]) / n_ticks
+    z = np.full((2, 2, 2), 0.5)
+    frame = to_frame([Mission.from_arrays(PATH, z, rate, n_ticks=n_ticks)])
+    frame.to_csv(tmp_path / "log.csv", index=False, float_format=f"%.{decimals}f")
+    rounded = frame.assign(contact_rate=frame["contact_rate"].round(decimals))
+    for table in (tmp_path / "log.csv", rounded):
+        (one,) = read_table(table)
+        np.testing.assert_array_equal(one.contact_rate, rate)
+
+
+@pytest.mark.parametrize("rates", [[None, 0.4, 0.7], [None, 0.431, 0.714], [None, 0.429, 0.7]])
+def test_rates_that_are_not_rounded_shares_are_refused(rates):
+    with pytest.raises(TrustboError, match="contact_rate"):
+        read_table(rows(contact_rate=rates, n_ticks=[None, 7, 7]))
+
+
+def test_trust_in_an_exported_table_is_not_a_feature():
+    (one,) = read_table(rows(trust_mean=[None, 0.5, 0.6], trust_sd=[None, 0.1, 0.1]))
+    assert one.features == ("visibility",)
+
+
+@pytest.mark.parametrize("name", ["x", "Y", "row", "Col", "robot", "Contact Rate", "=1+1"])
+def test_features_whose_column_would_not_be_read_back_are_refused(name):
+    z, y = np.full((2, 1, 2), 0.5), np.zeros((2, 1))
+    with pytest.raises(TrustboError, match="feature"):
+        to_frame([Mission.from_arrays(PATH, z, y, features=["near", name])])
+    with pytest.raises(TrustboError, match="robot"):
+        to_frame([Mission.from_arrays(PATH, z, y, robots=["=cmd|' /C calc'!A0"])])
+
+
 def test_only_missions_of_one_team_and_kind_make_a_frame():
     z, y = np.full((2, 1, 2), 0.5), np.zeros((2, 1))
     mapped, bare = (Mission.from_arrays(path, z, y) for path in (PATH, None))

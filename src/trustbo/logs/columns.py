@@ -4,6 +4,7 @@ import csv
 import io
 import re
 from collections.abc import Iterable
+from decimal import Decimal, InvalidOperation
 from os import PathLike
 from typing import Any
 
@@ -18,6 +19,25 @@ _BLANK = ("", "na", "n/a", "#n/a", "#na", "nan", "nat", "none", "null", "<na>")
 _WHOLE = re.compile(r"^(-?\d+)\.0+$")
 _THOUSANDS = re.compile(r"\s*[+-]?[1-9]\d{0,2}(,\d{3})+\s*")
 _DECIMAL_COMMA = re.compile(r"^\s*([+-]?\d*),(\d+(?:[eE][+-]?\d+)?)\s*$")
+_FORMULA = ("=", "+", "-", "@")
+"""First characters of cells that spreadsheets evaluate."""
+
+_OTHER_FILES = {
+    b"\x1f\x8b": ("a gzip archive", "pandas.read_csv(file)"),
+    b"PK\x03\x04": ("an Excel workbook or a zip archive", "pandas.read_excel(file)"),
+    b"\xd0\xcf\x11\xe0": ("an Excel workbook", "pandas.read_excel(file)"),
+    b"PAR1\x15": ("a Parquet file", "pandas.read_parquet(file)"),
+}
+"""First bytes of files that are not CSV, what they are, and what reads them."""
+
+_DATES = (
+    ", and dates in seconds, with one start for both tables: "
+    "(pandas.to_datetime(t) - start).dt.total_seconds()"
+)
+_ROUNDED_DTYPE = 0.1
+_ROUNDED_VALUES = 16.0
+"""Steps of float32 at the time of a log, s: refused for columns of float32, and for others in which
+every value is a float32."""
 
 
 class Columns:
@@ -32,13 +52,15 @@ class Columns:
         frame: Table; blank text cells are None. The index counts rows from 1 below the header.
     """
 
-    def __init__(self, table: Any, what: str = "the table") -> None:
+    def __init__(self, table: Any, what: str = "the table", *, may_be_empty: bool = False) -> None:
         """Read a CSV file (commas, semicolons or tabs), or any table that pandas accepts.
 
-        Raises TrustboError if a file is not a table, a column is repeated, or there are no rows.
+        Tables of xarray, polars and pyarrow are converted. Raises TrustboError if a file or value
+        is not a table, a column is repeated, or there are no rows although `may_be_empty` is False.
         """
         self.what = what
-        frame = _of_file(table) if isinstance(table, str | PathLike) else pd.DataFrame(table).copy()
+        is_file = isinstance(table, str | PathLike)
+        frame = _of_file(table) if is_file else _of_value(table, what)
         if any(names := frame.index.names):
             frame = frame.drop(columns=[name for name in names if name in frame]).reset_index()
         frame.columns = [str(name).strip() for name in frame.columns]
@@ -52,14 +74,14 @@ class Columns:
         frame[text] = frame[text].astype(object).map(_cell).astype(object)
         imports = [i for i, row in frame.iloc[:3].iterrows() if "ImportId" in str(row.tolist())]
         self.frame = frame.loc[max(imports, default=0) + 1 :].dropna(how="all")
-        if self.frame.empty:
+        if self.frame.empty and not may_be_empty:
             raise TrustboError(f"{what} has no rows.")
 
     def find(self, name: str) -> str | None:
         """Return the name of a column as spelled in the table; None if there is no such column."""
         if name in self.frame:
             return name
-        alike = [other for other in self.frame if _folded(other) == _folded(name)]
+        alike = [other for other in self.frame if folded(other) == folded(name)]
         if len(alike) > 1:
             raise TrustboError(f"{self.what} has the columns {', '.join(alike)}; rename one.")
         return alike[0] if alike else None
@@ -81,24 +103,43 @@ class Columns:
         return ["" if pd.isna(cell) else _WHOLE.sub(r"\1", str(cell)) for cell in cells]
 
     def numbers(
-        self, column: str, *, blank: bool = True, whole: bool = False, required: bool = True
+        self,
+        column: str,
+        *,
+        blank: bool = True,
+        whole: bool = False,
+        required: bool = True,
+        hint: str = "",
     ) -> np.ndarray:
         """Return a column as numbers, (row,); NaN where blank, or if an optional column is missing.
 
-        Raises TrustboError if a required column is missing, or if a value is not a finite number,
-        is blank although `blank` is False, or is not whole although `whole` is True.
+        Args:
+            column: Name of the column.
+            blank: Whether values may be blank.
+            whole: Whether values must be whole numbers.
+            required: Whether the column must exist.
+            hint: End of the message about a value that is not a number.
+
+        Raises:
+            TrustboError: A required column is missing, or a value is not a finite number, is blank
+                or is not whole.
         """
         cells = self._cells(column, required)
         parsed = pd.Series(pd.to_numeric(cells, errors="coerce")).to_numpy(float, na_value=np.nan)
         self.refuse(
             column,
             ~np.isfinite(parsed) & cells.notna().to_numpy(),
-            "is not a finite number; write decimals with a point, thousands without a mark, dates "
-            "in seconds, and words as numbers: frame[column].map({'agree': 6})",
+            "is not a finite number; write decimals with a point and thousands without a mark"
+            + hint,
         )
         self.refuse(column, np.isnan(parsed) & (not blank), "is blank")
         self.refuse(column, whole & (parsed > np.floor(parsed)), "must be a whole number")
         return cells.to_numpy(float, na_value=np.nan)
+
+    def decimals(self, column: str) -> int:
+        """Return the number of decimals with which the values of a column are written."""
+        cells = self._cells(column).dropna()
+        return max((_decimals(cell) for cell in cells), default=0)
 
     def _cells(self, column: str, required: bool = True) -> pd.Series:
         name = self.find(column)
@@ -109,35 +150,69 @@ class Columns:
 
 
 def seconds_of(first: Columns, second: Columns) -> list[np.ndarray]:
-    """Return the times `t` of two tables, each (row,), in s.
+    """Return the times `t` of two tables, each (row,), in s; the second table may be empty.
 
     Raises TrustboError if the times are not in seconds, or the tables do not share a clock.
     """
-    times = [table.numbers("t", blank=False) for table in (first, second)]
-    spans = [f"{t.min():.9g} to {t.max():.9g} s" for t in times]
+    times = [table.numbers("t", blank=False, hint=_DATES) for table in (first, second)]
+    for table, t in zip((first, second), times, strict=True):
+        _require_precision(table, t)
+
+    span = _span(times[0])
     if np.ptp(times[0]) > 7 * 86_400.0 or np.abs(times[0]).max() > 1e11:
         raise TrustboError(
-            f"times of {first.what} are {spans[0]}; they must be in seconds (divide milliseconds "
+            f"times of {first.what} are {span}; they must be in seconds (divide milliseconds "
             "by 1000) and span at most 7 days."
         )
+    if not times[1].size:
+        return times
+
     inside = ((times[1] >= times[0].min()) & (times[1] <= times[0].max())).mean()
     if inside < 0.5:
         raise TrustboError(
-            f"only {inside:.0%} of the times of {second.what} ({spans[1]}) are within the range of "
-            f"{first.what} ({spans[0]}); check the epoch, unit and time zone of both clocks."
+            f"only {inside:.0%} of the times of {second.what} ({_span(times[1])}) are within the "
+            f"range of {first.what} ({span}); check the epoch, unit and time zone of both clocks."
         )
     return times
+
+
+def _span(t: np.ndarray) -> str:
+    """Describe the range of times."""
+    return f"{t.min():.9g} to {t.max():.9g} s"
+
+
+def _require_precision(table: Columns, t: np.ndarray) -> None:
+    """Raise TrustboError if times were rounded to single precision and lost their seconds."""
+    if not t.size:
+        return
+    single = t.astype(np.float32)
+    step = float(np.spacing(np.abs(single).max()))
+    is_single = table.frame[table.find("t")].dtype == np.float32
+    if step > (_ROUNDED_DTYPE if is_single else _ROUNDED_VALUES) and np.array_equal(single, t):
+        raise TrustboError(
+            f"times of {table.what} ({_span(t)}) are rounded to steps of {step:g} s, because they "
+            "were stored as float32; use float64, or subtract the start before the conversion."
+        )
+
+
+def require_plain_names(what: str, names: Iterable[str]) -> None:
+    """Raise TrustboError for a name that a table cannot hold, or that a spreadsheet evaluates."""
+    for name in names:
+        if name.startswith(_FORMULA):
+            raise TrustboError(f"{what} {name!r}: spreadsheets take it for a formula; rename it.")
+        if _cell(name) != name or _WHOLE.match(name):
+            raise TrustboError(f"{what} {name!r} would be read as blank or changed; rename it.")
 
 
 def require_one_spelling(what: str, names: Iterable[str]) -> None:
     """Raise TrustboError if two names differ only by case, spaces or leading zeros."""
     spelled: dict[str, str] = {}
     for name in dict.fromkeys(names):
-        if (other := spelled.setdefault(_folded(name), name)) != name:
+        if (other := spelled.setdefault(folded(name), name)) != name:
             raise TrustboError(f"{what}: {other!r} and {name!r} look alike; use one spelling.")
 
 
-def _folded(name: str) -> str:
+def folded(name: str) -> str:
     """Return a name in lower case, without leading zeros and with uniform spaces."""
     spaced = re.sub(r"[\s_-]+", " ", name.casefold()).strip()
     return re.sub(r"(?<![\d.])0+(?=\d)", "", spaced)
@@ -149,10 +224,44 @@ def _cell(value: object) -> str | None:
     return None if text.lower() in _BLANK else text
 
 
+def _decimals(cell: Any) -> int:
+    """Return the number of decimals of a number, or of its text; 0 if there are none."""
+    try:
+        exponent = Decimal(str(cell)).as_tuple().exponent
+    except InvalidOperation:
+        return 0
+    return max(-exponent, 0) if isinstance(exponent, int) else 0
+
+
+def _of_value(table: Any, what: str) -> pd.DataFrame:
+    """Convert a table in memory; xarray has `to_dataframe`, polars and pyarrow `to_pandas`."""
+    try:
+        if not isinstance(table, pd.DataFrame):
+            convert = getattr(table, "to_dataframe", None) or getattr(table, "to_pandas", None)
+            table = convert() if callable(convert) else table
+        frame = pd.DataFrame(table).copy()
+    except Exception as error:  # each library raises its own types of errors
+        raise TrustboError(
+            f"{what} cannot be made from {type(table).__name__} {one_line(table)} "
+            f"({one_line(str(error))}); give the path of a CSV file, a DataFrame, or a mapping of "
+            "columns of one length."
+        ) from None
+    if isinstance(table, list | tuple) and any(isinstance(one, str | PathLike) for one in table):
+        raise TrustboError(
+            f"{what} must be one table; got the list {one_line(table)}. Join the files: "
+            "pandas.concat(map(pandas.read_csv, files))."
+        )
+    return frame.rename_axis(None) if frame.index.names == ["index"] else frame
+
+
 def _of_file(file: FilePath) -> pd.DataFrame:
     """Read the cells of a CSV file as text; decimal commas need a separator other than a comma."""
+    content = read_file(file)
+    for start, (kind, reader) in _OTHER_FILES.items():
+        if content.startswith(start):
+            raise TrustboError(f"{str(file)!r} is {kind}, not a CSV file; give {reader}.")
     try:
-        text = read_file(file).decode("utf-8-sig")
+        text = content.decode("utf-8-sig")
         first, _, rest = text.partition("\n")
         separator = max(",;\t", key=first.count)
         if named := re.fullmatch(r'"?sep=(.)"?\s*', first, re.IGNORECASE):

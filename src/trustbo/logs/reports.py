@@ -12,6 +12,7 @@ from trustbo.logs.columns import Columns, require_one_spelling
 
 _YES = ("1", "true", "yes", "success", "succeeded", "ok")
 _NO = ("0", "false", "no", "failure", "failed", "fail")
+_WORDS = ", and words as numbers: frame[column].map({'agree': 6})"
 
 
 def read_reports(
@@ -55,7 +56,7 @@ def read_reports(
     columns = Columns(table)
     people, steps = np.array(columns.texts(person, blank=False)), columns.numbers(step, blank=False)
     require_one_spelling(f"column {person}", people.tolist())
-    given = columns.numbers(report, whole=levels > 0)
+    given = columns.numbers(report, whole=levels > 0, hint=_WORDS)
     low, high = (1, levels) if levels else (0, 1)
     columns.refuse(
         report,
@@ -90,4 +91,4 @@ def _seen(columns: Columns, outcome: str | None, inputs: Sequence[str]) -> dict[
         columns.refuse(outcome, unknown, "must be 1 or 0, success or failure, or blank")
         seen["success"] = np.isin(given, _YES).astype(float)
         seen["failure"] = np.isin(given, _NO).astype(float)
-    return seen | {name: columns.numbers(name, blank=False) for name in inputs}
+    return seen | {name: columns.numbers(name, blank=False, hint=_WORDS) for name in inputs}

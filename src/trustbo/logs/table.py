@@ -6,15 +6,24 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from trustbo.data import FEATURES, Mission
+from trustbo.data import FEATURES, SHARE_TOLERANCE, Mission
 from trustbo.errors import TrustboError
-from trustbo.logs.columns import Columns, require_one_spelling
+from trustbo.logs.columns import Columns, folded, require_one_spelling, require_plain_names
 from trustbo.stacking import require_same_team
 
 KEYS = ("mission", "bound", "robot")
 RATES = ("contact_rate", "duration", "n_ticks")
 COLUMNS = (*KEYS, "row", "col", *RATES, "status")
 """Columns with a fixed meaning; other columns may be features of awareness."""
+TRUST = ("trust_mean", "trust_sd")
+"""Columns of a posterior, which `export.write_csv` adds and `read_table` ignores."""
+
+_NO_FEATURES = ("x", "y", "lon", "lat", "time", "timestamp")
+_FURTHER = "every further column is a feature of awareness; drop columns that are not"
+_MIN_DECIMALS = 2
+"""Rates of fewer decimals are not rounded to the nearest tick."""
+_LAST_BITS = 1e-12
+"""Differences of rates that are not due to rounded decimals."""
 
 
 def to_frame(missions: Sequence[Mission]) -> pd.DataFrame:
@@ -26,11 +35,16 @@ def to_frame(missions: Sequence[Mission]) -> pd.DataFrame:
 
     Raises:
         TrustboError: The missions have different robots or features, only some of them have a path,
-            or a feature has the name of another column.
+            a feature has the name of another column, or the name of a robot or feature would be
+            changed by a CSV file or is a formula of spreadsheets.
     """
     require_same_team(missions)
-    if taken := {*missions[0].features} & {*COLUMNS}:
-        raise TrustboError(f"features {sorted(taken)} are names of other columns; rename them.")
+    taken = {folded(name) for name in (*COLUMNS, *TRUST, *_NO_FEATURES)}
+    if bad := [name for name in missions[0].features if folded(name) in taken]:
+        raise TrustboError(f"features {bad} have names of other columns of a log; rename them.")
+    require_plain_names("feature", missions[0].features)
+    require_plain_names("robot", missions[0].robots)
+
     if len({bool(mission.path) for mission in missions}) > 1:
         raise TrustboError("some missions have a path and some do not; write them to two tables.")
     rows = []
@@ -59,7 +73,8 @@ def read_table(table: Any) -> list[Mission]:
     `status`. Other columns are features, by default `traversability` and `visibility` without any
     value. The status of the last bound is that of the mission. A blank means "not measured", and a
     blank status "ok". Bounds after the last one with a measurement were planned but not run. A
-    table without `row` and `col` is a log without a map.
+    table without `row` and `col` is a log without a map. If rates have been rounded, each one is
+    read as the nearest multiple of 1 / n_ticks within half a unit of the column's last decimal.
 
     Args:
         table: Path of a CSV file (commas, semicolons or tabs), a DataFrame, or a mapping of lists.
@@ -69,9 +84,9 @@ def read_table(table: Any) -> list[Mission]:
             type, rows of one bound disagree on its cell, or `Mission` rejects the data.
     """
     columns = Columns(table)
-    known = [columns.find(name) for name in COLUMNS]
+    known = [columns.find(name) for name in (*COLUMNS, *TRUST)]
     features = [name for name in columns.frame if name not in known] or list(FEATURES)
-    if odd := {"x", "y", "lon", "lat", "time", "timestamp"} & {*map(str.lower, features)}:
+    if odd := {*_NO_FEATURES} & {*map(str.lower, features)}:
         raise TrustboError(f"{sorted(odd)} are no features; drop them, and give cells as row, col.")
     frame = _parsed(columns, features)
     robots = tuple(name for name in frame["robot"].unique() if name)
@@ -97,9 +112,45 @@ def _parsed(columns: Columns, features: Sequence[str]) -> pd.DataFrame:
     is_mapped = any(columns.find(name) for name in ("row", "col"))
     for name in ("bound", "row", "col") if is_mapped else ("bound",):
         values[name] = columns.numbers(name, blank=False, whole=True).astype(int)
-    for name in (*RATES, *features):
+    for name in RATES:
         values[name] = columns.numbers(name, required=name == "contact_rate")
+    for name in features:
+        values[name] = columns.numbers(name, required=False, hint=f"; {_FURTHER}")
+
+    if is_mapped:
+        _refuse_values_that_are_no_awareness(columns, features, values)
+    if columns.find("n_ticks"):
+        values["contact_rate"] = _to_ticks(columns, values["contact_rate"], values["n_ticks"])
     return pd.DataFrame(values, index=columns.frame.index)
+
+
+def _refuse_values_that_are_no_awareness(
+    columns: Columns, features: Sequence[str], values: dict[str, Any]
+) -> None:
+    """Raise TrustboError for features outside [0, 1], or with a value at the start cell."""
+    for name in features:
+        outside = (values[name] < 0.0) | (values[name] > 1.0)
+        columns.refuse(name, outside, f"is outside [0, 1]; {_FURTHER}, and divide percent by 100")
+        at_start = (values["bound"] == 0) & ~np.isnan(values[name])
+        columns.refuse(name, at_start, f"must be blank at bound 0, the start cell; {_FURTHER}")
+
+
+def _to_ticks(columns: Columns, rate: np.ndarray, n_ticks: np.ndarray) -> np.ndarray:
+    """Return rates, (row,), of which rounded ones become multiples of 1 / n_ticks."""
+    unit = 0.1 ** max(columns.decimals("contact_rate"), _MIN_DECIMALS)
+    n = np.where(n_ticks >= 1.0, n_ticks, np.nan)  # `Mission` rejects others
+    nearest = np.round(rate * n) / n
+    off = np.abs(rate - nearest)
+    most = 0.5 * unit * (1.0 + 1e-9)
+
+    columns.refuse(
+        "contact_rate",
+        off > max(most, SHARE_TOLERANCE),
+        "is not a multiple of 1 / n_ticks; write more decimals, correct n_ticks, or leave out the "
+        "column n_ticks",
+    )
+    is_rounded = (off > _LAST_BITS) & (off <= most)
+    return np.where(is_rounded, nearest, rate)
 
 
 def _mission(rows: pd.DataFrame, features: Sequence[str], robots: tuple[str, ...]) -> Mission:
@@ -115,7 +166,9 @@ def _mission(rows: pd.DataFrame, features: Sequence[str], robots: tuple[str, ...
     values, status = rows.set_index([*KEYS[1:]])[[*RATES, *features]], rows["status"]
     measured = rows.loc[values.notna().to_numpy().any(axis=1) | (status != ""), "bound"]
     if measured.empty or measured.min() < 1:
-        raise TrustboError("bounds with a rate or feature must be numbered from 1; got none or 0.")
+        raise TrustboError(
+            "bounds with a rate, feature or status must be numbered from 1; got none or 0."
+        )
     n_run, ended = int(measured.max()), rows.loc[~status.isin(["", "ok"])]
     if ended["status"].nunique() > 1 or (ended["bound"] < n_run).any():
         raise TrustboError("only the last bound that was run may have a status other than ok.")
