@@ -35,9 +35,9 @@ def test_geometry_is_that_of_the_plane():
 
 
 def test_robot_without_detections_is_warned_of():
+    seen = {"t": [0.5, 0.7, 2.2], "watcher": [*"aac"], "seen": [*"cca"]}
     with pytest.warns(UserWarning, match="no detection names b"):
-        read_tracks(POSES | {"robot": [*"aabbcc"], "t": [0.0, 4.0] * 3},
-                    SEEN | {"watcher": [*"aac"], "seen": [*"cca"]}, window=4.0)  # fmt: skip
+        read_tracks(POSES | {"robot": [*"aabbcc"], "t": [0.0, 4.0] * 3}, seen, window=4.0)
 
 
 def test_windows_are_bounds_and_rates_are_shares_of_their_ticks():
@@ -162,3 +162,159 @@ def test_poses_off_the_map_are_refused_with_both_places():
     )
     with pytest.raises(TrustboError, match="never on the grid"):
         read_tracks(POSES | {"x": [50.0, 54.0, 58.0] * 2}, SEEN, workspace, lead="a")
+
+
+NAMES = ("a", "b")
+PLANNED = [(3, 0), (2, 1), (1, 2), (0, 3)]
+
+
+@pytest.fixture(scope="module")
+def field():
+    """A map of 4 by 4 cells of 20 m, with a team of two robots."""
+    z = np.full((2, 4, 4, 2), 0.5)
+    return tb.Workspace.from_awareness(z, cell_size=20.0, team=tb.Team(2, names=NAMES))
+
+
+def driven(field, cells, *, hz=1, rate=0.6, seed=0):
+    """Poses of a lead L and two robots along cells, 20 s for each, and detections of the lead."""
+    rng = np.random.default_rng(seed)
+    n = 20 * (len(cells) - 1)
+    t = np.arange(n * hz + 1) / hz
+    centres = np.array([field.grid.center(cell) for cell in cells])
+    x, y = (np.interp(t / 20.0, np.arange(len(cells)), axis) for axis in centres.T)
+    poses = pd.concat(
+        [pd.DataFrame({"t": t, "robot": name, "x": x - behind, "y": y - behind})
+         for name, behind in (("L", 0.0), ("a", 3.0), ("b", 6.0))]
+    )  # fmt: skip
+    seen = pd.concat(
+        [pd.DataFrame({"t": t[rng.random(len(t)) < rate], "watcher": name}) for name in NAMES]
+    )
+    return poses, seen.assign(seen="L")
+
+
+def read_driven(field, poses, seen, **options):
+    (one,) = read_tracks(poses, seen, field, lead="L", **{"path": PLANNED} | options)
+    return one
+
+
+def test_a_watcher_without_poses_is_warned_of(field):
+    poses, seen = driven(field, PLANNED)
+    renamed = seen.assign(watcher=seen.watcher.where((seen.watcher == "a") | (seen.t < 25), "b2"))
+    with pytest.warns(UserWarning, match="b2"):
+        read_driven(field, poses, renamed)
+
+    tree = seen.iloc[:1].assign(seen="tree")
+    read_driven(field, poses, pd.concat([seen, tree]))  # what is only seen need not be a robot
+
+
+def test_a_robot_that_is_neither_lead_nor_in_the_team_is_warned_of(field):
+    poses, seen = driven(field, PLANNED)
+
+    def renamed(table, column):
+        return table.assign(
+            **{column: table[column].where((table[column] != "b") | (table.t < 25), "b2")}
+        )
+
+    with pytest.warns(UserWarning, match="b2"):
+        read_driven(field, renamed(poses, "robot"), renamed(seen, "watcher"))
+
+
+def test_a_planned_cell_that_the_lead_misses_is_named(field):
+    round_it = [(3, 0), (2, 1), (2, 2), (1, 3), (0, 3)]
+    poses, seen = driven(field, round_it)
+    with pytest.raises(TrustboError, match=r"path.*|\(1, 2\)"):
+        read_driven(field, poses, seen)
+
+    one = read_driven(field, poses, seen, path=round_it)
+    assert (len(one.bounds), one.status) == (4, "ok")
+
+
+@pytest.mark.parametrize(
+    ("cells", "named"),
+    [
+        (PLANNED[1:], r"\(3, 0\)"),  # recorded late
+        ([(0, 0), (1, 1), (2, 2), (3, 3)], r"\(3, 0\)"),  # of another day
+        ([(3, 0), (3, 1), (3, 2)], r"\(2, 1\)"),
+        ([(3, 0), (3, 1)], r"\(2, 1\)"),
+    ],
+)
+def test_a_log_that_does_not_begin_with_the_path_is_refused_with_the_cell(field, cells, named):
+    with pytest.raises(TrustboError, match=named):
+        read_driven(field, *driven(field, cells))
+
+
+def test_a_mission_that_leaves_its_path_ends_in_the_last_cell_of_it(field):
+    poses, seen = driven(field, [(3, 0), (2, 1), (3, 2), (3, 3)])
+    with pytest.warns(UserWarning, match=r"\(1, 2\)"):
+        one = read_driven(field, poses, seen)
+    assert (len(one.bounds), one.status) == (1, "aborted")
+    assert one.duration[0, 0] == 20.0  # half of each of two moves
+
+
+def test_the_drive_back_from_the_goal_is_not_part_of_the_mission(field):
+    alone = read_driven(field, *driven(field, PLANNED))
+    back = read_driven(field, *driven(field, [*PLANNED, *PLANNED[-2::-1]]))
+    np.testing.assert_array_equal(back.duration[:-1], alone.duration[:-1])
+    assert back.status == "ok"
+    assert back.duration[-1, 0] == 20.0
+
+
+@pytest.mark.parametrize("shift", [25.0, -25.0, 5.0])
+def test_detections_outside_the_time_of_the_poses_are_warned_of(field, shift):
+    poses, seen = driven(field, PLANNED)
+    of_a = seen.watcher == "a"
+    for late in (seen.assign(t=seen.t + shift), seen.assign(t=seen.t + shift * of_a)):
+        with pytest.warns(UserWarning, match="by a.* lie outside"):
+            read_driven(field, poses, late)
+
+
+@pytest.mark.parametrize(("hz", "rate"), [(10, 0.15), (10, 0.9), (20, 0.05), (5, 0.3)])
+def test_a_detector_faster_than_the_tick_is_warned_of_with_its_interval(field, hz, rate):
+    poses, seen = driven(field, PLANNED, hz=hz, rate=rate)
+    with pytest.warns(UserWarning, match=f"tick={1.0 / hz:g}"):
+        read_driven(field, poses, seen)
+    one = read_driven(field, poses, seen, tick=1.0 / hz)
+    assert np.nanmean(one.contact_rate) == pytest.approx(rate, abs=0.05)
+
+
+def test_a_log_without_detections_is_contact_zero(field):
+    poses, seen = driven(field, PLANNED)
+    for table in (seen.iloc[:0], {"t": [], "watcher": [], "seen": []}):
+        with pytest.warns(UserWarning, match="no detection names a, b, L"):
+            one = read_driven(field, poses, table)
+        assert one.contact_rate.max() == 0.0
+        assert one.n_ticks.min() > 0.0
+    with pytest.raises(TrustboError, match="tree"):
+        read_driven(field, poses, seen.assign(seen="tree"))
+
+
+@pytest.mark.filterwarnings("ignore:robot .* usually moves")
+@pytest.mark.parametrize("unit", [60.0, 3600.0, 86400.0, 1e-3, 1e-6])
+def test_times_in_other_units_are_refused_with_the_unit(field, unit):
+    poses, seen = driven(field, PLANNED)
+    for start in (0.0, 738_000.0):
+        with pytest.raises(TrustboError, match="seconds"):
+            read_driven(field, *(table.assign(t=start + table.t / unit) for table in (poses, seen)))
+
+
+def test_a_long_log_in_minutes_is_warned_of(field):
+    poses, seen = driven(field, PLANNED)
+    fast = [table.assign(t=table.t / 40.0) for table in (poses.iloc[::1], seen)]
+    with pytest.warns(UserWarning, match="seconds|tick="):
+        read_tracks(*fast, window=1.0, tick=0.1)
+
+
+def test_exact_copies_of_poses_are_refused_with_the_remedy(field):
+    poses, seen = driven(field, PLANNED)
+    with pytest.raises(TrustboError, match="drop_duplicates"):
+        read_driven(field, pd.concat([poses, poses.iloc[:1]]), seen)
+    assert read_driven(field, pd.concat([poses, poses.iloc[:1]]).drop_duplicates(), seen).path
+
+
+def test_tables_of_xarray_are_read_as_frames_are(field):
+    poses, seen = driven(field, PLANNED)
+    tables = [table.reset_index(drop=True) for table in (poses, seen)]
+    one, other = (
+        read_driven(field, *of) for of in (tables, [table.to_xarray() for table in tables])
+    )
+    np.testing.assert_array_equal(one.contact_rate, other.contact_rate)

@@ -1,7 +1,7 @@
 """Conversion of poses and detections to missions in which all robots watch one lead."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from itertools import groupby
 from typing import Any
@@ -15,8 +15,19 @@ from trustbo.logs.columns import Columns, require_one_spelling, seconds_of
 from trustbo.workspace import Workspace
 
 _FEATURES = ("near", "ahead")
-_GAP, _FASTEST = 5.0, 100.0
-"""Longest gap between two poses that is interpolated, s, and fastest robot, m/s."""
+_GAP = 5.0
+"""Longest gap between two poses that is interpolated, s."""
+_FAST, _FASTEST = 30.0, 100.0
+"""Usual speed of a robot that is warned of, and highest speed that is read, m/s."""
+_OUTSIDE = 0.05
+"""Share of a robot's detections that may lie outside the time of the poses without a warning."""
+_OFTEN = 0.03
+_MANY = 4
+"""Share and number of intervals between detections that may be shorter than those of the detector.
+"""
+_SHORT = 10.0
+"""Length of a log whose unit of time is doubted, s."""
+_UNITS = "t in seconds (days * 86400, minutes * 60, milliseconds / 1000) and x, y in metres"
 
 
 def read_tracks(
@@ -38,7 +49,8 @@ def read_tracks(
     With a workspace, the result is one mission for `Campaign.tell`, with the robots and features of
     the workspace and without measured awareness. A bound begins where the lead enters the next cell
     of its path. If the planned path is given, a cell is not a bound if the lead only cuts its
-    corner. If the lead does not reach the last cell, the status is `"aborted"`.
+    corner. If the lead does not reach the last cell, the status is `"aborted"`. The last bound ends
+    where the lead leaves its cell for more than 5 s.
 
     Without a workspace, bounds are time windows. The lead is also listed as a robot, so that all
     missions have the same robots, with contact rates NaN and features 0. A bound without any tick
@@ -51,7 +63,8 @@ def read_tracks(
             if known, heading (rad from east, anticlockwise); by default, the heading is the
             direction of motion.
         detections: Another such table with the columns t (on the same clock), watcher and seen.
-            Detections of objects without poses are ignored.
+            Detections of objects without poses are ignored. A table without rows means that no
+            robot detected another.
         workspace: Map of the cells that the lead enters.
         path: Planned path, such as `campaign.ask().path`; it needs a workspace.
         lead: Name of the lead. By default the robot that is not in the workspace's team; without a
@@ -60,24 +73,27 @@ def read_tracks(
         tick: Length of a tick, s.
 
     Raises:
-        TrustboError: Values, times, poses or units are invalid, no robot detects another, the lead
-            is unknown, or the log has no complete bound.
+        TrustboError: Values, times, poses or units are invalid, no detection is between two robots
+            with poses, the lead is unknown, it misses a cell of the given path, or the log has no
+            complete bound.
+
+    Warns:
+        UserWarning: A watcher is unknown, detections lie outside the time of the poses, their
+            interval is not the tick, a robot is never seen or never watches, or the lead leaves the
+            planned path.
     """
     tick, window = require_positive("tick", tick), require_positive("window", window)
     if path is not None and workspace is None:
         raise TrustboError("path= needs the workspace of its cells.")
-    tracks, looks = _read(poses, detections, tick)
+    tracks, looks, strangers = _read(poses, detections)
     robots = tuple(tracks["robot"].unique())
     team = robots if workspace is None else workspace.team.names
-    for name in team:
-        require_choice("robot of the team", name, robots)
-    leads = [name for name in robots if workspace is None or name not in team]
-    if lead is not None:
-        leads = [require_choice("lead", lead, robots)]
-    elif workspace is not None and len(leads) != 1:
-        raise TrustboError(f"a log with a map has one lead; pass lead=, one of {leads or robots}.")
+    leads = _leads(lead, robots, workspace)
+
     t = tracks["t"].to_numpy()
     n = int(np.ptp(t) / tick + 1e-9)
+    if n < 1:
+        raise TrustboError(f"the log of {np.ptp(t):.3g} s is shorter than a tick; give {_UNITS}.")
     times = t.min() + (np.arange(n) + 0.5) * tick
     places = pd.concat([_at(_track(tracks, name), times) for name in robots])
     looks["tick"] = np.floor((looks["t"] - t.min()) / tick + 1e-9)
@@ -85,23 +101,45 @@ def read_tracks(
     missions = []
     for name in leads:
         cells, edges = None, np.arange(0, n + 1, max(round(window / tick), 1))
-        if workspace is not None:
-            cells, edges = _crossings(places.loc[places["robot"] == name], n, workspace, path)
+        of_name = places.loc[places["robot"] == name]
+        if workspace is not None and len(of_name):
+            cells, edges = _crossings(of_name, n, tick, workspace, path)
         of_lead = pairs.loc[pairs["lead"] == name]
         if len(edges) > 1 and len(of_lead):
             missions.append(_mission(of_lead, edges, tick, cells, team, workspace))
     if not missions:
+        usual = tracks.sort_values("t").groupby("robot")["t"].diff().median()
         raise TrustboError(
             f"the log of {n * tick:g} s has no complete bound in which the poses of two robots are "
-            f"at most {_GAP:g} s apart; give a shorter window, or the path that the lead took."
+            f"at most {_GAP:g} s apart; they are usually {usual:.3g} s apart. Give {_UNITS}, or a "
+            "shorter window."
         )
+
+    _warn_of_watchers(looks, strangers, leads, team)
+    _warn_of_detections(tracks, looks, tick)
     return missions
 
 
-def _read(poses: Any, detections: Any, tick: float) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Read poses (t, robot, x, y, heading) and detections (t, robot, lead)."""
+def _leads(lead: str | None, robots: Sequence[str], workspace: Workspace | None) -> Sequence[str]:
+    """Return the leads of a log: the given one, the robot that is not in the team, or all."""
+    team = () if workspace is None else workspace.team.names
+    for name in team:
+        require_choice("robot of the team", name, robots)
+    if lead is not None:
+        return [require_choice("lead", lead, robots)]
+    others = [name for name in robots if name not in team]
+    if workspace is not None and len(others) != 1:
+        raise TrustboError(f"a log with a map has one lead; pass lead=, one of {others or robots}.")
+    return others
+
+
+def _read(poses: Any, detections: Any) -> tuple[pd.DataFrame, pd.DataFrame, list[str]]:
+    """Read poses (t, robot, x, y, heading) and detections (t, robot, lead) between two robots.
+
+    Also returns the names of the watchers without poses.
+    """
     where = Columns(poses, "the table of poses")
-    seen = Columns(detections, "the table of detections")
+    seen = Columns(detections, "the table of detections", may_be_empty=True)
     t, seen_at = seconds_of(where, seen)
     tracks = pd.DataFrame({"t": t, "robot": where.texts("robot", blank=False)})
     tracks["x"], tracks["y"] = (where.numbers(name, blank=False) for name in ("x", "y"))
@@ -111,23 +149,80 @@ def _read(poses: Any, detections: Any, tick: float) -> tuple[pd.DataFrame, pd.Da
     require_one_spelling("names of robots", [*robots, *looks["robot"], *looks["lead"]])
     if np.ptp(tracks[["x", "y"]], axis=0).max() < 0.1:
         raise TrustboError("all poses lie within 0.1 m; x and y are in metres, not degrees or km.")
+
     known = looks["robot"].isin(robots) & looks["lead"].isin(robots)
-    looks = looks.loc[known & (looks["robot"] != looks["lead"])].drop_duplicates()
-    if looks.empty:
+    between = looks.loc[known & (looks["robot"] != looks["lead"])].drop_duplicates()
+    if between.empty and len(looks):
         raise TrustboError(
-            f"no detection (watcher, seen) is between two of the robots {', '.join(robots)}."
+            f"no detection (watcher, seen) is between two of the robots {', '.join(robots)}, which "
+            f"have poses; watchers are {_listed(looks['robot'])}, and seen are "
+            f"{_listed(looks['lead'])}. If no robot was detected, give a table without rows."
         )
-    gaps = looks.sort_values("t").groupby(["robot", "lead"])["t"].diff()
-    apart = float(gaps.quantile(0.05))  # NaN if no robot detects another twice
+    strangers = looks.loc[~looks["robot"].isin(robots), "robot"].unique().tolist()
+    return tracks, between, strangers
+
+
+def _listed(names: Iterable[str]) -> str:
+    """Return different names as text, at most ten of them."""
+    different = [name or "blank" for name in dict.fromkeys(names)]
+    return ", ".join([*different[:10], "..."] if len(different) > 10 else different)
+
+
+def _warn_of_watchers(
+    looks: pd.DataFrame, strangers: Sequence[str], leads: Sequence[str], team: Sequence[str]
+) -> None:
+    """Warn of watchers without poses, robots that are ignored, and robots without detections."""
+    if strangers:
+        warnings.warn(
+            f"detections by {_listed(strangers)} are ignored, because the table of poses lacks "
+            "these robots; if a robot was renamed, use one name in both tables.",
+            stacklevel=3,
+        )
+    named = pd.unique(looks[["robot", "lead"]].to_numpy().ravel())
+    if others := [name for name in named if name not in (*team, *leads)]:
+        warnings.warn(
+            f"detections by and of {_listed(others)} are ignored, because they are neither the "
+            f"lead nor in the team ({', '.join(team)}); if a robot was renamed, use one name.",
+            stacklevel=3,
+        )
+    if silent := [name for name in dict.fromkeys([*team, *leads]) if name not in named]:
+        warnings.warn(f"no detection names {', '.join(silent)}; their contact is 0.", stacklevel=3)
+
+
+def _warn_of_detections(tracks: pd.DataFrame, looks: pd.DataFrame, tick: float) -> None:
+    """Warn of detections outside the time of poses, and of a tick that is not their interval."""
+    spans = tracks.groupby("robot")["t"].agg(["min", "max"])
+    of_watcher, of_lead = (spans.loc[looks[name]].to_numpy() for name in ("robot", "lead"))
+    at = looks["t"].to_numpy()
+    begin = np.maximum(of_watcher[:, 0], of_lead[:, 0])
+    end = np.minimum(of_watcher[:, 1], of_lead[:, 1])
+    outside = pd.Series(np.maximum(begin - at, at - end), index=looks["robot"])
+    shares = (outside > tick).groupby(level=0).mean()
+    if late := shares.index[shares > _OUTSIDE].tolist():
+        warnings.warn(
+            f"{shares.max():.0%} of the detections by {_listed(late)} lie outside the time of the "
+            f"poses of the two robots, by up to {outside[late].max():.3g} s, and are ignored; "
+            "check that both tables have the same clock.",
+            stacklevel=3,
+        )
+
+    gaps = looks.sort_values("t").groupby(["robot", "lead"])["t"].diff().dropna()
+    apart = float(gaps.quantile(_OFTEN))  # NaN if no robot detects another twice
+    short = gaps[gaps < 0.5 * tick]
     if apart > 1.5 * tick:
         warnings.warn(
             f"detections of one robot by another are at least {apart:g} s apart, but every tick of "
             f"{tick:g} s without a detection counts as lost contact; pass tick={apart:g}.",
             stacklevel=3,
         )
-    if silent := [name for name in robots if name not in looks[["robot", "lead"]].values]:
-        warnings.warn(f"no detection names {', '.join(silent)}; their contact is 0.", stacklevel=3)
-    return tracks, looks
+    elif len(short) > max(_OFTEN * len(gaps), _MANY):
+        apart = float(short.quantile(0.05))
+        warnings.warn(
+            f"detections of one robot by another are only {apart:.3g} s apart, but one detection "
+            f"counts as contact in a whole tick of {tick:g} s; pass the interval between two "
+            f"readings of the detector, such as tick={apart:.3g}.",
+            stacklevel=3,
+        )
 
 
 def _track(tracks: pd.DataFrame, name: str) -> pd.DataFrame:
@@ -135,8 +230,13 @@ def _track(tracks: pd.DataFrame, name: str) -> pd.DataFrame:
     track = tracks.loc[tracks["robot"] == name]
     drops, track = -np.diff(track["t"]), track.sort_values("t")
     t, x, y, heading = track[["t", "x", "y", "heading"]].to_numpy().T
-    if len(t) < 2 or (np.diff(t) <= 0.0).any():
-        raise TrustboError(f"robot {name!r} has only one pose, or two poses at one time.")
+    if len(t) < 2:
+        raise TrustboError(f"robot {name!r} has only one pose; leave it out, or give more poses.")
+    if (same := np.diff(t) <= 0.0).any():
+        raise TrustboError(
+            f"robot {name!r} has two poses at t = {t[1:][same][0]:.9g} s; drop exact copies "
+            "(poses.drop_duplicates()), and give times in seconds that are not rounded."
+        )
     if (drops > 0.0).sum() == 1 and drops.max() > 0.5 * np.ptp(t):
         raise TrustboError(
             f"times of robot {name!r} fall by {drops.max():g} s in the middle of the log; correct "
@@ -144,12 +244,20 @@ def _track(tracks: pd.DataFrame, name: str) -> pd.DataFrame:
         )
     dx, dy = np.gradient(x, t), np.gradient(y, t)
     speed, course = np.hypot(dx, dy), np.arctan2(dy, dx)
+    moves = speed > 1e-3  # m/s; slower is standing
+    usual = float(np.median(speed[moves])) if moves.any() else 0.0
+    if usual > _FASTEST:
+        raise TrustboError(f"robot {name!r} usually moves at {usual:.3g} m/s; give {_UNITS}.")
+    if usual > _FAST:
+        warnings.warn(
+            f"robot {name!r} usually moves at {usual:.3g} m/s; the tables must have {_UNITS}.",
+            stacklevel=3,
+        )
     if speed.max() > _FASTEST:
         raise TrustboError(
             f"robot {name!r} moves at {speed.max():.3g} m/s at t = {t[speed.argmax()]:.9g} s; "
             "leave out poses without a fix, such as (0, 0), and give x and y in metres."
         )
-    moves = speed > 1e-3  # m/s; slower is standing
     if np.isnan(heading).all():
         heading = pd.Series(np.where(moves, course, np.nan)).ffill().bfill().to_numpy()
     if np.isnan(heading).any():
@@ -224,23 +332,96 @@ def _mission(
 
 
 def _crossings(
-    places: pd.DataFrame, end: int, workspace: Workspace, path: Sequence[Cell] | None
+    places: pd.DataFrame,
+    n: int,
+    tick: float,
+    workspace: Workspace,
+    planned: Sequence[Cell] | None,
 ) -> tuple[Sequence[Cell], np.ndarray]:
     """Return the path of the lead, by default all cells that it enters, and edges of its bounds."""
-    entered: list[tuple[int, Cell]] = []
+    visits: list[tuple[int, Cell | None]] = []
     for k, x, y in zip(places["tick"], places["x"], places["y"], strict=True):
+        cell = None
         with suppress(TrustboError):  # off the grid
-            entered.append((k, workspace.grid.locate({"x": x, "y": y})))
+            cell = workspace.grid.locate({"x": x, "y": y})
+        visits.append((k, cell))
+    entered = [(k, cell) for k, cell in visits if cell is not None]
     if not entered:
         x, y = places[["x", "y"]].median()
         raise TrustboError(
             f"the lead is never on the grid: its poses are around ({x:.8g}, {y:.8g}). Give x and y "
             f"in {workspace.grid.crs_name}, in which the lower left is {workspace.grid.corner}."
         )
-    if path is None:
-        path = [cell for cell, _ in groupby(cell for _, cell in entered)]
-    path, edges = require_cells("path", path), []
+
+    driven = [cell for cell, _ in groupby(cell for _, cell in entered)]
+    path = require_cells("path", driven if planned is None else planned)
+    if planned is not None and len(path) < 2:
+        raise TrustboError(f"path must have at least two cells; got {list(path)}.")
+    edges: list[int] = []
     for k, cell in entered:
         if len(edges) < len(path) and cell == path[len(edges)]:
             edges.append(k)
+    short = f" The log lasts {n * tick:g} s; give {_UNITS}." if n * tick < _SHORT else ""
+    _require_route(path, edges, entered, short)
+
+    end = _end_of_visit(visits, edges[-1], path[len(edges) - 1], _GAP / tick, n)
+    if len(edges) < len(path) and end < n:
+        warnings.warn(
+            f"the lead leaves cell {path[len(edges) - 1]} {end * tick:g} s after the start of the "
+            f"log and never enters the next cell of the path, {path[len(edges)]}; the mission is "
+            "read as aborted there.",
+            stacklevel=3,
+        )
     return path, np.array([*edges[1:], end])
+
+
+def _require_route(
+    path: Sequence[Cell], edges: Sequence[int], entered: Sequence[tuple[int, Cell]], hint: str
+) -> None:
+    """Raise TrustboError if the lead misses a cell of the path, or has no complete bound.
+
+    Args:
+        path: Planned or driven cells.
+        edges: First tick in each cell of the path that is reached in order.
+        entered: Tick and cell of each pose of the lead on the grid.
+        hint: End of the message.
+    """
+    n = len(edges)
+    if n == len(path) > 1:
+        return
+    first, last = entered[0][1], entered[-1][1]
+    if n == len(path):
+        raise TrustboError(
+            f"the lead stays in cell {path[0]} of the path, so there is no complete bound; use "
+            f"`Campaign.fail` if no bound was run.{hint}"
+        )
+
+    since = edges[-1] if edges else 0
+    later = [cell for k, cell in entered if k > since and cell in {*path[n + 1 :]} - {*path[:n]}]
+    if later:
+        raise TrustboError(
+            f"the lead never enters cell {path[n]}, number {n} of the path (0 is the start), but "
+            f"enters {later[0]}, which is further along. Pass the path that was driven, or leave "
+            f"path= out to take it from the poses.{hint}"
+        )
+    if n < 2:
+        raise TrustboError(
+            f"the lead never enters cell {path[n]}, number {n} of the path (0 is the start), so "
+            f"there is no complete bound; the log begins in cell {first} and ends in {last}. Pass "
+            f"the path of this mission, or use `Campaign.fail` if no bound was run.{hint}"
+        )
+
+
+def _end_of_visit(
+    visits: Sequence[tuple[int, Cell | None]], begin: int, cell: Cell, most: float, n: int
+) -> int:
+    """Return the tick in which the lead leaves a cell for more than `most` ticks, or else `n`."""
+    left = None
+    for k, at in visits:
+        if k < begin or at == cell:
+            left = None
+        elif left is None:
+            left = k
+        if left is not None and k - left > most:
+            return left
+    return n
