@@ -92,3 +92,72 @@ def test_markers_out_of_order_are_refused(markers, workspace, tmp_path):
         read_bag(log.save(tmp_path / "bag"), workspace)
     with pytest.raises(TrustboError):
         read_bag(tmp_path / "none.bag", workspace)
+
+
+def test_topics_in_a_namespace_are_read_with_their_prefix(driven, workspace, tmp_path):
+    topics = ("/mission/bound", "/mission/status")
+    path = record(driven, tmp_path / "log.bag", names={name: f"/ugv{name}" for name in topics})
+    with pytest.raises(TrustboError, match='prefix="/ugv"') as caught:
+        read_bag(path, workspace)
+    assert "contact=" not in str(caught.value)
+
+    for prefix in ("/ugv", "ugv/"):
+        found = read_bag(path, workspace, prefix=prefix)
+        assert [mission.status for mission in found] == ["ok", "aborted"]
+
+
+def test_the_message_about_a_missing_contact_topic_names_its_namespace(driven, workspace, tmp_path):
+    names = {f"/{robot}/contact": f"/ugv/{robot}/contact" for robot in ("r1", "r2")}
+    path = record(driven, tmp_path / "log.bag", names=names)
+    with pytest.raises(TrustboError, match="contact=") as caught:
+        read_bag(path, workspace)
+    assert "prefix=" not in str(caught.value)
+    assert 'contact="/ugv/{robot}/contact"' in str(caught.value)
+    assert len(read_bag(path, workspace, contact="/ugv/{robot}/contact")) == 2
+
+
+@pytest.mark.parametrize("kind", ["log.bag", "sqlite3"])
+def test_a_bag_that_was_split_is_read_as_one(kind, workspace, tmp_path):
+    whole = Log(1 if kind == "log.bag" else 2)
+    for k, marker in enumerate([(2, 0), (1, 1), (0, 2)]):
+        whole.bound(10.0 * k + 1.0, k, *marker)
+        for i in range(4 if k else 0):
+            for robot in ("r1", "r2"):
+                whole.contact(robot, (10.0 * k + 2.0 + i, i % 2 == 0))
+    first, second = Log(whole.version), Log(whole.version)
+    first.messages, second.messages = whole.messages[:6], whole.messages[6:]
+    paths = [one.save(tmp_path / f"{i}-{kind}") for i, one in enumerate((first, second))]
+
+    (one,) = read_bag(whole.save(tmp_path / kind), workspace)
+    (other,) = read_bag(paths, workspace)
+    np.testing.assert_array_equal(one.n_ticks, [[4, 4], [4, 4]])
+    np.testing.assert_array_equal(one.n_ticks, other.n_ticks)
+    np.testing.assert_array_equal(one.contact_rate, other.contact_rate)
+
+
+@pytest.mark.parametrize(
+    ("kind", "fields"),
+    [
+        ("geometry_msgs/msg/Point", {"x": 1.0, "y": 0.0, "z": 0.0}),
+        ("std_msgs/msg/String", {"data": "yes"}),
+    ],
+)
+def test_contact_of_another_type_is_refused_with_its_topic_and_type(
+    kind, fields, workspace, tmp_path
+):
+    log = Log()
+    log.bound(1.0, 0, 2, 0)
+    log.bound(2.0, 1, 1, 1)
+    log.contact("r1", (3.0, True))
+    log.say(3.0, "/r2/contact", kind, **fields)
+    with pytest.raises(TrustboError, match=f"/r2/contact.*{kind}"):
+        read_bag(log.save(tmp_path / "bag"), workspace)
+
+
+def test_a_bound_of_another_type_is_refused_with_its_topic_and_type(workspace, tmp_path):
+    log = Log()
+    log.say(1.0, "/mission/bound", "std_msgs/msg/Bool", data=True)
+    for robot in ("r1", "r2"):
+        log.contact(robot, (3.0, True))
+    with pytest.raises(TrustboError, match=r"/mission/bound.*std_msgs/msg/Bool"):
+        read_bag(log.save(tmp_path / "bag"), workspace)

@@ -13,6 +13,7 @@ are ignored. If the last bound is ok but not the last of the path, the mission i
 
 import json
 from collections.abc import Sequence
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -29,32 +30,43 @@ _BOUND, _STATUS = "/mission/bound", "/mission/status"
 
 
 def read_bag(
-    path: FilePath, workspace: Workspace, *, contact: str = "/{robot}/contact"
+    path: FilePath | Sequence[FilePath],
+    workspace: Workspace,
+    *,
+    contact: str = "/{robot}/contact",
+    prefix: str = "",
 ) -> list[Mission]:
     """Read the missions of a ROS bag, without ticks, pauses and measured awareness.
 
     Args:
-        path: A `.bag` file of ROS 1, or the folder of a bag of ROS 2.
+        path: A `.bag` file of ROS 1, or the folder of a bag of ROS 2; a list of them is read as one
+            bag that was split.
         workspace: Workspace whose robots are read, in the order of its team.
         contact: Topic with the contact of each robot, whose name replaces `{robot}`.
+        prefix: Namespace of the topics of bounds and statuses, such as `"/fleet"` for
+            `/fleet/mission/bound`.
 
     Raises:
-        TrustboError: rosbags is not installed, the path is not a complete bag, a topic is missing,
-            markers are out of order, or `Mission` rejects the data.
+        TrustboError: rosbags is not installed, the path is not a complete bag, a topic is missing
+            or of another type, markers are out of order, or `Mission` rejects the data.
     """
+    paths = [Path(one) for one in ([path] if isinstance(path, str | PathLike) else path)]
+    space = f"/{prefix.strip('/')}" if prefix.strip("/") else ""
+    of_bounds, of_statuses = space + _BOUND, space + _STATUS
     of_topic = {contact.replace("{robot}", robot): robot for robot in workspace.team.names}
-    messages = _messages(Path(path), [_BOUND, *of_topic])
+    messages = _messages(paths, of_bounds, of_statuses, contact, [*of_topic])
+
     seen = messages.loc[messages["topic"].isin([*of_topic])].astype({"data": float}).dropna()
     require_unit_interval(f"messages on {contact}", seen["data"].to_numpy())
     ticks = seen.assign(robot=seen["topic"].map(of_topic), contact=seen["data"] > 0.5)
-    marked = messages.loc[messages["topic"] == _BOUND, "data"]
-    statuses = messages.loc[messages["topic"] == _STATUS, "data"]
+    marked = messages.loc[messages["topic"] == of_bounds, "data"]
+    statuses = messages.loc[messages["topic"] == of_statuses, "data"]
     markers = sorted(_marker(time, text) for time, text in marked.items())
     bounds = pd.DataFrame(markers, columns=["begin", "bound", "cell", "path"])
     bounds["until"] = bounds["begin"].shift(-1, fill_value=np.iinfo(np.int64).max)
     missions = bounds.groupby((bounds["bound"] == 0).cumsum())
     if bounds.empty or (bounds["bound"] != missions.cumcount()).any():
-        raise TrustboError(f"the bounds in {str(path)!r} must be marked 0, 1, 2, ... in order.")
+        raise TrustboError(f"the bounds in {_listed(paths)} must be marked 0, 1, 2, ... in order.")
     tables = [
         _table(driven, ticks, statuses, workspace.team.names).assign(mission=mission)
         for mission, driven in missions
@@ -64,8 +76,23 @@ def read_bag(
     return read_table(pd.concat(tables).assign(**unknown)) if tables else []
 
 
-def _messages(path: Path, needed: Sequence[str]) -> pd.DataFrame:
-    """Read the topic and data of messages, indexed and sorted by recording time, ns."""
+def _listed(paths: Sequence[Path]) -> str:
+    """Return the names of bags for messages."""
+    return ", ".join(repr(str(path)) for path in paths)
+
+
+def _messages(
+    paths: Sequence[Path], bounds: str, statuses: str, contact: str, contacts: Sequence[str]
+) -> pd.DataFrame:
+    """Read the topic and data of messages, indexed and sorted by recording time, ns.
+
+    Args:
+        paths: Bags.
+        bounds: Topic of the bounds.
+        statuses: Topic of the statuses, which may be missing.
+        contact: Topic of contact, with `{robot}`, for messages.
+        contacts: Topics of the contact of each robot.
+    """
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
@@ -73,27 +100,69 @@ def _messages(path: Path, needed: Sequence[str]) -> pd.DataFrame:
         raise TrustboError("ROS bags need rosbags: python -m pip install rosbags") from None
 
     messages: list[tuple[int, str, Any]] = []
-    there = {}
     try:
         # ROS 2 bags recorded before Iron do not define their message types.
-        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+        with AnyReader(paths, default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             there = {c.topic: c.msgtype for c in reader.connections}
-            chosen = [c for c in reader.connections if c.topic in (*needed, _STATUS)]
-            for c, time, raw in reader.messages(connections=chosen) if chosen else ():
-                message: Any = reader.deserialize(raw, c.msgtype)
-                messages.append((time, c.topic, message.data))
+            _require_topics(paths, there, bounds, contact, contacts)
+            chosen = [c for c in reader.connections if c.topic in (bounds, statuses, *contacts)]
+            for c, time, raw in reader.messages(connections=chosen):
+                kinds = (str,) if c.topic in (bounds, statuses) else (bool, int, float, np.number)
+                messages.append((time, c.topic, _data(reader, c, raw, kinds)))
+    except TrustboError:
+        raise
     except Exception as error:  # rosbags raises many types of errors for bad files
         raise TrustboError(
-            f"{str(path)!r} cannot be read as a ROS bag ({error or type(error).__name__}); give a "
-            "complete .bag file of ROS 1, or the folder of a ROS 2 bag with its metadata.yaml."
+            f"{_listed(paths)} cannot be read as a ROS bag ({error or type(error).__name__}); give "
+            "a complete .bag file of ROS 1, or the folder of a ROS 2 bag with its metadata.yaml."
         ) from None
-    if missing := [topic for topic in needed if topic not in there]:
-        found = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(there.items()))
-        raise TrustboError(
-            f"{str(path)!r} lacks {', '.join(missing)}; it has {found or 'no topics'}. "
-            'Pass another topic, such as contact="/{robot}/sees".'
-        )
     return pd.DataFrame(messages, columns=["time", "topic", "data"]).set_index("time")
+
+
+def _data(reader: Any, connection: Any, raw: bytes, kinds: tuple[type, ...]) -> Any:
+    """Return the data of a message; raises TrustboError if they are not of one of these types."""
+    topic, kind = connection.topic, connection.msgtype
+    needed = "String" if kinds == (str,) else "Bool, Float32 or Float64"
+    try:
+        data = getattr(reader.deserialize(raw, kind), "data", None)
+    except Exception as error:  # of many types; also an unknown type of messages
+        raise TrustboError(
+            f"messages on {topic} ({kind}) cannot be decoded ({error or type(error).__name__}); "
+            f"publish std_msgs {needed}, or record the bag again if it is damaged."
+        ) from None
+    if not isinstance(data, kinds):
+        raise TrustboError(f"messages on {topic} are {kind}; publish std_msgs {needed}.")
+    return data
+
+
+def _require_topics(
+    paths: Sequence[Path],
+    there: dict[str, str],
+    bounds: str,
+    contact: str,
+    contacts: Sequence[str],
+) -> None:
+    """Raise TrustboError with the topics that are missing, and the argument that names others."""
+
+    def namespace(topic: str, other: str) -> str:
+        """Return what precedes a missing topic in the bag, or an example."""
+        return next((name.removesuffix(topic) for name in there if name.endswith(topic)), other)
+
+    missing = [topic for topic in (bounds, *contacts) if topic not in there]
+    if not missing:
+        return
+
+    remedies = []
+    if bounds in missing:
+        remedies.append(f'prefix="{namespace(_BOUND, "/fleet")}" for {_BOUND}')
+    if of_robots := [topic for topic in missing if topic != bounds]:
+        space = namespace(of_robots[0], "")
+        remedies.append(f'contact="{space + contact if space else "/{robot}/sees"}"')
+    found = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(there.items()))
+    raise TrustboError(
+        f"{_listed(paths)} lacks {', '.join(missing)}; it has {found or 'no topics'}. Pass the "
+        f"names of other topics, such as {' and '.join(remedies)}."
+    )
 
 
 def _marker(time: Any, text: Any) -> tuple[int, int, Cell, tuple[Cell, ...]]:
