@@ -123,6 +123,12 @@ def test_a_further_column_that_is_no_awareness_is_named(values):
         read_table(rows(battery=values))
 
 
+@pytest.mark.parametrize("name", ["contact_rate", "duration", "n_ticks"])
+def test_a_measurement_at_the_start_cell_is_named(name):
+    with pytest.raises(TrustboError, match=name):
+        read_table(rows(**{name: [1, 1, 1]}))
+
+
 @pytest.mark.parametrize("decimals", [2, 3, 6])
 def test_rounded_rates_are_read_as_the_nearest_share_of_their_ticks(decimals, tmp_path):
     n_ticks = np.array([[7, 9], [13, 30]])

@@ -203,7 +203,7 @@ def test_a_watcher_without_poses_is_warned_of(field):
     with pytest.warns(UserWarning, match="b2"):
         read_driven(field, poses, renamed)
 
-    tree = seen.iloc[:1].assign(seen="tree")
+    tree = seen.iloc[:-1].assign(seen="tree")
     read_driven(field, poses, pd.concat([seen, tree]))  # what is only seen need not be a robot
 
 
@@ -217,6 +217,12 @@ def test_a_robot_that_is_neither_lead_nor_in_the_team_is_warned_of(field):
 
     with pytest.warns(UserWarning, match="b2"):
         read_driven(field, renamed(poses, "robot"), renamed(seen, "watcher"))
+
+
+def test_a_lead_that_is_seen_under_another_name_from_some_time_on_is_warned_of(field):
+    poses, seen = driven(field, PLANNED)
+    with pytest.warns(UserWarning, match="L2"):
+        read_driven(field, poses, seen.assign(seen=seen.seen.where(seen.t < 25, "L2")))
 
 
 def test_a_planned_cell_that_the_lead_misses_is_named(field):

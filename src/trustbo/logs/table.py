@@ -118,21 +118,24 @@ def _parsed(columns: Columns, features: Sequence[str]) -> pd.DataFrame:
         values[name] = columns.numbers(name, required=False, hint=f"; {_FURTHER}")
 
     if is_mapped:
-        _refuse_values_that_are_no_awareness(columns, features, values)
+        _refuse_misplaced_values(columns, features, values)
     if columns.find("n_ticks"):
         values["contact_rate"] = _to_ticks(columns, values["contact_rate"], values["n_ticks"])
     return pd.DataFrame(values, index=columns.frame.index)
 
 
-def _refuse_values_that_are_no_awareness(
+def _refuse_misplaced_values(
     columns: Columns, features: Sequence[str], values: dict[str, Any]
 ) -> None:
-    """Raise TrustboError for features outside [0, 1], or with a value at the start cell."""
+    """Raise TrustboError for features outside [0, 1], and for values at the start cell."""
     for name in features:
         outside = (values[name] < 0.0) | (values[name] > 1.0)
         columns.refuse(name, outside, f"is outside [0, 1]; {_FURTHER}, and divide percent by 100")
+
+    for name in (*RATES, *features):
         at_start = (values["bound"] == 0) & ~np.isnan(values[name])
-        columns.refuse(name, at_start, f"must be blank at bound 0, the start cell; {_FURTHER}")
+        hint = f"; {_FURTHER}" if name in features else ""
+        columns.refuse(name, at_start, f"must be blank at bound 0, the start cell{hint}")
 
 
 def _to_ticks(columns: Columns, rate: np.ndarray, n_ticks: np.ndarray) -> np.ndarray:

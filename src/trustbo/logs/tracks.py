@@ -85,7 +85,7 @@ def read_tracks(
     tick, window = require_positive("tick", tick), require_positive("window", window)
     if path is not None and workspace is None:
         raise TrustboError("path= needs the workspace of its cells.")
-    tracks, looks, strangers = _read(poses, detections)
+    tracks, looks, unknown = _read(poses, detections)
     robots = tuple(tracks["robot"].unique())
     team = robots if workspace is None else workspace.team.names
     leads = _leads(lead, robots, workspace)
@@ -115,7 +115,7 @@ def read_tracks(
             "shorter window."
         )
 
-    _warn_of_watchers(looks, strangers, leads, team)
+    _warn_of_names(looks, unknown, leads, team)
     _warn_of_detections(tracks, looks, tick)
     return missions
 
@@ -133,10 +133,10 @@ def _leads(lead: str | None, robots: Sequence[str], workspace: Workspace | None)
     return others
 
 
-def _read(poses: Any, detections: Any) -> tuple[pd.DataFrame, pd.DataFrame, list[str]]:
-    """Read poses (t, robot, x, y, heading) and detections (t, robot, lead) between two robots.
+def _read(poses: Any, detections: Any) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame]:
+    """Read poses (t, robot, x, y, heading), and detections (t, robot, lead).
 
-    Also returns the names of the watchers without poses.
+    Returns the poses, the detections between two robots with poses, and all other detections.
     """
     where = Columns(poses, "the table of poses")
     seen = Columns(detections, "the table of detections", may_be_empty=True)
@@ -158,8 +158,7 @@ def _read(poses: Any, detections: Any) -> tuple[pd.DataFrame, pd.DataFrame, list
             f"have poses; watchers are {_listed(looks['robot'])}, and seen are "
             f"{_listed(looks['lead'])}. If no robot was detected, give a table without rows."
         )
-    strangers = looks.loc[~looks["robot"].isin(robots), "robot"].unique().tolist()
-    return tracks, between, strangers
+    return tracks, between, looks.loc[~known]
 
 
 def _listed(names: Iterable[str]) -> str:
@@ -168,16 +167,37 @@ def _listed(names: Iterable[str]) -> str:
     return ", ".join([*different[:10], "..."] if len(different) > 10 else different)
 
 
-def _warn_of_watchers(
-    looks: pd.DataFrame, strangers: Sequence[str], leads: Sequence[str], team: Sequence[str]
+def _warn_of_names(
+    looks: pd.DataFrame, unknown: pd.DataFrame, leads: Sequence[str], team: Sequence[str]
 ) -> None:
-    """Warn of watchers without poses, robots that are ignored, and robots without detections."""
-    if strangers:
+    """Warn of detections that are ignored because of their names, and of robots without any.
+
+    Args:
+        looks: Detections between two robots with poses.
+        unknown: All other detections.
+        leads: Robots that are watched.
+        team: Robots that watch.
+    """
+    robots = {*team, *leads, *looks["robot"], *looks["lead"]}
+    if strangers := [name for name in unknown["robot"].unique() if name not in robots]:
         warnings.warn(
             f"detections by {_listed(strangers)} are ignored, because the table of poses lacks "
             "these robots; if a robot was renamed, use one name in both tables.",
             stacklevel=3,
         )
+
+    # What is only seen may be a tree, unless it is seen where the lead is no longer seen.
+    of_lead = looks.loc[looks["lead"].isin(leads), "t"]
+    apart = unknown.loc[(unknown["t"] > of_lead.max()) | (unknown["t"] < of_lead.min())]
+    n_apart = apart["lead"].value_counts()
+    n_all = unknown["lead"].value_counts()
+    if replacing := [name for name, n in n_apart.items() if n_all[name] == n > _MANY]:
+        warnings.warn(
+            f"{_listed(map(str, replacing))} is seen only before or after all detections of the "
+            f"lead {_listed(leads)}, and has no poses; if the lead was renamed, use one name.",
+            stacklevel=3,
+        )
+
     named = pd.unique(looks[["robot", "lead"]].to_numpy().ravel())
     if others := [name for name in named if name not in (*team, *leads)]:
         warnings.warn(
