@@ -213,22 +213,24 @@ def _warn_of_detections(tracks: pd.DataFrame, looks: pd.DataFrame, tick: float) 
     """Warn of detections outside the time of poses, and of a tick that is not their interval."""
     spans = tracks.groupby("robot")["t"].agg(["min", "max"])
     of_watcher, of_lead = (spans.loc[looks[name]].to_numpy() for name in ("robot", "lead"))
-    at = looks["t"].to_numpy()
+    t = looks["t"].to_numpy()
     begin = np.maximum(of_watcher[:, 0], of_lead[:, 0])
     end = np.minimum(of_watcher[:, 1], of_lead[:, 1])
-    outside = pd.Series(np.maximum(begin - at, at - end), index=looks["robot"])
-    shares = (outside > tick).groupby(level=0).mean()
-    if late := shares.index[shares > _OUTSIDE].tolist():
+    outside = np.maximum(begin - t, t - end)
+
+    watchers = looks["robot"].to_numpy()
+    shares = {name: (outside[watchers == name] > tick).mean() for name in looks["robot"].unique()}
+    if late := [name for name, share in shares.items() if share > _OUTSIDE]:
         warnings.warn(
-            f"{shares.max():.0%} of the detections by {_listed(late)} lie outside the time of the "
-            f"poses of the two robots, by up to {outside[late].max():.3g} s, and are ignored; "
-            "check that both tables have the same clock.",
+            f"up to {max(shares.values()):.0%} of the detections by {_listed(late)} lie outside "
+            f"the time of the poses of the two robots, by up to {outside.max():.3g} s, and are "
+            "ignored; check that both tables have the same clock.",
             stacklevel=3,
         )
 
-    gaps = looks.sort_values("t").groupby(["robot", "lead"])["t"].diff().dropna()
-    apart = float(gaps.quantile(_OFTEN))  # NaN if no robot detects another twice
+    gaps = looks.sort_values("t").groupby(["robot", "lead"])["t"].diff().dropna().to_numpy()
     short = gaps[gaps < 0.5 * tick]
+    apart = float(np.quantile(gaps, _OFTEN)) if gaps.size else np.nan
     if apart > 1.5 * tick:
         warnings.warn(
             f"detections of one robot by another are at least {apart:g} s apart, but every tick of "
@@ -236,7 +238,7 @@ def _warn_of_detections(tracks: pd.DataFrame, looks: pd.DataFrame, tick: float) 
             stacklevel=3,
         )
     elif len(short) > max(_OFTEN * len(gaps), _MANY):
-        apart = float(short.quantile(0.05))
+        apart = float(np.quantile(short, 0.05))
         warnings.warn(
             f"detections of one robot by another are only {apart:.3g} s apart, but one detection "
             f"counts as contact in a whole tick of {tick:g} s; pass the interval between two "
