@@ -8,9 +8,9 @@ from typing import Any, Self
 
 import numpy as np
 import pandas as pd
-import xarray as xr
 from numpy.typing import ArrayLike
 
+from trustbo.arrays import as_names, default_robots, read_labelled
 from trustbo.display import Rows, Summary, joined
 from trustbo.errors import TrustboError, require_cells, require_choice, require_whole
 
@@ -61,15 +61,16 @@ class Bound:
     n_ticks: np.ndarray = None  # pyright: ignore[reportAssignmentType]
 
     def __post_init__(self) -> None:
-        for name in ("awareness", "contact_rate", "duration", "n_ticks"):
-            given = getattr(self, name)
-            values = np.full(len(self.awareness), np.nan) if given is None else given
-            object.__setattr__(self, name, as_array(name, values))
+        object.__setattr__(self, "awareness", _unnamed("awareness", self.awareness))
         if self.awareness.ndim != 2 or not self.awareness.size:
             raise TrustboError(
                 "awareness of a bound must have shape (robot, feature) without zeros; got "
                 f"{self.awareness.shape}. If you have no features, give one feature that is 0."
             )
+        for name in ("contact_rate", "duration", "n_ticks"):
+            given = getattr(self, name)
+            values = np.full(len(self.awareness), np.nan) if given is None else given
+            object.__setattr__(self, name, _unnamed(name, values))
         per_robot = self.awareness.shape[:1]
         for name in ("contact_rate", "duration"):
             if (shape := getattr(self, name).shape) != per_robot:
@@ -132,6 +133,7 @@ class Mission(Summary):
                 f'status "ok" means that the goal was reached, but only {n_run} of {n_planned} '
                 "bounds were run; give the status of the last one."
             )
+        _require_counted(self.path)
         for k, bound in enumerate(self.bounds, start=1):
             if bound.cell != (expected := self.path[k] if self.path else NOWHERE):
                 there = "there is no path" if expected == NOWHERE else f"the path has {expected}"
@@ -140,9 +142,12 @@ class Mission(Summary):
         if len(shapes) > 1:
             raise TrustboError(f"bounds disagree on (robot, feature): {sorted(shapes)}.")
         n_robots, n_features = shapes.pop()
-        robots = tuple(f"r{i + 1}" for i in range(n_robots))
-        for name, usual in (("features", default_features(n_features)), ("robots", robots)):
-            labels = tuple(getattr(self, name)) or usual
+        usual_names = {
+            "features": default_features(n_features),
+            "robots": default_robots(n_robots),
+        }
+        for name, usual in usual_names.items():
+            labels = as_names(name, getattr(self, name)) or usual
             if len(labels) != len(usual):
                 raise TrustboError(f"{name} must be {len(usual)} names; got {labels}.")
             object.__setattr__(self, name, labels)
@@ -181,33 +186,40 @@ class Mission(Summary):
         A mission that ended early has fewer bounds than planned, and a status:
         `from_arrays(path, z, y, status="stuck")`. A bound that was not measured is a row of NaN.
 
+        Arrays may carry labels: the dims and coordinates of a DataArray, the columns and index of a
+        DataFrame or Series, or the keys of a dict. Robots and features are put in order by name,
+        and bounds by number.
+
         Args:
             path: Planned cells, start first; None for a log without a map, which supports neither
                 planning nor place effects.
             awareness: Shape (bound, robot, feature), in [0, 1]; any finite values in a log without
                 a map.
             contact_rate: Shape (bound, robot), in [0, 1].
-            duration: Shape (bound, robot) or (bound,), s; None where not recorded.
+            duration: Shape (bound, robot) or (bound,), s, or one number for each robot by name;
+                None where not recorded.
             status: Outcome of the mission.
             n_ticks: Number of ticks over which `contact_rate` is averaged, shape (bound, robot) or
                 (bound,); None where not recorded.
-            features: Names of the features; by default traversability, visibility, z3, ... (a
-                workspace with the same number of features renames z3, ...).
-            robots: Names of the robots; by default r1, r2, ...
+            features: Names of the features; by default those of the labels, or traversability,
+                visibility, z3, ... (a workspace with the same number of features renames z3, ...).
+            robots: Names of the robots; by default those of the labels, or r1, r2, ...
 
         Raises:
-            TrustboError: The axes do not fit together, a value is outside [0, 1], or the status is
-                unknown.
+            TrustboError: The axes or labels do not fit together, a value is outside [0, 1], or the
+                status is unknown.
         """
-        labels = {"robot": robots, "feature": features}
-        z = _labelled("awareness", awareness, ("bound", "robot", "feature"), **labels)
-        y = _labelled("contact_rate", contact_rate, ("bound", "robot"), robot=robots)
+        names = {"robot": as_names("robots", robots), "feature": as_names("features", features)}
+        z = _read(names, "awareness", awareness, ("bound", "robot", "feature"))
+        y = _read(names, "contact_rate", contact_rate, ("bound", "robot"))
         if z.ndim != 3 or y.shape != z.shape[:2]:
             raise TrustboError(
                 "awareness must be (bound, robot, feature) and contact_rate (bound, robot); "
                 f"got {z.shape} and {y.shape}."
             )
-        seconds, ticks = _per_robot("duration", duration, y), _per_robot("n_ticks", n_ticks, y)
+        known = names["robot"] or default_robots(y.shape[1])
+        seconds = _per_robot("duration", duration, known, y.shape)
+        ticks = _per_robot("n_ticks", n_ticks, known, y.shape)
         cells = () if path is None else require_cells("path", path)
         if path is not None and len(cells) <= len(y):
             raise TrustboError(
@@ -218,8 +230,7 @@ class Mission(Summary):
         entered, statuses = cells[1:] or (NOWHERE,) * len(y), ["ok"] * (len(y) - 1) + [status]
         measured = zip(entered, z, y, seconds, statuses, [0.0, *ends], ticks, strict=False)
         bounds = tuple(Bound(*values, n_ticks=n) for *values, n in measured)
-        named = as_names("features", features), as_names("robots", robots)
-        return cls(cells, bounds, status, *named)
+        return cls(cells, bounds, status, names["feature"], names["robot"])
 
     def with_awareness(self, awareness: np.ndarray) -> Self:
         """Return the mission with another awareness, shape (bound, robot, feature)."""
@@ -350,27 +361,6 @@ def require_shares(rate: np.ndarray, ticks: np.ndarray) -> None:
         )
 
 
-def as_array(what: str, values: ArrayLike) -> np.ndarray:
-    """Return an array of floats, NaN where masked; raises TrustboError for other values."""
-    try:
-        if np.ma.isMaskedArray(values):
-            return np.ma.filled(np.ma.asarray(values, dtype=float), np.nan)
-        return np.asarray(values, dtype=float)
-    except (TypeError, ValueError):
-        raise TrustboError(f"{what} must be an array of numbers; got {values!r:.60}.") from None
-
-
-def as_names(what: str, given: Iterable[str]) -> tuple[str, ...]:
-    """Return names as a tuple; raises TrustboError if one is not a string or is repeated."""
-    listed = isinstance(given, Iterable) and not isinstance(given, str)
-    names = tuple(given) if listed else ()
-    if not listed or not all(isinstance(name, str) for name in names):
-        raise TrustboError(f"{what} must be a list of names; got {given!r:.60}.")
-    if len(set(names)) < len(names):
-        raise TrustboError(f"{what} must be different names; got {names}.")
-    return names
-
-
 def require_unit_interval(what: str, values: np.ndarray) -> None:
     """Raise TrustboError for values outside [0, 1]; NaN is allowed."""
     bad = (values < 0.0) | (values > 1.0)
@@ -381,32 +371,39 @@ def require_unit_interval(what: str, values: np.ndarray) -> None:
         raise TrustboError(f"{what}: [{index}] = {values[bad][0]:g} is outside [0, 1]{hint}.")
 
 
-def _labelled(what: str, values: Any, dims: Sequence[str], **names: Sequence[str]) -> np.ndarray:
-    """Return an array with its dims, and the names along some of them, in the given order.
-
-    Labels are the dims and coordinates of a DataArray, or the column names of a DataFrame for the
-    last dim, if they are strings. Raises TrustboError if they are not the given dims or names.
-    """
-    if isinstance(values, pd.DataFrame) and all(isinstance(name, str) for name in values):
-        numbers = values.to_numpy(dtype=object, na_value=np.nan)  # also pd.NA
-        values = xr.DataArray(numbers, dims=dims, coords={dims[-1]: list(values)})
-    if not isinstance(values, xr.DataArray):
-        return as_array(what, values)
-    if {*values.dims} != {*dims}:
-        raise TrustboError(f"{what} must have the dims {tuple(dims)}; got {values.dims}.")
-    for dim, given in names.items():
-        there = [str(name) for name in values[dim].values] if dim in values.coords else []
-        if there and given and sorted(there) != sorted(given):
-            raise TrustboError(f"{what} has the {dim}s {there}, not {list(given)}.")
-        if there and given:
-            values = values.isel({dim: [there.index(name) for name in given]})
-    return as_array(what, values.transpose(*dims))
+def _require_counted(path: Iterable[Cell]) -> None:
+    """Raise TrustboError for negative rows or columns, which would be read from the other end."""
+    for cell in path:
+        if min(cell) < 0:
+            raise TrustboError(
+                f"the path enters {tuple(cell)}, but rows and columns are counted from 0; give "
+                "path=None for a log without a map."
+            )
 
 
-def _per_robot(what: str, given: ArrayLike | None, rates: np.ndarray) -> np.ndarray:
-    """Broadcast one number, or values (bound,) or (bound, robot), to (bound, robot)."""
-    values = as_array(what, np.nan if given is None else given)
+def _unnamed(what: str, values: Any) -> np.ndarray:
+    """Read an array of a bound, whose robots and features have no names."""
+    dims = ("robot", "feature") if what == "awareness" else ("robot",)
+    return read_labelled(f"{what} of a bound", values, dims, dict.fromkeys(dims)).values
+
+
+def _read(
+    names: dict[str, tuple[str, ...]], what: str, values: Any, dims: Sequence[str]
+) -> np.ndarray:
+    """Read an array in the order of `names`, and add its labels to names that are not known."""
+    coords = {dim: names[dim] for dim in dims if dim in names}
+    read = read_labelled(what, values, dims, coords)
+    names |= read.coords
+    return read.values
+
+
+def _per_robot(what: str, given: Any, robots: Sequence[str], shape: tuple[int, ...]) -> np.ndarray:
+    """Read one number, or values (bound,) or (bound, robot), as an array (bound, robot)."""
+    if given is None:
+        return np.full(shape, np.nan)
+    dims, coords = ("bound", "robot"), {"robot": robots}
+    values = read_labelled(what, given, dims, coords, partial=True).values
     try:
-        return np.broadcast_to(values[:, None] if values.ndim == 1 else values, rates.shape)
+        return np.broadcast_to(values[:, None] if values.ndim == 1 else values, shape)
     except ValueError:
-        raise TrustboError(f"{what} must be {rates.shape}; got {values.shape}.") from None
+        raise TrustboError(f"{what} must be {shape}; got {values.shape}.") from None

@@ -51,16 +51,36 @@ def require_whole(what: str, value: object, minimum: int) -> int:
     return number
 
 
+def require_finite(what: str, value: Any) -> float:
+    """Return `value` as a float; raises TrustboError unless it is a finite real number."""
+    number = _number(value)
+    if not math.isfinite(number):
+        raise TrustboError(f"{what} must be a finite number; got {one_line(value)}.")
+    return number
+
+
 def require_positive(what: str, value: Any, *, or_zero: bool = False) -> float:
     """Return `value` as a float; raises TrustboError unless it is a positive, finite number."""
-    try:
-        number = math.nan if isinstance(value, str) else float(value)
-    except (TypeError, ValueError):
-        number = math.nan
+    number = _number(value)
     if not 0.0 <= number < math.inf or (number == 0.0 and not or_zero):
         least = "0 or more, and" if or_zero else "positive and"
         raise TrustboError(f"{what} must be {least} finite; got {value!r}.")
     return number
+
+
+def _number(value: Any) -> float:
+    """Return one real number of Python, NumPy or JAX as a float; NaN for anything else."""
+    kind = getattr(getattr(value, "dtype", None), "kind", "f")
+    if (
+        isinstance(value, str | bytes | bytearray)
+        or kind not in "biuf"
+        or getattr(value, "ndim", 0)
+    ):
+        return math.nan
+    try:
+        return float(value)
+    except (TypeError, ValueError, OverflowError):
+        return math.nan
 
 
 def require_kind(what: str, value: Any, kind: Any, remedy: str) -> Any:

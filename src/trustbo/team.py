@@ -6,6 +6,7 @@ from typing import Self
 
 import numpy as np
 
+from trustbo.arrays import as_names, default_robots
 from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError, require_kind, require_positive, require_whole
 
@@ -45,10 +46,11 @@ class Robot:
     drop: int = 1
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            require_positive(f"Robot.{name}", value)
-        for name in ("acquire", "drop"):
-            require_whole(f"Robot.{name}", getattr(self, name), 1)
+        for name, value in list(vars(self).items()):
+            number = require_positive(f"Robot.{name}", value)
+            if name in ("acquire", "drop"):
+                number = require_whole(f"Robot.{name}", value, 1)
+            object.__setattr__(self, name, number)  # a number of NumPy becomes Python's
         if self.detection > 1.0:
             raise TrustboError(f"Robot.detection must be in (0, 1]; got {self.detection:g}.")
         for name in ("vertical_fov", "max_slope"):
@@ -86,9 +88,8 @@ class Team(Summary):
         for robot in require_kind("Team.robots", self.robots, Sequence, remedy):
             require_kind("Team.robots", robot, Robot, remedy)
         robots = tuple(self.robots) or (Robot(),) * require_whole("n_robots", self.n_robots, 1)
-        names = tuple(self.names) or tuple(f"r{i + 1}" for i in range(len(robots)))
-        if not len(set(names)) == len(names) == len(robots):
-            raise TrustboError(f"names must be {len(robots)} different names; got {names}.")
+        n = len(robots)
+        names = as_names("names", self.names, n) or default_robots(n)
         for name, value in (("n_robots", len(robots)), ("robots", robots), ("names", names)):
             object.__setattr__(self, name, value)
 

@@ -5,8 +5,9 @@ from copy import copy
 import numpy as np
 from numpy.typing import ArrayLike
 
+from trustbo.arrays import read_labelled
 from trustbo.campaign.campaign import Campaign
-from trustbo.data import Bound, Cell, Mission, as_array
+from trustbo.data import Bound, Cell, Mission
 from trustbo.errors import TrustboError, require_pair
 from trustbo.inference import TrustFilter
 from trustbo.inference.filter import TrustForecast, TrustState
@@ -36,7 +37,7 @@ class Follower:
         self.running = False
         n_robots, family = self._workspace.team.n_robots, campaign.model.observation
         if (posterior := campaign.state.posterior) is not None:
-            start = TrustFilter(posterior)
+            start = TrustFilter(posterior, workspace=self._workspace)
         else:
             start = TrustFilter(campaign.draw_prior(1000), n_robots, observation=family)
         # `_before` has the bounds that have ended, and `_now` also the bound in progress.
@@ -72,10 +73,12 @@ class Follower:
         """Add a tick at time `t` to the bound in progress.
 
         `in_contact` is 1 for each robot that has contact with the lead, 0 for the others, and NaN
-        where it was not measured, shape (robot,).
+        where it was not measured, shape (robot,). A Series, a DataArray or a dict is read by the
+        names of the robots.
         """
         self._require(running=True, t=t)
-        seen = as_array("in_contact", in_contact)
+        robots = {"robot": self._workspace.team.names}
+        seen = read_labelled("in_contact", in_contact, ("robot",), robots).values
         measured = ~np.isnan(seen)
         if measured.shape != self._counts[0].shape or not np.isin(seen[measured], (0, 1)).all():
             raise TrustboError(f"in_contact must be 0, 1 or NaN for each robot; got {seen}.")

@@ -39,17 +39,37 @@ def require_posterior(who: str, value: object) -> xr.DataTree:
             f"{who} needs a posterior from fit, but this DataTree has no {missing[0]!r}. Give the "
             "complete result of trustbo.fit."
         )
+    sizes = value["posterior"].sizes
+    if lacks := [dim for dim in ("chain", "draw") if not sizes.get(dim)]:
+        raise TrustboError(
+            f"{who} needs the draws of a posterior, with the dims chain and draw, but there is no "
+            f"{lacks[0]}. Keep all draws, or select with a list, such as posterior.isel(chain=[0])."
+        )
     return value
 
 
 def sites_of(posterior: xr.DataTree) -> dict[str, np.ndarray]:
     """Return the parameter draws of a posterior by name, with chains joined in an axis (draw,).
 
+    Variables that the model does not have, such as a user's own, are left out.
+
     Raises:
-        TrustboError: If a draw is NaN, for example after masking with xarray.
+        TrustboError: If a parameter has other dims than the model's, or a draw is NaN, for example
+            after masking with xarray.
     """
-    draws = posterior["posterior"].to_dataset()
-    sites = {str(name): joined_draws(array) for name, array in draws.items()}
+    model = with_default_priors(json.loads(posterior.attrs["model_record"]))
+    axes = model.dims | model.effect_dims
+    sites = {}
+    for name, array in posterior["posterior"].to_dataset().items():
+        if name not in axes:
+            continue
+        dims = ("chain", "draw", *axes[name])
+        if set(array.dims) != set(dims):
+            raise TrustboError(
+                f"{name!r} of the posterior must have the dims {dims}; got {array.dims}. Give a "
+                "posterior from trustbo.fit with all its dims."
+            )
+        sites[str(name)] = joined_draws(array, axes[name])
     for name, values in sites.items():
         bad = np.isnan(values.reshape(len(values), -1)).any(1).sum()
         if bad:
@@ -96,7 +116,7 @@ def params_of(
             "trustbo.inference.predict_reports."
         )
     if workspace is not None:
-        posterior = _in_order_of(workspace, posterior)
+        posterior = in_order_of(posterior, workspace.team.names, workspace.features)
     sites, attrs = sites_of(posterior), posterior.attrs
     effects = [e for e in effects_of(posterior) if not isinstance(e, PlaceEffect)]
     needed = ("B0", "B") if "B0" in sites else ("beta0", "beta", "b", "delta_w", "delta_v")
@@ -132,25 +152,35 @@ def params_of(
     return params._replace(**maps)  # pyright: ignore
 
 
-def _in_order_of(workspace: Workspace, posterior: xr.DataTree) -> xr.DataTree:
-    """Reorder features and robots to match a workspace; raises TrustboError if names differ."""
-    draws, order = posterior["posterior"].to_dataset(), {}
-    data = posterior["constant_data"].to_dataset() if "constant_data" in posterior else draws
-    wanted = {"feature": list(workspace.features), "robot": list(workspace.team.names)}
-    for axis, names in wanted.items():
-        with_axis = draws if axis in draws.coords else data
-        if axis not in with_axis.coords:
-            continue
-        have = [str(name) for name in with_axis[axis].values]
-        of_all = axis == "robot" and axis not in draws.dims and "robots" not in posterior.children
-        if of_all:  # parameters that all robots share apply to any team
+def names_in(posterior: xr.DataTree, axis: str) -> tuple[str, ...]:
+    """Return the names of the robots or features of a posterior; empty if it has none."""
+    for group in ("posterior", "robots", "constant_data"):
+        if group in posterior.children and axis in posterior[group].coords:
+            return tuple(str(name) for name in posterior[group].coords[axis].values)
+    return ()
+
+
+def in_order_of(
+    posterior: xr.DataTree, robots: Sequence[str], features: Sequence[str]
+) -> xr.DataTree:
+    """Return a posterior with its robots and features in the order of these names.
+
+    Parameters that all robots share apply to any robots. Raises TrustboError if names differ.
+    """
+    order = {}
+    for axis, names in {"feature": list(features), "robot": list(robots)}.items():
+        have = list(names_in(posterior, axis))
+        shared = "robot" not in posterior["posterior"].dims and "robots" not in posterior.children
+        if have == names or not have or (axis == "robot" and shared):
             continue
         if sorted(have) != sorted(names):
             raise TrustboError(
-                f"the posterior has the {axis}s {', '.join(have)}, but the workspace has "
-                f"{', '.join(names)}; fit missions in this workspace."
+                f"the posterior has the {axis}s {', '.join(have)}, not {', '.join(names)}; fit "
+                "missions with these names."
             )
         order[axis] = names
+    if not order:
+        return posterior
     if "robot" in order:
         order["robot_"] = order["robot"]
 

@@ -7,13 +7,15 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from trustbo.data import Cell, as_array, require_shares, require_unit_interval
+from trustbo.arrays import Names, read_labelled
+from trustbo.data import Cell, require_shares, require_unit_interval
 from trustbo.errors import TrustboError, one_line, require_pair, require_whole
-from trustbo.inference.draws import params_of, require_posterior, sites_of
+from trustbo.inference.draws import names_in, params_of, require_posterior, sites_of
 from trustbo.inference.importance import systematic
 from trustbo.models.families import FAMILIES, Family
 from trustbo.models.params import CoupledParams, Params, check_params
 from trustbo.models.slots import NO_TICKS
+from trustbo.workspace import Workspace
 from trustbo.workspace.moves import bounds_along, require_on_grid
 
 _TICKS = 200.0  # number of ticks assumed for a future bound
@@ -215,6 +217,7 @@ class TrustFilter:
         *,
         observation: str = "gaussian",
         max_draws: int = 1000,
+        workspace: Workspace | None = None,
     ) -> None:
         """Start the filter before the first bound of a mission.
 
@@ -223,19 +226,27 @@ class TrustFilter:
             n_robots: Number of robots; needed only with `TrustParams`.
             observation: Observation family of parameter draws; ignored for a DataTree.
             max_draws: Maximum number of draws; if there are more, evenly spaced draws are selected.
+            workspace: Workspace whose robots and features the filter follows, in this order. By
+                default, arrays without labels are in the order of the draws.
 
         Raises:
-            TrustboError: If the number of robots does not match the draws, the posterior is not
+            TrustboError: If the posterior has other robots or features than the workspace, the
+                number of robots does not match the draws, the posterior is not
                 from `fit`, or `TrustParams` are given without `n_robots`.
         """
         delta_s, self._bounded = None, True
+        self._names: dict[str, Names | None] = {"robot": None, "feature": None}
+        if workspace is not None:
+            self._names = {"robot": workspace.team.names, "feature": workspace.features}
         if isinstance(posterior, xr.DataTree):
             require_posterior("TrustFilter", posterior)
             if "constant_data" in posterior.children:  # without a map, any awareness is valid
                 self._bounded = bool((posterior["constant_data"]["row"] >= 0).any())
             n_robots, observation = posterior.attrs["n_robots"], posterior.attrs["observation"]
             delta_s = sites_of(posterior).get("delta_s")
-            posterior = params_of(posterior, day=True)
+            if workspace is None:
+                self._names = {axis: names_in(posterior, axis) or None for axis in self._names}
+            posterior = params_of(posterior, workspace, day=True)
         elif not isinstance(posterior, Params):
             raise TrustboError(
                 "TrustFilter needs a posterior from fit or parameter draws; got "
@@ -294,11 +305,11 @@ class TrustFilter:
                 missing, off the grid or between cells that are not neighbours.
         """
         z, effect = self._checked(awareness, 2), self.effects(bound, 1)[0]
-        y = as_array("contact_rate", contact_rate)
+        y = self._of_robots("contact_rate", contact_rate)
         if y.shape != (self._n_robots,):
             raise TrustboError(f"contact_rate must have shape ({self._n_robots},); got {y.shape}.")
         require_unit_interval("contact_rate", y)
-        ticks = as_array("n_ticks", np.nan if n_ticks is None else n_ticks)
+        ticks = self._of_robots("n_ticks", np.nan if n_ticks is None else n_ticks)
         ticks = ticks if ticks.ndim else np.full(y.shape, ticks)
         require_shares(y, ticks)
         if self.family.needs_ticks and (np.isnan(ticks) & ~np.isnan(y)).any():
@@ -354,9 +365,14 @@ class TrustFilter:
             return [0.0] * n_bounds
         return list(np.moveaxis(self.params.of_places(bounds), -2, 0))
 
+    def _of_robots(self, what: str, values: ArrayLike) -> np.ndarray:
+        """Read values (robot,) by the names of the robots, if they are labelled."""
+        return read_labelled(what, values, ("robot",), {"robot": self._names["robot"]}).values
+
     def _checked(self, awareness: ArrayLike, n_axes: int) -> np.ndarray:
         """Return awareness as an array; raises TrustboError if its shape or values are wrong."""
-        z = as_array("awareness", awareness)
+        dims = ("bound", "robot", "feature")[-n_axes:]
+        z = read_labelled("awareness", awareness, dims, self._names).values
         expected = (self._n_robots, self._n_features)
         if z.ndim != n_axes or z.shape[-2:] != expected or not len(z):
             raise TrustboError(

@@ -7,7 +7,7 @@ import xarray as xr
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError, require_whole
-from trustbo.inference.draws import QUANTILES, require_posterior
+from trustbo.inference.draws import QUANTILES, in_order_of, require_posterior
 from trustbo.inference.filter import TrustFilter
 from trustbo.models.slots import require_ticks
 from trustbo.stacking import MissionBatch, stack_missions
@@ -56,12 +56,14 @@ def score(
     first = len(missions) - len(trees)
     missions = missions[first:]
     batch = stack_missions(missions)
-    y, trust = batch.contact_rate, _follow(trees[0])
+    y = batch.contact_rate
+    names = missions[0].robots, missions[0].features  # the same for all
+    trust = _follow(in_order_of(trees[0], *names))
     columns = {name: np.full(y.shape, np.nan) for name in ("mean", "pit", "log_score")}
     quantile = np.full((*y.shape, len(QUANTILES)), np.nan)
     for j, (tree, mission) in enumerate(zip(trees, missions, strict=True)):
         if j and tree is not trees[j - 1]:
-            trust = _follow(tree)
+            trust = _follow(in_order_of(tree, *names))
         k, rng = slice(len(mission.bounds)), np.random.default_rng([seed, j])
         one = MissionBatch(*(a[j, k] for a in batch))
         require_ticks(trust.family, one.contact_rate, one.n_ticks)

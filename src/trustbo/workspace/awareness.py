@@ -10,7 +10,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from trustbo.data import as_array, is_line_of_sight
+from trustbo.arrays import read_labelled
+from trustbo.data import is_line_of_sight
 from trustbo.errors import TrustboError, require_choice, require_kind
 from trustbo.team import Team
 from trustbo.terrain import FEATURES, CompositeIndex, pixel_size
@@ -140,26 +141,23 @@ def unlabelled(
 ) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...]]:
     """Return awareness in the axis order of `of_arrays`, and the names of robots and features.
 
-    A DataArray is reordered by its dimensions and labels. Names that are not given are taken from
-    the labels. Raises TrustboError if the DataArray has unexpected dimensions or labels.
+    Names that are not given are taken from the labels; see `read_labelled`.
     """
-    if not isinstance(awareness, xr.DataArray):
-        return as_array("awareness", awareness), tuple(names), tuple(features)
-    axes = [axis for axis in _DIMS if axis != "move" or "move" in awareness.dims]
-    if set(awareness.dims) != set(axes):
-        raise TrustboError(f"awareness must have the dims {_AXES}; got {awareness.dims}.")
-    chosen = []
-    for axis, given in (("robot", names), ("feature", features), ("move", MOVE_NAMES)):
-        labels = awareness[axis].values.astype(str).tolist() if axis in awareness.indexes else []
-        if labels and given and set(labels) != set(given):
-            raise TrustboError(
-                f"awareness has the {axis} labels {labels}, but {list(given)} are expected; rename "
-                "the labels."
-            )
-        if labels and given:
-            awareness = awareness.sel({axis: list(given)})
-        chosen.append(tuple(given or labels))
-    return as_array("awareness", awareness.transpose(*axes).values), chosen[0], chosen[1]
+    of_bounds = isinstance(awareness, xr.DataArray) and "move" in awareness.dims
+    dims = [dim for dim in _DIMS if dim != "move" or of_bounds]
+    coords = {"robot": names, "feature": features, "move": MOVE_NAMES}
+    read = read_labelled("awareness", awareness, dims, coords)
+    chosen = {dim: read.coords.get(dim, tuple(given)) for dim, given in coords.items()}
+    return read.values, chosen["robot"], chosen["feature"]
+
+
+def _truth_of(what: str, values: ArrayLike) -> np.ndarray:
+    """Read a map (row, col) of truth values; raises TrustboError for other numbers than 0 and 1."""
+    flags = read_labelled(what, values, ("row", "col")).values
+    if not np.isin(flags, (0.0, 1.0)).all():
+        other = flags[~np.isin(flags, (0.0, 1.0))][0]
+        raise TrustboError(f"{what} must be True or False in each cell; got {other:g}.")
+    return flags.astype(bool)
 
 
 def of_arrays(z: np.ndarray, passable: ArrayLike | None) -> tuple[np.ndarray, np.ndarray]:
@@ -183,7 +181,7 @@ def of_arrays(z: np.ndarray, passable: ArrayLike | None) -> tuple[np.ndarray, np
         raise TrustboError(f"awareness{list(index)} = {z[index]:g} is outside [0, 1]; rescale it.")
     finite = np.isfinite(z).all((0, -1))  # ([move], row, col)
     reached = finite if z.ndim == 4 else finite.any(0)
-    free = reached if passable is None else np.asarray(passable, dtype=bool)
+    free = reached if passable is None else _truth_of("passable", passable)
     if free.shape != z.shape[-3:-1]:
         shape = z.shape[-3:-1]
         raise TrustboError(f"the shape of passable must be (row, col) = {shape}; got {free.shape}.")

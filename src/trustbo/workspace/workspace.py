@@ -10,12 +10,12 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
+from trustbo.arrays import as_names
 from trustbo.data import (
     FEATURES,
     LINE_OF_SIGHT,
     Cell,
     Mission,
-    as_names,
     default_features,
     is_line_of_sight,
     require_map,
@@ -253,13 +253,14 @@ class Workspace(Summary):
         For example, robots do not measure line of sight. Campaigns fill missions automatically.
 
         Raises:
-            TrustboError: The mission's path is not a sequence of neighbouring passable cells.
+            TrustboError: The driven cells leave the grid, or are not neighbours.
         """
         ordered = self.in_order(mission)
         missing = np.isnan(ordered.awareness)
         if not missing.any():
             return ordered
-        known = self.along(ordered.path)[: len(missing)]
+        driven = ordered.path[: len(missing) + 1]
+        known = self.along(driven, anywhere=True)
         return ordered.with_awareness(np.where(missing, known, ordered.awareness))
 
     def locate(self, location: Location, what: str = "location") -> Cell:

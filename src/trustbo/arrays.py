@@ -1,0 +1,297 @@
+"""Read arrays of numbers by their dims and labels, from NumPy, xarray, pandas or a dict.
+
+Every argument that may carry names is read here, so that labels are honoured or refused, and never
+ignored: robots, features and moves are put in order by name, and bounds, rows and columns by
+number. Arrays without labels are read by place.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from numbers import Integral
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+from numpy.typing import ArrayLike
+
+from trustbo.errors import TrustboError, one_line
+
+_NUMERIC = "biufO"  # kinds of dtypes that may hold real numbers
+_TIMES = "mM"  # kinds of dtypes of dates and times
+_NO_NUMBERS = (str, bytes, np.datetime64, np.timedelta64)  # although `float` converts them
+_FIRST = {"bound": (0, 1), "row": (0,), "col": (0,)}
+"""Numbers that the labels of an axis may begin with, of the axes that are numbered."""
+_CHOSEN = ("robot", "feature")  # axes whose names the user chooses, or leaves out
+
+Names = tuple[str, ...]
+
+
+class Labelled(NamedTuple):
+    """Array with its axes in the requested order.
+
+    Attributes:
+        values: Numbers, float64. Axes that the argument lacks have length 1.
+        coords: Names along the axes that carry names, in the order of `values`.
+    """
+
+    values: np.ndarray
+    coords: dict[str, Names]
+
+
+def read_labelled(
+    what: str,
+    values: Any,
+    dims: Sequence[str],
+    coords: Mapping[str, Sequence[str] | None] | None = None,
+    *,
+    partial: bool = False,
+) -> Labelled:
+    """Read an array by its dims and labels, and by place where it has none.
+
+    Labels are the dims and coordinates of a DataArray, the index and the columns of a DataFrame,
+    the index of a Series, or the keys of a dict. Whole numbers that count from 0 or 1 in order say
+    no more than the place, and may stand for names.
+
+    Args:
+        what: Name of the argument in messages.
+        values: DataArray, DataFrame, Series, dict, or anything that NumPy takes for an array of
+            numbers. Only a DataArray can label more than two axes.
+        dims: Axes of the result.
+        coords: Names along each axis that carries names, in the order of the result. Empty names
+            are taken from the labels; None refuses labels, because there is nothing to compare them
+            with. Labels along `bound`, `row` and `col` are numbers. Labels along other axes, such
+            as `draw`, do not matter.
+        partial: Whether axes may be missing. A DataArray is then aligned by its dims, and an array
+            without labels is returned as it is, to be broadcast.
+
+    Raises:
+        TrustboError: The dims are not those, a label is unknown, missing or repeated, or a value is
+            not a number.
+    """
+    names = {} if coords is None else coords
+    array = _as_dataarray(what, values, dims, names, partial)
+    if array is None:
+        return Labelled(as_array(what, values), {})
+    wanted = [dim for dim in dims if dim in array.dims] if partial else list(dims)
+    if set(array.dims) != set(wanted):
+        raise TrustboError(f"{what} must have the dims {tuple(dims)}; got {array.dims}.")
+
+    found: dict[str, Names] = {}
+    for dim in wanted:
+        if dim not in array.coords:
+            continue
+        labels = array[dim].values.tolist()
+        if dim in names:
+            order, known = _by_name(what, dim, labels, tuple(names[dim] or ()))
+            if known and names[dim] is None:
+                raise TrustboError(
+                    f"{what} has the {dim}s {one_line(list(known))}, but there are no names of "
+                    f"{dim}s to compare them with; give the values without labels, in order."
+                )
+            if known:
+                found[dim] = known
+        elif dim in _FIRST:
+            order = _by_number(what, dim, array[dim].values)
+        else:
+            continue
+        array = array.isel({dim: order})
+
+    ordered = as_array(what, array.transpose(*wanted).values)
+    missing = tuple(i for i, dim in enumerate(dims) if dim not in wanted)
+    return Labelled(np.expand_dims(ordered, missing), found)
+
+
+def as_array(what: str, values: ArrayLike) -> np.ndarray:
+    """Return an array of floats, NaN where masked, without regard to labels.
+
+    Raises TrustboError for values that are no real numbers: text, dates, complex numbers, ragged
+    lists.
+    """
+    hint = ""
+    try:
+        masked = np.ma.isMaskedArray(values)
+        raw = np.ma.asarray(values) if masked else np.asarray(_with_nan(values))
+        if raw.dtype.kind in _TIMES:
+            hint = " Give seconds: divide times by numpy.timedelta64(1, 's')."
+        if raw.dtype.kind not in _NUMERIC:
+            raise TypeError
+        if raw.dtype.kind == "O" and any(isinstance(v, _NO_NUMBERS) for v in raw.ravel().tolist()):
+            raise TypeError
+        if masked:
+            return np.ma.filled(np.ma.asarray(raw, dtype=float), np.nan)
+        return np.asarray(raw, dtype=float)
+    except (TypeError, ValueError, OverflowError):
+        shown = one_line(values)
+        raise TrustboError(f"{what} must be an array of numbers; got {shown}.{hint}") from None
+
+
+def as_names(what: str, given: Iterable[str], n: int | None = None) -> Names:
+    """Return names as a tuple; raises TrustboError if one is not a string or is repeated.
+
+    If `n` is given, there must be none or `n` of them.
+    """
+    listed = isinstance(given, Iterable) and not isinstance(given, str | bytes)
+    names = tuple(given) if listed else ()
+    if not listed or not all(isinstance(name, str) for name in names):
+        raise TrustboError(f"{what} must be a list of names; got {one_line(given)}.")
+    if len(set(names)) < len(names) or (names and n not in (None, len(names))):
+        many = "" if n is None else f"{n} "
+        raise TrustboError(f"{what} must be {many}different names; got {names}.")
+    return tuple(str(name) for name in names)  # NumPy's strings become Python's
+
+
+def default_robots(n_robots: int) -> Names:
+    """Return default names of robots: r1, r2, ..."""
+    return tuple(f"r{i + 1}" for i in range(n_robots))
+
+
+def _with_nan(values: Any) -> Any:
+    """Replace pandas' missing values, which NumPy does not know, with NaN."""
+    if isinstance(values, pd.DataFrame | pd.Series | pd.Index):
+        return values.to_numpy(dtype=object, na_value=np.nan)
+    return values
+
+
+def _as_dataarray(
+    what: str,
+    values: Any,
+    dims: Sequence[str],
+    names: Mapping[str, Sequence[str] | None],
+    partial: bool,
+) -> xr.DataArray | None:
+    """Return labelled values as a DataArray, or None if they carry no labels."""
+    if isinstance(values, xr.DataArray):
+        return values
+    if isinstance(values, xr.Dataset | xr.DataTree):
+        kind, first = type(values).__name__, dims[-1]
+        raise TrustboError(f"{what} must be one array with the axis {first}; got a {kind}.")
+    if isinstance(values, Mapping):
+        values = _as_table(what, values)
+    if not isinstance(values, pd.Series | pd.DataFrame):
+        return None
+    axes = _axes_of(what, values, dims, names, partial)
+    coords = {}
+    for dim, index in axes.items():
+        if dim in _FIRST and index.name != dim:
+            _require_in_order(what, dim, index)
+        elif not isinstance(index, pd.RangeIndex):
+            coords[dim] = index.to_numpy()
+    return xr.DataArray(_with_nan(values), coords, tuple(axes))
+
+
+def _as_table(what: str, values: Mapping[Any, Any]) -> pd.Series | pd.DataFrame:
+    """Convert a dict of numbers to a Series, and a dict of columns to a DataFrame."""
+    try:
+        if all(np.ndim(value) == 0 for value in values.values()):
+            return pd.Series(dict(values))
+        return pd.DataFrame(dict(values))
+    except (TypeError, ValueError):
+        raise TrustboError(
+            f"{what} must hold one number, or one list of numbers of the same length, for each "
+            f"key; got {one_line(values)}."
+        ) from None
+
+
+def _axes_of(
+    what: str,
+    table: pd.Series | pd.DataFrame,
+    dims: Sequence[str],
+    names: Mapping[str, Sequence[str] | None],
+    partial: bool,
+) -> dict[str, pd.Index]:
+    """Return the index, and the columns, of a table by the axis that they stand for.
+
+    A Series has the axis that its labels or the name of its index say, else the first. A DataFrame
+    has the last two, in order unless the names of its index and columns say otherwise.
+    """
+    if any(isinstance(axis, pd.MultiIndex) for axis in table.axes):
+        raise TrustboError(
+            f"{what} has labels of several levels; give a DataArray with the dims {tuple(dims)}."
+        )
+    if isinstance(table, pd.Series):
+        texts = {str(label) for label in table.index}
+        usual = table.index.name if table.index.name in dims else dims[0]
+        named = (dim for dim in dims if texts == set(names.get(dim) or ()))
+        return {next(named, usual): table.index}
+    if len(dims) < 2 or (len(dims) > 2 and not partial):
+        raise TrustboError(
+            f"{what} must have the axes {tuple(dims)}, but a table has two; give a DataArray with "
+            "these dims."
+        )
+    first, second = dims[-2:]
+    if table.index.name == second or table.columns.name == first:
+        first, second = second, first
+    return {first: table.index, second: table.columns}
+
+
+def _by_name(what: str, dim: str, labels: list[Any], names: Names) -> tuple[list[int], Names]:
+    """Return the place of each name among the labels, and the names; no names if they count."""
+    is_text = [isinstance(label, str) for label in labels]
+    is_whole = [isinstance(label, Integral) and not isinstance(label, bool) for label in labels]
+    texts = [str(label) for label in labels]
+    if len(set(texts)) == len(texts) and set(texts) == set(names):
+        return [texts.index(name) for name in names], names
+    if (
+        dim in _CHOSEN
+        and all(is_whole)
+        and labels in [list(range(first, first + len(labels))) for first in (0, 1)]
+    ):
+        return list(range(len(labels))), ()
+    if not all(a or b for a, b in zip(is_text, is_whole, strict=True)):
+        raise TrustboError(f"{what} has the {dim} labels {one_line(labels)}; give names.")
+    if names:
+        raise TrustboError(
+            f"{what} has the {dim}s {one_line(texts)}, not {one_line(list(names))}; rename them."
+        )
+    return list(range(len(labels))), as_names(f"the {dim}s of {what}", texts)
+
+
+def _by_number(what: str, dim: str, labels: np.ndarray) -> list[int]:
+    """Return the place of each number, from the first to the last, if none is missing."""
+    if labels.dtype.kind in "iuf":
+        order = np.argsort(labels, kind="stable")
+        if any(_counts(labels[order], first) for first in _FIRST[dim]):
+            return order.tolist()
+    if _are_times(dim, labels):
+        return list(range(len(labels)))
+    raise _unnumbered(what, dim, labels, f"drop_vars({dim!r})")
+
+
+def _require_in_order(what: str, dim: str, index: pd.Index) -> None:
+    """Raise TrustboError unless an index without a name agrees with the place of each row.
+
+    After a sort by another column, nobody can tell whether the rows or the index are in order.
+    """
+    labels = index.to_numpy()
+    firsts = _FIRST[dim]
+    if dim == "bound":  # rows cut from the table of several missions
+        firsts = (*firsts, *labels[:1])
+    if not (any(_counts(labels, first) for first in firsts) or _are_times(dim, labels)):
+        raise _unnumbered(what, dim, labels, "reset_index(drop=True)")
+
+
+def _counts(labels: np.ndarray, first: Any) -> bool:
+    """Return whether labels are the whole numbers from `first`, in order."""
+    if not len(labels):
+        return True
+    whole = labels.dtype.kind in "iuf" and float(first).is_integer()
+    return bool(whole and (labels == first + np.arange(len(labels))).all())
+
+
+def _are_times(dim: str, labels: np.ndarray) -> bool:
+    """Return whether labels are increasing times of bounds, and no numbers of bounds."""
+    if dim != "bound" or labels.dtype.kind not in "fmM":
+        return False
+    if labels.dtype.kind == "f" and (labels == np.round(labels)).all():
+        return False
+    return bool((labels[1:] > labels[:-1]).all())
+
+
+def _unnumbered(what: str, dim: str, labels: np.ndarray, remedy: str) -> TrustboError:
+    """Return the error for labels along an axis whose labels are numbers."""
+    starts = " or ".join(str(first) for first in _FIRST[dim])
+    return TrustboError(
+        f"{what} has the {dim} labels {one_line(labels.tolist())}; they must be the numbers from "
+        f"{starts} without gaps, with NaN where nothing was measured. If the values are in order, "
+        f"use {remedy}."
+    )
