@@ -13,7 +13,7 @@ from trustbo.planning import Plan
 
 TOLD, LEARNED, EXCLUDED, GIVEN_UP = "told", "learned", "excluded", "given up"
 """States of a mission: recorded, used for learning, excluded, or given up without data."""
-_STREAMS = ("policy", "fit", "mission", "prior", "awareness", "hazard")
+_STREAMS = ("policy", "fit", "mission", "prior", "awareness", "hazard", "exclude")
 """Random streams; the seeds depend on their order, so add new names at the end."""
 
 
@@ -148,6 +148,8 @@ class State:
         """Return the seed of one random stream for the next mission."""
         n = len(self.entries)
         entropy = [self.settings["seed"], _STREAMS.index(stream), n]
+        if stream == "exclude":  # several fits may follow one mission
+            entropy.append(len(self.indices(EXCLUDED)))
         if n_failures := sum(failure.after == n for failure in self.failures):
             entropy.append(n_failures)  # after `fail`, a random policy may choose another path
         return int(np.random.SeedSequence(entropy).generate_state(1)[0])

@@ -20,6 +20,7 @@ from trustbo.inference import importance
 from trustbo.inference.diagnostics import complaints_of
 from trustbo.inference.posterior import Draws, Posterior
 from trustbo.models.backend import own_settings
+from trustbo.streams import stream
 
 _POINTS = 2000  # resampled points from which the covariance is estimated
 _FIELDS = {
@@ -49,7 +50,7 @@ def sample_by_nuts(
         Draws with chains joined, statistics (draw,) by name, diagnostics and a list of failed
         checks.
     """
-    rng = np.random.default_rng([seed, 1])
+    rng = stream(seed, "nuts")
     points = importance.sample(
         posterior.log_density, posterior.start()[None], rng, defensive=posterior.defensive
     )

@@ -14,6 +14,7 @@ from trustbo.models.model import TrustModel
 from trustbo.models.signal import each
 from trustbo.parallel import one_blas_thread
 from trustbo.stacking import require_same_team
+from trustbo.streams import stream
 
 _ALIKE = 16  # draws of a fitted person's trust for each draw of the population parameters
 
@@ -82,7 +83,7 @@ def predict_reports(
         out["probability"] = np.full((*shape, levels), np.nan)
     for j, mission in enumerate(missions):
         alike = _ALIKE if fitted else len(some)
-        rng = np.random.default_rng([seed, j])
+        rng = stream(seed, "reports", j)
         person = _of_person(ahead, draws, j, given == "earlier", alike, rng)
         for (k, i), weight, center, var in person:
             if k < len(mission.bounds):

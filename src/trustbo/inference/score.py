@@ -11,6 +11,7 @@ from trustbo.inference.draws import QUANTILES, in_order_of, require_posterior
 from trustbo.inference.filter import TrustFilter
 from trustbo.models.slots import require_ticks
 from trustbo.stacking import MissionBatch, stack_missions
+from trustbo.streams import stream
 from trustbo.workspace import Workspace
 
 INTERVALS = {"coverage_50": 0.5, "coverage_90": 0.9}
@@ -64,7 +65,7 @@ def score(
     for j, (tree, mission) in enumerate(zip(trees, missions, strict=True)):
         if j and tree is not trees[j - 1]:
             trust = _follow(in_order_of(tree, *names))
-        k, rng = slice(len(mission.bounds)), np.random.default_rng([seed, j])
+        k, rng = slice(len(mission.bounds)), stream(seed, "score", j)
         one = MissionBatch(*(a[j, k] for a in batch))
         require_ticks(trust.family, one.contact_rate, one.n_ticks)
         columns["log_score"][j, k], drawn = _predict(trust, mission, one, rng)

@@ -19,6 +19,7 @@ from trustbo.models.effects.effect import Effect
 from trustbo.models.model import TrustModel
 from trustbo.models.scores import log_density
 from trustbo.stacking import MissionBatch, stack_missions
+from trustbo.streams import stream
 
 _OF_RATES = ("mission", "bound", "robot")
 _DIMS = dict.fromkeys(("trust", "trust_mean", "trust_sd", "contact_rate"), _OF_RATES)
@@ -153,8 +154,8 @@ def complete(
     kept = np.linspace(0, n_draws - 1, min(n_draws, max(1, _N_TRAJECTORIES // n_chains)))
     kept = kept.astype(int)
     some = (np.arange(n_chains)[:, None] * n_draws + kept).ravel()
-    given = fitted.given(draws, some, np.random.default_rng([seed, 1]))
-    rng = np.random.default_rng([seed, 2])
+    given = fitted.given(draws, some, stream(seed, "latent"))
+    rng = stream(seed, "prior predictive")
     replicated = fitted.replicate(fitted.draw_prior(N_PRIOR, rng), rng)
     shift = fitted.model.family.log_resolution(fitted.slots.y, fitted.slots.n_ticks).sum((1, 2))
     counted = not np.isnan(shift).any()

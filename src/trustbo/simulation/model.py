@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
+from trustbo.arrays import read_labelled
 from trustbo.data import Cell, Mission
 from trustbo.errors import TrustboError, require_kind, require_whole
 from trustbo.inference.filter import Dynamics
@@ -12,8 +13,9 @@ from trustbo.models import PooledTrust
 from trustbo.models.model import TrustModel
 from trustbo.models.params import Params, check_params
 from trustbo.simulation.protocol import DescribedSimulator, require_path
+from trustbo.streams import stream
 from trustbo.workspace import Workspace
-from trustbo.workspace.moves import along, bounds_along, moves_along
+from trustbo.workspace.moves import MOVE_NAMES, along, bounds_along, moves_along
 
 _STREAM = 0x6D697373  # makes the random numbers differ from others with the same seed
 
@@ -58,7 +60,9 @@ class ModelSimulator(DescribedSimulator):
         self.workspace, self.params = workspace, params
         self.model = PooledTrust() if model is None else model
         shape = workspace.awareness.shape
-        self.awareness = workspace.awareness.values if awareness is None else np.asarray(awareness)
+        self.awareness = workspace.awareness.values
+        if awareness is not None:
+            self.awareness = read_labelled("awareness", awareness, *_labels_of(workspace)).values
         if self.awareness.shape != shape:
             raise TrustboError(f"awareness must have shape {shape}; got {self.awareness.shape}.")
         if params.leading:
@@ -107,15 +111,21 @@ class ModelSimulator(DescribedSimulator):
         n = len(cells) - 1
         if self.p_fail is None:
             return n, "ok"
-        rng = np.random.default_rng([seed, 1])
+        rng = stream(seed, "failures")
         p = self.p_fail[moves_along(cells), *np.array(cells)[1:].T]
         failed = np.flatnonzero(rng.random(n) < p)
         return (int(failed[0]) + 1, "stuck") if len(failed) else (n, "ok")
 
 
+def _labels_of(workspace: Workspace) -> tuple[tuple[str, ...], dict[str, tuple[str, ...]]]:
+    """Return the dims of a workspace's awareness, and the names along them."""
+    names = {"robot": workspace.team.names, "move": MOVE_NAMES, "feature": workspace.features}
+    return tuple(str(dim) for dim in workspace.awareness.dims), names
+
+
 def _require_probabilities(p_fail: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
     """Check failure probabilities (move, row, col), and return them as an array."""
-    p = np.asarray(p_fail, dtype=float)
+    p = read_labelled("p_fail", p_fail, ("move", "row", "col"), {"move": MOVE_NAMES}).values
     if p.shape != shape:
         raise TrustboError(f"p_fail must have the shape (move, row, col) = {shape}; got {p.shape}.")
     if (bad := (p < 0.0) | (p > 1.0)).any():

@@ -1,0 +1,22 @@
+"""Named streams of random numbers, so that one seed serves several purposes independently.
+
+Seeds such as `[seed, 1]` are soon used twice, and `default_rng([seed, 0])` equals
+`default_rng(seed)`. The name of a stream is hashed into the key of its seed sequence instead, which
+no list of seeds reproduces.
+"""
+
+import hashlib
+
+import numpy as np
+
+
+def stream(seed: int, name: str, *numbers: int) -> np.random.Generator:
+    """Return the generator of a named stream.
+
+    Args:
+        seed: Seed, 0 or more.
+        name: What the numbers are for; each use has its own name.
+        numbers: Further numbers that tell generators of one name apart, such as that of a mission.
+    """
+    key = int.from_bytes(hashlib.sha256(name.encode()).digest()[:4])
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(key, *numbers)))
