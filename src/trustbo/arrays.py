@@ -21,6 +21,7 @@ _TIMES = "mM"  # kinds of dtypes of dates and times
 _NO_NUMBERS = (str, bytes, np.datetime64, np.timedelta64)  # although `float` converts them
 _FIRST = {"bound": (0, 1), "row": (0,), "col": (0,)}
 """Numbers that the labels of an axis may begin with, of the axes that are numbered."""
+_LARGEST = 1e12  # of a parameter; trust near 1 added to it keeps four digits
 _CHOSEN = ("robot", "feature")  # axes whose names the user chooses, or leaves out
 
 Names = tuple[str, ...]
@@ -123,6 +124,24 @@ def as_array(what: str, values: ArrayLike) -> np.ndarray:
     except (TypeError, ValueError, OverflowError):
         shown = one_line(values)
         raise TrustboError(f"{what} must be an array of numbers; got {shown}.{hint}") from None
+
+
+def require_numbers(what: str, values: ArrayLike, *, missing: bool = False) -> np.ndarray:
+    """Return an array of numbers that double precision can tell apart when added to trust.
+
+    Raises TrustboError for infinite values, values beyond 1e12 and, unless `missing`, NaN.
+    """
+    array = as_array(what, values)
+    low = np.fmin.reduce(array, axis=None, initial=0.0)  # of large arrays, without a copy
+    high = np.fmax.reduce(array, axis=None, initial=0.0)
+    if max(-low, high) > _LARGEST or (not missing and np.isnan(array.sum())):
+        is_bad = (array > _LARGEST) | (array < -_LARGEST) | (np.isnan(array) & (not missing))
+        bad = array[is_bad].flat[0]
+        raise TrustboError(
+            f"{what} must be finite and at most {_LARGEST:g} in size; got {bad:g}. Trust and its "
+            "parameters are of the order of 1."
+        )
+    return array
 
 
 def as_names(what: str, given: Iterable[str], n: int | None = None) -> Names:

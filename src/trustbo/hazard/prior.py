@@ -9,7 +9,7 @@ import numpy as np
 from scipy import special
 from scipy.interpolate import PchipInterpolator
 
-from trustbo.errors import TrustboError, require_positive
+from trustbo.errors import TrustboError, require_finite, require_positive
 
 REFERENCE = 0.5
 """Difficulty at which the intercept is the logit of the prior mean."""
@@ -59,7 +59,8 @@ class Hazard:
     def __post_init__(self) -> None:
         for name in ("intercept", "coefficient", "margin", "log_width", "log_strength"):
             mean, sd = getattr(self, name)
-            object.__setattr__(self, name, (float(mean), require_positive(f"sd of {name}", sd)))
+            mean = require_finite(f"mean of {name}", mean)
+            object.__setattr__(self, name, (mean, require_positive(f"sd of {name}", sd)))
         share, sd = self.doubt
         share = require_positive("the probability of doubt", share, or_zero=True)
         if share >= 1.0:

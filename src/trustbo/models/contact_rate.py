@@ -9,6 +9,8 @@ from jax import Array, lax, random
 from jax.typing import ArrayLike
 from numpyro.distributions import constraints
 
+from trustbo.errors import TrustboError
+
 
 class ContactRate(dist.Distribution):
     """Distribution of contact rates given the drift, equations (3)-(4), with trust integrated out.
@@ -45,14 +47,37 @@ class ContactRate(dist.Distribution):
             delta_v: Standard deviation of the observation noise, shape () or (robot,).
             x0_mean: Mean of trust before the first bound, shape ().
             x0_sd: Standard deviation of trust before the first bound, shape ().
+
+        Raises:
+            TrustboError: The drift or a parameter has another shape.
         """
         self.drift = jnp.asarray(drift)
         self.parameters = tuple(jnp.asarray(p) for p in (beta0, delta_w, delta_v, x0_mean, x0_sd))
+        if self.drift.ndim != 3:
+            raise TrustboError(
+                f"drift must have the shape (mission, bound, robot); got {self.drift.shape}. For "
+                "one mission, give drift[None]."
+            )
+        n_robots = self.drift.shape[2]
+        for name, value in zip(("beta0", "delta_w", "delta_v"), self.parameters, strict=False):
+            if value.ndim and value.shape[-1] not in (1, n_robots):
+                raise TrustboError(
+                    f"{name} must have the shape () or ({n_robots},), as drift is of the shape "
+                    f"(mission, bound, robot) = {self.drift.shape}; got {value.shape}."
+                )
         super().__init__(self.drift.shape[:1], self.drift.shape[1:])
 
     @jax.numpy_rank_promotion("allow")
     def log_prob(self, value: Array) -> Array:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Compute the log density (mission,) of each mission with the Kalman filter."""
+        """Compute the log density (mission,) of each mission with the Kalman filter.
+
+        Raises TrustboError unless `value` has the shape (mission, bound, robot) of the drift.
+        """
+        if jnp.shape(value) != self.drift.shape:
+            raise TrustboError(
+                "contact rates must have the shape (mission, bound, robot) of the drift, "
+                f"{self.drift.shape}; got {jnp.shape(value)}."
+            )
         seen = ~jnp.isnan(value)
         bounds = (jnp.where(seen, value, 0.0), seen, self.drift)
         by_bound = tuple(jnp.swapaxes(a, 0, 1) for a in bounds)

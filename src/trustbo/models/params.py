@@ -5,6 +5,7 @@ from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 
+from trustbo.arrays import require_numbers
 from trustbo.data import Cell
 from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError
@@ -261,14 +262,24 @@ def assemble_params(
     return RobotParams(**values, **x0, memory=memory)
 
 
+def require_values(params: Params) -> None:
+    """Raise TrustboError for a value that is not a number, infinite or beyond 1e12.
+
+    Place effects may be NaN, where a map has no bound.
+    """
+    for field, value in params.by_name.items():
+        require_numbers(f"params.{field}", value, missing=field in PLACES)
+
+
 def check_params(params: Params, n_robots: int | None, n_features: int) -> None:
     """Check that the shapes of parameters match `n_features` and, unless None, `n_robots`.
 
-    Raises TrustboError if the number of robots or features differs, or a covariance is not
-    symmetric and positive definite.
+    Raises TrustboError if a value is not a number, infinite or beyond 1e12, the number of robots or
+    features differs, or a covariance is not symmetric and positive definite.
     """
     n = params.n_robots if n_robots is None else n_robots
     sizes = {"feature": {n_features}, "robot": {n}, "robot_": {n}, "effect": {1, n}}
+    require_values(params)
     for field, axes in params.AXES.items():
         if getattr(params, field) is None:
             continue

@@ -97,6 +97,7 @@ class DrawnPaths:
 
 def choose_draws(params: Params, n_draws: int | None, seed: int) -> Params:
     """Choose `n_draws` draws at random, or all draws if None; the leading axis is (draw,)."""
+    seed = require_whole("seed", seed, 0)
     flat = params.flat()
     n = flat.leading[0]
     if n_draws is None or require_whole("n_draws", n_draws, 1) >= n:

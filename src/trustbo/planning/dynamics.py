@@ -6,9 +6,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from trustbo.arrays import read_labelled, require_numbers
 from trustbo.data import Cell
 from trustbo.errors import TrustboError
-from trustbo.models.params import Params, check_params
+from trustbo.models.params import Params, check_params, require_values
 from trustbo.workspace.moves import bounds_along
 
 
@@ -118,7 +119,10 @@ def roll_trust(params: Params, awareness: ArrayLike, x0: ArrayLike | None = None
         TrustboError: If the number of robots or features does not match the parameters, or place
             effects are given for the grid instead of the path.
     """
-    of_robots = np.swapaxes(np.asarray(awareness, dtype=float), 0, 1)
+    require_values(params)
+    dims, unnamed = ("bound", "robot", "feature"), {"robot": None, "feature": None}
+    of_robots = np.swapaxes(read_labelled("awareness", awareness, dims, unnamed).values, 0, 1)
+    x0 = None if x0 is None else require_numbers("x0", x0)
     return roll(trust_dynamics(params, of_robots[:, None, None], x0, by_robot=True))
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
+from trustbo.arrays import read_labelled
 from trustbo.data import Cell
 from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError, require_choice
@@ -27,7 +28,7 @@ from trustbo.planning.problem import EXACT, InfeasibleError, Problem, draws_of, 
 from trustbo.planning.trust_map import cost_of, trust_map
 from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Location
-from trustbo.workspace.moves import along
+from trustbo.workspace.moves import MOVE_NAMES, along
 
 
 class Planner(Summary):
@@ -66,8 +67,9 @@ class Planner(Summary):
                 allows any walk of up to that many bounds. The default is n = 4 for lost_contact
                 and n = 2 for the others. If n > 2, paths may revisit cells (see `Plan.revisits`).
             toll: Additional cost of each bound, such as its length or duration. The array must
-                broadcast to (move, row, col), with the moves of `workspace.moves.MOVES`. Tolls are
-                in bounds for lost_contact, and in units of trust for the other objectives.
+                broadcast to (move, row, col), with the moves of `workspace.moves.MOVES`; a
+                DataArray is aligned by its dims and labels. Tolls are in bounds for lost_contact,
+                and in units of trust for the other objectives.
             max_failure: Largest failure probability of a path, in [0, 1); by default, no limit.
             failure_cost: Cost of a failure in bounds, for lost_contact. The value is reduced by
                 this cost times the failure probability. The default is the smallest number of
@@ -151,9 +153,11 @@ class Planner(Summary):
         Raises:
             TrustboError: If the shapes do not match, or a probability is outside [0, 1].
         """
-        drawn = None if draws is None else np.asarray(draws, dtype=float)
-        risk = Risk(np.asarray(p_fail, dtype=float), drawn, strata)
-        return self._with(risk=risk)
+        dims, moves = ("move", "row", "col"), {"move": MOVE_NAMES}
+        mean, drawn = read_labelled("p_fail", p_fail, dims, moves).values, None
+        if draws is not None:
+            drawn = read_labelled("draws", draws, ("draw", *dims), moves).values
+        return self._with(risk=Risk(mean, drawn, strata))
 
     def with_failure_cost(self, failure_cost: float) -> Self:
         """Return a planner with another failure cost, in bounds.
@@ -171,7 +175,8 @@ class Planner(Summary):
         Args:
             params: Posterior from `fit`, or parameters. If there are several draws, the path is
                 optimal for their mean, and the bands are quantiles over the draws.
-            x0: Expected trust at the start, shape () or (robot,); by default `params.x0_mean`.
+            x0: Expected trust at the start, shape () or (robot,), or by the names of the robots; by
+                default `params.x0_mean`.
 
         Raises:
             TrustboError: If the robots or features of the parameters differ from the workspace's,
@@ -386,7 +391,8 @@ def _toll_of(toll: ArrayLike, bounds: np.ndarray) -> np.ndarray:
 
     Raises TrustboError if the shape does not broadcast or the toll of a bound is not finite.
     """
-    given = np.asarray(toll, dtype=float)
+    dims, moves = ("move", "row", "col"), {"move": MOVE_NAMES}
+    given = read_labelled("toll", toll, dims, moves, partial=True).values
     try:
         tolls = np.where(bounds, np.broadcast_to(given, bounds.shape), 0.0)
     except ValueError:
@@ -409,6 +415,7 @@ def _value_along(
 
     The values do not include the expected cost of failure.
     """
+    x0 = problem.start(x0)
     z, of_path = along(problem.paths.workspace.awareness.values, cells), params.along(cells)
     z = z[:, None, None]  # a map with one move and one row, whose columns are the bounds
     by_robot = trust_dynamics(of_path, z, x0, by_robot=True)

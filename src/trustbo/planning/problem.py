@@ -9,12 +9,13 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
+from trustbo.arrays import read_labelled, require_numbers
 from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_kind, require_positive
 from trustbo.hazard.risk import ROUNDING, Risk
 from trustbo.inference.draws import params_of
 from trustbo.models.families import Family
-from trustbo.models.params import Params
+from trustbo.models.params import Params, require_values
 from trustbo.planning.dynamics import Dynamics, trust_dynamics
 from trustbo.planning.labels import LOGISTIC, LOSSES, TINY_SD, Costs, best_labels
 from trustbo.planning.objectives import Objective, Weights, capped, has_history, weights_of
@@ -119,7 +120,20 @@ class Problem:
         self, params: Params, x0: ArrayLike | None = None, *, by_robot: bool = False
     ) -> Dynamics:
         """Build the recursion for expected trust (see `trust_dynamics`)."""
-        return trust_dynamics(params, self.paths.workspace.awareness.values, x0, by_robot=by_robot)
+        z = self.paths.workspace.awareness.values
+        return trust_dynamics(params, z, self.start(x0), by_robot=by_robot)
+
+    def start(self, x0: ArrayLike | None) -> np.ndarray | None:
+        """Read expected trust at the start, shape () or (..., robot), by the robots' names."""
+        if x0 is None:
+            return None
+        dims = ("draw", "robot") if "draw" in getattr(x0, "dims", ()) else ("robot",)
+        robots = {"robot": self.paths.workspace.team.names}
+        start = require_numbers("x0", read_labelled("x0", x0, dims, robots).values)
+        n_robots = len(robots["robot"])
+        if start.ndim and start.shape[-1] != n_robots:
+            raise TrustboError(f"x0 must have the shape () or ({n_robots},); got {start.shape}.")
+        return start
 
     @cached_property
     def risks(self) -> "Risks | None":
@@ -246,6 +260,7 @@ def draws_of(posterior: Params | xr.DataTree, workspace: Workspace, *, day: bool
         return params_of(posterior, workspace, day=day)
     remedy = "give a posterior from fit, or parameters"
     params: Params = require_kind("posterior", posterior, Params, remedy)
+    require_values(params)
     return params.flat() if len(params.leading) > 1 else params
 
 
