@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
+import xarray as xr
 
 from trustbo.data import Bound, Mission
 from trustbo.errors import TrustboError
@@ -170,3 +171,65 @@ def test_bounds_of_odd_shapes_are_named():
     bounds = [Bound((1, 1), z, y, seconds), Bound((0, 2), z[:, :1], y, seconds)]
     with pytest.raises(TrustboError, match=r"bounds disagree on \(robot, feature\)"):
         Mission(tuple(PATH), tuple(bounds))
+
+
+def test_durations_and_ticks_are_read_by_name_as_rates_are():
+    z, y = arrays(n_robots=2)
+    rates = pd.DataFrame(y * [1.0, 2.0], columns=["b", "a"])
+    seconds = pd.DataFrame([[11.0, 71.0], [12.0, 72.0]], columns=["b", "a"])
+    ticks = {"a": 10, "b": 5}
+    found = Mission.from_arrays(PATH, z, rates, seconds, n_ticks=ticks, robots=("a", "b"))
+    np.testing.assert_array_equal(found.contact_rate, y * [2.0, 1.0])
+    np.testing.assert_array_equal(found.duration, [[71.0, 11.0], [72.0, 12.0]])
+    np.testing.assert_array_equal(found.n_ticks, [[10.0, 5.0]] * 2)
+
+
+def test_robots_and_features_are_those_of_the_labels():
+    z, y = arrays(n_robots=2)
+    rates = pd.DataFrame(y * [1.0, 2.0], columns=["husky", "spot"])
+    labelled = xr.DataArray(
+        z * [0.5, 1.0], {"feature": ["slope", "canopy"]}, ("bound", "robot", "feature")
+    )
+    found = Mission.from_arrays(PATH, labelled, rates)
+    assert found.robots == ("husky", "spot")
+    assert found.features == ("slope", "canopy")
+    turned = labelled.isel(feature=[1, 0])
+    again = Mission.from_arrays(PATH, turned, rates, features=("slope", "canopy"))
+    np.testing.assert_array_equal(again.awareness, found.awareness)
+    other = found.with_awareness(turned)
+    np.testing.assert_array_equal(other.awareness, found.awareness)
+
+
+def test_what_cannot_carry_the_labels_is_refused():
+    z, y = arrays(1, 1, 1)
+    for awareness in (pd.DataFrame({"a": [0.1]}), xr.Dataset({"awareness": ("bound", [0.1])})):
+        with pytest.raises(TrustboError, match="awareness"):
+            Mission.from_arrays(PATH[:2], awareness, y)
+    with pytest.raises(TrustboError, match="awareness"):
+        Bound((0, 0), 0.5, [0.5], [1.0])
+    with pytest.raises(TrustboError, match="contact_rate"):
+        Bound((0, 0), z[0], pd.Series({"husky": 0.5}), [1.0])
+
+
+def test_negative_cells_are_refused():
+    z, y = arrays(3)
+    with pytest.raises(TrustboError, match=r"\(-1, -1\)"):
+        Mission.from_arrays([(1, 1), (0, 0), (-1, -1), (-2, -2)], z, y)
+
+
+@pytest.mark.parametrize("value", ["3", b"3", 1j, np.nan, np.inf, None, [1.0], 10**400])
+def test_a_robot_s_speed_is_a_number(value):
+    with pytest.raises(TrustboError, match="speed"):
+        Robot(speed=value)
+
+
+def test_numbers_of_numpy_become_python_s():
+    robot = Robot(speed=np.float32(1.5), acquire=np.int64(2))
+    assert (type(robot.speed), type(robot.acquire)) == (float, int)
+    assert robot == Robot(speed=1.5, acquire=2)
+
+
+@pytest.mark.parametrize("names", [(1, 2, 3), (None, 1.5, "c"), "abc"])
+def test_names_of_a_team_are_texts(names):
+    with pytest.raises(TrustboError, match="names"):
+        Team(3, names=names)

@@ -234,7 +234,9 @@ class Mission(Summary):
 
     def with_awareness(self, awareness: np.ndarray) -> Self:
         """Return the mission with another awareness, shape (bound, robot, feature)."""
-        bounds = zip(self.bounds, awareness, strict=True)
+        names = {"robot": self.robots, "feature": self.features}
+        read = read_labelled("awareness", awareness, ("bound", "robot", "feature"), names)
+        bounds = zip(self.bounds, read.values, strict=True)
         return replace(self, bounds=tuple(replace(bound, awareness=z) for bound, z in bounds))
 
     def in_order(

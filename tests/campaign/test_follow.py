@@ -5,12 +5,15 @@ from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
+import xarray as xr
 from worlds import random_cells
 
 import trustbo as tb
 from trustbo.campaign.learning import as_learned
 from trustbo.inference import TrustFilter, sample_prior
+from trustbo.models import PooledTrust
 
 ROOT = Path(__file__).resolve().parents[2]
 ENDS = ((3, 0), (0, 3))
@@ -281,3 +284,17 @@ def test_the_example_for_foxglove_sends_trust_by_robot():
         assert state["bound"] == k + 1
         assert [state[r]["mean"] for r in robots] == follower.trust.mean.tolist()
     assert state["r1"]["ahead"] == []
+
+
+def test_a_tick_that_names_its_robots_is_read_by_name():
+    follower = tb.Follower(begun(PooledTrust(), 0))
+    seen = {"r3": True, "r2": False, "r1": False}
+    array = xr.DataArray([1.0, 0.0, np.nan], {"robot": ["r3", "r2", "r1"]}, "robot")
+    follower.begin(0.0)
+    for t, tick in enumerate((seen, pd.Series(seen), array), start=1):
+        follower.tick(t, tick)
+    with pytest.raises(tb.TrustboError, match="in_contact"):
+        follower.tick(4.0, {"r3": True, "r2": False, "r4": False})
+    follower.end(5.0)
+    np.testing.assert_array_equal(follower.bounds[0].contact_rate, [0.0, 0.0, 1.0])
+    np.testing.assert_array_equal(follower.bounds[0].n_ticks, [2.0, 3.0, 3.0])

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import xarray as xr
 from missions import N_TICKS, OF_FAMILY, counted_missions, random_params
 from references import dense_log_likelihood, dense_posterior_of_trust, on_a_grid
 from scipy import stats
@@ -9,7 +10,7 @@ from scipy import stats
 import trustbo as tb
 from trustbo.errors import TrustboError
 from trustbo.inference import TrustFilter, fit, params_of
-from trustbo.models import PooledTrust, TrustParams
+from trustbo.models import HierarchicalTrust, PooledTrust, TrustParams
 from trustbo.models.params import CoupledParams
 
 
@@ -225,3 +226,51 @@ def test_a_campaign_s_posterior_of_parameters_alone_is_followed():
     assert alone.state.mean.shape == (2,)
     expected = TrustFilter(params_of(whole), 2).update(z[0], y[0])
     np.testing.assert_array_equal(alone.update(z[0], y[0]).mean, expected.mean)
+
+
+def test_a_filter_reads_robots_and_features_by_name(missions):
+    """A posterior in another order, and labelled awareness and rates, change nothing."""
+    workspace = tb.Workspace.from_awareness(np.zeros((3, 2, 2, 2)))
+    posterior = fit(missions, HierarchicalTrust(), draws=100)
+    turned = posterior.isel(
+        feature=[1, 0], robot=[2, 0, 1], robot_=[2, 0, 1], missing_dims="ignore"
+    )
+    z, y = np.random.default_rng(3).uniform(size=(3, 2)), np.array([0.2, 0.5, 0.9])
+    names = {"robot": list(workspace.team.names), "feature": list(workspace.features)}
+    expected = TrustFilter(posterior).update(z, y)
+
+    by_workspace = TrustFilter(turned, workspace=workspace).update(z, y)
+    np.testing.assert_allclose(by_workspace.mean, expected.mean, rtol=1e-12)
+
+    labelled = xr.DataArray(z, names, ("robot", "feature"))
+    rates = dict(zip(names["robot"], y, strict=True))
+    by_label = TrustFilter(turned).update(labelled, rates)  # robots in the order of the posterior
+    np.testing.assert_allclose(by_label.mean, expected.mean[[2, 0, 1]], rtol=1e-12)
+
+    other = tb.Workspace.from_awareness(np.zeros((3, 2, 2, 2)), features=("slope", "canopy"))
+    with pytest.raises(TrustboError, match="features"):
+        TrustFilter(posterior, workspace=other)
+    with pytest.raises(TrustboError, match="awareness"):
+        TrustFilter(params_of(posterior)).update(labelled, y)
+
+
+@pytest.mark.parametrize(
+    "cut",
+    [
+        lambda tree: tree.isel(chain=0),
+        lambda tree: tree.mean("draw"),
+        lambda tree: tree.isel(draw=slice(0, 0)),
+    ],
+    ids=["one chain", "means", "no draws"],
+)
+def test_a_posterior_needs_chains_and_draws(posterior, cut):
+    with pytest.raises(TrustboError, match="draw"):
+        TrustFilter(cut(posterior))
+
+
+def test_variables_of_one_s_own_do_not_matter(posterior):
+    own = posterior.copy()
+    own["posterior"]["threshold"] = xr.DataArray(0.3)
+    own["posterior"]["trust"] = posterior["posterior"]["b"] * np.nan
+    assert params_of(own).by_name.keys() == params_of(posterior).by_name.keys()
+    np.testing.assert_array_equal(params_of(own).b, params_of(posterior).b)

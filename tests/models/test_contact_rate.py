@@ -4,8 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import numpyro
+import pytest
 from numpyro import handlers
 
+from trustbo.errors import TrustboError
 from trustbo.models import ContactRate
 
 X0 = 0.4, 0.6
@@ -40,3 +42,19 @@ def test_a_model_of_ones_own_is_a_numpyro_program():
     rates = handlers.seed(program, jax.random.key(0))()
     trace = handlers.trace(handlers.seed(program, jax.random.key(0))).get_trace(rates)
     assert trace["contact_rate"]["fn"].log_prob(rates).shape == (3,)
+
+
+@pytest.mark.parametrize("shape", [(4, 3), (2, 4, 3, 1), ()])
+def test_a_drift_of_another_shape_is_refused(shape):
+    with pytest.raises(TrustboError, match="drift"):
+        ContactRate(np.zeros(shape), 0.5, 0.1, 0.1)
+
+
+def test_rates_and_parameters_must_have_the_shape_of_the_drift():
+    rates = np.zeros((2, 4, 3))
+    law = ContactRate(rates, np.full(3, 0.5), 0.1, 0.1)
+    assert law.log_prob(rates).shape == (2,)
+    with pytest.raises(TrustboError, match="mission, bound, robot"):
+        law.log_prob(np.zeros((2, 3, 4)))
+    with pytest.raises(TrustboError, match="beta0"):
+        ContactRate(rates, np.full(4, 0.5), 0.1, 0.1)

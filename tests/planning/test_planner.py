@@ -3,6 +3,7 @@
 import networkx as nx
 import numpy as np
 import pytest
+import xarray as xr
 
 from trustbo.errors import TrustboError
 from trustbo.inference import sample_prior
@@ -10,6 +11,7 @@ from trustbo.models import PooledTrust, TrustParams
 from trustbo.planning import Planner, reference, roll_trust
 from trustbo.planning.paths import STEPS
 from trustbo.workspace import Workspace
+from trustbo.workspace.moves import MOVE_NAMES
 
 PARAMS = TrustParams(0.6, np.array([0.3, 0.2]), 0.05, 0.05, 0.05)
 ENDS = (4, 0), (0, 5)
@@ -172,3 +174,52 @@ def test_walks_that_need_too_large_a_graph_are_refused():
         Planner(workspace, (0, 0), (59, 59), max_bounds=50_000).plan(
             TrustParams(0.5, np.array([0.3]), 0.1, 0.1, 0.1)
         )
+
+
+def test_tolls_risks_and_starts_are_read_by_name(workspace):
+    rng = np.random.default_rng(1)
+    values = rng.uniform(size=(8, 5, 6))
+    coords = {"move": list(MOVE_NAMES), "row": range(5), "col": range(6)}
+    labelled = xr.DataArray(values, coords, tuple(coords))
+    turned = labelled.transpose().isel(move=slice(None, None, -1), row=[4, 0, 1, 2, 3])
+    x0 = {"r3": 0.9, "r1": 0.1, "r2": 0.5}
+
+    right = Planner(workspace, *ENDS, toll=values).with_risk(0.1 * values, 0.1 * values[None])
+    found = Planner(workspace, *ENDS, toll=turned).with_risk(
+        0.1 * turned, 0.1 * turned.expand_dims("draw", -1)
+    )
+    plan, expected = found.plan(PARAMS, x0=x0), right.plan(PARAMS, x0=[0.1, 0.5, 0.9])
+    assert (plan.path, plan.value, plan.p_arrive) == (
+        expected.path, expected.value, expected.p_arrive
+    )  # fmt: skip
+
+    of_cells = Planner(workspace, *ENDS, toll=turned.isel(move=0, drop=True))
+    np.testing.assert_array_equal(
+        of_cells.problem.toll, Planner(workspace, *ENDS, toll=values[7]).problem.toll
+    )
+    of_moves = Planner(workspace, *ENDS, toll=dict(zip(MOVE_NAMES, range(8), strict=True)))
+    by_place = Planner(workspace, *ENDS, toll=np.arange(8.0)[:, None, None])
+    np.testing.assert_array_equal(of_moves.problem.toll, by_place.problem.toll)
+
+
+def test_options_that_are_no_maps_are_refused(workspace):
+    for toll in ("a", {"up": 1.0}, xr.DataArray(np.zeros((5, 6)), dims=("y", "x"))):
+        with pytest.raises(TrustboError, match="toll"):
+            Planner(workspace, *ENDS, toll=toll)
+    planner = Planner(workspace, *ENDS)
+    for p_fail in ("a", xr.DataArray(np.zeros((5, 6)), dims=("row", "col"))):
+        with pytest.raises(TrustboError, match="p_fail"):
+            planner.with_risk(p_fail)
+    for x0 in ("3", np.inf, [], [0.5, 0.5], {"r1": 0.5}, 1j):
+        with pytest.raises(TrustboError, match="x0"):
+            planner.plan(PARAMS, x0=x0)
+
+
+@pytest.mark.parametrize("value", ["3", b"3", 1j, np.inf, np.nan, 1e24, np.datetime64("2026")])
+@pytest.mark.parametrize("field", ["beta0", "b", "delta_v", "x0_mean"])
+def test_unsafe_parameters_are_refused(workspace, field, value):
+    params = PARAMS._replace(**{field: value})
+    with pytest.raises(TrustboError, match=field):
+        Planner(workspace, *ENDS).plan(params)
+    with pytest.raises(TrustboError, match=field):
+        roll_trust(params, np.zeros((4, 3, 2)))

@@ -73,3 +73,16 @@ def test_impossible_settings_are_refused(workspace, options):
 def test_a_model_has_no_table_of_bounds(workspace):
     with pytest.raises(TrustboError):
         Truth.of(ModelSimulator(workspace, PARAMS))
+
+
+def test_true_awareness_and_probabilities_are_read_by_name(workspace):
+    truth = workspace.awareness.copy(data=workspace.awareness.values**2)
+    turned = truth.transpose().isel(robot=[2, 0, 1], feature=[1, 0], col=[3, 2, 1, 0])
+    np.testing.assert_array_equal(
+        ModelSimulator(workspace, PARAMS, awareness=turned).awareness, truth
+    )
+    p = workspace.passable_bounds.astype(float)
+    simulator = ModelSimulator(workspace, PARAMS, p_fail=p.isel(move=slice(None, None, -1)))
+    np.testing.assert_array_equal(simulator.p_fail, p)
+    with pytest.raises(TrustboError, match="awareness"):
+        ModelSimulator(workspace, PARAMS, awareness=truth.assign_coords(feature=["a", "b"]))

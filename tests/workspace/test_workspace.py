@@ -1,8 +1,11 @@
 """The planning grid and the workspace on it."""
 
 import numpy as np
+import pandas as pd
 import pytest
+import xarray as xr
 
+from trustbo.data import Mission
 from trustbo.errors import TrustboError
 from trustbo.team import Robot, Team
 from trustbo.terrain import pixel_size, read_terrain, synthetic_terrain
@@ -125,3 +128,43 @@ def test_arrays_with_other_moves_are_refused():
         Workspace.from_awareness(awareness.assign_coords(move=np.arange(8)))
     of_cells = awareness.isel(move=1).fillna(0.5)
     assert Workspace.from_awareness(of_cells).passable.all()
+
+
+def labelled_map():
+    """Awareness of four by three cells with labels along all axes, of one robot and feature."""
+    values = np.random.default_rng(1).uniform(size=(1, 4, 3, 1))
+    coords = {"robot": ["r1"], "row": range(4), "col": range(3), "feature": ["visibility"]}
+    return xr.DataArray(values, coords, tuple(coords))
+
+
+def test_rows_and_columns_are_put_in_order_by_number():
+    made = labelled_map()
+    right = Workspace.from_awareness(made).awareness
+    turned = made.isel(row=[3, 1, 0, 2], col=[2, 0, 1])
+    np.testing.assert_array_equal(Workspace.from_awareness(turned).awareness, right)
+    with pytest.raises(TrustboError, match="row"):
+        Workspace.from_awareness(made.assign_coords(row=[400.0, 300.0, 200.0, 100.0]))
+
+
+def test_passable_is_read_by_its_labels():
+    free = np.ones((4, 3), bool)
+    free[0, 2] = False
+    labelled = xr.DataArray(free, {"row": range(4), "col": range(3)}, ("row", "col"))
+    for given in (labelled.isel(row=[3, 2, 1, 0]), labelled.T, pd.DataFrame(free)):
+        found = Workspace.from_awareness(labelled_map(), given).passable
+        np.testing.assert_array_equal(found, free)
+    for other in (np.full((4, 3), np.nan), np.full((4, 3), 0.5), np.full((4, 3), "no")):
+        with pytest.raises(TrustboError, match="passable"):
+            Workspace.from_awareness(labelled_map(), other)
+
+
+def test_filling_a_mission_looks_up_only_the_cells_that_were_driven():
+    free = np.ones((4, 3), bool)
+    free[1, 2] = False
+    workspace = Workspace.from_awareness(labelled_map(), free)
+    path, unknown = [(3, 0), (2, 1), (1, 2), (0, 2)], np.full((1, 1, 1), np.nan)
+    mission = Mission.from_arrays(
+        path, unknown, [[0.7]], status="stuck", features=workspace.features
+    )
+    filled = workspace.fill(mission).awareness
+    np.testing.assert_array_equal(filled, workspace.along(path[:2]))

@@ -61,7 +61,8 @@ class HumanTrust(PooledTrust):
             object.__setattr__(self, "priors", _default_priors())
         super().__post_init__()
         for name in SDS:
-            require_positive(f"HumanTrust.{name}", getattr(self, name))
+            number = require_positive(f"HumanTrust.{name}", getattr(self, name))
+            object.__setattr__(self, name, number)
         if self.effects or self.shared_noise:
             raise TrustboError(
                 f"HumanTrust allows neither effects nor shared_noise; got effects={self.effects!r}."

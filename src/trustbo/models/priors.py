@@ -11,7 +11,7 @@ from numpyro.distributions import Distribution, constraints
 
 from trustbo.data import is_line_of_sight
 from trustbo.display import Rows, Summary
-from trustbo.errors import TrustboError, require_positive
+from trustbo.errors import TrustboError, require_finite, require_positive
 from trustbo.models.backend import own_settings
 from trustbo.models.families import FAMILIES
 from trustbo.models.scores import log_density
@@ -74,10 +74,13 @@ class Priors(Summary):
             prior = getattr(self, name)
             if wanted := _wanted(name, prior):
                 raise TrustboError(f"the prior Priors.{name} must be {wanted}; got {prior!r}.")
-        require_positive("Priors.concentration", self.concentration)
-        require_positive("Priors.x0_sd", self.x0_sd, or_zero=True)
-        if not np.isfinite(self.x0_mean):
-            raise TrustboError(f"Priors.x0_mean must be finite; got {self.x0_mean!r}.")
+        numbers = {
+            "concentration": require_positive("Priors.concentration", self.concentration),
+            "x0_mean": require_finite("Priors.x0_mean", self.x0_mean),
+            "x0_sd": require_positive("Priors.x0_sd", self.x0_sd, or_zero=True),
+        }
+        for name, number in numbers.items():
+            object.__setattr__(self, name, number)
 
     @classmethod
     @cache

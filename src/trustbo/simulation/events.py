@@ -12,7 +12,13 @@ import numpy as np
 from scipy.signal import lfilter
 from scipy.special import ndtr
 
-from trustbo.errors import TrustboError, require_choice, require_positive, require_whole
+from trustbo.errors import (
+    TrustboError,
+    require_choice,
+    require_finite,
+    require_positive,
+    require_whole,
+)
 from trustbo.simulation.world import World
 from trustbo.workspace.surface import Surface
 
@@ -34,7 +40,7 @@ class Event:
 
     def __post_init__(self) -> None:
         for name in self.SHARES:
-            if not 0.0 <= getattr(self, name) <= 1.0:
+            if not 0.0 <= require_finite(name, getattr(self, name)) <= 1.0:
                 raise TrustboError(f"{name} must be in [0, 1]; got {getattr(self, name)!r}.")
         require_whole("first", self.first, 0)
         if self.last is not None:

@@ -60,9 +60,10 @@ class Effect:
             EFFECTS[cls.__name__] = cls
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
+        for name, value in list(vars(self).items()):
             if name in self.names:
-                require_positive(f"{type(self).__name__}.{name}", value)
+                number = require_positive(f"{type(self).__name__}.{name}", value)
+                object.__setattr__(self, name, number)
 
     def columns(self, slots: Slots) -> Any:
         """Return a sparse matrix (slot, column), with flattened slots (mission, bound, robot)."""

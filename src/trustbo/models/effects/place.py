@@ -49,7 +49,8 @@ class PlaceEffect(Effect):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_positive("PlaceEffect.length_scale_sd", self.length_scale_sd)
+        sd = require_positive("PlaceEffect.length_scale_sd", self.length_scale_sd)
+        object.__setattr__(self, "length_scale_sd", sd)
 
     def hyperpriors(self) -> dict[str, dist.Distribution]:
         """See `Effect.hyperpriors`."""
