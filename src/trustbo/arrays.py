@@ -229,7 +229,7 @@ def _axes_of(
         )
     if isinstance(table, pd.Series):
         texts = {str(label) for label in table.index}
-        usual = table.index.name if table.index.name in dims else dims[0]
+        usual = str(table.index.name) if table.index.name in dims else dims[0]
         named = (dim for dim in dims if texts == set(names.get(dim) or ()))
         return {next(named, usual): table.index}
     if len(dims) < 2 or (len(dims) > 2 and not partial):

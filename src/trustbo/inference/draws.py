@@ -60,16 +60,18 @@ def sites_of(posterior: xr.DataTree) -> dict[str, np.ndarray]:
     model = with_default_priors(json.loads(posterior.attrs["model_record"]))
     axes = model.dims | model.effect_dims
     sites = {}
-    for name, array in posterior["posterior"].to_dataset().items():
+    draws = posterior["posterior"].to_dataset()
+    for name in map(str, draws):
         if name not in axes:
             continue
+        array = draws[name]
         dims = ("chain", "draw", *axes[name])
         if set(array.dims) != set(dims):
             raise TrustboError(
                 f"{name!r} of the posterior must have the dims {dims}; got {array.dims}. Give a "
                 "posterior from trustbo.fit with all its dims."
             )
-        sites[str(name)] = joined_draws(array, axes[name])
+        sites[name] = joined_draws(array, axes[name])
     for name, values in sites.items():
         bad = np.isnan(values.reshape(len(values), -1)).any(1).sum()
         if bad:
@@ -236,6 +238,7 @@ def read_posterior(
     missions = missions_of(posterior) if missions is None else list(missions)
     require_same_team(missions)
     features = missions[0].features
+    posterior = in_order_of(posterior, missions[0].robots, features)
     if model is None:
         model = model_from_record(json.loads(posterior.attrs["model_record"]), features=features)
     model = model.for_features(features)
