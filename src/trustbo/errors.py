@@ -83,6 +83,23 @@ def _number(value: Any) -> float:
         return math.nan
 
 
+def require_finite(what: str, value: Any) -> float:
+    """Return `value` as a float; raises TrustboError unless it is a finite number."""
+    number = _number(value)
+    if not math.isfinite(number):
+        raise TrustboError(f"{what} must be a finite number; got {one_line(value)}.")
+    return number
+
+
+def require_position(what: str, value: Any) -> tuple[float, float]:
+    """Return a position x and y as floats; raises TrustboError unless both are finite."""
+    try:
+        x, y = value
+    except (TypeError, ValueError):
+        raise TrustboError(f"{what} must be two numbers, x and y; got {one_line(value)}.") from None
+    return require_finite(f"x of {what}", x), require_finite(f"y of {what}", y)
+
+
 def require_kind(what: str, value: Any, kind: Any, remedy: str) -> Any:
     """Return `value` if it is an instance of `kind`; otherwise raise a TrustboError."""
     if not isinstance(value, kind):

@@ -75,6 +75,8 @@ def test_all_formats_are_written_to_a_folder(result, tmp_path):
     assert all(file.exists() for file in written)
     with pytest.raises(TrustboError, match="format"):
         export_result(result, tmp_path, ["kmz"])
+    with pytest.raises(TrustboError, match="list"):
+        export_result(result, tmp_path, "geotiff")
 
 
 def test_a_file_has_the_suffix_of_its_format(maps, tmp_path):

@@ -98,7 +98,40 @@ def test_edges_cost_their_failures_after_the_first_one(tmp_path):
     assert edge["cost"] > max(one["cost"] for one in found if one is not edge)
 
 
-@pytest.mark.parametrize("name", ["/tb3_0", "../r1", "lead"])
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"origin": (np.nan, 0.0)}, {"origin": "xy"}, {"origin": (1.0, 2.0, 3.0)}, {"origin": 1.0},
+        {"rotation": 90.0}, {"rotation": np.inf}, {"rotation": None}, {"name": ""}, {"name": None},
+    ],
+)  # fmt: skip
+def test_frames_that_no_robot_has_are_refused(wrong):
+    with pytest.raises(TrustboError, match=next(iter(wrong))):
+        Frame(**{"origin": (0.0, 0.0)} | wrong)
+
+
+def test_frames_of_numpy_numbers_are_written_as_those_of_floats(result, tmp_path):
+    x, y = result.workspace.grid.center((0, 0))
+    numbers = np.array([x, y]), np.float32(0.5)
+    write_nav2(tmp_path / "numpy", result, frame=Frame(*numbers))
+    write_nav2(tmp_path / "floats", result, frame=Frame((x, y), 0.5))
+    for file in (tmp_path / "floats").iterdir():
+        assert (tmp_path / "numpy" / file.name).read_bytes() == file.read_bytes()
+    whole = Frame((np.int64(round(x)), round(y)))
+    assert all(type(value) is float for value in (*whole.origin, whole.rotation))
+
+
+def test_frames_off_the_map_and_other_objects_are_refused_before_any_file(result, tmp_path):
+    x, y = result.workspace.grid.center((0, 0))
+    for frame in (Frame((-88.5, 47.2)), Frame((y, x)), (x, y), 0):
+        with pytest.raises(TrustboError, match="frame"):
+            write_nav2(tmp_path, result, frame=frame)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "name", ["/tb3_0", "../r1", "lead", "Lead", "-rf", " ", "r1 ", "r1.", "con", "CON.txt", "R2"]
+)
 def test_names_of_robots_that_are_no_names_of_files_are_refused(name, result, tmp_path):
     other = copy.copy(result)
     team = dataclasses.replace(

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from trustbo.campaign.result import Result
-from trustbo.errors import require_choice
+from trustbo.errors import TrustboError, require_choice
 from trustbo.export.gis import write_csv, write_geojson, write_geotiff
 from trustbo.export.nav2 import Frame, write_nav2
 from trustbo.files import FilePath
@@ -23,13 +23,18 @@ def export_result(
 ) -> list[Path]:
     """Write a result to a folder in several formats, and return the paths written.
 
-    The formats are geotiff, geojson, csv and nav2.
+    The formats are geotiff, geojson, csv and nav2. Raises TrustboError if a format is unknown, or a
+    file cannot be written.
     """
+    if isinstance(formats, str):  # a sequence of letters
+        raise TrustboError(f"formats must be a list of names; got {formats!r}: give [{formats!r}].")
+    names = [require_choice("format", name, WRITERS) for name in formats]
     written = []
-    for name in [require_choice("format", name, WRITERS) for name in formats]:
+    for name in names:
         file, write = WRITERS[name]
-        write(Path(folder) / file, result)
-        written.append(Path(folder) / file)
+        target = Path(folder).expanduser() / file
+        write(target, result)
+        written.append(target)
     return written
 
 

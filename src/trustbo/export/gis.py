@@ -18,6 +18,7 @@ from trustbo.files import FilePath, write_file, write_text
 from trustbo.logs.table import to_frame
 from trustbo.planning import Plan
 from trustbo.planning.plan import QUANTILES
+from trustbo.terrain.place import quiet_affine
 
 LEAD = "lead"
 """Name of the lead in exported files."""
@@ -40,10 +41,12 @@ def write_geotiff(path: FilePath, maps: Result | xr.Dataset) -> None:
     target = require_suffix(path, ".tif", ".tiff")
     if maps.rio.crs is None:
         raise TrustboError(_NO_CRS)
+    with quiet_affine():
+        place = maps.rio.transform()
     profile = {
         "driver": "GTiff", "interleave": "band", "height": maps.sizes["y"],
         "width": maps.sizes["x"], "count": len(maps.data_vars), "dtype": "float32",
-        "nodata": np.nan, "crs": maps.rio.crs, "transform": maps.rio.transform(),
+        "nodata": np.nan, "crs": maps.rio.crs, "transform": place,
         "compress": "deflate",
     }  # fmt: skip
 

@@ -8,16 +8,25 @@ CRS. YAML files are written as JSON, which is valid YAML.
 import json
 import math
 import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from trustbo.campaign.result import Result
-from trustbo.errors import TrustboError, require_choice, require_positive
+from trustbo.errors import (
+    TrustboError,
+    require_choice,
+    require_finite,
+    require_kind,
+    require_position,
+    require_positive,
+)
 from trustbo.export.gis import LEAD, require_suffix
-from trustbo.files import FilePath, write_file, write_text
+from trustbo.files import FilePath, write_file
 from trustbo.planning import Plan
 from trustbo.planning.problem import mean_of
 from trustbo.workspace import Workspace
@@ -30,9 +39,14 @@ _MAX_ID = 65_535
 """Largest id in Nav2 messages (uint16)."""
 _MIN_COST = 1e-9
 """Minimum cost of an edge, since the route server rejects 0."""
+_FARTHEST = 10_000.0
+"""Largest distance of a frame's origin from the map, in metres; float32 then resolves 1 mm."""
+_DEVICES = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
+"""Names that Windows reserves, with any suffix."""
 
 
-class Frame(NamedTuple):
+@dataclass(frozen=True)
+class Frame:
     """Coordinate frame of the robots, defined by the pose of its origin in the CRS.
 
     Attributes:
@@ -40,11 +54,30 @@ class Frame(NamedTuple):
         rotation: Angle from the x axis of the CRS (east) to the x axis of the frame, in rad,
             counterclockwise.
         name: Name of the frame, used as the `frame_id` of messages.
+
+    Raises:
+        TrustboError: The origin is not two finite numbers, the rotation is beyond a full turn, or
+            the name is empty.
     """
 
     origin: tuple[float, float]
     rotation: float = 0.0
     name: str = "map"
+
+    def __post_init__(self) -> None:
+        # Numbers of NumPy, as from an array, become floats, because JSON knows no others.
+        origin = require_position("the frame's origin", self.origin)
+        rotation = require_finite("the frame's rotation", self.rotation)
+        if abs(rotation) > 2.0 * math.pi:
+            raise TrustboError(
+                f"the frame's rotation must be in radians, within 2 pi; got {rotation:g} (degrees? "
+                "use numpy.deg2rad)."
+            )
+        remedy = "give the frame_id, such as 'map'"
+        if not require_kind("the frame's name", self.name, str, remedy).strip():
+            raise TrustboError(f"the frame's name is empty; {remedy}.")
+        object.__setattr__(self, "origin", origin)
+        object.__setattr__(self, "rotation", rotation)
 
     def of_crs(self, xy: Any) -> np.ndarray:
         """Convert positions (..., 2) from CRS metres to this frame, in metres."""
@@ -70,29 +103,55 @@ def write_nav2(
         pixel: Side length of a map pixel, in metres; by default a tenth of a cell's shorter side.
 
     Raises:
-        TrustboError: A robot has no route in a bound, the grid has too many cells for Nav2's ids,
-            the map has too many pixels, or a file cannot be written.
+        TrustboError: The frame is not a `Frame` or its origin is far off the map, a robot's name
+            cannot be part of a file name, a robot has no route in a bound, the grid has too many
+            cells for Nav2's ids, the map has too many pixels, or a file cannot be written.
     """
-    folder, workspace = Path(folder), result.workspace
-    place = frame or Frame(workspace.grid.center(result.path[0]))
+    folder = Path(folder).expanduser()
+    workspace = result.workspace
+    place = Frame(workspace.grid.center(result.path[0])) if frame is None else frame
     names = () if result.plan.stops is None else (LEAD, *workspace.team.names)
-    for name in names[1:]:
-        if not re.fullmatch(r"[\w -][\w .-]*", name) or name == LEAD:
-            raise TrustboError(
-                f"the robot's name {name!r} cannot be part of a file name, or is that of the lead; "
-                "use letters, digits, '_' and '-'."
-            )
-    stops = {robot: stops_of(result.plan, robot, place) for robot in names}
-    graph = _graph(result, place)
-    write_ros_map(folder / "cost_map.yaml", result.maps()["cost"], workspace, frame=place,
-                  pixel=pixel)  # fmt: skip
-    for robot, poses in stops.items():
-        listed = [_pose(place.name, *pose) for pose in poses.tolist()]
-        write_text(folder / f"waypoints_{robot}.yaml", json.dumps({"poses": listed}, indent=1))
-    write_text(folder / "route_graph.geojson", graph)
+    _require_file_names(names[1:])
+
+    # Everything is made before the first file is written, so that no half of the files is left.
+    files = _ros_map(folder / "cost_map.yaml", result.maps()["cost"], workspace, place, pixel)
+    for robot in names:
+        poses = stops_of(result.plan, robot, place).tolist()
+        listed = [_pose(place.name, *pose) for pose in poses]
+        files[folder / f"waypoints_{robot}.yaml"] = json.dumps({"poses": listed}, indent=1).encode()
+    files[folder / "route_graph.geojson"] = _graph(result, place).encode()
     parent = "grid" if workspace.grid.crs is None else workspace.grid.crs_name
-    about = {"frame": place.name, "parent": parent, "origin": [*place.origin]}
-    write_text(folder / "frame.yaml", json.dumps(about | {"rotation": place.rotation}))
+    about = {
+        "frame": place.name,
+        "parent": parent,
+        "origin": [*place.origin],
+        "rotation": place.rotation,
+    }
+    files[folder / "frame.yaml"] = json.dumps(about).encode()
+    _write(files)
+
+
+def _require_file_names(robots: Sequence[str]) -> None:
+    """Check that robots' names can be parts of file names, on Windows too, and differ there."""
+    seen = {LEAD: LEAD}
+    for name in robots:
+        if not re.fullmatch(r"\w([\w .-]*[\w-])?", name) or _DEVICES.fullmatch(name):
+            raise TrustboError(
+                f"the robot's name {name!r} cannot be part of a file name; use letters, digits, "
+                "'_' and '-', and begin with a letter or a digit."
+            )
+        other = seen.setdefault(name.casefold(), name)
+        if other != name or name == LEAD:
+            raise TrustboError(
+                f"the files of the robots {other!r} and {name!r} would have one name; rename a "
+                "robot."
+            )
+
+
+def _write(files: Mapping[Path, bytes]) -> None:
+    """Write the contents of files, in order."""
+    for path, content in files.items():
+        write_file(path, lambda file, content=content: file.write_bytes(content))
 
 
 def write_ros_map(
@@ -114,17 +173,23 @@ def write_ros_map(
         pixel: Side length of a pixel, in metres; by default a tenth of a cell's shorter side.
 
     Raises:
-        TrustboError: A cost is outside [0, 1], or the map has too many pixels.
+        TrustboError: A cost is outside [0, 1], the frame is not a `Frame` or its origin is far off
+            the map, the map has too many pixels, or a file cannot be written.
     """
-    target = require_suffix(path, ".yaml", ".yml")
+    _write(_ros_map(require_suffix(path, ".yaml", ".yml"), cost, workspace, frame, pixel))
+
+
+def _ros_map(
+    target: Path, cost: xr.DataArray, workspace: Workspace, frame: Frame, pixel: float | None
+) -> dict[Path, bytes]:
+    """Return the files of `write_ros_map` and their contents."""
     values, corner, side = occupancy(cost.values, workspace, frame, pixel)
     picture = target.with_suffix(".pgm")
     # The first row of an image is in the north. In raw mode, map_server reads bytes as costs.
     pixels = f"P5\n{values.shape[1]} {values.shape[0]}\n255\n".encode() + values[::-1].tobytes()
-    write_file(picture, lambda file: file.write_bytes(pixels))
     about = {"image": picture.name, "mode": "raw", "resolution": side, "origin": [*corner, 0.0],
              "negate": 0, "occupied_thresh": 0.65, "free_thresh": 0.196}  # fmt: skip
-    write_text(target, json.dumps(about))
+    return {picture: pixels, target: json.dumps(about).encode()}
 
 
 def occupancy(
@@ -136,6 +201,7 @@ def occupancy(
             f"cost must be in [0, 1]; got values from {np.nanmin(cost):g} to {np.nanmax(cost):g}."
         )
     grid, (rows, cols) = workspace.grid, workspace.grid.shape
+    _require_near(frame, grid.bounds)
     shorter = min(grid.cell_height, grid.cell_width)
     side = float(f"{shorter / 10.0:.2g}") if pixel is None else require_positive("pixel", pixel)
     left, bottom, right, top = grid.bounds
@@ -156,6 +222,20 @@ def occupancy(
         inside = (row >= 0) & (row < rows) & (col >= 0) & (col < cols)
         values[i, inside] = percent[row[inside], col[inside]]
     return values, corner.tolist(), side
+
+
+def _require_near(frame: Frame, bounds: tuple[float, float, float, float]) -> None:
+    """Check that a frame's origin is near the map with these edges: left, bottom, right, top."""
+    require_kind("frame", frame, Frame, "give an export.Frame, such as Frame((x, y), rotation)")
+    x, y = frame.origin
+    left, bottom, right, top = bounds
+    away = math.hypot(max(left - x, 0.0, x - right), max(bottom - y, 0.0, y - top))
+    if away > _FARTHEST:
+        raise TrustboError(
+            f"the frame's origin ({x:.10g}, {y:.10g}) is {away / 1000.0:.4g} km off the map, which "
+            f"covers x {left:.10g} to {right:.10g} and y {bottom:.10g} to {top:.10g}; give it in "
+            "metres of the map's CRS, not in degrees."
+        )
 
 
 def stops_of(plan: Plan, robot: str, frame: Frame) -> np.ndarray:
