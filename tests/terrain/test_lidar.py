@@ -168,6 +168,11 @@ def test_points_that_make_no_terrain_are_refused(tmp_path):
         read_lidar(tmp_path / "nowhere.las", 0.0)
 
 
+def test_lists_of_tiles_are_refused(tmp_path):
+    with pytest.raises(TrustboError, match="tiles"):
+        read_lidar([tmp_path / "1.laz", tmp_path / "2.laz"])
+
+
 def test_laspy_is_named_where_it_is_missing(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "laspy", None)
     with pytest.raises(TrustboError, match="laspy"):

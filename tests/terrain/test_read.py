@@ -3,6 +3,8 @@
 `benchmarks/field/` has the faults of rasters from public bug reports, one script each.
 """
 
+import warnings
+
 import numpy as np
 import pyproj
 import pytest
@@ -429,6 +431,104 @@ def test_what_is_no_raster_of_heights_is_refused(tmp_path, tif):
     for wrong in (both["dem"], both.drop_vars("dsm"), both.drop_vars("spatial_ref")):
         with pytest.raises(TrustboError):
             require_terrain(wrong)
+
+
+def test_half_of_a_mosaic_at_zero_is_warned_of_and_level_ground_is_not():
+    mosaic = plane(dtype=float)
+    mosaic[:, 4:] = 0.0
+    with pytest.warns(UserWarning, match=r"60\.0%"):
+        read_terrain(array(mosaic), array(mosaic))
+    hill = np.zeros((8, 10))
+    hill[3:5, 4:6] = [[2.0, 30.0], [5.0, 12.0]]
+    for level in (np.zeros((8, 10)), hill):
+        read_terrain(array(level), array(level))
+
+
+def test_ground_that_the_surface_does_not_cover_is_warned_of():
+    surface = plane(dtype=float) + 2.0
+    surface[:, 5:] = np.nan
+    with pytest.warns(UserWarning, match=r"50\.0%"):
+        terrain = read_terrain(array(plane()), array(surface))
+    require_terrain(terrain)  # without another warning
+    read_terrain(array(surface), array(plane() + 5.0))  # a surface that covers more
+
+
+def test_a_coarse_surface_below_the_ground_is_told_from_another_datum():
+    rough = plane(shape=(40, 40)) + 5.0 * np.random.default_rng(0).random((40, 40))
+    coarse = array(plane(shape=(10, 10)), step=4.0, left=500_002.0, top=4_999_998.0)
+    with pytest.warns(UserWarning, match="4 m") as said:
+        read_terrain(array(rough), coarse)
+    assert not any("datum" in str(w.message) for w in said)
+
+
+@pytest.mark.filterwarnings("ignore:It is recommended to use 'rio.write_crs")
+def test_what_rioxarray_s_accessor_holds_is_used():
+    tagged = array(plane(-1.0), crs=None)
+    tagged.rio.set_nodata(-1.0, inplace=True)
+    tagged.rio.set_crs(UTM, inplace=True)
+    assert_is_the_plane(read_terrain(tagged, tagged))
+
+
+def test_fill_values_that_are_no_numbers_are_refused(tif):
+    with pytest.raises(TrustboError, match="nodata"):
+        read_terrain(tif, tif, nodata="none")
+    with pytest.raises(TrustboError, match="missing_value"):
+        read_terrain(array(plane()).assign_attrs(missing_value="none"))
+
+
+def test_the_given_crs_is_that_of_the_raster_without_one(tif):
+    latlon = array(plane(shape=(60, 60)), "EPSG:4326", 1e-5, 15.0, 45.0)
+    bare = read_terrain(latlon, latlon)["dsm"].drop_vars("spatial_ref")
+    bare = xr.DataArray(bare.values, {axis: bare[axis].values for axis in ("y", "x")}, ("y", "x"))
+    terrain = read_terrain(latlon, bare, crs=UTM)
+    np.testing.assert_allclose(terrain["dsm"], terrain["dem"], atol=0.01)
+
+
+def test_errors_of_gdal_name_the_file_that_is_missing(tmp_path):
+    place = '<GeoTransform>500000,1,0,5200000,0,-1</GeoTransform><VRTRasterBand dataType="Float32">'
+    source = '<SimpleSource><SourceFilename relativeToVRT="1">tile_7.tif</SourceFilename>'
+    vrt = tmp_path / "mosaic.vrt"
+    vrt.write_text(
+        f'<VRTDataset rasterXSize="8" rasterYSize="8"><SRS>{UTM}</SRS>{place}{source}'
+        "</SimpleSource></VRTRasterBand></VRTDataset>"
+    )
+    with pytest.raises(TrustboError, match="tile_7"):
+        read_terrain(vrt)
+    tile = write(tmp_path / "tile.tif", np.random.default_rng(0).random((300, 300)))
+    tile.write_bytes(tile.read_bytes()[:200_000])
+    with (
+        rioxarray.open_rasterio(tile) as lazy,
+        pytest.raises(TrustboError, match="scanline"),
+    ):
+        read_terrain(lazy)
+
+
+def test_tiles_in_a_list_or_a_folder_are_refused_with_the_remedy(tmp_path, tif):
+    for tiles in ([tif, tif], tmp_path):
+        with pytest.raises(TrustboError, match="gdalbuildvrt"):
+            read_terrain(tiles)
+
+
+def test_a_path_in_the_home_folder_is_expanded(tif, monkeypatch):
+    monkeypatch.setenv("HOME", str(tif.parent))
+    assert_is_the_plane(read_terrain("~/tif.tif", "~/tif.tif"))
+
+
+def test_a_terrain_saved_and_opened_by_xarray_keeps_its_crs(tmp_path, tif):
+    terrain = read_terrain(tif, tif)
+    terrain.to_netcdf(tmp_path / "terrain.nc")
+    with xr.open_dataset(tmp_path / "terrain.nc") as opened:
+        assert require_terrain(opened).rio.crs.to_epsg() == 32633
+        with pytest.raises(TrustboError, match="decode_coords"):
+            require_terrain(opened.drop_vars("spatial_ref"))
+
+
+def test_terrain_is_read_when_warnings_are_errors(tif):
+    degrees = array(plane(shape=(60, 60)), "EPSG:4326", 1e-5, 15.0, 45.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        read_terrain(degrees, degrees)
+        read_terrain(tif, array(plane() + 15.0, step=2.0, left=500_001.0, top=4_999_999.0))
 
 
 def test_resolution_averages_whole_numbers_of_pixels(tmp_path, monkeypatch):

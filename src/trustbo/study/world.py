@@ -19,6 +19,7 @@ from trustbo.simulation.events import Event
 from trustbo.study.grid import Scene
 from trustbo.team import Team
 from trustbo.terrain.examples import EXAMPLE_FILES
+from trustbo.terrain.place import quiet_affine
 from trustbo.workspace import Workspace
 from trustbo.workspace.sight import Sight
 
@@ -154,7 +155,8 @@ class World:
 
     def _events(self, terrain: xr.Dataset) -> list[Event]:
         """Return the events with their centres in CRS metres."""
-        left, bottom, right, top = terrain.rio.bounds(recalc=True)
+        with quiet_affine():
+            left, bottom, right, top = terrain.rio.bounds(recalc=True)
         corner, size = np.array([left, bottom]), np.array([right - left, top - bottom])
         placed = []
         for event in self.events:

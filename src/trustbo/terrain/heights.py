@@ -2,17 +2,23 @@
 
 import re
 import warnings
+from collections.abc import Mapping
+from numbers import Real
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
 
-from trustbo.errors import TrustboError
+from trustbo.errors import TrustboError, require_kind
 
 LOWEST, HIGHEST = -450.0, 9000.0
 """Range of heights on land, m: the Dead Sea's shore is at -430 m, Everest's summit at 8849 m."""
 _FILLS = (-99999.0, -32768.0, -32767.0, -9999.0)  # also suspicious before scaling
-_FILL_NAMES = ("_FillValue", "missing_value", "fill_value", "nodata")
+ACCESSOR_FILL = "rio.nodata"
+"""Attribute that carries the fill value of rioxarray's accessor, which most operations drop."""
+_FILL_NAMES = ("_FillValue", "missing_value", "fill_value", "nodata", ACCESSOR_FILL)
+_LOW = 10.0  # m; heights on one level with zeros
 _METRE = {"m", "metre", "metres", "meter", "meters"}
 _FOOT = {"ft", "foot", "feet", "ftus", "usft"}
 _US = {"us", "survey", "ftus", "usft"}
@@ -46,10 +52,9 @@ def in_metres(stored: xr.DataArray, axis: float | None, nodata: float | None) ->
         warn(f"{name} has heights in units of {abs(metres):.6g} m; they are converted to metres.")
     values = raw.astype(float)
     missing = ~np.isfinite(values)
-    for tag in (nodata, *(attrs.get(key) for key in _FILL_NAMES)):
-        for fill in np.ravel(np.array(tag, float)).tolist():  # NaN if there is no such tag
-            with np.errstate(over="ignore"):
-                missing |= raw == fill  # rounded to the raster's type: float32 has no -3.4e38
+    for fill in _fills(name, attrs, nodata):
+        with np.errstate(over="ignore"):
+            missing |= raw == fill  # rounded to the raster's type: float32 has no -3.4e38
     scale, offset = attrs.get("scale_factor", 1.0), attrs.get("add_offset", 0.0)
     suspicious = np.isin(values, _FILLS if scale != 1.0 else (*_FILLS, -999.0))
     heights = metres * (scale * values + offset)
@@ -76,14 +81,36 @@ def in_metres(stored: xr.DataArray, axis: float | None, nodata: float | None) ->
     )
 
 
+def _fills(name: str, attrs: Mapping[str, Any], nodata: float | None) -> list[float]:
+    """Return the fill values of the attributes, and `nodata`; NaN for each that is not given."""
+    if nodata is not None:
+        require_kind("nodata", nodata, Real, "give the number that marks missing data, or None")
+    fills = [np.nan if nodata is None else float(nodata)]
+    for key in _FILL_NAMES:
+        try:
+            fills += np.ravel(np.array(attrs.get(key), float)).tolist()  # None becomes NaN
+        except (TypeError, ValueError):
+            raise TrustboError(
+                f"{name} declares the fill value {key} = {attrs[key]!r}, which is not a number; "
+                "correct the attribute."
+            ) from None
+    return fills
+
+
 def _warn_of_zeros(heights: np.ndarray, name: str) -> None:
-    """Warn of pixels at exactly 0 m that are far from all other heights (missing values?)."""
-    zero, low = heights == 0.0, np.abs(heights) <= 10.0
-    others = np.isfinite(heights).sum() - zero.sum()
-    if zero.any() and low.sum() < 1.1 * zero.sum() < 1.1 * others:  # else the ground is level
+    """Warn of pixels at exactly 0 m that are far from all other heights (missing values?).
+
+    Ground may be level, so if most pixels are zero, all others must be far away.
+    """
+    n_zero = int((heights == 0.0).sum())
+    n_low = int((np.abs(heights) <= _LOW).sum()) - n_zero
+    n_high = int(np.isfinite(heights).sum()) - n_zero - n_low
+    few_are_low = n_low < 0.1 * n_zero if n_zero < n_low + n_high else n_low == 0
+    if n_zero and n_high and few_are_low:
         warn(
-            f"{name} is exactly 0 m on {zero.mean():.1%} of its pixels, but hardly any other "
-            "height is below 10 m: zeros may be missing heights; pass nodata=0 if they are."
+            f"{name} is exactly 0 m on {n_zero / heights.size:.1%} of its pixels, but hardly any "
+            f"other height is below {_LOW:g} m: zeros may be missing heights; pass nodata=0 if "
+            "they are."
         )
 
 

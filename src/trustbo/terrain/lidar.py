@@ -1,6 +1,7 @@
 """DEM and DSM on one grid from classified lidar points."""
 
-from os import fspath
+from os import PathLike
+from os.path import expanduser
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from scipy.interpolate import LinearNDInterpolator
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import QhullError
 
-from trustbo.errors import TrustboError, require_positive
+from trustbo.errors import TrustboError, require_kind, require_positive
 from trustbo.files import FilePath
 from trustbo.terrain.heights import HIGHEST, LOWEST
 from trustbo.terrain.place import require_map
@@ -41,7 +42,9 @@ def read_lidar(points: FilePath, resolution: float = 1.0, *, crs: object = None)
             are no ground points; heights are impossible; or no pixel has both heights.
     """
     step = require_positive("resolution", resolution)
-    xyz, is_ground, own = _read_points(fspath(points), crs)
+    remedy = "give the path of one file; merge tiles first, e.g. with pdal merge"
+    path = expanduser(require_kind("points", points, str | PathLike, remedy))
+    xyz, is_ground, own = _read_points(path, crs)
     # Pixels are counted from the upper left; points on an edge are in the pixel south or east.
     place = np.array([[1.0, -1.0]]) * xyz[:, :2] / step
     corner = np.floor(place.min(0) + 1e-6)
@@ -66,7 +69,9 @@ def read_lidar(points: FilePath, resolution: float = 1.0, *, crs: object = None)
     nearest: Any = distance_transform_edt(np.isnan(canopy), step, return_indices=True)
     canopy = np.where(nearest[0] <= MAX_GAP, canopy[tuple(nearest[1])], np.nan)
     x, y = (corner[0] + centres[0, :, 0]) * step, -(corner[1] + centres[:, 0, 1]) * step
-    maps = (xr.DataArray(z, {"y": y, "x": x}, ("y", "x")) for z in (dem, dem + canopy))
+    surface = dem + canopy
+    ground = np.where(np.isfinite(surface), dem, np.nan)
+    maps = (xr.DataArray(z, {"y": y, "x": x}, ("y", "x")) for z in (ground, surface))
     return read_terrain(*(z.rio.write_crs(own) for z in maps))
 
 

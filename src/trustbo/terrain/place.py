@@ -1,5 +1,8 @@
 """Georeferencing: CRS of rasters, and warping to metric maps with north at the top."""
 
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -13,6 +16,17 @@ from rasterio.warp import transform
 from trustbo.errors import TrustboError
 
 _NORTH = 22.5  # degrees; half the angle between two neighbouring moves
+
+
+@contextmanager
+def quiet_affine() -> Iterator[None]:
+    """Ignore affine's PendingDeprecationWarning of products that rioxarray computes.
+
+    Users may turn warnings into errors (`python -W error`), but cannot change these products.
+    """
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Use `@` matmul", PendingDeprecationWarning)
+        yield
 
 
 def require_map(name: str, own: Any, given: Any) -> CRS:
@@ -107,12 +121,14 @@ def on_metric_grid(heights: xr.DataArray) -> xr.DataArray:
     zone = f"EPSG:{(32600 if lat >= 0.0 else 32700) + int((lon + 180.0) // 6.0) % 60 + 1}"
     if not -80.0 <= lat <= 84.0:  # no UTM zone
         zone = f"+proj=tmerc {at}"
-    return heights.rio.reproject(zone, resampling=Resampling.bilinear, nodata=np.nan)
+    with quiet_affine():
+        return heights.rio.reproject(zone, resampling=Resampling.bilinear, nodata=np.nan)
 
 
 def same_grid(a: xr.DataArray, b: xr.DataArray) -> bool:
     """Return whether the pixels of two rasters coincide within a thousandth of a pixel."""
     if a.shape != b.shape or a.rio.crs != b.rio.crs:
         return False
-    pixel = min(abs(side) for side in a.rio.resolution())
-    return np.allclose(a.rio.bounds(), b.rio.bounds(), rtol=0.0, atol=1e-3 * pixel)
+    with quiet_affine():
+        pixel = min(abs(side) for side in a.rio.resolution())
+        return np.allclose(a.rio.bounds(), b.rio.bounds(), rtol=0.0, atol=1e-3 * pixel)

@@ -6,7 +6,8 @@ NaN where missing, on a metric grid with north at the top.
 
 import math
 import warnings
-from os import PathLike, fspath
+from os import PathLike
+from os.path import expanduser, isdir
 from typing import Any
 
 import numpy as np
@@ -20,11 +21,12 @@ from rioxarray.exceptions import MissingSpatialDimensionError
 
 from trustbo.errors import TrustboError, require_kind, require_positive
 from trustbo.files import FilePath
-from trustbo.terrain.heights import in_metres, warn
+from trustbo.terrain.heights import ACCESSOR_FILL, in_metres, warn
 from trustbo.terrain.place import (
     horizontal,
     on_metric_grid,
     placed,
+    quiet_affine,
     require_map,
     same_grid,
     vertical_axis,
@@ -32,6 +34,10 @@ from trustbo.terrain.place import (
 
 _MOST_PIXELS = 1e8  # per raster: about 3 GB while it is read
 _CLIPPED = 0.02  # fraction of pixels with the surface below the ground that causes a warning
+_UNCOVERED = 0.02  # fraction of the DEM without a surface that causes a warning
+_COARSER = 2.0  # ratio of pixel sizes from which the coarser raster smooths the heights
+_DEGREE = 111_320.0  # m: length of a degree of latitude
+_TILES = "to read tiles as one raster, combine them: gdalbuildvrt -srcnodata -9999 all.vrt *.tif"
 _TALL, _RAISED = 60.0, 20.0  # m: higher medians and 5 % quantiles of canopy height are unlikely
 
 
@@ -75,11 +81,17 @@ def read_terrain(
     Example:
         >>> terrain = tb.terrain.read_terrain("dem.tif", "dsm.tif", resolution=1.0)
     """
-    ground = surface = _heights(dem, "dem", crs, nodata)
+    stored = [_stored(dem, "dem")]
+    if dsm is not None:
+        stored.append(_stored(dsm, "dsm"))
+    # If one raster has a CRS and the other has none, `crs` is that of the other.
+    is_placed = [raster.rio.crs is not None for raster in stored]
+    given = [crs if all(is_placed) or not own else None for own in is_placed]
+    heights = [_heights(*one, nodata) for one in zip(stored, given, strict=True)]
     if dsm is None:
         warn("no surface (DSM) is given, so no canopy is known: only the ground blocks sight.")
-    else:
-        surface = _heights(dsm, "dsm", crs, nodata)
+    ground, surface = heights[0], heights[-1]
+    sides = _pixel_side(ground), _pixel_side(surface)
     datums = [heights.attrs["datum"] for heights in (ground, surface)]
     if all(datums) and datums[0] != datums[1]:
         raise TrustboError(
@@ -88,10 +100,14 @@ def read_terrain(
         )
     alike, ground = same_grid(ground, surface), on_metric_grid(ground)
     if not alike:
-        surface = surface.rio.reproject_match(ground, resampling=Resampling.bilinear, nodata=np.nan)
+        with quiet_affine():
+            surface = surface.rio.reproject_match(
+                ground, resampling=Resampling.bilinear, nodata=np.nan
+            )
     surface = on_metric_grid(surface)
-    terrain = _averaged(_paired(ground, surface), resolution).rio.write_crs(ground.rio.crs)
-    return terrain.rio.write_transform(terrain.rio.transform(recalc=True))
+    terrain = _averaged(_paired(ground, surface, sides), resolution).rio.write_crs(ground.rio.crs)
+    with quiet_affine():
+        return terrain.rio.write_transform(terrain.rio.transform(recalc=True))
 
 
 def require_terrain(terrain: xr.Dataset) -> xr.Dataset:
@@ -102,8 +118,21 @@ def require_terrain(terrain: xr.Dataset) -> xr.Dataset:
     remedy = "give a Dataset with dem and dsm over (y, x), as from read_terrain"
     if not {"dem", "dsm"} <= {*require_kind("terrain", terrain, xr.Dataset, remedy)}:
         raise TrustboError(f"the terrain has {', '.join(map(str, terrain))}; {remedy}.")
-    read = read_terrain(terrain["dem"], terrain["dsm"], crs=terrain.rio.crs)
+    terrain = _with_grid_mapping(terrain)
+    crs = terrain.rio.crs or terrain["dem"].rio.crs
+    if crs is None:
+        raise TrustboError(
+            "the terrain has no coordinate reference system; open its file with "
+            'decode_coords="all", or set it, e.g. with terrain.rio.write_crs("EPSG:32633").'
+        )
+    read = read_terrain(terrain["dem"], terrain["dsm"], crs=crs)
     return read.assign_attrs(terrain.attrs)
+
+
+def _with_grid_mapping(terrain: xr.Dataset) -> xr.Dataset:
+    """Make the variable with the CRS a coordinate, which it is not in a file opened by xarray."""
+    names = {terrain[name].attrs.get("grid_mapping", "spatial_ref") for name in ("dem", "dsm")}
+    return terrain.set_coords([name for name in names if name in terrain.variables])
 
 
 def pixel_size(terrain: xr.Dataset) -> tuple[float, float]:
@@ -121,14 +150,12 @@ def check_size(shape: tuple[int, ...], name: str) -> None:
         )
 
 
-def _heights(
-    raster: FilePath | xr.DataArray, role: str, given: object, nodata: float | None
-) -> xr.DataArray:
-    """Read the heights of one raster, dem or dsm, in metres with north at the top.
+def _heights(array: xr.DataArray, given: object, nodata: float | None) -> xr.DataArray:
+    """Convert the stored values of a raster to heights in metres with north at the top.
 
-    The attribute `datum` is the vertical datum; None if none is declared.
+    `given` is the CRS of a raster without one. The attribute `datum` is the vertical datum; None if
+    none is declared.
     """
-    array = _stored(raster, role)
     name = str(array.name)
     crs = require_map(name, array.rio.crs, given)
     axis, datum = vertical_axis(crs)
@@ -141,17 +168,32 @@ def _heights(
 
 def _stored(raster: FilePath | xr.DataArray, role: str) -> xr.DataArray:
     """Read stored values of a file or an array, dims (y, x), named after `role` in messages."""
-    require_kind(role, raster, str | PathLike | xr.DataArray, "give a path or a DataArray")
+    remedy = "give a path or a DataArray"
+    if isinstance(raster, list | tuple):
+        remedy = f"{remedy}; {_TILES}"
+    require_kind(role, raster, str | PathLike | xr.DataArray, remedy)
     if isinstance(raster, xr.DataArray):
         name = f"{role}: DataArray" + (f" {raster.name!r}" if raster.name else "")
-        return _of_array(raster, name)
-    name = f"{role}: {fspath(raster)!r}"
+    else:
+        raster = expanduser(raster)
+        name = f"{role}: {raster!r}"
+        if isdir(raster):
+            raise TrustboError(f"{name} is a folder; give the path of a raster. {_TILES}.")
     try:
+        if isinstance(raster, xr.DataArray):
+            return _of_array(raster, name).compute()  # reads the file of a lazy array
         quiet = warnings.catch_warnings(action="ignore", category=NotGeoreferencedWarning)
         with quiet, rasterio.open(raster) as file:
             return _of_array(_of_file(file, name), name)
     except RasterioError as error:
-        raise TrustboError(f"{name} cannot be read by GDAL: {error}.") from None
+        raise TrustboError(f"{name} cannot be read by GDAL: {_cause_of(error)}.") from None
+
+
+def _cause_of(error: BaseException) -> str:
+    """Return the message of GDAL's first error, which names the file or the block."""
+    while error.__cause__ is not None:
+        error = error.__cause__
+    return str(error).rstrip(".")
 
 
 def _of_file(file: DatasetReader, name: str) -> xr.DataArray:
@@ -203,6 +245,8 @@ def _warn_of_bands(n: int, name: str) -> None:
 def _of_array(array: xr.DataArray, name: str) -> xr.DataArray:
     """Reduce an array to dims (y, x), evenly spaced, and to the first of several bands."""
     check_size(array.shape, name)
+    # The operations below drop rioxarray's accessor, and with it what its methods have set.
+    crs, fill = array.rio.crs, _accessor_fill(array)
     try:
         y, x = array.rio.y_dim, array.rio.x_dim
     except MissingSpatialDimensionError:
@@ -218,7 +262,20 @@ def _of_array(array: xr.DataArray, name: str) -> xr.DataArray:
     rows, cols = (_even(array[axis].values, f"{name}'s {axis}") for axis in (y, x))
     if (unit := str(array[x].attrs.get("units")).lower()).startswith(("k", "f", "us", "rad")):
         raise TrustboError(f"{name} has x in {unit!r}; convert x and y to metres.")
-    return array.rename({y: "y", x: "x"}).assign_coords(y=rows, x=cols).rename(name)
+    array = array.rename({y: "y", x: "x"}).assign_coords(y=rows, x=cols).rename(name)
+    array = array.assign_attrs({ACCESSOR_FILL: fill})
+    return array if crs is None else array.rio.write_crs(crs)
+
+
+def _accessor_fill(array: xr.DataArray) -> float | None:
+    """Return the fill value of rioxarray's accessor, as from `set_nodata`; None if there is none.
+
+    A fill value that the array's type cannot hold does not occur in the array.
+    """
+    try:
+        return array.rio.nodata
+    except (OverflowError, TypeError, ValueError):
+        return None
 
 
 def _even(values: np.ndarray, what: str) -> np.ndarray:
@@ -238,8 +295,18 @@ def _even(values: np.ndarray, what: str) -> np.ndarray:
     return given if off <= 1e-6 * step else even
 
 
-def _paired(ground: xr.DataArray, surface: xr.DataArray) -> xr.Dataset:
-    """Combine two rasters on one grid, with common NaN and no surface below the ground."""
+def _pixel_side(heights: xr.DataArray) -> float:
+    """Return the shorter side of a raster's pixels in metres, for degrees about."""
+    with quiet_affine():
+        side = min(abs(step) for step in heights.rio.resolution())
+    return side * _DEGREE if heights.rio.crs.is_geographic else side
+
+
+def _paired(ground: xr.DataArray, surface: xr.DataArray, sides: tuple[float, float]) -> xr.Dataset:
+    """Combine two rasters on one grid, with common NaN and no surface below the ground.
+
+    `sides` are the sides of their pixels before they were brought onto one grid, in metres.
+    """
     dem, dsm = ground.values, surface.values
     valid = np.isfinite(dem) & np.isfinite(dsm)
     if not valid.any():
@@ -247,11 +314,23 @@ def _paired(ground: xr.DataArray, surface: xr.DataArray) -> xr.Dataset:
             "no pixel has both a DEM and a DSM height: the rasters cover different areas, or one "
             "is all nodata where they overlap."
         )
+    uncovered = 1.0 - valid.sum() / np.isfinite(dem).sum()
+    if uncovered > _UNCOVERED:
+        warn(
+            f"the DSM has no height on {uncovered:.1%} of the DEM's pixels; these pixels count as "
+            f"missing, and robots cannot cross them. Give a DSM that covers the DEM; {_TILES}."
+        )
     canopy = (dsm - dem)[valid]
     if (share := (canopy < 0.0).mean()) > _CLIPPED:
+        check = "both have the same vertical datum and that they are not swapped"
+        if max(sides) >= _COARSER * min(sides):
+            check = (
+                f"both have similar pixels: the DEM's have {sides[0]:.3g} m and the DSM's "
+                f"{sides[1]:.3g} m, and the coarser raster smooths the heights"
+            )
         warn(
             f"the DSM lies below the DEM on {share:.1%} of pixels; it is raised to the DEM there. "
-            "Check that both have the same vertical datum and that they are not swapped."
+            f"Check that {check}."
         )
     low, middle = np.quantile(canopy, [0.05, 0.5])
     if low > _RAISED or middle > _TALL:

@@ -17,6 +17,7 @@ from rasterio.warp import transform_bounds
 from trustbo.data import Cell
 from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError, require_pair
+from trustbo.terrain.place import quiet_affine
 
 type Location = Cell | Mapping[str, float]
 """A cell (row, col), or a position with named coordinates; see `Grid.locate`."""
@@ -61,7 +62,8 @@ class Grid(Summary):
                 f"a grid of {rows} x {cols} cells needs at least 2 x 2 pixels per cell, but the "
                 f"terrain has {pixels[0]} x {pixels[1]} pixels. Use fewer cells or a finer raster."
             )
-        left, bottom, right, top = terrain.rio.bounds(recalc=True)
+        with quiet_affine():
+            left, bottom, right, top = terrain.rio.bounds(recalc=True)
         crs = terrain.rio.crs
         return cls(
             (rows, cols),
