@@ -17,7 +17,7 @@ from numba.core.registry import CPUDispatcher
 import trustbo
 
 _PACKAGE = Path(trustbo.__file__).parent
-_IMPORT = re.compile(r"^(from numba import|import numba)", re.MULTILINE)
+_IMPORT = re.compile(r"^from trustbo(\.kernels)? import .*kernel", re.MULTILINE)
 
 
 def kernels():

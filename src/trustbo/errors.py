@@ -83,14 +83,6 @@ def _number(value: Any) -> float:
         return math.nan
 
 
-def require_finite(what: str, value: Any) -> float:
-    """Return `value` as a float; raises TrustboError unless it is a finite number."""
-    number = _number(value)
-    if not math.isfinite(number):
-        raise TrustboError(f"{what} must be a finite number; got {one_line(value)}.")
-    return number
-
-
 def require_position(what: str, value: Any) -> tuple[float, float]:
     """Return a position x and y as floats; raises TrustboError unless both are finite."""
     try:

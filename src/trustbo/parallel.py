@@ -4,19 +4,12 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import Any
 
 import numpy as np
 from joblib import cpu_count
 from threadpoolctl import threadpool_limits
 
 _BLOCK = 64  # rows per call: few enough to fit in the caches
-
-PART: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-"""Options of functions called only by compiled code; they save a quarter of the compile time.
-
-Such functions are not cached on disk, but their compiled callers are.
-"""
 
 
 def plain(values: np.ndarray) -> np.ndarray:

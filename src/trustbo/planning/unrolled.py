@@ -11,10 +11,11 @@ from typing import NamedTuple
 
 import networkx as nx
 import numpy as np
-from numba import njit
 
-kernel = njit(cache=True, nogil=True, error_model="numpy")
-"""Numba decorator: kernels are cached on disk, release the GIL, and evaluate 1 / 0 as inf."""
+from trustbo import kernels
+
+kernel = kernels.kernel()
+"""Numba decorator of the kernels of the search."""
 
 
 class Unrolled(NamedTuple):

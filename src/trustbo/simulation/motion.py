@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from numba import njit
 
-from trustbo.parallel import PART
+from trustbo.kernels import PART, kernel
 from trustbo.team import Robot
 from trustbo.workspace.routes import speed_share
 from trustbo.workspace.surface import Surface
@@ -16,7 +16,7 @@ LOOKAHEAD = 1.5
 ARRIVED = 0.5
 """Distance in m from the goal at which a robot stops."""
 _LEAST_STEPS = 5  # smallest number of integration steps per tick
-_compiled = njit(cache=True, nogil=True, error_model="numpy")
+_compiled = kernel()
 _part = njit(nogil=True, error_model="numpy", **PART)
 _STATUS = ("ok", "stuck", "tipped", "timeout")
 

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from trustbo.kernels import kernel
 from trustbo.simulation.world import World
 from trustbo.team import Robot
 from trustbo.workspace.sight import detection_probability, optics
@@ -71,7 +71,7 @@ def contact_of(detected: np.ndarray, watchers: Sequence[Robot], tracks: np.ndarr
     return contact
 
 
-@njit(cache=True)
+@kernel()
 def _track(detected, limits, tracks, contact):
     """Write the contact after each scan, and update the tracks."""
     for k in range(detected.shape[0]):

@@ -16,9 +16,9 @@ import math
 import numpy as np
 from numba import njit
 
-from trustbo.parallel import PART
+from trustbo.kernels import PART, kernel
 
-_kernel = njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz", "arcp"})
+_kernel = kernel(fastmath={"contract", "nsz", "arcp"})
 _part = njit(nogil=True, error_model="numpy", fastmath={"contract", "nsz", "arcp"}, **PART)
 BLOCK, _RAYS = 4, 16
 """Side of the squares of pixels that share one value of openness, and number of directions."""

@@ -12,9 +12,9 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 import xarray as xr
-from numba import njit
 from scipy import ndimage
 
+from trustbo.kernels import kernel
 from trustbo.parallel import in_order
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import MOVES
@@ -28,6 +28,7 @@ _WIDTH = 2.0  # distance to an impassable pixel at which narrowness is 0.5, m
 _MOST = 2.0  # largest value of the measure tilt
 _TIGHT = 3.0  # log(1 + length in m) at which tightness is 1: 19 m
 _BLOCK = 16  # bounds per task of a thread
+_compiled = kernel()
 
 _cached: WeakKeyDictionary[Workspace, xr.DataArray] = WeakKeyDictionary()
 
@@ -104,7 +105,7 @@ def _of_bound(
     return worst
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@_compiled
 def _tilt(way, gradient, pixel, origin):
     """Compute the largest tangent of pitch or roll on a route (point, 2), averaged over 1 m."""
     along = np.zeros(len(way))
@@ -125,7 +126,7 @@ def _tilt(way, gradient, pixel, origin):
     return ((sums[m:] - sums[:-m]) / m).max()
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@_compiled
 def _point(way, along, s):
     """Return the position at distance s along a route, or the end of a shorter route."""
     k = min(np.searchsorted(along, s, side="right"), len(way) - 1)

@@ -10,9 +10,9 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 from scipy import ndimage
 
+from trustbo.kernels import kernel
 from trustbo.parallel import plain
 from trustbo.team import Robot
 from trustbo.workspace.surface import Surface
@@ -23,7 +23,7 @@ SLOWEST = 0.1
 """Speed at the slope limit as a fraction of the speed on level ground."""
 _CLEARANCE = 1.0  # preferred distance from obstacles, because robots stray from routes, m
 _CLOSE = 4.0  # factor on the cost of a route that is closer to an obstacle
-_compiled = njit(cache=True, nogil=True, error_model="numpy")
+_compiled = kernel()
 
 
 class Routes:

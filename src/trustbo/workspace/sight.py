@@ -8,12 +8,13 @@ import numpy as np
 from numba import njit
 
 from trustbo.errors import TrustboError
-from trustbo.parallel import PART, plain
+from trustbo.kernels import PART, kernel
+from trustbo.parallel import plain
 from trustbo.team import Robot
 from trustbo.terrain import rays
 from trustbo.workspace.surface import Surface
 
-_compiled = njit(cache=True, nogil=True, error_model="numpy")
+_compiled = kernel()
 _part = njit(nogil=True, error_model="numpy", **PART)
 
 _JITTER = 0.7  # radius of the disc of viewpoints around a post, m
