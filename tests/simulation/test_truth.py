@@ -12,6 +12,7 @@ from trustbo.errors import TrustboError
 from trustbo.simulation import KinematicSimulator, Truth
 from trustbo.simulation.replicates import edges_of, table_of
 from trustbo.team import Robot, Team
+from trustbo.terrain import TRAVERSABILITY
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import MOVES, existing_bounds
 
@@ -90,6 +91,20 @@ def test_tracks_that_outlast_misses_are_simulated():
     found, path = Truth.of(simulator, n_replicates=20), ((1, 0), (0, 0), (0, 1))
     rates = np.mean([simulator.run(path, seed=s).contact_rate for s in range(150)], axis=(0, 2))
     np.testing.assert_allclose(found._along(path)[0], rates, atol=0.05)
+
+
+def test_cached_truths_of_two_terrains_are_two(wooded, tmp_path):
+    features = {"traversability": TRAVERSABILITY}  # of the ground alone
+    bare = hillside()
+    bare["dsm"].values[:] = bare["dem"].values
+    for terrain in (bare, hillside()):
+        workspace = Workspace.from_terrain(
+            terrain, (3, 3), Team(1), features=features, bounds=False
+        )
+        simulator = KinematicSimulator(workspace)
+        cached = Truth.of(simulator, n_replicates=1, folder=tmp_path)
+        xr.testing.assert_identical(cached.bounds, Truth.of(simulator, n_replicates=1).bounds)
+    assert len(list(tmp_path.iterdir())) == 2
 
 
 def test_bounds_that_fail_say_so_and_keep_no_contact(wooded):

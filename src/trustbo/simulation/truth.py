@@ -17,6 +17,7 @@ from trustbo.data import Cell
 from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError, require_whole
 from trustbo.files import FilePath, to_json, write_file
+from trustbo.models.backend import VERSIONS
 from trustbo.planning.paths import AdmissiblePaths
 from trustbo.simulation.model import ModelSimulator
 from trustbo.simulation.protocol import digest, require_path
@@ -87,7 +88,7 @@ class Truth(Summary):
             )
         n_replicates = require_whole("n_replicates", n_replicates, 1)
         found: dict[str, Self] = {}
-        known = digest(workspace.awareness.values, workspace.passable_bounds.values)
+        known = _known(workspace)
 
         def of_mission(number: int) -> Self:
             require_whole("mission", number, 0)
@@ -95,7 +96,7 @@ class Truth(Summary):
                 settings = simulator.describe_world(number)
             else:
                 settings = getattr(simulator, "describe", lambda: type(simulator).__name__)()
-            world = to_json([settings, known, workspace.team, n_replicates, seed])
+            world = to_json([settings, known, n_replicates, seed])
             if world not in found:
                 make = partial(replicated, simulator, number, n_replicates, seed)
                 found[world] = cls(workspace, _cached(folder, world, make), of_mission)
@@ -171,15 +172,23 @@ class Truth(Summary):
         return self.bounds["contact"].values[where], self.bounds["passed"].values[where]
 
 
+def _known(workspace: Workspace) -> list[object]:
+    """Return what a truth depends on besides the simulator's settings, to name its file."""
+    arrays = [workspace.awareness.values, workspace.passable_bounds.values]
+    for maps in (workspace.terrain, workspace.pixels):
+        if maps is not None:
+            arrays += [maps[name].values for name in ("y", "x", *maps.data_vars)]
+    assumed = workspace.grid, workspace.team, workspace.sight
+    return [VERSIONS["trustbo"], digest(*arrays), *assumed]
+
+
 def _cached(folder: FilePath | None, world: str, make: Callable[[], xr.Dataset]) -> xr.Dataset:
     """Read the table of a world's bounds from the cache, or compute and store the table."""
     if folder is None:
         return make()
-    file = Path(folder) / f"truth-{digest(np.frombuffer(world.encode(), np.uint8))}.nc"
+    file = Path(folder).expanduser() / f"truth-{digest(np.frombuffer(world.encode(), np.uint8))}.nc"
     if not file.exists():
-        table = make()
-        file.parent.mkdir(parents=True, exist_ok=True)
-        write_file(file, table.to_netcdf)
+        write_file(file, make().to_netcdf)
     return xr.load_dataset(file)
 
 
