@@ -2,6 +2,7 @@
 
 import networkx as nx
 import numpy as np
+import pytest
 
 import trustbo as tb
 from trustbo.workspace.moves import MOVES, existing_bounds
@@ -19,6 +20,18 @@ def walled(gap=None, side=60, shape=(3, 3)):
     terrain["dem"].values[:] = dem
     terrain["dsm"].values[:] = dem
     return tb.Workspace.from_terrain(terrain, shape, sight=tb.workspace.Sight(0.0))
+
+
+def test_a_seam_of_missing_pixels_is_named_where_no_path_exists():
+    terrain = tb.terrain.synthetic_terrain((60.0, 60.0), seed=0, relief=1.0)
+    for name in ("dem", "dsm"):
+        terrain[name].values[:, 30] = np.nan
+    seam = tb.Workspace.from_terrain(terrain, (2, 2))
+    with pytest.raises(tb.planning.NoPathError, match="missing"):
+        tb.planning.Planner(seam, (0, 0), (0, 1))
+    with pytest.raises(tb.planning.NoPathError) as caught:
+        tb.planning.Planner(walled(shape=(2, 2)), (0, 0), (0, 1))
+    assert "missing" not in str(caught.value)
 
 
 def test_linked_pixels_are_those_of_networkx():

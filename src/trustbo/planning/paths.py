@@ -77,7 +77,7 @@ class AdmissiblePaths:
             raise NoPathError(
                 f"no path leads from {self.start} to {self.goal}. Of {n_cells} passable cells, "
                 f"{n_reached} can be reached from the start, and the goal can be reached from "
-                f"{n_goal}. Choose another start or goal, or a team with a larger max_slope."
+                f"{n_goal}. {self._remedy()}"
             )
         self.turns = not isinstance(max_bounds, str)
         self.max_bounds = max_bounds
@@ -95,6 +95,18 @@ class AdmissiblePaths:
                 f"max_bounds = {self.longest} is too small: a path from {self.start} to "
                 f"{self.goal} needs at least {self.shortest} bounds."
             )
+
+    def _remedy(self) -> str:
+        """Return what to do if no path leads to the goal, as a sentence."""
+        posts, terrain = self.workspace.posts, self.workspace.terrain
+        if posts is not None and terrain is not None:
+            missing = float(terrain["dem"].isnull().mean())
+            if missing and posts.are_parted_by_missing(self.start, self.goal):
+                return (
+                    f"They are parted by pixels with missing heights ({missing:.2%} of the "
+                    "terrain), which robots do not cross; fill them, e.g. with gdal_fillnodata.py."
+                )
+        return "Choose another start or goal, or a team with a larger max_slope."
 
     @cached_property
     def bounds_from_start(self) -> np.ndarray:

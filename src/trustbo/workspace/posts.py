@@ -107,6 +107,19 @@ class Posts:
                 linked[m, *c] = linked[last - m, *a] = region[end[0] - top, end[1] - left]
         return linked
 
+    def are_parted_by_missing(self, a: Cell, c: Cell) -> bool:
+        """Return whether only pixels without a height part the stops of two cells."""
+        rows, cols = self.surface.ground.shape
+        ends = [self.surface.pixel_at(*self.stop(cell).tolist()) for cell in (a, c)]
+        known = self.surface.passable
+        # The slope is unknown, too, beside a missing height.
+        missing = ndimage.binary_dilation(~np.isfinite(self.surface.ground), np.ones((3, 3)))
+        either = known | missing
+        now, then = (
+            bool(linked_to(mask, (0, rows, 0, cols), ends[0])[ends[1]]) for mask in (known, either)
+        )
+        return then and not now
+
     def bound_routes(
         self, a: Cell, c: Cell, next_cell: Cell | None
     ) -> tuple[np.ndarray | None, ...]:
