@@ -122,6 +122,12 @@ def test_fouling_is_uniform_in_the_long_run_and_carries_over(wooded):
         lambda: Season(2.0, first=3, last=2),
         lambda: Trees(-1.0, (0, 0), 1.0),
         lambda: Jam((0, 0), 1.0, strength=2.0),
+        lambda: Jam((0, 0), 1.0, strength="strong"),
+        lambda: Jam((0, 0), "y"),
+        lambda: Jam((0, math.nan), 1.0),
+        lambda: Jam(3, 1.0),
+        lambda: Trees(1.0, (0, 0), "y"),
+        lambda: Trees("tall", (0, 0), 1.0),
         lambda: Fouling(0.1, every=0),
     ],
 )
@@ -130,7 +136,7 @@ def test_impossible_events_are_refused(make):
         make()
 
 
-@pytest.mark.parametrize("event", [Trees(0.0, (-9e5, 0.0), 9.0), Degradation("r9", 0.5)])
+@pytest.mark.parametrize("event", [Trees(0.0, (-9e5, 0.0), 9.0), Degradation("r9", 0.5), 3])
 def test_events_that_do_not_fit_the_terrain_or_the_team_are_refused(wooded, event):
     with pytest.raises(TrustboError):
         KinematicSimulator(wooded, events=[event])

@@ -196,6 +196,8 @@ def test_a_feature_of_one_s_own():
         del FEATURES["northness"]
     with pytest.raises(TrustboError, match="sign"):
         feature("other", sign=0)
+    with pytest.raises(TrustboError, match="name"):
+        feature(None, sign=1)
 
 
 def test_a_hole_in_the_surface_leaves_the_means_around_it():

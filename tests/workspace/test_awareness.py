@@ -7,7 +7,7 @@ import xarray as xr
 from trustbo.errors import TrustboError
 from trustbo.terrain import synthetic_terrain
 from trustbo.terrain.features import canopy_cover
-from trustbo.workspace import Workspace
+from trustbo.workspace import Sight, Workspace
 
 
 @pytest.fixture(scope="module")
@@ -26,6 +26,19 @@ def test_features_are_composites_or_used_unchanged(terrain):
     cover = workspace.grid.cell_means(terrain["dem"].copy(data=canopy_cover(terrain)))
     of_r1 = workspace.awareness.sel(robot="r1", feature="cover").mean("move")
     np.testing.assert_allclose(of_r1, cover, atol=1e-6)
+
+
+def test_canopy_of_the_features_is_that_of_the_assumed_sight(terrain):
+    def pixels(**sight):
+        made = Workspace.from_terrain(terrain, (4, 3), bounds=False, features=features,
+                                      sight=Sight(**sight))  # fmt: skip
+        return made.pixels
+
+    features = {"open": "openness", "dense": "vegetation_density"}
+    clear, usual, solid = (pixels(extinction=x) for x in (0.0, 0.1, np.inf))
+    assert float(clear["open"].mean()) > float(usual["open"].mean()) > float(solid["open"].mean())
+    xr.testing.assert_equal(clear["dense"], solid["dense"])
+    assert float(pixels(crown_base=1.0)["dense"].max()) == 0.0
 
 
 @pytest.mark.parametrize(

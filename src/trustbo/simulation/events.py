@@ -16,6 +16,7 @@ from trustbo.errors import (
     TrustboError,
     require_choice,
     require_finite,
+    require_position,
     require_positive,
     require_whole,
 )
@@ -70,6 +71,10 @@ class Jam(Event):
     center: tuple[float, float]
     radius: float
     strength: float = 1.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _require_circle(self.center, self.radius)
 
     def change(self, world: World) -> World:
         """See `Event.change`."""
@@ -133,8 +138,8 @@ class Trees(Event):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 0.0 <= self.height < np.inf:
-            raise TrustboError(f"height must be finite and at least 0; got {self.height!r}.")
+        require_positive("height", self.height, or_zero=True)
+        _require_circle(self.center, self.radius)
 
     def change(self, world: World) -> World:
         """See `Event.change`."""
@@ -191,6 +196,7 @@ class Fouling(Event):
     def __post_init__(self) -> None:
         super().__post_init__()
         require_whole("every", self.every, 1)
+        require_whole("seed", self.seed, 0)
 
     def change(self, world: World) -> World:
         """See `Event.change`; for the long-run mean over missions, the factor is its mean."""
@@ -207,6 +213,12 @@ class Fouling(Event):
         return world._replace(detection=world.detection * factors)
 
 
+def _require_circle(center: object, radius: object) -> None:
+    """Check the centre and the radius of an event's circle."""
+    require_position("center", center)
+    require_positive("radius", radius)
+
+
 def _circle(surface: Surface, center: tuple[float, float], radius: float) -> np.ndarray:
     """Return a mask (row, col) of the pixels in a circle; raises TrustboError if there are none."""
     rows, cols = surface.ground.shape
@@ -215,7 +227,7 @@ def _circle(surface: Surface, center: tuple[float, float], radius: float) -> np.
         (np.arange(rows)[:, None] - row) * surface.pixel[0],
         (np.arange(cols) - col) * surface.pixel[1],
     )
-    inside = away <= require_positive("radius", radius)
+    inside = away <= radius
     if not inside.any():
         left, bottom, right, top = surface.extent
         raise TrustboError(

@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 
 from trustbo.data import Bound, Cell, Mission
-from trustbo.errors import TrustboError, require_positive, require_whole
+from trustbo.errors import TrustboError, require_kind, require_positive, require_whole
 from trustbo.simulation.events import Event
 from trustbo.simulation.motion import drive_together
 from trustbo.simulation.protocol import DescribedSimulator, digest, require_path
@@ -95,6 +95,7 @@ class KinematicSimulator(DescribedSimulator):
         detection = np.array([[robot.detection for robot in self.team.robots]])
         self._usual = World(surface, self.sight, self.team, detection, self.team.lead.detection)
         for event in self.events:
+            require_kind("events", event, Event, "give events such as simulation.Jam")
             event.change(self._usual)  # raises if the event does not fit
         self._posts: Posts = workspace.posts  # pyright: ignore[reportAttributeAccessIssue]
 

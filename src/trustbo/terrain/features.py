@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 from scipy import ndimage
 
-from trustbo.errors import TrustboError
+from trustbo.errors import TrustboError, require_kind
 from trustbo.parallel import over_rows
 from trustbo.terrain import rays
 from trustbo.terrain.read import pixel_size
@@ -39,8 +39,9 @@ FEATURES: dict[str, Feature] = {}
 def feature[F: Callable[..., np.ndarray]](name: str, *, sign: int) -> Callable[[F], F]:
     """Register a function as a feature of pixels under a new name (decorator).
 
-    Raises TrustboError if the name is taken or the sign is neither 1 nor -1.
+    Raises TrustboError if the name is no text or is taken, or the sign is neither 1 nor -1.
     """
+    require_kind("name of the feature", name, str, "give a text, such as 'stones'")
     if name in FEATURES:
         raise TrustboError(f"feature {name!r} already exists; choose another name.")
     if sign not in (1, -1):
@@ -112,24 +113,31 @@ def canopy_cover(terrain: xr.Dataset) -> np.ndarray:
 
 
 @feature("vegetation_density", sign=-1)
-def vegetation_density(terrain: xr.Dataset) -> np.ndarray:
+def vegetation_density(terrain: xr.Dataset, crown_base: float = 0.3) -> np.ndarray:
     """Compute the fraction of the lowest 3 m above ground that canopy fills.
 
-    It is averaged over squares of half-width 5 m. The canopy is the layer from 0.3 times its height
-    to its top.
+    It is averaged over squares of half-width 5 m. The canopy is the layer from `crown_base` times
+    its height to its top.
     """
     height = canopy_height(terrain)
-    filled = np.minimum(height, 3.0) - np.minimum(0.3 * height, 3.0)
+    filled = np.minimum(height, 3.0) - np.minimum(crown_base * height, 3.0)
     return _local_mean(terrain, np.maximum(filled, 0.0) / 3.0)
 
 
 @feature("openness", sign=+1)
 def openness(
-    terrain: xr.Dataset, reach: float = 50.0, *, eye: float = 1.0, target: float = 1.0
+    terrain: xr.Dataset,
+    reach: float = 50.0,
+    *,
+    eye: float = 1.0,
+    target: float = 1.0,
+    extinction: float = 0.1,
+    crown_base: float = 0.3,
 ) -> np.ndarray:
     """Compute the expected fraction of clear rays from a pixel to targets all around.
 
-    Rays are `reach` metres long and run from `eye` to `target` metres above ground. Rays that end
+    Rays are `reach` metres long and run from `eye` to `target` metres above ground. Canopy with an
+    `extinction` (1/m) attenuates them, from `crown_base` times its height to its top. Rays that end
     off the raster are ignored; a pixel with no other rays is NaN, so keep `reach` below half the
     terrain's shorter side. Pixels of a 4 x 4 square share the value of its centre.
     """
@@ -137,9 +145,11 @@ def openness(
     rows, cols = ground.shape
     coarse = np.empty((-(-rows // rays.BLOCK), -(-cols // rays.BLOCK)))
 
+    canopy = float(extinction), float(crown_base)
+
     def work(first: int, last: int) -> None:
         maps = ground, surface, pixel_size(terrain)
-        rays.openness(*maps, reach, (eye, target), (0.1, 0.3), coarse, first, last)
+        rays.openness(*maps, reach, (eye, target), canopy, coarse, first, last)
 
     over_rows(work, len(coarse))
     whole = coarse.repeat(rays.BLOCK, axis=0).repeat(rays.BLOCK, axis=1)[:rows, :cols]

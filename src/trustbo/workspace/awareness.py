@@ -20,18 +20,20 @@ from trustbo.workspace.grid import MAX_MISSING, Grid
 from trustbo.workspace.line_of_sight import bound_maps
 from trustbo.workspace.moves import MOVE_NAMES, MOVES, existing_bounds
 from trustbo.workspace.posts import TRAVERSABLE, Posts
+from trustbo.workspace.sight import Sight
 
 _DIMS = ("robot", "move", "row", "col", "feature")
 _AXES = "(robot, row, col, feature) or (robot, move, row, col, feature) with 8 moves"
 
 
 def cell_maps(
-    terrain: xr.Dataset, grid: Grid, features: Mapping[str, object], team: Team
+    terrain: xr.Dataset, grid: Grid, features: Mapping[str, object], team: Team, sight: Sight
 ) -> tuple[np.ndarray, np.ndarray, xr.Dataset, dict[str, CompositeIndex]]:
     """Compute the awareness and the passability of a terrain's cells.
 
     Openness is computed for the team's sensor and target heights. Its range is the smallest of the
-    team's largest lidar range, the diagonal of a cell, and half the terrain's shorter side.
+    team's largest lidar range, the diagonal of a cell, and half the terrain's shorter side. The
+    canopy of openness and vegetation density is that of the assumed model of sight.
 
     Returns:
         Awareness (row, col, feature) in [0, 1], NaN where a cell has no data; passability (row,
@@ -53,10 +55,14 @@ def cell_maps(
         "eye": team.robots[0].sensor_height,
         "target": team.lead.target_height,
     }
+    options = {
+        "openness": lidar | {"extinction": sight.extinction, "crown_base": sight.crown_base},
+        "vegetation_density": {"crown_base": sight.crown_base},
+    }
 
     def values_of(name: str) -> np.ndarray:
         compute = FEATURES[require_choice("feature", name, FEATURES)].compute
-        return compute(terrain, **lidar) if name == "openness" else compute(terrain)
+        return compute(terrain, **options.get(name, {}))
 
     pixels, composites = {}, {}
     for name, parts in features.items():

@@ -107,14 +107,15 @@ class Workspace(Summary):
             >>> tb.Workspace.from_terrain(terrain, shape=(10, 10), team=tb.Team(n_robots=3))
         """
         terrain, team = require_terrain(terrain), Team.of(team)
+        sight = sight or Sight()
         grid = Grid.over(terrain, shape)
         if features is None:
             visibility = VISIBILITY if bounds else PAPER_VISIBILITY
             features = {"traversability": TRAVERSABILITY, "visibility": visibility}
         with compiling():
-            cells, passable, pixels, composites = cell_maps(terrain, grid, features, team)
+            cells, passable, pixels, composites = cell_maps(terrain, grid, features, team, sight)
             z = np.repeat(of_moves(cells, passable)[None], team.n_robots, axis=0)
-            posts, names = Posts(grid, team, sight or Sight(), terrain, pixels), [*features]
+            posts, names = Posts(grid, team, sight, terrain, pixels), [*features]
             if bounds:
                 z = with_line_of_sight(z, names, passable, posts, pixels)
                 names.append(LINE_OF_SIGHT)
