@@ -77,6 +77,14 @@ def test_bounds_that_were_planned_and_not_run_are_part_of_the_path():
         read_table(table.drop(columns="status"))
 
 
+def test_a_logger_may_write_the_status_ok_for_the_start():
+    (always,), (blank,) = (read_table(rows(status=[s, "ok", "stuck"])) for s in ("ok", ""))
+    assert (always.path, always.status) == (blank.path, "stuck")
+    np.testing.assert_array_equal(always.contact_rate, blank.contact_rate)
+    with pytest.raises(TrustboError):
+        read_table(rows(status=["stuck", "ok", "ok"]))
+
+
 @pytest.mark.parametrize(
     "columns",
     [

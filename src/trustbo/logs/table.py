@@ -167,7 +167,9 @@ def _mission(rows: pd.DataFrame, features: Sequence[str], robots: tuple[str, ...
             f"one cell (row, col) each; got {numbers}."
         )
     values, status = rows.set_index([*KEYS[1:]])[[*RATES, *features]], rows["status"]
-    measured = rows.loc[values.notna().to_numpy().any(axis=1) | (status != ""), "bound"]
+    # Loggers that always write a status write "ok" for the start, where nothing is measured.
+    has_status = (status != "") & ((status != "ok") | (rows["bound"] > 0))
+    measured = rows.loc[values.notna().to_numpy().any(axis=1) | has_status, "bound"]
     if measured.empty or measured.min() < 1:
         raise TrustboError(
             "bounds with a rate, feature or status must be numbered from 1; got none or 0."
