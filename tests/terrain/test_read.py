@@ -440,7 +440,7 @@ def test_half_of_a_mosaic_at_zero_is_warned_of_and_level_ground_is_not():
         read_terrain(array(mosaic), array(mosaic))
     hill = np.zeros((8, 10))
     hill[3:5, 4:6] = [[2.0, 30.0], [5.0, 12.0]]
-    for level in (np.zeros((8, 10)), hill):
+    for level in (np.zeros((8, 10)), hill, np.where(hill > 0.0, 30.0, 0.0)):
         read_terrain(array(level), array(level))
 
 

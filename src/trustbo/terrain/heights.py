@@ -100,13 +100,16 @@ def _fills(name: str, attrs: Mapping[str, Any], nodata: float | None) -> list[fl
 def _warn_of_zeros(heights: np.ndarray, name: str) -> None:
     """Warn of pixels at exactly 0 m that are far from all other heights (missing values?).
 
-    Ground may be level, so if most pixels are zero, all others must be far away.
+    Ground may be level, so if most pixels are zero, all others must be far away and differ: walls
+    on a floor often have one height.
     """
     n_zero = int((heights == 0.0).sum())
     n_low = int((np.abs(heights) <= _LOW).sum()) - n_zero
-    n_high = int(np.isfinite(heights).sum()) - n_zero - n_low
-    few_are_low = n_low < 0.1 * n_zero if n_zero < n_low + n_high else n_low == 0
-    if n_zero and n_high and few_are_low:
+    high = heights[np.abs(heights) > _LOW]
+    few_are_low = n_low < 0.1 * n_zero
+    if n_zero >= n_low + len(high):
+        few_are_low = n_low == 0 and len(high) > 0 and high.min() < high.max()
+    if n_zero and few_are_low:
         warn(
             f"{name} is exactly 0 m on {n_zero / heights.size:.1%} of its pixels, but hardly any "
             f"other height is below {_LOW:g} m: zeros may be missing heights; pass nodata=0 if "
