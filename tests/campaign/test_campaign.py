@@ -5,7 +5,7 @@ from dataclasses import replace
 import jax
 import numpy as np
 import pytest
-from worlds import ModelSimulator, random_cells
+from worlds import ModelSimulator, hillside, random_cells
 
 import trustbo as tb
 from trustbo.data import Mission
@@ -37,6 +37,25 @@ def states(campaign):
 
 def refuse(*args, **kwargs):
     raise tb.PosteriorError("R-hat of beta0 is 1.5.")
+
+
+def test_floating_point_errors_of_users_are_not_raised_by_the_library():
+    workspace = tb.Workspace.from_terrain(hillside(), (3, 3))
+    robots = tb.simulation.KinematicSimulator(workspace)
+    with np.errstate(all="raise"):
+        campaign = tb.Campaign(workspace, (2, 0), (0, 2), planner={"max_failure": 0.5})
+        for n in range(2):
+            campaign.tell(robots.run(campaign.ask().path, seed=n, mission=n))
+        campaign.fail("stuck", where=campaign.ask().path[1])
+        campaign.ask()
+        campaign.maps()
+        tb.check(campaign.posterior)
+        for model in (CoupledTrust(), PooledTrust(observation="censored")):
+            posterior = fit(campaign.missions, model, workspace=workspace)
+        tb.inference.loo(posterior)
+        follow = tb.inference.TrustFilter(posterior)
+        follow.predict(campaign.missions[0].awareness[:, :, : len(workspace.features)])
+        follow.update(campaign.missions[0].awareness[0], [0.0, 1.0, np.nan])
 
 
 def test_ask_returns_the_same_plan_until_a_mission_is_told(workspace):

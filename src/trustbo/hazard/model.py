@@ -35,6 +35,7 @@ _ROUND, _ENOUGH, _N_DRAWS = 1024, 500.0, 1000  # points per round, effective poi
 _MAPS = "move", "row", "col"
 
 
+@np.errstate(under="ignore")  # small weights and tails round to 0
 def fit_hazard(
     missions: Sequence[Mission],
     workspace: Workspace,

@@ -115,6 +115,7 @@ class BoundPrior(NamedTuple):
         return prior_betas(*self.values(z), self.difficulty, self.steepness)
 
 
+@np.errstate(under="ignore")  # small weights and tails round to 0
 def prior_betas(
     weights: np.ndarray,
     limit: np.ndarray,
@@ -140,6 +141,7 @@ def steepness_of(tilt: np.ndarray, max_slope: float) -> np.ndarray:
     return np.rad2deg(np.arctan(tilt * np.tan(max_slope)) - max_slope)
 
 
+@np.errstate(under="ignore")  # small weights and tails round to 0
 def mixture_quantile(z: np.ndarray, narrow: float, share: float, wide: float) -> np.ndarray:
     """Solve Phi(z) = (1 - share) Phi(x / narrow) + share Phi(x / wide) for x.
 

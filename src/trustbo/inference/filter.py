@@ -280,6 +280,7 @@ class TrustFilter:
         """Trust of each robot after the bounds so far."""
         return _average(self._beliefs, self.weights)
 
+    @np.errstate(under="ignore")  # small weights and tails round to 0
     def update(
         self,
         awareness: ArrayLike,
@@ -322,6 +323,7 @@ class TrustFilter:
         self.n_bounds += 1
         return self.state
 
+    @np.errstate(under="ignore")  # small weights and tails round to 0
     def predict(self, awareness: ArrayLike, path: Sequence[Cell] | None = None) -> TrustForecast:
         """Predict trust and contact rates along future bounds.
 
@@ -389,6 +391,7 @@ class TrustFilter:
         return z
 
 
+@np.errstate(under="ignore")  # small weights and tails round to 0
 def _average(beliefs: Beliefs, weights: np.ndarray) -> TrustState:
     """Compute the mean and standard deviation of trust over weighted draws."""
     mean = beliefs.mean.reshape(len(weights), -1)

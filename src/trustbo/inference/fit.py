@@ -27,6 +27,7 @@ from trustbo.workspace import Workspace
 SAMPLERS = ("importance", "nuts")
 
 
+@np.errstate(under="ignore")  # small weights and tails round to 0
 def fit(
     missions: Sequence[Mission],
     model: TrustModel | None = None,

@@ -31,6 +31,7 @@ _POINTS = 500  # maximum number of distinct hyperparameter draws that are used
 
 
 @one_blas_thread()
+@np.errstate(under="ignore")  # small weights and tails round to 0
 def loo(posterior: xr.DataTree, *, model: TrustModel | None = None) -> ELPDData:
     """Estimate the log predictive density of each mission given all other missions.
 
@@ -111,6 +112,7 @@ def _log_evidence(posterior: Posterior, seed: int) -> tuple[float, float]:
     return summary["log_evidence"], summary["k_hat"]
 
 
+@np.errstate(under="ignore")  # small weights and tails round to 0
 def compare(posteriors: Mapping[str, xr.DataTree]) -> pd.DataFrame:
     """Rank posteriors by leave-one-mission-out cross-validation; see `loo` and `arviz.compare`.
 

@@ -18,6 +18,7 @@ INTERVALS = {"coverage_50": 0.5, "coverage_90": 0.9}
 _DIMS = ("mission", "bound", "robot")
 
 
+@np.errstate(under="ignore")  # small weights and tails round to 0
 def score(
     posterior: xr.DataTree | Sequence[xr.DataTree],
     missions: Sequence[Mission],

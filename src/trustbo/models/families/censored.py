@@ -44,6 +44,7 @@ class Censored(Gaussian):
         f, _ = super()._draw(np.where(cut, m + total * e, y), N, m, v, sd, rng)
         return f, self._match(y, N, m, v, sd)[0]
 
+    @np.errstate(under="ignore")  # small weights and tails round to 0
     def mean_rate(self, trust: Array, sd: Array) -> Array:
         """See `Family.mean_rate`; the mean of a normal variable clipped to [0, 1]."""
         low, high = -trust / sd, (1.0 - trust) / sd
