@@ -1,10 +1,15 @@
 """Bad input of a user is refused with an error that names it, before any work starts."""
 
+import math
+
+import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 import pytest
 import xarray as xr
 
 import trustbo as tb
+from trustbo import errors
 from trustbo.inference import TrustFilter, fit, params_of
 from trustbo.inference.diagnostics import diagnostics
 from trustbo.models import PooledTrust, Priors
@@ -64,3 +69,60 @@ def test_bad_input_is_refused_by_name(mistake, workspace, tmp_path, monkeypatch)
         make(workspace)
     assert "\n" not in str(error.value)
     assert not list(tmp_path.iterdir())
+
+
+ONE = (1, 1.0, True, np.int8(1), np.float32(1.0), np.array(1.0), jnp.asarray(1.0))
+NO_NUMBER = (None, "1", b"1", [], [1.0], {}, 1 + 0j, np.ones(1), pd.NA, object(), math.nan)
+NUMBERS = {
+    "finite": errors.require_finite,
+    "positive": errors.require_positive,
+    "share": errors.require_share,
+}
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+def test_numbers_of_any_library_are_numbers(name):
+    for value in ONE:
+        assert NUMBERS[name]("x", value) == 1.0
+        assert type(NUMBERS[name]("x", value)) is float
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+def test_what_is_not_one_finite_number_is_refused(name):
+    for value in (*NO_NUMBER, math.inf, -math.inf, 10**400):
+        with pytest.raises(tb.TrustboError, match="x must be"):
+            NUMBERS[name]("x", value)
+
+
+def test_share_includes_its_ends_unless_told_otherwise():
+    assert errors.require_share("x", 0) == 0.0
+    for value in (0.0, 1.0):
+        with pytest.raises(tb.TrustboError, match="x"):
+            errors.require_share("x", value, ends=False)
+
+
+def test_whole_numbers_have_limits():
+    assert errors.require_whole("n", np.int16(3), 0) == 3
+    assert errors.require_whole("seed", 2**63 - 1, 0) == 2**63 - 1
+    assert errors.require_count("n", errors.MANY) == errors.MANY
+    for value in (*NO_NUMBER, True, 1.0, -1, 10**24):
+        with pytest.raises(tb.TrustboError, match="n must be"):
+            errors.require_whole("n", value, 0)
+    for value in (0, errors.MANY + 1):
+        with pytest.raises(tb.TrustboError, match="n must be"):
+            errors.require_count("n", value)
+
+
+def test_any_iterable_is_a_list_except_text_and_dicts():
+    for value in ([1, 2], (1, 2), {1, 2}, range(1, 3), np.array([1, 2]), iter([1, 2])):
+        assert errors.require_list("n", value, int | np.integer) == [1, 2]
+    for value in (None, 3, "12", b"12", {1: 2}, np.array(1.0), np.ma.masked, [1, "2"]):
+        with pytest.raises(tb.TrustboError, match="n"):
+            errors.require_list("n", value, int)
+
+
+def test_cells_are_a_list_of_pairs_of_whole_numbers():
+    assert errors.require_cells("path", np.array([[1, 2], [0, 1]])) == ((1, 2), (0, 1))
+    for value in (None, 3, "1,2", [1, 2], [(1, 2, 3)], [(0.5, 1)], {(1, 2): 3}, np.array(1.0)):
+        with pytest.raises(tb.TrustboError, match="path"):
+            errors.require_cells("path", value)

@@ -3,7 +3,7 @@
 import math
 import operator
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -40,15 +40,29 @@ def require_choice(what: str, value: object, choices: Iterable[str]) -> str:
     return value
 
 
-def require_whole(what: str, value: object, minimum: int) -> int:
-    """Return `value` as an int; raises TrustboError unless it is whole and at least `minimum`."""
+MANY = 10**7
+"""Largest number of draws, missions, robots or other things that an argument can ask for."""
+_LARGEST = 2**63 - 1
+
+
+def require_whole(what: str, value: object, minimum: int, maximum: int = _LARGEST) -> int:
+    """Return `value` as an int; raises TrustboError unless it is whole and within the limits."""
     try:
         number = operator.index(value)  # pyright: ignore[reportArgumentType]
     except TypeError:
         number = None
     if number is None or isinstance(value, bool) or number < minimum:
-        raise TrustboError(f"{what} must be a whole number of at least {minimum}; got {value!r}.")
+        raise TrustboError(
+            f"{what} must be a whole number of at least {minimum}; got {one_line(value)}."
+        )
+    if number > maximum:
+        raise TrustboError(f"{what} must be at most {maximum}; got {one_line(value)}.")
     return number
+
+
+def require_count(what: str, value: object) -> int:
+    """Return a number of things as an int; raises TrustboError unless it is from 1 to `MANY`."""
+    return require_whole(what, value, 1, MANY)
 
 
 def require_finite(what: str, value: Any) -> float:
@@ -65,6 +79,18 @@ def require_positive(what: str, value: Any, *, or_zero: bool = False) -> float:
     if not 0.0 <= number < math.inf or (number == 0.0 and not or_zero):
         least = "0 or more, and" if or_zero else "positive and"
         raise TrustboError(f"{what} must be {least} finite; got {value!r}.")
+    return number
+
+
+def require_share(what: str, value: Any, *, ends: bool = True) -> float:
+    """Return `value` as a float; raises TrustboError unless it is in [0, 1].
+
+    Without `ends`, 0 and 1 are refused, too.
+    """
+    number = _number(value)
+    if not (0.0 <= number <= 1.0 if ends else 0.0 < number < 1.0):
+        interval = "[0, 1]" if ends else "(0, 1)"
+        raise TrustboError(f"{what} must be in {interval}; got {one_line(value)}.")
     return number
 
 
@@ -104,11 +130,25 @@ def one_line(value: object) -> str:
     return f"{' '.join(repr(value).split()):.60}"
 
 
+def require_list(what: str, value: Any, kind: Any = object, remedy: str = "") -> list[Any]:
+    """Return the entries of a list as a new list; raises TrustboError if one is of another kind.
+
+    Any iterable counts as a list, except for text and dicts, which are iterable by accident.
+    """
+    advice = remedy or "give a list"
+    try:
+        entries = None if isinstance(value, str | bytes | Mapping) else list(value)
+    except TypeError:  # also arrays without axes
+        entries = None
+    if entries is None:
+        raise TrustboError(f"{what} must be a list; got {one_line(value)}. {advice.capitalize()}.")
+    return [require_kind(f"{what}[{k}]", entry, kind, advice) for k, entry in enumerate(entries)]
+
+
 def require_cells(what: str, value: object) -> tuple[tuple[int, int], ...]:
     """Return cells (row, col) in order, such as a path; raises TrustboError if any is invalid."""
-    if isinstance(value, str) or not isinstance(value, Iterable):
-        raise TrustboError(f"{what} must be a list of cells (row, col); got {value!r:.60}.")
-    return tuple(require_pair(f"{what}[{k}]", cell) for k, cell in enumerate(value))
+    cells = require_list(what, value, remedy="give cells (row, col)")
+    return tuple(require_pair(f"{what}[{k}]", cell) for k, cell in enumerate(cells))
 
 
 def require_pair(what: str, value: object) -> tuple[int, int]:
