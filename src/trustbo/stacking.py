@@ -1,5 +1,6 @@
 """Stack missions of different lengths into one batch of arrays."""
 
+import warnings
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -35,11 +36,27 @@ def stack_missions(missions: Sequence[Mission]) -> MissionBatch:
             k, i, m = np.argwhere(np.isnan(mission.awareness))[0]
             raise TrustboError(
                 f"awareness of mission {j}, bound {k + 1}, robot {mission.robots[i]}, feature "
-                f"{mission.features[m]} is NaN; pass workspace= to fill it, or drop the bound."
+                f"{mission.features[m]} is NaN; pass workspace= to fill it, or leave out the "
+                "mission if the map does not know the cell."
             )
         for name, padded in batch._asdict().items():
             padded[j, : len(mission.bounds)] = getattr(mission, name)
     return batch
+
+
+def known_awareness(missions: Sequence[Mission]) -> list[int]:
+    """Return the indices of the missions whose awareness is known in all bounds.
+
+    Call this after the awareness of the map was filled in. A warning names the other missions, as
+    `Campaign.tell` does, which excludes them.
+    """
+    known = [j for j, mission in enumerate(missions) if not np.isnan(mission.awareness).any()]
+    if unknown := sorted({*range(len(missions))} - {*known}):
+        warnings.warn(
+            f"missions {unknown} are left out: the map has no awareness in some of their cells.",
+            stacklevel=3,
+        )
+    return known
 
 
 def require_same_team(missions: Sequence[Mission]) -> None:

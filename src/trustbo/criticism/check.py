@@ -15,11 +15,10 @@ from trustbo.inference.draws import (
     is_of_people,
     joined_draws,
     missions_of,
-    require_posterior,
     sites_of,
     theta_of,
 )
-from trustbo.inference.score import score
+from trustbo.inference.score import last_posterior, predictions, score
 from trustbo.models.families import FAMILIES
 
 SIZE, SURE = 0.1, 0.95
@@ -62,7 +61,7 @@ class Finding(NamedTuple):
 
 
 def check(
-    posterior: xr.DataTree | Sequence[xr.DataTree],
+    posterior: xr.DataTree | Sequence[xr.DataTree | None],
     missions: Sequence[Mission] | None = None,
 ) -> Check:
     """Check a fitted model of contact rates for possible problems.
@@ -78,13 +77,14 @@ def check(
         posterior: Posterior from `fit`, or all posteriors of a campaign (`Result.posteriors`). For
             a campaign, the last posterior is checked, and the predictions of the others are scored.
         missions: All missions of the campaign; by default, the missions in the last posterior.
+            Missions without an earlier posterior and excluded missions are not predicted.
 
     Raises:
         TrustboError: If the posterior is not from `fit`, was fitted to people's reports, or
             contains no data although `missions` is None.
     """
     trees = list(posterior) if isinstance(posterior, Sequence) else [posterior]
-    tree = require_posterior("check", trees[-1] if trees else None)
+    tree = last_posterior("check", trees)
     if is_of_people(tree):
         raise TrustboError(
             "check needs a posterior of contact rates; got a posterior of HumanTrust. Use "
@@ -95,7 +95,7 @@ def check(
         "robots": _check_robots(robots),
         "places": _check_places(tree),
         "weights": _check_weights(tree),
-        "coverage": _check_coverage(trees, missions),
+        "coverage": _check_coverage(trees, tree, missions),
     }
     table = pd.DataFrame(list(findings.values()), pd.Index(findings, name="check"))
     odd = [finding.finding for finding in findings.values() if finding.stands_out]
@@ -184,11 +184,16 @@ def _check_weights(posterior: xr.DataTree) -> Finding:
     return Finding(words, bool(odd), str(features[most]), size, p)
 
 
-def _check_coverage(trees: list[xr.DataTree], missions: Sequence[Mission] | None) -> Finding:
+def _check_coverage(
+    trees: list[xr.DataTree | None], last: xr.DataTree, missions: Sequence[Mission] | None
+) -> Finding:
     """Check whether 90 % intervals one mission ahead contain 90 % of the rates."""
     if len(trees) < 2:
         return Finding("not tested: this check needs all posteriors of a campaign")
-    pit = score(trees, missions_of(trees[-1]) if missions is None else missions)["pit"]
+    missions = missions_of(last) if missions is None else missions
+    if not predictions("check", trees, missions)[0]:
+        return Finding("not tested: no mission has an earlier posterior that predicts it")
+    pit = score(trees, missions)["pit"]
     within = (abs(pit - 0.5) <= 0.45).where(pit.notnull()).mean(("bound", "robot")).values
     within = within[np.isfinite(within)]
     if not len(within):

@@ -21,7 +21,7 @@ from trustbo.models.people import HumanTrust
 from trustbo.models.record import model_to_record
 from trustbo.models.visited import has_places
 from trustbo.parallel import one_blas_thread
-from trustbo.stacking import require_same_team
+from trustbo.stacking import known_awareness, require_same_team
 from trustbo.workspace import Workspace
 
 SAMPLERS = ("importance", "nuts")
@@ -54,8 +54,9 @@ def fit(
             NumPyro's NUTS, which also samples trust unless rates are Gaussian.
         workspace: Workspace of the missions. If given, features and robots are reordered to match
             the workspace, missing awareness such as line of sight is filled in (see
-            `Workspace.fill`), and place effects cover the whole grid. Otherwise, the grid of place
-            effects ends at the last row and column visited.
+            `Workspace.fill`), and place effects cover the whole grid. Missions over cells without
+            awareness are then left out with a warning. Otherwise, the grid of place effects ends at
+            the last row and column visited.
         draws: Number of draws per chain.
         chains: Number of chains, among which the draws of importance sampling are divided.
         warmup: Number of warm-up draws per chain of NUTS, which are discarded.
@@ -91,6 +92,8 @@ def fit(
     if workspace is not None:
         require_kind("workspace", workspace, Workspace, "give the workspace of the missions")
         missions = [workspace.fill(mission) for mission in missions]
+        missions = [missions[j] for j in known_awareness(missions)]
+        require_same_team(missions)  # also that one is left
     if model is None:
         scale = missions[0].scale  # empty unless the missions are people's reports
         model = HumanTrust(scale=scale) if scale else default_model(places=has_places(missions))

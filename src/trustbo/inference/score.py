@@ -6,11 +6,11 @@ import numpy as np
 import xarray as xr
 
 from trustbo.data import Mission
-from trustbo.errors import TrustboError, require_whole
+from trustbo.errors import TrustboError, require_kind, require_list, require_whole
 from trustbo.inference.draws import QUANTILES, in_order_of, require_posterior
 from trustbo.inference.filter import TrustFilter
 from trustbo.models.slots import require_ticks
-from trustbo.stacking import MissionBatch, stack_missions
+from trustbo.stacking import MissionBatch, known_awareness, stack_missions
 from trustbo.streams import stream
 from trustbo.workspace import Workspace
 
@@ -20,7 +20,7 @@ _DIMS = ("mission", "bound", "robot")
 
 @np.errstate(under="ignore")  # small weights and tails round to 0
 def score(
-    posterior: xr.DataTree | Sequence[xr.DataTree],
+    posterior: xr.DataTree | Sequence[xr.DataTree | None],
     missions: Sequence[Mission],
     *,
     workspace: Workspace | None = None,
@@ -34,7 +34,8 @@ def score(
     Args:
         posterior: Posterior that predicts all `missions` and was fitted to none of them; or all
             posteriors of a campaign (`Result.posteriors`), each of which predicts the next mission.
-        missions: Missions to predict; for a campaign, all missions in order.
+        missions: Missions to predict; for a campaign, all missions in order. Missions without an
+            earlier posterior and missions that the campaign excluded are left out.
         workspace: Workspace of the missions, used to fill in missing awareness as in `fit`.
         seed: Random seed for predictive draws and randomised PIT values.
 
@@ -53,10 +54,19 @@ def score(
             tick counts are missing.
     """
     require_whole("seed", seed, 0)
-    missions = [m if workspace is None else workspace.fill(m) for m in missions]
-    trees = _trees(posterior, missions)
-    first = len(missions) - len(trees)
-    missions = missions[first:]
+    missions = require_list("missions", missions, Mission, "give a list of missions")
+    known = range(len(missions))
+    if workspace is not None:
+        require_kind("workspace", workspace, Workspace, "give the workspace of the missions")
+        missions = [workspace.fill(mission) for mission in missions]
+        known = known_awareness(missions)
+    trees, indices = predictions("score", posterior, missions, known)
+    if not trees:
+        raise TrustboError(
+            f"score needs a mission that an earlier posterior predicts; none of {len(missions)} "
+            "missions has one. Run more missions."
+        )
+    missions = [missions[j] for j in indices]
     batch = stack_missions(missions)
     y = batch.contact_rate
     names = missions[0].robots, missions[0].features  # the same for all
@@ -83,7 +93,7 @@ def score(
     variables = {"contact_rate": (_DIMS, y), "quantile": ((*_DIMS, "level"), quantile)}
     variables |= {name: (_DIMS, column) for name, column in columns.items()}
     coords = {
-        "mission": np.arange(first, first + len(y)),
+        "mission": indices,
         "bound": np.arange(1, y.shape[1] + 1),
         "robot": list(missions[0].robots),
         "level": list(QUANTILES),
@@ -128,23 +138,60 @@ def _summary(
     return within | {"mean_log_score": log_scores, "r2": float(r2), "n": n}
 
 
-def _trees(
-    posterior: xr.DataTree | Sequence[xr.DataTree], missions: Sequence[Mission]
-) -> list[xr.DataTree]:
-    """List the posterior that predicts each mission; in a campaign, the first one is left out."""
+def predictions(
+    who: str,
+    posterior: xr.DataTree | Sequence[xr.DataTree | None],
+    missions: Sequence[Mission],
+    known: Sequence[int] | None = None,
+) -> tuple[list[xr.DataTree], list[int]]:
+    """Pair each mission that can be predicted with the posterior that predicts it.
+
+    One posterior predicts all missions. In a campaign, each posterior predicts the next mission.
+    Missions without an earlier posterior are left out, and so are missions that the last posterior
+    was not fitted to, according to its attribute `missions`: they were excluded.
+
+    Args:
+        who: Name of the public function, for messages.
+        posterior: Posterior, or the posterior after each mission, None where there was none yet.
+        missions: All missions, in order.
+        known: Indices of the missions whose awareness is known; by default, all.
+
+    Returns:
+        Posteriors and the indices of the missions that they predict, equally many, maybe none.
+
+    Raises:
+        TrustboError: If a posterior is not from `fit`, there is none yet, there are no missions, or
+            the numbers of posteriors and missions do not match.
+    """
     if not missions:
-        raise TrustboError("score needs missions to predict; got none.")
+        raise TrustboError(f"{who} needs missions to predict; got none.")
+    known = range(len(missions)) if known is None else known
     if isinstance(posterior, xr.DataTree) or not isinstance(posterior, Sequence):
-        return [require_posterior("score", posterior)] * len(missions)
-    trees = [require_posterior("score", tree) for tree in posterior]
-    if not len(missions) - 1 <= len(trees) <= len(missions):
+        return [require_posterior(who, posterior)] * len(known), list(known)
+    last = last_posterior(who, posterior)
+    if not len(missions) - 1 <= len(posterior) <= len(missions):
         raise TrustboError(
-            f"got {len(trees)} posteriors and {len(missions)} missions; give the posterior after "
-            "each mission, as in Result.posteriors."
+            f"got {len(posterior)} posteriors and {len(missions)} missions; give the posterior "
+            "after each mission, as in Result.posteriors."
         )
-    if len(missions) == 1:
-        raise TrustboError("score needs at least two missions of a campaign; got one.")
-    return trees[: len(missions) - 1]
+    used = np.intersect1d(known, last.attrs.get("missions", known))
+    pairs = [
+        (require_posterior(who, tree), j)
+        for j, tree in enumerate(posterior[: len(missions) - 1], start=1)
+        if tree is not None and j in used
+    ]
+    return [tree for tree, _ in pairs], [j for _, j in pairs]
+
+
+def last_posterior(who: str, posteriors: Sequence[xr.DataTree | None]) -> xr.DataTree:
+    """Return the last posterior of a campaign; raises TrustboError if there is none yet."""
+    trees = [tree for tree in posteriors if tree is not None]
+    if not trees:
+        raise TrustboError(
+            f"{who} needs a posterior, but nothing has been learned yet; run a mission with "
+            "measured contact rates first."
+        )
+    return require_posterior(who, trees[-1])
 
 
 def _pit(drawn: np.ndarray, y: np.ndarray, rng: np.random.Generator) -> np.ndarray:
