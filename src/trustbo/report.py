@@ -13,6 +13,7 @@ from arviz_stats.summary import summary
 
 from trustbo import plots
 from trustbo.campaign.result import Result
+from trustbo.errors import require_kind
 from trustbo.files import FilePath, write_text
 from trustbo.planning import Plan
 from trustbo.plots.style import drawing
@@ -60,6 +61,8 @@ def write_report(path: FilePath, result: Result) -> None:
     Raises:
         TrustboError: There is no posterior yet, or the file cannot be written.
     """
+    require_kind("result", result, Result, "give a result or a campaign")
+    _ = result.posterior  # raises if there is none yet
     body = [_facts(result), *_path(result.plan), *_trust(result), *_missions(result)]
     body += [*_uncertainty(result), *_diagnostics(result), *_settings(result)]
     n = len(result.missions)
