@@ -61,7 +61,7 @@ def sample_by_nuts(
         if posterior.exact:
             kernel = _marginal_kernel(posterior, center, scale)
             first = np.linalg.solve(scale, (rng.choice(z, chains, replace=False) - center).T).T
-            starts = jnp.asarray(first)
+            starts = jnp.asarray(first if chains > 1 else first[0])  # one chain has no axis
         else:
             kernel, starts = _full_kernel(posterior, z), None
         mcmc = MCMC(
