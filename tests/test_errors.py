@@ -14,15 +14,23 @@ from trustbo.inference import TrustFilter, fit, params_of
 from trustbo.inference.diagnostics import diagnostics
 from trustbo.models import PooledTrust, Priors
 from trustbo.planning import Planner
+from trustbo.planning.policies import optimistic
+from trustbo.simulation import KinematicSimulator, ModelSimulator, ReplaySimulator, Truth
 
 ENDS = (5, 0), (0, 5)
 PATH = [(5, 0), (4, 1), (3, 2)]
+PARAMS = tb.models.TrustParams(0.6, np.array([0.3, 0.2]), 0.05, 0.05, 0.05)
 Z, Y = np.full((2, 3, 2), 0.5), np.full((2, 3), 0.5)
 
 
 @pytest.fixture(scope="module")
 def workspace():
     return tb.Workspace.from_awareness(np.random.default_rng(0).uniform(size=(3, 6, 6, 2)))
+
+
+def hills(**options):
+    terrain = tb.terrain.synthetic_terrain((60.0, 60.0), resolution=3.0)
+    return tb.Workspace.from_terrain(terrain, (2, 2), **options)
 
 
 def made(z=Z, y=Y, path=PATH, **options):
@@ -58,7 +66,53 @@ MISTAKES = {
     "degrees for radians": (lambda w: tb.Robot(max_slope=45), "max_slope"),
     "no such raster": (lambda w: tb.terrain.read_terrain("no.tif", "no.tif"), r"no\.tif"),
     "no path to suggest": (lambda w: tb.Campaign(w, *ENDS).suggest([(0, 0)]), "path"),
+    "None for a path to suggest": (lambda w: tb.Campaign(w, *ENDS).suggest(None), "path"),
+    "None for a path": (lambda w: w.along(None), "path"),
+    "a path without cells": (lambda w: w.along([]), "path"),
+    "numbers for cells": (lambda w: Planner(w, *ENDS).evaluate([1, 2], PARAMS), "path"),
+    "a share as text": (lambda w: tb.RegretBound(eps="0.05"), "eps"),
+    "a correlation of 1": (lambda w: tb.models.RobotEffect(rho=1.0), "rho"),
+    "sight as text": (lambda w: tb.workspace.Sight(crown_base="0.3"), "crown_base"),
+    "extinction below 0": (lambda w: tb.workspace.Sight(extinction=-0.1), "extinction"),
+    "one number for a mean and an sd": (lambda w: tb.hazard.Hazard(margin=0.5), "margin"),
+    "no effects": (lambda w: PooledTrust(effects=None), "effects"),
+    "an unknown family": (lambda w: Priors.of(("a",), observation="x"), "observation"),
+    "a model as text": (lambda w: tb.inference.sample_prior("x", 2, 5, 0), "model"),
+    "a quantile as text": (lambda w: optimistic(None, PARAMS, None, quantile="9"), "quantile"),
+    "a map of risk of another shape": (lambda w: Planner(w, *ENDS).avoiding(Z, Z), "bounds"),
+    "x0 of another team": (lambda w: tb.planning.roll_trust(PARAMS, Z, [0.5, 0.5]), "x0"),
+    "None for parameters": (lambda w: tb.planning.roll_trust(None, Z), "params"),
+    "no missions to replay": (lambda w: ReplaySimulator([]), "missions"),
+    "a number for a mission": (lambda w: w.fill(3), "mission"),
+    "a number for a simulated workspace": (lambda w: KinematicSimulator(3), "workspace"),
+    "no features of a terrain": (lambda w: hills(features={}), "features"),
+    "signs as text": (lambda w: tb.terrain.CompositeIndex("slope"), "signs"),
+    "one side of a terrain": (lambda w: tb.terrain.synthetic_terrain(30.0), "size"),
+    "a number for a campaign": (lambda w: tb.Follower(3), "campaign"),
+    "options as text": (lambda w: tb.Campaign(w, *ENDS, fit="draws"), "fit"),
+    "an export of None": (lambda w: tb.export.write_csv("m.csv", None), "result"),
+    "a report of None": (lambda w: tb.report.write_report("r.html", None), "result"),
+    "a map of None": (lambda w: tb.plots.grid_map(None), "workspace"),
+    "no cases": (lambda w: tb.study.run_grid({}, {}, "study"), "case"),
+    "a column as a number": (lambda w: tb.logs.read_reports({}, person=3, inputs=["x"]), "person"),
 }
+HUGE = {
+    "n_robots": lambda w, n: tb.Team(n),
+    "draws": lambda w, n: fit([made()], draws=n),
+    "n_draws": lambda w, n: tb.inference.sample_prior(PooledTrust(), 2, n, 0),
+    "n_iterations": lambda w, n: list(tb.Campaign(w, *ENDS).run(ModelSimulator(w, PARAMS), n)),
+    "max_bounds": lambda w, n: Planner(w, *ENDS, max_bounds=n),
+    "max_bounds of the fewest and more": lambda w, n: Planner(w, *ENDS, max_bounds=f"shortest+{n}"),
+    "n_replicates": lambda w, n: Truth.of(KinematicSimulator(hills()), n_replicates=n),
+    "n_missions": lambda w, n: tb.study.run_grid({}, {}, "study", n_missions=n),
+    "seed": lambda w, n: Planner(w, *ENDS).plan_draws(PARAMS, seed=n),
+}
+
+
+@pytest.mark.parametrize("name", HUGE)
+def test_huge_numbers_are_refused(name, workspace):
+    with pytest.raises(tb.TrustboError, match=name.split()[0]):
+        HUGE[name](workspace, 10**24)
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)

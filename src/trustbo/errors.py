@@ -145,6 +145,14 @@ def require_list(what: str, value: Any, kind: Any = object, remedy: str = "") ->
     return [require_kind(f"{what}[{k}]", entry, kind, advice) for k, entry in enumerate(entries)]
 
 
+def require_tuple(what: str, value: Any, n: int) -> tuple[float, ...]:
+    """Return n numbers as floats, such as a mean and an sd; raises TrustboError unless finite."""
+    numbers = require_list(what, value, remedy=f"give {n} numbers")
+    if len(numbers) != n:
+        raise TrustboError(f"{what} must be {n} numbers; got {one_line(value)}.")
+    return tuple(require_finite(f"{what}[{k}]", number) for k, number in enumerate(numbers))
+
+
 def require_cells(what: str, value: object) -> tuple[tuple[int, int], ...]:
     """Return cells (row, col) in order, such as a path; raises TrustboError if any is invalid."""
     cells = require_list(what, value, remedy="give cells (row, col)")

@@ -8,7 +8,13 @@ import numpy as np
 
 from trustbo.arrays import as_names, default_robots
 from trustbo.display import Rows, Summary
-from trustbo.errors import TrustboError, require_kind, require_positive, require_whole
+from trustbo.errors import (
+    TrustboError,
+    require_count,
+    require_kind,
+    require_positive,
+    require_whole,
+)
 
 
 @dataclass(frozen=True)
@@ -87,7 +93,7 @@ class Team(Summary):
         remedy = "give a sequence of Robot, or n_robots= for identical robots"
         for robot in require_kind("Team.robots", self.robots, Sequence, remedy):
             require_kind("Team.robots", robot, Robot, remedy)
-        robots = tuple(self.robots) or (Robot(),) * require_whole("n_robots", self.n_robots, 1)
+        robots = tuple(self.robots) or (Robot(),) * require_count("n_robots", self.n_robots)
         n = len(robots)
         names = as_names("names", self.names, n) or default_robots(n)
         for name, value in (("n_robots", len(robots)), ("robots", robots), ("names", names)):

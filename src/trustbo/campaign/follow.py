@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from trustbo.arrays import read_labelled
 from trustbo.campaign.campaign import Campaign
 from trustbo.data import Bound, Cell, Mission
-from trustbo.errors import TrustboError, require_pair
+from trustbo.errors import TrustboError, require_finite, require_kind, require_pair
 from trustbo.inference import TrustFilter
 from trustbo.inference.filter import TrustForecast, TrustState
 
@@ -31,6 +31,7 @@ class Follower:
 
     def __init__(self, campaign: Campaign) -> None:
         """Follow the path that `campaign.ask()` returns, from its start."""
+        require_kind("campaign", campaign, Campaign, "give a trustbo.Campaign")
         self.path: tuple[Cell, ...] = tuple(campaign.ask().path)
         self._workspace, self._goal = campaign.workspace, self.path[-1]
         self.bounds: tuple[Bound, ...] = ()
@@ -134,5 +135,5 @@ class Follower:
         if running != self.running:
             some, first = ("no", "begin") if running else ("a", "end")
             raise TrustboError(f"{some} bound is in progress; call {first} first.")
-        if not self._last <= t < np.inf:
-            raise TrustboError(f"t = {t} s must be finite and not before {self._last} s.")
+        if require_finite(f"t = {t} s", t) < self._last:
+            raise TrustboError(f"t = {t} s must not be before the last time, {self._last} s.")

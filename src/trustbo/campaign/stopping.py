@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from trustbo.errors import TrustboError
+from trustbo.errors import require_share
 from trustbo.inference import params_of
 from trustbo.planning import InfeasibleError
 from trustbo.workspace.moves import bounds_along
@@ -42,8 +42,7 @@ class RegretBound:
 
     def __post_init__(self) -> None:
         for name, value in (("eps", self.eps), ("delta", self.delta)):
-            if not 0.0 < value < 1.0:
-                raise TrustboError(f"RegretBound.{name} must be in (0, 1); got {value!r}.")
+            require_share(f"RegretBound.{name}", value, ends=False)
 
     def __call__(self, campaign: "Campaign") -> str | None:
         """Return the reason to stop, or None."""

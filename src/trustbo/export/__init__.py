@@ -4,10 +4,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from trustbo.campaign.result import Result
-from trustbo.errors import TrustboError, require_choice
+from trustbo.errors import require_choice, require_list
 from trustbo.export.gis import write_csv, write_geojson, write_geotiff
 from trustbo.export.nav2 import Frame, write_nav2
-from trustbo.files import FilePath
+from trustbo.files import FilePath, to_path
 
 WRITERS: dict[str, tuple[str, Callable[[Path, Result], None]]] = {
     "geotiff": ("maps.tif", write_geotiff),
@@ -26,13 +26,14 @@ def export_result(
     The formats are geotiff, geojson, csv and nav2. Raises TrustboError if a format is unknown, or a
     file cannot be written.
     """
-    if isinstance(formats, str):  # a sequence of letters
-        raise TrustboError(f"formats must be a list of names; got {formats!r}: give [{formats!r}].")
-    names = [require_choice("format", name, WRITERS) for name in formats]
+    names = [
+        require_choice("format", name, WRITERS)
+        for name in require_list("formats", formats, remedy=f"give some of {', '.join(WRITERS)}")
+    ]
     written = []
     for name in names:
         file, write = WRITERS[name]
-        target = Path(folder).expanduser() / file
+        target = to_path(folder) / file
         write(target, result)
         written.append(target)
     return written

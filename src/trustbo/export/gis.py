@@ -38,6 +38,7 @@ def write_geotiff(path: FilePath, maps: Result | xr.Dataset) -> None:
         TrustboError: The maps have no CRS, or the file cannot be written.
     """
     maps = maps.maps() if isinstance(maps, Result) else maps
+    require_kind("maps", maps, xr.Dataset, "give a result, or maps such as result.maps()")
     target = require_suffix(path, ".tif", ".tiff")
     if maps.rio.crs is None:
         raise TrustboError(_NO_CRS)
@@ -112,6 +113,7 @@ def write_csv(path: FilePath, result: Result) -> None:
     Raises:
         TrustboError: There is no posterior yet, or the file cannot be written.
     """
+    require_kind("result", result, Result, "give a result or a campaign")
     table, latent = to_frame(result.missions), result.posterior["latent"].to_dataset()
     # The posterior lacks missions that are excluded or not learned from yet.
     of_mission = {int(j) + 1: i for i, j in enumerate(latent["mission"].values)}

@@ -26,7 +26,7 @@ from trustbo.errors import (
     require_positive,
 )
 from trustbo.export.gis import LEAD, require_suffix
-from trustbo.files import FilePath, write_file
+from trustbo.files import FilePath, to_path, write_file
 from trustbo.planning import Plan
 from trustbo.planning.problem import mean_of
 from trustbo.workspace import Workspace
@@ -107,7 +107,10 @@ def write_nav2(
             cannot be part of a file name, a robot has no route in a bound, the grid has too many
             cells for Nav2's ids, the map has too many pixels, or a file cannot be written.
     """
-    folder = Path(folder).expanduser()
+    require_kind("result", result, Result, "give a result or a campaign")
+    if frame is not None:
+        require_kind("frame", frame, Frame, "give a trustbo.export.Frame")
+    folder = to_path(folder)
     workspace = result.workspace
     place = Frame(workspace.grid.center(result.path[0])) if frame is None else frame
     names = () if result.plan.stops is None else (LEAD, *workspace.team.names)

@@ -9,7 +9,7 @@ import numpy as np
 from scipy import special
 from scipy.interpolate import PchipInterpolator
 
-from trustbo.errors import TrustboError, require_finite, require_positive
+from trustbo.errors import TrustboError, require_positive, require_tuple
 
 REFERENCE = 0.5
 """Difficulty at which the intercept is the logit of the prior mean."""
@@ -58,10 +58,9 @@ class Hazard:
 
     def __post_init__(self) -> None:
         for name in ("intercept", "coefficient", "margin", "log_width", "log_strength"):
-            mean, sd = getattr(self, name)
-            mean = require_finite(f"mean of {name}", mean)
+            mean, sd = require_tuple(f"Hazard.{name}", getattr(self, name), 2)
             object.__setattr__(self, name, (mean, require_positive(f"sd of {name}", sd)))
-        share, sd = self.doubt
+        share, sd = require_tuple("Hazard.doubt", self.doubt, 2)
         share = require_positive("the probability of doubt", share, or_zero=True)
         if share >= 1.0:
             raise TrustboError(f"the probability of doubt must be in [0, 1); got {share!r}.")

@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from trustbo.data import Mission, is_line_of_sight
-from trustbo.errors import TrustboError, require_kind, require_whole
+from trustbo.errors import TrustboError, require_count, require_kind, require_whole
 from trustbo.inference.place_maps import place_maps_of
 from trustbo.inference.posterior import Draws, Posterior
 from trustbo.models.effects.effect import Effect, Theta
@@ -118,6 +118,7 @@ def params_of(
             "trustbo.inference.predict_reports."
         )
     if workspace is not None:
+        require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
         posterior = in_order_of(posterior, workspace.team.names, workspace.features)
     sites, attrs = sites_of(posterior), posterior.attrs
     effects = [e for e in effects_of(posterior) if not isinstance(e, PlaceEffect)]
@@ -241,6 +242,7 @@ def read_posterior(
     posterior = in_order_of(posterior, missions[0].robots, features)
     if model is None:
         model = model_from_record(json.loads(posterior.attrs["model_record"]), features=features)
+    require_kind("model", model, TrustModel, "give the model of the posterior")
     model = model.for_features(features)
     fitted = Posterior(model, model.slots(missions))
     groups = {"posterior": sites_of(posterior)}
@@ -261,7 +263,7 @@ def sample_prior(
         n_robots: Number of robots, for models with separate parameters for each robot.
     """
     require_kind("model", model, TrustModel, "give a model such as PooledTrust()")
-    n_draws, seed = require_whole("n_draws", n_draws, 1), require_whole("seed", seed, 0)
+    n_draws, seed = require_count("n_draws", n_draws), require_whole("seed", seed, 0)
     prior, rng = _prior(model, n_features, n_robots), np.random.default_rng(seed)
     return assemble_params(prior.prior_sites(n_draws, rng), model.x0, model.memory)
 
@@ -277,7 +279,7 @@ def prior_mean(model: TrustModel, n_features: int, *, n_robots: int = 1) -> Para
 def _prior(model: TrustModel, n_features: int, n_robots: int) -> Posterior:
     """Make a `Posterior` without data or effects."""
     sizes = {"n_features": n_features, "n_robots": n_robots}
-    n_features, n_robots = (require_whole(name, n, 1) for name, n in sizes.items())
+    n_features, n_robots = (require_count(name, n) for name, n in sizes.items())
     none = np.full((1, 1, n_robots), np.nan)
     z = np.zeros((1, 1, n_robots, n_features))
     return Posterior(replace(model, effects=()), Slots(none, z, none, ("",) * n_features))

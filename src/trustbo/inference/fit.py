@@ -9,7 +9,14 @@ import numpy as np
 import xarray as xr
 
 from trustbo.data import Mission
-from trustbo.errors import PosteriorError, TrustboError, require_choice, require_kind, require_whole
+from trustbo.errors import (
+    PosteriorError,
+    TrustboError,
+    require_choice,
+    require_count,
+    require_kind,
+    require_whole,
+)
 from trustbo.inference.importance import MAX_KHAT, sample
 from trustbo.inference.place_maps import place_group
 from trustbo.inference.posterior import Draws, Posterior
@@ -100,7 +107,7 @@ def fit(
     require_kind("model", model, TrustModel, "give a model such as PooledTrust()")
     require_choice("sampler", sampler, SAMPLERS)
     sizes = {"draws": draws, "chains": chains, "warmup": warmup}
-    draws, chains, warmup = (require_whole(name, n, 1) for name, n in sizes.items())
+    draws, chains, warmup = (require_count(name, n) for name, n in sizes.items())
     seed = require_whole("seed", seed, 0)
     model = model.for_features(missions[0].features)
     slots = model.slots(missions, workspace)

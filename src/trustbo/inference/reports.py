@@ -7,7 +7,7 @@ import numpy as np
 import xarray as xr
 
 from trustbo.data import Mission, levels_of
-from trustbo.errors import TrustboError, require_choice, require_whole
+from trustbo.errors import TrustboError, require_choice, require_count, require_whole
 from trustbo.inference.draws import QUANTILES, is_of_people, read_posterior, require_posterior
 from trustbo.inference.posterior import Draws, Posterior
 from trustbo.models.model import TrustModel
@@ -63,7 +63,7 @@ def predict_reports(
         )
     require_same_team(missions)
     require_choice("given", given, ("earlier", "none"))
-    seed, n = require_whole("seed", seed, 0), require_whole("n_draws", n_draws, 1)
+    seed, n = require_whole("seed", seed, 0), require_count("n_draws", n_draws)
     of_fit, draws = read_posterior(posterior, model=model)
     if missions[0].features != of_fit.slots.features:
         raise TrustboError(

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from trustbo.data import Mission, levels_of
-from trustbo.errors import TrustboError
+from trustbo.errors import TrustboError, require_kind, require_list
 from trustbo.logs.columns import Columns, require_one_spelling
 
 _YES = ("1", "true", "yes", "success", "succeeded", "ok")
@@ -51,6 +51,10 @@ def read_reports(
             the scale, a person has no reports, or there is neither an outcome nor an input.
     """
     levels = levels_of(scale)
+    columns = {"person": person, "step": step, "report": report}
+    for what, name in columns.items():
+        require_kind(what, name, str, "give the name of a column")
+    inputs = require_list("inputs", inputs, str, "give the names of columns")
     if outcome is None and not inputs:
         raise TrustboError("give the column of outcomes (outcome=) or other columns (inputs=).")
     columns = Columns(table)

@@ -11,4 +11,5 @@ def default_model(*, places: bool = True) -> PooledTrust:
     Args:
         places: Whether to include place effects, which need missions with a map.
     """
-    return PooledTrust(effects=(PlaceEffect(),) * places + (RobotEffect(),))
+    effects = (PlaceEffect(), RobotEffect()) if places else (RobotEffect(),)
+    return PooledTrust(effects=effects)

@@ -14,7 +14,7 @@ from scipy import sparse
 
 from trustbo.data import Mission
 from trustbo.display import Rows, Summary
-from trustbo.errors import TrustboError, require_choice
+from trustbo.errors import TrustboError, require_choice, require_list
 from trustbo.models.backend import namespace
 from trustbo.models.effects.effect import Effect, Theta, sample_columns
 from trustbo.models.effects.weights import Weights
@@ -65,9 +65,8 @@ class TrustModel(Summary, ABC):
         elif not isinstance(self.priors, Priors):
             raise TrustboError(f"priors must be a trustbo.models.Priors; got {self.priors!r}.")
         given: Any = self.effects
-        effects = (given,) if isinstance(given, Effect) else tuple(given)
-        if unknown := [effect for effect in effects if not isinstance(effect, Effect)]:
-            raise TrustboError(f"effects must be objects like PlaceEffect(); got {unknown[0]!r}.")
+        given = [given] if isinstance(given, Effect) else given
+        effects = tuple(require_list("effects", given, Effect, "give objects like PlaceEffect()"))
         if len({type(effect) for effect in effects}) < len(effects):
             raise TrustboError(f"effects must be of different classes; got {effects!r}.")
         object.__setattr__(self, "effects", effects)

@@ -11,7 +11,13 @@ from numpyro.distributions import Distribution, constraints
 
 from trustbo.data import is_line_of_sight
 from trustbo.display import Rows, Summary
-from trustbo.errors import TrustboError, require_finite, require_positive
+from trustbo.errors import (
+    TrustboError,
+    require_choice,
+    require_finite,
+    require_list,
+    require_positive,
+)
 from trustbo.models.backend import own_settings
 from trustbo.models.families import FAMILIES
 from trustbo.models.scores import log_density
@@ -103,6 +109,8 @@ class Priors(Summary):
         For tick counts, the priors are scaled by 5, and a line of sight of 0.5 predicts a rate of
         0.5. Without line of sight, the result is `default`.
         """
+        features = require_list("features", features, str, "give the names of the features")
+        require_choice("observation", observation, FAMILIES)
         is_sight = np.array([is_line_of_sight(name) for name in features])
         default, n = cls.default(observation), max(int(is_sight.sum()), 1)
         if not is_sight.any():

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from trustbo.arrays import read_labelled, require_numbers
 from trustbo.data import Cell
-from trustbo.errors import TrustboError
+from trustbo.errors import TrustboError, require_kind
 from trustbo.models.params import Params, check_params, require_values
 from trustbo.workspace.moves import bounds_along
 
@@ -62,7 +62,13 @@ def trust_dynamics(
     start = np.asarray(params.x0_mean if x0 is None else x0, dtype=float)
     if x0 is None or not start.ndim:
         start = start[..., None]
-    start = np.broadcast_to(start, (*leading, n_robots))
+    try:
+        start = np.broadcast_to(start, (*leading, n_robots))
+    except ValueError:
+        raise TrustboError(
+            f"x0 must be one number or have the shape {(*leading, n_robots)}, one for each robot; "
+            f"got shape {start.shape}."
+        ) from None
     sd = np.asarray(params.delta_v, dtype=float)
     sd = np.broadcast_to(sd.mean(-1) if params.BY_ROBOT else sd, leading)
     if params.BY_ROBOT or by_robot:
@@ -119,6 +125,7 @@ def roll_trust(params: Params, awareness: ArrayLike, x0: ArrayLike | None = None
         TrustboError: If the number of robots or features does not match the parameters, or place
             effects are given for the grid instead of the path.
     """
+    require_kind("params", params, Params, "give parameters, such as TrustParams(...)")
     require_values(params)
     dims, unnamed = ("bound", "robot", "feature"), {"robot": None, "feature": None}
     of_robots = np.swapaxes(read_labelled("awareness", awareness, dims, unnamed).values, 0, 1)

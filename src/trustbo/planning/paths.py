@@ -25,6 +25,8 @@ STEPS = np.array(MOVES)
 """Row and column step of each move, shape (move, 2)."""
 _MOST_STATES = 20_000_000
 """Maximum number of states of the unrolled graph; a graph of this size needs about 3 GB."""
+_MOST_EXTRA = 10_000
+"""Maximum number of bounds beyond the fewest; longer walks would only go round in circles."""
 _SHORTEST = re.compile(r"shortest(?:\+(\d+))?")
 
 
@@ -89,6 +91,11 @@ class AdmissiblePaths:
             raise TrustboError(
                 f"unknown max_bounds {max_bounds!r}; give 'shortest', an int, or 'shortest+n', "
                 "such as 'shortest+2', to allow up to n more bounds without U-turns."
+            )
+        if self.longest - self.shortest > _MOST_EXTRA:
+            raise TrustboError(
+                f"max_bounds = {one_line(max_bounds)} is too large: at most {_MOST_EXTRA} bounds "
+                f"more than the shortest path, of {self.shortest} bounds, are allowed."
             )
         if self.longest < self.shortest:
             raise TrustboError(

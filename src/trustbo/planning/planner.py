@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from trustbo.arrays import read_labelled
 from trustbo.data import Cell
 from trustbo.display import Rows, Summary
-from trustbo.errors import TrustboError, require_choice
+from trustbo.errors import TrustboError, require_choice, require_positive
 from trustbo.hazard.risk import Risk
 from trustbo.hazard.strata import Strata
 from trustbo.models.families import FAMILIES
@@ -131,7 +131,13 @@ class Planner(Summary):
 
     def avoiding(self, bounds: np.ndarray, risk: np.ndarray) -> Self:
         """Return a planner that avoids the given bounds (see `AdmissiblePaths.avoiding`)."""
-        return self._with(paths=self.problem.paths.avoiding(bounds, risk))
+        dims, moves = ("move", "row", "col"), {"move": MOVE_NAMES}
+        avoided = read_labelled("bounds", bounds, dims, moves).values
+        risks = read_labelled("risk", risk, dims, moves).values
+        for name, values in (("bounds", avoided), ("risk", risks)):
+            if values.shape != (shape := self.problem.paths.bounds.shape):
+                raise TrustboError(f"{name} must have the shape {shape}; got {values.shape}.")
+        return self._with(paths=self.problem.paths.avoiding(avoided > 0.0, risks))
 
     def with_risk(
         self,
@@ -167,7 +173,8 @@ class Planner(Summary):
         Raises:
             TrustboError: If the failure cost is negative or not finite.
         """
-        return self._with(failure_cost=failure_cost) if self.problem.objective.of_contact else self
+        cost = require_positive("failure_cost", failure_cost, or_zero=True)
+        return self._with(failure_cost=cost) if self.problem.objective.of_contact else self
 
     def plan(self, params: Params | xr.DataTree, *, x0: ArrayLike | None = None) -> Plan:
         """Find the best admissible path for given parameters, or for the mean of a posterior.

@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from trustbo.errors import require_choice
+from trustbo.errors import require_choice, require_finite, require_share
 from trustbo.models.params import Params
 from trustbo.planning.draws import choose_draws
 from trustbo.planning.dynamics import Dynamics
@@ -41,6 +41,7 @@ def optimistic(
 
     The drift u of each bound is a high quantile over the draws; other parameters are means.
     """
+    require_share("quantile", quantile)
     some = choose_draws(params, 1000, _seed(rng))
     transition, drift, start, sd = planner.problem.dynamics(some)
     best = Dynamics(
@@ -51,6 +52,7 @@ def optimistic(
 
 def ucb(rng: np.random.Generator, params: Params, planner: Planner, *, kappa: float = 1.0) -> Plan:
     """Choose, among the draws' best paths, that with the largest mean + `kappa` sd of the value."""
+    require_finite("kappa", kappa)
     drawn = planner.plan_draws(params, n_draws=N_DRAWS, seed=_seed(rng))
     values = drawn.values_of(drawn.candidates)
     chosen = int(np.argmax(values.mean(0) + kappa * values.std(0)))

@@ -9,7 +9,8 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from trustbo.errors import TrustboError, require_choice
+from trustbo.errors import TrustboError, require_choice, require_whole
+from trustbo.inference.draws import require_posterior
 from trustbo.planning.plan import QUANTILES, Plan
 from trustbo.plots.style import (
     GREY,
@@ -77,14 +78,14 @@ def _latent_trust(
     posterior: xr.DataTree, mission: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Sequence[str]]:
     """Return bounds, trust medians and quantiles, contact rates and robots of a mission."""
+    require_posterior("trust_curves", posterior)
     if "latent" not in posterior.children:
         raise TrustboError(
             "this posterior has no latent trust; use inference.complete(posterior, missions)."
         )
     latent = posterior["latent"].to_dataset()
     n = latent.sizes["mission"]
-    if not -n <= mission < n:
-        raise TrustboError(f"mission must be an index from {-n} to {n - 1}; got {mission!r}.")
+    mission = require_whole("mission", mission, -n, n - 1)
     trust = latent["trust"].isel(mission=mission).stack(all_draws=("chain", "draw"))
     trust = trust.dropna("bound", how="all").transpose("all_draws", "bound", "robot")
     rates = posterior["observed_data"]["contact_rate"].isel(mission=mission)

@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 
 from trustbo.data import Cell
+from trustbo.errors import require_kind
 from trustbo.files import FilePath, write_text
 from trustbo.planning import Plan
 from trustbo.plots.maps import contours, extent_of, robust_limits, trust_limits
@@ -61,6 +62,9 @@ def explore(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> Explorer:
     Returns:
         Page, which notebooks display and `save` writes to a file.
     """
+    require_kind("plan", plan, Plan, "give a Plan, such as Result.plan")
+    require_kind("maps", maps, xr.Dataset, "give maps, such as Result.maps()")
+    require_kind("history", history, xr.Dataset, "give Result.history")
     from bokeh.embed import file_html  # imported here, as it takes half a second
     from bokeh.resources import INLINE
 

@@ -5,6 +5,7 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 
+from trustbo.errors import require_kind
 from trustbo.plots.style import figure_of, panels, styled
 from trustbo.workspace import Workspace
 
@@ -26,6 +27,7 @@ def grid_map(workspace: Workspace, *, ax: Axes | None = None) -> Axes:
     Returns:
         Axes of the figure.
     """
+    require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
     grid, (rows, cols) = workspace.grid, workspace.grid.shape
     tall = grid.cell_height / grid.cell_width
     height = float(np.clip(_WIDTH * rows * tall / cols, 2.0, 11.0))

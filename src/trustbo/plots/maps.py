@@ -13,11 +13,12 @@ from matplotlib.colors import Colormap, ListedColormap, Normalize
 from scipy.ndimage import gaussian_filter
 
 from trustbo.data import Cell
-from trustbo.errors import TrustboError
+from trustbo.errors import TrustboError, require_kind, require_list, require_tuple, require_whole
 from trustbo.plots.style import GREY, as_text, background, ink, outlined, panels, styled
 from trustbo.terrain import pixel_size
 from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Grid, over_cells
+from trustbo.workspace.moves import require_on_grid
 
 MOMENTS = (1, 2, 4)
 """Missions for which `trust_maps` plots the map used for planning, by default."""
@@ -59,6 +60,11 @@ def trust_maps(
     Returns:
         Axes, shape (panel,).
     """
+    require_kind("history", history, xr.Dataset, "give Result.history")
+    require_kind("trust_map", trust_map, xr.DataArray, "give Result.trust_map")
+    require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
+    path = require_path_of_cells(path, workspace)
+    missions = [require_whole("mission", i, 1) for i in require_list("missions", missions)]
     n_missions = history.sizes["iteration"]
     chosen = [i for i in missions if 1 <= i <= n_missions]
     maps = [history["trust_map"].sel(iteration=i) for i in chosen] + [trust_map]
@@ -99,6 +105,7 @@ def terrain_maps(workspace: Workspace, *, ax: Any = None) -> np.ndarray:
     Raises:
         TrustboError: The workspace has no terrain.
     """
+    require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
     terrain, pixels, grid = workspace.terrain, workspace.pixels, workspace.grid
     if terrain is None or pixels is None:
         raise TrustboError("terrain_maps needs a workspace made with Workspace.from_terrain.")
@@ -146,14 +153,26 @@ def cell_map(
     Returns:
         Axes of the map; the image of the map is `images[0]` of these axes.
     """
+    require_kind("values", values, xr.DataArray, "give a map of the cells")
+    require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
+    low, high = (None, None) if limits is None else require_tuple("limits", limits, 2)
+    cells = None if path is None else require_path_of_cells(path, workspace)
     axes = map_panels(workspace.grid, 1, ax)
-    image = draw_cells(axes[0], values, workspace, Normalize(*(limits or (None, None))), cmap)
-    if path is not None:
-        draw_path(axes[0], path, workspace.grid)
+    image = draw_cells(axes[0], values, workspace, Normalize(low, high), cmap)
+    if cells is not None:
+        draw_path(axes[0], cells, workspace.grid)
     draw_scale(axes[0], workspace.grid)
     if label != "":
         colour_bar(axes, image, label or as_text(values.name or ""))
     return axes[0]
+
+
+def require_path_of_cells(path: Sequence[Cell], workspace: Workspace) -> list[Cell]:
+    """Return the cells of a path; raises TrustboError if there are none or one is off the grid."""
+    cells = require_on_grid(path, workspace.grid.shape)
+    if not cells:
+        raise TrustboError("path must contain at least one cell; got none.")
+    return cells
 
 
 def draw_path(ax: Axes, path: Sequence[Cell], grid: Grid) -> None:

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from trustbo.errors import TrustboError
+from trustbo.errors import TrustboError, require_kind, require_list, require_whole
 from trustbo.planning import Plan
 from trustbo.plots.maps import VEGETATION, draw_ground, draw_path, draw_scale, extent_of
 from trustbo.plots.style import GREY, MARKERS, ROBOTS, add_legend, background, ink, panels, styled
@@ -34,12 +34,13 @@ def plan_map(plan: Plan, *, bounds: Sequence[int] | None = None, ax: Any = None)
     Raises:
         TrustboError: The workspace has no terrain, or there is no such bound.
     """
+    require_kind("plan", plan, Plan, "give a Plan, such as Result.plan")
     if plan.stops is None:
         raise TrustboError("plan_map needs a workspace made with Workspace.from_terrain.")
     n_bounds = len(plan.path) - 1
-    shown = range(1, n_bounds + 1) if bounds is None else bounds
-    if not set(shown) <= set(range(1, n_bounds + 1)):
-        raise TrustboError(f"bounds must be numbers from 1 to {n_bounds}; got {bounds!r}.")
+    shown = range(1, n_bounds + 1) if bounds is None else require_list("bounds", bounds)
+    for k in shown:
+        require_whole("bounds: a number", k, 1, n_bounds)
 
     axes = panels(1 + len(shown), ax, (2.5, 2.6))
     for one in axes:

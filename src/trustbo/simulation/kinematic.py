@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 
 from trustbo.data import Bound, Cell, Mission
-from trustbo.errors import TrustboError, require_kind, require_positive, require_whole
+from trustbo.errors import TrustboError, require_kind, require_list, require_positive, require_whole
 from trustbo.simulation.events import Event
 from trustbo.simulation.motion import drive_together
 from trustbo.simulation.protocol import DescribedSimulator, digest, require_path
@@ -79,6 +79,7 @@ class KinematicSimulator(DescribedSimulator):
             TrustboError: The workspace has no terrain, the team's names differ, a value is not
                 positive, or an event does not fit the terrain or the team.
         """
+        require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
         self.workspace, self.terrain = workspace, terrain
         self.sight = sight or workspace.sight or Sight()
         self.team = workspace.team if team is None else team
@@ -91,7 +92,7 @@ class KinematicSimulator(DescribedSimulator):
         self.tick = require_positive("tick", tick)
         self.bound_timeout = require_positive("bound_timeout", bound_timeout)
         self._max_ticks = round(self.bound_timeout / self.tick)
-        self.events = tuple(events)
+        self.events = tuple(require_list("events", events, Event, "give events such as Jam(...)"))
         detection = np.array([[robot.detection for robot in self.team.robots]])
         self._usual = World(surface, self.sight, self.team, detection, self.team.lead.detection)
         for event in self.events:

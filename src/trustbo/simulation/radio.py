@@ -10,7 +10,7 @@ from scipy.special import expit
 from scipy.stats import t as student
 
 from trustbo.data import Cell, Mission
-from trustbo.errors import TrustboError, require_whole
+from trustbo.errors import TrustboError, require_kind, require_whole
 from trustbo.simulation.protocol import DescribedSimulator, digest, require_path
 from trustbo.simulation.replicates import table_of
 from trustbo.terrain import pixel_size
@@ -47,6 +47,7 @@ class RadioSimulator(DescribedSimulator):
         Raises:
             TrustboError: The workspace has no terrain, and no other terrain is given.
         """
+        require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
         terrain = workspace.terrain if terrain is None else terrain
         if terrain is None:
             raise TrustboError("the radio simulator needs a workspace made from a terrain.")

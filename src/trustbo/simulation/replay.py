@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from trustbo.data import Cell, Mission, path_text, require_map
-from trustbo.errors import TrustboError, require_cells
+from trustbo.errors import TrustboError, require_cells, require_list, require_whole
 from trustbo.simulation.protocol import DescribedSimulator
 
 
@@ -27,8 +27,9 @@ class ReplaySimulator(DescribedSimulator):
         Raises:
             TrustboError: There are no missions, or they have no map.
         """
-        if isinstance(missions, Mission) or not missions:
-            raise TrustboError(f"give a list of one or more missions; got {missions!r}.")
+        missions = require_list("missions", missions, Mission, "give a list of missions")
+        if not missions:
+            raise TrustboError("missions must contain at least one mission; got none.")
         require_map("a replay", missions)
         self.missions, self.any_path = tuple(missions), any_path
 
@@ -43,7 +44,7 @@ class ReplaySimulator(DescribedSimulator):
         Raises:
             TrustboError: There is no mission with that number, or it has another path.
         """
-        if mission >= len(self.missions):
+        if require_whole("mission", mission, 0) >= len(self.missions):
             raise TrustboError(
                 f"mission {mission} is not among the {len(self.missions)} recorded missions, which "
                 "are counted from 0; run fewer missions."

@@ -15,7 +15,7 @@ import xarray as xr
 
 from trustbo.data import Cell
 from trustbo.display import Rows, Summary
-from trustbo.errors import TrustboError, require_whole
+from trustbo.errors import TrustboError, require_count, require_whole
 from trustbo.files import FilePath, to_json, write_file
 from trustbo.models.backend import VERSIONS
 from trustbo.planning.paths import AdmissiblePaths
@@ -86,7 +86,8 @@ class Truth(Summary):
                 "in a ModelSimulator, the contact of a bound depends on all earlier bounds; use "
                 "Planner.evaluate(path, params) and Planner.plan(params) instead."
             )
-        n_replicates = require_whole("n_replicates", n_replicates, 1)
+        n_replicates = require_count("n_replicates", n_replicates)
+        seed = require_whole("seed", seed, 0)
         found: dict[str, Self] = {}
         known = _known(workspace)
 
@@ -159,6 +160,7 @@ class Truth(Summary):
         The regret is the additional contact lost compared with the best path of at most
         `max_bounds` bounds between the same cells. It is negative if a longer path is better.
         """
+        path = require_path(self.workspace, path)
         best = self.best(path[0], path[-1], max_bounds)
         least = self.lost(best)
         kept = len(best) - 1 - least

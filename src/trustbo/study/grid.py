@@ -15,7 +15,7 @@ from threadpoolctl import threadpool_limits
 
 from trustbo.campaign.campaign import Campaign
 from trustbo.data import Cell
-from trustbo.errors import TrustboError, require_whole
+from trustbo.errors import TrustboError, require_count, require_kind, require_list, require_whole
 from trustbo.files import FilePath, write_file
 from trustbo.simulation import Truth
 from trustbo.simulation.protocol import Simulator
@@ -84,7 +84,16 @@ def run_grid(
         >>> cases = {"greedy": {}, "thompson": {"policy": "thompson"}}
         >>> table = tb.study.run_grid(cases, {"hills": make_scene}, "out", seeds=range(3))
     """
-    require_whole("n_missions", n_missions, 1)
+    require_count("n_missions", n_missions)
+    require_kind("cases", cases, Mapping, "give a dict of cases by name")
+    require_kind("scenes", scenes, Mapping, "give a dict of functions that make scenes, by name")
+    for name in (*cases, *scenes):
+        require_kind("the name of a case or scene", name, str, "give a text")
+    seeds = [require_whole("seed", seed, 0) for seed in require_list("seeds", seeds)]
+    if require_whole("n_jobs", n_jobs, -(10**6)) == 0:
+        raise TrustboError("n_jobs must be a number of processes, or -1; got 0.")
+    if not (cases and scenes and seeds):
+        raise TrustboError("run_grid needs at least one case, one scene and one seed.")
     root, runs = Path(folder), list(product(seeds, scenes, cases))
     files = {
         (seed, scene, case): root / f"{_plain(case)}~{_plain(scene)}~{seed}~{n_missions}.csv"

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from trustbo.errors import require_choice
+from trustbo.errors import TrustboError, require_choice, require_kind, require_list
 
 SHOWN = (0, 1, 3, 8, 15)
 """Numbers of missions after which the regret and the loss are reported."""
@@ -27,6 +27,7 @@ def numbers_of(table: pd.DataFrame) -> pd.DataFrame:
     the goal, `arrive of the first 3` and `arrive later` the same for the first three and the other
     missions. `seconds` is the CPU time per mission.
     """
+    require_kind("table", table, pd.DataFrame, "give the table of run_grid")
     judged = {"mission", "regret", "lost", "best", "status", "contact_rate", "driven",
               "best_driven", "failed_driven", "seconds"}  # fmt: skip
     labels = [name for name in table.columns if name not in judged]
@@ -69,9 +70,11 @@ def summary(numbers: pd.DataFrame, by: str | Sequence[str] = "case") -> pd.DataF
     Raises:
         TrustboError: If a column is unknown.
     """
-    by = [
-        require_choice("column", n, numbers.columns) for n in ([by] if isinstance(by, str) else by)
-    ]
+    require_kind("numbers", numbers, pd.DataFrame, "give the rows of numbers_of")
+    names = require_list("by", [by] if isinstance(by, str) else by, str, "give names of columns")
+    by = [require_choice("column", name, numbers.columns) for name in names]
+    if not by:
+        raise TrustboError("by must name at least one column; got none.")
     rows = {
         key if len(by) > 1 else key[0]: bootstrap(_values(rows), rows["scene"].to_numpy())  # pyright: ignore[reportIndexIssue]
         for key, rows in numbers.groupby(by, sort=False)

@@ -8,7 +8,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 from sklearn.decomposition import PCA
 
-from trustbo.errors import TrustboError
+from trustbo.errors import TrustboError, require_kind
 from trustbo.terrain.heights import warn
 
 MAX_PIXELS = 1_000_000
@@ -31,6 +31,9 @@ class CompositeIndex:
 
     def __init__(self, signs: Mapping[str, int], fitted: xr.Dataset | None = None) -> None:
         """Set the features with their signs and, optionally, the `fitted` of an earlier fit."""
+        require_kind(
+            "signs", signs, Mapping, "give the sign of each feature, such as {'slope': -1}"
+        )
         self.signs, self.fitted = dict(signs), xr.Dataset() if fitted is None else fitted
 
     def fit(self, features: Mapping[str, ArrayLike] | xr.Dataset) -> Self:
@@ -113,6 +116,8 @@ class CompositeIndex:
         return np.clip((score - bottom) / (top - bottom), 0.0, 1.0)
 
     def _columns(self, features: Mapping[str, ArrayLike] | xr.Dataset) -> list[np.ndarray]:
+        remedy = "give the values of each feature by name"
+        require_kind("features", features, Mapping | xr.Dataset, remedy)
         missing = [name for name in self.signs if name not in features]
         if missing:
             raise TrustboError(f"the composite needs {', '.join(missing)}; got {list(features)}.")

@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 from scipy import ndimage
 
-from trustbo.errors import TrustboError, require_positive, require_whole
+from trustbo.errors import TrustboError, require_positive, require_tuple, require_whole
 from trustbo.terrain.read import check_size, read_terrain
 
 _FOLDER = Path(__file__).parent / "data" / "wellington"
@@ -55,7 +55,8 @@ def synthetic_terrain(
         TrustboError: A size is under 4 pixels, or an argument is negative.
     """
     step = require_positive("resolution", resolution)
-    height, width = (require_positive(f"size[{i}]", side) for i, side in enumerate(size))
+    sides = require_tuple("size", size, 2)
+    height, width = (require_positive(f"size[{i}]", side) for i, side in enumerate(sides))
     shape = (round(height / step), round(width / step))
     check_size(shape, f"size {size} m at {resolution} m")
     if min(shape) < 4:

@@ -137,6 +137,7 @@ def _with_grid_mapping(terrain: xr.Dataset) -> xr.Dataset:
 
 def pixel_size(terrain: xr.Dataset) -> tuple[float, float]:
     """Return pixel height and width in metres."""
+    require_kind("terrain", terrain, xr.Dataset, "give a Dataset as from read_terrain")
     y, x = (terrain.variables[axis].values for axis in ("y", "x"))
     return abs(float(y[-1] - y[0])) / (len(y) - 1), abs(float(x[-1] - x[0])) / (len(x) - 1)
 

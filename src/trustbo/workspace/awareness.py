@@ -44,7 +44,9 @@ def cell_maps(
             used unchanged but has values outside [0, 1].
     """
     remedy = "map each feature to its pixel features, such as {'ease': ('slope', 'tri')}"
-    for name in require_kind("features", features, Mapping, remedy):
+    if not require_kind("features", features, Mapping, remedy):
+        raise TrustboError(f"features must contain at least one feature; {remedy}.")
+    for name in features:
         if is_line_of_sight(name):
             raise TrustboError(f"feature name {name!r} is reserved; choose another name.")
     sides = [n * step for n, step in zip(terrain["dem"].shape, pixel_size(terrain), strict=True)]

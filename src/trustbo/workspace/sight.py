@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 from numba import njit
 
-from trustbo.errors import TrustboError
+from trustbo.errors import require_positive, require_share
 from trustbo.kernels import PART, kernel
 from trustbo.parallel import plain
 from trustbo.team import Robot
@@ -40,11 +40,10 @@ class Sight:
     crown_base: float = 0.3
 
     def __post_init__(self) -> None:
-        if not self.extinction >= 0.0 or not 0.0 <= self.crown_base <= 1.0:
-            raise TrustboError(
-                "extinction must be at least 0, and crown_base must be in [0, 1]; got "
-                f"{self.extinction} and {self.crown_base}."
-            )
+        require_share("crown_base", self.crown_base)
+        is_solid = isinstance(self.extinction, float) and self.extinction == math.inf
+        if not is_solid:
+            require_positive("extinction", self.extinction, or_zero=True)
 
 
 def optics(watcher: Robot, watched: Robot) -> np.ndarray:

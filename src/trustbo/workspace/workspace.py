@@ -21,7 +21,7 @@ from trustbo.data import (
     require_map,
 )
 from trustbo.display import Rows, Summary, compiling
-from trustbo.errors import TrustboError, require_positive
+from trustbo.errors import TrustboError, require_kind, require_list, require_positive
 from trustbo.team import Team
 from trustbo.terrain.composite import CompositeIndex
 from trustbo.terrain.features import PAPER_VISIBILITY, TRAVERSABILITY, VISIBILITY
@@ -225,6 +225,9 @@ class Workspace(Summary):
                 one.
         """
         locate = self.grid.locate if anywhere else self.locate
+        path = require_list("path", path, remedy="give cells (row, col)")
+        if not path:
+            raise TrustboError("path must contain at least one cell; got none.")
         cells = [locate(cell, f"path[{k}]") for k, cell in enumerate(path)]
         return np.swapaxes(along(self.awareness.values, cells), 0, 1)
 
@@ -237,6 +240,7 @@ class Workspace(Summary):
         Raises:
             TrustboError: The mission has no map, or its robots or features do not match.
         """
+        require_kind("mission", mission, Mission, "give a trustbo.Mission")
         require_map("a workspace", [mission])
         unnamed = default_features(len(mission.features))
         if mission.features == unnamed and len(unnamed) == len(self.features):

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.random import Generator
 from scipy import sparse
 
-from trustbo.errors import TrustboError, require_finite
+from trustbo.errors import require_share
 from trustbo.models.backend import namespace
 from trustbo.models.effects.effect import LEAST, Effect, Theta, Values
 from trustbo.models.slots import Slots
@@ -44,10 +44,7 @@ class RobotEffect(Effect):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        rho = require_finite("RobotEffect.rho", self.rho)
-        if not 0.0 < rho < 1.0:
-            raise TrustboError(f"RobotEffect.rho must be between 0 and 1; got {rho!r}.")
-        object.__setattr__(self, "rho", rho)
+        object.__setattr__(self, "rho", require_share("RobotEffect.rho", self.rho, ends=False))
 
     def columns(self, slots: Slots) -> Any:
         """Return line of sight in one column per robot and mission; the mission varies fastest."""
