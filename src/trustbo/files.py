@@ -87,8 +87,11 @@ def _replace(target: Path, content: bytes | Callable[[Path], object]) -> None:
         with suppress(OSError):
             temporary.chmod(stat.S_IMODE(target.stat().st_mode))
         os.replace(temporary, target)
-    finally:
-        temporary.unlink(missing_ok=True)
+    except BaseException:
+        with suppress(OSError):
+            temporary.unlink()
+        raise
+    # The file is in place: from here on, nothing may fail.
     sync_folder(target.parent)
 
 

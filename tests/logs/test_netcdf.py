@@ -33,3 +33,15 @@ def test_damage_is_named_with_its_file(tmp_path):
     write_tree(other, xr.DataTree(xr.Dataset({"x": 1})))
     with pytest.raises(TrustboError, match=r"other.nc"):
         read_missions(other)
+
+
+def test_missions_of_several_files_and_folders_are_read_in_their_order(tmp_path):
+    told = [
+        Mission.from_arrays([(2, 0), (1, 1)], np.ones((1, 2, 3)), np.full((1, 2), rate))
+        for rate in (0.25, 0.5, 0.75)
+    ]
+    for n, mission in enumerate(told):
+        write_missions(tmp_path / f"campaign/missions/000{n}.nc", [mission])
+    write_missions(tmp_path / "others.nc", told[::-1])
+    read = read_missions([tmp_path / "others.nc", str(tmp_path / "campaign")])
+    assert [mission.contact_rate[0, 0] for mission in read] == [0.75, 0.5, 0.25, 0.25, 0.5, 0.75]

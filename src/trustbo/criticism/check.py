@@ -185,7 +185,7 @@ def _check_weights(posterior: xr.DataTree) -> Finding:
 
 
 def _check_coverage(
-    trees: list[xr.DataTree | None], last: xr.DataTree, missions: Sequence[Mission] | None
+    trees: Sequence[xr.DataTree | None], last: xr.DataTree, missions: Sequence[Mission] | None
 ) -> Finding:
     """Check whether 90 % intervals one mission ahead contain 90 % of the rates."""
     if len(trees) < 2:

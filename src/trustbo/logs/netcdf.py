@@ -1,7 +1,7 @@
 """Missions in netCDF files, stored as consecutive bounds with the ticks of the robots."""
 
 from collections.abc import Sequence
-from pathlib import Path
+from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -9,7 +9,7 @@ import xarray as xr
 
 from trustbo.data import NOWHERE, Bound, Mission
 from trustbo.errors import TrustboError
-from trustbo.files import FilePath, hash_of, interpreting, read_file, write_file
+from trustbo.files import FilePath, hash_of, interpreting, read_file, to_path, write_file
 from trustbo.stacking import require_same_team
 
 _ARRAYS = {"awareness": "1", "contact_rate": "1", "duration": "s", "n_ticks": "1"}
@@ -77,14 +77,22 @@ def write_missions(path: FilePath, missions: Sequence[Mission]) -> None:
     write_tree(path, missions_to_tree(missions))
 
 
-def read_missions(path: FilePath) -> list[Mission]:
-    """Read missions, as measured, from a netCDF file or from the folder of a campaign.
+def read_missions(path: FilePath | Sequence[FilePath]) -> list[Mission]:
+    """Read missions, as measured.
+
+    Args:
+        path: File, folder of a campaign, or several of them, which are read in their order.
 
     Raises:
-        TrustboError: The file does not exist, is damaged, or contains no missions.
+        TrustboError: A file does not exist, is damaged, or contains no missions.
     """
+    files = []
+    for one in [path] if isinstance(path, str | PathLike) else path:
+        place = to_path(one)
+        files += sorted(place.glob("missions/[0-9]*.nc")) or [place]
+
     missions = []
-    for file in sorted(Path(path).glob("missions/[0-9]*.nc")) or [path]:
+    for file in files:
         tree = read_tree(file)
         with interpreting(file):
             missions += missions_from_tree(tree)
