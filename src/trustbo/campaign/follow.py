@@ -135,5 +135,5 @@ class Follower:
         if running != self.running:
             some, first = ("no", "begin") if running else ("a", "end")
             raise TrustboError(f"{some} bound is in progress; call {first} first.")
-        if require_finite(f"t = {t} s", t) < self._last:
+        if require_finite("t", t) < self._last:
             raise TrustboError(f"t = {t} s must not be before the last time, {self._last} s.")

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.signal import lfilter
 from scipy.special import ndtr
 
+from trustbo.arrays import as_array
 from trustbo.errors import (
     TrustboError,
     require_choice,
@@ -222,7 +223,7 @@ def _require_circle(center: object, radius: object) -> None:
 def _circle(surface: Surface, center: tuple[float, float], radius: float) -> np.ndarray:
     """Return a mask (row, col) of the pixels in a circle; raises TrustboError if there are none."""
     rows, cols = surface.ground.shape
-    row, col = surface.to_pixel(*np.asarray(center, dtype=float))
+    row, col = surface.to_pixel(*as_array("center", center))
     away = np.hypot(
         (np.arange(rows)[:, None] - row) * surface.pixel[0],
         (np.arange(cols) - col) * surface.pixel[1],
