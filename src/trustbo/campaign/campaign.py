@@ -421,9 +421,9 @@ class Campaign(Result):
                 raise TrustboError(f"mission {n} is already excluded: {entry.row['reason']}")
             self._catch_up()
             with self._recorded():
-                self.state.due = self.state.seed_of("fit")
-                self.state.asked = None
                 entry.become(EXCLUDED, str(reason))
+                self.state.due = self.state.seed_of("exclude")
+                self.state.asked = None
             self._computed.clear()
             self._finish(f"the exclusion of mission {n} is recorded")
             return self.state.posterior
