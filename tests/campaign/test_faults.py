@@ -212,7 +212,7 @@ def test_operation_that_fails_at_any_call_is_recorded_or_not(
         check(folder, operate, mission, expected, failing)
         if failing.n_calls < n:
             break
-    assert n > 6
+    assert n > 5  # a file is opened, written, flushed, renamed, and its folder is flushed
 
 
 @pytest.mark.parametrize("fault", ["full", "interrupt"])

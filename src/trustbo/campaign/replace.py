@@ -22,12 +22,12 @@ _NEXT = ".next"
 _TO_DELETE = "to-delete.json"
 """File in `.next` that lists the old files; it is removed when they are deleted."""
 _TO_MOVE = "to-move.json"
-"""File in `.next` that lists the new files."""
+"""File in `.next` that lists the new files; it is removed when they are in their places."""
 
 
 def is_being_replaced(folder: Path) -> bool:
     """Return whether the campaign in a folder is being replaced, or this was interrupted."""
-    return (folder / _NEXT).exists()
+    return (folder / _NEXT / _TO_MOVE).exists()
 
 
 def recorded_files(folder: Path) -> list[str]:
@@ -109,6 +109,7 @@ def finish_replacement(folder: Path) -> None:
                 (folder / name).parent.mkdir(exist_ok=True)
                 os.replace(beside / name, folder / name)
                 sync_folder((folder / name).parent)
+        (beside / _TO_MOVE).unlink()
     except OSError as error:
         raise TrustboError(
             f"the campaign in {str(folder)!r} could not be replaced completely: {error.strerror}. "
@@ -118,8 +119,11 @@ def finish_replacement(folder: Path) -> None:
 
 
 def discard_remains(folder: Path) -> None:
-    """Delete what processes that died have left: incomplete campaigns and temporary files."""
-    for path in folder.glob(f"{_NEW}*"):
+    """Delete what processes that died have left: incomplete campaigns and temporary files.
+
+    Call `finish_replacement` first.
+    """
+    for path in (*folder.glob(f"{_NEW}*"), folder / _NEXT):
         remove_tree(path)
     for place in (folder, folder / "missions", folder / "posteriors"):
         for path in place.glob(f"{TEMPORARY}*"):
