@@ -10,7 +10,7 @@ shape or type, and objects of other classes. The outcome of such a call is one o
     TypeError     Python's own error, raised by the function that was called and not below it
     accepted      the call returns; the value may be valid for this argument
     foreign       another exception, from somewhere below
-    hang          the call takes longer than ten seconds
+    hang          the call takes more than ten seconds of processor time
 
 The first rows of the table are arguments that are numbers, names, arrays, lists or dicts, by kind
 of value. A user may plausibly pass these values, except for objects of other classes. The last rows
@@ -719,13 +719,13 @@ def _stop(*_: object) -> None:
 
 def outcome(function: Callable[..., Any], given: dict[str, Any], seconds: float) -> tuple[str, str]:
     """Return the outcome of a call, and the error with its line if it is foreign."""
-    signal.setitimer(signal.ITIMER_REAL, seconds)
+    signal.setitimer(signal.ITIMER_PROF, seconds)
     try:
         with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(io.StringIO()):
             function(**given)
         return "accepted", ""
     except TooLongError:
-        return "hang", f"more than {seconds:g} s"
+        return "hang", f"more than {seconds:g} s of processor time"
     except tb.TrustboError as error:
         return "TrustboError", str(error)
     except Exception as error:
@@ -738,15 +738,14 @@ def outcome(function: Callable[..., Any], given: dict[str, Any], seconds: float)
         )
         return "TypeError" if at_entry else "foreign", text
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
         plt.close("all")
 
 
 def row_of(valid: Any, value: Value) -> str:
     """Return the row of the table that a wrong value belongs to."""
-    if isinstance(valid, int | float | str | np.ndarray | list | tuple | dict):
-        if not isinstance(valid, bool):
-            return value.kind
+    if type(valid) in (int, float, str, np.ndarray, list, tuple, dict):  # not a bool or NamedTuple
+        return value.kind
     return "None for an object" if value.kind == "None" else "another object for an object"
 
 
@@ -774,7 +773,7 @@ def main() -> int:
 
     mpl.use("agg")
     warnings.simplefilter("ignore")
-    signal.signal(signal.SIGALRM, _stop)
+    signal.signal(signal.SIGPROF, _stop)
     used = int(re.findall(r"VmSize:\s+(\d+)", Path("/proc/self/status").read_text())[0]) * 1024
     resource.setrlimit(resource.RLIMIT_AS, (used + _MEMORY, used + _MEMORY))
 

@@ -20,6 +20,7 @@ from trustbo.simulation import KinematicSimulator, ModelSimulator, ReplaySimulat
 ENDS = (5, 0), (0, 5)
 PATH = [(5, 0), (4, 1), (3, 2)]
 PARAMS = tb.models.TrustParams(0.6, np.array([0.3, 0.2]), 0.05, 0.05, 0.05)
+RNG = np.random.default_rng(0)
 Z, Y = np.full((2, 3, 2), 0.5), np.full((2, 3), 0.5)
 
 
@@ -69,7 +70,7 @@ MISTAKES = {
     "None for a path to suggest": (lambda w: tb.Campaign(w, *ENDS).suggest(None), "path"),
     "None for a path": (lambda w: w.along(None), "path"),
     "a path without cells": (lambda w: w.along([]), "path"),
-    "numbers for cells": (lambda w: Planner(w, *ENDS).evaluate([1, 2], PARAMS), "path"),
+    "numbers for cells": (lambda w: Planner(w, *ENDS).evaluate([1, 2], PARAMS), "cell"),
     "a share as text": (lambda w: tb.RegretBound(eps="0.05"), "eps"),
     "a correlation of 1": (lambda w: tb.models.RobotEffect(rho=1.0), "rho"),
     "sight as text": (lambda w: tb.workspace.Sight(crown_base="0.3"), "crown_base"),
@@ -78,7 +79,10 @@ MISTAKES = {
     "no effects": (lambda w: PooledTrust(effects=None), "effects"),
     "an unknown family": (lambda w: Priors.of(("a",), observation="x"), "observation"),
     "a model as text": (lambda w: tb.inference.sample_prior("x", 2, 5, 0), "model"),
-    "a quantile as text": (lambda w: optimistic(None, PARAMS, None, quantile="9"), "quantile"),
+    "a quantile as text": (
+        lambda w: optimistic(RNG, PARAMS, Planner(w, *ENDS), quantile="9"),
+        "quantile",
+    ),
     "a map of risk of another shape": (lambda w: Planner(w, *ENDS).avoiding(Z, Z), "bounds"),
     "x0 of another team": (lambda w: tb.planning.roll_trust(PARAMS, Z, [0.5, 0.5]), "x0"),
     "None for parameters": (lambda w: tb.planning.roll_trust(None, Z), "params"),

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from trustbo.arrays import as_names, default_robots, read_labelled
 from trustbo.display import Rows, Summary, joined
-from trustbo.errors import TrustboError, require_cells, require_choice, require_whole
+from trustbo.errors import TrustboError, require_cells, require_choice, require_kind, require_whole
 
 Cell = tuple[int, int]
 STATUSES = ("ok", "stuck", "tipped", "timeout", "collision", "lost_contact", "aborted")
@@ -121,6 +121,9 @@ class Mission(Summary):
 
     def __post_init__(self) -> None:
         require_choice("status", self.status, STATUSES)
+        require_kind("path", self.path, Sequence, "give the cells in a tuple; () without a map")
+        for bound in require_kind("bounds", self.bounds, Sequence, "give the bounds in a tuple"):
+            require_kind("bounds", bound, Bound, "give a tuple of Bound")
         n_run, n_planned = len(self.bounds), len(self.path) - 1
         if not n_run or (self.path and n_run > n_planned):
             most = f" and at most {n_planned} on its path" if self.path else ""
@@ -316,7 +319,7 @@ def levels_of(scale: object) -> int:
     Raises TrustboError unless it is "unit", or "likertN" or "ordinalN" with N of at least 2.
     """
     found = re.fullmatch(r"(likert|ordinal)(\d*)", scale) if isinstance(scale, str) else None
-    if scale != "unit" and found is None:
+    if found is None and not (isinstance(scale, str) and scale == "unit"):
         raise TrustboError(
             'scale must be "unit", "likertN" or "ordinalN", where N is the number of levels; got '
             f"{scale!r}."

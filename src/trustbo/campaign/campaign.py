@@ -122,7 +122,8 @@ class Campaign(Result):
         require_kind("hazard", hazard, Hazard, "give a trustbo.hazard.Hazard")
         own = {"workspace": workspace, "seed": seed, "progress": True, "whole": False}
         for name, given in {"planner": planner, "fit": fit}.items():
-            require_kind(name, given or {}, Mapping, "give a dict of options")
+            if given is not None:
+                require_kind(name, given, Mapping, "give a dict of options")
         _FIT.bind([], model, sampler=sampler, **own, **(fit or {}))  # TypeError if one is unknown
         model = default_model() if model is None else model
         require_kind("model", model, TrustModel, "give a trust model, such as PooledTrust()")

@@ -175,7 +175,7 @@ class Risk:
         for name, p in {"p_fail": self.p_fail[None], **more}.items():
             if p is None:
                 continue
-            if p.ndim != 4 or p.shape[1:] != self.p_fail.shape:
+            if p.ndim != 4 or not len(p) or p.shape[1:] != self.p_fail.shape:
                 raise TrustboError(f"{name} must have shape (..., move, row, col); got {p.shape}.")
             if (bad := (p < 0.0) | (p > 1.0)).any():
                 raise TrustboError(f"{name} must be in [0, 1]; got {p[bad][0]:g}.")

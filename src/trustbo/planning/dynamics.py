@@ -128,7 +128,10 @@ def roll_trust(params: Params, awareness: ArrayLike, x0: ArrayLike | None = None
     require_kind("params", params, Params, "give parameters, such as TrustParams(...)")
     require_values(params)
     dims, unnamed = ("bound", "robot", "feature"), {"robot": None, "feature": None}
-    of_robots = np.swapaxes(read_labelled("awareness", awareness, dims, unnamed).values, 0, 1)
+    z = read_labelled("awareness", awareness, dims, unnamed).values
+    if z.ndim != len(dims) or not z.size:
+        raise TrustboError(f"awareness must have the shape (bound, robot, feature); got {z.shape}.")
+    of_robots = np.swapaxes(z, 0, 1)
     x0 = None if x0 is None else require_numbers("x0", x0)
     return roll(trust_dynamics(params, of_robots[:, None, None], x0, by_robot=True))
 

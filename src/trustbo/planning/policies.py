@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from trustbo.errors import require_choice, require_finite, require_share
+from trustbo.errors import require_choice, require_finite, require_kind, require_share
 from trustbo.models.params import Params
 from trustbo.planning.draws import choose_draws
 from trustbo.planning.dynamics import Dynamics
@@ -25,11 +25,13 @@ N_DRAWS = 200
 
 def greedy(rng: np.random.Generator, params: Params, planner: Planner) -> Plan:
     """Plan the best path under the posterior mean of the parameters, as in the paper."""
+    _require(rng, params, planner)
     return planner.plan(params.mean())
 
 
 def thompson(rng: np.random.Generator, params: Params, planner: Planner) -> Plan:
     """Plan the best path under one random posterior draw (probability matching)."""
+    _require(rng, params, planner)
     plan = planner.plan(params.draw(int(rng.integers(params.leading[0]))))
     return planner.evaluate(plan.path, params.mean())
 
@@ -41,6 +43,7 @@ def optimistic(
 
     The drift u of each bound is a high quantile over the draws; other parameters are means.
     """
+    _require(rng, params, planner)
     require_share("quantile", quantile)
     some = choose_draws(params, 1000, _seed(rng))
     transition, drift, start, sd = planner.problem.dynamics(some)
@@ -52,6 +55,7 @@ def optimistic(
 
 def ucb(rng: np.random.Generator, params: Params, planner: Planner, *, kappa: float = 1.0) -> Plan:
     """Choose, among the draws' best paths, that with the largest mean + `kappa` sd of the value."""
+    _require(rng, params, planner)
     require_finite("kappa", kappa)
     drawn = planner.plan_draws(params, n_draws=N_DRAWS, seed=_seed(rng))
     values = drawn.values_of(drawn.candidates)
@@ -61,6 +65,7 @@ def ucb(rng: np.random.Generator, params: Params, planner: Planner, *, kappa: fl
 
 def random(rng: np.random.Generator, params: Params, planner: Planner) -> Plan:
     """Plan the best path for random drifts, uniform on [0, 1], without using the posterior."""
+    _require(rng, params, planner)
     drift = rng.uniform(size=(1, *planner.problem.paths.bounds.shape))
     dynamics = Dynamics(np.zeros((1, 1)), drift, np.zeros(1), np.full((), 0.1))
     return planner.evaluate(planner.best_path(dynamics), params.mean())
@@ -83,6 +88,13 @@ def resolve_policy(policy: str | Policy) -> Policy:
         TrustboError: If `policy` is neither a known name nor a callable.
     """
     return policy if callable(policy) else POLICIES[require_choice("policy", policy, POLICIES)]
+
+
+def _require(rng: object, params: object, planner: object) -> None:
+    """Raise TrustboError unless the arguments of a policy are of the right kinds."""
+    require_kind("rng", rng, np.random.Generator, "give numpy.random.default_rng(seed)")
+    require_kind("params", params, Params, "give parameters, such as params_of(posterior)")
+    require_kind("planner", planner, Planner, "give a trustbo.planning.Planner")
 
 
 def _seed(rng: np.random.Generator) -> int:

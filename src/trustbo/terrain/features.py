@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 from scipy import ndimage
 
-from trustbo.errors import TrustboError, require_kind, require_tuple
+from trustbo.errors import TrustboError, one_line, require_kind, require_tuple
 from trustbo.parallel import over_rows
 from trustbo.terrain import rays
 from trustbo.terrain.read import pixel_size
@@ -66,6 +66,8 @@ def _window(z: np.ndarray) -> dict[tuple[int, int], np.ndarray]:
 
 def gradient(dem: np.ndarray, pixel: tuple[float, float]) -> np.ndarray:
     """Compute the gradient of the ground to the east and north (Horn 1981), (2, row, col)."""
+    if getattr(dem, "ndim", 0) != 2 or not dem.size or dem.dtype.kind not in "iuf":
+        raise TrustboError(f"dem must be an array of heights (row, col); got {one_line(dem)}.")
     height, width = require_tuple("pixel", pixel, 2)
     w = _window(dem)
     east = (w[-1, 1] - w[-1, -1]) + 2.0 * (w[0, 1] - w[0, -1]) + (w[1, 1] - w[1, -1])

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from trustbo.data import Cell
-from trustbo.errors import TrustboError, require_cells
+from trustbo.errors import TrustboError, require_list, require_pair
 
 MOVES = ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1))
 """Steps (down, right) to the neighbouring cells; the reverse of move m is move 7 - m."""
@@ -18,7 +18,8 @@ def require_on_grid(path: Sequence[Cell] | np.ndarray, shape: tuple[int, ...]) -
 
     Raises TrustboError if a cell is not a pair or is outside a grid with the shape (row, col).
     """
-    cells = list(require_cells("path", path))
+    listed = require_list("path", path, remedy="give cells (row, col)")
+    cells = [require_pair("a cell", cell) for cell in listed]
     rows, cols = shape
     for row, col in cells:
         if not (0 <= row < rows and 0 <= col < cols):
