@@ -96,7 +96,6 @@ class KinematicSimulator(DescribedSimulator):
         detection = np.array([[robot.detection for robot in self.team.robots]])
         self._usual = World(surface, self.sight, self.team, detection, self.team.lead.detection)
         for event in self.events:
-            require_kind("events", event, Event, "give events such as simulation.Jam")
             event.change(self._usual)  # raises if the event does not fit
         self._posts: Posts = workspace.posts  # pyright: ignore[reportAttributeAccessIssue]
 
