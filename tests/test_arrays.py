@@ -152,7 +152,7 @@ def test_tables_that_cannot_hold_the_axes_are_refused():
         {"a": 1.0},
         object(),
     ],
-    ids=str,
+    ids=lambda values: type(values).__name__,
 )
 def test_what_is_not_a_number_is_refused(values):
     with pytest.raises(TrustboError, match="speed"):
