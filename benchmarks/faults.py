@@ -52,11 +52,10 @@ class Fault(NamedTuple):
 
 
 MEASURED = """\
-        if self.storage is not None:
-            self.storage.add_mission(len(state.entries) + 1, entry)
+                    self.storage.add_mission(n_before + 1, entry)
 """
 LEARNED = """\
-        self._add(entry)
+                    self._add(entry)
 """
 FAULTS = (
     Fault("the evidence has the wrong sign of the residuals' square", "inference/engine.py",
@@ -103,10 +102,9 @@ FAULTS = (
     Fault("the truth's best path ends on the last bound but one", "simulation/truth.py",
           "last = (passed * contact)[:, *goal, END]", "last = (passed * contact)[:, *goal, 0]"),
     Fault("a fit takes the seeds of the policy", "campaign/campaign.py",
-          'seed = self.state, self.state.seed_of("fit")',
-          'seed = self.state, self.state.seed_of("policy")'),
+          'seed = state.seed_of("fit")', 'seed = state.seed_of("policy")'),
     Fault("a mission is learned from before it is on disk", "campaign/campaign.py",
-          MEASURED + LEARNED, LEARNED + MEASURED.replace(" + 1", "")),
+          MEASURED + LEARNED, LEARNED + MEASURED),
     Fault("the y axis of a map for ROS is flipped", "export/nav2.py",
           "values[::-1].tobytes()", "values.tobytes()"),
     Fault("effects of robots belong to the robots in reverse", "models/effects/robot.py",

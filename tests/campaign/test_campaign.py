@@ -265,8 +265,8 @@ def test_excluded_mission_is_forgotten_until_it_is_told_again(workspace):
     for mission in missions:
         campaign.tell(mission)
     assert campaign.hazard["failures"].values.sum() == 3
-    seed = campaign.state.seed_of("fit")
     posterior = campaign.exclude(2, "the lidar was covered")
+    seed = campaign.state.seed_of("exclude")
     assert states(campaign) == ["learned", "excluded", "learned"]
     assert campaign.table()["reason"][2] == "the lidar was covered"
     assert campaign.hazard["failures"].values.sum() == 2
