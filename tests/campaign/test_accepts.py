@@ -170,11 +170,15 @@ OF_MISSIONS = {
 }
 """Functions that need a mission, learned from or not."""
 
-OF_POSTERIOR = {
-    "posterior": lambda campaign, folder: campaign.posterior,
+OF_RATES = {
     "fit": lambda campaign, folder: tb.fit(
         campaign.missions, MODEL, workspace=campaign.workspace, **FIT
     ),
+}
+"""Functions that need a mission with a rate and a known awareness, excluded by the user or not."""
+
+OF_POSTERIOR = {
+    "posterior": lambda campaign, folder: campaign.posterior,
     "check": checked,
     "maps": lambda campaign, folder: campaign.maps(n_draws=20),
     "explore": explored,
@@ -227,12 +231,18 @@ def accepts(history):
         folder = Path(folder)
         use(ALWAYS, campaign, folder, works=True)
         use(OF_MISSIONS, campaign, folder, works=len(states) > 0)
+        usable = [
+            np.isfinite(mission.awareness).all() and np.isfinite(mission.contact_rate).any()
+            for mission in campaign.missions
+        ]
+        use(OF_RATES, campaign, folder, works=any(usable))
         use(OF_POSTERIOR, campaign, folder, works=LEARNED in states)
         use(OF_TWO, campaign, folder, works=states.count(LEARNED) > 1)
         use(OF_PREDICTION, campaign, folder, works=any(predicted))
 
 
 @example(([], 0))
+@example((["arrived", "excluded"], 0))
 @example((["no rates", "arrived", "unknown cell", "excluded", "failed", "arrived", "arrived"], 1))
 @settings(max_examples=2, deadline=None, derandomize=True)
 @given(histories())
