@@ -1,13 +1,17 @@
 """Parallel work in threads, which use all cores because compiled code releases the GIL."""
 
+import sys
+import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from joblib import cpu_count
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 
 _BLOCK = 64  # rows per call: few enough to fit in the caches
 
@@ -44,11 +48,60 @@ def in_order[T, R](work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
             yield pending.popleft().result()
 
 
+class _Limit:
+    """Limit of one BLAS thread, shared by all threads of the process that are inside."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._n_inside = 0
+        self._limiter: Any = None
+
+    def enter(self) -> None:
+        """Set the limit if no other thread is inside."""
+        with self._lock:
+            if self._n_inside == 0:
+                controller = _controller(len(sys.modules))
+                _take_control(controller)
+                self._limiter = controller.limit(limits=1, user_api="blas")
+            self._n_inside += 1
+
+    def leave(self) -> None:
+        """Restore the previous number of threads if no other thread is inside."""
+        with self._lock:
+            self._n_inside -= 1
+            if self._n_inside == 0:
+                controller = _controller(len(sys.modules))
+                _take_control(controller)
+                self._limiter.restore_original_limits()
+                _take_control(controller)
+
+
+_LIMIT = _Limit()
+
+
+@lru_cache(1)
+def _controller(n_modules: int) -> ThreadpoolController:
+    """Find the BLAS libraries again if modules were imported, because finding them takes 3 ms."""
+    return ThreadpoolController()
+
+
+def _take_control(controller: ThreadpoolController) -> None:
+    """Let any thread change the limit; threadpoolctl 3.8 ignores all threads but the first."""
+    for library in controller.lib_controllers:
+        if hasattr(library, "clear_controlling_thread"):
+            library.clear_controlling_thread(force=True)
+
+
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
     """Limit BLAS to one thread; with more, matrices of about 20 rows take 20 times as long.
 
-    The function can also be used as a decorator. It takes 3 ms to find the BLAS libraries.
+    All public functions that compute posteriors, predictions and plans are decorated with this
+    function, so inner functions need no limit of their own. The limit applies to the whole process.
+    If several threads are inside, the last one to leave restores the caller's setting.
     """
-    with threadpool_limits(limits=1, user_api="blas"):
+    _LIMIT.enter()
+    try:
         yield
+    finally:
+        _LIMIT.leave()

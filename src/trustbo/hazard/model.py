@@ -27,6 +27,7 @@ from trustbo.hazard.exposures import Exposures, LostMission
 from trustbo.hazard.prior import FLOOR, LIMIT_NAMES, TILT, BoundPrior, Hazard
 from trustbo.hazard.risk import BoundRisk, add_lost
 from trustbo.inference import importance
+from trustbo.parallel import one_blas_thread
 from trustbo.workspace import Workspace
 from trustbo.workspace.difficulty import difficulty_of
 from trustbo.workspace.moves import MOVE_NAMES
@@ -36,6 +37,7 @@ _MAPS = "move", "row", "col"
 
 
 @np.errstate(under="ignore")  # small weights and tails round to 0
+@one_blas_thread()
 def fit_hazard(
     missions: Sequence[Mission],
     workspace: Workspace,

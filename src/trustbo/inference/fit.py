@@ -35,6 +35,7 @@ SAMPLERS = ("importance", "nuts")
 
 
 @np.errstate(under="ignore")  # small weights and tails round to 0
+@one_blas_thread()
 def fit(
     missions: Sequence[Mission],
     model: TrustModel | None = None,
@@ -114,19 +115,18 @@ def fit(
     if np.isnan(slots.y).all():
         raise TrustboError("every contact rate is NaN; fit needs at least one measured rate.")
     posterior = Posterior(model, slots)
-    with one_blas_thread():
-        if sampler == "importance":
-            drawn, stats, summary = by_importance(posterior, chains * draws, seed)
-            complaints = [] if summary["k_hat"] <= MAX_KHAT else [
-                f"importance weights are uneven (k-hat {summary['k_hat']:.2f}, limit {MAX_KHAT})"
-            ]  # fmt: skip
-        else:
-            from trustbo.inference.nuts import sample_by_nuts  # slow to import
+    if sampler == "importance":
+        drawn, stats, summary = by_importance(posterior, chains * draws, seed)
+        complaints = [] if summary["k_hat"] <= MAX_KHAT else [
+            f"importance weights are uneven (k-hat {summary['k_hat']:.2f}, limit {MAX_KHAT})"
+        ]  # fmt: skip
+    else:
+        from trustbo.inference.nuts import sample_by_nuts  # slow to import
 
-            drawn, stats, summary, complaints = sample_by_nuts(
-                posterior, chains=chains, draws=draws, warmup=warmup, seed=seed, progress=progress
-            )
-        tree = _laid_out(posterior, drawn, stats, (chains, draws), missions, seed)
+        drawn, stats, summary, complaints = sample_by_nuts(
+            posterior, chains=chains, draws=draws, warmup=warmup, seed=seed, progress=progress
+        )
+    tree = _laid_out(posterior, drawn, stats, (chains, draws), missions, seed)
     tree.attrs |= _record(model, posterior) | summary | {"sampler": sampler, "seed": seed}
     if check and complaints:
         raise PosteriorError(

@@ -24,8 +24,6 @@ from arviz_stats.base.array import array_stats
 from scipy import optimize, special, stats
 from scipy.linalg import solve_triangular
 
-from trustbo.parallel import one_blas_thread
-
 GOOD_KHAT, MAX_KHAT = 0.5, 0.7
 """Limits on the Pareto shape k-hat of the weights, for stopping and for acceptable results."""
 _DEGREES = 8.0  # degrees of freedom of the proposals
@@ -153,32 +151,31 @@ def sample(
     prior = Student(np.zeros(d), 1.2 * np.eye(d))
     z, log_p, mixture = np.empty((0, d)), np.empty(0), []
 
-    with one_blas_thread():
-        modes = find_modes(log_density, starts)
-        proposals = modes if len(modes) > 1 else []
-        current, n_rounds, uneven = modes[0], 0, False
-        own = [current.scaled(_WIDER), *proposals]
-        while True:
-            n_rounds += 1
-            n_own, n_others = (size // 2,) * 2 if n_rounds == 1 else (size, size // _DEFENSIVE)
-            share = 1 << int(np.log2(n_own / len(own)))
-            others = defensive(current) if defensive else prior
-            for density, n in [*((one, share) for one in own), (others, n_others)]:
-                new = density.draw(n, rng)
-                z, log_p = np.vstack([z, new]), np.append(log_p, log_density(new))
-                mixture.append((density, n))
+    modes = find_modes(log_density, starts)
+    proposals = modes if len(modes) > 1 else []
+    current, n_rounds, uneven = modes[0], 0, False
+    own = [current.scaled(_WIDER), *proposals]
+    while True:
+        n_rounds += 1
+        n_own, n_others = (size // 2,) * 2 if n_rounds == 1 else (size, size // _DEFENSIVE)
+        share = 1 << int(np.log2(n_own / len(own)))
+        others = defensive(current) if defensive else prior
+        for density, n in [*((one, share) for one in own), (others, n_others)]:
+            new = density.draw(n, rng)
+            z, log_p = np.vstack([z, new]), np.append(log_p, log_density(new))
+            mixture.append((density, n))
 
-            log_q = [density.log_density(z) + np.log(n) for density, n in mixture]
-            log_q = special.logsumexp(log_q, axis=0) - np.log(len(z))
-            points = Points.of(z, log_p, np.where(np.isfinite(log_p), log_p, -np.inf) - log_q)
-            good = points.k_hat < GOOD_KHAT and points.kish > enough
-            if (good and n_rounds > 1) or n_rounds == most:
-                return points
-            current, uneven = points.fitted(), uneven or points.k_hat >= GOOD_KHAT
-            own = [current.scaled(_WIDER), *proposals]
-            if uneven:
-                kernel, chosen = current.scaled(_KERNEL_SCALE), points.resample(_KERNELS, rng)
-                own = [kernel._replace(center=center) for center in points.z[chosen]]
+        log_q = [density.log_density(z) + np.log(n) for density, n in mixture]
+        log_q = special.logsumexp(log_q, axis=0) - np.log(len(z))
+        points = Points.of(z, log_p, np.where(np.isfinite(log_p), log_p, -np.inf) - log_q)
+        good = points.k_hat < GOOD_KHAT and points.kish > enough
+        if (good and n_rounds > 1) or n_rounds == most:
+            return points
+        current, uneven = points.fitted(), uneven or points.k_hat >= GOOD_KHAT
+        own = [current.scaled(_WIDER), *proposals]
+        if uneven:
+            kernel, chosen = current.scaled(_KERNEL_SCALE), points.resample(_KERNELS, rng)
+            own = [kernel._replace(center=center) for center in points.z[chosen]]
 
 
 def find_modes(log_density: LogDensity, starts: np.ndarray) -> list[Student]:

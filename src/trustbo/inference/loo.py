@@ -113,6 +113,7 @@ def _log_evidence(posterior: Posterior, seed: int) -> tuple[float, float]:
 
 
 @np.errstate(under="ignore")  # small weights and tails round to 0
+@one_blas_thread()
 def compare(posteriors: Mapping[str, xr.DataTree]) -> pd.DataFrame:
     """Rank posteriors by leave-one-mission-out cross-validation; see `loo` and `arviz.compare`.
 

@@ -19,7 +19,6 @@ from scipy.linalg import cho_factor, cho_solve
 
 from trustbo.models.effects.place import matern
 from trustbo.models.visited import Visited
-from trustbo.parallel import one_blas_thread
 from trustbo.workspace.moves import MOVE_NAMES
 
 _STEP = 0.1  # step of log length scales
@@ -75,7 +74,6 @@ def place_maps_of(group: xr.Dataset, sites: Mapping[str, np.ndarray]) -> dict[st
     return {"place": place[:, None], "place_bound": place_bound[:, None]}
 
 
-@one_blas_thread()
 def _cells(
     s: np.ndarray,
     cells: np.ndarray,
