@@ -27,10 +27,11 @@ def test_a_gaussian_posterior_has_its_closed_form(d):
 
     assert points.k_hat < importance.MAX_KHAT
     assert points.kish > 200.0
-    fit = importance.Student.of(points.z, points.weight, 0.0)
     sd = np.sqrt(np.diag(covariance))
-    np.testing.assert_allclose(fit.center / sd, mean / sd, atol=5.0 / np.sqrt(points.kish))
-    correlation = fit.scale @ fit.scale.T / np.outer(sd, sd)
+    of_points = points.weight @ points.z
+    np.testing.assert_allclose(of_points / sd, mean / sd, atol=5.0 / np.sqrt(points.kish))
+    off = points.z - of_points
+    correlation = off.T * points.weight @ off / np.outer(sd, sd)
     np.testing.assert_allclose(
         correlation, covariance / np.outer(sd, sd), atol=8.0 / np.sqrt(points.kish)
     )
@@ -91,16 +92,49 @@ def test_a_student_integrates_to_its_density():
 
 
 def test_a_skewed_student_integrates_to_its_density():
-    sides = np.array([[0.5, 2.0], [3.0, 1.0]])
+    sides = np.array([[0.8, 1.5], [1.6, 1.0]])
     student = importance.Student(np.array([1.0, -1.0]), np.array([[2.0, 0.0], [0.5, 1.0]]), sides)
 
     rng = np.random.default_rng(7)
     z = student.draw(16384, rng)
-    other = stats.multivariate_t([1.0, 0.0], 8.0 * np.eye(2), df=30.0)
+    other = stats.multivariate_t([1.0, 0.0], 2.0 * np.eye(2), df=30.0)
     ratio = np.exp(other.logpdf(z) - student.log_density(z))
 
     assert ratio.mean() == pytest.approx(1.0, abs=0.02)
     assert (ratio * z[:, 0]).mean() == pytest.approx(1.0, abs=0.1)
+
+
+def test_a_skewed_student_has_no_jump_at_its_center():
+    sides = np.array([[0.5], [2.0]])
+    student = importance.Student(np.zeros(1), np.eye(1), sides)
+
+    below, above = student.log_density(np.array([[-1e-9], [1e-9]]))
+
+    assert below == pytest.approx(above)
+    assert (student.draw(4096, np.random.default_rng(8)) < 0.0).mean() == pytest.approx(
+        0.2, abs=0.01
+    )
+
+
+def test_a_two_piece_normal_is_found_from_its_points():
+    rng = np.random.default_rng(9)
+    width = np.where(rng.random(40_000) < 0.25, -0.5, 1.5)
+    x = 0.4 + width * np.abs(rng.standard_normal(40_000))
+
+    center, sides = importance.two_piece(x[:, None], np.full(len(x), 1.0 / len(x)), 0.0)
+
+    assert center[0] == pytest.approx(0.4, abs=0.11)  # centers are tried in steps of 0.1
+    np.testing.assert_allclose(sides[:, 0], [0.5, 1.5], atol=0.1)
+
+
+def test_few_points_give_a_proposal_near_the_one_before():
+    near = importance.Student(np.zeros(2), np.array([[2.0, 0.0], [1.0, 1.0]]))
+    z = 1e-3 * np.random.default_rng(10).standard_normal((3, 2))
+
+    fitted = importance.Student.of(z, np.full(3, 1.0 / 3.0), near)
+
+    covariance = fitted.scale @ fitted.scale.T
+    assert (np.diag(covariance) > 0.5 * np.diag(near.scale @ near.scale.T)).all()
 
 
 def test_resampling_is_proportional_to_the_weights():

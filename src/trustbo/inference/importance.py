@@ -8,7 +8,8 @@ Hyperparameters are sampled as *scores* z, which are standard normal a priori. A
 2. Each round draws points from the current proposal, from the fits at the modes if there are
    several modes, and from a defensive proposal, which covers regions that other proposals miss. All
    proposals so far form a mixture q, and every point has the weight p(z) / q(z).
-3. The moments of the weighted points give the next proposal. If k-hat is bad in any round, kernels
+3. A skewed Student-t is fitted to the weighted points for the next round. While few points are
+   effective, the fit stays near the first proposal. If k-hat is bad after the second round, kernels
    at points drawn by weight (West 1993) are the proposals from then on, because they also describe
    curved densities. Sampling stops when k-hat and the effective number of points are good.
 
@@ -26,14 +27,19 @@ from scipy.linalg import solve_triangular
 
 GOOD_KHAT, MAX_KHAT = 0.5, 0.7
 """Limits on the Pareto shape k-hat of the weights, for stopping and for acceptable results."""
+ENOUGH = 400.0
+"""Effective number of points at which sampling stops."""
 _DEGREES = 8.0  # degrees of freedom of the proposals
 _WIDER = 1.1  # scale of a proposal relative to the points that it is fitted to
 _KERNELS, _KERNEL_SCALE = 16, 0.7  # number of kernels, and their scale relative to the points
 _DEFENSIVE = 4  # points of other proposals per defensive point after the first round
+_EFFICIENCY = 0.5  # effective points expected per point, to choose the size of the last rounds
+_LEAST_ROUND = 4  # smallest round, as a divisor of the usual number of points
 _PER_AXIS = 4.0  # effective points per dimension needed to estimate moments
 _SLOPE_STEP, _CURVATURE_STEP = 1e-3, 3e-2  # steps of finite differences
 _LEAST_CURVATURE = 0.3  # least curvature of -log density at a mode; the prior has curvature 1
-_SKEW_STEP, _SKEWS = 2.0, (0.5, 3.0)  # where skewness is measured, in sds, and its limits
+_SKEW_STEP, _SKEWS = 2.0, (0.3, 3.0)  # where skewness is measured, in sds, and its limits
+_SHIFTS = np.linspace(-1.5, 1.5, 31)  # differences that are tried of a center and the mean, in sds
 _FARTHEST = 7.0  # largest absolute score of a mode
 
 LogDensity = Callable[[np.ndarray], np.ndarray]
@@ -43,8 +49,9 @@ LogDensity = Callable[[np.ndarray], np.ndarray]
 class Student(NamedTuple):
     """Multivariate Student-t distribution, which may be wider on one side of its center.
 
-    A point is center + scale (x sides), where x has a standard Student-t distribution and the
-    elements of x are multiplied by the first or second row of sides, depending on their sign.
+    A point is center + scale x. The elements of x have a standard Student-t distribution, stretched
+    by the first row of sides where negative and by the second row where positive. The density is
+    continuous, so the probabilities of the two signs are proportional to the sides.
     """
 
     center: np.ndarray  # (score,)
@@ -52,11 +59,24 @@ class Student(NamedTuple):
     sides: np.ndarray = np.ones((2, 1))  # (2, score), factors of negative and positive elements
 
     @classmethod
-    def of(cls, z: np.ndarray, weight: np.ndarray, ridge: float = 1e-3) -> Self:
-        """Match the mean and covariance of points z (point, score) with weights (point,)."""
+    def of(cls, z: np.ndarray, weight: np.ndarray, near: Self) -> Self:
+        """Fit points z (point, score) with weights (point,) that sum to 1.
+
+        A covariance has many elements, so it is averaged with the covariance of `near`, which
+        counts as one point for each element. The sides are fitted by `two_piece`.
+        """
+        d = z.shape[1]
+        per_score = d * (weight**2).sum()  # reciprocal of the effective points per score
+        share = per_score * (d + 1) / (1.0 + per_score * (d + 1))  # of `near` in the covariance
+
         mean = weight @ z
         covariance = (z - mean).T * weight @ (z - mean)
-        return cls(mean, np.linalg.cholesky(covariance + ridge * np.eye(z.shape[1])))
+        before = near.scale * near.sides.mean(0)
+        scale = np.linalg.cholesky((1.0 - share) * covariance + share * before @ before.T)
+
+        white = solve_triangular(scale, (z - mean).T, lower=True).T
+        shift, sides = two_piece(white, weight, per_score)
+        return cls(mean + scale @ shift, scale, sides)
 
     def scaled(self, factor: float) -> Self:
         """Return the distribution with its scale multiplied by a factor."""
@@ -67,18 +87,49 @@ class Student(NamedTuple):
         d = len(self.center)
         uniform = np.clip(stats.qmc.Sobol(d + 1, rng=rng).random(n), 1e-12, 1.0 - 1e-12)
         chi2 = 2.0 * special.gammaincinv(0.5 * _DEGREES, uniform[:, d:]) / _DEGREES
-        x = special.ndtri(uniform[:, :d]) / np.sqrt(chi2)
+
+        u, negative = uniform[:, :d], self.sides[0] / self.sides.sum(0)
+        below = 0.5 * u / negative
+        above = 0.5 + 0.5 * (u - negative) / (1.0 - negative)
+        x = special.ndtri(np.where(u < negative, below, above)) / np.sqrt(chi2)
         return self.center + (np.where(x < 0.0, *self.sides) * x) @ self.scale.T
 
     def log_density(self, z: np.ndarray) -> np.ndarray:
         """Compute the log density (point,) of points (point, score)."""
         nu, d = _DEGREES, len(self.center)
         x = solve_triangular(self.scale, (z - self.center).T, lower=True).T
-        side = np.where(x < 0.0, *self.sides)
+        square = ((x / np.where(x < 0.0, *self.sides)) ** 2).sum(1)
+
         constant = special.gammaln(0.5 * (nu + d)) - special.gammaln(0.5 * nu)
-        constant -= 0.5 * d * np.log(nu * np.pi) + np.log(np.diag(self.scale)).sum()
-        square = ((x / side) ** 2).sum(1)
-        return constant - np.log(side).sum(1) - 0.5 * (nu + d) * np.log1p(square / nu)
+        constant -= 0.5 * d * np.log(nu * np.pi)
+        constant -= np.log(np.diag(self.scale) * self.sides.mean(0)).sum()
+        return constant - 0.5 * (nu + d) * np.log1p(square / nu)
+
+
+def two_piece(
+    x: np.ndarray, weight: np.ndarray, n_standard: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Fit a two-piece normal distribution to each column of x (point, score).
+
+    For a given center, the sums of squares S on both sides give the maximum-likelihood widths
+    S^(1/3) (S_below^(1/3) + S_above^(1/3))^(1/2), and the likelihood decreases with the sum of the
+    cube roots (John 1982, Communications in Statistics 11). `n_standard` points of a standard
+    normal distribution are added to the points, whose weights (point,) sum to 1.
+
+    Returns:
+        Centers (score,) and widths (2, score) below and above the centers.
+    """
+    roots = np.empty((len(_SHIFTS), 2, x.shape[1]))
+    for k, shift in enumerate(_SHIFTS):
+        for side, sign in enumerate((-1.0, 1.0)):
+            own = weight @ np.maximum(sign * (x - shift), 0.0) ** 2
+            a = sign * shift
+            standard = (1.0 + a**2) * special.ndtr(-a) - a * stats.norm.pdf(a)
+            roots[k, side] = np.cbrt((own + n_standard * standard) / (1.0 + n_standard))
+
+    best = roots.sum(1).argmin(0)
+    chosen = roots[best, :, np.arange(x.shape[1])].T
+    return _SHIFTS[best], np.clip(chosen * np.sqrt(chosen.sum(0)), *_SKEWS)
 
 
 class Points(NamedTuple):
@@ -110,14 +161,14 @@ class Points(NamedTuple):
         """Effective number of points, which is 1 / sum of squared weights."""
         return 1.0 / float((self.weight**2).sum())
 
-    def fitted(self) -> Student:
-        """Fit a Student-t to the points' moments; if few points dominate, flatten their weights."""
+    def fitted(self, near: Student) -> Student:
+        """Fit a Student-t to the points; if few points dominate, flatten their weights."""
         weight, least = self.weight, _PER_AXIS * self.z.shape[1]
         for _ in range(6):
             if (weight**2).sum() * least <= 1.0:
                 break
             weight = np.sqrt(weight) / np.sqrt(weight).sum()
-        return Student.of(self.z, weight)
+        return Student.of(self.z, weight, near)
 
     def resample(self, n: int, rng: np.random.Generator) -> np.ndarray:
         """Draw sorted indices of `n` equally weighted points."""
@@ -130,9 +181,11 @@ def sample(
     rng: np.random.Generator,
     *,
     size: int = 256,
-    enough: float = 200.0,
+    enough: float = ENOUGH,
     most: int = 8,
     defensive: Callable[[Student], Student] | None = None,
+    first: Student | None = None,
+    visit: LogDensity | None = None,
 ) -> Points:
     """Sample a posterior of scores; the caller must check `k_hat`.
 
@@ -146,36 +199,46 @@ def sample(
         most: Maximum number of rounds.
         defensive: Function that returns a proposal for regions that the current proposal may miss;
             by default a Student-t slightly wider than the prior.
+        first: First proposal; by default fitted at the modes that the search finds.
+        visit: Log density of the drawn points, in the order of `Points.z`, if something has to be
+            recorded with each point; by default `log_density`.
     """
     d = starts.shape[1]
     prior = Student(np.zeros(d), 1.2 * np.eye(d))
+    visit = visit or log_density
     z, log_p, mixture = np.empty((0, d)), np.empty(0), []
 
-    modes = find_modes(log_density, starts)
+    modes = [first] if first else find_modes(log_density, starts)
     proposals = modes if len(modes) > 1 else []
-    current, n_rounds, uneven = modes[0], 0, False
+    current, uneven = modes[0], False
     own = [current.scaled(_WIDER), *proposals]
-    while True:
-        n_rounds += 1
-        n_own, n_others = (size // 2,) * 2 if n_rounds == 1 else (size, size // _DEFENSIVE)
+    n_own = n_others = size // 2
+    for n_rounds in range(1, most + 1):
         share = 1 << int(np.log2(n_own / len(own)))
         others = defensive(current) if defensive else prior
         for density, n in [*((one, share) for one in own), (others, n_others)]:
             new = density.draw(n, rng)
-            z, log_p = np.vstack([z, new]), np.append(log_p, log_density(new))
+            z, log_p = np.vstack([z, new]), np.append(log_p, visit(new))
             mixture.append((density, n))
 
         log_q = [density.log_density(z) + np.log(n) for density, n in mixture]
         log_q = special.logsumexp(log_q, axis=0) - np.log(len(z))
         points = Points.of(z, log_p, np.where(np.isfinite(log_p), log_p, -np.inf) - log_q)
-        good = points.k_hat < GOOD_KHAT and points.kish > enough
-        if (good and n_rounds > 1) or n_rounds == most:
-            return points
-        current, uneven = points.fitted(), uneven or points.k_hat >= GOOD_KHAT
+        good = points.k_hat < GOOD_KHAT
+        if (good and points.kish > enough and n_rounds > 1) or n_rounds == most:
+            break
+
+        current = points.fitted(modes[0])
+        uneven = uneven or (not good and n_rounds > 1)
         own = [current.scaled(_WIDER), *proposals]
         if uneven:
             kernel, chosen = current.scaled(_KERNEL_SCALE), points.resample(_KERNELS, rng)
             own = [kernel._replace(center=center) for center in points.z[chosen]]
+
+        missing = max(enough - points.kish, 1.0) / _EFFICIENCY
+        n_own = int(np.clip(2 ** np.ceil(np.log2(missing)), size // _LEAST_ROUND, size))
+        n_others = n_own // _DEFENSIVE
+    return points
 
 
 def find_modes(log_density: LogDensity, starts: np.ndarray) -> list[Student]:
