@@ -49,11 +49,25 @@ def test_sensitivity_flags_a_prior_in_conflict_with_the_data(missions, posterior
     assert float(other.loc["b", "prior"]) < 0.02
 
 
-def test_every_draw_has_predictions(posterior):
-    sizes = posterior["posterior"].sizes
-    for group in ("posterior_predictive", "log_likelihood", "log_prior"):
-        assert posterior[group].sizes["draw"] == sizes["draw"]
-        assert posterior[group].sizes["chain"] == sizes["chain"]
+def test_every_draw_has_a_likelihood_and_draws_with_trust_have_predictions(posterior):
+    of_draws = posterior["posterior"].sizes
+    for group in ("log_likelihood", "log_prior"):
+        assert posterior[group].sizes["draw"] == of_draws["draw"]
+        assert posterior[group].sizes["chain"] == of_draws["chain"]
+    for name in ("chain", "draw"):
+        predicted = posterior["posterior_predictive"][name]
+        np.testing.assert_array_equal(predicted, posterior["latent"][name])
+    assert posterior["posterior_predictive"].sizes["draw"] == 200
+
+
+def test_the_effective_sample_size_is_that_of_the_weights(missions):
+    for draws in (250, 1000):
+        posterior = tb.fit(missions, PooledTrust(), draws=draws, whole=False)
+        assert posterior["posterior"].sizes["chain"] == 1
+        ess = az.ess(posterior, var_names=["beta0", "delta_w", "delta_v"], method="mean")
+        least = min(float(values) for values in ess.data_vars.values())
+        kish = 1.0 / (1.0 / posterior.attrs["kish"] + 0.25 / draws)
+        assert 0.5 * kish < least < 2.0 * kish
 
 
 @pytest.mark.parametrize("model", [HierarchicalTrust(), CoupledTrust()])

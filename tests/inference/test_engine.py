@@ -89,6 +89,24 @@ def test_a_matrix_that_is_not_positive_definite_costs_its_point_alone():
 
 
 @pytest.mark.parametrize("name", ["shared noise", "coupled, places and robots"])
+def test_columns_drawn_often_at_visited_points_have_the_moments_of_the_joint_normal(name):
+    posterior, theta = posterior_of(name)
+    z = np.repeat(0.5 * np.random.default_rng(1).standard_normal((3, posterior.n_scores)), 500, 0)
+    rng = np.random.default_rng(0)
+    log_p, columns = posterior.visit(z, rng)
+    np.testing.assert_allclose(log_p[::500], posterior.log_density(z[::500]), rtol=1e-12)
+    for k in range(3):
+        first = np.arange(500 * k, 500 * (k + 1))
+        drawn = columns.draw(np.repeat(first, 20), rng)
+        one = at(theta, slice(k, k + 1))
+        mean, cov = Dense(posterior.model, posterior.slots, one).coefficients()
+        sd = np.sqrt(np.diag(cov))
+        n_independent = 4 * 500
+        assert (np.abs(drawn.mean(0) - mean) < 5.0 * sd / np.sqrt(n_independent)).all()
+        np.testing.assert_allclose(drawn.std(0), sd, rtol=5.0 / np.sqrt(2 * n_independent))
+
+
+@pytest.mark.parametrize("name", ["shared noise", "coupled, places and robots"])
 def test_drawn_columns_have_the_moments_of_the_joint_normal(name):
     posterior, theta = posterior_of(name)
     one = at(theta, slice(0, 1))

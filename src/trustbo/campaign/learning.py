@@ -70,7 +70,7 @@ def learn(
     try:
         tree = fit(
             missions, model, sampler=sampler, workspace=workspace, seed=seed, progress=progress,
-            whole=False, **(usual | options),
+            whole=False, start=_previous(state), **(usual | options),
         )  # fmt: skip
     except TrustboError as error:
         return None, getattr(error, "reason", str(error))
@@ -81,6 +81,14 @@ def learn(
     tree = parameters_alone(tree)
     tree.attrs["missions"] = used
     return tree, ""
+
+
+def _previous(state: State) -> xr.DataTree | None:
+    """Return the last posterior, or None if there is none or its file cannot be read."""
+    try:
+        return state.posterior
+    except TrustboError:
+        return None
 
 
 def learn_hazard(state: State, workspace: Workspace) -> xr.Dataset:

@@ -130,7 +130,7 @@ def sample(
             alpha, beta = prior.betas(points.z)
             places, log_fail = impute(alpha + failed, beta + n - failed, paths, rng)
             ratio = points.log_ratio + log_fail - log_any_fails(alpha, beta)
-            points = importance.Points.of(points.z, points.log_p, ratio)
+            points = importance.Points.of(points.z, points.log_p, ratio, points.near)
         if points.k_hat <= importance.MAX_KHAT:
             break
     return points, places

@@ -28,6 +28,7 @@ from trustbo.inference.factor import (
     log_det,
     log_diagonal,
     log_integral,
+    put,
     times,
 )
 from trustbo.models.backend import namespace
@@ -117,11 +118,14 @@ class Prior(NamedTuple):
         start = 0
         for part in self.parts:
             i = np.arange(start, start := start + part.shape[1])
-            a = b = np.arange(len(i))
-            if part.ndim == 3:
+            if part.ndim == 2:
+                A = add(A, (slice(None), order.entry(i, i)), part)
+            elif isinstance(A, np.ndarray):  # dependent columns are neighbours in the core
+                first, last = order.place[i[0]], order.place[i[-1]] + 1
+                order.views(A)[2][:, first:last, first:last] += part
+            else:
                 a, b = np.triu_indices(len(i))
-            values = part if part.ndim == 2 else part[:, a, b]
-            A = add(A, (slice(None), order.entry(i[a], i[b])), values)
+                A = add(A, (slice(None), order.entry(i[a], i[b])), part[:, a, b])
         return A
 
     def log_density(self, c: np.ndarray) -> np.ndarray:
@@ -174,7 +178,7 @@ def evidence(blocks: Blocks, signal: Signal, prior: Prior, lam: Any, y: Any = No
     h = times(b.U.T, back.reshape(n, -1))
     pairs = (xp.swapaxes(C, 2, 3) @ C)[:, :, *np.triu_indices(C.shape[3])]
     products = times(b.sums, pairs.reshape(n, -1))
-    A = add(xp.zeros((n, b.order.size)), (slice(None), b.at), products)
+    A = put(xp.zeros((n, b.order.size)), (slice(None), b.at), products)
     A = prior.add_to(A, b.order)
     many = np.bincount(b.kind, minlength=len(b.seen)).astype(float)
     log_p = log_sites @ many + 0.5 * (prior.log_det - (w**2).sum((1, 2)))
@@ -204,14 +208,16 @@ def expected(blocks: Blocks, signal: Signal, c: Any) -> Any:
     return each(signal.m, label) + (signal.T[:, label] @ drift[..., None])[..., 0]
 
 
-def draw_columns(prior: Prior, fit: Fit, count: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Draw coefficients (draw, column) from the posterior, `count` times at each point."""
-    drawn = []
-    for i, many in enumerate(count):
-        one = Factor(fit.F.order, *(part[i : i + 1] for part in fit.F[1:]))
-        white = fit.half[i] + rng.standard_normal((1, many, fit.half.shape[1]))
-        drawn.append(prior.mean[i] + one.back(white)[0])
-    return np.concatenate(drawn)
+def columns_of(
+    prior: Prior, fit: Fit, n: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return posterior means (point, column) and n deviations (point, n, column) of coefficients.
+
+    Deviations are independent draws from the normal posterior at each point, minus its mean.
+    """
+    white = rng.standard_normal((len(fit.half), n, fit.half.shape[1]))
+    found = fit.F.back(np.concatenate([fit.half[:, None], white], axis=1))
+    return prior.mean + found[:, 0], found[:, 1:]
 
 
 def marginals(

@@ -240,6 +240,14 @@ def add(A: Any, at: Any, values: Any) -> Any:
     return A
 
 
+def put(A: Any, at: Any, values: Any) -> Any:
+    """Set values of an array at an index, in place in NumPy and in a copy in JAX."""
+    if not isinstance(A, np.ndarray):
+        return A.at[at].set(values)
+    A[at] = values
+    return A
+
+
 def log_diagonal(L: Any) -> Any:
     """Compute the log determinants of triangular matrices."""
     xp = namespace(L)

@@ -17,9 +17,17 @@ from trustbo.errors import (
     require_kind,
     require_whole,
 )
-from trustbo.inference.importance import MAX_KHAT, sample
+from trustbo.inference.importance import (
+    MAX_KHAT,
+    LogDensity,
+    Points,
+    Student,
+    sample,
+    smoothed,
+    systematic,
+)
 from trustbo.inference.place_maps import place_group
-from trustbo.inference.posterior import Draws, Posterior
+from trustbo.inference.posterior import Columns, Draws, Posterior
 from trustbo.inference.tree import N_PRIOR, complete, to_datatree
 from trustbo.models.backend import VERSIONS
 from trustbo.models.default import default_model
@@ -32,6 +40,7 @@ from trustbo.stacking import known_awareness, require_same_team
 from trustbo.workspace import Workspace
 
 SAMPLERS = ("importance", "nuts")
+_CORRECTED = 2  # draws whose density by EP is corrected, per point of a round
 
 
 @np.errstate(under="ignore")  # small weights and tails round to 0
@@ -49,6 +58,7 @@ def fit(
     progress: bool = True,
     check: bool = True,
     whole: bool = True,
+    start: xr.DataTree | None = None,
 ) -> xr.DataTree:
     """Fit a trust model to missions, and return the posterior of parameters and latent trust.
 
@@ -66,13 +76,16 @@ def fit(
             awareness are then left out with a warning. Otherwise, the grid of place effects ends at
             the last row and column visited.
         draws: Number of draws per chain.
-        chains: Number of chains, among which the draws of importance sampling are divided.
+        chains: Number of chains of NUTS. Importance sampling returns as many draws in one chain,
+            because its draws are independent of each other.
         warmup: Number of warm-up draws per chain of NUTS, which are discarded.
         seed: Random seed; the same seed gives the same posterior.
         progress: Whether NUTS shows a progress bar.
         check: Whether to raise an error if diagnostics are bad: k-hat > 0.7 for importance
             sampling; R-hat > 1.01, bulk ESS < 400 or any divergence for NUTS.
         whole: Whether to add latent trust, log-likelihoods and predictions, as `complete` does.
+        start: Posterior of the same model given similar data, such as all missions but the last.
+            Importance sampling then begins with its proposal instead of a search for the mode.
 
     Returns:
         An ArviZ DataTree. `posterior` contains the parameters (for `PooledTrust` beta0,
@@ -116,7 +129,9 @@ def fit(
         raise TrustboError("every contact rate is NaN; fit needs at least one measured rate.")
     posterior = Posterior(model, slots)
     if sampler == "importance":
-        drawn, stats, summary = by_importance(posterior, chains * draws, seed)
+        chains, draws = 1, chains * draws  # independent draws belong to one chain
+        first = _first_proposal(start, model)
+        drawn, stats, summary = by_importance(posterior, draws, seed, first)
         complaints = [] if summary["k_hat"] <= MAX_KHAT else [
             f"importance weights are uneven (k-hat {summary['k_hat']:.2f}, limit {MAX_KHAT})"
         ]  # fmt: skip
@@ -127,6 +142,8 @@ def fit(
             posterior, chains=chains, draws=draws, warmup=warmup, seed=seed, progress=progress
         )
     tree = _laid_out(posterior, drawn, stats, (chains, draws), missions, seed)
+    if "proposal" in summary:
+        tree["sample_stats"].attrs["proposal"] = summary.pop("proposal")
     tree.attrs |= _record(model, posterior) | summary | {"sampler": sampler, "seed": seed}
     if check and complaints:
         raise PosteriorError(
@@ -142,25 +159,99 @@ def fit(
 
 
 def by_importance(
-    posterior: Posterior, n: int, seed: int
+    posterior: Posterior, n: int, seed: int, first: Student | None = None
 ) -> tuple[Draws, dict[str, np.ndarray], dict[str, Any]]:
-    """Draw n times by importance sampling; return draws, statistics (draw,) and a summary."""
+    """Draw n times by importance sampling; return draws, statistics (draw,) and a summary.
+
+    `first` is the first proposal. By default, or if its weights are uneven, the first proposal is
+    found by a search for the mode.
+    """
     rng = np.random.default_rng(seed)
-    for size, n_sweeps in ((256, 1), (1024, 4)):
-        start = posterior.start()[None]
-        size = size if len(start[0]) < 12 else 4 * size
-        points = sample(posterior.log_density, start, rng, size=size, defensive=posterior.defensive)
-        # Correcting EP at these points takes most time, but more points make k-hat more reliable.
-        chosen = points.resample(n if posterior.exact else 2 * size, rng)
-        drawn, which = posterior.draw(points.z[chosen], points.log_p[chosen], n, rng, n_sweeps)
-        k_hat = max(points.k_hat, drawn.k_hat)
-        if k_hat <= MAX_KHAT:
+    draw = _exact_draws if posterior.exact else _ep_draws
+    attempts = [(256, 1, None), (1024, 4, None)]
+    if first is not None:
+        attempts.insert(0, (256, 1, first))
+    for size, n_sweeps, proposal in attempts:
+        size = size if posterior.n_scores < 12 else 4 * size
+        drawn, log_p, summary = draw(posterior, n, size, n_sweeps, rng, proposal)
+        if summary["k_hat"] <= MAX_KHAT:
             break
-    shuffled = rng.permutation(n)
-    log_p = points.log_p[chosen[which[shuffled]]]
-    log_evidence = points.log_evidence + drawn.log_correction
-    summary = {"k_hat": k_hat, "kish": points.kish, "log_evidence": log_evidence}
-    return drawn.at(shuffled), {"lp": log_p}, summary
+    return drawn, {"lp": log_p}, summary
+
+
+def _exact_draws(
+    posterior: Posterior,
+    n: int,
+    size: int,
+    n_sweeps: int,
+    rng: np.random.Generator,
+    first: Student | None,
+) -> tuple[Draws, np.ndarray, dict[str, Any]]:
+    """Draw n times given Gaussian rates, for which the log density of scores is exact."""
+    visited: list[Columns] = []
+
+    def visit(z: np.ndarray) -> np.ndarray:
+        log_p, columns = posterior.visit(z, rng)
+        visited.append(columns)
+        return log_p
+
+    points = _points(posterior, size, rng, first, visit)
+    chosen = points.resample(n, rng)
+    c = Columns.joined(visited).draw(chosen, rng)
+    drawn = Draws(posterior.theta(points.z[chosen]), c)
+    summary = {name: getattr(points, name) for name in ("k_hat", "kish", "log_evidence")}
+    return drawn, points.log_p[chosen], summary | {"proposal": points.proposal.text}
+
+
+def _ep_draws(
+    posterior: Posterior,
+    n: int,
+    size: int,
+    n_sweeps: int,
+    rng: np.random.Generator,
+    first: Student | None,
+) -> tuple[Draws, np.ndarray, dict[str, Any]]:
+    """Draw n times given other rates, and correct the density of scores by EP with weights."""
+    points = _points(posterior, size, rng, first)
+    # Correcting EP at these points takes most time, but more points make k-hat more reliable.
+    some = points.resample(_CORRECTED * size, rng)
+    drawn, log_ratio = posterior.draw_by_ep(points.z[some], points.log_p[some], rng, n_sweeps)
+    weight, k_hat, log_mean = smoothed(log_ratio)
+    chosen = systematic(weight, n, rng)
+    summary = {
+        "k_hat": max(points.k_hat, k_hat),
+        "kish": 1.0 / float((np.bincount(some, weight) ** 2).sum()),
+        "log_evidence": points.log_evidence + log_mean,
+        "proposal": points.proposal.text,
+    }
+    return drawn.at(chosen), points.log_p[some[chosen]], summary
+
+
+def _points(
+    posterior: Posterior,
+    size: int,
+    rng: np.random.Generator,
+    first: Student | None,
+    visit: LogDensity | None = None,
+) -> Points:
+    """Sample the scores, beginning with the proposal `first` or with a search for the mode."""
+    if first is None:
+        start = posterior.start()
+    else:
+        start = first.center
+        posterior.settle(posterior.theta(start[None]))
+    return sample(
+        posterior.log_density, start[None], rng,
+        size=size, defensive=posterior.defensive, first=first, visit=visit,
+    )  # fmt: skip
+
+
+def _first_proposal(start: xr.DataTree | None, model: TrustModel) -> Student | None:
+    """Return the proposal of a posterior of the same model, or None if there is none."""
+    if start is None or start.attrs["model_record"] != json.dumps(model_to_record(model)):
+        return None
+    text = start["sample_stats"].attrs.get("proposal")
+    return None if text is None else Student.from_text(text)
 
 
 def _laid_out(

@@ -17,6 +17,7 @@ The weights are Pareto-smoothed (Vehtari, Simpson, Gelman, Yao and Gabry 2024). 
 before smoothing is an estimate of the evidence.
 """
 
+import json
 from collections.abc import Callable
 from typing import NamedTuple, Self
 
@@ -37,6 +38,8 @@ _EFFICIENCY = 0.5  # effective points expected per point, to choose the size of 
 _LEAST_ROUND = 4  # smallest round, as a divisor of the usual number of points
 _PER_AXIS = 4.0  # effective points per dimension needed to estimate moments
 _SLOPE_STEP, _CURVATURE_STEP = 1e-3, 3e-2  # steps of finite differences
+_WIDTH_STEP, _CURVATURES = 0.1, (0.5, 1e4)  # step and limits of curvatures at the start of a search
+_CLOSE = 0.1  # a search for a mode ends when a step gains less than this log density
 _LEAST_CURVATURE = 0.3  # least curvature of -log density at a mode; the prior has curvature 1
 _SKEW_STEP, _SKEWS = 2.0, (0.3, 3.0)  # where skewness is measured, in sds, and its limits
 _SHIFTS = np.linspace(-1.5, 1.5, 31)  # differences that are tried of a center and the mean, in sds
@@ -77,6 +80,16 @@ class Student(NamedTuple):
         white = solve_triangular(scale, (z - mean).T, lower=True).T
         shift, sides = two_piece(white, weight, per_score)
         return cls(mean + scale @ shift, scale, sides)
+
+    @property
+    def text(self) -> str:
+        """The distribution as JSON, from which `from_text` makes exactly the same one."""
+        return json.dumps([array.tolist() for array in self])
+
+    @classmethod
+    def from_text(cls, text: str) -> Self:
+        """Read a distribution from JSON."""
+        return cls(*(np.array(values) for values in json.loads(text)))
 
     def scaled(self, factor: float) -> Self:
         """Return the distribution with its scale multiplied by a factor."""
@@ -142,6 +155,7 @@ class Points(NamedTuple):
         weight: Pareto-smoothed weights with sum 1, shape (point,).
         k_hat: Pareto shape of the weights, which is good below 0.5 and bad above 0.7.
         log_evidence: Log of the integral of the density.
+        near: Proposal that `proposal` resembles if few points are effective.
     """
 
     z: np.ndarray
@@ -150,29 +164,36 @@ class Points(NamedTuple):
     weight: np.ndarray
     k_hat: float
     log_evidence: float
+    near: Student
 
     @classmethod
-    def of(cls, z: np.ndarray, log_p: np.ndarray, log_ratio: np.ndarray) -> Self:
+    def of(cls, z: np.ndarray, log_p: np.ndarray, log_ratio: np.ndarray, near: Student) -> Self:
         """Build weighted points by smoothing the importance weights."""
-        return cls(z, log_p, log_ratio, *smoothed(log_ratio))
+        return cls(z, log_p, log_ratio, *smoothed(log_ratio), near)
 
     @property
     def kish(self) -> float:
         """Effective number of points, which is 1 / sum of squared weights."""
         return 1.0 / float((self.weight**2).sum())
 
-    def fitted(self, near: Student) -> Student:
+    @property
+    def proposal(self) -> Student:
         """Fit a Student-t to the points; if few points dominate, flatten their weights."""
         weight, least = self.weight, _PER_AXIS * self.z.shape[1]
         for _ in range(6):
             if (weight**2).sum() * least <= 1.0:
                 break
             weight = np.sqrt(weight) / np.sqrt(weight).sum()
-        return Student.of(self.z, weight, near)
+        return Student.of(self.z, weight, self.near)
 
     def resample(self, n: int, rng: np.random.Generator) -> np.ndarray:
-        """Draw sorted indices of `n` equally weighted points."""
-        return systematic(self.weight, n, rng)
+        """Draw indices of `n` equally weighted points.
+
+        Points are in random order, but repetitions of a point are next to each other. Therefore,
+        the effective sample size that ArviZ computes from autocorrelations is about `kish`.
+        """
+        order = rng.permutation(len(self.z))
+        return order[systematic(self.weight[order], n, rng)]
 
 
 def sample(
@@ -223,12 +244,13 @@ def sample(
 
         log_q = [density.log_density(z) + np.log(n) for density, n in mixture]
         log_q = special.logsumexp(log_q, axis=0) - np.log(len(z))
-        points = Points.of(z, log_p, np.where(np.isfinite(log_p), log_p, -np.inf) - log_q)
+        log_ratio = np.where(np.isfinite(log_p), log_p, -np.inf) - log_q
+        points = Points.of(z, log_p, log_ratio, modes[0])
         good = points.k_hat < GOOD_KHAT
         if (good and points.kish > enough and n_rounds > 1) or n_rounds == most:
             break
 
-        current = points.fitted(modes[0])
+        current = points.proposal
         uneven = uneven or (not good and n_rounds > 1)
         own = [current.scaled(_WIDER), *proposals]
         if uneven:
@@ -258,19 +280,29 @@ def find_modes(log_density: LogDensity, starts: np.ndarray) -> list[Student]:
 
 
 def climb(log_density: LogDensity, start: np.ndarray) -> np.ndarray:
-    """Search for a mode (score,) by L-BFGS with derivatives from finite differences."""
-    axes = np.eye(len(start))
+    """Search for a mode (score,) by L-BFGS with derivatives from finite differences.
 
-    def cost(z: np.ndarray) -> tuple[float, np.ndarray]:
-        value = -log_density(np.vstack([z, z + _SLOPE_STEP * axes]))
+    The scores are divided by their widths at the start, so that the first steps are short enough.
+    """
+    d = len(start)
+    axes = np.eye(d)
+
+    value = log_density(start + _WIDTH_STEP * np.vstack([np.zeros((1, d)), axes, -axes]))
+    curvature = (2.0 * value[0] - value[1 : d + 1] - value[d + 1 :]) / _WIDTH_STEP**2
+    width = np.nan_to_num(curvature, nan=1.0, posinf=1.0, neginf=1.0).clip(*_CURVATURES) ** -0.5
+
+    def cost(x: np.ndarray) -> tuple[float, np.ndarray]:
+        steps = np.vstack([np.zeros((1, d)), _SLOPE_STEP * axes])
+        value = -log_density(start + width * (x + steps))
         value = np.minimum(np.nan_to_num(value, nan=np.inf), 1e10)
         return value[0], (value[1:] - value[0]) / _SLOPE_STEP
 
-    options = {"maxiter": 40, "ftol": 1e-2 / max(1.0, abs(cost(start)[0]))}
-    bounds = [(-_FARTHEST, _FARTHEST)] * len(start)
-    return optimize.minimize(
-        cost, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options
-    ).x
+    options = {"maxiter": 40, "ftol": _CLOSE / max(1.0, abs(value[0]))}
+    farthest = np.stack([-_FARTHEST - start, _FARTHEST - start], axis=1) / width[:, None]
+    found = optimize.minimize(
+        cost, np.zeros(d), jac=True, method="L-BFGS-B", bounds=farthest, options=options
+    )
+    return start + width * found.x
 
 
 def fit_mode(log_density: LogDensity, mode: np.ndarray) -> Student:

@@ -1,6 +1,6 @@
 """The posterior of a model: a density for samplers, and draws given the hyperparameters."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -8,9 +8,9 @@ from scipy import sparse
 from scipy.special import logsumexp
 
 from trustbo.inference import ep
-from trustbo.inference.engine import Blocks, Fit, Prior, draw_columns, evidence, expected, whiten
+from trustbo.inference.engine import Blocks, Fit, Prior, columns_of, evidence, expected, whiten
 from trustbo.inference.factor import Order, cholesky
-from trustbo.inference.importance import Student, climb, smoothed, systematic
+from trustbo.inference.importance import Student, climb
 from trustbo.models.backend import namespace
 from trustbo.models.effects.effect import Theta
 from trustbo.models.model import TrustModel
@@ -18,12 +18,15 @@ from trustbo.models.scores import Scores
 from trustbo.models.signal import Signal, each
 from trustbo.models.slots import Slots
 
-_CHUNK = 16  # points evaluated at once
+_CHUNK = 16  # largest number of points evaluated at once
+_NUMBERS = 3_000_000  # largest number of precision entries of the points evaluated at once
+_FEW = 15  # missions with which the search for the mode begins
 _SIZES = (0.3, 1.0, 1.8, 2.6)  # log ratios of the sd of rates to the noises at each start
 _LARGEST_NOISE, _LEAST_NOISE = 50.0, 1e-6  # limits of the size of the noises; see `Scores`
 _SWEEPS = 1  # EP sweeps at each point, beginning with the sites at the mode
 _SETTLED, _DAMPING = 12, 0.7  # EP sweeps and damping to find the sites at the mode
 _PARTICLES = 4  # signals drawn for each draw of the coefficients
+_DEVIATIONS = 4  # draws of the coefficients that are kept at each visited point
 
 
 class Draws(NamedTuple):
@@ -32,15 +35,37 @@ class Draws(NamedTuple):
     theta: dict[str, np.ndarray]  # (draw, ...)
     c: np.ndarray  # (draw, column)
     f: np.ndarray | None = None  # (draw, block, row)
-    k_hat: float = 0.0
-    """Pareto shape of the weights that correct EP, or 0 if the evidence is exact."""
-    log_correction: float = 0.0
-    """Correction of the log evidence by the weights that correct EP."""
 
     def at(self, index: np.ndarray) -> Self:
         """Select draws by index."""
         f = None if self.f is None else self.f[index]
         return self._replace(theta=at(self.theta, index), c=self.c[index], f=f)
+
+
+class Columns(NamedTuple):
+    """Normal distributions of the coefficients at points, represented by draws."""
+
+    mean: np.ndarray  # (point, column)
+    deviation: np.ndarray  # (point, deviation, column), independent draws minus the mean
+
+    @classmethod
+    def joined(cls, parts: Sequence[Self]) -> Self:
+        """Join the distributions of several groups of points."""
+        return cls(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+
+    def draw(self, index: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Draw coefficients (draw, column) at the points with the given index (draw,).
+
+        A combination of independent deviations with a random unit vector has the same normal
+        distribution as each deviation, so a point can be drawn any number of times.
+        """
+        unit = rng.standard_normal((len(index), self.deviation.shape[1]))
+        unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+        drawn = self.mean[index]
+        for point in np.unique(index):
+            here = index == point
+            drawn[here] += unit[here] @ self.deviation[point]
+        return drawn
 
 
 class Given(NamedTuple):
@@ -50,7 +75,7 @@ class Given(NamedTuple):
     mean: np.ndarray  # (mission, bound, robot), over all draws
     sd: np.ndarray
     log_likelihood: np.ndarray  # (draw, mission)
-    predicted: np.ndarray  # (draw, mission, bound, robot), replicated rates
+    predicted: np.ndarray  # (kept draw, mission, bound, robot), replicated rates
 
 
 class Posterior:
@@ -72,6 +97,11 @@ class Posterior:
         if not self.exact:
             self.terms = ep.Terms(model.family, y, self.layout.rows(slots.n_ticks))
             self.sites = ep.first_sites(self.terms)
+
+    @property
+    def _n_at_once(self) -> int:
+        """Number of points evaluated at once, so that their matrices stay in memory in use."""
+        return int(np.clip(_NUMBERS // self.blocks.order.size, 1, _CHUNK))
 
     def _order(self) -> Order:
         """Find the order in which the columns are eliminated; see `Order`."""
@@ -100,21 +130,42 @@ class Posterior:
             return self.log_evidence(self.theta(z)) + self.scores.log_prior(z)
         out = np.full(len(z), -np.inf)
         with np.errstate(all="ignore"):  # extreme scores overflow and get zero density
-            theta, log_prior = self.theta(z), self.scores.log_prior(z)
-            size = np.exp(z[:, self.scores.sizes])
-            flat = [np.asarray(values).reshape(len(z), -1) for values in theta.values()]
-            possible = np.isfinite(np.column_stack([*flat, log_prior])).all(1)
-            possible &= ((size > _LEAST_NOISE) & (size < _LARGEST_NOISE)).all(1)
-            some = np.flatnonzero(possible & (theta["rest"].reshape(len(z), -1) != 0.0).all(1))
-            out[some] = self.log_evidence(at(theta, some)) + log_prior[some]
+            theta, some = self._possible(z)
+            out[some] = self.log_evidence(theta) + self.scores.log_prior(z[some])
         return np.where(np.isfinite(out), out, -np.inf)
+
+    def visit(self, z: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, Columns]:
+        """Compute the log density of scores, and the coefficients there, given Gaussian rates."""
+        n, p = len(z), self._U.shape[1]
+        log_p = np.full(n, -np.inf)
+        mean, deviation = np.zeros((n, p)), np.zeros((n, _DEVIATIONS, p))
+        with np.errstate(all="ignore"):
+            theta, some = self._possible(z)
+            for where, chunk in chunks(theta, self._n_at_once):
+                fit, prior = self._fit(chunk)
+                log_p[some[where]] = fit.log_p
+                mean[some[where]], deviation[some[where]] = columns_of(prior, fit, _DEVIATIONS, rng)
+            log_p[some] += self.scores.log_prior(z[some])
+        return np.where(np.isfinite(log_p), log_p, -np.inf), Columns(mean, deviation)
+
+    def _possible(self, z: np.ndarray) -> tuple[dict[str, Any], np.ndarray]:
+        """Return the hyperparameters and the indices of scores whose density may be positive."""
+        theta, log_prior = self.theta(z), self.scores.log_prior(z)
+        size = np.exp(z[:, self.scores.sizes])
+        flat = [np.asarray(values).reshape(len(z), -1) for values in theta.values()]
+
+        possible = np.isfinite(np.column_stack([*flat, log_prior])).all(1)
+        possible &= ((size > _LEAST_NOISE) & (size < _LARGEST_NOISE)).all(1)
+        possible &= (theta["rest"].reshape(len(z), -1) != 0.0).all(1)
+        some = np.flatnonzero(possible)
+        return at(theta, some), some
 
     def log_evidence(self, theta: Theta) -> Any:
         """Compute log p(rates | theta) at each point, with EP if rates are not Gaussian."""
         if namespace(theta["rest"]) is not np:
             return self._fit(theta)[0].log_p
         found = np.empty(len(theta["rest"]))
-        for i, chunk in chunks(theta):
+        for i, chunk in chunks(theta, self._n_at_once):
             if self.exact:
                 found[i] = self._fit(chunk)[0].log_p
             else:
@@ -128,18 +179,30 @@ class Posterior:
             self.sites = ep.log_evidence(self._joint(center), self.sites, _SETTLED, _DAMPING)[1]
 
     def start(self) -> np.ndarray:
-        """Return the best of four starts of the mode search or, with EP, the mode."""
-        starts = np.zeros((len(_SIZES), self.n_scores))
-        unit = self.model.family.line_of_sight[0]
-        spread = np.log(np.clip(unit * np.nanstd(self.slots.y) / 0.2, 1e-2, 3.0))
-        starts[:, self.scores.sizes] = spread - np.array(_SIZES)[:, None]
-        self.settle(self.theta(starts[1:2]))
-        best = starts[self.log_density(starts).argmax()]
+        """Return a start of the search for the mode or, with EP, the mode.
+
+        With many missions, the start is the mode given the first few, whose density costs less.
+        """
+        few = self.slots.first(_FEW)
+        if self.slots.n_missions >= 2 * _FEW and not np.isnan(few.y).all():
+            of_few = Posterior(self.model, few)
+            best = climb(of_few.log_density, of_few.start())
+        else:
+            best = self._best_of_four_starts()
         if not self.exact:
             self.settle(self.theta(best[None]))
             best = climb(self.log_density, best)
             self.settle(self.theta(best[None]))
         return best
+
+    def _best_of_four_starts(self) -> np.ndarray:
+        """Return the best of scores at which the noises have different sizes."""
+        starts = np.zeros((len(_SIZES), self.n_scores))
+        unit = self.model.family.line_of_sight[0]
+        spread = np.log(np.clip(unit * np.nanstd(self.slots.y) / 0.2, 1e-2, 3.0))
+        starts[:, self.scores.sizes] = spread - np.array(_SIZES)[:, None]
+        self.settle(self.theta(starts[1:2]))
+        return starts[self.log_density(starts).argmax()]
 
     def defensive(self, proposal: Student) -> Student:
         """Make a wider proposal for beta0 and the noises; other scores stay near the prior."""
@@ -151,45 +214,35 @@ class Posterior:
         cov[others, others] = 1.2
         return Student(center, np.linalg.cholesky(cov))
 
-    def draw(
-        self, z: np.ndarray, log_p: np.ndarray, n: int, rng: np.random.Generator, n_sweeps: int
+    def draw_by_ep(
+        self, z: np.ndarray, log_p: np.ndarray, rng: np.random.Generator, n_sweeps: int
     ) -> tuple[Draws, np.ndarray]:
-        """Draw coefficients and signals given equally weighted hyperparameter points.
+        """Draw coefficients and signals once at each of the equally weighted points.
 
         Args:
             z: Scores (point, score).
-            log_p: Log density (point,) of the scores.
-            n: Number of draws; for Gaussian rates, one draw per point is returned instead.
+            log_p: Log density (point,) of the scores by EP.
             rng: Random number generator.
             n_sweeps: Number of EP sweeps at each point.
 
         Returns:
-            The draws, and the index (draw,) of the point of each draw.
+            The draws, and the log weights (point,) that correct the errors of EP.
         """
-        if self.exact:
-            unique, index, count = np.unique(z, axis=0, return_inverse=True, return_counts=True)
-            theta, index = self.theta(unique), index.ravel()
-            c = self.draw_columns(theta, rng, count)
-            order = np.argsort(np.argsort(index, kind="stable"), kind="stable")
-            return Draws(at(theta, index), c[order]), np.arange(len(z))
         theta, parts = self.theta(z), []
         for _, chunk in chunks(theta):
             joint = self._joint(chunk)
             sites = ep.log_evidence(joint, self.sites, n_sweeps)[1]
             parts.append(ep.draw(joint, sites, rng))
         c, f, log_weight = (np.concatenate(part) for part in zip(*parts, strict=True))
-        weight, k_hat, log_mean = smoothed(log_weight + self.scores.log_prior(z) - log_p)
-        chosen = systematic(weight, n, rng)
-        return Draws(at(theta, chosen), c[chosen], f[chosen], k_hat, log_mean), chosen
+        return Draws(theta, c, f), log_weight + self.scores.log_prior(z) - log_p
 
-    def draw_columns(
-        self, theta: Theta, rng: np.random.Generator, count: np.ndarray | None = None
-    ) -> np.ndarray:
-        """Draw the coefficients at each point given Gaussian rates, once or `count` times."""
-        count, drawn = np.ones(len(theta["rest"]), dtype=int) if count is None else count, []
-        for where, chunk in chunks(theta):
+    def draw_columns(self, theta: Theta, rng: np.random.Generator) -> np.ndarray:
+        """Draw the coefficients (point, column) once at each point given Gaussian rates."""
+        drawn = []
+        for _, chunk in chunks(theta):
             fit, prior = self._fit(chunk)
-            drawn.append(draw_columns(prior, fit, count[where], rng))
+            mean, deviation = columns_of(prior, fit, 1, rng)
+            drawn.append(mean + deviation[:, 0])
         return np.concatenate(drawn)
 
     def named(self, draws: Draws) -> dict[str, dict[str, np.ndarray]]:
@@ -241,7 +294,7 @@ class Posterior:
 
         Args:
             draws: Draws of hyperparameters and coefficients.
-            kept: Indices of the draws whose trust is kept.
+            kept: Indices of the draws whose trust and predicted rates are kept.
             rng: Random number generator.
         """
         rows = [v.reshape(len(draws.c), -1) for v in draws.theta.values()]
@@ -249,18 +302,27 @@ class Posterior:
             np.column_stack([*rows, draws.c]), axis=0, return_index=True, return_inverse=True
         )
         index, draws = index.ravel(), draws.at(some)
-        shape = (len(some), *self.slots.y.shape)
-        trust, predicted, log_likelihood = np.empty(shape), np.empty(shape), np.empty(shape[:2])
+        share = np.bincount(index, minlength=len(some)) / len(index)
+        shown, place = np.unique(index[kept], return_inverse=True)
+        shape = self.slots.y.shape
+
+        mean, square = np.zeros((2, *shape))
+        log_likelihood = np.empty((len(some), shape[0]))
+        trust, predicted = np.empty((2, len(shown), *shape))
         given_mean = self._exact_trust if self.exact else self._ep_trust
-        for where, theta, signal, mean in self.signals(draws):
-            x, log_p = given_mean(theta, signal, mean, rng)
-            trust[where] = self.layout.slots(x)
-            log_likelihood[where] = log_p.reshape(len(log_p), shape[1], -1).sum(2)
-            predicted[where] = self._rates(signal, mean, rng)
-        many = np.bincount(index, minlength=shape[0]) / len(index)
-        mean = np.tensordot(many, trust, 1)
-        sd = np.sqrt(np.maximum(np.tensordot(many, trust**2, 1) - mean**2, 0.0))
-        return Given(trust[index[kept]], mean, sd, log_likelihood[index], predicted[index])
+        for where, theta, signal, expected_signal in self.signals(draws):
+            x, log_p = given_mean(theta, signal, expected_signal, rng)
+            x = self.layout.slots(x)
+            mean += np.tensordot(share[where], x, 1)
+            square += np.tensordot(share[where], x**2, 1)
+            log_likelihood[where] = log_p.reshape(len(log_p), shape[0], -1).sum(2)
+
+            first, last = np.searchsorted(shown, (where.start, where.start + len(x)))
+            here = shown[first:last] - where.start
+            trust[first:last] = x[here]
+            predicted[first:last] = self._rates(signal, expected_signal, rng)[here]
+        sd = np.sqrt(np.maximum(square - mean**2, 0.0))
+        return Given(trust[place], mean, sd, log_likelihood[index], predicted[place])
 
     def replicate(self, draws: Draws, rng: np.random.Generator) -> np.ndarray:
         """Draw replicated rates (draw, mission, bound, robot) of the missions."""
@@ -349,8 +411,8 @@ def _root(covariance: np.ndarray) -> np.ndarray:
     return cholesky(even + (1e-10 * scale + 1e-20) * np.eye(n))
 
 
-def chunks(theta: Mapping[str, Any]) -> Iterator[tuple[slice, dict[str, Any]]]:
+def chunks(theta: Mapping[str, Any], size: int = _CHUNK) -> Iterator[tuple[slice, dict[str, Any]]]:
     """Yield the slice and the hyperparameters of each chunk of points."""
-    for start in range(0, len(theta["rest"]), _CHUNK):
-        where = slice(start, start + _CHUNK)
+    for start in range(0, len(theta["rest"]), size):
+        where = slice(start, start + size)
         yield where, at(theta, where)

@@ -24,7 +24,7 @@ from trustbo.streams import stream
 
 _OF_RATES = ("mission", "bound", "robot")
 _DIMS = dict.fromkeys(("trust", "trust_mean", "trust_sd", "contact_rate"), _OF_RATES)
-_N_TRAJECTORIES = 200  # kept draws of latent trust, evenly spaced in the chains
+_N_TRAJECTORIES = 200  # kept draws of latent trust and predicted rates, evenly spaced in the chains
 N_PRIOR = 500  # draws in the groups `prior` and `prior_predictive`
 _KEPT = ("posterior", "sample_stats", "prior", "hazard")  # groups kept by `parameters_alone`
 
@@ -174,7 +174,7 @@ def complete(
             "trust_sd": given.sd,
             "draw": kept,
         },
-        "posterior_predictive": {"contact_rate": by_chain(given.predicted)},
+        "posterior_predictive": {"contact_rate": by_chain(given.predicted), "draw": kept},
         "prior_predictive": {"contact_rate": replicated[None]},
         "log_prior": {
             name: by_chain(values)

@@ -58,6 +58,12 @@ class Slots(NamedTuple):
         steps = np.where(some, 1.0 / np.where(some, ticks, 1.0), UNKNOWN_RESOLUTION)
         return float(min(np.median(steps), COARSEST_RESOLUTION))
 
+    def first(self, n: int) -> Self:
+        """Return the first n missions."""
+        visited = None if self.visited is None else self.visited.first(n)
+        y, z, n_ticks = self.y[:n], self.z[:n], self.n_ticks[:n]
+        return self._replace(y=y, z=z, n_ticks=n_ticks, visited=visited)
+
     def without(self, missions: Sequence[int] | slice) -> Self:
         """Return a copy in which all rates of the given missions are NaN."""
         y = self.y.copy()

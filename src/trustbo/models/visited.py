@@ -21,6 +21,11 @@ class Visited(NamedTuple):
     cell_of: np.ndarray  # (bound,), index of the cell entered
     at: np.ndarray  # (mission, bound), index of the visited bound, -1 in the padding
 
+    def first(self, n: int) -> "Visited":
+        """Return the places that the first n missions visited."""
+        at = self.at[:n, :, None]
+        return visited(np.where(at >= 0, self.bounds[at[..., 0]], -1), self.shape)
+
 
 def bounds_of(missions: Sequence[Mission], shape: tuple[int, int] | None = None) -> np.ndarray:
     """Return an array (mission, bound, 3) of moves, rows and columns, with -1 in the padding.

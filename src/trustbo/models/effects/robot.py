@@ -8,6 +8,7 @@ effect d is independent between robots and has the following covariance over mis
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, ClassVar
 
 import numpy as np
@@ -59,7 +60,9 @@ class RobotEffect(Effect):
     def prior(self, theta: Theta, slots: Slots) -> tuple[Any, list[Any]]:
         """Return independent priors for the robots, as one array if `rest` is the same for all."""
         rest = theta["rest"]
-        Q = namespace(rest).linalg.inv(self._covariance(theta, slots.n_missions))
+        slow, day = self._variances(theta)
+        value, vector = _correlation_eigen(self.rho, slots.n_missions)
+        Q = (vector / (slow * value + day)[:, None]) @ vector.T
         if rest.ndim == 1:
             return None, [Q / rest[:, None, None] ** 2] * slots.n_robots
         return None, [Q / of_robot[:, None, None] ** 2 for of_robot in rest.T]
@@ -87,10 +90,26 @@ class RobotEffect(Effect):
 
     def _covariance(self, theta: Theta, n: int) -> Any:
         """Compute the covariance (point, mission, mission) of one robot's effects d."""
-        xp, i = namespace(theta["tau_slow"]), np.arange(n)
-        slow, day = (xp.maximum(theta[name], LEAST)[:, None, None] ** 2 for name in self.names)
-        fading = self.rho ** np.abs(i[:, None] - i)
-        return slow * fading[None] + day * np.eye(n)[None]
+        slow, day = self._variances(theta)
+        return slow[..., None] * _correlation(self.rho, n) + day[..., None] * np.eye(n)
+
+    def _variances(self, theta: Theta) -> list[Any]:
+        """Return the variances (point, 1) of the persistent and the mission-specific part."""
+        xp = namespace(theta["tau_slow"])
+        return [xp.maximum(theta[name], LEAST)[:, None] ** 2 for name in self.names]
+
+
+def _correlation(rho: float, n: int) -> np.ndarray:
+    """Compute the correlation (mission, mission) of the persistent part."""
+    mission = np.arange(n)
+    return rho ** np.abs(mission[:, None] - mission)
+
+
+@lru_cache(8)
+def _correlation_eigen(rho: float, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the eigenvalues and eigenvectors of the correlation of the persistent part."""
+    value, vector = np.linalg.eigh(_correlation(rho, n))
+    return np.maximum(value, 0.0), vector
 
 
 def _rest(theta: Theta) -> np.ndarray:
