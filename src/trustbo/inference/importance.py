@@ -9,9 +9,10 @@ Hyperparameters are sampled as *scores* z, which are standard normal a priori. A
    several modes, and from a defensive proposal, which covers regions that other proposals miss. All
    proposals so far form a mixture q, and every point has the weight p(z) / q(z).
 3. A skewed Student-t is fitted to the weighted points for the next round. While few points are
-   effective, the fit stays near the first proposal. If k-hat is bad after the second round, kernels
-   at points drawn by weight (West 1993) are the proposals from then on, because they also describe
-   curved densities. Sampling stops when k-hat and the effective number of points are good.
+   effective, the fit stays near the first proposal. If k-hat is bad after the second round, half of
+   the points are drawn from kernels at points drawn by weight (West 1993) from then on, because
+   kernels also describe curved densities. Sampling stops when k-hat and the effective number of
+   points are good.
 
 The weights are Pareto-smoothed (Vehtari, Simpson, Gelman, Yao and Gabry 2024). The mean weight
 before smoothing is an estimate of the evidence.
@@ -33,8 +34,8 @@ ENOUGH = 400.0
 _DEGREES = 8.0  # degrees of freedom of the proposals
 _WIDER = 1.1  # scale of a proposal relative to the points that it is fitted to
 _KERNELS, _KERNEL_SCALE = 16, 0.7  # number of kernels, and their scale relative to the points
-_DEFENSIVE = 4  # points of other proposals per defensive point after the first round
-_EFFICIENCY = 0.5  # effective points expected per point, to choose the size of the last rounds
+_DEFENSIVE = 8  # points of other proposals per defensive point after the first round
+_EFFICIENCY = 0.6  # effective points expected per point, to choose the size of the last rounds
 _LEAST_ROUND = 4  # smallest round, as a divisor of the usual number of points
 _PER_AXIS = 4.0  # effective points per dimension needed to estimate moments
 _SLOPE_STEP, _CURVATURE_STEP = 1e-3, 3e-2  # steps of finite differences
@@ -215,12 +216,13 @@ def sample(
         starts: Starting points of the search for modes, shape (start, score).
         rng: Random number generator.
         size: Number of points per round, a power of 2. In the first round, half of the points are
-            drawn from the defensive proposal; later rounds draw an additional quarter from it.
+            drawn from the defensive proposal; later rounds draw an additional eighth from it.
         enough: Effective number of points at which sampling stops if k-hat is good.
         most: Maximum number of rounds.
         defensive: Function that returns a proposal for regions that the current proposal may miss;
             by default a Student-t slightly wider than the prior.
-        first: First proposal; by default fitted at the modes that the search finds.
+        first: First proposal, such as that of a similar posterior; by default fitted at the modes
+            that the search finds. With `first`, the first round is like later rounds.
         visit: Log density of the drawn points, in the order of `Points.z`, if something has to be
             recorded with each point; by default `log_density`.
     """
@@ -230,14 +232,15 @@ def sample(
     z, log_p, mixture = np.empty((0, d)), np.empty(0), []
 
     modes = [first] if first else find_modes(log_density, starts)
-    proposals = modes if len(modes) > 1 else []
+    several = modes if len(modes) > 1 else []
     current, uneven = modes[0], False
-    own = [current.scaled(_WIDER), *proposals]
-    n_own = n_others = size // 2
+    n_own, n_others = size // 2, size // 2
+    if first:  # the region of the posterior is known
+        n_own, n_others = size, size // _DEFENSIVE
+    own = _shares([current.scaled(_WIDER), *several], n_own)
     for n_rounds in range(1, most + 1):
-        share = 1 << int(np.log2(n_own / len(own)))
         others = defensive(current) if defensive else prior
-        for density, n in [*((one, share) for one in own), (others, n_others)]:
+        for density, n in [*own, (others, n_others)]:
             new = density.draw(n, rng)
             z, log_p = np.vstack([z, new]), np.append(log_p, visit(new))
             mixture.append((density, n))
@@ -252,15 +255,21 @@ def sample(
 
         current = points.proposal
         uneven = uneven or (not good and n_rounds > 1)
-        own = [current.scaled(_WIDER), *proposals]
-        if uneven:
-            kernel, chosen = current.scaled(_KERNEL_SCALE), points.resample(_KERNELS, rng)
-            own = [kernel._replace(center=center) for center in points.z[chosen]]
-
         missing = max(enough - points.kish, 1.0) / _EFFICIENCY
         n_own = int(np.clip(2 ** np.ceil(np.log2(missing)), size // _LEAST_ROUND, size))
+        own = _shares([current.scaled(_WIDER), *several], n_own)
+        if uneven:
+            n_own = size
+            kernel, chosen = current.scaled(_KERNEL_SCALE), points.resample(_KERNELS, rng)
+            kernels = [kernel._replace(center=center) for center in points.z[chosen]]
+            own = [(current.scaled(_WIDER), size // 2), *_shares(kernels, size // 2)]
         n_others = n_own // _DEFENSIVE
     return points
+
+
+def _shares(densities: list[Student], n: int) -> list[tuple[Student, int]]:
+    """Divide n points among densities, in powers of 2."""
+    return [(density, 1 << int(np.log2(n / len(densities)))) for density in densities]
 
 
 def find_modes(log_density: LogDensity, starts: np.ndarray) -> list[Student]:
