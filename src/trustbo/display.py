@@ -17,6 +17,7 @@ with warnings.catch_warnings():  # tqdm warns if ipywidgets is missing
 Rows = list[tuple[str, str]]
 """Names and values, with units, of the main properties of an object."""
 _WIDTH = 100
+_PATIENCE = 5.0  # seconds of work before a progress bar appears
 
 
 class Summary:
@@ -46,6 +47,11 @@ class Summary:
 def joined(names: Sequence[str]) -> str:
     """Join one or more names: "a, b and c"."""
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def slow_bar(name: str, unit: str, shown: bool, *, total: int | None = None) -> tqdm:
+    """Make a progress bar that appears only if the work takes longer than 5 seconds."""
+    return tqdm(desc=name, unit=unit, total=total, delay=_PATIENCE, disable=not shown, leave=False)
 
 
 def compiling() -> AbstractContextManager[Any]:

@@ -90,7 +90,7 @@ def test_posterior_is_that_of_all_missions_with_the_awareness_of_the_map(workspa
     lower = tb.Workspace.from_awareness(0.5 * workspace.awareness.values)
     campaign = begin(workspace, fit={"draws": 300})
     for j in range(2):
-        seed, before = campaign.state.seed_of("fit"), campaign.posterior
+        seed, before = campaign.state.seed_of("fit"), campaign.state.posterior
         campaign.tell(ModelSimulator(lower).run(campaign.ask().path, seed=j))
     expected = [replace(m, bounds=tuple(
         replace(b, awareness=z) for b, z in zip(m.bounds, workspace.along(m.path), strict=True)

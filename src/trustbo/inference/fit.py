@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 
 from trustbo.data import Mission
+from trustbo.display import slow_bar
 from trustbo.errors import (
     PosteriorError,
     TrustboError,
@@ -80,7 +81,7 @@ def fit(
             because its draws are independent of each other.
         warmup: Number of warm-up draws per chain of NUTS, which are discarded.
         seed: Random seed; the same seed gives the same posterior.
-        progress: Whether NUTS shows a progress bar.
+        progress: Whether to show a progress bar; importance sampling shows it after 5 seconds.
         check: Whether to raise an error if diagnostics are bad: k-hat > 0.7 for importance
             sampling; R-hat > 1.01, bulk ESS < 400 or any divergence for NUTS.
         whole: Whether to add latent trust, log-likelihoods and predictions, as `complete` does.
@@ -131,10 +132,13 @@ def fit(
     if sampler == "importance":
         chains, draws = 1, chains * draws  # independent draws belong to one chain
         first = _first_proposal(start, model)
-        drawn, stats, summary = by_importance(posterior, draws, seed, first)
-        complaints = [] if summary["k_hat"] <= MAX_KHAT else [
-            f"importance weights are uneven (k-hat {summary['k_hat']:.2f}, limit {MAX_KHAT})"
-        ]  # fmt: skip
+        with slow_bar("fit", " points", progress) as bar:
+            posterior.evaluated = bar.update
+            drawn, stats, summary = by_importance(posterior, draws, seed, first)
+        complaints = []
+        if not summary["k_hat"] <= MAX_KHAT:
+            reason = f"k-hat {summary['k_hat']:.2f}, limit {MAX_KHAT}"
+            complaints.append(f"importance weights are uneven ({reason})")
     else:
         from trustbo.inference.nuts import sample_by_nuts  # slow to import
 

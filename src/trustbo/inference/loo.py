@@ -18,6 +18,7 @@ from arviz_stats.loo.compare import compare as ranked
 from arviz_stats.utils import ELPDData
 from scipy.special import logsumexp
 
+from trustbo.display import slow_bar
 from trustbo.errors import TrustboError, one_line
 from trustbo.inference.draws import missions_of, read_posterior, require_posterior
 from trustbo.inference.fit import by_importance
@@ -32,7 +33,9 @@ _POINTS = 500  # maximum number of distinct hyperparameter draws that are used
 
 @one_blas_thread()
 @np.errstate(under="ignore")  # small weights and tails round to 0
-def loo(posterior: xr.DataTree, *, model: TrustModel | None = None) -> ELPDData:
+def loo(
+    posterior: xr.DataTree, *, model: TrustModel | None = None, progress: bool = True
+) -> ELPDData:
     """Estimate the log predictive density of each mission given all other missions.
 
     Hyperparameter draws get Pareto-smoothed weights. All other variables are integrated out, by
@@ -43,6 +46,7 @@ def loo(posterior: xr.DataTree, *, model: TrustModel | None = None) -> ELPDData:
     Args:
         posterior: DataTree from `fit` that includes the data.
         model: Model of the posterior; needed if the priors are custom.
+        progress: Whether to show a progress bar after 5 seconds.
 
     Returns:
         Pointwise `ELPDData` of ArviZ for `az.compare({name: loo(posterior), ...})`. The coordinate
@@ -68,18 +72,20 @@ def loo(posterior: xr.DataTree, *, model: TrustModel | None = None) -> ELPDData:
     # `average` is the log of the mean density of each mission under the full posterior.
     density, k_hat, average = np.zeros((3, len(measured)))
     refitted, whole_refit = np.zeros(len(measured), dtype=bool), None
-    for i, j in enumerate(measured):
-        others = fitted.without(j)  # pyright: ignore[reportArgumentType]
-        ratio = others.log_evidence(theta) - whole
-        weight, k_hat[i], _ = smoothed(ratio + log_count)
-        density[i] = logsumexp(-ratio, b=weight)
-        average[i] = logsumexp(log_count - ratio)
-        if not k_hat[i] <= MAX_KHAT:
-            seed = int(posterior.attrs["seed"])
-            if whole_refit is None:
-                whole_refit = _log_evidence(fitted, seed)
-            rest, k_hat[i] = _log_evidence(others, seed)
-            density[i], refitted[i] = whole_refit[0] - rest, True
+    with slow_bar("loo", " missions", progress, total=len(measured)) as bar:
+        for i, j in enumerate(measured):
+            others = fitted.without(j)  # pyright: ignore[reportArgumentType]
+            ratio = others.log_evidence(theta) - whole
+            weight, k_hat[i], _ = smoothed(ratio + log_count)
+            density[i] = logsumexp(-ratio, b=weight)
+            average[i] = logsumexp(log_count - ratio)
+            if not k_hat[i] <= MAX_KHAT:
+                seed = int(posterior.attrs["seed"])
+                if whole_refit is None:
+                    whole_refit = _log_evidence(fitted, seed)
+                rest, k_hat[i] = _log_evidence(others, seed)
+                density[i], refitted[i] = whole_refit[0] - rest, True
+            bar.update()
 
     shift = fitted.model.family.log_resolution(fitted.slots.y, fitted.slots.n_ticks).sum((1, 2))
     if not np.isnan(shift).any():
@@ -114,12 +120,13 @@ def _log_evidence(posterior: Posterior, seed: int) -> tuple[float, float]:
 
 @np.errstate(under="ignore")  # small weights and tails round to 0
 @one_blas_thread()
-def compare(posteriors: Mapping[str, xr.DataTree]) -> pd.DataFrame:
+def compare(posteriors: Mapping[str, xr.DataTree], *, progress: bool = True) -> pd.DataFrame:
     """Rank posteriors by leave-one-mission-out cross-validation; see `loo` and `arviz.compare`.
 
     Args:
         posteriors: Two or more posteriors from `fit` by name, fitted to the same missions. The
             observation families may differ.
+        progress: Whether to show a progress bar after 5 seconds.
 
     Returns:
         Table from `arviz.compare` with one row per posterior, the best first. The columns include
@@ -146,4 +153,4 @@ def compare(posteriors: Mapping[str, xr.DataTree]) -> pd.DataFrame:
                 f"{name!r} and {first!r} were fitted to different rates or tick counts, of shape "
                 f"{data.shape[1:]} and {reference.shape[1:]}; fit both to the same missions."
             )
-    return ranked({name: loo(tree) for name, tree in trees.items()})
+    return ranked({name: loo(tree, progress=progress) for name, tree in trees.items()})

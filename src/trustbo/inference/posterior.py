@@ -1,6 +1,6 @@
 """The posterior of a model: a density for samplers, and draws given the hyperparameters."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -84,6 +84,7 @@ class Posterior:
     def __init__(self, model: TrustModel, slots: Slots) -> None:
         """Prepare the columns and blocks of a model for the rates and features in `slots`."""
         self.model, self.slots = model, slots
+        self.evaluated: Callable[[int], object] = lambda n: None  # called with numbers of points
         self.layout = model.layout(slots)
         self.scores = Scores(model.all_hyperpriors(slots))
         self.n_scores = self.scores.n_scores
@@ -387,6 +388,7 @@ class Posterior:
 
     def _at(self, theta: Theta) -> tuple[Signal, Prior]:
         """Return the distribution of the signals and the prior at each theta."""
+        self.evaluated(len(theta["rest"]))
         return self.model.signal(theta, self.slots, self.layout), self.prior(theta)
 
     def _lam(self, signal: Signal) -> Any:
