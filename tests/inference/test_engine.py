@@ -1,12 +1,14 @@
 """The engine against the joint normal of all rates, and a plain NumPyro program."""
 
+import sys
+
 import jax
 import numpy as np
 import pytest
 from joint_normal import Dense
 from numpyro import handlers
 
-from trustbo.inference import engine
+from trustbo.inference import engine, factor
 from trustbo.inference.posterior import Posterior, at
 from trustbo.models import (
     CoupledTrust,
@@ -60,6 +62,41 @@ def test_the_evidence_is_the_density_of_the_dense_joint_normal(name, gaps):
     for i, value in enumerate(posterior.log_evidence(theta)):
         dense = Dense(posterior.model, posterior.slots, at(theta, slice(i, i + 1)))
         np.testing.assert_allclose(value, dense.log_density(), rtol=1e-9)
+
+
+@pytest.fixture
+def chained(monkeypatch):
+    """Eliminates robots' effects as chains, as with a hundred missions, in blocks of 2 missions."""
+    monkeypatch.setattr(sys.modules["trustbo.inference.posterior"], "_CHAINED", 2)
+    monkeypatch.setattr(factor, "_CHAIN_BLOCK", 6)
+
+
+@pytest.mark.usefixtures("chained")
+@pytest.mark.parametrize("gaps", [False, True])
+@pytest.mark.parametrize("name", [name for name in MODELS if RobotEffect() in MODELS[name].effects])
+def test_effects_split_into_chains_have_the_same_evidence_and_draws(name, gaps):
+    posterior, theta = posterior_of(name, gaps=gaps, shape=(7, 5, 3))
+    assert posterior.blocks.order.hidden.shape == (7, 3)
+    for i, value in enumerate(posterior.log_evidence(theta)):
+        dense = Dense(posterior.model, posterior.slots, at(theta, slice(i, i + 1)))
+        np.testing.assert_allclose(value, dense.log_density(), rtol=1e-9)
+
+    drawn = posterior.draw_columns(at(theta, np.zeros(4000, int)), np.random.default_rng(0))
+    mean, cov = Dense(posterior.model, posterior.slots, at(theta, slice(0, 1))).coefficients()
+    sd = np.sqrt(np.diag(cov))
+    assert (np.abs(drawn.mean(0) - mean) < 5.0 * sd / np.sqrt(4000)).all()
+    np.testing.assert_allclose(drawn.std(0), sd, rtol=5.0 / np.sqrt(8000))
+
+
+@pytest.mark.usefixtures("chained")
+def test_slopes_of_chains_in_jax_are_those_in_numpy():
+    posterior, _ = posterior_of("places and robots", gaps=True)
+    z = 0.5 * np.random.default_rng(3).standard_normal(posterior.n_scores)
+    steps = 1e-4 * np.eye(len(z))
+    expected = (posterior.log_density(z + steps) - posterior.log_density(z - steps)) / 2e-4
+    with own_settings():
+        found = jax.grad(lambda one: posterior.log_density(one[None])[0])(jax.numpy.asarray(z))
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 1), (2, 1, 3), (3, 4, 1)])

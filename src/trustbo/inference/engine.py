@@ -32,6 +32,7 @@ from trustbo.inference.factor import (
     times,
 )
 from trustbo.models.backend import namespace
+from trustbo.models.effects.effect import Chains
 from trustbo.models.signal import Signal, each
 
 
@@ -93,6 +94,8 @@ class Prior(NamedTuple):
     mean: Any  # (point, column)
     parts: Sequence[Any]  # precisions (point, k, k), or (point, k) of independent columns, in order
     log_det: Any  # (point,), of the full precision
+    chains: Chains | None = None  # lasting parts of columns, as hidden columns
+    first: int = 0  # first column with a lasting part
 
     @classmethod
     def of(cls, groups: Sequence[tuple[Any, Sequence[Any]]]) -> Self:
@@ -126,6 +129,37 @@ class Prior(NamedTuple):
             else:
                 a, b = np.triu_indices(len(i))
                 A = add(A, (slice(None), order.entry(i[a], i[b])), part[:, a, b])
+        return A if self.chains is None else self._add_chains(A, order)
+
+    def with_chains(self, chains: Chains, first: int, n_missions: int) -> Self:
+        """Add hidden columns, the lasting parts of columns from `first`.
+
+        The other columns then have the precision of their independent part, which is in `parts`.
+        """
+        xp = namespace(chains.lasting)
+        n_chains = chains.lasting.shape[1]
+        log_det = n_missions * xp.log(chains.lasting).sum(1)
+        log_det = log_det - n_chains * (n_missions - 1) * np.log(1.0 - chains.rho**2)
+        return self._replace(log_det=self.log_det + log_det, chains=chains, first=first)
+
+    def _add_chains(self, A: Any, order: Order) -> Any:
+        """Add the precision of the hidden columns s, and their coupling to the columns s + e."""
+        independent, lasting, rho = self.chains  # pyright: ignore[reportGeneralTypeIssues]
+        n_missions = len(order.hidden)
+        s = order.hidden.T  # (chain, mission)
+        total = self.first + np.arange(s.size).reshape(s.shape)
+        inner = np.ones(n_missions)
+        inner[1:-1] += rho**2
+        tied = lasting[..., None] / (1.0 - rho**2)  # (point, chain, 1)
+
+        coupling = order.entry(total, s)
+        coupling = np.where(coupling < 0, order.entry(s, total), coupling)
+        for entry, values in (
+            (order.entry(s, s), independent[..., None] + tied * inner),
+            (order.entry(s[:, :-1], s[:, 1:]), -rho * tied * np.ones(n_missions - 1)),
+            (coupling, -independent[..., None] * np.ones(n_missions)),
+        ):
+            A = add(A, (slice(None), entry.ravel()), values.reshape(len(A), -1))
         return A
 
     def log_density(self, c: np.ndarray) -> np.ndarray:
@@ -176,6 +210,7 @@ def evidence(blocks: Blocks, signal: Signal, prior: Prior, lam: Any, y: Any = No
     C = W @ each(signal.T, b.label)
     back = (xp.swapaxes(C, 2, 3)[:, b.kind] @ w[..., None])[..., 0]
     h = times(b.U.T, back.reshape(n, -1))
+    h = xp.concatenate([h, xp.zeros((n, b.order.hidden.size))], axis=1)
     pairs = (xp.swapaxes(C, 2, 3) @ C)[:, :, *np.triu_indices(C.shape[3])]
     products = times(b.sums, pairs.reshape(n, -1))
     A = put(xp.zeros((n, b.order.size)), (slice(None), b.at), products)
@@ -217,6 +252,7 @@ def columns_of(
     """
     white = rng.standard_normal((len(fit.half), n, fit.half.shape[1]))
     found = fit.F.back(np.concatenate([fit.half[:, None], white], axis=1))
+    found = found[..., : prior.mean.shape[1]]  # without hidden columns
     return prior.mean + found[:, 0], found[:, 1:]
 
 

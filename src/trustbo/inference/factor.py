@@ -9,6 +9,11 @@ independent. With the leaves first, the precision A = F F' and its factor F are
 
 where D and G are block diagonal, with one block per mission. Only H is a large dense factor. LAPACK
 factors upper triangles fastest and in place, because LAPACK stores columns contiguously.
+
+Effects that last over many missions can be split (see `Chains`). Then, their independent parts are
+leaves, and their lasting parts are hidden columns, which are the first columns of the core. Each is
+coupled only to its mission and, a priori, to the missions before and after, so its part of C is
+block tridiagonal, which saves half of the work.
 """
 
 from collections.abc import Callable
@@ -21,6 +26,8 @@ from scipy import sparse
 from scipy.linalg import lapack
 
 from trustbo.models.backend import inverse_from_factor, namespace
+
+_CHAIN_BLOCK = 30  # columns of a chain that are eliminated at once
 
 
 class Order(NamedTuple):
@@ -35,20 +42,26 @@ class Order(NamedTuple):
     spread: Any  # sparse (core, mission * touched), sums the missions' terms of a vector
     pairs: Any  # sparse (pair, mission * touched * touched), sums the missions' terms of C
     pair: np.ndarray  # (pair,), flat index in C
+    hidden: np.ndarray  # (mission, chain), hidden columns
 
     @classmethod
-    def of(cls, met: np.ndarray, free: np.ndarray) -> Self:
+    def of(cls, met: np.ndarray, free: np.ndarray, n_chains: int = 0) -> Self:
         """Find the elimination order of the columns.
 
         Args:
             met: Mask (mission, column) of the columns that occur in each mission.
             free: Mask (column,) of the columns that are independent of all others a priori.
+            n_chains: Number of hidden columns per mission, which are added after the other columns.
         """
         n_missions = len(met)
+        hidden = len(free) + np.arange(n_missions * n_chains).reshape(n_missions, n_chains)
+        met = np.hstack([met, np.repeat(np.eye(n_missions, dtype=bool), n_chains, axis=1)])
+        free = np.append(free, np.zeros(hidden.size, dtype=bool))
         alone = free & (met.sum(0) == 1) & (n_missions > 1)
         only = np.where(alone, met.argmax(0), -1)
         place = np.empty(len(only), dtype=int)
         groups = [np.flatnonzero(only == j) for j in range(-1, n_missions)]
+        groups[0] = np.append(hidden.ravel(), np.setdiff1d(groups[0], hidden))
         for columns in groups:
             place[columns] = np.arange(len(columns))
         groups = [groups[0], *(columns for columns in groups[1:] if len(columns))]
@@ -70,7 +83,7 @@ class Order(NamedTuple):
         pair, row = np.unique(at[kept], return_inverse=True)
         at[kept] = row
         pairs = _summing(at, kept, len(pair))
-        return cls(leaf, groups[0], group, place, touched, number, spread, pairs, pair)
+        return cls(leaf, groups[0], group, place, touched, number, spread, pairs, pair, hidden)
 
     @property
     def shapes(self) -> tuple[tuple[int, ...], ...]:
@@ -122,7 +135,8 @@ class Factor(NamedTuple):
         X = inverse @ B
         squares = times(order.pairs, (xp.swapaxes(X, 2, 3) @ X).reshape(len(A), -1))
         C = add(C.reshape(len(A), -1), (slice(None), order.pair), -squares).reshape(C.shape)
-        return cls(order, inverse, X, upper_factor(C))
+        H = chain_factor(C, *order.hidden.shape) if order.hidden.size else upper_factor(C)
+        return cls(order, inverse, X, H)
 
     @property
     def size(self) -> int:
@@ -262,6 +276,36 @@ def upper_factor(A: Any) -> Any:
     for one in A:
         if lapack.dpotrf(one.T, lower=1, clean=0, overwrite_a=1)[1]:  # pyright: ignore[reportAttributeAccessIssue]
             one[:] = np.nan
+    return A
+
+
+def chain_factor(A: Any, n_missions: int, n_chains: int) -> Any:
+    """Factor matrices as `upper_factor`, if their first columns (mission, chain) are a chain.
+
+    A column of the chain may be coupled only to columns of the same mission, the mission before and
+    the mission after, and to columns outside of the chain.
+    """
+    if not isinstance(A, np.ndarray):
+        return upper_factor(A)
+    n, step = n_missions * n_chains, n_chains * -(-_CHAIN_BLOCK // n_chains)
+    for one in A:
+        for i in range(0, n, step):
+            j = min(i + step, n)
+            k = min(j + step, n)
+            L, failed = lapack.dpotrf(one[i:j, i:j].T, lower=1, clean=1)  # pyright: ignore[reportAttributeAccessIssue]
+            inverse = lapack.dtrtri(L, lower=1)[0]  # pyright: ignore[reportAttributeAccessIssue]
+            one[i:j, i:j] = L.T
+            following = one[i:j, j:k] = inverse @ one[i:j, j:k]
+            others = one[i:j, n:] = inverse @ one[i:j, n:]
+
+            one[j:k, j:k] -= following.T @ following
+            one[j:k, n:] -= following.T @ others
+            if failed:
+                one[:] = np.nan
+                break
+        rest = one[n:, n:] - one[:n, n:].T @ one[:n, n:]
+        L, failed = lapack.dpotrf(rest.T, lower=1, clean=0, overwrite_a=1)  # pyright: ignore[reportAttributeAccessIssue]
+        one[n:, n:] = np.nan if failed else L.T
     return A
 
 

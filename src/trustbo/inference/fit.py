@@ -172,15 +172,14 @@ def by_importance(
     """
     rng = np.random.default_rng(seed)
     draw = _exact_draws if posterior.exact else _ep_draws
-    attempts = [(256, 1, None), (1024, 4, None)]
-    if first is not None:
-        attempts.insert(0, (256, 1, first))
-    for size, n_sweeps, proposal in attempts:
+    attempts = [(256, 1, first), (256, 1, None), (1024, 4, None)]
+    attempts = attempts if first else attempts[1:]
+    while True:
+        size, n_sweeps, proposal = attempts.pop(0)
         size = size if posterior.n_scores < 12 else 4 * size
         drawn, log_p, summary = draw(posterior, n, size, n_sweeps, rng, proposal)
-        if summary["k_hat"] <= MAX_KHAT:
-            break
-    return drawn, {"lp": log_p}, summary
+        if summary["k_hat"] <= MAX_KHAT or not attempts:
+            return drawn, {"lp": log_p}, summary
 
 
 def _exact_draws(

@@ -238,7 +238,9 @@ def sample(
     if first:  # the region of the posterior is known
         n_own, n_others = size, size // _DEFENSIVE
     own = _shares([current.scaled(_WIDER), *several], n_own)
-    for n_rounds in range(1, most + 1):
+    n_rounds = 0
+    while True:
+        n_rounds += 1
         others = defensive(current) if defensive else prior
         for density, n in [*own, (others, n_others)]:
             new = density.draw(n, rng)
@@ -251,7 +253,7 @@ def sample(
         points = Points.of(z, log_p, log_ratio, modes[0])
         good = points.k_hat < GOOD_KHAT
         if (good and points.kish > enough and n_rounds > 1) or n_rounds == most:
-            break
+            return points
 
         current = points.proposal
         uneven = uneven or (not good and n_rounds > 1)
@@ -264,7 +266,6 @@ def sample(
             kernels = [kernel._replace(center=center) for center in points.z[chosen]]
             own = [(current.scaled(_WIDER), size // 2), *_shares(kernels, size // 2)]
         n_others = n_own // _DEFENSIVE
-    return points
 
 
 def _shares(densities: list[Student], n: int) -> list[tuple[Student, int]]:

@@ -19,7 +19,8 @@ from trustbo.models.signal import Signal, each
 from trustbo.models.slots import Slots
 
 _CHUNK = 16  # largest number of points evaluated at once
-_NUMBERS = 3_000_000  # largest number of precision entries of the points evaluated at once
+_NUMBERS = 6_000_000  # largest number of precision entries of the points evaluated at once
+_CHAINED = 100  # missions from which lasting effects are eliminated as chains
 _FEW = 15  # missions with which the search for the mode begins
 _SIZES = (0.3, 1.0, 1.8, 2.6)  # log ratios of the sd of rates to the noises at each start
 _LARGEST_NOISE, _LEAST_NOISE = 50.0, 1e-6  # limits of the size of the noises; see `Scores`
@@ -92,6 +93,7 @@ class Posterior:
         self._ends = np.cumsum([0, *(U.shape[1] for U in columns)])
         self._U = self.layout.columns(sparse.hstack(columns, format="csr"))
         self.exact = model.family.gaussian
+        self._chained = self.exact and slots.n_missions >= _CHAINED
         y = self.layout.rows(slots.y)
         apart, order = not self.exact, self._order()
         self.blocks = Blocks.of(y, self._U, self.layout.label, apart=apart, order=order)
@@ -107,11 +109,12 @@ class Posterior:
     def _order(self) -> Order:
         """Find the order in which the columns are eliminated; see `Order`."""
         n, (rows, p) = self.slots.n_missions, self._U.shape
-        parts = self.prior(self.theta(np.zeros((1, self.n_scores)))).parts
+        prior = self._prior_of_fit(self.theta(np.zeros((1, self.n_scores))))
+        parts, chains = prior.parts, prior.chains
         free = np.concatenate([np.full(part.shape[1], part.ndim == 2) for part in parts])
         at, met = self._U.tocoo(), np.zeros((n, p), dtype=bool)
         met[at.row * n // rows, at.col] = True
-        return Order.of(met, free)
+        return Order.of(met, free, 0 if chains is None else chains.lasting.shape[1])
 
     def without(self, mission: int) -> "Posterior":
         """Return the posterior without the data of one mission."""
@@ -307,15 +310,15 @@ class Posterior:
         shown, place = np.unique(index[kept], return_inverse=True)
         shape = self.slots.y.shape
 
-        mean, square = np.zeros((2, *shape))
+        mean, square = np.zeros(shape), np.zeros(shape)
         log_likelihood = np.empty((len(some), shape[0]))
         trust, predicted = np.empty((2, len(shown), *shape))
         given_mean = self._exact_trust if self.exact else self._ep_trust
         for where, theta, signal, expected_signal in self.signals(draws):
             x, log_p = given_mean(theta, signal, expected_signal, rng)
             x = self.layout.slots(x)
-            mean += np.tensordot(share[where], x, 1)
-            square += np.tensordot(share[where], x**2, 1)
+            mean += np.einsum("n,nmbr->mbr", share[where], x)
+            square += np.einsum("n,nmbr->mbr", share[where], x**2)
             log_likelihood[where] = log_p.reshape(len(log_p), shape[0], -1).sum(2)
 
             first, last = np.searchsorted(shown, (where.start, where.start + len(x)))
@@ -381,6 +384,22 @@ class Posterior:
         """Return the prior on all coefficients at each theta."""
         return Prior.of([effect.prior(theta, self.slots) for effect in self.model.columns])
 
+    def _prior_of_fit(self, theta: Theta) -> Prior:
+        """Return the prior in the form that is fastest for computing the evidence."""
+        slots, groups, chains, first = self.slots, [], None, 0
+        for effect, start in zip(self.model.columns, self._ends[:-1], strict=True):
+            found = effect.chains(theta, slots) if self._chained and chains is None else None
+            if found is None:
+                groups.append(effect.prior(theta, slots))
+                continue
+            chains, first = found, int(start)
+            of_columns = namespace(chains.independent).repeat(
+                chains.independent, slots.n_missions, axis=1
+            )
+            groups.append((None, [of_columns]))
+        prior = Prior.of(groups)
+        return prior if chains is None else prior.with_chains(chains, first, slots.n_missions)
+
     def _fit(self, theta: Theta) -> tuple[Fit, Prior]:
         """Compute the evidence of Gaussian rates at each theta; also return the prior."""
         signal, prior = self._at(theta)
@@ -389,7 +408,7 @@ class Posterior:
     def _at(self, theta: Theta) -> tuple[Signal, Prior]:
         """Return the distribution of the signals and the prior at each theta."""
         self.evaluated(len(theta["rest"]))
-        return self.model.signal(theta, self.slots, self.layout), self.prior(theta)
+        return self.model.signal(theta, self.slots, self.layout), self._prior_of_fit(theta)
 
     def _lam(self, signal: Signal) -> Any:
         """Return the precisions (point, kind, row) of Gaussian rates, 0 where not measured."""

@@ -17,7 +17,7 @@ from scipy import sparse
 
 from trustbo.errors import require_share
 from trustbo.models.backend import namespace
-from trustbo.models.effects.effect import LEAST, Effect, Theta, Values
+from trustbo.models.effects.effect import LEAST, Chains, Effect, Theta, Values
 from trustbo.models.slots import Slots
 
 
@@ -66,6 +66,12 @@ class RobotEffect(Effect):
         if rest.ndim == 1:
             return None, [Q / rest[:, None, None] ** 2] * slots.n_robots
         return None, [Q / of_robot[:, None, None] ** 2 for of_robot in rest.T]
+
+    def chains(self, theta: Theta, slots: Slots) -> Chains:
+        """See `Effect.chains`; each robot is a chain."""
+        slow, day = self._variances(theta)
+        rest = theta["rest"].reshape(len(slow), -1) * np.ones(slots.n_robots)
+        return Chains(1.0 / (day * rest**2), 1.0 / (slow * rest**2), self.rho)
 
     def named(self, c: np.ndarray, theta: Theta, slots: Slots) -> Values:
         """Return `robot_effect` (draw, mission, robot), the effects d on stationary trust."""
