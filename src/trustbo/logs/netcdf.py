@@ -60,12 +60,23 @@ def tree_to_bytes(tree: xr.DataTree) -> bytes:
     for group in tree.subtree:
         variables = group.to_dataset(inherit=False).variables
         encoding[group.path] = {
-            name: {"fletcher32": True}
+            name: {"fletcher32": True, "zlib": variable.dtype.kind in "iu"}  # such as draw numbers
             for name, variable in variables.items()
             if variable.ndim and variable.dtype.kind in "biufM"  # texts and scalars have none
         }
-    content = bytes(tree.to_netcdf(engine="netcdf4", encoding=encoding))
+    content = _without_padding(bytes(tree.to_netcdf(engine="netcdf4", encoding=encoding)))
     return content + _seal_of(content)
+
+
+def _without_padding(content: bytes) -> bytes:
+    """Remove the zeros that fill a file made in memory to a multiple of 64 kB.
+
+    The first block of an HDF5 file says where it ends (HDF5 file format 3.0, II.A, versions 2, 3).
+    """
+    version, end = content[8], int.from_bytes(content[28:36], "little")
+    if version not in (2, 3) or any(content[end:]):
+        return content
+    return content[:end]
 
 
 def _seal_of(content: bytes) -> bytes:
