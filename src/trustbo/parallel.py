@@ -96,12 +96,23 @@ def _take_control(controller: ThreadpoolController) -> None:
 def one_blas_thread() -> Iterator[None]:
     """Limit BLAS to one thread; with more, matrices of about 20 rows take 20 times as long.
 
-    All public functions that compute posteriors, predictions and plans are decorated with this
-    function, so inner functions need no limit of their own. The limit applies to the whole process.
-    If several threads are inside, the last one to leave restores the caller's setting.
+    The limit applies to the whole process. If several threads are inside, the last one to leave
+    restores the caller's setting.
     """
     _LIMIT.enter()
     try:
         yield
     finally:
         _LIMIT.leave()
+
+
+@contextmanager
+def computing() -> Iterator[None]:
+    """Settings for numerical work: one BLAS thread, and small numbers may round to 0.
+
+    All public functions that compute posteriors, predictions and plans are decorated with this
+    function, so inner functions need no settings of their own. Underflow is harmless in weights and
+    tails, but an error for users of `numpy.seterr(all="raise")`.
+    """
+    with one_blas_thread(), np.errstate(under="ignore"):
+        yield

@@ -20,7 +20,7 @@ from trustbo.inference.draws import (
 )
 from trustbo.inference.score import last_posterior, predictions, score
 from trustbo.models.families import FAMILIES
-from trustbo.parallel import one_blas_thread
+from trustbo.parallel import computing
 
 SIZE, SURE = 0.1, 0.95
 """Smallest effect on contact that may change a plan, and the probability required to report it."""
@@ -61,7 +61,7 @@ class Finding(NamedTuple):
     probability: float = np.nan
 
 
-@one_blas_thread()
+@computing()
 def check(
     posterior: xr.DataTree | Sequence[xr.DataTree | None],
     missions: Sequence[Mission] | None = None,

@@ -27,7 +27,7 @@ from trustbo.hazard.exposures import Exposures, LostMission
 from trustbo.hazard.prior import FLOOR, LIMIT_NAMES, TILT, BoundPrior, Hazard
 from trustbo.hazard.risk import BoundRisk, add_lost
 from trustbo.inference import importance
-from trustbo.parallel import one_blas_thread
+from trustbo.parallel import computing
 from trustbo.workspace import Workspace
 from trustbo.workspace.difficulty import difficulty_of
 from trustbo.workspace.moves import MOVE_NAMES
@@ -36,8 +36,7 @@ _ROUND, _ENOUGH, _N_DRAWS = 1024, 500.0, 1000  # points per round, effective poi
 _MAPS = "move", "row", "col"
 
 
-@np.errstate(under="ignore")  # small weights and tails round to 0
-@one_blas_thread()
+@computing()
 def fit_hazard(
     missions: Sequence[Mission],
     workspace: Workspace,

@@ -18,7 +18,7 @@ from trustbo.models.model import TrustModel
 from trustbo.models.params import Params, assemble_params
 from trustbo.models.record import effects_from_record, model_from_record, with_default_priors
 from trustbo.models.slots import Slots
-from trustbo.parallel import one_blas_thread
+from trustbo.parallel import computing
 from trustbo.stacking import require_same_team
 from trustbo.workspace import Workspace
 
@@ -93,7 +93,7 @@ def joined_draws(array: xr.DataArray, axes: Sequence[Any] = (...,)) -> np.ndarra
     return values.reshape(values.shape[0] * values.shape[1], *values.shape[2:])  # also for 0 draws
 
 
-@one_blas_thread()
+@computing()
 def params_of(
     posterior: xr.DataTree, workspace: Workspace | None = None, *, day: bool = False
 ) -> Params:

@@ -15,7 +15,7 @@ from trustbo.inference.importance import systematic
 from trustbo.models.families import FAMILIES, Family
 from trustbo.models.params import CoupledParams, Params, check_params
 from trustbo.models.slots import NO_TICKS
-from trustbo.parallel import one_blas_thread
+from trustbo.parallel import computing
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import bounds_along, require_on_grid
 
@@ -211,7 +211,7 @@ class TrustFilter:
         dynamics: Kalman filter step for one bound and all draws.
     """
 
-    @one_blas_thread()
+    @computing()
     def __init__(
         self,
         posterior: xr.DataTree | Params,
@@ -282,8 +282,7 @@ class TrustFilter:
         """Trust of each robot after the bounds so far."""
         return _average(self._beliefs, self.weights)
 
-    @np.errstate(under="ignore")  # small weights and tails round to 0
-    @one_blas_thread()
+    @computing()
     def update(
         self,
         awareness: ArrayLike,
@@ -326,8 +325,7 @@ class TrustFilter:
         self.n_bounds += 1
         return self.state
 
-    @np.errstate(under="ignore")  # small weights and tails round to 0
-    @one_blas_thread()
+    @computing()
     def predict(self, awareness: ArrayLike, path: Sequence[Cell] | None = None) -> TrustForecast:
         """Predict trust and contact rates along future bounds.
 

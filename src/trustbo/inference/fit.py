@@ -36,7 +36,7 @@ from trustbo.models.model import TrustModel
 from trustbo.models.people import HumanTrust
 from trustbo.models.record import model_to_record
 from trustbo.models.visited import has_places
-from trustbo.parallel import one_blas_thread
+from trustbo.parallel import computing
 from trustbo.stacking import known_awareness, require_same_team
 from trustbo.workspace import Workspace
 
@@ -44,8 +44,7 @@ SAMPLERS = ("importance", "nuts")
 _CORRECTED = 2  # draws whose density by EP is corrected, per point of a round
 
 
-@np.errstate(under="ignore")  # small weights and tails round to 0
-@one_blas_thread()
+@computing()
 def fit(
     missions: Sequence[Mission],
     model: TrustModel | None = None,

@@ -25,14 +25,13 @@ from trustbo.inference.fit import by_importance
 from trustbo.inference.importance import MAX_KHAT, smoothed
 from trustbo.inference.posterior import Posterior, at
 from trustbo.models.model import TrustModel
-from trustbo.parallel import one_blas_thread
+from trustbo.parallel import computing
 from trustbo.stacking import stack_missions
 
 _POINTS = 500  # maximum number of distinct hyperparameter draws that are used
 
 
-@one_blas_thread()
-@np.errstate(under="ignore")  # small weights and tails round to 0
+@computing()
 def loo(
     posterior: xr.DataTree, *, model: TrustModel | None = None, progress: bool = True
 ) -> ELPDData:
@@ -118,8 +117,7 @@ def _log_evidence(posterior: Posterior, seed: int) -> tuple[float, float]:
     return summary["log_evidence"], summary["k_hat"]
 
 
-@np.errstate(under="ignore")  # small weights and tails round to 0
-@one_blas_thread()
+@computing()
 def compare(posteriors: Mapping[str, xr.DataTree], *, progress: bool = True) -> pd.DataFrame:
     """Rank posteriors by leave-one-mission-out cross-validation; see `loo` and `arviz.compare`.
 

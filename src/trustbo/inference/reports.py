@@ -12,14 +12,14 @@ from trustbo.inference.draws import QUANTILES, is_of_people, read_posterior, req
 from trustbo.inference.posterior import Draws, Posterior
 from trustbo.models.model import TrustModel
 from trustbo.models.signal import each
-from trustbo.parallel import one_blas_thread
+from trustbo.parallel import computing
 from trustbo.stacking import require_same_team
 from trustbo.streams import stream
 
 _ALIKE = 16  # draws of a fitted person's trust for each draw of the population parameters
 
 
-@one_blas_thread()
+@computing()
 def predict_reports(
     posterior: xr.DataTree,
     missions: Sequence[Mission],

@@ -10,7 +10,7 @@ from trustbo.errors import TrustboError, require_kind, require_list, require_who
 from trustbo.inference.draws import QUANTILES, in_order_of, require_posterior
 from trustbo.inference.filter import TrustFilter
 from trustbo.models.slots import require_ticks
-from trustbo.parallel import one_blas_thread
+from trustbo.parallel import computing
 from trustbo.stacking import MissionBatch, known_awareness, stack_missions
 from trustbo.streams import stream
 from trustbo.workspace import Workspace
@@ -19,8 +19,7 @@ INTERVALS = {"coverage_50": 0.5, "coverage_90": 0.9}
 _DIMS = ("mission", "bound", "robot")
 
 
-@np.errstate(under="ignore")  # small weights and tails round to 0
-@one_blas_thread()
+@computing()
 def score(
     posterior: xr.DataTree | Sequence[xr.DataTree | None],
     missions: Sequence[Mission],

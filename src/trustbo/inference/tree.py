@@ -18,7 +18,7 @@ from trustbo.inference.posterior import Posterior
 from trustbo.models.effects.effect import Effect
 from trustbo.models.model import TrustModel
 from trustbo.models.scores import log_density
-from trustbo.parallel import one_blas_thread
+from trustbo.parallel import computing
 from trustbo.stacking import MissionBatch, stack_missions
 from trustbo.streams import stream
 
@@ -122,7 +122,7 @@ def parameters_alone(posterior: xr.DataTree) -> xr.DataTree:
     return alone
 
 
-@one_blas_thread()
+@computing()
 def complete(
     posterior: xr.DataTree,
     missions: Sequence[Mission] | None = None,

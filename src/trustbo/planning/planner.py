@@ -19,7 +19,7 @@ from trustbo.hazard.risk import Risk
 from trustbo.hazard.strata import Strata
 from trustbo.models.families import FAMILIES
 from trustbo.models.params import Params
-from trustbo.parallel import one_blas_thread
+from trustbo.parallel import computing
 from trustbo.planning.draws import DrawnPaths, choose_draws
 from trustbo.planning.dynamics import Dynamics, roll, trust_dynamics
 from trustbo.planning.objectives import LOST_CONTACT, OBJECTIVES, capped
@@ -177,7 +177,7 @@ class Planner(Summary):
         cost = require_positive("failure_cost", failure_cost, or_zero=True)
         return self._with(failure_cost=cost) if self.problem.objective.of_contact else self
 
-    @one_blas_thread()
+    @computing()
     def plan(self, params: Params | xr.DataTree, *, x0: ArrayLike | None = None) -> Plan:
         """Find the best admissible path for given parameters, or for the mean of a posterior.
 
@@ -215,7 +215,7 @@ class Planner(Summary):
         """
         return self.problem.paths.cells(self.problem.best(dynamics)[-1][0])
 
-    @one_blas_thread()
+    @computing()
     def plan_draws(
         self, posterior: Params | xr.DataTree, *, n_draws: int | None = None, seed: int = 0
     ) -> DrawnPaths:
@@ -234,7 +234,7 @@ class Planner(Summary):
         dynamics = self.problem.dynamics(params)
         return DrawnPaths(self.problem, dynamics, self.problem.best(dynamics)[-1])
 
-    @one_blas_thread()
+    @computing()
     def evaluate(
         self, path: Sequence[Cell], params: Params | xr.DataTree, *, x0: ArrayLike | None = None
     ) -> Plan:
@@ -281,7 +281,7 @@ class Planner(Summary):
             value_band=value_band,
         )
 
-    @one_blas_thread()
+    @computing()
     def graph(self, params: Params | xr.DataTree) -> nx.DiGraph:
         """Return the cells and bounds as a networkx graph.
 
@@ -330,7 +330,7 @@ class Planner(Summary):
             graph.add_edge(left, (row, col), **{name: float(v[k]) for name, v in values.items()})
         return graph
 
-    @one_blas_thread()
+    @computing()
     def trust_map(
         self, params: Params | xr.DataTree, *, per_robot: bool = False, x0: ArrayLike | None = None
     ) -> xr.DataArray:
@@ -349,14 +349,14 @@ class Planner(Summary):
         """
         return trust_map(self.problem, draws_of(params, self.workspace), per_robot=per_robot, x0=x0)
 
-    @one_blas_thread()
+    @computing()
     def cost_map(
         self, params: Params | xr.DataTree, *, per_robot: bool = False, x0: ArrayLike | None = None
     ) -> xr.DataArray:
         """Compute the cost f = 1 - sigma(trust) of each cell, equation (6), from `trust_map`."""
         return cost_of(self.trust_map(params, per_robot=per_robot, x0=x0))
 
-    @one_blas_thread()
+    @computing()
     def maps(
         self, posterior: Params | xr.DataTree, *, n_draws: int = 250, seed: int = 0
     ) -> xr.Dataset:
