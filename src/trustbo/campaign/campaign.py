@@ -201,35 +201,41 @@ class Campaign(Result):
         state = self.state
         if state.due is None:
             return
-        entry = state.entries[-1]
         n_used = len(state.indices(TOLD, LEARNED))
         tree, reason = None, ""
         if n_used:
-            tree, reason = learn(self.state, self.model, self.workspace, state.due, self._progress)
-        if tree is not None:
-            tree["hazard"] = xr.DataTree(self.hazard)
+            tree, reason = learn(state, self.model, self.workspace, state.due, self._progress)
+        hazard = self.hazard  # does not depend on what was learned about trust
+
         with holding_interrupts():
             state.due = None
-            if not n_used:
-                entry.posterior = None
-            elif tree is None:
+            if tree is not None:
+                tree["hazard"] = xr.DataTree(hazard)
+                self._use_posterior(tree, n_used)
+            elif n_used:
                 for j in state.indices(TOLD):
                     state.entries[j].become(TOLD, reason)
             else:
-                for j in state.indices(TOLD):
-                    state.entries[j].become(LEARNED)
-                entry.row = entry.row | diagnostics(tree)
-                n_excluded = len(state.entries) - n_used
-                name = f"{len(state.entries):04d}" + (f"-{n_excluded}" if n_excluded else "")
-                entry.posterior = Posterior(name, tree)
-            # The failure probabilities do not depend on what was learned about trust.
-            hazard = {name: self._computed[name] for name in ("hazard",) if name in self._computed}
-            self._computed = hazard
+                state.entries[-1].posterior = None
+            self._computed = {"hazard": hazard}
+
         if reason:
             warn(
                 f"mission {len(state.entries)} is recorded but cannot be used for learning yet: "
                 f"{reason.rstrip('.')}. Learning is retried after the next mission."
             )
+
+    def _use_posterior(self, tree: xr.DataTree, n_used: int) -> None:
+        """Make a posterior of `n_used` missions the one after the last mission."""
+        state = self.state
+        for j in state.indices(TOLD):
+            state.entries[j].become(LEARNED)
+
+        last = state.entries[-1]
+        last.row = last.row | diagnostics(tree)
+        n_excluded = len(state.entries) - n_used
+        suffix = f"-{n_excluded}" if n_excluded else ""
+        last.posterior = Posterior(f"{len(state.entries):04d}{suffix}", tree)
 
     def _finish(self, what: str) -> None:
         """Learn and write after something was recorded, whose description is `what`.
