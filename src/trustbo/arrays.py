@@ -149,7 +149,8 @@ def as_names(what: str, given: Iterable[str], n: int | None = None) -> Names:
 
     If `n` is given, there must be none or `n` of them.
     """
-    listed = isinstance(given, Iterable) and not isinstance(given, str | bytes)
+    is_scalar = isinstance(given, str | bytes) or getattr(given, "ndim", 1) == 0
+    listed = isinstance(given, Iterable) and not is_scalar
     names = tuple(given) if listed else ()
     if not listed or not all(isinstance(name, str) for name in names):
         raise TrustboError(f"{what} must be a list of names; got {one_line(given)}.")

@@ -154,7 +154,7 @@ class Mission(Summary):
             if len(labels) != len(usual):
                 raise TrustboError(f"{name} must be {len(usual)} names; got {labels}.")
             object.__setattr__(self, name, labels)
-        if self.scale:
+        if not isinstance(self.scale, str) or self.scale:
             levels_of(self.scale)
 
     def _rows(self) -> Rows:

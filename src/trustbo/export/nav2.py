@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from trustbo.arrays import as_array
 from trustbo.campaign.result import Result
 from trustbo.errors import (
     TrustboError,
@@ -81,13 +82,23 @@ class Frame:
 
     def of_crs(self, xy: Any) -> np.ndarray:
         """Convert positions (..., 2) from CRS metres to this frame, in metres."""
-        c, s = math.cos(self.rotation), math.sin(self.rotation)
-        return (np.asarray(xy, dtype=float) - self.origin) @ np.array([[c, -s], [s, c]])
+        c = math.cos(self.rotation)
+        s = math.sin(self.rotation)
+        return (_positions(xy) - self.origin) @ np.array([[c, -s], [s, c]])
 
     def to_crs(self, xy: Any) -> np.ndarray:
         """Convert positions (..., 2) in this frame to CRS coordinates, both in metres."""
-        c, s = math.cos(self.rotation), math.sin(self.rotation)
-        return np.asarray(xy, dtype=float) @ np.array([[c, s], [-s, c]]) + self.origin
+        c = math.cos(self.rotation)
+        s = math.sin(self.rotation)
+        return _positions(xy) @ np.array([[c, s], [-s, c]]) + self.origin
+
+
+def _positions(xy: Any) -> np.ndarray:
+    """Return positions (..., 2) as floats; raises TrustboError for another shape."""
+    values = as_array("positions", xy)
+    if values.shape[-1:] != (2,):
+        raise TrustboError(f"positions must have shape (..., 2), x and y; got {values.shape}.")
+    return values
 
 
 def write_nav2(

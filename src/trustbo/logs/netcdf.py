@@ -97,9 +97,11 @@ def read_missions(path: FilePath | Sequence[FilePath]) -> list[Mission]:
     Raises:
         TrustboError: A file does not exist, is damaged, or contains no missions.
     """
+    paths: Any = path
+    if isinstance(path, str | PathLike) or not isinstance(path, Sequence):
+        paths = [path]
     files = []
-    for one in [path] if isinstance(path, str | PathLike) else path:
-        place = to_path(one)
+    for place in map(to_path, paths):
         files += sorted(place.glob("missions/[0-9]*.nc")) or [place]
 
     missions = []

@@ -156,6 +156,8 @@ def cell_map(
     require_kind("values", values, xr.DataArray, "give a map of the cells")
     require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
     low, high = (None, None) if limits is None else require_tuple("limits", limits, 2)
+    if label is not None:
+        require_kind("label", label, str, "give a text; '' for no colour bar")
     cells = None if path is None else require_path_of_cells(path, workspace)
     axes = map_panels(workspace.grid, 1, ax)
     image = draw_cells(axes[0], values, workspace, Normalize(low, high), cmap)

@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_limits
 from trustbo.campaign.campaign import Campaign
 from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_count, require_kind, require_list, require_whole
-from trustbo.files import FilePath, write_file
+from trustbo.files import FilePath, to_path, write_file
 from trustbo.simulation import Truth
 from trustbo.simulation.protocol import Simulator
 from trustbo.workspace import Workspace
@@ -94,7 +94,8 @@ def run_grid(
         raise TrustboError("n_jobs must be a number of processes, or -1; got 0.")
     if not (cases and scenes and seeds):
         raise TrustboError("run_grid needs at least one case, one scene and one seed.")
-    root, runs = Path(folder), list(product(seeds, scenes, cases))
+    root = to_path(folder)
+    runs = list(product(seeds, scenes, cases))
     files = {
         (seed, scene, case): root / f"{_plain(case)}~{_plain(scene)}~{seed}~{n_missions}.csv"
         for seed, scene, case in runs

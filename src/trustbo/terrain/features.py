@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 from scipy import ndimage
 
-from trustbo.errors import TrustboError, one_line, require_kind, require_tuple
+from trustbo.errors import TrustboError, one_line, require_kind, require_tuple, require_whole
 from trustbo.parallel import over_rows
 from trustbo.terrain import rays
 from trustbo.terrain.read import pixel_size
@@ -44,7 +44,7 @@ def feature[F: Callable[..., np.ndarray]](name: str, *, sign: int) -> Callable[[
     require_kind("name of the feature", name, str, "give a text, such as 'stones'")
     if name in FEATURES:
         raise TrustboError(f"feature {name!r} already exists; choose another name.")
-    if sign not in (1, -1):
+    if require_whole("sign", sign, -1) == 0 or sign > 1:
         raise TrustboError(f"sign must be 1 or -1; got {sign!r}.")
 
     def register(compute: F) -> F:
