@@ -32,6 +32,11 @@ def test_importing_loads_nothing_heavy():
     assert printed(program) == "[]"
 
 
+def test_data_of_missions_load_no_compiler():
+    program = "import sys, trustbo; trustbo.Mission; print('numba' in sys.modules)"
+    assert printed(program) == "False"
+
+
 def test_fitting_loads_no_figures():
     program = (
         "import sys, trustbo.inference; "

@@ -8,8 +8,6 @@ from functools import cache
 from html import escape
 from typing import Any
 
-from numba.core import event
-
 with warnings.catch_warnings():  # tqdm warns if ipywidgets is missing
     warnings.simplefilter("ignore")
     from tqdm.auto import tqdm
@@ -56,15 +54,16 @@ def slow_bar(name: str, unit: str, shown: bool, *, total: int | None = None) -> 
 
 def compiling() -> AbstractContextManager[Any]:
     """Return a context in which the first compilation of a kernel prints a line."""
-    return event.install_listener("numba:compile", _Announcement())
+    from numba.core import event  # takes most of the time that importing this module would take
 
+    class Announcement(event.Listener):
+        def on_start(self, event: event.Event) -> None:
+            announce()
 
-class _Announcement(event.Listener):
-    def on_start(self, event: event.Event) -> None:
-        announce()
+        def on_end(self, event: event.Event) -> None:
+            pass
 
-    def on_end(self, event: event.Event) -> None:
-        pass
+    return event.install_listener("numba:compile", Announcement())
 
 
 @cache
