@@ -12,7 +12,7 @@ import pytest
 import trustbo
 
 ROOT = Path(__file__).resolve().parents[1]
-PARTS = ("export", "logs", "models", "planning", "plots", "report", "simulation", "study",
+PARTS = ("export", "hazard", "logs", "models", "planning", "plots", "report", "simulation", "study",
          "terrain", "workspace")  # fmt: skip
 
 
@@ -55,6 +55,25 @@ def test_every_public_name_is_there():
     for name in trustbo.__all__:
         assert getattr(trustbo, name) is not None
     assert re.fullmatch(r"\d+\.\d+\.\d+(\.dev\d+)?", trustbo.__version__)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "workspace.MOVES",
+        "hazard.fit_hazard",
+        "hazard.BoundRisk",
+        "hazard.CAUSES",
+        "models.CoupledParams",
+        "models.RobotParams",
+        "models.Effect",
+        "simulation.Event",
+    ],
+)
+def test_names_that_docstrings_cite_are_public(name):
+    package, name = name.split(".")
+    assert name in getattr(trustbo, package).__all__
+    assert getattr(getattr(trustbo, package), name) is not None
 
 
 def test_a_kernel_without_ipywidgets_is_not_warned_of_progress_bars():

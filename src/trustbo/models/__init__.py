@@ -6,23 +6,27 @@ from trustbo.models import backend as backend  # imported first because it loads
 from trustbo.models.contact_rate import ContactRate
 from trustbo.models.coupled import CoupledTrust
 from trustbo.models.default import default_model
+from trustbo.models.effects.effect import Effect
 from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.effects.robot import RobotEffect
 from trustbo.models.hierarchical import HierarchicalTrust
-from trustbo.models.params import TrustParams
+from trustbo.models.params import CoupledParams, RobotParams, TrustParams
 from trustbo.models.people import HumanTrust
 from trustbo.models.pooled import PooledTrust
 from trustbo.models.priors import Priors
 
 __all__ = [
     "ContactRate",
+    "CoupledParams",
     "CoupledTrust",
+    "Effect",
     "HierarchicalTrust",
     "HumanTrust",
     "PlaceEffect",
     "PooledTrust",
     "Priors",
     "RobotEffect",
+    "RobotParams",
     "TrustParams",
     "default_model",
 ]

@@ -68,7 +68,7 @@ class Planner(Summary):
                 allows any walk of up to that many bounds. The default is n = 4 for lost_contact
                 and n = 2 for the others. If n > 2, paths may revisit cells (see `Plan.revisits`).
             toll: Additional cost of each bound, such as its length or duration. The array must
-                broadcast to (move, row, col), with the moves of `workspace.moves.MOVES`; a
+                broadcast to (move, row, col), with the moves of `workspace.MOVES`; a
                 DataArray is aligned by its dims and labels. Tolls are in bounds for lost_contact,
                 and in units of trust for the other objectives.
             max_failure: Largest failure probability of a path, in [0, 1); by default, no limit.
