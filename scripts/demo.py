@@ -30,6 +30,7 @@ from trustbo.plots.maps import (
 from trustbo.plots.style import GREY, ROBOTS, outlined
 
 START, GOAL, MISSIONS = (9, 0), (0, 9), 8
+PLANNER = {"failure_cost": 0.0}  # the hillside is steep, but the robots can drive it
 HEIGHT, RADIUS = 3.0, 45.0
 BOUND = 10
 """Number of the bound of the new path that is drawn in panel (a), from 1."""
@@ -46,7 +47,9 @@ def main() -> None:
 
     mpl.use("agg")
     workspace = tb.Workspace.from_terrain(tb.terrain.example(), shape=(10, 10))
-    with tb.Campaign(workspace, START, GOAL, directory=given.out, overwrite=True) as campaign:
+    with tb.Campaign(
+        workspace, START, GOAL, directory=given.out, overwrite=True, planner=PLANNER
+    ) as campaign:
         path = campaign.ask().path
         center = workspace.grid.center(path[len(path) // 2])
         scrub = tb.simulation.Trees(HEIGHT, center, RADIUS)
@@ -75,7 +78,9 @@ def draw(
     """Draw a bound, the contact lost per mission, and trust and path before and after."""
     workspace = result.workspace
     right = tb.simulation.KinematicSimulator(workspace)
-    known = tb.iterate(workspace, START, GOAL, n_iterations=MISSIONS, simulator=right)
+    known = tb.iterate(
+        workspace, START, GOAL, n_iterations=MISSIONS, simulator=right, planner=PLANNER
+    )
 
     style = {"font.size": 9, "axes.titlesize": 10, "legend.frameon": False}
     with mpl.rc_context(style):

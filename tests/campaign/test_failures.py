@@ -163,6 +163,28 @@ def test_results_change_with_a_failure_and_price_it(hills):
     assert campaign.plan.value == campaign.recommend().value < before.value
 
 
+def test_unpriced_plan_that_may_well_fail_warns_once(steep):
+    campaign = begin(steep)
+    with pytest.warns(UserWarning, match="failure_cost") as said:
+        plan = campaign.ask()
+    assert plan.p_arrive < 0.9
+    assert campaign.state.asked is plan  # recorded, although warnings may be errors
+    assert [w.filename for w in said] == [__file__]
+    campaign.suggest(plan.path)  # warnings are errors
+
+
+def test_plan_that_may_well_fail_does_not_warn_if_failures_count_or_are_known(steep, tmp_path):
+    for options in ({"failure_cost": 0.1}, {"max_failure": 0.99}):
+        assert begin(steep, planner=options).ask().p_arrive < 0.9
+    campaign = begin(steep)
+    with pytest.warns(UserWarning, match="failure_cost"):
+        campaign.ask()
+    campaign.fail("stuck")
+    campaign.save(tmp_path)
+    with tb.Campaign.load(tmp_path) as again:  # which has not warned yet
+        assert again.ask().p_arrive < 0.9
+
+
 def test_price_after_a_failure_is_joint_over_strata(steep):
     """F sum_m w_m (1 - prod (1 - p_m)), below that of the product of the means."""
     campaign = begin(steep, planner={"failure_cost": 8.0})

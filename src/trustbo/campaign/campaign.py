@@ -46,6 +46,8 @@ from trustbo.workspace.grid import Location
 _OPTIONS = ("objective", "sampler", "seed", "initial", "planner", "fit")
 """Arguments of `Campaign` that are stored unchanged in the settings."""
 _FIT = inspect.signature(fit)
+_LIKELY_ARRIVAL = 0.9
+"""Arrival probability below which a campaign warns if failures have no cost and no limit."""
 
 
 class Campaign(Result):
@@ -153,6 +155,7 @@ class Campaign(Result):
         state = State(json.loads(to_json(settings)))  # as if read from a file
         super().__init__(workspace, state, model, base)
         self._progress = True  # of fits
+        self._has_warned_of_risk = False
         self.storage: Storage = MemoryStorage()
         self._turn = self.storage.turn
         if directory is not None:
@@ -315,7 +318,25 @@ class Campaign(Result):
                 f"the plan arrives with probability {accepted.p_arrive:.3g} only, and max_failure "
                 "does not allow this. Suggest a safer path, or increase max_failure."
             )
+        self._warn_of_risk(accepted)
         return accepted
+
+    def _warn_of_risk(self, plan: Plan) -> None:
+        """Warn, once per campaign, if failure is likely but does not influence the plans."""
+        options = self.state.settings["planner"]
+        limited = any(options.get(name) is not None for name in ("max_failure", "failure_cost"))
+        if self._has_warned_of_risk or limited or self.risk.has_failures:
+            return
+        if plan.p_arrive is None or plan.p_arrive >= _LIKELY_ARRIVAL:
+            return
+        self._has_warned_of_risk = True
+        remedy = 'planner={"max_failure": ...}'
+        if self.planner.problem.objective.of_contact:
+            remedy += ' or planner={"failure_cost": ...}'
+        warn(
+            f"the plan arrives with probability {plan.p_arrive:.2f} only, which does not influence "
+            f"the choice of paths yet; pass {remedy}, or lower the max_slope of the robots."
+        )
 
     def tell(self, mission: Mission, *, again: bool = False) -> xr.DataTree | None:
         """Record a mission and learn from it.
