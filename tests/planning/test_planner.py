@@ -6,10 +6,12 @@ import pytest
 import xarray as xr
 
 from trustbo.errors import TrustboError
-from trustbo.inference import sample_prior
+from trustbo.inference import fit, params_of, sample_prior
+from trustbo.inference.place_maps import place_maps_of
 from trustbo.models import PooledTrust, TrustParams
 from trustbo.planning import Planner, reference, roll_trust
 from trustbo.planning.paths import STEPS
+from trustbo.simulation import ModelSimulator
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import MOVE_NAMES
 
@@ -60,6 +62,30 @@ def test_a_plan_has_the_trust_and_the_value_of_its_path(workspace, draws):
     np.testing.assert_allclose(given.value_band, np.quantile(values, (0.05, 0.95)), rtol=1e-12)
     assert planner.plan(draws).path == planner.plan(draws.mean()).path
     assert planner.plan(draws).bands.shape[::2] == (4, 3)
+
+
+def test_plan_of_a_posterior_reads_it_once_and_is_that_of_its_mean_and_draws(
+    workspace, monkeypatch
+):
+    planner = Planner(workspace, *ENDS)
+    simulator = ModelSimulator(workspace, PARAMS)
+    missions = [simulator.run(planner.plan(PARAMS).path, seed=seed) for seed in range(2)]
+    posterior = fit(missions, workspace=workspace, draws=100, progress=False)  # with all effects
+    mean = planner.plan(params_of(posterior, workspace).mean())
+    expected = mean.with_draws(planner.evaluate(mean.path, posterior))
+
+    maps = []
+
+    def counted(*arguments):
+        maps.append(place_maps_of(*arguments))
+        return maps[-1]
+
+    monkeypatch.setattr("trustbo.inference.draws.place_maps_of", counted)
+    plan = planner.plan(posterior)
+    assert len(maps) == 1
+    assert (plan.path, plan.value) == (expected.path, expected.value)
+    assert plan.value_band == expected.value_band
+    np.testing.assert_array_equal(plan.bands, expected.bands)
 
 
 def test_a_toll_is_taken_from_the_value_of_its_bounds(workspace):

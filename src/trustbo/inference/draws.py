@@ -114,6 +114,22 @@ def params_of(
         TrustboError: If the posterior is not from `fit`; a variable is missing or has NaN draws; or
             features or robots differ from those of the workspace.
     """
+    return _read_params(posterior, workspace, [day])[0]
+
+
+@computing()
+def expected_and_drawn(
+    posterior: xr.DataTree, workspace: Workspace | None = None
+) -> tuple[Params, Params]:
+    """Return `params_of` without and with `day`, reading the posterior and drawing maps once."""
+    expected, drawn = _read_params(posterior, workspace, [False, True])
+    return expected, drawn
+
+
+def _read_params(
+    posterior: xr.DataTree, workspace: Workspace | None, days: Sequence[bool]
+) -> list[Params]:
+    """Return the parameters for each value of `day`; see `params_of`."""
     if is_of_people(require_posterior("params_of", posterior)):
         raise TrustboError(
             "a posterior of HumanTrust cannot be used for planning; to predict reports, use "
@@ -123,38 +139,53 @@ def params_of(
         require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
         posterior = in_order_of(posterior, workspace.team.names, workspace.features)
     sites, attrs = sites_of(posterior), posterior.attrs
-    effects = [e for e in effects_of(posterior) if not isinstance(e, PlaceEffect)]
     needed = ("B0", "B") if "B0" in sites else ("beta0", "beta", "b", "delta_w", "delta_v")
     if missing := [name for name in needed if name not in sites]:
         raise TrustboError(
             f"the posterior has no variable {missing[0]!r}, only {', '.join(sites)}. Give a "
             "posterior from trustbo.fit with unchanged names."
         )
-    if effects:
-        theta, rng = theta_of(posterior, sites), np.random.default_rng(_DAY_SEED) if day else None
-        robots = (len(theta["rest"]), attrs["n_robots"])
-        n = attrs["n_missions"]
-        slopes = [effect.ahead(values_of(posterior, effect), theta, n, rng) for effect in effects]
-        slope = np.broadcast_to(sum(slopes), robots)
-        features = posterior["posterior"].to_dataset()["feature"].values.tolist()
-        sight = [m for m, name in enumerate(features) if is_line_of_sight(name)]
-        weights = np.zeros((*robots, len(features)))
-        if sight:
-            weights[:, :, sight], slope = slope[..., None] / len(sight), np.zeros(robots)
-        sites["b"] = sites["b"].reshape(robots[0], -1) + slope
-        if "B0" in sites:
-            B, robot = sites["B"].copy(), np.arange(robots[1])
-            B[:, :, robot, robot] += np.swapaxes(weights, 1, 2)
-            sites["B"] = B
-        else:
-            beta = sites["beta"] if sites["beta"].ndim == 3 else sites["beta"][:, None]
-            sites["beta"] = beta + weights
     x0 = {name: attrs[name] for name in ("x0_mean", "x0_sd")}
-    params = assemble_params(sites, x0, attrs.get("memory", "level"))
-    if "places" not in posterior.children:
-        return params
-    maps = place_maps_of(posterior["places"].to_dataset(), sites)
-    return params._replace(**maps)  # pyright: ignore
+    maps = {}
+    if "places" in posterior.children:
+        maps = place_maps_of(posterior["places"].to_dataset(), sites)
+
+    found = []
+    for day in days:
+        ahead = sites | _robot_effects_ahead(posterior, sites, day)
+        params = assemble_params(ahead, x0, attrs.get("memory", "level"))
+        found.append(params._replace(**maps))  # pyright: ignore
+    return found
+
+
+def _robot_effects_ahead(
+    posterior: xr.DataTree, sites: Mapping[str, np.ndarray], day: bool
+) -> dict[str, np.ndarray]:
+    """Return the parameters (draw, robot, ...) that robot effects change in the next mission."""
+    effects = [e for e in effects_of(posterior) if not isinstance(e, PlaceEffect)]
+    if not effects:
+        return {}
+    theta = theta_of(posterior, sites)
+    rng = np.random.default_rng(_DAY_SEED) if day else None
+    robots = (len(theta["rest"]), posterior.attrs["n_robots"])
+    n = posterior.attrs["n_missions"]
+    slopes = [effect.ahead(values_of(posterior, effect), theta, n, rng) for effect in effects]
+    slope = np.broadcast_to(sum(slopes), robots)
+
+    features = posterior["posterior"].to_dataset()["feature"].values.tolist()
+    sight = [m for m, name in enumerate(features) if is_line_of_sight(name)]
+    weights = np.zeros((*robots, len(features)))
+    if sight:
+        weights[:, :, sight] = slope[..., None] / len(sight)
+        slope = np.zeros(robots)
+
+    b = sites["b"].reshape(robots[0], -1) + slope
+    if "B0" in sites:
+        B, robot = sites["B"].copy(), np.arange(robots[1])
+        B[:, :, robot, robot] += np.swapaxes(weights, 1, 2)
+        return {"b": b, "B": B}
+    beta = sites["beta"] if sites["beta"].ndim == 3 else sites["beta"][:, None]
+    return {"b": b, "beta": beta + weights}
 
 
 def names_in(posterior: xr.DataTree, axis: str) -> tuple[str, ...]:

@@ -25,7 +25,15 @@ from trustbo.planning.dynamics import Dynamics, roll, trust_dynamics
 from trustbo.planning.objectives import LOST_CONTACT, OBJECTIVES, capped
 from trustbo.planning.paths import STEPS, AdmissiblePaths
 from trustbo.planning.plan import QUANTILES, Plan
-from trustbo.planning.problem import EXACT, InfeasibleError, Problem, draws_of, mean_of, risk_of
+from trustbo.planning.problem import (
+    EXACT,
+    InfeasibleError,
+    Problem,
+    draws_of,
+    mean_and_draws_of,
+    mean_of,
+    risk_of,
+)
 from trustbo.planning.trust_map import cost_of, trust_map
 from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Location
@@ -193,12 +201,12 @@ class Planner(Summary):
             InfeasibleError: If no path respects `max_failure`.
         """
         started = time.perf_counter()
-        mean = mean_of(params, self.workspace)
+        mean, draws = mean_and_draws_of(params, self.workspace)
         score, limits, paths = self.problem.best(self.problem.dynamics(mean, x0))
         path = self.problem.paths.cells(paths[0])
         plan = self.evaluate(path, mean, x0=x0)
-        if mean is not params:
-            plan = plan.with_draws(self.evaluate(path, params, x0=x0))
+        if draws is not None:
+            plan = plan.with_draws(self.evaluate(path, draws, x0=x0))
         exact = bool(limits[0] - score[0] <= EXACT)
         limit = plan.value if exact else float(self.problem.objective.value(limits[0]))
         return replace(plan, exact=exact, limit=limit, seconds=time.perf_counter() - started)

@@ -13,7 +13,7 @@ from trustbo.arrays import read_labelled, require_numbers
 from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_kind, require_positive
 from trustbo.hazard.risk import ROUNDING, Risk
-from trustbo.inference.draws import params_of
+from trustbo.inference.draws import expected_and_drawn, params_of
 from trustbo.models.families import Family
 from trustbo.models.params import Params, require_values
 from trustbo.planning.dynamics import Dynamics, trust_dynamics
@@ -268,3 +268,17 @@ def mean_of(params: Params | xr.DataTree, workspace: Workspace) -> Params:
     """Return the mean of a posterior or of several draws; a single draw is returned unchanged."""
     draws = draws_of(params, workspace)
     return draws.mean() if draws.leading else draws
+
+
+def mean_and_draws_of(
+    params: Params | xr.DataTree, workspace: Workspace
+) -> tuple[Params, Params | None]:
+    """Return `mean_of`, and the draws for bands (`day`); None if there is only a single draw.
+
+    A posterior is read once, which draws its maps of place effects once.
+    """
+    if isinstance(params, xr.DataTree):
+        expected, drawn = expected_and_drawn(params, workspace)
+        return expected.mean(), drawn
+    draws = draws_of(params, workspace)
+    return (draws.mean(), draws) if draws.leading else (draws, None)
