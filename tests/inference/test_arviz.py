@@ -49,6 +49,26 @@ def test_sensitivity_flags_a_prior_in_conflict_with_the_data(missions, posterior
     assert float(other.loc["b", "prior"]) < 0.02
 
 
+@pytest.mark.parametrize("model", [PooledTrust(), CoupledTrust()], ids=["pooled", "coupled"])
+def test_log_prior_of_noise_is_at_the_noise_without_resolution(model):
+    """delta_v^2 + 0.1^2 is stored; the prior on delta_v is half-normal with scale 0.2."""
+    rng, path = np.random.default_rng(0), [(0, k) for k in range(7)]
+    missions = []
+    for _ in range(6):
+        rates = np.round(10.0 * rng.uniform(0.6, 0.8, (6, 2))) / 10.0
+        z = rng.uniform(size=(6, 2, 2))
+        missions.append(tb.Mission.from_arrays(path, z, rates, n_ticks=10))
+    posterior = tb.fit(missions, model, draws=200, progress=False)
+    draws = posterior["posterior"]
+    if "delta_v" in draws:
+        variance = draws["delta_v"].values[..., None] ** 2
+    else:
+        variance = np.diagonal(draws["Delta_v"].values, axis1=-2, axis2=-1)
+    log_p = 0.5 * np.log(2.0 / (np.pi * 0.2**2)) - (variance - 0.1**2) / (2.0 * 0.2**2)
+    found = posterior["log_prior"]["delta_v"].values
+    np.testing.assert_allclose(found, log_p.sum(-1), rtol=1e-9, atol=1e-9)
+
+
 def test_every_draw_has_a_likelihood_and_draws_with_trust_have_predictions(posterior):
     of_draws = posterior["posterior"].sizes
     for group in ("log_likelihood", "log_prior"):

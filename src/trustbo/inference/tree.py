@@ -193,16 +193,23 @@ def log_prior(fitted: Posterior, sites: Mapping[str, np.ndarray]) -> dict[str, n
 
     Deviations of robots from a common mean belong to the model and not to the prior, so only means
     and standard deviations are included for `HierarchicalTrust`. In the coupled model, the LKJ
-    prior on correlations R has the density det(R)^(concentration - 1), up to a constant.
+    prior on correlations R has the density det(R)^(concentration - 1), up to a constant. The prior
+    on `delta_v` excludes the noise that is due to the resolution of the rates.
 
     Args:
         fitted: Posterior of the model given missions.
         sites: Draws (draw, ...) of the parameters by name.
     """
     model, priors = fitted.model, fitted.scores.priors
+    resolution = fitted.slots.resolution
     rest = model.derived(sites)["rest"]
-    densities = {n: log_density(prior, sites[n]) for n, prior in priors.items() if n in sites}
+    parameters = dict(sites)
+    if "delta_v" in sites:
+        parameters["delta_v"] = model.noise_without(sites["delta_v"], resolution)
+    densities = {n: log_density(p, parameters[n]) for n, p in priors.items() if n in sites}
     for name, (field, values) in model.prior_terms(sites).items():
+        if field == "delta_v":
+            values = model.noise_without(values, resolution)
         given = rest.reshape(*rest.shape, *(1,) * (values.ndim - rest.ndim))
         densities[name] = model.priors.log_density(field, values, given)
     for noise in ("Delta_w", "Delta_v"):

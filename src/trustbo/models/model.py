@@ -141,6 +141,13 @@ class TrustModel(Summary, ABC):
             values = {**values, "delta_v": noise}
         return self.derived(values)
 
+    def noise_without(self, delta_v: np.ndarray, resolution: float) -> np.ndarray:
+        """Return the `delta_v` that has the prior, given one to which `theta` added noise."""
+        if not self.family.adds_noise:
+            return delta_v
+        # Rounding can make the difference of the squares slightly negative.
+        return np.sqrt(np.maximum((delta_v - resolution) * (delta_v + resolution), 0.0))
+
     def rates(self, theta: Theta, drift: Any) -> Distribution | None:
         """Return the distribution of rates given one theta and the drift (mission, bound, robot).
 
