@@ -27,7 +27,6 @@ from trustbo.inference.factor import (
     cholesky,
     log_det,
     log_diagonal,
-    log_integral,
     put,
     times,
 )
@@ -188,8 +187,8 @@ class Fit(NamedTuple):
     """Evidence and factors at each theta; coefficients are mean + F'^-1 (half + white noise)."""
 
     log_p: Any  # (point,)
-    F: Any  # Factor of the posterior precision of the coefficients, None in JAX
-    half: Any  # (point, column), a whitened vector, None in JAX
+    F: Any  # Factor of the posterior precision of the coefficients
+    half: Any  # (point, column), a whitened vector
     W: Any  # (point, kind, row, row)
 
 
@@ -217,8 +216,6 @@ def evidence(blocks: Blocks, signal: Signal, prior: Prior, lam: Any, y: Any = No
     A = prior.add_to(A, b.order)
     many = np.bincount(b.kind, minlength=len(b.seen)).astype(float)
     log_p = log_sites @ many + 0.5 * (prior.log_det - (w**2).sum((1, 2)))
-    if xp is not np:
-        return Fit(log_p + log_integral(b.order)(A, h), None, None, W)
     F = Factor.of(b.order, A)
     half = F.forward(h)
     return Fit(log_p + 0.5 * (half**2).sum(1) - F.log_det, F, half, W)

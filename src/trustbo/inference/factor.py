@@ -16,7 +16,6 @@ coupled only to its mission and, a priori, to the missions before and after, so 
 block tridiagonal, which saves half of the work.
 """
 
-from collections.abc import Callable
 from typing import Any, NamedTuple, Self
 
 import jax
@@ -25,7 +24,7 @@ import numpy as np
 from scipy import sparse
 from scipy.linalg import lapack
 
-from trustbo.models.backend import inverse_from_factor, namespace
+from trustbo.models.backend import inverse_and_log_det, inverse_from_factor, namespace
 
 _CHAIN_BLOCK = 30  # columns of a chain that are eliminated at once
 
@@ -131,7 +130,7 @@ class Factor(NamedTuple):
         D, B, C = order.views(A)
         xp = namespace(A)
         padding = (order.leaf == len(order.place))[..., None] * np.eye(order.leaf.shape[1])
-        inverse = xp.linalg.inv(cholesky(D + padding))
+        inverse = inverse_of_lower(cholesky(D + padding))
         X = inverse @ B
         squares = times(order.pairs, (xp.swapaxes(X, 2, 3) @ X).reshape(len(A), -1))
         C = add(C.reshape(len(A), -1), (slice(None), order.pair), -squares).reshape(C.shape)
@@ -204,28 +203,6 @@ class Factor(NamedTuple):
         touched = xp.concatenate([core, xp.zeros((len(c), 1))], axis=1)[:, order.touched]
         D, B = leaf[..., None] * leaf[:, :, None], leaf[..., None] * touched[:, :, None]
         return self._entries(D, B, core[..., None] * core[:, None])
-
-
-def log_integral(order: Order) -> Callable[[jax.Array, jax.Array], jax.Array]:
-    """Return the JAX function (h'A^-1 h - log |A|) / 2 of A (point, entry) and h (point, column).
-
-    The derivatives with respect to h and A are c = A^-1 h and -(A^-1 + cc') / 2. Computing them
-    directly is faster than differentiating the factor.
-    """
-
-    def value(A: jax.Array, h: jax.Array) -> tuple[jax.Array, Any]:
-        F = Factor.of(order, A)
-        half = F.forward(h)
-        c = F.back(half[:, None])[:, 0]
-        return 0.5 * (half**2).sum(1) - F.log_det, (F.covariance() + F.outer(c), c)
-
-    def slopes(saved: Any, slope: jax.Array) -> tuple[jax.Array, jax.Array]:
-        pairs, c = saved
-        return -slope[:, None] * pairs, slope[:, None] * c
-
-    function = jax.custom_vjp(lambda A, h: value(A, h)[0])
-    function.defvjp(value, slopes)
-    return function
 
 
 def _summing(row: np.ndarray, kept: np.ndarray, n: int) -> Any:
@@ -320,6 +297,14 @@ def solve_upper(H: Any, x: Any, *, transposed: bool) -> Any:
     return np.stack([lapack.dtrtrs(h.T, y.T, lower=1, trans=trans)[0].T for h, y in pairs])  # pyright: ignore[reportAttributeAccessIssue]
 
 
+def inverse_of_lower(L: Any) -> Any:
+    """Compute the inverses of lower triangular matrices (..., n, n)."""
+    if isinstance(L, np.ndarray):
+        return np.linalg.inv(L)
+    one = jnp.broadcast_to(jnp.eye(L.shape[-1]), L.shape)
+    return jax.lax.linalg.triangular_solve(L, one, left_side=True, lower=True)
+
+
 def inverse_of_upper(H: Any) -> Any:
     """Compute (H' H)^-1 for upper-triangular H (point, n, n); other entries are ignored."""
     if not isinstance(H, np.ndarray):
@@ -332,7 +317,7 @@ def inverse_of_upper(H: Any) -> Any:
 def log_det(A: Any) -> Any:
     """Compute the log determinants of positive definite matrices."""
     if not isinstance(A, np.ndarray):
-        return jnp.linalg.slogdet(A)[1]  # simpler to differentiate than a Cholesky factor
+        return inverse_and_log_det(A)[1]
     return 2.0 * log_diagonal(cholesky(A))
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from scipy import sparse
 from scipy.special import logsumexp
 
-from trustbo.inference import ep
+from trustbo.inference import ep, gradient
 from trustbo.inference.engine import Blocks, Fit, Prior, columns_of, evidence, expected, whiten
 from trustbo.inference.factor import Order, cholesky
 from trustbo.inference.importance import Student, climb
@@ -167,7 +167,8 @@ class Posterior:
     def log_evidence(self, theta: Theta) -> Any:
         """Compute log p(rates | theta) at each point, with EP if rates are not Gaussian."""
         if namespace(theta["rest"]) is not np:
-            return self._fit(theta)[0].log_p
+            signal, prior = self._at(theta)
+            return gradient.log_evidence(self.blocks, signal, prior, self._lam(signal))
         found = np.empty(len(theta["rest"]))
         for i, chunk in chunks(theta, self._n_at_once):
             if self.exact:

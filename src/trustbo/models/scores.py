@@ -6,6 +6,7 @@ the angle. The data usually determine the size well, but often not the angle.
 """
 
 from collections.abc import Mapping
+from functools import cached_property
 from typing import Any
 
 import jax
@@ -48,20 +49,32 @@ class Scores:
         """Slice of the scores that are the log sizes of the noises."""
         return self.at[NOISES[0]]
 
+    @cached_property
+    def terms(self) -> np.ndarray:
+        """Coefficients (power, interval, score) of splines through the quantiles of the priors."""
+        knots = np.linspace(-_FARTHEST, _FARTHEST, _N_KNOTS)
+        columns = []
+        for name, prior in self.priors.items():
+            n = self.at[name].stop - self.at[name].start
+            at = np.broadcast_to(knots[:, None], (_N_KNOTS, n))
+            columns.append(quantile(prior, at, name))
+        return CubicSpline(knots, np.concatenate(columns, axis=1)).c
+
     def values(self, z: Any) -> dict[str, Any]:
         """Convert scores (point, score) to hyperparameters (point,) or (point, k) by name."""
         xp = namespace(z)
         size, angle = xp.exp(z[:, self.at["delta_w"]]), z[:, self.at["delta_v"]]
+        others = None if xp is np else _interpolated(self.terms, z)
         found = {}
         for name, prior in self.priors.items():
             if name in NOISES:
                 side = 1.0 if name == "delta_w" else -1.0
                 share = xp.sin(0.5 * np.pi * special_functions(z).ndtr(side * angle))
                 values = of_size(prior, size * share, name)
-            elif xp is np:
+            elif others is None:
                 values = quantile(prior, z[:, self.at[name]], name)
             else:
-                values = _interpolated(prior, z[:, self.at[name]], name)
+                values = others[:, self.at[name]]
             found[name] = values if prior.batch_shape else values[:, 0]
         return found
 
@@ -108,14 +121,18 @@ def quantile(prior: Distribution, score: np.ndarray, name: str) -> np.ndarray:
     return _by_numpyro(prior, special.ndtr(score), name)
 
 
-def _interpolated(prior: Distribution, score: jax.Array, name: str) -> jax.Array:
-    """Interpolate `quantile` in JAX, which lacks the quantiles of some distributions."""
-    knots = np.linspace(-_FARTHEST, _FARTHEST, _N_KNOTS)
-    at = np.broadcast_to(knots[:, None], (_N_KNOTS, *score.shape[1:]))
-    terms = jnp.asarray(CubicSpline(knots, quantile(prior, at, name)).c)  # (power, interval, k)
-    interval = jnp.clip(jnp.searchsorted(knots, score) - 1, 0, _N_KNOTS - 2)
-    x = score - jnp.asarray(knots)[interval]
-    a, b, c, d = terms[:, interval, np.arange(score.shape[1])]
+def _interpolated(terms: np.ndarray, score: jax.Array) -> jax.Array:
+    """Interpolate quantiles in JAX, which lacks the quantiles of some distributions.
+
+    Args:
+        terms: Coefficients of cubic polynomials (power, interval, score); see `Scores.terms`.
+        score: Scores (point, score).
+    """
+    step = 2.0 * _FARTHEST / (_N_KNOTS - 1)
+    interval = jnp.clip(jnp.floor((score + _FARTHEST) / step), 0, _N_KNOTS - 2).astype(int)
+    x = score + _FARTHEST - step * interval
+
+    a, b, c, d = jnp.asarray(terms)[:, interval, np.arange(score.shape[1])]
     return ((a * x + b) * x + c) * x + d
 
 
