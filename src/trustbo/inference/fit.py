@@ -53,7 +53,7 @@ def fit(
     workspace: Workspace | None = None,
     draws: int = 1000,
     chains: int = 4,
-    warmup: int = 300,
+    warmup: int | None = None,
     seed: int = 0,
     progress: bool = True,
     check: bool = True,
@@ -78,7 +78,8 @@ def fit(
         draws: Number of draws per chain.
         chains: Number of chains of NUTS. Importance sampling returns as many draws in one chain,
             because its draws are independent of each other.
-        warmup: Number of warm-up draws per chain of NUTS, which are discarded.
+        warmup: Number of warm-up draws per chain of NUTS, which are discarded; by default 150 for
+            Gaussian rates, for which only the step size is tuned, and 300 for others.
         seed: Random seed; the same seed gives the same posterior.
         progress: Whether to show a progress bar; importance sampling shows it after 5 seconds.
         check: Whether to raise an error if diagnostics are bad: k-hat > 0.7 for importance
@@ -120,8 +121,10 @@ def fit(
         model = HumanTrust(scale=scale) if scale else default_model(places=has_places(missions))
     require_kind("model", model, TrustModel, "give a model such as PooledTrust()")
     require_choice("sampler", sampler, SAMPLERS)
-    sizes = {"draws": draws, "chains": chains, "warmup": warmup}
-    draws, chains, warmup = (require_count(name, n) for name, n in sizes.items())
+    draws = require_count("draws", draws)
+    chains = require_count("chains", chains)
+    if warmup is not None:
+        warmup = require_count("warmup", warmup)
     seed = require_whole("seed", seed, 0)
     model = model.for_features(missions[0].features)
     slots = model.slots(missions, workspace)
