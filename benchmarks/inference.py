@@ -1,31 +1,57 @@
-"""CPU time and effective draws of fits, compared with NUTS in NumPyro and in PyMC.
+"""CPU time, effective draws and memory of fits, compared with NUTS of other libraries.
 
-    python benchmarks/inference.py [fits] [nuts] [paper] [filter]
+    python benchmarks/inference.py [fits] [nuts] [paper] [memory] [busy] [filter]
 
-`fits`: CPU time of fits of the default model to 15, 60 and 200 missions, and with shared noise or
-censored rates. Both the first fit of a process and the median of later fits are printed.
+`fits`: CPU time of fits of the default model to 3, 15, 60 and 200 missions, with shared noise and
+with censored rates. `later` is a fit that starts from the posterior of one mission fewer, as in a
+campaign. The first fit of the process, of 3 missions, has its own row.
 `nuts`: CPU time of `sampler="nuts"` for the default model and eight missions, with compilation, and
 the difference of the means to importance sampling.
-`paper`: effective draws per second for the paper's model and 600 rates, compared with
-`MCMC(NUTS(model.program))` and with PyMC and nutpie.
+`paper`: effective draws and CPU seconds for the paper's model and 600 rates, compared with
+`MCMC(NUTS(model.program))`, with the same program with latent trust sampled, with the likelihood of
+dynamax and with PyMC and nutpie. All samplers run with the same seeds, one after another, and have
+run once before. The effective size is the smaller one of beta0 and delta_w.
+`memory`: bytes of a posterior of 60 missions, with all groups and with the parameters alone.
+`busy`: wall time of a fit of 60 missions with all groups, alone and beside two processes that
+always compute. Two cores shared fairly by three processes give a ratio of 1.5.
 `filter`: time to update the filter with one bound of three robots, with 1000 draws.
+
+The peers are installed by `pip install trustbo[bench]`; a peer that is missing is left out.
 """
 
+import subprocess
 import sys
 import time
+from importlib import import_module
 
-import jax
 import numpy as np
 from arviz_stats import sampling_diagnostics
-from numpyro.infer import MCMC, NUTS
+from common import Table, arguments, parsed
 
 import trustbo as tb
 from trustbo.inference import TrustFilter, sample_prior
 from trustbo.inference.diagnostics import diagnostics
+from trustbo.inference.tree import parameters_alone
 from trustbo.models import PlaceEffect, PooledTrust, RobotEffect
-from trustbo.models.backend import own_settings
 
 EFFECTS = (PlaceEffect(), RobotEffect())
+
+DEFAULT = PooledTrust(effects=EFFECTS)
+SHARED = PooledTrust(effects=EFFECTS, shared_noise=True)
+CENSORED = PooledTrust(effects=EFFECTS, observation="censored")
+
+FITS = {
+    "default model, 3 missions": (3, DEFAULT),
+    "default model, 15 missions": (15, DEFAULT),
+    "default model, 60 missions": (60, DEFAULT),
+    "default model, 200 missions": (200, DEFAULT),
+    "shared noise, 15 missions": (15, SHARED),
+    "censored rates, 15 missions": (15, CENSORED),
+}
+"""Number of missions and model by name."""
+
+NAMES = ("beta0", "delta_w")
+"""Parameters whose draws and means are compared in `paper`."""
 
 
 def missions(n, n_bounds=10, size=10, limit=False, seed=0):
@@ -44,27 +70,41 @@ def missions(n, n_bounds=10, size=10, limit=False, seed=0):
     return found
 
 
-def timed_fits():
-    """Print the CPU time of fits without predictions."""
-    cases = {
-        "default model, 15 missions": (15, PooledTrust(effects=EFFECTS), False),
-        "60 missions": (60, PooledTrust(effects=EFFECTS), False),
-        "200 missions": (200, PooledTrust(effects=EFFECTS), False),
-        "15 missions, shared noise": (15, PooledTrust(effects=EFFECTS, shared_noise=True), False),
-        "15 missions, censored": (15, PooledTrust(effects=EFFECTS, observation="censored"), True),
-    }
-    for name, (n, model, limit) in cases.items():
-        data, seconds = missions(n, limit=limit), []
-        for seed in range(4 if n < 200 else 2):
-            started = time.process_time()
-            fitted = tb.fit(data, model, seed=seed, whole=False, check=False)
-            seconds.append(time.process_time() - started)
-        rest = np.median(seconds[1:])
-        k_hat = fitted.attrs["k_hat"]
-        print(f"{name}: first {seconds[0]:.2f} s, then {rest:.2f} s, k-hat {k_hat:.2f}", flush=True)
+def timed_fits(given):
+    """Print the CPU time of fits without predictions, first and later in a campaign."""
+    columns = "fit", "CPU s, median", "least", "most", "kish", "ms per effective point", "k-hat"
+    table = Table(*columns, first=40)
+    one_case(table, "default model, 3 missions", 1, label="first fit of the process")
+    for name in FITS:
+        one_case(table, name, given.seeds)
+        if FITS[name][1] is DEFAULT:
+            one_case(table, name, given.seeds, later=True)
 
 
-def nuts():
+def one_case(table, name, n_seeds, later=False, label=""):
+    """Add the row of a fit; if `later`, it starts from the posterior of one mission fewer."""
+    n, model = FITS[name]
+    data = missions(n, limit=model is CENSORED)
+    options = {"whole": False, "check": False}
+    if later:
+        options["start"] = tb.fit(data[:-1], model, **options)
+
+    seconds, kish, k_hat = [], [], []
+    for seed in range(n_seeds):
+        started = time.process_time()
+        fitted = tb.fit(data, model, seed=seed, **options)
+        seconds.append(time.process_time() - started)
+        kish.append(fitted.attrs["kish"])
+        k_hat.append(fitted.attrs["k_hat"])
+
+    per_point = 1e3 * np.median(np.divide(seconds, kish))
+    table.row(
+        label or name + ", later" * later, f"{np.median(seconds):.2f}", f"{min(seconds):.2f}",
+        f"{max(seconds):.2f}", f"{np.median(kish):.0f}", f"{per_point:.1f}", f"{max(k_hat):.2f}",
+    )  # fmt: skip
+
+
+def nuts(given):
     """Print CPU time and error of NUTS for the default model and eight missions."""
     data, model = missions(8), PooledTrust(effects=EFFECTS)
     exact = tb.fit(data, model, draws=4000, whole=False)["posterior"].to_dataset()
@@ -76,45 +116,117 @@ def nuts():
     print(f"NUTS, 4 x (300 + 1000): {seconds:.0f} s, {diagnostics(chains)}, off by {worst:.3f} sd")
 
 
-def paper():
-    """Print effective draws per second for the paper's model, also of NumPyro and nutpie."""
-    data, model = missions(20), PooledTrust().for_features(["line_of_sight", "slope"])
-    tb.fit(data, model, whole=False)
-    started = time.process_time()
-    ours = tb.fit(data, model, whole=False).attrs["kish"] / (time.process_time() - started)
-    print(f"paper's model, 600 rates: {ours:.0f} effective draws per second")
-    for peer, (draws, seconds) in {"NumPyro": by_numpyro(model, data), **by_nutpie(data)}.items():
-        least = min(float(sampling_diagnostics.ess(draws[n])) for n in ("beta0", "delta_w"))
-        print(f"{peer}: {least / seconds:.0f} per second, a ratio of {ours * seconds / least:.1f}")
+def paper(given):
+    """Print effective draws, CPU seconds and means of the paper's model, also of the peers."""
+    data = missions(20)
+    samplers = compiled_samplers(data)
+    runs = {name: [] for name in samplers}
+    print("sampler, seed: effective size, CPU seconds, divergences, means of", *NAMES)
+    for seed in range(given.seeds):
+        for name, sample in samplers.items():
+            started = time.process_time()
+            draws, n_divergent = sample(seed)
+            seconds = time.process_time() - started
+            size = effective_size(draws)
+            means = [float(draws[n].mean()) for n in NAMES]
+            runs[name].append((size, seconds, n_divergent, *means))
+            print(f"{name}, {seed}: {size:.0f}, {seconds:.2f}, {n_divergent}, {means}", flush=True)
 
-
-def by_numpyro(model, data):
-    """Return draws of NumPyro's NUTS for the program, and the CPU time without compiling."""
-    with own_settings():
-        mcmc = MCMC(
-            NUTS(model.program), num_warmup=500, num_samples=1000, num_chains=4,
-            chain_method="vectorized", progress_bar=False,
+    columns = (
+        "sampler", "effective size", "worst", "CPU s", "worst", "effective draws per s", "worst",
+        "divergences, worst", *(f"{what} of {n}" for n in NAMES for what in ("mean", "range")),
+    )  # fmt: skip
+    table = Table(*columns, first=40)
+    for name, found in runs.items():
+        size, seconds, n_divergent, *means = np.array(found).T
+        rate = size / seconds
+        of_means = []
+        for mean in means:
+            of_means += [f"{np.median(mean):.3f}", f"{mean.min():.3f} to {mean.max():.3f}"]
+        table.row(
+            name, f"{np.median(size):.0f}", f"{size.min():.0f}",
+            f"{np.median(seconds):.2f}", f"{seconds.max():.2f}",
+            f"{np.median(rate):.0f}", f"{rate.min():.0f}",
+            f"{n_divergent.max():.0f}", *of_means,
         )  # fmt: skip
-        slots = model.slots(data)
-        mcmc.run(jax.random.key(0), slots)
-        started = time.process_time()
-        mcmc.run(jax.random.key(1), slots)
-        draws = {n: np.asarray(v) for n, v in mcmc.get_samples(group_by_chain=True).items()}
-    return draws, time.process_time() - started
 
 
-def by_nutpie(data):
-    """Return draws and CPU time of PyMC with nutpie; empty if they are not installed."""
-    try:
-        from peers.pymc_nutpie import pooled, sampled
-    except ImportError as error:
-        print(f"skipped: {error}")
-        return {}
+def effective_size(draws):
+    """Smaller effective size of the two parameters; for weighted points, at most `kish`."""
+    sizes = [float(sampling_diagnostics.ess(draws[n])) for n in NAMES]
+    return min(*sizes, draws.get("kish", np.inf))
+
+
+def compiled_samplers(data):
+    """Samplers of the paper's model by name: ours, and those of the peers that are installed."""
+    model = PooledTrust().for_features(["line_of_sight", "slope"])
     z, y = (np.stack([getattr(m, name) for m in data]) for name in ("awareness", "contact_rate"))
-    return {"PyMC with nutpie": sampled(pooled(z, y), ("beta0", "delta_w"))}
+
+    def ours(seed):
+        fitted = tb.fit(data, model, seed=seed, whole=False)
+        draws = {name: fitted["posterior"][name].to_numpy() for name in NAMES}
+        return {**draws, "kish": fitted.attrs["kish"]}, 0
+
+    ours(10_000)
+    found = {"trustbo, importance sampling": ours}
+    peers = {
+        "NumPyro's NUTS, model.program": ("numpyro_nuts", lambda p: p.pooled(model, data)),
+        "NumPyro's NUTS, latent trust sampled": ("numpyro_latent", lambda p: p.pooled(z, y)),
+        "dynamax's likelihood, NumPyro's NUTS": ("dynamax_lgssm", lambda p: p.pooled(z, y)),
+        "PyMC with nutpie": ("pymc_nutpie", lambda p: p.sampler(z, y)),
+        "PyMC with nutpie, low-rank": ("pymc_nutpie", lambda p: p.sampler(z, y, low_rank=True)),
+    }
+    for name, (module, make) in peers.items():
+        try:
+            peer = import_module(f"peers.{module}")
+        except ImportError as error:
+            print(f"{name}: skipped, {error}")
+            continue
+        found[name] = make(peer)
+    return found
 
 
-def one_bound():
+def memory(given):
+    """Print the bytes of a posterior of 60 missions, whole and without what grows with missions."""
+    fitted = tb.fit(missions(60), DEFAULT, check=False)
+    table = Table("posterior of 60 missions", "MB", first=40)
+    for name, group in fitted.children.items():
+        table.row(f"group {name}", f"{group.nbytes / 1e6:.2f}")
+    table.row("all groups", f"{fitted.nbytes / 1e6:.2f}")
+    table.row("parameters alone", f"{parameters_alone(fitted).nbytes / 1e6:.2f}")
+
+
+def busy(given):
+    """Print the wall time of a fit alone and beside two processes that always compute."""
+    data = missions(60)
+    tb.fit(missions(3), DEFAULT, check=False)
+    spin = [sys.executable, "-c", "while True: pass"]
+    alone, beside = [], []
+    for seed in range(given.seeds):
+        alone.append(wall_and_cpu(data, seed))
+        others = [subprocess.Popen(spin) for _ in range(2)]
+        try:
+            beside.append(wall_and_cpu(data, seed))
+        finally:
+            for other in others:
+                other.kill()
+                other.wait()
+
+    table = Table("60 missions, all groups", "wall s, median", "CPU s, median", first=40)
+    for name, seconds in {"alone": alone, "beside two busy processes": beside}.items():
+        table.row(name, *(f"{value:.1f}" for value in np.median(seconds, axis=0)))
+    ratios = np.divide(beside, alone)[:, 0]
+    print(f"ratio of wall times: median {np.median(ratios):.1f}, worst {ratios.max():.1f}")
+
+
+def wall_and_cpu(data, seed):
+    """Seconds of wall and processor of a fit with all groups."""
+    started = time.perf_counter(), time.process_time()
+    tb.fit(data, DEFAULT, seed=seed, check=False, progress=False)
+    return time.perf_counter() - started[0], time.process_time() - started[1]
+
+
+def one_bound(given):
     """Print the shortest time that the filter needs for one bound."""
     live = TrustFilter(sample_prior(PooledTrust(), 2, 1000, 0), 3)
     z, y, seconds = np.full((3, 2), 0.5), [0.5, 0.6, 0.7], []
@@ -125,7 +237,21 @@ def one_bound():
     print(f"TrustFilter, one bound: {1000.0 * min(seconds):.2f} ms")
 
 
+PARTS = {
+    "fits": timed_fits,
+    "nuts": nuts,
+    "paper": paper,
+    "memory": memory,
+    "busy": busy,
+    "filter": one_bound,
+}
+
+
+def main():
+    given = parsed(arguments(__doc__, names=PARTS, seeds=5))
+    for part in given.names:
+        PARTS[part](given)
+
+
 if __name__ == "__main__":
-    parts = {"fits": timed_fits, "nuts": nuts, "paper": paper, "filter": one_bound}
-    for part in sys.argv[1:] or parts:
-        parts[part]()
+    main()

@@ -4,12 +4,14 @@ The filter is unrolled over bounds, all sequences side by side, with one varianc
 rate is missing.
 """
 
-import time
+from collections.abc import Callable
 
 import numpy as np
 import nutpie
 import pymc as pm
 import pytensor.tensor as pt
+
+from peers.numpyro_nuts import CHAINS, DRAWS
 
 X0_MEAN, X0_VAR = 0.5, 0.25
 
@@ -37,12 +39,20 @@ def pooled(awareness: np.ndarray, rates: np.ndarray) -> pm.Model:
     return model
 
 
-def sampled(model: pm.Model, names: tuple[str, ...], seed: int = 0) -> tuple[dict, float]:
-    """Draws (chain, draw) of four chains by name, and seconds without compiling."""
-    compiled = nutpie.compile_pymc_model(model)
-    started = time.process_time()
-    trace = nutpie.sample(
-        compiled, draws=1000, chains=4, cores=1, seed=seed, progress_bar=False,
-    )  # fmt: skip
-    seconds = time.process_time() - started
-    return {name: np.asarray(trace["posterior"][name]) for name in names}, seconds
+def sampler(
+    awareness: np.ndarray, rates: np.ndarray, low_rank: bool = False
+) -> Callable[[int], tuple[dict, int]]:
+    """Sampler with nutpie's default warm-up, and a diagonal or a low-rank mass matrix."""
+    adaptation = "low_rank" if low_rank else "diag"
+    compiled = nutpie.compile_pymc_model(pooled(awareness, rates))
+
+    def sample(seed: int) -> tuple[dict, int]:
+        trace = nutpie.sample(
+            compiled, draws=DRAWS, chains=CHAINS, cores=1, seed=seed, progress_bar=False,
+            adaptation=adaptation,
+        )  # fmt: skip
+        draws = {name: np.asarray(v) for name, v in trace["posterior"].to_dataset().items()}
+        return draws, int(trace["sample_stats"]["diverging"].sum())
+
+    sample(10_000)
+    return sample

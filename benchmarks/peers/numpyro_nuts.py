@@ -1,0 +1,37 @@
+"""NumPyro's NUTS on a program, of ours or of other peers; trust is integrated out by ours."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from numpyro.infer import MCMC, NUTS
+
+from trustbo import Mission
+from trustbo.models.backend import own_settings
+from trustbo.models.model import TrustModel
+
+WARMUP, DRAWS, CHAINS = 500, 1000, 4
+"""Lengths of all peers' runs."""
+
+
+def nuts(program: Callable[..., None], *data: Any) -> Callable[[int], tuple[dict, int]]:
+    """Make a sampler of a program, called with `data`, that is compiled."""
+    mcmc = MCMC(
+        NUTS(program), num_warmup=WARMUP, num_samples=DRAWS, num_chains=CHAINS,
+        chain_method="vectorized", progress_bar=False,
+    )  # fmt: skip
+
+    def sample(seed: int) -> tuple[dict, int]:
+        with own_settings():
+            mcmc.run(jax.random.key(seed), *data)
+            draws = {n: np.asarray(v) for n, v in mcmc.get_samples(group_by_chain=True).items()}
+            return draws, int(mcmc.get_extra_fields()["diverging"].sum())
+
+    sample(10_000)
+    return sample
+
+
+def pooled(model: TrustModel, missions: Sequence[Mission]) -> Callable[[int], tuple[dict, int]]:
+    """Sampler of the program of one of our models."""
+    return nuts(model.program, model.slots(missions))
