@@ -50,10 +50,14 @@ def program(z: Any, y: Any) -> None:
     numpyro.factor("rates", log_p.sum())
 
 
-def pooled(awareness: np.ndarray, rates: np.ndarray) -> Callable[[int], tuple[dict, int]]:
-    """Sampler of awareness (mission, bound, robot, feature) and rates (mission, bound, robot)."""
+def samplers(
+    awareness: np.ndarray, rates: np.ndarray
+) -> dict[str, Callable[[int], tuple[dict, int]]]:
+    """The sampler by name, of awareness (mission, bound, robot, feature) and rates (mission, bound, robot)."""
     n_bounds, n_features = awareness.shape[1], awareness.shape[3]
     z = np.moveaxis(awareness, 1, 2).reshape(-1, n_bounds, n_features)
     y = np.moveaxis(rates, 1, 2).reshape(-1, n_bounds)
     with own_settings():
-        return nuts(program, jnp.asarray(z), jnp.asarray(y))
+        return {
+            "dynamax's likelihood, NumPyro's NUTS": nuts(program, jnp.asarray(z), jnp.asarray(y))
+        }

@@ -30,10 +30,14 @@ def program(z: Any, y: Any) -> None:
             numpyro.sample(f"y_{k + 1}", dist.Normal(x, delta_v), obs=y[k])
 
 
-def pooled(awareness: np.ndarray, rates: np.ndarray) -> Callable[[int], tuple[dict, int]]:
-    """Sampler of awareness (mission, bound, robot, feature) and rates (mission, bound, robot)."""
+def samplers(
+    awareness: np.ndarray, rates: np.ndarray
+) -> dict[str, Callable[[int], tuple[dict, int]]]:
+    """The sampler by name, of awareness (mission, bound, robot, feature) and rates (mission, bound, robot)."""
     n_bounds, n_features = awareness.shape[1], awareness.shape[3]
     z = np.moveaxis(awareness, 1, 0).reshape(n_bounds, -1, n_features)
     y = np.moveaxis(rates, 1, 0).reshape(n_bounds, -1)
     with own_settings():
-        return nuts(program, jnp.asarray(z), jnp.asarray(y))
+        return {
+            "NumPyro's NUTS, latent trust sampled": nuts(program, jnp.asarray(z), jnp.asarray(y))
+        }

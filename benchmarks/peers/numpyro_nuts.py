@@ -32,6 +32,8 @@ def nuts(program: Callable[..., None], *data: Any) -> Callable[[int], tuple[dict
     return sample
 
 
-def pooled(model: TrustModel, missions: Sequence[Mission]) -> Callable[[int], tuple[dict, int]]:
-    """Sampler of the program of one of our models."""
-    return nuts(model.program, model.slots(missions))
+def samplers(
+    model: TrustModel, missions: Sequence[Mission]
+) -> dict[str, Callable[[int], tuple[dict, int]]]:
+    """The sampler, by name, of the program of one of our models."""
+    return {"NumPyro's NUTS, model.program": nuts(model.program, model.slots(missions))}

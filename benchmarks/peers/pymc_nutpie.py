@@ -5,6 +5,7 @@ rate is missing.
 """
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import nutpie
@@ -39,14 +40,18 @@ def pooled(awareness: np.ndarray, rates: np.ndarray) -> pm.Model:
     return model
 
 
-def sampler(
-    awareness: np.ndarray, rates: np.ndarray, low_rank: bool = False
-) -> Callable[[int], tuple[dict, int]]:
-    """Sampler with nutpie's default warm-up, and a diagonal or a low-rank mass matrix."""
-    adaptation = "low_rank" if low_rank else "diag"
+def samplers(
+    awareness: np.ndarray, rates: np.ndarray
+) -> dict[str, Callable[[int], tuple[dict, int]]]:
+    """Samplers with a diagonal and a low-rank mass matrix, and nutpie's default warm-up.
+
+    Args:
+        awareness: Awareness (mission, bound, robot, feature).
+        rates: Rates (mission, bound, robot).
+    """
     compiled = nutpie.compile_pymc_model(pooled(awareness, rates))
 
-    def sample(seed: int) -> tuple[dict, int]:
+    def sample(seed: int, adaptation: str) -> tuple[dict, int]:
         trace = nutpie.sample(
             compiled, draws=DRAWS, chains=CHAINS, cores=1, seed=seed, progress_bar=False,
             adaptation=adaptation,
@@ -54,5 +59,10 @@ def sampler(
         draws = {name: np.asarray(v) for name, v in trace["posterior"].to_dataset().items()}
         return draws, int(trace["sample_stats"]["diverging"].sum())
 
-    sample(10_000)
-    return sample
+    found = {
+        "PyMC with nutpie": partial(sample, adaptation="diag"),
+        "PyMC with nutpie, low-rank": partial(sample, adaptation="low_rank"),
+    }
+    for sampler in found.values():
+        sampler(10_000)
+    return found
