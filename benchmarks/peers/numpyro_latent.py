@@ -33,7 +33,7 @@ def program(z: Any, y: Any) -> None:
 def samplers(
     awareness: np.ndarray, rates: np.ndarray
 ) -> dict[str, Callable[[int], tuple[dict, int]]]:
-    """The sampler by name, of awareness (mission, bound, robot, feature) and rates (mission, bound, robot)."""
+    """The sampler by name; arguments as in `pymc_nutpie.samplers`."""
     n_bounds, n_features = awareness.shape[1], awareness.shape[3]
     z = np.moveaxis(awareness, 1, 0).reshape(n_bounds, -1, n_features)
     y = np.moveaxis(rates, 1, 0).reshape(n_bounds, -1)
