@@ -10,7 +10,10 @@ the difference of the means to importance sampling.
 `paper`: effective draws and CPU seconds for the paper's model and 600 rates, compared with
 `MCMC(NUTS(model.program))`, with the same program with latent trust sampled, with the likelihood of
 dynamax and with PyMC and nutpie. All samplers run with the same seeds, one after another, and have
-run once before. The effective size is the smaller one of beta0 and delta_w.
+run once before. The effective size is the smaller one of beta0 and delta_w. There are two data
+sets: rates of `missions`, which have no memory, so that they tell delta_w^2 + delta_v^2 but hardly
+either of the two, and rates simulated from the model with beta0 = 0.6. All peers take some 30
+minutes of CPU time; set NPROC=1 for JAX in one thread.
 `memory`: bytes of a posterior of 60 missions, with all groups and with the parameters alone.
 `busy`: wall time of a fit of 60 missions with all groups, alone and beside two processes that
 always compute. Two cores shared fairly by three processes give a ratio of 1.5.
@@ -70,6 +73,22 @@ def missions(n, n_bounds=10, size=10, limit=False, seed=0):
     return found
 
 
+def missions_with_memory(n, seed=1):
+    """Simulate the paper's model along the paths of `missions`, with beta0 = 0.6."""
+    rng = np.random.default_rng(seed)
+    found = []
+    for mission in missions(n):
+        trust = np.full(3, 0.5)
+        rates = []
+        for z in mission.awareness:
+            trust = 0.6 * trust + 0.1 + z @ [0.25, 0.05] + 0.06 * rng.standard_normal(3)
+            rates.append(trust + 0.06 * rng.standard_normal(3))
+        y = np.clip(rates, 0.0, 1.0)
+        features = ["line_of_sight", "slope"]
+        found.append(tb.Mission.from_arrays(mission.path, mission.awareness, y, features=features))
+    return found
+
+
 def timed_fits(given):
     """Print the CPU time of fits without predictions, first and later in a campaign."""
     columns = "fit", "CPU s, median", "least", "most", "kish", "ms per effective point", "k-hat"
@@ -118,11 +137,18 @@ def nuts(given):
 
 def paper(given):
     """Print effective draws, CPU seconds and means of the paper's model, also of the peers."""
-    data = missions(20)
+    print("rates without memory")
+    compared(missions(20), given.seeds)
+    print("rates with memory")
+    compared(missions_with_memory(20), given.seeds)
+
+
+def compared(data, n_seeds):
+    """Print a row for each sampler and seed, then a table of medians and worst seeds."""
     samplers = compiled_samplers(data)
     runs = {name: [] for name in samplers}
     print("sampler, seed: effective size, CPU seconds, divergences, means of", *NAMES)
-    for seed in range(given.seeds):
+    for seed in range(n_seeds):
         for name, sample in samplers.items():
             started = time.process_time()
             draws, n_divergent = sample(seed)
