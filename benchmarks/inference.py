@@ -35,7 +35,7 @@ import trustbo as tb
 from trustbo.inference import TrustFilter, sample_prior
 from trustbo.inference.diagnostics import diagnostics
 from trustbo.inference.tree import parameters_alone
-from trustbo.models import PlaceEffect, PooledTrust, RobotEffect
+from trustbo.models import PlaceEffect, PooledTrust, Priors, RobotEffect
 
 EFFECTS = (PlaceEffect(), RobotEffect())
 
@@ -185,7 +185,8 @@ def effective_size(draws):
 
 def compiled_samplers(data):
     """Samplers of the paper's model by name: ours, and those of the peers that are installed."""
-    model = PooledTrust().for_features(["line_of_sight", "slope"])
+    # With explicit priors, as the default priors for line of sight are not those of the peers.
+    model = PooledTrust(priors=Priors()).for_features(["line_of_sight", "slope"])
     z, y = (np.stack([getattr(m, name) for m in data]) for name in ("awareness", "contact_rate"))
 
     def ours(seed):
