@@ -36,6 +36,7 @@ from trustbo.inference import TrustFilter, sample_prior
 from trustbo.inference.diagnostics import diagnostics
 from trustbo.inference.tree import parameters_alone
 from trustbo.models import PlaceEffect, PooledTrust, Priors, RobotEffect
+from trustbo.models.backend import own_settings
 
 EFFECTS = (PlaceEffect(), RobotEffect())
 
@@ -143,6 +144,7 @@ def paper(given):
     compared(missions_with_memory(20), given.seeds)
 
 
+@own_settings()
 def compared(data, n_seeds):
     """Print a row for each sampler and seed, then a table of medians and worst seeds."""
     samplers = compiled_samplers(data)

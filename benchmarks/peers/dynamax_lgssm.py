@@ -15,7 +15,6 @@ import numpyro.distributions as dist
 from dynamax.linear_gaussian_ssm.inference import lgssm_filter, make_lgssm_params
 
 from peers.numpyro_nuts import nuts
-from trustbo.models.backend import own_settings
 
 X0_MEAN, X0_VAR = 0.5, 0.25
 
@@ -57,7 +56,4 @@ def samplers(
     n_bounds, n_features = awareness.shape[1], awareness.shape[3]
     z = np.moveaxis(awareness, 1, 2).reshape(-1, n_bounds, n_features)
     y = np.moveaxis(rates, 1, 2).reshape(-1, n_bounds)
-    with own_settings():
-        return {
-            "dynamax's likelihood, NumPyro's NUTS": nuts(program, jnp.asarray(z), jnp.asarray(y))
-        }
+    return {"dynamax's likelihood, NumPyro's NUTS": nuts(program, jnp.asarray(z), jnp.asarray(y))}

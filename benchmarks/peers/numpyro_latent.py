@@ -9,7 +9,6 @@ import numpyro
 import numpyro.distributions as dist
 
 from peers.numpyro_nuts import nuts
-from trustbo.models.backend import own_settings
 
 X0_MEAN, X0_SD = 0.5, 0.5
 
@@ -37,7 +36,4 @@ def samplers(
     n_bounds, n_features = awareness.shape[1], awareness.shape[3]
     z = np.moveaxis(awareness, 1, 0).reshape(n_bounds, -1, n_features)
     y = np.moveaxis(rates, 1, 0).reshape(n_bounds, -1)
-    with own_settings():
-        return {
-            "NumPyro's NUTS, latent trust sampled": nuts(program, jnp.asarray(z), jnp.asarray(y))
-        }
+    return {"NumPyro's NUTS, latent trust sampled": nuts(program, jnp.asarray(z), jnp.asarray(y))}

@@ -8,7 +8,6 @@ import numpy as np
 from numpyro.infer import MCMC, NUTS
 
 from trustbo import Mission
-from trustbo.models.backend import own_settings
 from trustbo.models.model import TrustModel
 
 WARMUP, DRAWS, CHAINS = 500, 1000, 4
@@ -16,17 +15,20 @@ WARMUP, DRAWS, CHAINS = 500, 1000, 4
 
 
 def nuts(program: Callable[..., None], *data: Any) -> Callable[[int], tuple[dict, int]]:
-    """Make a sampler of a program, called with `data`, that is compiled."""
+    """Make a sampler of a program, called with `data`, that is compiled.
+
+    Call this function and the sampler within one `own_settings()`; NumPyro fails to run a second
+    time after the settings were left and entered again.
+    """
     mcmc = MCMC(
         NUTS(program), num_warmup=WARMUP, num_samples=DRAWS, num_chains=CHAINS,
         chain_method="vectorized", progress_bar=False,
     )  # fmt: skip
 
     def sample(seed: int) -> tuple[dict, int]:
-        with own_settings():
-            mcmc.run(jax.random.key(seed), *data)
-            draws = {n: np.asarray(v) for n, v in mcmc.get_samples(group_by_chain=True).items()}
-            return draws, int(mcmc.get_extra_fields()["diverging"].sum())
+        mcmc.run(jax.random.key(seed), *data)
+        draws = {n: np.asarray(v) for n, v in mcmc.get_samples(group_by_chain=True).items()}
+        return draws, int(mcmc.get_extra_fields()["diverging"].sum())
 
     sample(10_000)
     return sample
