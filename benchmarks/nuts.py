@@ -7,7 +7,7 @@ number of missions, the default model is fitted by NUTS with all seeds in one pr
 shows the fits that the diagnostics of `fit` refuse; the worst R-hat, the least ESS and the number
 of divergences of all fits; the CPU time of the first fit, which compiles, and the median of later
 fits; and the CPU time per effective draw. The last column is the largest difference between the
-posterior means of all chains and those of importance sampling with four times as many points as
+posterior means of all chains and those of importance sampling with eight times as many points as
 usual, in units of its Monte Carlo standard error.
 """
 
