@@ -20,14 +20,20 @@ from typing import Self
 import xarray as xr
 
 from trustbo.campaign.lock import FolderLock
-from trustbo.campaign.record import RECORD, record_to_bytes
+from trustbo.campaign.record import (
+    RECORD,
+    WORKSPACE,
+    mission_file,
+    posterior_file,
+    record_to_bytes,
+)
 from trustbo.campaign.replace import (
     commit_replacement,
-    discard_remains,
     finish_replacement,
     is_being_replaced,
     new_folder,
     recorded_files,
+    recover,
     remove_tree,
 )
 from trustbo.campaign.state import Entry, Posterior, State, StoredFile
@@ -45,10 +51,6 @@ from trustbo.logs.netcdf import missions_to_tree, read_tree, tree_from_bytes, tr
 from trustbo.planning.plan import plan_to_record
 from trustbo.workspace import Workspace
 from trustbo.workspace.netcdf import workspace_to_tree
-
-WORKSPACE = "workspace.nc"
-MISSIONS = "missions"
-POSTERIORS = "posteriors"
 
 
 class FolderStorage:
@@ -102,8 +104,7 @@ class FolderStorage:
         _make_folder(path)
         lock = FolderLock(path, take_over=take_over)
         try:
-            finish_replacement(lock.path)
-            discard_remains(lock.path)
+            recover(lock.path)
             if not overwrite:
                 _require_no_campaign(path)
             if (lock.path / RECORD).exists():
@@ -131,7 +132,7 @@ class FolderStorage:
     def add_mission(self, n: int, entry: Entry) -> None:
         """Write the measurements, plan and table row of mission n."""
         self.require_open()
-        name = f"{MISSIONS}/{n:04d}.nc"
+        name = mission_file(n)
         if (self.path / name).exists():
             raise TrustboError(
                 f"{str(self.path / name)!r} exists, but is not a mission of this campaign; move it "
@@ -147,7 +148,7 @@ class FolderStorage:
             if posterior is None or posterior.tree is None:
                 continue
             if posterior.file is None:
-                name = f"{POSTERIORS}/{posterior.name}.nc"
+                name = posterior_file(posterior.name)
                 posterior.file = self._write(name, tree_to_bytes(posterior.tree))
             if posterior is not state.last:
                 posterior.tree = None  # frees the memory
@@ -191,11 +192,11 @@ def _contents(workspace: Workspace, state: State) -> Iterator[tuple[str, bytes]]
     yield WORKSPACE, tree_to_bytes(workspace_to_tree(workspace))
     posteriors = {}
     for n, entry in enumerate(state.entries, start=1):
-        yield f"{MISSIONS}/{n:04d}.nc", tree_to_bytes(_entry_to_tree(entry))
+        yield mission_file(n), tree_to_bytes(_entry_to_tree(entry))
         if entry.posterior is not None:
             posteriors[entry.posterior.name] = entry.posterior
     for name, posterior in posteriors.items():
-        yield f"{POSTERIORS}/{name}.nc", _content_of(posterior)
+        yield posterior_file(name), _content_of(posterior)
 
 
 def _content_of(posterior: Posterior) -> bytes:

@@ -3,11 +3,18 @@
 import json
 from pathlib import Path
 
-from trustbo.campaign.folder import MISSIONS, POSTERIORS, WORKSPACE
 from trustbo.campaign.learning import as_learned
 from trustbo.campaign.lock import FolderLock
-from trustbo.campaign.record import RECORD, record_from_bytes, state_from_record
-from trustbo.campaign.replace import discard_remains, finish_replacement, is_being_replaced
+from trustbo.campaign.record import (
+    MISSIONS,
+    RECORD,
+    WORKSPACE,
+    mission_file,
+    posterior_file,
+    record_from_bytes,
+    state_from_record,
+)
+from trustbo.campaign.replace import is_being_replaced, recover
 from trustbo.campaign.state import Entry, Posterior, State, StoredFile
 from trustbo.errors import TrustboError
 from trustbo.files import FilePath, interpreting, read_file, to_path
@@ -28,8 +35,7 @@ def lock_campaign(directory: FilePath) -> FolderLock:
     path = require_campaign(directory)
     lock = FolderLock(path, take_over=True)
     try:
-        finish_replacement(lock.path)
-        discard_remains(lock.path)
+        recover(lock.path)
     except BaseException:
         lock.release()
         raise
@@ -60,7 +66,7 @@ def read_campaign(
         names = [None if name is None else str(name) for name in record["posteriors"]]
         stored = {
             name: Posterior(
-                name, file=StoredFile(folder / POSTERIORS / f"{name}.nc", _hash(files, name))
+                name, file=StoredFile(folder / posterior_file(name), files[posterior_file(name)])
             )
             for name in names
             if name is not None
@@ -78,10 +84,6 @@ def read_campaign(
     return state, workspace, entries[len(rows) :], files
 
 
-def _hash(files: dict[str, str], posterior: str) -> str:
-    return files[f"{POSTERIORS}/{posterior}.nc"]
-
-
 def _read_entries(
     folder: Path, workspace: Workspace, files: dict[str, str], n_rows: int
 ) -> list[Entry]:
@@ -93,7 +95,7 @@ def _read_entries(
     n_last = int(there[-1].stem) if there else 0
     entries = []
     for n in range(1, max(n_rows, n_last) + 1):
-        name = f"{MISSIONS}/{n:04d}.nc"
+        name = mission_file(n)
         file = folder / name
         if not file.exists() and n > n_rows:
             raise TrustboError(

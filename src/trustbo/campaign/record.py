@@ -14,6 +14,19 @@ from trustbo.planning.plan import plan_from_record, plan_to_record
 from trustbo.workspace import Workspace
 
 RECORD = "campaign.json"
+WORKSPACE = "workspace.nc"
+MISSIONS = "missions"
+POSTERIORS = "posteriors"
+
+
+def mission_file(n: int) -> str:
+    """Return the path of mission n, counted from 1, in the folder of its campaign."""
+    return f"{MISSIONS}/{n:04d}.nc"
+
+
+def posterior_file(name: str) -> str:
+    """Return the path of a posterior in the folder of its campaign."""
+    return f"{POSTERIORS}/{name}.nc"
 
 
 def record_to_bytes(state: State, files: Mapping[str, str]) -> bytes:

@@ -13,7 +13,13 @@ import shutil
 from collections.abc import Iterable
 from pathlib import Path
 
-from trustbo.campaign.record import RECORD, record_from_bytes
+from trustbo.campaign.record import (
+    MISSIONS,
+    POSTERIORS,
+    RECORD,
+    mission_file,
+    record_from_bytes,
+)
 from trustbo.errors import TrustboError
 from trustbo.files import TEMPORARY, interpreting, read_file, sync_folder, to_json, write_text
 
@@ -43,7 +49,7 @@ def recorded_files(folder: Path) -> list[str]:
     with interpreting(folder / RECORD):
         names = [str(name) for name in record["files"]]
         n_missions = len(record["rows"])
-    while (folder / (name := f"missions/{n_missions + 1:04d}.nc")).exists():
+    while (folder / (name := mission_file(n_missions + 1))).exists():
         names.append(name)
         n_missions += 1
     names.append(RECORD)
@@ -118,14 +124,12 @@ def finish_replacement(folder: Path) -> None:
     remove_tree(beside)
 
 
-def discard_remains(folder: Path) -> None:
-    """Delete what processes that died have left: incomplete campaigns and temporary files.
-
-    Call `finish_replacement` first.
-    """
+def recover(folder: Path) -> None:
+    """Finish or discard what processes that died have left in a folder that is locked."""
+    finish_replacement(folder)
     for path in (*folder.glob(f"{_NEW}*"), folder / _NEXT):
         remove_tree(path)
-    for place in (folder, folder / "missions", folder / "posteriors"):
+    for place in (folder, folder / MISSIONS, folder / POSTERIORS):
         for path in place.glob(f"{TEMPORARY}*"):
             path.unlink(missing_ok=True)
 
