@@ -8,8 +8,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 from sklearn.decomposition import PCA
 
-from trustbo.errors import TrustboError, require_kind
-from trustbo.terrain.heights import warn
+from trustbo.errors import TrustboError, require_kind, warn
 
 MAX_PIXELS = 1_000_000
 """Maximum number of samples used to fit an index, spread evenly over the given ones."""

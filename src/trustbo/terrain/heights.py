@@ -1,16 +1,14 @@
 """Conversion of stored raster values to heights in metres, NaN where missing."""
 
 import re
-import warnings
 from collections.abc import Mapping
 from numbers import Real
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
-from trustbo.errors import TrustboError, require_kind
+from trustbo.errors import TrustboError, require_kind, warn
 
 LOWEST, HIGHEST = -450.0, 9000.0
 """Range of heights on land, m: the Dead Sea's shore is at -430 m, Everest's summit at 8849 m."""
@@ -22,12 +20,6 @@ _LOW = 10.0  # m; heights on one level with zeros
 _METRE = {"m", "metre", "metres", "meter", "meters"}
 _FOOT = {"ft", "foot", "feet", "ftus", "usft"}
 _US = {"us", "survey", "ftus", "usft"}
-_PACKAGE = str(Path(__file__).parents[1])
-
-
-def warn(message: str) -> None:
-    """Issue a warning that points to the caller of the package."""
-    warnings.warn(message, skip_file_prefixes=(_PACKAGE,), stacklevel=2)
 
 
 def in_metres(stored: xr.DataArray, axis: float | None, nodata: float | None) -> np.ndarray:

@@ -19,9 +19,9 @@ from rasterio.errors import NotGeoreferencedWarning, RasterioError
 from rasterio.io import DatasetReader
 from rioxarray.exceptions import MissingSpatialDimensionError
 
-from trustbo.errors import TrustboError, require_kind, require_positive
+from trustbo.errors import TrustboError, require_kind, require_positive, warn
 from trustbo.files import FilePath
-from trustbo.terrain.heights import ACCESSOR_FILL, in_metres, warn
+from trustbo.terrain.heights import ACCESSOR_FILL, in_metres
 from trustbo.terrain.place import (
     horizontal,
     on_metric_grid,
