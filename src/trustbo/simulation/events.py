@@ -16,9 +16,9 @@ from trustbo.arrays import as_array
 from trustbo.errors import (
     TrustboError,
     require_choice,
-    require_finite,
     require_position,
     require_positive,
+    require_share,
     require_whole,
 )
 from trustbo.simulation.world import World
@@ -42,8 +42,7 @@ class Event:
 
     def __post_init__(self) -> None:
         for name in self.SHARES:
-            if not 0.0 <= require_finite(name, getattr(self, name)) <= 1.0:
-                raise TrustboError(f"{name} must be in [0, 1]; got {getattr(self, name)!r}.")
+            require_share(name, getattr(self, name))
         require_whole("first", self.first, 0)
         if self.last is not None:
             require_whole("last", self.last, self.first)

@@ -7,7 +7,6 @@ programming over bounds and the number of remaining bounds.
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
@@ -16,7 +15,7 @@ import xarray as xr
 from trustbo.data import Cell
 from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError, require_count, require_whole
-from trustbo.files import FilePath, to_json, write_file
+from trustbo.files import FilePath, to_json, to_path, write_file
 from trustbo.models.backend import VERSIONS
 from trustbo.planning.paths import AdmissiblePaths
 from trustbo.simulation.model import ModelSimulator
@@ -188,7 +187,7 @@ def _cached(folder: FilePath | None, world: str, make: Callable[[], xr.Dataset])
     """Read the table of a world's bounds from the cache, or compute and store the table."""
     if folder is None:
         return make()
-    file = Path(folder).expanduser() / f"truth-{digest(np.frombuffer(world.encode(), np.uint8))}.nc"
+    file = to_path(folder) / f"truth-{digest(np.frombuffer(world.encode(), np.uint8))}.nc"
     if not file.exists():
         write_file(file, make().to_netcdf)
     return xr.load_dataset(file)
