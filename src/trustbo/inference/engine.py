@@ -24,10 +24,10 @@ from trustbo.inference.factor import (
     Factor,
     Order,
     add,
+    add_products,
     cholesky,
     log_det,
     log_diagonal,
-    put,
     times,
 )
 from trustbo.models.backend import namespace
@@ -211,8 +211,7 @@ def evidence(blocks: Blocks, signal: Signal, prior: Prior, lam: Any, y: Any = No
     h = times(b.U.T, back.reshape(n, -1))
     h = xp.concatenate([h, xp.zeros((n, b.order.hidden.size))], axis=1)
     pairs = (xp.swapaxes(C, 2, 3) @ C)[:, :, *np.triu_indices(C.shape[3])]
-    products = times(b.sums, pairs.reshape(n, -1))
-    A = put(xp.zeros((n, b.order.size)), (slice(None), b.at), products)
+    A = add_products(xp.zeros((n, b.order.size)), b.at, b.sums, pairs.reshape(n, -1))
     A = prior.add_to(A, b.order)
     many = np.bincount(b.kind, minlength=len(b.seen)).astype(float)
     log_p = log_sites @ many + 0.5 * (prior.log_det - (w**2).sum((1, 2)))

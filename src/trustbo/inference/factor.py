@@ -24,6 +24,7 @@ import numpy as np
 from scipy import sparse
 from scipy.linalg import lapack
 
+from trustbo.kernels import kernel
 from trustbo.models.backend import inverse_and_log_det, inverse_from_factor, namespace
 
 _CHAIN_BLOCK = 30  # columns of a chain that are eliminated at once
@@ -132,8 +133,8 @@ class Factor(NamedTuple):
         padding = (order.leaf == len(order.place))[..., None] * np.eye(order.leaf.shape[1])
         inverse = inverse_of_lower(cholesky(D + padding))
         X = inverse @ B
-        squares = times(order.pairs, (xp.swapaxes(X, 2, 3) @ X).reshape(len(A), -1))
-        C = add(C.reshape(len(A), -1), (slice(None), order.pair), -squares).reshape(C.shape)
+        squares = (xp.swapaxes(X, 2, 3) @ X).reshape(len(A), -1)
+        C = add_products(C.reshape(len(A), -1), order.pair, order.pairs, -squares).reshape(C.shape)
         H = chain_factor(C, *order.hidden.shape) if order.hidden.size else upper_factor(C)
         return cls(order, inverse, X, H)
 
@@ -163,8 +164,9 @@ class Factor(NamedTuple):
         core = solve_upper(self.H, white[..., split:], transposed=False)
         leaf = white[..., :split].reshape(*white.shape[:2], *order.leaf.shape)
         padded = xp.concatenate([core, xp.zeros((*core.shape[:2], 1))], axis=2)
-        leaf = leaf - xp.einsum("ngkt,ndgt->ndgk", self.X, padded[..., order.touched])
-        leaf = xp.einsum("ngjk,ndgj->ndgk", self.inverse, leaf)
+        touched = xp.moveaxis(padded[..., order.touched], 1, 3)  # (point, mission, touched, draw)
+        leaf = xp.moveaxis(leaf, 1, 3) - self.X @ touched
+        leaf = xp.moveaxis(xp.swapaxes(self.inverse, 2, 3) @ leaf, 3, 1)
         found = xp.concatenate([leaf.reshape(*leaf.shape[:2], split), core], axis=2)
         group = np.where(order.group < 0, len(order.leaf), order.group)
         return found[..., group * order.leaf.shape[1] + order.place]
@@ -223,19 +225,44 @@ def times(M: Any, x: Any) -> Any:
     return jax.ops.segment_sum(terms, M.row[order], M.shape[0], indices_are_sorted=True).T
 
 
+def add_products(A: Any, at: np.ndarray, M: Any, x: Any) -> Any:
+    """Add M x to the entries `at` of vectors A (point, entry), in place in NumPy.
+
+    Args:
+        A: Vectors (point, entry), contiguous in NumPy.
+        at: Different indices (row,) of entries.
+        M: Sparse matrix (row, column).
+        x: Vectors (point, column).
+    """
+    if not isinstance(A, np.ndarray):
+        return A.at[:, at].add(times(M, x))
+    _add_products(A, at, M.indptr, M.indices, M.data, np.ascontiguousarray(x))
+    return A
+
+
+@kernel(fastmath={"contract"})
+def _add_products(
+    A: np.ndarray,
+    at: np.ndarray,
+    ends: np.ndarray,
+    column: np.ndarray,
+    value: np.ndarray,
+    x: np.ndarray,
+) -> None:
+    """Add products of a sparse matrix, given by its arrays, and x (point, column)."""
+    for point in range(len(A)):
+        for row in range(len(at)):
+            total = 0.0
+            for i in range(ends[row], ends[row + 1]):
+                total += value[i] * x[point, column[i]]
+            A[point, at[row]] += total
+
+
 def add(A: Any, at: Any, values: Any) -> Any:
     """Add values to an array at an index, in place in NumPy and to a copy in JAX."""
     if not isinstance(A, np.ndarray):
         return A.at[at].add(values)
     A[at] += values
-    return A
-
-
-def put(A: Any, at: Any, values: Any) -> Any:
-    """Set values of an array at an index, in place in NumPy and in a copy in JAX."""
-    if not isinstance(A, np.ndarray):
-        return A.at[at].set(values)
-    A[at] = values
     return A
 
 

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from trustbo.inference.engine import Blocks, Prior
-from trustbo.inference.factor import Factor, add, times
+from trustbo.inference.factor import Factor, add_products, times
 from trustbo.models.backend import inverse_and_log_det
 from trustbo.models.signal import Signal, each
 
@@ -86,9 +86,7 @@ def _of_data(blocks: Blocks) -> Callable[..., jax.Array]:
         h = times(b.U.T, (T_of.mT @ weighted[..., None])[..., 0].reshape(len(A), -1))
         h = jnp.concatenate([h, jnp.zeros((len(A), b.order.hidden.size))], axis=1)
         pairs = (T.mT @ PT)[:, :, *np.triu_indices(T.shape[3])]
-        F = Factor.of(
-            b.order, add(A, (slice(None), b.at), times(b.sums, pairs.reshape(len(A), -1)))
-        )
+        F = Factor.of(b.order, add_products(A, b.at, b.sums, pairs.reshape(len(A), -1)))
         half = F.forward(h)
 
         of_rates = log_det + np.log(2.0 * np.pi) * b.seen.sum(1)

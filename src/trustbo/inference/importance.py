@@ -138,7 +138,8 @@ def two_piece(
         for side, sign in enumerate((-1.0, 1.0)):
             own = weight @ np.maximum(sign * (x - shift), 0.0) ** 2
             a = sign * shift
-            standard = (1.0 + a**2) * special.ndtr(-a) - a * stats.norm.pdf(a)
+            density = np.exp(-0.5 * a**2) / np.sqrt(2.0 * np.pi)
+            standard = (1.0 + a**2) * special.ndtr(-a) - a * density
             roots[k, side] = np.cbrt((own + n_standard * standard) / (1.0 + n_standard))
 
     best = roots.sum(1).argmin(0)

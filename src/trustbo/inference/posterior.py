@@ -18,8 +18,8 @@ from trustbo.models.scores import Scores
 from trustbo.models.signal import Signal, each
 from trustbo.models.slots import Slots
 
-_CHUNK = 16  # largest number of points evaluated at once
-_NUMBERS = 6_000_000  # largest number of precision entries of the points evaluated at once
+_CHUNK = 32  # largest number of points evaluated at once
+_NUMBERS = 5_000_000  # largest number of precision entries of the points evaluated at once
 _CHAINED = 100  # missions from which lasting effects are eliminated as chains
 _FEW = 15  # missions with which the search for the mode begins
 _SIZES = (0.3, 1.0, 1.8, 2.6)  # log ratios of the sd of rates to the noises at each start

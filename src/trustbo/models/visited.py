@@ -20,6 +20,7 @@ class Visited(NamedTuple):
     bounds: np.ndarray  # (bound, 3): move, row, col
     cell_of: np.ndarray  # (bound,), index of the cell entered
     at: np.ndarray  # (mission, bound), index of the visited bound, -1 in the padding
+    square: np.ndarray  # (cell, cell), squared distances, which are whole numbers
 
     def first(self, n: int) -> "Visited":
         """Return the places that the first n missions visited."""
@@ -84,4 +85,5 @@ def visited(bounds: np.ndarray, shape: tuple[int, int] | None = None) -> Visited
     cells, cell_of = np.unique(found[:, 1:], axis=0, return_inverse=True)
     at = np.full(there.shape, -1)
     at[there] = index_of.ravel()
-    return Visited(shape, cells, found, cell_of.ravel(), at)
+    square = ((cells[:, None] - cells) ** 2).sum(-1)
+    return Visited(shape, cells, found, cell_of.ravel(), at, square)

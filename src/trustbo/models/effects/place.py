@@ -81,17 +81,17 @@ class PlaceEffect(Effect):
         places: Any = slots.visited
         of_bound = xp.maximum(theta["tau_e"], LEAST) ** -2.0
         of_bounds = xp.repeat(of_bound[:, None], len(places.bounds), axis=1)
-        return None, [self._cells(theta, places.cells), of_bounds]
+        return None, [self._cells(theta, places.square), of_bounds]
 
-    def _cells(self, theta: Theta, cells: np.ndarray) -> Any:
-        """Compute the precision (point, cell, cell) of s at cells (cell, 2)."""
+    def _cells(self, theta: Theta, square: np.ndarray) -> Any:
+        """Compute the precision (point, cell, cell) of s from squared distances (cell, cell)."""
         xp: Any = namespace(theta["tau_s"])
-        square = ((cells[:, None] - cells) ** 2).sum(-1)  # a whole number with few values
+        # Squared distances have few different values, for which the correlation is computed once.
         distance = np.sqrt(np.arange(square.max(initial=0) + 1.0))
         scale = xp.clip(theta["length_scale"], *_LENGTH_SCALES)
         K = matern(distance, scale[:, None])[:, square]
         tau = xp.maximum(theta["tau_s"], LEAST)[:, None, None]
-        return inverse(tau**2 * (K + _JITTER * np.eye(len(cells))))
+        return inverse(tau**2 * (K + _JITTER * np.eye(len(square))))
 
     def named(self, c: np.ndarray, theta: Theta, slots: Slots) -> Values:
         """Return the effects `place` (draw, cell) and `place_bound` (draw, bound)."""
