@@ -18,22 +18,21 @@ from typing import Any, NamedTuple, Self
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpyro.distributions import HalfNormal
 from numpyro.infer import MCMC, NUTS, init_to_value
 from numpyro.infer.util import ParamInfo
-from scipy import optimize, special
+from scipy import optimize
 
 from trustbo.inference import importance
 from trustbo.inference.diagnostics import complaints_of
 from trustbo.inference.posterior import Draws, Posterior
-from trustbo.models.backend import namespace, own_settings, special_functions
+from trustbo.models.backend import namespace, own_settings
 from trustbo.streams import stream
 
 _POINTS = 2000  # resampled points to which the coordinates are fitted
 _WARMUP = {True: 150, False: 300}
 """Warm-up draws that tune only a step size, and those that also tune a mass matrix."""
-_ACCEPT = 0.95  # target of the acceptance probability; lower ones diverge now and then
-_DEPTH = 4  # most doublings of a trajectory, after which it has 15 steps
+_ACCEPT = 0.9  # target of the acceptance probability; lower ones diverge now and then
+_DEPTH = 3  # most doublings of a trajectory, after which it has 7 steps
 _FIRST_STEP = 0.4  # step size at which warm-up starts, in sds
 _RIDGE = 1e-6  # added to the covariance of the points
 _SHRINK = 0.01  # penalty of the shape of a marginal, in nats per point
@@ -51,11 +50,9 @@ _FIELDS = {
 class Whitened(NamedTuple):
     """Coordinates in which points are nearly independent and standard normal.
 
-    Scores of two standard deviations of one effect, of which the data determine the sum of squares
-    best, are first replaced by polar coordinates; see `polar`. A coordinate is then
-    location + scale sinh((arcsinh(y) + skew) / weight), where y = center + root x. The transform of
-    Jones and Pewsey (2009, Biometrika 96) makes skewed marginals, with light or heavy tails,
-    normal; the coordinates x have no correlations.
+    A score is location + scale sinh((arcsinh(y) + skew) / weight), where y = center + root x. The
+    transform of Jones and Pewsey (2009, Biometrika 96) makes skewed marginals, with light or heavy
+    tails, normal; the coordinates x have no correlations.
     """
 
     location: np.ndarray  # (score,)
@@ -64,25 +61,22 @@ class Whitened(NamedTuple):
     weight: np.ndarray
     center: np.ndarray
     root: np.ndarray  # (score, score), lower triangular
-    pairs: tuple[tuple[int, int], ...] = ()
-    """Pairs of scores that are replaced by polar coordinates."""
 
     @classmethod
-    def of(cls, z: np.ndarray, pairs: tuple[tuple[int, int], ...] = ()) -> Self:
+    def of(cls, z: np.ndarray) -> Self:
         """Fit the coordinates to scores z (point, score) by maximum likelihood."""
-        by_pairs = polar(z, pairs)
-        shapes = [_marginal(one) for one in by_pairs.T]
+        shapes = [_marginal(one) for one in z.T]
         location, log_scale, skew, log_weight = np.transpose(shapes)
         marginals = location, np.exp(log_scale), skew, np.exp(log_weight)
 
         d = z.shape[1]
-        y = cls(*marginals, np.zeros(d), np.eye(d), pairs).whiten(z)
+        y = cls(*marginals, np.zeros(d), np.eye(d)).whiten(z)
         covariance = np.cov(y.T).reshape(d, d) + _RIDGE * np.eye(d)
-        return cls(*marginals, y.mean(0), np.linalg.cholesky(covariance), pairs)
+        return cls(*marginals, y.mean(0), np.linalg.cholesky(covariance))
 
     def whiten(self, z: np.ndarray) -> np.ndarray:
         """Convert scores z (point, score) to coordinates x (point, score)."""
-        u = (polar(z, self.pairs) - self.location) / self.scale
+        u = (z - self.location) / self.scale
         t = self.weight * np.arcsinh(u) - self.skew
         return np.linalg.solve(self.root, (np.sinh(t) - self.center).T).T
 
@@ -94,55 +88,8 @@ class Whitened(NamedTuple):
         xp = namespace(x)
         y = self.center + x @ self.root.T
         t = (xp.arcsinh(y) + self.skew) / self.weight
-        z, log_jacobian = from_polar(self.location + self.scale * xp.sinh(t), self.pairs)
-        return z, log_jacobian + (xp.log(xp.cosh(t)) - 0.5 * xp.log1p(y**2)).sum(-1)
-
-
-def polar(z: np.ndarray, pairs: tuple[tuple[int, int], ...]) -> np.ndarray:
-    """Replace pairs of scores z (point, score) by a log size and the normal score of an angle.
-
-    With half-normal scores (a, b) = size (sin(angle), cos(angle)), as for the noises in `Scores`.
-    """
-    z = z.copy()
-    for i, j in pairs:
-        a, b = (_half_normal(z[:, k]) for k in (i, j))
-        z[:, i] = np.log(np.hypot(a, b))
-        z[:, j] = special.ndtri(2.0 / np.pi * np.arctan2(a, b))
-    return z
-
-
-def from_polar(u: Any, pairs: tuple[tuple[int, int], ...]) -> tuple[Any, Any]:
-    """Invert `polar`, in NumPy or JAX; also return log determinants (point,) up to a constant."""
-    xp, library = namespace(u), special_functions(u)
-    columns = [u[:, k] for k in range(u.shape[1])]
-    log_jacobian = xp.zeros(len(u))
-    for i, j in pairs:
-        log_size, angle = columns[i], columns[j]
-        a, b = (
-            xp.exp(log_size) * xp.sin(0.5 * np.pi * library.ndtr(side * angle)) for side in (1, -1)
-        )
-        columns[i], columns[j] = (_normal(one) for one in (a, b))
-
-        # A half-normal score a has the derivative 2 phi(a) / phi(z) with respect to its score z.
-        of_scores = columns[i] ** 2 + columns[j] ** 2 - a**2 - b**2
-        log_jacobian = log_jacobian + 2.0 * log_size + 0.5 * (of_scores - angle**2)
-    return xp.stack(columns, axis=1), log_jacobian
-
-
-def _half_normal(z: np.ndarray) -> np.ndarray:
-    """Return the half-normal score with the same probability as a normal score z."""
-    low = special.erfinv(special.ndtr(np.minimum(z, 0.0)))
-    high = special.erfcinv(special.ndtr(-np.maximum(z, 0.0)))
-    return np.sqrt(2.0) * np.where(z < 0.0, low, high)
-
-
-def _normal(a: Any) -> Any:
-    """Return the normal score with the same probability as a half-normal score a."""
-    xp, library = namespace(a), special_functions(a)
-    x = a / np.sqrt(2.0)
-    low = library.ndtri(library.erf(xp.minimum(x, 0.5)))
-    high = -library.ndtri(library.erfc(xp.maximum(x, 0.5)))
-    return xp.where(x < 0.5, low, high)
+        log_jacobian = (xp.log(xp.cosh(t)) - 0.5 * xp.log1p(y**2)).sum(-1)
+        return self.location + self.scale * xp.sinh(t), log_jacobian
 
 
 def _marginal(z: np.ndarray) -> np.ndarray:
@@ -190,7 +137,7 @@ def sample_by_nuts(
         posterior.log_density, posterior.start()[None], rng, defensive=posterior.defensive
     )
     z = points.z[points.resample(_POINTS, rng)]
-    coordinates = Whitened.of(z, _pairs(posterior))
+    coordinates = Whitened.of(z)
     with own_settings():
         if posterior.exact:
             kernel = _marginal_kernel(posterior, coordinates)
@@ -222,18 +169,6 @@ def sample_by_nuts(
     by_chain = {name: v.reshape(chains, draws, *v.shape[1:]) for name, v in values.items()}
     found, complaints = complaints_of(by_chain, stats["diverging"])
     return drawn, stats, found, complaints
-
-
-def _pairs(posterior: Posterior) -> tuple[tuple[int, int], ...]:
-    """Return the indices of the scores of effects that have two standard deviations."""
-    pairs = []
-    for effect in posterior.model.effects:
-        priors = effect.hyperpriors()
-        spreads = [name for name in effect.names if isinstance(priors[name], HalfNormal)]
-        if len(spreads) == 2:
-            first, second = (int(posterior.scores.at[name].start) for name in spreads)
-            pairs.append((first, second))
-    return tuple(pairs)
 
 
 def _marginal_kernel(posterior: Posterior, coordinates: Whitened) -> NUTS:

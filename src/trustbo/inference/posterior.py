@@ -14,7 +14,6 @@ from trustbo.inference.importance import Student, climb
 from trustbo.models.backend import namespace
 from trustbo.models.effects.effect import Theta
 from trustbo.models.model import TrustModel
-from trustbo.models.scores import Scores
 from trustbo.models.signal import Signal, each
 from trustbo.models.slots import Slots
 
@@ -87,7 +86,7 @@ class Posterior:
         self.model, self.slots = model, slots
         self.evaluated: Callable[[int], object] = lambda n: None  # called with numbers of points
         self.layout = model.layout(slots)
-        self.scores = Scores(model.all_hyperpriors(slots))
+        self.scores = model.scores(slots)
         self.n_scores = self.scores.n_scores
         columns = [effect.columns(slots) for effect in model.columns]
         self._ends = np.cumsum([0, *(U.shape[1] for U in columns)])
@@ -155,7 +154,7 @@ class Posterior:
     def _possible(self, z: np.ndarray) -> tuple[dict[str, Any], np.ndarray]:
         """Return the hyperparameters and the indices of scores whose density may be positive."""
         theta, log_prior = self.theta(z), self.scores.log_prior(z)
-        size = np.exp(z[:, self.scores.sizes])
+        size = np.exp(z[:, self.scores.noises])
         flat = [np.asarray(values).reshape(len(z), -1) for values in theta.values()]
 
         possible = np.isfinite(np.column_stack([*flat, log_prior])).all(1)
@@ -205,12 +204,12 @@ class Posterior:
         starts = np.zeros((len(_SIZES), self.n_scores))
         unit = self.model.family.line_of_sight[0]
         spread = np.log(np.clip(unit * np.nanstd(self.slots.y) / 0.2, 1e-2, 3.0))
-        starts[:, self.scores.sizes] = spread - np.array(_SIZES)[:, None]
+        starts[:, self.scores.noises] = spread - np.array(_SIZES)[:, None]
         self.settle(self.theta(starts[1:2]))
         return starts[self.log_density(starts).argmax()]
 
     def defensive(self, proposal: Student) -> Student:
-        """Make a wider proposal for beta0 and the noises; other scores stay near the prior."""
+        """Make a wider proposal for beta0, noises and sizes; other scores stay near the prior."""
         core = self.scores.core
         others = np.setdiff1d(np.arange(self.n_scores), core)
         cov = 1.5 * proposal.scale @ proposal.scale.T

@@ -20,6 +20,7 @@ from trustbo.models.effects.effect import Effect, Theta, sample_columns
 from trustbo.models.effects.weights import Weights
 from trustbo.models.families import FAMILIES, Family
 from trustbo.models.priors import Priors
+from trustbo.models.scores import Scores
 from trustbo.models.signal import Layout, Signal
 from trustbo.models.slots import Slots, require_ticks
 from trustbo.stacking import stack_missions
@@ -128,6 +129,11 @@ class TrustModel(Summary, ABC):
         """Return the priors on all hyperparameters by name, with those of effects last."""
         priors = self.hyperpriors(slots.n_robots, slots.z.shape[3])
         return priors | {n: p for e in self.effects for n, p in e.hyperpriors().items()}
+
+    def scores(self, slots: Slots) -> Scores:
+        """Return the normal scores of all hyperparameters."""
+        pairs = [pair for effect in self.effects for pair in effect.pairs]
+        return Scores(self.all_hyperpriors(slots), pairs)
 
     def theta(self, values: Mapping[str, Any], resolution: float) -> dict[str, Any]:
         """Convert hyperparameters, named as in `all_hyperpriors`, to the `theta` of `signal`.

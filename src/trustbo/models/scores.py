@@ -1,11 +1,13 @@
 """Normal scores of hyperparameters, which are the coordinates that the samplers use.
 
-A score is standard normal a priori, except for the two noises. The noises have half-normal scores
-(a_w, a_v) = size (sin(angle), cos(angle)), and the coordinates are log size and a normal score of
-the angle. The data usually determine the size well, but often not the angle.
+A score is standard normal a priori, except for pairs of standard deviations that add to the same
+variance, such as the two noises. Their half-normal scores are (a, b) = size (sin(angle),
+cos(angle)), and the coordinates are log size and a normal score of the angle. The data usually
+determine the size well, but often not the angle. In these coordinates, a standard deviation that
+may be 0 has a light tail, like the prior; its own score would have a long one.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -28,9 +30,18 @@ _FARTHEST, _N_KNOTS = 9.0, 2001  # largest score and number of knots of quantile
 class Scores:
     """Conversion between scores (point, score) and hyperparameters with independent priors."""
 
-    def __init__(self, priors: Mapping[str, Distribution]) -> None:
-        """Set the scalar or vector priors by name; scores have the same order as the priors."""
+    def __init__(
+        self, priors: Mapping[str, Distribution], pairs: Sequence[tuple[str, str]] = ()
+    ) -> None:
+        """Set the priors; scores have the same order.
+
+        Args:
+            priors: Scalar or vector priors by name, which include the two noises.
+            pairs: Names of pairs of standard deviations, besides the noises, that have a common
+                size.
+        """
         self.priors = dict(priors)
+        self.pairs = (NOISES, *pairs)
         sizes = {name: int(np.prod(prior.batch_shape)) for name, prior in priors.items()}
         ends = np.cumsum([0, *sizes.values()])
         self.at = {n: slice(a, b) for n, a, b in zip(sizes, ends[:-1], ends[1:], strict=True)}
@@ -40,14 +51,23 @@ class Scores:
 
     @property
     def core(self) -> np.ndarray:
-        """Indices of the scores of beta0 and the noises, which the data determine best."""
-        names = ("beta0", *NOISES)
-        return np.concatenate([np.arange(self.n_scores)[self.at[n]] for n in names if n in self.at])
+        """Indices of beta0, the noises and all log sizes, which the data determine best."""
+        names = {"beta0", *NOISES, *(first for first, _ in self.pairs)}
+        return self._indices([name for name in self.at if name in names])
 
     @property
-    def sizes(self) -> slice:
+    def noises(self) -> slice:
         """Slice of the scores that are the log sizes of the noises."""
         return self.at[NOISES[0]]
+
+    @cached_property
+    def sizes(self) -> np.ndarray:
+        """Indices of the scores that are log sizes."""
+        return self._indices([first for first, _ in self.pairs])
+
+    def _indices(self, names: Sequence[str]) -> np.ndarray:
+        """Return the indices of the scores of some hyperparameters."""
+        return np.concatenate([np.arange(self.n_scores)[self.at[name]] for name in names])
 
     @cached_property
     def terms(self) -> np.ndarray:
@@ -63,14 +83,18 @@ class Scores:
     def values(self, z: Any) -> dict[str, Any]:
         """Convert scores (point, score) to hyperparameters (point,) or (point, k) by name."""
         xp = namespace(z)
-        size, angle = xp.exp(z[:, self.at["delta_w"]]), z[:, self.at["delta_v"]]
+        half_normal = {}
+        for first, second in self.pairs:
+            size, angle = xp.exp(z[:, self.at[first]]), z[:, self.at[second]]
+            for name, side in (first, 1.0), (second, -1.0):  # sines are accurate near 0
+                share = 0.5 * np.pi * special_functions(z).ndtr(side * angle)
+                half_normal[name] = size * xp.sin(share)
+
         others = None if xp is np else _interpolated(self.terms, z)
         found = {}
         for name, prior in self.priors.items():
-            if name in NOISES:
-                side = 1.0 if name == "delta_w" else -1.0
-                share = xp.sin(0.5 * np.pi * special_functions(z).ndtr(side * angle))
-                values = of_size(prior, size * share, name)
+            if name in half_normal:
+                values = of_half_normal(prior, half_normal[name], name)
             elif others is None:
                 values = quantile(prior, z[:, self.at[name]], name)
             else:
@@ -136,14 +160,14 @@ def _interpolated(terms: np.ndarray, score: jax.Array) -> jax.Array:
     return ((a * x + b) * x + c) * x + d
 
 
-def of_size(prior: Distribution, size: Any, name: str) -> Any:
-    """Compute the quantile of a prior at the probability P(|N(0, 1)| < size)."""
+def of_half_normal(prior: Distribution, score: Any, name: str) -> Any:
+    """Compute the quantile of a prior at the probability P(|N(0, 1)| < score)."""
     prior = _base(prior)
     if isinstance(prior, dist.HalfNormal):
-        return np.asarray(prior.scale) * size
-    if namespace(size) is not np:
-        return prior.icdf(jax.scipy.special.erf(size / np.sqrt(2.0)))
-    return _by_numpyro(prior, special.erf(size / np.sqrt(2.0)), name)
+        return np.asarray(prior.scale) * score
+    if namespace(score) is not np:
+        return prior.icdf(jax.scipy.special.erf(score / np.sqrt(2.0)))
+    return _by_numpyro(prior, special.erf(score / np.sqrt(2.0)), name)
 
 
 def log_density(prior: Distribution, x: np.ndarray) -> np.ndarray:

@@ -115,6 +115,16 @@ class Effect:
         """Return the priors on the hyperparameters by name."""
         return {name: dist.HalfNormal(getattr(self, name)) for name in self.names}
 
+    @property
+    def pairs(self) -> list[tuple[str, str]]:
+        """Pair of standard deviations that add to the same variance, if there is one.
+
+        Samplers then use their common size as a coordinate; see `Scores`.
+        """
+        priors = self.hyperpriors()
+        spreads = [name for name in self.names if isinstance(priors[name], dist.HalfNormal)]
+        return [(spreads[0], spreads[1])] if len(spreads) == 2 else []
+
     def slots(self, slots: Slots, missions: Sequence[Mission], on: Workspace | None) -> Slots:
         """Fill the slots with the data that the columns need; `on` is the workspace, if known."""
         return slots

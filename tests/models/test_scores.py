@@ -1,0 +1,56 @@
+"""Normal scores of hyperparameters: their prior density, with the Jacobian of the conversion."""
+
+import numpy as np
+import numpyro.distributions as dist
+import pytest
+from scipy import stats
+
+from trustbo.models import PlaceEffect, PooledTrust, RobotEffect
+from trustbo.models.scores import Scores
+
+PAIR = [("tau_s", "tau_e")]
+STEP = 1e-6
+
+
+@pytest.fixture(scope="module")
+def scores():
+    """Scores of the two noises and of the hyperparameters of a place effect."""
+    noises = {"delta_w": dist.HalfNormal(0.2), "delta_v": dist.HalfNormal(0.1)}
+    return Scores(noises | PlaceEffect().hyperpriors(), PAIR)
+
+
+def log_prior_of_values(scores, z):
+    """Log density (point,) of independent priors, times the Jacobian by finite differences."""
+    values = scores.values(z)
+    total = np.zeros(len(z))
+    for name, prior in scores.priors.items():
+        total += np.asarray(prior.log_prob(values[name]))
+
+    def stacked(z):
+        return np.stack([scores.values(z)[name] for name in scores.priors], axis=1)
+
+    axes = STEP * np.eye(z.shape[1])
+    slopes = [(stacked(z + axis) - stacked(z - axis)) / (2.0 * STEP) for axis in axes]
+    return total + np.linalg.slogdet(np.stack(slopes, axis=2))[1]
+
+
+def test_log_prior_is_that_of_independent_priors_in_other_coordinates(scores):
+    z = 0.7 * np.random.default_rng(0).standard_normal((50, scores.n_scores))
+    np.testing.assert_allclose(scores.log_prior(z), log_prior_of_values(scores, z), atol=1e-5)
+
+
+def test_sizes_and_angles_of_a_half_normal_pair_give_back_the_pair(scores):
+    rng = np.random.default_rng(1)
+    first, second = np.abs(rng.standard_normal((2, 100)))
+    z = np.zeros((100, scores.n_scores))
+    z[:, scores.at["tau_s"].start] = np.log(np.hypot(first, second))
+    z[:, scores.at["tau_e"].start] = stats.norm.ppf(2.0 / np.pi * np.arctan2(first, second))
+
+    values = scores.values(z)
+    np.testing.assert_allclose(values["tau_s"], 0.2 * first, rtol=1e-9)
+    np.testing.assert_allclose(values["tau_e"], 0.2 * second, rtol=1e-9)
+
+
+def test_each_effect_with_two_standard_deviations_has_a_size():
+    model = PooledTrust(effects=(PlaceEffect(), RobotEffect()))
+    assert [effect.pairs for effect in model.effects] == [PAIR, [("tau_slow", "tau_day")]]
