@@ -6,9 +6,9 @@ import pytest
 from scipy import stats
 
 from trustbo.models import PlaceEffect, PooledTrust, RobotEffect
+from trustbo.models.effects.place import matern
 from trustbo.models.scores import Scores
 
-PAIR = [("tau_s", "tau_e")]
 STEP = 1e-6
 
 
@@ -16,7 +16,8 @@ STEP = 1e-6
 def scores():
     """Scores of the two noises and of the hyperparameters of a place effect."""
     noises = {"delta_w": dist.HalfNormal(0.2), "delta_v": dist.HalfNormal(0.1)}
-    return Scores(noises | PlaceEffect().hyperpriors(), PAIR)
+    place = PlaceEffect()
+    return Scores(noises | place.hyperpriors(), place.pairs)
 
 
 def log_prior_of_values(scores, z):
@@ -47,10 +48,13 @@ def test_sizes_and_angles_of_a_half_normal_pair_give_back_the_pair(scores):
     z[:, scores.at["tau_e"].start] = stats.norm.ppf(2.0 / np.pi * np.arctan2(first, second))
 
     values = scores.values(z)
-    np.testing.assert_allclose(values["tau_s"], 0.2 * first, rtol=1e-9)
+    of_neighbour = matern(1.0, 2.0)  # the median length scale
+    sd = np.sqrt(1.0 - of_neighbour**2)
+    np.testing.assert_allclose(values["tau_s"], 0.2 * first / sd, rtol=1e-9)
     np.testing.assert_allclose(values["tau_e"], 0.2 * second, rtol=1e-9)
 
 
 def test_each_effect_with_two_standard_deviations_has_a_size():
     model = PooledTrust(effects=(PlaceEffect(), RobotEffect()))
-    assert [effect.pairs for effect in model.effects] == [PAIR, [("tau_slow", "tau_day")]]
+    pairs = [(pair.first, pair.second) for effect in model.effects for pair in effect.pairs]
+    assert pairs == [("tau_s", "tau_e"), ("tau_slow", "tau_day")]

@@ -31,7 +31,7 @@ from trustbo.streams import stream
 _POINTS = 2000  # resampled points to which the coordinates are fitted
 _WARMUP = {True: 150, False: 300}
 """Warm-up draws that tune only a step size, and those that also tune a mass matrix."""
-_ACCEPT = 0.9  # target of the acceptance probability; lower ones diverge now and then
+_ACCEPT = 0.9  # target of the acceptance probability
 _DEPTH = 3  # most doublings of a trajectory, after which it has 7 steps
 _FIRST_STEP = 0.4  # step size at which warm-up starts, in sds
 _RIDGE = 1e-6  # added to the covariance of the points

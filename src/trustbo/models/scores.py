@@ -5,11 +5,15 @@ variance, such as the two noises. Their half-normal scores are (a, b) = size (si
 cos(angle)), and the coordinates are log size and a normal score of the angle. The data usually
 determine the size well, but often not the angle. In these coordinates, a standard deviation that
 may be 0 has a light tail, like the prior; its own score would have a long one.
+
+If the data determine only the product of a and a factor of other hyperparameters, the product
+takes the place of a. For example, a Gaussian process with a long length scale and a large standard
+deviation differs little between neighbours.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,21 +31,29 @@ _LOG_ROOT_2PI = 0.5 * np.log(2.0 * np.pi)
 _FARTHEST, _N_KNOTS = 9.0, 2001  # largest score and number of knots of quantiles in JAX
 
 
+class Pair(NamedTuple):
+    """Two standard deviations whose common size is a coordinate."""
+
+    first: str
+    second: str
+    given: str = ""
+    """Hyperparameter on which the factor of the first one depends, if there is a factor."""
+    factor: Callable[[Any], Any] = np.ones_like
+    """Function of `given` (point, 1) that multiplies the first one."""
+
+
 class Scores:
     """Conversion between scores (point, score) and hyperparameters with independent priors."""
 
-    def __init__(
-        self, priors: Mapping[str, Distribution], pairs: Sequence[tuple[str, str]] = ()
-    ) -> None:
+    def __init__(self, priors: Mapping[str, Distribution], pairs: Sequence[Pair] = ()) -> None:
         """Set the priors; scores have the same order.
 
         Args:
             priors: Scalar or vector priors by name, which include the two noises.
-            pairs: Names of pairs of standard deviations, besides the noises, that have a common
-                size.
+            pairs: Pairs of standard deviations, besides the noises, that have a common size.
         """
         self.priors = dict(priors)
-        self.pairs = (NOISES, *pairs)
+        self.pairs = (Pair(*NOISES), *pairs)
         sizes = {name: int(np.prod(prior.batch_shape)) for name, prior in priors.items()}
         ends = np.cumsum([0, *sizes.values()])
         self.at = {n: slice(a, b) for n, a, b in zip(sizes, ends[:-1], ends[1:], strict=True)}
@@ -52,7 +64,7 @@ class Scores:
     @property
     def core(self) -> np.ndarray:
         """Indices of beta0, the noises and all log sizes, which the data determine best."""
-        names = {"beta0", *NOISES, *(first for first, _ in self.pairs)}
+        names = {"beta0", *NOISES, *(pair.first for pair in self.pairs)}
         return self._indices([name for name in self.at if name in names])
 
     @property
@@ -63,7 +75,7 @@ class Scores:
     @cached_property
     def sizes(self) -> np.ndarray:
         """Indices of the scores that are log sizes."""
-        return self._indices([first for first, _ in self.pairs])
+        return self._indices([pair.first for pair in self.pairs])
 
     def _indices(self, names: Sequence[str]) -> np.ndarray:
         """Return the indices of the scores of some hyperparameters."""
@@ -82,32 +94,52 @@ class Scores:
 
     def values(self, z: Any) -> dict[str, Any]:
         """Convert scores (point, score) to hyperparameters (point,) or (point, k) by name."""
-        xp = namespace(z)
         half_normal = {}
-        for first, second in self.pairs:
-            size, angle = xp.exp(z[:, self.at[first]]), z[:, self.at[second]]
-            for name, side in (first, 1.0), (second, -1.0):  # sines are accurate near 0
-                share = 0.5 * np.pi * special_functions(z).ndtr(side * angle)
-                half_normal[name] = size * xp.sin(share)
+        for pair in self.pairs:
+            half_normal |= self._half_normal(pair, z)
 
-        others = None if xp is np else _interpolated(self.terms, z)
         found = {}
         for name, prior in self.priors.items():
             if name in half_normal:
                 values = of_half_normal(prior, half_normal[name], name)
-            elif others is None:
-                values = quantile(prior, z[:, self.at[name]], name)
             else:
-                values = others[:, self.at[name]]
+                values = self._value(name, z)
             found[name] = values if prior.batch_shape else values[:, 0]
         return found
 
+    def _value(self, name: str, z: Any) -> Any:
+        """Return values (point, k) of a hyperparameter that is in no pair."""
+        at = self.at[name]
+        if namespace(z) is np:
+            return quantile(self.priors[name], z[:, at], name)
+        return _interpolated(self.terms[:, :, at], z[:, at])
+
+    def _factor(self, pair: Pair, z: Any) -> Any:
+        """Return the factor (point, 1) of the first standard deviation of a pair."""
+        return pair.factor(self._value(pair.given, z)) if pair.given else 1.0
+
+    def _half_normal(self, pair: Pair, z: Any) -> dict[str, Any]:
+        """Return the half-normal scores (point, k) of a pair by name."""
+        xp = namespace(z)
+        size, angle = xp.exp(z[:, self.at[pair.first]]), z[:, self.at[pair.second]]
+        first, second = (  # sines are accurate near 0
+            size * xp.sin(0.5 * np.pi * special_functions(z).ndtr(side * angle))
+            for side in (1.0, -1.0)
+        )
+        return {pair.first: first / self._factor(pair, z), pair.second: second}
+
     def log_prior(self, z: Any) -> Any:
         """Compute the log prior density (point,) of scores (point, score)."""
-        xp, size = namespace(z), z[:, self.sizes]
-        n_others = z.shape[1] - size.shape[1]
-        normal = -0.5 * ((z**2).sum(1) - (size**2).sum(1)) - n_others * _LOG_ROOT_2PI
-        return normal + (2.0 * size - 0.5 * xp.exp(2.0 * size)).sum(1)
+        xp, log_size = namespace(z), z[:, self.sizes]
+        n_others = z.shape[1] - log_size.shape[1]
+        total = -0.5 * ((z**2).sum(1) - (log_size**2).sum(1)) - n_others * _LOG_ROOT_2PI
+        total = total + 2.0 * log_size.sum(1)
+        for pair in self.pairs:
+            squares = sum((a**2).sum(1) for a in self._half_normal(pair, z).values())
+            total = total - 0.5 * squares
+            if pair.given:
+                total = total - xp.log(self._factor(pair, z))[:, 0]
+        return total
 
     def draw(
         self, n: int, rng: np.random.Generator, *, even: bool = False

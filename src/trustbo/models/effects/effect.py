@@ -18,6 +18,7 @@ from numpyro.distributions import Distribution
 from trustbo.data import Mission
 from trustbo.errors import require_positive
 from trustbo.models.backend import namespace
+from trustbo.models.scores import Pair
 from trustbo.models.slots import Slots
 from trustbo.workspace import Workspace
 
@@ -116,14 +117,14 @@ class Effect:
         return {name: dist.HalfNormal(getattr(self, name)) for name in self.names}
 
     @property
-    def pairs(self) -> list[tuple[str, str]]:
+    def pairs(self) -> list[Pair]:
         """Pair of standard deviations that add to the same variance, if there is one.
 
-        Samplers then use their common size as a coordinate; see `Scores`.
+        Samplers then use their common size as a coordinate; see `scores`.
         """
         priors = self.hyperpriors()
         spreads = [name for name in self.names if isinstance(priors[name], dist.HalfNormal)]
-        return [(spreads[0], spreads[1])] if len(spreads) == 2 else []
+        return [Pair(spreads[0], spreads[1])] if len(spreads) == 2 else []
 
     def slots(self, slots: Slots, missions: Sequence[Mission], on: Workspace | None) -> Slots:
         """Fill the slots with the data that the columns need; `on` is the workspace, if known."""

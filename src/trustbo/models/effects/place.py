@@ -13,6 +13,7 @@ from trustbo.data import Mission
 from trustbo.errors import require_positive
 from trustbo.models.backend import inverse, namespace
 from trustbo.models.effects.effect import LEAST, Effect, Theta, Values
+from trustbo.models.scores import Pair
 from trustbo.models.slots import Slots
 from trustbo.models.visited import bounds_of, visited
 from trustbo.workspace import Workspace
@@ -56,6 +57,11 @@ class PlaceEffect(Effect):
         """See `Effect.hyperpriors`."""
         length_scale = dist.LogNormal(np.log(self.length_scale), self.length_scale_sd)
         return super().hyperpriors() | {"length_scale": length_scale}
+
+    @property
+    def pairs(self) -> list[Pair]:
+        """See `Effect.pairs`; data mostly determine how s differs between neighbouring cells."""
+        return [Pair("tau_s", "tau_e", "length_scale", _sd_given_neighbour)]
 
     def slots(self, slots: Slots, missions: Sequence[Mission], on: Workspace | None) -> Slots:
         """See `Effect.slots`; adds the visited places."""
@@ -102,6 +108,13 @@ class PlaceEffect(Effect):
     def coefficients(self, values: Values, theta: Theta, slots: Slots) -> np.ndarray:
         """See `Effect.coefficients`."""
         return np.column_stack([values["place"], values["place_bound"]])
+
+
+def _sd_given_neighbour(length_scale: Any) -> Any:
+    """Compute the standard deviation of s / tau_s in a cell given s in a neighbouring cell."""
+    xp: Any = namespace(length_scale)
+    correlation = matern(1.0, xp.clip(length_scale, *_LENGTH_SCALES))
+    return xp.sqrt(xp.maximum((1.0 - correlation) * (1.0 + correlation), _JITTER))
 
 
 def matern(distance: ArrayLike, length_scale: ArrayLike) -> Any:
