@@ -17,6 +17,7 @@ import time
 import numpy as np
 from arviz_stats import sampling_diagnostics
 from common import Table, arguments, parsed
+from inference import hillside
 
 import trustbo as tb
 from trustbo.inference import importance
@@ -33,20 +34,13 @@ def main():
     """Print one row for each number of missions."""
     parser = arguments(__doc__, names=SIZES, seeds=10)
     given = parsed(parser)
-    data = missions(max(map(int, given.names)))
+    data = hillside(max(map(int, given.names)))
     table = Table(
         "missions", "refused", "R-hat", "ESS", "divergences", "steps per draw", "first, s",
         "later, s", "ms per effective draw", "difference, standard errors",
     )  # fmt: skip
     for name in given.names:
         table.row(name, *measured(data[: int(name)], given.seeds))
-
-
-def missions(n):
-    """Drive the first n missions of the campaign of `trustbo demo`."""
-    workspace = tb.Workspace.from_terrain(tb.terrain.example(), (10, 10))
-    result = tb.iterate(workspace, (9, 0), (0, 9), n_iterations=n, seed=0, progress=False)
-    return list(result.missions)
 
 
 def measured(data, n_seeds):
