@@ -78,7 +78,8 @@ def test_parts_of_persons_have_their_joint_law():
     posterior = Posterior(model, slots)
     theta = posterior.theta(np.zeros((1, posterior.n_scores)))
     with_parts = model.signal(theta, slots, posterior.layout).S
-    parts = model.parts(theta, slots)
+    effects = model.random_effects(theta, slots)
+    parts = model.state_space(theta, 1).response(4) @ effects.drift + effects.offset
     rest = with_parts - parts @ np.swapaxes(parts, 2, 3)
     beta0, delta_w = theta["beta0"][0], theta["delta_w"][0]
     lag = np.abs(np.subtract.outer(np.arange(4), np.arange(4)))

@@ -161,3 +161,18 @@ def test_of_equally_good_paths_a_shortest_is_planned(workspace, objective):
     params = TrustParams(0.0, np.zeros(2), 1.0, 0.1, 0.1)  # the same trust after every bound
     planner = Planner(workspace, *ENDS, objective=objective, max_bounds="shortest+3")
     assert len(planner.plan(params).path) == 4
+
+
+def test_contact_that_is_lost_depends_on_all_noise_of_a_rate():
+    """Censored rates depend on the sd of the noise, whether robots share the noise or not."""
+    rng = np.random.default_rng(0)
+    workspace = Workspace.from_awareness(
+        rng.uniform(size=(2, 3, 3, 1)), features=("line_of_sight",)
+    )
+    planner = Planner(workspace, (0, 0), (2, 2), objective="lost_contact", family="censored")
+    shared = TrustParams(0.5, np.array([0.4]), 0.3, 0.05, 0.1, delta_s=0.3)
+    own = TrustParams(0.5, np.array([0.4]), 0.3, 0.05, np.hypot(0.1, 0.3))
+
+    path = [(0, 0), (1, 1), (2, 2)]
+    values = [planner.evaluate(path, params).value for params in (shared, own)]
+    assert values[0] == pytest.approx(values[1], rel=1e-12)

@@ -32,7 +32,7 @@ from trustbo.inference.factor import (
 )
 from trustbo.models.backend import namespace
 from trustbo.models.effects.effect import Chains
-from trustbo.models.signal import Signal, each
+from trustbo.statespace.blocks import Signal, each
 
 
 class Blocks(NamedTuple):

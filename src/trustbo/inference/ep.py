@@ -16,7 +16,7 @@ from trustbo.inference.engine import Blocks, Prior, evidence, expected, marginal
 from trustbo.inference.factor import Factor, cholesky
 from trustbo.models.families import Family
 from trustbo.models.families.moments import log_normal
-from trustbo.models.signal import Signal, each
+from trustbo.statespace.blocks import Signal, each
 
 _LEAST = 1e-9  # smallest precision of a cavity or a site
 _TEMPERED = 0.6  # factor on the site precisions in the wider proposal

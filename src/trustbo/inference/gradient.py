@@ -21,7 +21,7 @@ import numpy as np
 from trustbo.inference.engine import Blocks, Prior
 from trustbo.inference.factor import Factor, add_products, times
 from trustbo.models.backend import inverse_and_log_det
-from trustbo.models.signal import Signal, each
+from trustbo.statespace.blocks import Signal, each
 
 
 def log_evidence(blocks: Blocks, signal: Signal, prior: Prior, lam: Any) -> Any:

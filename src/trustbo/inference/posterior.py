@@ -14,8 +14,8 @@ from trustbo.inference.importance import Student, climb
 from trustbo.models.backend import namespace
 from trustbo.models.effects.effect import Theta
 from trustbo.models.model import TrustModel
-from trustbo.models.signal import Signal, each
 from trustbo.models.slots import Slots
+from trustbo.statespace.blocks import Signal, each
 
 _CHUNK = 32  # largest number of points evaluated at once
 _NUMBERS = 5_000_000  # largest number of precision entries of the points evaluated at once
@@ -377,7 +377,7 @@ class Posterior:
         """Draw replicated rates (draw, mission, bound, robot) given the mean signals."""
         root = each(_root(signal.covariance), self.blocks.label[self.blocks.kind])
         f = self.layout.slots(mean + (root @ rng.standard_normal((*mean.shape, 1)))[..., 0])
-        sd = signal.sd[..., None] if signal.sd.shape[2] == 1 else self.layout.slots(signal.sd)
+        sd = self.layout.slots(np.broadcast_to(signal.sd, mean.shape))
         return self.model.family.sample(f, sd, self.slots.n_ticks, rng)
 
     def prior(self, theta: Theta) -> Prior:

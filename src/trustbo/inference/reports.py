@@ -11,9 +11,9 @@ from trustbo.errors import TrustboError, require_choice, require_count, require_
 from trustbo.inference.draws import QUANTILES, is_of_people, read_posterior, require_posterior
 from trustbo.inference.posterior import Draws, Posterior
 from trustbo.models.model import TrustModel
-from trustbo.models.signal import each
 from trustbo.parallel import computing
 from trustbo.stacking import require_same_team
+from trustbo.statespace.blocks import each
 from trustbo.streams import stream
 
 _ALIKE = 16  # draws of a fitted person's trust for each draw of the population parameters

@@ -12,6 +12,7 @@ from trustbo.inference.filter import TrustFilter
 from trustbo.models.slots import require_ticks
 from trustbo.parallel import computing
 from trustbo.stacking import MissionBatch, known_awareness, stack_missions
+from trustbo.statespace import kalman
 from trustbo.streams import stream
 from trustbo.workspace import Workspace
 
@@ -111,12 +112,21 @@ def _predict(
     trust: TrustFilter, mission: Mission, batch: MissionBatch, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return log densities (bound, robot) and draws (draw, bound, robot) of the rates."""
-    log_scores, drawn, (z, y, ticks) = np.full(batch.contact_rate.shape, np.nan), [], batch
+    z, y, ticks = batch
     path = mission.path[: len(z) + 1] if trust.params.places and mission.path else None
-    effects, start = trust.effects(path, len(z)), trust.dynamics.start()
-    for k, (beliefs, rates) in enumerate(trust.dynamics.ahead(start, z, ticks, effects, rng)):
-        density = np.logaddexp.reduce(trust.dynamics.log_densities(beliefs, y[k], ticks[k]), axis=0)
-        log_scores[k] = np.where(np.isnan(y[k]), np.nan, density - np.log(len(rates)))
+    counts = trust.space.grouped(ticks)
+    ahead = kalman.forecast(
+        trust.space, trust.start(), trust.inputs(z, path), counts, trust.family, rng
+    )
+
+    log_scores = np.full(y.shape, np.nan)
+    drawn = []
+    for k, (belief, rates) in enumerate(ahead):
+        of_rates = kalman.marginal_log_densities(
+            trust.space, belief, trust.space.grouped(y[k]), counts[k], trust.family
+        )
+        density = np.logaddexp.reduce(of_rates, axis=0) - np.log(len(rates))
+        log_scores[k] = np.where(np.isnan(y[k]), np.nan, density)
         drawn.append(rates)
     return log_scores, np.stack(drawn, axis=1)
 

@@ -15,7 +15,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 from importlib.metadata import version
-from types import ModuleType
 from typing import Any
 
 import jax
@@ -23,6 +22,8 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import special
 from scipy.linalg import lapack
+
+from trustbo.statespace.matrices import namespace as namespace
 
 with warnings.catch_warnings():
     warnings.filterwarnings("ignore", "IProgress not found")
@@ -39,11 +40,6 @@ for _name, _module in list(sys.modules.items()):
     _package, _, _child = _name.rpartition(".")
     if _package.startswith("numpyro") and not hasattr(sys.modules[_package], _child):
         setattr(sys.modules[_package], _child, _module)
-
-
-def namespace(x: Any) -> ModuleType:
-    """Return `jax.numpy` for a JAX array, otherwise NumPy, so that one formula works for both."""
-    return jnp if isinstance(x, jax.Array) else np
 
 
 def special_functions(x: Any) -> Any:

@@ -1,6 +1,6 @@
 """The state-space model as a NumPyro distribution, for built-in and custom models."""
 
-from typing import Any
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +10,9 @@ from jax.typing import ArrayLike
 from numpyro.distributions import constraints
 
 from trustbo.errors import TrustboError
+from trustbo.statespace import Inputs, StateSpace, kalman
+from trustbo.statespace.form import independent_robots
+from trustbo.statespace.matrices import apply, root
 
 
 class ContactRate(dist.Distribution):
@@ -24,11 +27,14 @@ class ContactRate(dist.Distribution):
     >>> with numpyro.plate("mission", len(drift)):
     ...     rates = ContactRate(drift, beta0, delta_w, delta_v)
     ...     numpyro.sample("contact_rate", rates, obs=contact_rate)
+
+    For robots that influence each other or share noise, see `ContactRate.of`.
     """
 
     support = constraints.independent(constraints.real, 2)  # pyright: ignore
-    pytree_data_fields = ("drift", "parameters")
+    pytree_data_fields = ("inputs", "space")
 
+    @jax.numpy_rank_promotion("allow")
     def __init__(
         self,
         drift: Array,
@@ -51,21 +57,51 @@ class ContactRate(dist.Distribution):
         Raises:
             TrustboError: The drift or a parameter has another shape.
         """
-        self.drift = jnp.asarray(drift)
-        self.parameters = tuple(jnp.asarray(p) for p in (beta0, delta_w, delta_v, x0_mean, x0_sd))
-        if self.drift.ndim != 3:
+        values = {"beta0": beta0, "delta_w": delta_w, "delta_v": delta_v}
+        values = {name: jnp.asarray(value) for name, value in values.items()}
+        drift = jnp.asarray(drift)
+        if drift.ndim != 3:
             raise TrustboError(
-                f"drift must have the shape (mission, bound, robot); got {self.drift.shape}. For "
-                "one mission, give drift[None]."
+                f"drift must have the shape (mission, bound, robot); got {drift.shape}. For one "
+                "mission, give drift[None]."
             )
-        n_robots = self.drift.shape[2]
-        for name, value in zip(("beta0", "delta_w", "delta_v"), self.parameters, strict=False):
+        n_robots = drift.shape[2]
+        for name, value in values.items():
             if value.ndim and value.shape[-1] not in (1, n_robots):
                 raise TrustboError(
                     f"{name} must have the shape () or ({n_robots},), as drift is of the shape "
-                    f"(mission, bound, robot) = {self.drift.shape}; got {value.shape}."
+                    f"(mission, bound, robot) = {drift.shape}; got {value.shape}."
                 )
-        super().__init__(self.drift.shape[:1], self.drift.shape[1:])
+
+        space = independent_robots(
+            values["beta0"].reshape(1, -1),
+            values["delta_w"].reshape(1, -1),
+            values["delta_v"].reshape(1, -1),
+            jnp.asarray(x0_mean),
+            jnp.asarray(x0_sd),
+        )
+        self._set(space, Inputs(drift))
+
+    @classmethod
+    def of(cls, space: StateSpace, inputs: Inputs) -> Self:
+        """Return the distribution for any state-space form.
+
+        Args:
+            space: Parameters at one point.
+            inputs: Drift and offset, each with shape (mission, bound, robot) or ().
+        """
+        self = cls.__new__(cls)
+        self._set(space, inputs)
+        return self
+
+    def _set(self, space: StateSpace, inputs: Inputs) -> None:
+        """Set the parameters, and the inputs (mission, bound, group, member)."""
+        drift, offset = jnp.broadcast_arrays(*(jnp.asarray(value, float) for value in inputs))
+        shape = drift.shape
+        grouped = *shape[:2], shape[2] // space.n_members, space.n_members
+        self.inputs = Inputs(drift.reshape(grouped), offset.reshape(grouped))
+        self.space = space
+        dist.Distribution.__init__(self, shape[:1], shape[1:])
 
     @jax.numpy_rank_promotion("allow")
     def log_prob(self, value: Array) -> Array:  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -73,38 +109,46 @@ class ContactRate(dist.Distribution):
 
         Raises TrustboError unless `value` has the shape (mission, bound, robot) of the drift.
         """
-        if jnp.shape(value) != self.drift.shape:
+        drift, offset = self.inputs
+        n_missions, n_bounds, n_groups, n_members = drift.shape
+        shape = n_missions, n_bounds, n_groups * n_members
+        if jnp.shape(value) != shape:
             raise TrustboError(
                 "contact rates must have the shape (mission, bound, robot) of the drift, "
-                f"{self.drift.shape}; got {jnp.shape(value)}."
+                f"{shape}; got {jnp.shape(value)}."
             )
-        seen = ~jnp.isnan(value)
-        bounds = (jnp.where(seen, value, 0.0), seen, self.drift)
-        by_bound = tuple(jnp.swapaxes(a, 0, 1) for a in bounds)
-        *_, x0_mean, x0_sd = self.parameters
-        shape = self.drift[:, 0].shape
-        start = jnp.full(shape, x0_mean), jnp.full(shape, x0_sd**2)
-        return lax.scan(self._filter, start, by_bound)[1].sum(0)
+        rates = jnp.reshape(value, drift.shape)
+        by_bound = tuple(jnp.swapaxes(a, 0, 1) for a in (rates, drift, offset))
 
-    def _filter(self, state: Any, inputs: Any) -> Any:
-        """Filter one bound; return trust afterwards and the log density (mission,) of the rates."""
-        (m, P), (y, seen, u), (beta0, delta_w, delta_v, *_) = state, inputs, self.parameters
-        m, P = beta0 * m + u, beta0**2 * P + delta_w**2  # predict
-        F = P + delta_v**2
-        gain, e = jnp.where(seen, P / F, 0.0), y - m
-        log_p = jnp.where(seen, -0.5 * (e**2 / F + jnp.log(2.0 * jnp.pi * F)), 0.0)
-        return (m + gain * e, P * (1.0 - gain)), log_p.sum(1)  # update
+        def step(belief: kalman.Belief, bound: Any) -> tuple[kalman.Belief, Array]:
+            y, u, o = bound
+            predicted = kalman.predict(self.space, belief, Inputs(u, o))
+            return kalman.update(self.space, predicted, y, y, kalman.GaussianRates())
+
+        start = jax.tree.map(
+            lambda a: jnp.broadcast_to(a.astype(float), (n_missions, *a.shape[1:])),
+            kalman.initial(self.space, n_groups),
+        )
+        return lax.scan(step, start, by_bound)[1].sum(0)
 
     @jax.numpy_rank_promotion("allow")
     def sample(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, key: Array, sample_shape: tuple[int, ...] = ()
     ) -> Array:
         """Draw contact rates with shape `(*sample_shape, mission, bound, robot)`."""
-        beta0, delta_w, delta_v, x0_mean, x0_sd = self.parameters
-        shape = *sample_shape, *self.drift.shape
-        w, v, e = (random.normal(k, shape) for k in random.split(key, 3))
-        x, rates = x0_mean + x0_sd * e[..., 0, :], []
-        for k in range(self.drift.shape[1]):
-            x = beta0 * x + self.drift[:, k] + delta_w * w[..., k, :]
-            rates.append(x + delta_v * v[..., k, :])
-        return jnp.stack(rates, axis=-2)
+        space = self.space
+        drift, offset = self.inputs
+        shape = *sample_shape, *drift.shape
+        w, v, s, e = (random.normal(k, shape) for k in random.split(key, 4))
+        d = space.initial_mean + apply(root(space.initial_cov), e[..., 0, :, :])
+        rates = []
+        for k in range(drift.shape[1]):
+            noise = apply(root(space.process_cov), w[..., k, :, :])
+            d = kalman.step(space.transition, d, drift[:, k]) + noise
+            f = d + offset[:, k]
+            if space.shared_cov is not None:
+                f = f + apply(root(space.shared_cov), s[..., k, :, :])
+            rates.append(f + space.noise_sd * v[..., k, :, :])
+
+        drawn = jnp.stack(rates, axis=-3)
+        return drawn.reshape(*sample_shape, *self.batch_shape, *self.event_shape)

@@ -13,8 +13,8 @@ from trustbo.models.effects.effect import Theta
 from trustbo.models.effects.weights import CoupledWeights
 from trustbo.models.model import TrustModel
 from trustbo.models.params import CoupledParams
-from trustbo.models.signal import Layout, Signal
-from trustbo.models.slots import Slots
+from trustbo.statespace import StateSpace
+from trustbo.statespace.form import coupled_robots
 
 
 @dataclass(frozen=True, repr=False)
@@ -68,28 +68,20 @@ class CoupledTrust(TrustModel):
             derived[f"Delta_{noise}"] = factor @ xp.swapaxes(factor, 1, 2)
         return {**derived, **values}
 
-    def layout(self, slots: Slots, *, contrasts: bool = True) -> Layout:
-        """See `TrustModel.layout`; each block is a mission."""
-        return Layout(slots.y.shape, joint=True)
+    @property
+    def joint(self) -> bool:
+        """See `TrustModel.joint`."""
+        return True
 
-    def signal(self, theta: Theta, slots: Slots, layout: Layout) -> Signal:
-        """Compute the trust of all robots at all bounds, with rows ordered as (bound, robot).
-
-        The observation noise has a shared part (Delta_v - eps I) and an independent part (eps I).
-        """
-        B0, K, R = theta["B0"], slots.n_bounds, slots.n_robots
-        xp: Any = namespace(B0)
-        T = xp.linalg.inv(np.eye(K * R) - _kron(np.eye(K, k=-1), B0))  # (1 - Lag x B0)^-1
-        start = T[:, :, :R] @ B0
-        S = T @ _kron(np.eye(K), theta["Delta_w"]) @ xp.swapaxes(T, 1, 2)
-        S = S + self.x0["x0_sd"] ** 2 * start @ xp.swapaxes(start, 1, 2)
-        m, noise = (self.x0["x0_mean"] * start.sum(2))[:, None], theta["Delta_v"]
-        if not self.family.adds_noise:
-            sd = xp.sqrt(xp.diagonal(noise, axis1=1, axis2=2))
-            return Signal(m, T[:, None], S[:, None], xp.tile(sd[:, None], (1, 1, K)))
-        eps = 0.5 * xp.linalg.eigvalsh(noise)[:, 0]
-        noise = _kron(np.eye(K), noise - eps[:, None, None] * np.eye(R))
-        return Signal(m, T[:, None], S[:, None], xp.sqrt(eps)[:, None, None], noise[:, None])
+    def state_space(self, theta: Theta, n_robots: int) -> StateSpace:
+        """See `TrustModel.state_space`."""
+        return coupled_robots(
+            theta["B0"],
+            theta["Delta_w"],
+            theta["Delta_v"],
+            **self.x0,
+            adds_noise=self.family.adds_noise,
+        )
 
     def prior_terms(self, sites: Mapping[str, np.ndarray]) -> dict[str, tuple[str, np.ndarray]]:
         """See `TrustModel.prior_terms`; diagonal and off-diagonal entries are separate terms."""
@@ -125,9 +117,3 @@ def correlation_factor(r: Any, n: int) -> Any:
         zeros = [xp.zeros(len(r))] * (n - 1 - i)
         rows.append(xp.stack([*row, left, *zeros], axis=1))
     return xp.stack(rows, axis=1)
-
-
-def _kron(A: np.ndarray, Q: Any) -> Any:
-    """Compute the Kronecker product of a matrix (k, k) with each of the matrices (point, n, n)."""
-    blocks = A[None, :, None, :, None] * Q[:, None, :, None, :]
-    return blocks.reshape(len(Q), *(len(A) * Q.shape[1],) * 2)

@@ -1,4 +1,4 @@
-"""Base class of trust models: an equation in matrix form, priors, and a NumPyro program."""
+"""Base class of trust models: priors, a state-space form, and a NumPyro program."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -16,14 +16,16 @@ from trustbo.data import Mission
 from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError, require_choice, require_list
 from trustbo.models.backend import namespace
+from trustbo.models.contact_rate import ContactRate
 from trustbo.models.effects.effect import Effect, Theta, sample_columns
 from trustbo.models.effects.weights import Weights
 from trustbo.models.families import FAMILIES, Family
 from trustbo.models.priors import Priors
 from trustbo.models.scores import Scores
-from trustbo.models.signal import Layout, Signal
 from trustbo.models.slots import Slots, require_ticks
 from trustbo.stacking import stack_missions
+from trustbo.statespace import Inputs, StateSpace
+from trustbo.statespace.blocks import Layout, Signal
 from trustbo.workspace import Workspace
 
 MODELS: dict[str, type["TrustModel"]] = {}
@@ -34,9 +36,9 @@ MODELS: dict[str, type["TrustModel"]] = {}
 class TrustModel(Summary, ABC):
     """Base class of trust models.
 
-    A subclass defines `weights`, `hyperpriors`, `derived`, `layout`, `signal` (the equation in
-    matrix form), `rates` (the equation as a distribution) and `dims`. Hyperparameters must include
-    `delta_w` and `delta_v`, and `dims` must list every parameter that planning needs.
+    A subclass defines `weights`, `hyperpriors`, `derived`, `state_space` (the equation) and `dims`
+    and, if robots depend on each other, `joint`. Hyperparameters must include `delta_w` and
+    `delta_v`, and `dims` must list every parameter that planning needs.
 
     Attributes:
         priors: Prior on each parameter. The default depends on the observation family and the
@@ -85,25 +87,65 @@ class TrustModel(Summary, ABC):
 
     @abstractmethod
     def derived(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Convert hyperparameters to the arguments of `signal`, and add `rest`; see `Theta`.
+        """Convert hyperparameters to those of `state_space`, and add `rest`; see `Theta`.
 
         `values` are hyperparameters (point, ...) by name, as in `hyperpriors` or in a posterior.
         """
 
     @abstractmethod
-    def layout(self, slots: Slots, *, contrasts: bool = True) -> Layout:
-        """Arrange slots in blocks; unless `contrasts` is true, each row is one robot's rate."""
+    def state_space(self, theta: Theta, n_robots: int) -> StateSpace:
+        """Return the model's equation at each theta, in NumPy or JAX.
 
-    @abstractmethod
-    def signal(self, theta: Theta, slots: Slots, layout: Layout) -> Signal:
-        """Compute trust at all bounds from the model's equation, in NumPy or JAX."""
+        The axis `group` has length 1. If `joint` is true, the group contains all robots.
+        """
 
     @property
     @abstractmethod
     def dims(self) -> dict[str, tuple[str, ...]]:
         """Axes of each parameter in a posterior by name, excluding parameters of effects."""
 
+    # --- overridden by some models ---
+
+    @property
+    def joint(self) -> bool:
+        """Whether robots depend on each other given the parameters and coefficients."""
+        return False
+
+    @property
+    def exchangeable(self) -> bool:
+        """Whether robots depend on each other only through equal, shared noise."""
+        return False
+
+    def carried(self, slots: Slots) -> bool | np.ndarray:
+        """Return which inputs are carried over to later bounds (see `statespace`).
+
+        The result is True for all columns, False for none, or a mask (column,).
+        """
+        return True
+
+    def random_effects(self, theta: Theta, slots: Slots) -> Inputs | None:
+        """Return inputs (point, mission, row, effect) of effects that belong to one mission each.
+
+        The effects are standard normal and integrated out with trust, so they have no columns.
+        """
+        return None
+
     # --- shared by all models ---
+
+    def layout(self, slots: Slots, *, contrasts: bool = True) -> Layout:
+        """Arrange slots in blocks; unless `contrasts` is true, each row is one robot's rate."""
+        return Layout.of(
+            slots.y,
+            joint=self.joint,
+            exchangeable=self.exchangeable and contrasts and self.family.gaussian,
+            carried=self.carried(slots),
+            apart=type(self).random_effects is not TrustModel.random_effects,
+        )
+
+    def signal(self, theta: Theta, slots: Slots, layout: Layout) -> Signal:
+        """Compute trust at all bounds from the state-space form, in NumPy or JAX."""
+        space = self.state_space(theta, slots.n_robots)
+        return Signal.of(space, layout, self.random_effects(theta, slots))
 
     @property
     def columns(self) -> tuple[Effect, ...]:
@@ -136,7 +178,7 @@ class TrustModel(Summary, ABC):
         return Scores(self.all_hyperpriors(slots), pairs)
 
     def theta(self, values: Mapping[str, Any], resolution: float) -> dict[str, Any]:
-        """Convert hyperparameters, named as in `all_hyperpriors`, to the `theta` of `signal`.
+        """Convert hyperparameters, named as in `all_hyperpriors`, to `theta` of `state_space`.
 
         Noise with standard deviation `resolution` is added to `delta_v` in quadrature. Without this
         noise, the density of rates that fit perfectly, such as constant rates, would be unbounded.
@@ -151,15 +193,9 @@ class TrustModel(Summary, ABC):
         """Return the `delta_v` that has the prior, given one to which `theta` added noise."""
         if not self.family.adds_noise:
             return delta_v
+
         # Rounding can make the difference of the squares slightly negative.
         return np.sqrt(np.maximum((delta_v - resolution) * (delta_v + resolution), 0.0))
-
-    def rates(self, theta: Theta, drift: Any) -> Distribution | None:
-        """Return the distribution of rates given one theta and the drift (mission, bound, robot).
-
-        The result is None if trust cannot be integrated out.
-        """
-        return None
 
     def prior_terms(self, sites: Mapping[str, np.ndarray]) -> dict[str, tuple[str, np.ndarray]]:
         """Return further terms of the log prior by label, each as (field of `Priors`, values)."""
@@ -193,34 +229,47 @@ class TrustModel(Summary, ABC):
     def program(self, slots: Slots) -> None:
         """Run the model as a NumPyro program, for a kernel such as `NUTS(model.program)`.
 
-        All variables are sampled, except that trust is integrated out if `rates` returns a
-        distribution. Call this method within `jax.enable_x64(True)`; effects need float64.
+        All variables are sampled, except that trust is integrated out if rates are Gaussian. Call
+        this method within `jax.enable_x64(True)`; effects need float64.
         """
         values = {
             name: numpyro.sample(name, prior.to_event(len(prior.batch_shape)))
             for name, prior in self.all_hyperpriors(slots).items()
         }
         values = {name: jnp.asarray(value)[None] for name, value in values.items()}
-        theta = self.theta(values, slots.resolution)
-        c = numpyro.deterministic("columns", sample_columns(self.columns, theta, slots))
+        theta: Any = self.theta(values, slots.resolution)
+        c: Any = numpyro.deterministic("columns", sample_columns(self.columns, theta, slots))
         U = sparse.hstack([effect.columns(slots) for effect in self.columns], format="csr")
-        rates = self.rates(theta, (U.toarray() @ c).reshape(slots.y.shape))
-        if rates is not None:
+
+        if self.family.gaussian:
+            carried = np.broadcast_to(self.carried(slots), U.shape[1])
+            dense = U.toarray()
+            inputs = Inputs(
+                drift=((dense * carried) @ c).reshape(slots.y.shape),
+                offset=((dense * ~carried) @ c).reshape(slots.y.shape),
+            )
+            rates = ContactRate.of(self.state_space(theta, slots.n_robots), inputs)
             with numpyro.plate("mission", slots.n_missions):
                 numpyro.sample("contact_rate", rates, obs=slots.y)
             return
+
         layout = self.layout(slots, contrasts=False)
+        signal: Any = self.signal(theta, slots, layout)
         u = (layout.columns(U).toarray() @ c).reshape(len(layout.label), -1)
-        signal = self.signal(theta, slots, layout)
-        y, ticks = layout.rows(slots.y), layout.rows(slots.n_ticks)
+        y = layout.rows(slots.y)
+        ticks = layout.rows(slots.n_ticks)
+
+        # Trust is its mean plus a Cholesky factor times white noise, which is easier to sample.
         root = jnp.linalg.cholesky(signal.covariance[0] + 1e-13 * jnp.eye(y.shape[1]))
         white = dist.Normal(0.0, 1.0).expand(y.shape).to_event(2)
-        e = numpyro.sample("trust_noise", white)
-        f = signal.m[0] + (signal.T[0] @ u[..., None])[..., 0] + (root @ e[..., None])[..., 0]  # pyright: ignore[reportArgumentType, reportCallIssue, reportIndexIssue]
-        numpyro.deterministic("signal", f)
+        e: Any = numpyro.sample("trust_noise", white)
+        mean = signal.m[0] + (signal.T[0] @ u[..., None])[..., 0]
+        f = numpyro.deterministic("signal", mean + (root @ e[..., None])[..., 0])
+
         seen = ~np.isnan(y)
-        some, N = np.where(seen, y, 0.5), np.where(ticks > 0.0, ticks, 1.0)
-        log_p = self.family.log_prob(some, N, f, signal.sd[0])
+        rates = np.where(seen, y, 0.5)
+        counts = np.where(ticks > 0.0, ticks, 1.0)
+        log_p = self.family.log_prob(rates, counts, f, signal.sd[0])
         numpyro.factor("contact_rate", jnp.where(seen, log_p, 0.0).sum())
 
     def options(self) -> dict[str, Any]:

@@ -9,6 +9,8 @@ from trustbo.arrays import require_numbers
 from trustbo.data import Cell
 from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError
+from trustbo.statespace import Inputs, StateSpace
+from trustbo.statespace.form import coupled_robots, independent_robots
 from trustbo.workspace.moves import bounds_along
 
 Numbers = Any
@@ -65,16 +67,58 @@ class ParameterDraws(Summary):
         axes = self.AXES[self.WEIGHTS]
         return np.shape(getattr(self, self.WEIGHTS))[axes.index("feature") - len(axes)]
 
-    def expected_transition(self, n_robots: int) -> np.ndarray:
-        """Return the transition matrix (..., robot, robot) of expected trust.
+    def state_space(self, n_robots: int, *, adds_noise: bool = True) -> StateSpace:
+        """Return the model's equation at each draw, with leading axes joined to one axis.
 
-        The matrix is B0 of equation (1). It is diagonal if robots do not influence each other, and
-        0 if `memory` is "deviation".
+        Args:
+            n_robots: Number of robots.
+            adds_noise: Whether the observation family adds noise (see `coupled_robots`).
         """
-        beta0 = np.asarray(self.beta0, dtype=float) * (self.memory == "level")  # pyright: ignore
-        if not self.BY_ROBOT:
-            beta0 = beta0[..., None]
-        return np.broadcast_to(beta0, (*self.leading, n_robots))[..., None] * np.eye(n_robots)
+        names = ("beta0", "delta_w", "delta_v", "x0_mean", "x0_sd", "delta_s")
+        values: dict[str, Any] = self._joined(names)
+        if not self.carried:
+            values["x0_mean"] = 0.0
+
+        delta_s = values.pop("delta_s", None)
+        n_members = 1 if delta_s is None else n_robots
+        return independent_robots(**values, delta_s=delta_s, n_members=n_members)
+
+    def _joined(self, names: Sequence[str]) -> dict[str, np.ndarray]:
+        """Return fields in float64 with exactly one leading axis (draw,), without None."""
+        leading = self.leading
+        n_draws = int(np.prod(leading))
+        joined = {}
+        for name in names:
+            value = getattr(self, name)
+            if value is None:
+                continue
+            value = np.asarray(value, dtype=float)
+            core = value.shape[value.ndim - len(self.AXES.get(name, ())) :]
+            joined[name] = np.broadcast_to(value, leading + core).reshape(n_draws, *core)
+        return joined
+
+    @property
+    def carried(self) -> bool:
+        """Whether the inputs of a bound are carried over to later bounds (see `statespace`)."""
+        return self.memory == "level"  # pyright: ignore[reportAttributeAccessIssue]
+
+    @property
+    def initial_offset(self) -> Numbers:
+        """Offset before the first bound: trust is x0_mean, whatever is carried over."""
+        return 0.0 if self.carried else self.x0_mean  # pyright: ignore[reportAttributeAccessIssue]
+
+    def inputs(self, u: np.ndarray) -> Inputs:
+        """Return inputs as a drift if they are carried over, otherwise as an offset."""
+        return Inputs(u) if self.carried else Inputs(drift=0.0, offset=u)
+
+    def of_bound(self, awareness: np.ndarray) -> np.ndarray:
+        """Compute the input (draw, robot) of a bound with awareness (robot, feature).
+
+        Place effects are not included; see `of_places`.
+        """
+        u = self.increments(awareness[:, None, None, None])[..., 0, 0, 0]
+        b = np.asarray(self.b)  # pyright: ignore[reportAttributeAccessIssue]
+        return u + (b if self.BY_ROBOT else b[..., None])
 
     def increments(self, awareness: np.ndarray) -> np.ndarray:
         """Compute the drift (..., robot, move, row, col) without the intercept.
@@ -126,14 +170,7 @@ class ParameterDraws(Summary):
 
     def flat(self) -> Self:
         """Return every field in float64 with exactly one leading axis (draw,)."""
-        leading = self.leading
-
-        def expand(value: Numbers, n: int) -> np.ndarray:
-            core = np.shape(value)[np.ndim(value) - n :]
-            full = np.broadcast_to(np.asarray(value, dtype=float), leading + core)
-            return full.reshape(int(np.prod(leading)), *core)
-
-        return self.map(expand)
+        return self._replace(**self._joined(list(self.by_name)))  # pyright: ignore[reportAttributeAccessIssue]
 
     def map(self, function: Callable[[Numbers, int], Numbers]) -> Self:
         """Apply `function(field, number of trailing axes)` to every field."""
@@ -155,6 +192,7 @@ class _Trust(NamedTuple):
     place: Numbers | None = None
     place_bound: Numbers | None = None
     memory: str = "level"
+    delta_s: Numbers | None = None
 
 
 class TrustParams(ParameterDraws, _Trust):
@@ -173,6 +211,7 @@ class TrustParams(ParameterDraws, _Trust):
         place_bound: Effects of bounds, shape (..., effect, move, row, col), or None. Moves are
             ordered as in `workspace.MOVES`.
         memory: Quantity carried over between bounds, `"level"` or `"deviation"`; see `PooledTrust`.
+        delta_s: Standard deviation of the noise that all robots share, shape (...,), or None.
     """
 
     __slots__ = ()
@@ -237,9 +276,10 @@ class CoupledParams(ParameterDraws, _Coupled):
         """Standard deviation (..., robot) of each robot's observation noise."""
         return np.sqrt(np.diagonal(self.Delta_v, axis1=-2, axis2=-1))
 
-    def expected_transition(self, n_robots: int) -> np.ndarray:
-        """See `ParameterDraws.expected_transition`."""
-        return np.asarray(self.B0, dtype=float)
+    def state_space(self, n_robots: int, *, adds_noise: bool = True) -> StateSpace:
+        """See `ParameterDraws.state_space`."""
+        values = self._joined(("B0", "Delta_w", "Delta_v", "x0_mean", "x0_sd"))
+        return coupled_robots(**values, adds_noise=adds_noise)
 
 
 Params = TrustParams | RobotParams | CoupledParams
@@ -254,7 +294,8 @@ def assemble_params(
     """
     if "B0" in sites:
         return CoupledParams(**{name: sites[name] for name in CoupledParams._fields[:5]}, **x0)
-    values = {name: sites[name] for name in TrustParams._fields[:5]}
+    values: dict[str, Any] = {name: sites[name] for name in TrustParams._fields[:5]}
+    values["delta_s"] = sites.get("delta_s")
     if sites["b"].ndim == 1:
         return TrustParams(**values, **x0, memory=memory)
     for name in ("beta0", "delta_w", "delta_v"):  # robots share these in the hierarchical model

@@ -15,8 +15,8 @@ from trustbo.models.effects.effect import Theta
 from trustbo.models.families import FAMILIES, Family, Levels
 from trustbo.models.pooled import PooledTrust
 from trustbo.models.priors import Priors
-from trustbo.models.signal import Layout, Signal, powers
 from trustbo.models.slots import Slots
+from trustbo.statespace import Inputs
 
 SUCCESS, FAILURE = "success", "failure"
 """Prefixes of the names of outcome features."""
@@ -92,46 +92,41 @@ class HumanTrust(PooledTrust):
             )
         return slots
 
-    def layout(self, slots: Slots, *, contrasts: bool = True) -> Layout:
-        """See `TrustModel.layout`: one block per person, with outcomes and base level as inputs."""
+    @property
+    def joint(self) -> bool:
+        """See `TrustModel.joint`; true, because personal effects appear in all reports."""
+        return True
+
+    @property
+    def exchangeable(self) -> bool:
+        """See `TrustModel.exchangeable`."""
+        return False
+
+    def carried(self, slots: Slots) -> np.ndarray:
+        """See `TrustModel.carried`; outcomes are carried over, and the base level is not."""
         outcomes = [name.startswith((SUCCESS, FAILURE)) for name in slots.features]
-        split = np.array([*outcomes, False])  # inputs that decay with beta0
-        return Layout(slots.y.shape, joint=True, split=split, apart=True)
+        return np.array([*outcomes, False])
 
-    def signal(self, theta: Theta, slots: Slots, layout: Layout) -> Signal:
-        """Compute trust at all bounds; the inputs that decay with beta0 precede the others."""
-        xp: Any = namespace(theta["beta0"])
-        lasting = self._lasting(theta, slots)
-        parts = self.parts(theta, slots)
-        S = theta["delta_w"][:, None, None] ** 2 * (lasting @ xp.swapaxes(lasting, 1, 2))
-        S = S[:, None] + parts @ xp.swapaxes(parts, 2, 3)
-        base = xp.broadcast_to(np.eye(lasting.shape[1]), lasting.shape)
-        T = xp.concatenate([lasting, base], axis=2)[:, None]
-        m = 0.0 * lasting[:, None, :, 0]
-        return Signal(m, T, S, theta["delta_v"][:, None, None])
+    def random_effects(self, theta: Theta, slots: Slots) -> Inputs:
+        """See `TrustModel.random_effects`.
 
-    def _lasting(self, theta: Theta, slots: Slots) -> Any:
-        """Compute the fraction (point, row, row) of each row's input that is left at later rows."""
-        xp: Any = namespace(theta["beta0"])
-        return xp.kron(powers(theta["beta0"], slots.n_bounds), np.eye(slots.n_robots))
-
-    def parts(self, theta: Theta, slots: Slots) -> Any:
-        """Compute the effects (point, mission, row, part) of standardised personal coefficients.
-
-        The parts are the start, the level, and the gains from success and from failure.
+        The effects are the personal start, level, gain from success and gain from failure.
         """
-        carried, level = np.zeros((2, *slots.y.shape, 4))
+        carried = np.zeros((*slots.y.shape, 4))
         carried[:, 0, :, 0] = 1.0  # start
+        for i, prefix in ((2, SUCCESS), (3, FAILURE)):
+            named = [m for m, name in enumerate(slots.features) if name.startswith(prefix)]
+            if named:
+                carried[..., i] = slots.z[..., named[0]]
+
+        level = np.zeros((*slots.y.shape, 4))
         level[..., 1] = 1.0
-        for i, name in ((2, SUCCESS), (3, FAILURE)):
-            first = next((m for m, f in enumerate(slots.features) if f.startswith(name)), None)
-            if first is not None:
-                carried[..., i] = slots.z[..., first]
+
+        start_sd, level_sd, gain_sd = (theta[name] for name in SDS)
+        xp = namespace(start_sd)
+        sds = xp.stack([start_sd, level_sd, gain_sd, gain_sd], axis=1)[:, None, None]
         carried, level = (a.reshape(slots.n_missions, -1, 4) for a in (carried, level))
-        parts = self._lasting(theta, slots)[:, None] @ carried + level
-        start, of_level, gain = (theta[name] for name in SDS)
-        sds = namespace(start).stack([start, of_level, gain, gain], axis=1)
-        return parts * sds[:, None, None]
+        return Inputs(drift=carried * sds, offset=level * sds)
 
     @property
     def dims(self) -> dict[str, tuple[str, ...]]:

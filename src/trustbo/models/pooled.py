@@ -6,16 +6,14 @@ from typing import Any
 
 import numpy as np
 from numpyro.distributions import Distribution
-from scipy.linalg import helmert
 
 from trustbo.errors import TrustboError, require_choice
-from trustbo.models.backend import namespace
-from trustbo.models.contact_rate import ContactRate
 from trustbo.models.effects.effect import Theta
 from trustbo.models.effects.weights import Weights
 from trustbo.models.model import TrustModel
-from trustbo.models.signal import Layout, Signal, powers
 from trustbo.models.slots import Slots
+from trustbo.statespace import StateSpace
+from trustbo.statespace.form import independent_robots
 
 
 @dataclass(frozen=True, repr=False)
@@ -57,54 +55,31 @@ class PooledTrust(TrustModel):
         rest = 1.0 - beta0 if self.memory == "level" else 0.0 * beta0 + 1.0
         return {**values, "rest": rest}
 
-    def layout(self, slots: Slots, *, contrasts: bool = True) -> Layout:
-        """Make one block per robot; if noise is shared, one per contrast of robots or per mission.
+    @property
+    def joint(self) -> bool:
+        """See `TrustModel.joint`."""
+        return self.shared_noise
 
-        Helmert contrasts of the robots' rates are independent if all robots are measured.
-        """
-        n = slots.n_robots
-        if not self.shared_noise or n == 1:
-            return Layout(slots.y.shape)
-        seen = ~np.isnan(slots.y)
-        if contrasts and self.family.gaussian and (seen.all(2) == seen.any(2)).all():
-            return Layout(slots.y.shape, rotation=helmert(n, full=True))
-        return Layout(slots.y.shape, joint=True)
+    @property
+    def exchangeable(self) -> bool:
+        """See `TrustModel.exchangeable`."""
+        return self.shared_noise
 
-    def signal(self, theta: Theta, slots: Slots, layout: Layout) -> Signal:
-        """Compute trust at all bounds, with the response T = (1 - beta0 Lag)^-1 to the drift."""
-        xp: Any = namespace(theta["beta0"])
-        n, K = slots.n_robots, slots.n_bounds
-        beta0, delta_w = theta["beta0"][:, None], theta["delta_w"][:, None, None]
-        T = powers(theta["beta0"], K)
-        start = beta0 ** np.arange(1, K + 1)
-        S = delta_w**2 * (T @ xp.swapaxes(T, 1, 2))
-        S = S + self.x0["x0_sd"] ** 2 * start[:, :, None] * start[:, None, :]
-        m = self.x0["x0_mean"] * start
-        if self.memory == "deviation":  # x - u is carried over, and has mean 0 at first
-            m, T = 0.0 * m, xp.broadcast_to(xp.eye(K), T.shape)
-        m, T, S = m[:, None], T[:, None], S[:, None]
-        sd = theta["delta_v"][:, None, None]
-        if not self.shared_noise:
-            return Signal(m, T, S, sd)
-        noise = theta["delta_s"][:, None, None, None] ** 2 * xp.eye(K)
-        if layout.joint:
-            m, T, S = xp.repeat(m, n, axis=2), xp.kron(T, np.eye(n)), xp.kron(S, np.eye(n))
-            return Signal(m, T, S, sd, xp.kron(noise, np.ones((n, n))))
-        if n == 1:
-            return Signal(m, T, S, sd, noise)
-        first = np.array([1.0, 0.0])[:, None]  # only the mean of robots has m and noise
-        return Signal(np.sqrt(n) * first * m, T, S, sd, n * first[..., None] * noise)
+    def carried(self, slots: Slots) -> bool | np.ndarray:
+        """See `TrustModel.carried`."""
+        return self.memory == "level"
 
-    def rates(self, theta: Theta, drift: Any) -> ContactRate | None:
-        """See `TrustModel.rates`."""
-        if self.shared_noise or not self.family.gaussian:
-            return None
-        beta0, x0 = theta["beta0"][0], self.x0
-        if self.memory == "deviation":
-            xp = namespace(drift)
-            first = xp.full_like(drift[:, :1], x0["x0_mean"])
-            drift = drift - beta0 * xp.concatenate([first, drift[:, :-1]], axis=1)
-        return ContactRate(drift, beta0, theta["delta_w"][0], theta["delta_v"][0], **x0)
+    def state_space(self, theta: Theta, n_robots: int) -> StateSpace:
+        """See `TrustModel.state_space`; a deviation from the mean has mean 0 at first."""
+        return independent_robots(
+            theta["beta0"],
+            theta["delta_w"],
+            theta["delta_v"],
+            x0_mean=self.x0["x0_mean"] if self.memory == "level" else 0.0,
+            x0_sd=self.x0["x0_sd"],
+            delta_s=theta["delta_s"] if self.shared_noise else None,
+            n_members=n_robots if self.joint else 1,
+        )
 
     @property
     def dims(self) -> dict[str, tuple[str, ...]]:

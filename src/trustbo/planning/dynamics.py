@@ -10,6 +10,7 @@ from trustbo.arrays import read_labelled, require_numbers
 from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_kind
 from trustbo.models.params import Params, check_params, require_values
+from trustbo.statespace import kalman
 from trustbo.workspace.moves import bounds_along
 
 
@@ -17,7 +18,8 @@ class Dynamics(NamedTuple):
     """Recursion x_k = transition x_{k-1} + drift(bound) for expected trust, with x_0 = start.
 
     The shapes are transition (..., state, state), drift (..., state, move, row, col), start
-    (..., state) and noise_sd (...,), where noise_sd is the mean of delta_v over robots. Each robot
+    (..., state) and noise_sd (...,), where noise_sd is the mean over robots of the standard
+    deviation of a rate given trust, including noise that robots share. Each robot
     is a state, and the team's trust is the mean of the states. If all robots have the same beta0,
     the mean trust is the only state. The drift at (move, row, col) belongs to the bound that enters
     the cell by that move; the drift is NaN if there is no such bound.
@@ -58,10 +60,24 @@ def trust_dynamics(
     Raises:
         TrustboError: If the number of robots or features does not match the parameters.
     """
-    n_robots, leading = len(z), params.leading
+    n_robots = len(z)
+    leading = params.leading
+    space = params.state_space(n_robots)
+
+    def of_draws(values: np.ndarray) -> np.ndarray:
+        """Give values (draw, ...) the leading axes of the parameters."""
+        return values.reshape((*leading, *values.shape[1:]))
+
+    # Expected trust is x_k = A (x_{k-1} - o_{k-1}) + u_k + o_k. Inputs either all are a drift u, or
+    # all are an offset o, in which case the expected state d = x - o stays 0.
+    transition = of_draws(space.over_robots(n_robots))
+    if not params.carried:
+        transition = np.zeros_like(transition)
+
     start = np.asarray(params.x0_mean if x0 is None else x0, dtype=float)
     if x0 is None or not start.ndim:
         start = start[..., None]
+
     try:
         start = np.broadcast_to(start, (*leading, n_robots))
     except ValueError:
@@ -69,14 +85,20 @@ def trust_dynamics(
             f"x0 must be one number or have the shape {(*leading, n_robots)}, one for each robot; "
             f"got shape {start.shape}."
         ) from None
-    sd = np.asarray(params.delta_v, dtype=float)
-    sd = np.broadcast_to(sd.mean(-1) if params.BY_ROBOT else sd, leading)
+
+    noise_sd = of_draws(space.rate_sd.mean((1, 2)))
     if params.BY_ROBOT or by_robot:
-        return Dynamics(params.expected_transition(n_robots), drift(params, z), start, sd)
+        return Dynamics(transition, drift(params, z), start, noise_sd)
+
     # With a common beta0, the mean trust of the robots obeys the same equation.
-    z = z.mean(0, keepdims=True) if n_robots > 1 else z
-    u = drift(params, z).mean(-4, keepdims=True)  # place effects may differ between robots
-    return Dynamics(params.expected_transition(1), u, start.mean(-1, keepdims=True), sd)
+    if n_robots > 1:
+        z = z.mean(0, keepdims=True)
+    return Dynamics(
+        transition=transition[..., :1, :1],
+        drift=drift(params, z).mean(-4, keepdims=True),  # place effects may differ between robots
+        start=start.mean(-1, keepdims=True),
+        noise_sd=noise_sd,
+    )
 
 
 def drift(params: Params, awareness: np.ndarray) -> np.ndarray:
@@ -141,5 +163,5 @@ def roll(along: Dynamics) -> np.ndarray:
     drift = np.moveaxis(along.drift[..., 0, 0, :], -1, 0)  # (bound, ..., state)
     trust = [along.start]
     for u in drift:
-        trust.append((along.transition @ trust[-1][..., None])[..., 0] + u)
+        trust.append(kalman.step(along.transition, trust[-1], u))
     return np.stack(trust[1:], axis=-2)

@@ -8,11 +8,11 @@ from numpy.typing import ArrayLike
 from trustbo.arrays import read_labelled
 from trustbo.data import Cell, Mission
 from trustbo.errors import TrustboError, require_kind, require_whole
-from trustbo.inference.filter import Dynamics
 from trustbo.models import PooledTrust
 from trustbo.models.model import TrustModel
 from trustbo.models.params import Params, check_params
 from trustbo.simulation.protocol import DescribedSimulator, require_path
+from trustbo.statespace import kalman
 from trustbo.streams import stream
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import MOVE_NAMES, along, bounds_along, moves_along
@@ -82,11 +82,17 @@ class ModelSimulator(DescribedSimulator):
         # Without _STREAM, seed 0 would give the same numbers as `default_rng(0)`.
         rng = np.random.default_rng([0, require_whole("seed", seed, 0), _STREAM])
         of_bounds = np.full(z.shape[:2], np.nan if self.n_ticks is None else self.n_ticks)
-        effects, params = [0.0] * len(z), self.params.flat()
+        params = self.params.flat()
+        space = params.state_space(z.shape[1], adds_noise=self.model.family.adds_noise)
+        u = np.stack([params.of_bound(of_bound) for of_bound in z])  # (bound, draw, robot)
         if params.places:
-            effects = list(np.moveaxis(params.of_places(bounds_along(cells)), -2, 0))
-        dynamics = Dynamics(params, self.model.family, z.shape[1])
-        drawn = dynamics.ahead(dynamics.start(), z, of_bounds, effects, rng)
+            u = u + np.moveaxis(params.of_places(bounds_along(cells)), -2, 0)
+        inputs = [params.inputs(space.grouped(of_bound)) for of_bound in u]
+
+        offset = np.broadcast_to(params.initial_offset, 1)[:, None, None]
+        start = kalman.initial(space, z.shape[1] // space.n_members, offset)
+        ticks = space.grouped(of_bounds)
+        drawn = kalman.forecast(space, start, inputs, ticks, self.model.family, rng)
         rates = np.clip([of_bound[0] for _, of_bound in drawn], 0.0, 1.0)
         n, status = self._end(cells, seed)
         ticks = None if self.n_ticks is None else np.full(rates[:n].shape, self.n_ticks)

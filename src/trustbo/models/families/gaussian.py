@@ -8,6 +8,7 @@ from numpy.random import Generator
 
 from trustbo.models.families.family import Array, Drawn, Family, Moments
 from trustbo.models.families.moments import log_normal
+from trustbo.statespace.kalman import gaussian_match
 
 
 @dataclass(frozen=True)
@@ -26,8 +27,7 @@ class Gaussian(Family):
         return log_normal(y - trust, sd**2)
 
     def _match(self, y: Array, N: Array, m: Array, v: Array, sd: Array) -> Moments:
-        total = v + sd**2
-        return log_normal(y - m, total), m + v / total * (y - m), v - v**2 / total
+        return gaussian_match(y, m, v, sd)
 
     def _draw(self, y: Array, N: Array, m: Array, v: Array, sd: Array, rng: Generator) -> Drawn:
         log_p, mean, var = self._match(y, N, m, v, sd)

@@ -1,0 +1,69 @@
+"""Every model with every observation family and effect is fitted and completed."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+
+import trustbo as tb
+from trustbo.models import CoupledTrust, HierarchicalTrust, PlaceEffect, PooledTrust, RobotEffect
+
+FAMILIES = "gaussian", "censored", "beta_binomial"
+EFFECTS = (), (PlaceEffect(), RobotEffect())
+N_TICKS = 20
+N_DRAWS = 20
+MODELS = {
+    f"{model.__name__}, {family}, {len(effects)} effects": model(
+        observation=family, effects=effects
+    )
+    for model, family, effects in product(
+        (PooledTrust, HierarchicalTrust, CoupledTrust), FAMILIES, EFFECTS
+    )
+}
+MODELS |= {
+    f"PooledTrust, {family}, shared noise": PooledTrust(observation=family, shared_noise=True)
+    for family in ("gaussian", "censored")
+}
+MODELS["PooledTrust, gaussian, deviation"] = PooledTrust(memory="deviation")
+
+
+@pytest.fixture(scope="module")
+def missions():
+    """Missions of different lengths, with a rate that was not measured."""
+    rng = np.random.default_rng(0)
+    found = []
+    for n_bounds in (5, 3, 4):
+        path = [(0, 0)]
+        for k in range(n_bounds):
+            row, col = path[-1]
+            path.append((row, col + 1) if k % 2 else (row + 1, col))
+
+        awareness = rng.uniform(size=(n_bounds, 2, 2))
+        rates = rng.integers(0, N_TICKS + 1, (n_bounds, 2)) / N_TICKS
+        rates[1, 0] = np.nan
+        found.append(
+            tb.Mission.from_arrays(
+                path,
+                awareness,
+                rates,
+                n_ticks=np.full(rates.shape, N_TICKS),
+                features=("line_of_sight", "slope"),
+            )
+        )
+    return found
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_fit_has_trust_predictions_and_likelihoods_of_all_rates(name, missions):
+    fitted = tb.fit(missions, MODELS[name], draws=N_DRAWS, chains=1, check=False, progress=False)
+
+    seen = ~np.isnan(fitted["observed_data"]["contact_rate"].to_numpy())
+    predicted = fitted["posterior_predictive"]["contact_rate"].to_numpy()
+    trust = fitted["latent"]["trust"].to_numpy()
+    of_missions = fitted["log_likelihood"]["contact_rate"].to_numpy()
+
+    assert predicted.shape == (1, N_DRAWS, 3, 5, 2)
+    assert np.isfinite(predicted[..., seen]).all()
+    assert np.isfinite(trust[..., seen]).all()
+    assert of_missions.shape == (1, N_DRAWS, 3)
+    assert np.isfinite(of_missions).all()
