@@ -159,7 +159,7 @@ def fit(
             "get the posterior anyway, pass check=False.",
         )
     if whole:
-        tree = complete(tree, missions, model=model)
+        tree = complete(tree, missions, model=model, progress=progress)
     tree.attrs["seconds"] = time.perf_counter() - started
     return tree
 

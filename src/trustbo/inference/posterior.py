@@ -338,6 +338,7 @@ class Posterior:
     def signals(self, draws: Draws) -> Iterator[tuple[slice, Theta, Signal, np.ndarray]]:
         """Yield the slice, hyperparameters, signals and mean signals of each chunk of draws."""
         for where, theta in chunks(draws.theta):
+            self.evaluated(len(theta["rest"]))
             signal = self.model.signal(theta, self.slots, self.layout)
             yield where, theta, signal, expected(self.blocks, signal, draws.c[where])
 

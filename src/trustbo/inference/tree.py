@@ -7,6 +7,7 @@ import numpy as np
 import xarray as xr
 
 from trustbo.data import NOWHERE, Mission
+from trustbo.display import slow_bar
 from trustbo.inference.draws import (
     effects_of,
     missions_of,
@@ -128,6 +129,7 @@ def complete(
     missions: Sequence[Mission] | None = None,
     *,
     model: TrustModel | None = None,
+    progress: bool = True,
 ) -> xr.DataTree:
     """Add latent trust, log-likelihoods and predictions to a posterior.
 
@@ -138,6 +140,7 @@ def complete(
         posterior: DataTree from `fit`, or one of `Result.posteriors`.
         missions: Fitted missions; needed if the posterior contains no data.
         model: Model of the posterior; needed if the priors are custom.
+        progress: Whether to show a progress bar after 5 seconds.
 
     Returns:
         The posterior with the groups `latent`, `posterior_predictive`, `prior_predictive`,
@@ -156,7 +159,10 @@ def complete(
     kept = np.linspace(0, n_draws - 1, min(n_draws, max(1, _N_TRAJECTORIES // n_chains)))
     kept = kept.astype(int)
     some = (np.arange(n_chains)[:, None] * n_draws + kept).ravel()
-    given = fitted.given(draws, some, stream(seed, "latent"))
+    with slow_bar("latent trust", " draws", progress) as bar:
+        fitted.evaluated = bar.update
+        given = fitted.given(draws, some, stream(seed, "latent"))
+
     rng = stream(seed, "prior predictive")
     replicated = fitted.replicate(fitted.draw_prior(N_PRIOR, rng), rng)
     shift = fitted.model.family.log_resolution(fitted.slots.y, fitted.slots.n_ticks).sum((1, 2))
