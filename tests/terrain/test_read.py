@@ -308,6 +308,13 @@ def test_maps_in_feet_of_no_place_or_without_crs_are_refused(tmp_path, crs):
         read_terrain(path)
 
 
+@pytest.mark.parametrize("crs", ["EPSG:4978", "EPSG:5703"])
+def test_crs_that_is_no_map_is_refused(tmp_path, crs):
+    path = write(tmp_path / "dem.tif", plane(), crs=None)
+    with pytest.raises(TrustboError):
+        read_terrain(path, crs=crs)
+
+
 def test_crs_is_for_rasters_without_one(tmp_path):
     path = write(tmp_path / "dem.tif", plane(), crs=None)
     assert read_terrain(path, path, crs=UTM).rio.crs.to_epsg() == 32633

@@ -9,7 +9,6 @@ import rasterio
 import rioxarray  # noqa: F401  (registers the .rio accessor)
 import shapely
 import xarray as xr
-from rasterio.warp import transform
 from shapely import affinity
 
 from trustbo.campaign.result import Result
@@ -18,7 +17,7 @@ from trustbo.files import FilePath, write_file, write_text
 from trustbo.logs.table import to_frame
 from trustbo.planning import Plan
 from trustbo.planning.plan import QUANTILES
-from trustbo.terrain.place import quiet_affine
+from trustbo.terrain.place import converted, quiet_affine
 
 LEAD = "lead"
 """Name of the lead in exported files."""
@@ -162,7 +161,7 @@ def _feature(plan: Plan, layer: str, places: np.ndarray, about: dict[str, Any]) 
     if plan.workspace.grid.crs is None:
         raise TrustboError(_NO_CRS)
     crs, xy = plan.workspace.grid.crs, np.atleast_2d(places)
-    lon, lat = (np.array(values) for values in transform(crs, "EPSG:4326", *xy.T.tolist()))
+    lon, lat = converted(crs, "EPSG:4326", *xy.T)
     shape = shapely.Point(lon[0], lat[0])
     if np.ndim(places) == 2:
         shape = _cut(shapely.LineString(np.column_stack([np.unwrap(lon, period=360.0), lat])))

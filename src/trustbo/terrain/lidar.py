@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from rasterio.crs import CRS
+from pyproj import CRS
 from scipy.interpolate import LinearNDInterpolator
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import QhullError
@@ -72,7 +72,7 @@ def read_lidar(points: FilePath, resolution: float = 1.0, *, crs: object = None)
     surface = dem + canopy
     ground = np.where(np.isfinite(surface), dem, np.nan)
     maps = (xr.DataArray(z, {"y": y, "x": x}, ("y", "x")) for z in (ground, surface))
-    return read_terrain(*(z.rio.write_crs(own) for z in maps))
+    return read_terrain(*(z.rio.write_crs(own.to_string()) for z in maps))
 
 
 def _read_points(path: str, given: object) -> tuple[np.ndarray, np.ndarray, CRS]:

@@ -7,11 +7,9 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from rasterio._err import CPLE_BaseError
-from rasterio.crs import CRS
+from pyproj import CRS, Transformer
+from pyproj.exceptions import CRSError
 from rasterio.enums import Resampling
-from rasterio.errors import CRSError
-from rasterio.warp import transform
 
 from trustbo.errors import TrustboError
 
@@ -37,17 +35,17 @@ def require_map(name: str, own: Any, given: Any) -> CRS:
     if own is None and given is None:
         raise TrustboError(f"{name} has no coordinate reference system; pass crs=.")
     try:
-        crs, *other = [CRS.from_user_input(one) for one in (own, given) if one is not None]
+        declared = [CRS.from_user_input(one) for one in (own, given) if one is not None]
     except CRSError:
         raise TrustboError(f"crs {given!r} is unknown to PROJ; give e.g. 'EPSG:32633'.") from None
+    crs = declared[0]
     flat = horizontal(crs)
-    if other and flat != horizontal(other[0]):
+    if not flat.equals(horizontal(declared[-1]), ignore_axis_order=True):
         raise TrustboError(
             f"{name} is in {crs.to_string()}, but crs= is {given}; leave crs= out, or correct the "
             "raster's own CRS, e.g. with gdal_edit.py -a_srs."
         )
-    in_metres = flat.is_projected and abs(flat.linear_units_factor[1] - 1.0) <= 1e-9
-    if not flat.is_geographic and not in_metres:
+    if not flat.is_geographic and not _is_in_metres(flat):
         raise TrustboError(
             f"{name} is in {crs.to_string()}, which is neither in degrees nor in metres; warp it, "
             "e.g. with gdalwarp -t_srs EPSG:32633."
@@ -55,29 +53,31 @@ def require_map(name: str, own: Any, given: Any) -> CRS:
     return crs
 
 
+def _is_in_metres(crs: CRS) -> bool:
+    """Return whether a CRS is a map whose coordinates are in metres."""
+    return crs.is_projected and abs(crs.axis_info[0].unit_conversion_factor - 1.0) <= 1e-9
+
+
 def horizontal(crs: CRS) -> CRS:
     """Return the CRS without its vertical axis."""
-    whole = crs.to_dict(projjson=True)
-    if whole["type"] == "CompoundCRS":
-        return CRS.from_dict(whole["components"][0])
-    system = whole.get("coordinate_system", {"axis": []})
-    if len(system["axis"]) < 3:
-        return crs
-    flat = whole | {"coordinate_system": system | {"axis": system["axis"][:2]}}
-    return CRS.from_dict({key: value for key, value in flat.items() if key != "id"})
+    return crs.to_2d()
 
 
 def vertical_axis(crs: CRS) -> tuple[float | None, str | None]:
     """Return the unit of a CRS's vertical axis in metres, negative for depths, and its datum."""
-    whole = crs.to_dict(projjson=True)
-    part = whole.get("components", [whole])[-1]
-    part = part.get("source_crs", part)
-    axis = part.get("coordinate_system", {"axis": [{}]})["axis"][-1]
-    if axis.get("direction") not in ("up", "down"):
+    part = crs.sub_crs_list[-1] if crs.is_compound else crs
+    if part.is_bound and part.source_crs is not None:  # heights tied to a grid of the geoid
+        part = part.source_crs
+
+    axis = part.axis_info[-1] if part.axis_info else None
+    if axis is None or axis.direction not in ("up", "down"):
         return None, None
-    length = 1.0 if axis["unit"] == "metre" else axis["unit"]["conversion_factor"]
-    datum = part.get("datum", part)["name"] if part["type"] == "VerticalCRS" else "the ellipsoid"
-    return length if axis["direction"] == "up" else -length, datum
+
+    length = axis.unit_conversion_factor
+    datum = "the ellipsoid"
+    if part.is_vertical:
+        datum = part.name if part.datum is None else part.datum.name
+    return length if axis.direction == "up" else -length, datum
 
 
 def placed(heights: xr.DataArray, name: str) -> xr.DataArray:
@@ -98,13 +98,10 @@ def placed(heights: xr.DataArray, name: str) -> xr.DataArray:
 def _middle(heights: xr.DataArray, crs: str, step: float = 0.0) -> np.ndarray:
     """Convert a raster's centre, and points one step east and north of it, to another CRS.
 
-    The result is NaN if the centre is outside the domain of the raster's CRS.
+    The result is infinite if the centre is outside the domain of the raster's CRS.
     """
     x, y = (0.5 * float(heights[axis][0] + heights[axis][-1]) for axis in ("x", "y"))
-    try:
-        return np.array(transform(heights.rio.crs, crs, [x, x + step, x], [y, y, y + step]))
-    except CPLE_BaseError:
-        return np.full((2, 3), np.nan)
+    return np.array(converted(heights.rio.crs, crs, [x, x + step, x], [y, y, y + step]))
 
 
 def on_metric_grid(heights: xr.DataArray) -> xr.DataArray:
@@ -123,6 +120,15 @@ def on_metric_grid(heights: xr.DataArray) -> xr.DataArray:
         zone = f"+proj=tmerc {at}"
     with quiet_affine():
         return heights.rio.reproject(zone, resampling=Resampling.bilinear, nodata=np.nan)
+
+
+def converted(source: Any, target: Any, x: Any, y: Any) -> tuple[Any, Any]:
+    """Convert positions to another CRS, where x is the easting or longitude in either CRS.
+
+    `x` and `y` are numbers or arrays, and so is the result. Coordinates are infinite where the
+    conversion is impossible.
+    """
+    return Transformer.from_crs(source, target, always_xy=True).transform(x, y)
 
 
 def same_grid(a: xr.DataArray, b: xr.DataArray) -> bool:

@@ -164,7 +164,7 @@ def _heights(array: xr.DataArray, given: object, nodata: float | None) -> xr.Dat
     coords = {axis: array[axis].values for axis in ("y", "x")}
     heights = xr.DataArray(values, coords, name=name, attrs={"datum": datum})
     heights = heights.sortby("y", ascending=False).sortby("x")
-    return placed(heights.rio.write_crs(horizontal(crs)), name)
+    return placed(heights.rio.write_crs(horizontal(crs).to_string()), name)
 
 
 def _stored(raster: FilePath | xr.DataArray, role: str) -> xr.DataArray:

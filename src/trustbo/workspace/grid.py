@@ -9,15 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
-from rasterio.crs import CRS
+from pyproj import CRS, Transformer
 from rasterio.transform import from_origin
-from rasterio.warp import transform as transform_points
-from rasterio.warp import transform_bounds
 
 from trustbo.data import Cell
 from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError, require_pair
-from trustbo.terrain.place import quiet_affine
+from trustbo.terrain.place import converted, quiet_affine
 
 type Location = Cell | Mapping[str, float]
 """A cell (row, col), or a position with named coordinates; see `Grid.locate`."""
@@ -159,7 +157,7 @@ class Grid(Summary):
         if len(location) > 2 or not math.isfinite(x + y):
             raise ValueError
         if names == ("lon", "lat"):
-            x, y = _moved(WGS84, self.require_crs(), x, y)
+            x, y = converted(WGS84, self.require_crs(), x, y)
         return (self.top - y) / self.cell_height, (x - self.left) / self.cell_width
 
     def _extent_text(self) -> str:
@@ -167,7 +165,8 @@ class Grid(Summary):
         if self.crs is None:
             return ""
         left, bottom, right, top = self.bounds
-        west, south, east, north = transform_bounds(self.require_crs(), WGS84, *self.bounds)
+        to_degrees = Transformer.from_crs(self.require_crs(), WGS84, always_xy=True)
+        west, south, east, north = to_degrees.transform_bounds(*self.bounds)
         return (
             f" (x {left:.1f} to {right:.1f} m and y {bottom:.1f} to {top:.1f} m in "
             f"{self.crs_name}; longitude {west:.5f} to {east:.5f}, latitude {south:.5f} to "
@@ -182,7 +181,7 @@ class Grid(Summary):
                 is not valid at the cell.
         """
         x, y = self.center(cell)
-        lon, lat = _moved(self.require_crs(), WGS84, x, y)
+        lon, lat = converted(self.require_crs(), WGS84, x, y)
         if not math.isfinite(lon + lat):
             raise TrustboError(
                 f"({x:.10g}, {y:.10g}) is not a point on Earth in {self.crs_name}; correct the "
@@ -197,7 +196,7 @@ class Grid(Summary):
         for axis in ("y", "x"):
             placed[axis].attrs = {"axis": axis.upper(), "units": "m"}
         if self.crs is not None:
-            placed = placed.rio.write_crs(self.require_crs())
+            placed = placed.rio.write_crs(self.crs)
         step = self.cell_width, self.cell_height
         return placed.rio.write_transform(from_origin(self.left, self.top, *step))
 
@@ -234,15 +233,6 @@ class Grid(Summary):
                 "from a terrain; give positions as x and y in metres."
             )
         return CRS.from_user_input(self.crs)
-
-
-def _moved(source: CRS, target: CRS, x: float, y: float) -> tuple[float, float]:
-    """Convert a position to another CRS; return infinite coordinates if this is impossible."""
-    try:
-        (u,), (v,) = transform_points(source, target, [x], [y])[:2]
-    except Exception:  # PROJ raises GDAL's errors, which have no common base
-        return math.inf, math.inf
-    return u, v
 
 
 def over_cells[Map: (xr.Dataset, xr.DataArray)](maps: Map) -> Map:
