@@ -1,5 +1,6 @@
 """What importing trustbo costs and touches."""
 
+import ast
 import re
 import subprocess
 import sys
@@ -95,9 +96,16 @@ def test_a_kernel_without_ipywidgets_is_not_warned_of_progress_bars():
 # Nothing before it is how all other processes of these tests import it.
 @pytest.mark.slow  # processes start for long
 @pytest.mark.parametrize(
-    "before", ["import arviz", "import arviz, numpyro.distributions", "import numpyro, arviz"]
+    ("before", "used"),
+    [
+        # In these two, numpyro has lost `distributions.distribution` before trustbo loads it.
+        ("import arviz", "numpyro.distributions.Unit"),
+        ("import arviz, numpyro.distributions", "numpyro.distributions.Unit"),
+        ("import arviz; import trustbo.models", "numpyro.distributions.distribution.Unit"),
+        ("import numpyro, arviz", "numpyro.distributions.distribution.Unit"),
+    ],
 )
-def test_numpyro_works_whatever_was_imported_first(before):
+def test_numpyro_works_whatever_was_imported_first(before, used):
     """arviz_base leaves it half loaded; and JAX's configuration is as it was."""
     program = (
         f"{before}\n"
@@ -112,9 +120,27 @@ def test_numpyro_works_whatever_was_imported_first(before):
         "z = np.full((3, 2, 2), 0.5)\n"
         "slots = model.slots([tb.Mission.from_arrays(path, z, z[..., 0])])\n"
         "print(handlers.trace(program).get_trace(slots)['contact_rate']['value'].shape)\n"
-        "import numpyro; numpyro.factor; numpyro.distributions.distribution.Unit\n"
+        "import numpyro.infer\n"
+        "draw = numpyro.infer.Predictive(model.program, num_samples=4)\n"
+        "print(draw(jax.random.key(0), slots)['contact_rate'].shape)\n"
+        f"numpyro.factor, {used}\n"
     )
-    assert printed(program) == "False float32\n(1, 3, 2)"
+    assert printed(program) == "False float32\n(1, 3, 2)\n(4, 1, 3, 2)"
+
+
+@pytest.mark.slow  # processes start for long
+def test_modules_of_numpyro_are_left_as_they_are():
+    """Even where they lack their submodules, which makes a write to them visible."""
+    program = (
+        "import arviz, numpyro.distributions\n"
+        "import sys\n"
+        "numpyro.factor\n"
+        "before = {n: {*vars(m)} for n, m in sys.modules.items() if n.startswith('numpyro')}\n"
+        "import trustbo.models, trustbo.campaign\n"
+        "added = {n: {*vars(sys.modules[n])} - names for n, names in before.items()}\n"
+        "print({n: names for n, names in added.items() if names})\n"
+    )
+    assert printed(program) == "{}"
 
 
 @pytest.mark.parametrize("name", ["trustbo", *(f"trustbo.{part}" for part in PARTS)])
@@ -143,6 +169,21 @@ def test_a_missing_package_is_named_itself_and_is_one_of_an_extra():
     }
     assert named >= {"rosbags", "laspy"}
     assert named <= offered
+
+
+def imported_names():
+    """All modules, as `a.b.c`, that the package imports from elsewhere."""
+    for file in (ROOT / "src" / "trustbo").rglob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.Import):
+                yield from (alias.name for alias in node.names)
+            elif isinstance(node, ast.ImportFrom) and node.module:
+                yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def test_no_private_module_of_another_package_is_imported():
+    private = re.compile(r"\._(?!_)")
+    assert [name for name in imported_names() if private.search(name)] == []
 
 
 def test_helpers_of_tests_are_not_in_test_files():

@@ -4,12 +4,10 @@ In Jupyter without ipywidgets, importing numpyro issues the warning "IProgress n
 warning is silenced because text progress bars suffice.
 
 arviz_base leaves a lazily loaded numpyro in `sys.modules`. If a submodule is imported first, as in
-`import arviz; import numpyro.distributions`, packages lack their submodules and numpyro fails
-("numpyro.distributions has no attribute 'distribution'"). Accessing an attribute of numpyro first
-avoids the error. If submodules are already missing from their packages, they are set below.
+`import arviz; import numpyro.distributions`, Python executes that package twice, and the second one
+lacks its submodules as attributes. Accessing an attribute of numpyro first avoids this, as below.
 """
 
-import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -29,17 +27,14 @@ with warnings.catch_warnings():
     warnings.filterwarnings("ignore", "IProgress not found")
     import numpyro
 
+    numpyro.__version__  # noqa: B018  (loads a numpyro that arviz_base has left unloaded)
+
 VERSIONS: dict[str, str] = {
     "trustbo": version("trustbo"),
     "numpyro": numpyro.__version__,
     "jax": jax.__version__,
 }
 """Versions recorded in posteriors, cached because each lookup takes 4 ms."""
-
-for _name, _module in list(sys.modules.items()):
-    _package, _, _child = _name.rpartition(".")
-    if _package.startswith("numpyro") and not hasattr(sys.modules[_package], _child):
-        setattr(sys.modules[_package], _child, _module)
 
 
 def special_functions(x: Any) -> Any:
