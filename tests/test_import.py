@@ -186,6 +186,16 @@ def test_no_private_module_of_another_package_is_imported():
     assert [name for name in imported_names() if private.search(name)] == []
 
 
+def test_every_imported_package_is_declared():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    required = [project["dependencies"], *project["optional-dependencies"].values()]
+    declared = {re.match(r"[\w-]+", each)[0].lower() for part in required for each in part}
+    declared |= {name.replace("-", "_") for name in declared} | {"sklearn"}  # scikit-learn
+
+    packages = {name.partition(".")[0] for name in imported_names()}
+    assert packages - {*sys.stdlib_module_names, "trustbo"} - declared == set()
+
+
 def test_helpers_of_tests_are_not_in_test_files():
     """They are in references.py, missions.py and worlds.py, also for programs that tests start."""
     imported = re.compile(r"^\s*(?:from|import) +(?:\w+\.)*(?:test_\w+|conftest)\b", re.MULTILINE)
