@@ -23,6 +23,15 @@ def test_text_of_the_user_cannot_break_the_page():
     assert "<script>" not in html
 
 
+def test_an_object_in_a_notebook_is_a_table_of_its_rows():
+    html = ElementTree.fromstring(f"<div>{Odd()._repr_html_()}</div>")
+    assert html.findtext("b") == "Odd"
+    assert [[cell.text for cell in row] for row in html.iter("tr")] == [
+        ["<script>", "</td>&"],
+        ["long", "x" * 500],
+    ]
+
+
 def test_lines_are_cut_at_the_width_of_a_terminal():
     assert max(map(len, repr(Odd()).splitlines())) == 100
 

@@ -48,6 +48,7 @@ def test_fitting_loads_no_figures():
 
 def test_type_checkers_are_told_that_it_is_typed():
     assert resources.files("trustbo").joinpath("py.typed").is_file()
+    assert resources.files("trustbo").joinpath("templates", "report.html").is_file()
     build = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["build"]
     assert build["targets"]["wheel"] == {"packages": ["src/trustbo"]}  # all files in it
 

@@ -5,7 +5,6 @@ import warnings
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from functools import cache
-from html import escape
 from typing import Any
 
 with warnings.catch_warnings():  # tqdm warns if ipywidgets is missing
@@ -34,12 +33,24 @@ class Summary:
         return "\n".join(line if len(line) <= _WIDTH else f"{line[:97]}..." for line in lines)
 
     def _repr_html_(self) -> str:
-        cells = "".join(
-            f'<tr><th style="text-align:left">{escape(name)}</th>'
-            f'<td style="text-align:left">{escape(value)}</td></tr>'
-            for name, value in self._rows()
-        )
-        return f"<b>{escape(type(self).__name__)}</b><table>{cells}</table>"
+        return render("summary.html", name=type(self).__name__, rows=self._rows())
+
+
+def render(template: str, **values: Any) -> str:
+    """Fill in a template of the folder `templates`; its values are escaped."""
+    return _environment().get_template(template).render(values)
+
+
+@cache
+def _environment() -> Any:
+    from jinja2 import Environment, PackageLoader  # only objects in notebooks and reports need it
+
+    return Environment(
+        loader=PackageLoader("trustbo"),
+        autoescape=True,
+        trim_blocks=True,
+        keep_trailing_newline=True,
+    )
 
 
 def joined(names: Sequence[str]) -> str:

@@ -3,8 +3,7 @@
 import base64
 import io
 from collections.abc import Callable
-from html import escape
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -13,6 +12,7 @@ from arviz_stats.summary import summary
 
 from trustbo import plots
 from trustbo.campaign.result import Result
+from trustbo.display import render
 from trustbo.errors import require_kind
 from trustbo.files import FilePath, write_text
 from trustbo.planning import Plan
@@ -26,26 +26,22 @@ _DRAWS = 50
 _SHOWN = 3
 """Number of bounds shown in detail, which are the bounds with the least trust."""
 _ENDS = {"n_iterations": "all missions were run", "interrupted": "none; more missions can be run"}
-_PAGE = """<!DOCTYPE html>
-<html lang="en"><head><meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{title}</title>
-<style>
-body {{ font: 16px/1.5 system-ui, sans-serif; max-width: 52em; margin: 1.5em auto; padding: 0 1em;
-  color: #1c1f22; background: #fff }}
-h1 {{ font-size: 1.6em }} h2 {{ font-size: 1.2em; margin-top: 2em }}
-img {{ max-width: 100%; height: auto }}
-.wide {{ overflow-x: auto; margin: 1em 0 }}
-@media (max-width: 46em) {{ img {{ max-width: 42rem }} }}
-table {{ border-collapse: collapse; font-size: .85em; border: 0 }}
-td, th {{ padding: .2em .7em; text-align: right; border: 0; border-bottom: 1px solid #ddd }}
-.facts td, .facts th {{ text-align: left; vertical-align: top; font-size: 1.1em }}
-.note {{ color: #555; font-size: .9em }}
-</style></head><body>
-<h1>{title}</h1>
-{body}
-</body></html>
-"""
+
+
+class _Block(NamedTuple):
+    """Part of a section of the page: an image, a table or a note."""
+
+    image: str = ""  # PNG in base64
+    alt: str = ""  # text in place of the image
+    table: str = ""  # HTML with its texts escaped
+    note: str = ""
+
+
+class _Section(NamedTuple):
+    """Section of the page."""
+
+    heading: str
+    blocks: list[_Block]
 
 
 def write_report(path: FilePath, result: Result) -> None:
@@ -63,19 +59,33 @@ def write_report(path: FilePath, result: Result) -> None:
     """
     require_kind("result", result, Result, "give a result or a campaign")
     _ = result.posterior  # raises if there is none yet
-    body = [_facts(result), *_path(result.plan), *_trust(result), *_missions(result)]
-    body += [*_uncertainty(result), *_diagnostics(result), *_settings(result)]
     n = len(result.missions)
-    title = f"Recommended path after {n} mission{'s' * (n != 1)}"
-    write_text(path, _PAGE.format(title=title, body="\n".join(body)))
+    missions = "1 mission" if n == 1 else f"{n} missions"
+    page = render(
+        "report.html",
+        title=f"Recommended path after {missions}",
+        facts=_facts(result),
+        sections=[
+            _path(result.plan),
+            _trust(result),
+            _missions(result),
+            _uncertainty(result),
+            _diagnostics(result),
+            _settings(result),
+        ],
+    )
+    write_text(path, page)
 
 
-def _facts(result: Result) -> str:
-    """Make a table of the facts needed to decide whether to drive the path."""
-    plan, problem = result.plan, result.planner.problem
+def _facts(result: Result) -> dict[str, str]:
+    """Return the facts, by name, that are needed to decide whether to drive the path."""
+    plan = result.plan
+    problem = result.planner.problem
     noise_sd = problem.dynamics(result.belief.mean()).noise_sd
     contact = np.minimum(problem.family.mean_rate(plan.trust, noise_sd), 1.0).mean(1)
-    worst, rate = int(np.argmin(contact)), result.state.entries[-1].row["contact_rate"]
+    worst = int(np.argmin(contact))
+
+    rate = result.state.entries[-1].row["contact_rate"]
     last = f"{rate:.1%} of the time" if np.isfinite(rate) else "not measured"
     cells = " → ".join(f"{row},{col}" for row, col in plan.path)
     facts = {
@@ -89,18 +99,15 @@ def _facts(result: Result) -> str:
     }
     if plan.p_arrive is not None:
         facts["Probability of arrival"] = f"{plan.p_arrive:.1%}, given the robots' slope limit"
-    rows = "".join(
-        f"<tr><th>{escape(name)}</th><td>{escape(text)}</td></tr>" for name, text in facts.items()
-    )
-    return f'<table class="facts">{rows}</table>'
+    return facts
 
 
-def _path(plan: Plan) -> list[str]:
+def _path(plan: Plan) -> _Section:
     """Plot the recommended path if there is a terrain, and make a table of its bounds."""
-    content = [_heading("Recommended path")]
+    blocks = []
     if plan.stops is not None:
         weakest = sorted((np.argsort(plan.trust.mean(1))[:_SHOWN] + 1).tolist())
-        content += [
+        blocks += [
             _image(lambda: plots.plan_map(plan, bounds=weakest), "path, posts and routes"),
             _note(
                 "The first map shows the path from start (circle) to goal (star). The others show "
@@ -108,6 +115,7 @@ def _path(plan: Plan) -> list[str]:
                 "drives, and then drive to their next posts."
             ),
         ]
+
     low, high = plan.bands[0], plan.bands[-1]
     table = pd.DataFrame({
         "cell": [_name(cell) for cell in plan.path[1:]],
@@ -115,39 +123,43 @@ def _path(plan: Plan) -> list[str]:
         "5 %": low.mean(1),
         "95 %": high.mean(1),
     }, index=pd.RangeIndex(1, len(plan.path), name="bound"))  # fmt: skip
-    return [*content, _table(table)]
+    return _Section("Recommended path", [*blocks, _table(table)])
 
 
-def _trust(result: Result) -> list[str]:
+def _trust(result: Result) -> _Section:
     is_logit = result.settings["observation"] == "beta_binomial"
     scale = "Trust is the logit of contact." if is_logit else "A trust of 1 means unbroken contact."
-    return [
-        _heading("Trust map"),
-        _image(result.plot_maps, "trust maps after selected missions"),
-        _note(
-            f"Expected trust in each cell, and the path planned with this trust. {scale} "
-            "Impassable cells are grey, and so is the start, whose trust is assumed."
-        ),
-    ]
+    return _Section(
+        "Trust map",
+        [
+            _image(result.plot_maps, "trust maps after selected missions"),
+            _note(
+                f"Expected trust in each cell, and the path planned with this trust. {scale} "
+                "Impassable cells are grey, and so is the start, whose trust is assumed."
+            ),
+        ],
+    )
 
 
-def _missions(result: Result) -> list[str]:
+def _missions(result: Result) -> _Section:
     table = result.table()
     columns = ("status", "contact_rate", "contact_lost", "objective", "n_bounds")
     shown = table.loc[:, [name for name in columns if name in table]].rename_axis("mission")
     shown.columns = [str(name).replace("_", " ") for name in shown.columns]
-    return [
-        _heading("Contact in each mission"),
-        _image(result.plot_history, "contact and objective of each mission"),
-        _table(shown),
-        _note(
-            f"The objective ({result.settings['objective'].replace('_', ' ')}) is the value "
-            "predicted for the plan of a mission, based on all earlier missions."
-        ),
-    ]
+    return _Section(
+        "Contact in each mission",
+        [
+            _image(result.plot_history, "contact and objective of each mission"),
+            _table(shown),
+            _note(
+                f"The objective ({result.settings['objective'].replace('_', ' ')}) is the value "
+                "predicted for the plan of a mission, based on all earlier missions."
+            ),
+        ],
+    )
 
 
-def _uncertainty(result: Result) -> list[str]:
+def _uncertainty(result: Result) -> _Section:
     plan = result.plan
     maps = result.maps(n_draws=_DRAWS)
     driven = {bound.cell for mission in result.missions for bound in mission.bounds}
@@ -162,22 +174,25 @@ def _uncertainty(result: Result) -> list[str]:
             f"The objective is {plan.value:.3g}, with a 90 % interval of {low:.3g} to {high:.3g}; "
             "only the objective limits trust to 1, so it can lie outside."
         )
-    return [
-        _heading("Uncertainty"),
-        _image(
-            lambda: plots.cell_map(
-                maps["trust_sd"], result.workspace, path=plan.path, label="sd of expected trust"
+    return _Section(
+        "Uncertainty",
+        [
+            _image(
+                lambda: plots.cell_map(
+                    maps["trust_sd"], result.workspace, path=plan.path, label="sd of expected trust"
+                ),
+                "standard deviation of trust",
             ),
-            "standard deviation of trust",
-        ),
-        _note(
-            f"{known} {band} The intervals assume an adequate model (see trustbo.criticism). "
-            "In cells that were never entered, trust is predicted from a map that may be outdated."
-        ),
-    ]
+            _note(
+                f"{known} {band} The intervals assume an adequate model (see trustbo.criticism). "
+                "In cells that were never entered, trust is predicted from a map that may be "
+                "outdated."
+            ),
+        ],
+    )
 
 
-def _diagnostics(result: Result) -> list[str]:
+def _diagnostics(result: Result) -> _Section:
     names = {
         "k_hat": "Pareto k-hat (at most 0.7, good below 0.5)",
         "kish": "effective samples (Kish)",
@@ -190,49 +205,48 @@ def _diagnostics(result: Result) -> list[str]:
     rows = {names[name]: float(last[name]) for name in known}
     table: Any = summary(result.posterior, round_to="none")
     kept = [name for name in ("mean", "sd", "eti89_lb", "eti89_ub") if name in table]
-    return [
-        _heading("Diagnostics"),
-        _note(f"Sampler: {result.posterior.attrs.get('sampler', 'unknown')}."),
-        _table(pd.Series(rows, name="value").rename_axis("diagnostic").to_frame()),
-        _table(table[kept].rename_axis("parameter")),
-    ]
+    return _Section(
+        "Diagnostics",
+        [
+            _note(f"Sampler: {result.posterior.attrs.get('sampler', 'unknown')}."),
+            _table(pd.Series(rows, name="value").rename_axis("diagnostic").to_frame()),
+            _table(table[kept].rename_axis("parameter")),
+        ],
+    )
 
 
-def _settings(result: Result) -> list[str]:
+def _settings(result: Result) -> _Section:
     texts = {name: str(value) for name, value in result.settings.items()}
     short = {name: text for name, text in texts.items() if len(text) < 120}
-    return [
-        _heading("Settings"),
-        _table(pd.Series(short, name="value").rename_axis("setting").to_frame()),
-    ]
+    return _Section(
+        "Settings",
+        [
+            _table(pd.Series(short, name="value").rename_axis("setting").to_frame()),
+        ],
+    )
 
 
 def _name(cell: tuple[int, int]) -> str:
     return f"{cell[0]},{cell[1]}"
 
 
-def _heading(text: str) -> str:
-    return f"<h2>{escape(text)}</h2>"
+def _note(text: str) -> _Block:
+    return _Block(note=text)
 
 
-def _note(text: str) -> str:
-    return f'<p class="note">{escape(text)}</p>'
-
-
-def _table(frame: pd.DataFrame) -> str:
+def _table(frame: pd.DataFrame) -> _Block:
     html = frame.reset_index().to_html(
         index=False, border=0, float_format=lambda x: f"{x:.3g}", na_rep="-"
     )
-    return f'<div class="wide">{html}</div>'
+    return _Block(table=html)
 
 
-def _image(draw: Callable[[], Any], alt: str) -> str:
-    """Draw a figure and return an HTML image with the figure."""
+def _image(draw: Callable[[], Any], alt: str) -> _Block:
+    """Draw a figure as an image with a text in its place."""
     with drawing("default"):
         figure = np.ravel(draw())[0].get_figure(root=True)
         file = io.BytesIO()
         figure.savefig(file, format="png", dpi=130, bbox_inches="tight")
         plt.close(figure)
-    data = base64.b64encode(file.getvalue()).decode()
-    image = f'<img alt="{escape(alt)}" src="data:image/png;base64,{data}">'
-    return f'<div class="wide">{image}</div>'
+
+    return _Block(image=base64.b64encode(file.getvalue()).decode(), alt=alt)
