@@ -177,7 +177,7 @@ def hillside(n):
 def long_run(data):
     """Return means and standard deviations of the hyperparameters by name, from many points."""
     model = tb.models.default_model().for_features(data[0].features)
-    posterior = Posterior(model, model.slots(data))
+    posterior = Posterior(model, model.observations(data))
     points = importance.sample(
         posterior.log_density, posterior.start()[None], np.random.default_rng(0),
         size=4096, enough=10_000.0, defensive=posterior.defensive,

@@ -86,13 +86,17 @@ def rank(model, missions, n, seed, n_ranked=N_RANKED):
     Measured rates are replaced by simulated rates; Gaussian rates are not clipped to [0, 1].
     """
     model = model.for_features(missions[0].features)
-    slots = model.slots(missions)
-    before, measured, ranks = Posterior(model, slots), ~np.isnan(slots.y), []
+    observations = model.observations(missions)
+    before, measured, ranks = (
+        Posterior(model, observations),
+        ~np.isnan(observations.contact_rate),
+        [],
+    )
     for j in range(n):
         rng = np.random.default_rng([seed, j])
         truth = before.draw_prior(1, rng)
         rates = np.where(measured, before.replicate(truth, rng)[0], np.nan)
-        posterior = Posterior(model, slots._replace(y=rates))
+        posterior = Posterior(model, observations._replace(contact_rate=rates))
         drawn, _, summary = by_importance(posterior, n_ranked, int(rng.integers(2**31)))
         if summary["k_hat"] <= MAX_KHAT:
             found, true = (numbers(posterior.named(d)) for d in (drawn, truth))

@@ -13,14 +13,14 @@ from scipy.stats import multivariate_normal
 class Dense:
     """Joint normal of all rates and coefficients, for one theta of arrays (1, ...)."""
 
-    def __init__(self, model, slots, theta):
+    def __init__(self, model, observations, theta):
         """Form the joint normal."""
-        n_missions, K, R = slots.y.shape
-        U = np.concatenate([e.columns(slots).toarray() for e in model.columns], axis=1)
+        n_missions, K, R = observations.contact_rate.shape
+        U = np.concatenate([e.columns(observations).toarray() for e in model.columns], axis=1)
         U = U.reshape(n_missions, K, R, -1)
         means, precisions = [], []
         for effect in model.columns:
-            mean, parts = effect.prior(theta, slots)
+            mean, parts = effect.prior(theta, observations)
             precisions += [part[0] if part.ndim == 3 else np.diag(part[0]) for part in parts]
             means.append(np.zeros(sum(p.shape[1] for p in parts)) if mean is None else mean[0])
         self.prior_mean = np.concatenate(means)
@@ -46,8 +46,8 @@ class Dense:
                 rates.append(measured)
             rates = np.concatenate(rates)
             cov.append(rates @ rates.T)
-        self.seen = ~np.isnan(slots.y.ravel())
-        self.y = slots.y.ravel()[self.seen]
+        self.seen = ~np.isnan(observations.contact_rate.ravel())
+        self.y = observations.contact_rate.ravel()[self.seen]
         self.of_c = np.concatenate(of_c)[self.seen]
         self.mean = np.concatenate(mean)[self.seen] + self.of_c @ self.prior_mean
         cov = block_diag(*cov)[np.ix_(self.seen, self.seen)]

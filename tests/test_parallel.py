@@ -25,9 +25,9 @@ class WatchedEffect(RobotEffect):
 
     SEEN = set()  # noqa: RUF012
 
-    def prior(self, theta, slots):
+    def prior(self, theta, observations):
         self.SEEN.update(blas_threads())
-        return super().prior(theta, slots)
+        return super().prior(theta, observations)
 
 
 @pytest.fixture

@@ -38,4 +38,4 @@ def samplers(
     model: TrustModel, missions: Sequence[Mission]
 ) -> dict[str, Callable[[int], tuple[dict, int]]]:
     """The sampler, by name, of the program of one of our models."""
-    return {"NumPyro's NUTS, model.program": nuts(model.program, model.slots(missions))}
+    return {"NumPyro's NUTS, model.program": nuts(model.program, model.observations(missions))}

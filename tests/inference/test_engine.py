@@ -18,7 +18,7 @@ from trustbo.models import (
     RobotEffect,
 )
 from trustbo.models.backend import own_settings
-from trustbo.models.slots import Slots
+from trustbo.models.observations import Observations
 from trustbo.models.visited import visited
 
 FEATURES = ("line_of_sight", "vegetation")
@@ -41,11 +41,11 @@ def slots_of(model, *, gaps=False, shape=(4, 5, 3)):
     if gaps:
         y[rng.random(shape) < 0.15] = np.nan
         y[1, 3:] = np.nan
-    slots = Slots(y, z, np.full(shape, 50.0), FEATURES)
+    observations = Observations(y, z, np.full(shape, 50.0), FEATURES)
     if PlaceEffect() not in model.effects:
-        return slots
+        return observations
     steps = [rng.integers(0, n, shape[:2]) for n in (8, 4, 4)]
-    return slots._replace(visited=visited(np.stack(steps, -1), (4, 4)))
+    return observations._replace(visited=visited(np.stack(steps, -1), (4, 4)))
 
 
 def posterior_of(name, **options):
@@ -60,7 +60,7 @@ def posterior_of(name, **options):
 def test_the_evidence_is_the_density_of_the_dense_joint_normal(name, gaps):
     posterior, theta = posterior_of(name, gaps=gaps)
     for i, value in enumerate(posterior.log_evidence(theta)):
-        dense = Dense(posterior.model, posterior.slots, at(theta, slice(i, i + 1)))
+        dense = Dense(posterior.model, posterior.observations, at(theta, slice(i, i + 1)))
         np.testing.assert_allclose(value, dense.log_density(), rtol=1e-9)
 
 
@@ -78,11 +78,13 @@ def test_effects_split_into_chains_have_the_same_evidence_and_draws(name, gaps):
     posterior, theta = posterior_of(name, gaps=gaps, shape=(7, 5, 3))
     assert posterior.blocks.order.hidden.shape == (7, 3)
     for i, value in enumerate(posterior.log_evidence(theta)):
-        dense = Dense(posterior.model, posterior.slots, at(theta, slice(i, i + 1)))
+        dense = Dense(posterior.model, posterior.observations, at(theta, slice(i, i + 1)))
         np.testing.assert_allclose(value, dense.log_density(), rtol=1e-9)
 
     drawn = posterior.draw_columns(at(theta, np.zeros(4000, int)), np.random.default_rng(0))
-    mean, cov = Dense(posterior.model, posterior.slots, at(theta, slice(0, 1))).coefficients()
+    mean, cov = Dense(
+        posterior.model, posterior.observations, at(theta, slice(0, 1))
+    ).coefficients()
     sd = np.sqrt(np.diag(cov))
     assert (np.abs(drawn.mean(0) - mean) < 5.0 * sd / np.sqrt(4000)).all()
     np.testing.assert_allclose(drawn.std(0), sd, rtol=5.0 / np.sqrt(8000))
@@ -102,7 +104,7 @@ def test_slopes_of_chains_in_jax_are_those_in_numpy():
 @pytest.mark.parametrize("shape", [(1, 1, 1), (2, 1, 3), (3, 4, 1)])
 def test_one_bound_and_one_robot_are_cases_like_others(shape):
     posterior, theta = posterior_of("shared noise", shape=shape)
-    dense = Dense(posterior.model, posterior.slots, at(theta, slice(0, 1)))
+    dense = Dense(posterior.model, posterior.observations, at(theta, slice(0, 1)))
     np.testing.assert_allclose(posterior.log_evidence(theta)[0], dense.log_density(), rtol=1e-9)
 
 
@@ -114,7 +116,7 @@ def test_the_evidence_holds_at_extreme_hyperparameters(name, value):
     posterior, theta = posterior_of("places and robots", gaps=True)
     theta = {**theta, name: np.full(3, value)}
     theta["rest"] = 1.0 - theta["beta0"]
-    dense = Dense(posterior.model, posterior.slots, at(theta, slice(0, 1)))
+    dense = Dense(posterior.model, posterior.observations, at(theta, slice(0, 1)))
     np.testing.assert_allclose(posterior.log_evidence(theta)[0], dense.log_density(), rtol=1e-7)
 
 
@@ -136,7 +138,7 @@ def test_columns_drawn_often_at_visited_points_have_the_moments_of_the_joint_nor
         first = np.arange(500 * k, 500 * (k + 1))
         drawn = columns.draw(np.repeat(first, 20), rng)
         one = at(theta, slice(k, k + 1))
-        mean, cov = Dense(posterior.model, posterior.slots, one).coefficients()
+        mean, cov = Dense(posterior.model, posterior.observations, one).coefficients()
         sd = np.sqrt(np.diag(cov))
         n_independent = 4 * 500
         assert (np.abs(drawn.mean(0) - mean) < 5.0 * sd / np.sqrt(n_independent)).all()
@@ -148,7 +150,7 @@ def test_drawn_columns_have_the_moments_of_the_joint_normal(name):
     posterior, theta = posterior_of(name)
     one = at(theta, slice(0, 1))
     drawn = posterior.draw_columns(at(theta, np.zeros(20_000, int)), np.random.default_rng(0))
-    mean, cov = Dense(posterior.model, posterior.slots, one).coefficients()
+    mean, cov = Dense(posterior.model, posterior.observations, one).coefficients()
     sd = np.sqrt(np.diag(cov))
     assert (np.abs(drawn.mean(0) - mean) < 5.0 * sd / np.sqrt(20_000)).all()
     np.testing.assert_allclose(drawn.std(0), sd, rtol=0.04)
@@ -160,16 +162,16 @@ def test_drawn_columns_have_the_moments_of_the_joint_normal(name):
 def test_the_plain_program_has_the_density_of_the_equations(name):
     """Given coefficients: signals by the program's filter, and by the matrices of `signal`."""
     posterior, theta = posterior_of(name, gaps=True)
-    model, slots, rng = posterior.model, posterior.slots, np.random.default_rng(2)
+    model, observations, rng = posterior.model, posterior.observations, np.random.default_rng(2)
     values = posterior.scores.draw(20, rng)
-    theta = model.theta(values, slots.resolution)
-    density = log_density_of_rates(model, slots)
+    theta = model.theta(values, observations.resolution)
+    density = log_density_of_rates(model, observations)
     with own_settings():
         for i in range(20):
             given = {n: jax.numpy.asarray(v[i]) for n, v in values.items()}
             c, start = posterior.prior(at(theta, slice(i, i + 1))).draw(rng)[0], 0
             for effect in model.columns:
-                mean, parts = effect.prior(at(theta, slice(i, i + 1)), slots)
+                mean, parts = effect.prior(at(theta, slice(i, i + 1)), observations)
                 first = start
                 for k, part in enumerate(parts):
                     stop = start + part.shape[1]
@@ -179,7 +181,7 @@ def test_the_plain_program_has_the_density_of_the_equations(name):
                     given[f"{effect.noun or 'weights'}_{k}"] = jax.numpy.asarray(of_part)
                     start = stop
             found = float(density(given))
-            signal = model.signal(at(theta, slice(i, i + 1)), slots, posterior.layout)
+            signal = model.signal(at(theta, slice(i, i + 1)), observations, posterior.layout)
             at_ = engine.expected(posterior.blocks, signal, c[None])
             W, log_sites = engine.whiten(
                 posterior.blocks, signal, posterior.blocks.seen / signal.sd**2
@@ -189,12 +191,12 @@ def test_the_plain_program_has_the_density_of_the_equations(name):
             np.testing.assert_allclose(found, wanted, rtol=1e-9)
 
 
-def log_density_of_rates(model, slots):
+def log_density_of_rates(model, observations):
     """By the program; noise that it samples is integrated out, as its log-density is quadratic."""
 
     def sites(given):
         program = handlers.substitute(handlers.seed(model.program, 0), given)
-        return handlers.trace(program).get_trace(slots)
+        return handlers.trace(program).get_trace(observations)
 
     def density(given):
         found = sites(given)

@@ -7,7 +7,7 @@ from scipy.special import logsumexp
 from trustbo.inference import ep
 from trustbo.inference.posterior import Posterior, at
 from trustbo.models import HumanTrust, PooledTrust
-from trustbo.models.slots import Slots
+from trustbo.models.observations import Observations
 
 FEATURES = ("vegetation",)
 
@@ -17,7 +17,7 @@ def small(observation, y):
     y = np.array(y, dtype=float).reshape(1, 2, 1)
     z = np.array([0.3, 0.8]).reshape(1, 2, 1, 1)
     model = PooledTrust(observation=observation).for_features(FEATURES)
-    return Posterior(model, Slots(y, z, np.full(y.shape, 40.0), FEATURES))
+    return Posterior(model, Observations(y, z, np.full(y.shape, 40.0), FEATURES))
 
 
 def by_quadrature(posterior, theta):
@@ -74,11 +74,11 @@ def test_parts_of_persons_have_their_joint_law():
     z = np.random.default_rng(0).integers(0, 2, (3, 4, 1, 2)).astype(float)
     features = ("success", "failure")
     model = HumanTrust(scale="likert7").for_features(features)
-    slots = Slots(y, z, np.full(y.shape, 6.0), features)
-    posterior = Posterior(model, slots)
+    observations = Observations(y, z, np.full(y.shape, 6.0), features)
+    posterior = Posterior(model, observations)
     theta = posterior.theta(np.zeros((1, posterior.n_scores)))
-    with_parts = model.signal(theta, slots, posterior.layout).S
-    effects = model.random_effects(theta, slots)
+    with_parts = model.signal(theta, observations, posterior.layout).S
+    effects = model.random_effects(theta, observations)
     parts = model.state_space(theta, 1).response(4) @ effects.drift + effects.offset
     rest = with_parts - parts @ np.swapaxes(parts, 2, 3)
     beta0, delta_w = theta["beta0"][0], theta["delta_w"][0]

@@ -45,13 +45,13 @@ def without_memory(model):
 def test_the_evidence_without_memory_is_that_of_quadrature():
     """Over both noises, half-normal a priori."""
     model = without_memory(PooledTrust())
-    posterior = Posterior(model, model.slots(missions_with(0.3, 1)))
+    posterior = Posterior(model, model.observations(missions_with(0.3, 1)))
     found = by_importance(posterior, 1000, 0)[2]["log_evidence"]
 
     p = (np.arange(80) + 0.5) / 80
     w, v = (x.ravel() for x in np.meshgrid(*[0.2 * stats.halfnorm.ppf(p)] * 2))
     values = {"beta0": 0.0 * w, "delta_w": w, "delta_v": v}
-    evidence = posterior.log_evidence(model.theta(values, posterior.slots.resolution))
+    evidence = posterior.log_evidence(model.theta(values, posterior.observations.resolution))
     expected = np.logaddexp.reduce(evidence) - np.log(len(w))
     assert found == pytest.approx(expected, abs=0.15)
 

@@ -70,14 +70,14 @@ def test_predictions_are_those_of_the_joint_normal_of_draws():
     found = predict_reports(posterior, [new], n_draws=400)
 
     fitted, draws = read_posterior(posterior)
-    slots = fitted.model.slots([new])
+    observations = fitted.model.observations([new])
     effects = zip(fitted.model.columns, strict=True)
-    U = np.column_stack([effect.columns(slots).toarray() for (effect,) in effects])
+    U = np.column_stack([effect.columns(observations).toarray() for (effect,) in effects])
     log_w, means = [], []
     for i in range(len(draws.c)):
         theta = at(draws.theta, slice(i, i + 1))
-        signal = fitted.model.signal(theta, slots, fitted.model.layout(slots))
-        inputs = fitted.model.layout(slots).columns(sparse.csr_array(U)) @ draws.c[i]
+        signal = fitted.model.signal(theta, observations, fitted.model.layout(observations))
+        inputs = fitted.model.layout(observations).columns(sparse.csr_array(U)) @ draws.c[i]
         mean = (signal.m[0, 0] + signal.T[0, 0] @ inputs.ravel()).ravel()
         S = signal.covariance[0, 0]
         C = S[:4, :4] + float(signal.sd[0].ravel()[0]) ** 2 * np.eye(4)

@@ -15,9 +15,9 @@ from trustbo.inference.posterior import Draws, Posterior
 from trustbo.models.effects.effect import Effect, Theta
 from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.model import TrustModel
+from trustbo.models.observations import Observations
 from trustbo.models.params import Params, assemble_params
 from trustbo.models.record import effects_from_record, model_from_record, with_default_priors
-from trustbo.models.slots import Slots
 from trustbo.parallel import computing
 from trustbo.stacking import require_same_team
 from trustbo.workspace import Workspace
@@ -277,7 +277,7 @@ def read_posterior(
         model = model_from_record(json.loads(posterior.attrs["model_record"]), features=features)
     require_kind("model", model, TrustModel, "give the model of the posterior")
     model = model.for_features(features)
-    fitted = Posterior(model, model.slots(missions))
+    fitted = Posterior(model, model.observations(missions))
     groups = {"posterior": sites_of(posterior)}
     groups |= {effect.noun: values_of(posterior, effect) for effect in model.effects}
     return fitted, fitted.draws_of(groups)
@@ -315,7 +315,7 @@ def _prior(model: TrustModel, n_features: int, n_robots: int) -> Posterior:
     n_features, n_robots = (require_count(name, n) for name, n in sizes.items())
     none = np.full((1, 1, n_robots), np.nan)
     z = np.zeros((1, 1, n_robots, n_features))
-    return Posterior(replace(model, effects=()), Slots(none, z, none, ("",) * n_features))
+    return Posterior(replace(model, effects=()), Observations(none, z, none, ("",) * n_features))
 
 
 def missions_of(posterior: xr.DataTree) -> list[Mission]:

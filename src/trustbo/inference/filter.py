@@ -13,8 +13,8 @@ from trustbo.errors import TrustboError, one_line, require_pair, require_whole
 from trustbo.inference.draws import names_in, params_of, require_posterior
 from trustbo.inference.importance import systematic
 from trustbo.models.families import FAMILIES
+from trustbo.models.observations import NO_TICKS
 from trustbo.models.params import Params, check_params
-from trustbo.models.slots import NO_TICKS
 from trustbo.parallel import computing
 from trustbo.statespace import Inputs, kalman
 from trustbo.workspace import Workspace

@@ -127,10 +127,10 @@ def fit(
         warmup = require_count("warmup", warmup)
     seed = require_whole("seed", seed, 0)
     model = model.for_features(missions[0].features)
-    slots = model.slots(missions, workspace)
-    if np.isnan(slots.y).all():
+    observations = model.observations(missions, workspace)
+    if np.isnan(observations.contact_rate).all():
         raise TrustboError("every contact rate is NaN; fit needs at least one measured rate.")
-    posterior = Posterior(model, slots)
+    posterior = Posterior(model, observations)
     if sampler == "importance":
         chains, draws = 1, chains * draws  # independent draws belong to one chain
         first = _first_proposal(start, model)
@@ -279,22 +279,22 @@ def _laid_out(
     groups["prior"] = {name: values[None] for name, values in prior_draws.items()}
     tree = to_datatree(groups, missions, model.dims, model.effects)
     if places is not None:
-        tree["places"] = xr.DataTree(place_group(places, posterior.slots.visited, seed))  # pyright: ignore[reportArgumentType]
+        tree["places"] = xr.DataTree(place_group(places, posterior.observations.visited, seed))  # pyright: ignore[reportArgumentType]
     return tree
 
 
 def _record(model: TrustModel, posterior: Posterior) -> dict[str, Any]:
     """Make the attributes that describe the model and the data of a posterior."""
-    slots = posterior.slots
+    observations = posterior.observations
     options = {name: int(v) if isinstance(v, bool) else v for name, v in model.options().items()}
     return {
         "model": type(model).__name__,
         **options,
         "model_record": json.dumps(model_to_record(model)),
-        "n_robots": slots.n_robots,
-        "n_missions": slots.n_missions,
+        "n_robots": observations.n_robots,
+        "n_missions": observations.n_missions,
         **model.x0,
-        "resolution": slots.resolution if model.family.adds_noise else 0.0,
+        "resolution": observations.resolution if model.family.adds_noise else 0.0,
         **{f"prior_{name}": text for name, text in model.priors.describe().items()},
         **{f"{name}_version": version for name, version in VERSIONS.items()},
     }

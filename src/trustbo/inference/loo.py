@@ -25,8 +25,8 @@ from trustbo.inference.fit import by_importance
 from trustbo.inference.importance import MAX_KHAT, smoothed
 from trustbo.inference.posterior import Posterior, at
 from trustbo.models.model import TrustModel
+from trustbo.models.observations import Observations
 from trustbo.parallel import computing
-from trustbo.stacking import stack_missions
 
 _POINTS = 500  # maximum number of distinct hyperparameter draws that are used
 
@@ -58,7 +58,7 @@ def loo(
     posterior = require_posterior("loo", posterior)
     fitted, draws = read_posterior(posterior, model=model)
     fitted.settle(draws.theta)
-    measured = np.flatnonzero(~np.isnan(fitted.slots.y).all((1, 2)))
+    measured = np.flatnonzero(~np.isnan(fitted.observations.contact_rate).all((1, 2)))
     if len(measured) < 2:
         raise TrustboError(f"loo needs at least 2 missions with rates; got {len(measured)}.")
 
@@ -86,7 +86,9 @@ def loo(
                 density[i], refitted[i] = whole_refit[0] - rest, True
             bar.update()
 
-    shift = fitted.model.family.log_resolution(fitted.slots.y, fitted.slots.n_ticks).sum((1, 2))
+    shift = fitted.model.family.log_resolution(
+        fitted.observations.contact_rate, fitted.observations.n_ticks
+    ).sum((1, 2))
     if not np.isnan(shift).any():
         density, average = density + shift[measured], average + shift[measured]
     coords = {"mission": measured, "refitted": ("mission", refitted)}
@@ -142,9 +144,7 @@ def compare(posteriors: Mapping[str, xr.DataTree], *, progress: bool = True) -> 
             f"compare needs a dict of two or more posteriors by name; got {one_line(posteriors)}."
         )
     trees = {name: require_posterior("compare", tree) for name, tree in posteriors.items()}
-    (first, reference), *others = (
-        (name, np.stack(stack_missions(missions_of(tree))[1:])) for name, tree in trees.items()
-    )
+    (first, reference), *others = ((name, _rates_and_ticks(tree)) for name, tree in trees.items())
     for name, data in others:
         if not np.array_equal(reference, data, equal_nan=True):
             raise TrustboError(
@@ -152,3 +152,9 @@ def compare(posteriors: Mapping[str, xr.DataTree], *, progress: bool = True) -> 
                 f"{data.shape[1:]} and {reference.shape[1:]}; fit both to the same missions."
             )
     return ranked({name: loo(tree, progress=progress) for name, tree in trees.items()})
+
+
+def _rates_and_ticks(posterior: xr.DataTree) -> np.ndarray:
+    """Return the contact rates and tick counts (2, mission, bound, robot) of a posterior."""
+    observations = Observations.from_missions(missions_of(posterior))
+    return np.stack([observations.contact_rate, observations.n_ticks])

@@ -161,7 +161,7 @@ def sample_by_nuts(
         values = posterior.scores.values(z)
     else:
         values = {name: samples[name] for name in posterior.scores.priors}
-    theta = posterior.model.theta(values, posterior.slots.resolution)
+    theta = posterior.model.theta(values, posterior.observations.resolution)
     if posterior.exact:
         drawn = Draws(theta, posterior.draw_columns(theta, rng))
     else:
@@ -205,6 +205,6 @@ def _full_kernel(posterior: Posterior, z: np.ndarray) -> NUTS:
     center = {name: jnp.asarray(np.median(v, axis=0)) for name, v in values.items()}
 
     def program() -> None:
-        posterior.model.program(posterior.slots)
+        posterior.model.program(posterior.observations)
 
     return NUTS(program, init_strategy=init_to_value(values=center), target_accept_prob=0.9)

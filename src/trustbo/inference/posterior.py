@@ -14,7 +14,7 @@ from trustbo.inference.importance import Student, climb
 from trustbo.models.backend import namespace
 from trustbo.models.effects.effect import Theta
 from trustbo.models.model import TrustModel
-from trustbo.models.slots import Slots
+from trustbo.models.observations import Observations
 from trustbo.statespace.blocks import Signal, each
 
 _CHUNK = 32  # largest number of points evaluated at once
@@ -81,23 +81,23 @@ class Given(NamedTuple):
 class Posterior:
     """Posterior of a trust model's hyperparameters, coefficients and signals."""
 
-    def __init__(self, model: TrustModel, slots: Slots) -> None:
-        """Prepare the columns and blocks of a model for the rates and features in `slots`."""
-        self.model, self.slots = model, slots
+    def __init__(self, model: TrustModel, observations: Observations) -> None:
+        """Prepare the columns and blocks of a model for the observations."""
+        self.model, self.observations = model, observations
         self.evaluated: Callable[[int], object] = lambda n: None  # called with numbers of points
-        self.layout = model.layout(slots)
-        self.scores = model.scores(slots)
+        self.layout = model.layout(observations)
+        self.scores = model.scores(observations)
         self.n_scores = self.scores.n_scores
-        columns = [effect.columns(slots) for effect in model.columns]
+        columns = [effect.columns(observations) for effect in model.columns]
         self._ends = np.cumsum([0, *(U.shape[1] for U in columns)])
         self._U = self.layout.columns(sparse.hstack(columns, format="csr"))
         self.exact = model.family.gaussian
-        self._chained = self.exact and slots.n_missions >= _CHAINED
-        y = self.layout.rows(slots.y)
+        self._chained = self.exact and observations.n_missions >= _CHAINED
+        y = self.layout.rows(observations.contact_rate)
         apart, order = not self.exact, self._order()
         self.blocks = Blocks.of(y, self._U, self.layout.label, apart=apart, order=order)
         if not self.exact:
-            self.terms = ep.Terms(model.family, y, self.layout.rows(slots.n_ticks))
+            self.terms = ep.Terms(model.family, y, self.layout.rows(observations.n_ticks))
             self.sites = ep.first_sites(self.terms)
 
     @property
@@ -107,7 +107,7 @@ class Posterior:
 
     def _order(self) -> Order:
         """Find the order in which the columns are eliminated; see `Order`."""
-        n, (rows, p) = self.slots.n_missions, self._U.shape
+        n, (rows, p) = self.observations.n_missions, self._U.shape
         prior = self._prior_of_fit(self.theta(np.zeros((1, self.n_scores))))
         parts, chains = prior.parts, prior.chains
         free = np.concatenate([np.full(part.shape[1], part.ndim == 2) for part in parts])
@@ -117,7 +117,7 @@ class Posterior:
 
     def without(self, mission: int) -> "Posterior":
         """Return the posterior without the data of one mission."""
-        other = Posterior(self.model, self.slots.without([mission]))
+        other = Posterior(self.model, self.observations.without([mission]))
         if not self.exact:
             kept = ~np.isnan(other.terms.y)
             other.sites = ep.Sites(*(np.where(kept, site, 0.0) for site in self.sites))
@@ -125,7 +125,7 @@ class Posterior:
 
     def theta(self, z: Any) -> dict[str, Any]:
         """Convert scores (point, score) to hyperparameters for the model's `signal`."""
-        return self.model.theta(self.scores.values(z), self.slots.resolution)
+        return self.model.theta(self.scores.values(z), self.observations.resolution)
 
     def log_density(self, z: Any) -> Any:
         """Compute the unnormalised log posterior density (point,) of scores (point, score)."""
@@ -187,8 +187,8 @@ class Posterior:
 
         With many missions, the start is the mode given the first few, whose density costs less.
         """
-        few = self.slots.first(_FEW)
-        if self.slots.n_missions >= 2 * _FEW and not np.isnan(few.y).all():
+        few = self.observations.first(_FEW)
+        if self.observations.n_missions >= 2 * _FEW and not np.isnan(few.contact_rate).all():
             of_few = Posterior(self.model, few)
             best = climb(of_few.log_density, of_few.start())
         else:
@@ -203,7 +203,7 @@ class Posterior:
         """Return the best of scores at which the noises have different sizes."""
         starts = np.zeros((len(_SIZES), self.n_scores))
         unit = self.model.family.line_of_sight[0]
-        spread = np.log(np.clip(unit * np.nanstd(self.slots.y) / 0.2, 1e-2, 3.0))
+        spread = np.log(np.clip(unit * np.nanstd(self.observations.contact_rate) / 0.2, 1e-2, 3.0))
         starts[:, self.scores.noises] = spread - np.array(_SIZES)[:, None]
         self.settle(self.theta(starts[1:2]))
         return starts[self.log_density(starts).argmax()]
@@ -254,7 +254,7 @@ class Posterior:
         model, theta = self.model, draws.theta
         groups = {"posterior": self._hyperparameters(theta)}
         for effect, a, b in zip(model.columns, self._ends[:-1], self._ends[1:], strict=True):
-            named = effect.named(draws.c[:, a:b], theta, self.slots)
+            named = effect.named(draws.c[:, a:b], theta, self.observations)
             groups.setdefault(effect.noun or "posterior", {}).update(named)
         return groups
 
@@ -269,14 +269,14 @@ class Posterior:
         theta = model.derived({n: sites[n] for n in model.dims | model.effect_dims if n in sites})
         theta = {name: v for name, v in theta.items() if name not in ("beta", "b", "B")}
         c = [
-            effect.coefficients(groups[effect.noun or "posterior"], theta, self.slots)
+            effect.coefficients(groups[effect.noun or "posterior"], theta, self.observations)
             for effect in model.columns
         ]
         return Draws(theta, np.column_stack(c))
 
     def draw_prior(self, n: int, rng: np.random.Generator) -> Draws:
         """Draw hyperparameters and coefficients from the prior."""
-        theta = self.model.theta(self.scores.draw(n, rng), self.slots.resolution)
+        theta = self.model.theta(self.scores.draw(n, rng), self.observations.resolution)
         c = [self.prior(chunk).draw(rng) for _, chunk in chunks(theta)]
         return Draws(theta, np.concatenate(c))
 
@@ -287,11 +287,11 @@ class Posterior:
 
         With `even`, hyperparameters are evenly spaced quantiles, and coefficients prior means.
         """
-        model, slots = self.model, self.slots
-        theta = model.theta(self.scores.draw(n, rng, even=even), slots.resolution)
-        weights = Prior.of([model.weights.prior(theta, slots)])
+        model, observations = self.model, self.observations
+        theta = model.theta(self.scores.draw(n, rng, even=even), observations.resolution)
+        weights = Prior.of([model.weights.prior(theta, observations)])
         c = weights.mean if even else weights.draw(rng)
-        return {**self._hyperparameters(theta), **model.weights.named(c, theta, slots)}
+        return {**self._hyperparameters(theta), **model.weights.named(c, theta, observations)}
 
     def given(self, draws: Draws, kept: np.ndarray, rng: np.random.Generator) -> Given:
         """Compute trust, likelihoods and predictions for given draws.
@@ -308,7 +308,7 @@ class Posterior:
         index, draws = index.ravel(), draws.at(some)
         share = np.bincount(index, minlength=len(some)) / len(index)
         shown, place = np.unique(index[kept], return_inverse=True)
-        shape = self.slots.y.shape
+        shape = self.observations.contact_rate.shape
 
         mean, square = np.zeros(shape), np.zeros(shape)
         log_likelihood = np.empty((len(some), shape[0]))
@@ -316,7 +316,7 @@ class Posterior:
         given_mean = self._exact_trust if self.exact else self._ep_trust
         for where, theta, signal, expected_signal in self.signals(draws):
             x, log_p = given_mean(theta, signal, expected_signal, rng)
-            x = self.layout.slots(x)
+            x = self.layout.unstack(x)
             mean += np.einsum("n,nmbr->mbr", share[where], x)
             square += np.einsum("n,nmbr->mbr", share[where], x**2)
             log_likelihood[where] = log_p.reshape(len(log_p), shape[0], -1).sum(2)
@@ -330,7 +330,7 @@ class Posterior:
 
     def replicate(self, draws: Draws, rng: np.random.Generator) -> np.ndarray:
         """Draw replicated rates (draw, mission, bound, robot) of the missions."""
-        rates = np.empty((len(draws.c), *self.slots.y.shape))
+        rates = np.empty((len(draws.c), *self.observations.contact_rate.shape))
         for i, _, signal, mean in self.signals(draws):
             rates[i] = self._rates(signal, mean, rng)
         return rates
@@ -339,7 +339,7 @@ class Posterior:
         """Yield the slice, hyperparameters, signals and mean signals of each chunk of draws."""
         for where, theta in chunks(draws.theta):
             self.evaluated(len(theta["rest"]))
-            signal = self.model.signal(theta, self.slots, self.layout)
+            signal = self.model.signal(theta, self.observations, self.layout)
             yield where, theta, signal, expected(self.blocks, signal, draws.c[where])
 
     def _exact_trust(
@@ -377,29 +377,31 @@ class Posterior:
     def _rates(self, signal: Signal, mean: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Draw replicated rates (draw, mission, bound, robot) given the mean signals."""
         root = each(_root(signal.covariance), self.blocks.label[self.blocks.kind])
-        f = self.layout.slots(mean + (root @ rng.standard_normal((*mean.shape, 1)))[..., 0])
-        sd = self.layout.slots(np.broadcast_to(signal.sd, mean.shape))
-        return self.model.family.sample(f, sd, self.slots.n_ticks, rng)
+        f = self.layout.unstack(mean + (root @ rng.standard_normal((*mean.shape, 1)))[..., 0])
+        sd = self.layout.unstack(np.broadcast_to(signal.sd, mean.shape))
+        return self.model.family.sample(f, sd, self.observations.n_ticks, rng)
 
     def prior(self, theta: Theta) -> Prior:
         """Return the prior on all coefficients at each theta."""
-        return Prior.of([effect.prior(theta, self.slots) for effect in self.model.columns])
+        return Prior.of([effect.prior(theta, self.observations) for effect in self.model.columns])
 
     def _prior_of_fit(self, theta: Theta) -> Prior:
         """Return the prior in the form that is fastest for computing the evidence."""
-        slots, groups, chains, first = self.slots, [], None, 0
+        observations, groups, chains, first = self.observations, [], None, 0
         for effect, start in zip(self.model.columns, self._ends[:-1], strict=True):
-            found = effect.chains(theta, slots) if self._chained and chains is None else None
+            found = effect.chains(theta, observations) if self._chained and chains is None else None
             if found is None:
-                groups.append(effect.prior(theta, slots))
+                groups.append(effect.prior(theta, observations))
                 continue
             chains, first = found, int(start)
             of_columns = namespace(chains.independent).repeat(
-                chains.independent, slots.n_missions, axis=1
+                chains.independent, observations.n_missions, axis=1
             )
             groups.append((None, [of_columns]))
         prior = Prior.of(groups)
-        return prior if chains is None else prior.with_chains(chains, first, slots.n_missions)
+        return (
+            prior if chains is None else prior.with_chains(chains, first, observations.n_missions)
+        )
 
     def _fit(self, theta: Theta) -> tuple[Fit, Prior]:
         """Compute the evidence of Gaussian rates at each theta; also return the prior."""
@@ -409,7 +411,7 @@ class Posterior:
     def _at(self, theta: Theta) -> tuple[Signal, Prior]:
         """Return the distribution of the signals and the prior at each theta."""
         self.evaluated(len(theta["rest"]))
-        return self.model.signal(theta, self.slots, self.layout), self._prior_of_fit(theta)
+        return self.model.signal(theta, self.observations, self.layout), self._prior_of_fit(theta)
 
     def _lam(self, signal: Signal) -> Any:
         """Return the precisions (point, kind, row) of Gaussian rates, 0 where not measured."""

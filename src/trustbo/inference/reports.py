@@ -65,18 +65,19 @@ def predict_reports(
     require_choice("given", given, ("earlier", "none"))
     seed, n = require_whole("seed", seed, 0), require_count("n_draws", n_draws)
     of_fit, draws = read_posterior(posterior, model=model)
-    if missions[0].features != of_fit.slots.features:
+    if missions[0].features != of_fit.observations.features:
         raise TrustboError(
-            f"the posterior was fitted to the inputs {of_fit.slots.features}, but the missions "
-            f"have {missions[0].features}; give missions with the same inputs as the posterior."
+            f"the posterior was fitted to the inputs {of_fit.observations.features}, but the "
+            f"missions have {missions[0].features}; give missions with the same inputs as the "
+            "posterior."
         )
     levels = levels_of(posterior.attrs["scale"])
-    ahead = Posterior(of_fit.model, of_fit.model.slots(missions))
+    ahead = Posterior(of_fit.model, of_fit.model.observations(missions))
     copies = _ALIKE if fitted else 1
     some = np.unique(np.linspace(0, len(draws.c) - 1, max(1, n // copies)).astype(int))
     draws = draws.at(np.repeat(some, copies))
 
-    shape = ahead.slots.y.shape
+    shape = ahead.observations.contact_rate.shape
     out = {name: np.full(shape, np.nan) for name in ("mean", "log_score")}
     out["quantile"] = np.full((*shape, len(QUANTILES)), np.nan)
     if levels:
@@ -92,7 +93,9 @@ def predict_reports(
                     out[name][j, k, i] = value
     for name in ("mean", "quantile"):
         out[name] = _answer_of(out[name], levels)
-    return _dataset(_answer_of(ahead.slots.y, levels), out, levels, missions[0].robots)
+    return _dataset(
+        _answer_of(ahead.observations.contact_rate, levels), out, levels, missions[0].robots
+    )
 
 
 def _of_person(
@@ -103,8 +106,8 @@ def _of_person(
     The person's trust is drawn row by row given the reports so far. Each run of `alike` draws has
     the same total weight.
     """
-    slots, family = ahead.slots, ahead.model.family
-    _, n_bounds, n_robots = slots.y.shape
+    observations, family = ahead.observations, ahead.model.family
+    _, n_bounds, n_robots = observations.contact_rate.shape
     mean, root = [], []
     for _, _, signal, of_all in ahead.signals(draws):
         mean.append(of_all[:, j])
@@ -112,7 +115,7 @@ def _of_person(
         cov = np.broadcast_to(cov, (len(of_all), *cov.shape[1:]))[:, j % cov.shape[1]]
         root.append(np.linalg.cholesky(cov + 1e-12 * np.eye(cov.shape[-1])))
     mean, root, sd = np.concatenate(mean), np.concatenate(root), draws.theta["delta_v"]
-    y, ticks = (a[j].ravel() for a in (slots.y, slots.n_ticks))
+    y, ticks = (a[j].ravel() for a in (observations.contact_rate, observations.n_ticks))
     white, log_weight = np.zeros(mean.shape), np.zeros(len(mean))
     for k in range(n_bounds):
         runs = log_weight.reshape(-1, alike)
@@ -144,7 +147,7 @@ def _prediction(
 ) -> dict[str, Any]:
     """Predict a report given trust ~ N(center, var) in each draw, with weights (draw,)."""
     family, sd = ahead.model.family, draws.theta["delta_v"]
-    y, ticks = ahead.slots.y[slot], ahead.slots.n_ticks[slot]
+    y, ticks = ahead.observations.contact_rate[slot], ahead.observations.n_ticks[slot]
     found: dict[str, Any] = {}
     if not np.isnan(y):
         mass = weight @ np.exp(family.match(y, ticks, center, var, sd)[0])

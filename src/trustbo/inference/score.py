@@ -9,9 +9,9 @@ from trustbo.data import Mission
 from trustbo.errors import TrustboError, require_kind, require_list, require_whole
 from trustbo.inference.draws import QUANTILES, in_order_of, require_posterior
 from trustbo.inference.filter import TrustFilter
-from trustbo.models.slots import require_ticks
+from trustbo.models.observations import Observations, require_ticks
 from trustbo.parallel import computing
-from trustbo.stacking import MissionBatch, known_awareness, stack_missions
+from trustbo.stacking import known_awareness
 from trustbo.statespace import kalman
 from trustbo.streams import stream
 from trustbo.workspace import Workspace
@@ -69,8 +69,8 @@ def score(
             "missions has one. Run more missions."
         )
     missions = [missions[j] for j in indices]
-    batch = stack_missions(missions)
-    y = batch.contact_rate
+    observations = Observations.from_missions(missions)
+    y = observations.contact_rate
     names = missions[0].robots, missions[0].features  # the same for all
     trust = _follow(in_order_of(trees[0], *names))
     columns = {name: np.full(y.shape, np.nan) for name in ("mean", "pit", "log_score")}
@@ -78,17 +78,19 @@ def score(
     for j, (tree, mission) in enumerate(zip(trees, missions, strict=True)):
         if j and tree is not trees[j - 1]:
             trust = _follow(in_order_of(tree, *names))
-        k, rng = slice(len(mission.bounds)), stream(seed, "score", j)
-        one = MissionBatch(*(a[j, k] for a in batch))
-        require_ticks(trust.family, one.contact_rate, one.n_ticks)
-        columns["log_score"][j, k], drawn = _predict(trust, mission, one, rng)
+
+        require_ticks(trust.family, y, observations.n_ticks)
+        k = slice(len(mission.bounds))
+        rng = stream(seed, "score", j)
+        ticks = observations.n_ticks[j, k]
+        columns["log_score"][j, k], drawn = _predict(trust, mission, y[j, k], ticks, rng)
         columns["mean"][j, k] = np.where(np.isnan(y[j, k]), np.nan, drawn.mean(0))
         columns["pit"][j, k] = _pit(drawn, y[j, k], rng)
         quantile[j, k] = np.moveaxis(np.quantile(drawn, QUANTILES, axis=0), 0, -1)
     quantile[np.isnan(y)] = np.nan
 
     attrs = {"log_score_of": "contact_rate"}
-    shift = trust.family.log_resolution(y, batch.n_ticks)
+    shift = trust.family.log_resolution(y, observations.n_ticks)
     if not np.isnan(shift).any():
         columns["log_score"] += shift
         attrs["log_score_of"] = "ticks"
@@ -109,10 +111,14 @@ def _follow(posterior: xr.DataTree) -> TrustFilter:
 
 
 def _predict(
-    trust: TrustFilter, mission: Mission, batch: MissionBatch, rng: np.random.Generator
+    trust: TrustFilter,
+    mission: Mission,
+    y: np.ndarray,
+    ticks: np.ndarray,
+    rng: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return log densities (bound, robot) and draws (draw, bound, robot) of the rates."""
-    z, y, ticks = batch
+    z = mission.awareness
     path = mission.path[: len(z) + 1] if trust.params.places and mission.path else None
     counts = trust.space.grouped(ticks)
     ahead = kalman.forecast(

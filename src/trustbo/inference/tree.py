@@ -18,9 +18,9 @@ from trustbo.inference.draws import (
 from trustbo.inference.posterior import Posterior
 from trustbo.models.effects.effect import Effect
 from trustbo.models.model import TrustModel
+from trustbo.models.observations import Observations
 from trustbo.models.scores import log_density
 from trustbo.parallel import computing
-from trustbo.stacking import MissionBatch, stack_missions
 from trustbo.streams import stream
 
 _OF_RATES = ("mission", "bound", "robot")
@@ -44,7 +44,7 @@ def to_datatree(
         site_dims: Axes of the model's parameters by name, without (chain, draw).
         effects: Effects of the model; the groups may include variables of these effects.
     """
-    observed = stack_missions(missions)
+    observed = Observations.from_missions(missions)
     n_missions, n_bounds = observed.contact_rate.shape[:2]
     lengths = np.array([len(m.bounds) for m in missions])
     ended = (np.arange(1, n_bounds + 1) > lengths[:, None])[..., None]  # (mission, bound, robot)
@@ -83,7 +83,7 @@ def to_datatree(
 
 
 def _data_groups(
-    observed: MissionBatch, missions: Sequence[Mission], coords: dict[str, object]
+    observed: Observations, missions: Sequence[Mission], coords: dict[str, object]
 ) -> tuple[xr.Dataset, xr.Dataset]:
     """Build the groups `observed_data` and `constant_data`."""
     shape = observed.contact_rate.shape
@@ -165,7 +165,9 @@ def complete(
 
     rng = stream(seed, "prior predictive")
     replicated = fitted.replicate(fitted.draw_prior(N_PRIOR, rng), rng)
-    shift = fitted.model.family.log_resolution(fitted.slots.y, fitted.slots.n_ticks).sum((1, 2))
+    shift = fitted.model.family.log_resolution(
+        fitted.observations.contact_rate, fitted.observations.n_ticks
+    ).sum((1, 2))
     counted = not np.isnan(shift).any()
     likelihood = given.log_likelihood + (shift if counted else 0.0)
 
@@ -207,7 +209,7 @@ def log_prior(fitted: Posterior, sites: Mapping[str, np.ndarray]) -> dict[str, n
         sites: Draws (draw, ...) of the parameters by name.
     """
     model, priors = fitted.model, fitted.scores.priors
-    resolution = fitted.slots.resolution
+    resolution = fitted.observations.resolution
     rest = model.derived(sites)["rest"]
     parameters = dict(sites)
     if "delta_v" in sites:

@@ -20,10 +20,9 @@ from trustbo.models.contact_rate import ContactRate
 from trustbo.models.effects.effect import Effect, Theta, sample_columns
 from trustbo.models.effects.weights import Weights
 from trustbo.models.families import FAMILIES, Family
+from trustbo.models.observations import Observations, require_ticks
 from trustbo.models.priors import Priors
 from trustbo.models.scores import Scores
-from trustbo.models.slots import Slots, require_ticks
-from trustbo.stacking import stack_missions
 from trustbo.statespace import Inputs, StateSpace
 from trustbo.statespace.blocks import Layout, Signal
 from trustbo.workspace import Workspace
@@ -116,14 +115,14 @@ class TrustModel(Summary, ABC):
         """Whether robots depend on each other only through equal, shared noise."""
         return False
 
-    def carried(self, slots: Slots) -> bool | np.ndarray:
+    def carried(self, observations: Observations) -> bool | np.ndarray:
         """Return which inputs are carried over to later bounds (see `statespace`).
 
         The result is True for all columns, False for none, or a mask (column,).
         """
         return True
 
-    def random_effects(self, theta: Theta, slots: Slots) -> Inputs | None:
+    def random_effects(self, theta: Theta, observations: Observations) -> Inputs | None:
         """Return inputs (point, mission, row, effect) of effects that belong to one mission each.
 
         The effects are standard normal and integrated out with trust, so they have no columns.
@@ -132,20 +131,20 @@ class TrustModel(Summary, ABC):
 
     # --- shared by all models ---
 
-    def layout(self, slots: Slots, *, contrasts: bool = True) -> Layout:
-        """Arrange slots in blocks; unless `contrasts` is true, each row is one robot's rate."""
+    def layout(self, observations: Observations, *, contrasts: bool = True) -> Layout:
+        """Arrange rates in blocks; unless `contrasts` is true, each row is one robot's rate."""
         return Layout.of(
-            slots.y,
+            observations.contact_rate,
             joint=self.joint,
             exchangeable=self.exchangeable and contrasts and self.family.gaussian,
-            carried=self.carried(slots),
+            carried=self.carried(observations),
             apart=type(self).random_effects is not TrustModel.random_effects,
         )
 
-    def signal(self, theta: Theta, slots: Slots, layout: Layout) -> Signal:
+    def signal(self, theta: Theta, observations: Observations, layout: Layout) -> Signal:
         """Compute trust at all bounds from the state-space form, in NumPy or JAX."""
-        space = self.state_space(theta, slots.n_robots)
-        return Signal.of(space, layout, self.random_effects(theta, slots))
+        space = self.state_space(theta, observations.n_robots)
+        return Signal.of(space, layout, self.random_effects(theta, observations))
 
     @property
     def columns(self) -> tuple[Effect, ...]:
@@ -167,15 +166,15 @@ class TrustModel(Summary, ABC):
         """Mean and standard deviation of trust before the first bound, by name."""
         return {name: float(getattr(self.priors, name)) for name in ("x0_mean", "x0_sd")}
 
-    def all_hyperpriors(self, slots: Slots) -> dict[str, Distribution]:
+    def all_hyperpriors(self, observations: Observations) -> dict[str, Distribution]:
         """Return the priors on all hyperparameters by name, with those of effects last."""
-        priors = self.hyperpriors(slots.n_robots, slots.z.shape[3])
+        priors = self.hyperpriors(observations.n_robots, observations.awareness.shape[3])
         return priors | {n: p for e in self.effects for n, p in e.hyperpriors().items()}
 
-    def scores(self, slots: Slots) -> Scores:
+    def scores(self, observations: Observations) -> Scores:
         """Return the normal scores of all hyperparameters."""
         pairs = [pair for effect in self.effects for pair in effect.pairs]
-        return Scores(self.all_hyperpriors(slots), pairs)
+        return Scores(self.all_hyperpriors(observations), pairs)
 
     def theta(self, values: Mapping[str, Any], resolution: float) -> dict[str, Any]:
         """Convert hyperparameters, named as in `all_hyperpriors`, to `theta` of `state_space`.
@@ -201,7 +200,9 @@ class TrustModel(Summary, ABC):
         """Return further terms of the log prior by label, each as (field of `Priors`, values)."""
         return {name: (name, sites[name]) for name in ("beta", "b")}
 
-    def slots(self, missions: Sequence[Mission], workspace: Workspace | None = None) -> Slots:
+    def observations(
+        self, missions: Sequence[Mission], workspace: Workspace | None = None
+    ) -> Observations:
         """Collect the rates and features of missions, and the data that the effects need.
 
         Raises:
@@ -209,13 +210,11 @@ class TrustModel(Summary, ABC):
                 awareness value is NaN; a measured rate lacks the n_ticks that the family needs; or
                 a path jumps or leaves the workspace.
         """
-        batch = stack_missions(missions)
-        require_ticks(self.family, batch.contact_rate, batch.n_ticks)
-        features = tuple(missions[0].features)
-        slots = Slots(batch.contact_rate, batch.awareness, batch.n_ticks, features)
+        observations = Observations.from_missions(missions)
+        require_ticks(self.family, observations.contact_rate, observations.n_ticks)
         for effect in self.effects:
-            slots = effect.slots(slots, missions, workspace)
-        return slots
+            observations = effect.add_data(observations, missions, workspace)
+        return observations
 
     def for_features(self, features: Sequence[str]) -> Self:
         """Return the model with default priors for these features, or with its custom priors.
@@ -226,7 +225,7 @@ class TrustModel(Summary, ABC):
             return self
         return replace(self, priors=Priors.of(tuple(features), self.observation))
 
-    def program(self, slots: Slots) -> None:
+    def program(self, observations: Observations) -> None:
         """Run the model as a NumPyro program, for a kernel such as `NUTS(model.program)`.
 
         All variables are sampled, except that trust is integrated out if rates are Gaussian. Call
@@ -234,30 +233,32 @@ class TrustModel(Summary, ABC):
         """
         values = {
             name: numpyro.sample(name, prior.to_event(len(prior.batch_shape)))
-            for name, prior in self.all_hyperpriors(slots).items()
+            for name, prior in self.all_hyperpriors(observations).items()
         }
         values = {name: jnp.asarray(value)[None] for name, value in values.items()}
-        theta: Any = self.theta(values, slots.resolution)
-        c: Any = numpyro.deterministic("columns", sample_columns(self.columns, theta, slots))
-        U = sparse.hstack([effect.columns(slots) for effect in self.columns], format="csr")
+        theta: Any = self.theta(values, observations.resolution)
+        c: Any = numpyro.deterministic("columns", sample_columns(self.columns, theta, observations))
+        U: Any = sparse.hstack(
+            [effect.columns(observations) for effect in self.columns], format="csr"
+        )
 
         if self.family.gaussian:
-            carried = np.broadcast_to(self.carried(slots), U.shape[1])
+            carried = np.broadcast_to(self.carried(observations), U.shape[1:])
             dense = U.toarray()
             inputs = Inputs(
-                drift=((dense * carried) @ c).reshape(slots.y.shape),
-                offset=((dense * ~carried) @ c).reshape(slots.y.shape),
+                drift=((dense * carried) @ c).reshape(observations.contact_rate.shape),
+                offset=((dense * ~carried) @ c).reshape(observations.contact_rate.shape),
             )
-            rates = ContactRate.of(self.state_space(theta, slots.n_robots), inputs)
-            with numpyro.plate("mission", slots.n_missions):
-                numpyro.sample("contact_rate", rates, obs=slots.y)
+            rates = ContactRate.of(self.state_space(theta, observations.n_robots), inputs)
+            with numpyro.plate("mission", observations.n_missions):
+                numpyro.sample("contact_rate", rates, obs=observations.contact_rate)
             return
 
-        layout = self.layout(slots, contrasts=False)
-        signal: Any = self.signal(theta, slots, layout)
+        layout = self.layout(observations, contrasts=False)
+        signal: Any = self.signal(theta, observations, layout)
         u = (layout.columns(U).toarray() @ c).reshape(len(layout.label), -1)
-        y = layout.rows(slots.y)
-        ticks = layout.rows(slots.n_ticks)
+        y = layout.rows(observations.contact_rate)
+        ticks = layout.rows(observations.n_ticks)
 
         # Trust is its mean plus a Cholesky factor times white noise, which is easier to sample.
         root = jnp.linalg.cholesky(signal.covariance[0] + 1e-13 * jnp.eye(y.shape[1]))

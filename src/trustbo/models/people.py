@@ -13,9 +13,9 @@ from trustbo.errors import TrustboError, require_positive
 from trustbo.models.backend import namespace, own_settings
 from trustbo.models.effects.effect import Theta
 from trustbo.models.families import FAMILIES, Family, Levels
+from trustbo.models.observations import Observations
 from trustbo.models.pooled import PooledTrust
 from trustbo.models.priors import Priors
-from trustbo.models.slots import Slots
 from trustbo.statespace import Inputs
 
 SUCCESS, FAILURE = "success", "failure"
@@ -79,18 +79,22 @@ class HumanTrust(PooledTrust):
         levels = levels_of(self.scale)
         return Levels(levels) if levels else FAMILIES["censored"]
 
-    def slots(self, missions: Any, workspace: Any = None) -> Slots:
-        """See `TrustModel.slots`; raises TrustboError if the reports have another scale."""
-        slots, levels = super().slots(missions, workspace), levels_of(self.scale)
+    def observations(self, missions: Any, workspace: Any = None) -> Observations:
+        """See `TrustModel.observations`; raises TrustboError if the reports have another scale."""
+        observations = super().observations(missions, workspace)
+        levels = levels_of(self.scale)
         wanted = levels - 1.0 if levels else np.nan
-        bad = ~np.isnan(slots.y) & ~np.isclose(slots.n_ticks, wanted, equal_nan=True)
+        bad = ~np.isnan(observations.contact_rate) & ~np.isclose(
+            observations.n_ticks, wanted, equal_nan=True
+        )
         if bad.any():
             raise TrustboError(
                 f"HumanTrust(scale={self.scale!r}) needs reports with n_ticks = {wanted:g} (number "
                 "of levels minus 1, or nan on the unit scale); got n_ticks = "
-                f"{slots.n_ticks[bad][0]:g}. Give the same scale to read_reports and HumanTrust."
+                f"{observations.n_ticks[bad][0]:g}. Give the same scale to read_reports and "
+                "HumanTrust."
             )
-        return slots
+        return observations
 
     @property
     def joint(self) -> bool:
@@ -102,30 +106,30 @@ class HumanTrust(PooledTrust):
         """See `TrustModel.exchangeable`."""
         return False
 
-    def carried(self, slots: Slots) -> np.ndarray:
+    def carried(self, observations: Observations) -> np.ndarray:
         """See `TrustModel.carried`; outcomes are carried over, and the base level is not."""
-        outcomes = [name.startswith((SUCCESS, FAILURE)) for name in slots.features]
+        outcomes = [name.startswith((SUCCESS, FAILURE)) for name in observations.features]
         return np.array([*outcomes, False])
 
-    def random_effects(self, theta: Theta, slots: Slots) -> Inputs:
+    def random_effects(self, theta: Theta, observations: Observations) -> Inputs:
         """See `TrustModel.random_effects`.
 
         The effects are the personal start, level, gain from success and gain from failure.
         """
-        carried = np.zeros((*slots.y.shape, 4))
+        carried = np.zeros((*observations.contact_rate.shape, 4))
         carried[:, 0, :, 0] = 1.0  # start
         for i, prefix in ((2, SUCCESS), (3, FAILURE)):
-            named = [m for m, name in enumerate(slots.features) if name.startswith(prefix)]
+            named = [m for m, name in enumerate(observations.features) if name.startswith(prefix)]
             if named:
-                carried[..., i] = slots.z[..., named[0]]
+                carried[..., i] = observations.awareness[..., named[0]]
 
-        level = np.zeros((*slots.y.shape, 4))
+        level = np.zeros((*observations.contact_rate.shape, 4))
         level[..., 1] = 1.0
 
         start_sd, level_sd, gain_sd = (theta[name] for name in SDS)
         xp = namespace(start_sd)
         sds = xp.stack([start_sd, level_sd, gain_sd, gain_sd], axis=1)[:, None, None]
-        carried, level = (a.reshape(slots.n_missions, -1, 4) for a in (carried, level))
+        carried, level = (a.reshape(observations.n_missions, -1, 4) for a in (carried, level))
         return Inputs(drift=carried * sds, offset=level * sds)
 
     @property

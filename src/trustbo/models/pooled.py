@@ -11,7 +11,7 @@ from trustbo.errors import TrustboError, require_choice
 from trustbo.models.effects.effect import Theta
 from trustbo.models.effects.weights import Weights
 from trustbo.models.model import TrustModel
-from trustbo.models.slots import Slots
+from trustbo.models.observations import Observations
 from trustbo.statespace import StateSpace
 from trustbo.statespace.form import independent_robots
 
@@ -65,7 +65,7 @@ class PooledTrust(TrustModel):
         """See `TrustModel.exchangeable`."""
         return self.shared_noise
 
-    def carried(self, slots: Slots) -> bool | np.ndarray:
+    def carried(self, observations: Observations) -> bool | np.ndarray:
         """See `TrustModel.carried`."""
         return self.memory == "level"
 

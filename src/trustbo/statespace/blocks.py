@@ -11,7 +11,7 @@ from trustbo.statespace.matrices import namespace, repeat_diagonal, transpose
 
 
 class Layout(NamedTuple):
-    """Layout of slots in blocks and rows; a slot is a bound of a robot in a mission.
+    """Layout of observations (mission, bound, robot) in blocks and rows.
 
     A block is a robot in a mission, with one row per bound. If `joint`, a block is a mission, with
     rows (bound, robot). With a `rotation`, blocks are orthonormal combinations of robots.
@@ -81,7 +81,7 @@ class Layout(NamedTuple):
             return values.reshape(*leading, n, a * b)
         return values.reshape(*leading, n * a, b)
 
-    def slots(self, values: np.ndarray) -> np.ndarray:
+    def unstack(self, values: np.ndarray) -> np.ndarray:
         """Rearrange values (..., block, row) as (..., mission, bound, robot)."""
         n_missions, n_bounds, n_robots = self.shape
         leading = values.shape[:-2]
@@ -93,7 +93,7 @@ class Layout(NamedTuple):
         return values if self.rotation is None else values @ self.rotation
 
     def columns(self, U: Any) -> Any:
-        """Rearrange a sparse design matrix (slot, column) to (block * input, column).
+        """Rearrange a sparse design matrix (observation, column) to (block * input, column).
 
         If only some columns are carried over, each block has first their inputs in all rows, and
         then the inputs of the other columns.

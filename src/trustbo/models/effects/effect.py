@@ -1,6 +1,6 @@
 """Base class of effects, which add columns with Gaussian coefficients to the drift of trust.
 
-The drift of all slots is u = U c, where the coefficients c are Gaussian given the hyperparameters
+The drift of all rates is u = U c, where the coefficients c are Gaussian given the hyperparameters
 theta. To add an effect, write a frozen dataclass with the methods of `Effect`. Inference and
 planning need no change.
 """
@@ -18,8 +18,8 @@ from numpyro.distributions import Distribution
 from trustbo.data import Mission
 from trustbo.errors import require_positive
 from trustbo.models.backend import namespace
+from trustbo.models.observations import Observations
 from trustbo.models.scores import Pair
-from trustbo.models.slots import Slots
 from trustbo.workspace import Workspace
 
 Theta = Mapping[str, Any]
@@ -77,11 +77,11 @@ class Effect:
                 number = require_positive(f"{type(self).__name__}.{name}", value)
                 object.__setattr__(self, name, number)
 
-    def columns(self, slots: Slots) -> Any:
-        """Return a sparse matrix (slot, column), with flattened slots (mission, bound, robot)."""
+    def columns(self, observations: Observations) -> Any:
+        """Return a sparse matrix (observation, column), with flattened (mission, bound, robot)."""
         raise NotImplementedError
 
-    def prior(self, theta: Theta, slots: Slots) -> tuple[Any, list[Any]]:
+    def prior(self, theta: Theta, observations: Observations) -> tuple[Any, list[Any]]:
         """Return the prior on the coefficients at each theta, in NumPy or JAX.
 
         Returns:
@@ -90,18 +90,18 @@ class Effect:
         """
         raise NotImplementedError
 
-    def chains(self, theta: Theta, slots: Slots) -> Chains | None:
+    def chains(self, theta: Theta, observations: Observations) -> Chains | None:
         """Return the same prior in the form of `Chains`, if it has this form.
 
         With many missions, this form is faster. The mission varies fastest among the columns.
         """
         return None
 
-    def named(self, c: np.ndarray, theta: Theta, slots: Slots) -> Values:
+    def named(self, c: np.ndarray, theta: Theta, observations: Observations) -> Values:
         """Convert coefficients c (draw, column) to variables by name."""
         raise NotImplementedError
 
-    def coefficients(self, values: Values, theta: Theta, slots: Slots) -> np.ndarray:
+    def coefficients(self, values: Values, theta: Theta, observations: Observations) -> np.ndarray:
         """Convert variables back to coefficients (draw, column), as the inverse of `named`."""
         raise NotImplementedError
 
@@ -126,16 +126,18 @@ class Effect:
         spreads = [name for name in self.names if isinstance(priors[name], dist.HalfNormal)]
         return [Pair(spreads[0], spreads[1])] if len(spreads) == 2 else []
 
-    def slots(self, slots: Slots, missions: Sequence[Mission], on: Workspace | None) -> Slots:
-        """Fill the slots with the data that the columns need; `on` is the workspace, if known."""
-        return slots
+    def add_data(
+        self, observations: Observations, missions: Sequence[Mission], on: Workspace | None
+    ) -> Observations:
+        """Add the data that the columns need; `on` is the workspace, if known."""
+        return observations
 
 
-def sample_columns(effects: Sequence[Effect], theta: Theta, slots: Slots) -> Any:
+def sample_columns(effects: Sequence[Effect], theta: Theta, observations: Observations) -> Any:
     """Sample all coefficients (column,) at one point theta within a NumPyro program."""
     columns = []
     for effect in effects:
-        mean, parts = effect.prior(theta, slots)
+        mean, parts = effect.prior(theta, observations)
         label = effect.noun or "weights"
         start = 0
         for i, part in enumerate(parts):

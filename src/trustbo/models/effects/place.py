@@ -13,8 +13,8 @@ from trustbo.data import Mission
 from trustbo.errors import require_positive
 from trustbo.models.backend import inverse, namespace
 from trustbo.models.effects.effect import LEAST, Effect, Theta, Values
+from trustbo.models.observations import Observations
 from trustbo.models.scores import Pair
-from trustbo.models.slots import Slots
 from trustbo.models.visited import bounds_of, visited
 from trustbo.workspace import Workspace
 
@@ -63,16 +63,18 @@ class PlaceEffect(Effect):
         """See `Effect.pairs`; data mostly determine how s differs between neighbouring cells."""
         return [Pair("tau_s", "tau_e", "length_scale", _sd_given_neighbour)]
 
-    def slots(self, slots: Slots, missions: Sequence[Mission], on: Workspace | None) -> Slots:
-        """See `Effect.slots`; adds the visited places."""
+    def add_data(
+        self, observations: Observations, missions: Sequence[Mission], on: Workspace | None
+    ) -> Observations:
+        """See `Effect.add_data`; adds the visited places."""
         grid = None if on is None else on.passable.shape
-        bounds = bounds_of(missions, slots.y.shape[:2])
-        return slots._replace(visited=visited(bounds, grid))  # pyright: ignore[reportArgumentType]
+        bounds = bounds_of(missions, observations.contact_rate.shape[:2])
+        return observations._replace(visited=visited(bounds, grid))  # pyright: ignore[reportArgumentType]
 
-    def columns(self, slots: Slots) -> Any:
+    def columns(self, observations: Observations) -> Any:
         """Return indicator columns of the cells entered and of the directed bounds."""
-        places: Any = slots.visited
-        at = np.broadcast_to(places.at[..., None], slots.y.shape).ravel()
+        places: Any = observations.visited
+        at = np.broadcast_to(places.at[..., None], observations.contact_rate.shape).ravel()
         met = np.flatnonzero(at >= 0)
         bound, ones = at[met], np.ones(len(met))
         parts = (places.cell_of[bound], len(places.cells)), (bound, len(places.bounds))
@@ -81,10 +83,10 @@ class PlaceEffect(Effect):
             format="csr",
         )
 
-    def prior(self, theta: Theta, slots: Slots) -> tuple[Any, list[Any]]:
+    def prior(self, theta: Theta, observations: Observations) -> tuple[Any, list[Any]]:
         """Return a Gaussian-process prior on cells and independent priors on bounds."""
         xp: Any = namespace(theta["tau_e"])
-        places: Any = slots.visited
+        places: Any = observations.visited
         of_bound = xp.maximum(theta["tau_e"], LEAST) ** -2.0
         of_bounds = xp.repeat(of_bound[:, None], len(places.bounds), axis=1)
         return None, [self._cells(theta, places.square), of_bounds]
@@ -99,13 +101,13 @@ class PlaceEffect(Effect):
         tau = xp.maximum(theta["tau_s"], LEAST)[:, None, None]
         return inverse(tau**2 * (K + _JITTER * np.eye(len(square))))
 
-    def named(self, c: np.ndarray, theta: Theta, slots: Slots) -> Values:
+    def named(self, c: np.ndarray, theta: Theta, observations: Observations) -> Values:
         """Return the effects `place` (draw, cell) and `place_bound` (draw, bound)."""
-        places: Any = slots.visited
+        places: Any = observations.visited
         n = len(places.cells)
         return {"place": c[:, :n], "place_bound": c[:, n:]}
 
-    def coefficients(self, values: Values, theta: Theta, slots: Slots) -> np.ndarray:
+    def coefficients(self, values: Values, theta: Theta, observations: Observations) -> np.ndarray:
         """See `Effect.coefficients`."""
         return np.column_stack([values["place"], values["place_bound"]])
 

@@ -18,7 +18,7 @@ from scipy import sparse
 from trustbo.errors import require_share
 from trustbo.models.backend import namespace
 from trustbo.models.effects.effect import LEAST, Chains, Effect, Theta, Values
-from trustbo.models.slots import Slots
+from trustbo.models.observations import Observations
 
 
 @dataclass(frozen=True)
@@ -47,38 +47,38 @@ class RobotEffect(Effect):
         super().__post_init__()
         object.__setattr__(self, "rho", require_share("RobotEffect.rho", self.rho, ends=False))
 
-    def columns(self, slots: Slots) -> Any:
+    def columns(self, observations: Observations) -> Any:
         """Return line of sight in one column per robot and mission; the mission varies fastest."""
-        n_missions, n_robots = slots.n_missions, slots.n_robots
-        mission, _, robot = np.indices(slots.y.shape)
+        n_missions, n_robots = observations.n_missions, observations.n_robots
+        mission, _, robot = np.indices(observations.contact_rate.shape)
         where = (robot * n_missions + mission).ravel()
         at = np.arange(len(where)), where
         return sparse.csr_array(
-            (slots.line_of_sight.ravel(), at), shape=(len(where), n_robots * n_missions)
+            (observations.line_of_sight.ravel(), at), shape=(len(where), n_robots * n_missions)
         )
 
-    def prior(self, theta: Theta, slots: Slots) -> tuple[Any, list[Any]]:
+    def prior(self, theta: Theta, observations: Observations) -> tuple[Any, list[Any]]:
         """Return independent priors for the robots, as one array if `rest` is the same for all."""
         rest = theta["rest"]
         slow, day = self._variances(theta)
-        value, vector = _correlation_eigen(self.rho, slots.n_missions)
+        value, vector = _correlation_eigen(self.rho, observations.n_missions)
         Q = (vector / (slow * value + day)[:, None]) @ vector.T
         if rest.ndim == 1:
-            return None, [Q / rest[:, None, None] ** 2] * slots.n_robots
+            return None, [Q / rest[:, None, None] ** 2] * observations.n_robots
         return None, [Q / of_robot[:, None, None] ** 2 for of_robot in rest.T]
 
-    def chains(self, theta: Theta, slots: Slots) -> Chains:
+    def chains(self, theta: Theta, observations: Observations) -> Chains:
         """See `Effect.chains`; each robot is a chain."""
         slow, day = self._variances(theta)
-        rest = theta["rest"].reshape(len(slow), -1) * np.ones(slots.n_robots)
+        rest = theta["rest"].reshape(len(slow), -1) * np.ones(observations.n_robots)
         return Chains(1.0 / (day * rest**2), 1.0 / (slow * rest**2), self.rho)
 
-    def named(self, c: np.ndarray, theta: Theta, slots: Slots) -> Values:
+    def named(self, c: np.ndarray, theta: Theta, observations: Observations) -> Values:
         """Return `robot_effect` (draw, mission, robot), the effects d on stationary trust."""
-        d = c.reshape(len(c), slots.n_robots, slots.n_missions) / _rest(theta)
+        d = c.reshape(len(c), observations.n_robots, observations.n_missions) / _rest(theta)
         return {"robot_effect": np.swapaxes(d, 1, 2)}
 
-    def coefficients(self, values: Values, theta: Theta, slots: Slots) -> np.ndarray:
+    def coefficients(self, values: Values, theta: Theta, observations: Observations) -> np.ndarray:
         """See `Effect.coefficients`."""
         d = np.swapaxes(values["robot_effect"], 1, 2) * _rest(theta)
         return d.reshape(len(d), -1)

@@ -8,8 +8,8 @@ from scipy import sparse
 
 from trustbo.models.backend import namespace
 from trustbo.models.effects.effect import LEAST, Effect, Theta, Values
+from trustbo.models.observations import Observations
 from trustbo.models.priors import Priors
-from trustbo.models.slots import Slots
 
 
 @dataclass(frozen=True)
@@ -18,27 +18,27 @@ class Weights(Effect):
 
     priors: Priors
 
-    def columns(self, slots: Slots) -> Any:
+    def columns(self, observations: Observations) -> Any:
         """Return the features and a column of ones."""
-        return sparse.csr_array(_inputs(slots))
+        return sparse.csr_array(_inputs(observations))
 
-    def prior(self, theta: Theta, slots: Slots) -> tuple[Any, list[Any]]:
+    def prior(self, theta: Theta, observations: Observations) -> tuple[Any, list[Any]]:
         """Return independent priors on the coefficients, scaled if `Priors.stationary` is true."""
-        mean, sd = self.moments(theta, slots)
+        mean, sd = self.moments(theta, observations)
         return mean, [sd**-2.0]
 
-    def moments(self, theta: Theta, slots: Slots) -> tuple[Any, Any]:
+    def moments(self, theta: Theta, observations: Observations) -> tuple[Any, Any]:
         """Return the prior means and sds (point, [robot,] column) of the coefficients."""
-        mean, sd = self.priors.coefficients(slots.z.shape[3])
+        mean, sd = self.priors.coefficients(observations.awareness.shape[3])
         rest = theta["rest"][..., None]
         rest = rest if self.priors.stationary else 0.0 * rest + 1.0
         return rest * mean, rest * sd
 
-    def named(self, c: np.ndarray, theta: Theta, slots: Slots) -> Values:
+    def named(self, c: np.ndarray, theta: Theta, observations: Observations) -> Values:
         """Return the weights `beta` (draw, feature) and the intercept `b` (draw,)."""
         return {"beta": c[:, :-1], "b": c[:, -1]}
 
-    def coefficients(self, values: Values, theta: Theta, slots: Slots) -> np.ndarray:
+    def coefficients(self, values: Values, theta: Theta, observations: Observations) -> np.ndarray:
         """See `Effect.coefficients`."""
         return np.column_stack([values["beta"], values["b"]])
 
@@ -47,15 +47,15 @@ class Weights(Effect):
 class RobotWeights(Weights):
     """Separate coefficients N(mu, tau^2) for each robot; the hyperparameter tau is in theta."""
 
-    def columns(self, slots: Slots) -> Any:
+    def columns(self, observations: Observations) -> Any:
         """Return the features and a constant 1 for each robot; the robot varies fastest."""
-        values = _inputs(slots)
-        mine = np.tile(np.eye(slots.n_robots), (len(values) // slots.n_robots, 1))
+        values = _inputs(observations)
+        mine = np.tile(np.eye(observations.n_robots), (len(values) // observations.n_robots, 1))
         return sparse.csr_array((values[..., None] * mine[:, None]).reshape(len(values), -1))
 
-    def prior(self, theta: Theta, slots: Slots) -> tuple[Any, list[Any]]:
+    def prior(self, theta: Theta, observations: Observations) -> tuple[Any, list[Any]]:
         """Return a prior that correlates the robots' coefficients through a common mean."""
-        n, (mean, sd) = slots.n_robots, self.moments(theta, slots)
+        n, (mean, sd) = observations.n_robots, self.moments(theta, observations)
         tau = namespace(mean).maximum(_spreads(theta), LEAST)
         share = sd**2 / (tau**2 + n * sd**2)  # (sd^2 11' + tau^2 I)^-1 in closed form
         parts = [
@@ -64,19 +64,19 @@ class RobotWeights(Weights):
         ]
         return namespace(mean).repeat(mean, n, axis=1), parts
 
-    def named(self, c: np.ndarray, theta: Theta, slots: Slots) -> Values:
+    def named(self, c: np.ndarray, theta: Theta, observations: Observations) -> Values:
         """Return the weights `beta` (draw, robot, feature), intercepts `b` (draw, robot) and means.
 
         The means `mean_beta` and `mean_b` are expected values given the coefficients.
         """
-        c = np.swapaxes(c.reshape(len(c), -1, slots.n_robots), 1, 2)
-        mean, sd = self.moments(theta, slots)
-        gain = sd**2 / (sd**2 + _spreads(theta) ** 2 / slots.n_robots)
+        c = np.swapaxes(c.reshape(len(c), -1, observations.n_robots), 1, 2)
+        mean, sd = self.moments(theta, observations)
+        gain = sd**2 / (sd**2 + _spreads(theta) ** 2 / observations.n_robots)
         mu = mean + gain * (c.mean(1) - mean)
         means = {"mean_beta": mu[:, :-1], "mean_b": mu[:, -1]}
         return {"beta": c[..., :-1], "b": c[..., -1]} | means
 
-    def coefficients(self, values: Values, theta: Theta, slots: Slots) -> np.ndarray:
+    def coefficients(self, values: Values, theta: Theta, observations: Observations) -> np.ndarray:
         """See `Effect.coefficients`."""
         c = np.concatenate([values["beta"], values["b"][..., None]], axis=-1)
         return np.swapaxes(c, 1, 2).reshape(len(c), -1)
@@ -86,43 +86,45 @@ class RobotWeights(Weights):
 class CoupledWeights(Weights):
     """Matrices B_m that weight feature m of robot l in the trust of robot i, and intercepts b_i."""
 
-    def columns(self, slots: Slots) -> Any:
+    def columns(self, observations: Observations) -> Any:
         """Return the features of all robots and a constant 1, for each robot."""
-        n = slots.n_robots
-        inputs = slots.z.reshape(-1, 1, n * slots.z.shape[3])  # (mission * bound, 1, (robot, m))
+        n = observations.n_robots
+        inputs = observations.awareness.reshape(
+            -1, 1, n * observations.awareness.shape[3]
+        )  # (mission * bound, 1, (robot, m))
         inputs = np.concatenate([inputs, np.ones((*inputs.shape[:2], 1))], axis=2)
         values = np.eye(n)[:, :, None] * inputs[:, :, None]  # (..., robot, of robot, input)
-        return sparse.csr_array(values.reshape(slots.y.size, -1))
+        return sparse.csr_array(values.reshape(observations.contact_rate.size, -1))
 
-    def prior(self, theta: Theta, slots: Slots) -> tuple[Any, list[Any]]:
+    def prior(self, theta: Theta, observations: Observations) -> tuple[Any, list[Any]]:
         """Return the prior on the weights, with `Priors.coupling` for features of other robots."""
-        n, n_features = slots.n_robots, slots.z.shape[3]
+        n, n_features = observations.n_robots, observations.awareness.shape[3]
         own = np.repeat(np.eye(n, dtype=bool), n_features, axis=1)
         own = np.column_stack([own, np.ones(n, dtype=bool)])  # (robot, input)
         feature = np.append(np.tile(np.arange(n_features), n), n_features)
         coupling = self.priors.moments("coupling")
-        (mean, sd), xp = self.moments(theta, slots), namespace(theta["rest"])
+        (mean, sd), xp = self.moments(theta, observations), namespace(theta["rest"])
         means = xp.where(own, mean[..., feature], coupling[0])
         sds = xp.where(own, sd[..., feature], coupling[1])
         return means.reshape(len(means), -1), [sds.reshape(len(sds), -1) ** -2.0]
 
-    def named(self, c: np.ndarray, theta: Theta, slots: Slots) -> Values:
+    def named(self, c: np.ndarray, theta: Theta, observations: Observations) -> Values:
         """Return matrices `B` (draw, feature, robot, robot') and intercepts `b` (draw, robot)."""
-        n = slots.n_robots
+        n = observations.n_robots
         c = c.reshape(len(c), n, -1)
         B = c[..., :-1].reshape(len(c), n, n, -1)
         return {"B": np.moveaxis(B, -1, 1), "b": c[..., -1]}
 
-    def coefficients(self, values: Values, theta: Theta, slots: Slots) -> np.ndarray:
+    def coefficients(self, values: Values, theta: Theta, observations: Observations) -> np.ndarray:
         """See `Effect.coefficients`."""
         B = np.moveaxis(values["B"], 1, -1)
         B = B.reshape(*B.shape[:2], -1)
         return np.concatenate([B, values["b"][..., None]], axis=2).reshape(len(B), -1)
 
 
-def _inputs(slots: Slots) -> np.ndarray:
-    """Return an array (slot, feature + 1) of the features and a column of ones."""
-    z = slots.z.reshape(-1, slots.z.shape[3])
+def _inputs(observations: Observations) -> np.ndarray:
+    """Return an array (observation, feature + 1) of the features and a column of ones."""
+    z = observations.awareness.reshape(-1, observations.awareness.shape[3])
     return np.column_stack([z, np.ones(len(z))])
 
 

@@ -1,0 +1,131 @@
+"""Contact rates and awareness of missions, padded to one array each."""
+
+from collections.abc import Sequence
+from typing import NamedTuple, Self
+
+import numpy as np
+
+from trustbo.data import Mission, is_line_of_sight
+from trustbo.errors import TrustboError
+from trustbo.models.families import Family
+from trustbo.models.visited import Visited
+from trustbo.stacking import require_same_team
+
+NO_TICKS = (
+    "The beta-binomial family counts ticks. Give the tick count of each bound as n_ticks, for "
+    'example in Mission.from_arrays, or use observation="censored".'
+)
+UNKNOWN_RESOLUTION = 0.005
+"""Resolution assumed for rates with an unknown tick count."""
+COARSEST_RESOLUTION = 0.1
+"""Limit on `Observations.resolution`."""
+
+
+class Observations(NamedTuple):
+    """Contact rates and awareness of missions, padded to the bounds of the longest mission."""
+
+    contact_rate: np.ndarray
+    """Shape (mission, bound, robot); NaN in the padding and where not measured."""
+    awareness: np.ndarray
+    """Shape (mission, bound, robot, feature); 0 in the padding."""
+    n_ticks: np.ndarray
+    """Number of ticks, shape (mission, bound, robot); NaN in the padding and where unknown."""
+    features: tuple[str, ...] = ()
+    visited: Visited | None = None
+    """Places of the bounds, if an effect needs them."""
+
+    @classmethod
+    def from_missions(cls, missions: Sequence[Mission]) -> Self:
+        """Pad missions with the same robots and features, of any length.
+
+        Raises:
+            TrustboError: If there are no missions, robots or features differ between missions, or
+                an awareness value is NaN; only contact rates may be missing.
+        """
+        require_same_team(missions)
+        n_bounds = max(len(mission.bounds) for mission in missions)
+        _, n_robots, n_features = missions[0].awareness.shape
+        shape = len(missions), n_bounds, n_robots
+        padded = cls(
+            contact_rate=np.full(shape, np.nan),
+            awareness=np.zeros((*shape, n_features)),
+            n_ticks=np.full(shape, np.nan),
+            features=tuple(missions[0].features),
+        )
+
+        for j, mission in enumerate(missions):
+            unknown = np.argwhere(np.isnan(mission.awareness))
+            if len(unknown):
+                k, i, m = unknown[0]
+                raise TrustboError(
+                    f"awareness of mission {j}, bound {k + 1}, robot {mission.robots[i]}, feature "
+                    f"{mission.features[m]} is NaN; pass workspace= to fill it, or leave out the "
+                    "mission if the map does not know the cell."
+                )
+            driven = slice(len(mission.bounds))
+            padded.contact_rate[j, driven] = mission.contact_rate
+            padded.awareness[j, driven] = mission.awareness
+            padded.n_ticks[j, driven] = mission.n_ticks
+        return padded
+
+    @property
+    def n_missions(self) -> int:
+        """Number of missions."""
+        return self.contact_rate.shape[0]
+
+    @property
+    def n_bounds(self) -> int:
+        """Number of bounds in the longest mission."""
+        return self.contact_rate.shape[1]
+
+    @property
+    def n_robots(self) -> int:
+        """Number of robots."""
+        return self.contact_rate.shape[2]
+
+    @property
+    def line_of_sight(self) -> np.ndarray:
+        """Mean (mission, bound, robot) of the line-of-sight features, or 1 if there are none."""
+        sight = [m for m, name in enumerate(self.features) if is_line_of_sight(name)]
+        if not sight:
+            return np.ones(self.contact_rate.shape)
+        return self.awareness[..., sight].mean(-1)
+
+    @property
+    def resolution(self) -> float:
+        """Median resolution 1 / n_ticks of the measured rates, at most `COARSEST_RESOLUTION`."""
+        ticks = np.nan_to_num(self.n_ticks[~np.isnan(self.contact_rate)])
+        if not len(ticks):
+            return UNKNOWN_RESOLUTION
+
+        some = ticks > 0.0
+        steps = np.where(some, 1.0 / np.where(some, ticks, 1.0), UNKNOWN_RESOLUTION)
+        return float(min(np.median(steps), COARSEST_RESOLUTION))
+
+    def first(self, n: int) -> Self:
+        """Return the first n missions."""
+        return self._replace(
+            contact_rate=self.contact_rate[:n],
+            awareness=self.awareness[:n],
+            n_ticks=self.n_ticks[:n],
+            visited=None if self.visited is None else self.visited.first(n),
+        )
+
+    def without(self, missions: Sequence[int] | slice) -> Self:
+        """Return a copy in which all rates of the given missions are NaN."""
+        contact_rate = self.contact_rate.copy()
+        contact_rate[missions] = np.nan
+        return self._replace(contact_rate=contact_rate)
+
+
+def require_ticks(family: Family, contact_rate: np.ndarray, n_ticks: np.ndarray) -> None:
+    """Raise TrustboError if the family needs n_ticks and a measured rate lacks it.
+
+    Both arrays have the shape (mission, bound, robot).
+    """
+    without = ~np.isnan(contact_rate) & ~(n_ticks >= 1.0)
+    if family.needs_ticks and without.any():
+        j, k, i = np.argwhere(without)[0]
+        raise TrustboError(
+            f"robot {i} has a rate but no n_ticks at bound {k + 1} of mission {j}. {NO_TICKS}"
+        )
