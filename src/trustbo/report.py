@@ -81,7 +81,7 @@ def _facts(result: Result) -> dict[str, str]:
     """Return the facts, by name, that are needed to decide whether to drive the path."""
     plan = result.plan
     problem = result.planner.problem
-    noise_sd = problem.dynamics(result.belief.mean()).noise_sd
+    noise_sd = problem.recursion(result.belief.mean()).noise_sd
     contact = np.minimum(problem.family.mean_rate(plan.trust, noise_sd), 1.0).mean(1)
     worst = int(np.argmin(contact))
 

@@ -115,7 +115,7 @@ def test_one_bound_and_one_robot_are_cases_like_others(shape):
 def test_the_evidence_holds_at_extreme_hyperparameters(name, value):
     posterior, theta = posterior_of("places and robots", gaps=True)
     theta = {**theta, name: np.full(3, value)}
-    theta["rest"] = 1.0 - theta["beta0"]
+    theta["inverse_gain"] = 1.0 - theta["beta0"]
     dense = Dense(posterior.model, posterior.observations, at(theta, slice(0, 1)))
     np.testing.assert_allclose(posterior.log_evidence(theta)[0], dense.log_density(), rtol=1e-7)
 
@@ -160,7 +160,7 @@ def test_drawn_columns_have_the_moments_of_the_joint_normal(name):
     "name", ["pooled", "deviation", "places and robots", "hierarchical", "coupled"]
 )
 def test_the_plain_program_has_the_density_of_the_equations(name):
-    """Given coefficients: signals by the program's filter, and by the matrices of `signal`."""
+    """Given coefficients: the program's filter, and the matrices of `linear_predictor`."""
     posterior, theta = posterior_of(name, gaps=True)
     model, observations, rng = posterior.model, posterior.observations, np.random.default_rng(2)
     values = posterior.scores.draw(20, rng)
@@ -178,13 +178,15 @@ def test_the_plain_program_has_the_density_of_the_equations(name):
                     of_part = c[start:stop] - (
                         0.0 if mean is None else mean[0, start - first : stop - first]
                     )
-                    given[f"{effect.noun or 'weights'}_{k}"] = jax.numpy.asarray(of_part)
+                    given[f"{effect.group or 'weights'}_{k}"] = jax.numpy.asarray(of_part)
                     start = stop
             found = float(density(given))
-            signal = model.signal(at(theta, slice(i, i + 1)), observations, posterior.layout)
-            at_ = engine.expected(posterior.blocks, signal, c[None])
+            predictor = model.linear_predictor(
+                at(theta, slice(i, i + 1)), observations, posterior.layout
+            )
+            at_ = engine.expected(posterior.blocks, predictor, c[None])
             W, log_sites = engine.whiten(
-                posterior.blocks, signal, posterior.blocks.seen / signal.sd**2
+                posterior.blocks, predictor, posterior.blocks.seen / predictor.noise_sd**2
             )
             w = W[:, posterior.blocks.kind] @ (posterior.blocks.y - at_)[..., None]
             wanted = log_sites[:, posterior.blocks.kind].sum() - 0.5 * (w**2).sum()

@@ -1,4 +1,4 @@
-"""Expectation propagation against quadrature over all signals of small cases."""
+"""Expectation propagation against quadrature over all linear predictors of small cases."""
 
 import numpy as np
 import pytest
@@ -21,20 +21,20 @@ def small(observation, y):
 
 
 def by_quadrature(posterior, theta):
-    """Log p(rates | theta) by a grid over both signals, coefficients integrated out."""
-    signal, prior = posterior._at(theta)
+    """Log p(rates | theta) by a grid over both linear predictors, coefficients integrated out."""
+    predictor, prior = posterior._at(theta)
     U = posterior.blocks.U.toarray()
     c_cov = np.diag(1.0 / np.concatenate([part[0] for part in prior.parts]))
-    T = signal.T[0, 0]
-    mean = signal.m[0, 0] + T @ U @ prior.mean[0]
-    cov = signal.covariance[0, 0] + T @ U @ c_cov @ U.T @ T.T
+    T = predictor.response[0, 0]
+    mean = predictor.mean[0, 0] + T @ U @ prior.mean[0]
+    cov = predictor.covariance[0, 0] + T @ U @ c_cov @ U.T @ T.T
     L, e = np.linalg.cholesky(cov), np.linspace(-8.0, 8.0, 801)
     a, b = np.meshgrid(e, e, indexing="ij")
     f = mean[:, None, None] + np.stack([L[0, 0] * a, L[1, 0] * a + L[1, 1] * b])
     terms, total = posterior.terms, -0.5 * (a**2 + b**2) - np.log(2.0 * np.pi)
     for k in range(2):
         if not np.isnan(terms.y[0, k]):
-            sd = signal.sd[0, 0, 0]
+            sd = predictor.noise_sd[0, 0, 0]
             total = total + terms.family.log_prob(terms.y[0, k], 40.0, f[k], sd)
     return logsumexp(total) + 2.0 * np.log(e[1] - e[0])
 
@@ -44,14 +44,14 @@ def by_quadrature(posterior, theta):
 def test_the_evidence_and_the_mean_weight_are_those_of_quadrature(observation, y):
     posterior = small(observation, y)
     theta = posterior.theta(np.array([[0.0, -0.5, 0.2]]))
-    posterior.settle(theta)
+    posterior.run_ep(theta)
     wanted = by_quadrature(posterior, theta)
     found, _ = ep.log_evidence(posterior._joint(theta), posterior.sites, 10)
     assert abs(found[0] - wanted) < 0.05  # EP's own error
     many = at(theta, np.zeros(20_000, int))
     joint = posterior._joint(many)
     sites = ep.Sites(*(np.repeat(s, 20_000, axis=0) for s in posterior.sites)).at(
-        posterior.terms, joint.signal.sd
+        posterior.terms, joint.predictor.noise_sd
     )
     _, _, log_weight = ep.draw(joint, sites, np.random.default_rng(0))
     weight = np.exp(log_weight - wanted)
@@ -77,7 +77,7 @@ def test_parts_of_persons_have_their_joint_law():
     observations = Observations(y, z, np.full(y.shape, 6.0), features)
     posterior = Posterior(model, observations)
     theta = posterior.theta(np.zeros((1, posterior.n_scores)))
-    with_parts = model.signal(theta, observations, posterior.layout).S
+    with_parts = model.linear_predictor(theta, observations, posterior.layout).trust_cov
     effects = model.random_effects(theta, observations)
     parts = model.state_space(theta, 1).response(4) @ effects.drift + effects.offset
     rest = with_parts - parts @ np.swapaxes(parts, 2, 3)

@@ -76,11 +76,13 @@ def test_predictions_are_those_of_the_joint_normal_of_draws():
     log_w, means = [], []
     for i in range(len(draws.c)):
         theta = at(draws.theta, slice(i, i + 1))
-        signal = fitted.model.signal(theta, observations, fitted.model.layout(observations))
+        predictor = fitted.model.linear_predictor(
+            theta, observations, fitted.model.layout(observations)
+        )
         inputs = fitted.model.layout(observations).columns(sparse.csr_array(U)) @ draws.c[i]
-        mean = (signal.m[0, 0] + signal.T[0, 0] @ inputs.ravel()).ravel()
-        S = signal.covariance[0, 0]
-        C = S[:4, :4] + float(signal.sd[0].ravel()[0]) ** 2 * np.eye(4)
+        mean = (predictor.mean[0, 0] + predictor.response[0, 0] @ inputs.ravel()).ravel()
+        S = predictor.covariance[0, 0]
+        C = S[:4, :4] + float(predictor.noise_sd[0].ravel()[0]) ** 2 * np.eye(4)
         off, factor = y[:4, 0] - mean[:4], cho_factor(C)
         white = cho_solve(factor, off)
         log_w.append(-0.5 * off @ white - np.log(np.diag(factor[0])).sum())

@@ -1,4 +1,4 @@
-"""Scores of predictions against joint normals written out, and against simulation."""
+"""NormalScores of predictions against joint normals written out, and against simulation."""
 
 import numpy as np
 import pytest

@@ -26,7 +26,7 @@ N = 40.0
 
 
 def density(family, y, m, v, sd):
-    """N(f; m, v) times the term of a rate, as a function of the signal f."""
+    """N(f; m, v) times the term of a rate, as a function of the predictor f."""
 
     def of(f):
         log_p = family.log_prob(np.array(y), np.array(N), np.array([f]), np.array(sd))[0]

@@ -7,17 +7,17 @@ from scipy import stats
 
 from trustbo.models import PlaceEffect, PooledTrust, RobotEffect
 from trustbo.models.effects.place import matern
-from trustbo.models.scores import Scores
+from trustbo.models.scores import NormalScores
 
 STEP = 1e-6
 
 
 @pytest.fixture(scope="module")
 def scores():
-    """Scores of the two noises and of the hyperparameters of a place effect."""
+    """NormalScores of the two noises and of the hyperparameters of a place effect."""
     noises = {"delta_w": dist.HalfNormal(0.2), "delta_v": dist.HalfNormal(0.1)}
     place = PlaceEffect()
-    return Scores(noises | place.hyperpriors(), place.pairs)
+    return NormalScores(noises | place.hyperpriors(), place.pairs)
 
 
 def log_prior_of_values(scores, z):

@@ -6,7 +6,7 @@ from scipy.linalg import block_diag, helmert
 
 from trustbo.models.families import FAMILIES
 from trustbo.statespace import Inputs, StateSpace, kalman
-from trustbo.statespace.blocks import Layout, Signal
+from trustbo.statespace.blocks import Layout, LinearPredictor
 from trustbo.statespace.form import coupled_robots, independent_robots
 
 K = 5
@@ -107,7 +107,7 @@ def test_the_filter_has_the_density_and_the_trust_of_the_joint_normal(name):
     y[1, 0, 2] = np.nan
     y[3] = np.nan
     layout = Layout.of(np.full((1, K, 3), np.nan), joint=True)
-    signal = Signal.of(space, layout)
+    predictor = LinearPredictor.of(space, layout)
     belief = kalman.initial(space, 1)
     log_density = 0.0
     for k in range(K):
@@ -117,13 +117,13 @@ def test_the_filter_has_the_density_and_the_trust_of_the_joint_normal(name):
 
     seen = ~np.isnan(y.ravel())
     for point in range(2):
-        mean = signal.m[point, 0] + signal.T[point, 0] @ u[:, point].ravel()
-        cov = signal.covariance[point, 0] + np.diag(
-            np.broadcast_to(signal.sd[point, 0], mean.shape) ** 2
+        mean = predictor.mean[point, 0] + predictor.response[point, 0] @ u[:, point].ravel()
+        cov = predictor.covariance[point, 0] + np.diag(
+            np.broadcast_to(predictor.noise_sd[point, 0], mean.shape) ** 2
         )
         off = y.ravel()[seen] - mean[seen]
         V = cov[np.ix_(seen, seen)]
-        cross = signal.S[point, 0][-3:, seen]
+        cross = predictor.trust_cov[point, 0][-3:, seen]
         wanted = -0.5 * (off @ np.linalg.solve(V, off) + np.linalg.slogdet(2.0 * np.pi * V)[1])
         assert log_density[point] == pytest.approx(wanted, rel=1e-9)
         trust = mean[-3:] + cross @ np.linalg.solve(V, off)
@@ -133,16 +133,16 @@ def test_the_filter_has_the_density_and_the_trust_of_the_joint_normal(name):
 def test_contrasts_of_exchangeable_robots_are_independent():
     space = SPACES["shared noise"]
     rotation = helmert(3, full=True)
-    joint = Signal.of(space, Layout((1, K, 3), joint=True))
-    apart = Signal.of(space, Layout((1, K, 3), rotation=rotation))
+    joint = LinearPredictor.of(space, Layout((1, K, 3), joint=True))
+    apart = LinearPredictor.of(space, Layout((1, K, 3), rotation=rotation))
     turn = np.kron(np.eye(K), rotation)
     for point in range(2):
         cov = turn @ joint.covariance[point, 0] @ turn.T
-        mean = turn @ joint.m[point, 0]
+        mean = turn @ joint.mean[point, 0]
         for i in range(3):
             rows = slice(i, None, 3)
             label = min(i, 1)
-            np.testing.assert_allclose(mean[rows], apart.m[point, label], atol=1e-12)
+            np.testing.assert_allclose(mean[rows], apart.mean[point, label], atol=1e-12)
             np.testing.assert_allclose(cov[rows, rows], apart.covariance[point, label], atol=1e-12)
             cov[rows, rows] = 0.0
         np.testing.assert_allclose(cov, 0.0, atol=1e-12)

@@ -151,8 +151,10 @@ def _check_places(posterior: xr.DataTree) -> Finding:
     )
     of_cells = joined_draws(places["place"])[:, [cells.index(cell) for cell in where]]
     total = joined_draws(places["place_bound"]) + of_cells
-    rest = theta_of(posterior, sites_of(posterior))["rest"]
-    draws = total / rest.reshape(len(total), -1).mean(1, keepdims=True)  # of stationary trust
+    inverse_gain = theta_of(posterior, sites_of(posterior))["inverse_gain"]
+    draws = total / inverse_gain.reshape(len(total), -1).mean(
+        1, keepdims=True
+    )  # of stationary trust
     draws = draws / FAMILIES[posterior.attrs["observation"]].line_of_sight[0]
     effect = draws.mean(0)
     sure = (draws * np.sign(effect) > 0.0).mean(0)

@@ -167,7 +167,7 @@ def _robot_effects_ahead(
         return {}
     theta = theta_of(posterior, sites)
     rng = np.random.default_rng(_DAY_SEED) if day else None
-    robots = (len(theta["rest"]), posterior.attrs["n_robots"])
+    robots = (len(theta["inverse_gain"]), posterior.attrs["n_robots"])
     n = posterior.attrs["n_missions"]
     slopes = [effect.ahead(values_of(posterior, effect), theta, n, rng) for effect in effects]
     slope = np.broadcast_to(sum(slopes), robots)
@@ -242,13 +242,13 @@ def is_of_people(posterior: xr.DataTree) -> bool:
 
 def values_of(posterior: xr.DataTree, effect: Effect) -> dict[str, np.ndarray]:
     """Return the variables of an effect by name, with chains joined in a leading axis (draw,)."""
-    group = posterior[effect.noun].to_dataset()
+    group = posterior[effect.group].to_dataset()
     axes = {name: axes or (...,) for name, axes in effect.variables.items() if name in group}
     return {name: joined_draws(group[name], of_name) for name, of_name in axes.items()}
 
 
 def theta_of(posterior: xr.DataTree, sites: Mapping[str, np.ndarray]) -> Theta:
-    """Return the hyperparameters of draws by name, including `rest`; see `Theta`."""
+    """Return the hyperparameters of draws by name, including `inverse_gain`; see `Theta`."""
     return with_default_priors(json.loads(posterior.attrs["model_record"])).derived(sites)
 
 
@@ -279,7 +279,7 @@ def read_posterior(
     model = model.for_features(features)
     fitted = Posterior(model, model.observations(missions))
     groups = {"posterior": sites_of(posterior)}
-    groups |= {effect.noun: values_of(posterior, effect) for effect in model.effects}
+    groups |= {effect.group: values_of(posterior, effect) for effect in model.effects}
     return fitted, fitted.draws_of(groups)
 
 

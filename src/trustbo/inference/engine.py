@@ -1,7 +1,7 @@
-"""Evidence of a model with blocks of jointly normal signals that share columns.
+"""Evidence of a model with blocks of jointly normal linear predictors that share columns.
 
 A block is a robot in a mission, a whole mission if its robots are dependent, or a person. Each
-block has trust x and a signal f,
+block has trust x and a predictor f,
 
     x = m + T U c + e,    f = x + n,    e ~ N(0, S),  n ~ N(0, noise),  c ~ N(mean, precision^-1),
 
@@ -32,7 +32,7 @@ from trustbo.inference.factor import (
 )
 from trustbo.models.backend import namespace
 from trustbo.models.effects.effect import Chains
-from trustbo.statespace.blocks import Signal, each
+from trustbo.statespace.blocks import LinearPredictor, each
 
 
 class Blocks(NamedTuple):
@@ -41,7 +41,7 @@ class Blocks(NamedTuple):
     y: np.ndarray  # (block, row), 0 where not measured
     U: Any  # sparse (block * input, column)
     kind: np.ndarray  # (block,), kind of each block; blocks of one kind share factors
-    label: np.ndarray  # (kind,), index on the second axis of a `Signal`
+    label: np.ndarray  # (kind,), index on the second axis of a `LinearPredictor`
     seen: np.ndarray  # (kind, row)
     sums: Any  # sparse (entry, kind * pair of inputs), for the precision entries in `at`
     at: np.ndarray  # (entry,), precision entries with products of columns; see `Order`
@@ -56,7 +56,7 @@ class Blocks(NamedTuple):
         Args:
             y: Observations (block, row), NaN where not measured.
             U: Columns as a sparse matrix (block * input, column).
-            label: Index (block,) of each block on the second axis of a `Signal`.
+            label: Index (block,) of each block on the second axis of a `LinearPredictor`.
             order: Order in which the columns are eliminated.
             apart: Whether each block is a separate kind, as needed if sites differ between blocks.
         """
@@ -192,21 +192,23 @@ class Fit(NamedTuple):
     W: Any  # (point, kind, row, row)
 
 
-def evidence(blocks: Blocks, signal: Signal, prior: Prior, lam: Any, y: Any = None) -> Fit:
-    """Compute log p(y | theta) at each theta, with signals and coefficients integrated out.
+def evidence(
+    blocks: Blocks, predictor: LinearPredictor, prior: Prior, lam: Any, y: Any = None
+) -> Fit:
+    """Compute log p(y | theta) at each theta; predictors and coefficients are integrated out.
 
     Args:
         blocks: Data of all blocks.
-        signal: Distribution of the signals given the coefficients.
+        predictor: Distribution of the linear predictors given the coefficients.
         prior: Prior on the coefficients.
         lam: Site precisions (point, kind, row), 0 where nothing was measured.
         y: Site means (point, block, row), if different from the observations.
     """
-    W, log_sites = whiten(blocks, signal, lam)
+    W, log_sites = whiten(blocks, predictor, lam)
     xp, n, b = namespace(W), len(W), blocks
-    residual = (b.y if y is None else y) - expected(b, signal, prior.mean)
+    residual = (b.y if y is None else y) - expected(b, predictor, prior.mean)
     w = (W[:, b.kind] @ residual[..., None])[..., 0]
-    C = W @ each(signal.T, b.label)
+    C = W @ each(predictor.response, b.label)
     back = (xp.swapaxes(C, 2, 3)[:, b.kind] @ w[..., None])[..., 0]
     h = times(b.U.T, back.reshape(n, -1))
     h = xp.concatenate([h, xp.zeros((n, b.order.hidden.size))], axis=1)
@@ -220,9 +222,9 @@ def evidence(blocks: Blocks, signal: Signal, prior: Prior, lam: Any, y: Any = No
     return Fit(log_p + 0.5 * (half**2).sum(1) - F.log_det, F, half, W)
 
 
-def whiten(blocks: Blocks, signal: Signal, lam: Any) -> tuple[Any, Any]:
+def whiten(blocks: Blocks, predictor: LinearPredictor, lam: Any) -> tuple[Any, Any]:
     """Return whitening matrices W (point, kind, row, row) and log densities at zero residual."""
-    V = each(signal.covariance, blocks.label)
+    V = each(predictor.covariance, blocks.label)
     xp, some = namespace(V), lam > 0.0
     d = xp.where(some, xp.where(some, lam, 1.0) ** 0.5, 0.0)  # lam**0.5 has no slope at 0
     L = cholesky(np.eye(V.shape[-1]) + d[..., :, None] * V * d[..., None, :])
@@ -230,13 +232,13 @@ def whiten(blocks: Blocks, signal: Signal, lam: Any) -> tuple[Any, Any]:
     return xp.linalg.inv(L) * d[..., None, :], log_sites - log_diagonal(L)
 
 
-def expected(blocks: Blocks, signal: Signal, c: Any) -> Any:
-    """Compute the mean signals (point, block, row) given coefficients (point, column)."""
+def expected(blocks: Blocks, predictor: LinearPredictor, c: Any) -> Any:
+    """Compute the mean linear predictors (point, block, row) given coefficients (point, column)."""
     drift = times(blocks.U, c).reshape(len(c), len(blocks.y), -1)
     xp, label = namespace(drift), blocks.label[blocks.kind]
-    if signal.T.shape[1] == 1:
-        return each(signal.m, label) + drift @ xp.swapaxes(signal.T[:, 0], 1, 2)
-    return each(signal.m, label) + (signal.T[:, label] @ drift[..., None])[..., 0]
+    if predictor.response.shape[1] == 1:
+        return each(predictor.mean, label) + drift @ xp.swapaxes(predictor.response[:, 0], 1, 2)
+    return each(predictor.mean, label) + (predictor.response[:, label] @ drift[..., None])[..., 0]
 
 
 def columns_of(
@@ -253,18 +255,18 @@ def columns_of(
 
 
 def marginals(
-    blocks: Blocks, signal: Signal, prior: Prior, fit: Fit, y: np.ndarray
+    blocks: Blocks, predictor: LinearPredictor, prior: Prior, fit: Fit, y: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the mean and variance (point, block, row) of every signal given all sites.
+    """Compute the mean and variance (point, block, row) of every predictor given all sites.
 
     Each block must be a separate kind (`apart` in `Blocks.of`), so that kind i is block i.
     """
-    V, T = each(signal.covariance, blocks.label), each(signal.T, blocks.label)
+    V, T = each(predictor.covariance, blocks.label), each(predictor.response, blocks.label)
     n, rows = len(V), V.shape[-1]
     c = prior.mean + fit.F.back(fit.half[:, None])[:, 0]
     gain = V @ (np.swapaxes(fit.W, 2, 3) @ fit.W)
     G = T - gain @ T
-    at = expected(blocks, signal, c)
+    at = expected(blocks, predictor, c)
     mean = at + np.einsum("nbij,nbj->nbi", gain, y - at)
     k, j = np.triu_indices(T.shape[3])
     M = np.zeros((n, len(blocks.y), T.shape[3], T.shape[3]))  # U cov U' for each block

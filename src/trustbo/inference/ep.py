@@ -1,10 +1,11 @@
-"""Expectation propagation (EP) for observations that are not linear in the signal.
+"""Expectation propagation (EP) for observations that are not linear in the predictor.
 
 Each likelihood term t(f) is replaced by a site exp(-lam f^2 / 2 + eta f). Given the sites, `engine`
-computes the marginals of the signals exactly. Dividing a marginal by its site gives the cavity. The
-site is then updated so that the product of the cavity and the site has the moments of the product
-of the cavity and the likelihood term. The log evidence is the log evidence of the sites plus, for
-each term, the log ratio of the masses of these products. Importance weights correct the draws.
+computes the marginals of the linear predictors exactly. Dividing a marginal by its site gives the
+cavity. The site is then updated so that the product of the cavity and the site has the moments of
+the product of the cavity and the likelihood term. The log evidence is the log evidence of the sites
+plus, for each term, the log ratio of the masses of these products. Importance weights correct the
+draws.
 """
 
 from typing import Any, NamedTuple
@@ -16,7 +17,7 @@ from trustbo.inference.engine import Blocks, Prior, evidence, expected, marginal
 from trustbo.inference.factor import Factor, cholesky
 from trustbo.models.families import Family
 from trustbo.models.families.moments import log_normal
-from trustbo.statespace.blocks import Signal, each
+from trustbo.statespace.blocks import LinearPredictor, each
 
 _LEAST = 1e-9  # smallest precision of a cavity or a site
 _TEMPERED = 0.6  # factor on the site precisions in the wider proposal
@@ -36,10 +37,10 @@ class Terms(NamedTuple):
 
 
 class Joint(NamedTuple):
-    """Blocks, signals, prior and observations at each theta."""
+    """Blocks, linear predictors, prior and observations at each theta."""
 
     blocks: Blocks
-    signal: Signal
+    predictor: LinearPredictor
     prior: Prior
     terms: Terms
 
@@ -86,14 +87,14 @@ def log_evidence(
     joint: Joint, sites: Sites, n_sweeps: int, damp: float = 1.0
 ) -> tuple[np.ndarray, Sites]:
     """Compute the EP log evidence (point,) and the sites after `n_sweeps` sweeps."""
-    blocks, signal, prior, terms = joint
-    seen, sd = ~np.isnan(terms.y), signal.sd
+    blocks, predictor, prior, terms = joint
+    seen, sd = ~np.isnan(terms.y), predictor.noise_sd
     sites = sites.at(terms, sd)
     total = np.zeros(len(sd))
     for sweep in range(n_sweeps + 1):
         lam, eta, y = *sites, sites.y
-        fit = evidence(blocks, signal, prior, lam, y)
-        mean, var = marginals(blocks, signal, prior, fit, y)
+        fit = evidence(blocks, predictor, prior, lam, y)
+        mean, var = marginals(blocks, predictor, prior, fit, y)
         rest = np.maximum(1.0 / var - lam, _LEAST)  # precision of the cavities
         slope = mean / var - eta
         m, v = slope / rest, 1.0 / rest
@@ -116,40 +117,41 @@ def _overlap(y: np.ndarray, lam: np.ndarray, m: np.ndarray, v: np.ndarray) -> np
 def draw(
     joint: Joint, sites: Sites, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Draw coefficients and signals at each theta, with weights whose mean is the evidence.
+    """Draw coefficients and predictors at each theta, with weights whose mean is the evidence.
 
     Coefficients are drawn from a mixture of two Student-t distributions, one centred on the
     EP posterior and one on a posterior with less precise sites.
 
     Returns:
-        Coefficients (point, column), signals (point, block, row) and log weights (point,).
+        Coefficients (point, column), linear predictors (point, block, row) and log weights
+        (point,).
     """
-    blocks, signal, prior, terms = joint
-    n, p = len(signal.sd), blocks.U.shape[1]
+    blocks, predictor, prior, terms = joint
+    n, p = len(predictor.noise_sd), blocks.U.shape[1]
     nu = max(8.0, 2.0 * p)
     proposals = []
     for share in (1.0, _TEMPERED):
         share = np.where(terms.linear, 1.0, share)
         lam, y = share * sites.lam, sites.y
-        fit = evidence(blocks, signal, prior, lam, y)
+        fit = evidence(blocks, predictor, prior, lam, y)
         proposals.append((prior.mean + fit.F.back(fit.half[:, None])[:, 0], fit.F))
     wide, t = rng.random(n) < 0.5, rng.standard_normal((n, 1, proposals[0][1].size))
     t /= np.sqrt(rng.chisquare(nu, (n, 1, 1)) / nu)
     narrow, wider = (center + F.back(t)[:, 0] for center, F in proposals)
     c = np.where(wide[:, None], wider, narrow)
     log_q = np.logaddexp(*(_log_student(c, *one, nu) for one in proposals)) - np.log(2.0)  # pyright: ignore[reportCallIssue]
-    f, log_block = draw_signals(joint, expected(blocks, signal, c), sites, rng)
+    f, log_block = draw_predictors(joint, expected(blocks, predictor, c), sites, rng)
     return c, f, prior.log_density(c) - log_q + log_block.sum(1)
 
 
-def draw_signals(
+def draw_predictors(
     joint: Joint, at: np.ndarray, sites: Sites, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draw signals row by row, given the means and the observations.
+    """Draw linear predictors row by row, given the means and the observations.
 
     Args:
-        joint: Blocks, signals, prior and observations.
-        at: Mean signals (draw, block, row) given the coefficients.
+        joint: Blocks, linear predictors, prior and observations.
+        at: Mean linear predictors (draw, block, row) given the coefficients.
         sites: Sites that approximate the likelihood of later rows.
         rng: Random number generator.
 
@@ -157,17 +159,17 @@ def draw_signals(
         Signals (draw, block, row) and log weights (draw, block). The mean weight is the likelihood
         of a block given the coefficients.
     """
-    blocks, signal, _, terms = joint
+    blocks, predictor, _, terms = joint
     lam, eta, y = *sites, sites.y
     seen = ~np.isnan(terms.y)
-    W, log_sites = whiten(blocks, signal, lam)
-    V = each(signal.covariance, blocks.label)
+    W, log_sites = whiten(blocks, predictor, lam)
+    V = each(predictor.covariance, blocks.label)
     gain = V @ (np.swapaxes(W, 2, 3) @ W)
     w = (W @ (y - at)[..., None])[..., 0]
     mean = at + (gain @ (y - at)[..., None])[..., 0]
     C = V - gain @ V
     G = cholesky(0.5 * (C + np.swapaxes(C, 2, 3)) + 1e-12 * np.eye(V.shape[-1]))
-    sd = np.broadcast_to(signal.sd, (len(signal.sd), 1, V.shape[-1]))
+    sd = np.broadcast_to(predictor.noise_sd, (len(predictor.noise_sd), 1, V.shape[-1]))
     f, e = np.zeros(mean.shape), np.zeros(mean.shape)
     total = log_sites - 0.5 * (w**2).sum(2)
     for k in range(V.shape[-1]):

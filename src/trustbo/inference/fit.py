@@ -244,7 +244,7 @@ def _points(
         start = posterior.start()
     else:
         start = first.center
-        posterior.settle(posterior.theta(start[None]))
+        posterior.run_ep(posterior.theta(start[None]))
     return sample(
         posterior.log_density, start[None], rng,
         size=size, defensive=posterior.defensive, first=first, visit=visit,

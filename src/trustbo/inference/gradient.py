@@ -21,15 +21,15 @@ import numpy as np
 from trustbo.inference.engine import Blocks, Prior
 from trustbo.inference.factor import Factor, add_products, times
 from trustbo.models.backend import inverse_and_log_det
-from trustbo.statespace.blocks import Signal, each
+from trustbo.statespace.blocks import LinearPredictor, each
 
 
-def log_evidence(blocks: Blocks, signal: Signal, prior: Prior, lam: Any) -> Any:
-    """Compute log p(y | theta) (point,) with signals and coefficients integrated out.
+def log_evidence(blocks: Blocks, predictor: LinearPredictor, prior: Prior, lam: Any) -> Any:
+    """Compute log p(y | theta) (point,) with linear predictors and coefficients integrated out.
 
     Args:
         blocks: Data of all blocks.
-        signal: Distribution of the signals given the coefficients.
+        predictor: Distribution of the linear predictors given the coefficients.
         prior: Prior on the coefficients.
         lam: Site precisions (point, kind, row), 0 where nothing was measured.
     """
@@ -37,9 +37,9 @@ def log_evidence(blocks: Blocks, signal: Signal, prior: Prior, lam: Any) -> Any:
     both = seen[:, :, None] & seen[:, None, :]
     variance = jnp.where(seen, 1.0 / jnp.where(seen, lam, 1.0), 1.0)
 
-    V = jnp.where(both, each(signal.covariance, label), 0.0)
+    V = jnp.where(both, each(predictor.covariance, label), 0.0)
     V = V + variance[..., None] * np.eye(V.shape[-1])
-    m, T = (_of_kinds(values, label) for values in (signal.m, signal.T))
+    m, T = (_of_kinds(values, label) for values in (predictor.mean, predictor.response))
 
     A = prior.add_to(jnp.zeros((n, blocks.order.size)), blocks.order)
     return _of_data(blocks)(m, T, V, prior.mean, A) + 0.5 * prior.log_det

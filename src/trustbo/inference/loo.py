@@ -57,7 +57,7 @@ def loo(
     """
     posterior = require_posterior("loo", posterior)
     fitted, draws = read_posterior(posterior, model=model)
-    fitted.settle(draws.theta)
+    fitted.run_ep(draws.theta)
     measured = np.flatnonzero(~np.isnan(fitted.observations.contact_rate).all((1, 2)))
     if len(measured) < 2:
         raise TrustboError(f"loo needs at least 2 missions with rates; got {len(measured)}.")

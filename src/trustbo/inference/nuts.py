@@ -1,8 +1,8 @@
 """Sampling with NumPyro's NUTS, on the marginal density or on the full program of a model.
 
-For Gaussian rates, coefficients and signals are integrated out, and NUTS samples only the scores of
-the hyperparameters, with gradients of the evidence from JAX (see `gradient`). Their posterior is
-skewed: below a score at which a standard deviation is too small to matter, the density falls as
+For Gaussian rates, coefficients and linear predictors are integrated out, and NUTS samples only the
+scores of the hyperparameters, with gradients of the evidence from JAX (see `gradient`). Their
+posterior is skewed: below a score at which a standard deviation is too small to matter, the density falls as
 slowly as the prior, and above it as fast as the likelihood. A step that suits one side diverges on
 the other. NUTS therefore samples `Whitened` coordinates, which are fitted to the points of the
 importance sampler and are nearly independent and standard normal. Warm-up tunes only the step size,
@@ -10,7 +10,7 @@ and chains start at points of the importance sampler. The coordinates change the
 not the distribution that it samples.
 
 For other families, EP only approximates the evidence, so NUTS samples `model.program`, including
-coefficients and signals.
+coefficients and linear predictors.
 """
 
 from typing import Any, NamedTuple, Self
@@ -165,7 +165,7 @@ def sample_by_nuts(
     if posterior.exact:
         drawn = Draws(theta, posterior.draw_columns(theta, rng))
     else:
-        drawn = Draws(theta, samples["columns"], samples["signal"])
+        drawn = Draws(theta, samples["columns"], samples["linear_predictor"])
     by_chain = {name: v.reshape(chains, draws, *v.shape[1:]) for name, v in values.items()}
     found, complaints = complaints_of(by_chain, stats["diverging"])
     return drawn, stats, found, complaints

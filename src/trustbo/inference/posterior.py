@@ -15,22 +15,22 @@ from trustbo.models.backend import namespace
 from trustbo.models.effects.effect import Theta
 from trustbo.models.model import TrustModel
 from trustbo.models.observations import Observations
-from trustbo.statespace.blocks import Signal, each
+from trustbo.statespace.blocks import LinearPredictor, each
 
 _CHUNK = 32  # largest number of points evaluated at once
 _NUMBERS = 5_000_000  # largest number of precision entries of the points evaluated at once
 _CHAINED = 100  # missions from which lasting effects are eliminated as chains
 _FEW = 15  # missions with which the search for the mode begins
 _SIZES = (0.3, 1.0, 1.8, 2.6)  # log ratios of the sd of rates to the noises at each start
-_LARGEST_NOISE, _LEAST_NOISE = 50.0, 1e-6  # limits of the size of the noises; see `Scores`
+_LARGEST_NOISE, _LEAST_NOISE = 50.0, 1e-6  # limits of the size of the noises; see `NormalScores`
 _SWEEPS = 1  # EP sweeps at each point, beginning with the sites at the mode
 _SETTLED, _DAMPING = 12, 0.7  # EP sweeps and damping to find the sites at the mode
-_PARTICLES = 4  # signals drawn for each draw of the coefficients
+_PARTICLES = 4  # linear predictors drawn for each draw of the coefficients
 _DEVIATIONS = 4  # draws of the coefficients that are kept at each visited point
 
 
 class Draws(NamedTuple):
-    """Draws of hyperparameters and coefficients, and of signals if rates are not Gaussian."""
+    """Draws of hyperparameters, coefficients and, unless rates are Gaussian, predictors."""
 
     theta: dict[str, np.ndarray]  # (draw, ...)
     c: np.ndarray  # (draw, column)
@@ -79,7 +79,7 @@ class Given(NamedTuple):
 
 
 class Posterior:
-    """Posterior of a trust model's hyperparameters, coefficients and signals."""
+    """Posterior of a trust model's hyperparameters, coefficients and linear predictors."""
 
     def __init__(self, model: TrustModel, observations: Observations) -> None:
         """Prepare the columns and blocks of a model for the observations."""
@@ -124,7 +124,7 @@ class Posterior:
         return other
 
     def theta(self, z: Any) -> dict[str, Any]:
-        """Convert scores (point, score) to hyperparameters for the model's `signal`."""
+        """Convert scores (point, score) to hyperparameters for the model's `linear_predictor`."""
         return self.model.theta(self.scores.values(z), self.observations.resolution)
 
     def log_density(self, z: Any) -> Any:
@@ -159,16 +159,16 @@ class Posterior:
 
         possible = np.isfinite(np.column_stack([*flat, log_prior])).all(1)
         possible &= ((size > _LEAST_NOISE) & (size < _LARGEST_NOISE)).all(1)
-        possible &= (theta["rest"].reshape(len(z), -1) != 0.0).all(1)
+        possible &= (theta["inverse_gain"].reshape(len(z), -1) != 0.0).all(1)
         some = np.flatnonzero(possible)
         return at(theta, some), some
 
     def log_evidence(self, theta: Theta) -> Any:
         """Compute log p(rates | theta) at each point, with EP if rates are not Gaussian."""
-        if namespace(theta["rest"]) is not np:
-            signal, prior = self._at(theta)
-            return gradient.log_evidence(self.blocks, signal, prior, self._lam(signal))
-        found = np.empty(len(theta["rest"]))
+        if namespace(theta["inverse_gain"]) is not np:
+            predictor, prior = self._at(theta)
+            return gradient.log_evidence(self.blocks, predictor, prior, self._lam(predictor))
+        found = np.empty(len(theta["inverse_gain"]))
         for i, chunk in chunks(theta, self._n_at_once):
             if self.exact:
                 found[i] = self._fit(chunk)[0].log_p
@@ -176,7 +176,7 @@ class Posterior:
                 found[i] = ep.log_evidence(self._joint(chunk), self.sites, _SWEEPS)[0]
         return found
 
-    def settle(self, theta: Theta) -> None:
+    def run_ep(self, theta: Theta) -> None:
         """Find the EP sites at the mean of theta, for use as initial sites at all other points."""
         if not self.exact:
             center = {name: values.mean(0, keepdims=True) for name, values in theta.items()}
@@ -194,9 +194,9 @@ class Posterior:
         else:
             best = self._best_of_four_starts()
         if not self.exact:
-            self.settle(self.theta(best[None]))
+            self.run_ep(self.theta(best[None]))
             best = climb(self.log_density, best)
-            self.settle(self.theta(best[None]))
+            self.run_ep(self.theta(best[None]))
         return best
 
     def _best_of_four_starts(self) -> np.ndarray:
@@ -205,7 +205,7 @@ class Posterior:
         unit = self.model.family.line_of_sight[0]
         spread = np.log(np.clip(unit * np.nanstd(self.observations.contact_rate) / 0.2, 1e-2, 3.0))
         starts[:, self.scores.noises] = spread - np.array(_SIZES)[:, None]
-        self.settle(self.theta(starts[1:2]))
+        self.run_ep(self.theta(starts[1:2]))
         return starts[self.log_density(starts).argmax()]
 
     def defensive(self, proposal: Student) -> Student:
@@ -221,10 +221,10 @@ class Posterior:
     def draw_by_ep(
         self, z: np.ndarray, log_p: np.ndarray, rng: np.random.Generator, n_sweeps: int
     ) -> tuple[Draws, np.ndarray]:
-        """Draw coefficients and signals once at each of the equally weighted points.
+        """Draw coefficients and linear predictors once at each of the equally weighted points.
 
         Args:
-            z: Scores (point, score).
+            z: NormalScores (point, score).
             log_p: Log density (point,) of the scores by EP.
             rng: Random number generator.
             n_sweeps: Number of EP sweeps at each point.
@@ -255,7 +255,7 @@ class Posterior:
         groups = {"posterior": self._hyperparameters(theta)}
         for effect, a, b in zip(model.columns, self._ends[:-1], self._ends[1:], strict=True):
             named = effect.named(draws.c[:, a:b], theta, self.observations)
-            groups.setdefault(effect.noun or "posterior", {}).update(named)
+            groups.setdefault(effect.group or "posterior", {}).update(named)
         return groups
 
     def _hyperparameters(self, theta: Theta) -> dict[str, np.ndarray]:
@@ -269,7 +269,7 @@ class Posterior:
         theta = model.derived({n: sites[n] for n in model.dims | model.effect_dims if n in sites})
         theta = {name: v for name, v in theta.items() if name not in ("beta", "b", "B")}
         c = [
-            effect.coefficients(groups[effect.noun or "posterior"], theta, self.observations)
+            effect.coefficients(groups[effect.group or "posterior"], theta, self.observations)
             for effect in model.columns
         ]
         return Draws(theta, np.column_stack(c))
@@ -314,8 +314,8 @@ class Posterior:
         log_likelihood = np.empty((len(some), shape[0]))
         trust, predicted = np.empty((2, len(shown), *shape))
         given_mean = self._exact_trust if self.exact else self._ep_trust
-        for where, theta, signal, expected_signal in self.signals(draws):
-            x, log_p = given_mean(theta, signal, expected_signal, rng)
+        for where, theta, predictor, expected_predictor in self.predictors(draws):
+            x, log_p = given_mean(theta, predictor, expected_predictor, rng)
             x = self.layout.unstack(x)
             mean += np.einsum("n,nmbr->mbr", share[where], x)
             square += np.einsum("n,nmbr->mbr", share[where], x**2)
@@ -324,30 +324,32 @@ class Posterior:
             first, last = np.searchsorted(shown, (where.start, where.start + len(x)))
             here = shown[first:last] - where.start
             trust[first:last] = x[here]
-            predicted[first:last] = self._rates(signal, expected_signal, rng)[here]
+            predicted[first:last] = self._rates(predictor, expected_predictor, rng)[here]
         sd = np.sqrt(np.maximum(square - mean**2, 0.0))
         return Given(trust[place], mean, sd, log_likelihood[index], predicted[place])
 
     def replicate(self, draws: Draws, rng: np.random.Generator) -> np.ndarray:
         """Draw replicated rates (draw, mission, bound, robot) of the missions."""
         rates = np.empty((len(draws.c), *self.observations.contact_rate.shape))
-        for i, _, signal, mean in self.signals(draws):
-            rates[i] = self._rates(signal, mean, rng)
+        for i, _, predictor, mean in self.predictors(draws):
+            rates[i] = self._rates(predictor, mean, rng)
         return rates
 
-    def signals(self, draws: Draws) -> Iterator[tuple[slice, Theta, Signal, np.ndarray]]:
-        """Yield the slice, hyperparameters, signals and mean signals of each chunk of draws."""
+    def predictors(
+        self, draws: Draws
+    ) -> Iterator[tuple[slice, Theta, LinearPredictor, np.ndarray]]:
+        """Yield the slice, hyperparameters, predictors and mean predictors of each chunk of draws."""
         for where, theta in chunks(draws.theta):
-            self.evaluated(len(theta["rest"]))
-            signal = self.model.signal(theta, self.observations, self.layout)
-            yield where, theta, signal, expected(self.blocks, signal, draws.c[where])
+            self.evaluated(len(theta["inverse_gain"]))
+            predictor = self.model.linear_predictor(theta, self.observations, self.layout)
+            yield where, theta, predictor, expected(self.blocks, predictor, draws.c[where])
 
     def _exact_trust(
-        self, theta: Theta, signal: Signal, mean: np.ndarray, rng: np.random.Generator
+        self, theta: Theta, predictor: LinearPredictor, mean: np.ndarray, rng: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
         """Draw trust given Gaussian rates; also return log-likelihoods (draw, block)."""
-        b, S = self.blocks, each(signal.S, self.blocks.label)
-        W, log_sites = whiten(b, signal, self._lam(signal))
+        b, S = self.blocks, each(predictor.trust_cov, self.blocks.label)
+        W, log_sites = whiten(b, predictor, self._lam(predictor))
         off = b.y - mean
         w = (W[:, b.kind] @ off[..., None])[..., 0]
         gain = S @ (np.swapaxes(W, 2, 3) @ W)
@@ -357,28 +359,30 @@ class Posterior:
         return x, log_sites[:, b.kind] - 0.5 * (w**2).sum(2)
 
     def _ep_trust(
-        self, theta: Theta, signal: Signal, mean: np.ndarray, rng: np.random.Generator
+        self, theta: Theta, predictor: LinearPredictor, mean: np.ndarray, rng: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
         """Draw trust given non-Gaussian rates by weighted particles; returns as `_exact_trust`."""
-        joint = ep.Joint(self.blocks, signal, self.prior(theta), self.terms)
+        joint = ep.Joint(self.blocks, predictor, self.prior(theta), self.terms)
         sites = ep.log_evidence(joint, self.sites, _SWEEPS)[1]
-        drawn = [ep.draw_signals(joint, mean, sites, rng) for _ in range(_PARTICLES)]
+        drawn = [ep.draw_predictors(joint, mean, sites, rng) for _ in range(_PARTICLES)]
         f, log_w = (np.stack(part) for part in zip(*drawn, strict=True))
         chosen = np.argmax(log_w + rng.gumbel(size=log_w.shape), axis=0)
         f = np.take_along_axis(f, chosen[None, ..., None], axis=0)[0]
         log_p = logsumexp(log_w, axis=0) - np.log(_PARTICLES)
-        if signal.noise is None:
+        if predictor.shared_cov is None:
             return f, log_p
-        V, S = (each(C, self.blocks.label) for C in (signal.covariance, signal.S))
+        V, S = (each(C, self.blocks.label) for C in (predictor.covariance, predictor.trust_cov))
         gain = np.swapaxes(np.linalg.solve(V, S), 2, 3)
         x = mean + (gain @ (f - mean)[..., None])[..., 0]
         return x + (_root(S - gain @ S) @ rng.standard_normal((*x.shape, 1)))[..., 0], log_p
 
-    def _rates(self, signal: Signal, mean: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Draw replicated rates (draw, mission, bound, robot) given the mean signals."""
-        root = each(_root(signal.covariance), self.blocks.label[self.blocks.kind])
+    def _rates(
+        self, predictor: LinearPredictor, mean: np.ndarray, rng: np.random.Generator
+    ) -> np.ndarray:
+        """Draw replicated rates (draw, mission, bound, robot) given the mean linear predictors."""
+        root = each(_root(predictor.covariance), self.blocks.label[self.blocks.kind])
         f = self.layout.unstack(mean + (root @ rng.standard_normal((*mean.shape, 1)))[..., 0])
-        sd = self.layout.unstack(np.broadcast_to(signal.sd, mean.shape))
+        sd = self.layout.unstack(np.broadcast_to(predictor.noise_sd, mean.shape))
         return self.model.family.sample(f, sd, self.observations.n_ticks, rng)
 
     def prior(self, theta: Theta) -> Prior:
@@ -405,20 +409,22 @@ class Posterior:
 
     def _fit(self, theta: Theta) -> tuple[Fit, Prior]:
         """Compute the evidence of Gaussian rates at each theta; also return the prior."""
-        signal, prior = self._at(theta)
-        return evidence(self.blocks, signal, prior, self._lam(signal)), prior
+        predictor, prior = self._at(theta)
+        return evidence(self.blocks, predictor, prior, self._lam(predictor)), prior
 
-    def _at(self, theta: Theta) -> tuple[Signal, Prior]:
-        """Return the distribution of the signals and the prior at each theta."""
-        self.evaluated(len(theta["rest"]))
-        return self.model.signal(theta, self.observations, self.layout), self._prior_of_fit(theta)
+    def _at(self, theta: Theta) -> tuple[LinearPredictor, Prior]:
+        """Return the distribution of the linear predictors and the prior at each theta."""
+        self.evaluated(len(theta["inverse_gain"]))
+        return self.model.linear_predictor(
+            theta, self.observations, self.layout
+        ), self._prior_of_fit(theta)
 
-    def _lam(self, signal: Signal) -> Any:
+    def _lam(self, predictor: LinearPredictor) -> Any:
         """Return the precisions (point, kind, row) of Gaussian rates, 0 where not measured."""
-        return self.blocks.seen / signal.sd**2
+        return self.blocks.seen / predictor.noise_sd**2
 
     def _joint(self, theta: Theta) -> ep.Joint:
-        """Return the blocks, signals, prior and observations for EP at each theta."""
+        """Return the blocks, linear predictors, prior and observations for EP at each theta."""
         return ep.Joint(self.blocks, *self._at(theta), self.terms)
 
 
@@ -437,6 +443,6 @@ def _root(covariance: np.ndarray) -> np.ndarray:
 
 def chunks(theta: Mapping[str, Any], size: int = _CHUNK) -> Iterator[tuple[slice, dict[str, Any]]]:
     """Yield the slice and the hyperparameters of each chunk of points."""
-    for start in range(0, len(theta["rest"]), size):
+    for start in range(0, len(theta["inverse_gain"]), size):
         where = slice(start, start + size)
         yield where, at(theta, where)

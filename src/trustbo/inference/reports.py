@@ -109,9 +109,9 @@ def _of_person(
     observations, family = ahead.observations, ahead.model.family
     _, n_bounds, n_robots = observations.contact_rate.shape
     mean, root = [], []
-    for _, _, signal, of_all in ahead.signals(draws):
+    for _, _, predictor, of_all in ahead.predictors(draws):
         mean.append(of_all[:, j])
-        cov = each(signal.covariance, ahead.blocks.label)
+        cov = each(predictor.covariance, ahead.blocks.label)
         cov = np.broadcast_to(cov, (len(of_all), *cov.shape[1:]))[:, j % cov.shape[1]]
         root.append(np.linalg.cholesky(cov + 1e-12 * np.eye(cov.shape[-1])))
     mean, root, sd = np.concatenate(mean), np.concatenate(root), draws.theta["delta_v"]

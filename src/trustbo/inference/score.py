@@ -1,4 +1,4 @@
-"""Scores of contact rates that were predicted before a mission."""
+"""NormalScores of contact rates that were predicted before a mission."""
 
 from collections.abc import Sequence
 

@@ -116,7 +116,7 @@ def _data_groups(
 
 def parameters_alone(posterior: xr.DataTree) -> xr.DataTree:
     """Drop the groups that grow with the number of missions; see `complete`."""
-    kept = [*_KEPT, *(effect.noun for effect in effects_of(posterior))]
+    kept = [*_KEPT, *(effect.group for effect in effects_of(posterior))]
     kept = [name for name in kept if name in posterior.children]
     alone = xr.DataTree.from_dict({name: posterior[name].to_dataset() for name in kept})
     alone.attrs = posterior.attrs
@@ -153,7 +153,7 @@ def complete(
         return posterior
     missions = missions_of(posterior) if missions is None else missions
     fitted, draws = read_posterior(posterior, missions, model=model)
-    fitted.settle(draws.theta)
+    fitted.run_ep(draws.theta)
     seed, sizes = posterior.attrs["seed"], posterior["posterior"].sizes
     n_chains, n_draws = sizes["chain"], sizes["draw"]
     kept = np.linspace(0, n_draws - 1, min(n_draws, max(1, _N_TRAJECTORIES // n_chains)))
@@ -210,7 +210,7 @@ def log_prior(fitted: Posterior, sites: Mapping[str, np.ndarray]) -> dict[str, n
     """
     model, priors = fitted.model, fitted.scores.priors
     resolution = fitted.observations.resolution
-    rest = model.derived(sites)["rest"]
+    inverse_gain = model.derived(sites)["inverse_gain"]
     parameters = dict(sites)
     if "delta_v" in sites:
         parameters["delta_v"] = model.noise_without(sites["delta_v"], resolution)
@@ -218,7 +218,7 @@ def log_prior(fitted: Posterior, sites: Mapping[str, np.ndarray]) -> dict[str, n
     for name, (field, values) in model.prior_terms(sites).items():
         if field == "delta_v":
             values = model.noise_without(values, resolution)
-        given = rest.reshape(*rest.shape, *(1,) * (values.ndim - rest.ndim))
+        given = inverse_gain.reshape(*inverse_gain.shape, *(1,) * (values.ndim - inverse_gain.ndim))
         densities[name] = model.priors.log_density(field, values, given)
     for noise in ("Delta_w", "Delta_v"):
         if noise in sites:

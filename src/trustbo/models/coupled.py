@@ -52,14 +52,14 @@ class CoupledTrust(TrustModel):
         """See `TrustModel.derived`; adds the matrices B0, Delta_w and Delta_v."""
         if "B0" in values:
             B0 = values["B0"]
-            return {**values, "rest": 1.0 - namespace(B0).diagonal(B0, axis1=1, axis2=2)}
+            return {**values, "inverse_gain": 1.0 - namespace(B0).diagonal(B0, axis1=1, axis2=2)}
         beta0, xp = values["beta0"], namespace(values["beta0"])
         n = beta0.shape[1]
         B0 = beta0[:, :, None] * np.eye(n)
         if n > 1:
             place = np.eye(n * n)[~np.eye(n, dtype=bool).ravel()]  # position of each coupling
             B0 = B0 + (values["coupling"] @ place).reshape(-1, n, n)
-        derived: dict[str, Any] = {"B0": B0, "rest": 1.0 - beta0}
+        derived: dict[str, Any] = {"B0": B0, "inverse_gain": 1.0 - beta0}
         for noise in ("w", "v"):
             factor = xp.broadcast_to(np.eye(n), B0.shape)
             if f"partial_{noise}" in values:

@@ -22,9 +22,9 @@ from trustbo.models.effects.weights import Weights
 from trustbo.models.families import FAMILIES, Family
 from trustbo.models.observations import Observations, require_ticks
 from trustbo.models.priors import Priors
-from trustbo.models.scores import Scores
+from trustbo.models.scores import NormalScores
 from trustbo.statespace import Inputs, StateSpace
-from trustbo.statespace.blocks import Layout, Signal
+from trustbo.statespace.blocks import Layout, LinearPredictor
 from trustbo.workspace import Workspace
 
 MODELS: dict[str, type["TrustModel"]] = {}
@@ -86,7 +86,7 @@ class TrustModel(Summary, ABC):
 
     @abstractmethod
     def derived(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Convert hyperparameters to those of `state_space`, and add `rest`; see `Theta`.
+        """Convert hyperparameters to those of `state_space`, and add `inverse_gain`; see `Theta`.
 
         `values` are hyperparameters (point, ...) by name, as in `hyperpriors` or in a posterior.
         """
@@ -141,10 +141,12 @@ class TrustModel(Summary, ABC):
             apart=type(self).random_effects is not TrustModel.random_effects,
         )
 
-    def signal(self, theta: Theta, observations: Observations, layout: Layout) -> Signal:
+    def linear_predictor(
+        self, theta: Theta, observations: Observations, layout: Layout
+    ) -> LinearPredictor:
         """Compute trust at all bounds from the state-space form, in NumPy or JAX."""
         space = self.state_space(theta, observations.n_robots)
-        return Signal.of(space, layout, self.random_effects(theta, observations))
+        return LinearPredictor.of(space, layout, self.random_effects(theta, observations))
 
     @property
     def columns(self) -> tuple[Effect, ...]:
@@ -171,10 +173,10 @@ class TrustModel(Summary, ABC):
         priors = self.hyperpriors(observations.n_robots, observations.awareness.shape[3])
         return priors | {n: p for e in self.effects for n, p in e.hyperpriors().items()}
 
-    def scores(self, observations: Observations) -> Scores:
+    def scores(self, observations: Observations) -> NormalScores:
         """Return the normal scores of all hyperparameters."""
         pairs = [pair for effect in self.effects for pair in effect.pairs]
-        return Scores(self.all_hyperpriors(observations), pairs)
+        return NormalScores(self.all_hyperpriors(observations), pairs)
 
     def theta(self, values: Mapping[str, Any], resolution: float) -> dict[str, Any]:
         """Convert hyperparameters, named as in `all_hyperpriors`, to `theta` of `state_space`.
@@ -255,22 +257,22 @@ class TrustModel(Summary, ABC):
             return
 
         layout = self.layout(observations, contrasts=False)
-        signal: Any = self.signal(theta, observations, layout)
+        predictor: Any = self.linear_predictor(theta, observations, layout)
         u = (layout.columns(U).toarray() @ c).reshape(len(layout.label), -1)
         y = layout.rows(observations.contact_rate)
         ticks = layout.rows(observations.n_ticks)
 
         # Trust is its mean plus a Cholesky factor times white noise, which is easier to sample.
-        root = jnp.linalg.cholesky(signal.covariance[0] + 1e-13 * jnp.eye(y.shape[1]))
+        root = jnp.linalg.cholesky(predictor.covariance[0] + 1e-13 * jnp.eye(y.shape[1]))
         white = dist.Normal(0.0, 1.0).expand(y.shape).to_event(2)
         e: Any = numpyro.sample("trust_noise", white)
-        mean = signal.m[0] + (signal.T[0] @ u[..., None])[..., 0]
-        f = numpyro.deterministic("signal", mean + (root @ e[..., None])[..., 0])
+        mean = predictor.mean[0] + (predictor.response[0] @ u[..., None])[..., 0]
+        f = numpyro.deterministic("linear_predictor", mean + (root @ e[..., None])[..., 0])
 
         seen = ~np.isnan(y)
         rates = np.where(seen, y, 0.5)
         counts = np.where(ticks > 0.0, ticks, 1.0)
-        log_p = self.family.log_prob(rates, counts, f, signal.sd[0])
+        log_p = self.family.log_prob(rates, counts, f, predictor.noise_sd[0])
         numpyro.factor("contact_rate", jnp.where(seen, log_p, 0.0).sum())
 
     def options(self) -> dict[str, Any]:
@@ -282,7 +284,7 @@ class TrustModel(Summary, ABC):
         return [
             ("rates", self.observation),
             *((n, str(v)) for n, v in self.options().items() if n != "observation"),
-            *(("effects", f"of {effect.noun}") for effect in self.effects),
+            *(("effects", f"of {effect.group}") for effect in self.effects),
         ]
 
     def in_short(self) -> str:
@@ -294,5 +296,5 @@ class TrustModel(Summary, ABC):
             if name != "observation" and value != defaults.get(name)
         ]
         return ", ".join(
-            [type(self).__name__, *(e.noun for e in self.effects), self.observation, *others]
+            [type(self).__name__, *(e.group for e in self.effects), self.observation, *others]
         )

@@ -52,8 +52,8 @@ class PooledTrust(TrustModel):
     def derived(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """See `TrustModel.derived`."""
         beta0 = values["beta0"]
-        rest = 1.0 - beta0 if self.memory == "level" else 0.0 * beta0 + 1.0
-        return {**values, "rest": rest}
+        inverse_gain = 1.0 - beta0 if self.memory == "level" else 0.0 * beta0 + 1.0
+        return {**values, "inverse_gain": inverse_gain}
 
     @property
     def joint(self) -> bool:

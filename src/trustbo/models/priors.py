@@ -136,19 +136,19 @@ class Priors(Summary):
         mean, sd = (np.append(np.broadcast_to(beta, n_features), b) for beta, b in pairs)
         return mean, sd
 
-    def log_density(self, name: str, values: np.ndarray, rest: np.ndarray) -> np.ndarray:
+    def log_density(self, name: str, values: np.ndarray, inverse_gain: np.ndarray) -> np.ndarray:
         """Compute the log density of the prior `name` at each value of the parameter.
 
         Args:
             name: Name of a field.
             values: Parameter values with shape (...), or (..., feature) for `beta`.
-            rest: Drift that raises stationary trust by 1, with a shape that broadcasts to that of
-                the values; used only if `stationary` is true.
+            inverse_gain: Drift that raises stationary trust by 1, with a shape that broadcasts to
+                that of the values; used only if `stationary` is true.
         """
         prior = getattr(self, name)
         if not self.stationary or name not in ("beta", "b"):
             return log_density(prior, values)
-        return log_density(prior, values / rest) - np.log(rest)
+        return log_density(prior, values / inverse_gain) - np.log(inverse_gain)
 
     def describe(self) -> dict[str, str]:
         """Describe each prior as text, for the record of a posterior."""

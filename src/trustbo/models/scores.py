@@ -42,7 +42,7 @@ class Pair(NamedTuple):
     """Function of `given` (point, 1) that multiplies the first one."""
 
 
-class Scores:
+class NormalScores:
     """Conversion between scores (point, score) and hyperparameters with independent priors."""
 
     def __init__(self, priors: Mapping[str, Distribution], pairs: Sequence[Pair] = ()) -> None:
@@ -181,8 +181,8 @@ def _interpolated(terms: np.ndarray, score: jax.Array) -> jax.Array:
     """Interpolate quantiles in JAX, which lacks the quantiles of some distributions.
 
     Args:
-        terms: Coefficients of cubic polynomials (power, interval, score); see `Scores.terms`.
-        score: Scores (point, score).
+        terms: Coefficients of cubic polynomials (power, interval, score); see `NormalScores.terms`.
+        score: NormalScores (point, score).
     """
     step = 2.0 * _FARTHEST / (_N_KNOTS - 1)
     interval = jnp.clip(jnp.floor((score + _FARTHEST) / step), 0, _N_KNOTS - 2).astype(int)

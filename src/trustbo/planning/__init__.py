@@ -1,13 +1,13 @@
 """Search for the most trustworthy path, given a posterior of the trust model."""
 
 from trustbo.planning import policies, reference
-from trustbo.planning.dynamics import roll_trust
 from trustbo.planning.objectives import OBJECTIVES
 from trustbo.planning.paths import NoPathError
 from trustbo.planning.plan import Plan
 from trustbo.planning.planner import Planner
 from trustbo.planning.policies import POLICIES
 from trustbo.planning.problem import InfeasibleError
+from trustbo.planning.recursion import roll_trust
 
 __all__ = [
     "OBJECTIVES", "POLICIES", "InfeasibleError", "NoPathError", "Plan", "Planner",

@@ -9,9 +9,9 @@ import numpy as np
 from trustbo.data import Cell
 from trustbo.errors import require_whole
 from trustbo.models.params import Params
-from trustbo.planning.dynamics import Dynamics, roll
 from trustbo.planning.objectives import capped
 from trustbo.planning.problem import EXACT, Problem
+from trustbo.planning.recursion import Recursion, roll
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,12 +20,12 @@ class DrawnPaths:
 
     Attributes:
         problem: Planning problem.
-        dynamics: Recursion for expected trust, with leading axis (draw,).
+        recursion: Recursion for expected trust, with leading axis (draw,).
         paths: Flat indices of the cells on each path, shape (draw, cell), padded with -1.
     """
 
     problem: Problem
-    dynamics: Dynamics
+    recursion: Recursion
     paths: np.ndarray
 
     @cached_property
@@ -44,12 +44,12 @@ class DrawnPaths:
         values, which = np.empty(len(self.paths)), self._distinct[1]
         for i, path in enumerate(self.candidates):
             best = which == i
-            values[best] = self._value(Dynamics(*(value[best] for value in self.dynamics)), path)
+            values[best] = self._value(Recursion(*(value[best] for value in self.recursion)), path)
         return values
 
     def values_of(self, paths: Sequence[Sequence[Cell]]) -> np.ndarray:
         """Return the value of each given path under every draw, shape (draw, path)."""
-        return np.stack([self._value(self.dynamics, path) for path in paths], axis=1)
+        return np.stack([self._value(self.recursion, path) for path in paths], axis=1)
 
     def regret(self, path: Sequence[Cell]) -> np.ndarray:
         """Return the best value of each draw minus the value of the given path, shape (draw,)."""
@@ -78,10 +78,10 @@ class DrawnPaths:
             count[tuple(np.array(path).T)] += n  # adds n once, even if a path enters the cell twice
         return count / len(self.paths)
 
-    def _value(self, dynamics: Dynamics, path: Sequence[Cell]) -> np.ndarray:
-        """Compute the value of a path for each draw of `dynamics`, shape (draw,)."""
+    def _value(self, recursion: Recursion, path: Sequence[Cell]) -> np.ndarray:
+        """Compute the value of a path for each draw of `recursion`, shape (draw,)."""
         problem = self.problem
-        along = capped(problem.objective, problem.family, dynamics.along(path))
+        along = capped(problem.objective, problem.family, recursion.along(path))
         value = problem.value_along(path, roll(along).mean(-1), along.noise_sd)
         return value - problem.failure_along(path)
 

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.special import expit
 
 from trustbo.models.families import Family
-from trustbo.planning.dynamics import Dynamics
+from trustbo.planning.recursion import Recursion
 
 Array = np.ndarray
 
@@ -68,7 +68,7 @@ class Weights(NamedTuple):
     """Divisor of the sum over the bounds of a path, shape (length,)."""
 
 
-def weights_of(objective: Objective, dynamics: Dynamics, view: Array, longest: int) -> Weights:
+def weights_of(objective: Objective, recursion: Recursion, view: Array, longest: int) -> Weights:
     """Compute the weights of the drifts in the score of paths of up to `longest` bounds.
 
     The recursion unrolls to x_k = B0^k x_0 + sum_{i <= k} B0^(k - i) u_i, and the team's trust is
@@ -78,17 +78,17 @@ def weights_of(objective: Objective, dynamics: Dynamics, view: Array, longest: i
     Args:
         objective: One of the objectives in `OBJECTIVES`. For lost_contact, the expected contact
             rate is assumed to equal trust.
-        dynamics: Recursion for trust, with leading axis (draw,).
+        recursion: Recursion for trust, with leading axis (draw,).
         view: Weights of the states in the team's trust, shape (state,).
         longest: Largest number of bounds of a path.
     """
     n = np.arange(longest + 1)
     credit = objective.credit(n)
-    powers = np.empty((len(dynamics.start), longest + 1, len(view)))  # view . B0^k
+    powers = np.empty((len(recursion.start), longest + 1, len(view)))  # view . B0^k
     powers[:, 0] = view
     for k in range(longest):
-        powers[:, k + 1] = np.einsum("ds,dst->dt", powers[:, k], dynamics.transition)
-    of_start = np.einsum("dks,ds->dk", powers, dynamics.start)
+        powers[:, k + 1] = np.einsum("ds,dst->dt", powers[:, k], recursion.transition)
+    of_start = np.einsum("dks,ds->dk", powers, recursion.start)
     of_start[:, 0] = 0.0  # trust counts only after a bound
     lags = np.tril(credit[n[:, None] - n])  # (left, lag): credit(left - lag)
     constant = of_start @ lags.T - (n if objective.of_contact else 0.0)
@@ -104,15 +104,15 @@ def has_history(objective: Objective, family: Family) -> bool:
     return objective.of_contact and family.expected_rate != "identity"
 
 
-def capped(objective: Objective, family: Family, dynamics: Dynamics) -> Dynamics:
+def capped(objective: Objective, family: Family, recursion: Recursion) -> Recursion:
     """Cap the drift and the initial trust, so that trust never exceeds 1 and no rate exceeds 1.
 
     If the drift of each state is at most 1 minus the row sum of B0, B0 >= 0 and x_0 <= 1, trust is
     at most 1. A loop then never increases the value. Only lost_contact with rates that are linear
-    in trust needs the cap; for other objectives or rates, the dynamics are returned unchanged.
+    in trust needs the cap; for other objectives or rates, the recursion are returned unchanged.
     """
     if not objective.of_contact or has_history(objective, family):
-        return dynamics
-    most = 1.0 - dynamics.transition.sum(-1)[..., None, None, None]
-    drift, start = np.minimum(dynamics.drift, most), np.minimum(dynamics.start, 1.0)
-    return dynamics._replace(drift=drift, start=start)
+        return recursion
+    most = 1.0 - recursion.transition.sum(-1)[..., None, None, None]
+    drift, start = np.minimum(recursion.drift, most), np.minimum(recursion.start, 1.0)
+    return recursion._replace(drift=drift, start=start)

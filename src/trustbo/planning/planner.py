@@ -21,7 +21,6 @@ from trustbo.models.families import FAMILIES
 from trustbo.models.params import Params
 from trustbo.parallel import computing
 from trustbo.planning.draws import DrawnPaths, choose_draws
-from trustbo.planning.dynamics import Dynamics, roll, trust_dynamics
 from trustbo.planning.objectives import LOST_CONTACT, OBJECTIVES, capped
 from trustbo.planning.paths import STEPS, AdmissiblePaths
 from trustbo.planning.plan import QUANTILES, Plan
@@ -34,6 +33,7 @@ from trustbo.planning.problem import (
     mean_of,
     risk_of,
 )
+from trustbo.planning.recursion import Recursion, roll, trust_recursion
 from trustbo.planning.trust_map import cost_of, trust_map
 from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Location
@@ -202,7 +202,7 @@ class Planner(Summary):
         """
         started = time.perf_counter()
         mean, draws = mean_and_draws_of(params, self.workspace)
-        score, limits, paths = self.problem.best(self.problem.dynamics(mean, x0))
+        score, limits, paths = self.problem.best(self.problem.recursion(mean, x0))
         path = self.problem.paths.cells(paths[0])
         plan = self.evaluate(path, mean, x0=x0)
         if draws is not None:
@@ -211,17 +211,17 @@ class Planner(Summary):
         limit = plan.value if exact else float(self.problem.objective.value(limits[0]))
         return replace(plan, exact=exact, limit=limit, seconds=time.perf_counter() - started)
 
-    def best_path(self, dynamics: Dynamics) -> tuple[Cell, ...]:
-        """Find the best admissible path for given dynamics, such as an optimistic drift.
+    def best_path(self, recursion: Recursion) -> tuple[Cell, ...]:
+        """Find the best admissible path for given recursion, such as an optimistic drift.
 
         Args:
-            dynamics: Recursion for expected trust, without leading axes (see `Problem.dynamics`).
+            recursion: Recursion for expected trust, without leading axes (see `Problem.recursion`).
 
         Raises:
             TrustboError: If beta0 is outside the range in which the search is exact.
             InfeasibleError: If no path respects `max_failure`.
         """
-        return self.problem.paths.cells(self.problem.best(dynamics)[-1][0])
+        return self.problem.paths.cells(self.problem.best(recursion)[-1][0])
 
     @computing()
     def plan_draws(
@@ -239,8 +239,8 @@ class Planner(Summary):
             InfeasibleError: If no path respects `max_failure`.
         """
         params = choose_draws(draws_of(posterior, self.workspace), n_draws, seed)
-        dynamics = self.problem.dynamics(params)
-        return DrawnPaths(self.problem, dynamics, self.problem.best(dynamics)[-1])
+        recursion = self.problem.recursion(params)
+        return DrawnPaths(self.problem, recursion, self.problem.best(recursion)[-1])
 
     @computing()
     def evaluate(
@@ -307,24 +307,24 @@ class Planner(Summary):
             TrustboError: If abs(beta0) >= 1, because trust would then grow without limit.
         """
         problem, mean = self.problem, mean_of(params, self.workspace)
-        dynamics = problem.dynamics(mean)
-        if (radius := np.abs(np.linalg.eigvals(dynamics.transition)).max()) >= 1.0:
+        recursion = problem.recursion(mean)
+        if (radius := np.abs(np.linalg.eigvals(recursion.transition)).max()) >= 1.0:
             raise TrustboError(
                 f"the graph needs abs(beta0) < 1, because trust must converge; got {radius:g}. "
                 "Give other parameters, or use `plan` to find a path."
             )
-        contact = capped(LOST_CONTACT, problem.family, dynamics)
+        contact = capped(LOST_CONTACT, problem.family, recursion)
         grid, bounds = self.workspace.grid, problem.paths.bounds
         length = np.hypot(*(STEPS * (grid.cell_height, grid.cell_width)).T)  # (move,)
 
         def of_bounds(values: np.ndarray) -> np.ndarray:
             return np.broadcast_to(values, bounds.shape)[bounds]
 
-        toll, settled = of_bounds(problem.toll), of_bounds(dynamics.settled())
-        rate = problem.family.mean_rate(of_bounds(contact.settled()), dynamics.noise_sd)
+        toll, settled = of_bounds(problem.toll), of_bounds(recursion.steady_state())
+        rate = problem.family.mean_rate(of_bounds(contact.steady_state()), recursion.noise_sd)
         values = {
             "length": of_bounds(length[:, None, None]),
-            "drift": of_bounds(dynamics.drift.mean(0)),
+            "drift": of_bounds(recursion.drift.mean(0)),
             "cost": toll + np.logaddexp(0.0, -settled),
             "lost": toll + 1.0 - rate,
         }
@@ -441,7 +441,7 @@ def _value_along(
     x0 = problem.start(x0)
     z, of_path = along(problem.paths.workspace.awareness.values, cells), params.along(cells)
     z = z[:, None, None]  # a map with one move and one row, whose columns are the bounds
-    by_robot = trust_dynamics(of_path, z, x0, by_robot=True)
+    by_robot = trust_recursion(of_path, z, x0, by_robot=True)
     trust = roll(by_robot)
     trust = trust.reshape(-1, *trust.shape[-2:])
     values = np.atleast_1d(problem.value_along(cells, trust.mean(-1), by_robot.noise_sd))
@@ -450,6 +450,6 @@ def _value_along(
         return trust, float(value), values
     # Capping the trust of each draw causes bias, so the value of each draw uses uncapped trust.
     # However, the contact lost on a path cannot be negative.
-    team = capped(problem.objective, problem.family, trust_dynamics(of_path, z, x0))
+    team = capped(problem.objective, problem.family, trust_recursion(of_path, z, x0))
     mean = problem.value_along(cells, roll(team).mean(-1), team.noise_sd).mean()
     return trust, float(mean), np.minimum(values, -problem.toll_along(cells))

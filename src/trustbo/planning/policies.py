@@ -12,9 +12,9 @@ import numpy as np
 from trustbo.errors import require_choice, require_finite, require_kind, require_share
 from trustbo.models.params import Params
 from trustbo.planning.draws import choose_draws
-from trustbo.planning.dynamics import Dynamics
 from trustbo.planning.plan import Plan
 from trustbo.planning.planner import Planner
+from trustbo.planning.recursion import Recursion
 
 Policy = Callable[[np.random.Generator, Params, Planner], Plan]
 """Function of a random generator, draws with leading axis (draw,) and a planner; returns a plan."""
@@ -46,8 +46,8 @@ def optimistic(
     _require(rng, params, planner)
     require_share("quantile", quantile)
     some = choose_draws(params, 1000, _seed(rng))
-    transition, drift, start, sd = planner.problem.dynamics(some)
-    best = Dynamics(
+    transition, drift, start, sd = planner.problem.recursion(some)
+    best = Recursion(
         transition.mean(0), np.quantile(drift, quantile, axis=0), start.mean(0), sd.mean(0)
     )
     return planner.evaluate(planner.best_path(best), params.mean())
@@ -67,8 +67,8 @@ def random(rng: np.random.Generator, params: Params, planner: Planner) -> Plan:
     """Plan the best path for random drifts, uniform on [0, 1], without using the posterior."""
     _require(rng, params, planner)
     drift = rng.uniform(size=(1, *planner.problem.paths.bounds.shape))
-    dynamics = Dynamics(np.zeros((1, 1)), drift, np.zeros(1), np.full((), 0.1))
-    return planner.evaluate(planner.best_path(dynamics), params.mean())
+    recursion = Recursion(np.zeros((1, 1)), drift, np.zeros(1), np.full((), 0.1))
+    return planner.evaluate(planner.best_path(recursion), params.mean())
 
 
 POLICIES: dict[str, Policy] = {

@@ -16,10 +16,10 @@ from trustbo.hazard.risk import ROUNDING, Risk
 from trustbo.inference.draws import expected_and_drawn, params_of
 from trustbo.models.families import Family
 from trustbo.models.params import Params, require_values
-from trustbo.planning.dynamics import Dynamics, trust_dynamics
 from trustbo.planning.labels import LOGISTIC, LOSSES, TINY_SD, Costs, best_labels
 from trustbo.planning.objectives import Objective, Weights, capped, has_history, weights_of
 from trustbo.planning.paths import AdmissiblePaths
+from trustbo.planning.recursion import Recursion, trust_recursion
 from trustbo.planning.sums import best_sums
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import MOVE_NAMES, bounds_along
@@ -116,12 +116,12 @@ class Problem:
             return True
         return 1.0 - self.risk.survival(path) <= self.max_failure + ROUNDING
 
-    def dynamics(
+    def recursion(
         self, params: Params, x0: ArrayLike | None = None, *, by_robot: bool = False
-    ) -> Dynamics:
-        """Build the recursion for expected trust (see `trust_dynamics`)."""
+    ) -> Recursion:
+        """Build the recursion for expected trust (see `trust_recursion`)."""
         z = self.paths.workspace.awareness.values
-        return trust_dynamics(params, z, self.start(x0), by_robot=by_robot)
+        return trust_recursion(params, z, self.start(x0), by_robot=by_robot)
 
     def start(self, x0: ArrayLike | None) -> np.ndarray | None:
         """Read expected trust at the start, shape () or (..., robot), by the robots' names."""
@@ -167,8 +167,8 @@ class Problem:
         of_bounds = risk_of(p_fail).reshape(len(p_fail), -1).T
         return Risks(np.ascontiguousarray(of_bounds), self.price * shares, limit)
 
-    def best(self, dynamics: Dynamics) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Find the best admissible path for each draw of the dynamics, or for a single draw.
+    def best(self, recursion: Recursion) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Find the best admissible path for each draw of the recursion, or for a single draw.
 
         Returns:
             Scores (draw,), upper limits on the score of any path (draw,), and paths (draw, cell) as
@@ -179,12 +179,12 @@ class Problem:
             InfeasibleError: If no path respects `max_failure`.
         """
         history = has_history(self.objective, self.family)
-        self._require_valid(dynamics, history)
-        dynamics = capped(self.objective, self.family, dynamics).flat()
-        n_draws, n_states = dynamics.start.shape
-        drift, toll = dynamics.drift.reshape(n_draws, n_states, -1), self.toll.ravel()
+        self._require_valid(recursion, history)
+        recursion = capped(self.objective, self.family, recursion).flat()
+        n_draws, n_states = recursion.start.shape
+        drift, toll = recursion.drift.reshape(n_draws, n_states, -1), self.toll.ravel()
         view, graph = np.full(n_states, 1.0 / n_states), self.paths.graph
-        weights = weights_of(self.objective, dynamics, view, graph.longest)
+        weights = weights_of(self.objective, recursion, view, graph.longest)
         if self.risks is None and not history:
             score, paths = best_sums(graph, drift, weights, toll)
             return score, score, paths
@@ -192,8 +192,8 @@ class Problem:
         if history:  # the cost depends on trust itself and is not a weighted sum of drifts
             n_trust, loss = n_states, LOSSES[self.family.expected_rate]
             weights = Weights(0.0 * weights.per_bound, 0.0 * weights.constant, weights.scale)
-        transition, x0 = dynamics.transition[:, :n_trust, :n_trust], dynamics.start[:, :n_trust]
-        trust = transition.copy(), x0.copy(), np.maximum(dynamics.noise_sd, TINY_SD)
+        transition, x0 = recursion.transition[:, :n_trust, :n_trust], recursion.start[:, :n_trust]
+        trust = transition.copy(), x0.copy(), np.maximum(recursion.noise_sd, TINY_SD)
         risks = self.risks or Risks(np.zeros((len(toll), 1)), np.zeros(1), np.inf)
         costs = Costs(loss, drift, weights.per_bound, -weights.constant, *trust, toll, *risks)
         cost, lower, paths = best_labels(graph, costs, weights.scale)
@@ -201,16 +201,16 @@ class Problem:
             raise self._infeasible(self.risk)
         return -cost, -lower, paths
 
-    def _require_valid(self, dynamics: Dynamics, history: bool) -> None:
-        """Raise TrustboError if the search is not exact for these dynamics."""
+    def _require_valid(self, recursion: Recursion, history: bool) -> None:
+        """Raise TrustboError if the search is not exact for these recursion."""
         if not self.objective.of_contact:
             return
-        beta0 = np.diagonal(dynamics.transition, axis1=-2, axis2=-1)
-        if beta0.min() < 0.0 or (history and dynamics.transition.min() < 0.0):
+        beta0 = np.diagonal(recursion.transition, axis1=-2, axis2=-1)
+        if beta0.min() < 0.0 or (history and recursion.transition.min() < 0.0):
             raise TrustboError(
                 f"the objective {self.objective.name!r} requires beta0 >= 0. If rates are "
                 "nonlinear in trust, it also requires all entries of B0 >= 0. The smallest is "
-                f"{dynamics.transition.min():g}; use 'terminal' or 'mean' instead."
+                f"{recursion.transition.min():g}; use 'terminal' or 'mean' instead."
             )
 
     def _infeasible(self, risk: Risk) -> InfeasibleError:

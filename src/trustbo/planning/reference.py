@@ -13,12 +13,12 @@ import xarray as xr
 
 from trustbo.data import Cell
 from trustbo.models.params import Params
-from trustbo.planning.dynamics import Dynamics
 from trustbo.planning.objectives import capped, has_history
 from trustbo.planning.paths import AdmissiblePaths
 from trustbo.planning.plan import Plan
 from trustbo.planning.planner import Planner
 from trustbo.planning.problem import mean_of
+from trustbo.planning.recursion import Recursion
 from trustbo.workspace.moves import MOVES
 
 
@@ -39,26 +39,26 @@ def plan(planner: Planner, params: Params | xr.DataTree) -> Plan:
         plans = [planner.evaluate(path, mean) for path in every_path(problem.paths)]
         within = [one for one in plans if not one.infeasible]
         return max(within, key=lambda one: one.value) if within else planner.plan(mean)
-    dynamics = capped(problem.objective, problem.family, problem.dynamics(mean))
-    plans = [planner.evaluate(path, mean) for path in shortest_paths(planner, dynamics)]
+    recursion = capped(problem.objective, problem.family, problem.recursion(mean))
+    plans = [planner.evaluate(path, mean) for path in shortest_paths(planner, recursion)]
     return max(plans, key=lambda one: one.value)
 
 
-def shortest_paths(planner: Planner, dynamics: Dynamics) -> Iterator[tuple[Cell, ...]]:
+def shortest_paths(planner: Planner, recursion: Recursion) -> Iterator[tuple[Cell, ...]]:
     """Find the best path for each number of bounds with `networkx.bellman_ford_path`.
 
     A bound with drift u and j bounds left after it adds w_j . u minus its toll to the value. Here,
     w_j = sum_{i <= j} credit(i) view . B0^(j - i), and view . x is the team's mean trust.
     """
     problem = planner.problem
-    graph, n_states = problem.paths.graph, len(dynamics.start)
+    graph, n_states = problem.paths.graph, len(recursion.start)
     credit = problem.objective.credit(np.arange(graph.longest + 1))
     view, weights = np.full(n_states, 1.0 / n_states), []
     carried = np.zeros(n_states)
     for j in range(graph.longest):
-        carried = carried @ dynamics.transition + credit[j] * view
+        carried = carried @ recursion.transition + credit[j] * view
         weights.append(carried)
-    drift, toll = dynamics.drift.reshape(n_states, -1), problem.toll.ravel()
+    drift, toll = recursion.drift.reshape(n_states, -1), problem.toll.ravel()
     left = graph.left[graph.head]  # bounds left after each edge
     cost = [toll[b] - weights[j] @ drift[:, b] for b, j in zip(graph.bound, left, strict=True)]
     network = graph.to_networkx(cost)

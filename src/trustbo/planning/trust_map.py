@@ -6,10 +6,10 @@ from numpy.typing import ArrayLike
 from scipy.special import expit
 
 from trustbo.models.params import Params
-from trustbo.planning.dynamics import Dynamics
 from trustbo.planning.objectives import TERMINAL, weights_of
 from trustbo.planning.paths import SIMPLE_EXTRA, STEPS, AdmissiblePaths
 from trustbo.planning.problem import Problem
+from trustbo.planning.recursion import Recursion
 from trustbo.planning.sums import best_sums
 
 
@@ -17,14 +17,14 @@ def trust_map(
     problem: Problem, params: Params, *, per_robot: bool = False, x0: ArrayLike | None = None
 ) -> xr.DataArray:
     """Compute the trust map; see `Planner.trust_map`."""
-    dynamics = problem.dynamics(params, x0, by_robot=per_robot).flat()
+    recursion = problem.recursion(params, x0, by_robot=per_robot).flat()
     like = problem.paths.workspace.awareness.isel(move=0, feature=0, drop=True)
-    n_states = dynamics.start.shape[-1]
+    n_states = recursion.start.shape[-1]
     if per_robot:
-        robots = [_largest(problem.paths, dynamics, view) for view in np.eye(n_states)]
+        robots = [_largest(problem.paths, recursion, view) for view in np.eye(n_states)]
         values = np.stack(robots, axis=1)
     else:
-        values = _largest(problem.paths, dynamics, np.full(n_states, 1.0 / n_states))
+        values = _largest(problem.paths, recursion, np.full(n_states, 1.0 / n_states))
         like = like.isel(robot=0, drop=True)
     like = like.expand_dims(draw=len(values)) if params.leading else like
     trust = like.copy(data=values if params.leading else values[0])
@@ -37,24 +37,24 @@ def cost_of(trust: xr.DataArray) -> xr.DataArray:
     return cost.assign_attrs(long_name="cost 1 - sigma(trust)")
 
 
-def _largest(paths: AdmissiblePaths, dynamics: Dynamics, view: np.ndarray) -> np.ndarray:
+def _largest(paths: AdmissiblePaths, recursion: Recursion, view: np.ndarray) -> np.ndarray:
     """Compute the largest trust, view . x, on arrival at each cell, (draw, row, col)."""
     extra = min(SIMPLE_EXTRA, paths.longest - paths.shortest)
-    weights = view @ dynamics.transition  # (draw, state)
+    weights = view @ recursion.transition  # (draw, state)
     beta0 = np.divide(weights, view, out=np.zeros_like(weights), where=view > 0.0)
     scalar = (weights == beta0.max(-1, keepdims=True) * view).all()  # view . x has a recursion
     if scalar and (beta0 >= 0.0).all():
-        drift = np.einsum("s,dsmrc->dmrc", view, dynamics.drift)
+        drift = np.einsum("s,dsmrc->dmrc", view, recursion.drift)
         drift = np.where(paths.bounds, drift, np.nan)
-        return best_trust(paths, extra, drift, beta0.max(-1), dynamics.start @ view)
-    drift = dynamics.drift.reshape(*dynamics.start.shape, -1)
+        return best_trust(paths, extra, drift, beta0.max(-1), recursion.start @ view)
+    drift = recursion.drift.reshape(*recursion.start.shape, -1)
     values = np.full((len(drift), *paths.bounds.shape[1:]), np.nan)
     no_toll = np.zeros(paths.bounds.size)
     for row, col in np.argwhere(paths.bounds_from_start > 0).tolist():
         graph = paths.to((row, col), extra).graph
-        weights = weights_of(TERMINAL, dynamics, view, graph.longest)
+        weights = weights_of(TERMINAL, recursion, view, graph.longest)
         values[:, row, col], _ = best_sums(graph, drift, weights, no_toll)
-    values[:, *paths.start] = dynamics.start @ view
+    values[:, *paths.start] = recursion.start @ view
     return values
 
 

@@ -119,18 +119,23 @@ class Layout(NamedTuple):
         return U[order.swapaxes(1, 2).ravel()]
 
 
-class Signal(NamedTuple):
+class LinearPredictor(NamedTuple):
     """Trust x = m + T u + e of each block at each point, with e ~ N(0, S) and inputs u = U c.
 
     Each row of a block is an observation. The second axis is the label of a block (see `Layout`),
     and has length 1 if all blocks have equal matrices.
     """
 
-    m: Any  # (point, label, row)
-    T: Any  # (point, label, row, input)
-    S: Any  # (point, label, row, row)
-    sd: Any  # (point, 1, 1 or row), sd of independent observation noise
-    noise: Any = None  # (point, label, row, row), covariance of shared noise, or None
+    mean: Any
+    """m, shape (point, label, row)."""
+    response: Any
+    """T, shape (point, label, row, input)."""
+    trust_cov: Any
+    """S, shape (point, label, row, row)."""
+    noise_sd: Any
+    """Standard deviation of the own noise of each rate, shape (point, 1, 1 or row)."""
+    shared_cov: Any = None
+    """Covariance of shared noise, shape (point, label, row, row), or None."""
 
     @classmethod
     def of(cls, space: StateSpace, layout: Layout, random: Inputs | None = None) -> Self:
@@ -172,7 +177,9 @@ class Signal(NamedTuple):
     @property
     def covariance(self) -> Any:
         """Covariance (point, label, row, row) of trust plus shared noise."""
-        return self.S if self.noise is None else self.S + self.noise
+        if self.shared_cov is None:
+            return self.trust_cov
+        return self.trust_cov + self.shared_cov
 
 
 def each(M: Any, label: np.ndarray) -> Any:

@@ -23,8 +23,8 @@ from trustbo.models.scores import Pair
 from trustbo.workspace import Workspace
 
 Theta = Mapping[str, Any]
-"""Hyperparameters (point, ...) by name. `rest`, with shape (point,) or (point, robot), is the drift
-that raises stationary trust by 1. It equals 1 - beta0 if `memory` is "level"."""
+"""Hyperparameters (point, ...) by name. `inverse_gain`, with shape (point,) or (point, robot), is
+the drift that raises stationary trust by 1. It equals 1 - beta0 if `memory` is "level"."""
 
 Values = Mapping[str, np.ndarray]
 """Variables (draw, ...) of an effect by name."""
@@ -52,7 +52,7 @@ class Effect:
 
     By default, hyperparameters are standard deviations with half-normal priors, whose scales are
     given by the fields of the same names. Override `hyperpriors` for other priors. Classes with a
-    `noun` can be read from files.
+    `group` can be read from files.
 
     Raises:
         TrustboError: If a prior scale is not positive.
@@ -60,15 +60,15 @@ class Effect:
 
     names: ClassVar[tuple[str, ...]] = ()
     """Names of the hyperparameters."""
-    noun: ClassVar[str] = ""
-    """Plural noun for what has the effect; also the name of the group in a posterior."""
+    group: ClassVar[str] = ""
+    """Plural group for what has the effect; also the name of the group in a posterior."""
     variables: ClassVar[Mapping[str, tuple[str, ...]]] = {}
     """Axes of each variable of the effect by name, after (chain, draw)."""
     coords: ClassVar[Mapping[str, Sequence[Any]]] = {}
     """Labels along the axes of the variables other than mission, bound, robot and feature."""
 
     def __init_subclass__(cls) -> None:
-        if cls.noun:
+        if cls.group:
             EFFECTS[cls.__name__] = cls
 
     def __post_init__(self) -> None:
@@ -110,7 +110,7 @@ class Effect:
 
         The effect is drawn if `rng` is given, otherwise expected. By default, the effect is 0.
         """
-        return np.zeros((len(theta["rest"]), 1))
+        return np.zeros((len(theta["inverse_gain"]), 1))
 
     def hyperpriors(self) -> dict[str, Distribution]:
         """Return the priors on the hyperparameters by name."""
@@ -138,7 +138,7 @@ def sample_columns(effects: Sequence[Effect], theta: Theta, observations: Observ
     columns = []
     for effect in effects:
         mean, parts = effect.prior(theta, observations)
-        label = effect.noun or "weights"
+        label = effect.group or "weights"
         start = 0
         for i, part in enumerate(parts):
             Q = part[0] if part.ndim == 3 else namespace(part).diag(part[0])

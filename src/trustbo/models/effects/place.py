@@ -45,7 +45,7 @@ class PlaceEffect(Effect):
     length_scale: float = 2.0
     length_scale_sd: float = 0.5
     names = ("tau_s", "length_scale", "tau_e")
-    noun = "places"
+    group = "places"
     variables: ClassVar = {"place": (), "place_bound": ()}  # axes are in `place_maps.place_group`
 
     def __post_init__(self) -> None:

@@ -40,7 +40,7 @@ class RobotEffect(Effect):
     tau_day: float = 0.2
     rho: float = 0.9
     names = ("tau_slow", "tau_day")
-    noun = "robots"
+    group = "robots"
     variables: ClassVar = {"robot_effect": ("mission", "robot")}
 
     def __post_init__(self) -> None:
@@ -58,29 +58,29 @@ class RobotEffect(Effect):
         )
 
     def prior(self, theta: Theta, observations: Observations) -> tuple[Any, list[Any]]:
-        """Return independent priors for the robots, as one array if `rest` is the same for all."""
-        rest = theta["rest"]
+        """Return independent priors for the robots, as one array if their gain is the same."""
+        inverse_gain = theta["inverse_gain"]
         slow, day = self._variances(theta)
         value, vector = _correlation_eigen(self.rho, observations.n_missions)
         Q = (vector / (slow * value + day)[:, None]) @ vector.T
-        if rest.ndim == 1:
-            return None, [Q / rest[:, None, None] ** 2] * observations.n_robots
-        return None, [Q / of_robot[:, None, None] ** 2 for of_robot in rest.T]
+        if inverse_gain.ndim == 1:
+            return None, [Q / inverse_gain[:, None, None] ** 2] * observations.n_robots
+        return None, [Q / of_robot[:, None, None] ** 2 for of_robot in inverse_gain.T]
 
     def chains(self, theta: Theta, observations: Observations) -> Chains:
         """See `Effect.chains`; each robot is a chain."""
         slow, day = self._variances(theta)
-        rest = theta["rest"].reshape(len(slow), -1) * np.ones(observations.n_robots)
-        return Chains(1.0 / (day * rest**2), 1.0 / (slow * rest**2), self.rho)
+        inverse_gain = theta["inverse_gain"].reshape(len(slow), -1) * np.ones(observations.n_robots)
+        return Chains(1.0 / (day * inverse_gain**2), 1.0 / (slow * inverse_gain**2), self.rho)
 
     def named(self, c: np.ndarray, theta: Theta, observations: Observations) -> Values:
         """Return `robot_effect` (draw, mission, robot), the effects d on stationary trust."""
-        d = c.reshape(len(c), observations.n_robots, observations.n_missions) / _rest(theta)
+        d = c.reshape(len(c), observations.n_robots, observations.n_missions) / _inverse_gain(theta)
         return {"robot_effect": np.swapaxes(d, 1, 2)}
 
     def coefficients(self, values: Values, theta: Theta, observations: Observations) -> np.ndarray:
         """See `Effect.coefficients`."""
-        d = np.swapaxes(values["robot_effect"], 1, 2) * _rest(theta)
+        d = np.swapaxes(values["robot_effect"], 1, 2) * _inverse_gain(theta)
         return d.reshape(len(d), -1)
 
     def ahead(self, values: Values, theta: Theta, n: int, rng: Generator | None) -> np.ndarray:
@@ -92,7 +92,7 @@ class RobotEffect(Effect):
         if rng is not None:
             left = np.maximum(C[:, 0, 0] - (gain * k).sum(1), 0.0)
             d = d + np.sqrt(left)[:, None] * rng.standard_normal(d.shape)
-        return _rest(theta)[..., 0] * d
+        return _inverse_gain(theta)[..., 0] * d
 
     def _covariance(self, theta: Theta, n: int) -> Any:
         """Compute the covariance (point, mission, mission) of one robot's effects d."""
@@ -118,7 +118,7 @@ def _correlation_eigen(rho: float, n: int) -> tuple[np.ndarray, np.ndarray]:
     return np.maximum(value, 0.0), vector
 
 
-def _rest(theta: Theta) -> np.ndarray:
+def _inverse_gain(theta: Theta) -> np.ndarray:
     """Return the drift (draw, robot or 1, 1) that raises stationary trust by 1."""
-    rest = theta["rest"]
-    return rest.reshape(len(rest), -1, 1)
+    inverse_gain = theta["inverse_gain"]
+    return inverse_gain.reshape(len(inverse_gain), -1, 1)

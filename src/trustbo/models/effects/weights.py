@@ -30,9 +30,9 @@ class Weights(Effect):
     def moments(self, theta: Theta, observations: Observations) -> tuple[Any, Any]:
         """Return the prior means and sds (point, [robot,] column) of the coefficients."""
         mean, sd = self.priors.coefficients(observations.awareness.shape[3])
-        rest = theta["rest"][..., None]
-        rest = rest if self.priors.stationary else 0.0 * rest + 1.0
-        return rest * mean, rest * sd
+        inverse_gain = theta["inverse_gain"][..., None]
+        inverse_gain = inverse_gain if self.priors.stationary else 0.0 * inverse_gain + 1.0
+        return inverse_gain * mean, inverse_gain * sd
 
     def named(self, c: np.ndarray, theta: Theta, observations: Observations) -> Values:
         """Return the weights `beta` (draw, feature) and the intercept `b` (draw,)."""
@@ -103,7 +103,7 @@ class CoupledWeights(Weights):
         own = np.column_stack([own, np.ones(n, dtype=bool)])  # (robot, input)
         feature = np.append(np.tile(np.arange(n_features), n), n_features)
         coupling = self.priors.moments("coupling")
-        (mean, sd), xp = self.moments(theta, observations), namespace(theta["rest"])
+        (mean, sd), xp = self.moments(theta, observations), namespace(theta["inverse_gain"])
         means = xp.where(own, mean[..., feature], coupling[0])
         sds = xp.where(own, sd[..., feature], coupling[1])
         return means.reshape(len(means), -1), [sds.reshape(len(sds), -1) ** -2.0]

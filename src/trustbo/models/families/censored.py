@@ -38,7 +38,7 @@ class Censored(Gaussian):
         return np.where(cut, match_interval(low, high, m, v, sd), super()._match(y, N, m, v, sd))
 
     def _draw(self, y: Array, N: Array, m: Array, v: Array, sd: Array, rng: Generator) -> Drawn:
-        """Draw the rate before clipping, and then the signal given that rate, both exactly."""
+        """Draw the rate before clipping, and then the predictor given that rate, both exactly."""
         (cut, low, high), total = _limits(y), np.sqrt(v + sd**2)
         e = draw_between((low - m) / total, (high - m) / total, rng)
         f, _ = super()._draw(np.where(cut, m + total * e, y), N, m, v, sd, rng)

@@ -1,7 +1,7 @@
-"""Base class of observation families: rates given signals, and signals given rates.
+"""Base class of observation families: rates given linear predictors, and the reverse.
 
-A signal f is trust plus noise shared between rates. To add a family, start from `censored` (moments
-in closed form) or `beta_binomial` (moments by quadrature), and add it to `families.FAMILIES`.
+The linear predictor f is trust plus noise shared between rates. To add a family, start from
+`censored` (moments in closed form) or `beta_binomial` (moments by quadrature), and add it to `families.FAMILIES`.
 """
 
 from abc import ABC, abstractmethod
@@ -16,7 +16,7 @@ Array = Any
 Moments = Any
 """Arrays of the log mass, the mean and the variance."""
 Drawn = tuple[Array, Array]
-"""Draws of the signal, and their log weights."""
+"""Draws of the linear predictor, and their log weights."""
 
 
 @dataclass(frozen=True)
@@ -30,12 +30,12 @@ class Family(ABC):
     name: ClassVar[str]
     """Name of the family, as given in the argument `observation`."""
     gaussian: ClassVar[bool] = False
-    """Whether rates are the signal plus normal noise, which allows exact integration."""
+    """Whether rates are the linear predictor plus normal noise, which allows exact integration."""
     needs_ticks: ClassVar[bool] = False
     """Whether every measured rate needs a tick count."""
     adds_noise: ClassVar[bool] = True
-    """Whether a rate is the signal plus noise with sd delta_v. The tick resolution then adds to
-    this noise, which may be correlated between robots."""
+    """Whether a rate is the linear predictor plus noise with sd delta_v. The tick resolution then
+    adds to this noise, which may be correlated between robots."""
     expected_rate: ClassVar[str] = "identity"
     """Form of `mean_rate` in compiled planning: `"identity"` (trust itself), `"logistic"`, or
     `"clipped"` (a normal variable with sd delta_v, clipped to [0, 1])."""
@@ -44,11 +44,11 @@ class Family(ABC):
 
     @abstractmethod
     def sample(self, trust: Array, sd: Array, N: Array, rng: Generator) -> Array:
-        """Draw rates given the signal."""
+        """Draw rates given the linear predictor."""
 
     @abstractmethod
     def log_prob(self, y: Array, N: Array, trust: Array, sd: Array) -> Array:
-        """Compute the log density or probability of measured rates given the signal."""
+        """Compute the log density or probability of measured rates given the linear predictor."""
 
     @abstractmethod
     def _match(self, y: Array, N: Array, m: Array, v: Array, sd: Array) -> Moments:
@@ -56,7 +56,7 @@ class Family(ABC):
 
     @abstractmethod
     def _draw(self, y: Array, N: Array, m: Array, v: Array, sd: Array, rng: Generator) -> Drawn:
-        """Draw the signal from N(f; m, v) times the likelihood of a rate; also return a log weight.
+        """Draw f from N(f; m, v) times the likelihood of a rate; also return a log weight.
 
         The mean weight is the mass of the product, and weights are constant if draws are exact.
         """
@@ -80,7 +80,7 @@ class Family(ABC):
         return np.where(seen, one, 0.0), np.where(seen, mean, m), np.where(seen, var, v)
 
     def draw(self, y: Array, N: Array, m: Array, v: Array, sd: Array, rng: Generator) -> Drawn:
-        """Draw signals given rates as in `_draw`; the draws are arbitrary where y is NaN."""
+        """Draw predictors given rates as in `_draw`; the draws are arbitrary where y is NaN."""
         _, (y, N, m, v, sd) = _measured(y, N, m, v, sd)
         return self._draw(y, N, m, v, sd, rng)
 

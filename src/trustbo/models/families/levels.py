@@ -56,7 +56,7 @@ class Levels(Family):
         return total, center, (w * (var + (mean - center) ** 2)).sum(0)
 
     def _draw(self, y: Array, N: Array, m: Array, v: Array, sd: Array, rng: Generator) -> Drawn:
-        """Draw the mixture component, the report before rounding, and the signal, all exactly."""
+        """Draw the mixture component, the report before rounding, and f, all exactly."""
         log_p = self._components(y, m, v, sd)[0]
         noise = _SDS[np.argmax(log_p + rng.gumbel(size=log_p.shape), axis=0)] * sd
         total, (low, high) = np.sqrt(v + noise**2), self.cuts(y)

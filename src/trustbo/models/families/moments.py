@@ -1,4 +1,4 @@
-"""Moments and draws of a normal signal times the likelihood of a rate."""
+"""Moments and draws of a normal linear predictor times the likelihood of a rate."""
 
 from collections.abc import Callable
 

@@ -14,7 +14,7 @@ from trustbo.statespace import kalman
 from trustbo.workspace.moves import bounds_along
 
 
-class Dynamics(NamedTuple):
+class Recursion(NamedTuple):
     """Recursion x_k = transition x_{k-1} + drift(bound) for expected trust, with x_0 = start.
 
     The shapes are transition (..., state, state), drift (..., state, move, row, col), start
@@ -30,24 +30,24 @@ class Dynamics(NamedTuple):
     start: np.ndarray
     noise_sd: np.ndarray
 
-    def flat(self) -> "Dynamics":
-        """Return the dynamics with a leading axis (draw,), which has length 1 for a single draw."""
-        return self if self.start.ndim > 1 else Dynamics(*(value[None] for value in self))
+    def flat(self) -> "Recursion":
+        """Return the recursion with a leading axis (draw,), of length 1 for a single draw."""
+        return self if self.start.ndim > 1 else Recursion(*(value[None] for value in self))
 
-    def along(self, path: Sequence[Cell] | np.ndarray) -> "Dynamics":
-        """Return the dynamics with the drift of a path's bounds, (..., state, 1, 1, bound)."""
+    def along(self, path: Sequence[Cell] | np.ndarray) -> "Recursion":
+        """Return the recursion with the drift of a path's bounds, (..., state, 1, 1, bound)."""
         moves, rows, cols = bounds_along(path).T
         return self._replace(drift=self.drift[..., moves, rows, cols][..., None, None, :])
 
-    def settled(self) -> np.ndarray:
+    def steady_state(self) -> np.ndarray:
         """Return the limit of the team's trust if a bound is repeated, (..., move, row, col)."""
         gain = np.linalg.inv(np.eye(self.start.shape[-1]) - self.transition)
         return np.einsum("...st,...tmrc->...mrc", gain, self.drift) / self.start.shape[-1]
 
 
-def trust_dynamics(
+def trust_recursion(
     params: Params, z: np.ndarray, x0: ArrayLike | None = None, *, by_robot: bool = False
-) -> Dynamics:
+) -> Recursion:
     """Build the recursion for expected trust from parameters with leading axes (...,).
 
     Args:
@@ -88,12 +88,12 @@ def trust_dynamics(
 
     noise_sd = of_draws(space.rate_sd.mean((1, 2)))
     if params.BY_ROBOT or by_robot:
-        return Dynamics(transition, drift(params, z), start, noise_sd)
+        return Recursion(transition, drift(params, z), start, noise_sd)
 
     # With a common beta0, the mean trust of the robots obeys the same equation.
     if n_robots > 1:
         z = z.mean(0, keepdims=True)
-    return Dynamics(
+    return Recursion(
         transition=transition[..., :1, :1],
         drift=drift(params, z).mean(-4, keepdims=True),  # place effects may differ between robots
         start=start.mean(-1, keepdims=True),
@@ -155,11 +155,11 @@ def roll_trust(params: Params, awareness: ArrayLike, x0: ArrayLike | None = None
         raise TrustboError(f"awareness must have the shape (bound, robot, feature); got {z.shape}.")
     of_robots = np.swapaxes(z, 0, 1)
     x0 = None if x0 is None else require_numbers("x0", x0)
-    return roll(trust_dynamics(params, of_robots[:, None, None], x0, by_robot=True))
+    return roll(trust_recursion(params, of_robots[:, None, None], x0, by_robot=True))
 
 
-def roll(along: Dynamics) -> np.ndarray:
-    """Compute expected trust after each bound, (..., bound, state), from `Dynamics.along(path)`."""
+def roll(along: Recursion) -> np.ndarray:
+    """Compute expected trust (..., bound, state) after each bound of `Recursion.along(path)`."""
     drift = np.moveaxis(along.drift[..., 0, 0, :], -1, 0)  # (bound, ..., state)
     trust = [along.start]
     for u in drift:
