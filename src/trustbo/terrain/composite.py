@@ -12,6 +12,7 @@ from trustbo.errors import TrustboError, require_kind, warn
 
 MAX_PIXELS = 1_000_000
 """Maximum number of samples used to fit an index, spread evenly over the given ones."""
+_CONSTANT = 1e-9  # spread below which a feature, or the score, counts as constant
 
 
 class CompositeIndex:
@@ -33,7 +34,8 @@ class CompositeIndex:
         require_kind(
             "signs", signs, Mapping, "give the sign of each feature, such as {'slope': -1}"
         )
-        self.signs, self.fitted = dict(signs), xr.Dataset() if fitted is None else fitted
+        self.signs = dict(signs)
+        self.fitted = xr.Dataset() if fitted is None else fitted
 
     def fit(self, features: Mapping[str, ArrayLike] | xr.Dataset) -> Self:
         """Fit the limits, the loadings and the scale.
@@ -48,23 +50,33 @@ class CompositeIndex:
         x = x[np.isfinite(x).all(1)]
         if not len(x):
             raise TrustboError(f"no pixel has all of the features {', '.join(self.signs)}.")
+
         x = x[:: -(-len(x) // MAX_PIXELS)]
         low, high = np.percentile(x, [1, 99], axis=0)
         x = np.clip(x, low, high)
-        mean, sd = x.mean(0), x.std(0)
+
+        mean = x.mean(0)
+        sd = x.std(0)
         # A (nearly) constant feature carries no information, and has no z-score.
-        varies = sd > 1e-9 * np.maximum(1.0, np.abs(mean))
+        varies = sd > _CONSTANT * np.maximum(1.0, np.abs(mean))
         sd = np.where(varies, sd, np.inf)
-        z, signs = ((x - mean) / sd)[:, varies], np.array([*self.signs.values()])
-        loadings, ratios = np.zeros(len(signs)), np.ones(1)
+
+        z = ((x - mean) / sd)[:, varies]
+        signs = np.array([*self.signs.values()])
+        loadings = np.zeros(len(signs))
+        ratios = np.ones(1)
         if varies.any():
             pca = PCA(svd_solver="covariance_eigh").fit(z)
-            first, ratios = np.asarray(pca.components_)[0], pca.explained_variance_ratio_
+            first = np.asarray(pca.components_)[0]
+            ratios = pca.explained_variance_ratio_
             loadings[varies] = (np.sign(first @ signs[varies]) or 1.0) * first
+
         score = z @ loadings[varies]
         bottom, top = np.percentile(score, [2, 98])
-        if top - bottom < 1e-9:  # nearly all samples are alike: take the extremes
-            bottom, top = score.min(), score.max()
+        if top - bottom < _CONSTANT:  # nearly all samples are alike: take the extremes
+            bottom = score.min()
+            top = score.max()
+
         columns = {
             "sign": signs, "loading": loadings, "low": low, "high": high, "mean": mean, "sd": sd
         }  # fmt: skip
@@ -74,17 +86,20 @@ class CompositeIndex:
             {"feature": [*self.signs], "component": np.arange(1, len(ratios) + 1)},
             {"bottom": float(bottom), "top": float(top)},
         )
+
         agrees = self.loadings_ * signs
         for name in agrees["feature"].values[agrees < 0].tolist():
             warn(
                 f"the loading of {name!r} has the opposite sign to the one declared; check "
                 "loadings_, and leave the feature out if it misleads."
             )
+
         if ratios[0] < 0.5:
             warn(
                 f"the first component of {', '.join(self.signs)} explains only {ratios[0]:.0%} of "
                 "their variance; check loadings_, and leave a feature out or use two composites."
             )
+
         return self
 
     @property
@@ -107,16 +122,21 @@ class CompositeIndex:
         """
         fitted = self.fitted
         low, high, mean, sd = (fitted[name].values for name in ("low", "high", "mean", "sd"))
-        weights, bottom, top = fitted["loading"].values / sd, fitted.bottom, fitted.top
+
+        weights = fitted["loading"].values / sd
+        bottom = fitted.bottom
+        top = fitted.top
         columns = enumerate(self._columns(features))
         score = sum(weights[k] * (np.clip(x, low[k], high[k]) - mean[k]) for k, x in columns)
-        if top - bottom < 1e-9:
+
+        if top - bottom < _CONSTANT:
             return np.where(np.isfinite(score), 0.5, np.nan)
         return np.clip((score - bottom) / (top - bottom), 0.0, 1.0)
 
     def _columns(self, features: Mapping[str, ArrayLike] | xr.Dataset) -> list[np.ndarray]:
         remedy = "give the values of each feature by name"
         require_kind("features", features, Mapping | xr.Dataset, remedy)
+
         missing = [name for name in self.signs if name not in features]
         if missing:
             raise TrustboError(f"the composite needs {', '.join(missing)}; got {list(features)}.")

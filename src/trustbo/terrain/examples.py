@@ -57,22 +57,28 @@ def synthetic_terrain(
     step = require_positive("resolution", resolution)
     sides = require_tuple("size", size, 2)
     height, width = (require_positive(f"size[{i}]", side) for i, side in enumerate(sides))
+
     shape = (round(height / step), round(width / step))
     check_size(shape, f"size {size} m at {resolution} m")
     if min(shape) < 4:
         raise TrustboError(f"size {size} m is under 4 pixels of {resolution} m.")
+
     relief = require_positive("relief", relief, or_zero=True)
     rng = np.random.default_rng(require_whole("seed", seed, 0))
     ground = _fractal(rng, shape, exponent=1.9)
+
     # Patches of ruggedness below a metre (ruts, rocks), which the relief lacks.
     rough = np.clip(ndimage.gaussian_filter(_fractal(rng, shape, 1.6), 2.0 / resolution), 0.3, 1.0)
     dem = relief * ground + 0.25 * rough * rng.standard_normal(shape)
     dem = ndimage.gaussian_filter(dem, 0.7)
+
     patches = _fractal(rng, shape, exponent=1.5)
     wooded = patches > np.quantile(patches, 0.6)
     crowns = ndimage.gaussian_filter(rng.standard_normal(shape), 2.0 / resolution)
+
     height = 6.0 * np.exp(0.5 * crowns / crowns.std() - 0.125)
     dsm = dem + np.where(wooded, height, 0.0)
+
     y = 5_225_000.0 - (np.arange(shape[0]) + 0.5) * resolution
     x = 380_000.0 + (np.arange(shape[1]) + 0.5) * resolution
     maps = (xr.DataArray(z, {"y": y, "x": x}, ("y", "x")) for z in (dem, dsm))
@@ -82,11 +88,14 @@ def synthetic_terrain(
 def _fractal(rng: np.random.Generator, shape: tuple[int, int], exponent: float) -> np.ndarray:
     """Draw a Gaussian field with spectrum f^-(2 exponent), scaled to [0, 1].
 
-    The field is synthesised at twice the size and cropped, because the Fourier method is periodic.
+    The field is synthesised by the Fourier method (Saupe 1988). As the method is periodic, the
+    field has twice the size and is cropped.
     """
-    rows, cols = 2 * shape[0], 2 * shape[1]
+    rows = 2 * shape[0]
+    cols = 2 * shape[1]
     frequency = np.hypot(np.fft.fftfreq(rows)[:, None], np.fft.rfftfreq(cols)[None])
     frequency[0, 0] = np.inf
+
     spectrum = np.fft.rfft2(rng.standard_normal((rows, cols))) * frequency**-exponent
     field = np.fft.irfft2(spectrum, s=(rows, cols))[: shape[0], : shape[1]]
     return (field - field.min()) / np.ptp(field)

@@ -23,6 +23,9 @@ VISIBILITY = ("vegetation_density", "openness")
 """Pixel features of visibility (z2): vegetation lowers it, openness raises it."""
 PAPER_VISIBILITY = ("canopy_height", "canopy_cover", "openness")
 """Pixel features of visibility in the paper; in forest, their index has the wrong sign."""
+_HALF_WIDTH = 5.0  # of the squares over which vegetation is averaged, m
+_COVER = 2.0  # height above which the surface counts as canopy cover, m
+_LAYER = 3.0  # height of the layer in which vegetation density is measured, m
 
 
 class Feature(NamedTuple):
@@ -59,7 +62,8 @@ def _window(z: np.ndarray) -> dict[tuple[int, int], np.ndarray]:
 
     The ground is taken to be level beyond the edge of the raster.
     """
-    wide, (rows, cols) = np.pad(z, 1, mode="edge"), z.shape
+    wide = np.pad(z, 1, mode="edge")
+    rows, cols = z.shape
     steps = (-1, 0, 1)
     return {(i, j): wide[1 + i :, 1 + j :][:rows, :cols] for i in steps for j in steps}
 
@@ -112,7 +116,7 @@ def canopy_height(terrain: xr.Dataset) -> np.ndarray:
 @feature("canopy_cover", sign=-1)
 def canopy_cover(terrain: xr.Dataset) -> np.ndarray:
     """Compute the fraction of a square of half-width 5 m covered by canopy over 2 m high."""
-    return _local_mean(terrain, (canopy_height(terrain) > 2.0).astype(float))
+    return _local_mean(terrain, (canopy_height(terrain) > _COVER).astype(float))
 
 
 @feature("vegetation_density", sign=-1)
@@ -123,8 +127,8 @@ def vegetation_density(terrain: xr.Dataset, crown_base: float = 0.3) -> np.ndarr
     its height to its top.
     """
     height = canopy_height(terrain)
-    filled = np.minimum(height, 3.0) - np.minimum(crown_base * height, 3.0)
-    return _local_mean(terrain, np.maximum(filled, 0.0) / 3.0)
+    filled = np.minimum(height, _LAYER) - np.minimum(crown_base * height, _LAYER)
+    return _local_mean(terrain, np.maximum(filled, 0.0) / _LAYER)
 
 
 @feature("openness", sign=+1)
@@ -144,7 +148,8 @@ def openness(
     off the raster are ignored; a pixel with no other rays is NaN, so keep `reach` below half the
     terrain's shorter side. Pixels of a 4 x 4 square share the value of its centre.
     """
-    ground, surface = terrain["dem"].values, terrain["dsm"].values
+    ground = terrain["dem"].values
+    surface = terrain["dsm"].values
     rows, cols = ground.shape
     coarse = np.empty((-(-rows // rays.BLOCK), -(-cols // rays.BLOCK)))
 
@@ -161,8 +166,9 @@ def openness(
 
 def _local_mean(terrain: xr.Dataset, values: np.ndarray) -> np.ndarray:
     """Average valid pixels in squares of half-width 5 m, in [0, 1]; NaN without ground."""
-    size = [2 * max(1, round(5.0 / step)) + 1 for step in pixel_size(terrain)]
-    has_ground, valid = np.isfinite(terrain["dem"].values), np.isfinite(values)
+    size = [2 * max(1, round(_HALF_WIDTH / step)) + 1 for step in pixel_size(terrain)]
+    has_ground = np.isfinite(terrain["dem"].values)
+    valid = np.isfinite(values)
     total, weight = (
         np.asarray(ndimage.uniform_filter(a, size, mode="nearest"))  # pyright: ignore[reportArgumentType]
         for a in (np.where(valid, values, 0.0), valid.astype(float))

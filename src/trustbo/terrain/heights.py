@@ -10,8 +10,10 @@ import xarray as xr
 
 from trustbo.errors import TrustboError, require_kind, warn
 
-LOWEST, HIGHEST = -450.0, 9000.0
-"""Range of heights on land, m: the Dead Sea's shore is at -430 m, Everest's summit at 8849 m."""
+LOWEST = -450.0
+"""Lowest height on land, m: the shore of the Dead Sea is at -430 m."""
+HIGHEST = 9000.0
+"""Largest height on land, m: the summit of Everest is at 8849 m."""
 _FILLS = (-99999.0, -32768.0, -32767.0, -9999.0)  # also suspicious before scaling
 ACCESSOR_FILL = "rio.nodata"
 """Attribute that carries the fill value of rioxarray's accessor, which most operations drop."""
@@ -20,6 +22,8 @@ _LOW = 10.0  # m; heights on one level with zeros
 _METRE = {"m", "metre", "metres", "meter", "meters"}
 _FOOT = {"ft", "foot", "feet", "ftus", "usft"}
 _US = {"us", "survey", "ftus", "usft"}
+_FOOT_IN_METRES = 0.3048
+_US_FOOT_IN_METRES = 1200.0 / 3937.0
 
 
 def in_metres(stored: xr.DataArray, axis: float | None, nodata: float | None) -> np.ndarray:
@@ -34,31 +38,41 @@ def in_metres(stored: xr.DataArray, axis: float | None, nodata: float | None) ->
             fill values, fill values blended with heights, or heights in another unit. Or the unit
             is unknown, or the band and the CRS disagree on it.
     """
-    name, attrs, raw = str(stored.name), stored.attrs, stored.to_numpy()
+    name = str(stored.name)
+    attrs = stored.attrs
+    raw = stored.to_numpy()
     if raw.dtype.kind not in "iuf":
         raise TrustboError(f"{name} holds {raw.dtype}, not heights; give real numbers.")
+
     metres = _unit_of(name, attrs.get("units"), axis)
     if attrs.get("positive") == "down":  # as in the CF conventions
         metres = -abs(metres)
     if abs(metres) != 1.0:
         warn(f"{name} has heights in units of {abs(metres):.6g} m; they are converted to metres.")
+
     values = raw.astype(float)
     missing = ~np.isfinite(values)
     for fill in _fills(name, attrs, nodata):
         with np.errstate(over="ignore"):
             missing |= raw == fill  # rounded to the raster's type: float32 has no -3.4e38
-    scale, offset = attrs.get("scale_factor", 1.0), attrs.get("add_offset", 0.0)
+
+    scale = attrs.get("scale_factor", 1.0)
+    offset = attrs.get("add_offset", 0.0)
     suspicious = np.isin(values, _FILLS if scale != 1.0 else (*_FILLS, -999.0))
+
     heights = metres * (scale * values + offset)
     heights[missing] = np.nan
     wrong = ~missing & (suspicious | (heights < LOWEST) | (heights > HIGHEST))
     if not wrong.any():
         _warn_of_zeros(heights, name)
         return heights
+
     r, c = np.unravel_index(np.argmax(wrong), wrong.shape)
-    value, height = float(raw[r, c]), heights[r, c]
+    value = float(raw[r, c])
+    height = heights[r, c]
     scaled = "" if value == height else f" (scaled to {height:g} m)"
     where = f"{name} holds {value!r}{scaled} at row {r}, column {c}"
+
     share = wrong.sum() / np.isfinite(heights).sum()
     if share > 0.5:
         raise TrustboError(
@@ -77,6 +91,7 @@ def _fills(name: str, attrs: Mapping[str, Any], nodata: float | None) -> list[fl
     """Return the fill values of the attributes, and `nodata`; NaN for each that is not given."""
     if nodata is not None:
         require_kind("nodata", nodata, Real, "give the number that marks missing data, or None")
+
     fills = [np.nan if nodata is None else float(nodata)]
     for key in _FILL_NAMES:
         try:
@@ -86,6 +101,7 @@ def _fills(name: str, attrs: Mapping[str, Any], nodata: float | None) -> list[fl
                 f"{name} declares the fill value {key} = {attrs[key]!r}, which is not a number; "
                 "correct the attribute."
             ) from None
+
     return fills
 
 
@@ -98,9 +114,11 @@ def _warn_of_zeros(heights: np.ndarray, name: str) -> None:
     n_zero = int((heights == 0.0).sum())
     n_low = int((np.abs(heights) <= _LOW).sum()) - n_zero
     high = heights[np.abs(heights) > _LOW]
+
     few_are_low = n_low < 0.1 * n_zero
     if n_zero >= n_low + len(high):
         few_are_low = n_low == 0 and len(high) > 0 and high.min() < high.max()
+
     if n_zero and few_are_low:
         warn(
             f"{name} is exactly 0 m on {n_zero / heights.size:.1%} of its pixels, but hardly any "
@@ -116,16 +134,23 @@ def _unit_of(name: str, declared: object, axis: float | None) -> float:
     """
     text = str(np.ravel(np.array(declared, object))[0] or "").strip()
     words = set(re.findall(r"[a-z]+", text.lower()))
-    in_metres, in_feet = bool(words & _METRE), bool(words & _FOOT)
+
+    in_metres = bool(words & _METRE)
+    in_feet = bool(words & _FOOT)
     if text and (in_metres == in_feet or re.search(r"^[\d.]|/|[a-z] ?(\^|\*\*)?-\d", text.lower())):
         raise TrustboError(
             f"{name} has heights in {text!r}, not in metres or feet; convert them, or declare "
             "the true unit, e.g. with gdal_edit.py -units m."
         )
-    length = 1.0 if not in_feet else 1200.0 / 3937.0 if words & _US else 0.3048
+
+    length = 1.0
+    if in_feet:
+        length = _US_FOOT_IN_METRES if words & _US else _FOOT_IN_METRES
+
     if text and axis and abs(length / abs(axis) - 1.0) > 1e-5:
         raise TrustboError(
             f"the band of {name} declares heights in {text!r}, but its CRS units of "
             f"{abs(axis):.6g} m; correct either with gdal_edit.py -units or gdal_edit.py -a_srs."
         )
+
     return axis or length

@@ -17,8 +17,12 @@ from trustbo.terrain.heights import HIGHEST, LOWEST
 from trustbo.terrain.place import require_map
 from trustbo.terrain.read import check_size, read_terrain
 
-GROUND_GAP, MAX_GAP = 10.0, 3.0
-"""Maximum distances of a pixel to one with ground points, and to the one that fills it, m."""
+GROUND_GAP = 10.0
+"""Maximum distance of a pixel to one with ground points, m."""
+MAX_GAP = 3.0
+"""Maximum distance of a pixel without returns to the one that fills it, m."""
+_GROUND = 2  # class of ground points (ASPRS LAS 1.4)
+_NOISE = (7, 18)  # classes of low and high noise
 
 
 def read_lidar(points: FilePath, resolution: float = 1.0, *, crs: object = None) -> xr.Dataset:
@@ -45,15 +49,19 @@ def read_lidar(points: FilePath, resolution: float = 1.0, *, crs: object = None)
     remedy = "give the path of one file; merge tiles first, e.g. with pdal merge"
     path = expanduser(require_kind("points", points, str | PathLike, remedy))
     xyz, is_ground, own = _read_points(path, crs)
+
     # Pixels are counted from the upper left; points on an edge are in the pixel south or east.
     place = np.array([[1.0, -1.0]]) * xyz[:, :2] / step
     corner = np.floor(place.min(0) + 1e-6)
     cols, rows = np.maximum(np.ceil(place.max(0) - 1e-6) - corner, 1.0).astype(int).tolist()
     check_size((rows, cols), f"a grid of {step:g} m")
     col, row = np.minimum((place - corner + 1e-6).astype(int), [cols - 1, rows - 1]).T
-    highest, no_ground = np.full((rows, cols), np.nan), np.ones((rows, cols), bool)
+
+    highest = np.full((rows, cols), np.nan)
+    no_ground = np.ones((rows, cols), bool)
     np.fmax.at(highest, (row, col), xyz[:, 2])
     no_ground[row[is_ground], col[is_ground]] = False
+
     # Coordinates relative to the corner keep the triangulation exact.
     centres = np.stack(np.meshgrid(np.arange(cols) + 0.5, np.arange(rows) + 0.5), axis=-1)
     try:
@@ -64,13 +72,17 @@ def read_lidar(points: FilePath, resolution: float = 1.0, *, crs: object = None)
             "filters.smrf."
         ) from None
     dem[np.asarray(distance_transform_edt(no_ground, step)) > GROUND_GAP] = np.nan
+
     # Heights above ground: on a slope, absolute heights would create steps and false canopy.
     canopy = np.maximum(highest - dem, 0.0)
     nearest: Any = distance_transform_edt(np.isnan(canopy), step, return_indices=True)
     canopy = np.where(nearest[0] <= MAX_GAP, canopy[tuple(nearest[1])], np.nan)
-    x, y = (corner[0] + centres[0, :, 0]) * step, -(corner[1] + centres[:, 0, 1]) * step
+
+    x = (corner[0] + centres[0, :, 0]) * step
+    y = -(corner[1] + centres[:, 0, 1]) * step
     surface = dem + canopy
     ground = np.where(np.isfinite(surface), dem, np.nan)
+
     maps = (xr.DataArray(z, {"y": y, "x": x}, ("y", "x")) for z in (ground, surface))
     return read_terrain(*(z.rio.write_crs(own.to_string()) for z in maps))
 
@@ -87,15 +99,18 @@ def _read_points(path: str, given: object) -> tuple[np.ndarray, np.ndarray, CRS]
     # A truncated file raises ValueError in NumPy, or RuntimeError in lazrs or PROJ.
     except (laspy.errors.LaspyException, OSError, RuntimeError, ValueError) as error:
         raise TrustboError(f"{path!r} cannot be read as LAS or LAZ: {error}.") from None
+
     label = np.asarray(cloud.classification, np.uint8)
-    usable = ~np.isin(label, (7, 18)) & (np.asarray(cloud.withheld) == 0)
+    usable = ~np.isin(label, _NOISE) & (np.asarray(cloud.withheld) == 0)
+
     xyz = np.column_stack([cloud.x, cloud.y, cloud.z])[usable]  # pyright: ignore[reportArgumentType, reportCallIssue]
     if ((xyz[:, 2] < LOWEST) | (xyz[:, 2] > HIGHEST)).any():
         raise TrustboError(
             f"{path!r} has points outside {LOWEST:g} to {HIGHEST:g} m; classify them as noise (7), "
             "or correct the unit."
         )
+
     crs = require_map(repr(path), own, given)
     if crs.is_geographic:
         raise TrustboError(f"{path!r} is in degrees; reproject its points to a UTM zone.")
-    return xyz, label[usable] == 2, crs
+    return xyz, label[usable] == _GROUND, crs

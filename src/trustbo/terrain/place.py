@@ -14,6 +14,9 @@ from rasterio.enums import Resampling
 from trustbo.errors import TrustboError
 
 _NORTH = 22.5  # degrees; half the angle between two neighbouring moves
+_DISTORTION = 0.01  # relative error of lengths from which a map is warped
+_SMALLEST = 0.01  # m; smaller pixels of a map are in degrees
+_STEP = 100.0  # m; distance over which a map's directions and lengths are measured
 
 
 @contextmanager
@@ -34,10 +37,12 @@ def require_map(name: str, own: Any, given: Any) -> CRS:
     """
     if own is None and given is None:
         raise TrustboError(f"{name} has no coordinate reference system; pass crs=.")
+
     try:
         declared = [CRS.from_user_input(one) for one in (own, given) if one is not None]
     except CRSError:
         raise TrustboError(f"crs {given!r} is unknown to PROJ; give e.g. 'EPSG:32633'.") from None
+
     crs = declared[0]
     flat = horizontal(crs)
     if not flat.equals(horizontal(declared[-1]), ignore_axis_order=True):
@@ -45,6 +50,7 @@ def require_map(name: str, own: Any, given: Any) -> CRS:
             f"{name} is in {crs.to_string()}, but crs= is {given}; leave crs= out, or correct the "
             "raster's own CRS, e.g. with gdal_edit.py -a_srs."
         )
+
     if not flat.is_geographic and not _is_in_metres(flat):
         raise TrustboError(
             f"{name} is in {crs.to_string()}, which is neither in degrees nor in metres; warp it, "
@@ -82,13 +88,17 @@ def vertical_axis(crs: CRS) -> tuple[float | None, str | None]:
 
 def placed(heights: xr.DataArray, name: str) -> xr.DataArray:
     """Check that a raster is on Earth, and shift longitudes to -180 to 180."""
-    crs, (y, x) = heights.rio.crs, (heights[axis].values for axis in ("y", "x"))
-    middle, side = 0.5 * (x[0] + x[-1]), min(abs(x[1] - x[0]), abs(y[1] - y[0]))
+    crs = heights.rio.crs
+    y, x = (heights[axis].values for axis in ("y", "x"))
+    middle = 0.5 * (x[0] + x[-1])
+    side = min(abs(x[1] - x[0]), abs(y[1] - y[0]))
+
     if crs.is_geographic:
         if max(abs(y[0]), abs(y[-1])) <= 90.0 and abs(middle) <= 540.0:
             return heights.assign_coords(x=x - 360.0 * round(middle / 360.0))
-    elif side >= 0.01 and np.isfinite(_middle(heights, "EPSG:4326")).all():  # m: not degrees
+    elif side >= _SMALLEST and np.isfinite(_middle(heights, "EPSG:4326")).all():
         return heights
+
     raise TrustboError(
         f"{name} has coordinates around ({middle:.8g}, {y[len(y) // 2]:.8g}) and pixels of "
         f"{side:.2g}, which is impossible in its CRS, {crs.to_string()}; correct the CRS."
@@ -109,15 +119,19 @@ def on_metric_grid(heights: xr.DataArray) -> xr.DataArray:
     lon, lat = _middle(heights, "EPSG:4326")[:, 0].tolist()
     at = f"+lat_0={lat} +lon_0={lon} +datum=WGS84 +units=m"
     if not heights.rio.crs.is_geographic:
-        here, to_east, to_north = _middle(heights, f"+proj=aeqd {at}", step=100.0).T / 100.0
-        (east, up), (right, north) = to_east - here, to_north - here
+        here, to_east, to_north = _middle(heights, f"+proj=aeqd {at}", step=_STEP).T / _STEP
+        east, up = to_east - here
+        right, north = to_north - here
+
         turned = np.rad2deg(np.arctan2([up, right], [east, north]))
         lengths = np.hypot([east, right], [up, north])
-        if (abs(lengths - 1.0) < 0.01).all() and np.abs(turned).max() < _NORTH:
+        if (abs(lengths - 1.0) < _DISTORTION).all() and np.abs(turned).max() < _NORTH:
             return heights
+
     zone = f"EPSG:{(32600 if lat >= 0.0 else 32700) + int((lon + 180.0) // 6.0) % 60 + 1}"
     if not -80.0 <= lat <= 84.0:  # no UTM zone
         zone = f"+proj=tmerc {at}"
+
     with quiet_affine():
         return heights.rio.reproject(zone, resampling=Resampling.bilinear, nodata=np.nan)
 

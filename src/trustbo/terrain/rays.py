@@ -20,8 +20,9 @@ from trustbo.kernels import PART, kernel
 
 _kernel = kernel(fastmath={"contract", "nsz", "arcp"})
 _part = njit(nogil=True, error_model="numpy", fastmath={"contract", "nsz", "arcp"}, **PART)
-BLOCK, _RAYS = 4, 16
-"""Side of the squares of pixels that share one value of openness, and number of directions."""
+BLOCK = 4
+"""Side of the squares of pixels that share one value of openness."""
+_RAYS = 16  # directions in which openness is computed
 
 
 @_part
@@ -30,8 +31,12 @@ def bilinear(heights, r, c):
     rows, cols = heights.shape
     if not (0.0 <= r <= rows - 1 and 0.0 <= c <= cols - 1):
         return math.nan
-    i, j = min(int(r), rows - 2), min(int(c), cols - 2)
-    p, q = r - i, c - j
+
+    i = min(int(r), rows - 2)
+    j = min(int(c), cols - 2)
+    p = r - i
+    q = c - j
+
     upper = heights[i, j] if q == 0.0 else (1.0 - q) * heights[i, j] + q * heights[i, j + 1]
     if p == 0.0:  # a neighbour without weight may be missing
         return upper
@@ -44,8 +49,10 @@ def bilinear(heights, r, c):
 def _along(raster, i, j, p, q, dp, dq):
     """Compute coefficients of the height on a line in a square from (p, q) to (p + dp, q + dq)."""
     corner = raster[i, j]
-    down, right = raster[i + 1, j] - corner, raster[i, j + 1] - corner
+    down = raster[i + 1, j] - corner
+    right = raster[i, j + 1] - corner
     both = raster[i + 1, j + 1] - raster[i, j + 1] - down
+
     start = corner + p * down + q * right + p * q * both
     return start, dp * down + dq * right + both * (p * dq + q * dp), both * dp * dq
 
@@ -54,9 +61,14 @@ def _along(raster, i, j, p, q, dp, dq):
 def _share_positive(c0, c1, c2):
     """Compute the fraction of [0, 1] in which c0 + c1 t + c2 t^2 is positive."""
     sign = 1.0 if c0 > 0.0 else -1.0
-    c0, c1, c2 = sign * c0, sign * c1, sign * c2
-    square, share = c1 * c1 - 4.0 * c2 * c0, 1.0  # with the sign at 0
+    c0 = sign * c0
+    c1 = sign * c1
+    c2 = sign * c2
+    square = c1 * c1 - 4.0 * c2 * c0
+    share = 1.0  # with the sign at 0
+
     if c0 + c1 + c2 < 0.0:  # one root
+        # Numerically stable roots (Press et al. 2007, section 5.6).
         half = -0.5 * (c1 + math.copysign(math.sqrt(square), c1))
         share = c0 / half if c1 < 0.0 else half / c2
     elif square > 0.0 and 0.0 < -c1 < 2.0 * c2:  # two roots
@@ -73,6 +85,7 @@ def _first_square(x0, dx, n):
     if dx > 0.0:
         square = min(int(x0), n - 2)
         return square, 1, (square + 1 - x0) / dx, 1.0 / dx
+
     if dx < 0.0:
         square = max(math.ceil(x0) - 1, 0)
         return square, -1, (square - x0) / dx, -1.0 / dx
@@ -85,41 +98,69 @@ def transmittance(ground, surface, pixel, start, end, extinction, crown_base):
 
     It is 0 if the ground blocks the ray, or if the ray leaves the raster or crosses missing data.
     """
-    (r0, c0, z0), (r1, c1, z1), (rows, cols) = start, end, ground.shape
+    r0, c0, z0 = start
+    r1, c1, z1 = end
+    rows, cols = ground.shape
+
     # With `not`, NaN is rejected too: all comparisons with it are false.
     if not (r0 >= 0.0 and r1 >= 0.0 and r0 <= rows - 1 and r1 <= rows - 1):
         return 0.0
     if not (c0 >= 0.0 and c1 >= 0.0 and c0 <= cols - 1 and c1 <= cols - 1):
         return 0.0
-    dr, dc, dz = r1 - r0, c1 - c0, z1 - z0
+
+    dr = r1 - r0
+    dc = c1 - c0
+    dz = z1 - z0
+
     i, down, next_row, rows_apart = _first_square(r0, dr, rows)
     j, right, next_col, cols_apart = _first_square(c0, dc, cols)
-    inside, t = 0.0, 0.0
+
+    inside = 0.0
+    t = 0.0
     while t < 1.0:
         then = min(next_row, next_col, 1.0)
-        z, rise = z0 + t * dz, (then - t) * dz
+        z = z0 + t * dz
+        rise = (then - t) * dz
+
         upper = max(surface[i, j], surface[i, j + 1])
         lower = max(surface[i + 1, j], surface[i + 1, j + 1])
+
         if not min(z, z + rise) > max(upper, lower):
             line = r0 + t * dr - i, c0 + t * dc - j, (then - t) * dr, (then - t) * dc
-            g, s = _along(ground, i, j, *line), _along(surface, i, j, *line)
-            a0, a1, a2 = z - g[0], rise - g[1], -g[2]  # height above the ground
+            g = _along(ground, i, j, *line)
+            s = _along(surface, i, j, *line)
+
+            # Coefficients of the ray's height above the ground.
+            a0 = z - g[0]
+            a1 = rise - g[1]
+            a2 = -g[2]
             dip = a1 * a1 / (4.0 * a2) if a2 > 0.0 and 0.0 < -a1 < 2.0 * a2 else 0.0
             if not min(a0 - dip, a0 + a1 + a2) >= -1e-9:
                 return 0.0
-            h0, h1, h2 = s[0] - g[0], s[1] - g[1], s[2] - g[2]  # of the canopy
+
+            # Coefficients of the height of the canopy.
+            h0 = s[0] - g[0]
+            h1 = s[1] - g[1]
+            h2 = s[2] - g[2]
             above = _share_positive(
                 a0 - crown_base * h0, a1 - crown_base * h1, a2 - crown_base * h2
             )
             below = _share_positive(h0 - a0, h1 - a1, h2 - a2)
             inside += (then - t) * max(above + below - 1.0, 0.0)
+
+        # Go on to the square beyond the nearer crossing (Amanatides and Woo 1987).
         if next_row <= next_col:
-            i, next_row = min(max(i + down, 0), rows - 2), next_row + rows_apart
+            i = min(max(i + down, 0), rows - 2)
+            next_row = next_row + rows_apart
         else:
-            j, next_col = min(max(j + right, 0), cols - 2), next_col + cols_apart
+            j = min(max(j + right, 0), cols - 2)
+            next_col = next_col + cols_apart
+
         t = then
+
     if inside == 0.0:  # also where the extinction is infinite
         return 1.0
+
     length = math.sqrt((dr * pixel[0]) ** 2 + (dc * pixel[1]) ** 2 + dz**2)
     return math.exp(-extinction * inside * length)
 
@@ -129,9 +170,11 @@ def transmittances(ground, surface, pixel, ends, extinction, crown_base):
     """Compute transmittances of rays (ray, 6): row, col, height of both ends; 0 if any is NaN."""
     out = np.zeros(len(ends))
     for i in range(len(ends)):
-        start, end = (ends[i, 0], ends[i, 1], ends[i, 2]), (ends[i, 3], ends[i, 4], ends[i, 5])
+        start = ends[i, 0], ends[i, 1], ends[i, 2]
+        end = ends[i, 3], ends[i, 4], ends[i, 5]
         if not (math.isnan(start[2]) or math.isnan(end[2])):
             out[i] = transmittance(ground, surface, pixel, start, end, extinction, crown_base)
+
     return out
 
 
@@ -148,14 +191,19 @@ def openness(ground, surface, pixel, reach, heights, canopy, coarse, first, last
         for j in range(coarse.shape[1]):
             r = min(BLOCK * i + middle, ground.shape[0] - 1.0)
             c = min(BLOCK * j + middle, ground.shape[1] - 1.0)
-            z, total, n = bilinear(ground, r, c), 0.0, 0
+
+            z = bilinear(ground, r, c)
+            total = 0.0
+            n = 0
             for k in range(_RAYS):
                 angle = 2.0 * math.pi * k / _RAYS
                 r1 = r - reach * math.sin(angle) / pixel[0]
                 c1 = c + reach * math.cos(angle) / pixel[1]
+
                 z1 = bilinear(ground, r1, c1)
                 if math.isfinite(z + z1):
                     ends = (r, c, z + heights[0]), (r1, c1, z1 + heights[1])
                     total += transmittance(ground, surface, pixel, *ends, *canopy)
                     n += 1
+
             coarse[i, j] = total / n if n > 0 else math.nan

@@ -38,7 +38,8 @@ _UNCOVERED = 0.02  # fraction of the DEM without a surface that causes a warning
 _COARSER = 2.0  # ratio of pixel sizes from which the coarser raster smooths the heights
 _DEGREE = 111_320.0  # m: length of a degree of latitude
 _TILES = "to read tiles as one raster, combine them: gdalbuildvrt -srcnodata -9999 all.vrt *.tif"
-_TALL, _RAISED = 60.0, 20.0  # m: higher medians and 5 % quantiles of canopy height are unlikely
+_TALL = 60.0  # m: a higher median of the canopy height is unlikely
+_RAISED = 20.0  # m: a higher 5 % quantile of the canopy height is unlikely
 
 
 def read_terrain(
@@ -84,26 +85,34 @@ def read_terrain(
     stored = [_stored(dem, "dem")]
     if dsm is not None:
         stored.append(_stored(dsm, "dsm"))
+
     # If one raster has a CRS and the other has none, `crs` is that of the other.
     is_placed = [raster.rio.crs is not None for raster in stored]
     given = [crs if all(is_placed) or not own else None for own in is_placed]
+
     heights = [_heights(*one, nodata) for one in zip(stored, given, strict=True)]
     if dsm is None:
         warn("no surface (DSM) is given, so no canopy is known: only the ground blocks sight.")
-    ground, surface = heights[0], heights[-1]
+
+    ground = heights[0]
+    surface = heights[-1]
     sides = _pixel_side(ground), _pixel_side(surface)
+
     datums = [heights.attrs["datum"] for heights in (ground, surface)]
     if all(datums) and datums[0] != datums[1]:
         raise TrustboError(
             f"{ground.name} has heights above {datums[0]!r}, but {surface.name} above "
             f"{datums[1]!r}; transform one of them, e.g. with gdalwarp -t_srs."
         )
-    alike, ground = same_grid(ground, surface), on_metric_grid(ground)
+
+    alike = same_grid(ground, surface)
+    ground = on_metric_grid(ground)
     if not alike:
         with quiet_affine():
             surface = surface.rio.reproject_match(
                 ground, resampling=Resampling.bilinear, nodata=np.nan
             )
+
     surface = on_metric_grid(surface)
     terrain = _averaged(_paired(ground, surface, sides), resolution).rio.write_crs(ground.rio.crs)
     with quiet_affine():
@@ -118,6 +127,7 @@ def require_terrain(terrain: xr.Dataset) -> xr.Dataset:
     remedy = "give a Dataset with dem and dsm over (y, x), as from read_terrain"
     if not {"dem", "dsm"} <= {*require_kind("terrain", terrain, xr.Dataset, remedy)}:
         raise TrustboError(f"the terrain has {', '.join(map(str, terrain))}; {remedy}.")
+
     terrain = _with_grid_mapping(terrain)
     crs = terrain.rio.crs or terrain["dem"].rio.crs
     if crs is None:
@@ -125,6 +135,7 @@ def require_terrain(terrain: xr.Dataset) -> xr.Dataset:
             "the terrain has no coordinate reference system; open its file with "
             'decode_coords="all", or set it, e.g. with terrain.rio.write_crs("EPSG:32633").'
         )
+
     read = read_terrain(terrain["dem"], terrain["dsm"], crs=crs)
     return read.assign_attrs(terrain.attrs)
 
@@ -173,6 +184,7 @@ def _stored(raster: FilePath | xr.DataArray, role: str) -> xr.DataArray:
     if isinstance(raster, list | tuple):
         remedy = f"{remedy}; {_TILES}"
     require_kind(role, raster, str | PathLike | xr.DataArray, remedy)
+
     if isinstance(raster, xr.DataArray):
         name = f"{role}: DataArray" + (f" {raster.name!r}" if raster.name else "")
     else:
@@ -180,6 +192,7 @@ def _stored(raster: FilePath | xr.DataArray, role: str) -> xr.DataArray:
         name = f"{role}: {raster!r}"
         if isdir(raster):
             raise TrustboError(f"{name} is a folder; give the path of a raster. {_TILES}.")
+
     try:
         if isinstance(raster, xr.DataArray):
             return _of_array(raster, name).compute()  # reads the file of a lazy array
@@ -206,6 +219,7 @@ def _of_file(file: DatasetReader, name: str) -> xr.DataArray:
     if not file.count:
         parts = ", ".join(file.subdatasets) or "nothing"
         raise TrustboError(f"{name} has no band; give one of its subdatasets: {parts}.")
+
     check_size(file.shape, name)
     t = file.transform
     # Less than a thousandth of a pixel over the whole raster is rounding.
@@ -216,24 +230,31 @@ def _of_file(file: DatasetReader, name: str) -> xr.DataArray:
             "a map, e.g. with gdalwarp -t_srs EPSG:32633, or declare its corners, e.g. with "
             "gdal_edit.py -a_ullr."
         )
+
     first, *others = file.colorinterp
     if first not in (ColorInterp.undefined, ColorInterp.gray):
         raise TrustboError(
             f"{name} is a picture: its first band has the colour {first.name!r}; give a raster of "
             "heights, e.g. one of its bands, extracted with gdal_translate -b."
         )
+
     stored = file.read(1, masked=True)
     values = stored.astype(np.result_type(stored, np.float32)).filled(np.nan)
+
     alpha = [k for k, colour in enumerate(others, 2) if colour == ColorInterp.alpha]
     for k in alpha:  # GDAL's mask ignores alpha bands of floats
         values[file.read(k) == 0] = np.nan
+
     _warn_of_bands(file.count - len(alpha), name)
+
     attrs = {
         "_FillValue": file.nodata, "scale_factor": file.scales[0], "add_offset": file.offsets[0],
         "units": file.units[0],
     }  # fmt: skip
-    rows, cols = np.arange(file.height) + 0.5, np.arange(file.width) + 0.5
+    rows = np.arange(file.height) + 0.5
+    cols = np.arange(file.width) + 0.5
     coords = {"y": t.f + rows * t.e, "x": t.c + cols * t.a}
+
     array = xr.DataArray(values, coords, ("y", "x"), attrs=attrs)
     return array if file.crs is None else array.rio.write_crs(file.crs)
 
@@ -246,23 +267,32 @@ def _warn_of_bands(n: int, name: str) -> None:
 def _of_array(array: xr.DataArray, name: str) -> xr.DataArray:
     """Reduce an array to dims (y, x), evenly spaced, and to the first of several bands."""
     check_size(array.shape, name)
+
     # The operations below drop rioxarray's accessor, and with it what its methods have set.
-    crs, fill = array.rio.crs, _accessor_fill(array)
+    crs = array.rio.crs
+    fill = _accessor_fill(array)
+
     try:
-        y, x = array.rio.y_dim, array.rio.x_dim
+        y = array.rio.y_dim
+        x = array.rio.x_dim
     except MissingSpatialDimensionError:
-        y, x = "lat", "lon"
+        y = "lat"
+        x = "lon"
+
     bands = [dim for dim in array.dims if dim not in (y, x)]
     if not {y, x} <= set(array.dims) & set(array.coords) or len(bands) > 1 or not array.size:
         raise TrustboError(
             f"{name} has axes {dict(array.sizes)}; it needs rows and columns, named (y, x), with "
             "coordinates, and at most one axis of bands."
         )
+
     _warn_of_bands(max([array.sizes[dim] for dim in bands], default=1), name)
     array = array.isel(dict.fromkeys(bands, 0)).transpose(y, x)
+
     rows, cols = (_even(array[axis].values, f"{name}'s {axis}") for axis in (y, x))
     if (unit := str(array[x].attrs.get("units")).lower()).startswith(("k", "f", "us", "rad")):
         raise TrustboError(f"{name} has x in {unit!r}; convert x and y to metres.")
+
     array = array.rename({y: "y", x: "x"}).assign_coords(y=rows, x=cols).rename(name)
     array = array.assign_attrs({ACCESSOR_FILL: fill})
     return array if crs is None else array.rio.write_crs(crs)
@@ -287,8 +317,11 @@ def _even(values: np.ndarray, what: str) -> np.ndarray:
     given = values.astype(float)
     if len(given) < 2:
         raise TrustboError(f"{what} has one value; a terrain needs at least two rows and columns.")
+
     even = np.linspace(given[0], given[-1], len(given))
-    step, off = abs(even[1] - even[0]), np.abs(given - even).max()
+    step = abs(even[1] - even[0])
+    off = np.abs(given - even).max()
+
     single = (given.astype(np.float32) == given).all()
     rounding = 2.0 * np.finfo(np.float32).eps * np.abs(given).max() if single else 0.0
     if not off <= max(1e-3 * step, min(rounding, 0.5 * step)) or step == 0.0:
@@ -308,19 +341,23 @@ def _paired(ground: xr.DataArray, surface: xr.DataArray, sides: tuple[float, flo
 
     `sides` are the sides of their pixels before they were brought onto one grid, in metres.
     """
-    dem, dsm = ground.values, surface.values
+    dem = ground.values
+    dsm = surface.values
+
     valid = np.isfinite(dem) & np.isfinite(dsm)
     if not valid.any():
         raise TrustboError(
             "no pixel has both a DEM and a DSM height: the rasters cover different areas, or one "
             "is all nodata where they overlap."
         )
+
     uncovered = 1.0 - valid.sum() / np.isfinite(dem).sum()
     if uncovered > _UNCOVERED:
         warn(
             f"the DSM has no height on {uncovered:.1%} of the DEM's pixels; these pixels count as "
             f"missing, and robots cannot cross them. Give a DSM that covers the DEM; {_TILES}."
         )
+
     canopy = (dsm - dem)[valid]
     if (share := (canopy < 0.0).mean()) > _CLIPPED:
         check = "both have the same vertical datum and that they are not swapped"
@@ -333,12 +370,14 @@ def _paired(ground: xr.DataArray, surface: xr.DataArray, sides: tuple[float, flo
             f"the DSM lies below the DEM on {share:.1%} of pixels; it is raised to the DEM there. "
             f"Check that {check}."
         )
+
     low, middle = np.quantile(canopy, [0.05, 0.5])
     if low > _RAISED or middle > _TALL:
         warn(
             f"the DSM lies {middle:.3g} m above the DEM in the median, and over {low:.3g} m nearly "
             "everywhere: check that both have the same unit and the same vertical datum."
         )
+
     heights = {"dem": dem, "dsm": np.fmax(dem, dsm)}
     masked = {name: np.where(valid, z, np.nan) for name, z in heights.items()}
     maps = {name: (("y", "x"), z, {"units": "m"}) for name, z in masked.items()}
@@ -349,9 +388,13 @@ def _averaged(terrain: xr.Dataset, resolution: float | None) -> xr.Dataset:
     """Average square blocks of side `resolution`, m; NaN if over half of a block is missing."""
     if resolution is None:
         return terrain
-    side, shape = require_positive("resolution", resolution), terrain["dem"].shape
+
+    side = require_positive("resolution", resolution)
+    shape = terrain["dem"].shape
     tall, wide = (max(1, round(side / pixel)) for pixel in pixel_size(terrain))
+
     if shape[0] < 2 * tall or shape[1] < 2 * wide:
         raise TrustboError(f"{shape} pixels are too few for {tall} x {wide}; reduce resolution=.")
+
     squares: Any = terrain.coarsen(y=tall, x=wide, boundary="trim")
     return squares.mean().where(2 * squares.count() >= tall * wide)
