@@ -46,12 +46,15 @@ def cell_maps(
     remedy = "map each feature to its pixel features, such as {'ease': ('slope', 'tri')}"
     if not require_kind("features", features, Mapping, remedy):
         raise TrustboError(f"features must contain at least one feature; {remedy}.")
+
     for name in features:
         if is_line_of_sight(name):
             raise TrustboError(f"feature name {name!r} is reserved; choose another name.")
+
     sides = [n * step for n, step in zip(terrain["dem"].shape, pixel_size(terrain), strict=True)]
     diagonal = float(np.hypot(grid.cell_height, grid.cell_width))
     ranges = [robot.lidar_range for robot in team.robots]
+
     lidar = {
         "reach": min(max(ranges), diagonal, 0.5 * min(sides)),
         "eye": team.robots[0].sensor_height,
@@ -66,26 +69,36 @@ def cell_maps(
         compute = FEATURES[require_choice("feature", name, FEATURES)].compute
         return compute(terrain, **options.get(name, {}))
 
-    pixels, composites = {}, {}
+    pixels = {}
+    composites = {}
+
     for name, parts in features.items():
         if isinstance(parts, str):
             values = pixels[name] = values_of(parts)
-            low, high = np.nanmin(values, initial=0.0), np.nanmax(values, initial=1.0)
+            low = np.nanmin(values, initial=0.0)
+            high = np.nanmax(values, initial=1.0)
             if low < 0.0 or high > 1.0:
                 raise TrustboError(
                     f"feature {name!r} is used unchanged and must be in [0, 1]; its values are "
                     f"{low:g} to {high:g}. Make it a composite index: {{{name!r}: [{parts!r}]}}."
                 )
             continue
+
         names = require_kind(f"feature {name!r}", parts, Iterable, remedy)
         values = {part: values_of(part) for part in names}
+
         index = CompositeIndex({part: FEATURES[part].sign for part in values}).fit(values)
-        pixels[name], composites[name] = index.transform(values), index
-    dem, is_drivable = terrain["dem"], slope(terrain) <= team.max_slope
+        pixels[name] = index.transform(values)
+        composites[name] = index
+
+    dem = terrain["dem"]
+    is_drivable = slope(terrain) <= team.max_slope
+
     maps = {
         name: xr.DataArray(values, dem.coords, dem.dims, attrs={"units": "1"})
         for name, values in pixels.items()
     }
+
     z = np.stack([grid.cell_means(one) for one in maps.values()], axis=-1)
     maps["passable"] = xr.DataArray(is_drivable, dem.coords, dem.dims)
     passable = grid.cell_means(maps["passable"].astype(float)) >= 1.0 - MAX_MISSING
@@ -111,6 +124,7 @@ def with_line_of_sight(
     """
     for row, col in np.argwhere(passable).tolist():
         posts.require_room((row, col))
+
     is_known = TRAVERSABLE in features
     of_pixels = pixels[TRAVERSABLE if is_known else "passable"].values
     seen, traversability = bound_maps(posts, passable, of_pixels)
@@ -132,11 +146,13 @@ def labelled(
             "no cell is passable. With a terrain, use a grid of another shape or a team with a "
             "larger max_slope; with arrays, give passable cells."
         )
+
     cells = {
         **{axis: np.arange(n) for axis, n in zip(("row", "col"), grid.shape, strict=True)},
         "y": ("row", grid.y),
         "x": ("col", grid.x),
     }
+
     names = {"robot": list(team.names), "move": list(MOVE_NAMES), "feature": list(features)}
     return (
         xr.DataArray(z, names | cells, _DIMS, "awareness"),
@@ -154,6 +170,7 @@ def unlabelled(
     of_bounds = isinstance(awareness, xr.DataArray) and "move" in awareness.dims
     dims = [dim for dim in _DIMS if dim != "move" or of_bounds]
     coords = {"robot": names, "feature": features, "move": MOVE_NAMES}
+
     read = read_labelled("awareness", awareness, dims, coords)
     chosen = {dim: read.coords.get(dim, tuple(given)) for dim, given in coords.items()}
     return read.values, chosen["robot"], chosen["feature"]
@@ -179,27 +196,34 @@ def of_arrays(z: np.ndarray, passable: ArrayLike | None) -> tuple[np.ndarray, np
     """
     if z.ndim not in (4, 5) or (z.ndim == 5 and z.shape[1] != len(MOVES)):
         raise TrustboError(f"awareness must have the shape {_AXES}; got shape {z.shape}.")
+
     if not z.size:
         raise TrustboError(
             f"awareness has an axis of length 0: its shape is {z.shape}. If you have no features, "
             "give one feature that is 0 everywhere."
         )
+
     if (bad := (z < 0.0) | (z > 1.0)).any():
         index = tuple(int(i) for i in np.argwhere(bad)[0])
         raise TrustboError(f"awareness{list(index)} = {z[index]:g} is outside [0, 1]; rescale it.")
+
     finite = np.isfinite(z).all((0, -1))  # ([move], row, col)
     reached = finite if z.ndim == 4 else finite.any(0)
     free = reached if passable is None else _truth_of("passable", passable)
+
     if free.shape != z.shape[-3:-1]:
         shape = z.shape[-3:-1]
         raise TrustboError(f"the shape of passable must be (row, col) = {shape}; got {free.shape}.")
+
     if (free & ~reached).any():
         cell = tuple(int(i) for i in np.argwhere(free & ~reached)[0])
         raise TrustboError(
             f"awareness of the passable cell {cell} is NaN; give a value or mark it impassable."
         )
+
     if z.ndim == 4:
         return of_moves(z, free), free
+
     exists = existing_bounds(free)
     if (missing := exists & ~finite).any():
         m, row, col = (int(i) for i in np.argwhere(missing)[0])
@@ -208,4 +232,5 @@ def of_arrays(z: np.ndarray, passable: ArrayLike | None) -> tuple[np.ndarray, np
             f"awareness of the bound {(row - down, col - right)} -> {(row, col)} is NaN; give a "
             "value or mark one of the cells impassable."
         )
+
     return np.where(exists[..., None], z, np.nan), free

@@ -23,7 +23,8 @@ from trustbo.workspace.posts import TRAVERSABLE, Posts
 MEASURES = ("untraversable", "tilt", "narrowness", "tightness")
 """Measures of difficulty; see `difficulty_of`."""
 _AHEAD = 1.5  # distance to the point of the route that a robot faces, m
-_STEP, _SUSTAINED = 0.25, 4  # distance between samples, m, and number of samples averaged
+_STEP = 0.25  # distance between samples of a route, m
+_SUSTAINED = 4  # number of samples over which the tilt is averaged
 _WIDTH = 2.0  # distance to an impassable pixel at which narrowness is 0.5, m
 _MOST = 2.0  # largest value of the measure tilt
 _TIGHT = 3.0  # log(1 + length in m) at which tightness is 1: 19 m
@@ -47,11 +48,13 @@ def difficulty_of(workspace: Workspace) -> xr.DataArray:
         dimension `measure` has length 0.
     """
     if workspace not in _cached:
-        exists, posts = workspace.passable_bounds, workspace.posts
+        exists = workspace.passable_bounds
+        posts = workspace.posts
         names = () if posts is None else MEASURES
         values = np.full((*exists.shape, len(names)), np.nan)
         if posts is not None:
             _measure(workspace, posts, exists.values, values)
+
         coords = {**exists.coords, "measure": list(names)}
         difficulty = xr.DataArray(values, coords, (*exists.dims, "measure"), "difficulty")
         _cached[workspace] = difficulty
@@ -60,18 +63,24 @@ def difficulty_of(workspace: Workspace) -> xr.DataArray:
 
 def _measure(workspace: Workspace, posts: Posts, exists: np.ndarray, out: np.ndarray) -> None:
     """Write the measures of existing bounds to `out`, shape (move, row, col, measure)."""
-    surface, pixels = posts.surface, workspace.pixels
+    surface = posts.surface
+    pixels = workspace.pixels
+
     room = np.full(surface.ground.shape, np.inf)  # distance to the nearest impassable pixel, m
     if not surface.passable.all():
         room = np.asarray(ndimage.distance_transform_edt(surface.passable, sampling=surface.pixel))
+
     easy = np.full(room.shape, np.nan)
     if pixels is not None and TRAVERSABLE in pixels:
         easy = pixels[TRAVERSABLE].values
 
     def work(block: Sequence[list[int]]) -> None:
         for m, row, col in block:
-            (down, right), cell = MOVES[m], (row, col)
-            left, ahead = (row - down, col - right), (row + down, col + right)
+            down, right = MOVES[m]
+            cell = row, col
+            left = row - down, col - right
+            ahead = row + down, col + right
+
             inside = 0 <= ahead[0] < exists.shape[1] and 0 <= ahead[1] < exists.shape[2]
             onward = ahead if inside and exists[m, *ahead] else None
             out[m, row, col] = _of_bound(posts, easy, room, posts.bound_routes(left, cell, onward))
@@ -84,16 +93,21 @@ def _of_bound(
     posts: Posts, easy: np.ndarray, room: np.ndarray, routes: Sequence[np.ndarray | None]
 ) -> np.ndarray:
     """Compute the maximum of each measure over the robots' routes in a bound, shape (measure,)."""
-    surface, team = posts.surface, posts.team
+    surface = posts.surface
+    team = posts.team
     ground = surface.gradient, surface.pixel, surface.origin
     robots = team.lead, *team.robots
+
     worst = np.zeros(len(MEASURES))
     for robot, route in zip(robots, routes, strict=True):
         if route is None:
             continue
+
         pixels = surface.nearest(*route.T)
-        of_route, gaps = easy[pixels], room[pixels]
+        of_route = easy[pixels]
+        gaps = room[pixels]
         of_route = of_route[np.isfinite(of_route)]
+
         tight = (gaps <= 1.001 * max(surface.pixel)).sum() * min(surface.pixel)
         measures = (
             1.0 - of_route.mean() if len(of_route) else 0.5,
@@ -101,6 +115,7 @@ def _of_bound(
             1.0 / (1.0 + gaps.min() / _WIDTH),
             np.log1p(tight) / _TIGHT,
         )
+
         worst = np.maximum(worst, measures)
     return worst
 
@@ -111,17 +126,28 @@ def _tilt(way, gradient, pixel, origin):
     along = np.zeros(len(way))
     for k in range(1, len(way)):
         along[k] = along[k - 1] + math.hypot(way[k, 0] - way[k - 1, 0], way[k, 1] - way[k - 1, 1])
+
     n = int(along[-1] / _STEP) + 1
-    tilt, sums, rows, cols = np.empty(n), np.zeros(n + 1), gradient.shape[1], gradient.shape[2]
+    tilt = np.empty(n)
+    sums = np.zeros(n + 1)
+
+    rows = gradient.shape[1]
+    cols = gradient.shape[2]
     for k in range(n):
         x, y = _point(way, along, k * _STEP)
         ahead_x, ahead_y = _point(way, along, k * _STEP + _AHEAD)
         i = min(rows - 1, max(0, int((origin[1] - y) / pixel[0] + 0.5)))
         j = min(cols - 1, max(0, int((x - origin[0]) / pixel[1] + 0.5)))
-        gx, gy, heading = gradient[0, i, j], gradient[1, i, j], math.atan2(ahead_y - y, ahead_x - x)
-        east, north = math.cos(heading), math.sin(heading)
+
+        gx = gradient[0, i, j]
+        gy = gradient[1, i, j]
+        heading = math.atan2(ahead_y - y, ahead_x - x)
+
+        east = math.cos(heading)
+        north = math.sin(heading)
         tilt[k] = max(abs(gx * east + gy * north), abs(gy * east - gx * north))
         sums[k + 1] = sums[k] + tilt[k]
+
     m = min(n, _SUSTAINED)
     return ((sums[m:] - sums[:-m]) / m).max()
 
@@ -132,5 +158,6 @@ def _point(way, along, s):
     k = min(np.searchsorted(along, s, side="right"), len(way) - 1)
     length = along[k] - along[k - 1]
     share = min(1.0, (s - along[k - 1]) / length) if length > 0.0 else 1.0
+
     x = way[k - 1, 0] + share * (way[k, 0] - way[k - 1, 0])
     return x, way[k - 1, 1] + share * (way[k, 1] - way[k - 1, 1])

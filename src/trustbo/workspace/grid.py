@@ -55,14 +55,18 @@ class Grid(Summary):
         pixels = terrain["dem"].shape
         if min(rows, cols) < 1 or rows * cols < 2:
             raise TrustboError(f"shape must be (rows, cols) with at least two cells; got {shape}.")
+
         if pixels[0] < 2 * rows or pixels[1] < 2 * cols:
             raise TrustboError(
                 f"a grid of {rows} x {cols} cells needs at least 2 x 2 pixels per cell, but the "
                 f"terrain has {pixels[0]} x {pixels[1]} pixels. Use fewer cells or a finer raster."
             )
+
         with quiet_affine():
             left, bottom, right, top = terrain.rio.bounds(recalc=True)
+
         crs = terrain.rio.crs
+
         return cls(
             (rows, cols),
             left,
@@ -113,6 +117,7 @@ class Grid(Summary):
         """Short name of the CRS, such as EPSG:2193."""
         if self.crs is None:
             return "no CRS"
+
         crs = self.require_crs()
         code = crs.to_epsg()
         return f"EPSG:{code}" if code else re.findall(r'"(.*?)"', crs.to_wkt())[0]
@@ -139,12 +144,14 @@ class Grid(Summary):
                 '{"x": ..., "y": ...} in metres or {"lon": ..., "lat": ...} in degrees; '
                 f"got {location!r}."
             ) from None
+
         rows, cols = self.shape
         if not (0 <= row < rows and 0 <= col < cols):
             raise TrustboError(
                 f"{what} {location!r} is outside the grid, which covers rows 0 (top) to {rows - 1} "
                 f"and columns 0 to {cols - 1}{self._extent_text()}."
             )
+
         return int(row), int(col)
 
     def _row_and_col(self, location: Location) -> tuple[float, float]:
@@ -152,10 +159,12 @@ class Grid(Summary):
         if not isinstance(location, Mapping):
             row, col = (operator.index(i) for i in location)
             return row, col
+
         names = ("lon", "lat") if "lon" in location else ("x", "y")
         x, y = (float(location[name]) for name in names)
         if len(location) > 2 or not math.isfinite(x + y):
             raise ValueError
+
         if names == ("lon", "lat"):
             x, y = converted(WGS84, self.require_crs(), x, y)
         return (self.top - y) / self.cell_height, (x - self.left) / self.cell_width
@@ -164,9 +173,11 @@ class Grid(Summary):
         """Describe the extent of the grid for error messages; empty without a CRS."""
         if self.crs is None:
             return ""
+
         left, bottom, right, top = self.bounds
         to_degrees = Transformer.from_crs(self.require_crs(), WGS84, always_xy=True)
         west, south, east, north = to_degrees.transform_bounds(*self.bounds)
+
         return (
             f" (x {left:.1f} to {right:.1f} m and y {bottom:.1f} to {top:.1f} m in "
             f"{self.crs_name}; longitude {west:.5f} to {east:.5f}, latitude {south:.5f} to "
@@ -182,6 +193,7 @@ class Grid(Summary):
         """
         x, y = self.center(cell)
         lon, lat = converted(self.require_crs(), WGS84, x, y)
+
         if not math.isfinite(lon + lat):
             raise TrustboError(
                 f"({x:.10g}, {y:.10g}) is not a point on Earth in {self.crs_name}; correct the "
@@ -195,8 +207,10 @@ class Grid(Summary):
         placed = placed.assign_coords(y=self.y, x=self.x)
         for axis in ("y", "x"):
             placed[axis].attrs = {"axis": axis.upper(), "units": "m"}
+
         if self.crs is not None:
             placed = placed.rio.write_crs(self.crs)
+
         step = self.cell_width, self.cell_height
         return placed.rio.write_transform(from_origin(self.left, self.top, *step))
 
@@ -210,11 +224,14 @@ class Grid(Summary):
             Means, shape (row, col); NaN where a cell has no finite value.
         """
         row, col = self.cells_along(values["y"].values, values["x"].values)
-        cell, z = row[:, None] * self.shape[1] + col, values.transpose("y", "x").values
+        cell = row[:, None] * self.shape[1] + col
+        z = values.transpose("y", "x").values
+
         valid = np.isfinite(z)
         total, count = (
             np.bincount(cell[valid], weights, math.prod(self.shape)) for weights in (z[valid], None)
         )
+
         with np.errstate(invalid="ignore"):
             return (total / count).reshape(self.shape)
 

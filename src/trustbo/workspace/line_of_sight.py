@@ -81,10 +81,12 @@ def geometry(posts: Posts, index: np.ndarray, passable: np.ndarray) -> Geometry:
     bounds = [
         ((i, j), (row, col)) for (i, j), (_, row, col) in zip(left, index.tolist(), strict=True)
     ]
+
     ends = []
     for a, c in bounds:
         ahead = [posts.watching(c, b) for b in _cells_ahead(passable, a, c)]
         ends.append([ahead[k % len(ahead)] for k in range(N_SAMPLES)])
+
     return Geometry(
         [posts.lead_line(a, c) for a, c in bounds],
         np.array([posts.watching(a, c) for a, c in bounds]),
@@ -95,7 +97,9 @@ def geometry(posts: Posts, index: np.ndarray, passable: np.ndarray) -> Geometry:
 
 def _cells_ahead(passable: np.ndarray, a: Cell, c: Cell) -> list[Cell | None]:
     """Return the cells that may follow the bound a -> c, without sharp turns if possible."""
-    (rows, cols), (down, right) = passable.shape, (c[0] - a[0], c[1] - a[1])
+    rows, cols = passable.shape
+    down, right = c[0] - a[0], c[1] - a[1]
+
     onward: list[Cell | None] = []
     ahead: list[Cell | None] = []
     for i, j in MOVES:
@@ -114,10 +118,12 @@ def bound_features(
     lead, lead_time = _timed(surface, team.lead, given.routes)
     drives = [_timed(surface, robot, given.routes) for robot in team.robots]
     first, last = (np.stack([route[end] for route in given.routes]) for end in (0, -1))
+
     # Scale T2's times by the ratio of the straight distances of T2 and of the lead.
     distance = np.linalg.norm(given.ends - given.posts[:, None], axis=-1).mean(1)
     longer = distance / np.maximum(np.linalg.norm(last - first, axis=1), 1.0)[:, None]
     times = np.stack([time for _, time in drives], axis=1) * longer  # (bound, robot)
+
     slowest = times.max(1)
     share = ((np.arange(N_SAMPLES) + 0.5) / N_SAMPLES)[:, None]
 
@@ -125,19 +131,26 @@ def bound_features(
         view = optics(watcher, watched)
         return (watcher.detection * detection_between(surface, sight, eye, target, view)).mean(-1)
 
-    line_of_sight, easy = np.empty(times.shape), np.empty(times.shape)
+    line_of_sight = np.empty(times.shape)
+    easy = np.empty(times.shape)
     for i, (robot, (route, _)) in enumerate(zip(team.robots, drives, strict=True)):
-        post, end, stop = given.posts[:, i, None], given.ends[:, :, i], given.stops[:, None]
+        post = given.posts[:, i, None]
+        end = given.ends[:, :, i]
+        stop = given.stops[:, None]
+
         track = route + (1.0 - share) * (post - first[:, None]) + share * (end - last[:, None])
         watched = seen(robot, team.lead, post + jittered(N_SAMPLES), lead)
         closing, waiting = (seen(team.lead, robot, stop, place) for place in (track, end))
+
         t2_time = times[:, i]
         total = lead_time * watched + t2_time * closing + (slowest - t2_time) * waiting
         line_of_sight[:, i] = total / (lead_time + slowest)
+
         values = traversability[surface.nearest(track[..., 0], track[..., 1])]
         known = np.isfinite(values)
         with np.errstate(invalid="ignore"):  # NaN if no value is known
             easy[:, i] = np.where(known, values, 0.0).sum(-1) / known.sum(-1)
+
     return line_of_sight, easy
 
 

@@ -20,6 +20,7 @@ def require_on_grid(path: Sequence[Cell] | np.ndarray, shape: tuple[int, ...]) -
     """
     listed = require_list("path", path, remedy="give cells (row, col)")
     cells = [require_pair("a cell", cell) for cell in listed]
+
     rows, cols = shape
     for row, col in cells:
         if not (0 <= row < rows and 0 <= col < cols):
@@ -37,10 +38,12 @@ def moves_along(path: Sequence[Cell] | np.ndarray) -> np.ndarray:
     """
     cells = np.asarray(path)
     steps = np.diff(cells, axis=0)
+
     if (far := np.abs(steps).max(1) != 1).any():
         k = int(np.argmax(far))
         a, c = (tuple(cells[i].tolist()) for i in (k, k + 1))
         raise TrustboError(f"no bound leads from {a} to {c}: the cells are not neighbours.")
+
     index = 3 * (steps[:, 0] + 1) + steps[:, 1] + 1  # 0..8, where 4 is no move
     return index - (index > 4)
 

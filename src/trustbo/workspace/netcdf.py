@@ -19,9 +19,11 @@ def workspace_to_tree(workspace: Workspace) -> xr.DataTree:
     cells = xr.Dataset({"awareness": workspace.awareness, "passable": workspace.passable})
     tree = {"cells": cells}
     tree |= {f"composites/{n}": index.fitted for n, index in workspace.composites.items()}
+
     if workspace.terrain is not None and workspace.pixels is not None:
         pixels = workspace.pixels.drop_vars("spatial_ref", errors="ignore")  # in the terrain
         tree |= {"terrain": workspace.terrain, "pixels": pixels}
+
     result = xr.DataTree.from_dict(tree)
     result.attrs = {
         "grid": to_json(asdict(workspace.grid)),
@@ -34,26 +36,32 @@ def workspace_to_tree(workspace: Workspace) -> xr.DataTree:
 def workspace_from_tree(tree: xr.DataTree) -> Workspace:
     """Restore a workspace from a data tree made by `workspace_to_tree`."""
     cells = tree["cells"].to_dataset()
-    grid, team = json.loads(tree.attrs["grid"]), json.loads(tree.attrs["team"])
+    grid = json.loads(tree.attrs["grid"])
+    team = json.loads(tree.attrs["team"])
+
     grid = Grid(**grid | {"shape": tuple(grid["shape"])})
     team = Team(
         robots=tuple(Robot(**robot) for robot in team["robots"]),
         lead=Robot(**team["lead"]),
         names=tuple(team["names"]),
     )
+
     terrain = pixels = posts = None
     if "terrain" in tree:
         terrain = tree["terrain"].to_dataset().set_coords("spatial_ref")
         for array in terrain.data_vars.values():  # rioxarray reads the encoding
             if "grid_mapping" in array.attrs:
                 array.encoding["grid_mapping"] = array.attrs.pop("grid_mapping")
+
         pixels = tree["pixels"].to_dataset().assign_coords(spatial_ref=terrain["spatial_ref"])
         posts = Posts(grid, team, Sight(**json.loads(tree.attrs["sight"])), terrain, pixels)
+
     nodes = tree["composites"].children if "composites" in tree else {}
     composites = {
         name: CompositeIndex(node["sign"].to_series().to_dict(), node.to_dataset())
         for name, node in nodes.items()
     }
+
     return Workspace(
         cells["awareness"], cells["passable"], grid, team, terrain, pixels, composites, posts
     )

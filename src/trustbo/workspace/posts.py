@@ -34,16 +34,21 @@ from trustbo.workspace.surface import surface_of
 
 TRAVERSABLE = "traversability"
 """Name of the feature that is averaged along the robots' tracks in each bound."""
-SPACING, RADIUS = 2.0, 25.0
-"""Minimum distance in m between T2's robots, and maximum distance of T2 from the lead's stop."""
+SPACING = 2.0
+"""Minimum distance between T2's robots, m."""
+RADIUS = 25.0
+"""Maximum distance of T2 from the lead's stop, m."""
 _GAP = 4.0  # preferred minimum distance between two posts, m
-_STEP, _STOP_RADIUS = 4.0, 16.0  # lattice spacing, and search radius for the lead's stop, m
+_STEP = 4.0  # spacing of the lattice of positions, m
+_STOP_RADIUS = 16.0  # search radius for the lead's stop, m
 _SMOOTHED = 5.0  # width of the moving average of traversability for stops, m
 _SAFE = 0.7  # steepest ground for posts, as a fraction of the slope limit
 _DISCOUNT = 0.005  # assumed rate at which detection falls with distance, 1/m
-_DOUBT, _DOUBT_REACH = 0.1, 40.0  # probability of seeing a hidden target; its decay length, m
+_DOUBT = 0.1  # probability of seeing a hidden target that is near
+_DOUBT_REACH = 40.0  # decay length of this probability, m
 _NEARER = 1e-3  # penalty on the score per metre from the stop
-_IN_THE_WAY, _TOO_CLOSE = 5.0, 10.0  # penalties, larger than any probability
+_IN_THE_WAY = 5.0  # penalty of a post on the lead's route, larger than any probability
+_TOO_CLOSE = 10.0  # penalty of a post beside another one
 _N_WATCHED = 30  # number of positions, best seen from the stops, that are rated for all aims
 _N_AIMS = 6  # number of times on the lead's route at which sight is computed
 _SHARES = np.array([0.25, 0.5, 0.75, 1.0])  # fractions of the straight line to a neighbouring stop
@@ -64,19 +69,26 @@ class Posts:
         self, grid: Grid, team: Team, sight: Sight, terrain: xr.Dataset, pixels: xr.Dataset
     ) -> None:
         """Prepare the rasters; `pixels` (y, x) has passability and, if known, traversability."""
-        self.grid, self.team, self.sight = grid, team, sight
+        self.grid = grid
+        self.team = team
+        self.sight = sight
+
         self.surface = surface_of(terrain, pixels["passable"].values.astype(bool))
         self.routes = Routes(self.surface)
+
         easy = pixels[TRAVERSABLE if TRAVERSABLE in pixels else "passable"].values.astype(float)
         self._easy = np.nan_to_num(easy)
         for axis, side in enumerate(self.surface.pixel):
             size = max(1, round(_SMOOTHED / side))
             self._easy = ndimage.uniform_filter1d(self._easy, size, axis, mode="nearest")
+
         self._standable = largest_region(self.surface.passable)
         steep = np.arctan(np.hypot(*self.surface.gradient))
         self._safe = self._standable & (steep <= _SAFE * team.max_slope)
+
         # Cell row of each pixel row, and cell column of each pixel column.
         self._cells = grid.cells_along(*self.surface.axes)
+
         self._central: dict[Cell, np.ndarray] = {}
         self._stops: dict[Cell, np.ndarray] = {}
         self._posts: dict[tuple[Cell, Cell | None], np.ndarray] = {}
@@ -85,7 +97,9 @@ class Posts:
 
     def window(self, *cells: Cell) -> Window:
         """Return the pixel window that contains cells and a margin of half a cell around them."""
-        (rows, cols), shape = self.surface.ground.shape, np.array(self.grid.shape)
+        rows, cols = self.surface.ground.shape
+        shape = np.array(self.grid.shape)
+
         size = np.array([rows, cols]) / shape
         top, left = ((np.min(cells, axis=0) - 0.5) * size).astype(int).tolist()
         bottom, right = np.ceil((np.max(cells, axis=0) + 1.5) * size).astype(int).tolist()
@@ -98,10 +112,14 @@ class Posts:
         cell. Therefore, if the stops of two cells are connected, all robots have routes in both
         directions, whatever the next cell is.
         """
-        linked, last = np.zeros_like(exists), len(MOVES) - 1
+        linked = np.zeros_like(exists)
+        last = len(MOVES) - 1
+
         for m, (down, right) in enumerate(MOVES[: len(MOVES) // 2]):  # the others are reverse moves
             for row, col in np.argwhere(exists[m]).tolist():
-                a, c = (row - down, col - right), (row, col)
+                a = row - down, col - right
+                c = row, col
+
                 region, (top, left) = self._linked_to(self.stop(a), a, c)
                 end = self.surface.pixel_at(*self.stop(c).tolist())
                 linked[m, *c] = linked[last - m, *a] = region[end[0] - top, end[1] - left]
@@ -111,10 +129,12 @@ class Posts:
         """Return whether only pixels without a height part the stops of two cells."""
         rows, cols = self.surface.ground.shape
         ends = [self.surface.pixel_at(*self.stop(cell).tolist()) for cell in (a, c)]
+
         known = self.surface.passable
         # The slope is unknown, too, beside a missing height.
         missing = ndimage.binary_dilation(~np.isfinite(self.surface.ground), np.ones((3, 3)))
         either = known | missing
+
         now, then = (
             bool(linked_to(mask, (0, rows, 0, cols), ends[0])[ends[1]]) for mask in (known, either)
         )
@@ -161,6 +181,7 @@ class Posts:
         position = np.concatenate([here[None], lattice[inside]])
         if not len(goals) or len(position) == 1:
             return here
+
         aims = (here + _SHARES[:, None, None] * (goals - here)).reshape(-1, 2)
         seen = self._seen(position[:, None], aims, self.team.lead, self.team.robots[0]).mean(1)
         return position[np.argmax(seen - _NEARER * np.linalg.norm(position - here, axis=1))]
@@ -169,6 +190,7 @@ class Posts:
         """Find a position with high traversability near the cell's centre, (2,)."""
         if cell not in self._central:
             row, col = self._pixels_of(cell)
+
             position = self._position(row, col)
             size = np.hypot(self.grid.cell_height, self.grid.cell_width)
             off_centre = np.linalg.norm(position - self.grid.center(cell), axis=1) / size
@@ -191,11 +213,17 @@ class Posts:
 
     def _choose_posts(self, cell: Cell, ahead: Sequence[Cell | None]) -> np.ndarray:
         """Choose the posts for each next cell, one robot at a time, (next cell, robot, 2)."""
-        here, robots = self.stop(cell), self.team.robots
-        position, gap = self._lattice(cell, here, RADIUS), _GAP
+        here = self.stop(cell)
+        robots = self.team.robots
+
+        position = self._lattice(cell, here, RADIUS)
+        gap = _GAP
         if len(position) < len(robots):  # too little safe ground
-            position, gap = self._pixels_near(cell, here), SPACING
+            position = self._pixels_near(cell, here)
+            gap = SPACING
+
         scores = self._scores(cell, ahead, position)
+
         posts = np.empty((len(ahead), len(robots), 2))
         for i, robot in enumerate(robots):
             score = scores[robot]
@@ -203,6 +231,7 @@ class Posts:
                 nearest = np.stack([cdist(position, taken).min(1) for taken in posts[:, :i]])
                 score = score - _TOO_CLOSE * (nearest < gap)
             posts[:, i] = position[np.argmax(score, axis=1)]
+
         for of_next, c in zip(posts, ahead, strict=True):
             self._abreast(of_next, np.array([0.0, 1.0]) if c is None else self.stop(c) - here)
         return posts
@@ -211,20 +240,25 @@ class Posts:
         self, cell: Cell, ahead: Sequence[Cell | None], position: np.ndarray
     ) -> dict[Robot, np.ndarray]:
         """Score positions as posts of each robot, (next cell, position); see the formula above."""
-        here, lead = self.stop(cell), self.team.lead
+        here = self.stop(cell)
+        lead = self.team.lead
         stops = np.array([here, *(here if c is None else self.stop(c) for c in ahead)])
         routes = [np.stack([here] * 2) if c is None else self.lead_line(cell, c) for c in ahead]
         first = np.cumsum([0, *map(len, routes)])
         aims, _ = at_times(self.surface, lead, np.concatenate(routes), first, _N_AIMS)
+
         nearer = _NEARER * np.linalg.norm(position - here, axis=1)
         blocking = np.array([cdist(position, route).min(1) < SPACING for route in routes])
+
         scores = {}
         for robot in dict.fromkeys(self.team.robots):
             closing = 0.25 * self._seen(stops[:, None], position, lead, robot)
             seen = closing[0] + closing[1:]
+
             best = np.argsort(nearer - seen, axis=1, kind="stable")[:, :_N_WATCHED]
             eyes = position[best][:, :, None] + jittered(_N_AIMS)
             watched = 0.5 * self._seen(eyes, aims[:, None], robot, lead).mean(-1)
+
             score = seen - 1.0  # for positions whose sight of the route is not computed
             np.put_along_axis(score, best, np.take_along_axis(seen, best, 1) + watched, 1)
             scores[robot] = score - _IN_THE_WAY * blocking - nearer
@@ -233,6 +267,7 @@ class Posts:
     def _abreast(self, posts: np.ndarray, direction: np.ndarray) -> None:
         """Sort identical robots from left to right, so that their routes do not cross."""
         robots = self.team.robots
+
         to_right = posts @ np.array([direction[1], -direction[0]])
         for robot in dict.fromkeys(robots):
             same = np.array([i for i, other in enumerate(robots) if other == robot])
@@ -249,6 +284,7 @@ class Posts:
         view = optics(watcher, watched)
         distance = np.linalg.norm(target - eye, axis=-1)
         seen = detection_between(self.surface, self.sight, eye, target, view)
+
         kept = seen * np.exp(-_DISCOUNT * distance)
         return kept + _DOUBT * np.exp(-distance / _DOUBT_REACH) * (1.0 - kept)
 
@@ -286,9 +322,11 @@ class Posts:
         offset = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
         distance = np.linalg.norm(offset, axis=1)
         offset = offset[(distance <= radius) & (distance >= SPACING)]
+
         pixels = np.rint(np.stack(self.surface.to_pixel(*(here + offset).T), axis=1)).astype(int)
         linked, corner = self._linked_to(here, cell, over=self._safe)
         inside = ((pixels >= corner) & (pixels < np.add(corner, linked.shape))).all(1)
+
         row, col = np.unique(pixels[inside], axis=0).T
         kept = linked[row - corner[0], col - corner[1]]
         return self._position(row[kept], col[kept])
@@ -298,8 +336,11 @@ class Posts:
         row, col = self._pixels_of(cell)
         region, (top, left) = self._linked_to(here, cell)
         linked = region[row - top, col - left]
+
         position = self._position(row, col)[linked if linked.any() else slice(None)]
-        distance, n_robots = np.linalg.norm(position - here, axis=1), len(self.team.robots)
+        distance = np.linalg.norm(position - here, axis=1)
+        n_robots = len(self.team.robots)
+
         near = np.flatnonzero((distance <= RADIUS) & (distance >= SPACING))
         if len(near) < n_robots:  # few or large pixels
             order = np.argsort(distance, kind="stable")
@@ -309,7 +350,9 @@ class Posts:
 
     def require_room(self, cell: Cell) -> None:
         """Raise TrustboError if a cell has too few passable pixels for the robots."""
-        n_pixels, names = len(self._pixels_of(cell)[0]), self.team.names
+        n_pixels = len(self._pixels_of(cell)[0])
+        names = self.team.names
+
         if n_pixels <= len(names):
             raise TrustboError(
                 f"cell {cell} has {n_pixels} passable pixels, on which robot "
@@ -324,11 +367,13 @@ class Posts:
         """
         top, bottom = np.searchsorted(self._cells[0], (cell[0], cell[0] + 1))
         left, right = np.searchsorted(self._cells[1], (cell[1], cell[1] + 1))
+
         anywhere = np.ones_like(self._standable)
         for allowed in (self._standable, self.surface.passable, anywhere):
             row, col = np.nonzero(allowed[top:bottom, left:right])
             if len(row):
                 break
+
         return row + top, col + left
 
     def _position(self, row: np.ndarray, col: np.ndarray) -> np.ndarray:

@@ -33,6 +33,7 @@ class Routes:
         """Compute the slope of each pixel, and find the pixels near obstacles."""
         self._surface = surface
         self._slope = np.arctan(np.hypot(*surface.gradient))
+
         free: Any = ndimage.distance_transform_edt(surface.passable, sampling=surface.pixel)
         self._is_close = free <= max(_CLEARANCE, *surface.pixel)
         self._paces: dict[float, np.ndarray] = {}
@@ -46,17 +47,21 @@ class Routes:
         The route stays inside the pixel window. It has shape (point, 2), x and y in CRS metres.
         """
         ends = [self._surface.pixel_at(*p.tolist()) for p in (start, goal)]
+
         low, high = sorted(ends)  # the reversed route is the same
         key = low, high, window, robot.max_slope
         if key not in self._cached:
             self._cached[key] = self._search(*key)
+
         cached = self._cached[key]
         if not len(cached):
             return None
         if len(cached) == 1:  # start and goal are in the same pixel
             return np.stack([start, goal])
+
         route = cached[:: 1 if ends[0] == low else -1].copy()
-        route[0], route[-1] = start, goal
+        route[0] = start
+        route[-1] = goal
         return route
 
     def _search(
@@ -68,6 +73,7 @@ class Routes:
             pace = 1.0 / speed_share(self._slope, max_slope)
             pace = np.where(self._is_close, _CLOSE * pace, pace)
             self._paces[max_slope] = np.where(surface.passable, pace, np.inf)
+
         top, bottom, left, right = window
         pixels = _a_star(
             plain(self._paces[max_slope][top:bottom, left:right]),
@@ -75,6 +81,7 @@ class Routes:
             (start[0] - top, start[1] - left),
             (goal[0] - top, goal[1] - left),
         )
+
         x = surface.origin[0] + (pixels[:, 1] + left) * surface.pixel[1]
         y = surface.origin[1] - (pixels[:, 0] + top) * surface.pixel[0]
         return np.stack([x, y], axis=1)
@@ -88,48 +95,63 @@ def speed_share(tilt, max_slope):
 
 @_compiled
 def _a_star(pace, pixel, start, goal):
-    """Find the pixels of the fastest route by A*; `pace` is infinite where impassable."""
+    """Find the pixels of the fastest route by A* (Hart, Nilsson and Raphael 1968).
+
+    `pace` is infinite where impassable.
+    """
     rows, cols = pace.shape
     best = np.full((rows, cols), np.inf)
     came = np.full((rows, cols), -1)
     least = pace.min()
+
     for r, c in (start, goal):
         if not (0 <= r < rows and 0 <= c < cols):
             return np.empty((0, 2), np.int64)
+
     best[start] = 0.0
     queue = [(0.0, start[0], start[1])]
     while queue:
         estimate, r, c = heapq.heappop(queue)
         if (r, c) == goal:
             break
+
+        # Admissible estimate: a straight line at the best pace.
         ahead = math.hypot((goal[0] - r) * pixel[0], (goal[1] - c) * pixel[1]) * least
         if estimate > best[r, c] + ahead + 1e-9:
             continue  # a stale entry: a faster way to the pixel was found
         for dr in range(-1, 2):
             for dc in range(-1, 2):
-                i, j = r + dr, c + dc
+                i = r + dr
+                j = c + dc
                 if (dr == 0 and dc == 0) or not (0 <= i < rows and 0 <= j < cols):
                     continue
                 # A route must not pass between two impassable pixels or cut the corner of one.
                 if not (np.isfinite(pace[i, c]) and np.isfinite(pace[r, j])):
                     continue
+
                 length = math.hypot(dr * pixel[0], dc * pixel[1])
                 cost = best[r, c] + 0.5 * (pace[r, c] + pace[i, j]) * length
+
                 if cost < best[i, j]:
                     best[i, j] = cost
                     came[i, j] = r * cols + c
                     rest = math.hypot((goal[0] - i) * pixel[0], (goal[1] - j) * pixel[1])
                     heapq.heappush(queue, (cost + rest * least, i, j))
+
     if not np.isfinite(best[goal]):
         return np.empty((0, 2), np.int64)
-    n, cell = 1, goal[0] * cols + goal[1]
+
+    n = 1
+    cell = goal[0] * cols + goal[1]
     while came[cell // cols, cell % cols] >= 0:
         cell = came[cell // cols, cell % cols]
         n += 1
+
     cells = np.empty((n, 2), np.int64)
     cell = goal[0] * cols + goal[1]
     for k in range(n - 1, -1, -1):
-        cells[k, 0], cells[k, 1] = cell // cols, cell % cols
+        cells[k, 0] = cell // cols
+        cells[k, 1] = cell % cols
         cell = came[cell // cols, cell % cols]
     return cells
 
@@ -152,29 +174,42 @@ def _resampled(gradient, pixel, origin, flat, first, limits, n_samples):
     """Compute the result of `at_times`; the speed decreases with the larger of pitch and roll."""
     rows, cols = gradient.shape[1:]
     n = len(first) - 1
-    points, duration = np.empty((n, n_samples, 2)), np.empty(n)
+    points = np.empty((n, n_samples, 2))
+    duration = np.empty(n)
+
     longest = 0
     for b in range(n):
         longest = max(longest, first[b + 1] - first[b])
+
     clock = np.empty(longest)
+
     for b in range(n):
         way = flat[first[b] : first[b + 1]]
         clock[0] = 0.0
         for k in range(1, len(way)):
-            dx, dy = way[k, 0] - way[k - 1, 0], way[k, 1] - way[k - 1, 1]
+            dx = way[k, 0] - way[k - 1, 0]
+            dy = way[k, 1] - way[k - 1, 1]
+
             length = max(np.hypot(dx, dy), 1e-9)
             i = min(rows - 1, max(0, int((origin[1] - way[k, 1]) / pixel[0] + 0.5)))
             j = min(cols - 1, max(0, int((way[k, 0] - origin[0]) / pixel[1] + 0.5)))
-            gx, gy = gradient[0, i, j], gradient[1, i, j]
-            pitch, roll = abs(gx * dx + gy * dy) / length, abs(gy * dx - gx * dy) / length
+
+            gx = gradient[0, i, j]
+            gy = gradient[1, i, j]
+
+            pitch = abs(gx * dx + gy * dy) / length
+            roll = abs(gy * dx - gx * dy) / length
             tilt = np.arctan(max(pitch, roll))
             clock[k] = clock[k - 1] + length / (limits[0] * speed_share(tilt, limits[1]))
+
         duration[b] = clock[len(way) - 1]
+
         k = 1
         for s in range(n_samples):
             t = duration[b] * (s + 0.5) / n_samples
             while k < len(way) - 1 and clock[k] < t:
                 k += 1
+
             share = (t - clock[k - 1]) / max(clock[k] - clock[k - 1], 1e-12)
             for axis in range(2):
                 points[b, s, axis] = way[k - 1, axis] + share * (way[k, axis] - way[k - 1, axis])
@@ -187,6 +222,7 @@ def largest_region(passable: np.ndarray) -> np.ndarray:
     labels, n_regions = regions
     if n_regions == 0:
         return passable
+
     sizes = np.bincount(labels.ravel())
     sizes[0] = 0
     return labels == np.argmax(sizes)

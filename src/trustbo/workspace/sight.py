@@ -18,6 +18,7 @@ _compiled = kernel()
 _part = njit(nogil=True, error_model="numpy", **PART)
 
 _JITTER = 0.7  # radius of the disc of viewpoints around a post, m
+_GOLDEN_ANGLE = 2.4  # between successive viewpoints, rad (Vogel 1979)
 
 
 @dataclass(frozen=True)
@@ -63,8 +64,11 @@ def jittered(n: int) -> np.ndarray:
     The view from the exact post is not representative, because a robot stops up to half a metre
     away, and its field of view tilts with the ground. The viewpoints are spread over a disc.
     """
-    k, order = np.arange(n), np.random.default_rng(0).permutation(n)
-    radius, angle = _JITTER * np.sqrt((k + 0.5) / n), 2.4 * k
+    k = np.arange(n)
+    order = np.random.default_rng(0).permutation(n)
+
+    radius = _JITTER * np.sqrt((k + 0.5) / n)
+    angle = _GOLDEN_ANGLE * k
     return (radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1))[order]
 
 
@@ -86,6 +90,7 @@ def detection_probability(
         plain(target),
         plain(np.broadcast_to(optics, (len(sensor), 4))),
     )
+
     rasters = surface.ground, surface.canopy, surface.pixel
     return rays.transmittances(*rasters, ends, sight.extinction, sight.crown_base)
 
@@ -108,23 +113,37 @@ def _ends(ground, gradient, pixel, origin, sensor, target, optics):
     """
     n_rows, n_cols = ground.shape
     ends = np.empty((len(sensor), 6))
+
     for i in range(len(sensor)):
         r0 = _inward((origin[1] - sensor[i, 1]) / pixel[0], n_rows)
         c0 = _inward((sensor[i, 0] - origin[0]) / pixel[1], n_cols)
         r1 = _inward((origin[1] - target[i, 1]) / pixel[0], n_rows)
         c1 = _inward((target[i, 0] - origin[0]) / pixel[1], n_cols)
+
         z0 = rays.bilinear(ground, r0, c0) + optics[i, 0]
         z1 = rays.bilinear(ground, r1, c1) + optics[i, 1]
-        east, north, up = (c1 - c0) * pixel[1], (r0 - r1) * pixel[0], z1 - z0
+
+        east = (c1 - c0) * pixel[1]
+        north = (r0 - r1) * pixel[0]
+        up = z1 - z0
         distance = math.sqrt(east**2 + north**2 + up**2)
+
         row = min(max(int(r0 + 0.5), 0), n_rows - 1)
         col = min(max(int(c0 + 0.5), 0), n_cols - 1)
-        gx, gy = gradient[0, row, col], gradient[1, row, col]
+        gx = gradient[0, row, col]
+        gy = gradient[1, row, col]
+
         # Distance from the plane of the robot's body, whose normal is (-gx, -gy, 1).
         above = abs(up - gx * east - gy * north) / math.sqrt(1.0 + gx * gx + gy * gy)
         seen = distance <= optics[i, 2] and above <= optics[i, 3] * max(distance, 1e-9)
-        ends[i, 0], ends[i, 1], ends[i, 2] = r0, c0, z0 if seen else math.nan
-        ends[i, 3], ends[i, 4], ends[i, 5] = r1, c1, z1
+
+        ends[i, 0] = r0
+        ends[i, 1] = c0
+        ends[i, 2] = z0 if seen else math.nan
+        ends[i, 3] = r1
+        ends[i, 4] = c1
+        ends[i, 5] = z1
+
     return ends
 
 

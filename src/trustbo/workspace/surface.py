@@ -31,7 +31,8 @@ class Surface(NamedTuple):
     def extent(self) -> tuple[float, float, float, float]:
         """Edges of the raster in CRS metres: smallest x, smallest y, largest x and largest y."""
         y, x = self.axes
-        high, wide = 0.5 * self.pixel[0], 0.5 * self.pixel[1]
+        high = 0.5 * self.pixel[0]
+        wide = 0.5 * self.pixel[1]
         return float(x[0] - wide), float(y[-1] - high), float(x[-1] + wide), float(y[0] + high)
 
     def to_pixel(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -50,7 +51,8 @@ class Surface(NamedTuple):
     def pixel_at(self, x: float, y: float) -> tuple[int, int]:
         """Return the row and column of the pixel nearest to one position."""
         rows, cols = self.ground.shape
-        row, col = (self.origin[1] - y) / self.pixel[0], (x - self.origin[0]) / self.pixel[1]
+        row = (self.origin[1] - y) / self.pixel[0]
+        col = (x - self.origin[0]) / self.pixel[1]
         return min(max(round(row), 0), rows - 1), min(max(round(col), 0), cols - 1)
 
 

@@ -106,19 +106,24 @@ class Workspace(Summary):
         Example:
             >>> tb.Workspace.from_terrain(terrain, shape=(10, 10), team=tb.Team(n_robots=3))
         """
-        terrain, team = require_terrain(terrain), Team.of(team)
+        terrain = require_terrain(terrain)
+        team = Team.of(team)
         sight = sight or Sight()
         grid = Grid.over(terrain, shape)
+
         if features is None:
             visibility = VISIBILITY if bounds else PAPER_VISIBILITY
             features = {"traversability": TRAVERSABILITY, "visibility": visibility}
+
         with compiling():
             cells, passable, pixels, composites = cell_maps(terrain, grid, features, team, sight)
             z = np.repeat(of_moves(cells, passable)[None], team.n_robots, axis=0)
-            posts, names = Posts(grid, team, sight, terrain, pixels), [*features]
+            posts = Posts(grid, team, sight, terrain, pixels)
+            names = [*features]
             if bounds:
                 z = with_line_of_sight(z, names, passable, posts, pixels)
                 names.append(LINE_OF_SIGHT)
+
         maps = labelled(z, passable, grid, team, names)
         return cls(*maps, grid, team, terrain, pixels, composites, posts)
 
@@ -152,16 +157,20 @@ class Workspace(Summary):
         features = as_names("features", features)
         z, robots, features = unlabelled(awareness, known, features)
         z, free = of_arrays(z, passable)
+
         team = Team(len(z), names=robots) if team is None else Team.of(team)
         if len(team.robots) != len(z):
             n = len(team.robots)
             raise TrustboError(
                 f"awareness has {len(z)} robots, but the team has {n}; the numbers must match."
             )
+
         names = features or default_features(z.shape[-1])
         if len(names) != z.shape[-1]:
             raise TrustboError(f"features must have {z.shape[-1]} names; got {names}.")
-        side, (rows, cols) = require_positive("cell_size", cell_size), free.shape
+
+        side = require_positive("cell_size", cell_size)
+        rows, cols = free.shape
         grid = Grid((rows, cols), 0.0, rows * side, side, side)
         return cls(*labelled(z, free, grid, team, names), grid, team)
 
@@ -171,13 +180,17 @@ class Workspace(Summary):
         return tuple(str(name) for name in self.awareness["feature"].values)
 
     def _rows(self) -> Rows:
-        grid, free, team = self.grid, self.passable.values, self.team
+        grid = self.grid
+        free = self.passable.values
+        team = self.team
         n_pixels = [] if self.terrain is None else self.terrain["dem"].shape
+
         shown = self.awareness.mean("robot")
         spread = [
             (f"  {name}", f"{float(one.quantile(0.1)):.2f} to {float(one.quantile(0.9)):.2f}")
             for name, one in ((n, shown.sel(feature=n)) for n in self.features)
         ]
+
         return [
             ("cells", f"{grid.shape[0]} x {grid.shape[1]}, {free.mean():.0%} passable"),
             ("cell", f"{grid.cell_height:.4g} m x {grid.cell_width:.4g} m"),
@@ -228,6 +241,7 @@ class Workspace(Summary):
         path = require_list("path", path, remedy="give cells (row, col)")
         if not path:
             raise TrustboError("path must contain at least one cell; got none.")
+
         cells = [locate(cell, f"path[{k}]") for k, cell in enumerate(path)]
         return np.swapaxes(along(self.awareness.values, cells), 0, 1)
 
@@ -242,6 +256,7 @@ class Workspace(Summary):
         """
         require_kind("mission", mission, Mission, "give a trustbo.Mission")
         require_map("a workspace", [mission])
+
         unnamed = default_features(len(mission.features))
         if mission.features == unnamed and len(unnamed) == len(self.features):
             named = tuple(
@@ -249,6 +264,7 @@ class Workspace(Summary):
                 for name, feature in zip(unnamed, self.features, strict=True)
             )
             mission = dataclasses.replace(mission, features=named)
+
         predicted = [name for name in self.features if is_line_of_sight(name)]
         return mission.in_order(self.team.names, self.features, predicted)
 
@@ -264,6 +280,7 @@ class Workspace(Summary):
         missing = np.isnan(ordered.awareness)
         if not missing.any():
             return ordered
+
         driven = ordered.path[: len(missing) + 1]
         known = self.along(driven, anywhere=True)
         return ordered.with_awareness(np.where(missing, known, ordered.awareness))
@@ -279,7 +296,8 @@ class Workspace(Summary):
         Raises:
             TrustboError: The location is invalid or off the grid, or the cell is impassable.
         """
-        cell, grid = self.grid.locate(location, what), self.grid
+        cell = self.grid.locate(location, what)
+        grid = self.grid
         if not self.passable.values[cell]:
             free = np.argwhere(self.passable.values)
             steps = (free - cell) * (grid.cell_height, grid.cell_width)
@@ -294,8 +312,10 @@ class Workspace(Summary):
         """Return the reason why a cell is impassable for a message; empty without a terrain."""
         if self.terrain is None:
             return ""
+
         missing = self.grid.cell_means(self.terrain["dem"].isnull().astype(float))[cell]
         if missing > MAX_MISSING:
             return f": {missing:.0%} of it has no data"
+
         steep = np.rad2deg(self.team.max_slope)
         return f": over half of it is missing or steeper than {steep:.0f} degrees, the team's limit"
