@@ -30,12 +30,14 @@ def export_result(
         require_choice("format", name, WRITERS)
         for name in require_list("formats", formats, remedy=f"give some of {', '.join(WRITERS)}")
     ]
+
     written = []
     for name in names:
         file, write = WRITERS[name]
         target = to_path(folder) / file
         write(target, result)
         written.append(target)
+
     return written
 
 

@@ -39,10 +39,12 @@ def write_geotiff(path: FilePath, maps: Result | xr.Dataset) -> None:
     maps = maps.maps() if isinstance(maps, Result) else maps
     require_kind("maps", maps, xr.Dataset, "give a result, or maps such as result.maps()")
     target = require_suffix(path, ".tif", ".tiff")
+
     if maps.rio.crs is None:
         raise TrustboError(_NO_CRS)
     with quiet_affine():
         place = maps.rio.transform()
+
     profile = {
         "driver": "GTiff", "interleave": "band", "height": maps.sizes["y"],
         "width": maps.sizes["x"], "count": len(maps.data_vars), "dtype": "float32",
@@ -84,17 +86,20 @@ def write_geojson(path: FilePath, plan: Plan | Result) -> None:
     features = [_feature(plan, "path", centres, facts | {"length_m": float(plan.length)})]
     for about, place in zip(_cells(plan), centres, strict=True):
         features.append(_feature(plan, "bounds", place, about))
+
     names = plan.workspace.team.names
     for k, (cell, places) in enumerate(zip(plan.path, _of(plan.posts), strict=False), start=1):
         for robot, place in zip(names, places, strict=True):
             features.append(
                 _feature(plan, "posts", place, {"bound": k, "robot": robot, "cell": [*cell]})
             )
+
     for k, routes in enumerate(_of(plan.routes), start=1):
         for robot, route in zip((LEAD, *names), routes, strict=True):
             if route is not None:
                 about = {"bound": k, "robot": robot, "length_m": shapely.LineString(route).length}
                 features.append(_feature(plan, "routes", route, about))
+
     write_text(path, json.dumps({"type": "FeatureCollection", "features": features}))
 
 
@@ -113,17 +118,23 @@ def write_csv(path: FilePath, result: Result) -> None:
         TrustboError: There is no posterior yet, or the file cannot be written.
     """
     require_kind("result", result, Result, "give a result or a campaign")
-    table, latent = to_frame(result.missions), result.posterior["latent"].to_dataset()
+    table = to_frame(result.missions)
+    latent = result.posterior["latent"].to_dataset()
+
     # The posterior lacks missions that are excluded or not learned from yet.
     of_mission = {int(j) + 1: i for i, j in enumerate(latent["mission"].values)}
+
     keys = table[["mission", "bound", "robot"]].itertuples(index=False, name=None)
     robots = result.workspace.team.names
     at = [(of_mission.get(j, -1), k - 1, robots.index(robot)) for j, k, robot in keys]
+
     for name in ("trust_mean", "trust_sd"):
-        values, n_bounds = latent[name].values, latent.sizes["bound"]
+        values = latent[name].values
+        n_bounds = latent.sizes["bound"]
         table[name] = [
             values[i, k, r] if i >= 0 and 0 <= k < n_bounds else np.nan for i, k, r in at
         ]
+
     write_text(path, table.to_csv(index=False, lineterminator="\n"))
 
 
@@ -146,8 +157,10 @@ def _cells(plan: Plan) -> list[dict[str, Any]]:
     for i, robot in enumerate(plan.workspace.team.names):
         columns[f"trust_{robot}"] = plan.trust[:, i]
         columns |= {f"trust_{robot}_{end}": plan.bands[q, :, i] for end, q in _BAND.items()}
+
     if plan.risk is not None:
         columns["p_fail"] = plan.risk.p_fail
+
     rows: list[dict[str, Any]] = []
     for k, cell in enumerate(plan.path):
         values = {name: float(v[k - 1]) for name, v in columns.items() if k}
@@ -160,11 +173,15 @@ def _feature(plan: Plan, layer: str, places: np.ndarray, about: dict[str, Any]) 
     """Make a GeoJSON Point at a position (2,) or LineString of positions (point, 2), CRS metres."""
     if plan.workspace.grid.crs is None:
         raise TrustboError(_NO_CRS)
-    crs, xy = plan.workspace.grid.crs, np.atleast_2d(places)
+
+    crs = plan.workspace.grid.crs
+    xy = np.atleast_2d(places)
     lon, lat = converted(crs, "EPSG:4326", *xy.T)
+
     shape = shapely.Point(lon[0], lat[0])
     if np.ndim(places) == 2:
         shape = _cut(shapely.LineString(np.column_stack([np.unwrap(lon, period=360.0), lat])))
+
     # RFC 7946, 11.2: no needless digits; the eighth decimal is about a millimetre.
     rounded = shapely.transform(shape, lambda values: np.round(values, 8))
     geometry = json.loads(shapely.to_geojson(rounded))
@@ -176,11 +193,13 @@ def _cut(line: shapely.LineString) -> shapely.Geometry:
     west, _, east, _ = line.bounds
     if -180.0 <= west and east <= 180.0:
         return line
+
     parts = []
     for turn in (-360.0, 0.0, 360.0):
         part = line.intersection(shapely.box(turn - 180.0, -90.0, turn + 180.0, 90.0))
         parts += [affinity.translate(one, -turn) for one in shapely.get_parts(part)
                   if one.geom_type == "LineString" and not one.is_empty]  # fmt: skip
+
     return shapely.MultiLineString(parts)
 
 

@@ -33,9 +33,13 @@ from trustbo.planning.problem import mean_of
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import MOVES
 
-IMPASSABLE, UNKNOWN, WORST = 100, 255, 98
-"""Pixel values of impassable cells, unknown cells and the highest cost; Nav2 forbids 99 and 100."""
-_MAX_PIXELS = 1e8
+IMPASSABLE = 100
+"""Pixel value of impassable cells."""
+UNKNOWN = 255
+"""Pixel value of unknown cells."""
+WORST = 98
+"""Pixel value of the highest cost, because Nav2 treats 99 and 100 as obstacles."""
+_MAX_PIXELS = 1e8  # of a map: 100 MB
 _MAX_ID = 65_535
 """Largest id in Nav2 messages (uint16)."""
 _MIN_COST = 1e-9
@@ -68,15 +72,18 @@ class Frame:
     def __post_init__(self) -> None:
         # Numbers of NumPy, as from an array, become floats, because JSON knows no others.
         origin = require_position("the frame's origin", self.origin)
+
         rotation = require_finite("the frame's rotation", self.rotation)
         if abs(rotation) > 2.0 * math.pi:
             raise TrustboError(
                 f"the frame's rotation must be in radians, within 2 pi; got {rotation:g} (degrees? "
                 "use numpy.deg2rad)."
             )
+
         remedy = "give the frame_id, such as 'map'"
         if not require_kind("the frame's name", self.name, str, remedy).strip():
             raise TrustboError(f"the frame's name is empty; {remedy}.")
+
         object.__setattr__(self, "origin", origin)
         object.__setattr__(self, "rotation", rotation)
 
@@ -133,6 +140,7 @@ def write_nav2(
         poses = stops_of(result.plan, robot, place).tolist()
         listed = [_pose(place.name, *pose) for pose in poses]
         files[folder / f"waypoints_{robot}.yaml"] = json.dumps({"poses": listed}, indent=1).encode()
+
     files[folder / "route_graph.geojson"] = _graph(result, place).encode()
     parent = "grid" if workspace.grid.crs is None else workspace.grid.crs_name
     about = {
@@ -201,8 +209,10 @@ def _ros_map(
     picture = target.with_suffix(".pgm")
     # The first row of an image is in the north. In raw mode, map_server reads bytes as costs.
     pixels = f"P5\n{values.shape[1]} {values.shape[0]}\n255\n".encode() + values[::-1].tobytes()
+
     about = {"image": picture.name, "mode": "raw", "resolution": side, "origin": [*corner, 0.0],
              "negate": 0, "occupied_thresh": 0.65, "free_thresh": 0.196}  # fmt: skip
+
     return {picture: pixels, target: json.dumps(about).encode()}
 
 
@@ -214,19 +224,26 @@ def occupancy(
         raise TrustboError(
             f"cost must be in [0, 1]; got values from {np.nanmin(cost):g} to {np.nanmax(cost):g}."
         )
-    grid, (rows, cols) = workspace.grid, workspace.grid.shape
+
+    grid = workspace.grid
+    rows, cols = workspace.grid.shape
     _require_near(frame, grid.bounds)
+
     shorter = min(grid.cell_height, grid.cell_width)
     side = float(f"{shorter / 10.0:.2g}") if pixel is None else require_positive("pixel", pixel)
+
     left, bottom, right, top = grid.bounds
     corners = frame.of_crs([[x, y] for x in (left, right) for y in (bottom, top)])
     corner = corners.min(0)
+
     # The quotient may be a whole number plus a rounding error.
     n_x, n_y = np.ceil(np.ptp(corners, axis=0) / side - 1e-6).astype(int)
     if float(n_x) * float(n_y) > _MAX_PIXELS:
         raise TrustboError(f"pixel={side:g} m gives {n_x} x {n_y} pixels; use a larger pixel.")
+
     percent = np.where(np.isnan(cost), UNKNOWN, np.fmin(np.rint(100.0 * cost), WORST))
     percent = np.where(workspace.passable.values, percent, IMPASSABLE)
+
     values = np.full((n_y, n_x), UNKNOWN, dtype=np.uint8)
     for i in range(n_y):  # row by row, because maps may be large
         x = (np.arange(n_x) + 0.5) * side
@@ -244,6 +261,7 @@ def _require_near(frame: Frame, bounds: tuple[float, float, float, float]) -> No
     x, y = frame.origin
     left, bottom, right, top = bounds
     away = math.hypot(max(left - x, 0.0, x - right), max(bottom - y, 0.0, y - top))
+
     if away > _FARTHEST:
         raise TrustboError(
             f"the frame's origin ({x:.10g}, {y:.10g}) is {away / 1000.0:.4g} km off the map, which "
@@ -262,14 +280,17 @@ def stops_of(plan: Plan, robot: str, frame: Frame) -> np.ndarray:
     require_choice("robot", robot, (LEAD, *plan.workspace.team.names))
     if plan.stops is None or plan.posts is None or plan.routes is None:
         raise TrustboError("waypoints need a workspace made with Workspace.from_terrain.")
+
     lead = frame.of_crs(plan.stops)
     if robot == LEAD:
         steps = np.diff(lead, axis=0)
         return _towards(lead, np.vstack([steps, steps[-1:]]))
+
     i = plan.workspace.team.names.index(robot)
     routes = [of_bound[i + 1] for of_bound in plan.routes]
     if any(route is None for route in routes) or routes[-1] is None:
         raise TrustboError(f"robot {robot!r} has no route in a bound; plan another path.")
+
     places = frame.of_crs(np.vstack([plan.posts[:, i], routes[-1][-1:]]))
     return _towards(places, np.vstack([lead[1:], lead[-1:]]) - places)
 
@@ -292,26 +313,31 @@ def _graph(result: Result, frame: Frame) -> str:
     id (1 + move) * cells + id of the stop entered. Nav2's PenaltyScorer reads `penalty`.
     """
     workspace = result.workspace
-    cols, n_cells = workspace.grid.shape[1], math.prod(workspace.grid.shape)
+    cols = workspace.grid.shape[1]
+    n_cells = math.prod(workspace.grid.shape)
     if (1 + len(MOVES)) * n_cells - 1 > _MAX_ID:
         raise TrustboError(
             f"a route graph of {n_cells} cells needs ids above {_MAX_ID}, the limit of Nav2; "
             "use larger cells."
         )
+
     posts = workspace.posts
     graph = result.planner.graph(mean_of(result.posterior, result.workspace))
     place = workspace.grid.center if posts is None else posts.stop
     where = {cell: frame.of_crs(place(cell)).tolist() for cell in graph.nodes}
+
     features = []
     for (row, col), xy in where.items():
         about = {"id": row * cols + col, "frame": frame.name, "metadata": {"row": row, "col": col}}
         features.append(_feature("Point", xy, about))
+
     price = result.planner.problem.price
     for a, c, edge in graph.edges(data=True):
         move = MOVES.index((c[0] - a[0], c[1] - a[1]))
         first, last = (row * cols + col for row, col in (a, c))
         p_fail = -math.expm1(-edge.get("risk", 0.0))
         cost = max(edge["lost"] + price * p_fail, _MIN_COST)
+
         about = {"id": (1 + move) * n_cells + last, "startid": first, "endid": last, "cost": cost}
         about |= {"overridable": True, "metadata": {"penalty": cost, "p_fail": p_fail}}
         features.append(_feature("MultiLineString", [[where[a], where[c]]], about))
