@@ -12,6 +12,9 @@ from trustbo.errors import TrustboError, require_kind, warn
 
 MAX_PIXELS = 1_000_000
 """Maximum number of samples used to fit an index, spread evenly over the given ones."""
+_WINSORISED = (1, 99)  # percentiles to which features are limited
+_SCALED = (2, 98)  # percentiles of the score that become 0 and 1
+_MISLEADING = 0.5  # share of the variance below which the first component gets a warning
 _CONSTANT = 1e-9  # spread below which a feature, or the score, counts as constant
 
 
@@ -52,7 +55,7 @@ class CompositeIndex:
             raise TrustboError(f"no pixel has all of the features {', '.join(self.signs)}.")
 
         x = x[:: -(-len(x) // MAX_PIXELS)]
-        low, high = np.percentile(x, [1, 99], axis=0)
+        low, high = np.percentile(x, _WINSORISED, axis=0)
         x = np.clip(x, low, high)
 
         mean = x.mean(0)
@@ -72,7 +75,7 @@ class CompositeIndex:
             loadings[varies] = (np.sign(first @ signs[varies]) or 1.0) * first
 
         score = z @ loadings[varies]
-        bottom, top = np.percentile(score, [2, 98])
+        bottom, top = np.percentile(score, _SCALED)
         if top - bottom < _CONSTANT:  # nearly all samples are alike: take the extremes
             bottom = score.min()
             top = score.max()
@@ -94,7 +97,7 @@ class CompositeIndex:
                 "loadings_, and leave the feature out if it misleads."
             )
 
-        if ratios[0] < 0.5:
+        if ratios[0] < _MISLEADING:
             warn(
                 f"the first component of {', '.join(self.signs)} explains only {ratios[0]:.0%} of "
                 "their variance; check loadings_, and leave a feature out or use two composites."

@@ -12,6 +12,8 @@ from trustbo.terrain.read import check_size, read_terrain
 _FOLDER = Path(__file__).parent / "data" / "wellington"
 EXAMPLE_FILES = str(_FOLDER / "dem.tif"), str(_FOLDER / "dsm.tif")
 """Paths of the DEM and the DSM of `example`."""
+_ORIGIN = 380_000.0, 5_225_000.0
+"""Upper left corner of `synthetic_terrain`: x and y in metres of EPSG:32616."""
 
 
 def example() -> xr.Dataset:
@@ -79,8 +81,8 @@ def synthetic_terrain(
     height = 6.0 * np.exp(0.5 * crowns / crowns.std() - 0.125)
     dsm = dem + np.where(wooded, height, 0.0)
 
-    y = 5_225_000.0 - (np.arange(shape[0]) + 0.5) * resolution
-    x = 380_000.0 + (np.arange(shape[1]) + 0.5) * resolution
+    y = _ORIGIN[1] - (np.arange(shape[0]) + 0.5) * resolution
+    x = _ORIGIN[0] + (np.arange(shape[1]) + 0.5) * resolution
     maps = (xr.DataArray(z, {"y": y, "x": x}, ("y", "x")) for z in (dem, dsm))
     return read_terrain(*(one.rio.write_crs("EPSG:32616") for one in maps))
 

@@ -21,6 +21,7 @@ _FILL_NAMES = ("_FillValue", "missing_value", "fill_value", "nodata", ACCESSOR_F
 _LOW = 10.0  # m; heights on one level with zeros
 _METRE = {"m", "metre", "metres", "meter", "meters"}
 _FOOT = {"ft", "foot", "feet", "ftus", "usft"}
+_OTHER_UNIT = 0.5  # share of impossible heights from which another unit is the likely cause
 _US = {"us", "survey", "ftus", "usft"}
 _FOOT_IN_METRES = 0.3048
 _US_FOOT_IN_METRES = 1200.0 / 3937.0
@@ -74,7 +75,7 @@ def in_metres(stored: xr.DataArray, axis: float | None, nodata: float | None) ->
     where = f"{name} holds {value!r}{scaled} at row {r}, column {c}"
 
     share = wrong.sum() / np.isfinite(heights).sum()
-    if share > 0.5:
+    if share > _OTHER_UNIT:
         raise TrustboError(
             f"{where}, and {share:.0%} of its heights lie outside {LOWEST:g} to {HIGHEST:g} m: "
             "they may be in another unit, such as centimetres; convert them, or declare their "

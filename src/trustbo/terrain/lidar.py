@@ -22,6 +22,7 @@ GROUND_GAP = 10.0
 MAX_GAP = 3.0
 """Maximum distance of a pixel without returns to the one that fills it, m."""
 _GROUND = 2  # class of ground points (ASPRS LAS 1.4)
+_ROUNDING = 1e-6  # pixels; points this close to an edge are on it
 _NOISE = (7, 18)  # classes of low and high noise
 
 
@@ -52,10 +53,10 @@ def read_lidar(points: FilePath, resolution: float = 1.0, *, crs: object = None)
 
     # Pixels are counted from the upper left; points on an edge are in the pixel south or east.
     place = np.array([[1.0, -1.0]]) * xyz[:, :2] / step
-    corner = np.floor(place.min(0) + 1e-6)
-    cols, rows = np.maximum(np.ceil(place.max(0) - 1e-6) - corner, 1.0).astype(int).tolist()
+    corner = np.floor(place.min(0) + _ROUNDING)
+    cols, rows = np.maximum(np.ceil(place.max(0) - _ROUNDING) - corner, 1.0).astype(int).tolist()
     check_size((rows, cols), f"a grid of {step:g} m")
-    col, row = np.minimum((place - corner + 1e-6).astype(int), [cols - 1, rows - 1]).T
+    col, row = np.minimum((place - corner + _ROUNDING).astype(int), [cols - 1, rows - 1]).T
 
     highest = np.full((rows, cols), np.nan)
     no_ground = np.ones((rows, cols), bool)

@@ -22,6 +22,7 @@ _kernel = kernel(fastmath={"contract", "nsz", "arcp"})
 _part = njit(nogil=True, error_model="numpy", fastmath={"contract", "nsz", "arcp"}, **PART)
 BLOCK = 4
 """Side of the squares of pixels that share one value of openness."""
+_GRAZING = -1e-9  # m; rays that are lower above the ground are blocked
 _RAYS = 16  # directions in which openness is computed
 
 
@@ -135,7 +136,7 @@ def transmittance(ground, surface, pixel, start, end, extinction, crown_base):
             a1 = rise - g[1]
             a2 = -g[2]
             dip = a1 * a1 / (4.0 * a2) if a2 > 0.0 and 0.0 < -a1 < 2.0 * a2 else 0.0
-            if not min(a0 - dip, a0 + a1 + a2) >= -1e-9:
+            if not min(a0 - dip, a0 + a1 + a2) >= _GRAZING:
                 return 0.0
 
             # Coefficients of the height of the canopy.

@@ -38,6 +38,8 @@ _UNCOVERED = 0.02  # fraction of the DEM without a surface that causes a warning
 _COARSER = 2.0  # ratio of pixel sizes from which the coarser raster smooths the heights
 _DEGREE = 111_320.0  # m: length of a degree of latitude
 _TILES = "to read tiles as one raster, combine them: gdalbuildvrt -srcnodata -9999 all.vrt *.tif"
+_ROUNDING = 1e-3  # of a pixel: smaller errors of a grid are rounding
+_EXACT = 1e-6  # of a pixel: smaller errors of coordinates are left as they are
 _TALL = 60.0  # m: a higher median of the canopy height is unlikely
 _RAISED = 20.0  # m: a higher 5 % quantile of the canopy height is unlikely
 
@@ -222,8 +224,9 @@ def _of_file(file: DatasetReader, name: str) -> xr.DataArray:
 
     check_size(file.shape, name)
     t = file.transform
-    # Less than a thousandth of a pixel over the whole raster is rounding.
-    turned = abs(t.b) * file.height > 1e-3 * abs(t.a) or abs(t.d) * file.width > 1e-3 * abs(t.e)
+    shear_x = abs(t.b) * file.height  # over the whole raster
+    shear_y = abs(t.d) * file.width
+    turned = shear_x > _ROUNDING * abs(t.a) or shear_y > _ROUNDING * abs(t.e)
     if t.is_identity or turned:
         raise TrustboError(
             f"{name} is not georeferenced, or only by control points or a rotated grid; warp it to "
@@ -324,9 +327,9 @@ def _even(values: np.ndarray, what: str) -> np.ndarray:
 
     single = (given.astype(np.float32) == given).all()
     rounding = 2.0 * np.finfo(np.float32).eps * np.abs(given).max() if single else 0.0
-    if not off <= max(1e-3 * step, min(rounding, 0.5 * step)) or step == 0.0:
+    if not off <= max(_ROUNDING * step, min(rounding, 0.5 * step)) or step == 0.0:
         raise TrustboError(f"{what} is not evenly spaced; resample it to a regular grid.")
-    return given if off <= 1e-6 * step else even
+    return given if off <= _EXACT * step else even
 
 
 def _pixel_side(heights: xr.DataArray) -> float:

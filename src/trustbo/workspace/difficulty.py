@@ -26,6 +26,8 @@ _AHEAD = 1.5  # distance to the point of the route that a robot faces, m
 _STEP = 0.25  # distance between samples of a route, m
 _SUSTAINED = 4  # number of samples over which the tilt is averaged
 _WIDTH = 2.0  # distance to an impassable pixel at which narrowness is 0.5, m
+_UNKNOWN = 0.5  # difficulty of routes without known traversability
+_BESIDE = 1.001  # pixels; a route this close to an impassable pixel is beside it
 _MOST = 2.0  # largest value of the measure tilt
 _TIGHT = 3.0  # log(1 + length in m) at which tightness is 1: 19 m
 _BLOCK = 16  # bounds per task of a thread
@@ -108,9 +110,9 @@ def _of_bound(
         gaps = room[pixels]
         of_route = of_route[np.isfinite(of_route)]
 
-        tight = (gaps <= 1.001 * max(surface.pixel)).sum() * min(surface.pixel)
+        tight = (gaps <= _BESIDE * max(surface.pixel)).sum() * min(surface.pixel)
         measures = (
-            1.0 - of_route.mean() if len(of_route) else 0.5,
+            1.0 - of_route.mean() if len(of_route) else _UNKNOWN,
             min(_tilt(route, *ground) / np.tan(robot.max_slope), _MOST),
             1.0 / (1.0 + gaps.min() / _WIDTH),
             np.log1p(tight) / _TIGHT,

@@ -98,7 +98,8 @@ def geometry(posts: Posts, index: np.ndarray, passable: np.ndarray) -> Geometry:
 def _cells_ahead(passable: np.ndarray, a: Cell, c: Cell) -> list[Cell | None]:
     """Return the cells that may follow the bound a -> c, without sharp turns if possible."""
     rows, cols = passable.shape
-    down, right = c[0] - a[0], c[1] - a[1]
+    down = c[0] - a[0]
+    right = c[1] - a[1]
 
     onward: list[Cell | None] = []
     ahead: list[Cell | None] = []

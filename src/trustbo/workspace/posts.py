@@ -49,6 +49,8 @@ _DOUBT_REACH = 40.0  # decay length of this probability, m
 _NEARER = 1e-3  # penalty on the score per metre from the stop
 _IN_THE_WAY = 5.0  # penalty of a post on the lead's route, larger than any probability
 _TOO_CLOSE = 10.0  # penalty of a post beside another one
+_WATCHING = 0.5  # weight of the sight of the lead's route in the score of a post
+_CLOSING = 0.25  # weight of the sight from each of the lead's two stops
 _N_WATCHED = 30  # number of positions, best seen from the stops, that are rated for all aims
 _N_AIMS = 6  # number of times on the lead's route at which sight is computed
 _SHARES = np.array([0.25, 0.5, 0.75, 1.0])  # fractions of the straight line to a neighbouring stop
@@ -252,12 +254,12 @@ class Posts:
 
         scores = {}
         for robot in dict.fromkeys(self.team.robots):
-            closing = 0.25 * self._seen(stops[:, None], position, lead, robot)
+            closing = _CLOSING * self._seen(stops[:, None], position, lead, robot)
             seen = closing[0] + closing[1:]
 
             best = np.argsort(nearer - seen, axis=1, kind="stable")[:, :_N_WATCHED]
             eyes = position[best][:, :, None] + jittered(_N_AIMS)
-            watched = 0.5 * self._seen(eyes, aims[:, None], robot, lead).mean(-1)
+            watched = _WATCHING * self._seen(eyes, aims[:, None], robot, lead).mean(-1)
 
             score = seen - 1.0  # for positions whose sight of the route is not computed
             np.put_along_axis(score, best, np.take_along_axis(seen, best, 1) + watched, 1)

@@ -22,6 +22,7 @@ Window = tuple[int, int, int, int]
 SLOWEST = 0.1
 """Speed at the slope limit as a fraction of the speed on level ground."""
 _CLEARANCE = 1.0  # preferred distance from obstacles, because robots stray from routes, m
+_TIE = 1e-9  # m on level ground; costs that differ by less are equal but for rounding
 _CLOSE = 4.0  # factor on the cost of a route that is closer to an obstacle
 _compiled = kernel()
 
@@ -117,7 +118,7 @@ def _a_star(pace, pixel, start, goal):
 
         # Admissible estimate: a straight line at the best pace.
         ahead = math.hypot((goal[0] - r) * pixel[0], (goal[1] - c) * pixel[1]) * least
-        if estimate > best[r, c] + ahead + 1e-9:
+        if estimate > best[r, c] + ahead + _TIE:
             continue  # a stale entry: a faster way to the pixel was found
         for dr in range(-1, 2):
             for dc in range(-1, 2):
