@@ -2,12 +2,12 @@
 
 For Gaussian rates, coefficients and linear predictors are integrated out, and NUTS samples only the
 scores of the hyperparameters, with gradients of the evidence from JAX (see `gradient`). Their
-posterior is skewed: below a score at which a standard deviation is too small to matter, the density falls as
-slowly as the prior, and above it as fast as the likelihood. A step that suits one side diverges on
-the other. NUTS therefore samples `Whitened` coordinates, which are fitted to the points of the
-importance sampler and are nearly independent and standard normal. Warm-up tunes only the step size,
-and chains start at points of the importance sampler. The coordinates change the speed of NUTS, but
-not the distribution that it samples.
+posterior is skewed: below a score at which a standard deviation is too small to matter, the density
+falls as slowly as the prior, and above it as fast as the likelihood. A step that suits one side
+diverges on the other. NUTS therefore samples `Whitened` coordinates, which are fitted to the points
+of the importance sampler and are nearly independent and standard normal. Warm-up tunes only the
+step size, and chains start at points of the importance sampler. The coordinates change the speed of
+NUTS, but not the distribution that it samples.
 
 For other families, EP only approximates the evidence, so NUTS samples `model.program`, including
 coefficients and linear predictors.
