@@ -338,7 +338,7 @@ class Posterior:
     def predictors(
         self, draws: Draws
     ) -> Iterator[tuple[slice, Theta, LinearPredictor, np.ndarray]]:
-        """Yield the slice, hyperparameters, predictors and mean predictors of each chunk of draws."""
+        """Yield the slice, theta, predictors and mean predictors of each chunk of draws."""
         for where, theta in chunks(draws.theta):
             self.evaluated(len(theta["inverse_gain"]))
             predictor = self.model.linear_predictor(theta, self.observations, self.layout)

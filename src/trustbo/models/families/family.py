@@ -1,7 +1,8 @@
 """Base class of observation families: rates given linear predictors, and the reverse.
 
 The linear predictor f is trust plus noise shared between rates. To add a family, start from
-`censored` (moments in closed form) or `beta_binomial` (moments by quadrature), and add it to `families.FAMILIES`.
+`censored` (moments in closed form) or `beta_binomial` (moments by quadrature), and add it to
+`families.FAMILIES`.
 """
 
 from abc import ABC, abstractmethod
