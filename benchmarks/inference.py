@@ -35,8 +35,8 @@ from common import Table, arguments, parsed
 
 import trustbo as tb
 from trustbo.inference import TrustFilter, importance, sample_prior
+from trustbo.inference.density import Density
 from trustbo.inference.diagnostics import diagnostics
-from trustbo.inference.posterior import Posterior
 from trustbo.inference.tree import parameters_alone
 from trustbo.models import PlaceEffect, PooledTrust, Priors, RobotEffect
 from trustbo.models.backend import own_settings
@@ -177,7 +177,7 @@ def hillside(n):
 def long_run(data):
     """Return means and standard deviations of the hyperparameters by name, from many points."""
     model = tb.models.default_model().for_features(data[0].features)
-    posterior = Posterior(model, model.observations(data))
+    posterior = Density(model, model.observations(data))
     points = importance.sample(
         posterior.log_density, posterior.start()[None], np.random.default_rng(0),
         size=4096, enough=10_000.0, defensive=posterior.defensive,

@@ -21,8 +21,8 @@ from inference import hillside
 
 import trustbo as tb
 from trustbo.inference import importance
+from trustbo.inference.density import Density
 from trustbo.inference.diagnostics import MAX_RHAT, MIN_ESS
-from trustbo.inference.posterior import Posterior
 
 SIZES = "3", "8", "15"
 OVER = "chain", "draw"
@@ -78,7 +78,7 @@ def scalars(draws):
 def difference(data, fits):
     """Compare the means of all fits with importance sampling; see the docstring of the script."""
     model = tb.models.default_model().for_features(data[0].features)
-    posterior = Posterior(model, model.observations(data))
+    posterior = Density(model, model.observations(data))
     rng = np.random.default_rng(0)
     points = importance.sample(
         posterior.log_density, posterior.start()[None], rng, size=_N_POINTS, enough=_ENOUGH,

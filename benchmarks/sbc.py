@@ -21,9 +21,11 @@ from scipy import stats
 from tqdm import tqdm
 
 import trustbo as tb
+from trustbo.inference.density import Density
 from trustbo.inference.fit import by_importance
 from trustbo.inference.importance import MAX_KHAT
-from trustbo.inference.posterior import Posterior
+from trustbo.inference.latent import replicate
+from trustbo.inference.variables import draw_prior, named
 from trustbo.models import (
     CoupledTrust,
     HierarchicalTrust,
@@ -88,18 +90,18 @@ def rank(model, missions, n, seed, n_ranked=N_RANKED):
     model = model.for_features(missions[0].features)
     observations = model.observations(missions)
     before, measured, ranks = (
-        Posterior(model, observations),
+        Density(model, observations),
         ~np.isnan(observations.contact_rate),
         [],
     )
     for j in range(n):
         rng = np.random.default_rng([seed, j])
-        truth = before.draw_prior(1, rng)
-        rates = np.where(measured, before.replicate(truth, rng)[0], np.nan)
-        posterior = Posterior(model, observations._replace(contact_rate=rates))
+        truth = draw_prior(before, 1, rng)
+        rates = np.where(measured, replicate(before, truth, rng)[0], np.nan)
+        posterior = Density(model, observations._replace(contact_rate=rates))
         drawn, _, summary = by_importance(posterior, n_ranked, int(rng.integers(2**31)))
         if summary["k_hat"] <= MAX_KHAT:
-            found, true = (numbers(posterior.named(d)) for d in (drawn, truth))
+            found, true = (numbers(named(posterior, d)) for d in (drawn, truth))
             ranks.append({name: int((found[name] < true[name][0]).sum()) for name in found})
     return pd.DataFrame(ranks), n - len(ranks)
 

@@ -9,7 +9,7 @@ from joint_normal import Dense
 from numpyro import handlers
 
 from trustbo.inference import engine, factor
-from trustbo.inference.posterior import Posterior, at
+from trustbo.inference.density import Density, at
 from trustbo.models import (
     CoupledTrust,
     HierarchicalTrust,
@@ -50,7 +50,7 @@ def slots_of(model, *, gaps=False, shape=(4, 5, 3)):
 
 def posterior_of(name, **options):
     model = MODELS[name].for_features(FEATURES)
-    posterior = Posterior(model, slots_of(model, **options))
+    posterior = Density(model, slots_of(model, **options))
     z = 0.5 * np.random.default_rng(1).standard_normal((3, posterior.n_scores))
     return posterior, posterior.theta(z)
 
@@ -67,7 +67,7 @@ def test_the_evidence_is_the_density_of_the_dense_joint_normal(name, gaps):
 @pytest.fixture
 def chained(monkeypatch):
     """Eliminates robots' effects as chains, as with a hundred missions, in blocks of 2 missions."""
-    monkeypatch.setattr(sys.modules["trustbo.inference.posterior"], "_CHAINED", 2)
+    monkeypatch.setattr(sys.modules["trustbo.inference.density"], "_CHAINED", 2)
     monkeypatch.setattr(factor, "_CHAIN_BLOCK", 6)
 
 

@@ -5,7 +5,7 @@ import pytest
 from scipy.special import logsumexp
 
 from trustbo.inference import ep
-from trustbo.inference.posterior import Posterior, at
+from trustbo.inference.density import Density, at
 from trustbo.models import HumanTrust, PooledTrust
 from trustbo.models.observations import Observations
 
@@ -17,7 +17,7 @@ def small(observation, y):
     y = np.array(y, dtype=float).reshape(1, 2, 1)
     z = np.array([0.3, 0.8]).reshape(1, 2, 1, 1)
     model = PooledTrust(observation=observation).for_features(FEATURES)
-    return Posterior(model, Observations(y, z, np.full(y.shape, 40.0), FEATURES))
+    return Density(model, Observations(y, z, np.full(y.shape, 40.0), FEATURES))
 
 
 def by_quadrature(posterior, theta):
@@ -75,7 +75,7 @@ def test_parts_of_persons_have_their_joint_law():
     features = ("success", "failure")
     model = HumanTrust(scale="likert7").for_features(features)
     observations = Observations(y, z, np.full(y.shape, 6.0), features)
-    posterior = Posterior(model, observations)
+    posterior = Density(model, observations)
     theta = posterior.theta(np.zeros((1, posterior.n_scores)))
     with_parts = model.linear_predictor(theta, observations, posterior.layout).trust_cov
     effects = model.random_effects(theta, observations)

@@ -15,6 +15,7 @@ from trustbo.inference import complete, fit, importance, params_of, sample_prior
 from trustbo.inference.diagnostics import diagnostics
 from trustbo.inference.draws import prior_mean, read_posterior
 from trustbo.inference.tree import parameters_alone
+from trustbo.inference.variables import named
 from trustbo.models import (
     CoupledTrust,
     HierarchicalTrust,
@@ -98,8 +99,8 @@ def test_any_model_has_any_effects_and_is_read_back_as_it_was(name):
     missions = walking_missions(0, 3)
     posterior = fit(missions, MODELS[name], check=False, **QUIET)
     fitted, draws = read_posterior(posterior)
-    named = fitted.named(draws)["posterior"]
-    for site, values in named.items():
+    by_name = named(fitted, draws)["posterior"]
+    for site, values in by_name.items():
         if not site.startswith("mean_"):
             kept = posterior["posterior"][site].values
             np.testing.assert_allclose(values, kept.reshape(values.shape), rtol=1e-9, atol=1e-12)

@@ -10,8 +10,8 @@ from references import dense_log_likelihood
 from scipy import stats
 
 import trustbo as tb
+from trustbo.inference.density import Density
 from trustbo.inference.fit import by_importance
-from trustbo.inference.posterior import Posterior
 from trustbo.models import PlaceEffect, PooledTrust, RobotEffect, TrustParams
 
 FEATURES = ["line_of_sight", "slope"]
@@ -45,7 +45,7 @@ def without_memory(model):
 def test_the_evidence_without_memory_is_that_of_quadrature():
     """Over both noises, half-normal a priori."""
     model = without_memory(PooledTrust())
-    posterior = Posterior(model, model.observations(missions_with(0.3, 1)))
+    posterior = Density(model, model.observations(missions_with(0.3, 1)))
     found = by_importance(posterior, 1000, 0)[2]["log_evidence"]
 
     p = (np.arange(80) + 0.5) / 80

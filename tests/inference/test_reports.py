@@ -8,8 +8,8 @@ from scipy.linalg import cho_factor, cho_solve
 import trustbo as tb
 from trustbo.errors import TrustboError
 from trustbo.inference import fit, loo, predict_reports
+from trustbo.inference.density import at
 from trustbo.inference.draws import read_posterior
-from trustbo.inference.posterior import at
 from trustbo.models import HumanTrust, PooledTrust
 
 FEATURES = ["success", "failure", "demand"]

@@ -10,8 +10,9 @@ import xarray as xr
 
 from trustbo.data import Mission, is_line_of_sight
 from trustbo.errors import TrustboError, require_count, require_kind, require_whole
+from trustbo.inference.density import Density, Draws
 from trustbo.inference.place_maps import place_maps_of
-from trustbo.inference.posterior import Draws, Posterior
+from trustbo.inference.variables import draws_of, prior_parameters
 from trustbo.models.effects.effect import Effect, Theta
 from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.model import TrustModel
@@ -257,8 +258,8 @@ def read_posterior(
     missions: Sequence[Mission] | None = None,
     *,
     model: TrustModel | None = None,
-) -> tuple[Posterior, Draws]:
-    """Rebuild the `Posterior` and the draws of a DataTree, with chains joined.
+) -> tuple[Density, Draws]:
+    """Rebuild the `Density` and the draws of a DataTree, with chains joined.
 
     Args:
         posterior: DataTree from `fit`.
@@ -277,10 +278,10 @@ def read_posterior(
         model = model_from_record(json.loads(posterior.attrs["model_record"]), features=features)
     require_kind("model", model, TrustModel, "give the model of the posterior")
     model = model.for_features(features)
-    fitted = Posterior(model, model.observations(missions))
+    fitted = Density(model, model.observations(missions))
     groups = {"posterior": sites_of(posterior)}
     groups |= {effect.group: values_of(posterior, effect) for effect in model.effects}
-    return fitted, fitted.draws_of(groups)
+    return fitted, draws_of(fitted, groups)
 
 
 def sample_prior(
@@ -298,24 +299,24 @@ def sample_prior(
     require_kind("model", model, TrustModel, "give a model such as PooledTrust()")
     n_draws, seed = require_count("n_draws", n_draws), require_whole("seed", seed, 0)
     prior, rng = _prior(model, n_features, n_robots), np.random.default_rng(seed)
-    return assemble_params(prior.prior_sites(n_draws, rng), model.x0, model.memory)
+    return assemble_params(prior_parameters(prior, n_draws, rng), model.x0, model.memory)
 
 
 def prior_mean(model: TrustModel, n_features: int, *, n_robots: int = 1) -> Params:
     """Compute the prior mean of the parameters without effects; see `sample_prior`."""
     prior, rng = _prior(model, n_features, n_robots), np.random.default_rng(0)
-    sites = prior.prior_sites(_N_MEAN, rng, even=True)
+    sites = prior_parameters(prior, _N_MEAN, rng, even=True)
     sites = {name: values.mean(0, keepdims=True) for name, values in sites.items()}
     return assemble_params(sites, model.x0, model.memory)
 
 
-def _prior(model: TrustModel, n_features: int, n_robots: int) -> Posterior:
-    """Make a `Posterior` without data or effects."""
+def _prior(model: TrustModel, n_features: int, n_robots: int) -> Density:
+    """Make a `Density` without data or effects."""
     sizes = {"n_features": n_features, "n_robots": n_robots}
     n_features, n_robots = (require_count(name, n) for name, n in sizes.items())
     none = np.full((1, 1, n_robots), np.nan)
     z = np.zeros((1, 1, n_robots, n_features))
-    return Posterior(replace(model, effects=()), Observations(none, z, none, ("",) * n_features))
+    return Density(replace(model, effects=()), Observations(none, z, none, ("",) * n_features))
 
 
 def missions_of(posterior: xr.DataTree) -> list[Mission]:

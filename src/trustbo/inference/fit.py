@@ -18,6 +18,7 @@ from trustbo.errors import (
     require_kind,
     require_whole,
 )
+from trustbo.inference.density import Columns, Density, Draws
 from trustbo.inference.importance import (
     MAX_KHAT,
     LogDensity,
@@ -28,8 +29,8 @@ from trustbo.inference.importance import (
     systematic,
 )
 from trustbo.inference.place_maps import place_group
-from trustbo.inference.posterior import Columns, Draws, Posterior
 from trustbo.inference.tree import N_PRIOR, complete, to_datatree
+from trustbo.inference.variables import named, prior_parameters
 from trustbo.models.backend import VERSIONS
 from trustbo.models.default import default_model
 from trustbo.models.model import TrustModel
@@ -130,13 +131,13 @@ def fit(
     observations = model.observations(missions, workspace)
     if np.isnan(observations.contact_rate).all():
         raise TrustboError("every contact rate is NaN; fit needs at least one measured rate.")
-    posterior = Posterior(model, observations)
+    density = Density(model, observations)
     if sampler == "importance":
         chains, draws = 1, chains * draws  # independent draws belong to one chain
         first = _first_proposal(start, model)
         with slow_bar("fit", " points", progress) as bar:
-            posterior.evaluated = bar.update
-            drawn, stats, summary = by_importance(posterior, draws, seed, first)
+            density.evaluated = bar.update
+            drawn, stats, summary = by_importance(density, draws, seed, first)
         complaints = []
         if not summary["k_hat"] <= MAX_KHAT:
             reason = f"k-hat {summary['k_hat']:.2f}, limit {MAX_KHAT}"
@@ -145,12 +146,12 @@ def fit(
         from trustbo.inference.nuts import sample_by_nuts  # slow to import
 
         drawn, stats, summary, complaints = sample_by_nuts(
-            posterior, chains=chains, draws=draws, warmup=warmup, seed=seed, progress=progress
+            density, chains=chains, draws=draws, warmup=warmup, seed=seed, progress=progress
         )
-    tree = _laid_out(posterior, drawn, stats, (chains, draws), missions, seed)
+    tree = _laid_out(density, drawn, stats, (chains, draws), missions, seed)
     if "proposal" in summary:
         tree["sample_stats"].attrs["proposal"] = summary.pop("proposal")
-    tree.attrs |= _record(model, posterior) | summary | {"sampler": sampler, "seed": seed}
+    tree.attrs |= _record(model, density) | summary | {"sampler": sampler, "seed": seed}
     if check and complaints:
         raise PosteriorError(
             f"the sampler's diagnostics are bad: {'; '.join(complaints)}.",
@@ -165,7 +166,7 @@ def fit(
 
 
 def by_importance(
-    posterior: Posterior, n: int, seed: int, first: Student | None = None
+    density: Density, n: int, seed: int, first: Student | None = None
 ) -> tuple[Draws, dict[str, np.ndarray], dict[str, Any]]:
     """Draw n times by importance sampling; return draws, statistics (draw,) and a summary.
 
@@ -173,19 +174,19 @@ def by_importance(
     found by a search for the mode.
     """
     rng = np.random.default_rng(seed)
-    draw = _exact_draws if posterior.exact else _ep_draws
+    draw = _exact_draws if density.exact else _ep_draws
     attempts = [(256, 1, first), (256, 1, None), (1024, 4, None)]
     attempts = attempts if first else attempts[1:]
     while True:
         size, n_sweeps, proposal = attempts.pop(0)
-        size = size if posterior.n_scores < 12 else 4 * size
-        drawn, log_p, summary = draw(posterior, n, size, n_sweeps, rng, proposal)
+        size = size if density.n_scores < 12 else 4 * size
+        drawn, log_p, summary = draw(density, n, size, n_sweeps, rng, proposal)
         if summary["k_hat"] <= MAX_KHAT or not attempts:
             return drawn, {"lp": log_p}, summary
 
 
 def _exact_draws(
-    posterior: Posterior,
+    density: Density,
     n: int,
     size: int,
     n_sweeps: int,
@@ -196,20 +197,20 @@ def _exact_draws(
     visited: list[Columns] = []
 
     def visit(z: np.ndarray) -> np.ndarray:
-        log_p, columns = posterior.visit(z, rng)
+        log_p, columns = density.visit(z, rng)
         visited.append(columns)
         return log_p
 
-    points = _points(posterior, size, rng, first, visit)
+    points = _points(density, size, rng, first, visit)
     chosen = points.resample(n, rng)
     c = Columns.joined(visited).draw(chosen, rng)
-    drawn = Draws(posterior.theta(points.z[chosen]), c)
+    drawn = Draws(density.theta(points.z[chosen]), c)
     summary = {name: getattr(points, name) for name in ("k_hat", "kish", "log_evidence")}
     return drawn, points.log_p[chosen], summary | {"proposal": points.proposal.text}
 
 
 def _ep_draws(
-    posterior: Posterior,
+    density: Density,
     n: int,
     size: int,
     n_sweeps: int,
@@ -217,10 +218,10 @@ def _ep_draws(
     first: Student | None,
 ) -> tuple[Draws, np.ndarray, dict[str, Any]]:
     """Draw n times given other rates, and correct the density of scores by EP with weights."""
-    points = _points(posterior, size, rng, first)
+    points = _points(density, size, rng, first)
     # Correcting EP at these points takes most time, but more points make k-hat more reliable.
     some = points.resample(_CORRECTED * size, rng)
-    drawn, log_ratio = posterior.draw_by_ep(points.z[some], points.log_p[some], rng, n_sweeps)
+    drawn, log_ratio = density.draw_by_ep(points.z[some], points.log_p[some], rng, n_sweeps)
     weight, k_hat, log_mean = smoothed(log_ratio)
     chosen = systematic(weight, n, rng)
     summary = {
@@ -233,7 +234,7 @@ def _ep_draws(
 
 
 def _points(
-    posterior: Posterior,
+    density: Density,
     size: int,
     rng: np.random.Generator,
     first: Student | None,
@@ -241,13 +242,13 @@ def _points(
 ) -> Points:
     """Sample the scores, beginning with the proposal `first` or with a search for the mode."""
     if first is None:
-        start = posterior.start()
+        start = density.start()
     else:
         start = first.center
-        posterior.run_ep(posterior.theta(start[None]))
+        density.run_ep(density.theta(start[None]))
     return sample(
-        posterior.log_density, start[None], rng,
-        size=size, defensive=posterior.defensive, first=first, visit=visit,
+        density.log_density, start[None], rng,
+        size=size, defensive=density.defensive, first=first, visit=visit,
     )  # fmt: skip
 
 
@@ -260,7 +261,7 @@ def _first_proposal(start: xr.DataTree | None, model: TrustModel) -> Student | N
 
 
 def _laid_out(
-    posterior: Posterior,
+    density: Density,
     drawn: Draws,
     stats: dict[str, np.ndarray],
     shape: tuple[int, int],
@@ -269,23 +270,23 @@ def _laid_out(
 ) -> xr.DataTree:
     """Build a DataTree from the data, and from posterior and prior draws."""
     rng = np.random.default_rng([seed, 3])
-    groups = posterior.named(drawn) | {"sample_stats": stats}
+    groups = named(density, drawn) | {"sample_stats": stats}
     groups = {
         group: {name: v.reshape(*shape, *v.shape[1:]) for name, v in values.items()}
         for group, values in groups.items()
     }
-    places, model = groups.pop("places", None), posterior.model
-    prior_draws = posterior.prior_sites(N_PRIOR, rng)
+    places, model = groups.pop("places", None), density.model
+    prior_draws = prior_parameters(density, N_PRIOR, rng)
     groups["prior"] = {name: values[None] for name, values in prior_draws.items()}
     tree = to_datatree(groups, missions, model.dims, model.effects)
     if places is not None:
-        tree["places"] = xr.DataTree(place_group(places, posterior.observations.visited, seed))  # pyright: ignore[reportArgumentType]
+        tree["places"] = xr.DataTree(place_group(places, density.observations.visited, seed))  # pyright: ignore[reportArgumentType]
     return tree
 
 
-def _record(model: TrustModel, posterior: Posterior) -> dict[str, Any]:
+def _record(model: TrustModel, density: Density) -> dict[str, Any]:
     """Make the attributes that describe the model and the data of a posterior."""
-    observations = posterior.observations
+    observations = density.observations
     options = {name: int(v) if isinstance(v, bool) else v for name, v in model.options().items()}
     return {
         "model": type(model).__name__,

@@ -20,10 +20,10 @@ from scipy.special import logsumexp
 
 from trustbo.display import slow_bar
 from trustbo.errors import TrustboError, one_line
+from trustbo.inference.density import Density, at
 from trustbo.inference.draws import missions_of, read_posterior, require_posterior
 from trustbo.inference.fit import by_importance
 from trustbo.inference.importance import MAX_KHAT, smoothed
-from trustbo.inference.posterior import Posterior, at
 from trustbo.models.model import TrustModel
 from trustbo.models.observations import Observations
 from trustbo.parallel import computing
@@ -113,9 +113,9 @@ def loo(
     )
 
 
-def _log_evidence(posterior: Posterior, seed: int) -> tuple[float, float]:
+def _log_evidence(density: Density, seed: int) -> tuple[float, float]:
     """Compute the log evidence by importance sampling, and the k-hat of the weights."""
-    summary = by_importance(posterior, 1000, seed)[2]
+    summary = by_importance(density, 1000, seed)[2]
     return summary["log_evidence"], summary["k_hat"]
 
 

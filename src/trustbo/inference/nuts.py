@@ -23,8 +23,8 @@ from numpyro.infer.util import ParamInfo
 from scipy import optimize
 
 from trustbo.inference import importance
+from trustbo.inference.density import Density, Draws
 from trustbo.inference.diagnostics import complaints_of
-from trustbo.inference.posterior import Draws, Posterior
 from trustbo.models.backend import namespace, own_settings
 from trustbo.streams import stream
 
@@ -108,7 +108,7 @@ def _marginal(z: np.ndarray) -> np.ndarray:
 
 
 def sample_by_nuts(
-    posterior: Posterior,
+    density: Density,
     *,
     chains: int,
     draws: int,
@@ -119,7 +119,7 @@ def sample_by_nuts(
     """Sample a posterior with NumPyro's NUTS in vectorised chains.
 
     Args:
-        posterior: Posterior of a model given missions.
+        density: Density of a model given missions.
         chains: Number of chains.
         draws: Number of draws per chain.
         warmup: Number of warm-up draws per chain; by default 150 for Gaussian rates, for which
@@ -132,20 +132,20 @@ def sample_by_nuts(
         checks.
     """
     rng = stream(seed, "nuts")
-    warmup = _WARMUP[posterior.exact] if warmup is None else warmup
+    warmup = _WARMUP[density.exact] if warmup is None else warmup
     points = importance.sample(
-        posterior.log_density, posterior.start()[None], rng, defensive=posterior.defensive
+        density.log_density, density.start()[None], rng, defensive=density.defensive
     )
     z = points.z[points.resample(_POINTS, rng)]
     coordinates = Whitened.of(z)
     with own_settings():
-        if posterior.exact:
-            kernel = _marginal_kernel(posterior, coordinates)
-            starts = _starts(posterior, coordinates, rng.choice(z, chains, replace=False))
+        if density.exact:
+            kernel = _marginal_kernel(density, coordinates)
+            starts = _starts(density, coordinates, rng.choice(z, chains, replace=False))
             if chains == 1:  # NumPyro expects no axis of chains
                 starts = jax.tree.map(lambda values: values[0], starts)
         else:
-            kernel, starts = _full_kernel(posterior, z), None
+            kernel, starts = _full_kernel(density, z), None
         mcmc = MCMC(
             kernel, num_warmup=warmup, num_samples=draws, num_chains=chains,
             chain_method="vectorized", progress_bar=progress,
@@ -155,15 +155,15 @@ def sample_by_nuts(
         samples: Any = jax.tree.map(np.asarray, mcmc.get_samples())
     stats = {ours: fields[theirs] for theirs, ours in _FIELDS.items()}
     stats["lp"] = -stats["lp"]
-    if posterior.exact:
+    if density.exact:
         z, log_jacobian = coordinates.scores(samples)
         stats["lp"] = stats["lp"] - log_jacobian
-        values = posterior.scores.values(z)
+        values = density.scores.values(z)
     else:
-        values = {name: samples[name] for name in posterior.scores.priors}
-    theta = posterior.model.theta(values, posterior.observations.resolution)
-    if posterior.exact:
-        drawn = Draws(theta, posterior.draw_columns(theta, rng))
+        values = {name: samples[name] for name in density.scores.priors}
+    theta = density.model.theta(values, density.observations.resolution)
+    if density.exact:
+        drawn = Draws(theta, density.draw_columns(theta, rng))
     else:
         drawn = Draws(theta, samples["columns"], samples["linear_predictor"])
     by_chain = {name: v.reshape(chains, draws, *v.shape[1:]) for name, v in values.items()}
@@ -171,12 +171,12 @@ def sample_by_nuts(
     return drawn, stats, found, complaints
 
 
-def _marginal_kernel(posterior: Posterior, coordinates: Whitened) -> NUTS:
+def _marginal_kernel(density: Density, coordinates: Whitened) -> NUTS:
     """Make the kernel for scores in whitened coordinates."""
 
     def potential(x: jax.Array) -> jax.Array:
         z, log_jacobian = coordinates.scores(x[None])
-        return -(posterior.log_density(z) + log_jacobian)[0]
+        return -(density.log_density(z) + log_jacobian)[0]
 
     return NUTS(
         potential_fn=potential, adapt_mass_matrix=False, target_accept_prob=_ACCEPT,
@@ -184,7 +184,7 @@ def _marginal_kernel(posterior: Posterior, coordinates: Whitened) -> NUTS:
     )  # fmt: skip
 
 
-def _starts(posterior: Posterior, coordinates: Whitened, z: np.ndarray) -> ParamInfo:
+def _starts(density: Density, coordinates: Whitened, z: np.ndarray) -> ParamInfo:
     """Return the states at which chains start, with scores z (chain, score).
 
     NumPy computes the first potentials and slopes, so that JAX compiles the gradient only once.
@@ -194,17 +194,17 @@ def _starts(posterior: Posterior, coordinates: Whitened, z: np.ndarray) -> Param
     steps = _SLOPE_STEP * np.vstack([np.zeros((1, d)), np.eye(d), -np.eye(d)])
 
     at, log_jacobian = coordinates.scores((x[:, None] + steps).reshape(-1, d))
-    potential = -(posterior.log_density(at) + log_jacobian).reshape(n, -1)
+    potential = -(density.log_density(at) + log_jacobian).reshape(n, -1)
     slope = (potential[:, 1 : d + 1] - potential[:, d + 1 :]) / (2.0 * _SLOPE_STEP)
     return ParamInfo(*map(jnp.asarray, (x, potential[:, 0], slope)))
 
 
-def _full_kernel(posterior: Posterior, z: np.ndarray) -> NUTS:
+def _full_kernel(density: Density, z: np.ndarray) -> NUTS:
     """Make the kernel for the model's program; chains start at the median of the scores z."""
-    values = posterior.scores.values(z)
+    values = density.scores.values(z)
     center = {name: jnp.asarray(np.median(v, axis=0)) for name, v in values.items()}
 
     def program() -> None:
-        posterior.model.program(posterior.observations)
+        density.model.program(density.observations)
 
     return NUTS(program, init_strategy=init_to_value(values=center), target_accept_prob=0.9)

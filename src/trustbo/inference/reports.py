@@ -8,8 +8,9 @@ import xarray as xr
 
 from trustbo.data import Mission, levels_of
 from trustbo.errors import TrustboError, require_choice, require_count, require_whole
+from trustbo.inference.density import Density, Draws
 from trustbo.inference.draws import QUANTILES, is_of_people, read_posterior, require_posterior
-from trustbo.inference.posterior import Draws, Posterior
+from trustbo.inference.latent import predictors
 from trustbo.models.model import TrustModel
 from trustbo.parallel import computing
 from trustbo.stacking import require_same_team
@@ -36,7 +37,7 @@ def predict_reports(
     Reports at the same bound are not used to predict each other.
 
     Args:
-        posterior: Posterior of `HumanTrust`.
+        posterior: Density of `HumanTrust`.
         missions: One mission per person; NaN reports are also predicted.
         given: `"earlier"` to use earlier reports of the person, or `"none"` to use no reports.
         fitted: Whether the posterior was fitted to the earlier reports of these persons. If so,
@@ -72,7 +73,7 @@ def predict_reports(
             "posterior."
         )
     levels = levels_of(posterior.attrs["scale"])
-    ahead = Posterior(of_fit.model, of_fit.model.observations(missions))
+    ahead = Density(of_fit.model, of_fit.model.observations(missions))
     copies = _ALIKE if fitted else 1
     some = np.unique(np.linspace(0, len(draws.c) - 1, max(1, n // copies)).astype(int))
     draws = draws.at(np.repeat(some, copies))
@@ -99,7 +100,7 @@ def predict_reports(
 
 
 def _of_person(
-    ahead: Posterior, draws: Draws, j: int, earlier: bool, alike: int, rng: np.random.Generator
+    ahead: Density, draws: Draws, j: int, earlier: bool, alike: int, rng: np.random.Generator
 ) -> Iterator[tuple[tuple[int, int], np.ndarray, np.ndarray, np.ndarray]]:
     """Yield (bound, robot), draw weights, and mean and variance of trust for each report.
 
@@ -109,7 +110,7 @@ def _of_person(
     observations, family = ahead.observations, ahead.model.family
     _, n_bounds, n_robots = observations.contact_rate.shape
     mean, root = [], []
-    for _, _, predictor, of_all in ahead.predictors(draws):
+    for _, _, predictor, of_all in predictors(ahead, draws):
         mean.append(of_all[:, j])
         cov = each(predictor.covariance, ahead.blocks.label)
         cov = np.broadcast_to(cov, (len(of_all), *cov.shape[1:]))[:, j % cov.shape[1]]
@@ -136,7 +137,7 @@ def _of_person(
 
 
 def _prediction(
-    ahead: Posterior,
+    ahead: Density,
     slot: tuple[int, int, int],
     weight: np.ndarray,
     center: np.ndarray,

@@ -8,6 +8,7 @@ import xarray as xr
 
 from trustbo.data import NOWHERE, Mission
 from trustbo.display import slow_bar
+from trustbo.inference.density import Density
 from trustbo.inference.draws import (
     effects_of,
     missions_of,
@@ -15,7 +16,8 @@ from trustbo.inference.draws import (
     require_posterior,
     sites_of,
 )
-from trustbo.inference.posterior import Posterior
+from trustbo.inference.latent import latent_of, replicate
+from trustbo.inference.variables import draw_prior
 from trustbo.models.effects.effect import Effect
 from trustbo.models.model import TrustModel
 from trustbo.models.observations import Observations
@@ -161,15 +163,15 @@ def complete(
     some = (np.arange(n_chains)[:, None] * n_draws + kept).ravel()
     with slow_bar("latent trust", " draws", progress) as bar:
         fitted.evaluated = bar.update
-        given = fitted.given(draws, some, stream(seed, "latent"))
+        latent = latent_of(fitted, draws, some, stream(seed, "latent"))
 
     rng = stream(seed, "prior predictive")
-    replicated = fitted.replicate(fitted.draw_prior(N_PRIOR, rng), rng)
+    replicated = replicate(fitted, draw_prior(fitted, N_PRIOR, rng), rng)
     shift = fitted.model.family.log_resolution(
         fitted.observations.contact_rate, fitted.observations.n_ticks
     ).sum((1, 2))
     counted = not np.isnan(shift).any()
-    likelihood = given.log_likelihood + (shift if counted else 0.0)
+    likelihood = latent.log_likelihood + (shift if counted else 0.0)
 
     def by_chain(array: np.ndarray) -> np.ndarray:
         return array.reshape(n_chains, -1, *array.shape[1:])
@@ -177,12 +179,12 @@ def complete(
     groups = {
         "log_likelihood": {"contact_rate": by_chain(likelihood)},
         "latent": {
-            "trust": by_chain(given.trust),
-            "trust_mean": given.mean,
-            "trust_sd": given.sd,
+            "trust": by_chain(latent.trust),
+            "trust_mean": latent.mean,
+            "trust_sd": latent.sd,
             "draw": kept,
         },
-        "posterior_predictive": {"contact_rate": by_chain(given.predicted), "draw": kept},
+        "posterior_predictive": {"contact_rate": by_chain(latent.predicted), "draw": kept},
         "prior_predictive": {"contact_rate": replicated[None]},
         "log_prior": {
             name: by_chain(values)
@@ -196,7 +198,7 @@ def complete(
     return whole
 
 
-def log_prior(fitted: Posterior, sites: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+def log_prior(fitted: Density, sites: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Compute the log prior density (draw,) of each parameter with an independent prior.
 
     Deviations of robots from a common mean belong to the model and not to the prior, so only means
@@ -205,7 +207,7 @@ def log_prior(fitted: Posterior, sites: Mapping[str, np.ndarray]) -> dict[str, n
     on `delta_v` excludes the noise that is due to the resolution of the rates.
 
     Args:
-        fitted: Posterior of the model given missions.
+        fitted: Density of the model given missions.
         sites: Draws (draw, ...) of the parameters by name.
     """
     model, priors = fitted.model, fitted.scores.priors

@@ -1,21 +1,20 @@
-"""The posterior of a model: a density for samplers, and draws given the hyperparameters."""
+"""The posterior density of a model for samplers, and draws of coefficients."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 from scipy import sparse
-from scipy.special import logsumexp
 
 from trustbo.inference import ep, gradient
-from trustbo.inference.engine import Blocks, Fit, Prior, columns_of, evidence, expected, whiten
-from trustbo.inference.factor import Order, cholesky
+from trustbo.inference.engine import Blocks, Fit, Prior, columns_of, evidence
+from trustbo.inference.factor import Order
 from trustbo.inference.importance import Student, climb
 from trustbo.models.backend import namespace
 from trustbo.models.effects.effect import Theta
 from trustbo.models.model import TrustModel
 from trustbo.models.observations import Observations
-from trustbo.statespace.blocks import LinearPredictor, each
+from trustbo.statespace.blocks import LinearPredictor
 
 _CHUNK = 32  # largest number of points evaluated at once
 _NUMBERS = 5_000_000  # largest number of precision entries of the points evaluated at once
@@ -23,9 +22,8 @@ _CHAINED = 100  # missions from which lasting effects are eliminated as chains
 _FEW = 15  # missions with which the search for the mode begins
 _SIZES = (0.3, 1.0, 1.8, 2.6)  # log ratios of the sd of rates to the noises at each start
 _LARGEST_NOISE, _LEAST_NOISE = 50.0, 1e-6  # limits of the size of the noises; see `NormalScores`
-_SWEEPS = 1  # EP sweeps at each point, beginning with the sites at the mode
+SWEEPS = 1  # EP sweeps at each point, beginning with the sites at the mode
 _SETTLED, _DAMPING = 12, 0.7  # EP sweeps and damping to find the sites at the mode
-_PARTICLES = 4  # linear predictors drawn for each draw of the coefficients
 _DEVIATIONS = 4  # draws of the coefficients that are kept at each visited point
 
 
@@ -68,18 +66,8 @@ class Columns(NamedTuple):
         return drawn
 
 
-class Given(NamedTuple):
-    """Trust, likelihoods and predictions for given draws."""
-
-    trust: np.ndarray  # (kept draw, mission, bound, robot)
-    mean: np.ndarray  # (mission, bound, robot), over all draws
-    sd: np.ndarray
-    log_likelihood: np.ndarray  # (draw, mission)
-    predicted: np.ndarray  # (kept draw, mission, bound, robot), replicated rates
-
-
-class Posterior:
-    """Posterior of a trust model's hyperparameters, coefficients and linear predictors."""
+class Density:
+    """Posterior density of a model's scores, and draws of its coefficients given the scores."""
 
     def __init__(self, model: TrustModel, observations: Observations) -> None:
         """Prepare the columns and blocks of a model for the observations."""
@@ -89,7 +77,7 @@ class Posterior:
         self.scores = model.scores(observations)
         self.n_scores = self.scores.n_scores
         columns = [effect.columns(observations) for effect in model.columns]
-        self._ends = np.cumsum([0, *(U.shape[1] for U in columns)])
+        self.ends = np.cumsum([0, *(U.shape[1] for U in columns)])
         self._U = self.layout.columns(sparse.hstack(columns, format="csr"))
         self.exact = model.family.gaussian
         self._chained = self.exact and observations.n_missions >= _CHAINED
@@ -115,9 +103,9 @@ class Posterior:
         met[at.row * n // rows, at.col] = True
         return Order.of(met, free, 0 if chains is None else chains.lasting.shape[1])
 
-    def without(self, mission: int) -> "Posterior":
+    def without(self, mission: int) -> "Density":
         """Return the posterior without the data of one mission."""
-        other = Posterior(self.model, self.observations.without([mission]))
+        other = Density(self.model, self.observations.without([mission]))
         if not self.exact:
             kept = ~np.isnan(other.terms.y)
             other.sites = ep.Sites(*(np.where(kept, site, 0.0) for site in self.sites))
@@ -167,13 +155,15 @@ class Posterior:
         """Compute log p(rates | theta) at each point, with EP if rates are not Gaussian."""
         if namespace(theta["inverse_gain"]) is not np:
             predictor, prior = self._at(theta)
-            return gradient.log_evidence(self.blocks, predictor, prior, self._lam(predictor))
+            return gradient.log_evidence(
+                self.blocks, predictor, prior, self.site_precision(predictor)
+            )
         found = np.empty(len(theta["inverse_gain"]))
         for i, chunk in chunks(theta, self._n_at_once):
             if self.exact:
                 found[i] = self._fit(chunk)[0].log_p
             else:
-                found[i] = ep.log_evidence(self._joint(chunk), self.sites, _SWEEPS)[0]
+                found[i] = ep.log_evidence(self._joint(chunk), self.sites, SWEEPS)[0]
         return found
 
     def run_ep(self, theta: Theta) -> None:
@@ -189,7 +179,7 @@ class Posterior:
         """
         few = self.observations.first(_FEW)
         if self.observations.n_missions >= 2 * _FEW and not np.isnan(few.contact_rate).all():
-            of_few = Posterior(self.model, few)
+            of_few = Density(self.model, few)
             best = climb(of_few.log_density, of_few.start())
         else:
             best = self._best_of_four_starts()
@@ -249,142 +239,6 @@ class Posterior:
             drawn.append(mean + deviation[:, 0])
         return np.concatenate(drawn)
 
-    def named(self, draws: Draws) -> dict[str, dict[str, np.ndarray]]:
-        """Return the variables of draws by group (`posterior` and one per effect) and name."""
-        model, theta = self.model, draws.theta
-        groups = {"posterior": self._hyperparameters(theta)}
-        for effect, a, b in zip(model.columns, self._ends[:-1], self._ends[1:], strict=True):
-            named = effect.named(draws.c[:, a:b], theta, self.observations)
-            groups.setdefault(effect.group or "posterior", {}).update(named)
-        return groups
-
-    def _hyperparameters(self, theta: Theta) -> dict[str, np.ndarray]:
-        """Select the hyperparameters that the group `posterior` contains."""
-        names = self.model.dims.keys() | self.model.effect_dims.keys()
-        return {name: values for name, values in theta.items() if name in names}
-
-    def draws_of(self, groups: Mapping[str, Mapping[str, np.ndarray]]) -> Draws:
-        """Make draws from variables by group and name, as returned by `named`."""
-        sites, model = groups["posterior"], self.model
-        theta = model.derived({n: sites[n] for n in model.dims | model.effect_dims if n in sites})
-        theta = {name: v for name, v in theta.items() if name not in ("beta", "b", "B")}
-        c = [
-            effect.coefficients(groups[effect.group or "posterior"], theta, self.observations)
-            for effect in model.columns
-        ]
-        return Draws(theta, np.column_stack(c))
-
-    def draw_prior(self, n: int, rng: np.random.Generator) -> Draws:
-        """Draw hyperparameters and coefficients from the prior."""
-        theta = self.model.theta(self.scores.draw(n, rng), self.observations.resolution)
-        c = [self.prior(chunk).draw(rng) for _, chunk in chunks(theta)]
-        return Draws(theta, np.concatenate(c))
-
-    def prior_sites(
-        self, n: int, rng: np.random.Generator, *, even: bool = False
-    ) -> dict[str, np.ndarray]:
-        """Draw parameters (draw, ...) by name from the prior, without effects.
-
-        With `even`, hyperparameters are evenly spaced quantiles, and coefficients prior means.
-        """
-        model, observations = self.model, self.observations
-        theta = model.theta(self.scores.draw(n, rng, even=even), observations.resolution)
-        weights = Prior.of([model.weights.prior(theta, observations)])
-        c = weights.mean if even else weights.draw(rng)
-        return {**self._hyperparameters(theta), **model.weights.named(c, theta, observations)}
-
-    def given(self, draws: Draws, kept: np.ndarray, rng: np.random.Generator) -> Given:
-        """Compute trust, likelihoods and predictions for given draws.
-
-        Args:
-            draws: Draws of hyperparameters and coefficients.
-            kept: Indices of the draws whose trust and predicted rates are kept.
-            rng: Random number generator.
-        """
-        rows = [v.reshape(len(draws.c), -1) for v in draws.theta.values()]
-        _, some, index = np.unique(  # EP draws may repeat, so evaluate each distinct draw once
-            np.column_stack([*rows, draws.c]), axis=0, return_index=True, return_inverse=True
-        )
-        index, draws = index.ravel(), draws.at(some)
-        share = np.bincount(index, minlength=len(some)) / len(index)
-        shown, place = np.unique(index[kept], return_inverse=True)
-        shape = self.observations.contact_rate.shape
-
-        mean, square = np.zeros(shape), np.zeros(shape)
-        log_likelihood = np.empty((len(some), shape[0]))
-        trust, predicted = np.empty((2, len(shown), *shape))
-        given_mean = self._exact_trust if self.exact else self._ep_trust
-        for where, theta, predictor, expected_predictor in self.predictors(draws):
-            x, log_p = given_mean(theta, predictor, expected_predictor, rng)
-            x = self.layout.unstack(x)
-            mean += np.einsum("n,nmbr->mbr", share[where], x)
-            square += np.einsum("n,nmbr->mbr", share[where], x**2)
-            log_likelihood[where] = log_p.reshape(len(log_p), shape[0], -1).sum(2)
-
-            first, last = np.searchsorted(shown, (where.start, where.start + len(x)))
-            here = shown[first:last] - where.start
-            trust[first:last] = x[here]
-            predicted[first:last] = self._rates(predictor, expected_predictor, rng)[here]
-        sd = np.sqrt(np.maximum(square - mean**2, 0.0))
-        return Given(trust[place], mean, sd, log_likelihood[index], predicted[place])
-
-    def replicate(self, draws: Draws, rng: np.random.Generator) -> np.ndarray:
-        """Draw replicated rates (draw, mission, bound, robot) of the missions."""
-        rates = np.empty((len(draws.c), *self.observations.contact_rate.shape))
-        for i, _, predictor, mean in self.predictors(draws):
-            rates[i] = self._rates(predictor, mean, rng)
-        return rates
-
-    def predictors(
-        self, draws: Draws
-    ) -> Iterator[tuple[slice, Theta, LinearPredictor, np.ndarray]]:
-        """Yield the slice, theta, predictors and mean predictors of each chunk of draws."""
-        for where, theta in chunks(draws.theta):
-            self.evaluated(len(theta["inverse_gain"]))
-            predictor = self.model.linear_predictor(theta, self.observations, self.layout)
-            yield where, theta, predictor, expected(self.blocks, predictor, draws.c[where])
-
-    def _exact_trust(
-        self, theta: Theta, predictor: LinearPredictor, mean: np.ndarray, rng: np.random.Generator
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Draw trust given Gaussian rates; also return log-likelihoods (draw, block)."""
-        b, S = self.blocks, each(predictor.trust_cov, self.blocks.label)
-        W, log_sites = whiten(b, predictor, self._lam(predictor))
-        off = b.y - mean
-        w = (W[:, b.kind] @ off[..., None])[..., 0]
-        gain = S @ (np.swapaxes(W, 2, 3) @ W)
-        root = _root(S - gain @ S)[:, b.kind]
-        x = mean + (gain[:, b.kind] @ off[..., None])[..., 0]
-        x += (root @ rng.standard_normal((*x.shape, 1)))[..., 0]
-        return x, log_sites[:, b.kind] - 0.5 * (w**2).sum(2)
-
-    def _ep_trust(
-        self, theta: Theta, predictor: LinearPredictor, mean: np.ndarray, rng: np.random.Generator
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Draw trust given non-Gaussian rates by weighted particles; returns as `_exact_trust`."""
-        joint = ep.Joint(self.blocks, predictor, self.prior(theta), self.terms)
-        sites = ep.log_evidence(joint, self.sites, _SWEEPS)[1]
-        drawn = [ep.draw_predictors(joint, mean, sites, rng) for _ in range(_PARTICLES)]
-        f, log_w = (np.stack(part) for part in zip(*drawn, strict=True))
-        chosen = np.argmax(log_w + rng.gumbel(size=log_w.shape), axis=0)
-        f = np.take_along_axis(f, chosen[None, ..., None], axis=0)[0]
-        log_p = logsumexp(log_w, axis=0) - np.log(_PARTICLES)
-        if predictor.shared_cov is None:
-            return f, log_p
-        V, S = (each(C, self.blocks.label) for C in (predictor.covariance, predictor.trust_cov))
-        gain = np.swapaxes(np.linalg.solve(V, S), 2, 3)
-        x = mean + (gain @ (f - mean)[..., None])[..., 0]
-        return x + (_root(S - gain @ S) @ rng.standard_normal((*x.shape, 1)))[..., 0], log_p
-
-    def _rates(
-        self, predictor: LinearPredictor, mean: np.ndarray, rng: np.random.Generator
-    ) -> np.ndarray:
-        """Draw replicated rates (draw, mission, bound, robot) given the mean linear predictors."""
-        root = each(_root(predictor.covariance), self.blocks.label[self.blocks.kind])
-        f = self.layout.unstack(mean + (root @ rng.standard_normal((*mean.shape, 1)))[..., 0])
-        sd = self.layout.unstack(np.broadcast_to(predictor.noise_sd, mean.shape))
-        return self.model.family.sample(f, sd, self.observations.n_ticks, rng)
-
     def prior(self, theta: Theta) -> Prior:
         """Return the prior on all coefficients at each theta."""
         return Prior.of([effect.prior(theta, self.observations) for effect in self.model.columns])
@@ -392,7 +246,7 @@ class Posterior:
     def _prior_of_fit(self, theta: Theta) -> Prior:
         """Return the prior in the form that is fastest for computing the evidence."""
         observations, groups, chains, first = self.observations, [], None, 0
-        for effect, start in zip(self.model.columns, self._ends[:-1], strict=True):
+        for effect, start in zip(self.model.columns, self.ends[:-1], strict=True):
             found = effect.chains(theta, observations) if self._chained and chains is None else None
             if found is None:
                 groups.append(effect.prior(theta, observations))
@@ -410,7 +264,7 @@ class Posterior:
     def _fit(self, theta: Theta) -> tuple[Fit, Prior]:
         """Compute the evidence of Gaussian rates at each theta; also return the prior."""
         predictor, prior = self._at(theta)
-        return evidence(self.blocks, predictor, prior, self._lam(predictor)), prior
+        return evidence(self.blocks, predictor, prior, self.site_precision(predictor)), prior
 
     def _at(self, theta: Theta) -> tuple[LinearPredictor, Prior]:
         """Return the distribution of the linear predictors and the prior at each theta."""
@@ -419,7 +273,7 @@ class Posterior:
             theta, self.observations, self.layout
         ), self._prior_of_fit(theta)
 
-    def _lam(self, predictor: LinearPredictor) -> Any:
+    def site_precision(self, predictor: LinearPredictor) -> Any:
         """Return the precisions (point, kind, row) of Gaussian rates, 0 where not measured."""
         return self.blocks.seen / predictor.noise_sd**2
 
@@ -431,14 +285,6 @@ class Posterior:
 def at(theta: Mapping[str, Any], index: Any) -> dict[str, Any]:
     """Select the hyperparameters at the given points."""
     return {name: values[index] for name, values in theta.items()}
-
-
-def _root(covariance: np.ndarray) -> np.ndarray:
-    """Compute Cholesky factors of covariances (..., row, row) that may be nearly singular."""
-    n = covariance.shape[-1]
-    even = 0.5 * (covariance + np.swapaxes(covariance, -1, -2))
-    scale = np.trace(even, axis1=-2, axis2=-1)[..., None, None] / n
-    return cholesky(even + (1e-10 * scale + 1e-20) * np.eye(n))
 
 
 def chunks(theta: Mapping[str, Any], size: int = _CHUNK) -> Iterator[tuple[slice, dict[str, Any]]]:

@@ -1,0 +1,58 @@
+"""Variables of a posterior by group and name, and their draws from the prior."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from trustbo.inference.density import Density, Draws, chunks
+from trustbo.inference.engine import Prior
+from trustbo.models.effects.effect import Theta
+
+
+def named(density: Density, draws: Draws) -> dict[str, dict[str, np.ndarray]]:
+    """Return the variables of draws by group (`posterior` and one per effect) and name."""
+    model, theta = density.model, draws.theta
+    groups = {"posterior": _hyperparameters(density, theta)}
+    for effect, a, b in zip(model.columns, density.ends[:-1], density.ends[1:], strict=True):
+        named = effect.named(draws.c[:, a:b], theta, density.observations)
+        groups.setdefault(effect.group or "posterior", {}).update(named)
+    return groups
+
+
+def draws_of(density: Density, groups: Mapping[str, Mapping[str, np.ndarray]]) -> Draws:
+    """Make draws from variables by group and name, as returned by `named`."""
+    sites, model = groups["posterior"], density.model
+    theta = model.derived({n: sites[n] for n in model.dims | model.effect_dims if n in sites})
+    theta = {name: v for name, v in theta.items() if name not in ("beta", "b", "B")}
+    c = [
+        effect.coefficients(groups[effect.group or "posterior"], theta, density.observations)
+        for effect in model.columns
+    ]
+    return Draws(theta, np.column_stack(c))
+
+
+def draw_prior(density: Density, n: int, rng: np.random.Generator) -> Draws:
+    """Draw hyperparameters and coefficients from the prior."""
+    theta = density.model.theta(density.scores.draw(n, rng), density.observations.resolution)
+    c = [density.prior(chunk).draw(rng) for _, chunk in chunks(theta)]
+    return Draws(theta, np.concatenate(c))
+
+
+def prior_parameters(
+    density: Density, n: int, rng: np.random.Generator, *, even: bool = False
+) -> dict[str, np.ndarray]:
+    """Draw parameters (draw, ...) by name from the prior, without effects.
+
+    With `even`, hyperparameters are evenly spaced quantiles, and coefficients prior means.
+    """
+    model, observations = density.model, density.observations
+    theta = model.theta(density.scores.draw(n, rng, even=even), observations.resolution)
+    weights = Prior.of([model.weights.prior(theta, observations)])
+    c = weights.mean if even else weights.draw(rng)
+    return {**_hyperparameters(density, theta), **model.weights.named(c, theta, observations)}
+
+
+def _hyperparameters(density: Density, theta: Theta) -> dict[str, np.ndarray]:
+    """Select the hyperparameters that the group `posterior` contains."""
+    names = density.model.dims.keys() | density.model.effect_dims.keys()
+    return {name: values for name, values in theta.items() if name in names}
