@@ -26,7 +26,12 @@ from trustbo.files import FilePath
 from trustbo.logs.table import read_table
 from trustbo.workspace import Workspace
 
-_BOUND, _STATUS = "/mission/bound", "/mission/status"
+_BOUND = "/mission/bound"
+_STATUS = "/mission/status"
+_NANOSECONDS = 1e9
+"""Nanoseconds per second."""
+_NEVER = np.iinfo(np.int64).max
+"""Time after the last message, ns."""
 
 
 def read_bag(
@@ -46,34 +51,48 @@ def read_bag(
         prefix: Namespace of the topics of bounds and statuses, such as `"/fleet"` for
             `/fleet/mission/bound`.
 
+    Returns:
+        Missions in the order of their markers. Awareness is NaN; campaigns take it from the map.
+
     Raises:
         TrustboError: rosbags is not installed, the path is not a complete bag, a topic is missing
             or of another type, markers are out of order, or `Mission` rejects the data.
     """
-    paths = [Path(one) for one in ([path] if isinstance(path, str | PathLike) else path)]
+    files = [path] if isinstance(path, str | PathLike) else path
+    paths = [Path(file) for file in files]
     space = f"/{prefix.strip('/')}" if prefix.strip("/") else ""
-    of_bounds, of_statuses = space + _BOUND, space + _STATUS
+    of_bounds = space + _BOUND
+    of_statuses = space + _STATUS
+
     of_topic = {contact.replace("{robot}", robot): robot for robot in workspace.team.names}
     messages = _messages(paths, of_bounds, of_statuses, contact, [*of_topic])
 
     seen = messages.loc[messages["topic"].isin([*of_topic])].astype({"data": float}).dropna()
     require_unit_interval(f"messages on {contact}", seen["data"].to_numpy())
     ticks = seen.assign(robot=seen["topic"].map(of_topic), contact=seen["data"] > 0.5)
+
     marked = messages.loc[messages["topic"] == of_bounds, "data"]
     statuses = messages.loc[messages["topic"] == of_statuses, "data"]
     markers = sorted(_marker(time, text) for time, text in marked.items())
+
     bounds = pd.DataFrame(markers, columns=["begin", "bound", "cell", "path"])
-    bounds["until"] = bounds["begin"].shift(-1, fill_value=np.iinfo(np.int64).max)
+    bounds["until"] = bounds["begin"].shift(-1, fill_value=_NEVER)
     missions = bounds.groupby((bounds["bound"] == 0).cumsum())
+
     if bounds.empty or (bounds["bound"] != missions.cumcount()).any():
         raise TrustboError(f"the bounds in {_listed(paths)} must be marked 0, 1, 2, ... in order.")
+
     tables = [
         _table(driven, ticks, statuses, workspace.team.names).assign(mission=mission)
         for mission, driven in missions
         if len(driven) > 1
     ]
+
+    if not tables:
+        return []
+
     unknown = dict.fromkeys(workspace.features, np.nan)
-    return read_table(pd.concat(tables).assign(**unknown)) if tables else []
+    return read_table(pd.concat(tables).assign(**unknown))
 
 
 def _listed(paths: Sequence[Path]) -> str:
@@ -121,7 +140,8 @@ def _messages(
 
 def _data(reader: Any, connection: Any, raw: bytes, kinds: tuple[type, ...]) -> Any:
     """Return the data of a message; raises TrustboError if they are not of one of these types."""
-    topic, kind = connection.topic, connection.msgtype
+    topic = connection.topic
+    kind = connection.msgtype
     needed = "String" if kinds == (str,) else "Bool, Float32 or Float64"
     try:
         data = getattr(reader.deserialize(raw, kind), "data", None)
@@ -180,18 +200,27 @@ def _table(
     bounds: pd.DataFrame, ticks: pd.DataFrame, statuses: pd.Series, robots: Sequence[str]
 ) -> pd.DataFrame:
     """Return a mission as a table: rows of its planned cells, then rows of its bounds."""
-    start, path = bounds["cell"].iloc[0], bounds["path"].iloc[0]
+    start = bounds["cell"].iloc[0]
+    path = bounds["path"].iloc[0]
     planned = [(0, *start), *((k, *cell) for k, cell in enumerate(path))]
     tables = [pd.DataFrame(planned, columns=["bound", "row", "col"]).drop_duplicates()]
+
     for begin, k, (row, col), _, until in bounds.iloc[1:].itertuples(index=False):
         ended = statuses.loc[begin + 1 : until].iloc[:1]
-        looks = ticks.loc[begin + 1 : ended.index[0] if len(ended) else until]
-        end = max(ended.index if len(ended) else looks.index, default=begin)
-        duration = (end - begin) / 1e9 if end > begin else np.nan
+        if len(ended):
+            end = ended.index[0]
+            looks = ticks.loc[begin + 1 : end]
+        else:
+            looks = ticks.loc[begin + 1 : until]
+            end = max(looks.index, default=begin)
+
+        duration = (end - begin) / _NANOSECONDS if end > begin else np.nan
         status = ended.iloc[0] if len(ended) else "ok"
         if status == "ok" and k == len(bounds) - 1 < len(path) - 1:
             status = "aborted"  # no record of the reason
+
         contact = looks.groupby("robot")["contact"]
         table = contact.agg(contact_rate="mean", n_ticks="count").reindex(robots).reset_index()
         tables.append(table.assign(bound=k, row=row, col=col, duration=duration, status=status))
+
     return pd.concat(tables)

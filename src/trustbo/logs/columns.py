@@ -35,9 +35,13 @@ _DATES = (
     "(pandas.to_datetime(t) - start).dt.total_seconds()"
 )
 _ROUNDED_DTYPE = 0.1
+"""Step of float32 at the time of a log, s, above which a column of float32 is refused."""
 _ROUNDED_VALUES = 16.0
-"""Steps of float32 at the time of a log, s: refused for columns of float32, and for others in which
-every value is a float32."""
+"""The same for a column of another type in which every value is a float32."""
+_LONGEST = 7 * 86_400.0
+"""Longest log, s: longer ones have times in milliseconds."""
+_LATEST = 1e11
+"""Latest time of a log, s: epochs in milliseconds are later."""
 
 
 class Columns:
@@ -61,17 +65,22 @@ class Columns:
         self.what = what
         is_file = isinstance(table, str | PathLike)
         frame = _of_file(table) if is_file else _of_value(table, what)
-        if any(names := frame.index.names):
+        names = frame.index.names
+        if any(names):
             frame = frame.drop(columns=[name for name in names if name in frame]).reset_index()
+
         frame.columns = [str(name).strip() for name in frame.columns]
         frame = frame.loc[:, [not re.fullmatch(r"(Unnamed: \d+)?", n) for n in frame.columns]]
         if not frame.columns.is_unique:
             raise TrustboError(f"{what} repeats a column name: {', '.join(frame.columns)}.")
+
         frame.index = pd.RangeIndex(1, len(frame) + 1)
         spans = frame.select_dtypes("timedelta").columns
         frame[spans] = frame[spans] / pd.Timedelta(seconds=1)
         text = frame.select_dtypes(exclude=["number", "bool"]).columns
         frame[text] = frame[text].astype(object).map(_cell).astype(object)
+
+        # Qualtrics exports repeat the header in prose and then as JSON with "ImportId".
         imports = [i for i, row in frame.iloc[:3].iterrows() if "ImportId" in str(row.tolist())]
         self.frame = frame.loc[max(imports, default=0) + 1 :].dropna(how="all")
         if self.frame.empty and not may_be_empty:
@@ -81,6 +90,7 @@ class Columns:
         """Return the name of a column as spelled in the table; None if there is no such column."""
         if name in self.frame:
             return name
+
         alike = [other for other in self.frame if folded(other) == folded(name)]
         if len(alike) > 1:
             raise TrustboError(f"{self.what} has the columns {', '.join(alike)}; rename one.")
@@ -89,7 +99,8 @@ class Columns:
     def refuse(self, column: str, bad: np.ndarray, why: str) -> None:
         """Raise TrustboError for the first value of a column that is marked in `bad`, (row,)."""
         if bad.any():
-            row, value = self.frame.index[bad][0], self._cells(column).to_numpy(object)[bad][0]
+            row = self.frame.index[bad][0]
+            value = self._cells(column).to_numpy(object)[bad][0]
             raise TrustboError(f"row {row} of {self.what}: {column} = {one_line(value)} {why}.")
 
     def texts(self, column: str, *, blank: bool = True, required: bool = True) -> list[str]:
@@ -99,7 +110,8 @@ class Columns:
         is blank although `blank` is False.
         """
         cells = self._cells(column, required).astype(object)
-        self.refuse(column, cells.isna().to_numpy() & (not blank), "is blank; leave the row out")
+        if not blank:
+            self.refuse(column, cells.isna().to_numpy(), "is blank; leave the row out")
         return ["" if pd.isna(cell) else _WHOLE.sub(r"\1", str(cell)) for cell in cells]
 
     def numbers(
@@ -126,14 +138,18 @@ class Columns:
         """
         cells = self._cells(column, required)
         parsed = pd.Series(pd.to_numeric(cells, errors="coerce")).to_numpy(float, na_value=np.nan)
+
         self.refuse(
             column,
             ~np.isfinite(parsed) & cells.notna().to_numpy(),
             "is not a finite number; write decimals with a point and thousands without a mark"
             + hint,
         )
-        self.refuse(column, np.isnan(parsed) & (not blank), "is blank")
-        self.refuse(column, whole & (parsed > np.floor(parsed)), "must be a whole number")
+
+        if not blank:
+            self.refuse(column, np.isnan(parsed), "is blank")
+        if whole:
+            self.refuse(column, parsed > np.floor(parsed), "must be a whole number")
         return cells.to_numpy(float, na_value=np.nan)
 
     def decimals(self, column: str) -> int:
@@ -159,7 +175,7 @@ def seconds_of(first: Columns, second: Columns) -> list[np.ndarray]:
         _require_precision(table, t)
 
     span = _span(times[0])
-    if np.ptp(times[0]) > 7 * 86_400.0 or np.abs(times[0]).max() > 1e11:
+    if np.ptp(times[0]) > _LONGEST or np.abs(times[0]).max() > _LATEST:
         raise TrustboError(
             f"times of {first.what} are {span}; they must be in seconds (divide milliseconds "
             "by 1000) and span at most 7 days."
@@ -188,7 +204,9 @@ def _require_precision(table: Columns, t: np.ndarray) -> None:
     single = t.astype(np.float32)
     step = float(np.spacing(np.abs(single).max()))
     is_single = table.frame[table.find("t")].dtype == np.float32
-    if step > (_ROUNDED_DTYPE if is_single else _ROUNDED_VALUES) and np.array_equal(single, t):
+    limit = _ROUNDED_DTYPE if is_single else _ROUNDED_VALUES
+
+    if step > limit and np.array_equal(single, t):
         raise TrustboError(
             f"times of {table.what} ({_span(t)}) are rounded to steps of {step:g} s, because they "
             "were stored as float32; use float64, or subtract the start before the conversion."
@@ -208,7 +226,8 @@ def require_one_spelling(what: str, names: Iterable[str]) -> None:
     """Raise TrustboError if two names differ only by case, spaces or leading zeros."""
     spelled: dict[str, str] = {}
     for name in dict.fromkeys(names):
-        if (other := spelled.setdefault(folded(name), name)) != name:
+        other = spelled.setdefault(folded(name), name)
+        if other != name:
             raise TrustboError(f"{what}: {other!r} and {name!r} look alike; use one spelling.")
 
 
@@ -246,11 +265,13 @@ def _of_value(table: Any, what: str) -> pd.DataFrame:
             f"({one_line(str(error))}); give the path of a CSV file, a DataFrame, or a mapping of "
             "columns of one length."
         ) from None
+
     if isinstance(table, list | tuple) and any(isinstance(one, str | PathLike) for one in table):
         raise TrustboError(
             f"{what} must be one table; got the list {one_line(table)}. Join the files: "
             "pandas.concat(map(pandas.read_csv, files))."
         )
+
     return frame.rename_axis(None) if frame.index.names == ["index"] else frame
 
 
@@ -260,29 +281,46 @@ def _of_file(file: FilePath) -> pd.DataFrame:
     for start, (kind, reader) in _OTHER_FILES.items():
         if content.startswith(start):
             raise TrustboError(f"{str(file)!r} is {kind}, not a CSV file; give {reader}.")
+
     try:
         text = content.decode("utf-8-sig")
         first, _, rest = text.partition("\n")
         separator = max(",;\t", key=first.count)
         if named := re.fullmatch(r'"?sep=(.)"?\s*', first, re.IGNORECASE):
-            separator, text = named[1], rest
+            separator = named[1]
+            text = rest
         lines = [*csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True)]
     except (UnicodeDecodeError, csv.Error) as error:
         raise TrustboError(
             f"{str(file)!r} cannot be read as CSV in UTF-8: {error}. Close its quotes and save it "
             'as UTF-8, or give a DataFrame, such as pandas.read_csv(file, encoding="cp1252").'
         ) from None
-    header, *rows = [line for line in lines if line] or [[]]
+
+    filled = [line for line in lines if line]
+    header, *rows = filled or [[]]
+    frame = _rectangle(file, header, rows, separator)
+    if separator == ",":
+        return frame
+
+    for name in frame:
+        commas = [text for text in frame[name] if "," in text]
+        if not all(map(_THOUSANDS.fullmatch, commas)):  # else `numbers` refuses them
+            frame[name] = frame[name].replace(_DECIMAL_COMMA, r"\1.\2", regex=True)
+
+    return frame
+
+
+def _rectangle(
+    file: FilePath, header: list[str], rows: list[list[str]], separator: str
+) -> pd.DataFrame:
+    """Return rows as a table; raises TrustboError for rows that are shifted or hold other rows."""
     n = len(header)
     for i, row in enumerate(rows, start=1):
         if len(row) < n or any(cell.strip() for cell in row[n:]):
             raise TrustboError(f"row {i} of {str(file)!r} has {len(row)} values, the header {n}.")
+
         hidden = [line for cell in row for line in cell.splitlines()[1:]]
         if any(line.count(separator) >= n - 1 > 0 for line in hidden):
             raise TrustboError(f"a quote in row {i} of {str(file)!r} is closed in a later row.")
-    frame = pd.DataFrame([row[:n] for row in rows], columns=header, dtype=object)
-    for name in frame if separator != "," else ():
-        commas = [text for text in frame[name] if "," in text]
-        if not all(map(_THOUSANDS.fullmatch, commas)):  # else `numbers` refuses them
-            frame[name] = frame[name].replace(_DECIMAL_COMMA, r"\1.\2", regex=True)
-    return frame
+
+    return pd.DataFrame([row[:n] for row in rows], columns=header, dtype=object)

@@ -15,8 +15,9 @@ from trustbo.stacking import require_same_team
 _ARRAYS = {"awareness": "1", "contact_rate": "1", "duration": "s", "n_ticks": "1"}
 """Arrays of a bound, (robot,) or (robot, feature), and their units."""
 _SEAL = b"sha256:"
+"""Beginning of the hash that follows the content of a file."""
 _SEAL_LENGTH = len(_SEAL) + 64
-"""Beginning and length of the hash that follows the content of a file."""
+"""Bytes of the hash, 64 of which are hexadecimal digits."""
 
 
 def read_tree(path: FilePath, sha256: str = "") -> xr.DataTree:
@@ -26,6 +27,7 @@ def read_tree(path: FilePath, sha256: str = "") -> xr.DataTree:
         TrustboError: The file is missing or damaged, or `sha256` is given and is not its hash.
     """
     content = read_file(path, sha256)
+
     try:
         return tree_from_bytes(content)
     except Exception:  # the library raises many types of errors for bad files
@@ -44,6 +46,7 @@ def tree_from_bytes(content: bytes) -> xr.DataTree:
         content = content[:-_SEAL_LENGTH]
         if seal != _seal_of(content):
             raise ValueError("the hash at the end of the file is not that of its content")
+
     with xr.open_datatree(content, engine="netcdf4") as tree:
         return tree.load()
 
@@ -64,6 +67,7 @@ def tree_to_bytes(tree: xr.DataTree) -> bytes:
             for name, variable in variables.items()
             if variable.ndim and variable.dtype.kind in "biufM"  # texts and scalars have none
         }
+
     content = _without_padding(bytes(tree.to_netcdf(engine="netcdf4", encoding=encoding)))
     return content + _seal_of(content)
 
@@ -73,7 +77,9 @@ def _without_padding(content: bytes) -> bytes:
 
     The first block of an HDF5 file says where it ends (HDF5 file format 3.0, II.A, versions 2, 3).
     """
-    version, end = content[8], int.from_bytes(content[28:36], "little")
+    version = content[8]
+    end = int.from_bytes(content[28:36], "little")
+
     if version not in (2, 3) or any(content[end:]):
         return content
     return content[:end]
@@ -113,11 +119,16 @@ def read_missions(path: FilePath | Sequence[FilePath]) -> list[Mission]:
 
 
 def missions_to_tree(missions: Sequence[Mission]) -> xr.DataTree:
-    """Convert missions of one team to a tree, with ticks of bounds with poses and contacts."""
+    """Convert missions to a tree, with ticks of bounds with poses and contacts.
+
+    Raises:
+        TrustboError: The robots or features differ between missions.
+    """
     require_same_team(missions)
     bounds = [bound for mission in missions for bound in mission.bounds]
     ticks = [_ticks(bound) for bound in bounds]
     poses, contacts = (np.concatenate(values) for values in zip(*ticks, strict=True))
+
     cells = [cell for mission in missions for cell in mission.path]
     variables: dict[str, Any] = {
         "path": (("step", "axis"), np.reshape(cells, (-1, 2)).astype(int)),
@@ -131,9 +142,12 @@ def missions_to_tree(missions: Sequence[Mission]) -> xr.DataTree:
         "status": ("mission", [mission.status for mission in missions]),
         "scale": ("mission", [mission.scale for mission in missions]),
     }
+
     for name, units in _ARRAYS.items():
         values = np.stack([getattr(bound, name) for bound in bounds])
-        variables[name] = ("bound", "robot", "feature")[: values.ndim], values, {"units": units}
+        dims = ("bound", "robot", "feature")[: values.ndim]
+        variables[name] = (dims, values, {"units": units})
+
     names = {"robot": list(missions[0].robots), "feature": list(missions[0].features)}
     axes = {"axis": ["row", "col"], "component": ["x", "y", "heading"]}
     return xr.DataTree(xr.Dataset(variables, names | axes))
@@ -146,19 +160,35 @@ def missions_from_tree(tree: xr.DataTree) -> list[Mission]:
     def parts(values: np.ndarray, counts: str) -> list[np.ndarray]:
         return np.split(values, np.cumsum(table[counts])[:-1])
 
-    robots, features = (tuple(map(str, table[name])) for name in ("robot", "feature"))
-    poses, contacts = parts(table["pose"], "recorded"), parts(table["contact"], "recorded")
-    paths, rows = parts(table["path"], "n_steps"), parts(np.arange(len(poses)), "n_bounds")
+    robots = tuple(map(str, table["robot"]))
+    features = tuple(map(str, table["feature"]))
+    poses = parts(table["pose"], "recorded")
+    contacts = parts(table["contact"], "recorded")
+    paths = parts(table["path"], "n_steps")
+    rows = parts(np.arange(len(poses)), "n_bounds")
+
     missions = []
     for j, of_mission in enumerate(rows):
         path = tuple((int(row), int(col)) for row, col in paths[j])
         bounds = []
-        for cell, i in zip(path[1:] or [NOWHERE] * len(of_mission), of_mission, strict=False):
-            z, y, seconds, n = (table[name][i] for name in _ARRAYS)
-            status, t0 = str(table["bound_status"][i]), float(table["start"][i])
-            ticks = (poses[i], contacts[i].astype(bool)) if len(poses[i]) else (None, None)
-            bounds.append(Bound(cell, z, y, seconds, status, t0, *ticks, n))
-        status, scale = str(table["status"][j]), str(table["scale"][j])
+        entered = path[1:] or [NOWHERE] * len(of_mission)
+        for cell, i in zip(entered, of_mission, strict=False):  # planned cells may follow
+            has_ticks = len(poses[i]) > 0
+            bound = Bound(
+                cell,
+                awareness=table["awareness"][i],
+                contact_rate=table["contact_rate"][i],
+                duration=table["duration"][i],
+                n_ticks=table["n_ticks"][i],
+                status=str(table["bound_status"][i]),
+                t0=float(table["start"][i]),
+                poses=poses[i] if has_ticks else None,
+                contact=contacts[i].astype(bool) if has_ticks else None,
+            )
+            bounds.append(bound)
+
+        status = str(table["status"][j])
+        scale = str(table["scale"][j])
         missions.append(Mission(path, tuple(bounds), status, features, robots, scale))
     return missions
 

@@ -57,20 +57,27 @@ def read_reports(
     inputs = require_list("inputs", inputs, str, "give the names of columns")
     if outcome is None and not inputs:
         raise TrustboError("give the column of outcomes (outcome=) or other columns (inputs=).")
+
     columns = Columns(table)
-    people, steps = np.array(columns.texts(person, blank=False)), columns.numbers(step, blank=False)
+    people = np.array(columns.texts(person, blank=False))
+    steps = columns.numbers(step, blank=False)
     require_one_spelling(f"column {person}", people.tolist())
+
     given = columns.numbers(report, whole=levels > 0, hint=_WORDS)
-    low, high = (1, levels) if levels else (0, 1)
+    low = 1 if levels else 0
+    high = levels or 1
     columns.refuse(
         report,
         (given < low) | (given > high),
         f'is not between {low} and {high}; give the scale, such as scale="likert7", divide '
         "percentages by 100, and leave missing answers blank",
     )
+
     y = (given - low) / (high - low)
     seen = _seen(columns, outcome, inputs)
-    z, missions = np.column_stack([*seen.values()]), []
+    z = np.column_stack([*seen.values()])
+
+    missions = []
     for name in dict.fromkeys(people.tolist()):
         of = np.flatnonzero(people == name)
         of = of[np.argsort(steps[of])]
@@ -78,11 +85,17 @@ def read_reports(
             raise TrustboError(f"{person} {name}: two rows have the same step.")
         if np.isnan(y[of]).all():
             raise TrustboError(f"{person} {name}: there is no report; leave out these rows.")
+
         made = Mission.from_arrays(
-            None, z[of][:, None], y[of][:, None], n_ticks=levels - 1.0 if levels else None,
-            features=[*seen], robots=["report"],
-        )  # fmt: skip
+            None,
+            z[of][:, None],
+            y[of][:, None],
+            n_ticks=levels - 1.0 if levels else None,
+            features=[*seen],
+            robots=["report"],
+        )
         missions.append(replace(made, scale=scale))
+
     return missions
 
 
@@ -95,4 +108,5 @@ def _seen(columns: Columns, outcome: str | None, inputs: Sequence[str]) -> dict[
         columns.refuse(outcome, unknown, "must be 1 or 0, success or failure, or blank")
         seen["success"] = np.isin(given, _YES).astype(float)
         seen["failure"] = np.isin(given, _NO).astype(float)
+
     return seen | {name: columns.numbers(name, blank=False, hint=_WORDS) for name in inputs}

@@ -40,17 +40,21 @@ def to_frame(missions: Sequence[Mission]) -> pd.DataFrame:
     """
     require_same_team(missions)
     taken = {folded(name) for name in (*COLUMNS, *TRUST, *_NO_FEATURES)}
-    if bad := [name for name in missions[0].features if folded(name) in taken]:
+    bad = [name for name in missions[0].features if folded(name) in taken]
+    if bad:
         raise TrustboError(f"features {bad} have names of other columns of a log; rename them.")
+
     require_plain_names("feature", missions[0].features)
     require_plain_names("robot", missions[0].robots)
 
     if len({bool(mission.path) for mission in missions}) > 1:
         raise TrustboError("some missions have a path and some do not; write them to two tables.")
+
     rows = []
     for j, mission in enumerate(missions, start=1):
         n_run = len(mission.bounds)
-        for k in range(0 if mission.path else 1, max(len(mission.path), n_run + 1)):
+        first = 0 if mission.path else 1
+        for k in range(first, max(len(mission.path), n_run + 1)):
             for i, robot in enumerate(mission.robots):
                 row: dict[str, Any] = dict(zip(KEYS, (j, k, robot), strict=True))
                 if mission.path:
@@ -61,6 +65,7 @@ def to_frame(missions: Sequence[Mission]) -> pd.DataFrame:
                     row["status"] = mission.status if k == n_run else "ok"
                     row |= dict(zip(mission.features, bound.awareness[i], strict=True))
                 rows.append(row)
+
     names = [name for name in COLUMNS if missions[0].path or name not in ("row", "col")]
     return pd.DataFrame(rows, columns=[*names, *missions[0].features])
 
@@ -79,6 +84,9 @@ def read_table(table: Any) -> list[Mission]:
     Args:
         table: Path of a CSV file (commas, semicolons or tabs), a DataFrame, or a mapping of lists.
 
+    Returns:
+        Missions in the order of the table.
+
     Raises:
         TrustboError: A column, bound or robot is missing, a row is repeated, a value has the wrong
             type, rows of one bound disagree on its cell, or `Mission` rejects the data.
@@ -86,14 +94,17 @@ def read_table(table: Any) -> list[Mission]:
     columns = Columns(table)
     known = [columns.find(name) for name in (*COLUMNS, *TRUST)]
     features = [name for name in columns.frame if name not in known] or list(FEATURES)
-    if odd := {*_NO_FEATURES} & {*map(str.lower, features)}:
+    odd = {*_NO_FEATURES} & {*map(str.lower, features)}
+    if odd:
         raise TrustboError(f"{sorted(odd)} are no features; drop them, and give cells as row, col.")
+
     frame = _parsed(columns, features)
     robots = tuple(name for name in frame["robot"].unique() if name)
     require_one_spelling("column robot", robots)
     columns.refuse("bound", frame.duplicated([*KEYS]).to_numpy(), "is repeated for its robot")
     nameless = (frame["robot"] == "") & frame["contact_rate"].notna()
     columns.refuse("contact_rate", nameless.to_numpy(), "has no robot; 'NA' and 'none' are blank")
+
     missions = []
     for label, rows in frame.groupby("mission", sort=False):
         try:
@@ -109,6 +120,7 @@ def _parsed(columns: Columns, features: Sequence[str]) -> pd.DataFrame:
     require_one_spelling("column mission", values["mission"])
     values["robot"] = columns.texts("robot")
     values["status"] = [text.lower() for text in columns.texts("status", required=False)]
+
     is_mapped = any(columns.find(name) for name in ("row", "col"))
     for name in ("bound", "row", "col") if is_mapped else ("bound",):
         values[name] = columns.numbers(name, blank=False, whole=True).astype(int)
@@ -159,14 +171,18 @@ def _to_ticks(columns: Columns, rate: np.ndarray, n_ticks: np.ndarray) -> np.nda
 def _mission(rows: pd.DataFrame, features: Sequence[str], robots: tuple[str, ...]) -> Mission:
     """Make a mission from its rows."""
     cells = rows.filter(["bound", "row", "col"]).drop_duplicates().sort_values("bound")
-    is_mapped, numbers = "row" in cells, cells["bound"].tolist()
+    is_mapped = "row" in cells
+    numbers = cells["bound"].tolist()
     first = 0 if is_mapped else 1
     if numbers != [*range(first, first + len(numbers))]:
         raise TrustboError(
             f"bounds must be numbered {first}, {first + 1}, ... (0 is the start cell) and have "
             f"one cell (row, col) each; got {numbers}."
         )
-    values, status = rows.set_index([*KEYS[1:]])[[*RATES, *features]], rows["status"]
+
+    values = rows.set_index([*KEYS[1:]])[[*RATES, *features]]
+    status = rows["status"]
+
     # Loggers that always write a status write "ok" for the start, where nothing is measured.
     has_status = (status != "") & ((status != "ok") | (rows["bound"] > 0))
     measured = rows.loc[values.notna().to_numpy().any(axis=1) | has_status, "bound"]
@@ -174,16 +190,28 @@ def _mission(rows: pd.DataFrame, features: Sequence[str], robots: tuple[str, ...
         raise TrustboError(
             "bounds with a rate, feature or status must be numbered from 1; got none or 0."
         )
-    n_run, ended = int(measured.max()), rows.loc[~status.isin(["", "ok"])]
+
+    n_run = int(measured.max())
+    ended = rows.loc[~status.isin(["", "ok"])]
     if ended["status"].nunique() > 1 or (ended["bound"] < n_run).any():
         raise TrustboError("only the last bound that was run may have a status other than ok.")
+
     expected = pd.MultiIndex.from_product([range(1, n_run + 1), robots])
-    for k, robot in expected.difference(values.index):
+    missing = expected.difference(values.index)
+    if len(missing):
+        k, robot = missing[0]
         raise TrustboError(f"bound {k} has no row for {robot}; add it, with blank values.")
+
     arrays = values.loc[expected].to_numpy(float).reshape(n_run, len(robots), -1)
     rate, duration, n_ticks = np.moveaxis(arrays[..., : len(RATES)], -1, 0)
+
     return Mission.from_arrays(
         cells[["row", "col"]].to_numpy().tolist() if is_mapped else None,
-        arrays[..., len(RATES) :], rate, duration, [*ended["status"], "ok"][0], n_ticks=n_ticks,
-        features=features, robots=robots,
-    )  # fmt: skip
+        arrays[..., len(RATES) :],
+        rate,
+        duration,
+        status=ended["status"].iloc[0] if len(ended) else "ok",
+        n_ticks=n_ticks,
+        features=features,
+        robots=robots,
+    )
