@@ -69,7 +69,7 @@ FAULTS = (
     Fault("weights that leave out a mission have the wrong sign", "inference/loo.py",
           "smoothed(ratio + log_count)", "smoothed(log_count - ratio)"),
     Fault("a bound that failed is also counted as passed", "hazard/risk.py",
-          "a, b = a + failed, b + n - failed", "a, b = a + failed, b + n"),
+          "b = b + n - failed", "b = b + n"),
     Fault("the margin raises the slope limit", "hazard/prior.py",
           "beyond = (steepness + limit[:, :1])", "beyond = (steepness - limit[:, :1])"),
     Fault("the loss of a bound is clipped a second time", "planning/problem.py",

@@ -55,7 +55,8 @@ class Exposures(NamedTuple):
         known += [_located(mission) for mission in lost if mission.where is not None]
         unknown = [mission.path for mission in lost if mission.where is None]
 
-        met = [bounds_along(path) for path in (*(path for path, _ in known), *unknown)]
+        every = [path for path, _ in known] + unknown
+        met = [bounds_along(path) for path in every]
         rows = np.concatenate([np.empty((0, 3), int), *met])
         bounds, index = np.unique(rows, axis=0, return_inverse=True)
         paths = np.split(index, np.cumsum([len(part) for part in met])[:-1]) if met else []
@@ -69,13 +70,17 @@ class Exposures(NamedTuple):
 
 def _reported(mission: Mission) -> tuple[Sequence[Cell], bool]:
     """Return the path up to the last bound with a known outcome, and whether that bound failed."""
-    n, fails = len(mission.bounds), mission.status in CAUSES
-    return mission.path[: n + (fails or mission.status == "ok")], fails
+    n_run = len(mission.bounds)
+    fails = mission.status in CAUSES
+    is_known = fails or mission.status == "ok"  # an aborted bound neither failed nor was passed
+    n_cells = n_run + 1 if is_known else n_run
+    return mission.path[:n_cells], fails
 
 
 def _located(mission: LostMission) -> tuple[Sequence[Cell], bool]:
     """Return the path of a lost mission up to `where`, and True because the last bound failed."""
     if mission.where not in mission.path[1:]:
         raise TrustboError(f"where must be a cell that the path enters; got {mission}.")
+
     n = mission.path.index(mission.where, 1)
     return mission.path[: n + 1], True

@@ -32,7 +32,23 @@ from trustbo.workspace import Workspace
 from trustbo.workspace.difficulty import difficulty_of
 from trustbo.workspace.moves import MOVE_NAMES
 
-_ROUND, _ENOUGH, _N_DRAWS = 1024, 500.0, 1000  # points per round, effective points, and draws
+_ROUND = 1024
+"""Points of importance sampling per round."""
+_ENOUGH = 500.0
+"""Effective number of points that is sought."""
+_MORE = 8
+"""Factor of both numbers in a second attempt, if the weights are uneven."""
+_N_DRAWS = 1000
+"""Draws of the posterior."""
+_SMALLEST_P = 1e-12
+"""Smallest probability of passing that is distinguished from 0."""
+_LARGEST_KHAT = 1e3
+"""Largest k-hat that is stored, so that it is finite also if its estimate is not."""
+_POSITIONS = {"strength": -1, "margin": -3}
+"""Positions of two parameters among the normal scores, see `Hazard.of_bounds`."""
+_MODES = {"strength": 1.5, "margin": 1.8}
+"""Absolute normal scores near which the posterior may have modes: at low and high strength, and at
+a correct and a wrong limit."""
 _MAPS = "move", "row", "col"
 
 
@@ -67,28 +83,36 @@ def fit_hazard(
         TrustboError: If the path of a mission skips cells or leaves the grid.
         PosteriorError: If the k-hat of the importance weights exceeds 0.7.
     """
-    started, hazard = time.perf_counter(), hazard or Hazard()
-    exposures, difficulty = Exposures.of(missions, lost), difficulty_of(workspace)
-    shape, cells = difficulty.shape[1:3], exposures.bounds[:, 1:]
-    for cell in cells[((cells < 0) | (cells >= shape)).any(1)]:
-        name = tuple(cell.tolist())
-        raise TrustboError(f"a mission enters {name}, outside the workspace of shape {shape}.")
+    started = time.perf_counter()
+    hazard = hazard or Hazard()
+    exposures = Exposures.of(missions, lost)
+    difficulty = difficulty_of(workspace)
+
+    shape = difficulty.shape[1:3]
+    cells = exposures.bounds[:, 1:]
+    outside = ((cells < 0) | (cells >= shape)).any(1)
+    if outside.any():
+        cell = tuple(cells[outside][0].tolist())
+        raise TrustboError(f"a mission enters {cell}, outside the workspace of shape {shape}.")
 
     # A bound that was driven but does not exist on the map has the largest difficulty.
     met = np.nan_to_num(difficulty.values[*exposures.bounds.T], nan=1.0)
     measures = difficulty["measure"].values.tolist()
     prior = hazard.of_bounds(met, measures, workspace.team.max_slope)
-    points, places = sample(prior, exposures, np.random.default_rng(require_whole("seed", seed, 0)))
+    rng = np.random.default_rng(require_whole("seed", seed, 0))
+    points, places = sample(prior, exposures, rng)
 
     group = _to_dataset(prior, exposures, points, places, difficulty, seed)
-    k_hat = float(np.clip(points.k_hat, -1.0, 1e3))
+    k_hat = float(np.clip(points.k_hat, -1.0, _LARGEST_KHAT))
     group.attrs = {"k_hat": k_hat, "kish": points.kish, "seed": seed}
     group.attrs |= {f"prior_{name}": list(value) for name, value in asdict(hazard).items()}
     group = group.assign(p_fail=(_MAPS, BoundRisk(group, workspace).mean))
     group.attrs["seconds"] = time.perf_counter() - started
+
     if not points.k_hat <= importance.MAX_KHAT:
         reason = f"the hazard posterior has k-hat {points.k_hat:.2f} > {importance.MAX_KHAT:g}."
         raise PosteriorError(reason, group, "Use more informative priors in Hazard(...).")
+
     return group
 
 
@@ -96,43 +120,69 @@ def sample(
     prior: BoundPrior, exposures: Exposures, rng: np.random.Generator
 ) -> tuple[importance.Points, np.ndarray]:
     """Draw weighted points and, for each point, the bound at which each lost mission failed."""
-    n, failed, paths = exposures.n, exposures.failed, exposures.lost
+    n = exposures.n
+    failed = exposures.failed
+    paths = exposures.lost
     counts, kind = np.unique(n, return_inverse=True)
-    times, bad = np.bincount(kind, minlength=len(counts)), failed > 0.0
+    times = np.bincount(kind, minlength=len(counts))
+    bad = failed > 0.0
 
     def log_any_fails(alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
         """Compute the log probability that all lost missions fail, as if they were independent."""
         if not paths:
             return np.zeros(len(alpha))
-        a, b = alpha + failed, beta + n - failed
-        passed = np.log1p(-np.minimum(a / (a + b), 1.0 - 1e-12))
+        a = alpha + failed
+        b = beta + n - failed
+
+        p_fail = np.minimum(a / (a + b), 1.0 - _SMALLEST_P)
+        passed = np.log1p(-p_fail)
         return np.sum([np.log(-np.expm1(passed[:, path].sum(1))) for path in paths], axis=0)
 
     def log_density(z: np.ndarray) -> np.ndarray:
         alpha, beta = prior.betas(z)
-        strength = prior.values(z)[2][:, None] + 2.0 * FLOOR
+        _, _, strength = prior.values(z)
+        strength = strength[:, None] + 2.0 * FLOOR  # alpha + beta
+
+        # Beta-binomial probability of the counts, with p_e integrated out.
         total = stats.norm.logpdf(z).sum(1) + log_any_fails(alpha, beta)
         total += _log_rising(beta, n - failed).sum(1)
         total += _log_rising(alpha[:, bad], failed[bad]).sum(1)
+
         return total - _log_rising(strength, counts) @ times
 
-    # The posterior may have modes at low and high strength, and at a correct and a wrong limit.
-    elsewhere = {-1: 1.5} if prior.steepness is None else {-1: 1.5, -3: 1.8}
-    starts = np.zeros((1 + 2 * len(elsewhere), len(prior.center)))
-    for k, (score, value) in enumerate(elsewhere.items()):
-        starts[2 * k + 1 : 2 * k + 3, score] = -value, value
-    for more in (1, 8):  # repeat with more points if the weights are uneven
-        size, enough = more * _ROUND, more * _ENOUGH
+    starts = _starts(prior)
+    for more in (1, _MORE):
+        size = more * _ROUND
+        enough = more * _ENOUGH
         points = importance.sample(log_density, starts, rng, size=size, enough=enough)
         places = np.zeros((len(points.z), len(paths)), int)
+
         if paths:
             alpha, beta = prior.betas(points.z)
+            # Sequential imputation (Kong, Liu and Wong 1994) corrects for dependent failures.
             places, log_fail = impute(alpha + failed, beta + n - failed, paths, rng)
             ratio = points.log_ratio + log_fail - log_any_fails(alpha, beta)
             points = importance.Points.of(points.z, points.log_p, ratio, points.near)
+
         if points.k_hat <= importance.MAX_KHAT:
             break
     return points, places
+
+
+def _starts(prior: BoundPrior) -> np.ndarray:
+    """Return the prior mean and points near possible modes as normal scores, (start, parameter)."""
+    names = ["strength"]
+    if prior.steepness is not None:
+        names.append("margin")
+
+    center = np.zeros(len(prior.center))
+    starts = [center]
+    for name in names:
+        for score in (-_MODES[name], _MODES[name]):
+            start = center.copy()
+            start[_POSITIONS[name]] = score
+            starts.append(start)
+    return np.array(starts)
 
 
 def _log_rising(x: np.ndarray, k: np.ndarray) -> np.ndarray:
@@ -155,22 +205,33 @@ def impute(
         Places (point, mission), as indices into the paths, and log weights (point,). The mean of
         the weights is the probability that all missions fail.
     """
-    a, b, uniform = a.copy(), b.copy(), rng.random((len(a), len(paths)))
-    places, log_weight = np.zeros(uniform.shape, int), np.zeros(len(a))
+    a = a.copy()
+    b = b.copy()
+    uniform = rng.random((len(a), len(paths)))
+    places = np.zeros(uniform.shape, int)
+    log_weight = np.zeros(len(a))
     for j, path in enumerate(paths):
-        survived, within, done = np.ones(len(a)), np.empty((len(a), len(path))), b.copy()
+        # Probability that the mission passes all bounds before k and fails at k.
+        survived = np.ones(len(a))
+        within = np.empty((len(a), len(path)))
+        done = b.copy()
         for k, e in enumerate(path):
             fails = a[:, e] / (a[:, e] + done[:, e])
             within[:, k] = survived * fails
             survived = survived * (1.0 - fails)
             done[:, e] += 1.0  # a path may include a bound twice
+
         favour = _lookahead(path, paths[j + 1 :], a, b)
         cumulative = (within * favour).cumsum(1)
         total = cumulative[:, -1]
+
         places[:, j] = (cumulative < uniform[:, j, None] * total[:, None]).sum(1)
+        # The weight is the probability of a failure, relative to the favour of the place drawn.
         drawn = np.take_along_axis(favour, places[:, j, None], axis=1)[:, 0]
         log_weight += np.log(total / drawn)
+
         add_lost(path, places[:, j], a, b)
+
     return places, log_weight
 
 
@@ -189,7 +250,7 @@ def _lookahead(
         for k, e in enumerate(path):
             if e in other:
                 ratio = (a[:, e] + b[:, e]) / (a[:, e] + b[:, e] + 1.0)
-                favour[:, k] *= (1.0 - arrives * ratio) / np.maximum(1.0 - arrives, 1e-12)
+                favour[:, k] *= (1.0 - arrives * ratio) / np.maximum(1.0 - arrives, _SMALLEST_P)
     return favour
 
 
@@ -205,14 +266,22 @@ def _to_dataset(
     rng = np.random.default_rng([seed, 2])
     chosen = rng.permutation(points.resample(_N_DRAWS, rng))
     weights, limit, strength = prior.values(points.z[chosen])
+
     degrees = {"units": "degrees"}
-    of_limit = {name: ("draw", v, degrees) for name, v in zip(LIMIT_NAMES, limit.T, strict=False)}
+    of_limit = {
+        name: ("draw", values, degrees)
+        for name, values in zip(LIMIT_NAMES, limit.T, strict=False)  # none without a limit
+    }
+
     n, failed = np.zeros((2, *difficulty.shape[:3]))
-    n[*exposures.bounds.T], failed[*exposures.bounds.T] = exposures.n, exposures.failed
+    n[*exposures.bounds.T] = exposures.n
+    failed[*exposures.bounds.T] = exposures.failed
+
     longest = max((len(path) for path in exposures.lost), default=0)
     lost = np.full((len(exposures.lost), longest, 3), -1)
     for j, path in enumerate(exposures.lost):
         lost[j, : len(path)] = exposures.bounds[path]
+
     return xr.Dataset(
         {
             "intercept": ("draw", weights[:, 0]),

@@ -19,8 +19,12 @@ LIMIT_NAMES = ("margin", "width")
 """Parameters of the robots' slope limit, in degrees."""
 FLOOR = 1e-12
 """Smallest alpha and beta of a Beta prior, needed because the prior mean may round to 0 or 1."""
-_LARGEST_LOG = 50.0  # largest absolute log of the width and the strength
-_FARTHEST = 40.0  # largest tabulated quantile of the margin, in sds of the wider normal
+_LARGEST_LOG = 50.0
+"""Largest absolute log of the width and the strength."""
+_FARTHEST = 40.0
+"""Largest tabulated quantile of the margin, in sds of the wider normal."""
+_N_TABULATED = 4000
+"""Number of tabulated quantiles of the margin."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +64,7 @@ class Hazard:
         for name in ("intercept", "coefficient", "margin", "log_width", "log_strength"):
             mean, sd = require_tuple(f"Hazard.{name}", getattr(self, name), 2)
             object.__setattr__(self, name, (mean, require_positive(f"sd of {name}", sd)))
+
         share, sd = require_tuple("Hazard.doubt", self.doubt, 2)
         share = require_positive("the probability of doubt", share, or_zero=True)
         if share >= 1.0:
@@ -71,10 +76,13 @@ class Hazard:
     ) -> "BoundPrior":
         """Make the prior for bounds with difficulty (bound, measure) and a slope limit in rad."""
         weighted = [m for m, name in enumerate(measures) if name != TILT]
-        normals, steepness = [self.intercept, *[self.coefficient] * len(weighted)], None
+        normals = [self.intercept] + [self.coefficient] * len(weighted)
+        steepness = None
+
         if TILT in measures:
             normals += [self.margin, self.log_width]
             steepness = steepness_of(difficulty[:, list(measures).index(TILT)], max_slope)
+
         center, scale = np.array([*normals, self.log_strength]).T
         return BoundPrior(center, scale, difficulty[:, weighted] - REFERENCE, steepness, self.doubt)
 
@@ -101,12 +109,14 @@ class BoundPrior(NamedTuple):
         """
         values = self.center + self.scale * z
         n = 1 + self.difficulty.shape[1]
+
         if self.steepness is not None and self.doubt[0] > 0.0:
             off = mixture_quantile(z[:, n], float(self.scale[n]), *self.doubt)
             values[:, n] = self.center[n] + off
-        first_log = n + (self.steepness is not None)
+        first_log = n if self.steepness is None else n + 1  # the margin is not a log
         logs = np.clip(values[:, first_log:], -_LARGEST_LOG, _LARGEST_LOG)
         values[:, first_log:] = np.exp(logs)
+
         return values[:, :n], values[:, n:-1], values[:, -1]
 
     def betas(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -128,10 +138,14 @@ def prior_betas(
     1 - m is the product of sigma(-logit) and sigma(-(steepness + margin) / width).
     """
     logit = weights[:, :1] + weights[:, 1:] @ difficulty.T
-    fails, passes = special.expit(logit), special.expit(-logit)
+    fails = special.expit(logit)
+    passes = special.expit(-logit)
+
     if steepness is not None:
         beyond = (steepness + limit[:, :1]) / limit[:, 1:]
-        fails, passes = fails + passes * special.expit(beyond), passes * special.expit(-beyond)
+        fails = fails + passes * special.expit(beyond)
+        passes = passes * special.expit(-beyond)
+
     return strength[:, None] * fails + FLOOR, strength[:, None] * passes + FLOOR
 
 
@@ -156,12 +170,12 @@ def mixture_quantile(z: np.ndarray, narrow: float, share: float, wide: float) ->
 def _quantile_curve(narrow: float, share: float, wide: float) -> PchipInterpolator:
     """Tabulate the quantile function for z >= 0; the mixture is symmetric."""
     largest = _FARTHEST * max(narrow, wide)
-    x = narrow * np.sinh(np.linspace(0.0, np.arcsinh(largest / narrow), 4000))
+    x = narrow * np.sinh(np.linspace(0.0, np.arcsinh(largest / narrow), _N_TABULATED))
+
     # Use the logs of the upper tails, because 1 - F rounds to 0 beyond 38 sds.
-    tails = (
-        np.log1p(-share) + special.log_ndtr(-x / narrow),
-        np.log(share) + special.log_ndtr(-x / wide),
-    )
-    z = -special.ndtri_exp(np.logaddexp(*tails))
+    log_narrow = np.log1p(-share) + special.log_ndtr(-x / narrow)
+    log_wide = np.log(share) + special.log_ndtr(-x / wide)
+
+    z = -special.ndtri_exp(np.logaddexp(log_narrow, log_wide))
     z[0] = 0.0
     return PchipInterpolator(z, x)

@@ -18,9 +18,12 @@ from trustbo.workspace.moves import bounds_along
 
 ROUNDING = 1e-12
 """Tolerance for rounding errors when the risk of a path is compared with its limit."""
-_BAND = (0.05, 0.95)  # levels of the ends of `p_arrive_band`
-_ENTRIES = 1 << 20  # maximum size of an array (draw, bound)
-_SOME = 256  # approximate number of bounds whose mean probability orders the draws
+_BAND = (0.05, 0.95)
+"""Levels of the ends of `p_arrive_band`."""
+_ENTRIES = 1 << 20
+"""Maximum size of an array (draw, bound)."""
+_SOME = 256
+"""Approximate number of bounds whose mean probability orders the draws."""
 
 
 class BoundRisk:
@@ -40,19 +43,27 @@ class BoundRisk:
     def __init__(self, hazard: xr.Dataset, workspace: Workspace) -> None:
         """Read the group `hazard` of a posterior (see `fit_hazard`) for a workspace."""
         self.exists = workspace.passable_bounds.values
-        self.exposures, self.failures = hazard["exposures"].values, hazard["failures"].values
+        self.exposures = hazard["exposures"].values
+        self.failures = hazard["failures"].values
+
         difficulty = difficulty_of(workspace)
-        measures, limit = hazard["measure"].values.tolist(), [n for n in LIMIT_NAMES if n in hazard]
+        measures = hazard["measure"].values.tolist()
+        limit = [n for n in LIMIT_NAMES if n in hazard]
         self._difficulty = difficulty.sel(measure=measures).values - REFERENCE
         self.steepness = None
+
         if limit:
             tilt = difficulty.sel(measure=TILT).values
             self.steepness = steepness_of(tilt, workspace.team.max_slope)
+
         self._strength = hazard["strength"].values  # (draw,)
-        weights = hazard["intercept"].values[:, None], hazard["coefficient"].values
-        self._weights = np.concatenate(weights, axis=1)  # (draw, 1 + measure)
+        intercept = hazard["intercept"].values[:, None]
+        coefficient = hazard["coefficient"].values
+        self._weights = np.concatenate([intercept, coefficient], axis=1)  # (draw, 1 + measure)
+
         of_draws = [hazard[name].values for name in limit]
         self._limit = np.reshape(of_draws, (len(limit), len(self._strength))).T
+
         self._lost = [path[path[:, 0] >= 0] for path in hazard["lost_bound"].values]
         self._place = hazard["place"].values  # (draw, lost), from 1
 
@@ -86,9 +97,11 @@ class BoundRisk:
                 few draws suffice to estimate the mean arrival probability.
             seed: Random seed.
         """
-        rng, order = np.random.default_rng(seed), np.argsort(self._severity)
+        rng = np.random.default_rng(seed)
+        order = np.argsort(self._severity)
         steps = (np.arange(require_whole("n", n, 1)) + 0.5) / n
         chosen = rng.permutation(order[(steps * len(order)).astype(int)])
+
         out = np.full((n, *self.exists.shape), np.nan)
         for bounds, a, b in self._betas(chosen):
             out.reshape(n, -1)[:, bounds] = rng.beta(a, b)
@@ -102,9 +115,12 @@ class BoundRisk:
         order = np.argsort(self._severity)
         ends = partition(self._severity[order], require_whole("n", n, 1))
         sizes = np.diff(ends, prepend=0)
+
         member = np.empty(len(order), int)
         member[order] = np.repeat(np.arange(len(ends)), sizes)
+        # One product averages over the members of each group.
         weights = (member == np.arange(len(ends))[:, None]) / sizes[:, None]
+
         p_fail = np.full((len(ends), *self.exists.shape), np.nan)
         for bounds, a, b in self._betas():
             p_fail.reshape(len(ends), -1)[:, bounds] = weights @ (a / (a + b))
@@ -113,13 +129,15 @@ class BoundRisk:
     @cached_property
     def _severity(self) -> np.ndarray:
         """Mean failure probability (draw,) over a subset of bounds for each hyperparameter draw."""
-        some = np.flatnonzero(self.exists)
-        a, b = self._betas_of(some[:: 1 + len(some) // _SOME])
+        every = np.flatnonzero(self.exists)
+        step = 1 + len(every) // _SOME
+        a, b = self._betas_of(every[::step])
         return (a / (a + b)).mean(1)
 
     def _betas(self, draws: Any = slice(None)) -> Iterator[tuple[np.ndarray, ...]]:
         """Yield chunks of existing bounds: flat indices, and alpha and beta (draw, bound)."""
-        every, n_draws = np.flatnonzero(self.exists), len(self._strength[draws])
+        every = np.flatnonzero(self.exists)
+        n_draws = len(self._strength[draws])
         step = max(1, _ENTRIES // n_draws)
         for start in range(0, len(every), step):
             bounds = every[start : start + step]
@@ -129,10 +147,19 @@ class BoundRisk:
         """Return alpha and beta (draw, bound) of the posterior Beta distributions of bounds."""
         where = np.unravel_index(bounds, self.exists.shape)
         steepness = None if self.steepness is None else self.steepness[where]
-        drawn = self._weights[draws], self._limit[draws], self._strength[draws]
-        a, b = prior_betas(*drawn, self._difficulty[where], steepness)
-        n, failed = self.exposures.ravel()[bounds], self.failures.ravel()[bounds]
-        a, b = a + failed, b + n - failed
+        a, b = prior_betas(
+            self._weights[draws],
+            self._limit[draws],
+            self._strength[draws],
+            self._difficulty[where],
+            steepness,
+        )
+
+        n = self.exposures.ravel()[bounds]
+        failed = self.failures.ravel()[bounds]
+        a = a + failed
+        b = b + n - failed
+
         position = np.full(self.exists.shape, -1)
         position[where] = np.arange(len(bounds))
         for j, path in enumerate(self._lost):
@@ -177,7 +204,8 @@ class Risk:
                 continue
             if p.ndim != 4 or not len(p) or p.shape[1:] != self.p_fail.shape:
                 raise TrustboError(f"{name} must have shape (..., move, row, col); got {p.shape}.")
-            if (bad := (p < 0.0) | (p > 1.0)).any():
+            bad = (p < 0.0) | (p > 1.0)
+            if bad.any():
                 raise TrustboError(f"{name} must be in [0, 1]; got {p[bad][0]:g}.")
 
     def survival(self, path: Sequence[Cell] | np.ndarray) -> float:
@@ -202,13 +230,16 @@ class Risk:
         reach = np.cumprod(1.0 - p)
         if self.draws is None:
             return PathRisk(p, float(reach[-1]), (np.nan, np.nan))
+
         drawn = self.draws[:, *index]
         low, high = np.quantile(np.prod(1.0 - drawn, axis=1), _BAND).tolist()
+
         # Passing all bounds is more probable than if bounds were independent. The sampling errors
         # of the mean p_fail nearly cancel in the ratio of the two probabilities.
         together = np.cumprod(1.0 - drawn, axis=1).mean(0)
         apart = np.cumprod((1.0 - drawn).mean(0))
         ratio = np.divide(together, apart, out=np.ones_like(apart), where=apart > 0.0)
+
         reach = np.minimum.accumulate(np.minimum(reach * ratio, 1.0 - p))
         return PathRisk(p, float(reach[-1]), (low, high))
 

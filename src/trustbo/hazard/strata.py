@@ -31,17 +31,24 @@ def partition(values: np.ndarray, n: int) -> np.ndarray:
     mix the few largest values with others. Time and memory are quadratic in the number of values.
     """
     size = len(values)
-    total, squares = (np.concatenate([[0.0], np.cumsum(v)]) for v in (values, values**2))
+    total = np.concatenate([[0.0], np.cumsum(values)])
+    squares = np.concatenate([[0.0], np.cumsum(values**2)])
+
+    # within[i, j] is the sum of squared deviations of values[i:j] from their mean.
     first, last = np.meshgrid(np.arange(size + 1), np.arange(size + 1), indexing="ij")
     count = np.maximum(last - first, 1)
     within = squares[last] - squares[first] - (total[last] - total[first]) ** 2 / count
     within[first >= last] = np.inf
+
     # least[j] is the optimum for values[:j] in the groups so far; the last begins at cuts[-1][j].
-    least, cuts = within[0], []
+    least = within[0]
+    cuts = []
     for _ in range(min(n, len(np.unique(values))) - 1):
         with_one_more = least[:, None] + within
         cuts.append(with_one_more.argmin(0))
         least = with_one_more.min(0)
+
+    # Follow the cuts back from the end of the last group.
     ends = [size]
     for cut in reversed(cuts):
         ends.append(int(cut[ends[-1]]))
