@@ -22,11 +22,18 @@ from trustbo.inference.score import last_posterior, predictions, score
 from trustbo.models.families import FAMILIES
 from trustbo.parallel import computing
 
-SIZE, SURE = 0.1, 0.95
-"""Smallest effect on contact that may change a plan, and the probability required to report it."""
-_SIGNED = 0.6  # prior probability of a sign above which the sign is expected
-_TOLERANCE = 0.05  # tolerated error of the coverage of 90 % intervals
-_ERRORS = 2.0  # number of standard errors above which a difference is significant
+SIZE = 0.1
+"""Smallest effect on contact that may change a plan."""
+SURE = 0.95
+"""Probability of such an effect that is required to report it."""
+_SIGNED = 0.6
+"""Prior probability of a sign above which the sign is expected."""
+_COVERAGE = 0.9
+"""Probability of the intervals whose coverage is checked."""
+_TOLERANCE = 0.05
+"""Tolerated error of their coverage."""
+_ERRORS = 2.0
+"""Number of standard errors above which a difference is significant."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -92,6 +99,7 @@ def check(
             "check needs a posterior of contact rates; got a posterior of HumanTrust. Use "
             "trustbo.inference.predict_reports instead."
         )
+
     robots = effects_of_robots(tree)
     findings = {
         "robots": _check_robots(robots),
@@ -99,6 +107,7 @@ def check(
         "weights": _check_weights(tree),
         "coverage": _check_coverage(trees, tree, missions),
     }
+
     table = pd.DataFrame(list(findings.values()), pd.Index(findings, name="check"))
     odd = [finding.finding for finding in findings.values() if finding.stands_out]
     return Check(("; ".join(odd) or "nothing stands out") + ".", table, robots)
@@ -110,12 +119,15 @@ def effects_of_robots(posterior: xr.DataTree) -> pd.DataFrame:
         return pd.DataFrame()
     group = posterior["robots"].to_dataset()
     draws = joined_draws(group["robot_effect"])
+
     # The weight of line of sight already includes what all robots and missions have in common.
     draws = draws - np.median(draws, axis=(1, 2), keepdims=True)
     draws = draws / FAMILIES[posterior.attrs["observation"]].line_of_sight[0]
+
     probability = np.maximum((draws < -SIZE).mean(0), (draws > SIZE).mean(0))
     columns = {"effect": draws.mean(0), "sd": draws.std(0), "probability": probability}
     columns["stands_out"] = probability > SURE
+
     labels = group["mission"].values + 1, group["robot"].values
     index = pd.MultiIndex.from_product(labels, names=("mission", "robot"))
     return pd.DataFrame({n: v.ravel() for n, v in columns.items()}, index).reset_index()
@@ -125,18 +137,26 @@ def _check_robots(robots: pd.DataFrame) -> Finding:
     """Check whether the effect of a robot in a mission differs from the median."""
     if not len(robots):
         return Finding("not tested: the model has no robot effects")
-    effect, odd = robots["effect"].to_numpy(), robots["stands_out"].to_numpy()
+    effect = robots["effect"].to_numpy()
+    odd = robots["stands_out"].to_numpy()
     if not odd.any():
         return Finding("no robot stands out", size=float(np.abs(effect).max()))
-    mission, robot = robots["mission"].to_numpy(), robots["robot"].to_numpy()
+
+    mission = robots["mission"].to_numpy()
+    robot = robots["robot"].to_numpy()
+
     words = []
     for name in dict.fromkeys(robot[odd]):
         rows = odd & (robot == name)
-        when = f"mission {joined(mission[rows].astype(str).tolist())}"
-        when = "all missions" if rows.sum() == (robot == name).sum() else when
+        if rows.sum() == (robot == name).sum():
+            when = "all missions"
+        else:
+            when = f"mission {joined(mission[rows].astype(str).tolist())}"
         words.append(f"{name}: {effect[rows].mean():+.2f} contact at full line of sight in {when}")
-    most = int(np.argmax(np.abs(effect) * odd))
-    size, p = float(effect[most]), float(robots["probability"].to_numpy()[most])
+
+    most = int(np.argmax(np.where(odd, np.abs(effect), 0.0)))
+    size = float(effect[most])
+    p = float(robots["probability"].to_numpy()[most])
     return Finding(joined(words), True, str(robot[most]), size, p)
 
 
@@ -145,10 +165,8 @@ def _check_places(posterior: xr.DataTree) -> Finding:
     if "places" not in posterior.children:
         return Finding("not tested: the model has no place effects")
     places = posterior["places"].to_dataset()
-    cells, where = (
-        list(zip(places[f"{kind}_row"].values, places[f"{kind}_col"].values, strict=True))
-        for kind in ("cell", "bound")
-    )
+    cells = list(zip(places["cell_row"].values, places["cell_col"].values, strict=True))
+    where = list(zip(places["bound_row"].values, places["bound_col"].values, strict=True))
     of_cells = joined_draws(places["place"])[:, [cells.index(cell) for cell in where]]
     total = joined_draws(places["place_bound"]) + of_cells
     inverse_gain = theta_of(posterior, sites_of(posterior))["inverse_gain"]
@@ -156,13 +174,17 @@ def _check_places(posterior: xr.DataTree) -> Finding:
         1, keepdims=True
     )  # of stationary trust
     draws = draws / FAMILIES[posterior.attrs["observation"]].line_of_sight[0]
+
     effect = draws.mean(0)
     sure = (draws * np.sign(effect) > 0.0).mean(0)
     odd = (sure > SURE) & (np.abs(effect) > SIZE)
-    most = int(np.argmax(np.abs(effect) * (odd if odd.any() else 1.0)))
+    among = odd if odd.any() else np.ones(len(odd), bool)
+    most = int(np.argmax(np.where(among, np.abs(effect), 0.0)))
     row, col = (int(i) for i in where[most])
+
     words = f"{odd.sum()} of {len(odd)} places stand out; the largest effect is {effect[most]:+.2f}"
-    size, p = float(effect[most]), float(sure[most])
+    size = float(effect[most])
+    p = float(sure[most])
     return Finding(words, bool(odd.any()), f"({row}, {col})", size, p)
 
 
@@ -172,20 +194,30 @@ def _check_weights(posterior: xr.DataTree) -> Finding:
     if "prior" not in posterior.children or name not in posterior["prior"]:
         return Finding("not tested: the posterior contains no prior draws")
     features = posterior["posterior"].to_dataset()["feature"].values
-    groups = (posterior[group].to_dataset() for group in ("prior", "posterior"))
-    prior, draws = (joined_draws(group[name]) for group in groups)
-    if name == "B":  # keep the weights of each robot's own features, which have an expected sign
-        prior, draws = (np.einsum("dmii->dim", B) for B in (prior, draws))
-    prior, draws = (weights.reshape(-1, len(features)) for weights in (prior, draws))
+    prior = _weights(posterior, "prior", name)
+    draws = _weights(posterior, "posterior", name)
+
     sign = np.sign(prior.mean(0))
     expected = (prior * sign > 0.0).mean(0) > _SIGNED
     wrong = (draws * sign < 0.0).mean(0) * expected
-    most, odd = int(wrong.argmax()), [str(feature) for feature in features[wrong > SURE]]
+
+    most = int(wrong.argmax())
+    odd = [str(feature) for feature in features[wrong > SURE]]
     words = "no weight has a sign that contradicts its prior"
     if odd:
         words = f"the sign of the weight contradicts the prior for {joined(odd)}"
-    size, p = float(draws[:, most].mean()), float(wrong[most])
+
+    size = float(draws[:, most].mean())
+    p = float(wrong[most])
     return Finding(words, bool(odd), str(features[most]), size, p)
+
+
+def _weights(posterior: xr.DataTree, group: str, name: str) -> np.ndarray:
+    """Return the draws of the weights in a group, (draw, feature), of all robots."""
+    weights = joined_draws(posterior[group].to_dataset()[name])
+    if name == "B":  # keep the weights of each robot's own features, which have an expected sign
+        weights = np.einsum("dmii->dim", weights)
+    return weights.reshape(-1, weights.shape[-1])
 
 
 def _check_coverage(
@@ -194,15 +226,18 @@ def _check_coverage(
     """Check whether 90 % intervals one mission ahead contain 90 % of the rates."""
     if len(trees) < 2:
         return Finding("not tested: this check needs all posteriors of a campaign")
+
     missions = missions_of(last) if missions is None else missions
     if not predictions("check", trees, missions)[0]:
         return Finding("not tested: no mission has an earlier posterior that predicts it")
+
     pit = score(trees, missions)["pit"]
-    within = (abs(pit - 0.5) <= 0.45).where(pit.notnull()).mean(("bound", "robot")).values
+    is_inside = (abs(pit - 0.5) <= 0.5 * _COVERAGE).where(pit.notnull())
+    within = is_inside.mean(("bound", "robot")).values
     within = within[np.isfinite(within)]
     if not len(within):
         return Finding("not tested: no rate of the predicted missions was measured")
-    off = float(within.mean() - 0.9)
+    off = float(within.mean() - _COVERAGE)
     error = within.std(ddof=1) / np.sqrt(len(within)) if len(within) > 1 else np.inf
     words = f"90 % intervals one mission ahead contain {within.mean():.0%} of the rates"
     return Finding(words, bool(abs(off) > max(_TOLERANCE, _ERRORS * error)), "90 %", off)
