@@ -34,6 +34,9 @@ _LABELS = {
 """Axis labels of the variables that `campaign_history` plots, keyed by name."""
 SMALL_EFFECT = 0.1
 """Robot effect, as a fraction of contact, up to which plans hardly change."""
+_SPREAD = 0.2
+"""Largest shift of a robot's markers from the number of their mission, so that they do not overlap.
+"""
 
 
 @styled
@@ -53,22 +56,29 @@ def trust_curves(given: xr.DataTree | Plan, mission: int = -1, *, ax: Any = None
         TrustboError: There is no such mission, or the posterior has no latent trust.
     """
     if isinstance(given, Plan):
-        x, middle, bands = np.arange(1, len(given.trust) + 1), given.trust, given.bands
-        rates, robots = np.full(given.trust.shape, np.nan), given.workspace.team.names
+        x = np.arange(1, len(given.trust) + 1)
+        middle = given.trust
+        bands = given.bands
+        rates = np.full(given.trust.shape, np.nan)
+        robots = given.workspace.team.names
     else:
         x, middle, bands, rates, robots = _latent_trust(given, mission)
+
     axes = panels(len(robots), ax, (2.4, 1.9), sharex=True, sharey=True)
-    for i, (one, name) in enumerate(zip(axes, robots, strict=True)):
-        colour, (low, lower, upper, high) = accent(), bands[..., i]
+    for i, (panel, name) in enumerate(zip(axes, robots, strict=True)):
+        colour = accent()
+        low, lower, upper, high = bands[..., i]
         style: dict[str, Any] = {"color": colour, "linewidth": 0.0}
-        one.fill_between(x, low, high, alpha=0.25, label="90 %", **style)
-        one.fill_between(x, lower, upper, alpha=0.5, label="50 %", **style)
-        one.plot(x, middle[:, i], color=colour, marker="." if len(x) == 1 else "", label="trust")
+        panel.fill_between(x, low, high, alpha=0.25, label="90 %", **style)
+        panel.fill_between(x, lower, upper, alpha=0.5, label="50 %", **style)
+        marker = "." if len(x) == 1 else ""  # a line of one point is invisible
+        panel.plot(x, middle[:, i], color=colour, marker=marker, label="trust")
         if np.isfinite(rates[:, i]).any():
-            one.plot(x, rates[:, i], "o", color=ink(), markersize=3.5, label="contact rate")
-        one.set_title(as_text(name))
-        one.set_xlabel("bound")
-        one.xaxis.set_major_locator(MaxNLocator(integer=True))
+            panel.plot(x, rates[:, i], "o", color=ink(), markersize=3.5, label="contact rate")
+        panel.set_title(as_text(name))
+        panel.set_xlabel("bound")
+        panel.xaxis.set_major_locator(MaxNLocator(integer=True))
+
     axes[0].set_ylabel("trust, contact rate")
     add_legend(axes, axes[0].get_legend_handles_labels()[0])
     return axes
@@ -83,14 +93,18 @@ def _latent_trust(
         raise TrustboError(
             "this posterior has no latent trust; use inference.complete(posterior, missions)."
         )
+
     latent = posterior["latent"].to_dataset()
     n = latent.sizes["mission"]
     mission = require_whole("mission", mission, -n, n - 1)
     trust = latent["trust"].isel(mission=mission).stack(all_draws=("chain", "draw"))
     trust = trust.dropna("bound", how="all").transpose("all_draws", "bound", "robot")
+
     rates = posterior["observed_data"]["contact_rate"].isel(mission=mission)
     rates = rates.sel(bound=trust["bound"]).transpose("bound", "robot").values
-    middle, bands = np.median(trust.values, 0), np.quantile(trust.values, QUANTILES, axis=0)
+
+    middle = np.median(trust.values, 0)
+    bands = np.quantile(trust.values, QUANTILES, axis=0)
     return trust["bound"].values, middle, bands, rates, trust["robot"].values.tolist()
 
 
@@ -114,17 +128,20 @@ def campaign_history(history: xr.Dataset, *, ax: Any = None) -> np.ndarray:
     mission = history["iteration"].values
     changed = history["path_changed"].values.astype(bool) | (mission == 1)
     failed = history["status"].values.astype(str) != "ok"
+
     axes = panels(len(names), ax, (4.6, 1.5), columns=1, sharex=True)
-    for one, name in zip(axes, names, strict=True):
+    for panel, name in zip(axes, names, strict=True):
         values = history[name].values
-        one.plot(mission, values, color=accent(), linewidth=1.0)
+        panel.plot(mission, values, color=accent(), linewidth=1.0)
         for which, fill, label in ((changed, accent(), "new path"), (~changed, "none", "same")):
             dots = {"markerfacecolor": fill, "markeredgecolor": accent(), "label": label}
-            one.plot(mission[which], values[which], "o", markersize=5.5, **dots)
+            panel.plot(mission[which], values[which], "o", markersize=5.5, **dots)
+
         if failed.any():
             cross = {"color": ROBOTS[1], "markersize": 9.0, "label": "goal not reached"}
-            one.plot(mission[failed], values[failed], "x", **cross)
-        one.set_ylabel(_LABELS[name])
+            panel.plot(mission[failed], values[failed], "x", **cross)
+        panel.set_ylabel(_LABELS[name])
+
     axes[-1].set_xlabel("mission")
     axes[-1].xaxis.set_major_locator(MaxNLocator(integer=True))
     add_legend(axes, axes[0].get_legend_handles_labels()[0])
@@ -151,19 +168,24 @@ def robot_effects(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
     """
     for name in ("mission", "robot", "effect", "sd", "stands_out"):
         require_choice("column", name, [str(column) for column in table.columns])
+
     axes = panels(1, ax, (5.0, 2.6))
-    one = axes[0]
-    one.axhspan(-SMALL_EFFECT, SMALL_EFFECT, color=GREY, alpha=0.25, linewidth=0.0)
+    panel = axes[0]
+    panel.axhspan(-SMALL_EFFECT, SMALL_EFFECT, color=GREY, alpha=0.25, linewidth=0.0)
     groups = list(table.groupby("robot", sort=False))
-    shifts = np.linspace(-0.2, 0.2, len(groups)) if len(groups) > 1 else [0.0]
+    shifts = np.linspace(-_SPREAD, _SPREAD, len(groups)) if len(groups) > 1 else [0.0]
+
     for i, (name, rows) in enumerate(groups):
-        colour, marker = ROBOTS[i % len(ROBOTS)], MARKERS[i % len(MARKERS)]
-        x, y = rows["mission"].to_numpy() + shifts[i], rows["effect"].to_numpy()
+        colour = ROBOTS[i % len(ROBOTS)]
+        marker = MARKERS[i % len(MARKERS)]
+        x = rows["mission"].to_numpy() + shifts[i]
+        y = rows["effect"].to_numpy()
         odd = rows["stands_out"].to_numpy(dtype=bool)
-        one.errorbar(x, y, 2.0 * rows["sd"].to_numpy(), color=colour, fmt="none", elinewidth=1.0)
-        one.plot(x, y, marker, color=colour, markerfacecolor=background(), label=str(name))
-        one.plot(x[odd], y[odd], marker, color=colour)
-    one.set(xlabel="mission", ylabel="effect on contact at full sight")
-    one.xaxis.set_major_locator(MaxNLocator(integer=True))
-    add_legend(axes, one.get_legend_handles_labels()[0])
-    return one
+        panel.errorbar(x, y, 2.0 * rows["sd"].to_numpy(), color=colour, fmt="none", elinewidth=1.0)
+        panel.plot(x, y, marker, color=colour, markerfacecolor=background(), label=str(name))
+        panel.plot(x[odd], y[odd], marker, color=colour)
+
+    panel.set(xlabel="mission", ylabel="effect on contact at full sight")
+    panel.xaxis.set_major_locator(MaxNLocator(integer=True))
+    add_legend(axes, panel.get_legend_handles_labels()[0])
+    return panel

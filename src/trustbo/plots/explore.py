@@ -20,6 +20,12 @@ _PLANNED_ON = "trust map used to plan the mission"
 _MARKERS = ("circle", "square", "diamond", "triangle", "inverted_triangle", "plus")
 _HEIGHT = 640
 """Height of the page in a notebook, pixels."""
+_WIDTH = 600
+"""Width for which the height of the map is chosen, pixels."""
+_HEIGHTS = (250, 700)
+"""Least and largest height of the map, pixels."""
+_BELOW = 200
+"""Height of the colour bar and the legend, pixels."""
 _UPDATE = """
 const n = mission.value
 const column = layer.value == planned_on ? `mission ${n}` : layer.value
@@ -77,7 +83,6 @@ def _layout(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> Any:
     """Lay out the controls, the map and the description of the mission."""
     from bokeh import models
     from bokeh.layouts import column
-    from bokeh.plotting import figure
 
     grid = plan.workspace.grid
     layers = _layers(plan, maps, history)
@@ -85,45 +90,33 @@ def _layout(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> Any:
     trusts = [name for name in layers if name == "trust mean" or name not in names]
     limits = {name: robust_limits(values) for name, values in layers.items()}
     limits |= dict.fromkeys(trusts, trust_limits(np.stack([layers[name] for name in trusts])))
+
     x, y = np.meshgrid(grid.x - grid.corner[0], grid.y - grid.corner[1])
     row, col = np.indices(grid.shape)
     columns = {name: values.ravel() for name, values in layers.items()}
     position = {"x": x.ravel(), "y": y.ravel(), "cell_row": row.ravel(), "cell_col": col.ravel()}
     cells = models.ColumnDataSource({**position, **columns, "value": columns[names[0]]})
+
     low, high = limits[names[0]]
     colours = models.LinearColorMapper(
         palette="Viridis256", low=low, high=high, nan_color="#9a9a9a"
     )
+    plot = _plot_cells(plan, names, cells, colours)
 
-    left, right, bottom, top = extent_of(grid)
-    height = int(np.clip(600 * (top - bottom) / (right - left), 250, 700))
-    plot = figure(
-        height=height + 200, sizing_mode="stretch_width", match_aspect=True,
-        tools="pan,wheel_zoom,reset,save", active_drag=None, toolbar_location="above",
-        x_axis_label="east (m)", y_axis_label="north (m)",
-    )  # fmt: skip
-    plot.grid.visible = False
-    size: dict[str, Any] = {"width": grid.cell_width, "height": grid.cell_height}
-    fill: Any = {"field": "value", "transform": colours}
-    drawn = plot.rect("x", "y", source=cells, fill_color=fill, line_color=None, **size)
-    plot.add_layout(models.ColorBar(color_mapper=colours, height=12), "below")
-    tips = [("cell", "@cell_row,@cell_col"), ("selected layer", "@value{0.000}")]
-    tips += ((n, f"@{{{n}}}{{0.000}}") for n in names)
-    plot.add_tools(models.HoverTool(renderers=[drawn], tooltips=tips))
-    lines = contours(plan.workspace)
-    if lines:
-        xs: Any = [line[:, 0] for line in lines]
-        ys: Any = [line[:, 1] for line in lines]
-        plot.multi_line(xs, ys, color="black", alpha=0.25, line_width=0.7)
-
-    paths = [_places(_cells(one), grid) for one in history["path"].values]
+    paths = [_places(_cells(steps), grid) for steps in history["path"].values]
     texts = [_text(history.isel(iteration=i)) for i in range(len(paths))]
     n_missions = len(paths)
     planned = models.ColumnDataSource(paths[-1])
     plot.line(
-        "x", "y", source=planned, color="#d55e00", line_width=4, line_dash="dashed",
+        "x",
+        "y",
+        source=planned,
+        color=ROBOTS[1],
+        line_width=4,
+        line_dash="dashed",
         legend_label="plan of the mission",
-    )  # fmt: skip
+    )
+
     _draw_plan(plot, plan)
     plot.legend.click_policy = "hide"
     plot.legend.update(orientation="horizontal", ncols=2, location="left", spacing=8, margin=0)
@@ -131,19 +124,76 @@ def _layout(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> Any:
 
     layer = models.Select(title="Layer", value=names[0], options=[*names, _PLANNED_ON])
     mission = models.Slider(
-        title="Mission", start=1, end=max(n_missions, 2), value=n_missions, step=1,
-        visible=n_missions > 1, sizing_mode="stretch_width",
-    )  # fmt: skip
+        title="Mission",
+        start=1,
+        end=max(n_missions, 2),
+        value=n_missions,
+        step=1,
+        visible=n_missions > 1,
+        sizing_mode="stretch_width",
+    )
     text = models.Div(text=texts[-1], sizing_mode="stretch_width")
     shared = {
-        "cells": cells, "colours": colours, "planned": planned, "layer": layer, "mission": mission,
-        "text": text, "limits": limits, "paths": paths, "texts": texts, "planned_on": _PLANNED_ON,
-    }  # fmt: skip
+        "cells": cells,
+        "colours": colours,
+        "planned": planned,
+        "layer": layer,
+        "mission": mission,
+        "text": text,
+        "limits": limits,
+        "paths": paths,
+        "texts": texts,
+        "planned_on": _PLANNED_ON,
+    }
     update = models.CustomJS(args=shared, code=_UPDATE)
     layer.js_on_change("value", update)
     mission.js_on_change("value", update)
+
     styles = {"max-width": "900px", "margin": "0 auto", "padding": "0 8px"}
     return column(layer, mission, text, plot, sizing_mode="stretch_width", styles=styles)
+
+
+def _plot_cells(plan: Plan, names: Sequence[str], cells: Any, colours: Any) -> Any:
+    """Plot the selected layer, with the values of all layers in `names` at the pointer.
+
+    Args:
+        plan: Plan, whose workspace has the contour lines.
+        names: Names of the layers.
+        cells: Bokeh data source of the cells, whose column `value` is shown.
+        colours: Colour mapper.
+    """
+    from bokeh import models
+    from bokeh.plotting import figure
+
+    grid = plan.workspace.grid
+    left, right, bottom, top = extent_of(grid)
+    height = int(np.clip(_WIDTH * (top - bottom) / (right - left), *_HEIGHTS))
+    plot = figure(
+        height=height + _BELOW,
+        sizing_mode="stretch_width",
+        match_aspect=True,
+        tools="pan,wheel_zoom,reset,save",
+        active_drag=None,
+        toolbar_location="above",
+        x_axis_label="east (m)",
+        y_axis_label="north (m)",
+    )
+    plot.grid.visible = False
+    size: dict[str, Any] = {"width": grid.cell_width, "height": grid.cell_height}
+    fill: Any = {"field": "value", "transform": colours}
+    drawn = plot.rect("x", "y", source=cells, fill_color=fill, line_color=None, **size)
+
+    plot.add_layout(models.ColorBar(color_mapper=colours, height=12), "below")
+    tips = [("cell", "@cell_row,@cell_col"), ("selected layer", "@value{0.000}")]
+    tips += ((n, f"@{{{n}}}{{0.000}}") for n in names)
+    plot.add_tools(models.HoverTool(renderers=[drawn], tooltips=tips))
+
+    lines = contours(plan.workspace)
+    if lines:
+        xs: Any = [line[:, 0] for line in lines]
+        ys: Any = [line[:, 1] for line in lines]
+        plot.multi_line(xs, ys, color="black", alpha=0.25, line_width=0.7)
+    return plot
 
 
 def _layers(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> dict[str, np.ndarray]:
@@ -154,8 +204,10 @@ def _layers(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> dict[str, np.n
         for name, values in maps.data_vars.items()
         if values.ndim == 2
     }
+
     trust = history["trust_map"].transpose("iteration", "row", "col").values
     layers |= {f"mission {i + 1}": values for i, values in enumerate(trust)}
+
     learned = free.copy()
     learned[plan.path[0]] = False  # the trust at the start is assumed
     about_trust = "trust", "cost", "mission"
@@ -168,14 +220,19 @@ def _layers(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> dict[str, np.n
 def _draw_plan(plot: Any, plan: Plan) -> None:
     """Plot the recommended path and, with a terrain, the posts and routes of the robots."""
     grid = plan.workspace.grid
-    corner, path = np.array(grid.corner), _places(plan.path, grid)
+    corner = np.array(grid.corner)
+    path = _places(plan.path, grid)
     plot.line(path["x"], path["y"], color="black", line_width=5, legend_label="recommended")
     plot.line(path["x"], path["y"], color="white", line_width=3, legend_label="recommended")
+
     for k, marker in ((0, "circle"), (-1, "star")):
-        end = [path["x"][k]], [path["y"][k]]
-        plot.scatter(*end, marker=marker, size=14, color="white", line_color="black")
+        x = path["x"][k]
+        y = path["y"][k]
+        plot.scatter([x], [y], marker=marker, size=14, color="white", line_color="black")
+
     if plan.posts is None or plan.routes is None:
         return
+
     for i, name in enumerate(plan.workspace.team.names):
         x, y = (plan.posts[:, i] - corner).T
         look = {"color": ROBOTS[i % len(ROBOTS)], "legend_label": f"posts of {name}"}

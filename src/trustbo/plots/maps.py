@@ -1,5 +1,6 @@
 """Maps of the terrain and of the planning cells, with contour lines, paths and a scale bar."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -24,13 +25,26 @@ MOMENTS = (1, 2, 4)
 """Missions for which `trust_maps` plots the map used for planning, by default."""
 VEGETATION = (0.44, 0.56, 0.39, 0.4)
 """Colour of vegetation: a semi-transparent green for light and dark backgrounds."""
-_GROWN = 0.5  # minimum height of vegetation above the ground, m
-_CONTOURS = 12  # maximum number of contour levels
-_MAX_PIXELS = 400  # maximum number of rows or columns when contour lines are computed
-_SMOOTH = 0.01  # sd of the smoothing, as a fraction of the raster's longer side
-_ROBUST = (0.02, 0.98)  # quantiles at the ends of the colour scale
-_BESIDE = 1.1  # width of axis labels and colour bar, in inches
-_LOGIT = 1.5  # trust above this value is on the logit scale of beta-binomial models
+_GROWN = 0.5
+"""Minimum height of vegetation above the ground, m."""
+_CONTOURS = 12
+"""Maximum number of contour levels."""
+_LEVEL = 0.05
+"""Range of heights, m, up to which the ground is level and has no contour lines."""
+_MAX_PIXELS = 400
+"""Maximum number of rows or columns when contour lines are computed."""
+_SMOOTH = 0.01
+"""Standard deviation of the smoothing, as a fraction of the raster's longer side."""
+_ROBUST = (0.02, 0.98)
+"""Quantiles at the ends of the colour scale."""
+_BESIDE = 1.1
+"""Width of axis labels and colour bar, in inches."""
+_LOGIT = 1.5
+"""Trust above this value is on the logit scale of beta-binomial models."""
+_LONGEST_BAR = 0.4
+"""Longest scale bar, as a fraction of the width of a map."""
+_BAR_END = 0.96
+"""Right end of the scale bar, as a fraction of the width of a map."""
 
 
 @styled
@@ -63,29 +77,39 @@ def trust_maps(
     require_kind("history", history, xr.Dataset, "give Result.history")
     require_kind("trust_map", trust_map, xr.DataArray, "give Result.trust_map")
     require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
+
     path = require_path_of_cells(path, workspace)
     missions = [require_whole("mission", i, 1) for i in require_list("missions", missions)]
+
     n_missions = history.sizes["iteration"]
     chosen = [i for i in missions if 1 <= i <= n_missions]
     maps = [history["trust_map"].sel(iteration=i) for i in chosen] + [trust_map]
     steps = [history["path"].sel(iteration=i).values for i in chosen] + [np.array(path)]
-    paths = [[(int(row), int(col)) for row, col in one if row >= 0] for one in steps]
+    paths = [[(int(row), int(col)) for row, col in cells if row >= 0] for cells in steps]
     learned = [i - 1 for i in chosen] + [n_missions]
 
-    values = np.stack([one.transpose("row", "col").values for one in maps])
+    values = np.stack([trust.transpose("row", "col").values for trust in maps])
     values[:, *path[0]] = np.nan
     low, high = trust_limits(values[[n > 0 for n in learned]])
     norm = Normalize(low, high)
 
     axes = map_panels(workspace.grid, len(maps), ax)
-    for one, trust, cells, n in zip(axes, values, paths, learned, strict=True):
-        draw_cells(one, maps[0].copy(data=trust), workspace, norm)
-        draw_path(one, cells, workspace.grid)
-        one.set_title("before the first mission" if n == 0 else f"after {n} mission{'s' * (n > 1)}")
+    for panel, trust, cells, n in zip(axes, values, paths, learned, strict=True):
+        draw_cells(panel, maps[0].copy(data=trust), workspace, norm)
+        draw_path(panel, cells, workspace.grid)
+        panel.set_title(_moment(n))
+
     draw_scale(axes[0], workspace.grid)
     unit = "\n(1: unbroken contact)" if high <= 1.0 else ""
     colour_bar(axes, ScalarMappable(norm), f"expected trust{unit}", extend="both")
     return axes
+
+
+def _moment(n: int) -> str:
+    """Describe the moment after n missions."""
+    if n == 0:
+        return "before the first mission"
+    return "after 1 mission" if n == 1 else f"after {n} missions"
 
 
 @styled
@@ -106,22 +130,30 @@ def terrain_maps(workspace: Workspace, *, ax: Any = None) -> np.ndarray:
         TrustboError: The workspace has no terrain.
     """
     require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
-    terrain, pixels, grid = workspace.terrain, workspace.pixels, workspace.grid
+    terrain = workspace.terrain
+    pixels = workspace.pixels
+    grid = workspace.grid
     if terrain is None or pixels is None:
         raise TrustboError("terrain_maps needs a workspace made with Workspace.from_terrain.")
+
     axes = map_panels(grid, 1 + len(workspace.features), ax)
     surface, *others = axes
-    extent, of_cells = extent_of(grid), workspace.awareness.mean(("robot", "move"))
+    extent = extent_of(grid)
+    of_cells = workspace.awareness.mean(("robot", "move"))
+
     heights = surface.imshow(terrain["dsm"].values, cmap="cividis", extent=extent)
     surface.set_title("surface (DSM)")
-    for one, name in zip(others, workspace.features, strict=True):
+
+    for panel, name in zip(others, workspace.features, strict=True):
         index = pixels[name].values if name in pixels else of_cells.sel(feature=name).values
-        one.set_facecolor(GREY)
-        one.imshow(index, vmin=0.0, vmax=1.0, extent=extent)
-        one.set_title(as_text(name))
-    for one in axes:
-        draw_contours(one, workspace, "black", 0.25)
-        draw_cell_edges(one, grid)
+        panel.set_facecolor(GREY)
+        panel.imshow(index, vmin=0.0, vmax=1.0, extent=extent)
+        panel.set_title(as_text(name))
+
+    for panel in axes:
+        draw_contours(panel, workspace, "black", 0.25)
+        draw_cell_edges(panel, grid)
+
     draw_scale(surface, grid)
     colour_bar(axes, heights, "height (m)", location="bottom", aspect=40)
     colour_bar(axes, ScalarMappable(Normalize(0.0, 1.0)), "index\n(0 worst, 1 best)")
@@ -155,12 +187,17 @@ def cell_map(
     """
     require_kind("values", values, xr.DataArray, "give a map of the cells")
     require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
-    low, high = (None, None) if limits is None else require_tuple("limits", limits, 2)
+    norm = Normalize()
+    if limits is not None:
+        low, high = require_tuple("limits", limits, 2)
+        norm = Normalize(low, high)
     if label is not None:
         require_kind("label", label, str, "give a text; '' for no colour bar")
     cells = None if path is None else require_path_of_cells(path, workspace)
+
     axes = map_panels(workspace.grid, 1, ax)
-    image = draw_cells(axes[0], values, workspace, Normalize(low, high), cmap)
+    image = draw_cells(axes[0], values, workspace, norm, cmap)
+
     if cells is not None:
         draw_path(axes[0], cells, workspace.grid)
     draw_scale(axes[0], workspace.grid)
@@ -190,16 +227,19 @@ def map_panels(grid: Grid, n: int, ax: Any) -> np.ndarray:
     """Return axes for n maps; positions are in metres from the lower left corner of the grid."""
     left, right, bottom, top = extent_of(grid)
     tall = float(np.clip((top - bottom) / (right - left), 0.3, 3.0))
-    width, columns = 3.0 if n > 1 else 4.0, 2 if n == 4 else 3
+    width = 3.0 if n > 1 else 4.0
+    columns = 2 if n == 4 else 3
+
     inner = width - _BESIDE / min(n, columns)
     axes = panels(n, ax, (width, inner * tall + 0.4), columns=columns)
-    for one in axes:
-        one.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
-        one.spines[:].set_visible(True)
-        one.locator_params(nbins=4)
-        one.set(xlabel="east (m)", ylabel="north (m)")
-        if one.get_subplotspec() is not None:
-            one.label_outer()
+
+    for panel in axes:
+        panel.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
+        panel.spines[:].set_visible(True)
+        panel.locator_params(nbins=4)
+        panel.set(xlabel="east (m)", ylabel="north (m)")
+        if panel.get_subplotspec() is not None:
+            panel.label_outer()
     return axes
 
 
@@ -219,6 +259,7 @@ def draw_cells(
     """Draw a map of the planning cells, and return the image."""
     shown = over_cells(values).transpose("row", "col").values
     data = np.where(workspace.passable.values, shown, np.nan)
+
     ax.set_facecolor(GREY)
     image = ax.imshow(data, cmap=cmap, norm=norm, extent=extent_of(workspace.grid))
     draw_contours(ax, workspace, "black", 0.25)
@@ -227,12 +268,14 @@ def draw_cells(
 
 def draw_ground(ax: Axes, workspace: Workspace) -> None:
     """Draw vegetation and contour lines or, without a terrain, the cell edges."""
-    terrain, extent = workspace.terrain, extent_of(workspace.grid)
+    terrain = workspace.terrain
+    extent = extent_of(workspace.grid)
     ax.set(xlim=extent[:2], ylim=extent[2:], aspect="equal", xticks=[], yticks=[])
     ax.spines[:].set_visible(True)
     if terrain is None:
         draw_cell_edges(ax, workspace.grid)
         return
+
     grown = np.where((terrain["dsm"] - terrain["dem"]).values > _GROWN, 1.0, np.nan)
     ax.imshow(grown, cmap=ListedColormap([VEGETATION]), extent=extent)
     draw_contours(ax, workspace, GREY, 0.8)
@@ -260,8 +303,9 @@ def contours(workspace: Workspace) -> list[np.ndarray]:
     """
     if workspace.terrain is None:
         return []
+
     terrain = workspace.terrain
-    step = -(-max(terrain["dem"].shape) // _MAX_PIXELS)
+    step = math.ceil(max(terrain["dem"].shape) / _MAX_PIXELS)
     height = terrain["dem"].values[::step, ::step]
     valid = np.isfinite(height)
     if min(height.shape) < 3 or not valid.any():
@@ -271,12 +315,14 @@ def contours(workspace: Workspace) -> list[np.ndarray]:
     width = max(1.0, _SMOOTH * max(height.shape))
     weight = gaussian_filter(valid.astype(float), width)
     smooth = gaussian_filter(np.where(valid, height, 0.0), width) / np.maximum(weight, 1e-9)
-    low, high = float(smooth[valid].min()), float(smooth[valid].max())
+
+    low = float(smooth[valid].min())
+    high = float(smooth[valid].max())
     interval = contour_interval(high - low)
     if interval is None:
         return []
 
-    dy, dx = (float(size) for size in pixel_size(terrain))
+    dy, dx = (float(size) for size in pixel_size(terrain))  # m
     x = (np.arange(height.shape[1]) * step + 0.5) * dx
     y = extent_of(workspace.grid)[3] - (np.arange(height.shape[0]) * step + 0.5) * dy
     traced = contour_generator(x, y, np.ma.masked_where(~valid, smooth), line_type="Separate")
@@ -286,7 +332,7 @@ def contours(workspace: Workspace) -> list[np.ndarray]:
 
 def contour_interval(relief: float) -> float | None:
     """Choose a round contour interval, m, for this height range, m; None on level ground."""
-    if not relief > 0.05:
+    if not relief > _LEVEL:
         return None
     magnitude = 10.0 ** np.floor(np.log10(relief / _CONTOURS))
     steps = (factor * magnitude for factor in (1, 2, 5, 10))
@@ -296,26 +342,34 @@ def contour_interval(relief: float) -> float | None:
 def robust_limits(values: np.ndarray) -> tuple[float, float]:
     """Return limits of a colour scale: the 2 % and 98 % quantiles, to be robust to outliers."""
     low, high = np.nanquantile(values, _ROBUST).tolist()
-    return (low, high) if low < high else (low - 0.5e-3, high + 0.5e-3)
+    if low < high:
+        return low, high
+    return low - 0.5e-3, high + 0.5e-3  # a scale of one value has no colours
 
 
 def trust_limits(values: np.ndarray) -> tuple[float, float]:
     """Return `robust_limits`, where an upper limit just above 1 (unbroken contact) becomes 1."""
     low, high = robust_limits(values)
-    return low, 1.0 if low < 1.0 < high < _LOGIT else high
+    if low < 1.0 < high < _LOGIT:
+        high = 1.0
+    return low, high
 
 
 def draw_scale(ax: Axes, grid: Grid) -> None:
     """Draw a scale bar, whose length is a round number, in the lower right corner of a map."""
     left, right = ax.get_xlim()
     width = right - left
-    magnitude = 10.0 ** np.floor(np.log10(0.4 * width))
-    length = max(f * magnitude for f in (1, 2, 5) if f * magnitude <= 0.4 * width * (1 + 1e-9))
-    ends = [0.96 - length / width, 0.96]
+    longest = _LONGEST_BAR * width
+    magnitude = 10.0 ** np.floor(np.log10(longest))
+    lengths = (factor * magnitude for factor in (1, 2, 5))
+    length = max(length for length in lengths if length <= longest * (1 + 1e-9))  # or its rounding
+    ends = [_BAR_END - length / width, _BAR_END]
+
     (bar,) = ax.plot(ends, [0.045, 0.045], color=ink(), linewidth=2.0, transform=ax.transAxes)
     bar.set(solid_capstyle="butt", path_effects=outlined(4.0, background()))
+
     label = f"{length / 1000:g} km" if length >= 1000 else f"{length:g} m"
-    text = ax.text(0.96, 0.065, label, ha="right", color=ink(), transform=ax.transAxes)
+    text = ax.text(_BAR_END, 0.065, label, ha="right", color=ink(), transform=ax.transAxes)
     text.set_path_effects(outlined(2.5, background()))
 
 

@@ -14,6 +14,11 @@ from trustbo.plots.maps import VEGETATION, draw_ground, draw_path, draw_scale, e
 from trustbo.plots.style import GREY, MARKERS, ROBOTS, add_legend, background, ink, panels, styled
 
 _DASHED = (0, (3, 1.5))
+"""Line style of the routes between posts."""
+_HALF = 0.56
+"""Half the width of the map of a bound, relative to what it must show."""
+_LEAST_HALF = 2.0
+"""Half the width of a map that shows a single point, m."""
 
 
 @styled
@@ -43,43 +48,52 @@ def plan_map(plan: Plan, *, bounds: Sequence[int] | None = None, ax: Any = None)
         require_whole("bounds: a number", k, 1, n_bounds)
 
     axes = panels(1 + len(shown), ax, (2.5, 2.6))
-    for one in axes:
-        draw_ground(one, plan.workspace)
+    for panel in axes:
+        draw_ground(panel, plan.workspace)
     draw_path(axes[0], plan.path, plan.workspace.grid)
     draw_scale(axes[0], plan.workspace.grid)
     axes[0].set_title(f"path of {n_bounds} bounds")
-    for one, k in zip(axes[1:], shown, strict=True):
-        _draw_bound(one, plan, k - 1)
+
+    for panel, k in zip(axes[1:], shown, strict=True):
+        _draw_bound(panel, plan, k - 1)
         (a, b), (c, d) = plan.path[k - 1 : k + 1]
-        one.set_title(f"bound {k}\n{a},{b} to {c},{d}")
-    handles = _legend(plan.workspace.team.names)
-    add_legend(axes, handles)
+        panel.set_title(f"bound {k}\n{a},{b} to {c},{d}")
+
+    add_legend(axes, _legend(plan.workspace.team.names))
     return axes
 
 
 def _draw_bound(ax: Axes, plan: Plan, k: int) -> None:
     """Plot bound k, counted from 0, and its surroundings."""
-    stops, posts, routes = plan.stops, plan.posts, plan.routes
+    stops = plan.stops
+    posts = plan.posts
+    routes = plan.routes
     assert stops is not None and posts is not None and routes is not None  # noqa: S101, PT018
+
     corner = np.array(plan.workspace.grid.corner)
     lead, *others = [None if route is None else route - corner for route in routes[k]]
     before, after = stops[k : k + 2] - corner
+
     if lead is not None:
         ax.plot(*lead.T, color=ink(), linewidth=2.6, zorder=3)
+
     for i, (post, route) in enumerate(zip(posts[k] - corner, others, strict=True)):
-        colour, marker = ROBOTS[i % len(ROBOTS)], MARKERS[i % len(MARKERS)]
+        colour = ROBOTS[i % len(ROBOTS)]
+        marker = MARKERS[i % len(MARKERS)]
         ax.plot(*np.stack([post, after]).T, color=colour, linewidth=0.8, zorder=5)
         ax.plot(*post, marker, **_filled(colour), zorder=7)
         if route is not None:
             ax.plot(*route.T, color=colour, linewidth=1.4, linestyle=_DASHED, zorder=4)
             ax.plot(*route[-1], marker, **_open(colour), zorder=6)
+
     ax.plot(*np.stack([before, after]).T, "*", **_filled(ink(), 11), linestyle="none", zorder=6)
 
-    seen = np.concatenate([
-        [before, after], posts[k] - corner, *(one for one in (lead, *others) if one is not None)
-    ])  # fmt: skip
+    driven = [route for route in (lead, *others) if route is not None]
+    seen = np.concatenate([[before, after], posts[k] - corner, *driven])
+
     middle = (seen.min(0) + seen.max(0)) / 2.0
-    half = 0.56 * float(np.ptp(seen, axis=0).max()) + 2.0
+    half = _HALF * float(np.ptp(seen, axis=0).max()) + _LEAST_HALF
+
     left, right, bottom, top = extent_of(plan.workspace.grid)
     ax.set_xlim(*_window(middle[0], half, left, right))
     ax.set_ylim(*_window(middle[1], half, bottom, top))
@@ -99,7 +113,8 @@ def _legend(names: Sequence[str]) -> list[Line2D | Patch]:
         Line2D([], [], marker="*", linewidth=2.6, label="lead: stops, route", **star)
     ]
     for i, name in enumerate(names):
-        marker, style = MARKERS[i % len(MARKERS)], _filled(ROBOTS[i % len(ROBOTS)])
+        marker = MARKERS[i % len(MARKERS)]
+        style = _filled(ROBOTS[i % len(ROBOTS)])
         label = f"{name}: post, route"
         handles.append(Line2D([], [], marker=marker, linestyle=_DASHED, label=label, **style))
     return [

@@ -1,5 +1,6 @@
 """Style, colours and axes of all figures."""
 
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -38,6 +39,8 @@ GREY = "0.55"
 """Colour of impassable cells and auxiliary lines, for light and dark backgrounds."""
 PAGE = 7.6
 """Page width in inches, which is the maximum width of a new figure."""
+_WIDE = 5.0
+"""Width of a figure, in inches, from which a legend has four columns instead of two."""
 
 
 @contextmanager
@@ -73,20 +76,23 @@ def panels(
     """
     if ax is not None:
         given = np.asarray(ax, dtype=object).ravel()
-        if len(given) < n or not all(isinstance(one, Axes) for one in given):
+        if len(given) < n or not all(isinstance(panel, Axes) for panel in given):
             raise TrustboError(f"ax must have at least {n} Axes, one per panel; got {ax!r:.80}.")
-        for one in given[:n]:  # the font sizes of the user's axes may differ
-            one.tick_params(labelsize=RC["xtick.labelsize"])
-            for text in (one.xaxis.label, one.yaxis.label):
+        for panel in given[:n]:  # the font sizes of the user's axes may differ
+            panel.tick_params(labelsize=RC["xtick.labelsize"])
+            for text in (panel.xaxis.label, panel.yaxis.label):
                 text.set_size(RC["axes.labelsize"])
         return given[:n]
+
     cols = min(n, columns)
-    rows = -(-n // cols)
+    rows = math.ceil(n / cols)
     width = min(cols * size[0], PAGE)
+    height = rows * size[1] * width / (cols * size[0])
+
     _, axes = plt.subplots(
-        rows, cols, figsize=(width, rows * size[1] * width / (cols * size[0])), squeeze=False,
-        layout="compressed", **shared,
-    )  # fmt: skip
+        rows, cols, figsize=(width, height), squeeze=False, layout="compressed", **shared
+    )
+
     for unused in axes.ravel()[n:]:
         unused.remove()
     return axes.ravel()[:n]
@@ -103,7 +109,8 @@ def add_legend(axes: np.ndarray, handles: Sequence[Any]) -> None:
     """Add a legend below the axes or, without a constrained layout, inside the first axes."""
     figure = figure_of(axes)
     if isinstance(figure.get_layout_engine(), ConstrainedLayoutEngine):
-        columns = min(len(handles), 4 if figure.get_figwidth() >= 5.0 else 2)
+        most = 4 if figure.get_figwidth() >= _WIDE else 2
+        columns = min(len(handles), most)
         figure.legend(handles=list(handles), loc="outside lower center", ncols=columns)
     else:
         axes[0].legend(handles=list(handles))
@@ -112,7 +119,8 @@ def add_legend(axes: np.ndarray, handles: Sequence[Any]) -> None:
 def accent() -> str:
     """Return the colour of a single curve: a light blue on dark backgrounds, else a dark blue."""
     red, green, blue = to_rgb(background())
-    return ROBOTS[4] if 0.3 * red + 0.6 * green + 0.1 * blue < 0.5 else ROBOTS[0]
+    brightness = 0.3 * red + 0.6 * green + 0.1 * blue
+    return ROBOTS[4] if brightness < 0.5 else ROBOTS[0]
 
 
 def ink() -> str:
