@@ -21,6 +21,11 @@ from trustbo.simulation import Truth
 from trustbo.simulation.protocol import Simulator
 from trustbo.workspace import Workspace
 
+_MAX_JOBS = 10**6
+"""Largest number of processes that joblib may leave free (a negative `n_jobs`)."""
+_N_SHOWN = 3
+"""Number of errors of runs in the message."""
+
 
 class Scene(NamedTuple):
     """World of a simulated campaign: the assumed workspace, the simulator, start and goal."""
@@ -90,29 +95,34 @@ def run_grid(
     for name in (*cases, *scenes):
         require_kind("the name of a case or scene", name, str, "give a text")
     seeds = [require_whole("seed", seed, 0) for seed in require_list("seeds", seeds)]
-    if require_whole("n_jobs", n_jobs, -(10**6)) == 0:
+    if require_whole("n_jobs", n_jobs, -_MAX_JOBS) == 0:
         raise TrustboError("n_jobs must be a number of processes, or -1; got 0.")
     if not (cases and scenes and seeds):
         raise TrustboError("run_grid needs at least one case, one scene and one seed.")
+
     root = to_path(folder)
     runs = list(product(seeds, scenes, cases))
     files = {
         (seed, scene, case): root / f"{_plain(case)}~{_plain(scene)}~{seed}~{n_missions}.csv"
         for seed, scene, case in runs
     }
+
     if len(set(files.values())) < len(runs):
         raise TrustboError(
             "names of cases, and of scenes, must differ in more than punctuation; rename one."
         )
+
     errors = Parallel(n_jobs=n_jobs)(
         delayed(_run)(cases[case], scenes[scene], (case, scene, seed), n_missions, file)
         for (seed, scene, case), file in files.items()
         if not file.exists()
     )
-    if failed := [error for error in errors if error]:
+
+    failed = [error for error in errors if error]
+    if failed:
         raise TrustboError(
             f"{len(failed)} of {len(runs)} runs failed; call run_grid again to repeat them. The "
-            f"first errors are: {'; '.join(failed[:3])}"
+            f"first errors are: {'; '.join(failed[:_N_SHOWN])}"
         )
     return pd.concat([pd.read_csv(file) for file in files.values()], ignore_index=True)
 
@@ -144,14 +154,21 @@ def _rows(case: Case, scene: Scene, seed: int, n_missions: int) -> Iterator[dict
     """Run a campaign and yield its rows; the first is from before the first mission."""
     options = case(scene) if callable(case) else case
     given = {
-        "workspace": scene.workspace, "start": scene.start, "goal": scene.goal, "seed": seed,
-        **scene.options, **copy.deepcopy(dict(options)),
-    }  # fmt: skip
+        "workspace": scene.workspace,
+        "start": scene.start,
+        "goal": scene.goal,
+        "seed": seed,
+        **scene.options,
+        **copy.deepcopy(dict(options)),  # a policy with a state must not be shared by runs
+    }
+
     with Campaign(**given) as campaign:
         policy = campaign.policy
         yield {"mission": 0, **_recommended(campaign, scene, 0)}
+
         began = time.process_time()
         driven = campaign.run(scene.simulator, n_missions)
+
         for number, (_, mission) in enumerate(driven, start=1):
             if hasattr(policy, "learn"):
                 policy.learn(campaign, mission)  # pyright: ignore[reportFunctionMemberAccess]
@@ -166,6 +183,7 @@ def _recommended(campaign: Campaign, scene: Scene, mission: int) -> dict[str, fl
     """Compute regret and loss of the path recommended before `mission`, an index from 0."""
     if scene.truth is None:
         return {}
+
     choose = getattr(campaign.policy, "recommend", None)
     path = campaign.recommend().path if choose is None else choose(campaign)
     truth = scene.truth.at(mission)
@@ -178,7 +196,9 @@ def _driven(path: Sequence[Cell], scene: Scene, mission: int) -> dict[str, float
     """Compute the expected losses on the path of `mission`, an index from 0, and on the best."""
     if scene.truth is None:
         return {}
-    truth, ends = scene.truth.at(mission), (scene.start, scene.goal)
+
+    truth = scene.truth.at(mission)
+    ends = (scene.start, scene.goal)
     best = truth.best(*ends, **scene.judged)
     safest = truth.best(*ends, **scene.judged, failures=True)
     return {

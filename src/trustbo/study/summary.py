@@ -12,7 +12,25 @@ SHOWN = (0, 1, 3, 8, 15)
 """Numbers of missions after which the regret and the loss are reported."""
 NEAR = 1.0
 """Regret in % up to which a recommended path counts as nearly optimal."""
+_JUDGED = {
+    "mission",
+    "regret",
+    "lost",
+    "best",
+    "status",
+    "contact_rate",
+    "driven",
+    "best_driven",
+    "failed_driven",
+    "seconds",
+}
+"""Columns of `run_grid` that describe a mission; the others are labels of the run."""
 _RUN = ["case", "scene", "seed"]
+"""Columns that identify a run."""
+_N_RESAMPLES = 1000
+"""Number of bootstrap resamples."""
+_ENDS = (0.025, 0.975)
+"""Levels of the ends of a 95 % interval."""
 
 
 def numbers_of(table: pd.DataFrame) -> pd.DataFrame:
@@ -28,9 +46,7 @@ def numbers_of(table: pd.DataFrame) -> pd.DataFrame:
     missions. `seconds` is the CPU time per mission.
     """
     require_kind("table", table, pd.DataFrame, "give the table of run_grid")
-    judged = {"mission", "regret", "lost", "best", "status", "contact_rate", "driven",
-              "best_driven", "failed_driven", "seconds"}  # fmt: skip
-    labels = [name for name in table.columns if name not in judged]
+    labels = [name for name in table.columns if name not in _JUDGED]
     rows = [_numbers(run) for _, run in table.groupby(_RUN, sort=False)]
     of_runs = table.groupby(_RUN, sort=False)[labels].first()
     return pd.concat([of_runs.reset_index(drop=True), pd.DataFrame(rows)], axis=1)
@@ -39,17 +55,21 @@ def numbers_of(table: pd.DataFrame) -> pd.DataFrame:
 def _numbers(run: pd.DataFrame) -> dict[str, float]:
     """Summarise one run, given its rows for missions 0, 1, ..."""
     run = run.sort_values("mission")
-    driven, regret = run.iloc[1:], run["regret"].to_numpy()
+    driven = run.iloc[1:]
+    regret = run["regret"].to_numpy()
     after = [n for n in SHOWN if n < len(run)]
-    lost, arrived = (run["lost"] - run["best"]).to_numpy(), driven["status"] == "ok"
-    far = np.flatnonzero(~(regret <= NEAR))
+    lost = (run["lost"] - run["best"]).to_numpy()
+    arrived = driven["status"] == "ok"
+    far = np.flatnonzero(~(regret <= NEAR))  # also NaN
+    n_until_near = far[-1] + 1 if len(far) else 0
+
     return {
         **{f"regret after {n}": regret[n] for n in after},
         **{f"lost after {n}": lost[n] for n in after},
         "regret now": np.nanmean(regret),
         "lost while learning": (driven["driven"] - driven["best_driven"]).mean(),
         "lost with failures": driven["failed_driven"].mean(),
-        f"missions to {NEAR:g} %": float(far[-1] + 1 if len(far) else 0),
+        f"missions to {NEAR:g} %": float(n_until_near),
         "arrive": arrived.mean(),
         "arrive of the first 3": arrived[:3].mean(),
         "arrive later": arrived[3:].mean(),
@@ -75,10 +95,11 @@ def summary(numbers: pd.DataFrame, by: str | Sequence[str] = "case") -> pd.DataF
     by = [require_choice("column", name, numbers.columns) for name in names]
     if not by:
         raise TrustboError("by must name at least one column; got none.")
-    rows = {
-        key if len(by) > 1 else key[0]: bootstrap(_values(rows), rows["scene"].to_numpy())  # pyright: ignore[reportIndexIssue]
-        for key, rows in numbers.groupby(by, sort=False)
-    }
+
+    rows = {}
+    for key, runs in numbers.groupby(by, sort=False):
+        label = key if len(by) > 1 else key[0]  # pyright: ignore[reportIndexIssue]
+        rows[label] = bootstrap(_values(runs), runs["scene"].to_numpy())
     return _table(rows, by)
 
 
@@ -100,17 +121,21 @@ def differences(numbers: pd.DataFrame, ours: str, by: Sequence[str] = ()) -> pd.
     require_choice("case", ours, list(numbers["case"]))
     for name in by:
         require_choice("column", name, numbers.columns)
+
     mine = numbers[numbers["case"] == ours]
     pairs = mine.merge(numbers[numbers["case"] != ours], on=["scene", "seed"], suffixes=("", " 2"))
+
     rows: dict[Any, dict[tuple[str, str], float]] = {}
     names = [name for name in _values(numbers) if not name.startswith("lost after")]
-    for key, some in pairs.groupby([*by, "case 2"], sort=False):
-        less = {name: (some[name] - some[f"{name} 2"]).to_numpy() for name in names}
-        apart = some["scene"].to_numpy()
-        row = bootstrap(less, apart, np.nanmean)
-        if len(set(apart)) == 1:
+    for key, runs in pairs.groupby([*by, "case 2"], sort=False):
+        less = {name: (runs[name] - runs[f"{name} 2"]).to_numpy() for name in names}
+        scenes = runs["scene"].to_numpy()
+
+        row = bootstrap(less, scenes, np.nanmean)
+        if len(set(scenes)) == 1:
             row |= {(name, end): np.nan for name in names for end in ("low", "high")}
-        rows[key if by else key[0]] = {("pairs", "value"): float(len(some))} | row  # pyright: ignore[reportIndexIssue]
+        label = key if by else key[0]  # pyright: ignore[reportIndexIssue]
+        rows[label] = {("pairs", "value"): float(len(runs))} | row
     return _table(rows, [*by, f"{ours} less"])
 
 
@@ -123,20 +148,26 @@ def bootstrap(
 
     The runs of a cluster are resampled together, and all quantities use the same resamples.
     """
-    rng, (names, index) = np.random.default_rng(0), np.unique(clusters, return_inverse=True)
+    rng = np.random.default_rng(0)
+    names, index = np.unique(clusters, return_inverse=True)
+
     members = [np.flatnonzero(index == i) for i in range(len(names))]
     drawn = [
         np.concatenate([members[i] for i in rng.integers(len(names), size=len(names))])
-        for _ in range(1000)
+        for _ in range(_N_RESAMPLES)
     ]
+
     row = {}
     for name, values in numbers.items():
         if np.isnan(values).all():  # such as "arrive later" after three missions
             row |= {(name, what): np.nan for what in ("value", "low", "high")}
             continue
+
         usual = middle or (np.nanmedian if " after " in name else np.nanmean)
-        low, high = np.quantile([usual(values[chosen]) for chosen in drawn], [0.025, 0.975])
-        row |= {(name, "value"): float(usual(values)), (name, "low"): low, (name, "high"): high}
+        low, high = np.quantile([usual(values[chosen]) for chosen in drawn], _ENDS)
+        row[name, "value"] = float(usual(values))
+        row[name, "low"] = low
+        row[name, "high"] = high
     return row
 
 

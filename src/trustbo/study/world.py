@@ -31,6 +31,14 @@ _STRIP = 250
 """Extent in y, in metres, to which a real terrain is cropped if it is more than twice as long."""
 _RELIEF = 0.06
 """Height range of a synthetic terrain, as a fraction of its longer side."""
+_PATCH = 10.0
+"""Correlation length of the errors of an outdated survey, m."""
+_CLEARED = 0.15
+"""Share of the area without its canopy in an outdated survey."""
+_CANOPY = 0.7
+"""Height of the other canopy in an outdated survey, relative to the true height."""
+_GROUND_ERROR = 0.3
+"""Standard deviation of the ground errors of an outdated survey, m."""
 
 
 def drawn(ground: str, what: str) -> np.random.Generator:
@@ -96,19 +104,23 @@ class World:
         """
         if self.data is None and self.is_packaged:
             return list(EXAMPLE_FILES)
+
         folder = "" if self.data is None else Path(self.data).absolute()
         files = [Path(folder, self.ground, f"{name}.tif") for name in ("dem", "dsm")]
-        if absent := [str(f) for f in files if self.data is None or not f.is_file()]:
+        absent = [str(file) for file in files if self.data is None or not file.is_file()]
+        if absent:
             raise TrustboError(
                 f"world {self.name!r} needs {' and '.join(absent)}. Set data= to the folder that "
                 f"contains {self.ground}/, or leave this world out."
             )
+
         return [str(file) for file in files]
 
     def true_terrain(self) -> xr.Dataset:
         """Return the true DEM and DSM."""
         if not self.is_made:
             return _read(*self.files())
+
         name = self.ground.partition("-")[2]
         seed = int(name) if name.isdigit() else int(drawn(self.ground, "terrain").integers(2**31))
         rows, cols = self.shape
@@ -116,11 +128,18 @@ class World:
 
     def workspace(self, **options: Any) -> Workspace:
         """Make the assumed workspace; `options` are passed to `Workspace.from_terrain`."""
+        # Worlds that differ only in what is true share a workspace in the cache.
         assumed = replace(
-            self, name="", kind="", sight=self.assumed or self.sight, assumed=None,
-            team=self.assumed_team or self.team, assumed_team=None, events=(),
+            self,
+            name="",
+            kind="",
+            sight=self.assumed or self.sight,
+            assumed=None,
+            team=self.assumed_team or self.team,
+            assumed_team=None,
+            events=(),
             radio=False,
-        )  # fmt: skip
+        )
         return _workspace(assumed, tuple(sorted(options.items())))
 
     def simulator(self, workspace: Workspace) -> KinematicSimulator | RadioSimulator:
@@ -128,6 +147,7 @@ class World:
         terrain = self.true_terrain()
         if self.radio:
             return RadioSimulator(workspace, terrain=terrain)
+
         given = {"terrain": terrain, "sight": self.sight, "team": self.team}
         return KinematicSimulator(workspace, events=self._events(terrain), **given)
 
@@ -149,18 +169,24 @@ class World:
         workspace = self.workspace(**options)
         paths = {"max_bounds": max_bounds}
         labels = {"world": self.name, "kind": self.kind, "of": self.case, "course": course}
-        simulator, truth = self.simulator(workspace), self.truth(folder)
-        ends, options = self.ends(course), {"planner": paths}
+
+        simulator = self.simulator(workspace)
+        truth = self.truth(folder)
+        ends = self.ends(course)
+        options = {"planner": paths}
         return Scene(workspace, simulator, *ends, truth, options, labels, paths)
 
     def _events(self, terrain: xr.Dataset) -> list[Event]:
         """Return the events with their centres in CRS metres."""
         with quiet_affine():
             left, bottom, right, top = terrain.rio.bounds(recalc=True)
-        corner, size = np.array([left, bottom]), np.array([right - left, top - bottom])
+        corner = np.array([left, bottom])
+        size = np.array([right - left, top - bottom])
+
         placed = []
         for event in self.events:
-            if (share := getattr(event, "center", None)) is not None:
+            share = getattr(event, "center", None)
+            if share is not None:
                 x, y = corner + share * size
                 event = replace(cast(Any, event), center=(float(x), float(y)))
             placed.append(event)
@@ -175,13 +201,17 @@ class World:
             "n-s": ((0, cols // 2), (rows, cols - cols // 2)),
             "w-e": ((rows - rows // 2, 0), (rows // 2, cols)),
         }[require_choice("course", course, COURSES)]
+
         regions: Any = ndimage.label(self.workspace().passable.values, np.ones((3, 3)))
         labels = regions[0]
         largest = np.argmax(np.bincount(labels.ravel())[1:]) + 1
         free = np.argwhere(labels == largest)
-        near = [free[np.argmin(((free - cell) ** 2).sum(1))] for cell in (start, goal)]
-        (a, b), (c, d) = near
-        return (int(a), int(b)), (int(c), int(d))
+
+        def nearest(cell: Cell) -> Cell:
+            row, col = free[np.argmin(((free - cell) ** 2).sum(1))]
+            return int(row), int(col)
+
+        return nearest(start), nearest(goal)
 
 
 def aged(now: xr.Dataset, seed: int = 0) -> xr.Dataset:
@@ -191,17 +221,20 @@ def aged(now: xr.Dataset, seed: int = 0) -> xr.Dataset:
     canopy is missing. The ground errors have a standard deviation of 0.3 m and a correlation length
     of about 10 m.
     """
-    rng, step = np.random.default_rng(seed), abs(float(now["x"][1] - now["x"][0]))
-    dem, dsm = now["dem"].values, now["dsm"].values
+    rng = np.random.default_rng(seed)
+    step = abs(float(now["x"][1] - now["x"][0]))
+    dem = now["dem"].values
+    dsm = now["dsm"].values
 
     def noise() -> np.ndarray:
-        smooth = ndimage.gaussian_filter(rng.standard_normal(dem.shape), 10.0 / step)
+        smooth = ndimage.gaussian_filter(rng.standard_normal(dem.shape), _PATCH / step)
         return smooth / smooth.std()
 
     clearings = noise()
-    clearings = clearings > np.quantile(clearings, 0.85)
-    ground = dem + 0.3 * noise()
-    canopy = np.where(clearings, 0.0, 0.7 * (dsm - dem))
+    clearings = clearings > np.quantile(clearings, 1.0 - _CLEARED)
+    ground = dem + _GROUND_ERROR * noise()
+    canopy = np.where(clearings, 0.0, _CANOPY * (dsm - dem))
+
     old = now["dem"].copy(data=ground), now["dsm"].copy(data=ground + canopy)
     return terrain.read_terrain(*(heights.rio.write_crs(now.rio.crs) for heights in old))
 
@@ -227,6 +260,7 @@ def _read(dem: str, dsm: str) -> xr.Dataset:
     n_rows = round(_STRIP / step)
     if whole.sizes["y"] <= 2 * n_rows:
         return whole
+
     with_data = np.isfinite(whole["dem"].values).sum(1)
     first = int(np.convolve(with_data, np.ones(n_rows), "valid").argmax())
     return whole.isel(y=slice(first, first + n_rows))

@@ -14,7 +14,9 @@ from trustbo.team import Robot, Team
 from trustbo.workspace.sight import Sight
 
 _SYNTHETIC = tuple(f"synthetic-{seed}" for seed in range(3))
-_ALDER, _BIRCH, _CEDAR = (f"synthetic-{name}" for name in ("alder", "birch", "cedar"))
+_ALDER = "synthetic-alder"
+_BIRCH = "synthetic-birch"
+_CEDAR = "synthetic-cedar"
 _AFTER = 6
 """Index of the first mission after a change of the world, the seventh mission."""
 _DAYS = (1, 3, 4, 7)
@@ -159,14 +161,13 @@ _CASES: tuple[_Case, ...] = (
 
 
 def _all() -> list[World]:
-    return [
-        World(
-            "-".join(filter(None, (ground, case))), kind, ground,
-            **(settings(ground) if callable(settings) else settings),
-        )
-        for kind, case, grounds, settings in _CASES
-        for ground in grounds
-    ]  # fmt: skip
+    every = []
+    for kind, case, grounds, settings in _CASES:
+        for ground in grounds:
+            name = f"{ground}-{case}" if case else ground
+            given = settings(ground) if callable(settings) else settings
+            every.append(World(name, kind, ground, **given))
+    return every
 
 
 def worlds(data: FilePath | None = None) -> dict[str, World]:
