@@ -118,7 +118,8 @@ class Dust(Event):
 
     def change(self, world: World) -> World:
         """See `Event.change`."""
-        t2, lead = self.detection * world.detection, self.detection * world.lead_detection
+        t2 = self.detection * world.detection
+        lead = self.detection * world.lead_detection
         return world._replace(detection=t2, lead_detection=lead)
 
 
@@ -202,13 +203,16 @@ class Fouling(Event):
         """See `Event.change`; for the long-run mean over missions, the factor is its mean."""
         if world.mission is None:
             return world._replace(detection=0.5 * (1.0 + self.worst) * world.detection)
+
         first = world.mission * self.every
         noise = np.stack([
             np.random.default_rng([self.seed, i]).standard_normal(first + self.every)
             for i in range(world.team.n_robots)
         ])  # fmt: skip
+
         noise[:, 1:] *= np.sqrt(1.0 - self.correlation**2)
         z: Any = lfilter([1.0], [1.0, -self.correlation], noise)
+
         factors = self.worst + (1.0 - self.worst) * ndtr(z[:, first:].T)  # (bound, robot)
         return world._replace(detection=world.detection * factors)
 
@@ -227,6 +231,7 @@ def _circle(surface: Surface, center: tuple[float, float], radius: float) -> np.
         (np.arange(rows)[:, None] - row) * surface.pixel[0],
         (np.arange(cols) - col) * surface.pixel[1],
     )
+
     inside = away <= radius
     if not inside.any():
         left, bottom, right, top = surface.extent

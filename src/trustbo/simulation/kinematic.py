@@ -19,7 +19,10 @@ from trustbo.workspace import Workspace
 from trustbo.workspace.posts import Posts
 from trustbo.workspace.sight import Sight
 
-_LEAD, _T2 = slice(0, 1), slice(1, None)  # robots in arrays with the lead first
+_LEAD = slice(0, 1)
+"""The lead in arrays with the lead first."""
+_T2 = slice(1, None)
+"""The other robots in such arrays."""
 
 
 class State(NamedTuple):
@@ -80,7 +83,8 @@ class KinematicSimulator(DescribedSimulator):
                 positive, or an event does not fit the terrain or the team.
         """
         require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
-        self.workspace, self.terrain = workspace, terrain
+        self.workspace = workspace
+        self.terrain = terrain
         self.sight = sight or workspace.sight or Sight()
         self.team = workspace.team if team is None else team
         if self.team.names != workspace.team.names:
@@ -88,20 +92,24 @@ class KinematicSimulator(DescribedSimulator):
                 f"the simulated team has the robots {self.team.names}, but the workspace's team "
                 f"has {workspace.team.names}; the names must match."
             )
+
         surface = true_surface(workspace, terrain)
         self.tick = require_positive("tick", tick)
         self.bound_timeout = require_positive("bound_timeout", bound_timeout)
         self._max_ticks = round(self.bound_timeout / self.tick)
         self.events = tuple(require_list("events", events, Event, "give events such as Jam(...)"))
+
         detection = np.array([[robot.detection for robot in self.team.robots]])
         self._usual = World(surface, self.sight, self.team, detection, self.team.lead.detection)
         for event in self.events:
             event.change(self._usual)  # raises if the event does not fit
+
         self._posts: Posts = workspace.posts  # pyright: ignore[reportAttributeAccessIssue]
 
     def describe(self) -> dict[str, object]:
         """Return the settings that affect the measurements of a mission."""
-        same_team, terrain = self.team == self.workspace.team, self.terrain
+        same_team = self.team == self.workspace.team
+        terrain = self.terrain
         rasters = () if terrain is None else (terrain[n].values for n in ("y", "x", "dem", "dsm"))
         return {
             "simulator": type(self).__name__,
@@ -139,21 +147,38 @@ class KinematicSimulator(DescribedSimulator):
         Raises:
             TrustboError: A cell is off the grid or impassable, or there are fewer than two cells.
         """
-        cells, seed = require_path(self.workspace, path), require_whole("seed", seed, 0)
-        awareness, world = self.workspace.along(cells), self.world(mission)
-        state, time = self.standing(*cells[:2]), 0.0
+        cells = require_path(self.workspace, path)
+        seed = require_whole("seed", seed, 0)
+        awareness = self.workspace.along(cells)
+        world = self.world(mission)
+
+        state = self.standing(*cells[:2])
+        time = 0.0
         bounds: list[Bound] = []
         for k, (cell, after) in enumerate(zip(cells[1:], [*cells[2:], None], strict=True), start=1):
             rng = np.random.default_rng([seed, k])
             [(drive, contact, state)] = self.outcomes(world, state, k, cell, [after], rng)
             n_ticks = np.full(self.team.n_robots, len(contact))
-            measured = awareness[k - 1], contact.mean(0), n_ticks * self.tick
-            bounds.append(Bound(cell, *measured, drive.status, time, drive.poses, contact, n_ticks))
-            time = bounds[-1].t1
+            bound = Bound(
+                cell,
+                awareness[k - 1],
+                contact_rate=contact.mean(0),
+                duration=n_ticks * self.tick,
+                status=drive.status,
+                t0=time,
+                poses=drive.poses,
+                contact=contact,
+                n_ticks=n_ticks,
+            )
+            bounds.append(bound)
+
+            time = bound.t1
             if drive.status != "ok":
                 break
-        names = self.workspace.features, self.workspace.team.names
-        return Mission(tuple(cells), tuple(bounds), bounds[-1].status, *names)
+
+        features = self.workspace.features
+        robots = self.workspace.team.names
+        return Mission(tuple(cells), tuple(bounds), bounds[-1].status, features, robots)
 
     def standing(self, cell: Cell, next_cell: Cell | None) -> State:
         """Return the state of a team that stands at the stop and the posts of a cell."""
@@ -209,31 +234,40 @@ class KinematicSimulator(DescribedSimulator):
             For each next cell, the movements, the contact at each tick, shape (tick, robot), and
             the state after the bound.
         """
+        # First phase: the lead drives, and T2 watches.
         goals = self._posts.stop(cell)[None]
         lead = self._move(world, state, cell, _LEAD, goals, self._max_ticks, rng)
-        drives, runs = [lead], []
-        moves: dict[bytes, int] = {}  # keyed by goals
+        drives = [lead]
+        runs = []
+        moves: dict[bytes, int] = {}  # index into `drives`, keyed by goals
+
+        # Second phase: T2 drives to its posts for the next cell, and the lead watches.
         for next_cell in ahead:
             run = [0]
             if lead.status == "ok":
                 goals = self._posts.watching(cell, next_cell)
-                if (key := goals.tobytes()) not in moves:
+                key = goals.tobytes()
+                if key not in moves:
                     now = state._replace(poses=lead.poses[-1], stops=lead.stops)
-                    left = self._max_ticks - len(lead.poses)
+                    n_left = self._max_ticks - len(lead.poses)
                     moves[key] = len(drives)
-                    drives.append(self._move(world, now, cell, _T2, goals, left, rng))
+                    drives.append(self._move(world, now, cell, _T2, goals, n_left, rng))
                 run.append(moves[key])
             runs.append(run)
+
         lidars = world.team.lead, *world.team.robots
-        expected &= all(robot.acquire == robot.drop == 1 for robot in lidars)
+        is_single_scan = all(robot.acquire == robot.drop == 1 for robot in lidars)
         seen = detections(world, drives, k)
+
         found = []
         for run in runs:
             poses = np.concatenate([drives[i].poses for i in run])
             lead_moves = np.concatenate([drives[i].lead_moves for i in run])
             whole = drives[run[-1]]._replace(poses=poses, lead_moves=lead_moves)
-            contact, tracks = np.concatenate([seen[i] for i in run]), state.tracks
-            if not expected:
+            contact = np.concatenate([seen[i] for i in run])
+
+            tracks = state.tracks
+            if not (expected and is_single_scan):
                 contact, tracks = self._contact(world, tracks, whole, contact, rng)
             found.append((whole, contact, State(cell, whole.poses[-1], whole.stops, tracks)))
         return found
@@ -252,23 +286,28 @@ class KinematicSimulator(DescribedSimulator):
 
         Routes are planned from planned positions, but the robots start at their current positions.
         """
-        true, planned = (
-            (team.lead, *team.robots)[members] for team in (world.team, self.workspace.team)
-        )
-        now, window = state.poses, self._posts.window(state.cell, cell)
+        true = (world.team.lead, *world.team.robots)[members]
+        planned = (self.workspace.team.lead, *self.workspace.team.robots)[members]
+
+        now = state.poses
+        window = self._posts.window(state.cell, cell)
         routes: list[np.ndarray | None] = []
         for robot, start, goal, pose in zip(
             planned, state.stops[members], goals, now[members], strict=True
         ):
             route = self._posts.routes.find(robot, start, goal, window)
             routes.append(None if route is None else np.concatenate([pose[None, :2], route[1:]]))
+
         moved, status = self.drive(world, now[members], true, routes, window, max_ticks, rng)
         poses = np.repeat(now[None], len(moved), axis=0)
         poses[:, members] = moved
+
         stops = state.stops.copy()
         if status == "ok":
             stops[members] = goals
-        return Drive(poses, np.full(len(poses), members == _LEAD), status, stops)
+
+        lead_moves = np.full(len(poses), members == _LEAD)
+        return Drive(poses, lead_moves, status, stops)
 
     def _contact(
         self,
@@ -280,7 +319,8 @@ class KinematicSimulator(DescribedSimulator):
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the contact at each tick, (tick, robot), and the tracks after the last tick."""
         detected = rng.random(probability.shape) < probability
-        contact, tracks = np.empty(detected.shape, bool), tracks.copy()
+        contact = np.empty(detected.shape, bool)
+        tracks = tracks.copy()
         watchers = world.team.robots, (world.team.lead,) * world.team.n_robots
         for phase, lidars in enumerate(watchers):
             mask = drive.lead_moves == (phase == 0)

@@ -15,10 +15,18 @@ LOOKAHEAD = 1.5
 """Distance in m to the point of the route that a robot steers towards."""
 ARRIVED = 0.5
 """Distance in m from the goal at which a robot stops."""
-_LEAST_STEPS = 5  # smallest number of integration steps per tick
+_LEAST_STEPS = 5
+"""Smallest number of integration steps per tick."""
+_SLIP = 0.05
+"""Standard deviation of the log of the factor by which wheel slip multiplies the speed."""
 _compiled = kernel()
 _part = njit(nogil=True, error_model="numpy", **PART)
 _STATUS = ("ok", "stuck", "tipped", "timeout")
+"""Statuses in the order of their codes."""
+_OK = 0
+_STUCK = 1
+_TIPPED = 2
+_TIMEOUT = 3
 
 
 def drive(
@@ -40,6 +48,8 @@ def drive(
 
     Returns the poses (x, y, heading) after each tick, shape (tick, 3), and the status.
     """
+    # The steps are short enough that no step jumps over the goal.
+    n_steps = max(_LEAST_STEPS, math.ceil(robot.speed * tick / (0.5 * ARRIVED)))
     poses, code = _drive(
         surface.gradient,
         surface.pixel,
@@ -48,8 +58,7 @@ def drive(
         heading,
         (robot.speed, robot.turn_rate, robot.max_slope),
         tick,
-        # The steps are short enough that no step jumps over the goal.
-        max(_LEAST_STEPS, math.ceil(robot.speed * tick / (0.5 * ARRIVED))),
+        n_steps,
         rng.standard_normal(max_ticks),
     )
     return poses, _STATUS[code]
@@ -69,17 +78,26 @@ def drive_together(
     A robot without a route is stuck. Initial poses have shape (robot, 3). Returns the poses after
     each tick, shape (tick, robot, 3), and the status: "ok", or that of the first robot that fails.
     """
-    tracks, failures = [], []
+    tracks = []
+    failures = []
     for pose, robot, route in zip(poses, robots, routes, strict=True):
         if route is None:
-            track, status = pose[None], "stuck"
+            track = pose[None]
+            status = "stuck"
         else:
             track, status = drive(surface, robot, route, pose[2], tick, max(1, max_ticks), rng)
         tracks.append(track)
         if status != "ok":
             failures.append((len(track), status))
-    n_ticks, status = min(failures, default=(max(len(t) for t in tracks), "ok"))
-    held = [t[np.minimum(np.arange(n_ticks), len(t) - 1)] for t in tracks]
+
+    if failures:
+        n_ticks, status = min(failures)  # in one tick, the first status in the alphabet
+    else:
+        n_ticks = max(len(track) for track in tracks)
+        status = "ok"
+
+    # A robot that has arrived waits for the others.
+    held = [track[np.minimum(np.arange(n_ticks), len(track) - 1)] for track in tracks]
     return np.stack(held, axis=1), status
 
 
@@ -99,36 +117,53 @@ def _within_a_turn(angle):
 
 @_compiled
 def _drive(gradient, pixel, origin, route, heading, limits, tick, n_steps, slip):
+    """Integrate the motion in steps; return the poses after each tick, and the status code."""
     speed, turn_rate, max_slope = limits
     rows, cols = gradient.shape[1:]
-    x, y, aim = route[0, 0], route[0, 1], min(1, len(route) - 1)
+
+    x = route[0, 0]
+    y = route[0, 1]
+    aim = min(1, len(route) - 1)
     poses = np.empty((len(slip), 3))
-    dt, steepest = tick / n_steps, math.tan(max_slope)
+    dt = tick / n_steps
+    steepest = math.tan(max_slope)
+
     for k in range(len(slip)):
-        pace = speed * math.exp(0.05 * slip[k])
+        pace = speed * math.exp(_SLIP * slip[k])
         for _ in range(n_steps):
+            # Pure pursuit: steer towards a point of the route ahead (Coulter 1992).
             while aim < len(route) - 1 and _squared(route, aim, x, y) < LOOKAHEAD**2:
                 aim += 1
-            dx, dy = route[aim, 0] - x, route[aim, 1] - y
+
+            dx = route[aim, 0] - x
+            dy = route[aim, 1] - y
             error = _within_a_turn(math.atan2(dy, dx) - heading)
             turn = min(turn_rate * dt, max(-turn_rate * dt, error))
             heading += turn
+
             i = min(rows - 1, max(0, int((origin[1] - y) / pixel[0] + 0.5)))
             j = min(cols - 1, max(0, int((x - origin[0]) / pixel[1] + 0.5)))
-            gx, gy = gradient[0, i, j], gradient[1, i, j]
-            ahead, left = math.cos(heading), math.sin(heading)
+            gx = gradient[0, i, j]
+            gy = gradient[1, i, j]
+
+            ahead = math.cos(heading)
+            left = math.sin(heading)
             # Tangents of pitch and roll.
-            pitch, roll = abs(gx * ahead + gy * left), abs(gy * ahead - gx * left)
+            pitch = abs(gx * ahead + gy * left)
+            roll = abs(gy * ahead - gx * left)
             if not (roll <= steepest and pitch <= steepest):  # NaN slopes also fail
                 poses[k, 0], poses[k, 1], poses[k, 2] = x, y, heading
-                return poses[: k + 1], 2 if roll > steepest else 1
+                return poses[: k + 1], _TIPPED if roll > steepest else _STUCK
+
             # A skid-steer robot turns on the spot until it faces its route.
             v = pace * speed_share(math.atan(max(pitch, roll)), max_slope)
             v *= 1.0 if error == turn else max(0.0, math.cos(error - turn))
             x += v * dt * ahead
             y += v * dt * left
+
             if aim == len(route) - 1 and _squared(route, aim, x, y) < ARRIVED**2:
                 poses[k, 0], poses[k, 1], poses[k, 2] = x, y, heading
-                return poses[: k + 1], 0
+                return poses[: k + 1], _OK
+
         poses[k, 0], poses[k, 1], poses[k, 2] = x, y, heading
-    return poses, 3
+    return poses, _TIMEOUT

@@ -17,10 +17,22 @@ from trustbo.terrain import pixel_size
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import MOVES, moves_along
 
-FREEDOM, SCALE = 3.0, 0.06
-"""Degrees of freedom and scale of the noise on contact rates."""
-_REACH, _WINDOW, _FIELD = 60.0, 20.0, 35.0
-"""In metres: unit of distance, window width for canopy cover, and length scale of the field."""
+FREEDOM = 3.0
+"""Degrees of freedom of the noise on contact rates."""
+SCALE = 0.06
+"""Scale of the noise on contact rates."""
+_REACH = 60.0
+"""Unit of distance, m."""
+_WINDOW = 20.0
+"""Width of the window for canopy cover, m."""
+_CANOPY = 1.5
+"""Height above which vegetation is canopy, m."""
+_FIELD = 35.0
+"""Length scale of the hidden field, m."""
+_QUALITY = 0.25
+"""Standard deviation of the quality of the radios."""
+_N_BETWEEN = 9
+"""Number of points between two cells at which the cover is read."""
 
 
 class RadioSimulator(DescribedSimulator):
@@ -51,8 +63,10 @@ class RadioSimulator(DescribedSimulator):
         terrain = workspace.terrain if terrain is None else terrain
         if terrain is None:
             raise TrustboError("the radio simulator needs a workspace made from a terrain.")
+
         rasters = (terrain[name].values.astype(float) for name in ("y", "x", "dem", "dsm"))
-        self.workspace, self._terrain = workspace, digest(*rasters)
+        self.workspace = workspace
+        self._terrain = digest(*rasters)
         own = int(self._terrain[:8], 16)
         self.seed = own if seed is None else require_whole("seed", seed, 0)
         self.mean = _mean_contact(workspace, terrain, self.seed)
@@ -63,7 +77,9 @@ class RadioSimulator(DescribedSimulator):
         mean = self.mean[:, moves_along(cells), *np.array(cells)[1:].T].T  # (bound, robot)
         rng = np.random.default_rng(require_whole("seed", seed, 0))
         rates = np.clip(mean + SCALE * rng.standard_t(FREEDOM, mean.shape), 0.0, 1.0)
-        z, features = self.workspace.along(cells), self.workspace.features
+
+        z = self.workspace.along(cells)
+        features = self.workspace.features
         robots = self.workspace.team.names
         return Mission.from_arrays(cells, z, rates, features=features, robots=robots)
 
@@ -94,16 +110,22 @@ def expected_rate(mean: np.ndarray) -> np.ndarray:
 
 def _mean_contact(workspace: Workspace, terrain: xr.Dataset, seed: int) -> np.ndarray:
     """Compute the mean contact of all moves, (robot, move, row, col), possible or not."""
-    grid, step, x, y = workspace.grid, pixel_size(terrain), terrain["x"].values, terrain["y"].values
-    dem, dsm = terrain["dem"].values, terrain["dsm"].values
-    window: Any = [max(1, round(_WINDOW / one)) for one in step]
-    cover = ndimage.uniform_filter((np.nan_to_num(dsm - dem) > 1.5).astype(float), window)
+    grid = workspace.grid
+    step = pixel_size(terrain)
+    x = terrain["x"].values
+    y = terrain["y"].values
+    dem = terrain["dem"].values
+    dsm = terrain["dsm"].values
+
+    window: Any = [max(1, round(_WINDOW / size)) for size in step]
+    cover = ndimage.uniform_filter((np.nan_to_num(dsm - dem) > _CANOPY).astype(float), window)
     ground = ndimage.uniform_filter(np.where(np.isfinite(dem), dem, np.nanmean(dem)), window)
+
     rng = np.random.default_rng(seed)
     noise = rng.standard_normal(ground.shape)
-    field = ndimage.gaussian_filter(noise, [_FIELD / one for one in step])
+    field = ndimage.gaussian_filter(noise, [_FIELD / size for size in step])
     field = (field - field.mean()) / field.std()
-    radios = 0.25 * rng.standard_normal(workspace.team.n_robots)
+    radios = _QUALITY * rng.standard_normal(workspace.team.n_robots)
 
     b = np.stack(np.indices(grid.shape), -1)  # (row, col, axis), in cells  # pyright: ignore[reportArgumentType, reportCallIssue]
     a = b - np.array(MOVES)[:, None, None]  # (move, row, col, axis)
@@ -114,9 +136,12 @@ def _mean_contact(workspace: Workspace, terrain: xr.Dataset, seed: int) -> np.nd
         pixels = (y[0] - grid.top + south) / step[0], (grid.left + east - x[0]) / step[1]
         return ndimage.map_coordinates(raster, pixels, order=1, mode="nearest")
 
-    c = np.mean([read(cover, a + share * (b - a)) for share in np.linspace(0.0, 1.0, 9)], axis=0)
+    shares = np.linspace(0.0, 1.0, _N_BETWEEN)
+    c = np.mean([read(cover, a + share * (b - a)) for share in shares], axis=0)
     c = np.clip(c, 0.0, 1.0)  # the running mean has rounding errors
     d = np.hypot(*np.moveaxis((b - a) * sides, -1, 0)) / _REACH
     h = np.maximum(read(ground, b) - read(ground, a), 0.0)
+
+    # The formula in the docstring of `RadioSimulator`.
     eta = 2.2 - 3.5 * c**1.5 * d - 0.1 * h + 0.9 * (0.3 + c) * np.tanh(read(field, b))
     return expit(eta + radios[:, None, None, None])

@@ -22,7 +22,10 @@ SIGNS = {
 """Inputs of each feature, with the signs of their effects; pitch is in rad, range in m."""
 MIN_SAMPLES = 200
 """Smallest number of samples (robots x bounds); loadings from fewer samples are unstable."""
-_SHARES, _ANGLES = np.array([0.25, 0.5, 0.75, 1.0]), np.linspace(0.0, 2.0 * np.pi, 13)[:-1]
+_SHARES = np.array([0.25, 0.5, 0.75, 1.0])
+"""Points along a beam, as shares of its reach, up to which sight is computed."""
+_ANGLES = np.linspace(0.0, 2.0 * np.pi, 13)[:-1]
+"""Directions of the twelve beams of a lidar, rad from east, anticlockwise."""
 
 
 class RealtimeAwareness:
@@ -34,34 +37,47 @@ class RealtimeAwareness:
 
     def __init__(self, simulator: KinematicSimulator, missions: Sequence[Mission]) -> None:
         """Fit the indices to calibration missions; raises TrustboError if there are too few."""
-        self._workspace, self._world = simulator.workspace, simulator.world()
+        self._workspace = simulator.workspace
+        self._world = simulator.world()
         self._tick = simulator.tick
         samples = [self.inputs(bound) for mission in missions for bound in mission.bounds]
-        if (n := len(samples) * self._world.team.n_robots) < MIN_SAMPLES:
+        n = len(samples) * self._world.team.n_robots
+        if n < MIN_SAMPLES:
             raise TrustboError(
                 f"real-time awareness needs {MIN_SAMPLES} samples (robots x bounds); got {n}. Give "
                 "more missions."
             )
+
         self.indices = {}
         for feature, signs in SIGNS.items():
-            of_all = {n: np.concatenate([one[feature][n] for one in samples]) for n in signs}
-            self.indices[feature] = CompositeIndex(signs).fit(of_all)
+            inputs = {
+                name: np.concatenate([sample[feature][name] for sample in samples])
+                for name in signs
+            }
+            self.indices[feature] = CompositeIndex(signs).fit(inputs)
 
     def inputs(self, bound: Bound) -> dict[str, dict[str, np.ndarray]]:
         """Compute the inputs of each feature (see `SIGNS`), each of shape (robot,)."""
-        world, workspace, poses = self._world, self._workspace, bound.poses[:, 1:]  # pyright: ignore[reportOptionalSubscript]
+        world = self._world
+        workspace = self._workspace
+        poses = bound.poses[:, 1:]  # pyright: ignore[reportOptionalSubscript]
+
         way = np.diff(poses[..., :2], axis=0, prepend=poses[:1, :, :2])
         speed = np.hypot(way[..., 0], way[..., 1]) / self._tick
         gx, gy = world.surface.gradient[:, *world.surface.nearest(poses[..., 0], poses[..., 1])]
-        ahead, left = np.cos(poses[..., 2]), np.sin(poses[..., 2])
+
+        ahead = np.cos(poses[..., 2])
+        left = np.sin(poses[..., 2])
         state = self._lidar(poses) | {
             "speed_ratio": np.minimum(speed / [robot.speed for robot in world.team.robots], 1.0),
             "pitch": np.abs(np.arctan(gx * ahead + gy * left)),
             "roll": np.abs(np.arctan(gy * ahead - gx * left)),
         }
+
         place = workspace.surface.nearest(poses[..., 0], poses[..., 1])  # pyright: ignore[reportOptionalMemberAccess]
         moved = speed > 0.0
         moved[0] |= ~moved.any(0)  # the first tick represents a robot that never moves
+
         found = {}
         for feature, signs in SIGNS.items():
             ticks = state | {"map": workspace.pixels[feature].values[place]}  # pyright: ignore[reportOptionalSubscript]
@@ -82,14 +98,17 @@ class RealtimeAwareness:
 
         The mean range is the integral over the range of the fraction of beams that reach it.
         """
-        world, robot = self._world, self._world.team.robots[0]
+        world = self._world
+        robot = self._world.team.robots[0]
         low, high = np.reshape(world.surface.extent, (2, 2))
         reach = min(robot.lidar_range, 0.5 * float((high - low).min()))
         beams = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
         eye = poses[..., None, None, :2]
         target = np.clip(eye + reach * _SHARES[:, None, None] * beams, low, high)
+
         lidar = optics(robot, world.team.lead)
         clear = detection_between(world.surface, world.sight, eye, target, lidar).mean(-1)
+
         seen = np.insert(clear, 0, 1.0, axis=-1)  # (tick, robot, 1 + share)
         reached = np.asarray(np.trapezoid(seen, [0.0, *_SHARES], axis=-1))
         return {"return_range": reach * reached, "visible_share": seen[..., -1]}

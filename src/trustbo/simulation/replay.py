@@ -31,7 +31,8 @@ class ReplaySimulator(DescribedSimulator):
         if not missions:
             raise TrustboError("missions must contain at least one mission; got none.")
         require_map("a replay", missions)
-        self.missions, self.any_path = tuple(missions), any_path
+        self.missions = tuple(missions)
+        self.any_path = any_path
 
     def describe(self) -> dict[str, object]:
         """Return the number of missions and the value of `any_path`."""
@@ -49,7 +50,9 @@ class ReplaySimulator(DescribedSimulator):
                 f"mission {mission} is not among the {len(self.missions)} recorded missions, which "
                 "are counted from 0; run fewer missions."
             )
-        recorded, asked = self.missions[mission], require_cells("path", path)
+
+        recorded = self.missions[mission]
+        asked = require_cells("path", path)
         if recorded.path != asked and not self.any_path:
             raise TrustboError(
                 f"mission {mission} was recorded on the path {path_text(recorded.path)}, not on "

@@ -48,8 +48,14 @@ def edges_of(workspace: Workspace) -> list[Edge]:
         down, right = MOVES[move]
         to = [(row + i, col + j) for i, j in MOVES]
         nexts = [n for n, (i, j) in enumerate(to) if around[n, i + 1, j + 1]]
-        ahead = *(to[n] for n in nexts), None
-        edges.append(Edge(move, (row - down, col - right), (row, col), (*nexts, END), ahead))
+        edge = Edge(
+            move,
+            left=(row - down, col - right),
+            cell=(row, col),
+            next_moves=(*nexts, END),
+            ahead=(*(to[n] for n in nexts), None),
+        )
+        edges.append(edge)
     return edges
 
 
@@ -57,10 +63,14 @@ def replicated(simulator: Any, mission: int, n_replicates: int, seed: int) -> xr
     """Average the contact and success of all bounds over replicates; see `Truth.of`."""
     if hasattr(simulator, "expected_contact"):
         return simulator.expected_contact()
+
     workspace = simulator.workspace
     shape = END, *workspace.passable.shape, END + 1
-    total, n_passed, n = np.zeros(shape), np.zeros(shape), np.zeros(shape)
+    total = np.zeros(shape)
+    n_passed = np.zeros(shape)
+    n = np.zeros(shape)
     replicates = _of_bounds if isinstance(simulator, KinematicSimulator) else _of_missions
+
     edges = edges_of(workspace)
     for edge, outcomes in replicates(simulator, edges, mission, n_replicates, seed):
         for next_move, (contact, status) in zip(edge.next_moves, outcomes, strict=True):
@@ -69,6 +79,7 @@ def replicated(simulator: Any, mission: int, n_replicates: int, seed: int) -> xr
             if status == "ok":
                 n_passed[where] += 1.0
                 total[where] += contact
+
     with np.errstate(invalid="ignore", divide="ignore"):
         contact = np.where(n_passed > 0.0, total / n_passed, np.where(n > 0.0, 0.0, np.nan))
         return table_of(contact, n_passed / n)
@@ -84,15 +95,20 @@ def _of_bounds(
     world = simulator.world(mission, long_run=True)
     ends: dict[tuple[Cell, Cell | None], dict[int, State]] = {}
     for number in range(n + 1):
-        before, ends = ends, {where: dict(states) for where, states in ends.items()}
+        before = ends
+        ends = {where: dict(states) for where, states in ends.items()}
 
         def replicate(
             edge: Edge, number: int = number, before: dict[Any, dict[int, State]] = before
         ) -> list[tuple[float, str, State]]:
             rng = np.random.default_rng([seed, number, edge.move, *edge.cell])
+            # The replicates take the preceding bounds in turn.
             states = before.get((edge.left, edge.cell), {})
-            state = states[sorted(states)[number % len(states)]] if states else None
-            state = state or simulator.standing(edge.left, edge.cell)
+            if states:
+                state = states[sorted(states)[number % len(states)]]
+            else:
+                state = simulator.standing(edge.left, edge.cell)
+
             found = simulator.outcomes(world, state, 1, edge.cell, edge.ahead, rng, expected=True)
             return [(float(contact.mean()), drive.status, after) for drive, contact, after in found]
 
@@ -112,9 +128,12 @@ def _of_missions(
         for edge in edges:
             outcomes = []
             for i, next_cell in enumerate(edge.ahead):
-                path = edge.left, edge.cell, *((next_cell,) if next_cell is not None else ())
+                path = [edge.left, edge.cell]
+                if next_cell is not None:
+                    path.append(next_cell)
+
                 entropy = [seed, number, edge.move, *edge.cell, i]
                 drawn = int(np.random.SeedSequence(entropy).generate_state(1)[0])
-                bound = simulator.run(path, seed=drawn, mission=mission).bounds[0]
+                bound = simulator.run(tuple(path), seed=drawn, mission=mission).bounds[0]
                 outcomes.append((float(np.mean(bound.contact_rate)), bound.status))
             yield edge, outcomes

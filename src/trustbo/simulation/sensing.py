@@ -35,22 +35,30 @@ def detections(world: World, drives: Sequence[Drive], k: int) -> list[np.ndarray
     team = world.team
     poses = np.concatenate([drive.poses[..., :2] for drive in drives])
     t2_scans = np.concatenate([drive.lead_moves for drive in drives])[:, None]  # else the lead
-    lead, t2 = np.repeat(poses[:, :1], team.n_robots, axis=1), poses[:, 1:]
+    lead = np.repeat(poses[:, :1], team.n_robots, axis=1)
+    t2 = poses[:, 1:]
+
     by_t2 = np.stack([optics(robot, team.lead) for robot in team.robots])
     by_lead = np.stack([optics(team.lead, robot) for robot in team.robots])
-    sensor, target, scanners = (
-        np.where(t2_scans[..., None], a, b).reshape(-1, a.shape[-1])  # (tick * robot, ...)
-        for a, b in ((t2, lead), (lead, t2), (by_t2, by_lead))
-    )
+
+    # One row for each tick and robot: who scans, and whom.
+    by_robot = t2_scans[..., None]
+    sensor = np.where(by_robot, t2, lead).reshape(-1, 2)
+    target = np.where(by_robot, lead, t2).reshape(-1, 2)
+    scanners = np.where(by_robot, by_t2, by_lead).reshape(-1, by_t2.shape[-1])
+
     probability = detection_probability(world.surface, world.sight, sensor, target, scanners)
     for mask, strength in world.jams:
         inside = mask[world.surface.nearest(sensor[:, 0], sensor[:, 1])]
         inside |= mask[world.surface.nearest(target[:, 0], target[:, 1])]
         probability[inside] *= 1.0 - strength
+
     probability = probability.reshape(-1, team.n_robots)
     detection = world.detection[min(k, len(world.detection)) - 1]
     probability *= np.where(t2_scans, detection, world.lead_detection)
-    return np.split(probability, np.cumsum([len(drive.poses) for drive in drives])[:-1])
+
+    ends = np.cumsum([len(drive.poses) for drive in drives])
+    return np.split(probability, ends[:-1])
 
 
 def new_tracks(n_robots: int) -> np.ndarray:
@@ -80,7 +88,8 @@ def _track(detected, limits, tracks, contact):
             if detected[k, i] != (tracked == 1):
                 tracks[i, 1] += 1
                 if tracks[i, 1] >= limits[i, tracked]:
-                    tracks[i, 0], tracks[i, 1] = 1 - tracked, 0
+                    tracks[i, 0] = 1 - tracked
+                    tracks[i, 1] = 0
             else:
                 tracks[i, 1] = 0
             contact[k, i] = tracks[i, 0] == 1

@@ -41,7 +41,9 @@ class Truth(Summary):
         self, workspace: Workspace, bounds: xr.Dataset, of: "Callable[[int], Truth] | None" = None
     ) -> None:
         """Store the bounds; `of(mission)` computes the truth of another mission's world."""
-        self.workspace, self.bounds, self._of = workspace, bounds, of
+        self.workspace = workspace
+        self.bounds = bounds
+        self._of = of
 
     def _rows(self) -> Rows:
         rows, cols = self.workspace.grid.shape
@@ -85,6 +87,7 @@ class Truth(Summary):
                 "in a ModelSimulator, the contact of a bound depends on all earlier bounds; use "
                 "Planner.evaluate(path, params) and Planner.plan(params) instead."
             )
+
         n_replicates = require_count("n_replicates", n_replicates)
         seed = require_whole("seed", seed, 0)
         found: dict[str, Self] = {}
@@ -96,6 +99,7 @@ class Truth(Summary):
                 settings = simulator.describe_world(number)
             else:
                 settings = getattr(simulator, "describe", lambda: type(simulator).__name__)()
+
             world = to_json([settings, known, n_replicates, seed])
             if world not in found:
                 make = partial(replicated, simulator, number, n_replicates, seed)
@@ -148,10 +152,11 @@ class Truth(Summary):
             NoPathError: The goal cannot be reached.
         """
         paths = AdmissiblePaths(self.workspace, start, goal, max_bounds)
-        contact, passed = (self.bounds[name].values for name in ("contact", "passed"))
-        passed = passed if failures else np.ones(passed.shape)
-        ends = paths.start, paths.goal
-        return _most_kept(contact, passed, *ends, paths.longest, u_turns=paths.turns)
+        contact = self.bounds["contact"].values
+        passed = self.bounds["passed"].values if failures else np.ones(contact.shape)
+        return _most_kept(
+            contact, passed, paths.start, paths.goal, paths.longest, u_turns=paths.turns
+        )
 
     def regret(self, path: Sequence[Cell], max_bounds: int | str = "shortest+4") -> float:
         """Compute the regret of a path, as a percentage of the contact kept on the best path.
@@ -161,6 +166,7 @@ class Truth(Summary):
         """
         path = require_path(self.workspace, path)
         best = self.best(path[0], path[-1], max_bounds)
+
         least = self.lost(best)
         kept = len(best) - 1 - least
         return 100.0 * (self.lost(path) - least) / kept if kept > 0.0 else np.nan
@@ -168,7 +174,9 @@ class Truth(Summary):
     def _along(self, path: Sequence[Cell]) -> tuple[np.ndarray, np.ndarray]:
         """Return the contact and the completion probability of a path's bounds, each (bound,)."""
         cells = require_path(self.workspace, path)
-        moves, (rows, cols) = moves_along(cells), np.array(cells)[1:].T
+        moves = moves_along(cells)
+        rows, cols = np.array(cells)[1:].T
+
         where = moves, rows, cols, np.append(moves[1:], END)
         return self.bounds["contact"].values[where], self.bounds["passed"].values[where]
 
@@ -179,14 +187,16 @@ def _known(workspace: Workspace) -> list[object]:
     for maps in (workspace.terrain, workspace.pixels):
         if maps is not None:
             arrays += [maps[name].values for name in ("y", "x", *maps.data_vars)]
-    assumed = workspace.grid, workspace.team, workspace.sight
-    return [VERSIONS["trustbo"], digest(*arrays), *assumed]
+
+    version = VERSIONS["trustbo"]
+    return [version, digest(*arrays), workspace.grid, workspace.team, workspace.sight]
 
 
 def _cached(folder: FilePath | None, world: str, make: Callable[[], xr.Dataset]) -> xr.Dataset:
     """Read the table of a world's bounds from the cache, or compute and store the table."""
     if folder is None:
         return make()
+
     file = to_path(folder) / f"truth-{digest(np.frombuffer(world.encode(), np.uint8))}.nc"
     if not file.exists():
         write_file(file, make().to_netcdf)
@@ -205,15 +215,21 @@ def _most_kept(
     follows = np.ones((END, END), bool)  # (move, next move)
     if not u_turns:
         follows &= ~np.eye(END, dtype=bool)[::-1]  # the reverse of move m is move 7 - m
+
     possible = np.isfinite(contact[..., :END]) & follows[:, None, None]
     last = (passed * contact)[:, *goal, END]
     value = np.full(contact.shape[:3], -np.inf)  # (move, row, col)
     value[:, *goal] = np.where(np.isfinite(last), last, -np.inf)
-    most, first, choices = [], [], []
+
+    # Backward recursion over the number of remaining bounds (Bellman 1957).
+    most = []  # contact kept from the start on, for each number of bounds
+    first = []  # first move of these paths
+    choices = []  # next move after each bound
     for _ in range(longest):
         onward = np.stack([_by_cell_left(value[move], move) for move in range(END)])
         first.append(int(onward[:, *start].argmax()))
         most.append(onward[first[-1], *start])
+
         after = np.moveaxis(onward, 0, -1)  # (row, col, next move)
         ends = possible & np.isfinite(after)
         kept = passed[..., :END] * (contact[..., :END] + np.where(np.isfinite(after), after, 0.0))
@@ -221,17 +237,23 @@ def _most_kept(
         choices.append(kept.argmax(-1))
         value = kept.max(-1)
         value[:, *goal] = -np.inf  # a path ends at the goal
+
+    # Choose the number of bounds that loses least, and follow the choices from the start.
     n = int(np.argmin(np.arange(1, longest + 1) - np.array(most)))
-    path, move = [start], first[n]
+    path = [start]
+    move = first[n]
     for choice in [*choices[:n][::-1], None]:
-        (row, col), (down, right) = path[-1], MOVES[move]
+        row, col = path[-1]
+        down, right = MOVES[move]
         path.append((row + down, col + right))
-        move = move if choice is None else int(choice[move, *path[-1]])
+        if choice is not None:
+            move = int(choice[move, *path[-1]])
     return tuple(path)
 
 
 def _by_cell_left(values: np.ndarray, move: int) -> np.ndarray:
     """Index the values (row, col) of a move by the cell left instead of the cell entered."""
-    (down, right), (rows, cols) = MOVES[move], values.shape
+    down, right = MOVES[move]
+    rows, cols = values.shape
     framed = np.pad(values, 1, constant_values=-np.inf)
     return framed[1 + down :, 1 + right :][:rows, :cols]

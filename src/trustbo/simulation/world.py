@@ -54,8 +54,12 @@ def true_surface(workspace: Workspace, terrain: xr.Dataset | None) -> Surface:
             f"the true terrain has the CRS {terrain.rio.crs}, but the workspace has the CRS "
             f"{workspace.terrain.rio.crs}; reproject the terrain."
         )
+
     surface = surface_of(terrain, np.isfinite(terrain["dem"].values))
-    extent, needed, pixel = surface.extent, planned.extent, max(*surface.pixel, *planned.pixel)
+    extent = surface.extent
+    needed = planned.extent
+
+    pixel = max(*surface.pixel, *planned.pixel)
     short = max(*np.subtract(extent, needed)[:2], *np.subtract(needed, extent)[2:])
     if short > pixel:
         raise TrustboError(
