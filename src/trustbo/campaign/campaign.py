@@ -1,10 +1,8 @@
 """Campaign with an ask/tell interface: `ask` for a path, drive it, and `tell` the mission."""
 
-import inspect
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
 from typing import Any, Self
 
 import numpy as np
@@ -15,6 +13,14 @@ from trustbo.campaign.learning import as_learned, is_excluded_by_user, learn, wh
 from trustbo.campaign.read import lock_campaign, read_campaign
 from trustbo.campaign.record import RECORD
 from trustbo.campaign.result import Result, in_a_line
+from trustbo.campaign.settings import (
+    name_of,
+    require_model,
+    require_options,
+    require_options_of_fit,
+    to_arguments,
+    to_settings,
+)
 from trustbo.campaign.state import EXCLUDED, LEARNED, TOLD, Entry, Failure, Posterior, State
 from trustbo.campaign.stopping import Stop
 from trustbo.campaign.storage import MemoryStorage, Storage
@@ -28,14 +34,13 @@ from trustbo.errors import (
     require_whole,
     warn,
 )
-from trustbo.files import FilePath, holding_interrupts, interpreting, to_json, to_plain
+from trustbo.files import FilePath, holding_interrupts, interpreting, to_json
 from trustbo.hazard import Hazard
 from trustbo.hazard.exposures import CAUSES
 from trustbo.inference.diagnostics import diagnostics
-from trustbo.inference.fit import SAMPLERS, fit
-from trustbo.models import HumanTrust, default_model
+from trustbo.inference.fit import SAMPLERS
 from trustbo.models.model import TrustModel
-from trustbo.models.record import model_from_record, model_to_record
+from trustbo.models.record import model_from_record
 from trustbo.planning import InfeasibleError, Plan, Planner
 from trustbo.planning.policies import POLICIES, Policy, resolve_policy
 from trustbo.simulation import KinematicSimulator
@@ -43,9 +48,6 @@ from trustbo.simulation.protocol import Simulator
 from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Location
 
-_OPTIONS = ("objective", "sampler", "seed", "initial", "planner", "fit")
-"""Arguments of `Campaign` that are stored unchanged in the settings."""
-_FIT = inspect.signature(fit)
 _LIKELY_ARRIVAL = 0.9
 """Arrival probability below which a campaign warns if failures have no cost and no limit."""
 
@@ -122,38 +124,29 @@ class Campaign(Result):
         require_choice("sampler", sampler, SAMPLERS)
         hazard = Hazard() if hazard is None else hazard
         require_kind("hazard", hazard, Hazard, "give a trustbo.hazard.Hazard")
-        own = {"workspace": workspace, "seed": seed, "progress": True, "whole": False}
-        for name, given in {"planner": planner, "fit": fit}.items():
-            if given is not None:
-                require_kind(name, given, Mapping, "give a dict of options")
-        _FIT.bind([], model, sampler=sampler, **own, **(fit or {}))  # TypeError if one is unknown
-        model = default_model() if model is None else model
-        require_kind("model", model, TrustModel, "give a trust model, such as PooledTrust()")
-        if isinstance(model, HumanTrust):
-            raise TrustboError("model: HumanTrust cannot plan paths; give PooledTrust() instead.")
+        options = require_options("planner", planner)
+        fit_options = require_options("fit", fit)
+        require_options_of_fit(fit_options)
+        model = require_model(model)
+
         self.policy = resolve_policy(policy)
-        options = dict(planner or {})
         base = Planner(workspace, start, goal, objective, family=model.observation, **options)
-        if "toll" in options:
-            options["toll"] = base.problem.toll  # in the order of the moves, rows and columns
-        settings = {
-            "start": base.start,
-            "goal": base.goal,
-            "max_bounds": base.max_bounds,
-            "policy": policy if isinstance(policy, str) else f"{_name_of(policy)} (custom)",
-            "objective": objective,
-            "sampler": sampler,
-            "seed": require_whole("seed", seed, 0),
-            "initial": initial,
-            "planner": to_plain("planner", options),
-            "fit": to_plain("fit", dict(fit or {})),
-            "hazard": asdict(hazard),
-            "observation": model.observation,
-            "model": model.in_short(),
-            "model_record": model_to_record(model),
-        }
-        state = State(json.loads(to_json(settings)))  # as if read from a file
+        settings = to_settings(
+            base,
+            model,
+            policy,
+            objective=objective,
+            sampler=sampler,
+            seed=seed,
+            initial=initial,
+            hazard=hazard,
+            planner=options,
+            fit=fit_options,
+        )
+
+        state = State(settings)
         super().__init__(workspace, state, model, base)
+
         self._progress = True  # of fits
         self._has_warned_of_risk = False
         self.storage: Storage = MemoryStorage()
@@ -187,8 +180,13 @@ class Campaign(Result):
     def _recorded(self) -> Iterator[None]:
         """Change the state in the block, and write it; if this fails, undo the changes."""
         state = self.state
-        before = {n: list(v) if isinstance(v, list) else v for n, v in vars(state).items()}
+        before = {
+            name: list(value) if isinstance(value, list) else value
+            for name, value in vars(state).items()
+        }
+
         rows = [entry.row for entry in state.entries]
+
         with holding_interrupts():
             try:
                 yield
@@ -204,8 +202,10 @@ class Campaign(Result):
         state = self.state
         if state.due is None:
             return
+
         n_used = len(state.indices(TOLD, LEARNED))
-        tree, reason = None, ""
+        tree = None
+        reason = ""
         if n_used:
             tree, reason = learn(state, self.model, self.workspace, state.due, self._progress)
         hazard = self.hazard  # does not depend on what was learned about trust
@@ -277,11 +277,13 @@ class Campaign(Result):
         self.storage.require_open()
         self._catch_up()
         name = f"policy {self.state.settings['policy']!r}"
+
         rng = np.random.default_rng(self.state.seed_of("policy"))
         try:
             plan = self.policy(rng, self.belief, self.planner)
         except InfeasibleError as error:  # `_accept` issues the warning
             plan = self.planner.evaluate(error.path, self.belief.mean())
+
         require_kind(name, plan, Plan, "a policy must return a trustbo.planning.Plan")
         try:
             self.planner.require_path(plan.path)
@@ -301,6 +303,7 @@ class Campaign(Result):
         """
         with self._turn:
             self.storage.require_open()
+
             self._catch_up()
             return self._accept(self.planner.evaluate(path, self.belief.mean()))
 
@@ -313,6 +316,7 @@ class Campaign(Result):
         accepted = self._with_bands(plan)
         with self._recorded():
             self.state.asked = accepted
+
         if plan.infeasible:
             warn(
                 f"the plan arrives with probability {accepted.p_arrive:.3g} only, and max_failure "
@@ -324,11 +328,12 @@ class Campaign(Result):
     def _warn_of_risk(self, plan: Plan) -> None:
         """Warn, once per campaign, if failure is likely but does not influence the plans."""
         options = self.state.settings["planner"]
-        limited = any(options.get(name) is not None for name in ("max_failure", "failure_cost"))
-        if self._has_warned_of_risk or limited or self.risk.has_failures:
+        is_limited = any(options.get(name) is not None for name in ("max_failure", "failure_cost"))
+        if self._has_warned_of_risk or is_limited or self.risk.has_failures:
             return
         if plan.p_arrive is None or plan.p_arrive >= _LIKELY_ARRIVAL:
             return
+
         self._has_warned_of_risk = True
         remedy = 'planner={"max_failure": ...}'
         if self.planner.problem.objective.of_contact:
@@ -368,6 +373,7 @@ class Campaign(Result):
             mission = self.workspace.in_order(mission)
             if not again:
                 self._require_new(mission)
+
             # If nothing was asked since the last mission, this plans a path, which may take long.
             plan = self.state.asked or self._with_bands(self._propose())
             if mission.path[0] != plan.path[0]:
@@ -375,9 +381,11 @@ class Campaign(Result):
                     f"the mission starts in cell {mission.path[0]}; it must start in "
                     f"{plan.path[0]}."
                 )
+
             learned = as_learned(mission, self.workspace)
             row = self.state.row_of(plan, mission)
             entry = Entry(plan, mission, learned, self.trust_map, row)
+
             n_before = len(self.state.entries)
             try:
                 with holding_interrupts():
@@ -389,6 +397,7 @@ class Campaign(Result):
                         f"mission {n_before + 1} is recorded; it will be learned at the next call."
                     )
                 raise
+
             self._finish_mission(entry)
             return self.state.posterior
 
@@ -396,6 +405,7 @@ class Campaign(Result):
         """Raise TrustboError if a mission with the same data is recorded and not excluded."""
         if not np.isfinite(mission.contact_rate).any():
             return  # nothing can be learned twice
+
         for n, entry in enumerate(self.state.entries, start=1):
             if entry.measured.has_same_data(mission) and not is_excluded_by_user(entry):
                 raise TrustboError(
@@ -411,7 +421,9 @@ class Campaign(Result):
         state.asked = None
         state.entries.append(entry)
         self._computed.clear()
-        if reason := why_never_learned(entry.mission):
+
+        reason = why_never_learned(entry.mission)
+        if reason:
             entry.become(EXCLUDED, reason)
         else:
             state.due = seed
@@ -440,18 +452,22 @@ class Campaign(Result):
         """
         with self._turn:
             self.storage.require_open()
-            if require_whole("n", n, 1) > (n_told := len(self.state.entries)):
+            n_told = len(self.state.entries)
+            if require_whole("n", n, 1) > n_told:
                 raise TrustboError(
                     f"there is no mission {n} to exclude; the last is mission {n_told}."
                 )
+
             entry = self.state.entries[n - 1]
             if is_excluded_by_user(entry):
                 raise TrustboError(f"mission {n} is already excluded: {entry.row['reason']}")
+
             self._catch_up()
             with self._recorded():
                 entry.become(EXCLUDED, str(reason))
                 self.state.due = self.state.seed_of("exclude")
                 self.state.asked = None
+
             self._computed.clear()
             self._finish(f"the exclusion of mission {n} is recorded")
             return self.state.posterior
@@ -482,11 +498,13 @@ class Campaign(Result):
                     f"where = {where} must be a cell that the plan enters, {path[1:]}, with one of "
                     f"the reasons {', '.join(CAUSES)}; got reason {reason!r}."
                 )
+
             self._catch_up()
             with self._recorded():
                 failure = Failure(len(self.state.entries), reason, tuple(path), where)
                 self.state.failures.append(failure)
                 self.state.asked = None
+
             self._computed.clear()
 
     def run(
@@ -516,6 +534,7 @@ class Campaign(Result):
             )
         if stop is not None and (isinstance(stop, type) or not callable(stop)):
             raise TrustboError(f"stop must be a function of the campaign; got {stop!r}.")
+
         describe = getattr(runner, "describe", lambda: {"simulator": type(runner).__name__})
         with self._turn:
             settings = {**describe(), "n_iterations": n_iterations}
@@ -540,14 +559,17 @@ class Campaign(Result):
                 bar.set_postfix_str(in_a_line(state.entries[-1].row), refresh=False)
                 bar.update()
                 yield plan, mission
+
         with self._turn, self._recorded():
             state.stop_reason = reason
 
     def _reason_to_end(self, n_iterations: int, stop: Stop | None) -> str | None:
         """Return the reason to stop, or None to continue."""
         n = len(self.state.entries)
-        if n and stop is not None and (verdict := stop(self)):
-            return verdict if isinstance(verdict, str) else _name_of(stop)
+        if n and stop is not None:
+            verdict = stop(self)
+            if verdict:
+                return verdict if isinstance(verdict, str) else name_of(stop)
         return "n_iterations" if n >= n_iterations else None
 
     @classmethod
@@ -579,19 +601,19 @@ class Campaign(Result):
                     )
                 campaign = cls(
                     workspace,
-                    given["start"],
-                    given["goal"],
                     model=model_from_record(given["model_record"], model),
                     policy=given["policy"] if policy is None else policy,
-                    hazard=Hazard(**given["hazard"]),
-                    **{name: given[name] for name in _OPTIONS},
+                    **to_arguments(given),
                 )
-            if (name := campaign.state.settings["policy"]) != given["policy"]:
+
+            name = campaign.state.settings["policy"]
+            if name != given["policy"]:
                 raise TrustboError(f"policy {name!r} is not the campaign's, {given['policy']!r}.")
             campaign.state = state
             campaign._use(FolderStorage(lock, files))
             if state.due is not None:
                 campaign._finish("an exclusion is recorded")
+
             for entry in pending:
                 campaign._catch_up()
                 campaign._add(entry)
@@ -621,7 +643,3 @@ class Campaign(Result):
 
     def __exit__(self, *error: object) -> None:
         self.close()
-
-
-def _name_of(function: object) -> str:
-    return getattr(function, "__name__", type(function).__name__)

@@ -100,9 +100,11 @@ class FolderStorage:
         path = to_path(directory)
         if not overwrite:
             _require_no_campaign(path)
+
         is_new = not path.exists()
         _make_folder(path)
         lock = FolderLock(path, take_over=take_over)
+
         try:
             recover(lock.path)
             if not overwrite:
@@ -143,6 +145,7 @@ class FolderStorage:
     def write(self, state: State) -> None:
         """Write the posteriors that have no files yet, and then campaign.json."""
         self.require_open()
+
         for entry in state.entries:
             posterior = entry.posterior
             if posterior is None or posterior.tree is None:
@@ -152,6 +155,7 @@ class FolderStorage:
                 posterior.file = self._write(name, tree_to_bytes(posterior.tree))
             if posterior is not state.last:
                 posterior.tree = None  # frees the memory
+
         record = record_to_bytes(state, self.files)
         write_file(self.path / RECORD, record, make_folder=False)
         self._written = _version_of(self.path / RECORD)
@@ -174,6 +178,7 @@ def _write_stored(folder: Path, name: str, content: bytes) -> StoredFile:
         file.parent.mkdir(exist_ok=True)
     except OSError as error:
         raise TrustboError(f"cannot create {str(file.parent)!r}: {error.strerror}.") from error
+
     write_file(file, content, make_folder=False)
     return StoredFile(file, hash_of(content))
 
@@ -190,6 +195,7 @@ def _entry_to_tree(entry: Entry) -> xr.DataTree:
 def _contents(workspace: Workspace, state: State) -> Iterator[tuple[str, bytes]]:
     """Make the files of a campaign, except campaign.json: path in the folder, and content."""
     yield WORKSPACE, tree_to_bytes(workspace_to_tree(workspace))
+
     posteriors = {}
     for n, entry in enumerate(state.entries, start=1):
         yield mission_file(n), tree_to_bytes(_entry_to_tree(entry))
@@ -223,6 +229,7 @@ def without_lost_posteriors(state: State) -> State:
                 entry = replace(entry, posterior=None)
                 lost.append(n)
         entries.append(entry)
+
     if not lost:
         return state
     warn(
@@ -267,6 +274,7 @@ def _replace_campaign(folder: Path, workspace: Workspace, state: State) -> dict[
             name: _write_stored(beside, name, content).sha256
             for name, content in _contents(workspace, state)
         }
+
         for name in files:
             if name not in old and (folder / name).exists():
                 raise TrustboError(
@@ -274,6 +282,7 @@ def _replace_campaign(folder: Path, workspace: Workspace, state: State) -> dict[
                     "folder; move it, or give another folder."
                 )
         write_file(beside / RECORD, record_to_bytes(state, files), make_folder=False)
+
         with holding_interrupts():
             commit_replacement(folder, beside, old, list(files))
             finish_replacement(folder)

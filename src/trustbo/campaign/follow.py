@@ -12,6 +12,9 @@ from trustbo.errors import TrustboError, require_finite, require_kind, require_p
 from trustbo.inference import TrustFilter
 from trustbo.inference.filter import TrustForecast, TrustState
 
+_N_DRAWS = 1000
+"""Draws of the prior, from which trust is estimated before the first posterior."""
+
 
 class Follower:
     """Follows a mission of a campaign bound by bound and tick by tick.
@@ -19,8 +22,7 @@ class Follower:
     Call `begin`, `tick` and `end` for each bound; after the last one, `to_mission` returns the
     mission for `Campaign.tell`. Times are in seconds, from a single clock. Trust is estimated by a
     `TrustFilter` with the campaign's last posterior, or with the prior before the first one.
-    Awareness is taken from the map. All methods raise TrustboError if they are called out of order
-    or if an argument, such as a time before the previous time, is invalid.
+    Awareness is taken from the map.
 
     Attributes:
         path: Cells of the mission in order: the cells entered, followed by the planned ones.
@@ -30,17 +32,26 @@ class Follower:
     """
 
     def __init__(self, campaign: Campaign) -> None:
-        """Follow the path that `campaign.ask()` returns, from its start."""
+        """Follow the path that `campaign.ask()` returns, from its start.
+
+        Raises:
+            TrustboError: `campaign` is not a campaign, or cannot plan a path (see `Campaign.ask`).
+        """
         require_kind("campaign", campaign, Campaign, "give a trustbo.Campaign")
         self.path: tuple[Cell, ...] = tuple(campaign.ask().path)
-        self._workspace, self._goal = campaign.workspace, self.path[-1]
+        self._workspace = campaign.workspace
+        self._goal = self.path[-1]
         self.bounds: tuple[Bound, ...] = ()
         self.running = False
-        n_robots, family = self._workspace.team.n_robots, campaign.model.observation
-        if (posterior := campaign.state.posterior) is not None:
+
+        n_robots = self._workspace.team.n_robots
+        family = campaign.model.observation
+        posterior = campaign.state.posterior
+        if posterior is not None:
             start = TrustFilter(posterior, workspace=self._workspace)
         else:
-            start = TrustFilter(campaign.draw_prior(1000), n_robots, observation=family)
+            start = TrustFilter(campaign.draw_prior(_N_DRAWS), n_robots, observation=family)
+
         # `_before` has the bounds that have ended, and `_now` also the bound in progress.
         self._before = self._now = start
         self.trust: TrustState = start.state
@@ -50,57 +61,86 @@ class Follower:
     @property
     def rest(self) -> tuple[Cell, ...]:
         """Cell that the lead is in or is entering, followed by the planned cells."""
-        return self.path[len(self.bounds) + self.running :]
+        n_entered = len(self.bounds) + 1 if self.running else len(self.bounds)
+        return self.path[n_entered:]
 
     def begin(self, t: float, cell: Cell | None = None) -> None:
         """Begin the next bound at time `t`, into the planned cell or into a neighbouring `cell`.
 
         An unplanned cell discards the rest of the plan; all later bounds then need a `cell`.
+
+        Raises:
+            TrustboError: A bound is in progress, the mission is over, no cell is planned, the cell
+                is not a neighbour, or `t` is before the previous time.
         """
         self._require(running=False, t=t)
         if self.bounds and self.bounds[-1].status != "ok":
             raise TrustboError(f"the mission is over ({self.bounds[-1].status}); call to_mission.")
+
         here, *planned = self.rest
         if cell is None and not planned:
             raise TrustboError(f"no cell is planned after {here}; pass the next cell to begin.")
         cell = planned[0] if cell is None else require_pair("cell", cell)
+
         self._count(t, np.zeros_like(self._counts), (here, cell))
         if planned[:1] != [cell]:
             self.path = (*self.path[: len(self.bounds) + 1], cell)
+
         self._started = self._started if self.bounds else t
-        self._begun, self.running = t, True
+        self._begun = t
+        self.running = True
 
     def tick(self, t: float, in_contact: ArrayLike) -> None:
         """Add a tick at time `t` to the bound in progress.
 
-        `in_contact` is 1 for each robot that has contact with the lead, 0 for the others, and NaN
-        where it was not measured, shape (robot,). A Series, a DataArray or a dict is read by the
-        names of the robots.
+        Args:
+            t: Time, s.
+            in_contact: 1 for each robot that has contact with the lead, 0 for the others, and NaN
+                where it was not measured, shape (robot,). A Series, a DataArray or a dict is read
+                by the names of the robots.
+
+        Raises:
+            TrustboError: No bound is in progress, a value is not 0, 1 or NaN, the number of values
+                or their names are not those of the robots, or `t` is before the previous time.
         """
         self._require(running=True, t=t)
         robots = {"robot": self._workspace.team.names}
         seen = read_labelled("in_contact", in_contact, ("robot",), robots).values
+
         measured = ~np.isnan(seen)
         if measured.shape != self._counts[0].shape or not np.isin(seen[measured], (0, 1)).all():
             raise TrustboError(f"in_contact must be 0, 1 or NaN for each robot; got {seen}.")
+
         counts = self._counts + np.stack([np.nan_to_num(seen), measured])
         here, cell = self.path[len(self.bounds) :][:2]
         self._count(t, counts, (here, cell))
 
     def end(self, t: float, status: str = "ok") -> None:
-        """End the bound in progress; a status other than `"ok"` ends the mission."""
+        """End the bound in progress; a status other than `"ok"` ends the mission.
+
+        Raises:
+            TrustboError: No bound is in progress, the status is unknown, the bound has no duration,
+                or `t` is before the previous time.
+        """
         self._require(running=True, t=t)
         unknown = np.full((self._counts.shape[1], len(self._workspace.features)), np.nan)
-        seconds, since = np.full(len(unknown), t - self._begun), self._begun - self._started
+        seconds = np.full(len(unknown), t - self._begun)
+        since = self._begun - self._started
+
         rates, n_ticks = self._measured
         bound = Bound(self.rest[0], unknown, rates, seconds, status, since, n_ticks=n_ticks)
         self.bounds = (*self.bounds, bound)
-        self.running, self._last, self._before = False, t, self._now
+        self.running = False
+        self._last = t
+        self._before = self._now
 
     def ahead(self) -> TrustForecast:
         """Predict trust and contact rates in the bounds of `rest`, shapes (bound, robot).
 
         A bound in progress is treated as if it ended now.
+
+        Raises:
+            TrustboError: No bound is planned.
         """
         here, *planned = self.rest
         if not planned:
@@ -111,12 +151,17 @@ class Follower:
         """Return the completed bounds as a mission, whose awareness is NaN (not measured).
 
         The mission has the status of its last bound, or `"aborted"` if that bound is `"ok"` but did
-        not reach the goal. If no bound was run, use `Campaign.fail` instead.
+        not reach the goal.
+
+        Raises:
+            TrustboError: A bound is in progress, or none was run (use `Campaign.fail`).
         """
         if self.running or not self.bounds:
             state = "a bound is in progress; call end" if self.running else "no bound was run"
             raise TrustboError(f"there is no mission yet: {state}.")
-        status, workspace = self.bounds[-1].status, self._workspace
+
+        status = self.bounds[-1].status
+        workspace = self._workspace
         if status == "ok" and self.rest != (self._goal,):
             status = "aborted"
         return Mission(self.path, self.bounds, status, workspace.features, workspace.team.names)
@@ -124,16 +169,22 @@ class Follower:
     def _count(self, t: float, counts: np.ndarray, bound: tuple[Cell, Cell]) -> None:
         """Store tick counts (2, robot) of a bound, and the trust as if the bound ended now."""
         now = copy(self._before)  # shallow, since `update` replaces arrays
+
         [known] = self._workspace.along(bound, anywhere=True)
-        n_ticks = np.where(counts[1] > 0.0, counts[1], np.nan)
-        self._measured = rates, n_ticks = counts[0] / n_ticks, n_ticks
+        contacts, ticks = counts
+        n_ticks = np.where(ticks > 0.0, ticks, np.nan)
+        rates = contacts / n_ticks
         self.trust = now.update(known, rates, bound, n_ticks=n_ticks)
-        self._now, self._counts, self._last = now, counts, t
+        self._now = now
+        self._measured = rates, n_ticks
+        self._counts = counts
+        self._last = t
 
     def _require(self, *, running: bool, t: float) -> None:
         """Raise TrustboError if the call is out of order or `t` is before the previous time."""
         if running != self.running:
-            some, first = ("no", "begin") if running else ("a", "end")
-            raise TrustboError(f"{some} bound is in progress; call {first} first.")
+            if running:
+                raise TrustboError("no bound is in progress; call begin first.")
+            raise TrustboError("a bound is in progress; call end first.")
         if require_finite("t", t) < self._last:
             raise TrustboError(f"t = {t} s must not be before the last time, {self._last} s.")

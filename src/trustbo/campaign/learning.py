@@ -17,10 +17,16 @@ from trustbo.models.model import TrustModel
 from trustbo.planning import Planner
 from trustbo.workspace import Workspace
 
-_N_DRAWS, _N_RISKS = 1000, 200
-"""Numbers of posterior draws of the trust parameters, and of the failure probabilities."""
-_STOPPED, _RECOVERED = 2, 0.2
-"""Failures after which a bound is avoided, and failure probability below which it is allowed."""
+_N_DRAWS = 1000
+"""Posterior draws of the trust parameters."""
+_N_PLACE_DRAWS = 250
+"""The same with place effects, whose draws are large, from the importance sampler."""
+_N_RISKS = 200
+"""Posterior draws of the failure probabilities."""
+_STOPPED = 2
+"""Failures after which a bound is avoided."""
+_RECOVERED = 0.2
+"""Failure probability below which such a bound is allowed again."""
 
 
 def as_learned(mission: Mission, workspace: Workspace) -> Mission:
@@ -64,20 +70,31 @@ def learn(
     missions = [state.entries[j].mission for j in used]
     sampler = state.settings["sampler"]
     options = state.settings["fit"]
-    # Importance draws are independent, so fewer suffice; draws of place effects are large.
-    few = sampler == "importance" and any(isinstance(e, PlaceEffect) for e in model.effects)
-    usual = {"draws": _N_DRAWS // 4 if few else _N_DRAWS}
+
+    # Importance draws are independent, so fewer suffice than of a chain.
+    has_places = any(isinstance(effect, PlaceEffect) for effect in model.effects)
+    few = sampler == "importance" and has_places
+    usual = {"draws": _N_PLACE_DRAWS if few else _N_DRAWS}
+
     try:
         tree = fit(
-            missions, model, sampler=sampler, workspace=workspace, seed=seed, progress=progress,
-            whole=False, start=_previous(state), **(usual | options),
-        )  # fmt: skip
+            missions,
+            model,
+            sampler=sampler,
+            workspace=workspace,
+            seed=seed,
+            progress=progress,
+            whole=False,
+            start=_previous(state),
+            **(usual | options),
+        )
     except TrustboError as error:
         return None, getattr(error, "reason", str(error))
     except Exception as error:  # a bug must not lose a recorded mission
         if isinstance(error.__cause__, KeyboardInterrupt):  # numba wraps it
             raise error.__cause__ from None
         return None, f"{type(error).__name__}: {error}"
+
     tree = parameters_alone(tree)
     tree.attrs["missions"] = used
     return tree, ""
@@ -104,7 +121,9 @@ def learn_hazard(state: State, workspace: Workspace) -> xr.Dataset:
         return fit_hazard(measured, workspace, prior, lost=lost, seed=state.seed_of("hazard"))
     except PosteriorError as error:
         warn(f"{error} The campaign uses the previous hazard posterior.")
-    if (last := state.posterior) is not None:
+
+    last = state.posterior
+    if last is not None:
         return last["hazard"].to_dataset()
     return fit_hazard([], workspace, prior)
 
@@ -118,11 +137,14 @@ def informed_planner(planner: Planner, risk: BoundRisk) -> Planner:
     longer paths that keep contact and never fail. The cost is computed jointly over strata of the
     hazard posterior, since all bounds share the slope limit.
     """
-    stopped = (risk.stopped >= _STOPPED - 1e-9) & ~(risk.mean < _RECOVERED)
+    n_failures = risk.stopped + 1e-9  # expected numbers, with rounding errors
+    stopped = (n_failures >= _STOPPED) & ~(risk.mean < _RECOVERED)
+
     if stopped.any():
         planner = planner.avoiding(stopped, risk.mean)
     if planner.problem.failure_cost is None and not risk.has_failures:
         planner = planner.with_failure_cost(0.0)
+
     priced = planner.problem.objective.of_contact and planner.problem.failure_cost != 0.0
     strata = risk.strata() if priced else None
     return planner.with_risk(risk.mean, risk.draw(_N_RISKS), strata)

@@ -44,10 +44,12 @@ class FolderLock:
         self._why_released = ""
         self._process = os.getpid()
         self._folder = _identity(self.path)
+
         older = _OPEN.get(self._folder)
         if older is not None and take_over:
             with older.turn:  # waits for the end of an operation in another thread
                 older.release("it was opened again by a newer campaign of this process")
+
         self._lock = self._acquire()
         self._file = None if self._lock is None else _identity(self.path / LOCK)
         _OPEN[self._folder] = self
@@ -71,8 +73,10 @@ class FolderLock:
             if code not in _NO_LOCKS:
                 reason = getattr(error, "strerror", None) or error
                 raise TrustboError(f"cannot write in {str(self.path)!r}: {reason}.") from None
+
         if lock.is_locked and not isinstance(lock, SoftFileLock):
             return lock
+
         lock.release(force=True)
         warn(
             f"the file system of {str(self.path)!r} has no locks. Make sure that no other process "
@@ -93,17 +97,20 @@ class FolderLock:
                 f"the campaign in {where} was closed: {self._why_released}. Continue it with "
                 "Campaign.load."
             )
+
         if os.getpid() != self._process:
             raise TrustboError(
                 f"the campaign in {where} belongs to the process that opened it, and this process "
                 "is a copy (fork) of it; only the first one can record missions."
             )
+
         if _identity(self.path) != self._folder:
             raise TrustboError(
                 f"the folder {where} was moved, deleted or replaced while the campaign was open, "
                 "so nothing was recorded. Move it back, or write the campaign to another folder "
                 "with Campaign.save."
             )
+
         if self._lock is not None and _identity(self.path / LOCK) != self._file:
             self._lock.release(force=True)
             self._lock = self._acquire()  # refused if another process has opened the folder
@@ -117,6 +124,7 @@ class FolderLock:
         self._why_released = reason
         if self._lock is not None and os.getpid() == self._process:
             self._lock.release(force=True)
+
         if _OPEN.get(self._folder) is self:
             del _OPEN[self._folder]
 

@@ -42,7 +42,8 @@ def iterate(
             continues from it.
         overwrite: Whether to replace an existing campaign in that folder.
         progress: Whether to show a progress bar.
-        **options: Further arguments of `Campaign`, such as `model`, `policy` or `fit`.
+        **options: Further arguments of `Campaign`: `model`, `policy`, `objective`, `sampler`,
+            `seed`, `initial`, `hazard`, `planner` and `fit`.
 
     Returns:
         Campaign after the last mission, whose properties are the results; a `directory` is closed.
@@ -94,22 +95,27 @@ def resume(
             policy or simulator differs from the original, or a file is missing or damaged.
     """
     with Campaign.load(directory, model=model, policy=policy) as campaign:
-        state, before = campaign.state, campaign.state.simulation
+        state = campaign.state
+        before = state.simulation
         if state.entries and not before and simulator is None:
             raise TrustboError(
                 f"{str(directory)!r} was not simulated; use Campaign.load, or give simulator=."
             )
+
         ended = state.stop_reason not in ("interrupted", "n_iterations")
         if ended and stop is None and (n_iterations or 0) <= len(state.entries):
             return campaign
+
         total = before.get("n_iterations", 8) if n_iterations is None else n_iterations
         steps = campaign.run(simulator, total, stop=stop, progress=progress)
+
         for name, value in state.simulation.items():
             if name != "n_iterations" and repr(before.get(name, value)) != repr(value):
                 raise TrustboError(
                     f"simulator: the campaign was run with {name} = {before[name]!r}, not "
                     f"{value!r}; give the same simulator."
                 )
+
         for _ in steps:
             pass
     return campaign

@@ -58,28 +58,30 @@ def read_campaign(
     folder = require_campaign(directory)
     if is_being_replaced(folder):
         lock_campaign(folder).release()  # refused while another process replaces it
+
     path = folder / RECORD
     record = record_from_bytes(read_file(path), path)
     with interpreting(path):
         files = {str(name): str(sha256) for name, sha256 in record["files"].items()}
         rows = [dict(row) for row in record["rows"]]
         names = [None if name is None else str(name) for name in record["posteriors"]]
-        stored = {
-            name: Posterior(
-                name, file=StoredFile(folder / posterior_file(name), files[posterior_file(name)])
-            )
-            for name in names
-            if name is not None
-        }
+        stored = {}
+        for name in names:
+            if name is not None:
+                file = posterior_file(name)
+                stored[name] = Posterior(name, file=StoredFile(folder / file, files[file]))
+
     tree = read_tree(folder / WORKSPACE, files.get(WORKSPACE, ""))
     with interpreting(folder / WORKSPACE):
         workspace = workspace_from_tree(tree)
     with interpreting(path):
         state = state_from_record(record, workspace)
+
     entries = _read_entries(folder, workspace, files, len(rows))
     for entry, row, name in zip(entries, rows, names, strict=False):
         entry.row = row
         entry.posterior = None if name is None else stored[name]
+
     state.entries = entries[: len(rows)]
     return state, workspace, entries[len(rows) :], files
 
@@ -91,7 +93,7 @@ def _read_entries(
 
     Raises TrustboError if one is missing.
     """
-    there = sorted((folder / MISSIONS).glob("[0-9]" * 4 + ".nc"))
+    there = sorted((folder / MISSIONS).glob("[0-9][0-9][0-9][0-9].nc"))
     n_last = int(there[-1].stem) if there else 0
     entries = []
     for n in range(1, max(n_rows, n_last) + 1):
@@ -102,6 +104,7 @@ def _read_entries(
                 f"{str(file)!r} is missing, although {there[-1].name} exists. Restore it, or move "
                 "the later missions to another folder."
             )
+
         tree = read_tree(file, files.get(name, ""))
         with interpreting(file):
             [measured] = missions_from_tree(tree)
@@ -109,6 +112,7 @@ def _read_entries(
             plan = plan_from_record(json.loads(planned.attrs["plan"]), workspace)
             row = json.loads(planned.attrs["row"])
             learned = as_learned(measured, workspace)
+
         entries.append(Entry(plan, measured, learned, planned["trust_map"], row))
     return entries
 

@@ -16,7 +16,9 @@ from trustbo.workspace import Workspace
 RECORD = "campaign.json"
 WORKSPACE = "workspace.nc"
 MISSIONS = "missions"
+"""Folder of the missions in the folder of a campaign."""
 POSTERIORS = "posteriors"
+"""Folder of the posteriors in the folder of a campaign."""
 
 
 def mission_file(n: int) -> str:
@@ -48,6 +50,7 @@ def record_to_bytes(state: State, files: Mapping[str, str]) -> bytes:
         "stop_reason": state.stop_reason,
         "files": files,
     }
+
     plain = json.loads(to_json(record))
     return to_json(plain | {"checksum": _checksum(plain)}).encode()
 
@@ -62,11 +65,13 @@ def record_from_bytes(content: bytes, path: FilePath) -> dict[str, Any]:
         record = dict(json.loads(content))
         versions = record.get("versions")
         written = versions.get("trustbo") if isinstance(versions, dict) else None
+
     if not isinstance(written, str) or _series(written) != _series(VERSIONS["trustbo"]):
         raise TrustboError(
             f"{str(path)!r} was written by trustbo {written or 'of an unknown version'}; this is "
             f"trustbo {VERSIONS['trustbo']}, which cannot read it. Use the version that wrote it."
         )
+
     checksum = record.pop("checksum", None)
     if checksum != _checksum(record):
         raise TrustboError(f"{str(path)!r} is damaged or was edited; restore it from a copy.")
@@ -79,6 +84,7 @@ def state_from_record(record: dict[str, Any], workspace: Workspace) -> State:
     for after, reason, path, where in record["failures"]:
         cells = tuple((row, col) for row, col in path)
         failures.append(Failure(after, reason, cells, None if where is None else tuple(where)))
+
     asked = record["asked"]
     return State(
         settings=record["settings"],

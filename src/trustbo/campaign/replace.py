@@ -49,16 +49,19 @@ def recorded_files(folder: Path) -> list[str]:
     with interpreting(folder / RECORD):
         names = [str(name) for name in record["files"]]
         n_missions = len(record["rows"])
-    while (folder / (name := mission_file(n_missions + 1))).exists():
-        names.append(name)
+
+    while (folder / mission_file(n_missions + 1)).exists():
         n_missions += 1
+        names.append(mission_file(n_missions))
     names.append(RECORD)
+
     for name in names:
         parts = Path(name).parts
         if Path(name).is_absolute() or ".." in parts:
             raise TrustboError(f"{str(folder / RECORD)!r} lists {name!r}, which is outside of it.")
         for k in range(1, len(parts) + 1):
-            if (link := folder.joinpath(*parts[:k])).is_symlink():
+            link = folder.joinpath(*parts[:k])
+            if link.is_symlink():
                 raise TrustboError(
                     f"{str(link)!r} is a link, and the campaign is not replaced through it; give "
                     "another folder."
@@ -103,6 +106,7 @@ def finish_replacement(folder: Path) -> None:
     if not is_being_replaced(folder):
         return
     beside = folder / _NEXT
+
     try:
         listed = beside / _TO_DELETE
         if listed.exists():
@@ -110,6 +114,7 @@ def finish_replacement(folder: Path) -> None:
                 (folder / name).unlink(missing_ok=True)
             listed.unlink()
             sync_folder(beside)
+
         for name in json.loads(read_file(beside / _TO_MOVE)):
             if (beside / name).exists():
                 (folder / name).parent.mkdir(exist_ok=True)
@@ -121,6 +126,7 @@ def finish_replacement(folder: Path) -> None:
             f"the campaign in {str(folder)!r} could not be replaced completely: {error.strerror}. "
             "Repeat the call when this is mended."
         ) from error
+
     remove_tree(beside)
 
 
@@ -129,6 +135,7 @@ def recover(folder: Path) -> None:
     finish_replacement(folder)
     for path in (*folder.glob(f"{_NEW}*"), folder / _NEXT):
         remove_tree(path)
+
     for place in (folder, folder / MISSIONS, folder / POSTERIORS):
         for path in place.glob(f"{TEMPORARY}*"):
             path.unlink(missing_ok=True)

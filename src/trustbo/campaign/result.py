@@ -14,6 +14,7 @@ from trustbo.campaign.folder import FolderStorage, without_lost_posteriors
 from trustbo.campaign.learning import informed_planner, learn_hazard
 from trustbo.campaign.read import read_campaign
 from trustbo.campaign.record import RECORD
+from trustbo.campaign.settings import to_planner
 from trustbo.campaign.state import State
 from trustbo.data import NOWHERE, Cell, Mission
 from trustbo.display import Rows, Summary
@@ -32,6 +33,20 @@ from trustbo.workspace import Workspace
 
 if TYPE_CHECKING:
     from trustbo.plots.explore import Explorer
+
+_FIRST_COLUMNS = (
+    "mission",
+    "status",
+    "state",
+    "reason",
+    "where",
+    "contact_rate",
+    "objective",
+    "n_bounds",
+    "path_changed",
+    "path",
+)
+"""First columns of the table of missions."""
 
 
 class Result(Summary):
@@ -62,7 +77,9 @@ class Result(Summary):
         self._turn = threading.RLock()
 
     def _rows(self) -> Rows:
-        settings, state = self.state.settings, self.state
+        state = self.state
+        settings = state.settings
+
         counts = self.table()["state"].value_counts()
         shown = [f"{number} {name}" for name, number in counts.items()]
         rows = [
@@ -71,6 +88,7 @@ class Result(Summary):
             ("model", settings["model"]),
             ("policy", f"{settings['policy']}, objective {settings['objective']}"),
         ]
+
         if state.last is not None:
             best = f"{len(self.path) - 1} bounds, value {self.plan.value:.3g}"
             rows += [("recommended", best), ("last mission", in_a_line(state.entries[-1].row))]
@@ -79,7 +97,8 @@ class Result(Summary):
     @property
     def settings(self) -> dict[str, Any]:
         """Settings of the campaign, its model and its simulator."""
-        state, version = self.state, {"trustbo_version": VERSIONS["trustbo"]}
+        state = self.state
+        version = {"trustbo_version": VERSIONS["trustbo"]}
         return {**state.simulation, **state.settings, **version}
 
     @property
@@ -107,14 +126,17 @@ class Result(Summary):
         Raises:
             TrustboError: Nothing could be learned yet.
         """
-        if (stored := self.state.posterior) is None:
+        stored = self.state.posterior
+        if stored is None:
             raise TrustboError(
                 f"there is no posterior: none of the {len(self.missions)} recorded missions can be "
                 "used for learning yet; table() lists the reasons."
             )
+
         indices = np.atleast_1d(stored.attrs["missions"]).astype(int).tolist()
         # The group `log_prior` requires the model if its priors are not the defaults.
         whole = complete(stored, [self.missions[j] for j in indices], model=self.model)
+
         for group in whole.children.values():
             if "mission" in group.dims:
                 group.dataset = group.to_dataset().assign_coords(mission=indices)
@@ -124,18 +146,23 @@ class Result(Summary):
     @computed
     def belief(self) -> Params:
         """Parameter draws of the last posterior, or of the prior before anything was learned."""
-        if (posterior := self.state.posterior) is not None:
+        posterior = self.state.posterior
+        if posterior is not None:
             return params_of(posterior)
         if self.state.settings["initial"] == "prior_draw":
             return self.draw_prior(1)
-        features, n_robots = self.workspace.features, self.workspace.team.n_robots
+
+        features = self.workspace.features
+        n_robots = self.workspace.team.n_robots
         model = self.model.for_features(features)
         return prior_mean(model, len(features), n_robots=n_robots).flat()
 
     def draw_prior(self, n_draws: int) -> Params:
         """Draw parameters from the prior, with a leading axis (draw,)."""
-        features, n_robots = self.workspace.features, self.workspace.team.n_robots
-        seed, model = State(self.state.settings).seed_of("prior"), self.model.for_features(features)
+        features = self.workspace.features
+        n_robots = self.workspace.team.n_robots
+        seed = State(self.state.settings).seed_of("prior")
+        model = self.model.for_features(features)
         return sample_prior(model, len(features), n_draws, seed, n_robots=n_robots).flat()
 
     @computed
@@ -189,12 +216,15 @@ class Result(Summary):
         `trust_map` used for planning, and the numbers and texts of `table`. Raises TrustboError if
         there is no mission yet.
         """
-        if not (entries := self.state.entries):
+        entries = self.state.entries
+        if not entries:
             raise TrustboError("the campaign has no mission yet; call tell or run first.")
+
         paths = [entry.plan.path for entry in entries]
         steps = np.stack([*zip_longest(*paths, fillvalue=NOWHERE)], axis=1)
         numbers = pd.RangeIndex(1, len(paths) + 1, name="iteration")
         table = pd.DataFrame([entry.row for entry in entries], numbers)
+
         history = table.drop(columns=["where", "n_bounds", "path"]).to_xarray()
         history["path"] = ("iteration", "step", "axis"), steps
         history["trust_map"] = xr.concat([entry.trust_map for entry in entries], numbers)
@@ -213,15 +243,23 @@ class Result(Summary):
         rows = [entry.row | {"mission": n} for n, entry in enumerate(self.state.entries, start=1)]
         for i, failure in enumerate(self.state.failures):  # after the mission that precedes it
             rows.insert(failure.after + i, failure.row())
-        head = "mission status state reason where contact_rate objective n_bounds path_changed path"
-        columns = dict.fromkeys([*head.split(), *chain(*rows)])
+
+        columns = dict.fromkeys([*_FIRST_COLUMNS, *chain(*rows)])
         table = pd.DataFrame(rows, columns=list(columns))
         return table.astype({"mission": "Int64"}).set_index("mission")
 
     def maps(self, *, n_draws: int = 250) -> xr.Dataset:
         """Compute maps of the cells after the last mission; see `planning.Planner.maps`.
 
-        Raises TrustboError if nothing could be learned yet.
+        Args:
+            n_draws: Number of posterior draws.
+
+        Returns:
+            Dataset with the dims (y, x), whose coordinates are the centres of the cells in CRS
+            metres; `isel(y=row, x=col)` selects a cell, and the accessor `.rio` writes rasters.
+
+        Raises:
+            TrustboError: Nothing could be learned yet.
         """
         return self.planner.maps(self.posterior, n_draws=n_draws)
 
@@ -241,13 +279,19 @@ class Result(Summary):
         history = self.history
         if truth is not None:
             require_kind("truth", truth, Truth, "give simulation.Truth.of(simulator)")
-            longest, paths = self.planner.max_bounds, [e.plan.path for e in self.state.entries]
+
+            longest = self.planner.max_bounds
+            paths = [entry.plan.path for entry in self.state.entries]
             regret = [truth.at(n).regret(path, longest) for n, path in enumerate(paths)]
             history = history.assign(regret=("iteration", regret))
         return campaign_history(history, **options)
 
     def explore(self) -> "Explorer":
-        """Make an interactive map of the layers and missions for notebooks; see `plots.explore`."""
+        """Make an interactive map of the layers and missions for notebooks; see `plots.explore`.
+
+        Raises:
+            TrustboError: Nothing could be learned yet.
+        """
         from trustbo import plots
 
         return plots.explore(self.plan, self.maps(), self.history)
@@ -257,6 +301,10 @@ class Result(Summary):
 
         An existing campaign in that folder is replaced only with `overwrite`, when the new one is
         complete on disk. Other files in the folder are not changed.
+
+        Args:
+            directory: Folder to write to.
+            overwrite: Whether to replace an existing campaign in that folder.
 
         Raises:
             TrustboError: The folder already contains a campaign and `overwrite` is False, another
@@ -269,7 +317,12 @@ class Result(Summary):
 
 
 def load_result(directory: FilePath) -> Result:
-    """Read the result of a campaign, which may still be running, from its folder (not locked).
+    """Read the result of a campaign from its folder, without locking the folder.
+
+    The campaign may still be running in another process.
+
+    Args:
+        directory: Folder of a campaign, or a folder written by `Result.save`.
 
     Raises:
         TrustboError: The folder contains no campaign, the campaign has no mission yet, or a file is
@@ -279,8 +332,10 @@ def load_result(directory: FilePath) -> Result:
     for entry in pending:  # recorded, but not learned yet
         entry.posterior = state.last
         state.entries.append(entry)
+
     if not state.entries:
         raise TrustboError(f"the campaign in {str(directory)!r} has no mission; run one first.")
+
     with interpreting(to_path(directory) / RECORD):
         given = state.settings
         try:
@@ -289,10 +344,8 @@ def load_result(directory: FilePath) -> Result:
             if state.last is None:
                 raise
             model = None
-        base = Planner(
-            workspace, given["start"], given["goal"], given["objective"],
-            family=given["observation"], **given["planner"],
-        )  # fmt: skip
+        base = to_planner(given, workspace)
+
     return Result(workspace, state, model, base)
 
 

@@ -11,8 +11,14 @@ from trustbo.data import Cell, Mission, path_text
 from trustbo.logs.netcdf import read_tree
 from trustbo.planning import Plan
 
-TOLD, LEARNED, EXCLUDED, GIVEN_UP = "told", "learned", "excluded", "given up"
-"""States of a mission: recorded, used for learning, excluded, or given up without data."""
+TOLD = "told"
+"""State of a mission that is recorded, but not used for learning yet."""
+LEARNED = "learned"
+"""State of a mission that is used for learning."""
+EXCLUDED = "excluded"
+"""State of a mission that is not used for learning."""
+GIVEN_UP = "given up"
+"""State of a mission without data."""
 _STREAMS = ("policy", "fit", "mission", "prior", "awareness", "hazard", "exclude")
 """Random streams; the seeds depend on their order, so add new names at the end."""
 
@@ -150,21 +156,27 @@ class State:
         entropy = [self.settings["seed"], _STREAMS.index(stream), n]
         if stream == "exclude":  # several fits may follow one mission
             entropy.append(len(self.indices(EXCLUDED)))
-        if n_failures := sum(failure.after == n for failure in self.failures):
+
+        n_failures = sum(failure.after == n for failure in self.failures)
+        if n_failures:
             entropy.append(n_failures)  # after `fail`, a random policy may choose another path
         return int(np.random.SeedSequence(entropy).generate_state(1)[0])
 
     def row_of(self, plan: Plan, mission: Mission) -> dict[str, Any]:
         """Return the row of a new mission for `Result.table`."""
         before = self.entries[-1].plan if self.entries else plan
-        planned = plan.path if mission.path[-1] != plan.path[-1] else ()
-        longest, rates = max(len(mission.path), len(planned)) - 1, mission.contact_rate
+
+        n_planned = len(mission.path) - 1
+        if mission.path[-1] != plan.path[-1]:  # the goal was not in the path any more
+            n_planned = max(n_planned, len(plan.path) - 1)
+        rates = mission.contact_rate
         contact = float(np.nanmean(rates)) if np.isfinite(rates).any() else np.nan
+
         return {
             "objective": plan.value,
             "path_changed": plan.path != before.path,
             "contact_rate": contact,
-            "contact_lost": longest - len(mission.bounds) * contact,
+            "contact_lost": n_planned - len(mission.bounds) * contact,
             "status": mission.status,
             "state": TOLD,
             "reason": "",

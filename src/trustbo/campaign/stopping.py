@@ -17,13 +17,18 @@ if TYPE_CHECKING:
 Stop = Callable[["Campaign"], str | bool | None]
 """Function called between missions; returning a reason (or True) ends the campaign."""
 
+_N_DRAWS = 500
+"""Posterior draws under each of which the best path is planned."""
+_N_SURE = 2
+"""Successive missions after which the probability must be large enough."""
+
 
 @dataclass(frozen=True)
 class RegretBound:
     """Stop when the recommended path is nearly optimal, with high probability.
 
-    The best path is planned exactly under each of 500 posterior draws. For lost_contact, the
-    regret of the recommended path is the additional contact that it loses, as a fraction of the
+    The best path is planned exactly under each of a few hundred posterior draws. For lost_contact,
+    the regret of the recommended path is the additional contact that it loses, as a fraction of the
     contact kept on the best path. For other objectives, regret is a fraction of the best path's
     value. From the third mission on, the campaign stops if P(regret <= eps) >= 1 - delta after each
     of the last two missions, and every bound of the recommended path has been completed at least
@@ -46,25 +51,33 @@ class RegretBound:
 
     def __call__(self, campaign: "Campaign") -> str | None:
         """Return the reason to stop, or None."""
-        if (n := len(campaign.state.entries)) <= 2:
+        n = len(campaign.state.entries)
+        if n <= _N_SURE:
             return None
-        sure = self.probability(campaign, n)
-        if min(sure, self.probability(campaign, n - 1)) < 1.0 - self.delta:
+
+        sure = [self.probability(campaign, n - k) for k in range(_N_SURE)]
+        if min(sure) < 1.0 - self.delta:
             return None
-        risk, bounds = campaign.risk, tuple(bounds_along(np.array(campaign.recommend().path)).T)
-        if not (risk.exposures[bounds] > risk.failures[bounds]).all():  # a bound is new
+
+        risk = campaign.risk
+        bounds = tuple(bounds_along(np.array(campaign.recommend().path)).T)
+        was_completed = risk.exposures[bounds] > risk.failures[bounds]
+        if not was_completed.all():
             return None
-        return f"regret_bound: P(regret <= {self.eps:g}) = {sure:.3f} >= {1.0 - self.delta:g}"
+        return f"regret_bound: P(regret <= {self.eps:g}) = {sure[0]:.3f} >= {1.0 - self.delta:g}"
 
     def probability(self, campaign: "Campaign", n_missions: int) -> float:
         """Compute P(regret of the recommended path <= eps) after the first `n_missions`."""
         posterior = campaign.state.entries[n_missions - 1].posterior
         if posterior is None:
             return 0.0
-        planner, draws = campaign.planner, params_of(posterior())
+
+        planner = campaign.planner
+        draws = params_of(posterior())
         try:
             path = planner.plan(draws.mean()).path
-            drawn = planner.plan_draws(draws, n_draws=500)
+            drawn = planner.plan_draws(draws, n_draws=_N_DRAWS)
         except InfeasibleError:  # no path satisfies `max_failure`
             return 0.0
+
         return float(np.mean(drawn.relative_regret(path) <= self.eps))

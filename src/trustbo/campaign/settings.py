@@ -1,0 +1,128 @@
+"""Settings of a campaign: its arguments, checked, and in the form in which they are stored."""
+
+import inspect
+import json
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
+
+from trustbo.errors import TrustboError, require_kind, require_whole
+from trustbo.files import to_json, to_plain
+from trustbo.hazard import Hazard
+from trustbo.inference.fit import fit
+from trustbo.models import HumanTrust, default_model
+from trustbo.models.model import TrustModel
+from trustbo.models.record import model_to_record
+from trustbo.planning import Planner
+from trustbo.planning.policies import Policy
+from trustbo.workspace import Workspace
+
+_UNCHANGED = ("objective", "sampler", "seed", "initial", "planner", "fit")
+"""Arguments of `Campaign` that are stored unchanged."""
+_FIT = inspect.signature(fit)
+
+
+def require_options(what: str, options: Any) -> dict[str, Any]:
+    """Return options as a new dict; raises TrustboError if they are not a mapping or None."""
+    if options is None:
+        return {}
+    return dict(require_kind(what, options, Mapping, "give a dict of options"))
+
+
+def require_options_of_fit(options: Mapping[str, Any]) -> None:
+    """Raise TypeError for options that `fit` does not have, or that the campaign sets itself."""
+    own = {"model": None, "sampler": None, "workspace": None, "seed": 0}
+    _FIT.bind([], **own, progress=True, whole=False, **options)
+
+
+def require_model(model: Any) -> TrustModel:
+    """Return the model of a campaign, by default the default one.
+
+    Raises:
+        TrustboError: It is not a trust model, or a model without paths.
+    """
+    if model is None:
+        return default_model()
+    require_kind("model", model, TrustModel, "give a trust model, such as PooledTrust()")
+    if isinstance(model, HumanTrust):
+        raise TrustboError("model: HumanTrust cannot plan paths; give PooledTrust() instead.")
+    return model
+
+
+def to_settings(
+    base: Planner,
+    model: TrustModel,
+    policy: str | Policy,
+    *,
+    objective: str,
+    sampler: str,
+    seed: int,
+    initial: str,
+    hazard: Hazard,
+    planner: dict[str, Any],
+    fit: dict[str, Any],
+) -> dict[str, Any]:
+    """Return the settings of a campaign as if they were read from a file.
+
+    Args:
+        base: Planner before any learning.
+        model: Trust model.
+        policy: Argument of `Campaign`, like all others.
+        objective: Objective of the paths.
+        sampler: Sampler of the posterior.
+        seed: Seed of all random numbers.
+        initial: Parameters for the first plan.
+        hazard: Priors of the failure probabilities.
+        planner: Further options of the planner.
+        fit: Further options of `fit`.
+
+    Raises:
+        TrustboError: The seed is not a whole number, or an option cannot be stored in a file.
+    """
+    if "toll" in planner:
+        planner = planner | {"toll": base.problem.toll}  # in the order of the moves, rows, columns
+
+    settings = {
+        "start": base.start,
+        "goal": base.goal,
+        "max_bounds": base.max_bounds,
+        "policy": policy if isinstance(policy, str) else f"{name_of(policy)} (custom)",
+        "objective": objective,
+        "sampler": sampler,
+        "seed": require_whole("seed", seed, 0),
+        "initial": initial,
+        "planner": to_plain("planner", planner),
+        "fit": to_plain("fit", fit),
+        "hazard": asdict(hazard),
+        "observation": model.observation,
+        "model": model.in_short(),
+        "model_record": model_to_record(model),
+    }
+    return json.loads(to_json(settings))
+
+
+def to_arguments(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the arguments of `Campaign`, except for workspace, model and policy."""
+    return {
+        "start": settings["start"],
+        "goal": settings["goal"],
+        "hazard": Hazard(**settings["hazard"]),
+        **{name: settings[name] for name in _UNCHANGED},
+    }
+
+
+def to_planner(settings: Mapping[str, Any], workspace: Workspace) -> Planner:
+    """Make the planner of a campaign before any learning."""
+    return Planner(
+        workspace,
+        settings["start"],
+        settings["goal"],
+        settings["objective"],
+        family=settings["observation"],
+        **settings["planner"],
+    )
+
+
+def name_of(function: object) -> str:
+    """Return the name of a function, or the class of a callable object."""
+    return getattr(function, "__name__", type(function).__name__)
