@@ -16,13 +16,18 @@ from numpy.typing import ArrayLike
 
 from trustbo.errors import TrustboError, one_line
 
-_NUMERIC = "biufO"  # kinds of dtypes that may hold real numbers
-_TIMES = "mM"  # kinds of dtypes of dates and times
-_NO_NUMBERS = (str, bytes, np.datetime64, np.timedelta64)  # although `float` converts them
+_NUMERIC = "biufO"
+"""Kinds of dtypes that may hold real numbers."""
+_TIMES = "mM"
+"""Kinds of dtypes of dates and times."""
+_NO_NUMBERS = (str, bytes, np.datetime64, np.timedelta64)
+"""Types that are not numbers, although `float` converts them."""
 _FIRST = {"bound": (0, 1), "row": (0,), "col": (0,)}
 """Numbers that the labels of an axis may begin with, of the axes that are numbered."""
-_LARGEST = 1e12  # of a parameter; trust near 1 added to it keeps four digits
-_CHOSEN = ("robot", "feature")  # axes whose names the user chooses, or leaves out
+_LARGEST = 1e12
+"""Largest size of a parameter; trust near 1 added to it keeps four digits."""
+_CHOSEN = ("robot", "feature")
+"""Axes whose names the user chooses, or leaves out."""
 
 Names = tuple[str, ...]
 
@@ -133,9 +138,12 @@ def require_numbers(what: str, values: ArrayLike, *, missing: bool = False) -> n
     """
     array = as_array(what, values)
     low = np.fmin.reduce(array, axis=None, initial=0.0)  # of large arrays, without a copy
+
     high = np.fmax.reduce(array, axis=None, initial=0.0)
     if max(-low, high) > _LARGEST or (not missing and np.isnan(array.sum())):
-        is_bad = (array > _LARGEST) | (array < -_LARGEST) | (np.isnan(array) & (not missing))
+        is_bad = (array > _LARGEST) | (array < -_LARGEST)
+        if not missing:
+            is_bad |= np.isnan(array)
         bad = array[is_bad].flat[0]
         raise TrustboError(
             f"{what} must be finite and at most {_LARGEST:g} in size; got {bad:g}. Trust and its "
@@ -154,6 +162,7 @@ def as_names(what: str, given: Iterable[str], n: int | None = None) -> Names:
     names = tuple(given) if listed else ()
     if not listed or not all(isinstance(name, str) for name in names):
         raise TrustboError(f"{what} must be a list of names; got {one_line(given)}.")
+
     if len(set(names)) < len(names) or (names and n not in (None, len(names))):
         many = "" if n is None else f"{n} "
         raise TrustboError(f"{what} must be {many}different names; got {names}.")
@@ -183,12 +192,14 @@ def _as_dataarray(
     if isinstance(values, xr.DataArray):
         return values
     if isinstance(values, xr.Dataset | xr.DataTree):
-        kind, first = type(values).__name__, dims[-1]
+        kind = type(values).__name__
+        first = dims[-1]
         raise TrustboError(f"{what} must be one array with the axis {first}; got a {kind}.")
     if isinstance(values, Mapping):
         values = _as_table(what, values)
     if not isinstance(values, pd.Series | pd.DataFrame):
         return None
+
     axes = _axes_of(what, values, dims, names, partial)
     coords = {}
     for dim, index in axes.items():
@@ -228,16 +239,19 @@ def _axes_of(
         raise TrustboError(
             f"{what} has labels of several levels; give a DataArray with the dims {tuple(dims)}."
         )
+
     if isinstance(table, pd.Series):
         texts = {str(label) for label in table.index}
         usual = str(table.index.name) if table.index.name in dims else dims[0]
         named = (dim for dim in dims if texts == set(names.get(dim) or ()))
         return {next(named, usual): table.index}
+
     if len(dims) < 2 or (len(dims) > 2 and not partial):
         raise TrustboError(
             f"{what} must have the axes {tuple(dims)}, but a table has two; give a DataArray with "
             "these dims."
         )
+
     first, second = dims[-2:]
     if table.index.name == second or table.columns.name == first:
         first, second = second, first
@@ -249,15 +263,16 @@ def _by_name(what: str, dim: str, labels: list[Any], names: Names) -> tuple[list
     is_text = [isinstance(label, str) for label in labels]
     is_whole = [isinstance(label, Integral) and not isinstance(label, bool) for label in labels]
     texts = [str(label) for label in labels]
+
     if len(set(texts)) == len(texts) and set(texts) == set(names):
         return [texts.index(name) for name in names], names
-    if (
-        dim in _CHOSEN
-        and all(is_whole)
-        and labels in [list(range(first, first + len(labels))) for first in (0, 1)]
-    ):
+
+    # Whole numbers in order say no more than the place.
+    counts = [list(range(first, first + len(labels))) for first in (0, 1)]
+    if dim in _CHOSEN and all(is_whole) and labels in counts:
         return list(range(len(labels))), ()
-    if not all(a or b for a, b in zip(is_text, is_whole, strict=True)):
+
+    if not all(text or whole for text, whole in zip(is_text, is_whole, strict=True)):
         raise TrustboError(f"{what} has the {dim} labels {one_line(labels)}; give names.")
     if names:
         raise TrustboError(

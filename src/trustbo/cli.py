@@ -21,13 +21,21 @@ if TYPE_CHECKING:
 POLICIES = ("greedy", "optimistic", "thompson", "ucb", "random")
 OBJECTIVES = ("lost_contact", "terminal", "mean")
 FORMATS = ("geotiff", "geojson", "csv", "nav2")
-BAD_INPUT, INTERRUPTED = 2, 130
+BAD_INPUT = 2
+"""Exit code for input that trustbo refuses."""
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as in a shell."""
 PLACE = "ROW,COL with row 0 in the north, x=...,y=... in CRS metres, or lon=...,lat=... (degrees)"
-_COLUMNS = ["status", "contact_rate", "objective", "k_hat", "r_hat", "path_changed"]  # printed
+_COLUMNS = ["status", "contact_rate", "objective", "k_hat", "r_hat", "path_changed"]
+"""Columns of the table of missions that are printed."""
 
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
-    """Run a command and exit; errors are printed as one line on standard error."""
+    """Run a command and exit; errors are printed as one line on standard error.
+
+    Args:
+        arguments: Words after `trustbo`; by default those of this process.
+    """
     args = parser().parse_args(arguments)
     warnings.showwarning = lambda message, *_, **__: print(f"warning: {message}", file=sys.stderr)
     for stream in (sys.stdout, sys.stderr):  # a terminal may not support all characters
@@ -172,7 +180,11 @@ def run(args: argparse.Namespace) -> None:
     """Run a simulated campaign on the user's terrain."""
     import trustbo as tb
 
-    features, options = (tb.paper.WORKSPACE, dict(tb.paper.CAMPAIGN)) if args.paper else ({}, {})
+    features = {}
+    options = {}
+    if args.paper:
+        features = dict(tb.paper.WORKSPACE)
+        options = dict(tb.paper.CAMPAIGN)
     given = {"policy": args.policy, "objective": args.objective}
     options |= {name: value for name, value in given.items() if value is not None}
     workspace = _workspace(args, args.start, args.goal, **features)
@@ -199,9 +211,14 @@ def _run(args: argparse.Namespace, workspace: "Workspace", **options: Any) -> No
     import trustbo as tb
 
     result = tb.iterate(
-        workspace, n_iterations=args.missions, directory=args.out, overwrite=args.overwrite,
-        seed=args.seed, progress=not args.quiet, **options,
-    )  # fmt: skip
+        workspace,
+        n_iterations=args.missions,
+        directory=args.out,
+        overwrite=args.overwrite,
+        seed=args.seed,
+        progress=not args.quiet,
+        **options,
+    )
     _finish(result, args.out, args.quiet)
 
 

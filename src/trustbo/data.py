@@ -22,6 +22,8 @@ FEATURES = ("traversability", "visibility")
 """Names of the first two features, z1 and z2 of the paper."""
 SHARE_TOLERANCE = 1e-6
 """Largest difference of a contact rate from a multiple of 1 / n_ticks."""
+_USUAL_LEVELS = 7
+"""Number of levels of the scales "likert" and "ordinal"."""
 LINE_OF_SIGHT = "line_of_sight"
 """Feature name of the predicted contact rate; `line_of_sight_1`, `_2`, ... if several."""
 
@@ -71,11 +73,14 @@ class Bound:
             given = getattr(self, name)
             values = np.full(len(self.awareness), np.nan) if given is None else given
             object.__setattr__(self, name, _unnamed(name, values))
+
         per_robot = self.awareness.shape[:1]
         for name in ("contact_rate", "duration"):
-            if (shape := getattr(self, name).shape) != per_robot:
+            shape = getattr(self, name).shape
+            if shape != per_robot:
                 raise TrustboError(f"{name} of a bound must be {per_robot}; got shape {shape}.")
         require_choice("status", self.status, STATUSES)
+
         mapped = self.cell != NOWHERE
         where = f"the bound into cell {self.cell}" if mapped else "a bound without a map"
         require_unit_interval(f"contact_rate of {where}", self.contact_rate)
@@ -83,8 +88,12 @@ class Bound:
             require_unit_interval(f"awareness of {where}", self.awareness)
         elif np.isinf(self.awareness).any():
             raise TrustboError(f"awareness of {where} must be finite, or NaN where not measured.")
-        for i in np.flatnonzero(self.duration <= 0.0):
+
+        is_bad = self.duration <= 0.0
+        if is_bad.any():
+            i = np.flatnonzero(is_bad)[0]
             raise TrustboError(f"duration[{i}] = {self.duration[i]:g} s must be positive.")
+
         require_shares(self.contact_rate, self.n_ticks)
 
     @property
@@ -124,7 +133,9 @@ class Mission(Summary):
         require_kind("path", self.path, Sequence, "give the cells in a tuple; () without a map")
         for bound in require_kind("bounds", self.bounds, Sequence, "give the bounds in a tuple"):
             require_kind("bounds", bound, Bound, "give a tuple of Bound")
-        n_run, n_planned = len(self.bounds), len(self.path) - 1
+
+        n_run = len(self.bounds)
+        n_planned = len(self.path) - 1
         if not n_run or (self.path and n_run > n_planned):
             most = f" and at most {n_planned} on its path" if self.path else ""
             raise TrustboError(
@@ -136,15 +147,19 @@ class Mission(Summary):
                 f'status "ok" means that the goal was reached, but only {n_run} of {n_planned} '
                 "bounds were run; give the status of the last one."
             )
+
         _require_counted(self.path)
         for k, bound in enumerate(self.bounds, start=1):
-            if bound.cell != (expected := self.path[k] if self.path else NOWHERE):
+            expected = self.path[k] if self.path else NOWHERE
+            if bound.cell != expected:
                 there = "there is no path" if expected == NOWHERE else f"the path has {expected}"
                 raise TrustboError(f"bound {k} enters {bound.cell}, but {there}.")
+
         shapes = {bound.awareness.shape for bound in self.bounds}
         if len(shapes) > 1:
             raise TrustboError(f"bounds disagree on (robot, feature): {sorted(shapes)}.")
         n_robots, n_features = shapes.pop()
+
         usual_names = {
             "features": default_features(n_features),
             "robots": default_robots(n_robots),
@@ -154,14 +169,17 @@ class Mission(Summary):
             if len(labels) != len(usual):
                 raise TrustboError(f"{name} must be {len(usual)} names; got {labels}.")
             object.__setattr__(self, name, labels)
+
         if not isinstance(self.scale, str) or self.scale:
             levels_of(self.scale)
 
     def _rows(self) -> Rows:
-        rates, took = self.contact_rate, self.bounds[-1].t1
+        rates = self.contact_rate
+        took = self.bounds[-1].t1
         planned = f"{path_text(self.path[:1])} to {path_text(self.path[-1:])}"
         measured = "trust reported" if self.scale else "contact rate"
         by_robot = zip(self.robots, pd.DataFrame(rates).mean(), strict=True)
+
         return [
             ("path", planned if self.path else "none: no map"),
             ("outcome", f"{self.status}, {len(self.bounds)} bounds run"),
@@ -220,20 +238,34 @@ class Mission(Summary):
                 "awareness must be (bound, robot, feature) and contact_rate (bound, robot); "
                 f"got {z.shape} and {y.shape}."
             )
+
         known = names["robot"] or default_robots(y.shape[1])
         seconds = _per_robot("duration", duration, known, y.shape)
         ticks = _per_robot("n_ticks", n_ticks, known, y.shape)
+
         cells = () if path is None else require_cells("path", path)
         if path is not None and len(cells) <= len(y):
             raise TrustboError(
                 f"{len(y)} bounds need a path of at least {len(y) + 1} cells; got {len(cells)}. "
                 "Give None for a log without a map."
             )
+
         ends = np.cumsum(np.nan_to_num(seconds).max(axis=1)).tolist()
-        entered, statuses = cells[1:] or (NOWHERE,) * len(y), ["ok"] * (len(y) - 1) + [status]
-        measured = zip(entered, z, y, seconds, statuses, [0.0, *ends], ticks, strict=False)
-        bounds = tuple(Bound(*values, n_ticks=n) for *values, n in measured)
-        return cls(cells, bounds, status, names["feature"], names["robot"])
+        starts = [0.0, *ends]
+        bounds = []
+        for k in range(len(y)):
+            bound = Bound(
+                cells[k + 1] if cells else NOWHERE,
+                awareness=z[k],
+                contact_rate=y[k],
+                duration=seconds[k],
+                status=status if k == len(y) - 1 else "ok",
+                t0=starts[k],
+                n_ticks=ticks[k],
+            )
+            bounds.append(bound)
+
+        return cls(cells, tuple(bounds), status, names["feature"], names["robot"])
 
     def with_awareness(self, awareness: np.ndarray) -> Self:
         """Return the mission with another awareness, shape (bound, robot, feature)."""
@@ -247,12 +279,18 @@ class Mission(Summary):
     ) -> Self:
         """Return the mission with its robots and features in the order of these names.
 
-        Features in `unmeasured` may be missing from the mission; their values are then NaN. Raises
-        TrustboError if the mission has other robots or features.
+        Args:
+            robots: Names of the robots.
+            features: Names of the features.
+            unmeasured: Features that may be missing from the mission; their values are then NaN.
+
+        Raises:
+            TrustboError: The mission has other robots or features.
         """
         names = {"robots": tuple(robots), "features": tuple(features)}
         if names == {"robots": self.robots, "features": self.features}:
             return self
+
         lacks = [name for name in features if name in unmeasured and name not in self.features]
         own = {"robots": self.robots, "features": (*self.features, *lacks)}
         for what, wanted in names.items():
@@ -261,16 +299,21 @@ class Mission(Summary):
                     f"the mission has {what} {getattr(self, what)}, not {wanted}; rename them, or "
                     "use a workspace with these names."
                 )
-        i, m = ([own[what].index(name) for name in wanted] for what, wanted in names.items())
+        i = [own["robots"].index(name) for name in robots]
+        m = [own["features"].index(name) for name in features]
+
         bounds = []
-        for b in self.bounds:
-            z = np.pad(b.awareness, ((0, 0), (0, len(lacks))), constant_values=np.nan)
-            per_robot = {n: getattr(b, n)[i] for n in ("contact_rate", "duration", "n_ticks")}
-            if b.contact is not None:
-                per_robot["contact"] = b.contact[:, i]
-            if b.poses is not None:
-                per_robot["poses"] = b.poses[:, [0, *(1 + j for j in i)]]
-            bounds.append(replace(b, awareness=z[np.ix_(i, m)], **per_robot))
+        for bound in self.bounds:
+            z = np.pad(bound.awareness, ((0, 0), (0, len(lacks))), constant_values=np.nan)
+            changes = {"awareness": z[np.ix_(i, m)]}
+            for name in ("contact_rate", "duration", "n_ticks"):
+                changes[name] = getattr(bound, name)[i]
+            if bound.contact is not None:
+                changes["contact"] = bound.contact[:, i]
+            if bound.poses is not None:
+                changes["poses"] = bound.poses[:, [0, *(1 + j for j in i)]]  # the lead is first
+            bounds.append(replace(bound, **changes))
+
         return replace(self, bounds=tuple(bounds), **names)
 
     def has_same_data(self, other: "Mission") -> bool:
@@ -318,13 +361,18 @@ def levels_of(scale: object) -> int:
 
     Raises TrustboError unless it is "unit", or "likertN" or "ordinalN" with N of at least 2.
     """
-    found = re.fullmatch(r"(likert|ordinal)(\d*)", scale) if isinstance(scale, str) else None
-    if found is None and not (isinstance(scale, str) and scale == "unit"):
+    text = scale if isinstance(scale, str) else ""
+    if text == "unit":
+        return 0
+
+    found = re.fullmatch(r"(likert|ordinal)(\d*)", text)
+    if found is None:
         raise TrustboError(
             'scale must be "unit", "likertN" or "ordinalN", where N is the number of levels; got '
             f"{scale!r}."
         )
-    return 0 if found is None else require_whole("levels of a scale", int(found[2] or 7), 2)
+    n_levels = int(found[2] or _USUAL_LEVELS)
+    return require_whole("levels of a scale", n_levels, 2)
 
 
 def require_map(what: str, missions: Iterable[Mission]) -> None:
@@ -356,10 +404,15 @@ def require_shares(rate: np.ndarray, ticks: np.ndarray) -> None:
     """Reject ticks that are not whole and rates that are not multiples of 1 / ticks."""
     if ticks.shape != rate.shape:
         raise TrustboError(f"n_ticks of a bound must be {rate.shape}; got shape {ticks.shape}.")
-    for i in np.flatnonzero((ticks < 1.0) | (ticks != np.round(ticks)) & ~np.isnan(ticks)):
+
+    is_bad = (ticks < 1.0) | (ticks != np.round(ticks)) & ~np.isnan(ticks)
+    if is_bad.any():
+        i = np.flatnonzero(is_bad)[0]
         raise TrustboError(f"n_ticks[{i}] = {ticks[i]:g} must be a whole number of ticks.")
+
     off = np.abs(rate * ticks - np.round(rate * ticks)) > SHARE_TOLERANCE * ticks
-    for i in np.flatnonzero(off):
+    if off.any():
+        i = np.flatnonzero(off)[0]
         raise TrustboError(
             f"contact_rate[{i}] = {rate[i]:g} is not a multiple of 1 / {ticks[i]:g} (n_ticks); "
             "give all decimals, or leave n_ticks out."
@@ -406,7 +459,8 @@ def _per_robot(what: str, given: Any, robots: Sequence[str], shape: tuple[int, .
     """Read one number, or values (bound,) or (bound, robot), as an array (bound, robot)."""
     if given is None:
         return np.full(shape, np.nan)
-    dims, coords = ("bound", "robot"), {"robot": robots}
+    dims = ("bound", "robot")
+    coords = {"robot": robots}
     values = read_labelled(what, given, dims, coords, partial=True).values
     try:
         return np.broadcast_to(values[:, None] if values.ndim == 1 else values, shape)

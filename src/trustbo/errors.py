@@ -24,7 +24,8 @@ class PosteriorError(TrustboError):
 
     def __init__(self, reason: str, posterior: object = None, remedy: str = "") -> None:
         super().__init__(f"{reason} {remedy}".rstrip())
-        self.posterior, self.reason = posterior, reason.rstrip(".")
+        self.posterior = posterior
+        self.reason = reason.rstrip(".")
 
 
 def warn(message: str) -> None:
@@ -43,6 +44,9 @@ def require_choice(what: str, value: object, choices: Iterable[str]) -> str:
 MANY = 10**7
 """Largest number of draws, missions, robots or other things that an argument can ask for."""
 _LARGEST = 2**63 - 1
+"""Largest number that fits in an int64."""
+_SHOWN = 60
+"""Number of characters of a value that a message shows."""
 
 
 def require_whole(what: str, value: object, minimum: int, maximum: int = _LARGEST) -> int:
@@ -51,6 +55,7 @@ def require_whole(what: str, value: object, minimum: int, maximum: int = _LARGES
         number = operator.index(value)  # pyright: ignore[reportArgumentType]
     except TypeError:
         number = None
+
     if number is None or isinstance(value, bool) or number < minimum:
         raise TrustboError(
             f"{what} must be a whole number of at least {minimum}; got {one_line(value)}."
@@ -88,7 +93,8 @@ def require_share(what: str, value: Any, *, ends: bool = True) -> float:
     Without `ends`, 0 and 1 are refused, too.
     """
     number = _number(value)
-    if not (0.0 <= number <= 1.0 if ends else 0.0 < number < 1.0):
+    is_inside = 0.0 <= number <= 1.0 if ends else 0.0 < number < 1.0
+    if not is_inside:
         interval = "[0, 1]" if ends else "(0, 1)"
         raise TrustboError(f"{what} must be in {interval}; got {one_line(value)}.")
     return number
@@ -96,13 +102,11 @@ def require_share(what: str, value: Any, *, ends: bool = True) -> float:
 
 def _number(value: Any) -> float:
     """Return one real number of Python, NumPy or JAX as a float; NaN for anything else."""
+    is_text = isinstance(value, str | bytes | bytearray)  # `float` would read it
     kind = getattr(getattr(value, "dtype", None), "kind", "f")
-    if (
-        isinstance(value, str | bytes | bytearray)
-        or kind not in "biuf"
-        or getattr(value, "ndim", 0)
-    ):
+    if is_text or kind not in "biuf" or getattr(value, "ndim", 0):
         return math.nan
+
     try:
         return float(value)
     except (TypeError, ValueError, OverflowError):
@@ -115,6 +119,7 @@ def require_position(what: str, value: Any) -> tuple[float, float]:
         x, y = value
     except (TypeError, ValueError):
         raise TrustboError(f"{what} must be two numbers, x and y; got {one_line(value)}.") from None
+
     return require_finite(f"x of {what}", x), require_finite(f"y of {what}", y)
 
 
@@ -127,7 +132,8 @@ def require_kind(what: str, value: Any, kind: Any, remedy: str) -> Any:
 
 def one_line(value: object) -> str:
     """Format a value for a one-line message: the first 60 characters of its repr."""
-    return f"{' '.join(repr(value).split()):.60}"
+    words = " ".join(repr(value).split())
+    return words[:_SHOWN]
 
 
 def require_list(what: str, value: Any, kind: Any = object, remedy: str = "") -> list[Any]:
@@ -140,6 +146,7 @@ def require_list(what: str, value: Any, kind: Any = object, remedy: str = "") ->
         entries = None if isinstance(value, str | bytes | Mapping) else list(value)
     except TypeError:  # also arrays without axes
         entries = None
+
     if entries is None:
         raise TrustboError(f"{what} must be a list; got {one_line(value)}. {advice.capitalize()}.")
     return [require_kind(f"{what}[{k}]", entry, kind, advice) for k, entry in enumerate(entries)]

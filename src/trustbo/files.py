@@ -29,10 +29,12 @@ def to_path(path: FilePath) -> Path:
     Raises:
         TrustboError: The path is not a text or a path, or it is empty, or no file can have it.
     """
-    if not isinstance(path, str | PathLike) or not isinstance(text := os.fspath(path), str):
+    text = os.fspath(path) if isinstance(path, str | PathLike) else None
+    if not isinstance(text, str):
         raise TrustboError(f"a path must be a text or a pathlib.Path; got {path!r:.60}.")
     if not text or "\0" in text:
         raise TrustboError(f"{text!r:.60} is not a path; give the path of a file or folder.")
+
     try:
         os.fsencode(text)
         return Path(text).expanduser()
@@ -82,8 +84,10 @@ def _replace(target: Path, content: bytes | Callable[[Path], object]) -> None:
                 stream.write(content)
             else:
                 content(temporary)
+
         with temporary.open("rb+") as stream:
             os.fsync(stream.fileno())
+
         with suppress(OSError):
             temporary.chmod(stat.S_IMODE(target.stat().st_mode))
         os.replace(temporary, target)
@@ -91,6 +95,7 @@ def _replace(target: Path, content: bytes | Callable[[Path], object]) -> None:
         with suppress(OSError):
             temporary.unlink()
         raise
+
     # The file is in place: from here on, nothing may fail.
     sync_folder(target.parent)
 
@@ -118,10 +123,12 @@ def holding_interrupts() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
+
     usual = signal.getsignal(signal.SIGINT)
     if not callable(usual):  # ignored, or handled outside of Python
         yield
         return
+
     received: list[tuple[Any, ...]] = []
     signal.signal(signal.SIGINT, lambda *args: received.append(args))
     try:
@@ -144,6 +151,7 @@ def read_file(path: FilePath, sha256: str = "") -> bytes:
         content = given.read_bytes()
     except OSError as error:
         raise TrustboError(f"{str(given)!r} cannot be read: {error.strerror}.") from None
+
     if sha256 and hash_of(content) != sha256:
         raise TrustboError(
             f"{str(given)!r} is damaged or was replaced: its content is not the recorded one. "

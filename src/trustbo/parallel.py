@@ -13,7 +13,8 @@ import numpy as np
 from joblib import cpu_count
 from threadpoolctl import ThreadpoolController
 
-_BLOCK = 64  # rows per call: few enough to fit in the caches
+_BLOCK = 64
+"""Rows per call, few enough to fit in the caches."""
 
 
 def plain(values: np.ndarray) -> np.ndarray:
@@ -29,6 +30,7 @@ def over_rows(work: Callable[[int, int], None], n_rows: int) -> None:
     """Call `work(first, last)` on blocks of rows, on all cores."""
     if n_rows <= _BLOCK:
         return work(0, n_rows)
+
     blocks = [(first, min(first + _BLOCK, n_rows)) for first in range(0, n_rows, _BLOCK)]
     work(0, 0)  # compiles in one thread
     with ThreadPoolExecutor(cpu_count()) as pool:

@@ -1,12 +1,11 @@
 """Checks of missions that are to be fitted together."""
 
-import warnings
 from collections.abc import Sequence
 
 import numpy as np
 
 from trustbo.data import Mission
-from trustbo.errors import TrustboError, one_line
+from trustbo.errors import TrustboError, one_line, warn
 
 
 def known_awareness(missions: Sequence[Mission]) -> list[int]:
@@ -16,11 +15,9 @@ def known_awareness(missions: Sequence[Mission]) -> list[int]:
     `Campaign.tell` does, which excludes them.
     """
     known = [j for j, mission in enumerate(missions) if not np.isnan(mission.awareness).any()]
-    if unknown := sorted({*range(len(missions))} - {*known}):
-        warnings.warn(
-            f"missions {unknown} are left out: the map has no awareness in some of their cells.",
-            stacklevel=3,
-        )
+    unknown = sorted({*range(len(missions))} - {*known})
+    if unknown:
+        warn(f"missions {unknown} are left out: the map has no awareness in some of their cells.")
     return known
 
 
@@ -31,6 +28,7 @@ def require_same_team(missions: Sequence[Mission]) -> None:
             f"missions must be a list of at least one mission; got {one_line(missions)}. For a "
             "single mission, give [mission]; for a result or a campaign, give its .missions."
         )
+
     first = missions[0]
     for j, mission in enumerate(missions):
         if not isinstance(mission, Mission):

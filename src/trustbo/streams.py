@@ -18,5 +18,6 @@ def stream(seed: int, name: str, *numbers: int) -> np.random.Generator:
         name: What the numbers are for; each use has its own name.
         numbers: Further numbers that tell generators of one name apart, such as that of a mission.
     """
-    key = int.from_bytes(hashlib.sha256(name.encode()).digest()[:4])
-    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(key, *numbers)))
+    key = int.from_bytes(hashlib.sha256(name.encode()).digest()[:4])  # 32 bits, as numpy needs
+    sequence = np.random.SeedSequence(seed, spawn_key=(key, *numbers))
+    return np.random.default_rng(sequence)

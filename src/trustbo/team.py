@@ -57,6 +57,7 @@ class Robot:
             if name in ("acquire", "drop"):
                 number = require_whole(f"Robot.{name}", value, 1)
             object.__setattr__(self, name, number)  # a number of NumPy becomes Python's
+
         if self.detection > 1.0:
             raise TrustboError(f"Robot.detection must be in (0, 1]; got {self.detection:g}.")
         for name in ("vertical_fov", "max_slope"):
@@ -96,8 +97,10 @@ class Team(Summary):
         robots = tuple(self.robots) or (Robot(),) * require_count("n_robots", self.n_robots)
         n = len(robots)
         names = as_names("names", self.names, n) or default_robots(n)
-        for name, value in (("n_robots", len(robots)), ("robots", robots), ("names", names)):
-            object.__setattr__(self, name, value)
+
+        object.__setattr__(self, "n_robots", n)
+        object.__setattr__(self, "robots", robots)
+        object.__setattr__(self, "names", names)
 
     @property
     def max_slope(self) -> float:
