@@ -12,10 +12,10 @@ deviations, compared with a run of over 20 000 points, for 3, 8 and 15 missions 
 `paper`: effective draws and CPU seconds for the paper's model and 600 rates, compared with
 `MCMC(NUTS(model.program))`, with the same program with latent trust sampled, with the likelihood of
 dynamax and with PyMC and nutpie. All samplers run with the same seeds, one sampler after another,
-and have run once before. The effective size is the smaller one of beta0 and delta_w. There are two data
-sets: rates of `missions`, which have no memory, so that they tell delta_w^2 + delta_v^2 but hardly
-either of the two, and rates simulated from the model with beta0 = 0.6. All peers take some 30
-minutes of CPU time; set NPROC=1 for JAX in one thread.
+and have run once before. The effective size is the smaller one of beta0 and delta_w. There are two
+data sets: rates of `missions`, which have no memory, so that they tell delta_w^2 + delta_v^2 but
+hardly either of the two, and rates simulated from the model with beta0 = 0.6. All peers take some
+30 minutes of CPU time; set NPROC=1 for JAX in one thread.
 `memory`: bytes of a posterior of 60 missions, with all groups and with the parameters alone.
 `busy`: wall time of a fit of 60 missions with all groups, alone and beside two processes that
 always compute. Two cores shared fairly by three processes give a ratio of 1.5.
