@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 import trustbo as tb
+from trustbo.inference import complete
+from trustbo.inference.tree import parameters_alone
 from trustbo.models import CoupledTrust, HierarchicalTrust, PlaceEffect, PooledTrust, RobotEffect
 
 FAMILIES = "gaussian", "censored", "beta_binomial"
@@ -67,3 +69,7 @@ def test_a_fit_has_trust_predictions_and_likelihoods_of_all_rates(name, missions
     assert np.isfinite(trust[..., seen]).all()
     assert of_missions.shape == (1, N_DRAWS, 3)
     assert np.isfinite(of_missions).all()
+
+    later = complete(parameters_alone(fitted), missions, progress=False)
+    for group in ("latent", "posterior_predictive", "log_likelihood", "log_prior"):
+        assert later[group].to_dataset().equals(fitted[group].to_dataset()), group

@@ -86,7 +86,7 @@ class Density:
         self.blocks = Blocks.of(y, self._U, self.layout.label, apart=apart, order=order)
         if not self.exact:
             self.terms = ep.Terms(model.family, y, self.layout.rows(observations.n_ticks))
-            self.sites = ep.first_sites(self.terms)
+            self.reset_ep()
 
     @property
     def _n_at_once(self) -> int:
@@ -165,6 +165,11 @@ class Density:
             else:
                 found[i] = ep.log_evidence(self._joint(chunk), self.sites, SWEEPS)[0]
         return found
+
+    def reset_ep(self) -> None:
+        """Forget the EP sites, so that results do not depend on what was computed before."""
+        if not self.exact:
+            self.sites = ep.first_sites(self.terms)
 
     def run_ep(self, theta: Theta) -> None:
         """Find the EP sites at the mean of theta, for use as initial sites at all other points."""

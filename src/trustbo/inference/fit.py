@@ -29,8 +29,8 @@ from trustbo.inference.importance import (
     systematic,
 )
 from trustbo.inference.place_maps import place_group
-from trustbo.inference.tree import N_PRIOR, complete, to_datatree
-from trustbo.inference.variables import named, prior_parameters
+from trustbo.inference.tree import N_PRIOR, to_datatree, with_latent
+from trustbo.inference.variables import draws_of, named, prior_parameters
 from trustbo.models.backend import VERSIONS
 from trustbo.models.default import default_model
 from trustbo.models.model import TrustModel
@@ -148,7 +148,9 @@ def fit(
         drawn, stats, summary, complaints = sample_by_nuts(
             density, chains=chains, draws=draws, warmup=warmup, seed=seed, progress=progress
         )
-    tree = _laid_out(density, drawn, stats, (chains, draws), missions, seed)
+
+    variables = named(density, drawn)
+    tree = _laid_out(density, variables, stats, (chains, draws), missions, seed)
     if "proposal" in summary:
         tree["sample_stats"].attrs["proposal"] = summary.pop("proposal")
     tree.attrs |= _record(model, density) | summary | {"sampler": sampler, "seed": seed}
@@ -160,7 +162,8 @@ def fit(
             "get the posterior anyway, pass check=False.",
         )
     if whole:
-        tree = complete(tree, missions, model=model, progress=progress)
+        as_read = draws_of(density, variables)  # equal to those that `complete` reads from a file
+        tree = with_latent(tree, missions, density, as_read, progress=progress)
     tree.attrs["seconds"] = time.perf_counter() - started
     return tree
 
@@ -262,7 +265,7 @@ def _first_proposal(start: xr.DataTree | None, model: TrustModel) -> Student | N
 
 def _laid_out(
     density: Density,
-    drawn: Draws,
+    variables: dict[str, dict[str, np.ndarray]],
     stats: dict[str, np.ndarray],
     shape: tuple[int, int],
     missions: Sequence[Mission],
@@ -270,7 +273,7 @@ def _laid_out(
 ) -> xr.DataTree:
     """Build a DataTree from the data, and from posterior and prior draws."""
     rng = np.random.default_rng([seed, 3])
-    groups = named(density, drawn) | {"sample_stats": stats}
+    groups = variables | {"sample_stats": stats}
     groups = {
         group: {name: v.reshape(*shape, *v.shape[1:]) for name, v in values.items()}
         for group, values in groups.items()

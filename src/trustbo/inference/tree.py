@@ -8,7 +8,7 @@ import xarray as xr
 
 from trustbo.data import NOWHERE, Mission
 from trustbo.display import slow_bar
-from trustbo.inference.density import Density
+from trustbo.inference.density import Density, Draws
 from trustbo.inference.draws import (
     effects_of,
     missions_of,
@@ -155,6 +155,27 @@ def complete(
         return posterior
     missions = missions_of(posterior) if missions is None else missions
     fitted, draws = read_posterior(posterior, missions, model=model)
+    return with_latent(posterior, missions, fitted, draws, progress=progress)
+
+
+def with_latent(
+    posterior: xr.DataTree,
+    missions: Sequence[Mission],
+    fitted: Density,
+    draws: Draws,
+    *,
+    progress: bool = True,
+) -> xr.DataTree:
+    """Add latent trust, log-likelihoods and predictions to a posterior; see `complete`.
+
+    Args:
+        posterior: DataTree with the parameters.
+        missions: Fitted missions.
+        fitted: Density of the model given the missions.
+        draws: Draws as read from the posterior, so that `complete` gives the same later.
+        progress: Whether to show a progress bar after 5 seconds.
+    """
+    fitted.reset_ep()
     fitted.run_ep(draws.theta)
     seed, sizes = posterior.attrs["seed"], posterior["posterior"].sizes
     n_chains, n_draws = sizes["chain"], sizes["draw"]
