@@ -29,6 +29,7 @@ from common import Table, arguments, parsed, timed
 ROOT = Path(__file__).resolve().parents[1]
 SOURCE = "src/trustbo"
 NEIGHBOURS = {
+    "statespace": ("models", "inference", "planning"),
     "models": ("inference", "criticism", "campaign"),
     "inference": ("models", "criticism", "campaign"),
     "hazard": ("campaign", "planning"),
@@ -60,10 +61,11 @@ LEARNED = """\
 FAULTS = (
     Fault("the evidence has the wrong sign of the residuals' square", "inference/engine.py",
           "prior.log_det - (w**2).sum((1, 2))", "prior.log_det + (w**2).sum((1, 2))"),
-    Fault("trust before the first bound has no mean", "models/pooled.py",
-          'm = self.x0["x0_mean"] * start', "m = 0.0 * start"),
-    Fault("the filter ignores what a rate says of trust", "inference/filter.py",
-          "mean = mean + gain * (after - m)[..., None]", "mean = mean + 0.0 * gain"),
+    Fault("trust before the first bound has no mean", "statespace/form.py",
+          "mean = (of_start * self.initial_mean[..., None, :]).sum(-1)",
+          "mean = 0.0 * (of_start * self.initial_mean[..., None, :]).sum(-1)"),
+    Fault("the filter ignores what a rate says of trust", "statespace/kalman.py",
+          "mean = mean + gain * (m_after - m)[..., None]", "mean = mean + 0.0 * gain"),
     Fault("a mixture of proposals ignores their sizes", "inference/importance.py",
           "density.log_density(z) + np.log(n)", "density.log_density(z)"),
     Fault("weights that leave out a mission have the wrong sign", "inference/loo.py",
