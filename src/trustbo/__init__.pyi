@@ -25,6 +25,8 @@ from .errors import PosteriorError as PosteriorError
 from .errors import TrustboError as TrustboError
 from .inference import compare as compare
 from .inference import fit as fit
+from .planning import Plan as Plan
+from .planning import Planner as Planner
 from .planning.paths import NoPathError as NoPathError
 from .team import Robot as Robot
 from .team import Team as Team
