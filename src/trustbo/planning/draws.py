@@ -41,10 +41,12 @@ class DrawnPaths:
     @cached_property
     def values(self) -> np.ndarray:
         """Value of each draw's best path under that draw, shape (draw,)."""
-        values, which = np.empty(len(self.paths)), self._distinct[1]
+        values = np.empty(len(self.paths))
+        which = self._distinct[1]
         for i, path in enumerate(self.candidates):
             best = which == i
             values[best] = self._value(Recursion(*(value[best] for value in self.recursion)), path)
+
         return values
 
     def values_of(self, paths: Sequence[Sequence[Cell]]) -> np.ndarray:
@@ -67,6 +69,7 @@ class DrawnPaths:
         if self.problem.objective.of_contact:
             most = [len(path) - 1 + self.problem.toll_along(path) for path in self.candidates]
             scale = np.maximum(0.0, np.array(most)[self._distinct[1]] + self.values)
+
         regret = self.regret(path)
         nothing = np.where(regret > EXACT, np.inf, 0.0)
         return np.divide(regret, scale, out=nothing, where=scale > 0.0)
@@ -92,7 +95,8 @@ class DrawnPaths:
             self.paths, axis=0, return_inverse=True, return_counts=True
         )
         order = np.argsort(-counts, kind="stable")
-        return paths[order], np.argsort(order)[which.ravel()], counts[order]
+        rank = np.argsort(order)  # new index of each path, the inverse of `order`
+        return paths[order], rank[which.ravel()], counts[order]
 
 
 def choose_draws(params: Params, n_draws: int | None, seed: int) -> Params:
@@ -102,5 +106,6 @@ def choose_draws(params: Params, n_draws: int | None, seed: int) -> Params:
     n = flat.leading[0]
     if n_draws is None or require_whole("n_draws", n_draws, 1) >= n:
         return flat
+
     chosen = np.sort(np.random.default_rng(seed).choice(n, n_draws, replace=False))
     return flat.draw(chosen)  # pyright: ignore[reportArgumentType]

@@ -26,15 +26,24 @@ import numpy as np
 from trustbo.parallel import over_rows
 from trustbo.planning.sums import costs_of_sums
 from trustbo.planning.unrolled import Unrolled, edges_from, fill_to_go, kernel, new_to_go
+from trustbo.workspace.moves import MOVES
 
 MAX_LABELS = 300_000
 """Maximum number of labels. A larger search stops with the best path found and a lower limit."""
-LOGISTIC, CLIPPED = range(2)
-"""Loss of a bound: 1 - sigma(trust), or 1 - E[y] for y ~ N(trust, sd^2) clipped to [0, 1]."""
+LOGISTIC = 0
+"""Loss of a bound 1 - sigma(trust)."""
+CLIPPED = 1
+"""Loss of a bound 1 - E[y] for y ~ N(trust, sd^2) clipped to [0, 1]."""
 LOSSES = {"logistic": LOGISTIC, "clipped": CLIPPED}
 """Loss of a bound for each nonlinear `Family.expected_rate`."""
 TINY_SD = 1e-9
 """Smallest standard deviation of a contact rate; smaller values are replaced."""
+_N_MOVES = len(MOVES)  # largest number of labels that extend one label
+_MAX_EXPONENT = 700.0  # exp(710) exceeds the range of a float
+_N_TANGENTS = 8  # most tangents to the failure cost; few are needed to find good paths
+_N_PRICES = 16  # most prices of the limited sum for which the dual is computed
+_PRICE_TOLERANCE = 1e-9  # relative change below which the tangents have converged
+_NO_CELL_YET = -2  # differs from all cells and from -1, the cell before the start
 
 
 class Costs(NamedTuple):
@@ -78,16 +87,22 @@ def best_labels(
     divisor = scale[graph.left[graph.starts]]
     if not (divisor == divisor[0]).all():  # one search for each number of bounds
         searches = [graph._replace(starts=graph.starts[k : k + 1]) for k in range(len(divisor))]
-    n, most = len(costs.drift), MAX_LABELS
-    cost, lower = np.empty((2, len(searches), n))
+
+    n = len(costs.drift)
+    most = MAX_LABELS  # an argument, because a compiled kernel keeps its globals
+    cost = np.empty((len(searches), n))
+    lower = np.empty((len(searches), n))
     paths = np.full((len(searches), n, graph.longest + 1), -1, np.int32)
+
     for k, part in enumerate(searches):
 
         def work(begin: int, end: int, k: int = k, part: Unrolled = part) -> None:
             _best_labels(part, costs, most, cost[k], lower[k], paths[k], begin, end)
 
         over_rows(work, n)
-        cost[k], lower[k] = cost[k] / divisor[k], lower[k] / divisor[k]
+        cost[k] = cost[k] / divisor[k]
+        lower[k] = lower[k] / divisor[k]
+
     best = cost.argmin(0)
     return cost.min(0), lower.min(0), paths[best, np.arange(n)]
 
@@ -106,9 +121,14 @@ def _best_labels(graph, costs, most, cost, lower, paths, begin, end):
 def _lost(loss, x, sd):
     """Compute the expected contact lost in a bound after which trust is x."""
     if loss == LOGISTIC:
-        return 1.0 / (1.0 + math.exp(min(x, 700.0)))
-    low, high, root = -x / sd, (1.0 - x) / sd, math.sqrt(0.5)
-    below, above = 0.5 * math.erfc(-low * root), 0.5 * math.erfc(high * root)
+        return 1.0 / (1.0 + math.exp(min(x, _MAX_EXPONENT)))
+
+    # One minus the mean of N(x, sd^2) clipped to [0, 1], as in `Censored.mean_rate`.
+    low = -x / sd
+    high = (1.0 - x) / sd
+    root = math.sqrt(0.5)
+    below = 0.5 * math.erfc(-low * root)
+    above = 0.5 * math.erfc(high * root)
     density = (math.exp(-0.5 * low * low) - math.exp(-0.5 * high * high)) / math.sqrt(2.0 * math.pi)
     return 1.0 - (x * (1.0 - below - above) + sd * density + above)
 
@@ -116,9 +136,11 @@ def _lost(loss, x, sd):
 @kernel
 def _lost_on(graph, costs, e, x, after):
     """Compute the contact lost on edge e, entered with trust x; write the new trust to `after`."""
-    mean, n = 0.0, len(costs.x0)
+    n = len(costs.x0)
     if n == 0:
         return 0.0
+
+    mean = 0.0
     for i in range(n):
         after[i] = costs.drift[i, graph.bound[e]]
         for j in range(n):
@@ -132,16 +154,21 @@ def _least_costs(graph, costs, edge_cost):
     """Compute the cost (edge,) of each edge, entered with the largest possible trust."""
     if len(costs.x0) == 0:
         return edge_cost
+
     cost = np.full(len(graph.head), np.inf)
-    most, after = np.full((len(graph.cell), len(costs.x0)), -np.inf), np.empty(len(costs.x0))
+    most = np.full((len(graph.cell), len(costs.x0)), -np.inf)  # largest trust in each state
+    after = np.empty(len(costs.x0))
     for s in graph.starts:
         most[s] = costs.x0
+
+    # The order of states is topological, so the largest trust in a state is final when it is read.
     for s in range(len(graph.cell) - 1, 0, -1):
         if most[s, 0] == -np.inf:  # every path to the state passes through the goal
             continue
         for e in range(graph.first[s], graph.first[s + 1]):
             cost[e] = edge_cost[e] + _lost_on(graph, costs, e, most[s], after)
             most[graph.head[e]] = np.maximum(most[graph.head[e]], after)
+
     return cost
 
 
@@ -174,26 +201,34 @@ def _try_paths(graph, costs, edge_cost, to_go, known):
 
     The best path within the limit and the sums of the cheapest path are written to `known`.
     """
-    least, after, x = np.inf, np.empty(len(costs.x0)), np.empty(len(costs.x0))
+    least = np.inf
+    after = np.empty(len(costs.x0))
+    x = np.empty(len(costs.x0))
     sums = np.empty(len(costs.failure))
+
     for s in graph.starts:
         cost = costs.start[graph.left[s]]
         value = cost + to_go.least[s]
         if value == np.inf:
             continue
+
         n = edges_from(graph, to_go, s, known.trial)
-        sums[:], x[:] = 0.0, costs.x0
+        sums[:] = 0.0
+        x[:] = costs.x0
         for e in known.trial[:n]:
             cost += edge_cost[e] + _lost_on(graph, costs, e, x, after)
             x[:] = after
             sums += costs.risk[graph.bound[e]]
         cost += _failing(costs.failure, sums)
+
         if sums[-1] <= costs.limit and cost < known.cost[0]:
-            known.cost[0], known.edges[:] = cost, -1
+            known.cost[0] = cost
+            known.edges[:] = -1
             known.edges[:n] = known.trial[:n]
         if value < least:
             least = value
             known.sums[:] = sums
+
     return least
 
 
@@ -204,6 +239,7 @@ def _fill_priced(graph, costs, least_cost, price, to_go):
     for e in range(len(cost)):
         for m in range(len(price)):
             cost[e] += price[m] * costs.risk[graph.bound[e], m]
+
     fill_to_go(graph, cost, to_go)
 
 
@@ -227,30 +263,40 @@ class Limits(NamedTuple):
 @kernel
 def _limits(graph, costs, edge_cost, least_cost, known):
     """Find good paths and lower limits; no search is needed if the best path attains `lower`."""
-    to_go, n_sums = new_to_go(len(graph.cell)), len(costs.failure)
-    safest, low = np.empty((len(graph.cell), n_sums)), np.empty(n_sums)
+    n_sums = len(costs.failure)
+    to_go = new_to_go(len(graph.cell))
+    safest = np.empty((len(graph.cell), n_sums))
+    low = np.empty(n_sums)
+
     for m in range(n_sums):
         _fill_priced(graph, costs, np.zeros(len(graph.head)), np.eye(n_sums)[m], to_go)
         safest[:, m] = to_go.least
         low[m] = to_go.least[graph.starts].min()
     _try_paths(graph, costs, edge_cost, to_go, known)  # safest with respect to the limited sum
+
     fill_to_go(graph, least_cost, to_go)
-    free, price = to_go.least.copy(), np.zeros(n_sums)
+    free = to_go.least.copy()
     least = _try_paths(graph, costs, edge_cost, to_go, known)
     if known.cost[0] == np.inf:
-        return Limits(np.inf, safest, free, free, price, 0.0)
-    for _ in range(8):  # tangents to the concave failure cost give good paths
-        before, price = price, costs.failure * np.exp(-known.sums)
-        if np.abs(price - before).max() <= 1e-9 * costs.failure.max():
+        return Limits(np.inf, safest, free, free, np.zeros(n_sums), 0.0)
+
+    price = np.zeros(n_sums)
+    for _ in range(_N_TANGENTS):  # tangents to the concave failure cost give good paths
+        before = price
+        price = costs.failure * np.exp(-known.sums)
+        if np.abs(price - before).max() <= _PRICE_TOLERANCE * costs.failure.max():
             break
         _fill_priced(graph, costs, least_cost, price, to_go)
         _try_paths(graph, costs, edge_cost, to_go, known)
+
+    # With the chord as prices, a sum over edges bounds the cost from below (see the module).
     chord, offset = _chords(costs, low, known.cost[0] - least)
-    of_edges = edge_cost, least_cost
-    lower, extra = _price_of_limit(graph, costs, *of_edges, chord, offset, to_go, known)
+    lower, extra = _price_of_limit(graph, costs, edge_cost, least_cost, chord, offset, to_go, known)
     chord[-1] += extra
     _fill_priced(graph, costs, least_cost, chord, to_go)
-    offset -= extra * costs.limit if extra > 0.0 else 0.0
+    if extra > 0.0:  # otherwise, the limit may be inf, and 0 times inf is NaN
+        offset -= extra * costs.limit
+
     return Limits(lower, safest, free, to_go.least, chord, offset)
 
 
@@ -261,19 +307,26 @@ def _chords(costs, low, gap):
     An optimal path has sums of at least `low` and a failure cost of at most `gap`. The gap is the
     cost of the best path found so far minus the least cost without failure.
     """
-    failure, slopes, constant = costs.failure, np.zeros(len(low)), 0.0
+    failure = costs.failure
+    slopes = np.zeros(len(low))
+    constant = 0.0
     at_low = _failing(failure, low)
+
     for m in range(len(low)):
         if failure[m] == 0.0:
             continue
+
+        # If the other sums are at their lowest, this sum can rise to `high` before the gap is used.
         here = -failure[m] * math.expm1(-low[m])
         share = (gap - at_low + here) / failure[m]
         high = -math.log1p(-max(share, 0.0)) if share < 1.0 else np.inf
         if m == len(low) - 1:
             high = min(high, costs.limit)
+
         if low[m] < high < np.inf:
             slopes[m] = (-failure[m] * math.expm1(-high) - here) / (high - low[m])
         constant += here - slopes[m] * low[m]
+
     return slopes, constant
 
 
@@ -282,38 +335,58 @@ def _price_of_limit(graph, costs, edge_cost, least_cost, chord, offset, to_go, k
     """Find the price of the limited sum that maximises the lower limit on the cost of all paths.
 
     The lower limit (the Lagrangian dual) is concave in the price. The slope is the limited sum of
-    the cheapest path minus the limit.
+    the cheapest path minus the limit. The maximum is found by bisection (Handler and Zang 1980).
     """
-    limit, price = costs.limit, chord.copy()
-    lower, chosen, extra, under, over = -np.inf, 0.0, 0.0, 0.0, np.inf
-    for _ in range(16):
+    limit = costs.limit
+    price = chord.copy()
+    lower = -np.inf
+    chosen = 0.0
+    extra = 0.0
+    under = 0.0  # the best price is between `under` and `over`
+    over = np.inf
+
+    for _ in range(_N_PRICES):
         price[-1] = chord[-1] + extra
         _fill_priced(graph, costs, least_cost, price, to_go)
         dual = offset + _try_paths(graph, costs, edge_cost, to_go, known)
-        dual -= extra * limit if extra > 0.0 else 0.0
+        if extra > 0.0:  # otherwise, the limit may be inf, and 0 times inf is NaN
+            dual -= extra * limit
+
         if dual > lower:
-            lower, chosen = dual, extra
+            lower = dual
+            chosen = extra
         if lower >= known.cost[0] or (extra == 0.0 and known.sums[-1] <= limit):
             break
-        under, over = (extra, over) if known.sums[-1] > limit else (under, extra)
+
+        if known.sums[-1] > limit:
+            under = extra
+        else:
+            over = extra
         extra = 2.0 * max(extra, 1.0) if over == np.inf else 0.5 * (under + over)
+
     return lower, chosen
 
 
 @kernel
 def _best_path(graph, costs, most, path):
     """Write the cheapest path within the limit, and return its cost (or inf) and a lower limit."""
-    edge_cost, n, n_sums = np.empty(len(graph.head)), len(path), len(costs.failure)
+    n = len(path)
+    n_sums = len(costs.failure)
+    edge_cost = np.empty(len(graph.head))
     costs_of_sums(graph, costs.drift, costs.weight, costs.toll, edge_cost)
+
     known = Known(np.full(1, np.inf), np.full(n, -1), np.full(n, -1), np.zeros(n_sums))
-    limits = _limits(graph, costs, edge_cost, _least_costs(graph, costs, edge_cost), known)
+    least_cost = _least_costs(graph, costs, edge_cost)
+    limits = _limits(graph, costs, edge_cost, least_cost, known)
     lower = limits.lower
     if lower < known.cost[0]:
         lower = _search(graph, costs, most, edge_cost, limits, known)
+
     if known.cost[0] < np.inf:
         path[0] = graph.cell[graph.starts[0]]
     for k, e in enumerate(known.edges[: n - 1]):
         path[k + 1] = graph.cell[graph.head[e]] if e >= 0 else -1
+
     return known.cost[0], min(lower, known.cost[0])
 
 
@@ -338,23 +411,33 @@ class Labels(NamedTuple):
 def _search(graph, costs, most, edge_cost, limits, known):
     """Search for the best path; return its cost, or a lower limit if there are too many labels."""
     n_numbers = 1 + len(costs.failure) + len(costs.x0)
-    made, last = np.empty((4, most), np.int64), np.full(len(graph.cell), -1)
+    made = np.empty((4, most), np.int64)
+    last = np.full(len(graph.cell), -1)
     labels = Labels(np.empty((most, n_numbers)), made[0], made[1], made[2], made[3], last)
+
     n = 0
     for s in graph.starts:
-        labels.number[n], labels.last[s] = 0.0, n
-        labels.edge[n], labels.left[n], labels.parent[n], labels.before[n] = -1, -1, -1, -1
+        labels.edge[n] = -1
+        labels.left[n] = -1
+        labels.parent[n] = -1
+        labels.before[n] = -1
+        labels.last[s] = n
+        labels.number[n] = 0.0
         labels.number[n, 0] = costs.start[graph.left[s]]
         labels.number[n, 1 + len(costs.failure) :] = costs.x0
         n += 1
+
+    # Edges lead to states of lower index. All labels of a state are therefore known when the state
+    # is reached, and each label is extended at most once (label setting, Martins 1984).
     for s in range(len(graph.cell) - 1, 0, -1):
         label = labels.last[s]
         while label >= 0:
-            if n + 8 > most:
+            if n + _N_MOVES > most:
                 return limits.lower
             if not _is_dominated(graph, labels, label, labels.last[s], len(costs.failure)):
                 n = _extend(graph, costs, edge_cost, limits, known, labels, s, label, n)
             label = labels.before[label]
+
     return known.cost[0]
 
 
@@ -362,24 +445,35 @@ def _search(graph, costs, most, edge_cost, limits, known):
 def _extend(graph, costs, edge_cost, limits, known, labels, s, label, n):
     """Add the successors of a label that may be optimal, and return the new number of labels."""
     n_sums = len(costs.failure)
-    number, after, sums = labels.number[label], np.empty(len(costs.x0)), np.empty(n_sums)
+    number = labels.number[label]
+    after = np.empty(len(costs.x0))
+    sums = np.empty(n_sums)
+
     for e in range(graph.first[s], graph.first[s + 1]):
         h = graph.head[e]
         if not graph.turns and graph.cell[h] == labels.left[label]:
             continue
+
         lost = _lost_on(graph, costs, e, number[1 + n_sums :], after)
         cost = number[0] + (edge_cost[e] + lost)
         sums[:] = number[1 : 1 + n_sums] + costs.risk[graph.bound[e]]
         if _is_hopeless(costs, limits, h, cost, sums, known.cost[0]):
             continue
-        labels.number[n, 0], labels.number[n, 1 : 1 + n_sums] = cost, sums
+
+        labels.number[n, 0] = cost
+        labels.number[n, 1 : 1 + n_sums] = sums
         labels.number[n, 1 + n_sums :] = after
-        labels.edge[n], labels.left[n], labels.parent[n] = e, graph.cell[s], label
-        labels.before[n], labels.last[h] = labels.last[h], n
+        labels.edge[n] = e
+        labels.left[n] = graph.cell[s]
+        labels.parent[n] = label
+        labels.before[n] = labels.last[h]
+        labels.last[h] = n
+
         if h == 0:
             known.cost[0] = cost + _failing(costs.failure, sums)
             _write_edges(graph, labels, n, known.edges)
         n += 1
+
     return n
 
 
@@ -388,42 +482,57 @@ def _is_hopeless(costs, limits, h, cost, sums, known):
     """Check whether no path that enters state h with this cost and these sums can be optimal."""
     if sums[-1] + limits.safest[h, -1] > costs.limit:
         return True
+
+    # A plane below the failure cost, with the limit relaxed.
     at_least = cost + limits.priced[h] + limits.offset
     for m in range(len(sums)):
         at_least += limits.price[m] * sums[m]
     if at_least >= known:
         return True
+
+    # The failure cost itself, at the smallest sums that can still be reached.
     return cost + limits.free[h] + _failing(costs.failure, sums + limits.safest[h]) >= known
 
 
 @kernel
 def _write_edges(graph, labels, label, edges):
     """Write the edges of the path that leads to a label, padded with -1, to `edges`."""
-    n, k = label, 0
+    n = label
+    k = 0
     while labels.parent[n] >= 0:
-        n, k = labels.parent[n], k + 1
+        n = labels.parent[n]
+        k += 1
+
     edges[:] = -1
     while labels.parent[label] >= 0:
         k -= 1
-        edges[k], label = labels.edge[label], labels.parent[label]
+        edges[k] = labels.edge[label]
+        label = labels.parent[label]
 
 
 @kernel
 def _is_dominated(graph, labels, label, other, n_sums):
     """Check whether other labels of the same state make a label unnecessary."""
-    number, by = labels.number[label], -2
+    number = labels.number[label]
+    by = _NO_CELL_YET  # cell before the label that dominates this one, if U-turns are forbidden
+
     while other >= 0:
-        covers, equal = other != label, True
+        covers = other != label
+        equal = True
         for k in range(len(number)):  # cost and sums should be small, trust large
-            a, b = labels.number[other, k], number[k]
-            if (a > b) if k <= n_sums else (a < b):
+            a = labels.number[other, k]
+            b = number[k]
+            worse = a > b if k <= n_sums else a < b
+            if worse:
                 covers = False
                 break
             equal = equal and a == b
-        if covers and (not equal or other < label):
+
+        if covers and (not equal or other < label):  # of equal labels, the first remains
             left = labels.left[other]
-            if graph.turns or left == labels.left[label] or by not in (-2, left):
+            if graph.turns or left == labels.left[label] or by not in (_NO_CELL_YET, left):
                 return True
             by = left
         other = labels.before[other]
+
     return False

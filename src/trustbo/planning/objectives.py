@@ -83,15 +83,20 @@ def weights_of(objective: Objective, recursion: Recursion, view: Array, longest:
         longest: Largest number of bounds of a path.
     """
     n = np.arange(longest + 1)
-    credit = objective.credit(n)
     powers = np.empty((len(recursion.start), longest + 1, len(view)))  # view . B0^k
     powers[:, 0] = view
     for k in range(longest):
         powers[:, k + 1] = np.einsum("ds,dst->dt", powers[:, k], recursion.transition)
+
     of_start = np.einsum("dks,ds->dk", powers, recursion.start)
     of_start[:, 0] = 0.0  # trust counts only after a bound
+
+    credit = objective.credit(n)
     lags = np.tril(credit[n[:, None] - n])  # (left, lag): credit(left - lag)
-    constant = of_start @ lags.T - (n if objective.of_contact else 0.0)
+    constant = of_start @ lags.T
+    if objective.of_contact:  # lost contact is one minus the contact rate of each bound
+        constant = constant - n
+
     return Weights(lags @ powers, constant, objective.scale(n.astype(float)))
 
 
@@ -109,10 +114,13 @@ def capped(objective: Objective, family: Family, recursion: Recursion) -> Recurs
 
     If the drift of each state is at most 1 minus the row sum of B0, B0 >= 0 and x_0 <= 1, trust is
     at most 1. A loop then never increases the value. Only lost_contact with rates that are linear
-    in trust needs the cap; for other objectives or rates, the recursion are returned unchanged.
+    in trust needs the cap; for other objectives or rates, the recursion is returned unchanged.
     """
     if not objective.of_contact or has_history(objective, family):
         return recursion
+
     most = 1.0 - recursion.transition.sum(-1)[..., None, None, None]
-    drift, start = np.minimum(recursion.drift, most), np.minimum(recursion.start, 1.0)
-    return recursion._replace(drift=drift, start=start)
+    return recursion._replace(
+        drift=np.minimum(recursion.drift, most),
+        start=np.minimum(recursion.start, 1.0),
+    )

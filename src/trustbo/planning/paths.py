@@ -66,10 +66,12 @@ class AdmissiblePaths:
         self.goal = workspace.locate(goal, "goal")
         if self.start == self.goal:
             raise TrustboError(f"start and goal are both the cell {self.start}; choose two cells.")
+
         self.avoided = avoided
         self.bounds = workspace.passable_bounds.values
         if avoided is not None:
             self.bounds = self.bounds & ~avoided
+
         self.bounds_to_goal = fewest_bounds(self.bounds, self.goal, back=True)
         self.shortest = int(self.bounds_to_goal[self.start])
         if self.shortest < 0:
@@ -81,10 +83,12 @@ class AdmissiblePaths:
                 f"{n_reached} can be reached from the start, and the goal can be reached from "
                 f"{n_goal}. {self._remedy()}"
             )
+
         self.turns = not isinstance(max_bounds, str)
         self.max_bounds = max_bounds
         if not isinstance(max_bounds, str):
-            self.max_bounds = self.longest = require_whole("max_bounds", max_bounds, 1)
+            self.max_bounds = require_whole("max_bounds", max_bounds, 1)
+            self.longest = self.max_bounds
         elif named := _SHORTEST.fullmatch(max_bounds):
             self.longest = self.shortest + int(named[1] or 0)
         else:
@@ -92,6 +96,7 @@ class AdmissiblePaths:
                 f"unknown max_bounds {max_bounds!r}; give 'shortest', an int, or 'shortest+n', "
                 "such as 'shortest+2', to allow up to n more bounds without U-turns."
             )
+
         if self.longest - self.shortest > _MOST_EXTRA:
             raise TrustboError(
                 f"max_bounds = {one_line(max_bounds)} is too large: at most {_MOST_EXTRA} bounds "
@@ -105,7 +110,8 @@ class AdmissiblePaths:
 
     def _remedy(self) -> str:
         """Return what to do if no path leads to the goal, as a sentence."""
-        posts, terrain = self.workspace.posts, self.workspace.terrain
+        posts = self.workspace.posts
+        terrain = self.workspace.terrain
         if posts is not None and terrain is not None:
             missing = float(terrain["dem"].isnull().mean())
             if missing and posts.are_parted_by_missing(self.start, self.goal):
@@ -125,23 +131,31 @@ class AdmissiblePaths:
         """Unrolled graph of the paths; raises TrustboError if it is too large."""
         n_moves, rows, cols = self.bounds.shape
         bounds = self.bounds.reshape(n_moves, -1)
-        far, near = self.bounds_to_goal.ravel(), self.bounds_from_start.ravel()
+        far = self.bounds_to_goal.ravel()
+        near = self.bounds_from_start.ravel()
+
         # Count the possible numbers of bounds left in each cell: `far` or more, but 0 at the goal.
         n_left = np.maximum(np.where(far == 0, 1, self.longest - near - far + 1), 0)
         n_left[(far < 0) | (near < 0)] = 0
-        if (n_states := int(n_left.sum())) > _MOST_STATES:
+        n_states = int(n_left.sum())
+        if n_states > _MOST_STATES:
             raise TrustboError(
                 f"max_bounds = {self.max_bounds!r} (up to {self.longest} bounds) is too large: the "
                 f"search has {n_states:.3g} states, but at most {_MOST_STATES:.3g} are allowed. "
                 "Give a smaller max_bounds."
             )
+
+        # List the states by cell, where the states of a cell begin at `base`, then sort by `left`.
         cell = np.repeat(np.arange(rows * cols, dtype=np.int32), n_left)
         base = np.concatenate([[0], np.cumsum(n_left)])
         left = (np.arange(n_states) - base[cell] + far[cell]).astype(np.int32)
         order = np.argsort(left, kind="stable")
         rank = np.empty(n_states, np.int32)
         rank[order] = np.arange(n_states)
-        cell, left = cell[order], left[order]
+        cell = cell[order]
+        left = left[order]
+
+        # Find the state to which each move leads from each state; -1 if there is no such state.
         head = np.full((n_states, n_moves), -1, np.int32)
         for m, step in enumerate(STEPS @ (cols, 1)):  # no bound enters a cell across a border
             tail = np.flatnonzero((cell + step >= 0) & (cell + step < rows * cols) & (left > 0))
@@ -149,12 +163,15 @@ class AdmissiblePaths:
             more = left[tail] - 1 - far[other]  # bounds left after the move, minus the fewest
             fits = bounds[m, other] & (more >= 0) & (more < n_left[other])
             head[tail[fits], m] = rank[base[other[fits]] + more[fits]]
+
+        # Keep the edges that exist, sorted by the states that they leave.
         tail, move = np.nonzero(head >= 0)
         head = head[tail, move]
         first = np.searchsorted(tail, np.arange(n_states + 1))
+        bound = (move * rows * cols + cell[head]).astype(np.int32)
+
         start = np.flatnonzero(near == 0)[0]
         starts = rank[base[start] : base[start + 1]]
-        bound = (move * rows * cols + cell[head]).astype(np.int32)
         return Unrolled(cell, left, first, head, bound, starts, self.turns)
 
     def avoiding(self, bounds: np.ndarray, risk: np.ndarray) -> "AdmissiblePaths":
@@ -169,16 +186,18 @@ class AdmissiblePaths:
         avoided = bounds & self.workspace.passable_bounds.values
         if self.avoided is not None:
             avoided |= self.avoided
-        order = np.argwhere(avoided)
-        order = order[np.argsort(risk[avoided], kind="stable")]
-        ends = self.workspace, self.start, self.goal, self.max_bounds
-        for least in (None, *order.tolist()):
-            if least is not None:
-                avoided[*least] = False
+
+        safest_first = np.argwhere(avoided)[np.argsort(risk[avoided], kind="stable")]
+        for allowed in (None, *safest_first.tolist()):
+            if allowed is not None:
+                avoided[*allowed] = False
             try:
-                return AdmissiblePaths(*ends, avoided.copy())
+                return AdmissiblePaths(
+                    self.workspace, self.start, self.goal, self.max_bounds, avoided.copy()
+                )
             except TrustboError:  # the goal cannot be reached within max_bounds
                 continue
+
         return self
 
     def to(self, cell: Cell, extra: int) -> "AdmissiblePaths":
@@ -203,6 +222,7 @@ class AdmissiblePaths:
             raise TrustboError(
                 f"a path must lead from {self.start} to {self.goal}; got {one_line(list(cells))}."
             )
+
         entered = np.array(cells[1:]).T
         broken = ~self.workspace.passable_bounds.values[moves_along(cells), *entered]
         if broken.any():
@@ -211,6 +231,7 @@ class AdmissiblePaths:
                 f"no bound leads from {cells[k]} to {cells[k + 1]}: a cell is impassable, or no "
                 "route connects the cells. Give another path."
             )
+
         return cells
 
 
@@ -227,5 +248,6 @@ def fewest_bounds(bounds: np.ndarray, cell: Cell, *, back: bool = False) -> np.n
     left = entered - (STEPS @ (cols, 1))[move]
     ends = (entered, left) if back else (left, entered)
     graph = csr_array((np.ones(len(move)), ends), shape=(rows * cols, rows * cols))
+
     fewest = dijkstra(graph, indices=cell[0] * cols + cell[1], unweighted=True)
     return np.where(np.isfinite(fewest), fewest, -1).astype(np.int32).reshape(rows, cols)

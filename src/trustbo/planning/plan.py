@@ -69,20 +69,24 @@ class Plan(Summary):
         best = "no path is better" if self.exact else f"no path exceeds {self.limit:.3g}"
         if np.isnan(self.limit):
             best = "not known: the path was given or chosen by a policy"
+
         within = ""
         if self.value_band is not None:
             within = ", {:.3g} to {:.3g} in 90 % of the draws".format(*self.value_band)
+
         rows = [
             ("path", f"{path_text(self.path)}: {len(self.path) - 1} bounds, {self.length:.0f} m"),
             ("value", f"{self.value:.3g} ({self.objective})" + within),
             ("best", best),
             ("trust at the goal", f"{self.trust[-1].mean():.3f}, mean of the robots"),
         ]
+
         if self.p_arrive is not None:
             beyond = "; the failure probability exceeds max_failure" if self.infeasible else ""
             rows.append(("arrival probability", f"{self.p_arrive:.3g}{beyond}"))
         if not np.isnan(self.limit):
             rows.append(("search", f"{1e3 * self.seconds:.1f} ms"))
+
         return rows
 
     @property
@@ -99,13 +103,18 @@ class Plan(Summary):
     def stops(self) -> np.ndarray | None:
         """Position at which the lead stops in each cell of the path, shape (bound + 1, 2)."""
         posts = self.workspace.posts
-        return None if posts is None else np.stack([posts.stop(cell) for cell in self.path])
+        if posts is None:
+            return None
+        return np.stack([posts.stop(cell) for cell in self.path])
 
     @cached_property
     def posts(self) -> np.ndarray | None:
         """Overwatch positions of T2 before each bound, shape (bound, robot, 2)."""
-        posts, path = self.workspace.posts, self.path
-        return None if posts is None else np.stack([*map(posts.watching, path, path[1:])])
+        posts = self.workspace.posts
+        if posts is None:
+            return None
+        bounds = zip(self.path, self.path[1:], strict=False)
+        return np.stack([posts.watching(left, entered) for left, entered in bounds])
 
     @cached_property
     def routes(self) -> tuple[tuple[np.ndarray | None, ...], ...] | None:
@@ -114,17 +123,23 @@ class Plan(Summary):
         The lead comes first. T2 moves to its posts for the next bound or, at the goal, to positions
         around the lead. An entry is None if the robot has no route.
         """
-        posts, path = self.workspace.posts, self.path
+        posts = self.workspace.posts
         if posts is None:
             return None
-        return tuple(map(posts.bound_routes, path, path[1:], [*path[2:], None]))
+
+        path = self.path
+        onward = [*path[2:], None]  # T2 moves to its posts for the bound to this cell
+        return tuple(map(posts.bound_routes, path, path[1:], onward))
 
 
 def plan_to_record(plan: Plan) -> dict[str, Any]:
     """Convert a plan, without its workspace, to plain lists and numbers."""
     values = {f.name: getattr(plan, f.name) for f in fields(plan) if f.name != "workspace"}
     values["risk"] = None if plan.risk is None else plan.risk.to_record()
-    return {n: v.tolist() if isinstance(v, np.ndarray) else v for n, v in values.items()}
+    return {
+        name: value.tolist() if isinstance(value, np.ndarray) else value
+        for name, value in values.items()
+    }
 
 
 def plan_from_record(record: dict[str, Any], workspace: Workspace) -> Plan:
@@ -132,9 +147,11 @@ def plan_from_record(record: dict[str, Any], workspace: Workspace) -> Plan:
     values: dict[str, Any] = {**record, "workspace": workspace}
     for name in ("positions", "trust", "bands"):
         values[name] = np.array(record[name])
+
     if record.get("value_band"):
         values["value_band"] = tuple(record["value_band"])
     if record["risk"]:
         values["risk"] = PathRisk.from_record(record["risk"])
+
     values["path"] = tuple((row, col) for row, col in record["path"])
     return Plan(**values)

@@ -39,6 +39,9 @@ from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Location
 from trustbo.workspace.moves import MOVE_NAMES, along
 
+_DIMS = ("move", "row", "col")
+_MOVE_LABELS = {"move": MOVE_NAMES}
+
 
 class Planner(Summary):
     """Planner that finds the most trustworthy path in a workspace.
@@ -93,13 +96,16 @@ class Planner(Summary):
         """
         aim = OBJECTIVES[require_choice("objective", objective, OBJECTIVES)]
         rates = FAMILIES[require_choice("family", family, FAMILIES)]
-        most = aim.max_bounds if max_bounds is None else max_bounds
-        paths = AdmissiblePaths(workspace, start, goal, most)
+        if max_bounds is None:
+            max_bounds = aim.max_bounds
+
+        paths = AdmissiblePaths(workspace, start, goal, max_bounds)
         tolls = _toll_of(toll, paths.bounds)
         self.problem = Problem(paths, aim, rates, tolls, max_failure, failure_cost)
 
     def _rows(self) -> Rows:
-        problem, paths = self.problem, self.problem.paths
+        problem = self.problem
+        paths = problem.paths
         return [
             ("from", f"{self.start} to {self.goal}"),
             ("objective", problem.objective.name),
@@ -140,12 +146,14 @@ class Planner(Summary):
 
     def avoiding(self, bounds: np.ndarray, risk: np.ndarray) -> Self:
         """Return a planner that avoids the given bounds (see `AdmissiblePaths.avoiding`)."""
-        dims, moves = ("move", "row", "col"), {"move": MOVE_NAMES}
-        avoided = read_labelled("bounds", bounds, dims, moves).values
-        risks = read_labelled("risk", risk, dims, moves).values
+        avoided = read_labelled("bounds", bounds, _DIMS, _MOVE_LABELS).values
+        risks = read_labelled("risk", risk, _DIMS, _MOVE_LABELS).values
+
+        shape = self.problem.paths.bounds.shape
         for name, values in (("bounds", avoided), ("risk", risks)):
-            if values.shape != (shape := self.problem.paths.bounds.shape):
+            if values.shape != shape:
                 raise TrustboError(f"{name} must have the shape {shape}; got {values.shape}.")
+
         return self._with(paths=self.problem.paths.avoiding(avoided > 0.0, risks))
 
     def with_risk(
@@ -168,10 +176,10 @@ class Planner(Summary):
         Raises:
             TrustboError: If the shapes do not match, or a probability is outside [0, 1].
         """
-        dims, moves = ("move", "row", "col"), {"move": MOVE_NAMES}
-        mean, drawn = read_labelled("p_fail", p_fail, dims, moves).values, None
+        mean = read_labelled("p_fail", p_fail, _DIMS, _MOVE_LABELS).values
+        drawn = None
         if draws is not None:
-            drawn = read_labelled("draws", draws, ("draw", *dims), moves).values
+            drawn = read_labelled("draws", draws, ("draw", *_DIMS), _MOVE_LABELS).values
         return self._with(risk=Risk(mean, drawn, strata))
 
     def with_failure_cost(self, failure_cost: float) -> Self:
@@ -183,7 +191,9 @@ class Planner(Summary):
             TrustboError: If the failure cost is negative or not finite.
         """
         cost = require_positive("failure_cost", failure_cost, or_zero=True)
-        return self._with(failure_cost=cost) if self.problem.objective.of_contact else self
+        if not self.problem.objective.of_contact:
+            return self
+        return self._with(failure_cost=cost)
 
     @computing()
     def plan(self, params: Params | xr.DataTree, *, x0: ArrayLike | None = None) -> Plan:
@@ -203,10 +213,12 @@ class Planner(Summary):
         started = time.perf_counter()
         mean, draws = mean_and_draws_of(params, self.workspace)
         score, limits, paths = self.problem.best(self.problem.recursion(mean, x0))
+
         path = self.problem.paths.cells(paths[0])
         plan = self.evaluate(path, mean, x0=x0)
         if draws is not None:
             plan = plan.with_draws(self.evaluate(path, draws, x0=x0))
+
         exact = bool(limits[0] - score[0] <= EXACT)
         limit = plan.value if exact else float(self.problem.objective.value(limits[0]))
         return replace(plan, exact=exact, limit=limit, seconds=time.perf_counter() - started)
@@ -221,7 +233,8 @@ class Planner(Summary):
             TrustboError: If beta0 is outside the range in which the search is exact.
             InfeasibleError: If no path respects `max_failure`.
         """
-        return self.problem.paths.cells(self.problem.best(recursion)[-1][0])
+        _, _, paths = self.problem.best(recursion)
+        return self.problem.paths.cells(paths[0])
 
     @computing()
     def plan_draws(
@@ -240,7 +253,8 @@ class Planner(Summary):
         """
         params = choose_draws(draws_of(posterior, self.workspace), n_draws, seed)
         recursion = self.problem.recursion(params)
-        return DrawnPaths(self.problem, recursion, self.problem.best(recursion)[-1])
+        _, _, paths = self.problem.best(recursion)
+        return DrawnPaths(self.problem, recursion, paths)
 
     @computing()
     def evaluate(
@@ -260,17 +274,25 @@ class Planner(Summary):
             TrustboError: If the robots or features of the parameters differ from the workspace's,
                 or the path has gaps or does not lead from start to goal.
         """
-        path, problem = self.require_path(path), self.problem
-        draws, cells = draws_of(params, self.workspace, day=True), np.array(path)
+        problem = self.problem
+        path = self.require_path(path)
+        cells = np.array(path)
+        draws = draws_of(params, self.workspace, day=True)
+
         trust, value, values = _value_along(problem, cells, draws, x0)
-        cost, (rows, cols) = problem.failure_along(cells), cells.T
-        bands, value_band = np.repeat(trust, len(QUANTILES), axis=0), None
+        cost = problem.failure_along(cells)
+
+        bands = np.repeat(trust, len(QUANTILES), axis=0)
+        value_band = None
         if len(trust) > 1:
             bands = np.quantile(trust, QUANTILES, axis=0)
             low, high = np.quantile(values - cost, (QUANTILES[0], QUANTILES[-1])).tolist()
             value_band = low, high
+
         grid = self.workspace.grid
+        rows, cols = cells.T
         positions = np.stack([grid.x[cols], grid.y[rows]], axis=1)
+
         return Plan(
             path=path,
             positions=positions,
@@ -306,21 +328,25 @@ class Planner(Summary):
         Raises:
             TrustboError: If abs(beta0) >= 1, because trust would then grow without limit.
         """
-        problem, mean = self.problem, mean_of(params, self.workspace)
-        recursion = problem.recursion(mean)
-        if (radius := np.abs(np.linalg.eigvals(recursion.transition)).max()) >= 1.0:
+        problem = self.problem
+        recursion = problem.recursion(mean_of(params, self.workspace))
+        radius = np.abs(np.linalg.eigvals(recursion.transition)).max()
+        if radius >= 1.0:
             raise TrustboError(
                 f"the graph needs abs(beta0) < 1, because trust must converge; got {radius:g}. "
                 "Give other parameters, or use `plan` to find a path."
             )
+
         contact = capped(LOST_CONTACT, problem.family, recursion)
-        grid, bounds = self.workspace.grid, problem.paths.bounds
+        grid = self.workspace.grid
+        bounds = problem.paths.bounds
         length = np.hypot(*(STEPS * (grid.cell_height, grid.cell_width)).T)  # (move,)
 
         def of_bounds(values: np.ndarray) -> np.ndarray:
             return np.broadcast_to(values, bounds.shape)[bounds]
 
-        toll, settled = of_bounds(problem.toll), of_bounds(recursion.steady_state())
+        toll = of_bounds(problem.toll)
+        settled = of_bounds(recursion.steady_state())
         rate = problem.family.mean_rate(of_bounds(contact.steady_state()), recursion.noise_sd)
         values = {
             "length": of_bounds(length[:, None, None]),
@@ -330,12 +356,14 @@ class Planner(Summary):
         }
         if problem.risk is not None:
             values["risk"] = of_bounds(risk_of(problem.risk.p_fail))
+
         graph = nx.DiGraph()
         for row, col in np.argwhere(self.workspace.passable.values).tolist():
             graph.add_node((row, col), x=float(grid.x[col]), y=float(grid.y[row]))
         for k, (move, row, col) in enumerate(np.argwhere(bounds).tolist()):
             left = row - int(STEPS[move, 0]), col - int(STEPS[move, 1])
             graph.add_edge(left, (row, col), **{name: float(v[k]) for name, v in values.items()})
+
         return graph
 
     @computing()
@@ -385,12 +413,14 @@ class Planner(Summary):
             `awareness_<name>` if the name is taken). Impassable cells are NaN.
         """
         params = choose_draws(draws_of(posterior, self.workspace), n_draws, seed)
-        trust, passable = trust_map(self.problem, params), self.workspace.passable
+        trust = trust_map(self.problem, params)
+        passable = self.workspace.passable
         try:
             share = self.plan_draws(params, n_draws=n_draws).share()
         except InfeasibleError as error:
             share = np.zeros(passable.shape)
             share[tuple(np.array(error.path).T)] = 1.0
+
         maps = {
             "trust_mean": (trust.mean("draw"), "mean expected trust"),
             "trust_sd": (trust.std("draw"), "sd of expected trust"),
@@ -401,10 +431,14 @@ class Planner(Summary):
             place = xr.DataArray(params.places["place"].mean(1), dims=("draw", "row", "col"))
             maps["place_mean"] = place.mean("draw"), "mean place effect"
             maps["place_sd"] = place.std("draw"), "sd of the place effect"
-        awareness, taken = self.workspace.awareness, {*maps, "x", "y", "row", "col", "spatial_ref"}
+
+        awareness = self.workspace.awareness
+        taken = {*maps, "x", "y", "row", "col", "spatial_ref"}
         for name in self.workspace.features:
             mean = awareness.sel(feature=name, drop=True).mean(("robot", "move"))
-            maps[f"awareness_{name}" if name in taken else name] = mean, f"{name}, 0 worst, 1 best"
+            label = f"awareness_{name}" if name in taken else name
+            maps[label] = mean, f"{name}, 0 worst, 1 best"
+
         dataset = xr.Dataset({name: v.assign_attrs(long_name=t) for name, (v, t) in maps.items()})
         return self.workspace.grid.place(dataset.where(passable))
 
@@ -414,20 +448,21 @@ def _toll_of(toll: ArrayLike, bounds: np.ndarray) -> np.ndarray:
 
     Raises TrustboError if the shape does not broadcast or the toll of a bound is not finite.
     """
-    dims, moves = ("move", "row", "col"), {"move": MOVE_NAMES}
-    given = read_labelled("toll", toll, dims, moves, partial=True).values
+    given = read_labelled("toll", toll, _DIMS, _MOVE_LABELS, partial=True).values
     try:
         tolls = np.where(bounds, np.broadcast_to(given, bounds.shape), 0.0)
     except ValueError:
         raise TrustboError(
             f"toll must broadcast to (move, row, col) = {bounds.shape}; got shape {given.shape}."
         ) from None
+
     if not np.isfinite(tolls).all():
         move, row, col = np.argwhere(~np.isfinite(tolls))[0].tolist()
         raise TrustboError(
             f"toll[{move}, {row}, {col}] = {tolls[move, row, col]} is not finite; give a finite "
             "toll for every bound."
         )
+
     return tolls
 
 
@@ -439,8 +474,10 @@ def _value_along(
     The values do not include the expected cost of failure.
     """
     x0 = problem.start(x0)
-    z, of_path = along(problem.paths.workspace.awareness.values, cells), params.along(cells)
+    of_path = params.along(cells)
+    z = along(problem.paths.workspace.awareness.values, cells)
     z = z[:, None, None]  # a map with one move and one row, whose columns are the bounds
+
     by_robot = trust_recursion(of_path, z, x0, by_robot=True)
     trust = roll(by_robot)
     trust = trust.reshape(-1, *trust.shape[-2:])
@@ -448,6 +485,7 @@ def _value_along(
     if not problem.objective.of_contact:
         value = problem.value_along(cells, trust.mean((0, -1)), by_robot.noise_sd)
         return trust, float(value), values
+
     # Capping the trust of each draw causes bias, so the value of each draw uses uncapped trust.
     # However, the contact lost on a path cannot be negative.
     team = capped(problem.objective, problem.family, trust_recursion(of_path, z, x0))

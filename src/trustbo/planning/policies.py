@@ -21,6 +21,7 @@ Policy = Callable[[np.random.Generator, Params, Planner], Plan]
 
 N_DRAWS = 200
 """Number of draws for which `ucb` finds the best path."""
+_N_DRIFTS = 1000  # number of draws whose quantiles `optimistic` computes
 
 
 def greedy(rng: np.random.Generator, params: Params, planner: Planner) -> Plan:
@@ -45,18 +46,23 @@ def optimistic(
     """
     _require(rng, params, planner)
     require_share("quantile", quantile)
-    some = choose_draws(params, 1000, _seed(rng))
-    transition, drift, start, sd = planner.problem.recursion(some)
-    best = Recursion(
-        transition.mean(0), np.quantile(drift, quantile, axis=0), start.mean(0), sd.mean(0)
+
+    some = choose_draws(params, _N_DRIFTS, _seed(rng))
+    drawn = planner.problem.recursion(some)
+    optimistic = Recursion(
+        transition=drawn.transition.mean(0),
+        drift=np.quantile(drawn.drift, quantile, axis=0),
+        start=drawn.start.mean(0),
+        noise_sd=drawn.noise_sd.mean(0),
     )
-    return planner.evaluate(planner.best_path(best), params.mean())
+    return planner.evaluate(planner.best_path(optimistic), params.mean())
 
 
 def ucb(rng: np.random.Generator, params: Params, planner: Planner, *, kappa: float = 1.0) -> Plan:
     """Choose, among the draws' best paths, that with the largest mean + `kappa` sd of the value."""
     _require(rng, params, planner)
     require_finite("kappa", kappa)
+
     drawn = planner.plan_draws(params, n_draws=N_DRAWS, seed=_seed(rng))
     values = drawn.values_of(drawn.candidates)
     chosen = int(np.argmax(values.mean(0) + kappa * values.std(0)))
@@ -66,8 +72,13 @@ def ucb(rng: np.random.Generator, params: Params, planner: Planner, *, kappa: fl
 def random(rng: np.random.Generator, params: Params, planner: Planner) -> Plan:
     """Plan the best path for random drifts, uniform on [0, 1], without using the posterior."""
     _require(rng, params, planner)
-    drift = rng.uniform(size=(1, *planner.problem.paths.bounds.shape))
-    recursion = Recursion(np.zeros((1, 1)), drift, np.zeros(1), np.full((), 0.1))
+
+    recursion = Recursion(
+        transition=np.zeros((1, 1)),
+        drift=rng.uniform(size=(1, *planner.problem.paths.bounds.shape)),
+        start=np.zeros(1),
+        noise_sd=np.full((), 0.1),  # matters only for censored rates
+    )
     return planner.evaluate(planner.best_path(recursion), params.mean())
 
 

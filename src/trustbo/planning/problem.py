@@ -39,7 +39,8 @@ class InfeasibleError(TrustboError):
 
     def __init__(self, message: str, path: tuple[Cell, ...], p_fail: float) -> None:
         super().__init__(message)
-        self.path, self.p_fail = path, p_fail
+        self.path = path
+        self.p_fail = p_fail
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +70,7 @@ class Problem:
             require_positive("max_failure", self.max_failure, or_zero=True)
             if self.max_failure >= 1.0:
                 raise TrustboError(f"max_failure must be below 1; got {self.max_failure!r}.")
+
         if self.failure_cost is not None:
             require_positive("failure_cost", self.failure_cost, or_zero=True)
             if not self.objective.of_contact:
@@ -76,6 +78,7 @@ class Problem:
                     f"failure_cost is a loss of contact, but the objective "
                     f"{self.objective.name!r} does not measure contact; use max_failure instead."
                 )
+
         shape = self.paths.bounds.shape
         if self.risk is not None and self.risk.p_fail.shape != shape:
             raise TrustboError(f"p_fail must have the shape {shape}; got {self.risk.p_fail.shape}.")
@@ -85,7 +88,9 @@ class Problem:
         """Cost of a failure in bounds; 0 without a risk, or if contact is not the objective."""
         if self.risk is None or not self.objective.of_contact:
             return 0.0
-        return float(self.paths.shortest) if self.failure_cost is None else self.failure_cost
+        if self.failure_cost is None:
+            return float(self.paths.shortest)
+        return self.failure_cost
 
     def toll_along(self, path: Sequence[Cell] | np.ndarray) -> float:
         """Sum the tolls along a path."""
@@ -98,17 +103,22 @@ class Problem:
 
         The team's `trust` after each bound has shape (..., bound), and `noise_sd` has shape (...,).
         """
-        objective, toll, n_bounds = self.objective, self.toll_along(path), trust.shape[-1]
+        objective = self.objective
+        toll = self.toll_along(path)
         if objective.of_contact:
             lost = 1.0 - self.family.mean_rate(trust, noise_sd[..., None])
             return objective.value(-lost.sum(-1) - toll)
+
+        n_bounds = trust.shape[-1]
         credit = objective.credit(np.arange(n_bounds))[::-1]
         scale = objective.scale(np.array([float(n_bounds)]))[0]
         return objective.value((trust @ credit - toll) / scale)
 
     def failure_along(self, path: Sequence[Cell] | np.ndarray) -> float:
         """Compute the expected cost of failure: `price` times the failure probability of a path."""
-        return self.price * self.risk.priced(path) if self.risk and self.price else 0.0
+        if not self.risk or not self.price:
+            return 0.0
+        return self.price * self.risk.priced(path)
 
     def is_within_limit(self, path: Sequence[Cell] | np.ndarray) -> bool:
         """Return whether a path respects `max_failure`."""
@@ -127,9 +137,11 @@ class Problem:
         """Read expected trust at the start, shape () or (..., robot), by the robots' names."""
         if x0 is None:
             return None
+
         dims = ("draw", "robot") if "draw" in getattr(x0, "dims", ()) else ("robot",)
         robots = {"robot": self.paths.workspace.team.names}
         start = require_numbers("x0", read_labelled("x0", x0, dims, robots).values)
+
         n_robots = len(robots["robot"])
         if start.ndim and start.shape[-1] != n_robots:
             raise TrustboError(f"x0 must have the shape () or ({n_robots},); got {start.shape}.")
@@ -149,21 +161,28 @@ class Problem:
             )
         if self.risk is None or (self.max_failure is None and self.price == 0.0):
             return None
-        p_fail, shares = self.risk.p_fail[None], np.ones(1)
+
         if self.risk.strata is not None and self.price > 0.0:
             p_fail, shares = self.risk.strata
+        else:
+            p_fail = self.risk.p_fail[None]
+            shares = np.ones(1)
+
         limit = np.inf
         if self.max_failure is not None:
             limit = -np.log1p(-self.max_failure) + ROUNDING
             if len(shares) > 1:  # the last sum is for the mean of the strata
                 p_fail = np.concatenate([p_fail, self.risk.p_fail[None]])
                 shares = np.append(shares, 0.0)
-        if (missing := np.isnan(p_fail).any(0) & self.paths.bounds).any():
+
+        missing = np.isnan(p_fail).any(0) & self.paths.bounds
+        if missing.any():
             move, row, col = np.argwhere(missing)[0].tolist()
             raise TrustboError(
                 f"p_fail is NaN for the bound that enters {(row, col)} by the move "
                 f"{MOVE_NAMES[move]!r}; give a probability for every possible bound."
             )
+
         of_bounds = risk_of(p_fail).reshape(len(p_fail), -1).T
         return Risks(np.ascontiguousarray(of_bounds), self.price * shares, limit)
 
@@ -181,30 +200,49 @@ class Problem:
         history = has_history(self.objective, self.family)
         self._require_valid(recursion, history)
         recursion = capped(self.objective, self.family, recursion).flat()
+
+        graph = self.paths.graph
         n_draws, n_states = recursion.start.shape
-        drift, toll = recursion.drift.reshape(n_draws, n_states, -1), self.toll.ravel()
-        view, graph = np.full(n_states, 1.0 / n_states), self.paths.graph
+        drift = recursion.drift.reshape(n_draws, n_states, -1)
+        toll = self.toll.ravel()
+        view = np.full(n_states, 1.0 / n_states)
         weights = weights_of(self.objective, recursion, view, graph.longest)
+
         if self.risks is None and not history:
             score, paths = best_sums(graph, drift, weights, toll)
             return score, score, paths
-        n_trust, loss = 0, LOGISTIC
+
+        n_trust = 0
+        loss = LOGISTIC  # not used, because no trust is followed
         if history:  # the cost depends on trust itself and is not a weighted sum of drifts
-            n_trust, loss = n_states, LOSSES[self.family.expected_rate]
+            n_trust = n_states
+            loss = LOSSES[self.family.expected_rate]
             weights = Weights(0.0 * weights.per_bound, 0.0 * weights.constant, weights.scale)
-        transition, x0 = recursion.transition[:, :n_trust, :n_trust], recursion.start[:, :n_trust]
-        trust = transition.copy(), x0.copy(), np.maximum(recursion.noise_sd, TINY_SD)
+
         risks = self.risks or Risks(np.zeros((len(toll), 1)), np.zeros(1), np.inf)
-        costs = Costs(loss, drift, weights.per_bound, -weights.constant, *trust, toll, *risks)
+        costs = Costs(
+            loss=loss,
+            drift=drift,
+            weight=weights.per_bound,
+            start=-weights.constant,
+            transition=recursion.transition[:, :n_trust, :n_trust].copy(),
+            x0=recursion.start[:, :n_trust].copy(),
+            sd=np.maximum(recursion.noise_sd, TINY_SD),
+            toll=toll,
+            risk=risks.of_bounds,
+            failure=risks.failure,
+            limit=risks.limit,
+        )
         cost, lower, paths = best_labels(graph, costs, weights.scale)
         if self.risk is not None and np.isinf(cost).any():
             raise self._infeasible(self.risk)
         return -cost, -lower, paths
 
     def _require_valid(self, recursion: Recursion, history: bool) -> None:
-        """Raise TrustboError if the search is not exact for these recursion."""
+        """Raise TrustboError if the search is not exact for this recursion."""
         if not self.objective.of_contact:
             return
+
         beta0 = np.diagonal(recursion.transition, axis1=-2, axis2=-1)
         if beta0.min() < 0.0 or (history and recursion.transition.min() < 0.0):
             raise TrustboError(
@@ -215,8 +253,11 @@ class Problem:
 
     def _infeasible(self, risk: Risk) -> InfeasibleError:
         """Return an error that says that no path respects `max_failure`, with the safest path."""
-        graph, n = self.paths.graph, self.paths.graph.longest + 1
+        graph = self.paths.graph
+        n = graph.longest + 1
         nothing = Weights(np.zeros((1, n, 1)), np.zeros((1, n)), np.ones(n))
+
+        # The safest path is the cheapest one if the toll of each bound is its risk -log(1 - p).
         of_bounds = risk_of(risk.p_fail).ravel()
         _, paths = best_sums(graph, np.zeros((1, 1, len(of_bounds))), nothing, of_bounds)
         path = self.paths.cells(paths[0])
@@ -258,6 +299,7 @@ def draws_of(posterior: Params | xr.DataTree, workspace: Workspace, *, day: bool
     """
     if isinstance(posterior, xr.DataTree):
         return params_of(posterior, workspace, day=day)
+
     remedy = "give a posterior from fit, or parameters"
     params: Params = require_kind("posterior", posterior, Params, remedy)
     require_values(params)
@@ -280,5 +322,8 @@ def mean_and_draws_of(
     if isinstance(params, xr.DataTree):
         expected, drawn = expected_and_drawn(params, workspace)
         return expected.mean(), drawn
+
     draws = draws_of(params, workspace)
-    return (draws.mean(), draws) if draws.leading else (draws, None)
+    if not draws.leading:
+        return draws, None
+    return draws.mean(), draws

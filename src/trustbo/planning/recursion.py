@@ -114,11 +114,13 @@ def drift(params: Params, awareness: np.ndarray) -> np.ndarray:
         TrustboError: If the number of robots, features or cells does not match the parameters.
     """
     check_params(params, None if params.places else len(awareness), awareness.shape[-1])
-    u, b = params.increments(awareness), np.asarray(params.b, dtype=float)
+    u = params.increments(awareness)
+    b = np.asarray(params.b, dtype=float)
     if not params.BY_ROBOT and b.ndim <= len(params.leading):
         b = b[..., None]
     if b.ndim == len(params.leading) + 3:  # (..., 1, bound, robot), along a path
         return u + np.swapaxes(b[..., 0, :, :], -1, -2)[..., None, None, :]
+
     u += b[..., None, None, None]  # in place, because the array can be large
     for name, effect in params.places.items():
         if effect.shape[-2:] != u.shape[-2:]:
@@ -126,7 +128,10 @@ def drift(params: Params, awareness: np.ndarray) -> np.ndarray:
                 f"params.{name} has the grid shape {effect.shape[-2:]}, but the awareness has "
                 f"{u.shape[-2:]}. For the awareness along a path, use params.along(path)."
             )
-        u = u + (effect[..., None, :, :] if name == "place" else effect)
+        if name == "place":  # the effect of a cell is the same for all moves that enter it
+            effect = effect[..., None, :, :]
+        u = u + effect
+
     return u
 
 
@@ -149,12 +154,16 @@ def roll_trust(params: Params, awareness: ArrayLike, x0: ArrayLike | None = None
     """
     require_kind("params", params, Params, "give parameters, such as TrustParams(...)")
     require_values(params)
-    dims, unnamed = ("bound", "robot", "feature"), {"robot": None, "feature": None}
+
+    dims = ("bound", "robot", "feature")
+    unnamed = {"robot": None, "feature": None}
     z = read_labelled("awareness", awareness, dims, unnamed).values
     if z.ndim != len(dims) or not z.size:
         raise TrustboError(f"awareness must have the shape (bound, robot, feature); got {z.shape}.")
+    if x0 is not None:
+        x0 = require_numbers("x0", x0)
+
     of_robots = np.swapaxes(z, 0, 1)
-    x0 = None if x0 is None else require_numbers("x0", x0)
     return roll(trust_recursion(params, of_robots[:, None, None], x0, by_robot=True))
 
 

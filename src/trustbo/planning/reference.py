@@ -34,11 +34,16 @@ def plan(planner: Planner, params: Params | xr.DataTree) -> Plan:
     Raises:
         InfeasibleError: If no path respects `max_failure`.
     """
-    problem, mean = planner.problem, mean_of(params, planner.workspace)
+    problem = planner.problem
+    mean = mean_of(params, planner.workspace)
+
     if problem.risks is not None or has_history(problem.objective, problem.family):
         plans = [planner.evaluate(path, mean) for path in every_path(problem.paths)]
-        within = [one for one in plans if not one.infeasible]
-        return max(within, key=lambda one: one.value) if within else planner.plan(mean)
+        feasible = [one for one in plans if not one.infeasible]
+        if not feasible:
+            return planner.plan(mean)  # raises InfeasibleError
+        return max(feasible, key=lambda one: one.value)
+
     recursion = capped(problem.objective, problem.family, problem.recursion(mean))
     plans = [planner.evaluate(path, mean) for path in shortest_paths(planner, recursion)]
     return max(plans, key=lambda one: one.value)
@@ -51,23 +56,30 @@ def shortest_paths(planner: Planner, recursion: Recursion) -> Iterator[tuple[Cel
     w_j = sum_{i <= j} credit(i) view . B0^(j - i), and view . x is the team's mean trust.
     """
     problem = planner.problem
-    graph, n_states = problem.paths.graph, len(recursion.start)
+    graph = problem.paths.graph
+    n_states = len(recursion.start)
+    view = np.full(n_states, 1.0 / n_states)
     credit = problem.objective.credit(np.arange(graph.longest + 1))
-    view, weights = np.full(n_states, 1.0 / n_states), []
+
+    weights = []
     carried = np.zeros(n_states)
     for j in range(graph.longest):
         carried = carried @ recursion.transition + credit[j] * view
         weights.append(carried)
-    drift, toll = recursion.drift.reshape(n_states, -1), problem.toll.ravel()
+
+    drift = recursion.drift.reshape(n_states, -1)
+    toll = problem.toll.ravel()
     left = graph.left[graph.head]  # bounds left after each edge
     cost = [toll[b] - weights[j] @ drift[:, b] for b, j in zip(graph.bound, left, strict=True)]
     network = graph.to_networkx(cost)
+
     for s in graph.starts:
         start = None, int(graph.cell[s]), int(graph.left[s])
         try:
             nodes = nx.bellman_ford_path(network, start, "goal", weight="cost")
         except (nx.NetworkXNoPath, nx.NodeNotFound):  # every path of this length has a U-turn
             continue
+
         cells = np.array([node[1] for node in nodes[:-1]])
         yield (*problem.paths.cells(cells), planner.goal)
 
@@ -78,6 +90,7 @@ def every_path(paths: AdmissiblePaths) -> Iterator[tuple[Cell, ...]]:
     for move, row, col in np.argwhere(paths.bounds).tolist():
         down, right = MOVES[move]
         onward.setdefault((row - down, col - right), []).append((row, col))
+
     stack: list[tuple[Cell, ...]] = [(paths.start,)]
     while stack:
         path = stack.pop()

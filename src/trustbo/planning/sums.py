@@ -27,7 +27,8 @@ def best_sums(
         Scores (draw,) and paths (draw, cell) as flat cell indices, padded with -1.
     """
     n = len(drift)
-    scores, paths = np.full(n, -np.inf), np.full((n, graph.longest + 1), -1, np.int32)
+    scores = np.full(n, -np.inf)
+    paths = np.full((n, graph.longest + 1), -1, np.int32)
 
     def work(begin: int, end: int) -> None:
         _best_sums(graph, drift, *weights, toll, scores, paths, begin, end)
@@ -39,16 +40,21 @@ def best_sums(
 @kernel
 def _best_sums(graph, drift, per_bound, constant, scale, toll, scores, paths, begin, end):
     """Write the best score and path of the draws from `begin` to `end`."""
-    cost, to_go = np.empty(len(graph.head)), new_to_go(len(graph.cell))
+    cost = np.empty(len(graph.head))
+    to_go = new_to_go(len(graph.cell))
     edges = np.empty(paths.shape[1], np.int64)
+
     for d in range(begin, end):
         costs_of_sums(graph, drift[d], per_bound[d], toll, cost)
         fill_to_go(graph, cost, to_go)
+
         chosen = -1
         for s in graph.starts:
             score = (constant[d, graph.left[s]] - to_go.least[s]) / scale[graph.left[s]]
             if score > scores[d]:
-                scores[d], chosen = score, s
+                scores[d] = score
+                chosen = s
+
         if chosen >= 0:
             n = edges_from(graph, to_go, chosen, edges)
             paths[d, 0] = graph.cell[chosen]
@@ -60,7 +66,8 @@ def _best_sums(graph, drift, per_bound, constant, scale, toll, scores, paths, be
 def costs_of_sums(graph, drift, per_bound, toll, cost) -> None:
     """Write the cost of each edge for one draw, which is the toll minus w_j . u, to `cost`."""
     for e in range(len(graph.head)):
-        left, b = graph.left[graph.head[e]], graph.bound[e]
+        left = graph.left[graph.head[e]]
+        b = graph.bound[e]
         cost[e] = toll[b]
         for i in range(len(drift)):
             cost[e] -= per_bound[left, i] * drift[i, b]

@@ -20,14 +20,18 @@ def trust_map(
     recursion = problem.recursion(params, x0, by_robot=per_robot).flat()
     like = problem.paths.workspace.awareness.isel(move=0, feature=0, drop=True)
     n_states = recursion.start.shape[-1]
+
     if per_robot:
         robots = [_largest(problem.paths, recursion, view) for view in np.eye(n_states)]
         values = np.stack(robots, axis=1)
     else:
         values = _largest(problem.paths, recursion, np.full(n_states, 1.0 / n_states))
         like = like.isel(robot=0, drop=True)
-    like = like.expand_dims(draw=len(values)) if params.leading else like
-    trust = like.copy(data=values if params.leading else values[0])
+
+    if params.leading:
+        trust = like.expand_dims(draw=len(values)).copy(data=values)
+    else:
+        trust = like.copy(data=values[0])
     return trust.rename("trust").assign_attrs(long_name="expected trust")
 
 
@@ -40,6 +44,7 @@ def cost_of(trust: xr.DataArray) -> xr.DataArray:
 def _largest(paths: AdmissiblePaths, recursion: Recursion, view: np.ndarray) -> np.ndarray:
     """Compute the largest trust, view . x, on arrival at each cell, (draw, row, col)."""
     extra = min(SIMPLE_EXTRA, paths.longest - paths.shortest)
+
     weights = view @ recursion.transition  # (draw, state)
     beta0 = np.divide(weights, view, out=np.zeros_like(weights), where=view > 0.0)
     scalar = (weights == beta0.max(-1, keepdims=True) * view).all()  # view . x has a recursion
@@ -47,6 +52,8 @@ def _largest(paths: AdmissiblePaths, recursion: Recursion, view: np.ndarray) -> 
         drift = np.einsum("s,dsmrc->dmrc", view, recursion.drift)
         drift = np.where(paths.bounds, drift, np.nan)
         return best_trust(paths, extra, drift, beta0.max(-1), recursion.start @ view)
+
+    # Otherwise, one search for each cell.
     drift = recursion.drift.reshape(*recursion.start.shape, -1)
     values = np.full((len(drift), *paths.bounds.shape[1:]), np.nan)
     no_toll = np.zeros(paths.bounds.size)
@@ -54,6 +61,7 @@ def _largest(paths: AdmissiblePaths, recursion: Recursion, view: np.ndarray) -> 
         graph = paths.to((row, col), extra).graph
         weights = weights_of(TERMINAL, recursion, view, graph.longest)
         values[:, row, col], _ = best_sums(graph, drift, weights, no_toll)
+
     values[:, *paths.start] = recursion.start @ view
     return values
 
@@ -76,15 +84,21 @@ def best_trust(
     Returns:
         Largest trust, shape (draw, row, col).
     """
-    start, fewest = paths.start, paths.bounds_from_start
-    margin = ((0, 0), (0, 0), (1, 1), (1, 1))
+    fewest = paths.bounds_from_start
+    margin = ((0, 0), (0, 0), (1, 1), (1, 1))  # of one cell, so that no index is out of range
     u = np.pad(np.where(np.isnan(drift), -np.inf, drift), margin, constant_values=-np.inf)
     n_draws, n_moves, rows, cols = u.shape
     reach = np.pad(np.where(fewest < 0, -1, fewest + extra), 1, constant_values=-1)
-    top, second = np.full((2, n_draws, rows, cols), -np.inf)
+
+    start_row = paths.start[0] + 1
+    start_col = paths.start[1] + 1
+    top = np.full((n_draws, rows, cols), -np.inf)
+    top[:, start_row, start_col] = x0
+    second = top.copy()
+    best = top.copy()
     by = np.full((n_draws, rows, cols), -1)
-    top[:, start[0] + 1, start[1] + 1] = second[:, start[0] + 1, start[1] + 1] = x0
-    best, entered = top.copy(), np.empty((n_moves, n_draws, rows, cols))
+    entered = np.empty((n_moves, n_draws, rows, cols))
+
     for k in range(1, int(fewest.max()) + extra + 1):
         for m, step in enumerate(STEPS):
             before = np.where(by == n_moves - 1 - m, second, top)  # the reverse move is forbidden
@@ -92,9 +106,11 @@ def best_trust(
             carried = np.where(np.isneginf(before), before, beta0[:, None, None] * before)
             entered[m] = carried + u[:, m]
         entered[:, :, k > reach] = -np.inf
+
         by = entered.argmax(0)
         top = np.take_along_axis(entered, by[None], 0)[0]
         np.put_along_axis(entered, by[None], -np.inf, 0)
         second = entered.max(0)
         best = np.maximum(best, top)
+
     return np.where(np.isfinite(best), best, np.nan)[:, 1:-1, 1:-1]

@@ -57,6 +57,7 @@ class Unrolled(NamedTuple):
         graph = nx.DiGraph()
         nodes: list[tuple[int | None, int]] = [(None, s) for s in self.starts.tolist()]
         met = set(nodes)
+
         while nodes:
             before, s = nodes.pop()
             tail = (before, int(self.cell[s]), int(self.left[s]))
@@ -64,12 +65,14 @@ class Unrolled(NamedTuple):
                 h = int(self.head[e])
                 if not self.turns and self.cell[h] == before:
                     continue
+
                 onward = (None if self.turns else tail[1], h)
                 head = "goal" if h == 0 else (onward[0], int(self.cell[h]), int(self.left[h]))
                 graph.add_edge(tail, head, cost=float(cost[e]), bound=int(self.bound[e]))
                 if h > 0 and onward not in met:
                     met.add(onward)
                     nodes.append(onward)
+
         return graph
 
 
@@ -89,7 +92,8 @@ class ToGo(NamedTuple):
 @kernel
 def new_to_go(n_states: int) -> ToGo:
     """Allocate arrays for the costs from `n_states` states to the goal."""
-    edge, other = np.full(n_states, -1), np.full(n_states, -1)
+    edge = np.full(n_states, -1)
+    other = np.full(n_states, -1)
     return ToGo(np.zeros(n_states), edge, np.full(n_states, np.inf), other)
 
 
@@ -97,28 +101,50 @@ def new_to_go(n_states: int) -> ToGo:
 def fill_to_go(graph, cost, to_go) -> None:
     """Fill `to_go` for the edge costs (edge,) by dynamic programming, starting at the goal."""
     least, edge, second, other = to_go
-    cell, first, head = graph.cell, graph.first, graph.head
+    cell = graph.cell
+    first = graph.first
+    head = graph.head
+
     for s in range(1, len(cell)):
-        low, next_low, at, at_next = np.inf, np.inf, -1, -1
+        low = np.inf
+        next_low = np.inf
+        at = -1
+        at_next = -1
         for e in range(first[s], first[s + 1]):
             h = head[e]
-            value = cost[e] + least[h]
+            value = cost[e] + least[h]  # Bellman's equation
             if not graph.turns and edge[h] >= 0 and cell[head[edge[h]]] == cell[s]:
-                value = cost[e] + second[h]
+                value = cost[e] + second[h]  # the best path from h would be a U-turn
+
             if value < low:
-                next_low, at_next, low, at = low, at, value, e
+                next_low = low
+                at_next = at
+                low = value
+                at = e
             elif value < next_low:
-                next_low, at_next = value, e
-        least[s], edge[s], second[s], other[s] = low, at, next_low, at_next
+                next_low = value
+                at_next = e
+
+        least[s] = low
+        edge[s] = at
+        second[s] = next_low
+        other[s] = at_next
 
 
 @kernel
 def edges_from(graph, to_go, start, edges) -> int:
     """Write the edges of the cheapest path from a state to `edges`, and return their number."""
-    s, before, n = start, -1, 0
+    s = start
+    before = -1
+    n = 0
+
     while s > 0:
         e = to_go.edge[s]
         if not graph.turns and graph.cell[graph.head[e]] == before:
             e = to_go.other[s]
-        edges[n], before, s, n = e, graph.cell[s], graph.head[e], n + 1
+        edges[n] = e
+        before = graph.cell[s]
+        s = graph.head[e]
+        n += 1
+
     return n
