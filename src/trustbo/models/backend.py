@@ -46,9 +46,11 @@ def inverse(A: Any) -> Any:
     """Invert positive definite matrices (point, n, n); in NumPy, other matrices give NaN."""
     if isinstance(A, jax.Array):
         return inverse_and_log_det(A)[0]
+
     H = A.copy()
     for one in H:  # `one.T` equals the symmetric `one`, and has LAPACK's memory order
-        if lapack.dpotrf(one.T, lower=1, overwrite_a=1)[1]:  # pyright: ignore[reportAttributeAccessIssue]
+        _, failed = lapack.dpotrf(one.T, lower=1, overwrite_a=1)  # pyright: ignore[reportAttributeAccessIssue]
+        if failed:
             one[:] = np.nan
     return inverse_from_factor(H)
 
@@ -84,6 +86,8 @@ def _with_inverse(A: jax.Array) -> tuple[tuple[jax.Array, jax.Array], jax.Array]
 def _slopes(inverse: jax.Array, slopes: tuple[jax.Array, jax.Array]) -> tuple[jax.Array]:
     """Return the derivatives with respect to A, given those with respect to both values."""
     of_inverse, of_log_det = slopes
+
+    # d log det A = tr(A^-1 dA) and d A^-1 = -A^-1 dA A^-1 (Petersen, Pedersen 2012, 2.1-2.2).
     return (of_log_det[..., None, None] * inverse - inverse @ of_inverse @ inverse,)
 
 

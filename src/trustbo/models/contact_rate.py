@@ -65,6 +65,7 @@ class ContactRate(dist.Distribution):
                 f"drift must have the shape (mission, bound, robot); got {drift.shape}. For one "
                 "mission, give drift[None]."
             )
+
         n_robots = drift.shape[2]
         for name, value in values.items():
             if value.ndim and value.shape[-1] not in (1, n_robots):
@@ -99,6 +100,7 @@ class ContactRate(dist.Distribution):
         drift, offset = jnp.broadcast_arrays(*(jnp.asarray(value, float) for value in inputs))
         shape = drift.shape
         grouped = *shape[:2], shape[2] // space.n_members, space.n_members
+
         self.inputs = Inputs(drift.reshape(grouped), offset.reshape(grouped))
         self.space = space
         dist.Distribution.__init__(self, shape[:1], shape[1:])
@@ -117,6 +119,7 @@ class ContactRate(dist.Distribution):
                 "contact rates must have the shape (mission, bound, robot) of the drift, "
                 f"{shape}; got {jnp.shape(value)}."
             )
+
         rates = jnp.reshape(value, drift.shape)
         by_bound = tuple(jnp.swapaxes(a, 0, 1) for a in (rates, drift, offset))
 
@@ -140,11 +143,13 @@ class ContactRate(dist.Distribution):
         drift, offset = self.inputs
         shape = *sample_shape, *drift.shape
         w, v, s, e = (random.normal(k, shape) for k in random.split(key, 4))
+
         d = space.initial_mean + apply(root(space.initial_cov), e[..., 0, :, :])
         rates = []
-        for k in range(drift.shape[1]):
+        for k in range(drift.shape[1]):  # equations (1) and (2)
             noise = apply(root(space.process_cov), w[..., k, :, :])
             d = kalman.step(space.transition, d, drift[:, k]) + noise
+
             f = d + offset[:, k]
             if space.shared_cov is not None:
                 f = f + apply(root(space.shared_cov), s[..., k, :, :])

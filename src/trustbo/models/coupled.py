@@ -12,7 +12,7 @@ from trustbo.models.backend import namespace
 from trustbo.models.effects.effect import Theta
 from trustbo.models.effects.weights import CoupledWeights
 from trustbo.models.model import TrustModel
-from trustbo.models.params import CoupledParams
+from trustbo.models.params import COUPLED_NAMES, CoupledParams
 from trustbo.statespace import StateSpace
 from trustbo.statespace.form import coupled_robots
 
@@ -35,17 +35,22 @@ class CoupledTrust(TrustModel):
 
     def hyperpriors(self, n_robots: int, n_features: int) -> dict[str, Distribution]:
         """See `TrustModel.hyperpriors`; the correlations R are given by partial correlations."""
-        n, priors = n_robots, self.priors
+        n = n_robots
+        priors = self.priors
         names = ("beta0", "delta_w", "delta_v")
         named = {name: getattr(priors, name).expand((n,)) for name in names}
         if n == 1:
             return named
+
         named["coupling"] = priors.coupling.expand((n * (n - 1),))
+
+        # Partial correlations of the LKJ prior (Lewandowski, Kurowicka and Joe 2009).
         column = np.tril_indices(n, -1)[1]
         shape = priors.concentration + 0.5 * (n - 2 - column)
         partials = {"partial_w": dist.Beta(shape, shape)}
         if self.family.adds_noise:
             partials["partial_v"] = dist.Beta(shape, shape)
+
         return named | partials
 
     def derived(self, values: Mapping[str, Any]) -> dict[str, Any]:
@@ -53,12 +58,15 @@ class CoupledTrust(TrustModel):
         if "B0" in values:
             B0 = values["B0"]
             return {**values, "inverse_gain": 1.0 - namespace(B0).diagonal(B0, axis1=1, axis2=2)}
-        beta0, xp = values["beta0"], namespace(values["beta0"])
+
+        beta0 = values["beta0"]
+        xp = namespace(beta0)
         n = beta0.shape[1]
         B0 = beta0[:, :, None] * np.eye(n)
         if n > 1:
             place = np.eye(n * n)[~np.eye(n, dtype=bool).ravel()]  # position of each coupling
             B0 = B0 + (values["coupling"] @ place).reshape(-1, n, n)
+
         derived: dict[str, Any] = {"B0": B0, "inverse_gain": 1.0 - beta0}
         for noise in ("w", "v"):
             factor = xp.broadcast_to(np.eye(n), B0.shape)
@@ -66,6 +74,7 @@ class CoupledTrust(TrustModel):
                 factor = correlation_factor(2.0 * values[f"partial_{noise}"] - 1.0, n)
             factor = values[f"delta_{noise}"][:, :, None] * factor
             derived[f"Delta_{noise}"] = factor @ xp.swapaxes(factor, 1, 2)
+
         return {**derived, **values}
 
     @property
@@ -102,18 +111,23 @@ class CoupledTrust(TrustModel):
     @property
     def dims(self) -> dict[str, tuple[str, ...]]:
         """See `TrustModel.dims`."""
-        return {name: CoupledParams.AXES[name] for name in CoupledParams._fields[:5]}
+        return {name: CoupledParams.AXES[name] for name in COUPLED_NAMES}
 
 
 def correlation_factor(r: Any, n: int) -> Any:
     """Compute Cholesky factors (point, n, n) of correlation matrices from partial correlations."""
-    xp, k, rows = namespace(r), 0, []
+    xp = namespace(r)
+    k = 0  # index of the partial correlation, in the order of the lower triangle
+    rows = []
     for i in range(n):
-        left, row = xp.ones(len(r)), []
+        row = []
+        length = xp.ones(len(r))  # of the rest of the row, because rows have length 1
         for _ in range(i):
-            row.append(r[:, k] * left)
-            left = left * xp.sqrt(1.0 - r[:, k] ** 2)
+            row.append(r[:, k] * length)
+            length = length * xp.sqrt(1.0 - r[:, k] ** 2)
             k += 1
+
         zeros = [xp.zeros(len(r))] * (n - 1 - i)
-        rows.append(xp.stack([*row, left, *zeros], axis=1))
+        rows.append(xp.stack([*row, length, *zeros], axis=1))
+
     return xp.stack(rows, axis=1)

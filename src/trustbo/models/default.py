@@ -11,5 +11,6 @@ def default_model(*, places: bool = True) -> PooledTrust:
     Args:
         places: Whether to include place effects, which need missions with a map.
     """
-    effects = (PlaceEffect(), RobotEffect()) if places else (RobotEffect(),)
-    return PooledTrust(effects=effects)
+    if not places:
+        return PooledTrust(effects=(RobotEffect(),))
+    return PooledTrust(effects=(PlaceEffect(), RobotEffect()))

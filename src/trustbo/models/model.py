@@ -29,6 +29,7 @@ from trustbo.workspace import Workspace
 
 MODELS: dict[str, type["TrustModel"]] = {}
 """Model classes by name, to read models from files."""
+_JITTER = 1e-13  # added to the covariance of trust, so that rounding does not make it singular
 
 
 @dataclass(frozen=True, repr=False)
@@ -66,8 +67,10 @@ class TrustModel(Summary, ABC):
             object.__setattr__(self, "priors", Priors.default(self.observation))
         elif not isinstance(self.priors, Priors):
             raise TrustboError(f"priors must be a trustbo.models.Priors; got {self.priors!r}.")
+
         given: Any = self.effects
-        given = [given] if isinstance(given, Effect) else given
+        if isinstance(given, Effect):
+            given = [given]
         effects = tuple(require_list("effects", given, Effect, "give objects like PlaceEffect()"))
         if len({type(effect) for effect in effects}) < len(effects):
             raise TrustboError(f"effects must be of different classes; got {effects!r}.")
@@ -239,6 +242,7 @@ class TrustModel(Summary, ABC):
         }
         values = {name: jnp.asarray(value)[None] for name, value in values.items()}
         theta: Any = self.theta(values, observations.resolution)
+
         c: Any = numpyro.deterministic("columns", sample_columns(self.columns, theta, observations))
         U: Any = sparse.hstack(
             [effect.columns(observations) for effect in self.columns], format="csr"
@@ -263,7 +267,8 @@ class TrustModel(Summary, ABC):
         ticks = layout.rows(observations.n_ticks)
 
         # Trust is its mean plus a Cholesky factor times white noise, which is easier to sample.
-        root = jnp.linalg.cholesky(predictor.covariance[0] + 1e-13 * jnp.eye(y.shape[1]))
+        jitter = _JITTER * jnp.eye(y.shape[1])
+        root = jnp.linalg.cholesky(predictor.covariance[0] + jitter)
         white = dist.Normal(0.0, 1.0).expand(y.shape).to_event(2)
         e: Any = numpyro.sample("trust_noise", white)
         mean = predictor.mean[0] + (predictor.response[0] @ u[..., None])[..., 0]
@@ -277,8 +282,10 @@ class TrustModel(Summary, ABC):
 
     def options(self) -> dict[str, Any]:
         """Return the options by name, except priors, effects and `memory` if it is "level"."""
-        others = ("priors", "effects", *("memory",) * (self.memory == "level"))
-        return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in others}
+        left_out = {"priors", "effects"}
+        if self.memory == "level":
+            left_out.add("memory")
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in left_out}
 
     def _rows(self) -> Rows:
         return [

@@ -62,10 +62,12 @@ class Observations(NamedTuple):
                     f"{mission.features[m]} is NaN; pass workspace= to fill it, or leave out the "
                     "mission if the map does not know the cell."
                 )
+
             driven = slice(len(mission.bounds))
             padded.contact_rate[j, driven] = mission.contact_rate
             padded.awareness[j, driven] = mission.awareness
             padded.n_ticks[j, driven] = mission.n_ticks
+
         return padded
 
     @property

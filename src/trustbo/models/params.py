@@ -93,8 +93,10 @@ class ParameterDraws(Summary):
             if value is None:
                 continue
             value = np.asarray(value, dtype=float)
+
             core = value.shape[value.ndim - len(self.AXES.get(name, ())) :]
             joined[name] = np.broadcast_to(value, leading + core).reshape(n_draws, *core)
+
         return joined
 
     @property
@@ -144,6 +146,7 @@ class ParameterDraws(Summary):
             total = total + self.places["place"][..., rows, cols]
         if "place_bound" in self.places:
             total = total + self.places["place_bound"][..., moves, rows, cols]
+
         return np.swapaxes(np.where(moves < 0, 0.0, total), -1, -2)
 
     def along(self, path: Sequence[Cell] | np.ndarray) -> Self:
@@ -155,6 +158,7 @@ class ParameterDraws(Summary):
         """
         if not self.places:
             return self
+
         b = np.asarray(self.b)  # pyright: ignore[reportAttributeAccessIssue]
         b = b[..., None, None, :] if self.BY_ROBOT else b[..., None, None, None]
         b = b + self.of_places(bounds_along(path))[..., None, :, :]
@@ -284,6 +288,12 @@ class CoupledParams(ParameterDraws, _Coupled):
 
 Params = TrustParams | RobotParams | CoupledParams
 
+COUPLED_NAMES = CoupledParams._fields[:5]
+"""Parameters of the coupled model, excluding x0 and place effects."""
+_POOLED_NAMES = TrustParams._fields[:5]
+
+_MOST_SHOWN = 6  # numbers of a field that a summary shows; of longer fields, it shows the range
+
 
 def assemble_params(
     sites: Mapping[str, np.ndarray], x0: Mapping[str, float], memory: str = "level"
@@ -293,11 +303,13 @@ def assemble_params(
     `memory` is the quantity carried over between bounds; see `PooledTrust`.
     """
     if "B0" in sites:
-        return CoupledParams(**{name: sites[name] for name in CoupledParams._fields[:5]}, **x0)
-    values: dict[str, Any] = {name: sites[name] for name in TrustParams._fields[:5]}
+        return CoupledParams(**{name: sites[name] for name in COUPLED_NAMES}, **x0)
+
+    values: dict[str, Any] = {name: sites[name] for name in _POOLED_NAMES}
     values["delta_s"] = sites.get("delta_s")
     if sites["b"].ndim == 1:
         return TrustParams(**values, **x0, memory=memory)
+
     for name in ("beta0", "delta_w", "delta_v"):  # robots share these in the hierarchical model
         values[name] = np.broadcast_to(values[name][:, None], sites["b"].shape)
     return RobotParams(**values, **x0, memory=memory)
@@ -321,9 +333,11 @@ def check_params(params: Params, n_robots: int | None, n_features: int) -> None:
     n = params.n_robots if n_robots is None else n_robots
     sizes = {"feature": {n_features}, "robot": {n}, "robot_": {n}, "effect": {1, n}}
     require_values(params)
+
     for field, axes in params.AXES.items():
         if getattr(params, field) is None:
             continue
+
         value = np.asarray(getattr(params, field))
         ends = dict(zip(axes, value.shape[-len(axes) :], strict=False))
         wrong = [axis for axis, size in ends.items() if size not in sizes.get(axis, {size})]
@@ -332,6 +346,7 @@ def check_params(params: Params, n_robots: int | None, n_features: int) -> None:
                 f"params.{field} must end in the axes {axes}, with {n_features} features "
                 f"and {n or 'any number of'} robots; got the shape {value.shape}."
             )
+
         if field.startswith("Delta"):
             same = np.allclose(value, np.swapaxes(value, -1, -2), rtol=1e-8, atol=1e-12)
             if not (same and np.linalg.eigvalsh(value).min() > 0.0):
@@ -342,8 +357,12 @@ def check_params(params: Params, n_robots: int | None, n_features: int) -> None:
 
 def _written(draws: np.ndarray) -> str:
     """Format the mean and standard deviation of a field (draw, ...) over draws."""
-    mean, sd = draws.mean(0), draws.std(0)
-    if mean.size > 6:
+    mean = draws.mean(0)
+    if mean.size > _MOST_SHOWN:
         return f"{mean.shape}, {mean.min():.3g} to {mean.max():.3g}"
-    spread = zip(np.ravel(mean), np.ravel(sd), strict=True)
-    return ", ".join(f"{m:.3g}" + (f" +- {s:.2g}" if len(draws) > 1 else "") for m, s in spread)
+    if len(draws) == 1:
+        return ", ".join(f"{m:.3g}" for m in np.ravel(mean))
+
+    sd = draws.std(0)
+    moments = zip(np.ravel(mean), np.ravel(sd), strict=True)
+    return ", ".join(f"{m:.3g} +- {s:.2g}" for m, s in moments)

@@ -18,7 +18,8 @@ from trustbo.models.pooled import PooledTrust
 from trustbo.models.priors import Priors
 from trustbo.statespace import Inputs
 
-SUCCESS, FAILURE = "success", "failure"
+SUCCESS = "success"
+FAILURE = "failure"
 """Prefixes of the names of outcome features."""
 SDS = "tau_start", "tau_level", "tau_gain"
 """Names of the standard deviations of the personal coefficients."""
@@ -60,9 +61,11 @@ class HumanTrust(PooledTrust):
         if self.priors is None:
             object.__setattr__(self, "priors", _default_priors())
         super().__post_init__()
+
         for name in SDS:
             number = require_positive(f"HumanTrust.{name}", getattr(self, name))
             object.__setattr__(self, name, number)
+
         if self.effects or self.shared_noise:
             raise TrustboError(
                 f"HumanTrust allows neither effects nor shared_noise; got effects={self.effects!r}."
@@ -82,6 +85,7 @@ class HumanTrust(PooledTrust):
     def observations(self, missions: Any, workspace: Any = None) -> Observations:
         """See `TrustModel.observations`; raises TrustboError if the reports have another scale."""
         observations = super().observations(missions, workspace)
+
         levels = levels_of(self.scale)
         wanted = levels - 1.0 if levels else np.nan
         bad = ~np.isnan(observations.contact_rate) & ~np.isclose(
@@ -94,6 +98,7 @@ class HumanTrust(PooledTrust):
                 f"{observations.n_ticks[bad][0]:g}. Give the same scale to read_reports and "
                 "HumanTrust."
             )
+
         return observations
 
     @property
@@ -116,21 +121,22 @@ class HumanTrust(PooledTrust):
 
         The effects are the personal start, level, gain from success and gain from failure.
         """
-        carried = np.zeros((*observations.contact_rate.shape, 4))
+        shape = *observations.contact_rate.shape, 4
+        carried = np.zeros(shape)
         carried[:, 0, :, 0] = 1.0  # start
         for i, prefix in ((2, SUCCESS), (3, FAILURE)):
             named = [m for m, name in enumerate(observations.features) if name.startswith(prefix)]
             if named:
                 carried[..., i] = observations.awareness[..., named[0]]
 
-        level = np.zeros((*observations.contact_rate.shape, 4))
+        level = np.zeros(shape)
         level[..., 1] = 1.0
 
         start_sd, level_sd, gain_sd = (theta[name] for name in SDS)
         xp = namespace(start_sd)
         sds = xp.stack([start_sd, level_sd, gain_sd, gain_sd], axis=1)[:, None, None]
-        carried, level = (a.reshape(observations.n_missions, -1, 4) for a in (carried, level))
-        return Inputs(drift=carried * sds, offset=level * sds)
+        by_row = observations.n_missions, -1, 4
+        return Inputs(drift=carried.reshape(by_row) * sds, offset=level.reshape(by_row) * sds)
 
     @property
     def dims(self) -> dict[str, tuple[str, ...]]:

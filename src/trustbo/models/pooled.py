@@ -46,13 +46,18 @@ class PooledTrust(TrustModel):
 
     def hyperpriors(self, n_robots: int, n_features: int) -> dict[str, Distribution]:
         """See `TrustModel.hyperpriors`."""
-        names = ("beta0", "delta_w", "delta_v", *("delta_s",) * self.shared_noise)
+        names = ["beta0", "delta_w", "delta_v"]
+        if self.shared_noise:
+            names.append("delta_s")
         return {name: getattr(self.priors, name) for name in names}
 
     def derived(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """See `TrustModel.derived`."""
         beta0 = values["beta0"]
-        inverse_gain = 1.0 - beta0 if self.memory == "level" else 0.0 * beta0 + 1.0
+        if self.memory == "level":
+            inverse_gain = 1.0 - beta0
+        else:
+            inverse_gain = 0.0 * beta0 + 1.0  # ones, in NumPy or JAX
         return {**values, "inverse_gain": inverse_gain}
 
     @property
@@ -85,4 +90,6 @@ class PooledTrust(TrustModel):
     def dims(self) -> dict[str, tuple[str, ...]]:
         """See `TrustModel.dims`."""
         axes = {"beta0": (), "beta": ("feature",), "b": (), "delta_w": (), "delta_v": ()}
-        return axes | ({"delta_s": ()} if self.shared_noise else {})
+        if self.shared_noise:
+            axes["delta_s"] = ()
+        return axes

@@ -22,6 +22,11 @@ from trustbo.models.backend import own_settings
 from trustbo.models.families import FAMILIES
 from trustbo.models.scores import log_density
 
+# Prior sds of the coefficients of stationary trust, with line of sight (see `Priors.of`).
+_SIGHT_SD = 0.3
+_FEATURE_SD = 0.25
+_INTERCEPT_SD = 0.15
+
 
 def _built(kind: Any, *parameters: float) -> Distribution:
     """Make a float64 distribution on demand, because importing trustbo must create no JAX array."""
@@ -80,6 +85,7 @@ class Priors(Summary):
             prior = getattr(self, name)
             if wanted := _wanted(name, prior):
                 raise TrustboError(f"the prior Priors.{name} must be {wanted}; got {prior!r}.")
+
         numbers = {
             "concentration": require_positive("Priors.concentration", self.concentration),
             "x0_mean": require_finite("Priors.x0_mean", self.x0_mean),
@@ -111,17 +117,20 @@ class Priors(Summary):
         """
         features = require_list("features", features, str, "give the names of the features")
         require_choice("observation", observation, FAMILIES)
+
+        default = cls.default(observation)
         is_sight = np.array([is_line_of_sight(name) for name in features])
-        default, n = cls.default(observation), max(int(is_sight.sum()), 1)
         if not is_sight.any():
             return default
-        unit, centre = FAMILIES[observation].line_of_sight
+
+        n = int(is_sight.sum())
+        slope, zero = FAMILIES[observation].line_of_sight
         with own_settings():
-            sd = np.where(is_sight, 0.3 / np.sqrt(n), 0.25)
+            sd = np.where(is_sight, _SIGHT_SD / np.sqrt(n), _FEATURE_SD)
             return replace(
                 default,
-                beta=dist.Normal(unit * is_sight / n, unit * sd),
-                b=dist.Normal(-unit * centre, unit * 0.15),
+                beta=dist.Normal(slope * is_sight / n, slope * sd),
+                b=dist.Normal(-slope * zero, slope * _INTERCEPT_SD),
                 stationary=True,
             )
 
@@ -148,6 +157,8 @@ class Priors(Summary):
         prior = getattr(self, name)
         if not self.stationary or name not in ("beta", "b"):
             return log_density(prior, values)
+
+        # The density of `values` is that of the stationary coefficient times the Jacobian.
         return log_density(prior, values / inverse_gain) - np.log(inverse_gain)
 
     def describe(self) -> dict[str, str]:
@@ -159,14 +170,20 @@ def _wanted(name: str, prior: Any) -> str:
     """Return the requirement that a prior violates, or an empty string."""
     if not isinstance(prior, Distribution) or len(prior.shape()) > (name == "beta"):
         return "a scalar NumPyro distribution, e.g. Normal(0.0, 1.0)"
+
     if name in ("beta", "b", "coupling"):
-        wanted, good = "Normal, because the model integrates", isinstance(prior, dist.Normal)
-        wanted += f" {name} out (for other priors, write a NumPyro model with models.ContactRate)"
+        good = isinstance(prior, dist.Normal)
+        wanted = (
+            f"Normal, because the model integrates {name} out (for other priors, write a NumPyro "
+            "model with models.ContactRate)"
+        )
     elif name == "beta0":
-        wanted, good = "on (0, 1), e.g. Beta(2.0, 2.0)", prior.support is constraints.unit_interval
+        good = prior.support is constraints.unit_interval
+        wanted = "on (0, 1), e.g. Beta(2.0, 2.0)"
     else:
-        wanted = "on positive numbers, e.g. HalfNormal(0.2)"
         good = np.all(np.asarray(getattr(prior.support, "lower_bound", -np.inf)) >= 0.0)
+        wanted = "on positive numbers, e.g. HalfNormal(0.2)"
+
     return "" if good else wanted
 
 
@@ -176,6 +193,7 @@ def _as_text(prior: Distribution | float) -> str:
         return "yes" if prior else "no"
     if not isinstance(prior, Distribution):
         return f"{prior:g}"
+
     numbers = ", ".join(f"{n}={_numbers(getattr(prior, n))}" for n in type(prior).arg_constraints)
     return f"{type(prior).__name__}({numbers})"
 
@@ -183,4 +201,6 @@ def _as_text(prior: Distribution | float) -> str:
 def _numbers(values: object) -> str:
     """Format a number or a vector as text."""
     array = np.asarray(values, dtype=float)
-    return f"{array:g}" if not array.ndim else f"[{', '.join(f'{v:g}' for v in array)}]"
+    if not array.ndim:
+        return f"{array:g}"
+    return f"[{', '.join(f'{v:g}' for v in array)}]"

@@ -41,12 +41,16 @@ def model_from_record(
                 f"the given model must match the record {record}; got {model_to_record(given)}."
             )
         return given
+
+    # The priors are default if one of these models has the record: `Priors.default` (the object
+    # itself, which stands for priors by feature), equal priors as another object, or `Priors.of`.
     default = with_default_priors(record)
     of_features = Priors.of(features, record["observation"])
     for priors in (default.priors, replace(default.priors), of_features):
         model = replace(default, priors=priors)
         if model_to_record(model) == record:
             return model
+
     raise TrustboError(
         f"the priors of the model {record['class']} are custom, and cannot be rebuilt from their "
         f"text {record['priors']}; give the model with model=."
@@ -58,8 +62,10 @@ def with_default_priors(record: Mapping[str, Any]) -> TrustModel:
 
     Raises TrustboError if the class of the model or of an effect has not been imported.
     """
-    if (kind := MODELS.get(record["class"])) is None:
+    kind = MODELS.get(record["class"])
+    if kind is None:
         raise TrustboError(f"unknown model {record['class']!r}; import the module that defines it.")
+
     others = ("class", "priors", "by_feature", "effects")
     options = {name: value for name, value in record.items() if name not in others}
     return kind(effects=effects_from_record(record), **options)
@@ -73,10 +79,12 @@ def effects_from_record(record: Mapping[str, Any]) -> tuple[Effect, ...]:
     effects = []
     for one in record.get("effects", ()):
         settings = {n: tuple(v) if isinstance(v, list) else v for n, v in one.items()}
-        if (kind := settings.pop("kind")) not in EFFECTS:
+        kind = settings.pop("kind")
+        if kind not in EFFECTS:
             raise TrustboError(
                 f"unknown effect {kind!r} in the model; import the module that defines this class. "
                 f"Known effects are {', '.join(sorted(EFFECTS))}."
             )
         effects.append(EFFECTS[kind](**settings))
+
     return tuple(effects)

@@ -28,7 +28,10 @@ from trustbo.models.backend import call, namespace, own_settings, special_functi
 
 NOISES = "delta_w", "delta_v"
 _LOG_ROOT_2PI = 0.5 * np.log(2.0 * np.pi)
-_FARTHEST, _N_KNOTS = 9.0, 2001  # largest score and number of knots of quantiles in JAX
+_FARTHEST = 9.0  # largest score at which quantiles are interpolated in JAX
+_N_KNOTS = 2001
+_SMALLEST_P = 1e-300  # probabilities at which NumPyro computes quantiles are in this range
+_LARGEST_P = 1.0 - 1e-16
 
 
 class Pair(NamedTuple):
@@ -54,10 +57,12 @@ class NormalScores:
         """
         self.priors = dict(priors)
         self.pairs = (Pair(*NOISES), *pairs)
+
         sizes = {name: int(np.prod(prior.batch_shape)) for name, prior in priors.items()}
         ends = np.cumsum([0, *sizes.values()])
         self.at = {n: slice(a, b) for n, a, b in zip(sizes, ends[:-1], ends[1:], strict=True)}
         self.n_scores = int(ends[-1])
+
         for name, prior in self.priors.items():
             quantile(prior, np.zeros(sizes[name]), name)  # raises if there are no quantiles
 
@@ -90,6 +95,7 @@ class NormalScores:
             n = self.at[name].stop - self.at[name].start
             at = np.broadcast_to(knots[:, None], (_N_KNOTS, n))
             columns.append(quantile(prior, at, name))
+
         return CubicSpline(knots, np.concatenate(columns, axis=1)).c
 
     def values(self, z: Any) -> dict[str, Any]:
@@ -105,6 +111,7 @@ class NormalScores:
             else:
                 values = self._value(name, z)
             found[name] = values if prior.batch_shape else values[:, 0]
+
         return found
 
     def _value(self, name: str, z: Any) -> Any:
@@ -121,24 +128,33 @@ class NormalScores:
     def _half_normal(self, pair: Pair, z: Any) -> dict[str, Any]:
         """Return the half-normal scores (point, k) of a pair by name."""
         xp = namespace(z)
-        size, angle = xp.exp(z[:, self.at[pair.first]]), z[:, self.at[pair.second]]
-        first, second = (  # sines are accurate near 0
-            size * xp.sin(0.5 * np.pi * special_functions(z).ndtr(side * angle))
-            for side in (1.0, -1.0)
-        )
+        ndtr = special_functions(z).ndtr
+        size = xp.exp(z[:, self.at[pair.first]])
+        angle = z[:, self.at[pair.second]]
+
+        # The cosine of an angle is the sine of its complement, which is accurate near 0.
+        first = size * xp.sin(0.5 * np.pi * ndtr(angle))
+        second = size * xp.sin(0.5 * np.pi * ndtr(-angle))
         return {pair.first: first / self._factor(pair, z), pair.second: second}
 
     def log_prior(self, z: Any) -> Any:
         """Compute the log prior density (point,) of scores (point, score)."""
-        xp, log_size = namespace(z), z[:, self.sizes]
+        xp = namespace(z)
+        log_size = z[:, self.sizes]
+
+        # Scores other than log sizes are standard normal.
         n_others = z.shape[1] - log_size.shape[1]
         total = -0.5 * ((z**2).sum(1) - (log_size**2).sum(1)) - n_others * _LOG_ROOT_2PI
+
+        # In polar coordinates, the density of half-normal scores (a, b) has the factor size. The
+        # Jacobian of the log size is another factor size.
         total = total + 2.0 * log_size.sum(1)
         for pair in self.pairs:
             squares = sum((a**2).sum(1) for a in self._half_normal(pair, z).values())
             total = total - 0.5 * squares
             if pair.given:
                 total = total - xp.log(self._factor(pair, z))[:, 0]
+
         return total
 
     def draw(
@@ -152,21 +168,26 @@ class NormalScores:
         for name, prior in self.priors.items():
             score = rng.standard_normal((n, *prior.batch_shape))
             if even:
-                spread = special.ndtri((np.arange(n) + 0.5) / n)
-                score = spread[np.argsort(score, axis=0)]
+                evenly_spaced = special.ndtri((np.arange(n) + 0.5) / n)
+                score = evenly_spaced[np.argsort(score, axis=0)]
             found[name] = quantile(prior, score, name)
+
         return found
 
 
 def quantile(prior: Distribution, score: np.ndarray, name: str) -> np.ndarray:
     """Compute the quantile of a prior at probability Phi(score), accurate in both tails."""
     prior = _base(prior)
+
     if isinstance(prior, dist.Normal):
         return np.asarray(prior.loc) + np.asarray(prior.scale) * score
     if isinstance(prior, dist.LogNormal):
         return np.exp(np.asarray(prior.loc) + np.asarray(prior.scale) * score)
+
+    # Each half uses its own tail probability, because 1 - Phi(score) rounds to 0 in the upper tail.
     if isinstance(prior, dist.Beta):
-        a, b = np.asarray(prior.concentration1), np.asarray(prior.concentration0)
+        a = np.asarray(prior.concentration1)
+        b = np.asarray(prior.concentration0)
         low = special.betaincinv(a, b, special.ndtr(np.minimum(score, 0.0)))
         high = 1.0 - special.betaincinv(b, a, special.ndtr(-np.maximum(score, 0.0)))
         return np.where(score < 0.0, low, high)
@@ -174,6 +195,7 @@ def quantile(prior: Distribution, score: np.ndarray, name: str) -> np.ndarray:
         low = special.erfinv(special.ndtr(np.minimum(score, 0.0)))
         high = special.erfcinv(special.ndtr(-np.maximum(score, 0.0)))
         return np.asarray(prior.scale) * np.sqrt(2.0) * np.where(score < 0.0, low, high)
+
     return _by_numpyro(prior, special.ndtr(score), name)
 
 
@@ -205,16 +227,19 @@ def of_half_normal(prior: Distribution, score: Any, name: str) -> Any:
 def log_density(prior: Distribution, x: np.ndarray) -> np.ndarray:
     """Compute the log density of a prior, in closed form for common priors."""
     prior = _base(prior)
+
     if isinstance(prior, dist.HalfNormal):
         return stats.halfnorm.logpdf(x, scale=np.asarray(prior.scale))
     if isinstance(prior, dist.Beta):
-        a, b = np.asarray(prior.concentration1), np.asarray(prior.concentration0)
+        a = np.asarray(prior.concentration1)
+        b = np.asarray(prior.concentration0)
         return stats.beta.logpdf(x, a, b)
     if isinstance(prior, dist.Normal):
         return stats.norm.logpdf(x, np.asarray(prior.loc), np.asarray(prior.scale))
     if isinstance(prior, dist.LogNormal):
         scale = np.exp(np.asarray(prior.loc))
         return stats.lognorm.logpdf(x, np.asarray(prior.scale), scale=scale)
+
     with own_settings():
         return np.asarray(call(prior, "log_prob", jnp.asarray(x)), dtype=float)
 
@@ -228,8 +253,8 @@ def _by_numpyro(prior: Distribution, p: np.ndarray, name: str) -> np.ndarray:
     """Compute quantiles with NumPyro; raises TrustboError if the prior on `name` has none."""
     try:
         with own_settings():
-            share = jnp.asarray(np.clip(p, 1e-300, 1.0 - 1e-16))
-            return np.asarray(call(prior, "icdf", share), dtype=float)
+            inside = jnp.asarray(np.clip(p, _SMALLEST_P, _LARGEST_P))
+            return np.asarray(call(prior, "icdf", inside), dtype=float)
     except (NotImplementedError, ImportError):  # some quantiles need another package
         raise TrustboError(
             f"the prior on {name} must have quantiles (icdf), but {prior!r} has none. Give another "

@@ -37,6 +37,7 @@ def bounds_of(missions: Sequence[Mission], shape: tuple[int, int] | None = None)
     require_map("a model with place effects", missions)
     if shape is None:
         shape = len(missions), max(len(mission.bounds) for mission in missions)
+
     bounds = np.full((*shape, 3), -1)
     for j, mission in enumerate(missions):
         path = mission.path[: len(mission.bounds) + 1]  # failed missions do not complete the path
@@ -47,6 +48,7 @@ def bounds_of(missions: Sequence[Mission], shape: tuple[int, int] | None = None)
                 f"mission {j}: {error} A model with place effects needs paths without jumps; omit "
                 "PlaceEffect(), or split the mission at the jump."
             ) from None
+
     return bounds
 
 
@@ -70,6 +72,7 @@ def visited(bounds: np.ndarray, shape: tuple[int, int] | None = None) -> Visited
     if shape is None:
         rows, cols = (found[:, 1:].max(0, initial=0) + 1).tolist()
         shape = rows, cols
+
     outside = there & (bounds[..., 1:] >= shape).any(-1)
     if outside.any():
         j, k = np.argwhere(outside)[0]
@@ -77,11 +80,13 @@ def visited(bounds: np.ndarray, shape: tuple[int, int] | None = None) -> Visited
             f"mission {j} enters cell {tuple(bounds[j, k, 1:].tolist())}, outside the grid of "
             f"{shape[0]} rows and {shape[1]} columns; give the workspace of the missions."
         )
+
     if len(found) > _MOST:
         raise TrustboError(
             f"the missions visited {len(found)} bounds, but place effects support at most {_MOST}. "
             "Use larger cells, or omit PlaceEffect()."
         )
+
     cells, cell_of = np.unique(found[:, 1:], axis=0, return_inverse=True)
     at = np.full(there.shape, -1)
     at[there] = index_of.ravel()

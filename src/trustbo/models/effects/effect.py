@@ -123,8 +123,10 @@ class Effect:
         Samplers then use their common size as a coordinate; see `scores`.
         """
         priors = self.hyperpriors()
-        spreads = [name for name in self.names if isinstance(priors[name], dist.HalfNormal)]
-        return [Pair(spreads[0], spreads[1])] if len(spreads) == 2 else []
+        sds = [name for name in self.names if isinstance(priors[name], dist.HalfNormal)]
+        if len(sds) != 2:
+            return []
+        return [Pair(sds[0], sds[1])]
 
     def add_data(
         self, observations: Observations, missions: Sequence[Mission], on: Workspace | None
@@ -146,4 +148,5 @@ def sample_columns(effects: Sequence[Effect], theta: Theta, observations: Observ
             c: Any = numpyro.sample(f"{label}_{i}", white)
             columns.append(c if mean is None else c + mean[0, start : start + len(Q)])
             start += len(Q)
+
     return jnp.concatenate(columns)

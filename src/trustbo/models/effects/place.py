@@ -19,7 +19,7 @@ from trustbo.models.visited import bounds_of, visited
 from trustbo.workspace import Workspace
 
 _JITTER = 1e-8  # added to the correlation matrix of cells
-_LENGTH_SCALES = 1e-6, 1e6  # limits in cells, at which cells are independent or equal
+_LENGTH_SCALES = (1e-6, 1e6)  # limits in cells, at which cells are independent or equal
 
 
 @dataclass(frozen=True)
@@ -67,21 +67,22 @@ class PlaceEffect(Effect):
         self, observations: Observations, missions: Sequence[Mission], on: Workspace | None
     ) -> Observations:
         """See `Effect.add_data`; adds the visited places."""
-        grid = None if on is None else on.passable.shape
+        shape: Any = None if on is None else on.passable.shape
         bounds = bounds_of(missions, observations.contact_rate.shape[:2])
-        return observations._replace(visited=visited(bounds, grid))  # pyright: ignore[reportArgumentType]
+        return observations._replace(visited=visited(bounds, shape))
 
     def columns(self, observations: Observations) -> Any:
         """Return indicator columns of the cells entered and of the directed bounds."""
         places: Any = observations.visited
         at = np.broadcast_to(places.at[..., None], observations.contact_rate.shape).ravel()
-        met = np.flatnonzero(at >= 0)
-        bound, ones = at[met], np.ones(len(met))
-        parts = (places.cell_of[bound], len(places.cells)), (bound, len(places.bounds))
-        return sparse.hstack(
-            [sparse.csr_array((ones, (met, of)), shape=(len(at), n)) for of, n in parts],
-            format="csr",
-        )
+        row = np.flatnonzero(at >= 0)
+        bound = at[row]
+        cell = places.cell_of[bound]
+
+        ones = np.ones(len(row))
+        of_cells = sparse.csr_array((ones, (row, cell)), shape=(len(at), len(places.cells)))
+        of_bounds = sparse.csr_array((ones, (row, bound)), shape=(len(at), len(places.bounds)))
+        return sparse.hstack([of_cells, of_bounds], format="csr")
 
     def prior(self, theta: Theta, observations: Observations) -> tuple[Any, list[Any]]:
         """Return a Gaussian-process prior on cells and independent priors on bounds."""
@@ -94,10 +95,12 @@ class PlaceEffect(Effect):
     def _cells(self, theta: Theta, square: np.ndarray) -> Any:
         """Compute the precision (point, cell, cell) of s from squared distances (cell, cell)."""
         xp: Any = namespace(theta["tau_s"])
+
         # Squared distances have few different values, for which the correlation is computed once.
         distance = np.sqrt(np.arange(square.max(initial=0) + 1.0))
         scale = xp.clip(theta["length_scale"], *_LENGTH_SCALES)
         K = matern(distance, scale[:, None])[:, square]
+
         tau = xp.maximum(theta["tau_s"], LEAST)[:, None, None]
         return inverse(tau**2 * (K + _JITTER * np.eye(len(square))))
 

@@ -49,7 +49,8 @@ class RobotEffect(Effect):
 
     def columns(self, observations: Observations) -> Any:
         """Return line of sight in one column per robot and mission; the mission varies fastest."""
-        n_missions, n_robots = observations.n_missions, observations.n_robots
+        n_missions = observations.n_missions
+        n_robots = observations.n_robots
         mission, _, robot = np.indices(observations.contact_rate.shape)
         where = (robot * n_missions + mission).ravel()
         at = np.arange(len(where)), where
@@ -63,6 +64,7 @@ class RobotEffect(Effect):
         slow, day = self._variances(theta)
         value, vector = _correlation_eigen(self.rho, observations.n_missions)
         Q = (vector / (slow * value + day)[:, None]) @ vector.T
+
         if inverse_gain.ndim == 1:
             return None, [Q / inverse_gain[:, None, None] ** 2] * observations.n_robots
         return None, [Q / of_robot[:, None, None] ** 2 for of_robot in inverse_gain.T]
@@ -85,13 +87,16 @@ class RobotEffect(Effect):
 
     def ahead(self, values: Values, theta: Theta, n: int, rng: Generator | None) -> np.ndarray:
         """See `Effect.ahead`; the next effect d is drawn given d in all n missions."""
-        C, slow = self._covariance(theta, n), np.maximum(theta["tau_slow"], LEAST) ** 2
-        k = slow[:, None] * self.rho ** np.arange(n, 0, -1)
+        C = self._covariance(theta, n)
+        slow = np.maximum(theta["tau_slow"], LEAST) ** 2
+        k = slow[:, None] * self.rho ** np.arange(n, 0, -1)  # covariance of the next d with the n
+
         gain = np.linalg.solve(C, k[..., None])[..., 0]
         d = np.einsum("nm,nmi->ni", gain, values["robot_effect"])
         if rng is not None:
-            left = np.maximum(C[:, 0, 0] - (gain * k).sum(1), 0.0)
-            d = d + np.sqrt(left)[:, None] * rng.standard_normal(d.shape)
+            variance = np.maximum(C[:, 0, 0] - (gain * k).sum(1), 0.0)  # rounding may make it < 0
+            d = d + np.sqrt(variance)[:, None] * rng.standard_normal(d.shape)
+
         return _inverse_gain(theta)[..., 0] * d
 
     def _covariance(self, theta: Theta, n: int) -> Any:

@@ -31,7 +31,8 @@ class Weights(Effect):
         """Return the prior means and sds (point, [robot,] column) of the coefficients."""
         mean, sd = self.priors.coefficients(observations.awareness.shape[3])
         inverse_gain = theta["inverse_gain"][..., None]
-        inverse_gain = inverse_gain if self.priors.stationary else 0.0 * inverse_gain + 1.0
+        if not self.priors.stationary:
+            inverse_gain = 0.0 * inverse_gain + 1.0  # ones, in NumPy or JAX
         return inverse_gain * mean, inverse_gain * sd
 
     def named(self, c: np.ndarray, theta: Theta, observations: Observations) -> Values:
@@ -55,9 +56,12 @@ class RobotWeights(Weights):
 
     def prior(self, theta: Theta, observations: Observations) -> tuple[Any, list[Any]]:
         """Return a prior that correlates the robots' coefficients through a common mean."""
-        n, (mean, sd) = observations.n_robots, self.moments(theta, observations)
+        n = observations.n_robots
+        mean, sd = self.moments(theta, observations)
         tau = namespace(mean).maximum(_spreads(theta), LEAST)
-        share = sd**2 / (tau**2 + n * sd**2)  # (sd^2 11' + tau^2 I)^-1 in closed form
+
+        # (sd^2 11' + tau^2 I)^-1 by the formula of Sherman and Morrison.
+        share = sd**2 / (tau**2 + n * sd**2)
         parts = [
             (np.eye(n) - share[:, m, None, None]) / tau[:, m, None, None] ** 2
             for m in range(mean.shape[1])
@@ -70,6 +74,8 @@ class RobotWeights(Weights):
         The means `mean_beta` and `mean_b` are expected values given the coefficients.
         """
         c = np.swapaxes(c.reshape(len(c), -1, observations.n_robots), 1, 2)
+
+        # Posterior mean of a normal mean, given the coefficients of the robots.
         mean, sd = self.moments(theta, observations)
         gain = sd**2 / (sd**2 + _spreads(theta) ** 2 / observations.n_robots)
         mu = mean + gain * (c.mean(1) - mean)
@@ -98,14 +104,17 @@ class CoupledWeights(Weights):
 
     def prior(self, theta: Theta, observations: Observations) -> tuple[Any, list[Any]]:
         """Return the prior on the weights, with `Priors.coupling` for features of other robots."""
-        n, n_features = observations.n_robots, observations.awareness.shape[3]
+        n = observations.n_robots
+        n_features = observations.awareness.shape[3]
         own = np.repeat(np.eye(n, dtype=bool), n_features, axis=1)
         own = np.column_stack([own, np.ones(n, dtype=bool)])  # (robot, input)
         feature = np.append(np.tile(np.arange(n_features), n), n_features)
-        coupling = self.priors.moments("coupling")
-        (mean, sd), xp = self.moments(theta, observations), namespace(theta["inverse_gain"])
-        means = xp.where(own, mean[..., feature], coupling[0])
-        sds = xp.where(own, sd[..., feature], coupling[1])
+
+        mean, sd = self.moments(theta, observations)
+        coupling_mean, coupling_sd = self.priors.moments("coupling")
+        xp = namespace(theta["inverse_gain"])
+        means = xp.where(own, mean[..., feature], coupling_mean)
+        sds = xp.where(own, sd[..., feature], coupling_sd)
         return means.reshape(len(means), -1), [sds.reshape(len(sds), -1) ** -2.0]
 
     def named(self, c: np.ndarray, theta: Theta, observations: Observations) -> Values:

@@ -16,6 +16,8 @@ from trustbo.models.families.family import Array, Drawn, Family, Moments
 from trustbo.models.families.moments import draw_between_knots, log_normal, match_by_nodes
 
 _KNOTS = np.linspace(-5.0, 5.0, 21)  # knots of the proposal, in sds from the mean
+_LEAST = 1e-12  # smallest parameter of a beta distribution that is drawn from
+_LEAST_VARIANCE = 1e-6  # limits the concentration
 
 
 @dataclass(frozen=True)
@@ -41,33 +43,44 @@ class BetaBinomial(Family):
 
     def sample(self, trust: Array, sd: Array, N: Array, rng: Generator) -> Array:
         """See `Family.sample`."""
-        phi, p = _concentration(sd), special.expit(trust)
+        phi = _concentration(sd)
+        p = special.expit(trust)
         N = np.where(N > 0.0, N, np.nan)
         a, b, N = np.broadcast_arrays(phi * p, phi * (1.0 - p), N)
+
+        share = rng.beta(np.maximum(a, _LEAST), np.maximum(b, _LEAST))
         counted = np.where(np.isnan(N), 0.0, N).astype(int)
-        return rng.binomial(counted, rng.beta(np.maximum(a, 1e-12), np.maximum(b, 1e-12))) / N
+        return rng.binomial(counted, share) / N
 
     def log_prob(self, y: Array, N: Array, trust: Array, sd: Array) -> Array:
         """See `Family.log_prob`."""
-        xp, library, phi = namespace(trust), special_functions(trust), _concentration(sd)
+        xp = namespace(trust)
+        library = special_functions(trust)
+        phi = _concentration(sd)
         choose = -library.betaln(xp.round(y * N) + 1.0, N - xp.round(y * N) + 1.0) - xp.log(N + 1.0)
         scale = library.gammaln(phi) - library.gammaln(phi + N)
         return choose + scale + self._of_trust(y, N, trust, phi)
 
     def _of_trust(self, y: Array, N: Array, trust: Array, phi: Array) -> Array:
         """Compute the terms of the log probability that depend on trust."""
-        xp, library = namespace(trust), special_functions(trust)
-        n, a = xp.round(y * N), phi * library.expit(trust)
-        b, log_gamma = phi * library.expit(-trust), library.gammaln
+        library = special_functions(trust)
+        log_gamma = library.gammaln
+        n = namespace(trust).round(y * N)
+        a = phi * library.expit(trust)
+        b = phi * library.expit(-trust)
         return log_gamma(n + a) - log_gamma(a) + log_gamma(N - n + b) - log_gamma(b)
 
     def _match(self, y: Array, N: Array, m: Array, v: Array, sd: Array) -> Moments:
         """See `Family._match`; uses Gauss-Hermite quadrature around the mode."""
+        # The search for the mode starts from the empirical logit, combined with the prior.
         n = np.round(y * N)
-        lam = 1.0 / (1.0 / (n + 0.5) + 1.0 / (N - n + 0.5) + 0.2)  # empirical logit
+        lam = 1.0 / (1.0 / (n + 0.5) + 1.0 / (N - n + 0.5) + 0.2)
         start = (m / v + lam * np.log((n + 0.5) / (N - n + 0.5))) / (1.0 / v + lam)
+
         constant = self.log_prob(y, N, start, sd) - self._of_trust(y, N, start, _concentration(sd))
-        y, N, phi = y[..., None], N[..., None], _concentration(sd)[..., None]
+        y = y[..., None]
+        N = N[..., None]
+        phi = _concentration(sd)[..., None]
         log_mass, mean, var = match_by_nodes(lambda f: self._of_trust(y, N, f, phi), start, m, v)
         return log_mass + constant, mean, var
 
@@ -90,4 +103,4 @@ class BetaBinomial(Family):
 
 def _concentration(sd: Any) -> Any:
     """Return the concentration of the beta distribution, limited to 1e6 (nearly binomial)."""
-    return 1.0 / (sd**2 + 1e-6)
+    return 1.0 / (sd**2 + _LEAST_VARIANCE)

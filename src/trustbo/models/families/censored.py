@@ -27,7 +27,8 @@ class Censored(Gaussian):
 
     def log_prob(self, y: Array, N: Array, trust: Array, sd: Array) -> Array:
         """See `Family.log_prob`."""
-        xp, log_ndtr = namespace(trust), special_functions(trust).log_ndtr
+        xp = namespace(trust)
+        log_ndtr = special_functions(trust).log_ndtr
         inside = super().log_prob(y, N, trust, sd)
         beyond = xp.where(y >= 1.0, log_ndtr((trust - 1.0) / sd), inside)
         return xp.where(y <= 0.0, log_ndtr(-trust / sd), beyond)
@@ -39,7 +40,8 @@ class Censored(Gaussian):
 
     def _draw(self, y: Array, N: Array, m: Array, v: Array, sd: Array, rng: Generator) -> Drawn:
         """Draw the rate before clipping, and then the predictor given that rate, both exactly."""
-        (cut, low, high), total = _limits(y), np.sqrt(v + sd**2)
+        cut, low, high = _limits(y)
+        total = np.sqrt(v + sd**2)
         e = draw_between((low - m) / total, (high - m) / total, rng)
         f, _ = super()._draw(np.where(cut, m + total * e, y), N, m, v, sd, rng)
         return f, self._match(y, N, m, v, sd)[0]
@@ -47,7 +49,8 @@ class Censored(Gaussian):
     @np.errstate(under="ignore")  # small weights and tails round to 0
     def mean_rate(self, trust: Array, sd: Array) -> Array:
         """See `Family.mean_rate`; the mean of a normal variable clipped to [0, 1]."""
-        low, high = -trust / sd, (1.0 - trust) / sd
+        low = -trust / sd
+        high = (1.0 - trust) / sd
         inside = trust * (norm.cdf(high) - norm.cdf(low))
         return inside + sd * (norm.pdf(low) - norm.pdf(high)) + norm.sf(high)
 
@@ -58,5 +61,7 @@ class Censored(Gaussian):
 
 def _limits(y: Array) -> tuple[Array, Array, Array]:
     """Return whether each rate is 0 or 1, and the interval of the rate before clipping."""
-    one = y >= 1.0
-    return one | (y <= 0.0), np.where(one, 1.0, -np.inf), np.where(one, np.inf, 0.0)
+    is_one = y >= 1.0
+    low = np.where(is_one, 1.0, -np.inf)
+    high = np.where(is_one, np.inf, 0.0)
+    return is_one | (y <= 0.0), low, high

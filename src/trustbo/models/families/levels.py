@@ -11,6 +11,7 @@ from trustbo.models.backend import namespace, special_functions
 from trustbo.models.families.family import Array, Drawn, Family, Moments
 from trustbo.models.families.moments import draw_between, match_interval
 
+_LEAST_P = 1e-300  # smallest probability of a report, so that its log is finite
 _SHARES = np.array([0.252201, 0.585225, 0.162574])
 _SDS = np.sqrt(3.0) / np.pi / np.array([0.90793, 0.577787, 0.364038])
 """Weights and sds of a normal mixture within 1e-3 of a logistic distribution with sd 1, whose heavy
@@ -27,40 +28,54 @@ class Levels(Family):
 
     def cuts(self, y: Array) -> tuple[Array, Array]:
         """Return the cut points below and above each report."""
-        xp, n = namespace(y), self.levels - 1
+        xp = namespace(y)
+        n = self.levels - 1
         level = xp.round(y * n)
         low = xp.where(level < 0.5, -np.inf, (level - 0.5) / n)
-        return low, xp.where(level > n - 0.5, np.inf, (level + 0.5) / n)
+        high = xp.where(level > n - 0.5, np.inf, (level + 0.5) / n)
+        return low, high
 
     def sample(self, trust: Array, sd: Array, N: Array, rng: Generator) -> Array:
         """See `Family.sample`."""
-        shape, n = np.broadcast(trust, sd, N).shape, self.levels - 1
+        n = self.levels - 1
+        shape = np.broadcast(trust, sd, N).shape
         noise = rng.choice(_SDS, shape, p=_SHARES / _SHARES.sum()) * rng.standard_normal(shape)
         return np.clip(np.round((trust + sd * noise) * n), 0.0, n) / n
 
     def log_prob(self, y: Array, N: Array, trust: Array, sd: Array) -> Array:
         """See `Family.log_prob`."""
-        xp, ndtr, total = namespace(trust), special_functions(trust).ndtr, 0.0
+        xp = namespace(trust)
+        ndtr = special_functions(trust).ndtr
         low, high = (end - trust for end in self.cuts(xp.asarray(y)))
-        low, high = xp.where(low > 0.0, -high, low), xp.where(low > 0.0, -low, high)  # lower tail
+
+        # Mirror intervals above 0, because differences are more accurate in the lower tail.
+        mirror = low > 0.0
+        low, high = xp.where(mirror, -high, low), xp.where(mirror, -low, high)
+
+        total = 0.0
         for share, of_one in zip(_SHARES, _SDS, strict=True):
             total = total + share * (ndtr(high / (of_one * sd)) - ndtr(low / (of_one * sd)))
-        return xp.log(xp.maximum(total, 1e-300))
+        return xp.log(xp.maximum(total, _LEAST_P))
 
     def _match(self, y: Array, N: Array, m: Array, v: Array, sd: Array) -> Moments:
         """See `Family._match`; a mixture of normals between two cut points."""
         log_p, mean, var = self._components(y, m, v, sd)
         total: Any = special.logsumexp(log_p, axis=0)
         w = np.exp(log_p - total)
+
         center = (w * mean).sum(0)
-        return total, center, (w * (var + (mean - center) ** 2)).sum(0)
+        spread = (w * (var + (mean - center) ** 2)).sum(0)
+        return total, center, spread
 
     def _draw(self, y: Array, N: Array, m: Array, v: Array, sd: Array, rng: Generator) -> Drawn:
         """Draw the mixture component, the report before rounding, and f, all exactly."""
         log_p = self._components(y, m, v, sd)[0]
         noise = _SDS[np.argmax(log_p + rng.gumbel(size=log_p.shape), axis=0)] * sd
-        total, (low, high) = np.sqrt(v + noise**2), self.cuts(y)
+
+        total = np.sqrt(v + noise**2)
+        low, high = self.cuts(y)
         e = draw_between((low - m) / total, (high - m) / total, rng)
+
         white = rng.standard_normal(m.shape)
         f = m + v / total * e + np.sqrt(v) * noise / total * white
         return f, special.logsumexp(log_p, axis=0)

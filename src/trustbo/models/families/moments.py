@@ -13,6 +13,12 @@ from trustbo.models.families.family import Array, Drawn, Moments
 _NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(9)
 _LOG_WEIGHTS = np.log(_WEIGHTS / _WEIGHTS.sum())
 _STEP = 0.05  # step of finite differences in the search for the mode
+_N_NEWTON_STEPS = 3
+_LONGEST_STEP = 2.0  # limit on a Newton step, in units of the linear predictor
+_WIDER = 1.1  # ratio of the sd of the nodes to the sd that the curvature at the mode gives
+_LEAST_VARIANCE = 1e-9
+_LEAST_RISE = 1e-9  # rises below this are replaced, because the formulas divide by the rise
+_LARGEST_LOG = -1e-300  # largest log ratio of probabilities, so that 1 minus the ratio is not 0
 
 
 def log_normal(e: Array, variance: Array) -> Array:
@@ -24,7 +30,7 @@ def match_interval(low: ndarray, high: ndarray, m: ndarray, v: ndarray, noise: n
     """Compute moments of N(f; m, v) given that f plus normal noise lies between low and high."""
     total = v + noise**2
     sd = np.sqrt(total)
-    log_p, e, spread = truncated(*((end - m) / sd for end in (low, high)))
+    log_p, e, spread = truncated((low - m) / sd, (high - m) / sd)
     return log_p, m + v / sd * e, v - v**2 / total * (1.0 - spread)
 
 
@@ -32,40 +38,50 @@ def truncated(a: ndarray, b: ndarray) -> Moments:
     """Compute the log probability, mean and variance of a standard normal between a and b."""
     mirror = a > -b  # use the lower tail, which is more accurate
     a, b = np.where(mirror, -b, a), np.where(mirror, -a, b)
+
     with np.errstate(divide="ignore"):  # log(Phi(b) - Phi(a)), accurate for a + b <= 0
         log_b = special.log_ndtr(b)
-        gap = np.minimum(special.log_ndtr(a) - log_b, -1e-300)
+        gap = np.minimum(special.log_ndtr(a) - log_b, _LARGEST_LOG)
         log_p = log_b + np.log(-np.expm1(gap))
+
     with np.errstate(invalid="ignore"):
         at_a, at_b = (np.exp(-0.5 * x**2 - 0.5 * np.log(2.0 * np.pi) - log_p) for x in (a, b))
         slope = np.where(np.isfinite(a), a, 0.0) * at_a - np.where(np.isfinite(b), b, 0.0) * at_b
+
     mean = at_a - at_b
-    return log_p, np.where(mirror, -mean, mean), np.clip(1.0 + slope - mean**2, 0.0, 1.0)
+    var = np.clip(1.0 + slope - mean**2, 0.0, 1.0)
+    return log_p, np.where(mirror, -mean, mean), var
 
 
 def draw_between(a: ndarray, b: ndarray, rng: Generator) -> ndarray:
     """Draw standard normal variables truncated to the interval from a to b."""
     mirror = a > -b
     a, b = np.where(mirror, -b, a), np.where(mirror, -a, b)
+
     with np.errstate(divide="ignore"):
         log_b = special.log_ndtr(b)
         below = np.exp(np.minimum(special.log_ndtr(a) - log_b, 0.0))
         share = rng.random(np.broadcast(a, b).shape)
         z = special.ndtri_exp(log_b + np.log(below + (1.0 - below) * share))
+
     z = np.clip(z, a, b)
     return np.where(mirror, -z, z)
 
 
 def draw_between_knots(knots: ndarray, log_f: ndarray, rng: Generator) -> Drawn:
     """Draw from a density whose log is linear between knots (..., knot); also return the log."""
-    width, rise = np.diff(knots), np.diff(log_f)
-    rise = np.where(np.abs(rise) < 1e-9, 1e-9, rise)
+    width = np.diff(knots)
+    rise = np.diff(log_f)
+    rise = np.where(np.abs(rise) < _LEAST_RISE, _LEAST_RISE, rise)
     log_mass = log_f[..., :-1] + np.log(width) + np.log(np.expm1(rise) / rise)
+
+    # Choose a piece by the Gumbel-max trick, then draw within the piece.
     piece = np.argmax(log_mass + rng.gumbel(size=log_mass.shape), axis=-1)[..., None]
     start, width, slope, low = (
         np.take_along_axis(a, piece, axis=-1)[..., 0] for a in (knots, width, rise, log_f)
     )
     share = np.log1p(rng.random(start.shape) * np.expm1(slope)) / slope
+
     log_total = special.logsumexp(log_mass, axis=-1)
     return start + share * width, low + share * slope - log_total
 
@@ -77,17 +93,22 @@ def match_by_nodes(
 
     `log_prob` returns log likelihoods at nodes (..., node); the mode search begins at `start`.
     """
-    x, q = np.array(start), 1.0 / v
-    for _ in range(3):
+    x = np.array(start)
+    q = 1.0 / v
+    for _ in range(_N_NEWTON_STEPS):
         low, middle, high = np.moveaxis(log_prob(x[..., None] + _STEP * np.arange(-1, 2)), -1, 0)
         q = 1.0 / v - np.minimum((high - 2.0 * middle + low) / _STEP**2, 0.0)
-        x = x + np.clip(((high - low) / (2.0 * _STEP) - (x - m) / v) / q, -2.0, 2.0)
-    sd = 1.1 / np.sqrt(q)
+        x = x + np.clip(
+            ((high - low) / (2.0 * _STEP) - (x - m) / v) / q, -_LONGEST_STEP, _LONGEST_STEP
+        )
+
+    sd = _WIDER / np.sqrt(q)
     node = x[..., None] + sd[..., None] * _NODES
     log_f = log_prob(node) - 0.5 * (node - m[..., None]) ** 2 / v[..., None]
     log_f += _LOG_WEIGHTS + 0.5 * _NODES**2
+
     log_mass = special.logsumexp(log_f, axis=-1)
     weight = np.exp(log_f - log_mass[..., None])  # pyright: ignore[reportArgumentType, reportCallIssue]
     mean = (weight * node).sum(-1)
     var = (weight * (node - mean[..., None]) ** 2).sum(-1)
-    return log_mass + np.log(sd / np.sqrt(v)), mean, np.maximum(var, 1e-9)
+    return log_mass + np.log(sd / np.sqrt(v)), mean, np.maximum(var, _LEAST_VARIANCE)
