@@ -89,7 +89,7 @@ def best_labels(
         searches = [graph._replace(starts=graph.starts[k : k + 1]) for k in range(len(divisor))]
 
     n = len(costs.drift)
-    most = MAX_LABELS  # an argument, because a compiled kernel keeps its globals
+    max_labels = MAX_LABELS  # an argument, because a compiled kernel keeps its globals
     cost = np.empty((len(searches), n))
     lower = np.empty((len(searches), n))
     paths = np.full((len(searches), n, graph.longest + 1), -1, np.int32)
@@ -97,7 +97,7 @@ def best_labels(
     for k, part in enumerate(searches):
 
         def work(begin: int, end: int, k: int = k, part: Unrolled = part) -> None:
-            _best_labels(part, costs, most, cost[k], lower[k], paths[k], begin, end)
+            _best_labels(part, costs, max_labels, cost[k], lower[k], paths[k], begin, end)
 
         over_rows(work, n)
         cost[k] = cost[k] / divisor[k]
@@ -108,13 +108,13 @@ def best_labels(
 
 
 @kernel
-def _best_labels(graph, costs, most, cost, lower, paths, begin, end):
+def _best_labels(graph, costs, max_labels, cost, lower, paths, begin, end):
     """Write the results of `_best_path` for the draws from `begin` to `end`."""
     loss, drift, weight, start, transition, x0, sd, toll, risk, failure, limit = costs
     for d in range(begin, end):
         trust = transition[d], x0[d], sd[d]
         one = Costs(loss, drift[d], weight[d], start[d], *trust, toll, risk, failure, limit)
-        cost[d], lower[d] = _best_path(graph, one, most, paths[d])
+        cost[d], lower[d] = _best_path(graph, one, max_labels, paths[d])
 
 
 @kernel
@@ -156,18 +156,18 @@ def _least_costs(graph, costs, edge_cost):
         return edge_cost
 
     cost = np.full(len(graph.head), np.inf)
-    most = np.full((len(graph.cell), len(costs.x0)), -np.inf)  # largest trust in each state
+    highest = np.full((len(graph.cell), len(costs.x0)), -np.inf)  # largest trust in each state
     after = np.empty(len(costs.x0))
     for s in graph.starts:
-        most[s] = costs.x0
+        highest[s] = costs.x0
 
     # The order of states is topological, so the largest trust in a state is final when it is read.
     for s in range(len(graph.cell) - 1, 0, -1):
-        if most[s, 0] == -np.inf:  # every path to the state passes through the goal
+        if highest[s, 0] == -np.inf:  # every path to the state passes through the goal
             continue
         for e in range(graph.first[s], graph.first[s + 1]):
-            cost[e] = edge_cost[e] + _lost_on(graph, costs, e, most[s], after)
-            most[graph.head[e]] = np.maximum(most[graph.head[e]], after)
+            cost[e] = edge_cost[e] + _lost_on(graph, costs, e, highest[s], after)
+            highest[graph.head[e]] = np.maximum(highest[graph.head[e]], after)
 
     return cost
 
@@ -368,7 +368,7 @@ def _price_of_limit(graph, costs, edge_cost, least_cost, chord, offset, to_go, k
 
 
 @kernel
-def _best_path(graph, costs, most, path):
+def _best_path(graph, costs, max_labels, path):
     """Write the cheapest path within the limit, and return its cost (or inf) and a lower limit."""
     n = len(path)
     n_sums = len(costs.failure)
@@ -380,7 +380,7 @@ def _best_path(graph, costs, most, path):
     limits = _limits(graph, costs, edge_cost, least_cost, known)
     lower = limits.lower
     if lower < known.cost[0]:
-        lower = _search(graph, costs, most, edge_cost, limits, known)
+        lower = _search(graph, costs, max_labels, edge_cost, limits, known)
 
     if known.cost[0] < np.inf:
         path[0] = graph.cell[graph.starts[0]]
@@ -394,31 +394,31 @@ class Labels(NamedTuple):
     """Table of labels.
 
     `number` (label, number) contains the cost, the sums and the trust of each label. The other
-    columns have shape (label,): `edge` is the edge that led to the label, `left` the cell before
-    this edge, `parent` the previous label of the path, and `before` the previous label of the same
-    state. `last` (state,) is the newest label of each state. Missing entries are -1.
+    columns have shape (label,): `edge` is the edge that led to the label, `came_from` the cell that
+    this edge leaves, `parent` the previous label of the path, and `before` the previous label of
+    the same state. `last` (state,) is the newest label of each state. Missing entries are -1.
     """
 
     number: np.ndarray
     edge: np.ndarray
-    left: np.ndarray
+    came_from: np.ndarray
     parent: np.ndarray
     before: np.ndarray
     last: np.ndarray
 
 
 @kernel
-def _search(graph, costs, most, edge_cost, limits, known):
+def _search(graph, costs, max_labels, edge_cost, limits, known):
     """Search for the best path; return its cost, or a lower limit if there are too many labels."""
     n_numbers = 1 + len(costs.failure) + len(costs.x0)
-    made = np.empty((4, most), np.int64)
+    made = np.empty((4, max_labels), np.int64)
     last = np.full(len(graph.cell), -1)
-    labels = Labels(np.empty((most, n_numbers)), made[0], made[1], made[2], made[3], last)
+    labels = Labels(np.empty((max_labels, n_numbers)), made[0], made[1], made[2], made[3], last)
 
     n = 0
     for s in graph.starts:
         labels.edge[n] = -1
-        labels.left[n] = -1
+        labels.came_from[n] = -1
         labels.parent[n] = -1
         labels.before[n] = -1
         labels.last[s] = n
@@ -432,7 +432,7 @@ def _search(graph, costs, most, edge_cost, limits, known):
     for s in range(len(graph.cell) - 1, 0, -1):
         label = labels.last[s]
         while label >= 0:
-            if n + _N_MOVES > most:
+            if n + _N_MOVES > max_labels:
                 return limits.lower
             if not _is_dominated(graph, labels, label, labels.last[s], len(costs.failure)):
                 n = _extend(graph, costs, edge_cost, limits, known, labels, s, label, n)
@@ -451,7 +451,7 @@ def _extend(graph, costs, edge_cost, limits, known, labels, s, label, n):
 
     for e in range(graph.first[s], graph.first[s + 1]):
         h = graph.head[e]
-        if not graph.turns and graph.cell[h] == labels.left[label]:
+        if not graph.turns and graph.cell[h] == labels.came_from[label]:
             continue
 
         lost = _lost_on(graph, costs, e, number[1 + n_sums :], after)
@@ -464,7 +464,7 @@ def _extend(graph, costs, edge_cost, limits, known, labels, s, label, n):
         labels.number[n, 1 : 1 + n_sums] = sums
         labels.number[n, 1 + n_sums :] = after
         labels.edge[n] = e
-        labels.left[n] = graph.cell[s]
+        labels.came_from[n] = graph.cell[s]
         labels.parent[n] = label
         labels.before[n] = labels.last[h]
         labels.last[h] = n
@@ -529,10 +529,12 @@ def _is_dominated(graph, labels, label, other, n_sums):
             equal = equal and a == b
 
         if covers and (not equal or other < label):  # of equal labels, the first remains
-            left = labels.left[other]
-            if graph.turns or left == labels.left[label] or by not in (_NO_CELL_YET, left):
+            came_from = labels.came_from[other]
+            if graph.turns or came_from == labels.came_from[label]:
                 return True
-            by = left
+            if by not in (_NO_CELL_YET, came_from):  # two labels, from different cells
+                return True
+            by = came_from
         other = labels.before[other]
 
     return False

@@ -245,8 +245,8 @@ def fewest_bounds(bounds: np.ndarray, cell: Cell, *, back: bool = False) -> np.n
     """
     rows, cols = bounds.shape[1:]
     move, entered = np.nonzero(bounds.reshape(len(bounds), -1))
-    left = entered - (STEPS @ (cols, 1))[move]
-    ends = (entered, left) if back else (left, entered)
+    origin = entered - (STEPS @ (cols, 1))[move]
+    ends = (entered, origin) if back else (origin, entered)
     graph = csr_array((np.ones(len(move)), ends), shape=(rows * cols, rows * cols))
 
     fewest = dijkstra(graph, indices=cell[0] * cols + cell[1], unweighted=True)

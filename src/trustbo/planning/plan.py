@@ -114,7 +114,7 @@ class Plan(Summary):
         if posts is None:
             return None
         bounds = zip(self.path, self.path[1:], strict=False)
-        return np.stack([posts.watching(left, entered) for left, entered in bounds])
+        return np.stack([posts.watching(origin, entered) for origin, entered in bounds])
 
     @cached_property
     def routes(self) -> tuple[tuple[np.ndarray | None, ...], ...] | None:

@@ -361,8 +361,8 @@ class Planner(Summary):
         for row, col in np.argwhere(self.workspace.passable.values).tolist():
             graph.add_node((row, col), x=float(grid.x[col]), y=float(grid.y[row]))
         for k, (move, row, col) in enumerate(np.argwhere(bounds).tolist()):
-            left = row - int(STEPS[move, 0]), col - int(STEPS[move, 1])
-            graph.add_edge(left, (row, col), **{name: float(v[k]) for name, v in values.items()})
+            origin = row - int(STEPS[move, 0]), col - int(STEPS[move, 1])
+            graph.add_edge(origin, (row, col), **{name: float(v[k]) for name, v in values.items()})
 
         return graph
 
